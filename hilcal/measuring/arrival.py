@@ -34,8 +34,6 @@ MOVES_M = 0.005
 
 @dataclass(slots=True, eq=False)
 class _Sighting:
-    """A reading, for the registration."""
-
     held: Floats  # (3,) nominal position of the target, base axes, m
     position: Floats  # (3,) measured position, sensor axes, m
     target: int

@@ -227,7 +227,6 @@ def _expected_text(e: Floats, unit: str, gravity: Floats) -> str:
 
 
 def _measured_text(e: Floats, f: Floats, limit: float, unit: str, gravity: Floats) -> str:
-    """Return a description of the measured vector f where e was expected."""
     expected_size, measured_size = float(np.linalg.norm(e)), float(np.linalg.norm(f))
     if measured_size <= limit:
         return "that is nothing"

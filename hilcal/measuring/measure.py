@@ -78,7 +78,9 @@ def average(samples: Sequence[TrackerSample], systematic_share: float = 0.0) -> 
         )
     prior = stated[retained].mean(axis=0)
     mean, residuals = deviations(values[retained])
-    ratio, p = _trace_test(residuals, prior)
+    total = float(np.sum((residuals @ inverse_root(prior).T) ** 2))  # Σ_k r_kᵀ Σ̄⁻¹ r_k
+    dof = residuals.shape[1] * (len(residuals) - 1)
+    ratio, p = total / dof, float(stats.chi2.sf(total, dof))
     factor = 1.0 if p >= UNEXPLAINED else ratio
     covariance = covariance_of_mean(prior, residuals, systematic_share, factor)
     warnings = [f"reading {k + 1} of {len(samples)} is a gross outlier, left out" for k in left_out]
@@ -114,14 +116,6 @@ def deviations(values: Floats) -> tuple[Floats, Floats]:
     return mean, residuals
 
 
-def _trace_test(residuals: Floats, prior: Floats) -> tuple[float, float]:
-    """Return T / (m (K - 1)), T = Σ_k r_kᵀ Σ̄⁻¹ r_k, and P(chi² >= T), m (K - 1) dof."""
-    count, m = residuals.shape
-    white = residuals @ inverse_root(prior).T
-    total, dof = float(np.sum(white**2)), m * (count - 1)
-    return total / dof, float(stats.chi2.sf(total, dof))
-
-
 def _not_gross(values: Floats, stated: Floats) -> Bools:
     """Return which samples (K,) are no gross outliers."""
     m = values.shape[1]
@@ -149,23 +143,22 @@ LONGEST = 10  # largest window, over K samples
 
 
 class SettleWindow:
-    """Collects samples after the arm has stopped, and tests whether they are at rest."""
+    """Collects samples after the arm has stopped, and tests whether they are at rest.
+
+    `settled` tells whether they are; it is False before K samples.
+    """
 
     def __init__(self, count: int) -> None:
         """Start empty; `count` is K, at least 3 for a trend."""
         self._count = count
         self._samples: list[TrackerSample] = []
-        self._settled = self._has_drifted = False
+        self.settled = self._has_drifted = False
 
     def add(self, sample: TrackerSample) -> None:
         """Add the next sample."""
         self._samples.append(sample)
         del self._samples[: -2 * LONGEST * self._count]
-        self._settled = len(self._samples) >= self._count and self._judge()
-
-    def settled(self) -> bool:
-        """Whether the readings are at rest; False before K samples."""
-        return self._settled
+        self.settled = len(self._samples) >= self._count and self._judge()
 
     def _judge(self) -> bool:
         window = self._samples[-max(self._count, len(self._samples) // 2) :]
@@ -200,8 +193,6 @@ class SettleWindow:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Trend:
-    """A line through a window."""
-
     white_slope: Floats  # (m,) per s, whitened by the mean stated covariance
     moment: float  # Σ (t_k - t̄)², s²
     span: float  # from the first to the last sample, s
@@ -299,7 +290,7 @@ class Measurer:
                 rest_start = clock.now() if rest_start is None else rest_start
                 window.add(self._tracker.measure())
                 count += 1
-                if clock.now() - rest_start >= acquire.settle_s and window.settled():
+                if clock.now() - rest_start >= acquire.settle_s and window.settled:
                     return clock.now() - start
             late = clock.now() - start > acquire.settle_timeout_s
             if late and (rest_start is None or count >= PATIENCE * acquire.samples):

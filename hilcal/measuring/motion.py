@@ -166,7 +166,6 @@ class LoadWatch:
         return deviation, limit
 
     def _message(self, tared: TaredWrench) -> str:
-        """Return measured and expected load in one line."""
         part, unit, _ = judged_part(self._hung)
         felt, hung = (np.linalg.norm(w[part]) for w in (self._meter.load_wrench(tared), self._hung))
         name = "nothing" if self._load is None else self._load.name

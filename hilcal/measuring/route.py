@@ -154,7 +154,6 @@ def _cell_problems(config: CellConfig) -> list[str]:
 
 
 def _load_problems(limits: Feasibility, plan: Plan) -> list[str]:
-    """Check names, payload, and force on the sensor."""
     names = [load.name for load in limits.config.loads]
     out: list[str] = []
     for name in (UNLOADED, *plan.loads):

@@ -431,7 +431,11 @@ class Session:
         content = {"shift_m": shift.metres.tolist(), "sigma": shift.sigma}
         self._event("drift", {"cycle": step.cycle, **content, "over": shift.sigma > limit})
         if shift.sigma > limit:
-            self._remark(shift.words(limit))
+            self._remark(
+                f"the reference pose has moved by {1e6 * np.linalg.norm(shift.metres):.0f} µm, "
+                f"{shift.sigma:.1f} sigma (drift_limit_sigma {limit:g}): is the tracker or the "
+                "target loose, or the arm still warming up?"
+            )
 
     def _tell(self, step: Step, reading: Readings, settling: float, remaining: float) -> None:
         number = int(reading.target[0])

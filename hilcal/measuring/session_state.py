@@ -131,7 +131,7 @@ def stored_wrench(stored: dict[str, Any]) -> TaredWrench | None:
     if felt is None:
         return None
     arrays = felt["wrench"], felt["covariance"], stored["q_actual"]
-    return TaredWrench(*map(np.array, arrays))
+    return TaredWrench(*(np.array(values) for values in arrays))
 
 
 def sample_json(sample: ArmSample | TrackerSample | WrenchSample | Losses | None) -> Any:
@@ -156,15 +156,6 @@ class Shift:
 
     metres: Floats  # (3,) d, sensor axes, m
     sigma: float  # in standard deviations, sqrt(dᵀ (C₁ + C)⁻¹ d)
-
-    def words(self, limit: float) -> str:
-        """Return a sentence for people on a shift over a limit, sigma."""
-        micrometres = 1e6 * float(np.linalg.norm(self.metres))
-        return (
-            f"the reference pose has moved by {micrometres:.0f} µm, {self.sigma:.1f} sigma "
-            f"(drift_limit_sigma {limit:g}): is the tracker or the target loose, or the arm "
-            "still warming up?"
-        )
 
 
 LOADING_S = 60.0
