@@ -15,36 +15,7 @@ from hilcal.store.run_log import RunLog
 from tests.support.campaign_cases import LOOK_S, still_running
 from tests.support.paths import ROOT
 
-CELL = """\
-[robot]
-model = "ur10e"
-[tool]
-target_m = [0.06, 0.02, 0.12]
-load_point_m = [0.10, 0.0, 0.15]
-mass_kg = 0.8
-com_m = [0.01, 0.0, 0.06]
-[repeatability]
-joint_std_rad = 1e-5
-[[loads]]
-name = "pull x"
-force_N = [80.0, 0.0, 0.0]
-moment_Nm = [0.0, 6.0, 6.0]
-[operator.options]
-hand_s = 2.0
-[motion]
-speed_rad_s = 1.0
-acceleration_rad_s2 = 2.0
-[acquire]
-samples = 3
-[limits]
-workspace_min_m = [-1.6, -1.6, 0.05]
-[planning]
-candidates = 40
-against = []
-[simulation]
-seed = 4
-clock = 40.0
-"""
+CELL = (ROOT / "tests" / "data" / "calibrated_cell.toml").read_text(encoding="utf-8")
 """A tiny cell without a force sensor; its world goes forty times faster than a clock."""
 SIZE = ("--poses", "4", "--validation", "3")
 LONGEST = 120.0  # a calibration that is not killed takes a fifth of this, s

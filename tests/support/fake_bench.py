@@ -20,7 +20,6 @@ from hilcal.config import (
     Tool,
     Tracker,
 )
-from hilcal.errors import DeviceError
 from hilcal.measuring.connect import Rig
 from hilcal.measuring.devices import (
     ArmSample,
@@ -145,14 +144,14 @@ class MemoryStore:
 
     def __init__(self, world: World) -> None:
         self.world = world
-        self.full_at: int | None = None
+        self.refuses: dict[int, Exception] = {}  # by the number of rows that are there
         self.rows: list[tuple[Step, Readings, str]] = []
         self.events: list[tuple[str, dict[str, Any]]] = []
 
     def record(self, reading: Readings, step: Step, detail: dict[str, Any]) -> None:
         self.world.call("store.record")
-        if self.full_at == len(self.rows):
-            raise DeviceError("run.hilcal: the disk is full")
+        if len(self.rows) in self.refuses:
+            raise self.refuses[len(self.rows)]
         assert len(reading) == 1
         assert not self.world.is_moving, "stored in motion"
         text = json.dumps(detail, allow_nan=False)
@@ -447,6 +446,32 @@ class Bench:
         self.rig = Rig(FakeArm(self.world), FakeTracker(self.world), force, self.operator)
         self.clock = FakeClock(world=self.world)
 
+    @property
+    def asked_for(self) -> list[str]:
+        """Names of the loads that were asked for, in order."""
+        return [name for name, _ in self.operator.asked]
+
+    def remarks(self, words: str = "") -> list[str]:
+        return [note.text for note in self.notes.of(Remark) if words in note.text]
+
+    def measure(self, plan: Plan | None = None, **more: Any) -> Readings:
+        """Run a plan (the usual one if None) to its end; returns all readings."""
+        plan = plan or usual_plan()
+        run(self.rig, self.cell, self.config, plan, self.store, self.clock, self.notes, **more)
+        readings = self.store.readings()
+        assert readings is not None
+        return readings
+
+    def interrupt(self, stored: int, plan: Plan | None = None, **more: Any) -> None:
+        """Kill a run when so many readings are stored, and start the program anew."""
+        self.world.kill_after = ("store.recorded", stored)
+        try:
+            self.measure(plan, **more)
+        except Killed:
+            self.world.again()
+        else:
+            raise AssertionError("the run came to its end")
+
 
 def before(device: Any, call: str, do: Callable[..., None]) -> None:
     """Have something done before each call of a device, with what the call is given."""
@@ -463,33 +488,6 @@ def changed(device: Any, call: str, by: Callable[[Any], Any]) -> None:
     """Have something else returned by each call of a device, made of what it returns."""
     real = getattr(device, call)
     setattr(device, call, lambda *given: by(real(*given)))
-
-
-def asked_for(b: Bench) -> list[str]:
-    return [name for name, _ in b.operator.asked]
-
-
-def remarks(b: Bench, words: str = "") -> list[str]:
-    return [note.text for note in b.notes.of(Remark) if words in note.text]
-
-
-def measure(b: Bench, plan: Plan | None = None, **more: Any) -> Readings:
-    """Run a plan (the usual one if None) to its end; returns all readings."""
-    run(b.rig, b.cell, b.config, plan or usual_plan(), b.store, b.clock, b.notes, **more)
-    readings = b.store.readings()
-    assert readings is not None
-    return readings
-
-
-def interrupt(b: Bench, stored: int, plan: Plan | None = None, **more: Any) -> None:
-    """Kill a run when so many readings are stored, and start the program anew."""
-    b.world.kill_after = ("store.recorded", stored)
-    try:
-        measure(b, plan, **more)
-    except Killed:
-        b.world.again()
-    else:
-        raise AssertionError("the run came to its end")
 
 
 def rows(readings: Readings, load: str) -> Bools:

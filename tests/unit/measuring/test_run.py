@@ -25,13 +25,9 @@ from tests.support.fake_bench import (
     STD,
     TORQUE,
     Bench,
-    asked_for,
     before,
     changed,
-    interrupt,
-    measure,
     plan_of,
-    remarks,
     rows,
     usual_plan,
 )
@@ -42,7 +38,7 @@ from tests.support.refusals import refusal_of
 def ran():
     """A usual campaign at its end, to look at."""
     b = Bench()
-    measure(b)
+    b.measure()
     return b
 
 
@@ -69,7 +65,7 @@ def test_wrench_is_measured_or_told_as_the_cell_says(use, mass, pull):
     b = Bench(force_sensor=ForceSensor(driver="fake", port="nowhere", use=use))
     loads = (CellLoad(name="3kg", mass_kg=3.03), CellLoad(name="pull", force_N=(38.0, 0.0, 0.0)))
     b.world.config = b.config.model_copy(update={"loads": loads})
-    readings = measure(b)
+    readings = b.measure()
     weight = [0, 0, -mass * 9.80665, 0, 0, 0]
     for load, wrench in (("none", np.zeros(6)), ("3kg", weight), ("pull", [pull, 0, 0, 0, 0, 0])):
         felt = readings.states.wrench[rows(readings, load)]
@@ -93,7 +89,7 @@ def test_wrench_is_that_at_the_load_point_wherever_the_sensor_sits(b):
         return np.concatenate([axes.T @ f, axes.T @ m]) + b.world.offset
 
     changed(b.world, "wrench", at_the_sensor)
-    readings = measure(b)
+    readings = b.measure()
     for name, force in (("3kg", [0, 0, -3.0 * 9.80665]), ("pull", [40.0, 0, 0])):
         assert np.allclose(
             readings.states.wrench[rows(readings, name)], [*force, 0, 0, 0], atol=1e-6
@@ -146,8 +142,8 @@ def test_progress(ran):
     b, plan = ran, usual_plan()
     drifts = [content for kind, content in b.store.events if kind == "drift"]
     assert [d["over"] for d in drifts] == [False, False]
-    assert not remarks(b, "has moved")
-    assert not remarks(b, "[tool]")
+    assert not b.remarks("has moved")
+    assert not b.remarks("[tool]")
     taken = b.notes.of(ReadingStored)
     assert [t.done for t in taken] == list(range(1, len(plan.steps) + 1))
     assert {t.total for t in taken} == {len(plan.steps)}
@@ -171,7 +167,7 @@ def test_the_judge_sees_all_readings_and_may_not_know(b):
             raise CannotAnswerError("too few readings")
         return LiveResidual(1e-5, 0.5) if len(readings) > 3 else LiveResidual()
 
-    measure(b, live=judge)
+    b.measure(live=judge)
     assert seen == list(range(1, len(usual_plan().steps) + 1))
     taken = b.notes.of(ReadingStored)
     assert [t.live.residual for t in taken[:4]] == [None, None, None, 1e-5]
@@ -184,10 +180,10 @@ def test_drift_of_the_reference_pose_is_told(b):
             b.world.shift = np.array([0.0, 0.0, 4e-4])
 
     before(b.store, "record", shift)
-    measure(b)
+    b.measure()
     drifts = [content for kind, content in b.store.events if kind == "drift"]
     assert [d["over"] for d in drifts] == [True, True]
-    said = remarks(b, "reference pose has moved")
+    said = b.remarks("reference pose has moved")
     assert len(said) == 2
     assert any(word in said[0] for word in ("by 39", "by 40", "by 41"))
 
@@ -209,13 +205,13 @@ def test_repeatability_is_estimated_at_the_end():
 
     b.world.position = position
     plan = plan_of(*((p, "none", c) for c in range(12) for p in ("p1", "p2", "p3")))
-    measure(b, plan)
+    b.measure(plan)
     found = b.store.last("repeatability")
     assert found["poses"] == 3
     assert found["dof"] == 33
     assert found["joint_std"] == pytest.approx(5e-5, rel=0.35)
     assert found["scatter"] > 3 * found["instrument"]
-    (said,) = remarks(b, "33 returns to 3 poses")
+    (said,) = b.remarks("33 returns to 3 poses")
     assert f"joint_std_rad is about {found['joint_std']:.1g}" in said
 
 
@@ -246,35 +242,44 @@ def test_an_arm_that_does_not_scatter_is_seldom_said_to():
     assert said < 12
 
 
-def test_a_cell_without_a_tool():
+def test_without_a_tool_and_without_a_force_sensor():
     b = Bench(tool=Tool(target_m=(0.0, 0.0, 0.1)))
     b.world.tool_mass = 0.0
-    measure(b)
+    b.measure()
     assert b.world.payload[0] == 0.0
+    b = Bench(force_sensor=None)
+    b.world.wrong = ["none", "6kg"]
+    readings = b.measure()
+    assert len(readings) == len(usual_plan().steps)
+    assert np.allclose(readings.states.wrench[rows(readings, "pull")], [40.0, 0, 0, 0, 0, 0])
+    assert json.loads(b.store.rows[0][2])["force"] is None
 
 
 def test_a_wrong_load_is_asked_for_again_with_the_reason(b):
     b.world.wrong = ["none", "6kg"]  # the first answer is that to "take everything off"
-    readings = measure(b)
+    readings = b.measure()
     assert len(readings) == len(usual_plan().steps)
-    assert asked_for(b)[:3] == ["none", "3kg", "3kg"]
+    assert b.asked_for[:3] == ["none", "3kg", "3kg"]
     assert b.operator.asked[1][1] == ""
     assert "6.0 kg" in b.operator.asked[2][1]
-    assert remarks(b, "asked to hang 3kg")
+    assert b.remarks("asked to hang 3kg")
 
 
 @pytest.mark.long
 def test_three_wrong_loads_end_the_run(b):
     b.world.wrong = ["none", "6kg", "none", "6kg"]
-    refusal_of(DeviceError, r"asked 3 times to hang 3kg.*--resume$", measure, b)
+    refusal_of(DeviceError, r"asked 3 times to hang 3kg.*--resume$", b.measure)
     assert len(b.store.rows) == 5
     assert b.world.calls[-2] == "arm.stop"
     b.world.again()
-    b.world.wrong = ["none", "3kg", "3kg"]  # one that is not taken off is noticed
-    asked = len(b.operator.asked)
-    assert len(measure(b)) == len(usual_plan().steps)
-    assert asked_for(b)[asked:] == ["none", "3kg", "none", "none", "pull", "none"]
-    assert "3.0 kg still hangs" in b.operator.asked[asked + 3][1]
+    assert len(b.measure()) == len(usual_plan().steps)
+
+
+def test_a_load_that_is_not_taken_off_is_noticed(b):
+    b.world.wrong = ["none", "3kg", "3kg"]
+    b.measure()
+    assert b.asked_for == ["none", "3kg", "none", "none", "pull", "none"]
+    assert "3.0 kg still hangs" in b.operator.asked[3][1]
 
 
 @pytest.mark.long
@@ -289,27 +294,18 @@ def test_a_swinging_load_is_weighed_twice(b):
             b.world.extra[0] = 8.0 if swings else 0.0
 
     before(b.rig.force, "average", swinging)
-    measure(b)
-    assert asked_for(b) == ["none", "3kg", "none", "pull", "none"]
-
-
-def test_without_a_force_sensor_the_person_is_believed():
-    b = Bench(force_sensor=None)
-    b.world.wrong = ["none", "6kg"]
-    readings = measure(b)
-    assert len(readings) == len(usual_plan().steps)
-    assert np.allclose(readings.states.wrench[rows(readings, "pull")], [40.0, 0, 0, 0, 0, 0])
-    assert json.loads(b.store.rows[0][2])["force"] is None
+    b.measure()
+    assert b.asked_for == ["none", "3kg", "none", "pull", "none"]
 
 
 def test_the_tool_is_identified_and_compared_with_the_configuration(b):
     b.world.tool_mass = 1.4
-    measure(b)
+    b.measure()
     assert b.store.kinds().index("tool") < b.store.kinds().index("load")
     tool = b.store.last("tool")
     assert tool["mass_kg"] == pytest.approx(1.4, abs=1e-6)
     assert tool["com_m"] == pytest.approx([0.01, 0.0, 0.06], abs=1e-6)
-    assert remarks(b, "[tool] says 0.8 kg")
+    assert b.remarks("[tool] says 0.8 kg")
 
 
 def test_unloaded_poses_that_do_not_tell_the_tool_are_no_failure(b):
@@ -319,8 +315,8 @@ def test_unloaded_poses_that_do_not_tell_the_tool_are_no_failure(b):
         *((p, load, 0) for load in ("none", "3kg") for p in poses),
         poses={"reference": POSES["reference"], **poses},
     )
-    assert len(measure(b, plan)) == 8
-    assert remarks(b, "not identified")
+    assert len(b.measure(plan)) == 8
+    assert b.remarks("not identified")
 
 
 def test_resume_measures_exactly_what_is_missing_and_time_goes_on(b):
@@ -330,37 +326,37 @@ def test_resume_measures_exactly_what_is_missing_and_time_goes_on(b):
     def wall():
         return day[0] + b.world.time
 
-    interrupt(b, 7, plan, wall=wall)
+    b.interrupt(7, plan, wall=wall)
     done = len(b.store.rows)
     assert 5 < done < len(plan.steps)
     day[0] += 7200.0  # two hours later
     loads = len(b.operator.asked)
-    readings = measure(b, plan, wall=wall)
+    readings = b.measure(plan, wall=wall)
     assert [s for s, _, _ in b.store.rows] == list(plan.steps)
     gaps = np.diff(readings.states.time)
     assert 7200.0 < gaps[done - 1] < 7200.0 + 120.0
     assert np.all(np.delete(gaps, done - 1) < 60.0)
-    asked = asked_for(b)[loads:]
+    asked = b.asked_for[loads:]
     assert asked[0] == "none"  # nobody knows what hangs
     assert asked[1] == plan.steps[done].load == "3kg"
 
 
 @pytest.mark.long
 def test_time_never_goes_back_whatever_the_clock_on_the_wall_does(b):
-    interrupt(b, 4, wall=lambda: 5000.0 + b.world.time)
-    readings = measure(b, wall=lambda: 1000.0 + b.world.time)
+    b.interrupt(4, wall=lambda: 5000.0 + b.world.time)
+    readings = b.measure(wall=lambda: 1000.0 + b.world.time)
     assert np.all(np.diff(readings.states.time) > 0)
 
 
 @pytest.mark.long
 def test_a_load_that_still_hangs_at_a_resume_is_noticed(b):
-    interrupt(b, 7)
+    b.interrupt(7)
     assert b.world.load == "3kg"
     b.world.wrong = ["3kg"]  # the first answer is wrong
     # the sensor was off meanwhile
     b.world.offset = b.world.offset + np.array([2.0, 2.0, -2.0, 0, 0, 0])
     seen = len(b.operator.asked)
-    measure(b)
+    b.measure()
     asked = b.operator.asked[seen:]
     assert [name for name, _ in asked[:3]] == ["none", "none", "3kg"]
     assert "3kg seems to hang still" in asked[1][1]
@@ -369,16 +365,16 @@ def test_a_load_that_still_hangs_at_a_resume_is_noticed(b):
 
 def test_a_load_left_on_at_the_very_beginning_is_asked_about_said_and_found_in_motion(b):
     b.world.load, b.world.wrong = "3kg", ["3kg", "3kg"]  # both answers are wrong
-    refusal_of(DeviceError, "take everything off", measure, b)
-    assert remarks(b, "answered twice that nothing hangs")
+    refusal_of(DeviceError, "take everything off", b.measure)
+    assert b.remarks("answered twice that nothing hangs")
     # where gravity has not turned in the sensor since its tare, a load is a zero
     assert {step for step, *_ in b.store.rows} <= {Step("reference", "none", 0)}
 
 
 def test_a_finished_campaign_touches_nothing(b):
-    measure(b)
+    b.measure()
     b.world.calls.clear()
-    measure(b)
+    b.measure()
     assert b.world.calls == []
     assert b.notes.of(Phase)[-1].text == "nothing is missing"
 
@@ -387,9 +383,9 @@ def test_a_finished_campaign_touches_nothing(b):
 def test_the_tool_is_known_from_an_earlier_session_after_the_sensor_was_off(b):
     """Another bias in the second session: the pulls are measured right nevertheless."""
     b.world.tool_mass = 1.4
-    interrupt(b, 7)
+    b.interrupt(7)
     b.world.offset = -b.world.offset
-    readings = measure(b)
+    readings = b.measure()
     felt = readings.states.wrench[rows(readings, "pull")]
     assert np.allclose(felt, [40.0, 0, 0, 0, 0, 0], atol=1e-6)
 
@@ -399,22 +395,22 @@ LOST = "no longer tells the torques"
 
 def test_torques_are_averaged_over_the_reading(b):
     b.world.torques = np.inf
-    torque = measure(b).states.torque
+    torque = b.measure().states.torque
     # means of at least three samples that scatter by 0.1 N·m
     assert np.abs(torque - TORQUE).max() < 5 * 0.1 / np.sqrt(3)
-    assert not remarks(b, LOST)
+    assert not b.remarks(LOST)
     assert b.store.details()[0]["torque"] == torque[0].tolist()
 
 
 def test_a_lost_link_is_said_once_and_readings_go_on(b, tmp_path):
     b.world.torques = 60
-    readings = measure(b)
+    readings = b.measure()
     torque = readings.states.torque
     lost = np.isnan(torque).all(axis=1)
     assert np.array_equal(lost, np.isnan(torque).any(axis=1))
     assert 0 < lost.argmax() < len(lost)
     assert lost[lost.argmax() :].all()
-    assert len(remarks(b, LOST)) == 1
+    assert len(b.remarks(LOST)) == 1
     with CampaignFile.create(tmp_path / "r.hilcal", "{}", ".", "test") as file:
         file.append_readings(readings[:1])
         file.append_readings(readings[1:])
@@ -442,12 +438,12 @@ def test_a_lost_link_is_said_once_and_readings_go_on(b, tmp_path):
 @pytest.mark.parametrize("first", [0, np.inf])
 def test_a_campaign_goes_on_as_it_began(b, first):
     b.world.torques = first
-    interrupt(b, 4)
+    b.interrupt(4)
     b.world.torques = -1 if first else np.inf
-    torque = measure(b).states.torque
+    torque = b.measure().states.torque
     if not first:
         assert torque is None
     else:
         assert np.isfinite(torque[:4]).all()
         assert np.isnan(torque[4:]).all()
-        assert len(remarks(b, LOST)) == 1
+        assert len(b.remarks(LOST)) == 1

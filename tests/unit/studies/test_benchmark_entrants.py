@@ -74,16 +74,13 @@ def asked():
     return Asked.read(first_task("elastic"))
 
 
-def test_positions_are_those_of_hilcals_chain(asked):
+def test_positions_and_torques_are_those_of_another_mechanics(asked):
     theta = np.zeros(51)
     theta[:6] = [0.3, -1.0, 2.0, 1.0, 2.0, 3.0]
     arm = arm_from_urdf(asked.task.folder / "robot.urdf")
     point = evaluate(arm, asked.train.q).point(asked.arm.target)
     expected = point @ rotation(theta[:3]).T + theta[3:6]
     np.testing.assert_allclose(asked.arm.predict(theta, asked.train), expected, atol=1e-12)
-
-
-def test_torques_are_those_of_another_dynamics():
     law = Asked.read(first_task("law"))
     stated = np.stack([law.train.columns[f"x_tau{j}_Nm"] for j in range(1, 7)], axis=1)
     np.testing.assert_allclose(law.train.torque, stated, atol=6e-4)  # they are rounded to 1e-3
