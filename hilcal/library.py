@@ -39,8 +39,8 @@ from hilcal.refinement import Refinement
 from hilcal.refinement import refine as refine_model
 from hilcal.store.plan import Plan
 from hilcal.store.schema import HEADER
-from hilcal.stream import fit as streams
-from hilcal.stream.fit import StreamFit
+from hilcal.stream import StreamFit
+from hilcal.stream import fit_stream as fit_all
 from hilcal.tables.importing import import_readings
 from hilcal.tables.parquet_stream import open_stream
 from hilcal.types import Floats
@@ -108,7 +108,7 @@ def fit_stream(
     stream = open_stream(Path(path), cell.arm, tracker_noise(tracker), tracker.station_m)
     named: dict[str, Options] | None = None if effects is None else {name: {} for name in effects}
     with open_engine(workers, scheduler) as engine:
-        return streams.fit_stream(stream, cell, engine, named, prior=prior)
+        return fit_all(stream, cell, engine, named, prior=prior)
 
 
 def bootstrap(

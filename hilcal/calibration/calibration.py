@@ -45,7 +45,7 @@ from hilcal.robot.factory import SAME, flange_difference, of_dict, with_factory
 from hilcal.shown import Brief
 from hilcal.store.codec import read_file, write_document
 from hilcal.store.schema import is_campaign
-from hilcal.stream.fit import StreamFit
+from hilcal.stream import StreamFit
 from hilcal.types import Bools, Floats, Ints
 
 

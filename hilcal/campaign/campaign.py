@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Self
 
@@ -143,10 +144,8 @@ class Campaign(Brief):
         cell, restated = cell_from_config(config, None, *robot_texts), _restates(file, changes)
         noise = None if restated else estimated_noise(file)
         readings = _with_instrument(file.readings(), config, restated, noise)
-        covers = INSTRUMENT if restated else file.about(COVERS)
-        readings = replace(
-            full_readings(readings, covers, cell, config), noise_stated=noise is None
-        )
+        readings = full_readings(readings, _covers(file, changes), cell, config)
+        readings = replace(readings, noise_stated=noise is None)
         values = (file, config, cell, readings, catalogue, changes, noise)
         for field, value in zip(fields(self), values, strict=True):
             object.__setattr__(self, field.name, value)
@@ -163,11 +162,8 @@ class Campaign(Brief):
         """Return the campaign with further changes of the cell; the file is not changed.
 
         The tracker's noise determines the covariances of readings whose table states none, as in
-        an import; no other number of a reading changes.
-
-        Args:
-            changes: values by section and key, for the keys of `config.changes.CHANGEABLE`; the
-                value None removes a key.
+        an import; no other number of a reading changes. `changes` are values by section and key,
+        for the keys of `config.changes.CHANGEABLE`; the value None removes a key.
 
         Raises:
             InputError: a key or a value is not valid, or these readings do not use the key.
@@ -192,7 +188,7 @@ class Campaign(Brief):
         if noise is None and self.file.about(FROM) != TRACKER:
             why = "the covariances of these readings are those that were measured, or of the table"
             reasons |= {("tracker", key): why for key in INSTRUMENT_NOISE}
-        covers = INSTRUMENT if _restates(self.file, changes) else self.file.about(COVERS)
+        covers = _covers(self.file, changes)
         if covers != INSTRUMENT:
             hint = "; state the noise in [tracker], too" if noise is not None else ""
             why = f"the covariances of these readings include the arm's scatter already{hint}"
@@ -210,11 +206,7 @@ class Campaign(Brief):
     @property
     def covariance_parts(self) -> CovarianceParts:
         """The components of the readings' covariance."""
-        return covariance_parts(self._stated_covers, self.config)
-
-    @property
-    def _stated_covers(self) -> str | None:
-        return INSTRUMENT if _restates(self.file, self.changes) else self.file.about(COVERS)
+        return covariance_parts(_covers(self.file, self.changes), self.config)
 
     @property
     def covers(self) -> str:
@@ -229,7 +221,7 @@ class Campaign(Brief):
         a scatter of the arm.
         """
         added = covariance_parts(INSTRUMENT, self.config) != "instrument"
-        return self._stated_covers or (WHOLE if added else INSTRUMENT)
+        return _covers(self.file, self.changes) or (WHOLE if added else INSTRUMENT)
 
     @property
     def data_hash(self) -> str:
@@ -239,12 +231,8 @@ class Campaign(Brief):
     def save_table(self, path: Path, *, as_stored: bool = False) -> None:
         """Write the readings as an exchange table, CSV or Parquet by the file's name.
 
-        Args:
-            path: the file; an existing one is replaced.
-            as_stored: leave out the arm's scatter where it was added to the covariance.
-
-        Raises:
-            InputError: the file cannot be written.
+        `as_stored` leaves out the arm's scatter where it was added to the covariance. An existing
+        file is replaced; InputError: it cannot be written.
         """
         about = {"campaign": self.path.name, "source": self.file.source}
         about["robot"] = self.cell.arm.name
@@ -395,20 +383,14 @@ class Campaign(Brief):
     def history(self, revision: int | None = None) -> History:
         """Return the history of a revision's model, which `diagnose` takes."""
         record = self.in_use(revision)
-        return revisions.history(
-            () if record is None else revisions.chain(self.file.revisions(), record.number)
-        )
+        chain = () if record is None else revisions.chain(self.file.revisions(), record.number)
+        return revisions.history(chain)
 
     def append(self, found: Fit | Diagnosis | Refinement) -> int:
         """Append a fit, a diagnosed fit, or all steps of a refinement as revisions.
 
-        Nothing is stored where the latest revisions are these already.
-
-        Returns:
-            The number of the (last) revision.
-
-        Raises:
-            InputError: it was fitted to other readings than those of this campaign.
+        Return the number of the (last) revision. Nothing is stored where the latest revisions are
+        these already. Raises as `store` does.
         """
         if isinstance(found, Refinement):
             records = [self.record(s.fit, s.diagnosis, s.added, s.removed) for s in found.steps]
@@ -421,11 +403,10 @@ class Campaign(Brief):
     def append_records(
         self, records: Sequence[RevisionRecord], parent: int | None = None
     ) -> tuple[int, ...]:
-        """Store a chain of revisions, each made from the previous one; return their numbers.
+        """Store a chain of revisions from `record`, each made from the previous one.
 
-        Args:
-            records: from `record`; none is stored where the latest chain ends with them already.
-            parent: number of the revision that the first one is made from; None for a first model.
+        Return their numbers; none is stored where the latest chain ends with them already.
+        `parent` is the number of the revision that the first one is made from, if any.
         """
         if not records:
             return ()
@@ -433,10 +414,10 @@ class Campaign(Brief):
         comparable = last and last[0].made_from == parent and len(last) == len(records)
         if comparable and all(map(revisions.is_again, records, last)):
             return tuple(r.number for r in last)
-        numbers: list[int] = []
+        numbers = []
         for record in records:
-            previous = numbers[-1] if numbers else parent
-            numbers.append(self.file.append_revision(replace(record, parent=previous)))
+            parent = self.file.append_revision(replace(record, parent=parent))
+            numbers.append(parent)
         return tuple(numbers)
 
     def store(
@@ -449,11 +430,8 @@ class Campaign(Brief):
     ) -> int:
         """Store a fit, with the effect that was added to or removed from the model.
 
-        Args:
-            parent: number of the revision that was changed; the previous one where None.
-
-        Returns:
-            The number of the revision.
+        Return the number of the revision. `parent` is the number of the revision that was changed;
+        None: the previous one.
 
         Raises:
             InputError: it was fitted to other readings than those of this campaign, or these are
@@ -476,10 +454,10 @@ class Campaign(Brief):
             raise InputError(f"{self.path}: the fit is of other readings than this campaign's")
         document = None if diagnosis is None else to_json(diagnosis)
         record = revisions.to_record(found, document, added, hashed, removed, parent)
-        options: dict[str, Any] = {STORED: self.data_hash, **typed_now()}
+        options = {**record.options, STORED: self.data_hash, **typed_now()}
         if self.changes:
             options[CELL] = self.changes
-        return replace(record, options={**record.options, **options})
+        return replace(record, options=options)
 
     def fit_in_use(
         self, say: Say = lambda text: None, revision: int | None = None
@@ -540,13 +518,11 @@ def _judged(
 
 def _named_from(fits: Sequence[Fit]) -> Sequence[Fit]:
     """Return the first fit, and the next ones that only name further effects of its background."""
-    first, count = fits[0], 1
-    for f in fits[1:]:
-        previous = fits[count - 1].model.background
-        if not f.model.background < previous or not np.array_equal(f.theta, first.theta):
-            break
-        count += 1
-    return fits[:count]
+    for count, (previous, f) in enumerate(pairwise(fits), start=1):
+        fewer = f.model.background < previous.model.background
+        if not fewer or not np.array_equal(f.theta, fits[0].theta):
+            return fits[:count]
+    return fits
 
 
 def estimated_noise(file: CampaignFile) -> NoiseEstimate | None:
@@ -574,6 +550,11 @@ def _restates(file: CampaignFile, changes: Changes) -> bool:
     if file.about(NOISE) is not None:
         return not keys.isdisjoint(INSTRUMENT_NOISE)
     return file.about(FROM) == TRACKER and not keys.isdisjoint((*INSTRUMENT_NOISE, "station_m"))
+
+
+def _covers(file: CampaignFile, changes: Changes) -> str | None:
+    """Return what the covariance of the readings covers before the arm's scatter is added."""
+    return INSTRUMENT if _restates(file, changes) else file.about(COVERS)
 
 
 @contextmanager

@@ -61,7 +61,7 @@ def add_effect(
     say(f"adding {named}")
     after = add(before, effect, options=options)
     added = named if effect in before.model.names else effect
-    return _stored(o, number, before, after, added, None, say, judged)
+    return _stored(o, number, before, after, say, judged, added=added)
 
 
 def remove_effect(
@@ -74,7 +74,7 @@ def remove_effect(
 ) -> Changed:
     """Remove an effect from a revision's model; else as `add_effect`."""
     say(f"removing {effect}")
-    return _stored(o, number, before, remove(before, effect), None, effect, say, judged)
+    return _stored(o, number, before, remove(before, effect), say, judged, removed=effect)
 
 
 def _stored(
@@ -82,16 +82,16 @@ def _stored(
     number: int | None,
     before: Fit,
     after: Fit,
-    added: str | None,
-    removed: str | None,
     say: Say,
     judged: Diagnosis | None,
+    added: str | None = None,
+    removed: str | None = None,
 ) -> Changed:
     say("diagnosing")
     previous = o.history(number)
     history = History(
         added=tuple(n for n in after.model.names if n in (added, *previous.added)),
-        removed=(*previous.removed, *([] if removed is None else [removed])),
+        removed=previous.removed if removed is None else (*previous.removed, removed),
     )
     d = diagnose(after, history, say)
     for f in (before, after):
@@ -99,8 +99,7 @@ def _stored(
         _ = f.holdout
         say("computing standard uncertainties")
         _ = f.uncertainty
-    if number is None:
-        number = o.store(before, judged)
+    number = o.store(before, judged) if number is None else number
     new_number = o.store(after, d, added, removed, number)
     promised = added is not None and before.scaling == "gc"
     expected = addition(before, after) if promised else None
@@ -150,6 +149,5 @@ def change_cell(
     changed = o.with_cell(changes)
     record = o.record(before) if number is None else o.file.revision(number)
     diagnosis = refit(changed, record, say, o.history(number))
-    if number is None:
-        number = o.store(before, judged)
+    number = o.store(before, judged) if number is None else number
     return changed, changed.store(diagnosis.fit, diagnosis, parent=number), diagnosis

@@ -54,8 +54,14 @@ def to_record(
     revision that it was made from, where that is not the previous one.
     """
     model, cell, readings = fitted.model, fitted.model.cell, fitted.readings
+    options: dict[str, Any] = {
+        "readings": fitted.mode,
+        "scaling": fitted.scaling,
+        "effects": {e.name: dict(e.options) for e in model.effects},
+    }
     files = {name: model.catalogue.file_of(name) for name in model.names}
-    sources = {n: {"file": f.path, "sha256": f.sha256} for n, f in files.items() if f is not None}
+    if sources := {n: {"file": f.path, "sha256": f.sha256} for n, f in files.items() if f}:
+        options[SOURCES] = sources
     std = {name: values.tolist() for name, values in model.random.items()}
     optional = {
         "targets": None if cell.targets is None else cell.targets.tolist(),
@@ -73,12 +79,7 @@ def to_record(
         added=added,
         removed=removed,
         parent=parent,
-        options={
-            "readings": fitted.mode,
-            "scaling": fitted.scaling,
-            "effects": {e.name: dict(e.options) for e in model.effects},
-            **({SOURCES: sources} if sources else {}),
-        },
+        options=options,
         data_hash=data_hash,
         program_version=__version__,
         parameters_json={
@@ -181,14 +182,33 @@ def restore_model(
     record: RevisionRecord, cell: Cell, readings: Readings, catalogue: Catalogue | None = None
 ) -> tuple[Model, Floats]:
     """Return model and parameters (P,) of a revision, in the cell as registered by its fit."""
+    catalogue = catalogue or installed()
+    stored: Mapping[str, Any] = record.parameters_json
     with sound(record):
-        return _restored(record, cell, readings, catalogue or installed())
+        cell = _registered(record, cell, readings)
+        options, random_effects = record.options["effects"], stored.get(RANDOM)
+        names = tuple(random_effects["effects"] if random_effects else record.effects)
+        effects = tuple(catalogue.make(e, cell, readings.states, options.get(e)) for e in names)
+        size = {e.name: len(e.magnitudes) for e in effects}
+        std = random_effects["std"] if random_effects else {}
+        random = {name: np.array(values, dtype=float) for name, values in std.items()}
+        for name, values in random.items():
+            if values.shape != (size.get(name),) or not np.all((values > 0) & (values < LARGEST)):
+                raise ValueError("random effects with standard deviations that are none")
+        background = frozenset(names) - frozenset(record.effects)
+        if not background <= random.keys() or not set(record.effects) <= set(names):
+            raise ValueError("a background that is not random")
+        model = Model(cell, effects, catalogue, readings, carried_of(record), random, background)
+        if _names(model) != stored["names"]:
+            raise InputError(
+                f"revision {record.number} was made by hilcal {record.program_version}, whose "
+                "effects have other parameters; run hilcal identify again"
+            )
+        return model, numbers("theta", stored["theta"], (model.size,))
 
 
-def _restored(
-    record: RevisionRecord, cell: Cell, readings: Readings, catalogue: Catalogue
-) -> tuple[Model, Floats]:
-    """Do the same; a damaged record may raise any exception."""
+def _registered(record: RevisionRecord, cell: Cell, readings: Readings) -> Cell:
+    """Return the cell with the frames of a fit; a damaged record may raise any exception."""
     stored: Mapping[str, Any] = record.parameters_json
     targets = frames("targets", stored.get("targets", [stored["target"]]), several=True)
     registration = frames("registration", stored["registration"])
@@ -199,31 +219,13 @@ def _restored(
         )
     cell = replace(cell.with_targets(targets), registration=registration)
     cell = cell.observed_by(readings.observers)
-    if cell.observers:
-        observed = stored["observers"]
-        places = frames("observers", [o["frame"] for o in observed], several=True)
-        trios = zip(cell.observers, places, observed, strict=True)
-        placed = (replace(o, frame=f, offset=float(s["offset_m"])) for o, f, s in trios)
-        cell = replace(cell, observers=tuple(placed))
-    options, random_effects = record.options["effects"], stored.get(RANDOM)
-    names = tuple(random_effects["effects"] if random_effects else record.effects)
-    effects = tuple(catalogue.make(e, cell, readings.states, options.get(e)) for e in names)
-    size = {e.name: len(e.magnitudes) for e in effects}
-    std = random_effects["std"] if random_effects else {}
-    random = {name: np.array(values, dtype=float) for name, values in std.items()}
-    for name, values in random.items():
-        if values.shape != (size.get(name),) or not np.all((values > 0) & (values < LARGEST)):
-            raise ValueError("random effects with standard deviations that are none")
-    background = frozenset(names) - frozenset(record.effects)
-    if not background <= random.keys() or not set(record.effects) <= set(names):
-        raise ValueError("a background that is not random")
-    model = Model(cell, effects, catalogue, readings, carried_of(record), random, background)
-    if _names(model) != stored["names"]:
-        raise InputError(
-            f"revision {record.number} was made by hilcal {record.program_version}, whose effects "
-            "have other parameters; run hilcal identify again"
-        )
-    return model, numbers("theta", stored["theta"], (model.size,))
+    if not cell.observers:
+        return cell
+    observed = stored["observers"]
+    places = frames("observers", [o["frame"] for o in observed], several=True)
+    trios = zip(cell.observers, places, observed, strict=True)
+    placed = (replace(o, frame=f, offset=float(s["offset_m"])) for o, f, s in trios)
+    return replace(cell, observers=tuple(placed))
 
 
 def carried_of(record: RevisionRecord) -> CarriedPrior | None:

@@ -37,8 +37,8 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES, SCALINGS, Mode, Scaling
 from hilcal.store.procedure_log import purpose_of, refuse_fitting, release
 from hilcal.store.revision import RevisionRecord
-from hilcal.stream.fit import fit_stream
-from hilcal.stream.fit import to_json as stream_json
+from hilcal.stream import fit_stream
+from hilcal.stream import to_json as stream_json
 from hilcal.tables.files import is_parquet
 from hilcal.tables.parquet_stream import open_stream
 

@@ -34,8 +34,6 @@ MOVES_M = 0.005
 
 @dataclass(slots=True, eq=False)
 class _Sighting:
-    """A reading, for the registration."""
-
     held: Floats  # (3,) nominal position of the target, base axes, m
     position: Floats  # (3,) measured position, sensor axes, m
     target: int
@@ -60,8 +58,8 @@ class RoughRegistration:
 
         A reading that repeats the previous one is skipped; older versions stored such readings.
         """
-        held = self._positions(q)[target]
-        if self._stuck(held, position, target) is None:
+        if self._stuck(q, position, target) is None:
+            held = self._positions(q)[target]
             self._sightings.append(_Sighting(held, np.asarray(position), target, step))
 
     def late_doubts(self) -> list[tuple[Step, str]]:
@@ -75,18 +73,17 @@ class RoughRegistration:
             repeated, self._repeated = self._repeated, []
             return repeated
         out = []
-        for sighting in self._sightings:
-            far = float(_far(pose, sighting.held[None], sighting.position[None])[0])
-            known_target = self._cell.known_targets[sighting.target]
-            if far > PLAUSIBLE_M and known_target and not sighting.doubted:
-                sighting.doubted = True
+        for x in self._sightings:
+            far = float(_far(pose, x.held[None], x.position[None])[0])
+            if far > PLAUSIBLE_M and self._cell.known_targets[x.target] and not x.doubted:
+                x.doubted = True
                 why = f"its target was {far:.3g} m from where the arm held it; another reflector?"
-                out += [] if sighting.step is None else [(sighting.step, why)]
+                out += [] if x.step is None else [(x.step, why)]
         return out
 
     def doubt_repeated(self, q: Floats, position: Floats, target: int = 0) -> None:
         """Doubt the reading that a refused reading repeats, unless the registration is known."""
-        if self._stuck(self._positions(q)[target], position, target) is None or self.pose():
+        if self._stuck(q, position, target) is None or self.pose():
             return
         last = self._last(target)
         if last is not None and last.step is not None and not last.doubted:
@@ -127,31 +124,28 @@ class RoughRegistration:
 
     def implausible(self, q: Floats, position: Floats, target: int = 0) -> str | None:
         """Return why a reading cannot be of the target on the arm, in one line; else None."""
-        stuck = self._stuck(self._positions(q)[target], position, target)
-        if stuck is not None:
+        stuck = self._stuck(q, position, target)
+        if stuck is not None or not self._cell.known_targets[target]:
             return stuck
-        if not self._cell.known_targets[target]:
-            return None
         places = self.expected(q)
         if places is None:
-            error = self._apart(self._positions(q)[target], position)
+            error, limit, more = self._apart(q, position, target), APART_M, " or more"
         else:
-            error = float(np.linalg.norm(position - places[target]))
-        if error <= (APART_M if places is None else PLAUSIBLE_M):
+            error, limit, more = float(np.linalg.norm(position - places[target])), PLAUSIBLE_M, ""
+        if error <= limit:
             return None
-        suffix = " or more" if places is None else ""
         return (
-            f"tracker: it sees its target {error:.3g} m{suffix} from where the arm holds it; does "
+            f"tracker: it sees its target {error:.3g} m{more} from where the arm holds it; does "
             "it follow another reflector, or has it been moved? Have it see the target; where it "
             "has been moved, go on in a new campaign"
         )
 
-    def _stuck(self, held: Floats, position: Floats, target: int) -> str | None:
+    def _stuck(self, q: Floats, position: Floats, target: int) -> str | None:
         """Return why a reading repeats the previous one, or is of an object at rest; else None."""
         last = self._last(target)
         if last is None:
             return None
-        moved = float(np.linalg.norm(held - last.held))
+        moved = float(np.linalg.norm(self._positions(q)[target] - last.held))
         measured = float(np.linalg.norm(position - last.position))
         known_target = self._cell.known_targets[target]
         limit = max(STUCK_M, STUCK_SHARE * moved if known_target else 0.0)
@@ -163,7 +157,7 @@ class RoughRegistration:
             "not on the arm. Have it see the target"
         )
 
-    def _apart(self, held: Floats, position: Floats) -> float:
+    def _apart(self, q: Floats, position: Floats, target: int) -> float:
         """Return the median error of the distances from other readings, m.
 
         Zero with fewer than two other readings, one of which may be wrong.
@@ -171,9 +165,8 @@ class RoughRegistration:
         places, positions = self._places()
         if len(places) < WITNESSES:
             return 0.0
-        moved = np.linalg.norm(places - held, axis=1)
-        measured = np.linalg.norm(positions - position, axis=1)
-        errors = np.sort(np.abs(measured - moved))
+        moved = np.linalg.norm(places - self._positions(q)[target], axis=1)
+        errors = np.sort(np.abs(np.linalg.norm(positions - position, axis=1) - moved))
         return float(errors[(len(errors) - 1) // 2])
 
     def _last(self, target: int) -> _Sighting | None:
@@ -218,15 +211,6 @@ def _far(pose: tuple[Floats, Floats], held: Floats, measured: Floats) -> Floats:
     return np.asarray(np.linalg.norm(measured - held @ pose[0].T - pose[1], axis=1))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TargetReading:
-    """One reading of an arrival."""
-
-    target: int | None  # index in the cell; None where there is one target
-    measured: MeasuredStop
-    ended: float  # cell s
-
-
 class ArrivalReader:
     """Reads the targets of a tool at one stop, in the order of the cell.
 
@@ -238,7 +222,7 @@ class ArrivalReader:
     def __init__(self, setup: Setup, measurer: Measurer, registration: RoughRegistration) -> None:
         cell, tracker = setup.cell, setup.rig.tracker
         self._cell, self._measurer, self._registration = cell, measurer, registration
-        self._clock, self._watcher, self._announced = setup.clock, setup.watcher, False
+        self._watcher, self._announced = setup.watcher, False
         self._tracker: PointingTracker | None = None
         if cell.targets is None:
             return
@@ -253,10 +237,10 @@ class ArrivalReader:
         distance = np.linalg.norm(places[:, None] - places, axis=2)
         self._radius = 0.5 * float(distance[distance > 0].min(initial=np.inf))
 
-    def read(self, q: Floats, name: str) -> list[TargetReading]:
+    def read(self, q: Floats, name: str) -> list[MeasuredStop]:
         """Read at the pose `name`, where the arm stands; q (n,) are commanded joint angles, rad."""
         if self._tracker is None:
-            return [TargetReading(None, self._measurer.measure(name), self._clock.now())]
+            return [self._measurer.measure(name)]
         places = self._registration.expected(q)
         if places is None:
             if not self._announced:
@@ -267,40 +251,32 @@ class ArrivalReader:
                 )
                 self._watcher.notify(Remark(text))
                 self._announced = True
-            return [TargetReading(0, self._measurer.measure(name), self._clock.now())]
-        readings: list[TargetReading] = []
+            return [self._measurer.measure(name, target=0)]
+        readings: list[MeasuredStop] = []
         lost: list[str] = []
         force: WrenchSample | None = None
         for k, target in enumerate(self._cell.target_names):
+            aim = partial(self._tracker.aim, places[k], self._radius)
             try:
-                measured = self._read_target(self._tracker, places, k, name, force)
+                try:
+                    aim()
+                except TargetLostError:  # once more: a person may have walked through the beam
+                    aim()
+                measured = self._measurer.measure(name, aim, force, k)
+                self._check_target(measured, places, k)
             except TargetLostError as error:
                 lost.append(f"target {target} is not read: {error}")
                 continue
             force = measured.force
-            readings.append(TargetReading(k, measured, self._clock.now()))
+            readings.append(measured)
         if not readings:
             raise DeviceError(f"{name}: {lost[0]} (and so are all others)")
         for reason in lost:
             self._watcher.notify(Remark(f"{name}: {reason}"))
         return readings
 
-    def _read_target(
-        self,
-        tracker: PointingTracker,
-        places: Floats,
-        k: int,
-        name: str,
-        force: WrenchSample | None,
-    ) -> MeasuredStop:
-        aim = partial(tracker.aim, places[k], self._radius)
-        try:
-            aim()
-        except TargetLostError:  # once more: a person may have walked through the beam
-            aim()
-        measured = self._measurer.measure(name, aim, force)
+    def _check_target(self, measured: MeasuredStop, places: Floats, k: int) -> None:
         nearest = int(np.argmin(np.linalg.norm(places - measured.mean.value[:3], axis=1)))
         if nearest != k:
             name = self._cell.target_names[nearest]
             raise TargetLostError(f"tracker: it sees {name} in its place")
-        return measured

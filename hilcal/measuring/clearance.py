@@ -117,7 +117,8 @@ class LineOfSight:
         A beam ends shortly before its target. Ignored are parts of the tool next to the target,
         whose shape is unknown, and obstacles that the tracker stands in or on.
         """
-        return np.asarray(np.all([self.sees(q, load, k) for k in self._targets], axis=0))
+        count = len(self.clearance.cell.all_targets)
+        return np.asarray(np.all([self.sees(q, load, k) for k in range(count)], axis=0))
 
     def sees(self, q: Floats, load: str, target: int) -> Bools:
         """Return (N,) in which states the beam to one target is free."""
@@ -152,8 +153,8 @@ class LineOfSight:
                 f"{where}: the beam meets the reflector at {float(angle.max()):.3g} rad; [sight] "
                 f"incidence_max_rad is {most:g}"
             )
-        hidden = self.hidden(q, load)
-        if len(hidden) == len(self._targets):  # some hidden targets only cost readings
+        hidden, targets = self.hidden(q, load), self.clearance.cell.all_targets
+        if len(hidden) == len(targets):  # some hidden targets only cost readings
             hits = self.clearance.scene.free.named(q, 0.0, self.beam(q))
             names = tuple(dict.fromkeys(name for name, _ in hits))
             names += tuple(x.name for x in self.clearance.segments(q, load) if not names)
@@ -163,17 +164,13 @@ class LineOfSight:
 
     def hidden(self, q: Floats, load: str) -> tuple[int, ...]:
         """Return the indices of the targets that are hidden in one state (1, n)."""
-        return tuple(k for k in self._targets if not self.sees(q, load, k).all())
-
-    @property
-    def _targets(self) -> range:
-        return range(len(self.clearance.cell.all_targets))
+        count = len(self.clearance.cell.all_targets)
+        return tuple(k for k in range(count) if not self.sees(q, load, k).all())
 
     def beam(self, q: Floats, number: int = 0) -> Segment:
         """Return the beam to a target in N states (N, n)."""
         config, cell = self.clearance.config, self.clearance.cell
-        radius = config.sight.clearance_m
-        offset = cell.all_targets[number, :3, 3]
+        radius, offset = config.sight.clearance_m, cell.all_targets[number, :3, 3]
         target = chains.evaluate(cell.arm, q).point(offset)
         way = target - self.tracker
         length = np.linalg.norm(way, axis=1, keepdims=True)
@@ -207,8 +204,7 @@ def segment_distance(a: Floats, b: Floats, c: Floats, d: Floats) -> Floats:
     ur, vr = _dot(u, r), _dot(v, r)
     det = uu * vv - uv * uv
     far = det > 1e-12 * uu * vv  # not parallel
-    s = np.where(far, (uv * vr - ur * vv) / np.where(far, det, 1.0), 0.0)
-    s = np.clip(s, 0.0, 1.0)
+    s = np.clip(np.where(far, (uv * vr - ur * vv) / np.where(far, det, 1.0), 0.0), 0.0, 1.0)
     t = np.clip((uv * s + vr) / np.where(vv > _TINY, vv, 1.0), 0.0, 1.0)
     s = np.clip((uv * t - ur) / np.where(uu > _TINY, uu, 1.0), 0.0, 1.0)
     gap = r + s[..., None] * u - t[..., None] * v

@@ -122,21 +122,16 @@ def connect(config: CellConfig) -> tuple[Rig | None, tuple[ConnectionResult, ...
     factories = [driver(group, name, key) for _, group, name, key in parts]
     with ThreadPoolExecutor(len(parts)) as pool:
         opened = list(pool.map(lambda factory: _tried(factory, config), factories))
-    by_part: dict[str, Any] = {}
     answers: list[ConnectionResult] = []
     for (part, _, name, _), (device, error) in zip(parts, opened, strict=True):
-        by_part[part] = device
         report, why = (None, error) if error is not None else _tried(methodcaller("report"), device)
         failure = "" if why is None else _failure(part, why)
         answers.append(ConnectionResult(part, name or "", report, failure))
+    arm, tracker, operator, *force = (device for device, _ in opened)
+    rig = Rig(arm, tracker, force[0] if force else None, operator)
     if not any(answer.failure for answer in answers):
-        rig = Rig(
-            by_part["arm"], by_part["tracker"], by_part.get("force sensor"), by_part["operator"]
-        )
         return rig, tuple(answers)
-    for device in by_part.values():
-        if device is not None:
-            device.close()
+    rig.close()
     for _, error in opened:
         if isinstance(error, InputError):
             raise error

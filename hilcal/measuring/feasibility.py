@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -10,7 +9,6 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig, ForceSensor
 from hilcal.measuring.clearance import Clearance
 from hilcal.robot import se3
-from hilcal.robot.arm import Arm
 from hilcal.robot.body import body_poses, is_known
 from hilcal.robot.chain import Chain, evaluate
 from hilcal.robot.scene import Pairs, Segment, from_axis, on_flange
@@ -125,9 +123,9 @@ class Feasibility:
 
     def findings(self, q: Floats, load: str, kinds: tuple[str, ...] = STATE) -> Iterator[Violation]:
         """Yield the violations of the states (N, n) under a load, each at its worst."""
-        placed = _Placed(self.cell.arm, q)
+        chain = evaluate(self.cell.arm, q)
         for kind in kinds:
-            for part in self._parts(kind, placed, load):
+            for part in self._parts(kind, q, chain, load):
                 yield from part.findings(kind)
 
     def unbearable(self, load: str) -> dict[str, str]:
@@ -192,7 +190,9 @@ class Feasibility:
     def _beyond(self, kind: str, q: Floats, load: str, turn: Floats | None = None) -> Bools:
         """Return (N,) which states violate a kind, or may within turns (N, n) of the joints."""
         out = ~self._always(q)
-        for part in self._parts(kind, _Placed(self.cell.arm, q), load):
+        if not len(q):
+            return out
+        for part in self._parts(kind, q, evaluate(self.cell.arm, q), load):
             remaining = np.flatnonzero(~out)
             if len(remaining):
                 out[remaining] = part.beyond(remaining, None if turn is None else turn[remaining])
@@ -200,25 +200,23 @@ class Feasibility:
 
     # checks
 
-    def _parts(self, kind: str, placed: "_Placed", load: str) -> Iterator["_Bounds | _Touch"]:
-        scene, margins, q = self.shapes.scene, self.margins, placed.q
-        if not len(q):
-            return
+    def _parts(self, kind: str, q: Floats, chain: Chain, load: str) -> Iterator["_Bounds | _Touch"]:
+        scene, margins = self.shapes.scene, self.margins
         if kind == JOINTS:
             yield self._joints(q)
         elif kind == WORKSPACE:
-            places = self._places(body_poses(self.cell.arm, q, placed.chain), slice(None))
+            places = self._places(body_poses(self.cell.arm, q, chain), slice(None))
             yield self._inside(self._names, places, self._radius, self._held, self._rates)
         elif kind == TORQUE:
-            yield self._torque(placed.chain, load)
+            yield self._torque(chain, load)
         elif kind == SENSOR and (sensor := self.config.force_sensor) is not None:
-            yield self._moment(sensor, placed.chain, load)
+            yield self._moment(sensor, chain, load)
         elif kind == ITSELF:
             yield _Touch(scene.itself, q, margins.itself, scene.itself.rates, guessed=self._guessed)
         elif kind == OBSTACLE:
             yield _Touch(scene.around, q, margins.clear, scene.around.rates)
         elif kind == HANGING:
-            segments = self.shapes.segments_at(placed.chain.point(self.cell.load_point), load)
+            segments = self.shapes.segments_at(chain.point(self.cell.load_point), load)
             if segments:
                 places = np.stack([np.stack([x.start, x.end], axis=1) for x in segments], axis=1)
                 held = np.ones((len(segments), len(_SIDES)), dtype=np.bool_)
@@ -234,11 +232,12 @@ class Feasibility:
         extra = self.margins.joint
 
         def violation(k: int, state: int) -> Violation:
-            return Violation(
-                JOINTS, arm.joint_names[k], UNLOADED,
-                f"{arm.joint_names[k]} is at {q[state, k]:.4g} {arm.unit(k)}; usable are "
-                f"{low[k]:.4g} to {high[k]:.4g} (joint_margin_rad {margin:g})",
-            )  # fmt: skip
+            name = arm.joint_names[k]
+            text = (
+                f"{name} is at {q[state, k]:.4g} {arm.unit(k)}; usable are {low[k]:.4g} to "
+                f"{high[k]:.4g} (joint_margin_rad {margin:g})"
+            )
+            return Violation(JOINTS, name, UNLOADED, text)
 
         over = np.maximum(low - q, q - high) + extra
         return _Bounds(over, np.zeros((arm.n, arm.n)), np.zeros(arm.n), violation)
@@ -255,15 +254,12 @@ class Feasibility:
         def violation(k: int, state: int) -> Violation:
             name, (axis, below) = names[body[k]], _SIDES[side[k]]
             far, limit = chosen[state, k] - margin, self._box[0 if below else 1][axis]
+            text = f"{name} is {far:.3g} m outside the workspace, whose {'xyz'[axis]} ends at "
+            text += f"{limit:g} m"
             if below and self._floor:
                 text = (
                     f"{name} is {far:.3g} m below the mounting plane z = 0; where the arm may go "
                     "there, [limits] workspace_min_m says how far, e.g. [-2.0, -2.0, -1.0]"
-                )
-            else:
-                text = (
-                    f"{name} is {far:.3g} m outside the workspace, whose {'xyz'[axis]} ends at "
-                    f"{limit:g} m"
                 )
             return Violation(WORKSPACE, f"{name} {axis} {below}", UNLOADED, text)
 
@@ -338,14 +334,12 @@ class Feasibility:
         self._held = np.repeat(moving[:, None], len(_SIDES), axis=1)
         mount = self._body < min(2, arm.n - 1)
         turns = np.zeros((64, arm.n))
-        slides = bool(arm.slides[0])
-        first = float(arm.q_min[0]) if slides else -np.pi
-        last = float(arm.q_max[0]) if slides else np.pi
+        first, last = (arm.q_min[0], arm.q_max[0]) if arm.slides[0] else (-np.pi, np.pi)
         turns[:, 0] = np.linspace(first, last, len(turns))
-        ends = self._places(body_poses(arm, turns), mount)
+        places = self._places(body_poses(arm, turns), mount)
         everywhere = np.ones((int(mount.sum()), len(_SIDES)), dtype=np.bool_)
         names = [self._names[k] for k in np.flatnonzero(mount)]
-        fixed = self._inside(names, ends, self._radius[mount], everywhere, self._rates[mount])
+        fixed = self._inside(names, places, self._radius[mount], everywhere, self._rates[mount])
         outside = fixed.over.reshape(-1, len(_SIDES)) - self.margins.inside
         respected = mount.any() & np.all(outside <= 0.0, axis=0)
         self._held |= (~moving & ~mount)[:, None] & respected
@@ -379,17 +373,6 @@ class Feasibility:
         """Return the wrench (6,) of a load at the load point, base axes; zero unloaded."""
         hung = self.shapes.load(load)
         return np.zeros(6) if hung is None else hung.wrench(self.cell.gravity)
-
-
-class _Placed:
-    """An arm in N states q (N, n), with one forward kinematics for all checks."""
-
-    def __init__(self, arm: Arm, q: Floats) -> None:
-        self.arm, self.q = arm, q
-
-    @cached_property
-    def chain(self) -> Chain:
-        return evaluate(self.arm, self.q)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -453,6 +436,4 @@ class _Touch:
 
     def _segment(self, rows: Ints) -> Segment | None:
         x = self.segment
-        if x is None:
-            return None
-        return Segment(x.name, x.start[rows], x.end[rows], x.radius, x.ignored)
+        return x and Segment(x.name, x.start[rows], x.end[rows], x.radius, x.ignored)

@@ -19,6 +19,7 @@ from hilcal.config import CellLoad, Operator
 from hilcal.config import ForceSensor as Settings
 from hilcal.errors import CannotAnswerError, DeviceError, InputError
 from hilcal.measuring.devices import ForceSensorDevice, WrenchSample
+from hilcal.readings.whitening import inverse_root
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
 from hilcal.types import Floats
@@ -41,16 +42,19 @@ class ToolLoad:
     dof: int  # degrees of freedom; 0 after a tare
 
     @property
+    def weighed(self) -> bool:
+        """Whether the mass is above 3 sigma."""
+        return bool(self.mass > 3.0 * np.sqrt(self.covariance[6, 6]))
+
+    @property
     def com(self) -> Floats:
-        """(3,) centre of mass, m, sensor axes; zero while the mass is not above 3 sigma."""
-        if self.mass <= 3.0 * np.sqrt(self.covariance[6, 6]) or self.mass <= 0.0:
-            return np.zeros(3)
-        return self.moment / self.mass
+        """(3,) centre of mass, m, sensor axes; zero unless weighed."""
+        return self.moment / self.mass if self.weighed else np.zeros(3)
 
     @property
     def com_std(self) -> Floats:
-        """(3,) standard uncertainty of `com`, m, to first order; infinite where unknown."""
-        if not np.any(self.com) and self.mass <= 3.0 * np.sqrt(self.covariance[6, 6]):
+        """(3,) standard uncertainty of `com`, m, to first order; infinite unless weighed."""
+        if not self.weighed:
             return np.full(3, np.inf)
         J = np.hstack([-self.com[:, None], np.eye(3)]) / self.mass
         return np.asarray(np.sqrt(np.diagonal(J @ self.covariance[6:, 6:] @ J.T)))
@@ -100,7 +104,7 @@ def identify_tool_load(
     """
     _check_finite(wrench, covariance, rotation)
     _check_orientations(rotation, gravity)
-    white = np.linalg.inv(_root(covariance))
+    white = inverse_root(covariance)
     A = (white @ design(rotation, gravity)).reshape(-1, PARAMETERS)
     y = (white @ wrench[..., None]).reshape(-1)
     scale = np.linalg.norm(A, axis=0)
@@ -115,15 +119,8 @@ def identify_tool_load(
             f"force sensor: its readings give a tool of {mass:.3g} kg; its axes or its sign are "
             "wrong: check rotvec_rad in [force_sensor]"
         )
-    return ToolLoad(
-        bias=x[:6],
-        mass=mass,
-        moment=x[7:],
-        covariance=cov,
-        gravity=gravity,
-        chi2=float(residual @ residual),
-        dof=len(y) - PARAMETERS,
-    )
+    chi2, dof = float(residual @ residual), len(y) - PARAMETERS
+    return ToolLoad(x[:6], mass, x[7:], cov, gravity, chi2, dof)
 
 
 def tare(
@@ -152,33 +149,15 @@ def _check_finite(*readings: Floats) -> None:
         raise InputError("tool load: a reading has values that are no finite numbers")
 
 
-def _root(covariance: Floats) -> Floats:
-    """Return Cholesky factors (K, 6, 6), computed from the correlation matrices."""
-    std = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
-    try:
-        with np.errstate(divide="raise", invalid="raise"):
-            correlation = covariance / (std[..., :, None] * std[..., None, :])
-        return np.asarray(std[..., None] * np.linalg.cholesky(correlation))
-    except (np.linalg.LinAlgError, FloatingPointError):
-        raise InputError(
-            "tool load: the covariance of a mean wrench is not positive definite; average over "
-            "more frames (force_window_s in [acquire])"
-        ) from None
-
-
 def _check_orientations(rotation: Floats, gravity: Floats) -> None:
     """Refuse orientations whose directions of gravity are too similar.
 
     If u varies in one direction only, the readings determine the mass, and the centre of mass
     except its component in that direction.
     """
-    size = float(np.linalg.norm(gravity))
-    K = len(rotation)
-    spread = np.zeros(2)
-    if size > 0.0 and K > 1:
-        u = np.swapaxes(rotation, -1, -2) @ (gravity / size)
-        values = np.linalg.svd(u - u.mean(axis=0), compute_uv=False) / np.sqrt(K)
-        spread[: len(values[:2])] = values[:2]
+    K, size = len(rotation), max(float(np.linalg.norm(gravity)), 1e-30)
+    u = np.swapaxes(rotation, -1, -2) @ (gravity / size)
+    spread = np.append(np.linalg.svd(u - u.mean(axis=0), compute_uv=False) / np.sqrt(K), 0.0)
     if spread[0] < MIN_SPREAD:
         along, missing = "one direction", "mass and centre of mass"
     elif spread[1] < MIN_SPREAD:
@@ -248,7 +227,6 @@ def _expected_text(e: Floats, unit: str, gravity: Floats) -> str:
 
 
 def _measured_text(e: Floats, f: Floats, limit: float, unit: str, gravity: Floats) -> str:
-    """Return a description of the measured vector f where e was expected."""
     expected_size, measured_size = float(np.linalg.norm(e)), float(np.linalg.norm(f))
     if measured_size <= limit:
         return "that is nothing"
@@ -304,13 +282,11 @@ class ForceMeter:
         self, sensor: ForceSensorDevice, settings: Settings, cell: Cell, window: float
     ) -> None:
         """Use an open sensor, averaged over a window, real s."""
-        self.sensor = sensor
-        self.zero = np.zeros(6)
+        self.sensor, self.zero, self.identified = sensor, np.zeros(6), False
         self._cell, self._seconds = cell, window
         self._origin = np.array(settings.origin_m)
         self._axes = se3.rotation(np.array(settings.rotvec_rad))
         self._com = self._axes.T @ (cell.tool_com - self._origin)
-        self.identified = False
         self._tared_down: Floats | None = None
         nothing = np.zeros((PARAMETERS, PARAMETERS))
         moment = cell.tool_mass * self._com
@@ -353,7 +329,7 @@ class ForceMeter:
         """Set the zero by an unloaded mean wrench at joint angles (n,)."""
         cell, rotation = self._cell, self.frame(q)[0]
         self._tared_down = rotation.T @ cell.gravity
-        covariance = sample.covariance / max(sample.frames, 1) + _FLOOR
+        covariance = self.tared(sample, q).covariance
         zero = tare(sample.wrench, covariance, rotation, cell.gravity, cell.tool_mass, self._com)
         self.zero = zero.bias
         if not self.identified:

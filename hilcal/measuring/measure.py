@@ -23,7 +23,7 @@ the scatter (chi² test, p < 0.001); then τ is the ratio of scatter and stated 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
@@ -78,7 +78,9 @@ def average(samples: Sequence[TrackerSample], systematic_share: float = 0.0) -> 
         )
     prior = stated[retained].mean(axis=0)
     mean, residuals = deviations(values[retained])
-    ratio, p = _trace_test(residuals, prior)
+    total = float(np.sum((residuals @ inverse_root(prior).T) ** 2))  # Σ_k r_kᵀ Σ̄⁻¹ r_k
+    dof = residuals.shape[1] * (len(residuals) - 1)
+    ratio, p = total / dof, float(stats.chi2.sf(total, dof))
     factor = 1.0 if p >= UNEXPLAINED else ratio
     covariance = covariance_of_mean(prior, residuals, systematic_share, factor)
     warnings = [f"reading {k + 1} of {len(samples)} is a gross outlier, left out" for k in left_out]
@@ -114,14 +116,6 @@ def deviations(values: Floats) -> tuple[Floats, Floats]:
     return mean, residuals
 
 
-def _trace_test(residuals: Floats, prior: Floats) -> tuple[float, float]:
-    """Return T / (m (K - 1)), T = Σ_k r_kᵀ Σ̄⁻¹ r_k, and P(chi² >= T), m (K - 1) dof."""
-    count, m = residuals.shape
-    white = residuals @ inverse_root(prior).T
-    total, dof = float(np.sum(white**2)), m * (count - 1)
-    return total / dof, float(stats.chi2.sf(total, dof))
-
-
 def _not_gross(values: Floats, stated: Floats) -> Bools:
     """Return which samples (K,) are no gross outliers."""
     m = values.shape[1]
@@ -149,23 +143,22 @@ LONGEST = 10  # largest window, over K samples
 
 
 class SettleWindow:
-    """Collects samples after the arm has stopped, and tests whether they are at rest."""
+    """Collects samples after the arm has stopped, and tests whether they are at rest.
+
+    `settled` tells whether they are; it is False before K samples.
+    """
 
     def __init__(self, count: int) -> None:
         """Start empty; `count` is K, at least 3 for a trend."""
         self._count = count
         self._samples: list[TrackerSample] = []
-        self._settled = self._has_drifted = False
+        self.settled = self._has_drifted = False
 
     def add(self, sample: TrackerSample) -> None:
         """Add the next sample."""
         self._samples.append(sample)
         del self._samples[: -2 * LONGEST * self._count]
-        self._settled = len(self._samples) >= self._count and self._judge()
-
-    def settled(self) -> bool:
-        """Whether the readings are at rest; False before K samples."""
-        return self._settled
+        self.settled = len(self._samples) >= self._count and self._judge()
 
     def _judge(self) -> bool:
         window = self._samples[-max(self._count, len(self._samples) // 2) :]
@@ -200,8 +193,6 @@ class SettleWindow:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Trend:
-    """A line through a window."""
-
     white_slope: Floats  # (m,) per s, whitened by the mean stated covariance
     moment: float  # Σ (t_k - t̄)², s²
     span: float  # from the first to the last sample, s
@@ -232,7 +223,7 @@ PATIENCE = 4  # windows of measurements after which, and after its time-out, set
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredStop:
-    """The measurement at one stop."""
+    """The measurement of one target at one stop."""
 
     mean: Average  # of the tracker's measurements, sensor axes
     q: Floats  # (n,) mean actual joint angles, rad
@@ -241,9 +232,11 @@ class MeasuredStop:
     tracker: tuple[TrackerSample, ...]
     force: WrenchSample | None  # mean wrench of the force sensor; None without one
     settling: float  # settling time, cell s
+    ended: float  # cell s
     remarks: tuple[str, ...]
     torque: Floats | None = None
     """(n,) mean measured torques of the drives, N·m; None where the arm does not report them."""
+    target: int | None = None  # index in the cell; None where there is one target
 
 
 class Measurer:
@@ -254,7 +247,11 @@ class Measurer:
         self._config, self._clock, self._watcher = setup.config, setup.clock, setup.watcher
 
     def measure(
-        self, name: str, find: Callable[[], None] | None = None, force: WrenchSample | None = None
+        self,
+        name: str,
+        find: Callable[[], None] | None = None,
+        force: WrenchSample | None = None,
+        target: int | None = None,
     ) -> MeasuredStop:
         """Measure at the pose `name`, where the arm stands.
 
@@ -265,13 +262,14 @@ class Measurer:
         while True:
             try:
                 settling = self._settle(name)
-                measured, why = self._averaged(settling, tuple(remarks), force)
+                measured, why = self._averaged(settling, force)
             except TargetLostError as error:
                 searches = self._search(error, name, searches, find or self._tracker.find_target)
                 remarks.append(f"target lost and found again: {error}")
                 continue
             if measured is not None:
-                return measured
+                remarks += measured.mean.warnings
+                return replace(measured, remarks=tuple(remarks), target=target)
             repeats += 1
             if repeats == AGAIN:
                 raise DeviceError(f"{name}: measured {AGAIN} times without success: {why}")
@@ -281,9 +279,8 @@ class Measurer:
     def _settle(self, name: str) -> float:
         """Wait until arm and readings have settled; return the settling time, cell s."""
         acquire, clock = self._config.acquire, self._clock
-        start = clock.now()
+        start, count = clock.now(), 0
         rest_start: float | None = None
-        count = 0
         window = SettleWindow(acquire.samples)
         while True:
             if not self._mover.at_rest(self._mover.look()):
@@ -293,34 +290,35 @@ class Measurer:
                 rest_start = clock.now() if rest_start is None else rest_start
                 window.add(self._tracker.measure())
                 count += 1
-                if clock.now() - rest_start >= acquire.settle_s and window.settled():
+                if clock.now() - rest_start >= acquire.settle_s and window.settled:
                     return clock.now() - start
             late = clock.now() - start > acquire.settle_timeout_s
             if late and (rest_start is None or count >= PATIENCE * acquire.samples):
-                moving = "the arm does not rest at its goal"
-                reason = moving if rest_start is None else "the readings drift"
+                reason = "the readings drift"
+                if rest_start is None:
+                    reason = "the arm does not rest at its goal"
                 raise DeviceError(
                     f"{name}: not settled within {acquire.settle_timeout_s:g} s: {reason}. Look "
                     "for a swinging load, a loose target or a warming tracker"
                 )
 
     def _averaged(
-        self, settling: float, remarks: tuple[str, ...], force: WrenchSample | None
+        self, settling: float, force: WrenchSample | None
     ) -> tuple[MeasuredStop | None, str]:
         """Average over the window; None and the reason where the reading is void."""
-        differed, before = self._mover.differed, self._mover.look()
+        watch, before = self._mover.watch, self._mover.look()
+        differed = 0 if watch is None else watch.differed
         tracker: list[TrackerSample] = []
-        arm_samples: list[ArmSample] = []
+        arm_samples = [before]
         for _ in range(self._config.acquire.samples):
             tracker.append(self._tracker.measure())
             arm_samples.append(self._mover.look())
         if force is None and self._meter is not None:
             force = self._meter.average()
         after = self._mover.look()
-        why = self._mover.check_still(before, after)
-        if why is not None:
+        if (why := self._mover.check_still(before, after)) is not None:
             return None, why
-        if self._mover.differed != differed and not self._wrong(force, after):
+        if watch is not None and watch.differed != differed and not self._wrong(force, after):
             return None, (
                 "the force sensor felt something else than what hangs for a moment: was the tool "
                 "touched?"
@@ -337,12 +335,12 @@ class Measurer:
         if not (np.isfinite(mean.value).all() and np.isfinite(mean.covariance).all()):
             return None, "the tracker gives what is not a number"
         arm_samples.append(after)
-        q = np.mean([before.q, *(sample.q for sample in arm_samples)], axis=0)
-        torques = [sample.torque for sample in arm_samples if sample.torque is not None]
-        torque = np.mean(torques, axis=0) if len(torques) == len(arm_samples) else None
-        all_remarks = (*remarks, *mean.warnings)
+        q = np.mean([sample.q for sample in arm_samples], axis=0)
+        torques = [sample.torque for sample in arm_samples[1:] if sample.torque is not None]
+        torque = np.mean(torques, axis=0) if len(torques) == len(arm_samples) - 1 else None
+        ended = self._clock.now()
         return MeasuredStop(
-            mean, q, before, after, tuple(tracker), force, settling, all_remarks, torque
+            mean, q, before, after, tuple(tracker), force, settling, ended, (), torque
         ), ""
 
     def _wrong(self, force: WrenchSample | None, sample: ArmSample) -> bool:

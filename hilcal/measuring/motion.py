@@ -36,12 +36,15 @@ class Guard:
         self, sample: ArmSample, felt: Floats | None = None, hanging: str = UNLOADED
     ) -> str | None:
         """Return the violated limit in one line, or None; `felt` is the sensor's wrench (6,)."""
-        return (
-            self.state(sample)
-            or self._speed(sample)
-            or self._place(sample.q, hanging)
-            or self._pull(felt)
-        )
+        if (unfit := self.state(sample)) is not None:
+            return unfit
+        speed, limit = np.abs(sample.qd), self.config.limits.joint_speed_rad_s
+        k = int(np.argmax(speed))
+        if speed[k] > limit:
+            name = self.cell.arm.joint_names[k]
+            return f"arm: {name} moves at {speed[k]:.3g} rad/s; joint_speed_rad_s is {limit:g}"
+        violation = next(self._limits.findings(sample.q[None], hanging), None)
+        return self._pull(felt) if violation is None else f"{violation.at('arm')}; {HOW_ON}"
 
     def state(self, sample: ArmSample) -> str | None:
         """Return why a sample is not one of this arm, ready to move, in one line; or None."""
@@ -53,18 +56,6 @@ class Guard:
         if not (np.isfinite(sample.q).all() and np.isfinite(sample.qd).all()):
             return "arm: it reports joint angles that are not numbers"
         return None
-
-    def _speed(self, sample: ArmSample) -> str | None:
-        speed, limit = np.abs(sample.qd), self.config.limits.joint_speed_rad_s
-        k = int(np.argmax(speed))
-        if speed[k] <= limit:
-            return None
-        name = self.cell.arm.joint_names[k]
-        return f"arm: {name} moves at {speed[k]:.3g} rad/s; joint_speed_rad_s is {limit:g}"
-
-    def _place(self, q: Floats, hanging: str) -> str | None:
-        violation = next(self._limits.findings(q[None], hanging), None)
-        return None if violation is None else f"{violation.at('arm')}; {HOW_ON}"
 
     def _pull(self, felt: Floats | None) -> str | None:
         sensor = self.config.force_sensor
@@ -110,13 +101,14 @@ class LoadWatch:
         """Start without comparison, until `expect`."""
         self._meter, self._cell, self._config = meter, cell, config
         self._load: CellLoad | None = None
-        self.watching = False
-        self.differed = 0
+        self._hung = np.zeros(6)  # wrench of the load at the load point, base axes
+        self.watching, self.differed = False, 0
         self._since: tuple[int, int] | None = None
 
     def expect(self, load: CellLoad | None) -> None:
         """Start to compare with a load; None: without a load."""
         self._load, self.watching, self._since = load, True, None
+        self._hung = np.zeros(6) if load is None else load.wrench(self._cell.gravity)
 
     def suspend(self) -> None:
         """Stop comparing, for a change of the load."""
@@ -151,10 +143,9 @@ class LoadWatch:
         A swinging weight pulls sideways; in motion, its vertical force is compared separately.
         """
         load, operator, cell = self._load, self._config.operator, self._cell
-        hung = self._hung()
-        difference = self._meter.load_wrench(tared) - hung
-        part, _, lever = judged_part(hung)
-        size, deviation = (float(np.linalg.norm(w[part])) / lever for w in (hung, difference))
+        difference = self._meter.load_wrench(tared) - self._hung
+        part, _, lever = judged_part(self._hung)
+        size, deviation = (float(np.linalg.norm(w[part])) / lever for w in (self._hung, difference))
         pulled = load is not None and any((*load.force_N, *load.moment_Nm))
         share = max(ALLOWED * operator.tolerance_share, PULL if pulled else 0.0)
         limit = max(ALLOWED * operator.tolerance_N, share * size)
@@ -174,22 +165,14 @@ class LoadWatch:
                 return down, lifted
         return deviation, limit
 
-    def _hung(self) -> Floats:
-        """Return the wrench (6,) of the expected load at the load point, base axes."""
-        return np.zeros(6) if self._load is None else self._load.wrench(self._cell.gravity)
-
     def _message(self, tared: TaredWrench) -> str:
-        """Return measured and expected load in one line."""
-        hung, felt = self._hung(), self._meter.load_wrench(tared)
-        part, unit, _ = judged_part(hung)
+        part, unit, _ = judged_part(self._hung)
+        felt, hung = (np.linalg.norm(w[part]) for w in (self._meter.load_wrench(tared), self._hung))
         name = "nothing" if self._load is None else self._load.name
-        message = (
-            f"the force sensor feels {np.linalg.norm(felt[part]):.1f} {unit} where {name} should "
-            f"hang ({np.linalg.norm(hung[part]):.1f} {unit}): has a load fallen off, or does "
-            "somebody touch the tool?"
-        )
+        suffix = "" if self._meter.identified else " Or is [tool] mass_kg or com_m wrong?"
         return (
-            message if self._meter.identified else f"{message} Or is [tool] mass_kg or com_m wrong?"
+            f"the force sensor feels {felt:.1f} {unit} where {name} should hang ({hung:.1f} "
+            f"{unit}): has a load fallen off, or does somebody touch the tool?{suffix}"
         )
 
 
@@ -241,10 +224,8 @@ class Mover:
             if sample.safety != NORMAL:
                 self._arm.moving()  # in motion the driver raises the cause and the remedy
             raise DeviceError(reason)
-        if not self._under_way:
-            moved = self.moved(sample)
-            if moved is not None:
-                raise DeviceError(f"arm: {moved}")
+        if not self._under_way and (moved := self.moved(sample)) is not None:
+            raise DeviceError(f"arm: {moved}")
         if self.watch is not None and felt is not None:
             self.watch.look(sample, felt, moving=self._under_way)
         return sample
@@ -292,8 +273,7 @@ class Mover:
     def free_way(self, goal: Floats, name: str) -> ArmSample:
         """Return a sample of the arm; refuse one not ready, or whose way to `goal` is not free."""
         sample = self._arm.sample()
-        unfit = self.guard.state(sample)
-        if unfit is not None:
+        if (unfit := self.guard.state(sample)) is not None:
             raise DeviceError(unfit)
         self.check_way(sample.q, goal, name)
         return sample
@@ -413,11 +393,6 @@ class Mover:
         goal = sample.q if self.goal is None else self.goal
         arrived = np.abs(sample.q - goal).max() <= self._motion.arrival_rad
         return bool(arrived and np.abs(sample.qd).max() <= self._motion.speed_rad_s / 50)
-
-    @property
-    def differed(self) -> int:
-        """Number of samples so far with a wrong load."""
-        return 0 if self.watch is None else self.watch.differed
 
     def check_still(self, before: ArmSample, after: ArmSample) -> str | None:
         """Return why a reading between two samples is void, in one line; or None."""

@@ -128,19 +128,13 @@ def dry_run(cell: Cell, config: CellConfig, plan: Plan) -> DryRun:
     stops = route(plan, cell.arm, config.limits.joint_margin_rad)
     problems += on_route(limits, stops)
     moves = [(a, b) for a, b in pairwise(stops) if not np.array_equal(a.q, b.q)]
-    motion = config.motion
-    pace = motion.speed_rad_s, motion.acceleration_rad_s2
-    moving = sum(duration(a.q, b.q, *pace) for a, b in moves)
+    pace = config.motion.speed_rad_s, config.motion.acceleration_rad_s2
     changes = sum(stop.change_to is not None for stop in stops)
-    return DryRun(
-        tuple(dict.fromkeys(problems)),
-        (*_remarks(plan, limits), *limits.remarks),
-        moving
-        + changes * config.planning.load_change_s
-        + len(plan.steps) * seconds_at_rest(config),
-        len(moves),
-        changes,
-    )
+    seconds = sum(duration(a.q, b.q, *pace) for a, b in moves)
+    seconds += changes * config.planning.load_change_s
+    seconds += len(plan.steps) * seconds_at_rest(config)
+    remarks = *_remarks(plan, limits), *limits.remarks
+    return DryRun(tuple(dict.fromkeys(problems)), remarks, seconds, len(moves), changes)
 
 
 def _cell_problems(config: CellConfig) -> list[str]:
@@ -151,17 +145,15 @@ def _cell_problems(config: CellConfig) -> list[str]:
         if len(config.tool.targets) > 1 and t.target_m is None
     ]
     speed, limit = config.motion.speed_rad_s, config.limits.joint_speed_rad_s
-    if speed <= limit:
-        return out
-    return [
-        *out,
-        f"[motion] speed_rad_s = {speed:g} is over [limits] joint_speed_rad_s = {limit:g}; "
-        "the arm would be stopped in every motion",
-    ]
+    if speed > limit:
+        out.append(
+            f"[motion] speed_rad_s = {speed:g} is over [limits] joint_speed_rad_s = {limit:g}; "
+            "the arm would be stopped in every motion"
+        )
+    return out
 
 
 def _load_problems(limits: Feasibility, plan: Plan) -> list[str]:
-    """Check names, payload, and force on the sensor."""
     names = [load.name for load in limits.config.loads]
     out: list[str] = []
     for name in (UNLOADED, *plan.loads):
@@ -221,9 +213,9 @@ def _remarks(plan: Plan, limits: Feasibility) -> list[str]:
 def seconds_at_rest(config: CellConfig) -> float:
     """Return the time of the arm at rest for the readings of one step, cell s."""
     acquire, targets = config.acquire, max(len(config.tool.targets), 1)
-    once = 0.0 if config.force_sensor is None else acquire.force_window_s
     if config.planning.reading_s is not None:
         return targets * config.planning.reading_s
+    once = 0.0 if config.force_sensor is None else acquire.force_window_s
     per_target = acquire.settle_s + acquire.samples * MEASURING_S + (targets > 1) * AIMING_S
     return targets * per_target + once
 

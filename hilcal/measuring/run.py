@@ -1,24 +1,486 @@
-"""Running a campaign: nothing moves without a checked plan, and any failure stops the arm."""
+"""A session of a campaign: from connected devices to the last missing reading.
+
+Nothing moves without a checked plan, every reading is stored before the next motion, and any
+failure stops the arm before anything else.
+"""
 
 import time
 import traceback
 from collections.abc import Callable
-from typing import Any
+from contextlib import suppress
+from dataclasses import asdict
+from functools import partial
+from typing import Any, TypeVar
+
+import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.errors import DeviceError, HilcalError, InputError
+from hilcal.measuring.arrival import ArrivalReader, RoughRegistration
 from hilcal.measuring.connect import Rig, Setup
-from hilcal.measuring.devices import ArmDevice, Clock
-from hilcal.measuring.progress import Phase, Remark, Watcher
-from hilcal.measuring.route import DryRun, dry_run, route
-from hilcal.measuring.session import LiveModel, Session, StoppingRule
-from hilcal.store.plan import Plan
+from hilcal.measuring.devices import (
+    ArmDevice,
+    Clock,
+    LoadChangedError,
+    TargetLostError,
+    WrenchSample,
+)
+from hilcal.measuring.force import ForceMeter, TaredWrench
+from hilcal.measuring.loads import TRIES, Hook, payload
+from hilcal.measuring.measure import MeasuredStop, Measurer
+from hilcal.measuring.motion import Mover
+from hilcal.measuring.progress import (
+    GoalMet,
+    GoalStatus,
+    LiveResidual,
+    Phase,
+    ReadingStored,
+    Remark,
+    Watcher,
+)
+from hilcal.measuring.route import DryRun, Stop, dry_run, route, way_home
+from hilcal.measuring.session_state import (
+    Eta,
+    SessionState,
+    Shift,
+    detail,
+    repeatability,
+    sample_json,
+    stored_wrench,
+)
+from hilcal.readings.readings import Readings, States
+from hilcal.store.plan import UNLOADED, Plan, Step
 from hilcal.store.run_log import RunLog
+from hilcal.types import Floats
 
 HOW_ON = "The campaign is safe: run again with --resume"
 EMERGENCY = "press the emergency stop"
 _STOPS = 3
+Done = TypeVar("Done")
+LiveModel = Callable[[Readings], LiveResidual]
+"""Returns the residual of the last reading by a model fitted to the previous ones."""
+StoppingRule = Callable[[Readings, bool], GoalStatus]
+"""Returns the status of the goal from all readings. The second argument tells that the plan has no
+further readings; else the status may be of fewer readings, as fits must not delay the campaign."""
+
+
+class Session:
+    """Follows a route, and stores a reading at every stop with a step."""
+
+    def __init__(
+        self,
+        setup: Setup,
+        plan: Plan,
+        store: RunLog,
+        live: LiveModel | None = None,
+        wall: Callable[[], float] = time.time,
+        goal: StoppingRule | None = None,
+        epoch: float | None = None,
+    ) -> None:
+        """Read the stored readings of earlier sessions; no device is used yet."""
+        self.in_control = False
+        rig, cell, config = setup.rig, setup.cell, setup.config
+        self._rig, self._cell, self._config = rig, cell, config
+        self._clock, self._watcher = setup.clock, setup.watcher
+        self._plan, self._store, self._live, self._wall = plan, store, live, wall
+        self._rule = goal
+        self._goal: GoalStatus | None = None
+        self._meter: ForceMeter | None = None
+        if rig.force is not None and config.force_sensor is not None:
+            window = setup.clock.real(config.acquire.force_window_s)
+            self._meter = ForceMeter(rig.force, config.force_sensor, cell, window)
+        self._mover = Mover(setup, self._meter)
+        self._hook = Hook(setup, self._meter, self._mover)
+        self._joint_std = config.repeatability.per_joint(cell.arm.n)
+        self._state = SessionState(cell, self._joint_std)
+        measurer = Measurer(setup, self._meter, self._mover)
+        self._reader = ArrivalReader(setup, measurer, self._state.registration)
+        self._identified = 0
+        self._temperatures: bool | None = None
+        self._torques: bool | None = None
+        self._torques_lost = self._tared = False
+        self._done = 0
+        start = wall()
+        self._epoch = start if epoch is None else epoch
+        self._start = setup.clock.now()
+        self._elapsed = (start - self._epoch) * setup.clock.scale
+        self._remember()
+
+    def _remember(self) -> None:
+        """Restore times, tool, reference and unloaded positions from the stored readings."""
+        details = self._store.details()
+        stored = self._store.readings()
+        if not details or stored is None:
+            return
+        self._epoch = float(details[0]["epoch_wall_s"])
+        last = 0.0 if stored.states.time is None else float(stored.states.time[-1])
+        self._elapsed = max(last, (self._wall() - self._epoch) * self._clock.scale)
+        self._temperatures = stored.states.joint_temperature is not None
+        self._torques = stored.states.torque is not None
+        self._done = len(self._store.done())
+        for raw, value, target in zip(details, stored.value, stored.target.tolist(), strict=True):
+            step = Step(raw["pose"], raw["load"], raw["cycle"])
+            q, covariance = np.array(raw["q_actual"]), np.array(raw["tracker_covariance"])
+            self._state.add(step, q, value, covariance, stored_wrench(raw), target)
+        felt = details[-1].get("felt")
+        if self._meter is not None and felt is not None:
+            self._meter.zero = np.array(felt["zero"])
+            self._identify()
+
+    def walk(self, stops: tuple[Stop, ...]) -> None:
+        """Visit all stops; move home as soon as the goal is met."""
+        self._event("start", {"missing": sum(s.step is not None for s in stops)})
+        self._begin(stops[:2])
+        pace = self._pace = Eta(self._clock)
+        behind, ahead = list(stops[:2]), stops[2:]
+        if self._goal_newly_met(last=False):  # the last session was stopped on its way home
+            ahead = way_home(self._cell, self._config, self._plan, behind, self._store.done())
+        while ahead:
+            stop, ahead = ahead[0], ahead[1:]
+            behind.append(stop)
+            result = self._watched(partial(self._visit, stop))
+            if stop.step is not None and result is not None:
+                pace.read()
+                if self._goal_newly_met(last=all(s.step is None for s in ahead)):
+                    done = self._store.done()
+                    ahead = way_home(self._cell, self._config, self._plan, behind, done)
+                readings_left = sum(s.step is not None for s in ahead)
+                remaining = pace.left(readings_left, sum(s.change_to is not None for s in ahead))
+                self._tell(stop.step, *result, remaining)
+        self._finish()
+
+    def _goal_newly_met(self, last: bool) -> bool:
+        """Apply the stopping rule; return whether the goal has just been met, which is reported."""
+        readings = None if self._rule is None else self._store.readings()
+        if self._rule is None or readings is None or (self._goal is not None and self._goal.met):
+            return False
+        status = self._goal = self._rule(readings, last)
+        count, planned = len(readings), len(self._plan.steps)
+        if status.met or last:
+            self._event("goal", {**status.to_dict(), "readings": count, "planned": planned})
+        if status.met:
+            self._watcher.notify(GoalMet(status, count, planned))
+        return status.met
+
+    def _visit(self, stop: Stop) -> tuple[Readings, float] | None:
+        self._move(stop)
+        change = None if stop.change_to == self._hook.hanging else stop.change_to
+        if change is not None:
+            self._pace.arrived()
+            self._change(change)
+        if not self._tared:
+            self._tare()
+        if change is not None:
+            self._pace.changed()
+        return None if stop.step is None else self._reading(stop, stop.step)
+
+    def _watched(self, do: Callable[[], Done]) -> Done:
+        """Call a function; call it again after a wrong load has been corrected."""
+        for remaining in reversed(range(TRIES)):
+            try:
+                return do()
+            except LoadChangedError as error:
+                self._rig.arm.stop()
+                if not remaining:
+                    raise
+                self._mover.left_here()
+                self._event("load", {"hanging": None, "why": str(error)})
+                self._remark(f"{error} The arm stands")
+                self._hook.restore(str(error))
+                self._event("load", {"hanging": self._hook.hanging})
+        raise AssertionError("unreachable")
+
+    def _begin(self, start: tuple[Stop, ...]) -> None:
+        """Check the arm's position, have the load taken off, move to the reference, tare.
+
+        The force sensor is tared before the first motion, too, so that it is compared from then on.
+        The position is checked again after every question and, by the mover, before each motion, as
+        the arm may be moved by hand. In a resumed campaign, people are asked if the arm does not
+        stand at its last reading.
+        """
+        first, last_q = start[0], self._state.last_q
+        sample = self._mover.free_way(first.q, first.name)
+        if self._temperatures is None:
+            self._temperatures = bool(np.isfinite(sample.joint_temperature).all())
+        self._hook.begin()
+        expected = sample.q if last_q is None else last_q
+        self._mover.goal = self._mover.agreed(first.q, first.name, expected, self._hook.confirm)
+        self.in_control = True
+        self._rig.arm.take_control(*payload(self._cell, None))
+        self._watched(self._zero)
+        registration = RoughRegistration(self._cell)  # of this session: the tracker may have moved
+        positions = []
+        for stop in start:
+            self._watched(partial(self._move, stop))
+            with suppress(TargetLostError):  # a reading will search it
+                positions.append((stop.q, self._rig.tracker.measure().value[:3]))
+        for position in positions:
+            if (wrong := registration.implausible(*position)) is not None:
+                raise DeviceError(wrong)
+            registration.add(*position)
+        for position in positions:
+            self._state.registration.add(*position)
+        self._watched(self._tare)
+
+    def _move(self, stop: Stop) -> None:
+        if not self._mover.is_at(stop.q):
+            self._watcher.notify(Phase(f"moving to {stop.name}"))
+            self._mover.move(stop.q, stop.name)
+
+    def _tare(self) -> None:
+        """Set the force sensor's zero at the reference pose, and store it."""
+        zero = self._zero()
+        self._tared = True
+        if zero is not None:
+            sample, q = zero
+            self._event("tare", {"force": sample_json(sample), "q": q.tolist()})
+
+    def _zero(self) -> tuple[WrenchSample, Floats] | None:
+        """Set the zero at the present pose, unloaded; return mean wrench and joint angles."""
+        meter, watch = self._meter, self._mover.watch
+        if meter is None or watch is None:
+            return None
+        self._watcher.notify(Phase("taring the force sensor"))
+        self._mover.wait(self._config.acquire.settle_s)
+        sample = meter.average()
+        q = self._mover.look().q
+        wrong = watch.wrong(meter.tared(sample, q))
+        if wrong:
+            raise LoadChangedError(wrong)
+        meter.set_zero(sample, q)
+        watch.expect(None)
+        return sample, q
+
+    def _change(self, name: str) -> None:
+        if name != UNLOADED and len(self._state.tared_wrenches) > self._identified:
+            self._identify()
+        self._hook.change(name)
+        self._event("load", {"hanging": name})
+        self._tared = name != UNLOADED
+
+    def _identify(self) -> None:
+        if self._meter is None:
+            return
+        self._identified = len(self._state.tared_wrenches)
+        tolerance = self._config.operator.tolerance_N
+        try:
+            left_out = self._meter.identify(self._state.tared_wrenches, tolerance)
+        except HilcalError as error:
+            self._remark(f"the tool is not identified: {error}")
+            return
+        if left_out is None:
+            return
+        if left_out:
+            self._remark(
+                f"{len(left_out)} of {self._identified} unloaded readings differ by more than "
+                f"{tolerance:g} N from the tool that the others weigh: was the tool touched?"
+            )
+        tool = self._meter.tool
+        content: dict[str, Any] = {
+            "mass_kg": float(tool.mass),
+            "com_m": self._meter.to_flange(tool.com).tolist(),
+            "bias": tool.bias.tolist(),
+            "variance_factor": tool.variance_factor,
+            "readings": self._identified,
+            "left_out": list(left_out),
+        }
+        self._event("tool", content)
+        if (differs := self._meter.tool_differs(tolerance)) is not None:
+            self._remark(differs)
+
+    def _reading(self, stop: Stop, step: Step) -> tuple[Readings, float]:
+        """Measure and store all targets; return the first reading and the total settling time."""
+        self._watcher.notify(Phase(f"measuring {step}"))
+        measurements = self._reader.read(stop.q, stop.name)
+        pairs = [self._row(stop, step, measured) for measured in measurements]
+        rows, details = map(list, zip(*pairs, strict=True))
+        self._check(measurements, details)
+        self._store.record(Readings.joined(rows), step, details[0], *details[1:])
+        self._done += 1
+        for measured in measurements:
+            mean, target = measured.mean, measured.target
+            name = f"{step}" if target is None else f"{step}, {self._cell.target_names[target]}"
+            for text in measured.remarks:
+                self._remark(f"{name}: {text}")
+            tared = None if target else self._tared_wrench(measured)
+            shift = self._state.add(
+                step, measured.q, mean.value, mean.covariance, tared, target or 0
+            )
+            if shift is not None:
+                self._tell_drift(step, shift)
+        self._look_back()
+        return rows[0], sum(measured.settling for measured in measurements)
+
+    def _check(self, measurements: list[MeasuredStop], details: list[dict[str, Any]]) -> None:
+        """Refuse the readings of an arrival if one is of another target or load."""
+        wrong = next(filter(None, map(self._doubt, measurements)), None)
+        if wrong is None:
+            return
+        for raw in details:
+            self._event("doubted", {"why": str(wrong), "reading": raw})
+        for measured in measurements:
+            position, target = measured.mean.value[:3], measured.target or 0
+            self._state.registration.doubt_repeated(measured.q, position, target)
+        self._look_back()
+        raise wrong
+
+    def _look_back(self) -> None:
+        """Report stored readings that have become doubtful."""
+        for step, why in self._state.registration.late_doubts():
+            self._event("doubted", {"why": why, "reading": asdict(step), "stored": True})
+            self._remark(f"{step}, stored before: {why} A fit sets gross errors aside")
+
+    def _doubt(self, measured: MeasuredStop) -> DeviceError | None:
+        """Return why a reading cannot be of its target under its load, or None."""
+        position, target = measured.mean.value[:3], measured.target or 0
+        stray = self._state.registration.implausible(measured.q, position, target)
+        if stray is not None:
+            return DeviceError(stray)
+        watch, tared = self._mover.watch, self._tared_wrench(measured)
+        wrong = "" if watch is None or tared is None else watch.wrong(tared)
+        return LoadChangedError(wrong) if wrong else None
+
+    def _row(
+        self, stop: Stop, step: Step, measured: MeasuredStop
+    ) -> tuple[Readings, dict[str, Any]]:
+        """Return one reading, with the instrument's covariance, and its raw data."""
+        tared, target, names = (
+            self._tared_wrench(measured),
+            measured.target,
+            self._cell.target_names,
+        )
+        elapsed = self._elapsed + measured.ended - self._start
+        temperature, torque = self._temperature(measured), self._torque(measured)
+        states = States(
+            q=stop.q[None].copy(),
+            wrench=self._wrench(step, tared)[None].copy(),
+            time=np.array([elapsed]),
+            load_time=np.array([measured.ended - self._hook.since]),
+            joint_temperature=None if temperature is None else temperature[None],
+            approach=self._mover.side[None].copy(),
+            q_actual=measured.q[None].copy(),
+            torque=None if torque is None else torque[None].copy(),
+            target=None if target is None else np.array([target]),
+        )
+        number = np.zeros(1, dtype=np.int64)
+        row = Readings(
+            states=states,
+            pose=number,
+            load=number,
+            cycle=np.array([step.cycle], dtype=np.int64),
+            value=measured.mean.value[None].copy(),
+            covariance=measured.mean.covariance[None].copy(),
+            load_names=(step.load,),
+            pose_names=(step.pose,),
+            target_names=() if target is None else names,
+        )
+        session: dict[str, Any] = {
+            "epoch_wall_s": self._epoch,
+            "wall_s": self._wall(),
+            "time_s": elapsed,
+            "side": self._mover.side.tolist(),
+            "losses": None if self._rig.force is None else sample_json(self._rig.force.losses()),
+        }
+        if target is not None:
+            session["target"] = names[target]
+        zero = None if self._meter is None else self._meter.zero
+        return row, detail(step, measured, tared, zero) | session
+
+    def _tared_wrench(self, measured: MeasuredStop) -> TaredWrench | None:
+        if self._meter is None or measured.force is None:
+            return None
+        return self._meter.tared(measured.force, measured.q)
+
+    def _wrench(self, step: Step, tared: TaredWrench | None) -> Floats:
+        """Return the load's wrench (6,) at the load point, base axes: configured or measured."""
+        load, sensor = self._hook.load(step.load), self._config.force_sensor
+        if load is None:
+            return np.zeros(6)
+        if sensor is not None and self._meter is not None and tared is not None:
+            pulls = any((*load.force_N, *load.moment_Nm))
+            if sensor.use == "all" or (sensor.use == "pulls" and pulls):
+                return self._meter.load_wrench(tared)
+        return load.wrench(self._cell.gravity)
+
+    def _temperature(self, measured: MeasuredStop) -> Floats | None:
+        """Return the joint temperatures (n,), °C, or None in a campaign without."""
+        if not self._temperatures:
+            return None
+        mean = (measured.before.joint_temperature + measured.after.joint_temperature) / 2
+        if not np.isfinite(mean).all():
+            raise DeviceError("arm: it no longer reports the temperatures of its joints")
+        return np.asarray(mean)
+
+    def _torque(self, measured: MeasuredStop) -> Floats | None:
+        """Return measured torques (n,) of the drives, N·m, NaN if lost; None without any."""
+        lost = measured.torque is None
+        if self._torques is None:
+            self._torques = not lost
+        if not self._torques:
+            return None
+        if lost and not self._torques_lost:
+            self._remark(
+                "arm: it no longer tells the torques of its joints; readings go on without them"
+            )
+        self._torques_lost = lost
+        return np.full(self._cell.arm.n, np.nan) if measured.torque is None else measured.torque
+
+    def _tell_drift(self, step: Step, shift: Shift) -> None:
+        limit = self._config.acquire.drift_limit_sigma
+        content = {"shift_m": shift.metres.tolist(), "sigma": shift.sigma}
+        self._event("drift", {"cycle": step.cycle, **content, "over": shift.sigma > limit})
+        if shift.sigma > limit:
+            self._remark(
+                f"the reference pose has moved by {1e6 * np.linalg.norm(shift.metres):.0f} µm, "
+                f"{shift.sigma:.1f} sigma (drift_limit_sigma {limit:g}): is the tracker or the "
+                "target loose, or the arm still warming up?"
+            )
+
+    def _tell(self, step: Step, reading: Readings, settling: float, remaining: float) -> None:
+        number = int(reading.target[0])
+        (_, live), *others = self._compared(reading)
+        stored = ReadingStored(
+            step,
+            self._done,
+            len(self._plan.steps),
+            self._clock.real(remaining),
+            remaining,
+            self._state.deflection(step, reading.value[0, :3], number),
+            live,
+            settling,
+            self._goal,
+            number,
+            tuple(others),
+        )
+        self._watcher.notify(stored)
+
+    def _compared(self, reading: Readings) -> list[tuple[int, LiveResidual]]:
+        """Return the residual of each target of an arrival, by a model of the previous readings."""
+        out = [(int(k), LiveResidual()) for k in reading.target]
+        readings = None if self._live is None else self._store.readings()
+        if self._live is None or readings is None:
+            return out
+        previous = np.arange(len(readings) - len(reading))
+        for k, (target, _) in enumerate(out):
+            with suppress(HilcalError):  # too few readings for a model
+                selected = readings[np.append(previous, len(previous) + k)]
+                out[k] = target, self._live(selected)
+        return out
+
+    def _finish(self) -> None:
+        estimate = repeatability(self._state.visits)
+        if estimate is not None:
+            self._event("repeatability", asdict(estimate))
+            self._remark(estimate.words(self._joint_std))
+        self._event("finished", {"readings": self._done})
+        self._watcher.notify(Phase("finished"))
+
+    def _remark(self, text: str) -> None:
+        self._watcher.notify(Remark(text))
+
+    def _event(self, kind: str, content: dict[str, Any]) -> None:
+        self._store.event(kind, {"wall_s": self._wall(), **content})
 
 
 def run(
@@ -47,30 +509,29 @@ def run(
         DeviceError: a device failed, a limit was exceeded, a person gave up.
         KeyboardInterrupt: unchanged; the arm stands.
     """
-    full = dry_run(cell, config, plan)
-    refuse(full)
+    full = _safe(dry_run(cell, config, plan))
     missing = plan.without(store.done())
     if not missing.steps:
         watcher.notify(Phase("nothing is missing"))
         return
-    refuse(dry_run(cell, config, missing))  # its route differs
+    _safe(dry_run(cell, config, missing))  # its route differs
     for text in full.remarks:
         watcher.notify(Remark(text))
-    stops = route(missing, cell.arm, config.limits.joint_margin_rad)
     setup = Setup(rig, cell, config, clock, watcher)
     session = Session(setup, plan, store, live, wall, goal, epoch)
     try:
-        session.walk(stops)
+        session.walk(route(missing, cell.arm, config.limits.joint_margin_rad))
     except BaseException as error:
         trouble = _stop(rig.arm) if session.in_control else ""
         _note(store, error, trouble)
         _raise(error, trouble)
 
 
-def refuse(checked: DryRun) -> None:
+def _safe(checked: DryRun) -> DryRun:
     """Refuse a plan with problems: InputError names the first, and how many more there are."""
     if checked.problems:
         raise InputError(f"the plan is not safe to run, nothing has moved: {checked.first}")
+    return checked
 
 
 def _stop(arm: ArmDevice) -> str:
@@ -103,18 +564,14 @@ def _note(store: RunLog, error: BaseException, trouble: str) -> None:
 def _raise(error: BaseException, trouble: str) -> None:
     if not isinstance(error, Exception) and not trouble:
         raise error
-    text = _line(error)
+    sentences = [_line(error)]
     if not isinstance(error, HilcalError | KeyboardInterrupt):
-        text = f"unexpected {text} (its details are in the campaign)"
-    if trouble and EMERGENCY not in text:
-        text = f"{_sentence(text)}THE ARM MAY STILL MOVE ({trouble}): {EMERGENCY}"
+        sentences = [f"unexpected {sentences[0]} (its details are in the campaign)"]
+    if trouble and EMERGENCY not in sentences[0]:
+        sentences.append(f"THE ARM MAY STILL MOVE ({trouble}): {EMERGENCY}")
+    ended = [x if x.endswith(("?", "!")) else f"{x}." for x in sentences]
     kind = type(error) if isinstance(error, HilcalError) and not trouble else DeviceError
-    raise kind(_sentence(text) + HOW_ON) from error
-
-
-def _sentence(text: str) -> str:
-    """Return a text that ends a sentence, with a space."""
-    return f"{text} " if text.endswith(("?", "!")) else f"{text}. "
+    raise kind(" ".join([*ended, HOW_ON])) from error
 
 
 def _line(error: BaseException) -> str:

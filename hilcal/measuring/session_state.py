@@ -46,6 +46,12 @@ class RepeatabilityEstimate:
         total, noise = self.scatter**2, self.instrument**2
         return bool(total - noise > 3.0 * noise * np.sqrt(2.0 / (3.0 * max(self.dof, 1))))
 
+    @property
+    def returns(self) -> str:
+        """Numbers of returns and poses, in words."""
+        dof, poses = self.dof, self.poses
+        return f"{dof} return{'s' * (dof != 1)} to {poses} pose{'s' * (poses != 1)}"
+
     def words(self, configured: Floats) -> str:
         """Return the estimate for people, with the configured standard deviations (n,), rad."""
         stated = float(np.sqrt(np.mean(configured**2)))
@@ -55,12 +61,6 @@ class RepeatabilityEstimate:
             f"the instrument alone by {1e6 * self.instrument:.0f} µm: joint_std_rad {joints}, "
             f"configured {stated:.1g}"
         )
-
-    @property
-    def returns(self) -> str:
-        """Numbers of returns and poses, in words."""
-        dof, poses = self.dof, self.poses
-        return f"{dof} return{'s' * (dof != 1)} to {poses} pose{'s' * (poses != 1)}"
 
 
 def repeatability(visits: Sequence[UnloadedVisit]) -> RepeatabilityEstimate | None:
@@ -130,9 +130,8 @@ def stored_wrench(stored: dict[str, Any]) -> TaredWrench | None:
     felt = stored.get("felt")
     if felt is None:
         return None
-    return TaredWrench(
-        np.array(felt["wrench"]), np.array(felt["covariance"]), np.array(stored["q_actual"])
-    )
+    arrays = felt["wrench"], felt["covariance"], stored["q_actual"]
+    return TaredWrench(*(np.array(values) for values in arrays))
 
 
 def sample_json(sample: ArmSample | TrackerSample | WrenchSample | Losses | None) -> Any:
@@ -144,15 +143,11 @@ def sample_json(sample: ArmSample | TrackerSample | WrenchSample | Losses | None
 
 def _value(value: Any) -> Any:
     """Return a JSON value; a number that is not finite becomes null."""
-    if isinstance(value, np.ndarray):
-        return [_value(x) for x in value.tolist()]
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
     if isinstance(value, list):
         return [_value(x) for x in value]
-    if isinstance(value, float | np.floating):
-        return float(value) if np.isfinite(value) else None
-    if isinstance(value, np.integer):
-        return int(value)
-    return value
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,15 +156,6 @@ class Shift:
 
     metres: Floats  # (3,) d, sensor axes, m
     sigma: float  # in standard deviations, sqrt(dᵀ (C₁ + C)⁻¹ d)
-
-    def words(self, limit: float) -> str:
-        """Return a sentence for people on a shift over a limit, sigma."""
-        micrometres = 1e6 * float(np.linalg.norm(self.metres))
-        return (
-            f"the reference pose has moved by {micrometres:.0f} µm, {self.sigma:.1f} sigma "
-            f"(drift_limit_sigma {limit:g}): is the tracker or the target loose, or the arm "
-            "still warming up?"
-        )
 
 
 LOADING_S = 60.0
@@ -180,9 +166,7 @@ class Eta:
     """Durations of readings with their motions, and of load changes, cell s; estimates the rest."""
 
     def __init__(self, clock: Clock) -> None:
-        self._clock = clock
-        self._mark = clock.now()
-        self._moving = 0.0
+        self._clock, self._mark, self._moving = clock, clock.now(), 0.0
         self._readings: list[float] = []
         self._changes: list[float] = []
 
@@ -220,7 +204,7 @@ class SessionState:
         self.last_q: Floats | None = None
         self._cell, self._joint_std = cell, joint_std
         self._unloaded: dict[tuple[str, int, int], Floats] = {}
-        self._visits: list[UnloadedVisit] = []
+        self.visits: list[UnloadedVisit] = []
         self._reference: tuple[Floats, Floats] | None = None
 
     def add(
@@ -251,7 +235,7 @@ class SessionState:
         chain = chains.evaluate(self._cell.arm, q[None])
         jac = drive_jacobian(self._cell.arm, chain, chain.point(self._cell.target[:3, 3]))[0, :3]
         instrument = covariance[:3, :3]
-        self._visits.append(UnloadedVisit(step.pose, position, instrument, float(np.sum(jac**2))))
+        self.visits.append(UnloadedVisit(step.pose, position, instrument, float(np.sum(jac**2))))
         if step.pose != REFERENCE:
             return None
         if self._reference is None:
@@ -267,7 +251,3 @@ class SessionState:
         if step.load == UNLOADED or unloaded is None:
             return None
         return float(np.linalg.norm(position - unloaded))
-
-    def repeatability(self) -> RepeatabilityEstimate | None:
-        """Return the scatter of the unloaded readings; None where no pose has two."""
-        return repeatability(self._visits)

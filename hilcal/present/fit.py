@@ -28,7 +28,7 @@ from hilcal.present.registration import fitted_lines
 from hilcal.present.verdict import correlated, sigmas
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Scaling
-from hilcal.stream.fit import StreamFit
+from hilcal.stream import StreamFit
 from hilcal.types import Ints
 
 ALL_ROWS = 60

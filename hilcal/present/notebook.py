@@ -29,7 +29,7 @@ from hilcal.present.plan import plan_report
 from hilcal.readings.readings import Readings
 from hilcal.refinement import Refinement
 from hilcal.store.revision import change
-from hilcal.stream.fit import StreamFit
+from hilcal.stream import StreamFit
 from hilcal.tables.table import exchange_columns
 from hilcal.tables.write import plan_csv
 

@@ -59,9 +59,15 @@ def deflection_groups(readings: Readings) -> list[Group]:
     """
     if len(readings) and readings.unloaded.all():
         raise InputError("readings = deflection: there is no loaded reading; use absolute")
-    _refuse_without_unloaded(readings)
+    if not (has := has_unloaded(readings)).all():
+        row = int(np.argmin(has))
+        name = readings.pose_names[readings.pose[row]]
+        raise InputError(
+            f"pose {name}, cycle {readings.cycle[row]}: no unloaded reading (load = none), which "
+            "a deflection needs; measure it, or use --readings absolute"
+        )
     keys = [readings.pose, readings.cycle]
-    rows = np.flatnonzero(_has_unloaded(readings, [*keys, readings.line]))
+    rows = np.flatnonzero(has_unloaded(readings, readings.line))
     unloaded, target = readings.unloaded[rows], readings.line[rows]
     if readings.common is None:
         keys.append(readings.line)
@@ -123,27 +129,15 @@ def _numbered(keys: Sequence[Ints]) -> Ints:
     return np.unique(np.stack(keys, axis=1), axis=0, return_inverse=True)[1].reshape(-1)
 
 
-def has_unloaded(readings: Readings) -> Bools:
-    """Return (N,) which readings have an unloaded one, or are one, in their pose and cycle."""
-    return _has_unloaded(readings, [readings.pose, readings.cycle])
+def has_unloaded(readings: Readings, *also: Ints) -> Bools:
+    """Return (N,) which readings have an unloaded one, or are one, in their pose and cycle.
 
-
-def _has_unloaded(readings: Readings, keys: Sequence[Ints]) -> Bools:
-    group = _numbered(keys)
+    `also` are further numbers (N,) in which the two must agree.
+    """
+    group = _numbered([readings.pose, readings.cycle, *also])
     has = np.zeros(int(group.max()) + 1, dtype=bool)
     has[group[readings.unloaded]] = True
     return np.asarray(has[group])
-
-
-def _refuse_without_unloaded(readings: Readings) -> None:
-    has = has_unloaded(readings)
-    if not has.all():
-        row = int(np.argmin(has))
-        name = readings.pose_names[readings.pose[row]]
-        raise InputError(
-            f"pose {name}, cycle {readings.cycle[row]}: no unloaded reading (load = none), which "
-            "a deflection needs; measure it, or use --readings absolute"
-        )
 
 
 Scaling = Literal["none", "gu", "gc"]
@@ -151,7 +145,6 @@ Mode = Literal["deflection", "absolute"]
 SCALINGS: tuple[Scaling, ...] = ("none", "gu", "gc")
 MODES: tuple[Mode, ...] = ("deflection", "absolute")
 RANK_TOLERANCE = 1e-10
-MANY = 1000  # blocks from which on Cholesky's factor is tried; a choice by timing
 TOGETHER = 1_000_000  # Numbers that are whitened at a time; a choice by memory
 RUN = 200  # measurements in a run of correlated noise; a choice: of fewer all is exact
 
@@ -162,7 +155,7 @@ def inverse_root(covariance: Floats, scaling: Scaling = "gc") -> Floats:
     For `gc`, V = D C D with D the standard deviations and C = U Λ Uᵀ the correlation matrix;
     S = D U Λ^½, so that S Sᵀ = V and S⁻¹ ε does not depend on the units of ε. (The
     eigenvectors of V itself would turn with the units; every S with S Sᵀ = V gives the same
-    estimate. Of `MANY` blocks, those of full rank take S = D L with C = L Lᵀ.)
+    estimate.)
 
     Rule for rank-deficient V: an element of zero variance, or a direction whose eigenvalue
     of C is below 1e-10 of the largest, has no stated noise to weigh it by. It is left out:
@@ -176,35 +169,12 @@ def inverse_root(covariance: Floats, scaling: Scaling = "gc") -> Floats:
     per_std = np.where(positive, 1.0, 0.0) / np.sqrt(np.where(positive, variance, 1.0))
     if scaling == "gu":
         return np.asarray(per_std[..., None] * np.eye(k))
-    if covariance.ndim == 3 and len(covariance) >= MANY:
-        return _triangular_roots(covariance, per_std)
-    return _eigenvalue_roots(covariance, per_std)
-
-
-def _eigenvalue_roots(covariance: Floats, per_std: Floats) -> Floats:
-    """S⁻¹ (..., k, k) by eigenvalues of the correlation matrix, the rule applied."""
     correlation = covariance * per_std[..., :, None] * per_std[..., None, :]
     values, vectors = np.linalg.eigh((correlation + np.swapaxes(correlation, -1, -2)) / 2)
     regular = values > RANK_TOLERANCE * values[..., -1:]
     per_root = np.where(regular, 1.0, 0.0) / np.sqrt(np.where(regular, values, 1.0))
     rows = per_root[..., :, None] * np.swapaxes(vectors, -1, -2)
     return np.asarray(rows * per_std[..., None, :])
-
-
-def _triangular_roots(covariance: Floats, per_std: Floats) -> Floats:
-    """S⁻¹ (N, k, k) by Cholesky's factor; by eigenvalues where the rule may leave something out.
-
-    The correlation matrix has trace k, so that λ_max ≤ k, and the product of the k − 1 largest
-    eigenvalues is below e: with det > e k `RANK_TOLERANCE` the rule leaves nothing out.
-    """
-    k = covariance.shape[-1]
-    correlation = covariance * per_std[:, :, None] * per_std[:, None, :]
-    sure = np.linalg.det(correlation) > math.e * k * RANK_TOLERANCE
-    out = np.empty(covariance.shape)
-    lower = np.linalg.cholesky((correlation + np.swapaxes(correlation, 1, 2))[sure] / 2)
-    out[sure] = np.linalg.inv(lower) * per_std[sure, None, :]
-    out[~sure] = _eigenvalue_roots(covariance[~sure], per_std[~sure])
-    return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,6 +8,7 @@
 import json
 import sys
 import textwrap
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
@@ -22,70 +23,8 @@ KEPT = ROOT / "docs" / "measured" / "peers" / "peers.json"
 PAGE = ROOT / "docs" / "reference" / "peers.md"
 
 
-KINDS = {
-    "plan": (
-        "Plans",
-        """
-        Poses for the geometry of a UR10, D-optimal, out of the same candidates. Both programs have
-        figaroh's own regressor, and one judge: det(M)^(1/p) over that of figaroh's continuous
-        optimum for as many readings. The continuous optima agree. figaroh gives every candidate to
-        a general cone solver (CVXOPT, through PICOS), and its time grows fast with their number;
-        hilcal solves the problem for few of them, and scans the others for those that would add
-        something. For a number of poses figaroh takes those of most weight, or exchanges one pose
-        at a time (its `Detmax`, which needs no continuous optimum, is at least as fast as hilcal's
-        whole search among few candidates, and returns the value that it reached but not the poses).
-        hilcal searches for whole numbers from the continuous optimum on, and states a proved bound
-        of what is lost.
-        """,
-    ),
-    "calibration": (
-        "Calibration",
-        """
-        The geometry of an arm from the same positions of an unlocated target, seen from an unknown
-        place, judged at poses that were not fitted: by their true positions for the simulated
-        arms, whose mechanics share no code with hilcal's effects, and by their readings, with
-        noise, for the real one. figaroh has the arm's URDF with the tool's mass. Its `structural`
-        can drop parameters that the readings determine (its documentation says so, since the place
-        of the target is not seen in that step). `map` keeps all, under priors of a stated size,
-        and `map_cv` finds their size by folds: on a rigid arm they are nearly as good as hilcal.
-        figaroh combines elastic joints with `structural` alone, and version 1.0.2 loses them
-        beside an unknown base (their names are overwritten by the base's), so the base is known
-        there, from the rigid calibration. figaroh's residual is a loop over the poses in Python
-        and its Jacobian numerical, where hilcal's is exact and over all poses at once. On the real
-        arm figaroh's `structural` is faster than hilcal's fit, which searches a misfit far beyond
-        the noise for gross errors, and with elastic joints its error is smaller than that of
-        hilcal's same fit, with half as many parameters. There the transmission error is missing,
-        which figaroh does not know; hilcal's `refine` finds and adds it, and takes its time for
-        that.
-        """,
-    ),
-    "least squares": (
-        "Least squares",
-        """
-        One residual function, of frames, links and elastic joints, minimised over the same
-        coordinates from the same start. All reach the same minimum. hilcal takes full
-        Gauss-Newton steps where SciPy's `least_squares` builds up a trust region, and gets the
-        prediction once for residual and Jacobian; with differences in place of the exact Jacobian
-        every step costs one prediction for each coordinate. `all` is over every parameter of the
-        model: χ² is lower there, and the error at other poses larger, since directions that the
-        readings do not determine take up noise. hilcal leaves these alone.
-        """,
-    ),
-    "cross-validation": (
-        "Cross-validation",
-        """
-        mrcal calibrates cameras, so that its method is used here and not the program: two halves
-        of the poses are fitted apart, and the difference of their predictions is compared with
-        what the readings' noise lets them differ by. hilcal predicts every tenth of the poses
-        from the others, by downdating one fit. Half of the campaigns lack nothing, half have a
-        transmission error that the model lacks; figures are misfits in units of what noise alone
-        makes of them, 1 where the model is right. mrcal's figure is for any poses, also those
-        that nobody measured, and where an effect is missing it grows more; hilcal's scatters less
-        where the model is right.
-        """,
-    ),
-}
-"""Title of each kind of table, and why the rows are as they are."""
+KINDS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+"""Title and words of each kind of table: why the rows are as they are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,13 +86,9 @@ def page(content: Mapping[str, Any]) -> str:
         f"other work too, with {versions}. Times are of the processor; the ratio is to the first "
         "row.",
     ]
-    for kind, (title, words) in KINDS.items():
-        out += [
-            "",
-            f"## {title}",
-            "",
-            *textwrap.wrap(" ".join(words.split()), 140, break_on_hyphens=False),
-        ]
+    for kind, about in KINDS.items():
+        words = " ".join(about["words"].split())
+        out += ["", f"## {about['title']}", "", *textwrap.wrap(words, 140, break_on_hyphens=False)]
         for table in content["tables"]:
             if table["kind"] != kind:
                 continue

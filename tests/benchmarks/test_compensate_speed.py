@@ -1,7 +1,7 @@
 """Cost of compensation against evaluating the nominal chain once for the same points."""
 
-import time
 from collections.abc import Callable
+from timeit import repeat
 from typing import Any
 
 import numpy as np
@@ -22,15 +22,8 @@ ROUNDS = 5
 
 def shortest(work: Callable[[], object], times: int = 1) -> float:
     """Return the median of some calls, least of all rounds, s."""
-    out = []
-    for _ in range(ROUNDS):
-        each = []
-        for _ in range(times):
-            begun = time.perf_counter()
-            work()
-            each.append(time.perf_counter() - begun)
-        out.append(float(np.median(each)))
-    return min(out)
+    timed = [repeat(work, number=1, repeat=times) for _ in range(ROUNDS)]
+    return float(np.median(timed, axis=1).min())
 
 
 EFFECTS = [

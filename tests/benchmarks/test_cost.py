@@ -7,8 +7,7 @@ end, each with the limit that README states, and stores them in `extra_info`.
 
 import tracemalloc
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -29,11 +28,12 @@ from hilcal.identification.gauss_newton import (
 from hilcal.identification.priors import prior_of, scales_of
 from hilcal.identification.residual import residual
 from hilcal.model.model import Model, Prediction
-from hilcal.readings.readings import Readings, States
+from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening, whitening
 from hilcal.types import Floats
 from tests.benchmarks.conftest import Claim
 from tests.support.arm_cases import arm_of, cell_of
+from tests.support.readings_cases import made
 from tests.support.timing import shortest
 
 pytestmark = pytest.mark.slow
@@ -51,36 +51,25 @@ EFFECTS = (
 )  # 6 + 3 + 6 + 6 + 6 + 3 = 30 parameters
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Problem:
-    """Readings of a UR10e of which every fourth is unloaded, and a model of 30 parameters."""
-
+class Problem(NamedTuple):
     model: Model
     readings: Readings
     theta: Floats
 
 
 def problem_of(count: int) -> Problem:
+    """Readings of a UR10e of which every fourth is unloaded, and a model of 30 parameters."""
     rng = np.random.default_rng(20)
     cell = cell_of(arm_of("ur10e"))
     number = np.arange(count)
     loaded = number % 4 > 0
-    states = States(
-        q=rng.uniform(-np.pi, np.pi, (count, 6)),
-        wrench=rng.normal(size=(count, 6)) * [60, 60, 60, 5, 5, 5] * loaded[:, None],
-    )
+    q = rng.uniform(-np.pi, np.pi, (count, 6))
+    wrench = rng.normal(size=(count, 6)) * [60, 60, 60, 5, 5, 5] * loaded[:, None]
     root = rng.normal(size=(count, 3, 3))
-    readings = Readings(
-        states=states,
-        pose=number // 4,
-        load=loaded.astype(np.int64),
-        cycle=np.zeros(count, dtype=np.int64),
-        value=rng.normal(size=(count, 3)),
-        covariance=4e-10 * (root @ np.swapaxes(root, 1, 2) + np.eye(3)),
-        load_names=("none", "load"),
-        pose_names=tuple(str(i) for i in range(int(number[-1]) // 4 + 1)),
-    )
-    model = Model(cell, tuple(effect(cell, states) for effect in EFFECTS))
+    covariance = 4e-10 * (root @ np.swapaxes(root, 1, 2) + np.eye(3))
+    value, poses = rng.normal(size=(count, 3)), number // 4
+    readings = made(q, value, wrench=wrench, pose=poses, load=loaded, covariance=covariance)
+    model = Model(cell, tuple(effect(cell, readings.states) for effect in EFFECTS))
     assert model.size == 30
     return Problem(model, readings, scales_of(model) * np.abs(rng.normal(size=model.size)))
 
@@ -106,17 +95,12 @@ def step(p: Problem, prediction: Prediction) -> Floats:
     return solve(p, prediction, w, assemble(p, prediction, w))
 
 
-def lapack_qr(a: Floats) -> Floats:
-    """LAPACK's QR alone."""
-    return np.asarray(sl.qr(a, mode="r", check_finite=False)[0])
-
-
 def works_of(p: Problem) -> dict[str, Callable[[], object]]:
     prediction = p.model.predict(p.readings.states, p.theta)
     w = whitening(p.readings, "absolute")
     a = assemble(p, prediction, w)
     return {
-        "qr": lambda: lapack_qr(a),
+        "qr": lambda: sl.qr(a, mode="r", check_finite=False),
         "whitening": lambda: whitening(p.readings, "absolute"),
         "jacobian": lambda: p.model.jacobian(prediction, p.theta, 3),
         "assembling": lambda: assemble(p, prediction, w),

@@ -40,10 +40,7 @@ print(json.dumps({
 
 
 def read_for(seconds, port):
-    config = {
-        "robot": {"model": "ur10e"},
-        "force_sensor": {"driver": "bota", "port": str(port)},
-    }
+    config = {"robot": {"model": "ur10e"}, "force_sensor": {"driver": "bota", "port": str(port)}}
     done = subprocess.run(
         [sys.executable, "-c", READ, json.dumps(config), str(seconds)],
         capture_output=True,

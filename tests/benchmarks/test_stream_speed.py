@@ -17,11 +17,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from hilcal import stream as passes
 from hilcal.effects.protocol import Effect
 from hilcal.identification.priors import scales_of
 from hilcal.model.model import Model
 from hilcal.regression.normal_equations import Triangle
-from hilcal.stream import fit as passes
 from hilcal.tables.parquet_stream import ReadingStream, open_stream
 from hilcal.types import Floats
 from tests.benchmarks.conftest import Claim

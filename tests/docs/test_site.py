@@ -199,21 +199,15 @@ def test_every_effect_has_its_law_its_parameters_and_a_picture(
             assert "<math>" in after, kind.name
 
 
-def test_every_name_of_the_library_has_its_entry(site: Path, pages: dict[Path, Parsed]) -> None:
+def test_names_keys_and_links_have_their_entries(site: Path, pages: dict[Path, Parsed]) -> None:
     for name in NAMES:
         said = pages[site / "reference" / "api" / f"{name}.html"].text
         first = (inspect.getdoc(getattr(hc, name)) or "").split("\n\n")[0]
         assert " ".join(first.replace("`", "").split()) in said, name
-
-
-def test_every_key_of_a_cell_has_its_entry(site: Path, pages: dict[Path, Parsed]) -> None:
     said = pages[site / "reference" / "cell-configuration.html"].text
     for section in reference.tables({}):
         for key in section.keys:
             assert key.name in said, (section.name, key.name)
-
-
-def test_links_to_other_sites_are_listed(site: Path, pages: dict[Path, Parsed]) -> None:
     listed = (site / "external-links.txt").read_text(encoding="utf-8").splitlines()
     known = {line.split("\t")[0] for line in listed}
     found = {link for page in pages.values() for link in page.links if urlsplit(link).scheme}

@@ -29,7 +29,6 @@ def again(x: Readings, rng: np.random.Generator, cycle: int) -> Readings:
 
 
 def append(path: Path, seed: int, pause: float) -> None:
-    """Append until the process is killed."""
     rng = np.random.default_rng(seed)
     with CampaignFile.open(path, read_only=True) as file:
         x = file.readings()

@@ -15,36 +15,7 @@ from hilcal.store.run_log import RunLog
 from tests.support.campaign_cases import LOOK_S, still_running
 from tests.support.paths import ROOT
 
-CELL = """\
-[robot]
-model = "ur10e"
-[tool]
-target_m = [0.06, 0.02, 0.12]
-load_point_m = [0.10, 0.0, 0.15]
-mass_kg = 0.8
-com_m = [0.01, 0.0, 0.06]
-[repeatability]
-joint_std_rad = 1e-5
-[[loads]]
-name = "pull x"
-force_N = [80.0, 0.0, 0.0]
-moment_Nm = [0.0, 6.0, 6.0]
-[operator.options]
-hand_s = 2.0
-[motion]
-speed_rad_s = 1.0
-acceleration_rad_s2 = 2.0
-[acquire]
-samples = 3
-[limits]
-workspace_min_m = [-1.6, -1.6, 0.05]
-[planning]
-candidates = 40
-against = []
-[simulation]
-seed = 4
-clock = 40.0
-"""
+CELL = (ROOT / "tests" / "data" / "calibrated_cell.toml").read_text(encoding="utf-8")
 """A tiny cell without a force sensor; its world goes forty times faster than a clock."""
 SIZE = ("--poses", "4", "--validation", "3")
 LONGEST = 120.0  # a calibration that is not killed takes a fifth of this, s
@@ -56,7 +27,6 @@ class Calibration:
     """Starts `calibrate` in a session of its own, as often as it takes."""
 
     def __init__(self, directory: Path) -> None:
-        """Write the cell; nothing is started."""
         self.toml, self.run = directory / "cell.toml", directory / "run.hilcal"
         self.log = directory / "calibrate.log"
         self.toml.write_text(CELL, encoding="utf-8")
@@ -95,13 +65,11 @@ class Calibration:
         return not ended
 
     def finish(self) -> None:
-        """Let it go on to its end."""
         process = self.start()
         assert process.wait(LONGEST) == 0, self.words
 
     @property
     def words(self) -> str:
-        """What it has said."""
         return self.log.read_text(encoding="utf-8", errors="replace")[-4000:]
 
     def left_behind(self) -> list[str]:
@@ -122,7 +90,6 @@ class Calibration:
         return count
 
     def stored(self) -> int:
-        """Return how many readings the campaign holds, each once."""
         if not self.run.exists():
             return 0
         with CampaignFile.open(self.run, read_only=True) as campaign:
@@ -139,7 +106,6 @@ class Calibration:
                     assert len(RunLog(campaign).details()) == campaign.n_readings
 
     def look(self, pid: int) -> None:
-        """Remember the processes that it has started."""
         try:
             children = psutil.Process(pid).children(recursive=True)
         except psutil.Error:

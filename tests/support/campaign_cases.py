@@ -70,7 +70,6 @@ class Site:
         self.ask("arm", "set", slider=share)
 
     def shorter(self, directory: Path, poses: int) -> "Site":
-        """The same cell with a plan of fewer poses."""
         plan = spread_plan(self.cell, self.config, poses, np.random.default_rng(7), repeats=0)
         plan_file = directory / "plan.json"
         plan_file.write_text(plan.to_json(), encoding="utf-8")
@@ -175,11 +174,9 @@ class Run:
 
     @property
     def words(self) -> str:
-        """What it has said so far."""
         return self.log.read_text(encoding="utf-8", errors="replace")
 
     def wait_until(self, what: Callable[[], bool], words: str) -> None:
-        """Wait until something holds."""
         end = time.monotonic() + DEADLINE
         while not what():
             self._look()
@@ -189,7 +186,6 @@ class Run:
             time.sleep(0.02)
 
     def some_readings(self) -> None:
-        """Wait until this run has stored a reading."""
         self.wait_until(lambda: bool(TAKEN.search(self.words)), "a reading")
 
     def moving(self) -> Floats:
@@ -210,14 +206,12 @@ class Run:
         return goal
 
     def measuring(self) -> None:
-        """Wait until a reading has just begun."""
         count = len(self.words.splitlines())
         self.wait_until(
             lambda: "measuring" in "".join(self.words.splitlines()[count:]), "measurement"
         )
 
     def next_reading(self, words: str) -> None:
-        """Wait until one more reading is stored."""
         count = len(TAKEN.findall(self.words))
         self.wait_until(lambda: len(TAKEN.findall(self.words)) > count, f"a reading with {words}")
 
@@ -242,7 +236,6 @@ class Run:
         os.killpg(self.process.pid, signal.SIGINT)
 
     def kill(self) -> None:
-        """Kill -9, only the program itself."""
         self.family()
         self.process.kill()
 
@@ -309,7 +302,6 @@ class Fault:
 
 
 def act(device: str, op: str, **arguments: object) -> Act:
-    """Return what switches something at a simulated device."""
     return lambda cell: cell.ask(device, op, **arguments)
 
 
@@ -318,12 +310,10 @@ def nothing(cell: Site) -> None:
 
 
 def switch(name: str, device: str, op: str, *says: str, fast: bool = False) -> Fault:
-    """A fault that is switched on and off."""
     return Fault(name, act(device, op, on=True), act(device, op, on=False), says, fast=fast)
 
 
 def each(faults: tuple[Fault, ...]) -> pytest.MarkDecorator:
-    """Run a test with every fault, under its name."""
     mark = {True: pytest.mark.long, False: pytest.mark.slow}
     rows = [pytest.param(one, id=one.name, marks=mark[one.fast]) for one in faults]
     return pytest.mark.parametrize("fault", rows)

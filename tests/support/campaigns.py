@@ -70,15 +70,10 @@ def plan(poses: int = 12, seed: int = 0, cycles: int = 1) -> Plan:
 def world_of(cell: Cell, rng: np.random.Generator) -> World:
     """A world with joint compliance alone, tracker and repeatability as configured."""
     config = configuration()
-    t = config.tracker
-    noise = SimulatedNoise(
-        (t.range_std_m, t.range_std_per_m),
-        (t.transverse_std_m, t.transverse_std_per_m),
-        t.orientation_std_rad,
-    )
-    return nothing_hidden(
-        cell, rng, noise=noise, joint_std=config.repeatability.per_joint(cell.arm.n)
-    )
+    t, joint_std = config.tracker, config.repeatability.per_joint(cell.arm.n)
+    along, across = (t.range_std_m, t.range_std_per_m), (t.transverse_std_m, t.transverse_std_per_m)
+    noise = SimulatedNoise(along, across, t.orientation_std_rad)
+    return nothing_hidden(cell, rng, noise=noise, joint_std=joint_std)
 
 
 @cache

@@ -58,7 +58,6 @@ def run(capsys: Capsys, *arguments: str | Path) -> Outcome:
 
 
 def ok(capsys: Capsys, *arguments: str | Path) -> Outcome:
-    """Run a command that must succeed."""
     result = run(capsys, *arguments)
     assert result.code == 0, result.err
     return result
@@ -106,6 +105,5 @@ def stored_readings(
 
 
 def table(path: Path, hidden: str, seed: int = 1, poses: int = POSES) -> Path:
-    """Write the exchange table of a simulated campaign."""
     write_table(rehearsal(hidden, seed, poses).readings, path, WHOLE)
     return path

@@ -120,7 +120,6 @@ SOFT = 2e-5  # compliance of every joint in what follows, rad/(N·m)
 
 
 def soft(cell: Cell, states: States, name: str, options=None) -> Model:
-    """Compliant joints and one more effect."""
     names = ("joint_compliance", name)
     return Model(cell, tuple(make(n, cell, states, options if n == name else {}) for n in names))
 

@@ -11,7 +11,6 @@ from hilcal.robot.catalogue import load_arm
 
 
 def ur10e_arm() -> Arm:
-    """The arm of the catalogue."""
     return load_arm("ur10e")
 
 

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,6 @@ from hilcal.config import (
     Tool,
     Tracker,
 )
-from hilcal.errors import DeviceError
 from hilcal.measuring.connect import Rig
 from hilcal.measuring.devices import (
     ArmSample,
@@ -110,7 +109,6 @@ class World:
         self.calls.clear()
 
     def joints(self) -> Floats:
-        """Where the joints are now, rad."""
         if self.is_moving:
             share = min(1.0, (self.time - self.begun) / self.lasts)
             self.q = self.start + share * (self.goal - self.start)
@@ -146,14 +144,14 @@ class MemoryStore:
 
     def __init__(self, world: World) -> None:
         self.world = world
-        self.full_at: int | None = None
+        self.refuses: dict[int, Exception] = {}  # by the number of rows that are there
         self.rows: list[tuple[Step, Readings, str]] = []
         self.events: list[tuple[str, dict[str, Any]]] = []
 
     def record(self, reading: Readings, step: Step, detail: dict[str, Any]) -> None:
         self.world.call("store.record")
-        if self.full_at == len(self.rows):
-            raise DeviceError("run.hilcal: the disk is full")
+        if len(self.rows) in self.refuses:
+            raise self.refuses[len(self.rows)]
         assert len(reading) == 1
         assert not self.world.is_moving, "stored in motion"
         text = json.dumps(detail, allow_nan=False)
@@ -178,28 +176,18 @@ class MemoryStore:
         rows = [reading for _, reading, _ in self.rows]
         poses = tuple(dict.fromkeys(r.pose_names[0] for r in rows))
         loads = tuple(dict.fromkeys(r.load_names[0] for r in rows))
-        states = {
-            name: np.concatenate([getattr(r.states, name) for r in rows])
-            for name in rows[0].states.__dataclass_fields__
-            if getattr(rows[0].states, name) is not None
-        }
-        return Readings(
-            states=type(rows[0].states)(**states),
+        return replace(
+            Readings.joined(rows),
             pose=np.array([poses.index(r.pose_names[0]) for r in rows]),
             load=np.array([loads.index(r.load_names[0]) for r in rows]),
-            cycle=np.concatenate([r.cycle for r in rows]),
-            value=np.concatenate([r.value for r in rows]),
-            covariance=np.concatenate([r.covariance for r in rows]),
             load_names=loads,
             pose_names=poses,
         )
 
     def kinds(self) -> list[str]:
-        """Kinds of the events, in order."""
         return [kind for kind, _ in self.events]
 
     def last(self, kind: str) -> dict[str, Any]:
-        """The newest event of a kind."""
         return next(content for k, content in reversed(self.events) if k == kind)
 
 
@@ -213,7 +201,6 @@ class Notes:
         self.told.append(event)
 
     def of(self, kind: type) -> list[Any]:
-        """What was told of one kind."""
         return [event for event in self.told if isinstance(event, kind)]
 
 
@@ -223,8 +210,6 @@ TORQUE = np.array([3.0, -40.0, 20.0, 5.0, 1.0, -0.5])  # N·m, of every pose
 
 @dataclass
 class FakeArm:
-    """An arm that moves in straight lines."""
-
     world: World
 
     def report(self) -> Report:
@@ -432,7 +417,6 @@ POSES = {
 
 
 def plan_of(*steps: tuple[str, str, int], poses: dict[str, Any] | None = None) -> Plan:
-    """A plan with steps over `POSES`."""
     poses = POSES if poses is None else poses
     return Plan(tuple(poses), np.array(list(poses.values())), tuple(Step(*step) for step in steps))
 
@@ -462,6 +446,32 @@ class Bench:
         self.rig = Rig(FakeArm(self.world), FakeTracker(self.world), force, self.operator)
         self.clock = FakeClock(world=self.world)
 
+    @property
+    def asked_for(self) -> list[str]:
+        """Names of the loads that were asked for, in order."""
+        return [name for name, _ in self.operator.asked]
+
+    def remarks(self, words: str = "") -> list[str]:
+        return [note.text for note in self.notes.of(Remark) if words in note.text]
+
+    def measure(self, plan: Plan | None = None, **more: Any) -> Readings:
+        """Run a plan (the usual one if None) to its end; returns all readings."""
+        plan = plan or usual_plan()
+        run(self.rig, self.cell, self.config, plan, self.store, self.clock, self.notes, **more)
+        readings = self.store.readings()
+        assert readings is not None
+        return readings
+
+    def interrupt(self, stored: int, plan: Plan | None = None, **more: Any) -> None:
+        """Kill a run when so many readings are stored, and start the program anew."""
+        self.world.kill_after = ("store.recorded", stored)
+        try:
+            self.measure(plan, **more)
+        except Killed:
+            self.world.again()
+        else:
+            raise AssertionError("the run came to its end")
+
 
 def before(device: Any, call: str, do: Callable[..., None]) -> None:
     """Have something done before each call of a device, with what the call is given."""
@@ -480,35 +490,5 @@ def changed(device: Any, call: str, by: Callable[[Any], Any]) -> None:
     setattr(device, call, lambda *given: by(real(*given)))
 
 
-def asked_for(b: Bench) -> list[str]:
-    """Names of the loads that were asked for, in order."""
-    return [name for name, _ in b.operator.asked]
-
-
-def remarks(b: Bench, words: str = "") -> list[str]:
-    """Remarks that hold some words."""
-    return [note.text for note in b.notes.of(Remark) if words in note.text]
-
-
-def measure(b: Bench, plan: Plan | None = None, **more: Any) -> Readings:
-    """Run a plan (the usual one if None) to its end; returns all readings."""
-    run(b.rig, b.cell, b.config, plan or usual_plan(), b.store, b.clock, b.notes, **more)
-    readings = b.store.readings()
-    assert readings is not None
-    return readings
-
-
-def interrupt(b: Bench, stored: int, plan: Plan | None = None, **more: Any) -> None:
-    """Kill a run when so many readings are stored, and start the program anew."""
-    b.world.kill_after = ("store.recorded", stored)
-    try:
-        measure(b, plan, **more)
-    except Killed:
-        b.world.again()
-    else:
-        raise AssertionError("the run came to its end")
-
-
 def rows(readings: Readings, load: str) -> Bools:
-    """Which readings were taken under a load."""
     return readings.load == readings.load_names.index(load)

@@ -25,7 +25,6 @@ def based(cell: Cell, readings: Readings, mode: Mode, names: Collection[str] | N
 
 
 def named(found: Fit) -> dict[str, tuple[float, float]]:
-    """Value and standard uncertainty by name."""
     names = [f"{e.name}.{p.name}" for e in found.model.effects for p in e.parameters]
     return dict(zip(names, zip(found.theta, found.uncertainty.std, strict=True), strict=True))
 
@@ -43,5 +42,4 @@ def predicted(model: Model, readings: Readings, theta: np.ndarray) -> Readings:
 
 
 def refined(cell: Cell, readings: Readings, mode: Mode) -> Refinement:
-    """The baseline of readings, refined."""
     return refine(baseline(cell, readings, mode), readings, mode)

@@ -84,7 +84,6 @@ def table_instrument(table: Table) -> Iterator[tuple[str, list[int]]]:
 
 
 def cell(port: object, scale: float = 20.0, **tracker: object) -> CellConfig:
-    """A cell whose tracker is a GeoCOM instrument at a port."""
     return CellConfig.model_validate(
         {
             "robot": {"model": "ur10e"},

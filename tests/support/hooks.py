@@ -7,7 +7,6 @@ from tests.support.paths import ROOT
 
 
 def hook(name: str) -> ModuleType:
-    """Return a module of docs/hooks."""
     spec = importlib.util.spec_from_file_location(f"hook_{name}", ROOT / f"docs/hooks/{name}.py")
     assert spec is not None
     assert spec.loader is not None

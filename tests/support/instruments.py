@@ -36,7 +36,6 @@ class Instrument:
     process: subprocess.Popen[bytes]  # the server
 
     def admin(self, op: str, **arguments: Any) -> Any:
-        """Switch a fault, or ask for the state."""
         return ask(self.socket, op, **arguments)
 
     def truth(self, **fields: Any) -> None:

@@ -14,7 +14,6 @@ BLIND = 8  # readings before there is a model
 
 
 def plan(poses: int = 24, loads: tuple[str, ...] = ("none", "10kg"), seed: int = 3) -> Plan:
-    """A plan of so many poses, each under every load."""
     rng = np.random.default_rng(seed)
     low, high = np.array([-1.6, -2.3, 0.3, -2.4, -2.0, -1.0]), np.array([1.6, -0.5, 2.0, 0, -1, 1])
     names = tuple(f"p{k + 1}" for k in range(poses))
@@ -23,7 +22,6 @@ def plan(poses: int = 24, loads: tuple[str, ...] = ("none", "10kg"), seed: int =
 
 
 def measuring(made: Plan | None = None, earlier: tuple[tuple[float, Step], ...] = ()) -> Measuring:
-    """The beginning of a campaign."""
     return Measuring("RUN.hilcal", ur10e(), np.array([[0.03, 0.0, 0.12]]), made or plan(), earlier)
 
 

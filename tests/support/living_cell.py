@@ -151,7 +151,6 @@ class Life:
 
 
 def states(q: Floats, wrench: Sequence[float] | Floats, time: float) -> States:
-    """One state."""
     return States(
         q=np.asarray(q)[None],
         wrench=np.asarray(wrench, dtype=float)[None],

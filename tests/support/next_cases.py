@@ -76,7 +76,6 @@ def settled(first: Doubtful, poses: int = 20) -> tuple[Diagnosis, Next]:
 
 
 def both(a: Readings, b: Readings) -> Readings:
-    """All readings of two campaigns in one cell."""
     names = tuple(dict.fromkeys((*a.pose_names, *b.pose_names)))
     place = [np.array([names.index(n) for n in r.pose_names])[r.pose] for r in (a, b)]
     states = {

@@ -118,5 +118,4 @@ def stated(names: Sequence[str]) -> dict[str, Point]:
 
 
 def moved(frame: Floats, by: Floats) -> Floats:
-    """A frame with its twist."""
     return np.asarray(se3.matrix(*se3.exp(by)) @ frame)

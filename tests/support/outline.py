@@ -20,7 +20,6 @@ class Outline(HTMLParser):
         self.words.append(data)
 
     def of(self, tag: str, key: str) -> list[str]:
-        """Values of an attribute that every such tag has."""
         return [attrs[key] for name, attrs in self.found if name == tag]
 
     @property

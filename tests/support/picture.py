@@ -6,17 +6,16 @@ import ctypes.util
 import json
 import os
 import socket
-import struct
 import subprocess
 import tempfile
 import time
-import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from PIL import Image
 
 from hilcal.present.viewer.recording import executable
 
@@ -203,45 +202,9 @@ def _environment(home: Path) -> dict[str, str]:
 
 
 def pixels(png: Path) -> np.ndarray:
-    """Decode an 8-bit PNG without interlace into (height, width, channels)."""
-    data, at, body = png.read_bytes(), 8, b""
-    while at < len(data):
-        size, kind = struct.unpack(">I4s", data[at : at + 8])
-        chunk = data[at + 8 : at + 8 + size]
-        if kind == b"IHDR":
-            width, height, depth, color = struct.unpack(">IIBB", chunk[:10])
-        elif kind == b"IDAT":
-            body += chunk
-        at += size + 12
-    assert depth == 8
-    channels = {2: 3, 6: 4}[color]
-    raw = np.frombuffer(zlib.decompress(body), np.uint8).reshape(height, width * channels + 1)
-    out = np.zeros((height, width * channels), dtype=np.uint8)
-    above = np.zeros(width * channels, dtype=np.uint8)
-    for i, line in enumerate(raw):
-        above = out[i] = unfilter(int(line[0]), line[1:], above, channels)
-    return out.reshape(height, width, channels)
-
-
-def unfilter(kind: int, line: np.ndarray, above: np.ndarray, step: int) -> np.ndarray:
-    """Undo one PNG line filter."""
-    if kind == 0:
-        return line
-    if kind == 1:
-        return np.cumsum(line.reshape(-1, step), axis=0, dtype=np.uint8).reshape(-1)
-    if kind == 2:
-        return line + above
-    done = [0] * step
-    corner = [0] * step + above.tolist()
-    for k, (value, up) in enumerate(zip(line.tolist(), above.tolist(), strict=True)):
-        left, diagonal = done[k], corner[k]
-        if kind == 3:
-            guess = (left + up) // 2
-        else:
-            p = left + up - diagonal
-            guess = min((left, up, diagonal), key=lambda c: abs(p - c))
-        done.append((value + guess) & 255)
-    return np.array(done[step:], dtype=np.uint8)
+    """Return a picture as (height, width, channels)."""
+    with Image.open(png) as image:
+        return np.array(image)
 
 
 def contrast(a: Sequence[int], b: Sequence[int]) -> float:

@@ -21,7 +21,6 @@ def config_of(
 
 
 def poses_of(count: int, seed: int = 0) -> Floats:
-    """Joint angles of the poses of a campaign."""
     p = plan(count, seed)
     return np.array([p.states.q[np.flatnonzero(p.pose == k)[0]] for k in range(count)])
 

@@ -69,7 +69,6 @@ class Drawn:
             log.record(rows, step, *({"epoch_wall_s": 0.0} for _ in range(each)))
 
     def do(self, step: ProcedureStep) -> object:
-        """Do one step."""
         self.kinds.append(step.kind)
         p = self.procedure
         if step.kind == "plan":
@@ -81,7 +80,6 @@ class Drawn:
         return result
 
     def to_the_end(self) -> object:
-        """Do all steps; returns the result of the last one."""
         result = None
         while (step := self.procedure.next()).kind != "done":
             result = self.do(step)

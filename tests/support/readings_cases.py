@@ -10,17 +10,6 @@ from hilcal.readings.readings import Readings, States
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats
 
-STATE_FIELDS = (
-    "q",
-    "wrench",
-    "time",
-    "load_time",
-    "air_temperature",
-    "joint_temperature",
-    "approach",
-    "q_actual",
-)
-
 
 def make_arm(n: int = 6) -> Arm:
     """An arm of n joints with a reach of n times 0.25 m and limits of ±2π."""
@@ -41,7 +30,6 @@ def make_arm(n: int = 6) -> Arm:
 
 
 def floats(shape: tuple[int, ...], size: float) -> st.SearchStrategy[Floats]:
-    """Arrays of any doubles within ±size."""
     return arrays(np.float64, shape, elements=st.floats(-size, size, allow_nan=False))
 
 
@@ -92,18 +80,14 @@ def readings(draw: st.DrawFn, n: int = 6) -> Readings:
 
 
 def first_seen(numbers: list[int]) -> np.ndarray:
-    """Renumber in order of first appearance."""
     order = {k: i for i, k in enumerate(dict.fromkeys(numbers))}
     return np.array([order[k] for k in numbers], dtype=np.int64)
 
 
 def made(q: Floats, value: Floats, **more: Any) -> Readings:
-    """Readings of joint values, each of a pose of its own and unloaded unless more is said.
+    """Readings of joint values (N, n), each of a pose of its own and unloaded unless more is said.
 
-    Args:
-        q: (N, n).
-        value: (N, m).
-        more: fields of readings and of states; `std` of every element in place of a covariance.
+    `more` are fields of readings and of states, or `std` of every element for a covariance.
     """
     count, m = value.shape
     told: dict[str, Any] = {"wrench": np.zeros((count, 6))} | more
@@ -120,7 +104,6 @@ def made(q: Floats, value: Floats, **more: Any) -> Readings:
 
 
 def simple(count: int, m: int = 3, seed: int = 0) -> Readings:
-    """Readings of `count` poses without a load."""
     rng = np.random.default_rng(seed)
     q, time = rng.uniform(-3, 3, (count, 6)), np.arange(count, dtype=float)
     return made(q, rng.uniform(-1, 1, (count, m)), time=time, std=1e-9**0.5)
@@ -128,7 +111,7 @@ def simple(count: int, m: int = 3, seed: int = 0) -> Readings:
 
 def assert_same(a: Readings, b: Readings) -> None:
     """Every array equal to the last bit, every name equal."""
-    for name in STATE_FIELDS:
+    for name in States.__dataclass_fields__:
         left, right = getattr(a.states, name), getattr(b.states, name)
         assert (left is None) == (right is None), name
         if left is not None:

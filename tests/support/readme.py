@@ -12,7 +12,6 @@ _OPTIONAL = re.compile(r"\[(--[^\]]*)\]")
 
 
 def campaign() -> str:
-    """The section on a campaign."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     return CAMPAIGN + text.split(CAMPAIGN, 1)[1].split("\n## ", 1)[0]
 

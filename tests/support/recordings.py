@@ -11,7 +11,6 @@ from hilcal.present.viewer.recording import executable
 
 
 def chunks(path: Path, entity: str = "") -> Iterator[Any]:
-    """The chunks of an entity, or of all."""
     stream = RrdReader(path).stream()
     return iter((stream.filter(content=entity) if entity else stream).to_chunks())
 

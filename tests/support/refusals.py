@@ -55,12 +55,7 @@ def refuses(case: tuple[str, str], call: Callable[[], object], path: Path | None
 
 
 def refusal(words: str, call: Callable[..., object], /, *given: Any, **more: Any) -> str:
-    """Call with what is given, which is wrong input: the one line that says so, with these words.
-
-    Args:
-        words: a pattern in the line.
-        call: what is called.
-    """
+    """Call with what is given, which is wrong input: the line that says so, with these words."""
     return refusal_of(InputError, words, call, *given, **more)
 
 

@@ -29,7 +29,6 @@ class Problem:
 
     @property
     def estimate(self) -> Floats:
-        """(K,) of the model."""
         h = self.rows.T @ self.rows + np.diag(self.ridge)
         return np.linalg.solve(h, self.rows.T @ self.y)
 

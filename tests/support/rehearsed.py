@@ -17,8 +17,6 @@ from studies.random_campaigns import dead_weights, rehearsal_states
 
 @dataclass(frozen=True, eq=False)
 class Rehearsed:
-    """What was simulated."""
-
     cell: Cell  # the cell
     world: World  # its truth
     readings: Readings  # (D,) deflections with their noise

@@ -12,7 +12,6 @@ import termios
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 import pyte
@@ -52,12 +51,8 @@ class AtTerminal:
             stdout=slave,
             stderr=slave,
             cwd=home,
-            env={
-                **{name: value for name, value in os.environ.items() if name not in hidden},
-                "PYTHONPATH": str(ROOT),
-                "OMP_NUM_THREADS": "1",
-                "TERM": "xterm-256color",
-            },
+            env={name: value for name, value in os.environ.items() if name not in hidden}
+            | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "TERM": "xterm-256color"},
             start_new_session=True,
             preexec_fn=lambda: fcntl.ioctl(slave, termios.TIOCSCTTY, 0),
         )
@@ -130,7 +125,6 @@ class AtTerminal:
         assert self.text.count(words) >= times, f"wiped away: {words!r}\n" + "\n".join(self.lines)
 
     def wait(self, holds: Callable[[], bool], what: str) -> None:
-        """Wait until something holds."""
         end = time.monotonic() + DEADLINE
         while not holds():
             there = self.look()
@@ -140,11 +134,9 @@ class AtTerminal:
             assert time.monotonic() < end, f"never {what}:\n" + "\n".join(self.lines)
 
     def types(self, keys: str) -> None:
-        """Press keys."""
         os.write(self._master, keys.encode())
 
     def ends(self, within: float = DEADLINE) -> int:
-        """Wait for the end, so many s; returns the exit code."""
         end = time.monotonic() + within
         while self.look(0.2):
             assert time.monotonic() < end, "it does not end:\n" + "\n".join(self.lines)
@@ -153,12 +145,7 @@ class AtTerminal:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self.process.poll() is None:
             os.killpg(self.process.pid, signal.SIGKILL)
             self.process.wait()

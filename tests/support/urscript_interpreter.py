@@ -164,7 +164,6 @@ class Machine:
         return _Expression(self, list(_tokens(text.rstrip())), scopes, line).value(0)
 
     def called(self, name, given, named, scopes, line):
-        """What a function returns."""
         if name in MOTIONS:
             target = given[0] if given else named.get("q", named.get("pose"))
             if isinstance(target, list):

@@ -89,7 +89,6 @@ def strict():
 
 
 def configured(**sections: object) -> tuple[Cell, CellConfig]:
-    """Return the demo's cell with some sections of its own."""
     told = load_config(CELL).model_dump(mode="json", exclude_none=True)
     config = CellConfig.model_validate(told | sections)
     return cell_from_config(config), config

@@ -22,7 +22,6 @@ _DH = (  # d, a, alpha of a UR10e (Universal Robots' published DH parameters)
 
 
 def ur10e() -> Arm:
-    """Build the arm from its DH table."""
     links = np.stack([np.eye(4)] * 7)
     for k, (d, a, alpha) in enumerate(_DH):
         c, s = np.cos(alpha), np.sin(alpha)

@@ -48,11 +48,7 @@ def odd_campaigns(draw):
     if draw(st.booleans()):
         covariance[::2, 0] = covariance[::2, :, 0] = 0.0
     odd = replace(
-        some,
-        states=states,
-        value=value,
-        covariance=covariance,
-        scatter_stated=draw(st.booleans()),
+        some, states=states, value=value, covariance=covariance, scatter_stated=draw(st.booleans())
     )
     twice = np.append(np.arange(len(q)), np.arange(len(q)))
     return odd[twice] if draw(st.booleans()) else odd, cell, mode

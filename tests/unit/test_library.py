@@ -64,8 +64,7 @@ def names():
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=pytest.mark.long if n == "discover" else ()) for n in names()],
+    "name", [pytest.param(n, marks=pytest.mark.long if n == "discover" else ()) for n in names()]
 )
 def test_the_examples_of_a_docstring_run(name, site):
     thing = getattr(hc, name)
@@ -96,12 +95,6 @@ def test_the_lazy_names_are_those_that_type_checkers_see():
     assert seen == hc._PLACES
 
 
-def test_no_package_has_the_name_of_a_function():
-    places = {path.stem for path in (ROOT / "hilcal").iterdir()}
-    functions = {name for name in hc.__all__ if name.islower()}
-    assert not places & functions
-
-
 def test_an_absent_viewer_is_named(site):
     code = (
         "import sys; sys.modules['rerun'] = None\nimport hilcal as hc\n"
@@ -123,10 +116,13 @@ def test_a_diagnosis_as_a_dictionary_is_what_the_command_prints(site):
     assert str(told["message"]).startswith(d.suspects[0].effect)
 
 
-def test_an_unknown_name_is_an_attribute_error():
+def test_an_unknown_name_is_an_attribute_error_and_none_is_a_package_too():
     with pytest.raises(AttributeError, match="no attribute 'fitt'"):
         hc.fitt  # noqa: B018
     assert set(names()) <= set(dir(hc))
+    places = {path.stem for path in (ROOT / "hilcal").iterdir()}
+    functions = {name for name in hc.__all__ if name.islower()}
+    assert not places & functions
 
 
 def test_the_public_names_are_documented_and_typed():
@@ -145,6 +141,10 @@ def test_wrong_words_are_refused_with_the_valid_ones(site):
     model = hc.baseline(cell, readings)
     refusal("valid: none, gu, gc", hc.fit, model, readings, scaling="gx")
     refusal("valid: deflection, absolute", hc.fit, model, readings, readings="relative")
+    refusal(r"valid: baseline\(cell, readings\)", hc.baseline, cell)
+    refusal(r"valid: refine\(model, readings\)", hc.refine, model)
+    wrong = {"readings": "deflection", "mode": "absolute"}
+    refusal("valid: one of both", hc.fit, model, readings, **wrong)
 
 
 def test_what_a_stranger_guesses_works(site, tmp_path):
@@ -180,16 +180,6 @@ def _free_port():
         return int(probe.getsockname()[1])
 
 
-def test_what_is_missing_or_said_twice_is_refused_in_a_line(site):
-    cell = hc.Cell.load(site.cell)
-    readings = hc.read_table(site.table, cell)
-    model = hc.baseline(cell, readings)
-    refusal(r"valid: baseline\(cell, readings\)", hc.baseline, cell)
-    refusal(r"valid: refine\(model, readings\)", hc.refine, model)
-    wrong = {"readings": "deflection", "mode": "absolute"}
-    refusal("valid: one of both", hc.fit, model, readings, **wrong)
-
-
 def test_what_a_console_prints_of_a_value_is_at_most_fifteen_lines(site):
     with hc.Campaign.open(site.run, read_only=True) as run:
         model = hc.baseline(run.cell, run.readings)
@@ -208,9 +198,6 @@ def test_what_a_console_prints_of_a_value_is_at_most_fifteen_lines(site):
         assert judged.verdict in repr(judged)
         assert judged.suspects[0].effect in repr(judged)
         assert all(step.diagnosis.verdict in repr(found) for step in found.steps)
-
-
-def test_a_campaign_is_printed_when_it_is_closed(site):
     with hc.Campaign(site.run, read_only=True) as run:
         pass
     assert "the file is closed" in repr(run)
@@ -231,9 +218,6 @@ def test_results_are_data_frames(site, tmp_path):
         judged = hc.diagnose(fit)
         assert judged.to_frame()["effect"].tolist() == [s.effect for s in judged.suspects]
         assert fit.parameters.to_frame().index.tolist() == [p.name for p in fit.parameters]
-
-
-def test_a_plan_is_a_data_frame(site):
     made = hc.plan(hc.Cell.load(site.cell), poses=3, seed=1)
     frame = made.to_frame()
     assert frame["pose"].tolist() == [step.pose for step in made.plan.steps]

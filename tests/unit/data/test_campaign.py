@@ -101,13 +101,7 @@ def test_hash_does_not_depend_on_how_readings_were_appended(tmp_path, cuts):
         assert campaign.data_hash() == content_hash(x)
 
 
-def test_hash_does_not_depend_on_the_numbers_of_names():
-    x = simple(3)
-    other = replace(x, pose=np.array([3, 1, 0]), pose_names=("p2", "p1", "unused", "p0"))
-    assert content_hash(other) == content_hash(x)
-
-
-def test_hash_sees_every_change():
+def test_hash_sees_every_change_but_not_the_numbers_of_names():
     x = simple(3)
     value = x.value.copy()
     value[2, 1] = np.nextafter(value[2, 1], 9.0)
@@ -126,6 +120,9 @@ def test_hash_sees_every_change():
     ]
     hashes = {content_hash(r) for r in (x, *others)}
     assert len(hashes) == len(others) + 1
+    x = simple(3)
+    other = replace(x, pose=np.array([3, 1, 0]), pose_names=("p2", "p1", "unused", "p0"))
+    assert content_hash(other) == content_hash(x)
 
 
 def test_later_readings_bring_new_poses_and_loads(run):

@@ -85,7 +85,8 @@ def test_rounding_is_found_and_added(tmp_path):
     assert len(through_a_table(tmp_path, coarse).notes) == 1  # it does not count beside 1 mm
 
 
-def test_the_step_of_values():
+def test_the_step_of_values_and_what_rounding_does():
+    """Δ²/12 against the scatter that rounding really makes."""
     rng = np.random.default_rng(0)
     values = rng.uniform(-2000, 2000, 50)
     assert step(values) == 0
@@ -94,10 +95,6 @@ def test_the_step_of_values():
     assert step(np.round(values[:8], 1)) == 0  # too few to tell
     np.testing.assert_allclose(rounding_variance(np.round(values[:48].reshape(16, 3), 2), 1e-3),
                                (1e-5) ** 2 / 12)  # fmt: skip
-
-
-def test_rounding_changes_the_spread_by_its_variance():
-    """Δ²/12 against the scatter that rounding really makes."""
     rng = np.random.default_rng(1)
     exact = rng.uniform(-1, 1, (20000, 3))
     error = np.round(exact, 2) - exact
@@ -133,15 +130,12 @@ def test_repeatability_is_added_to_an_imported_table(table, tmp_path, capsys):
     assert "[repeatability]" in ok(capsys, "identify", run, "--details").out
 
 
-def test_the_cell_may_say_that_tables_include_it(table, tmp_path, capsys):
+def test_nothing_is_added_where_the_cell_or_an_older_import_says_so(table, tmp_path, capsys):
     cell, run = tmp_path / "cell.toml", tmp_path / "run.hilcal"
     text = CELL.read_text(encoding="utf-8")
     cell.write_text(text.replace("[repeatability]", "[repeatability]\nin_tables = true"))
     ok(capsys, "import", table, "--config", cell, "-o", run)
     np.testing.assert_array_equal(*covariances(run))
-
-
-def test_a_campaign_that_an_older_version_imported_is_read_as_it_was(table, tmp_path):
     config, run = hc.Cell.load(CELL).configured(), tmp_path / "old.hilcal"
     with CampaignFile.create(run, config.to_json(), str(CELL.parent), "t.csv (table)") as file:
         file.append_readings(rehearsal("nothing").readings)

@@ -104,16 +104,13 @@ def test_a_driver_of_another_package_is_found_by_its_name(foreign):
     rig.close()
 
 
-def test_a_driver_that_fails_in_its_own_way_is_told_and_the_others_are_closed(foreign):
+def test_a_driver_that_fails_in_its_own_way_is_told_and_all_are_closed(foreign):
     rig, answers = connect(load_config(cell(foreign, "true")))
     assert rig is None
     problems = {a.device: a.problems for a in answers}
     assert problems["arm"] == problems["operator"] == ()
     assert problems["tracker"] == ("tracker: RuntimeError: no licence found",)
     assert closed() == ["their arm", "their operator"]
-
-
-def test_a_driver_that_opens_and_then_fails_to_report_is_closed_too(foreign):
     rig, answers = connect(load_config(cell(foreign, port="mute")))
     assert rig is None
     assert [a.problems for a in answers if a.device == "tracker"] == [
@@ -122,11 +119,8 @@ def test_a_driver_that_opens_and_then_fails_to_report_is_closed_too(foreign):
     assert "their tracker at mute" in closed()
 
 
-def test_an_unknown_driver_is_answered_with_the_valid_ones(foreign):
+def test_a_driver_that_is_unknown_or_cannot_be_loaded_is_one_line(foreign):
     with pytest.raises(InputError, match=r"their_trackr.*their_tracker") as raised:
         driver(TRACKERS, "their_trackr", "[tracker] driver")
     assert "geocom" in str(raised.value)
-
-
-def test_a_driver_that_cannot_be_loaded_is_one_line(foreign):
     refusal("their_devices:no_such_function", driver, TRACKERS, "not_there", "[tracker] driver")

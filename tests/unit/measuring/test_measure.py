@@ -42,32 +42,20 @@ def covered(rng, count, windows, share=0.0, worse=1.0):
     return inside / windows
 
 
-# the law
-
-
-def test_samples_that_agree_have_the_posterior_covariance():
+def test_the_covariance_of_a_mean_is_its_law():
     mean = average(samples_of([PLACE] * 5))
     assert mean.value == pytest.approx(PLACE, abs=1e-15)
     assert mean.covariance == pytest.approx(20 / 24 * V / 5, rel=1e-12)
-
-
-def test_scatter_enters_with_its_weight_against_the_prior():
     off = np.array([10e-6, -20e-6, 5e-6])
     values = [PLACE + off, PLACE - off, PLACE]
     mean = average(samples_of(values))
     assert mean.value == pytest.approx(PLACE, abs=1e-15)
     assert mean.covariance == pytest.approx((20 * V + 2 * np.outer(off, off)) / 22 / 3, rel=1e-9)
-
-
-def test_systematic_share_is_not_averaged_away():
     rng = np.random.default_rng(0)
     values = drawn(rng, 1000, 0.7 * V)
     covariance = average(samples_of(values), 0.3).covariance
     assert np.trace(covariance) == pytest.approx(0.3 * np.trace(V), rel=0.01)
     assert average(samples_of([PLACE] * 10), 1.0).covariance == pytest.approx(V, rel=1e-12)
-
-
-# calibration
 
 
 @pytest.mark.parametrize(
@@ -93,21 +81,15 @@ def test_noise_far_above_what_is_stated_is_not_believed_away(worse):
     assert got > 0.85
 
 
-def test_scatter_p_values_are_uniform_under_the_stated_noise():
+def test_scatter_is_how_much_worse_it_is_with_uniform_p_values():
     rng = np.random.default_rng(11)
     p = [average(samples_of(drawn(rng, 6))).scatter_p for _ in range(800)]
     assert stats.kstest(p, "uniform").pvalue > 1e-3
-
-
-def test_scatter_is_how_much_worse_it_is():
     rng = np.random.default_rng(12)
     result = average(samples_of(drawn(rng, 400, 9 * V)))
     assert result.scatter == pytest.approx(9, rel=0.15)
     assert result.scatter_p < 1e-12
     assert "3.0 times" in result.warnings[0]
-
-
-# poses
 
 
 def test_rotations_average_on_the_sphere_also_across_the_half_turn():
@@ -133,9 +115,6 @@ def test_deviations_of_poses_turn_with_the_sensor_axes():
     assert residuals_seen[:, 3:] == pytest.approx(frame.apply(residuals[:, 3:]), abs=1e-10)
     there = frame * Rotation.from_rotvec(mean[3:])
     assert Rotation.from_rotvec(mean_seen[3:]).as_matrix() == pytest.approx(there.as_matrix())
-
-
-# outliers and remarks
 
 
 def test_gross_outlier_is_left_out_and_named():
@@ -191,7 +170,7 @@ def wait(rng, count, signal=lambda t: 0.0 * ALONG, worse=1.0, limit=400):
     for k in range(limit):
         t = k * DT
         window.add(sample(t, signal(t) + worse * STD * rng.standard_normal(3)))
-        if window.settled():
+        if window.settled:
             return k + 1, t
     return limit + 1, t
 
@@ -235,20 +214,21 @@ def test_vibration_is_waited_for_until_its_rest_is_below_the_noise(tau):
     assert max(left) < 2.0
 
 
-def test_steady_motion_never_settles():
+def test_drift_that_matters_never_settles():
+    """Seen clearly by many samples, but far below what a mean of them can tell."""
     rng = np.random.default_rng(4)
     for _ in range(20):
         took, _ = wait(rng, 5, lambda t: 60e-6 * ALONG * t, limit=60)
         assert took > 60
-
-
-def test_drift_that_does_not_matter_is_let_through():
-    """Seen clearly by many samples, but far below what a mean of them can tell."""
     window = SettleWindow(400)
     for k in range(400):
         noise = 0.02 * STD * (-1) ** k
         window.add(sample(k * DT, noise + 0.015 * STD * k / 400))
-    assert window.settled()
+    assert window.settled
+    window = SettleWindow(3)
+    for _ in range(9):
+        window.add(sample(1.0, STD))
+    assert not window.settled
 
 
 def test_poses_are_judged_by_their_turning_too():
@@ -259,12 +239,5 @@ def test_poses_are_judged_by_their_turning_too():
         noise = np.sqrt(np.diag(covariance)) * rng.standard_normal(6)
         still.add(sample(k * DT, noise, covariance))
         turning.add(sample(k * DT, noise + 1e-3 * k * DT * np.eye(6)[5], covariance))
-    assert still.settled()
-    assert not turning.settled()
-
-
-def test_samples_without_time_between_them_tell_nothing():
-    window = SettleWindow(3)
-    for _ in range(9):
-        window.add(sample(1.0, STD))
-    assert not window.settled()
+    assert still.settled
+    assert not turning.settled

@@ -25,13 +25,9 @@ from tests.support.fake_bench import (
     STD,
     TORQUE,
     Bench,
-    asked_for,
     before,
     changed,
-    interrupt,
-    measure,
     plan_of,
-    remarks,
     rows,
     usual_plan,
 )
@@ -42,11 +38,8 @@ from tests.support.refusals import refusal_of
 def ran():
     """A usual campaign at its end, to look at."""
     b = Bench()
-    measure(b)
+    b.measure()
     return b
-
-
-# what is stored
 
 
 def test_readings_are_what_the_world_is(ran):
@@ -64,27 +57,19 @@ def test_readings_are_what_the_world_is(ran):
     assert np.all(ratio < 1.3)
 
 
-def test_wrench_is_measured_for_pulls_and_told_for_weights(b):
+@pytest.mark.parametrize(
+    ("use", "mass", "pull"), [("all", 3.03, 38.0), ("verify", 3.0, 40.0), ("pulls", 3.0, 38.0)]
+)
+def test_wrench_is_measured_or_told_as_the_cell_says(use, mass, pull):
     """The rope pulls 5 % less than asked for, and the weight is 1 % too heavy."""
+    b = Bench(force_sensor=ForceSensor(driver="fake", port="nowhere", use=use))
     loads = (CellLoad(name="3kg", mass_kg=3.03), CellLoad(name="pull", force_N=(38.0, 0.0, 0.0)))
     b.world.config = b.config.model_copy(update={"loads": loads})
-    readings = measure(b)
-    weight, pull = readings.states.wrench[rows(readings, "3kg")], rows(readings, "pull")
-    assert np.array_equal(weight, np.tile([0, 0, -3.0 * 9.80665, 0, 0, 0], (4, 1)))
-    felt = readings.states.wrench[pull]
-    assert np.allclose(felt, [38.0, 0, 0, 0, 0, 0], atol=1e-6)
-    assert not np.any(readings.states.wrench[rows(readings, "none")])
-
-
-@pytest.mark.parametrize(("use", "force"), [("all", 3.03), ("verify", 3.0), ("pulls", 3.0)])
-def test_use_of_the_force_sensor(use, force):
-    settings = ForceSensor(driver="fake", port="nowhere", use=use)
-    b = Bench(force_sensor=settings)
-    loads = (CellLoad(name="3kg", mass_kg=3.03),)
-    b.world.config = b.config.model_copy(update={"loads": loads})
-    readings = measure(b, plan_of(*((p, x, 0) for x in ("none", "3kg") for p in POSES)))
-    loaded = readings.states.wrench[rows(readings, "3kg")]
-    assert np.allclose(loaded[:, 2], -force * 9.80665, atol=1e-6)
+    readings = b.measure()
+    weight = [0, 0, -mass * 9.80665, 0, 0, 0]
+    for load, wrench in (("none", np.zeros(6)), ("3kg", weight), ("pull", [pull, 0, 0, 0, 0, 0])):
+        felt = readings.states.wrench[rows(readings, load)]
+        assert np.allclose(felt, wrench, atol=1e-6 if use in ("all", "pulls") else 0.0)
 
 
 def test_wrench_is_that_at_the_load_point_wherever_the_sensor_sits(b):
@@ -104,7 +89,7 @@ def test_wrench_is_that_at_the_load_point_wherever_the_sensor_sits(b):
         return np.concatenate([axes.T @ f, axes.T @ m]) + b.world.offset
 
     changed(b.world, "wrench", at_the_sensor)
-    readings = measure(b)
+    readings = b.measure()
     for name, force in (("3kg", [0, 0, -3.0 * 9.80665]), ("pull", [40.0, 0, 0])):
         assert np.allclose(
             readings.states.wrench[rows(readings, name)], [*force, 0, 0, 0], atol=1e-6
@@ -152,11 +137,13 @@ def test_nothing_moves_between_measuring_and_storing(ran):
         assert "arm.start_move" not in calls[last:z]
 
 
-# people
-
-
 def test_progress(ran):
+    """What is as configured is not remarked."""
     b, plan = ran, usual_plan()
+    drifts = [content for kind, content in b.store.events if kind == "drift"]
+    assert [d["over"] for d in drifts] == [False, False]
+    assert not b.remarks("has moved")
+    assert not b.remarks("[tool]")
     taken = b.notes.of(ReadingStored)
     assert [t.done for t in taken] == list(range(1, len(plan.steps) + 1))
     assert {t.total for t in taken} == {len(plan.steps)}
@@ -167,12 +154,8 @@ def test_progress(ran):
         else:
             force = 3.0 * 9.80665 if t.step.load == "3kg" else 40.0
             assert t.deflection == pytest.approx(SAG * force, abs=6 * STD)
-    ended = b.world.time
-    assert taken[9].left_cell == pytest.approx(ended - _time_of(b, 10), rel=0.5)
-
-
-def _time_of(b, done):
-    return json.loads(b.store.rows[done - 1][2])["tracker"][-1]["host_ns"] * 1e-9
+    tenth = json.loads(b.store.rows[9][2])["tracker"][-1]["host_ns"] * 1e-9
+    assert taken[9].left_cell == pytest.approx(b.world.time - tenth, rel=0.5)
 
 
 def test_the_judge_sees_all_readings_and_may_not_know(b):
@@ -184,7 +167,7 @@ def test_the_judge_sees_all_readings_and_may_not_know(b):
             raise CannotAnswerError("too few readings")
         return LiveResidual(1e-5, 0.5) if len(readings) > 3 else LiveResidual()
 
-    measure(b, live=judge)
+    b.measure(live=judge)
     assert seen == list(range(1, len(usual_plan().steps) + 1))
     taken = b.notes.of(ReadingStored)
     assert [t.live.residual for t in taken[:4]] == [None, None, None, 1e-5]
@@ -192,26 +175,17 @@ def test_the_judge_sees_all_readings_and_may_not_know(b):
 
 
 def test_drift_of_the_reference_pose_is_told(b):
-
     def shift(*_):
         if len(b.store.rows) == 6:
             b.world.shift = np.array([0.0, 0.0, 4e-4])
 
     before(b.store, "record", shift)
-    measure(b)
+    b.measure()
     drifts = [content for kind, content in b.store.events if kind == "drift"]
     assert [d["over"] for d in drifts] == [True, True]
-    said = remarks(b, "reference pose has moved")
+    said = b.remarks("reference pose has moved")
     assert len(said) == 2
     assert any(word in said[0] for word in ("by 39", "by 40", "by 41"))
-
-
-def test_what_is_as_configured_is_not_remarked(ran):
-    b = ran
-    drifts = [content for kind, content in b.store.events if kind == "drift"]
-    assert [d["over"] for d in drifts] == [False, False]
-    assert not remarks(b, "has moved")
-    assert not remarks(b, "[tool]")
 
 
 @pytest.mark.long
@@ -231,13 +205,13 @@ def test_repeatability_is_estimated_at_the_end():
 
     b.world.position = position
     plan = plan_of(*((p, "none", c) for c in range(12) for p in ("p1", "p2", "p3")))
-    measure(b, plan)
+    b.measure(plan)
     found = b.store.last("repeatability")
     assert found["poses"] == 3
     assert found["dof"] == 33
     assert found["joint_std"] == pytest.approx(5e-5, rel=0.35)
     assert found["scatter"] > 3 * found["instrument"]
-    (said,) = remarks(b, "33 returns to 3 poses")
+    (said,) = b.remarks("33 returns to 3 poses")
     assert f"joint_std_rad is about {found['joint_std']:.1g}" in said
 
 
@@ -268,40 +242,43 @@ def test_an_arm_that_does_not_scatter_is_seldom_said_to():
     assert said < 12
 
 
-def test_a_cell_without_a_tool():
+def test_without_a_tool_and_without_a_force_sensor():
     b = Bench(tool=Tool(target_m=(0.0, 0.0, 0.1)))
     b.world.tool_mass = 0.0
-    measure(b)
+    b.measure()
     assert b.world.payload[0] == 0.0
-
-
-# loads
+    b = Bench(force_sensor=None)
+    b.world.wrong = ["none", "6kg"]
+    readings = b.measure()
+    assert len(readings) == len(usual_plan().steps)
+    assert np.allclose(readings.states.wrench[rows(readings, "pull")], [40.0, 0, 0, 0, 0, 0])
+    assert json.loads(b.store.rows[0][2])["force"] is None
 
 
 def test_a_wrong_load_is_asked_for_again_with_the_reason(b):
     b.world.wrong = ["none", "6kg"]  # the first answer is that to "take everything off"
-    readings = measure(b)
+    readings = b.measure()
     assert len(readings) == len(usual_plan().steps)
-    assert asked_for(b)[:3] == ["none", "3kg", "3kg"]
+    assert b.asked_for[:3] == ["none", "3kg", "3kg"]
     assert b.operator.asked[1][1] == ""
     assert "6.0 kg" in b.operator.asked[2][1]
-    assert remarks(b, "asked to hang 3kg")
+    assert b.remarks("asked to hang 3kg")
 
 
 @pytest.mark.long
 def test_three_wrong_loads_end_the_run(b):
     b.world.wrong = ["none", "6kg", "none", "6kg"]
-    refusal_of(DeviceError, r"asked 3 times to hang 3kg.*--resume$", measure, b)
+    refusal_of(DeviceError, r"asked 3 times to hang 3kg.*--resume$", b.measure)
     assert len(b.store.rows) == 5
     assert b.world.calls[-2] == "arm.stop"
     b.world.again()
-    assert len(measure(b)) == len(usual_plan().steps)
+    assert len(b.measure()) == len(usual_plan().steps)
 
 
 def test_a_load_that_is_not_taken_off_is_noticed(b):
     b.world.wrong = ["none", "3kg", "3kg"]
-    measure(b)
-    assert asked_for(b) == ["none", "3kg", "none", "none", "pull", "none"]
+    b.measure()
+    assert b.asked_for == ["none", "3kg", "none", "none", "pull", "none"]
     assert "3.0 kg still hangs" in b.operator.asked[3][1]
 
 
@@ -317,27 +294,18 @@ def test_a_swinging_load_is_weighed_twice(b):
             b.world.extra[0] = 8.0 if swings else 0.0
 
     before(b.rig.force, "average", swinging)
-    measure(b)
-    assert asked_for(b) == ["none", "3kg", "none", "pull", "none"]
-
-
-def test_without_a_force_sensor_the_person_is_believed():
-    b = Bench(force_sensor=None)
-    b.world.wrong = ["none", "6kg"]
-    readings = measure(b)
-    assert len(readings) == len(usual_plan().steps)
-    assert np.allclose(readings.states.wrench[rows(readings, "pull")], [40.0, 0, 0, 0, 0, 0])
-    assert json.loads(b.store.rows[0][2])["force"] is None
+    b.measure()
+    assert b.asked_for == ["none", "3kg", "none", "pull", "none"]
 
 
 def test_the_tool_is_identified_and_compared_with_the_configuration(b):
     b.world.tool_mass = 1.4
-    measure(b)
+    b.measure()
     assert b.store.kinds().index("tool") < b.store.kinds().index("load")
     tool = b.store.last("tool")
     assert tool["mass_kg"] == pytest.approx(1.4, abs=1e-6)
     assert tool["com_m"] == pytest.approx([0.01, 0.0, 0.06], abs=1e-6)
-    assert remarks(b, "[tool] says 0.8 kg")
+    assert b.remarks("[tool] says 0.8 kg")
 
 
 def test_unloaded_poses_that_do_not_tell_the_tool_are_no_failure(b):
@@ -347,86 +315,79 @@ def test_unloaded_poses_that_do_not_tell_the_tool_are_no_failure(b):
         *((p, load, 0) for load in ("none", "3kg") for p in poses),
         poses={"reference": POSES["reference"], **poses},
     )
-    assert len(measure(b, plan)) == 8
-    assert remarks(b, "not identified")
+    assert len(b.measure(plan)) == 8
+    assert b.remarks("not identified")
 
 
-# going on
-
-
-def test_resume_measures_exactly_what_is_missing_and_time_goes_on():
-    b, plan = Bench(), usual_plan()
+def test_resume_measures_exactly_what_is_missing_and_time_goes_on(b):
+    plan = usual_plan()
     day = [1000.0]
 
     def wall():
         return day[0] + b.world.time
 
-    interrupt(b, 7, plan, wall=wall)
+    b.interrupt(7, plan, wall=wall)
     done = len(b.store.rows)
     assert 5 < done < len(plan.steps)
     day[0] += 7200.0  # two hours later
     loads = len(b.operator.asked)
-    readings = measure(b, plan, wall=wall)
+    readings = b.measure(plan, wall=wall)
     assert [s for s, _, _ in b.store.rows] == list(plan.steps)
     gaps = np.diff(readings.states.time)
     assert 7200.0 < gaps[done - 1] < 7200.0 + 120.0
     assert np.all(np.delete(gaps, done - 1) < 60.0)
-    asked = asked_for(b)[loads:]
+    asked = b.asked_for[loads:]
     assert asked[0] == "none"  # nobody knows what hangs
     assert asked[1] == plan.steps[done].load == "3kg"
 
 
 @pytest.mark.long
-def test_time_never_goes_back_whatever_the_clock_on_the_wall_does():
-    b, plan = Bench(), usual_plan()
-    interrupt(b, 4, plan, wall=lambda: 5000.0 + b.world.time)
-    readings = measure(b, plan, wall=lambda: 1000.0 + b.world.time)
+def test_time_never_goes_back_whatever_the_clock_on_the_wall_does(b):
+    b.interrupt(4, wall=lambda: 5000.0 + b.world.time)
+    readings = b.measure(wall=lambda: 1000.0 + b.world.time)
     assert np.all(np.diff(readings.states.time) > 0)
 
 
 @pytest.mark.long
-def test_a_load_that_still_hangs_at_a_resume_is_noticed():
-    b, plan = Bench(), usual_plan()
-    interrupt(b, 7, plan)
+def test_a_load_that_still_hangs_at_a_resume_is_noticed(b):
+    b.interrupt(7)
     assert b.world.load == "3kg"
     b.world.wrong = ["3kg"]  # the first answer is wrong
     # the sensor was off meanwhile
     b.world.offset = b.world.offset + np.array([2.0, 2.0, -2.0, 0, 0, 0])
     seen = len(b.operator.asked)
-    measure(b, plan)
+    b.measure()
     asked = b.operator.asked[seen:]
     assert [name for name, _ in asked[:3]] == ["none", "none", "3kg"]
     assert "3kg seems to hang still" in asked[1][1]
-    assert [s for s, _, _ in b.store.rows] == list(plan.steps)
+    assert [s for s, _, _ in b.store.rows] == list(usual_plan().steps)
 
 
 def test_a_load_left_on_at_the_very_beginning_is_asked_about_said_and_found_in_motion(b):
     b.world.load, b.world.wrong = "3kg", ["3kg", "3kg"]  # both answers are wrong
-    refusal_of(DeviceError, "take everything off", measure, b)
-    assert remarks(b, "answered twice that nothing hangs")
+    refusal_of(DeviceError, "take everything off", b.measure)
+    assert b.remarks("answered twice that nothing hangs")
     # where gravity has not turned in the sensor since its tare, a load is a zero
     assert {step for step, *_ in b.store.rows} <= {Step("reference", "none", 0)}
 
 
 def test_a_finished_campaign_touches_nothing(b):
-    measure(b)
+    b.measure()
     b.world.calls.clear()
-    measure(b)
+    b.measure()
     assert b.world.calls == []
     assert b.notes.of(Phase)[-1].text == "nothing is missing"
 
 
 @pytest.mark.long
-def test_the_tool_is_known_from_an_earlier_session_after_the_sensor_was_off():
+def test_the_tool_is_known_from_an_earlier_session_after_the_sensor_was_off(b):
     """Another bias in the second session: the pulls are measured right nevertheless."""
-    b, plan = Bench(), usual_plan()
     b.world.tool_mass = 1.4
-    interrupt(b, 7, plan)
+    b.interrupt(7)
     b.world.offset = -b.world.offset
-    readings = measure(b, plan)
-    assert np.allclose(
-        readings.states.wrench[rows(readings, "pull")], [40.0, 0, 0, 0, 0, 0], atol=1e-6
-    )
+    readings = b.measure()
+    felt = readings.states.wrench[rows(readings, "pull")]
+    assert np.allclose(felt, [40.0, 0, 0, 0, 0, 0], atol=1e-6)
 
 
 LOST = "no longer tells the torques"
@@ -434,22 +395,22 @@ LOST = "no longer tells the torques"
 
 def test_torques_are_averaged_over_the_reading(b):
     b.world.torques = np.inf
-    torque = measure(b).states.torque
+    torque = b.measure().states.torque
     # means of at least three samples that scatter by 0.1 N·m
     assert np.abs(torque - TORQUE).max() < 5 * 0.1 / np.sqrt(3)
-    assert not remarks(b, LOST)
+    assert not b.remarks(LOST)
     assert b.store.details()[0]["torque"] == torque[0].tolist()
 
 
 def test_a_lost_link_is_said_once_and_readings_go_on(b, tmp_path):
     b.world.torques = 60
-    readings = measure(b)
+    readings = b.measure()
     torque = readings.states.torque
     lost = np.isnan(torque).all(axis=1)
     assert np.array_equal(lost, np.isnan(torque).any(axis=1))
     assert 0 < lost.argmax() < len(lost)
     assert lost[lost.argmax() :].all()
-    assert len(remarks(b, LOST)) == 1
+    assert len(b.remarks(LOST)) == 1
     with CampaignFile.create(tmp_path / "r.hilcal", "{}", ".", "test") as file:
         file.append_readings(readings[:1])
         file.append_readings(readings[1:])
@@ -477,12 +438,12 @@ def test_a_lost_link_is_said_once_and_readings_go_on(b, tmp_path):
 @pytest.mark.parametrize("first", [0, np.inf])
 def test_a_campaign_goes_on_as_it_began(b, first):
     b.world.torques = first
-    interrupt(b, 4)
+    b.interrupt(4)
     b.world.torques = -1 if first else np.inf
-    torque = measure(b).states.torque
+    torque = b.measure().states.torque
     if not first:
         assert torque is None
     else:
         assert np.isfinite(torque[:4]).all()
         assert np.isnan(torque[4:]).all()
-        assert len(remarks(b, LOST)) == 1
+        assert len(b.remarks(LOST)) == 1

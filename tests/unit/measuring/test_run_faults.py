@@ -13,7 +13,7 @@ from hilcal.config import Acquire, ForceSensor, Limits
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.arrival import RoughRegistration
 from hilcal.measuring.progress import ReadingStored
-from hilcal.measuring.run import HOW_ON, run
+from hilcal.measuring.run import HOW_ON
 from hilcal.robot import chain as chains
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.plan import Step
@@ -23,10 +23,8 @@ from tests.support.fake_bench import (
     Bench,
     FakeClock,
     Killed,
-    asked_for,
     before,
     changed,
-    measure,
     plan_of,
     usual_plan,
 )
@@ -56,10 +54,6 @@ def bench():
     return Bench(limits=Limits())
 
 
-def run_once(b, plan):
-    run(b.rig, b.cell, b.config, plan, b.store, b.clock, b.notes)
-
-
 def each_once(b, plan):
     return Counter(step for step, _, _ in b.store.rows) == Counter(plan.steps)
 
@@ -67,7 +61,7 @@ def each_once(b, plan):
 @cache
 def calls_of_a_whole_run():
     b = bench()
-    run_once(b, small_plan())
+    b.measure(small_plan())
     assert each_once(b, small_plan())
     return len(b.world.calls)
 
@@ -99,7 +93,7 @@ def check_fault(fault, k):
         b.world.fail[k] = fault
     expected = DeviceError if isinstance(fault, OSError) else type(fault)
     with pytest.raises(expected) as raised:
-        run_once(b, plan)
+        b.measure(plan)
     if isinstance(raised.value, DeviceError):
         said = str(raised.value)
         assert said.endswith(HOW_ON), (k, said)
@@ -107,7 +101,7 @@ def check_fault(fault, k):
     check_stopped(b, k)
     before = [step for step, _, _ in b.store.rows]
     b.world.again()
-    run_once(b, plan)
+    b.measure(plan)
     assert [step for step, _, _ in b.store.rows][: len(before)] == before
     assert each_once(b, plan), k
     readings = b.store.readings()
@@ -127,28 +121,24 @@ def check_stopped(b, k):
         assert after == ["store.event"], (k, after)
 
 
-def test_disk_full_stops_the_arm_and_says_what_to_do():
+@pytest.mark.parametrize(
+    "error",
+    [
+        DeviceError("run.hilcal: the disk is full"),
+        InputError("run.hilcal: the readings differ from those before"),
+    ],
+)
+def test_a_row_that_is_not_stored_stops_the_arm_and_says_what_to_do(error):
+    """What the store refuses as wrong input stays that (exit code 2)."""
     b, plan = bench(), small_plan()
-    b.store.full_at = 2
-    refusal_of(DeviceError, r"disk is full.*--resume$", run_once, b, plan)
+    b.store.refuses = {2: error}
+    refusal_of(type(error), rf"{error}\. .*--resume$", b.measure, plan)
     assert b.world.calls[-2:] == ["arm.stop", "store.event"]
     assert len(b.store.rows) == 2
-    b.store.full_at = None
+    b.store.refuses = {}
     b.world.again()
-    run_once(b, plan)
+    b.measure(plan)
     assert each_once(b, plan)
-
-
-def test_a_refused_row_keeps_its_kind_of_error(monkeypatch):
-    """What the store refuses as wrong input stays that (exit code 2), and stops the arm."""
-    b = bench()
-
-    def refuse(*_):
-        raise InputError("run.hilcal: the readings differ from those before")
-
-    monkeypatch.setattr(b.store, "record", refuse)
-    refusal(r"differ from those before\. .*--resume$", run_once, b, small_plan())
-    assert b.world.calls[-2] == "arm.stop"
 
 
 @pytest.mark.parametrize(
@@ -174,7 +164,7 @@ def test_an_arm_that_does_not_stop_is_told_loudly_and_once(fault, stop, said, mo
 
     monkeypatch.setattr(b.rig.arm, "stop", fails)
     b.world.fail[120] = fault
-    raised = refusal_of(DeviceError, said, run_once, b, small_plan())
+    raised = refusal_of(DeviceError, said, b.measure, small_plan())
     assert raised.count("emergency stop") == 1
     assert raised.endswith(HOW_ON)
     assert b.store.events[-1][1]["arm_not_stopped"] == stop
@@ -192,26 +182,22 @@ def test_impatience_does_not_keep_the_arm_from_stopping():
 
     before(b.rig.arm, "stop", stop)
     b.world.fail[120] = DeviceError("tracker: silent")
-    refusal_of(DeviceError, r"tracker: silent.*--resume$", run_once, b, small_plan())
+    refusal_of(DeviceError, r"tracker: silent.*--resume$", b.measure, small_plan())
     assert len(stops) == 2
     assert not b.world.is_moving
 
 
-def test_unexpected_errors_are_one_line_and_their_trace_is_stored():
-    b = bench()
-    b.world.fail[150] = ZeroDivisionError("of a driver of somebody else's")
-    with pytest.raises(DeviceError, match=r"unexpected ZeroDivisionError: of a driver.*--resume"):
-        run_once(b, small_plan())
-    assert "Traceback" in b.store.last("failed")["trace"]
-
-
-def test_nothing_is_stopped_before_the_arm_is_ours():
+def test_unexpected_errors_and_errors_before_the_arm_is_ours():
     """A fault before `take_control`: somebody else's program may be running."""
     b = bench()
+    b.world.fail[150] = ZeroDivisionError("of a driver of somebody else's")
+    words = "unexpected ZeroDivisionError: of a driver.*--resume"
+    refusal_of(DeviceError, words, b.measure, small_plan())
+    assert "Traceback" in b.store.last("failed")["trace"]
+    b = bench()
     b.world.fail[2] = DeviceError("force sensor: silent")
-    refusal_of(DeviceError, "silent", run_once, b, small_plan())
-    assert "arm.take_control" not in b.world.calls
-    assert "arm.stop" not in b.world.calls
+    refusal_of(DeviceError, "silent", b.measure, small_plan())
+    assert not {"arm.take_control", "arm.stop"} & set(b.world.calls)
 
 
 def held(rng, count, spread=0.7, *, known=True, off_m=0.0):
@@ -275,12 +261,9 @@ def test_a_target_that_is_not_where_it_is_said_refuses_no_reading(known, off_m):
 LIMIT = ForceSensor(driver="fake", port="nowhere", max_force_N=120.0)
 
 
-# order and safety
-
-
 def test_order_of_the_start(b):
     """The hook is cleared before anything moves, the tare comes before the first reading."""
-    measure(b)
+    b.measure()
     first = {name: b.world.calls.index(name) for name in set(b.world.calls)}
     assert first["operator.hang"] < first["arm.take_control"] < first["arm.start_move"]
     tare = b.world.calls.index("force.average", first["arm.start_move"])
@@ -300,7 +283,7 @@ def test_payload_is_set_before_a_weight_is_hung_and_after_it_is_off(b):
     plan = plan_of(
         ("p1", "none", 0), ("p1", "3kg", 0), ("p1", "6kg", 0), ("p1", "3kg", 1), ("p1", "pull", 0)
     )
-    measure(b, plan)
+    b.measure(plan)
     com = {m: np.round((0.8 * b.cell.tool_com + (m - 0.8) * b.cell.load_point) / m, 6).tolist()
            for m in (3.8, 6.8)}  # fmt: skip
     assert given == [
@@ -314,8 +297,8 @@ def test_payload_is_set_before_a_weight_is_hung_and_after_it_is_off(b):
 def test_loads_change_only_at_the_reference_and_motions_carry_them(b):
     where = []
     before(b.operator, "hang", lambda *_: where.append(b.world.q.copy()))
-    measure(b)
-    assert asked_for(b) == ["none", "3kg", "none", "pull", "none"]
+    b.measure()
+    assert b.asked_for == ["none", "3kg", "none", "pull", "none"]
     for q in where[1:]:
         assert np.allclose(q, POSES["reference"])
     assert {load for _, load in b.world.at_start} == {"none", "3kg", "pull"}
@@ -324,9 +307,7 @@ def test_loads_change_only_at_the_reference_and_motions_carry_them(b):
 def test_an_unsafe_plan_is_refused_before_any_device_is_asked():
     b = Bench(limits=Limits(workspace_min_m=(-3, -3, 0.9)))
     plan = plan_of(("p1", "none", 0), ("p1", "brick", 0))
-    raised = refusal("not safe", measure, b, plan)
-    words = raised
-    assert "\n" not in words  # one line says the first problem, and how to see the others
+    words = refusal("not safe", b.measure, plan)  # the first problem, and how to see the others
     assert "brick" in words
     assert "more: hilcal check --plan" in words
     assert b.world.calls == []
@@ -337,9 +318,8 @@ def test_an_arm_that_stands_outside_its_workspace_is_not_moved():
     b = Bench(limits=Limits(workspace_min_m=(-1.2, -0.5, 0.05), workspace_max_m=(1.2, 1.2, 1.5)))
     b.world.q = np.array([1.5, -1.3, 1.6, -1.4, -1.4, 0.1])  # beyond y = -0.5
     plan = plan_of(("reference", "none", 0), poses={"reference": POSES["reference"]})
-    refusal_of(DeviceError, r"outside the workspace.*drive it by hand", measure, b, plan)
-    assert "arm.start_move" not in b.world.calls
-    assert "arm.take_control" not in b.world.calls
+    refusal_of(DeviceError, r"outside the workspace.*drive it by hand", b.measure, plan)
+    assert not {"arm.start_move", "arm.take_control"} & set(b.world.calls)
 
 
 @pytest.mark.parametrize(
@@ -363,7 +343,7 @@ def test_limits_are_enforced_in_motion(change, said):
         return still
 
     changed(b.rig.arm, "moving", exceeds)
-    refusal_of(DeviceError, said, measure, b)
+    refusal_of(DeviceError, said, b.measure)
     assert b.world.calls[-2:] == ["arm.stop", "store.event"]
     assert not b.world.is_moving
     assert b.world.time - since[0] <= 0.05
@@ -378,7 +358,7 @@ def test_limits_are_enforced_at_rest():
             b.world.extra = np.array([0, 130.0, 0, 0, 0, 0])
 
     before(b.rig.tracker, "measure", pushes)
-    refusal_of(DeviceError, "max_force_N", measure, b)
+    refusal_of(DeviceError, "max_force_N", b.measure)
     assert len(b.store.rows) == 2
     assert b.world.calls[-2] == "arm.stop"
 
@@ -390,22 +370,19 @@ def test_an_arm_that_does_not_arrive(b):
         real(q - 0.002, speed, acceleration)
 
     b.rig.arm.start_move = short
-    refusal_of(DeviceError, r"stands 0\.002 rad off", measure, b)
+    refusal_of(DeviceError, r"stands 0\.002 rad off", b.measure)
 
 
 @pytest.mark.long
 def test_a_motion_that_never_ends_is_given_up(b):
     b.rig.arm.moving = lambda: True
-    refusal_of(DeviceError, "not finished after", measure, b)
+    refusal_of(DeviceError, "not finished after", b.measure)
     assert b.world.calls[-2] == "arm.stop"
-
-
-# the target
 
 
 def test_a_lost_target_is_found_again(b):
     b.world.lost = 3  # at both stops of the approach, where nothing is read, and at the reading
-    readings = measure(b)
+    readings = b.measure()
     assert len(readings) == len(usual_plan().steps)
     assert b.world.calls.count("tracker.find_target") == 1
     assert any("found again" in x for x in json.loads(b.store.rows[0][2])["remarks"])
@@ -414,31 +391,27 @@ def test_a_lost_target_is_found_again(b):
 @pytest.mark.parametrize("lost", [5, 1000])
 def test_a_target_that_stays_lost_ends_the_run(b, lost):
     b.world.lost, b.world.not_found = lost, 0 if lost == 5 else 1000
-    refusal_of(DeviceError, r"line of sight.*--resume$", measure, b)
+    refusal_of(DeviceError, r"line of sight.*--resume$", b.measure)
     assert b.store.rows == []
     assert b.world.calls.count("tracker.find_target") == 2
     assert b.world.calls[-2] == "arm.stop"
 
 
 def test_another_reflector_is_not_believed(b):
-
     def other(*_):
         if len(b.store.rows) == 5:
             b.world.shift = np.array([0.0, 0.3, 0.0])
 
     before(b.store, "event", other)
-    refusal_of(DeviceError, "another reflector", measure, b)
+    refusal_of(DeviceError, "another reflector", b.measure)
     assert len(b.store.rows) == 5
-
-
-# settling
 
 
 def test_readings_that_drift_are_waited_for_and_given_up():
     b = Bench(acquire=Acquire(samples=3, settle_s=0.2, settle_timeout_s=20.0))
     b.world.creep = 1e-3
     begun = b.world.time
-    refusal_of(DeviceError, "not settled within 20 s: the readings drift", measure, b)
+    refusal_of(DeviceError, "not settled within 20 s: the readings drift", b.measure)
     assert b.store.rows == []
     assert b.world.time - begun < 120.0
 
@@ -454,11 +427,11 @@ def test_drift_that_ends_is_waited_for():
         return place + 1e-3 * np.exp(-(b.world.time - since) / 0.5)
 
     changed(b.world, "position", settles)
-    measure(b, few)
+    b.measure(few)
     taken = b.notes.of(ReadingStored)
     assert min(t.settling for t in taken) > 1.0
     quiet = Bench()
-    measure(quiet, few)
+    quiet.measure(few)
     assert max(t.settling for t in quiet.notes.of(ReadingStored)) < 1.0
     away = b.store.readings().value - quiet.store.readings().value
     assert np.abs(away).max() < 6 * STD
@@ -466,7 +439,7 @@ def test_drift_that_ends_is_waited_for():
 
 def test_an_arm_that_trembles_is_measured_again_and_given_up(b):
     b.world.jitter = 1e-4
-    refusal_of(DeviceError, r"measured 3 times without success: arm: it moved by", measure, b)
+    refusal_of(DeviceError, r"measured 3 times without success: arm: it moved by", b.measure)
     assert b.store.rows == []
 
 
@@ -480,7 +453,7 @@ def test_somebody_who_jogs_the_arm_meanwhile_spoils_the_reading(b):
             b.world.q = b.world.q + 3e-4
 
     before(b.rig.force, "average", jog)
-    measure(b)
+    b.measure()
     assert "measured again: arm: it moved by 0.0003" in b.store.rows[1][2]
     assert len(b.store.rows) == len(usual_plan().steps)
 
@@ -488,7 +461,7 @@ def test_somebody_who_jogs_the_arm_meanwhile_spoils_the_reading(b):
 def test_at_least_twenty_frames_whatever_the_clock():
     """The window of a fast clock is too short for a real line of 100 Hz."""
     b = Bench(acquire=Acquire(samples=3, settle_s=0.2, force_window_s=0.05))
-    measure(b, plan_of(("p1", "none", 0), ("p2", "none", 0)))
+    b.measure(plan_of(("p1", "none", 0), ("p2", "none", 0)))
     assert all(json.loads(text)["force"]["frames"] >= 20 for _, _, text in b.store.rows)
     assert b.world.calls.count("force.average") == 2 + 4  # the first one was too short
 
@@ -513,6 +486,6 @@ def test_everything_is_looked_at_twenty_times_a_second_in_motion(b, scale):
             last.clear()
 
     before(b.world, "call", noted)
-    measure(b, plan_of(("p1", "none", 0), ("p1", "3kg", 0)))
+    b.measure(plan_of(("p1", "none", 0), ("p1", "3kg", 0)))
     assert looks > 30
     assert max(gaps.values()) <= 0.05, gaps

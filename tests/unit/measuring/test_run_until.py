@@ -13,7 +13,7 @@ from hilcal.measuring.route import Stop, route_problems, way_home
 from hilcal.present.progress import met_words
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import Step
-from tests.support.fake_bench import POSES, Bench, Killed, asked_for, measure, plan_of, usual_plan
+from tests.support.fake_bench import POSES, Bench, Killed, plan_of, usual_plan
 from tests.support.rows import first
 
 HOME = POSES["reference"]
@@ -40,16 +40,13 @@ def is_home(b):
     return b.world.load == "none" and np.allclose(b.world.q, HOME) and not b.world.is_moving
 
 
-# the way home
-
-
 def test_a_goal_that_is_met_under_a_load():
     """The load is taken off at the reference pose, and the drift of so far is read."""
     b, plan = Bench(), usual_plan()
-    measure(b, goal=Enough(7))
+    b.measure(goal=Enough(7))
     assert steps(b) == [*plan.steps[:7], Step("reference", "none", 1)]
     assert is_home(b)
-    assert asked_for(b) == ["none", "3kg", "none"]
+    assert b.asked_for == ["none", "3kg", "none"]
     assert b.world.payload[0] == b.cell.tool_mass
     kinds = b.store.kinds()
     assert kinds[kinds.index("goal") :] == [
@@ -74,7 +71,7 @@ def test_a_goal_that_is_met_under_a_load():
 )
 def test_a_goal_that_is_met_elsewhere(count, more):
     b, plan = Bench(), usual_plan()
-    measure(b, goal=Enough(count))
+    b.measure(goal=Enough(count))
     assert steps(b) == [*plan.steps[:count], *more]
     assert is_home(b)
     assert b.store.kinds().count("goal") == 1
@@ -83,7 +80,7 @@ def test_a_goal_that_is_met_elsewhere(count, more):
 
 def test_a_plan_without_returns_ends_at_the_reference_too(b):
     plan = plan_of(("p1", "none", 0), ("p1", "3kg", 0), ("p2", "3kg", 0), ("p2", "none", 0))
-    measure(b, plan, goal=Enough(2))
+    b.measure(plan, goal=Enough(2))
     assert steps(b) == list(plan.steps[:2])
     assert is_home(b)
 
@@ -109,48 +106,42 @@ def test_the_way_home_is_clear(b):
     assert [s.name for s in free] == ["reference"]
 
 
-# going on
-
-
 @pytest.mark.long
 def test_what_was_left_out_is_measured_on_resuming():
     b, plan = Bench(), usual_plan()
-    measure(b, goal=Enough(7))
+    b.measure(goal=Enough(7))
     b.world.again()
-    measure(b)
+    b.measure()
     assert Counter(steps(b)) == Counter(plan.steps)
     assert steps(b)[-1] == plan.steps[-1]  # the campaign still ends with a look at the drift
 
 
 def test_resuming_towards_a_farther_goal():
     b, plan = Bench(), usual_plan()
-    measure(b, goal=Enough(7))
+    b.measure(goal=Enough(7))
     b.world.again()
-    measure(b, goal=Enough(11))
+    b.measure(goal=Enough(11))
     assert len(steps(b)) == 12
     assert set(steps(b)) < set(plan.steps)
     assert is_home(b)
     b.world.again()
     b.operator.asked.clear()
-    measure(b, goal=Enough(12))  # is met already
+    b.measure(goal=Enough(12))  # is met already
     assert len(steps(b)) == 12
-    assert asked_for(b) == ["none"]
+    assert b.asked_for == ["none"]
     assert is_home(b)
 
 
 def test_a_goal_that_is_never_met():
     b, plan = Bench(), usual_plan()
     rule = Enough(0)
-    measure(b, goal=rule)
+    b.measure(goal=rule)
     assert steps(b) == list(plan.steps)
     assert rule.asked == [(k, k == 15) for k in range(1, 16)]
     assert b.store.kinds().count("goal") == 1
     told = b.store.last("goal")
     assert (told["met"], told["readings"], told["planned"]) == (False, 15, 15)
     assert not b.notes.of(GoalMet)
-
-
-# interrupted on the way home
 
 
 def short():
@@ -171,7 +162,7 @@ def short():
 def test_interrupted_on_the_way_home(fault):
     """At some calls after the goal: the arm stands, and resuming brings it home, once."""
     b, plan = short()
-    measure(b, plan, goal=Enough(3))
+    b.measure(plan, goal=Enough(3))
     wanted = [*plan.steps[:3], plan.steps[4]]
     assert steps(b) == wanted
     calls = b.world.calls
@@ -183,12 +174,12 @@ def test_interrupted_on_the_way_home(fault):
         else:
             b.world.fail[k] = fault
         with pytest.raises(type(fault)):
-            measure(b, plan, goal=Enough(3))
+            b.measure(plan, goal=Enough(3))
         if not b.world.killed:
             assert b.world.calls[k:] == ["arm.stop", "store.event"]
         assert steps(b) in (wanted[:3], wanted)
         b.world.again()
-        measure(b, plan, goal=Enough(3))
+        b.measure(plan, goal=Enough(3))
         assert steps(b) == wanted, k
         assert is_home(b), k
         assert b.store.kinds()[-1] == "finished"

@@ -10,19 +10,7 @@ from hilcal.errors import DeviceError
 from hilcal.measuring.measure import Measurer
 from hilcal.measuring.progress import Phase
 from hilcal.robot.chain import evaluate
-from tests.support.fake_bench import (
-    POSES,
-    Bench,
-    asked_for,
-    before,
-    changed,
-    interrupt,
-    measure,
-    plan_of,
-    remarks,
-    rows,
-    usual_plan,
-)
+from tests.support.fake_bench import POSES, Bench, before, changed, plan_of, rows, usual_plan
 from tests.support.refusals import refusal_of
 from tests.support.rows import first
 
@@ -35,7 +23,7 @@ def jogged(b, at, q, *, after=0):
     moves = []
 
     def moved(answer):
-        name = asked_for(b)[-1]
+        name = b.asked_for[-1]
         if name == at and len(b.operator.asked) > after and not moves:
             moves.append(name)
             b.world.q = np.array(q)
@@ -64,20 +52,17 @@ KNOWN = {("none", 0.8), ("3kg", 3.8), ("pull", 0.8)}
 SHORT = plan_of(("p1", "none", 0), ("p1", "3kg", 0), ("reference", "none", 1))
 
 
-# moved by hand
-
-
 @pytest.mark.parametrize("load", ["none", "3kg"])
 def test_an_arm_jogged_into_a_blocked_place_during_a_question_is_not_moved(b, load):
     jogged(b, load, FOLDED)
-    refusal_of(DeviceError, r"outside the workspace.*drive it by hand.*--resume$", measure, b)
+    refusal_of(DeviceError, r"outside the workspace.*drive it by hand.*--resume$", b.measure)
     assert load not in [hung for _, hung in b.world.at_start]
     assert ("arm.take_control" in b.world.calls) is (load == "3kg")
 
 
 def test_an_arm_jogged_to_a_free_place_is_asked_for_and_the_way_checked_from_there(b):
     jogged(b, "none", FREE)
-    measure(b)
+    b.measure()
     (asked,) = confirmed(b)
     assert "shoulder_pan is 0.5 rad off" in asked
     assert b.world.calls.index("operator.confirm") < b.world.calls.index("arm.take_control")
@@ -93,13 +78,13 @@ def test_an_arm_that_is_moved_while_it_is_asked_for_is_asked_for_again(b):
             b.world.q = places.pop()
 
     before(b.operator, "confirm", again)
-    measure(b)
+    b.measure()
     assert len(confirmed(b)) == 2
 
 
 def test_an_arm_jogged_while_control_is_taken_is_not_moved(b):
     before(b.rig.arm, "take_control", lambda *_: setattr(b.world, "q", FREE.copy()))
-    refusal_of(DeviceError, r"has commanded it since.*0\.5 rad", measure, b)
+    refusal_of(DeviceError, r"has commanded it since.*0\.5 rad", b.measure)
     assert "arm.start_move" not in b.world.calls
 
 
@@ -108,7 +93,7 @@ def test_an_arm_moved_while_a_load_is_changed_goes_back_once_that_is_agreed(b, l
     away = np.array(POSES["reference"]) + 0.2 * np.eye(6)[0]
     jogged(b, load, away, after=after)
     motions = carried(b)
-    readings = measure(b, SHORT)
+    readings = b.measure(SHORT)
     assert len(readings) == len(SHORT.steps)
     (asked,) = confirmed(b)
     assert "shoulder_pan is 0.2 rad off" in asked
@@ -128,7 +113,7 @@ def test_an_operator_who_cannot_be_asked_is_not_taken_to_agree(b):
             self.report, self.hang, self.close = asks.report, asks.hang, asks.close
 
     b.rig = replace(b.rig, operator=Silent(b.operator))
-    refusal_of(DeviceError, "does not stand where it was left", measure, b)
+    refusal_of(DeviceError, "does not stand where it was left", b.measure)
     assert "arm.start_move" not in b.world.calls
 
 
@@ -136,10 +121,10 @@ def test_an_operator_who_cannot_be_asked_is_not_taken_to_agree(b):
 def test_a_campaign_that_goes_on_says_that_the_arm_stands_elsewhere_and_asks():
     for moved, questions in ((False, 0), (True, 1)):
         b = Bench()
-        interrupt(b, 1, SHORT)
+        b.interrupt(1, SHORT)
         if moved:
             b.world.q = FREE.copy()
-        measure(b, SHORT)
+        b.measure(SHORT)
         assert len(confirmed(b)) == questions
 
 
@@ -160,12 +145,9 @@ def test_an_arm_that_is_moved_at_rest_is_named_at_the_next_look(b, change, said)
         return replace(here, **{name: getattr(here, name) + by for name, by in change.items()})
 
     changed(b.rig.arm, "sample", moved)
-    refusal_of(DeviceError, said, measure, b)
+    refusal_of(DeviceError, said, b.measure)
     assert b.world.time - begun[0] < 1.0
     assert b.world.calls[-2] == "arm.stop"
-
-
-# in motion
 
 
 def in_motion(b, change, motion=4):
@@ -201,13 +183,13 @@ def test_feedback_that_stands_still_in_motion_is_named_within_a_second(b, names,
         )
 
     begun = in_motion(b, frozen)
-    refusal_of(DeviceError, said, measure, b)
+    refusal_of(DeviceError, said, b.measure)
     assert b.world.time - begun[0] < 1.0
 
 
 def test_an_arm_that_leaves_its_straight_way_is_stopped(b):
     begun = in_motion(b, lambda here: replace(here, q=here.q + 0.06 * np.eye(6)[3]))
-    refusal_of(DeviceError, "wrist_1 has left the straight way", measure, b)
+    refusal_of(DeviceError, "wrist_1 has left the straight way", b.measure)
     assert b.world.time - begun[0] < 0.1
 
 
@@ -217,10 +199,7 @@ def test_a_motion_at_the_slowest_slider_does_not_stand_still(b):
     b.world.hurry = 0.02
     changed(b.rig.arm, "sample", lambda here: replace(here, speed_scaling=0.02))
     poses = {"reference": POSES["reference"], "p1": tuple(near)}
-    measure(b, plan_of(("reference", "none", 0), ("p1", "none", 0), poses=poses))
-
-
-# loads
+    b.measure(plan_of(("reference", "none", 0), ("p1", "none", 0), poses=poses))
 
 
 def falls_in_motion(b, *wrong):
@@ -246,10 +225,10 @@ def test_a_load_that_falls_off_in_motion_stops_the_arm_and_is_asked_for_again(b)
     fell, motions = falls_in_motion(b), carried(b)
     before(b.rig.arm, "set_payload", lambda mass, com: payloads.append((b.world.load, mass)))
     before(b.rig.arm, "stop", lambda: stopped.append(b.world.time))
-    readings = measure(b)
+    readings = b.measure()
     assert len(readings) == len(usual_plan().steps)
     assert stopped[0] - fell[0] < 0.5
-    assert asked_for(b)[1:3] == ["3kg", "3kg"]
+    assert b.asked_for[1:3] == ["3kg", "3kg"]
     assert "0.0 N where 3kg should hang (29.4 N)" in b.operator.asked[2][1]
     assert ("none", 0.8) in payloads  # the controller knows that nothing hangs
     assert set(motions) == KNOWN  # and that it was hung again
@@ -281,8 +260,8 @@ def assert_true(b):
 def test_a_load_that_falls_off_between_readings_leaves_no_reading_without_it(b):
     """It falls while the tracker measures: the reading is kept as doubted, and taken again."""
     falls_at_rest(b, "3kg", 7)
-    measure(b)
-    assert asked_for(b)[1:3] == ["3kg", "3kg"]
+    b.measure()
+    assert b.asked_for[1:3] == ["3kg", "3kg"]
     assert_true(b)
 
 
@@ -298,14 +277,14 @@ def test_leaning_on_the_tool_during_a_reading_is_kept_as_doubted_and_measured_ag
             b.world.extra = np.array([0, 60.0, 0, 0, 0, 0])
 
     before(b.rig.force, "average", leans)
-    readings = measure(b)
+    readings = b.measure()
     assert leaned
     assert len(readings) == len(usual_plan().steps)
     doubted = b.store.last("doubted")
     assert "60" in doubted["why"] or load != "none"
     assert doubted["reading"]["load"] == load
-    assert asked_for(b).count(load) > 1
-    assert remarks(b, "somebody touch the tool")
+    assert b.asked_for.count(load) > 1
+    assert b.remarks("somebody touch the tool")
 
 
 def test_a_light_load_that_falls_before_the_tool_is_weighed_is_noticed():
@@ -314,9 +293,9 @@ def test_a_light_load_that_falls_before_the_tool_is_weighed_is_noticed():
     b = Bench(loads=(CellLoad(name=load, mass_kg=2.0, hang_m=0.1),))
     steps = (("p1", "none", 0), ("p3", "none", 0), ("p1", load, 0), ("p3", load, 0))
     falls_at_rest(b, load, 3)
-    measure(b, plan_of(*steps, poses={k: POSES[k] for k in ("reference", "p1", "p3")}))
+    b.measure(plan_of(*steps, poses={k: POSES[k] for k in ("reference", "p1", "p3")}))
     assert "tool" not in b.store.kinds()
-    assert asked_for(b)[-2:] == [load, load]
+    assert b.asked_for[-2:] == [load, load]
     assert f"where {load} should hang" in b.operator.asked[-1][1]
 
 
@@ -341,7 +320,7 @@ def test_leaning_in_the_first_motion_or_during_a_tare_is_asked_for_and_not_tared
 ):
     b.world.hurry = 1.0
     leans_in_phase(b, phase, number)
-    measure(b, SHORT)
+    b.measure(SHORT)
     assert any("feels 60.0 N where nothing should hang" in why for _, why in b.operator.asked)
     zeros = [d["felt"]["zero"] for d in b.store.details()]
     assert np.allclose(zeros, b.world.offset, atol=1e-6)
@@ -350,9 +329,9 @@ def test_leaning_in_the_first_motion_or_during_a_tare_is_asked_for_and_not_tared
 @pytest.mark.long
 def test_a_first_tare_that_was_leaned_on_ends_the_run_and_says_so(b):
     leans_in_phase(b, "taring", 1)
-    refusal_of(DeviceError, r"the tool was touched while the sensor was tared", measure, b, SHORT)
+    refusal_of(DeviceError, r"the tool was touched while the sensor was tared", b.measure, SHORT)
     assert b.store.rows == []
-    measure(b, SHORT)  # with a tare of its own
+    b.measure(SHORT)  # with a tare of its own
 
 
 def test_leaning_in_most_samples_of_a_reading_and_not_at_its_end_is_measured_again(b, monkeypatch):
@@ -375,15 +354,15 @@ def test_leaning_in_most_samples_of_a_reading_and_not_at_its_end_is_measured_aga
 
     before(b.rig.tracker, "measure", leans)
     before(b.rig.force, "average", lets_go)
-    measure(b, SHORT)
-    assert remarks(b, "was the tool touched")
+    b.measure(SHORT)
+    assert b.remarks("was the tool touched")
     assert_true(b)
 
 
 def test_a_tool_far_from_its_configuration_is_refused_before_it_is_measured_with(b):
     b.world.tool_mass = 4.0  # [tool] says 0.8 kg, which the controller is told
     with pytest.raises(DeviceError, match=r"asked 3 times") as raised:
-        measure(b)
+        b.measure()
     assert any("[tool] mass_kg" in why for _, why in b.operator.asked), raised.value
 
 
@@ -395,9 +374,9 @@ def test_unloaded_readings_that_were_leaned_on_do_not_spoil_the_tool(b):
         b.world.extra = np.array([0, 5.0 * (len(b.store.rows) == 2), 0, 0, 0, 0])
 
     before(b.rig.force, "average", leans)
-    measure(b)
+    b.measure()
     assert b.store.last("tool")["mass_kg"] == pytest.approx(0.8, abs=1e-6)
-    assert remarks(b, "was the tool touched")
+    assert b.remarks("was the tool touched")
 
 
 @pytest.mark.long
@@ -410,8 +389,8 @@ def test_a_load_that_swings_a_little_in_motion_is_let_swing(b):
         return one
 
     changed(b.rig.force, "latest", swings)
-    measure(b)
-    assert asked_for(b) == ["none", "3kg", "none", "pull", "none"]
+    b.measure()
+    assert b.asked_for == ["none", "3kg", "none", "pull", "none"]
 
 
 @pytest.mark.long
@@ -421,14 +400,14 @@ def test_who_bears_a_part_of_a_heavy_load_in_motion_is_noticed_though_it_may_swi
 
     def bears(one):
         b.world.hurry = 1.0 if b.world.load == "6kg" else 20.0
-        if b.world.load == "6kg" and b.world.is_moving and asked_for(b).count("6kg") == 1:
+        if b.world.load == "6kg" and b.world.is_moving and b.asked_for.count("6kg") == 1:
             borne.append(b.world.time)
             turned = evaluate(b.cell.arm, b.world.joints()[None]).rotation[-1][0]
             one.wrench[:3] += turned.T @ np.array([0.0, 0.0, 30.0])
         return one
 
     changed(b.rig.force, "latest", bears)
-    measure(b, plan_of(("p1", "none", 0), ("p1", "6kg", 0), ("p2", "6kg", 0)))
+    b.measure(plan_of(("p1", "none", 0), ("p1", "6kg", 0), ("p2", "6kg", 0)))
     assert borne
     assert borne[-1] - borne[0] < 1.0
     assert "6kg" in [name for name, why in b.operator.asked if "where 6kg should hang" in why]
@@ -437,17 +416,14 @@ def test_who_bears_a_part_of_a_heavy_load_in_motion_is_noticed_though_it_may_swi
 @pytest.mark.long
 def test_a_load_that_stays_wrong_ends_the_run(b):
     falls_in_motion(b, "none", "none", "none")
-    refusal_of(DeviceError, r"asked 3 times to hang 3kg.*--resume$", measure, b)
+    refusal_of(DeviceError, r"asked 3 times to hang 3kg.*--resume$", b.measure)
     assert len(b.store.rows) == 7
-
-
-# devices that repeat themselves
 
 
 def test_a_tracker_whose_target_does_not_move_with_the_arm_is_named_before_any_reading(b):
     still = b.world.position()
     b.world.position = lambda: still
-    refusal_of(DeviceError, "repeats an old reading, or follows a reflector", measure, b)
+    refusal_of(DeviceError, "repeats an old reading, or follows a reflector", b.measure)
     assert b.store.rows == []
 
 
@@ -461,7 +437,7 @@ def test_a_tracker_that_repeats_one_measurement_is_named(b):
         return one
 
     changed(b.rig.tracker, "measure", repeats)
-    refusal_of(DeviceError, "the same to the last digit", measure, b)
+    refusal_of(DeviceError, "the same to the last digit", b.measure)
     assert len(b.store.rows) == 3
 
 
@@ -476,7 +452,7 @@ def test_a_tracker_that_keeps_to_the_place_of_the_last_pose_is_named(b, good):
         return kept[0]
 
     changed(b.world, "position", stuck)
-    refusal_of(DeviceError, "repeats an old reading", measure, b)
+    refusal_of(DeviceError, "repeats an old reading", b.measure)
     assert len(b.store.rows) == good
     assert "why" in b.store.last("doubted")
     doubted = [content["reading"] for _, content in b.store.events if content.get("stored")]
@@ -487,15 +463,15 @@ def test_a_tracker_that_keeps_to_the_place_of_the_last_pose_is_named(b, good):
 def test_stored_readings_of_a_stuck_tracker_do_not_keep_a_campaign_from_going_on(b):
     """As older versions stored them: four right ones, then three at one and the same place."""
     plan = usual_plan()
-    interrupt(b, 7, plan)
+    b.interrupt(7, plan)
     step, reading, _ = b.store.rows[3]
     for k in (4, 5, 6):
         step, other, text = b.store.rows[k]
         b.store.rows[k] = (step, replace(other, value=reading.value), text)
-    assert len(measure(b, plan)) == len(plan.steps)
+    assert len(b.measure(plan)) == len(plan.steps)
 
 
 def test_a_force_sensor_that_repeats_itself_is_named(b):
     changed(b.rig.force, "average", lambda one: replace(one, covariance=np.zeros((6, 6))))
-    refusal_of(DeviceError, "frames are the same to the last digit", measure, b)
+    refusal_of(DeviceError, "frames are the same to the last digit", b.measure)
     assert b.store.rows == []

@@ -26,7 +26,6 @@ from tests.support.fake_bench import (
     Killed,
     before,
     changed,
-    remarks,
     usual_plan,
 )
 from tests.support.reflector_cases import NAMES, OFFSETS
@@ -111,7 +110,7 @@ def test_each_target_is_read_at_each_stop(tmp_path):
     stops = len(plan.steps)
     assert r.target.tolist() == [0] * BOOTSTRAP + [0, 1, 2] * (stops - BOOTSTRAP)
     assert len(np.unique(r.arrivals)) == stops
-    assert len(remarks(b, "only target R1")) == 1
+    assert len(b.remarks("only target R1")) == 1
     assert [e.done for e in b.notes.of(ReadingStored)] == list(range(1, stops + 1))
     chain = chains.evaluate(b.cell.arm, r.states.q)
     held = chain.point(OFFSETS[r.target]) + SAG * r.states.wrench[:, :3]
@@ -132,7 +131,7 @@ def test_a_hidden_reflector_is_a_missing_reading_with_a_word(tmp_path):
     assert lost
     later = {key for key in by_key(r) if key[:3] in {(s.pose, s.load, s.cycle) for s in steps}}
     assert later == wanted - lost
-    assert remarks(b, "R2 is not read") == [
+    assert b.remarks("R2 is not read") == [
         "p4: target R2 is not read: tracker: no target in sight"
     ] * len(lost)
     b, tracker = bench()
@@ -146,7 +145,7 @@ def test_a_neighbour_is_not_taken_for_a_target(tmp_path):
     tracker.misled = True
     r = measure(b, tmp_path / "r.hilcal")
     assert set(r.target.tolist()) == {0, 2}
-    assert remarks(b, "R2 is not read: tracker: it sees R1 in its place")
+    assert b.remarks("R2 is not read: tracker: it sees R1 in its place")
 
 
 @pytest.mark.long

@@ -15,7 +15,7 @@ from hilcal.identification.fit import fit
 from hilcal.readings.readings import Readings
 from hilcal.regression import normal_equations
 from hilcal.regression.normal_equations import Triangle, combined, find_basis
-from hilcal.stream.fit import fit_stream
+from hilcal.stream import fit_stream
 from hilcal.tables.parquet_stream import open_stream
 from tests.support.cli_cases import ok, refused
 from tests.support.refusals import refusal

@@ -63,24 +63,18 @@ def test_a_perfect_a_constant_and_an_overconfident_entrant(tmp_path):
     off = 3e-5 * rng.standard_normal(truth.position.shape)
     near = (truth.position + off).tolist()
     middle = np.broadcast_to(truth.position.mean(axis=0), truth.position.shape)
-    half = dict.fromkeys(task.candidates, 0.5)
-    none = dict.fromkeys(task.candidates, 0.0)
-    each = dict.fromkeys(task.candidates, 1.0)
+    half, none, each = (dict.fromkeys(task.candidates, p) for p in (0.5, 0.0, 1.0))
+    wide, narrow = (np.full(off.shape, std).tolist() for std in (3e-5, 3e-6))
     found = scored(
         tmp_path,
         folder,
         perfect=answer(folder),
         constant=answer(folder, prediction_m=middle.tolist(), std_m=None, effects=half),
-        honest=answer(
-            folder, prediction_m=near, std_m=np.full(off.shape, 3e-5).tolist(), effects=none
-        ),
-        overconfident=answer(
-            folder, prediction_m=near, std_m=np.full(off.shape, 3e-6).tolist(), effects=each
-        ),
+        honest=answer(folder, prediction_m=near, std_m=wide, effects=none),
+        over=answer(folder, prediction_m=near, std_m=narrow, effects=each),
     )
-    perfect, constant, honest, over = (
-        found[name][0] for name in ("perfect", "constant", "honest", "overconfident")
-    )
+    names = ("perfect", "constant", "honest", "over")
+    perfect, constant, honest, over = (found[name][0] for name in names)
     assert (perfect["rms_m"], perfect["coverage"], perfect["log_score"]) == (0.0, 1.0, 0.0)
     assert (perfect["false_alarms"], perfect["found"]) == (0.0, 1.0)
     assert constant["log_score"] == pytest.approx(np.log(0.5))

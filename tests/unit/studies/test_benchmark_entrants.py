@@ -60,10 +60,9 @@ def test_an_adapter_is_small_and_pinned(path):
 @pytest.mark.parametrize("name", ["common.py", "run.py", "tables.py", "frames/entrant.py"])
 def test_what_others_need_imports_numpy_alone(name):
     tree = ast.parse((HERE / name).read_text())
-    plain = [a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names]
-    plain += [
-        n.module or "" for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and not n.level
-    ]
+    nodes = list(ast.walk(tree))
+    plain = [a.name for n in nodes if isinstance(n, ast.Import) for a in n.names]
+    plain += [n.module or "" for n in nodes if isinstance(n, ast.ImportFrom) and not n.level]
     known = {*sys.stdlib_module_names, "numpy", "benchmark"}
     assert {n.split(".")[0] for n in plain} <= known
 
@@ -74,16 +73,13 @@ def asked():
     return Asked.read(first_task("elastic"))
 
 
-def test_positions_are_those_of_hilcals_chain(asked):
+def test_positions_and_torques_are_those_of_another_mechanics(asked):
     theta = np.zeros(51)
     theta[:6] = [0.3, -1.0, 2.0, 1.0, 2.0, 3.0]
     arm = arm_from_urdf(asked.task.folder / "robot.urdf")
     point = evaluate(arm, asked.train.q).point(asked.arm.target)
     expected = point @ rotation(theta[:3]).T + theta[3:6]
     np.testing.assert_allclose(asked.arm.predict(theta, asked.train), expected, atol=1e-12)
-
-
-def test_torques_are_those_of_another_dynamics():
     law = Asked.read(first_task("law"))
     stated = np.stack([law.train.columns[f"x_tau{j}_Nm"] for j in range(1, 7)], axis=1)
     np.testing.assert_allclose(law.train.torque, stated, atol=6e-4)  # they are rounded to 1e-3
@@ -172,11 +168,8 @@ def test_simple_entrants_run_and_geometry_is_better_than_frames(tmp_path, capsys
 
 @pytest.mark.slow
 def test_hilcals_adapter_predicts_with_bands_and_names(tmp_path):
-    task = next(
-        path
-        for path in sorted(TASKS.glob("elastic-*"))
-        if read_task(path).about["n_poses"] == 30 and read_truth(path).about["strength_sigma"] >= 1
-    )
+    strong = [p for p in TASKS.glob("elastic-*") if read_truth(p).about["strength_sigma"] >= 1]
+    task = next(path for path in sorted(strong) if read_task(path).about["n_poses"] == 30)
     words = [str(TASKS), "--entrants", "hilcal,ridge", "--tasks", task.name]
     assert run(tmp_path, *words) == 0
     rows = {r["entrant"]: r for r in scores(TASKS, tmp_path / "out")}
@@ -206,10 +199,8 @@ def fakes(tmp_path):
 
 
 def test_the_runner_survives_whatever_entrants_do(tmp_path, fakes):
-    task = first_task("elastic").name
-    assert (
-        run(tmp_path, str(TASKS), "--tasks", task, "--limit", "3", "--jobs", "2", home=fakes) == 0
-    )
+    words = ("--tasks", first_task("elastic").name, "--limit", "3", "--jobs", "2")
+    assert run(tmp_path, str(TASKS), *words, home=fakes) == 0
     found = scores(TASKS, tmp_path / "out")
     why = {r["entrant"]: r["failed"] for r in found}
     assert why.pop("good") is None
@@ -232,10 +223,8 @@ def test_what_was_run_is_not_run_again(tmp_path, fakes):
     kept_in, told = tmp_path / "kept.json", tmp_path / "page.md"
     assert run(tmp_path, *words, "--keep", str(kept_in), "--page", str(told), home=fakes) == 0
     date, rows = kept(kept_in)
-    assert {r["entrant"]: r["failed"] for r in rows} == {
-        "good": None,
-        "cannot": "not run: needs Julia",
-    }
+    failed = {r["entrant"]: r["failed"] for r in rows}
+    assert failed == {"good": None, "cannot": "not run: needs Julia"}
     assert told.read_text() == page(date, rows, fakes)
 
 

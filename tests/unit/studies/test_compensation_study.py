@@ -38,11 +38,15 @@ def test_errors_are_counted_against_what_the_tracker_reads_elsewhere():
     assert not judged(c, p, further)[1].any()
 
 
-def test_halves_are_halves():
+def test_parts_are_halves_or_four_fifths():
     found = dict(_parts(100, 2, 0.5))
     assert list(found) == ["random half 1", "random half 2", "first half"]
     assert all(rows.sum() == 50 for rows in found.values())
     assert found["first half"][:50].all()
+    (name, rows), (other, different) = _parts(100, 2, 0.8)
+    assert (name, other) == ("random 80 % 1", "random 80 % 2")
+    assert rows.sum() == different.sum() == 80
+    assert (rows != different).any()
 
 
 def test_the_worst_split_decides():
@@ -53,10 +57,3 @@ def test_the_worst_split_decides():
     assert "73.0 µm, 76.0 µm" in bad[0].measured
     far = replace(LEFT, split="first half", beyond=0.3, beyond_mean_m=3e-4, beyond_inside=1.0)
     assert "30.0 % of poses; left there 300 µm" in list(_figures("B", [far]))[2].measured
-
-
-def test_four_fifths_are_four_fifths():
-    (name, rows), (other, different) = _parts(100, 2, 0.8)
-    assert (name, other) == ("random 80 % 1", "random 80 % 2")
-    assert rows.sum() == different.sum() == 80
-    assert (rows != different).any()

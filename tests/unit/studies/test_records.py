@@ -10,8 +10,11 @@ from tests.support.refusals import refusal
 MEASURED = ROOT / "docs" / "measured"
 
 
-def test_the_page_of_results_is_made_of_what_was_measured():
+def test_the_page_of_results_is_made_of_what_was_measured(tmp_path):
     assert (ROOT / "docs" / "reference" / "results.md").read_text() == page(MEASURED)
+    refusal(r"no \*.json", page, tmp_path)
+    (tmp_path / "x.json").write_text("{}")
+    refusal(r"x\.json: not a record", page, tmp_path)
 
 
 def test_a_record_has_its_command_and_comes_back_as_a_section(tmp_path, monkeypatch):
@@ -32,12 +35,6 @@ def test_a_study_keeps_its_figures(tmp_path, capsys):
     ok(capsys, "studies", "scaling", "--runs", "20", "--keep", path)
     figures = json.loads(path.read_text())["figures"]
     assert [f["what"].split(":")[0] for f in figures] == ["none"] * 2 + ["gu"] * 2 + ["gc"] * 2
-
-
-def test_a_folder_without_records_and_a_wrong_file_are_named(tmp_path):
-    refusal(r"no \*.json", page, tmp_path)
-    (tmp_path / "x.json").write_text("{}")
-    refusal(r"x\.json: not a record", page, tmp_path)
 
 
 def test_the_command_that_is_kept_is_the_one_without_the_file(tmp_path, monkeypatch):

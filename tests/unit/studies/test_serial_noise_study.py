@@ -5,14 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.cli.demo import CELL
-from hilcal.config import load_config
-from hilcal.robot.catalogue import configs_dir
 from studies.serial_noise import Outcome, SerialCase, serial_case, serial_readings
 from studies.serial_noise_command import _figures
 from studies.study_cases import study_case
+from tests.support.campaigns import configuration
 
-CONFIG = load_config(configs_dir() / "cells" / CELL)
+CONFIG = configuration()
 
 
 def test_the_noise_has_the_stated_covariance_and_the_correlation():

@@ -4,34 +4,24 @@ import numpy as np
 import pytest
 
 from hilcal.cell import cell_from_config
-from hilcal.cli.demo import CELL
-from hilcal.config import load_config
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.injected_effects import EFFECTS
 from hilcal.errors import InputError
 from hilcal.readings.whitening import whitening
-from hilcal.robot.catalogue import configs_dir
 from studies.diagnosis import intervals
 from studies.random_campaigns import dead_weights
-from studies.study_cases import (
-    effects_shown,
-    study_case,
-    with_study_loads,
-)
+from studies.study_cases import effects_shown, study_case, with_study_loads
 from studies.study_more import measure_more, suspects
 from studies.unmodelled_laws import LAWS, law_named, shift
+from tests.support.campaigns import configuration
 from tests.support.effect_cases import make
 from tests.support.fit_cases import based
 from tests.support.refusals import refusal
 
 
-def config():
-    return load_config(configs_dir() / "cells" / CELL)
-
-
 def case(*hidden, mode="absolute", strength=2.0, **given):
     return study_case(
-        config(), "ur10e", mode, hidden, strength, int(given.get("seed", 3)),
+        configuration(), "ur10e", mode, hidden, strength, int(given.get("seed", 3)),
         cycles=int(given.get("cycles", 1)),
         stated=given.get("stated", 1.0),
         n_poses=int(given.get("poses", 8)),
@@ -45,13 +35,13 @@ def seen(c):
 
 @pytest.mark.parametrize("robot", ["ur3e", "ur5e", "ur10e"])
 def test_loads_are_what_the_arm_can_carry(robot):
-    own, loads = with_study_loads(config(), robot)
+    own, loads = with_study_loads(configuration(), robot)
     arm = cell_from_config(own).arm
     assert len(loads) == 5
     carried = [float(np.linalg.norm(w[:3])) / 9.81 + own.tool.mass_kg for _, w in loads]
     assert max(carried) <= arm.payload
     assert max(carried) > 0.7 * arm.payload
-    c = study_case(config(), robot, "deflection", (), 0.0, 0)
+    c = study_case(configuration(), robot, "deflection", (), 0.0, 0)
     assert len(c.readings) == 180
     assert set(c.readings.load_names) == {"none", *(name for name, _ in loads)}
     pulls = np.array([w for _, w in loads])
@@ -129,7 +119,7 @@ def test_true_parameters_have_the_program_s_names():
 
 
 def test_intervals_hold_true_parameters_and_no_others():
-    c = study_case(config(), "ur10e", "absolute", (), 0.0, 1)
+    c = study_case(configuration(), "ur10e", "absolute", (), 0.0, 1)
     f = based(c.cell, c.readings, "absolute")
     (told,) = intervals(f, c.world.truth)
     assert (told.effect, told.parameters) == ("joint_compliance", 6)
@@ -148,7 +138,7 @@ def test_a_further_round_adds_readings_of_new_poses_in_the_same_world():
     c = case("link_compliance", mode="deflection", strength=0.5, poses=10)
     d = diagnosed(c)
     assert len(suspects(d)) > 1
-    all_ = measure_more(config(), "ur10e", c, d, seed=1, poses=4)
+    all_ = measure_more(configuration(), "ur10e", c, d, seed=1, poses=4)
     n = len(c.readings)
     assert len(all_) > n + 10
     np.testing.assert_array_equal(all_.value[:n], c.readings.value)
@@ -169,4 +159,4 @@ def test_nothing_is_measured_where_one_effect_leads_alone():
     c = case("hysteresis", mode="deflection", strength=3.0, poses=20)
     d = diagnosed(c)
     assert suspects(d) == ("hysteresis",)
-    assert measure_more(config(), "ur10e", c, d, seed=1) is None
+    assert measure_more(configuration(), "ur10e", c, d, seed=1) is None

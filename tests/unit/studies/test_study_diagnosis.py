@@ -8,15 +8,7 @@ from rich.console import Console
 
 from hilcal.errors import InputError
 from hilcal.readings.whitening import MODES
-from studies.diagnosis import (
-    Added,
-    Asked,
-    Inside,
-    Judgement,
-    Outcome,
-    Refined,
-    run_case,
-)
+from studies.diagnosis import Added, Asked, Inside, Judgement, Outcome, Refined, run_case
 from studies.diagnosis_claims import claims
 from studies.diagnosis_document import document
 from studies.diagnosis_pool import run_all
@@ -51,14 +43,9 @@ def said(lead="creep", *same_as, verdict="missing_effect", variables=("time", "l
 
 
 def refined(*added, same_as=(), verdict="adequate", holdout=1.0, inside=()):
-    return Refined(
-        judgement=said(verdict=verdict),
-        added=tuple(Added(a, same_as) for a in added),
-        model=("joint_compliance", *added),
-        holdout=holdout,
-        holdout_real=holdout,
-        intervals=inside,
-    )
+    model = ("joint_compliance", *added)
+    sets = tuple(Added(a, same_as) for a in added)
+    return Refined(said(verdict=verdict), sets, model, holdout, holdout, inside)
 
 
 def outcome(lead="creep", *same_as, **given):
@@ -167,13 +154,8 @@ def test_claims_are_met_or_not_by_what_is_asked():
     (claim,) = claims([*quiet, loud, loud])
     assert claim.met is False
     # An interval may hold too often as well.
-    (always,) = (
-        c
-        for c in claims(
-            [Outcome(asked(), said(), refined("creep", inside=(Inside("creep", 9, 9),)))]
-        )
-        if "intervals" in c.words
-    )
+    often = Outcome(asked(), said(), refined("creep", inside=(Inside("creep", 9, 9),)))
+    (always,) = (c for c in claims([often]) if "intervals" in c.words)
     assert always.met is False
 
 
@@ -189,23 +171,21 @@ def test_everything_is_asked_of_every_arm():
     assert {(q.mode, q.hidden) for q in first} == {(q.mode, q.hidden) for q in every}
 
 
-def test_a_case_that_fails_is_a_miss_that_says_why():
-    def broken(question):
-        raise ValueError("no\n such thing")
+def raising(error):
+    def run(question):
+        raise error
 
-    o = run_case(asked(), broken)
+    return run
+
+
+def test_a_case_that_fails_is_a_miss_that_says_why_and_one_that_cannot_be_does_not_count():
+    o = run_case(asked(), raising(ValueError("no\n such thing")))
     assert o.failure == "ValueError: no such thing"
     assert not found(o)
     shown = written([o])
     assert "1 cases failed" in shown
     assert "creep, ur10e, absolute, 2 σ, seed 0" in shown
-
-
-def test_a_campaign_that_cannot_be_does_not_count():
-    def beyond(question):
-        raise InputError("effect 'creep' cannot reach 2 sigma")
-
-    o = run_case(asked(), beyond)
+    o = run_case(asked(), raising(InputError("effect 'creep' cannot reach 2 sigma")))
     assert (o.failure, o.impossible) == ("", "effect 'creep' cannot reach 2 sigma")
     (row,) = by_effect([outcome(), o])
     assert (row.found.hits, row.found.cases, row.instead) == (1, 1, ())

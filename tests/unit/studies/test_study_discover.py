@@ -41,9 +41,6 @@ def test_claims_count_what_they_say():
     assert found["no law where nothing is hidden"].met is True
     assert found["no law where the noise is misjudged by two"].met is False
     assert "no law where an effect of the catalogue is hidden" not in found  # none was
-
-
-def test_more_is_claimed_of_laws_that_are_plain():
     plain = replace(GOOD, strength=10.0, poses=100)
     nine = [Outcome(plain, "law", "dq_2 = a", "wear", True, True, 0.99, 2.0, 1.1)] * 9
     wrong = Outcome(plain, "law", "dq_3 = a", "wear", False, True, 0.99, 2.0, 1.1)

@@ -73,15 +73,11 @@ def test_errors_are_summarised_over_campaigns():
 def test_the_stated_uncertainty_of_the_simulation_is_that_of_repeated_studies():
     rng = np.random.default_rng(1)
     std = np.array([1.0, 2.0])
-    many = [
-        summary(
-            [
-                errors_of(std * rng.standard_normal(2), std, float(abs(rng.standard_normal())))
-                for _ in range(50)
-            ]
-        )
-        for _ in range(300)
-    ]
+
+    def one():
+        return errors_of(std * rng.standard_normal(2), std, float(abs(rng.standard_normal())))
+
+    many = [summary([one() for _ in range(50)]) for _ in range(300)]
     for figure in ("parameter_real", "spread", "position_real"):
         found = [getattr(s, figure) for s in many]
         scatter = np.std([f.value for f in found])
@@ -181,9 +177,8 @@ def test_the_study_compares_equal_numbers_of_readings(small):
     for s in small.shrinkage():
         own, base = small.of(s.kind).result, small.of(RANDOM).result
         assert s.position == pytest.approx(base.position / own.position)
-        assert s.parameter_real.value == pytest.approx(
-            base.parameter_real.value / own.parameter_real.value
-        )
+        ratio = base.parameter_real.value / own.parameter_real.value
+        assert s.parameter_real.value == pytest.approx(ratio)
 
 
 @pytest.mark.long

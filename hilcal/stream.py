@@ -317,7 +317,7 @@ def fit_stream(
         theta = solved.point.theta
         errors = solved.errors(far)
         aside = {k: e.far for k, e in enumerate(errors) if len(e.far)}
-        count, previous = _count(aside), _count(problem.work.outliers)
+        count, previous = (sum(map(len, x.values())) for x in (aside, problem.work.outliers))
         if count in (0, previous) or count > MAX_OUTLIER_SHARE * len(stream):
             break
         if search < OUTLIER_ROUNDS:
@@ -340,10 +340,6 @@ def _sample(work: PassTask, engine: Engine, counting: Counting) -> Readings:
     sample = Readings.joined([part for part in parts if part is not None])
     names = tuple(f"row {k + 1}" for k in sample.pose)
     return replace(sample, pose=np.arange(len(sample)), pose_names=names)
-
-
-def _count(rows: Mapping[int, Ints]) -> int:
-    return sum(map(len, rows.values()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -421,7 +417,7 @@ class _StreamMinimum:
             error=blocks[0],
             holdout=blocks[1],
             noise_floor=float(np.sqrt(sum(e.floor for e in errors) / count)),
-            outliers=_count(aside),
+            outliers=sum(map(len, aside.values())),
             named=tuple(sorted(worst, key=lambda row: -row[1])[:NAMED]),
             passes=1 + len(problem.passed),
             converged=self.converged,
@@ -461,7 +457,6 @@ def to_json(fit: StreamFit) -> dict[str, object]:
 
     `error.holdout`: each tenth of the stream, predicted without it.
     """
-    low, high = fit.variance_factor_interval
     return {
         "model": list(fit.model.names),
         "readings": "absolute",
@@ -476,7 +471,7 @@ def to_json(fit: StreamFit) -> dict[str, object]:
         "unidentifiable": list(fit.null),
         "inflated": fit.inflated,
         "variance_factor": fit.variance_factor,
-        "variance_factor_interval": [low, high],
+        "variance_factor_interval": list(fit.variance_factor_interval),
         "error": {"fit": fit.error.to_json(), "holdout": fit.holdout.to_json()},
         "noise_floor_m": fit.noise_floor,
         "n_outliers": fit.outliers,

@@ -1,1 +1,0 @@
-"""Identification of readings that do not fit into memory."""
