@@ -10,9 +10,8 @@ from hilcal.config import STANDARD_GRAVITY_M_S2, CellConfig, load_config
 from hilcal.config.sections import Gauge, Point
 from hilcal.errors import InputError
 from hilcal.readings.readings import ObserverName
-from hilcal.robot.arm import Arm
+from hilcal.robot.arm import Arm, as_counted
 from hilcal.robot.catalogue import load_arm
-from hilcal.robot.conventions import as_counted
 from hilcal.robot.factory import FactoryKinematics, read_factory, with_factory
 from hilcal.robot.se3 import rotation
 from hilcal.shown import Brief

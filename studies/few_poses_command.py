@@ -26,7 +26,7 @@ from hilcal.design.information import problem
 from hilcal.design.nominal_model import nominal_model
 from hilcal.design.planner import without_undetermined
 from hilcal.design.predicted import prediction_poses
-from hilcal.engine.engine import open_engine
+from hilcal.engine import open_engine
 from hilcal.identification.arm_scatter import with_arm_scatter
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit

@@ -13,7 +13,7 @@ import numpy as np
 
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
-from hilcal.robot.batch import along_states, by_field, empty
+from hilcal.robot.se3 import along_states, by_field, empty
 from hilcal.types import Bools, Floats
 
 

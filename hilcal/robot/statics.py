@@ -23,8 +23,8 @@ import numpy as np
 
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
-from hilcal.robot.batch import empty, zeros
 from hilcal.robot.chain import Chain
+from hilcal.robot.se3 import empty, zeros
 from hilcal.types import Floats
 
 

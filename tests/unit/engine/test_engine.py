@@ -15,9 +15,7 @@ import numpy as np
 import psutil
 import pytest
 
-from hilcal.engine.cluster import Cluster
-from hilcal.engine.engine import open_engine
-from hilcal.engine.processes import ClusterError
+from hilcal.engine import Cluster, ClusterError, open_engine
 from hilcal.errors import InputError
 from tests.support.cluster import (
     HERE,
@@ -189,7 +187,7 @@ def test_what_is_no_cluster_is_said_in_one_line():
 
 
 def test_a_scheduler_without_workers_is_refused(monkeypatch):
-    monkeypatch.setattr("hilcal.engine.cluster.WORKERS_S", 0.2)
+    monkeypatch.setattr("hilcal.engine.WORKERS_S", 0.2)
     with (
         scheduler() as address,
         pytest.raises(ClusterError, match="dask worker"),

@@ -9,9 +9,8 @@ import pytest
 
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
-from hilcal.robot.body import body_poses
 from hilcal.robot.chain import Deviation, evaluate, joint_jacobian, twist_jacobian
-from hilcal.robot.scene import FLANGE, pinocchio_model
+from hilcal.robot.scene import FLANGE, body_poses, pinocchio_model
 from hilcal.robot.statics import Load, geometric_stiffness, slot_wrench_change, slot_wrenches
 from tests.support.arm_cases import ARMS, ODD, arm_of, displacement, slope, twisted
 from tests.support.effect_cases import CELLS, situation

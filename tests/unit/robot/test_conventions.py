@@ -14,9 +14,9 @@ from hilcal.design.feasible import Space, draw
 from hilcal.model.model import Model
 from hilcal.readings.covariance import TrackerNoise
 from hilcal.readings.readings import States
+from hilcal.robot.arm import as_counted
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import drive_jacobian, evaluate
-from hilcal.robot.conventions import as_counted
 from hilcal.robot.urdf import arm_from_urdf
 from hilcal.tables.table import read_table
 from tests.support.effect_cases import make

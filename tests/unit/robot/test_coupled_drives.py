@@ -12,10 +12,9 @@ from hilcal.drivers.simulated.ur_state import GRAVITY, Kinematics
 from hilcal.drivers.simulated.world import SimulatedNoise, World
 from hilcal.identification.full_covariance import joint_factors
 from hilcal.model.model import Model
-from hilcal.robot.body import body_poses, capsules, is_known
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
-from hilcal.robot.scene import Scene, pinocchio_model
+from hilcal.robot.scene import Scene, body_poses, capsules, is_known, pinocchio_model
 from tests.support.campaigns import true_parameters
 from tests.support.effect_cases import make, numeric_jacobian, some_states
 from tests.support.readings_cases import made

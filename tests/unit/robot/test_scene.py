@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 
 from hilcal.config import Obstacle
 from hilcal.measuring.clearance import segment_distance
-from hilcal.robot.body import capsules, is_known
 from hilcal.robot.catalogue import load_arm, robot_names
 from hilcal.robot.chain import evaluate
-from hilcal.robot.scene import Scene, Segment
+from hilcal.robot.scene import Scene, Segment, capsules, is_known
 from tests.support.arm_cases import ODD, arm_of
 from tests.support.fake_bench import POSES
 from tests.support.space_cases import frames, gap, gap_to, placed, self_gap

@@ -9,12 +9,12 @@ import pytest
 from rich.console import Console
 from scipy import stats
 
-from hilcal.engine.engine import open_engine
+from hilcal.engine import open_engine
 from hilcal.errors import CannotAnswerError
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import Deviation, evaluate
 from hilcal.robot.se3 import rotation_vector
-from hilcal.study.scaling import (
+from hilcal.study import (
     CORRELATIONS,
     CURVES,
     TARGET,

@@ -22,7 +22,7 @@ from rich.text import Text
 from scipy import stats
 from scipy.linalg import solve_triangular
 
-from hilcal.engine.engine import ALONE, Advance, Engine
+from hilcal.engine import ALONE, Advance, Engine
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.readings.covariance import TrackerNoise, joint_scatter, tracker_covariance
 from hilcal.readings.readings import Readings, States

@@ -1,9 +1,23 @@
-"""Workers that are processes of this machine, connected by pipes only.
+"""Many independent computations: `Engine.map`, bit-identical for any number of workers.
 
-Workers run code that they receive. A socket on the loopback address would admit every user of the
-machine; a pipe has no name by which another process could open it.
+A single worker computes in this process. Several are processes of this machine or of a running
+cluster (Dask). The following do not depend on the number of workers nor on the distribution of the
+items:
+
+- the random numbers: item k has the k-th child of `SeedSequence(seed)`;
+- BLAS: one thread;
+- the order of the results, and so of a sum over them.
+
+The item of a worker that dies is computed again. Ctrl-C leaves no process.
+
+Workers run code that they receive. Those of this machine are connected by pipes only: a socket on
+the loopback address would admit every user of the machine; a pipe has no name by which another
+process could open it. Anybody who reaches a scheduler or a worker at a tcp:// address can run code
+there. With tls:// both sides need certificates of the same authority; Dask's configuration names
+their files (`distributed.comm.tls`, https://distributed.dask.org/en/stable/tls.html).
 """
 
+import logging
 import multiprocessing
 import os
 import pickle
@@ -21,7 +35,7 @@ from functools import cache
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import scipy
@@ -30,7 +44,14 @@ from threadpoolctl import threadpool_limits
 
 from hilcal import __version__
 from hilcal.errors import HilcalError, InputError
+from hilcal.optional import needed_by
 
+if TYPE_CHECKING:  # takes half a second to import
+    from distributed import Client
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+Advance = Callable[[int], None]
 Versions = tuple[tuple[str, str], ...]
 
 DEATHS = 3  # most workers that may die with one item before it is given up; Dask's own, a choice
@@ -256,3 +277,169 @@ def _signals_as_exit() -> Iterator[None]:
     finally:
         for kind in kinds:
             signal.signal(kind, signal.SIG_DFL)
+
+
+ANSWER_S = 10.0  # most time for the scheduler's answer, s; a choice
+WORKERS_S = 10.0  # most time until a cluster has a worker, s; a choice
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cluster:
+    """Workers behind a scheduler."""
+
+    client: "Client"
+    address: str
+
+    def results(
+        self, task: Task, items: Sequence[Any], seeds: Sequence[np.random.SeedSequence | None]
+    ) -> Iterator[tuple[int, Any]]:
+        """Yield (number of the item, result) in the order of completion."""
+        from distributed import KilledWorker, as_completed
+        from distributed.client import FutureCancelledError
+
+        if not items:
+            return
+        futures = self.client.map(task, list(items), list(seeds), pure=False)
+        number = {future.key: k for k, future in enumerate(futures)}
+        waiting = as_completed(futures, loop=self.client.loop, with_results=True)
+        del futures  # so that workers can release fetched results
+        try:
+            for future, result in waiting:
+                yield number[future.key], result
+        except KilledWorker as error:
+            raise deadly(f"cluster {self.address}") from error
+        except (FutureCancelledError, OSError) as error:
+            raise ClusterError(
+                f"cluster {self.address}: lost in the middle; start it again"
+            ) from error
+        finally:
+            waiting.clear()
+
+
+@contextmanager
+def cluster(address: str) -> Iterator[Cluster]:
+    """Yield a connection to a cluster."""
+    with _quiet():
+        from distributed import Client
+
+        if address.startswith("tls://"):
+            _check_certificates(address)
+        try:
+            client = Client(address, timeout=ANSWER_S, set_as_default=False)
+        except ValueError as error:
+            raise InputError(
+                f"--scheduler {address}: not an address; valid: as `dask scheduler` prints it, "
+                "tcp://host:8786"
+            ) from error
+        except OSError as error:
+            raise ClusterError(
+                f"--scheduler {address}: no scheduler answers within {ANSWER_S:g} s, or none that "
+                "takes tcp:// or our certificate; start one with `dask scheduler --host ADDRESS`"
+            ) from error
+        with client:
+            try:
+                client.wait_for_workers(1, timeout=WORKERS_S)
+            except TimeoutError as error:
+                raise ClusterError(
+                    f"--scheduler {address}: the scheduler has no workers; start some with "
+                    f"`dask worker {address}`"
+                ) from error
+            yield Cluster(client, address)
+
+
+def _check_certificates(address: str) -> None:
+    """Raise InputError if certificates are not configured or cannot be read."""
+    from distributed.security import Security
+
+    why: object = "none are named"
+    try:
+        if Security().get_connection_args("client")["ssl_context"] is not None:
+            return
+    except OSError as error:
+        why = error
+    raise InputError(
+        f"--scheduler {address}: no certificates ({why}); Dask's configuration names their files: "
+        "distributed.comm.tls.ca-file, client.cert and client.key"
+    )
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Suppress Dask's log messages on workers that come and go."""
+    with needed_by("a cluster"):
+        import dask
+        import distributed  # loads its default settings, before they are changed
+
+    loggers = [logging.getLogger(name) for name in (distributed.__name__, "tornado")]
+    levels = [logger.level for logger in loggers]
+    with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1GB"}):
+        for logger in loggers:
+            logger.setLevel(logging.CRITICAL)
+        try:
+            yield
+        finally:
+            for logger, level in zip(loggers, levels, strict=True):
+                logger.setLevel(level)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Engine:
+    """Computes many items; created by `open_engine`."""
+
+    workers: Processes | Cluster | None  # None: this process computes
+
+    def map(
+        self,
+        function: Callable[..., Result],
+        items: Sequence[Item],
+        seed: int | None = None,
+        advance: Advance | None = None,
+    ) -> tuple[Result, ...]:
+        """Return function(item) of every item, in the order of the items."""
+        results: dict[int, Result] = {}
+        for k, result in self.results(function, items, seed):
+            results[k] = result
+            if advance is not None:
+                advance(1)
+        return tuple(results[k] for k in range(len(items)))
+
+    def results(
+        self, function: Callable[..., Result], items: Sequence[Item], seed: int | None = None
+    ) -> Iterator[tuple[int, Result]]:
+        """Yield (number of the item, result) in the order of completion; see `map`."""
+        count = len(items)
+        seeds = [None] * count if seed is None else np.random.SeedSequence(seed).spawn(count)
+        if self.workers is None:
+            for k, item in enumerate(items):
+                yield k, compute(function, item, seeds[k])
+            return
+        yield from self.workers.results(Task(function, versions()), items, seeds)
+
+
+ALONE = Engine(None)  # computes in this process, with the present number of BLAS threads
+
+
+@contextmanager
+def open_engine(workers: int | None = None, scheduler: str | None = None) -> Iterator[Engine]:
+    """Yield an engine of processes of this machine or of a cluster; processes end with the block.
+
+    Anybody who reaches a scheduler at a tcp:// address can run code there, and here; tls:// admits
+    only holders of a certificate. An invalid address is an InputError, a silent one a ClusterError.
+    """
+    if scheduler is not None:
+        if workers is not None:
+            raise InputError(
+                "a cluster has its own workers; valid: --workers N or --scheduler ADDRESS"
+            )
+        with cluster(scheduler) as remote:
+            yield Engine(remote)
+        return
+    count = len(os.sched_getaffinity(0)) if workers is None else workers
+    if count < 1:
+        raise InputError(f"--workers {count}; valid: a whole number from 1")
+    if count == 1:
+        with threadpool_limits(limits=1, user_api="blas"):
+            yield ALONE
+        return
+    with processes(count) as local:
+        yield Engine(local)
