@@ -25,7 +25,8 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from hilcal.config import CellConfig
-from hilcal.design.criterion import CandidateSet, inverse_factor
+from hilcal.design.criteria import MeanVariance
+from hilcal.design.criterion import CandidateSet, Objective, inverse_factor
 from hilcal.design.information import (
     DesignProblem,
     information_of,
@@ -43,18 +44,8 @@ SAMPLE = 300  # candidate poses that determine Q; a choice
 LEAST = 1e-3  # least motion of the units by a direction of Q, RMS, over the noise
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MixedDesign:
-    """A design problem in the coordinates (b, Qᵀ v)."""
-
-    units: CandidateSet  # the units of the problem
-    prior: Floats  # (P, P) prior information
-    c: Floats  # (P, P) C, m²
-    names: tuple[str, ...]  # of b, then numbers of Qᵀ v; numbers only after `balanced`
-
-
-def mixed_design(problem: DesignProblem, config: CellConfig, work: PredictionPoses) -> MixedDesign:
-    """Return the design problem of predictions with all effects."""
+def mixed_design(problem: DesignProblem, config: CellConfig, work: PredictionPoses) -> Objective:
+    """Return the objective of predictions with all effects, in the coordinates (b, Qᵀ v)."""
     nominal, config = problem.nominal, _with_scatter(problem.nominal, config)
     effects, std = other_effects(nominal, config)
     prior_std = nominal.prior_std[nominal.live]
@@ -73,26 +64,28 @@ def mixed_design(problem: DesignProblem, config: CellConfig, work: PredictionPos
     coordinates = _coordinates(information, flat, sample)
     count = int(flat.sum()) + coordinates.random.shape[1]
     rows = np.zeros((*problem.units.rows.shape[:2], count))
-    for units, part in all_rows():
-        rows[units, : part.shape[1]] = coordinates.whitened(part)
+    for members, part in all_rows():
+        rows[members, : part.shape[1]] = coordinates.whitened(part)
     v = coordinates.columns(position_derivative(nominal, work, effects, scale)).reshape(-1, count)
     prior = np.eye(count)
     prior[: coordinates.flat.shape[1], : coordinates.flat.shape[1]] = coordinates.prior
     names = [t.name for t, free in zip(problem.terms, flat, strict=False) if free]
     names += [f"direction {k}" for k in range(1, coordinates.random.shape[1] + 1)]
     c = v.T @ v / len(work.q)
-    return MixedDesign(CandidateSet(rows, problem.units.cost), prior, c, tuple(names))
+    units = CandidateSet(rows, problem.units.cost)
+    return Objective(units, MeanVariance(c), prior, tuple(names))
 
 
-def balanced(design: MixedDesign) -> MixedDesign:
-    """Return the problem in coordinates in which the information of all units is the identity.
+def balanced(design: Objective) -> Objective:
+    """Return an objective in coordinates in which the information of all units is the identity.
 
     tr(C M⁻¹) does not depend on coordinates. After a fit, some directions are known 10⁶ times as
-    well as others, and rounding would decide. A problem that leaves a coordinate undetermined is
+    well as others, and rounding would decide. An objective that leaves a coordinate undetermined is
     returned unchanged, with its names.
     """
-    units = design.units
-    total = design.prior + units.information(np.full(len(units), 1.0 / len(units)))
+    units, criterion = design.units, design.criterion
+    assert isinstance(criterion, MeanVariance)  # noqa: S101  (of `mixed_design`)
+    total = design.information(np.full(len(units), 1.0 / len(units)))
     size = np.sqrt(np.diag(total))
     if not np.all(size > 0):
         return design
@@ -100,10 +93,10 @@ def balanced(design: MixedDesign) -> MixedDesign:
     if inverted is None:
         return design
     turn = np.linalg.cholesky(inverted[0] @ inverted[0].T) / size[:, None]
-    rows = units.rows @ turn
+    turned = CandidateSet(units.rows @ turn, units.cost)
     names = tuple(f"direction {k}" for k in range(1, len(size) + 1))
-    prior, c = (0.5 * (m + m.T) for m in (turn.T @ m @ turn for m in (design.prior, design.c)))
-    return MixedDesign(CandidateSet(rows, units.cost), prior, c, names)
+    prior, c = (turn.T @ m @ turn for m in (design.prior, criterion.c))
+    return Objective(turned, MeanVariance(0.5 * (c + c.T)), 0.5 * (prior + prior.T), names)
 
 
 def other_effects(nominal: NominalModel, config: CellConfig) -> tuple[tuple[Effect, ...], Floats]:

@@ -7,11 +7,10 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.design.criteria import Pair
+from hilcal.design.criterion import DiscriminatedPairs, Pair
 from hilcal.design.discriminated_pairs import (
     LEAST_POWER,
     LEVEL,
-    DiscriminatedPairs,
     not_ruled_out,
     pair_of,
     power,
@@ -131,7 +130,7 @@ def _pair_powers(
     observable = {e.name for e in problem.families}
     supported = supported_parameters(problem, DRAWS)
     for e in names:
-        betas = [p.beta for p, n in zip(pairs.pairs, pairs.names, strict=True) if n[0] == e]
+        betas = [p.beta for p in pairs.pairs if p.names[0] == e]
         if e in supported:
             betas = list(supported[e] / problem.scale[problem.of_effect(e)])
         for f in names:

@@ -12,22 +12,19 @@ from hilcal.config import CellConfig
 from hilcal.design.approximate_design import ApproximateDesign
 from hilcal.design.choice import (
     EFFORT,
-    Objective,
     canonical,
     certified,
-    choose,
     choose_poses,
     compound_objective,
     costly_loads,
-    only,
     pose_units,
     promising,
 )
-from hilcal.design.criterion import CandidateSet
+from hilcal.design.criterion import CandidateSet, Objective
 from hilcal.design.feasible import DrawnPoses, Space, draw
 from hilcal.design.information import DesignProblem, problem, reading_covariance, readings_of
 from hilcal.design.nominal_model import after, nominal_model
-from hilcal.design.optimum import Design
+from hilcal.design.optimum import Design, best
 from hilcal.design.predicted import (
     PredictedUncertainty,
     PredictionPoses,
@@ -241,7 +238,8 @@ def make(
             )
         else:
             start = relaxed.among(usable)
-            design = choose(only(objective, usable), budget, rng, request.effort, start)
+            asked = objective.among(usable)
+            design = best(asked, budget, rng, effort=request.effort, relaxed=start)
             counts = np.zeros(len(usable), dtype=np.int64)
             counts[usable] = design.counts
         units = np.flatnonzero(counts)

@@ -11,16 +11,17 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
+from hilcal.design.approximate_design import relax
 from hilcal.design.choice import (
+    LOOSE,
     certified,
-    choose,
     choose_poses,
     compound_objective,
-    only,
     pose_units,
     unknown,
 )
 from hilcal.design.information import DesignProblem, reading_derivatives
+from hilcal.design.optimum import best
 from hilcal.design.planner import Planned, Say
 from hilcal.design.predicted import predicted
 from hilcal.design.run_order import Confounding, Duration
@@ -304,7 +305,7 @@ def _criteria(
                 chosen, _ = choose_poses(objective, candidates, among, planned.asked_poses, rng, 1)
                 design = certified(objective, chosen, planned.usable)
             else:
-                design = choose(only(objective, planned.usable), planned.budget, rng, 1)
+                design = best(objective.among(planned.usable), planned.budget, rng, effort=1)
         except CannotAnswerError:
             continue
         counts = np.zeros(len(problem.units))
@@ -346,7 +347,7 @@ def _prefixes(problem: DesignProblem, *roles: Role) -> tuple[str, ...]:
 
 def _curve(planned: Planned) -> Iterator[CurvePoint]:
     problem = planned.problem
-    objective, usable = only(planned.asked, planned.usable), np.flatnonzero(planned.usable)
+    objective, usable = planned.asked.among(planned.usable), np.flatnonzero(planned.usable)
     n_poses = len({problem.what[k][0] for k in np.flatnonzero(planned.counts)})
     last, previous = planned.design.relaxed, 0
     for share in SHARES:
@@ -354,7 +355,7 @@ def _curve(planned: Planned) -> Iterator[CurvePoint]:
         if budget < objective.units.cost.max() or poses == previous:
             continue
         previous = poses
-        last = objective.relaxed(budget, start=last)
+        last = relax(objective, budget, tolerance=LOOSE, start=last)
         information = problem.prior + problem.units.information(last.weight, usable[last.index])
         position = _finite(predicted(problem, information=information, work=planned.work).position)
         if position is not None:
