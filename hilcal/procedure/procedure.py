@@ -66,7 +66,7 @@ from hilcal.procedure.validation_plan import corrected_plan, left_out_of, paired
 from hilcal.readings.covariance import COVERS, INSTRUMENT
 from hilcal.readings.readings import ArmScatter, Readings
 from hilcal.readings.same_readings import already
-from hilcal.readings.whitening import Mode, usual_mode
+from hilcal.readings.whitening import usual_mode
 from hilcal.refinement import Refinement, refine
 from hilcal.refinement import RefinementStep as RefinementStep
 from hilcal.store.campaign_file import CampaignFile
@@ -99,24 +99,15 @@ class Procedure:
     >>> p = hc.Procedure.at("new.hilcal", hc.Cell.load(CELL), poses=6)
     >>> p.next().kind
     'plan'
-
-    Attributes:
-        run: the campaign file that is fitted; the others are in the same directory.
-        cell: the cell as configured.
-        config: its configuration.
-        base_dir: directory that paths in the configuration are relative to.
-        catalogue: the effects that a model can have.
-        settings: goals, sizes and seed.
-        known: the prior of every fit, from `settings.prior`; None without one.
     """
 
-    run: Path
-    cell: Cell
+    run: Path  # the campaign file that is fitted; the others are in the same directory
+    cell: Cell  # as configured
     config: CellConfig
-    base_dir: Path
-    catalogue: Catalogue
-    settings: Settings
-    known: CarriedPrior | None = None
+    base_dir: Path  # that paths in the configuration are relative to
+    catalogue: Catalogue  # the effects that a model can have
+    settings: Settings  # goals, sizes and seed
+    known: CarriedPrior | None = None  # the prior of every fit, from `settings.prior`
     _refinements: list[Refinement] = field(default_factory=list, repr=False)  # the latest, if any
 
     @classmethod
@@ -125,11 +116,7 @@ class Procedure:
     ) -> "Procedure":
         """Begin a calibration, or resume that of an existing campaign file.
 
-        Args:
-            run: the campaign file; the others go into the same directory.
-            cell: from `Cell.load`.
-            catalogue: the effects that a model can have; the installed ones unless given.
-            **options: fields of `Settings`; by default those of the existing calibration.
+        The options are fields of `Settings`; by default those of the existing calibration.
         """
         path, config, effects = Path(run), cell.configured(), catalogue or installed()
         if path.exists():
@@ -154,8 +141,6 @@ class Procedure:
     def next(self) -> ProcedureStep:
         """Return the next step."""
         return next_step(self.run)
-
-    # the first plan
 
     def plan(self, say: Say = lambda text: None) -> CheckedPlan:
         """Choose the first plan, unstored; a CannotAnswerError for a cell with too few poses."""
@@ -189,14 +174,10 @@ class Procedure:
         if stored is None or stored["settings"] != settings:
             log.append(BEGUN, {"settings": settings})
 
-    # measuring
-
     def measure(self, step: ProcedureStep, measure: Measure) -> int:
         """Measure the missing readings of a plan; return the number that its campaign then holds.
 
-        Raises:
-            DeviceError: a device failed; the readings so far are stored.
-            KeyboardInterrupt: interrupted; the readings so far are stored.
+        After a DeviceError or a KeyboardInterrupt, the readings so far are stored.
         """
         epoch = None if step.path == self.run else self._epoch()
         with CampaignFile.open(step.path) as campaign:
@@ -209,8 +190,6 @@ class Procedure:
             details = RunLog(campaign).details() if campaign.about(PLAN) is not None else []
         return float(details[0]["epoch_wall_s"]) if details else None
 
-    # fitting
-
     def refine(
         self,
         say: Say = lambda text: None,
@@ -218,15 +197,11 @@ class Procedure:
     ) -> Refinement:
         """Fit, diagnose, and change the model until it is adequate; all revisions are stored.
 
-        Args:
-            say: takes progress.
-            seen: takes each step as soon as it is diagnosed, after the number of its revision.
-
-        Raises:
-            CannotAnswerError: the readings do not determine the baseline.
+        `seen` takes each step as soon as it is diagnosed, after the number of its revision. A
+        CannotAnswerError where the readings do not determine the baseline.
         """
         with Campaign.open(self.run, self.catalogue) as o:
-            mode = self._mode(o.readings)
+            mode = usual_mode(o.readings, self.settings.readings)
             say("registering")
             model = baseline(o.cell, o.readings, mode, o.catalogue, self.known)
             numbers = itertools.count(len(o.file.revisions()) + 1)
@@ -255,9 +230,8 @@ class Procedure:
                 say(f"diagnosing revision {record.number}")
                 d = diagnose(o.restore(record), o.history(record.number), say)
             rng = self._rng(_FURTHER, len(run.plans))
-            reference = reference_of(run.plans[0])
             site = (self.cell, self._planned(), self.settings)
-            decision = FurtherMeasuring(*site, d, run.plans, reference, rng, say).decide()
+            decision = FurtherMeasuring(*site, d, run.plans, rng, say).decide()
             plan = decision.plan if decision.measures else None
             if plan is not None:
                 plan = run.with_new_names(plan)  # `run` checks every motion of it
@@ -272,15 +246,8 @@ class Procedure:
 
     def compute(self, step: ProcedureStep, say: Say = lambda text: None) -> object:
         """Do a step in which nothing moves, other than "plan"; return its result."""
-        steps: dict[str, Callable[[Say], object]] = {
-            "refine": self.refine,
-            "decide": self.decide,
-            "plan_validation": self.plan_validation,
-            "validate": self.validate,
-            "correct": self.correct,
-            "compare": self.compare,
-        }
-        return steps[step.kind](say)
+        result: object = getattr(self, step.kind)(say)
+        return result
 
     def predicted(self) -> PredictedError:
         """Predict the error after compensation with the last model."""
@@ -288,23 +255,15 @@ class Procedure:
             calibration, record = self._calibration(o)
             return predicted_error(calibration, o.fitted_readings(record).states, self.config)
 
-    # testing what is never fitted
-
     def plan_validation(self, say: Say = lambda text: None) -> Plan:
         """Choose poses and loads of the validation campaign, and make its file."""
         with Campaign.open(self.run, self.catalogue, read_only=True) as o:
             say("restoring the model")
             calibration, record = self._calibration(o)
+            fitted, rng = o.fitted_readings(record), self._rng(_VALIDATING)
+            reference = reference_in(o.file)
             plan = validation_plan(
-                self.cell,
-                self.config,
-                calibration,
-                o.fitted_readings(record),
-                reference_in(o.file),
-                self.settings.validation,
-                self._rng(_VALIDATING),
-                say,
-                under_load=self.settings.under_load,
+                self.cell, self.config, calibration, fitted, reference, self.settings, rng, say
             )
             self._create(self.files.validation, VALIDATION, plan, o)
         return plan
@@ -327,7 +286,7 @@ class Procedure:
                 )
             say(f"predicting {len(readings)} readings")
             model, theta = o.restore_model(record)
-            mode = self._mode(fitted)
+            mode = usual_mode(fitted, self.settings.readings)
             prediction = validation.validate(model, theta, fitted, readings, mode)
             beyond = extrapolation(o.predictive(record, model, theta), fitted, prediction)
             shares = acceptance(prediction, beyond)
@@ -361,17 +320,9 @@ class Procedure:
             calibration, record = self._calibration(o)
             readings = self._readings(o, record, unseen)
             measured_plan = read_plan(unseen.about(PLAN) or "", f"{unseen.path}, its plan")
-            reference = reference_of(measured_plan)
-            time = readings.states.time
+            reference, rng = reference_of(measured_plan), self._rng(_CORRECTING)
             plan = corrected_plan(
-                self.cell,
-                self.config,
-                calibration,
-                readings,
-                readings.states.q[0] if reference is None else reference,
-                0.0 if time is None else float(time[-1]),
-                self._rng(_CORRECTING),
-                say,
+                self.cell, self.config, calibration, readings, reference, rng, say
             )
             self._create(self.files.corrected, CORRECTED, plan, o)
         return plan
@@ -397,8 +348,6 @@ class Procedure:
                 log.append(IMPROVED, {**content, **gain.to_dict()})
         return gain
 
-    # what the steps share
-
     def _rng(self, *stream: int) -> np.random.Generator:
         return np.random.default_rng([self.settings.seed, *stream])
 
@@ -406,10 +355,6 @@ class Procedure:
         """Return the configuration for planning, with the kind of readings that is fitted."""
         planning = self.config.planning.model_copy(update={"readings": self.settings.readings})
         return self.config.model_copy(update={"planning": planning})
-
-    def _mode(self, readings: Readings) -> Mode:
-        """Return the kind of readings to fit; deflections only where the readings allow."""
-        return usual_mode(readings, self.settings.readings)
 
     def _record(self, o: Campaign) -> RevisionRecord:
         refined = ProcedureLog(o.file).last(REFINED)
@@ -434,11 +379,8 @@ class Procedure:
         return with_arm_scatter(cell, readings, ArmScatter.from_json(scatter))
 
     def _create(self, path: Path, purpose: str, plan: Plan, o: Campaign) -> None:
-        texts = {
-            PURPOSE: purpose,
-            CALIBRATION: identity(self.run),
-            COVERS: o.file.about(COVERS) or INSTRUMENT,
-        }
+        covers = o.file.about(COVERS) or INSTRUMENT
+        texts = {PURPOSE: purpose, CALIBRATION: identity(self.run), COVERS: covers}
         config = CellConfig.from_json(o.file.config_json)
         source = self._source(f"{purpose} campaign of {self.run.name}, ")
         create_run(path, config, self.base_dir, plan, source=source, more=texts).close()

@@ -131,18 +131,13 @@ class Arm(Brief):
 
     def along(self, wrench: Floats) -> Floats:
         """Return torques or forces (..., n) along the joints, from wrenches (..., n + 1, 6)."""
-        torque = wrench[..., :-1, 5]
-        if self.prismatic is None:
-            return torque
-        return np.where(self.prismatic, wrench[..., :-1, 2], torque)
+        return np.where(self.slides, wrench[..., :-1, 2], wrench[..., :-1, 5])
 
     def phases(self, q: Floats) -> Floats:
         """Return phases (..., n) for periodic laws, rad; of a slide, one turn over its travel."""
-        angle = self.drive_angles(q)
-        if self.prismatic is None:
-            return angle
-        turn = 2 * np.pi / np.where(self.prismatic, self.q_max - self.q_min, 1.0)
-        return np.where(self.prismatic, angle * turn, angle)
+        angle, slides = self.drive_angles(q), self.slides
+        turn = 2 * np.pi / np.where(slides, self.q_max - self.q_min, 1.0)
+        return np.where(slides, angle * turn, angle)
 
     def chain_angles(self, q: Floats) -> Floats:
         """Return angles (..., n) θ of the chain's joints, from the controller's values."""
@@ -180,10 +175,9 @@ class Arm(Brief):
 
     def __post_init__(self) -> None:
         """Refuse too many joints, and a slide without limits."""
-        if self.prismatic is not None:
-            travel = (self.q_max - self.q_min)[self.prismatic]
-            if not np.all(np.isfinite(travel) & (travel > 0.0)):
-                raise InputError(f"{self.name}: a prismatic joint needs two limits, in m")
+        travel = (self.q_max - self.q_min)[self.slides]
+        if not np.all(np.isfinite(travel) & (travel > 0.0)):
+            raise InputError(f"{self.name}: a prismatic joint needs two limits, in m")
         if self.n > limits.JOINTS:
             raise InputError(f"{self.name}: {self.n} joints; valid: at most {limits.JOINTS}")
 
@@ -200,10 +194,7 @@ class Arm(Brief):
     @property
     def travels(self) -> Floats:
         """(n,) largest distances of slides from their zeros, m; 0 of revolute joints."""
-        if self.prismatic is None:
-            return np.zeros(self.n)
-        far = np.maximum(np.abs(self.q_min), np.abs(self.q_max))
-        return np.where(self.prismatic, far, 0.0)
+        return np.where(self.slides, np.maximum(np.abs(self.q_min), np.abs(self.q_max)), 0.0)
 
 
 _HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])  # Rx(π): Rz(−θ) = Rx(π) Rz(θ) Rx(π)

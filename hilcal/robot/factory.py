@@ -101,9 +101,12 @@ def _why(error: Exception) -> str:
 
 
 def read_factory(path: Path, nominal: Arm, text: str | None = None) -> FactoryKinematics:
-    """Read a file of one arm's kinematics; a calibration.conf adds to the nominal arm."""
-    kind = path.suffix.lower()
-    reader = {".conf": _of_conf, ".yaml": _of_yaml, ".yml": _of_yaml, ".toml": _of_toml}.get(kind)
+    """Read a file of one arm's kinematics; a calibration.conf adds to the nominal arm.
+
+    The kinematics of another arm are refused.
+    """
+    readers = {".conf": _of_conf, ".yaml": _of_yaml, ".yml": _of_yaml, ".toml": _of_toml}
+    reader = readers.get(path.suffix.lower())
     if reader is None:
         raise InputError(f"{path}: not the kinematics of an arm; valid: {KINDS}")
     try:
@@ -117,18 +120,13 @@ def read_factory(path: Path, nominal: Arm, text: str | None = None) -> FactoryKi
         raise InputError(
             f"{path}: not the kinematics of an arm ({_why(error)}); valid: {KINDS}"
         ) from None
-    check_of(factory, nominal)
-    return factory
-
-
-def check_of(factory: FactoryKinematics, nominal: Arm) -> None:
-    """Refuse the kinematics of another arm."""
     difference = flange_difference(with_factory(nominal, factory), nominal)[1]
     if not difference < FAR:
         raise InputError(
             f"{factory.source}: of another arm than {nominal.name}: its flange lies up to "
             f"{1e3 * difference:.0f} mm from where that one's does"
         )
+    return factory
 
 
 def with_factory(nominal: Arm, factory: FactoryKinematics) -> Arm:

@@ -116,10 +116,9 @@ def body_poses(arm: Arm, q: Floats, chain: Chain | None = None) -> Floats:
     out[:, 1:, :3, 3] = np.swapaxes(chain.position, 0, 1)
     turn = np.tile(np.eye(3), (len(q), arm.n, 1, 1))
     angle = arm.chain_angles(q)
-    if arm.prismatic is not None:
-        along = np.swapaxes(chain.rotation[:-1, :, :, 2], 0, 1)
-        out[:, 1:-1, :3, 3] += along * (angle * arm.prismatic)[..., None]
-        angle = angle * ~arm.prismatic
+    along = np.swapaxes(chain.rotation[:-1, :, :, 2], 0, 1)
+    out[:, 1:-1, :3, 3] += along * (angle * arm.slides)[..., None]
+    angle = angle * ~arm.slides
     turn[..., 0, 0] = turn[..., 1, 1] = np.cos(angle)
     turn[..., 1, 0] = np.sin(angle)
     turn[..., 0, 1] = -turn[..., 1, 0]
@@ -129,8 +128,7 @@ def body_poses(arm: Arm, q: Floats, chain: Chain | None = None) -> Floats:
 
 def flange_capsule(arm: Arm, name: str, start: Floats, end: Floats, radius: float) -> Capsule:
     """Return a capsule fixed to the flange, between two ends (3,), flange axes, m."""
-    axes, origin = arm.links[arm.n][:3, :3], arm.links[arm.n][:3, 3]
-    return Capsule(name, arm.n, origin + axes @ start, origin + axes @ end, radius)
+    return Capsule(name, arm.n, on_flange(arm, start), on_flange(arm, end), radius)
 
 
 def _of_ur(arm: Arm, figures: Figures) -> tuple[Capsule, ...]:
@@ -144,7 +142,7 @@ def _of_ur(arm: Arm, figures: Figures) -> tuple[Capsule, ...]:
     top = np.array([0.0, 0.0, d1])
     spin = arm.links[4][:3, 2]  # the second wrist's axis, in the frame of body 4
     d5 = float(arm.links[5][2, 3])
-    out = [
+    return (
         _housing(BASE, 0, np.zeros(3), 0.0, 0.6 * d1, r1),
         Capsule("shoulder", 1, 0.6 * top, top, r1),
         Capsule("shoulder", 1, top, top + 0.5 * outer * lift, r2),
@@ -158,8 +156,7 @@ def _of_ur(arm: Arm, figures: Figures) -> tuple[Capsule, ...]:
         Capsule("wrist 1", 4, d4 * _Z, d4 * _Z + 0.4 * d5 * spin, r4),
         _housing("wrist 2", 5, np.zeros(3), 0.4 * d5, d5 + r4, r4),
         Capsule("wrist 3", 6, np.zeros(3), arm.links[6][:3, 3] - _RIM * r4 * _Z, r4),
-    ]
-    return tuple(out)
+    )
 
 
 def _housing(
@@ -178,12 +175,12 @@ def _of_any(arm: Arm) -> tuple[Capsule, ...]:
     reach = max(arm.reach - float(arm.travels.sum()), 0.1)
     radii = np.linspace(_THICK, _THIN, arm.n + 1) * reach
     names = (BASE, *arm.joint_names)
-    out = []
-    for k, link in enumerate(arm.links):
-        end = link[:3, 3]
-        if float(np.linalg.norm(end)) > _LEAST_LINK:
-            out.append(Capsule(names[k], k, np.zeros(3), end, float(radii[k])))
-    return tuple(out)
+    ends = enumerate(arm.links[:, :3, 3])
+    return tuple(
+        Capsule(names[k], k, np.zeros(3), end, float(radii[k]))
+        for k, end in ends
+        if float(np.linalg.norm(end)) > _LEAST_LINK
+    )
 
 
 def pinocchio_model(arm: Arm) -> "pin.Model":
@@ -232,13 +229,6 @@ class Scene:
 
     Pairs within one body and of neighbouring bodies are not checked, nor are pairs whose crude
     shapes touch in a large share of all states, as about a spherical wrist.
-
-    Attributes:
-        parts: capsules of the arm, then those on the flange.
-        rates: (P, n) largest motion of a point of a part per radian of a joint, m.
-        itself: pairs of parts.
-        around: parts and obstacles, without base and shoulder, which stand at the mounting.
-        free: parts and obstacles against a segment that comes with the states.
     """
 
     def __init__(
@@ -246,12 +236,13 @@ class Scene:
     ) -> None:
         """Build the shapes."""
         self.arm, self.model = arm, pinocchio_model(arm)
-        self.parts = (*capsules(arm), *carried)
+        self.parts = (*capsules(arm), *carried)  # carried ones are on the flange
         self.things = [(thing.name, *_obstacle(thing)) for thing in obstacles]
         joints = range(1, arm.n + 1)
         ends = [(part.body, np.array([part.start, part.end])) for part in self.parts]
         far = np.array([[from_axis(arm, body, end, i) for i in joints] for body, end in ends])
         bodies = np.array([part.body for part in self.parts])
+        # (P, n) largest motion of a point of a part per radian of a joint, m
         self.rates = np.where(np.arange(1, arm.n + 1) <= bodies[:, None], far, 0.0)
         count = len(self.parts)
         last = count + len(self.things)
@@ -261,12 +252,13 @@ class Scene:
             for b in range(a + 1, count)
             if abs(self.parts[a].body - self.parts[b].body) > 1
         ]
-        around = [
+        around = [  # without base and shoulder, which stand at the mounting
             (a, b) for a in range(count) if self.parts[a].body > 1 for b in range(count, last)
         ]
         checked = self._not_always(distant)
         self.itself = Pairs(self, checked, [self._approach(a, b, far) for a, b in checked])
         self.around = Pairs(self, around, [self.rates[a] for a, _ in around])
+        # parts and obstacles against a segment that comes with the states
         self.free = Pairs(self, [(a, last) for a in range(last)])
 
     def towards(self, point: Floats) -> Floats:
@@ -315,6 +307,7 @@ class Pairs:
         """Build the shapes of a scene: parts, obstacles, and a free segment."""
         import pinocchio as pin
 
+        self._pin = pin
         self.rates = np.reshape(rates, (-1, scene.arm.n))
         self._arm, self._model, self._pairs = scene.arm, scene.model, tuple(pairs)
         self._data, self._geometry = scene.model.createData(), pin.GeometryModel()
@@ -335,63 +328,50 @@ class Pairs:
         self, q: Floats, margin: float | Floats = 0.0, segment: Segment | None = None
     ) -> Bools:
         """Return (N,) in which states (N, n) any pair is closer than its margin, m."""
-        import pinocchio as pin
-
         out = np.zeros(len(q), dtype=np.bool_)
         if not self._pairs:
             return out
         self._prepare(margin, segment)
-        placements = None if segment is None else _placements(segment, len(q))
+        placements = _placements(segment, len(q))
         for i, turned in enumerate(np.ascontiguousarray(self._arm.chain_angles(q))):
             self._place(turned, placements, i)
-            out[i] = pin.computeCollisions(self._geometry, self._state, True)
+            out[i] = self._pin.computeCollisions(self._geometry, self._state, True)
         return out
 
     def named(
         self, q: Floats, margin: float = 0.0, segment: Segment | None = None
     ) -> dict[tuple[str, str], float]:
         """Return the pairs closer than a margin in any state (N, n), and their distance, m."""
-        import pinocchio as pin
-
         out: dict[tuple[str, str], float] = {}
-        hits = np.flatnonzero(self.touching(q, margin, segment))
-        if not len(hits):
-            return out
-        placements = None if segment is None else _placements(segment, len(q))
-        for i in hits.tolist():
+        placements = _placements(segment, len(q))
+        for i in np.flatnonzero(self.touching(q, margin, segment)).tolist():
             self._place(self._arm.chain_angles(q[i]), placements, i)
             for k, (a, b) in enumerate(self._pairs):
                 active = self._state.activeCollisionPairs[k]
-                if active and pin.computeCollision(self._geometry, self._state, k):
+                if active and self._pin.computeCollision(self._geometry, self._state, k):
                     name = self._names[a], self._names[b] if segment is None else segment.name
                     out[name] = min(out.get(name, np.inf), self._gap(k))
         return out
 
     def how_often(self, q: Floats, margin: float = 0.0) -> Floats:
         """Return the share (K,) of the states in which each pair is closer than a margin, m."""
-        import pinocchio as pin
-
         count = np.zeros(len(self._pairs))
         self._prepare(margin, None)
         for turned in self._arm.chain_angles(q):
             self._place(turned)
-            pin.computeCollisions(self._geometry, self._state, False)
+            self._pin.computeCollisions(self._geometry, self._state, False)
             count += [result.isCollision() for result in self._state.collisionResults]
         return np.asarray(count / len(q))
 
     def distance(self, q: Floats, segment: Segment | None = None) -> float:
         """Return the least distance in one state (n,), m; negative where shapes overlap."""
         self._prepare(0.0, segment)
-        self._place(self._arm.chain_angles(q), None if segment is None else _placements(segment, 1))
+        self._place(self._arm.chain_angles(q), _placements(segment, 1))
         active = self._state.activeCollisionPairs
-        return min(
-            (self._gap(k) for k in range(len(self._pairs)) if active[k]), default=float("inf")
-        )
+        return min((self._gap(k) for k in range(len(self._pairs)) if active[k]), default=np.inf)
 
     def _gap(self, k: int) -> float:
-        import pinocchio as pin
-
-        return float(pin.computeDistance(self._geometry, self._state, k).min_distance)
+        return float(self._pin.computeDistance(self._geometry, self._state, k).min_distance)
 
     def _prepare(self, margin: float | Floats, segment: Segment | None) -> None:
         """Set the margins of all pairs, and activate the pairs to check."""
@@ -406,8 +386,7 @@ class Pairs:
                 self._state.activeCollisionPairs[k] = self._names[a] not in segment.ignored
 
     def _place(self, turned: Floats, placements: "_Placements | None" = None, i: int = 0) -> None:
-        import pinocchio as pin
-
+        pin = self._pin
         pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._state, turned)
         if placements is not None:
             half, turn, middle = placements
@@ -465,7 +444,9 @@ def _spread(count: int, n: int) -> Floats:
 _Placements = tuple[Floats, Floats, Floats]  # half lengths (N,), axes (N, 3, 3), middles (N, 3)
 
 
-def _placements(segment: Segment, count: int) -> _Placements:
+def _placements(segment: Segment | None, count: int) -> _Placements | None:
+    if segment is None:
+        return None
     shape = (count, 3)
     start, end = np.broadcast_to(segment.start, shape), np.broadcast_to(segment.end, shape)
     way = end - start

@@ -85,7 +85,7 @@ _B_SLOPE, _C_SLOPE = ([k * c for k, c in enumerate(series)][1:] for series in (_
 
 def cross(a: Floats, b: Floats) -> Floats:
     """Return the cross product a × b over the last axis; (..., 3), broadcast."""
-    out = empty(*_shape(a.shape, b.shape))
+    out = empty(*np.broadcast_shapes(a.shape, b.shape))
     # memory runs along the states, even if a or b is the same in all states
     part = empty(*out.shape[:-1])
     for axis in range(3):
@@ -98,13 +98,13 @@ def cross(a: Floats, b: Floats) -> Floats:
 
 def apply(r: Floats, v: Floats) -> Floats:
     """Return matrices times vectors; (..., 3, 3), (..., 3) -> (..., 3), broadcast."""
-    out = empty(*_shape(r.shape[:-1], v.shape))
+    out = empty(*np.broadcast_shapes(r.shape[:-1], v.shape))
     return np.asarray(np.einsum("...ij,...j->...i", r, v, out=out))
 
 
 def product(a: Floats, b: Floats) -> Floats:
     """Return matrices times matrices; (..., i, j), (..., j, k) -> (..., i, k), broadcast."""
-    lead = _shape(a.shape[:-2], b.shape[:-2])
+    lead = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
     out = empty(*lead, a.shape[-2], b.shape[-1])
     return np.asarray(np.einsum("...ij,...jk->...ik", a, b, out=out))
 
@@ -251,10 +251,6 @@ def right_jacobian_blocks(twist: Floats) -> tuple[Floats, Floats]:
     q += cv[..., :, None] * w[..., None, :]
     q += w[..., :, None] * cv[..., None, :]
     return j, q
-
-
-def _shape(a: tuple[int, ...], b: tuple[int, ...]) -> tuple[int, ...]:
-    return a if a == b else np.broadcast_shapes(a, b)
 
 
 def _square(w: Floats) -> Floats:
