@@ -44,25 +44,10 @@ class Space(Feasibility):
     def __init__(self, cell: Cell, config: CellConfig, margins: Margins = PLANNED) -> None:
         """Build the shapes once."""
         super().__init__(cell, config, margins)
-
-    @property
-    def low(self) -> Floats:
-        """(n,) lowest usable joint values, rad or m; at most half a turn."""
-        return np.asarray(self.cell.arm.usual_range[0] + self._margin)
-
-    @property
-    def high(self) -> Floats:
-        """(n,) highest usable joint values, rad or m; at most half a turn."""
-        return np.asarray(self.cell.arm.usual_range[1] - self._margin)
-
-    @property
-    def _margin(self) -> float:
-        return self.config.limits.joint_margin_rad + self.margins.joint
-
-    @property
-    def loads(self) -> tuple[str, ...]:
-        """1 + L names of the loads, "none" first."""
-        return (UNLOADED, *(load.name for load in self.config.loads))
+        low, high = cell.arm.usual_range
+        margin = config.limits.joint_margin_rad + margins.joint
+        self.low, self.high = low + margin, high - margin  # (n,) usable joint values, rad or m
+        self.loads = (UNLOADED, *(load.name for load in config.loads))  # names, "none" first
 
     @property
     def remarks(self) -> tuple[str, ...]:

@@ -75,18 +75,14 @@ def measure_next(
     names = tuple(dict.fromkeys(suspects))
     if len(names) < 2:
         raise InputError(f"{len(names)} suspects; two or more are needed to separate them")
-    update = {
-        "readings": fit.mode,
-        "against": names,
-        "candidates": min(config.planning.candidates, CANDIDATES),
-    }
+    count = min(config.planning.candidates, CANDIDATES)
+    update = {"readings": fit.mode, "against": names, "candidates": count}
     planning = config.planning.model_copy(update=update)
     config = config.model_copy(update={"planning": planning})
     readings = request.readings or request.poses * (1 + len(config.loads))
+    asked = replace(request, criterion="separate", readings=readings)
     try:
-        planned = make(
-            cell, config, replace(request, criterion="separate", readings=readings), rng, fit, say
-        )
+        planned = make(cell, config, asked, rng, fit, say)
     except InputError as error:
         if "effects to tell apart" not in str(error):
             raise
@@ -247,9 +243,8 @@ def measure_poses(
     count = max(SPARE * poses, LEAST)
     planning = config.planning.model_copy(update={"readings": fit.mode, "candidates": count})
     config = config.model_copy(update={"loads": [], "planning": planning})
-    planned = make(
-        cell, config, Request(poses, readings=poses, criterion=CRITERION, effort=0), rng, fit, say
-    )
+    request = Request(poses, readings=poses, criterion=CRITERION, effort=0)
+    planned = make(cell, config, request, rng, fit, say)
     say("spreading the poses")
     problem, space = planned.problem, Space(cell, config)
     home = planned.ordered.plan.q[0] if reference is None else reference

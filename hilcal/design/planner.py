@@ -31,13 +31,14 @@ from hilcal.design.predicted import (
     predicted,
     prediction_poses,
 )
-from hilcal.design.run_order import Chosen, Ordered, Ordering, order_plan, pace
+from hilcal.design.run_order import Chosen, Ordered, Ordering, order_plan
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.per_joint import PerJoint
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.carried import CarriedPrior
 from hilcal.identification.fit import Fit
 from hilcal.identification.registration import MIN_POSES
+from hilcal.measuring.route import seconds_at_rest
 from hilcal.regression.normal_equations import INFORMATION
 from hilcal.regression.schur import DETERMINED
 from hilcal.store.plan import UNLOADED
@@ -89,7 +90,7 @@ def without_undetermined(
         return problem, ()
     undetermined = tuple(_named(problem, k, confounded) for k, confounded in omitted.items())
     if len(omitted) == int(flat.sum()):
-        raise CannotAnswerError("; ".join(dict.fromkeys(f.remark for f in undetermined[:1])))
+        raise CannotAnswerError(undetermined[0].remark)
     retained = np.setdiff1d(np.arange(len(problem.terms)), list(omitted))
     of_model, carried = retained[retained < size], problem.nominal.carried
     nominal = replace(
@@ -111,11 +112,10 @@ def without_undetermined(
 
 def _undetermined(m: Floats, flat: Bools) -> Iterator[tuple[int, Ints]]:
     """Yield the parameters that M (P, P) does not determine, with those confounded with each."""
-    retained = np.arange(len(m))
     blind = np.flatnonzero(flat & (np.diag(m) < INFORMATION**2))
     for k in blind:
         yield int(k), np.zeros(0, dtype=np.int64)
-    retained = np.setdiff1d(retained, blind)
+    retained = np.setdiff1d(np.arange(len(m)), blind)
     while flat[retained].any():
         root = np.sqrt(np.diag(m)[retained])
         values, vectors = np.linalg.eigh(m[np.ix_(retained, retained)] / np.outer(root, root))
@@ -129,8 +129,7 @@ def _undetermined(m: Floats, flat: Bools) -> Iterator[tuple[int, Ints]]:
 
 
 def _named(problem: DesignProblem, k: int, confounded: Ints) -> UndeterminedParameter:
-    term = problem.terms[k]
-    joint = ""
+    term, joint = problem.terms[k], ""
     for e in problem.nominal.model.effects:
         if isinstance(e, PerJoint) and e.role == "baseline" and e.name == term.effect:
             names = [f"{e.name}.{p.name}" for p in e.parameters]
@@ -219,8 +218,8 @@ def make(
     costly: tuple[tuple[str, float], ...] = ()
     if by_poses:
         say("weighing what each load costs")
-        seconds = pace(config)
-        costly = costly_loads(objective, reduced, budget, seconds.change_s / seconds.reading_s, rng)
+        change = config.planning.load_change_s / seconds_at_rest(config)
+        costly = costly_loads(objective, reduced, budget, change, rng)
     say(f"choosing poses by criterion {criterion}")
     pose_of = np.array([pose for pose, _ in reduced.what])
     first, relaxed = promising(objective, budget)
@@ -263,10 +262,8 @@ def make(
         )
     say("ordering the readings")
     repeats = max(2, (visited - 1) // 10)
-    sampled = reduced.candidates[slice(0, SAMPLE)].states()
-    covariance = reading_covariance(
-        reduced.nominal, config, reduced.nominal.model.predict(sampled, reduced.nominal.theta)
-    )
+    sampled, nominal = reduced.candidates[slice(0, SAMPLE)].states(), reduced.nominal
+    covariance = reading_covariance(nominal, config, nominal.model.predict(sampled, nominal.theta))
     std = float(np.sqrt(np.mean(np.diagonal(covariance[:, :3, :3], axis1=1, axis2=2))))
     ordering = Ordering(unloaded=request.unloaded, repeats=repeats, reading_std=std)
     order = ordered(space, reduced, home, counts, rng, ordering)
@@ -315,10 +312,9 @@ def _reference(space: Space, drawn: DrawnPoses, rng: np.random.Generator) -> tup
 def _unreachable(space: Space, problem: DesignProblem, home: Floats, units: Ints) -> Ints:
     """Return the poses of the units that no clear straight motion reaches from home."""
     by_load: dict[str, set[int]] = {}
-    for k in units:
-        pose, loads = problem.what[k]
-        for load in readings_of((pose, loads), problem.mode):
-            by_load.setdefault(load, set()).add(pose)
+    for unit in (problem.what[k] for k in units):
+        for load in readings_of(unit, problem.mode):
+            by_load.setdefault(load, set()).add(unit[0])
     unreachable: set[int] = set()
     for load, poses in by_load.items():
         indices = np.array(sorted(poses))
@@ -336,16 +332,9 @@ def ordered(
     ordering: Ordering,
 ) -> Ordered:
     """Name the poses of the chosen units p1, p2, ..., and put their readings in order."""
-    used = np.flatnonzero(counts)
-    poses = sorted({problem.what[k][0] for k in used})
+    units = [(problem.what[k], int(counts[k])) for k in np.flatnonzero(counts)]
+    poses = sorted({pose for (pose, _), _ in units})
     names = {pose: f"p{k}" for k, pose in enumerate(poses, start=1)}
-    chosen = [
-        Chosen(
-            names[problem.what[k][0]], readings_of(problem.what[k], problem.mode), int(counts[k])
-        )
-        for k in used
-    ]
-    return order_plan(
-        space.cell, space.config, list(names.values()), problem.candidates.q[poses], home, chosen,
-        space.passable, rng, ordering,
-    )  # fmt: skip
+    chosen = [Chosen(names[u[0]], readings_of(u, problem.mode), count) for u, count in units]
+    q, site = problem.candidates.q[poses], (space.cell, space.config)
+    return order_plan(*site, list(names.values()), q, home, chosen, space.passable, rng, ordering)

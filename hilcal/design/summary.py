@@ -221,12 +221,10 @@ def position_note(quantity: str) -> str:
 def _parameters(planned: Planned) -> tuple[PredictedParameter, ...]:
     precision, frames = planned.predicted, _prefixes(planned.problem, *FRAME_ROLES)
     by_name = {
-        name: PredictedParameter(name, float(std), float(value) or None, unit)
-        for name, std, value, unit in zip(
-            precision.names, precision.std, precision.values, precision.units, strict=True
-        )
+        t.name: PredictedParameter(t.name, float(std), t.value or None, t.unit)
+        for t, std in zip(precision.terms, precision.std, strict=True)
         # deflections do not determine the origin of a frame
-        if np.isfinite(std) or not name.startswith(frames)
+        if np.isfinite(std) or not t.name.startswith(frames)
     }
     for u in planned.undetermined:
         by_name[u.name] = PredictedParameter(u.name, np.inf, u.value or None, u.unit)
@@ -260,7 +258,7 @@ def remarks(planned: Planned) -> tuple[str, ...]:
             f"as many readings, at the most informative poses and loads (--readings "
             f"{readings}), are up to {100 / efficiency - 100:.0f} % more efficient",
         )
-    undetermined = tuple(u.remark for u in planned.undetermined)
+    undetermined = (u.remark for u in planned.undetermined)
     notes = (*undetermined, *omitted, *planned.drawn.remarks, *planned.problem.notes)
     return tuple(dict.fromkeys(notes))
 
@@ -324,9 +322,9 @@ def _result(planned: Planned, name: str, counts: Floats, efficiency: float) -> C
     readings = float(counts @ problem.units.cost)
     baseline = _prefixes(problem, "baseline")
     shares = [
-        std / abs(value)
-        for name, std, value in zip(precision.names, precision.std, precision.values, strict=True)
-        if name.startswith(baseline) and value
+        std / abs(t.value)
+        for t, std in zip(precision.terms, precision.std, strict=True)
+        if t.name.startswith(baseline) and t.value
     ]
     volume = float(np.exp(np.mean(np.log(np.maximum(sigma, 1e-300)))))
     return CriterionResult(
@@ -390,8 +388,7 @@ def detectable_effects(planned: Planned, config: CellConfig) -> Iterator[Detecta
             size_m = float(np.sqrt(3.0 * np.mean((displacement[:, columns] @ beta) ** 2)))
             visible = noncentrality > VISIBLE * len(columns)
             strengths.append(size_m / np.sqrt(noncentrality) if visible else np.inf)
-        smallest = float(np.median(strengths))
-        yield DetectableEffect(effect.name, smallest if np.isfinite(smallest) else None)
+        yield DetectableEffect(effect.name, _finite(float(np.median(strengths))))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,7 +22,7 @@ from hilcal.design.optimum import best
 from hilcal.design.predicted import position_derivative, prediction_poses
 from tests.support.campaigns import campaign, cell_of
 from tests.support.fit_cases import based
-from tests.support.plan_cases import config_of, poses_of
+from tests.support.plan_cases import changed, config_of, poses_of
 from tests.support.rows import first
 
 AGAINST = ("joint_tilt_compliance", "link_geometry", "transmission_error")
@@ -31,8 +31,7 @@ STD_RAD = 2e-5
 
 def config(mode):
     found = config_of(mode, against=AGAINST, work_load="none" if mode == "absolute" else "10kg")
-    scatter = found.repeatability.model_copy(update={"joint_std_rad": STD_RAD})
-    return found.model_copy(update={"repeatability": scatter})
+    return changed(found, repeatability={"joint_std_rad": STD_RAD})
 
 
 def scene(mode, *, fitted):
