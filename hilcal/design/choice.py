@@ -150,7 +150,7 @@ def certified(
 
 def promising(objective: Objective, budget: float) -> tuple[Ints, ApproximateDesign]:
     """Return the units of the best prices, of which a plan is likely made, and the optimum."""
-    tolerance = min(KINKED_TOLERANCE, LOOSE) if objective.criterion.kinked else LOOSE
+    tolerance = KINKED_TOLERANCE if objective.criterion.kinked else LOOSE
     relaxed = relax(objective, budget, tolerance=tolerance)
     count = min(2 * len(relaxed.index), len(objective.units))
     best_first = np.argsort(-relaxed.price / objective.units.cost, kind="stable")
@@ -176,20 +176,17 @@ def costly_loads(
         return ()
     current = _value(objective, problem, sample, loads, budget)
     while len(loads) > 1 and current > 0:
-        trials = [
-            (_value(objective, problem, sample, _without(loads, name), budget + change), name)
-            for name in loads
-        ]
-        value, name = max(trials)
+        budget += change
+        without = {name: tuple(load for load in loads if load != name) for name in loads}
+        value, name = max(
+            (_value(objective, problem, sample, others, budget), name)
+            for name, others in without.items()
+        )
         if not value > current * (1.0 + LOOSE):
             break
         costly.append((name, value / current - 1.0))
-        loads, current, budget = _without(loads, name), value, budget + change
+        loads, current = without[name], value
     return tuple(costly)
-
-
-def _without(loads: tuple[str, ...], name: str) -> tuple[str, ...]:
-    return tuple(load for load in loads if load != name)
 
 
 def _value(

@@ -62,7 +62,17 @@ class Space(Feasibility):
         """Return (N,) which states pass one of `REASONS` under a load."""
         if kind == "joint limits":
             return np.asarray(np.all((q >= self.low) & (q <= self.high), axis=1))
-        return self._regular(q) if kind == "singularity" else super().keeps(kind, q, load)
+        if kind != "singularity":
+            return super().keeps(kind, q, load)
+        # σ_min ≥ [planning] singularity · σ_max of the flange's Jacobian over the reach
+        least = self.config.planning.singularity
+        if least == 0.0 or not len(q):
+            return np.ones(len(q), dtype=np.bool_)
+        chain = evaluate(self.cell.arm, q)
+        jacobian = np.array(joint_jacobian(chain, chain.position[-1]))
+        jacobian[:, :3] /= self.cell.arm.reach
+        sigma = np.linalg.svd(jacobian, compute_uv=False)
+        return np.asarray(sigma[:, -1] >= least * sigma[:, 0])
 
     def allowed(
         self, q: Floats, load: str = UNLOADED, kinds: tuple[str, ...] = tuple(REASONS)
@@ -85,17 +95,6 @@ class Space(Feasibility):
             self.allowed(away, load, STATE).all() and self.passable(q, away, load).all()
             for load in loads
         )
-
-    def _regular(self, q: Floats) -> Bools:
-        """Check σ_min ≥ [planning] singularity · σ_max of the flange's Jacobian over the reach."""
-        least = self.config.planning.singularity
-        if least == 0.0 or not len(q):
-            return np.ones(len(q), dtype=np.bool_)
-        chain = evaluate(self.cell.arm, q)
-        jacobian = np.array(joint_jacobian(chain, chain.position[-1]))
-        jacobian[:, :3] /= self.cell.arm.reach
-        sigma = np.linalg.svd(jacobian, compute_uv=False)
-        return np.asarray(sigma[:, -1] >= least * sigma[:, 0])
 
 
 _CHUNK = 1 << 12
@@ -135,6 +134,7 @@ def draw(
 
     sequence = qmc.Sobol(len(low), scramble=False)
     shift = rng.random(len(low))
+    # states left after each reason, and samples of those that it rejects
     remaining, lost = dict.fromkeys(REASONS, 0), dict[str, Floats]()
     parts = [np.empty((0, len(low)))]
     drawn = have = 0
@@ -142,9 +142,16 @@ def draw(
     while have < count and drawn < (most if have else _VAIN):
         u = (sequence.random(_CHUNK) + shift) % 1.0
         q = space.cell.arm.complete(low + u * (high - low))
-        parts.append(_allowed_unloaded(space, q, remaining, lost))
+        for reason in REASONS:
+            if len(q):
+                passes = space.keeps(reason, q, UNLOADED)
+                if not passes.all():
+                    lost[reason] = q[~passes][:_LOOK]
+                q = q[passes]
+            remaining[reason] += len(q)
+        parts.append(q)
         drawn += _CHUNK
-        have += len(parts[-1])
+        have += len(q)
     if have < least:
         raise CannotAnswerError(_too_few(space, drawn, remaining, lost, least))
     q = np.vstack(parts)[:count]
@@ -159,20 +166,6 @@ def draw(
     if len(space.loads) > 1 and not allowed[:, 1:].any():
         raise CannotAnswerError("; ".join(remarks[-(len(space.loads) - 1) :]))
     return DrawnPoses(q, space.loads, allowed, drawn, remaining, tuple(remarks))
-
-
-def _allowed_unloaded(
-    space: Space, q: Floats, remaining: dict[str, int], lost: dict[str, Floats]
-) -> Floats:
-    """Return the states allowed unloaded; count those left, and keep samples of those rejected."""
-    for reason in REASONS:
-        if len(q):
-            passes = space.keeps(reason, q, UNLOADED)
-            if not passes.all():
-                lost[reason] = q[~passes][:_LOOK]
-            q = q[passes]
-        remaining[reason] += len(q)
-    return q
 
 
 def _too_few(

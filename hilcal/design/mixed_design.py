@@ -46,7 +46,9 @@ LEAST = 1e-3  # least motion of the units by a direction of Q, RMS, over the noi
 
 def mixed_design(problem: DesignProblem, config: CellConfig, work: PredictionPoses) -> Objective:
     """Return the objective of predictions with all effects, in the coordinates (b, Qᵀ v)."""
-    nominal, config = problem.nominal, _with_scatter(problem.nominal, config)
+    nominal = problem.nominal
+    if not np.any(config.repeatability.per_joint(nominal.cell.arm.n)):  # not stated
+        config = _with_scatter(nominal, config)
     effects, std = other_effects(nominal, config)
     prior_std = nominal.prior_std[nominal.live]
     flat = np.concatenate([np.isinf(prior_std), np.zeros(len(std), dtype=bool)])
@@ -115,10 +117,7 @@ def other_effects(nominal: NominalModel, config: CellConfig) -> tuple[tuple[Effe
 
 
 def _with_scatter(nominal: NominalModel, config: CellConfig) -> CellConfig:
-    """Return the configuration with the arm's repeatability: stated, estimated or ordinary."""
-    stated = config.repeatability.per_joint(nominal.cell.arm.n)
-    if np.any(stated):
-        return config
+    """Return the configuration with the arm's repeatability: estimated or ordinary."""
     std: tuple[float, ...] = (SCATTER_RAD,)
     scatter = None if nominal.fit is None else nominal.fit.readings.arm_scatter
     if scatter is not None and scatter.kind != "isotropic":

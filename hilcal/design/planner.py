@@ -198,13 +198,11 @@ def make(
     usual = "I" if config.planning.readings == "absolute" else "D"
     criterion = canonical(request.criterion or config.planning.criterion or usual)
     say("drawing candidate poses")
-    space = Space(cell, config)
+    space, home = Space(cell, config), reference
     drawn = draw(space, config.planning.candidates, rng, least=2)
-    if reference is None:
+    if home is None:
         home, poses = _reference(space, drawn, rng)
         drawn = replace(drawn, q=drawn.q[poses], allowed=drawn.allowed[poses])
-    else:
-        home = reference
     say("computing the information of each pose")
     if known is None:
         model = nominal_model(cell, config, 3, catalogue, prior)
@@ -212,9 +210,12 @@ def make(
         model = after(known, config)
     reduced, undetermined = without_undetermined(problem(model, config, drawn.q, drawn.allowed))
     work = prediction_poses(reduced.nominal, config, drawn.q, space.clear)
-    budget = _budget(request, reduced)
-    objective = compound_objective(reduced, config, criterion, work, budget, rng)
     by_poses = request.readings is None
+    count, unit = (request.poses, "poses") if by_poses else (request.readings or 0, "readings")
+    if count < 1:
+        raise InputError(f"{count} {unit}; valid: a whole number from 1")
+    budget = float(count * (len(reduced.candidates.loads) if by_poses else 1))
+    objective = compound_objective(reduced, config, criterion, work, budget, rng)
     costly: tuple[tuple[str, float], ...] = ()
     if by_poses:
         say("weighing what each load costs")
@@ -258,7 +259,7 @@ def make(
     if not cell.registration_known and known is None and visited < MIN_POSES:
         raise CannotAnswerError(
             f"the plan has {visited} poses, the reference among them; an unknown registration "
-            f"needs at least {MIN_POSES}: ask for more {'poses' if by_poses else 'readings'}"
+            f"needs at least {MIN_POSES}: ask for more {unit}"
         )
     say("ordering the readings")
     repeats = max(2, (visited - 1) // 10)
@@ -272,14 +273,6 @@ def make(
         order, design, costly, reduced, objective, usable, work, drawn, budget, criterion,
         precision, undetermined, request.poses if by_poses else None,
     )  # fmt: skip
-
-
-def _budget(request: Request, problem: DesignProblem) -> float:
-    by_poses = request.readings is None
-    count, unit = (request.poses, "poses") if by_poses else (request.readings or 0, "readings")
-    if count < 1:
-        raise InputError(f"{count} {unit}; valid: a whole number from 1")
-    return float(count * (len(problem.candidates.loads) if by_poses else 1))
 
 
 def _reference(space: Space, drawn: DrawnPoses, rng: np.random.Generator) -> tuple[Floats, Ints]:

@@ -289,9 +289,8 @@ class Scene:
 
     def _not_always(self, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
         """Return the pairs without those that touch in a large share of all states."""
-        drawn = _spread(_SAMPLES, self.arm.n)
         low, high = self.arm.usual_range
-        q, tested = low + drawn * (high - low), Pairs(self, pairs)
+        q, tested = low + _spread(_SAMPLES, self.arm.n) * (high - low), Pairs(self, pairs)
         often = tested.how_often(q)
         near = np.zeros(len(pairs)) if is_known(self.arm) else tested.how_often(q, _NEAR)
         checked = (often < _ALWAYS) & (near < 1.0)

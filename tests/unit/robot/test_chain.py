@@ -318,7 +318,6 @@ def test_gradient_by_joints_and_twists(arm):
         np.testing.assert_allclose(gradient.joint(j), expected, rtol=1e-7, atol=1e-6)
     for k in range(n + 1):
         v = gradient.displacement(k)
-        v = np.zeros((count, 2, 3)) if v is None else v
         moved = twist_jacobian(chain.rotation[k], np.zeros((count, 3)), chain.twist[k])
         found = np.concatenate([v, gradient.turn(k)], axis=2) @ moved
         for e in range(6):
