@@ -6,14 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg as sl
 
-from hilcal.design.criterion import (
-    CandidateSet,
-    Objective,
-    Smooth,
-    best_first,
-    prices,
-    upper_bound,
-)
+from hilcal.design.criterion import CandidateSet, Objective, Smooth, best_first, prices, upper_bound
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.types import Bools, Floats, Ints
 

@@ -27,12 +27,7 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from hilcal.config import CellConfig
 from hilcal.design.criteria import MeanVariance
 from hilcal.design.criterion import CandidateSet, Objective, inverse_factor
-from hilcal.design.information import (
-    DesignProblem,
-    information_of,
-    reading_derivatives,
-    unit_rows,
-)
+from hilcal.design.information import DesignProblem, information_of, reading_derivatives, unit_rows
 from hilcal.design.nominal_model import NominalModel, build, expected_std, potential_names
 from hilcal.design.predicted import PredictionPoses, position_derivative
 from hilcal.effects.protocol import Effect

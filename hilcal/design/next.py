@@ -118,10 +118,7 @@ def expected(
 
 
 def _pair_powers(
-    problem: DesignProblem,
-    pairs: DiscriminatedPairs,
-    names: tuple[str, ...],
-    information: Floats,
+    problem: DesignProblem, pairs: DiscriminatedPairs, names: tuple[str, ...], information: Floats
 ) -> Iterator[PairPower]:
     observable = {e.name for e in problem.families}
     supported = supported_parameters(problem, DRAWS)

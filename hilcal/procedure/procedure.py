@@ -37,12 +37,7 @@ from hilcal.identification.carried import CarriedPrior
 from hilcal.identification.full_covariance import full_readings
 from hilcal.identification.validation import Acceptance, acceptance, extrapolation
 from hilcal.present.progress import Say
-from hilcal.procedure.next_plan import (
-    Decision,
-    FurtherMeasuring,
-    PredictedError,
-    predicted_error,
-)
+from hilcal.procedure.next_plan import Decision, FurtherMeasuring, PredictedError, predicted_error
 from hilcal.procedure.state import (
     BEGUN,
     DECIDED,

@@ -171,7 +171,7 @@ def _only_leaf(model: pin.Model, path: Path) -> str:
     return leaves[0]
 
 
-Mimic = tuple[str, float, float]  # <mimic>: joint to follow, multiplier and offset (rad or m)
+Mimic = tuple[str, str, str]  # <mimic>: joint to follow, multiplier, offset (rad or m)
 
 
 @limits.bounded

@@ -18,6 +18,7 @@ from hilcal.store.plan import UNLOADED, Plan, Step
 from tests.support.arm_cases import ODD, arm_of
 from tests.support.fake_bench import Bench
 from tests.support.refusals import refusal_of
+from tests.support.serial_urdf import serial_urdf
 from tests.support.space_cases import (
     TABLE,
     along,
@@ -341,25 +342,16 @@ URDF = "urdf"
 """Six joints, a shape that nobody knows."""
 
 
+PLACES = ("0 0 0.2", "0 0.1 0", "0 -0.1 0.5", "0 0 0.45", "0 0.1 0", "0 0 0.1")
+AXES = ("0 0 1", "0 1 0", "0 1 0", "0 1 0", "0 0 1", "0 1 0")
+LAB = serial_urdf(
+    [{"xyz": at, "axis": axis, "mass": 3, "lower": -3, "upper": 3, "effort": 300}
+     for at, axis in zip(PLACES, AXES, strict=True)]
+)  # fmt: skip
+
+
 def arm(name):
-    return load_arm("lab.urdf", text=_urdf()) if name == URDF else arm_of(name)
-
-
-def _urdf():
-    rows = [("0 0 0.2", "0 0 1"), ("0 0.1 0", "0 1 0"), ("0 -0.1 0.5", "0 1 0"),
-            ("0 0 0.45", "0 1 0"), ("0 0.1 0", "0 0 1"), ("0 0 0.1", "0 1 0")]  # fmt: skip
-    links = "".join(
-        f'<link name="l{k}"><inertial><mass value="3"/><origin xyz="0 0 0.1"/>'
-        '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
-        for k in range(7)
-    )
-    joints = "".join(
-        f'<joint name="j{k + 1}" type="revolute"><parent link="l{k}"/><child link="l{k + 1}"/>'
-        f'<origin xyz="{at}"/><axis xyz="{axis}"/>'
-        '<limit lower="-3" upper="3" effort="300" velocity="2"/></joint>'
-        for k, (at, axis) in enumerate(rows)
-    )
-    return f'<robot name="lab">{links}{joints}</robot>'
+    return load_arm("lab.urdf", text=LAB) if name == URDF else arm_of(name)
 
 
 @st.composite
@@ -375,10 +367,7 @@ def cells_of_same_feasibility(draw):
     size = st.tuples(*[st.floats(0.02, 0.4)] * 3)
     things = draw(st.lists(st.tuples(place, size), max_size=2))
     offsets = draw(st.lists(st.tuples(*[st.floats(-0.3, 0.3)] * 3), min_size=1, max_size=3))
-    tool = {
-        "load_point_m": draw(st.tuples(*[st.floats(-0.15, 0.15)] * 3)),
-        "mass_kg": 1.0,
-    }
+    tool = {"load_point_m": draw(st.tuples(*[st.floats(-0.15, 0.15)] * 3)), "mass_kg": 1.0}
     if len(offsets) > 1:
         tool["targets"] = [{"name": f"t{k}", "target_m": at} for k, at in enumerate(offsets)]
     else:

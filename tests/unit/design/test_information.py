@@ -13,12 +13,7 @@ from hilcal.cell import cell_from_config
 from hilcal.config import load_config
 from hilcal.config.cell import Target
 from hilcal.config.sections import Gauge, Point
-from hilcal.design.information import (
-    MOST_PARAMETERS,
-    MOST_TIMES,
-    problem,
-    reading_covariance,
-)
+from hilcal.design.information import MOST_PARAMETERS, MOST_TIMES, problem, reading_covariance
 from hilcal.design.nominal_model import after, nominal_model, nominal_states
 from hilcal.design.predicted import predicted, prediction_poses
 from hilcal.effects.catalogue import installed

@@ -195,8 +195,7 @@ OF_THREE = {
 QUICK = {"D of some", "I", "compound determinant", "E"}
 """One of each kind; the others are long."""
 every_of_three = pytest.mark.parametrize(
-    "name",
-    [pytest.param(c, marks=() if c in QUICK else pytest.mark.long) for c in OF_THREE],
+    "name", [pytest.param(c, marks=() if c in QUICK else pytest.mark.long) for c in OF_THREE]
 )
 
 

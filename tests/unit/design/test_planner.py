@@ -14,12 +14,7 @@ from hilcal.config.reference import to_toml
 from hilcal.config.sections import CellLoad
 from hilcal.design.choice import CRITERIA, costly_loads, objective_of
 from hilcal.design.nominal_model import nominal_model, planned_effects
-from hilcal.design.planner import (
-    Request,
-    UndeterminedParameter,
-    make,
-    without_undetermined,
-)
+from hilcal.design.planner import Request, UndeterminedParameter, make, without_undetermined
 from hilcal.design.predicted import predicted
 from hilcal.design.summary import remarks, summarise
 from hilcal.effects.catalogue import installed
@@ -316,9 +311,7 @@ def test_weights_make_no_torque_about_a_vertical_joint():
 
 def test_with_a_side_pull_everything_is_determined():
     whole = twelve(cell_with(WEIGHT, PULL))
-    reduced, lost = without_undetermined(whole)
-    assert lost == ()
-    assert reduced is whole
+    assert without_undetermined(whole) == (whole, ())
 
 
 def test_confounded_parameters_are_named_together():

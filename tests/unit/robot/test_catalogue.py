@@ -17,28 +17,23 @@ from tests.support.refusals import edited, refusal, refusals, refuses
 
 PI2 = math.pi / 2
 ALPHA = [PI2, 0.0, 0.0, PI2, -PI2, 0.0]
-# (d1, a2, a3, d4, d5, d6) of the published tables, and the weight of the whole arm, kg
+# (d1, a2, a3, d4, d5, d6) of the published tables, the weight of the whole arm, the payload, kg
 PUBLISHED = {
-    "ur3": (0.1519, -0.24365, -0.21325, 0.11235, 0.08535, 0.0819, 11.0),
-    "ur5": (0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823, 18.4),
-    "ur10": (0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922, 28.9),
-    "ur3e": (0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921, 11.2),
-    "ur5e": (0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, 20.6),
-    "ur7e": (0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, 20.6),
-    "ur8long": (0.2186, -0.8989, -0.7149, 0.1824, 0.1361, 0.1434, None),
-    "ur12e": (0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655, 33.5),
-    "ur15": (0.2186, -0.6475, -0.5164, 0.1824, 0.1361, 0.1434, 40.7),
-    "ur18": (0.2186, -0.475, -0.3389, 0.1824, 0.1361, 0.1434, None),
-    "ur10e": (0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655, 33.5),
-    "ur16e": (0.1807, -0.4784, -0.36, 0.17415, 0.11985, 0.11655, 33.1),
-    "ur20": (0.2363, -0.862, -0.7287, 0.201, 0.1593, 0.1543, 64.0),
-    "ur30": (0.2363, -0.637, -0.5037, 0.201, 0.1593, 0.1543, 63.5),
+    "ur3": (0.1519, -0.24365, -0.21325, 0.11235, 0.08535, 0.0819, 11.0, 3),
+    "ur5": (0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823, 18.4, 5),
+    "ur10": (0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922, 28.9, 10),
+    "ur3e": (0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921, 11.2, 3),
+    "ur5e": (0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, 20.6, 5),
+    "ur7e": (0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, 20.6, 7.5),
+    "ur8long": (0.2186, -0.8989, -0.7149, 0.1824, 0.1361, 0.1434, None, 8),
+    "ur12e": (0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655, 33.5, 12.5),
+    "ur15": (0.2186, -0.6475, -0.5164, 0.1824, 0.1361, 0.1434, 40.7, 15),
+    "ur18": (0.2186, -0.475, -0.3389, 0.1824, 0.1361, 0.1434, None, 18),
+    "ur10e": (0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655, 33.5, 12.5),
+    "ur16e": (0.1807, -0.4784, -0.36, 0.17415, 0.11985, 0.11655, 33.1, 16),
+    "ur20": (0.2363, -0.862, -0.7287, 0.201, 0.1593, 0.1543, 64.0, 20),
+    "ur30": (0.2363, -0.637, -0.5037, 0.201, 0.1593, 0.1543, 63.5, 30),
 }
-PAYLOAD = {
-    "ur3": 3, "ur5": 5, "ur10": 10, "ur3e": 3, "ur5e": 5,
-    "ur10e": 12.5, "ur16e": 16, "ur20": 20, "ur30": 30,
-    "ur7e": 7.5, "ur8long": 8, "ur12e": 12.5, "ur15": 15, "ur18": 18,
-}  # fmt: skip
 
 
 def rz(angle):
@@ -49,7 +44,7 @@ def rz(angle):
 
 def dh_frames(name, q):
     """Frames after each row, from the closed form of a classic DH matrix."""
-    d1, a2, a3, d4, d5, d6, _ = PUBLISHED[name]
+    d1, a2, a3, d4, d5, d6, *_ = PUBLISHED[name]
     frames, pose = [], np.eye(4)
     for t, a, d, al in zip(q, [0, a2, a3, 0, 0, 0], [d1, 0, 0, d4, d5, d6], ALPHA, strict=True):
         c, s, ca, sa = math.cos(t), math.sin(t), math.cos(al), math.sin(al)
@@ -203,12 +198,12 @@ def test_pinocchio_agrees(name):
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_masses_and_limits_are_plausible(name):
-    arm, weight = load_arm(name), PUBLISHED[name][-1]
+    arm, (*_, weight, payload) = load_arm(name), PUBLISHED[name]
     # the foot does not move: the rest weighs less than the whole, but is most of it
     if weight is not None:
         assert 0.75 * weight < arm.masses.sum() < weight
     assert np.all(arm.masses > 0)
-    assert arm.payload == PAYLOAD[name]
+    assert arm.payload == payload
     assert np.all(arm.q_min == -arm.q_max)
     assert np.degrees(arm.q_max).round(9).tolist() == [360, 360, 180, 360, 360, 360]
     assert "Universal Robots" in arm.source

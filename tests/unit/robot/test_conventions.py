@@ -21,6 +21,7 @@ from hilcal.robot.urdf import arm_from_urdf
 from hilcal.tables.table import read_table
 from tests.support.effect_cases import make
 from tests.support.refusals import refusal, refusals, refuses
+from tests.support.serial_urdf import serial_urdf
 
 SIGN = [1, -1, 1, 1, -1, 1]
 OFFSET = [0.0, 90.0, -30.0, 0.0, 180.0, 5.0]
@@ -110,16 +111,10 @@ def test_modified_rows_are_those_of_craig(tmp_path):
     np.testing.assert_allclose(chain.com[:, 0], coms, atol=1e-12)
 
 
-URDF = """<robot name="r"><link name="base"/><link name="a"/><link name="b"/>
-<joint name="j1" type="{kind}"><parent link="base"/><child link="a"/><axis xyz="0 0 1"/>
-<limit lower="0" upper="0" effort="1" velocity="1"/></joint>
-<joint name="j2" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0.5 0 0"/>
-<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
-
-
 def urdf(tmp_path, kind="revolute"):
     path = tmp_path / "r.urdf"
-    path.write_text(URDF.format(kind=kind))
+    last = {"xyz": "0.5 0 0", "axis": "0 1 0", "lower": -1, "upper": 1}
+    path.write_text(serial_urdf([{"type": kind, "lower": 0, "upper": 0}, last]))
     return path
 
 
@@ -135,11 +130,6 @@ def test_a_rail_without_ends_is_refused_by_name(tmp_path):
     refusal(r'prismatic joint "j1" has no <limit', arm_from_urdf, urdf(tmp_path, "prismatic"))
 
 
-JOINT = """<joint name="j{k}" type="revolute"><parent link="l{k}"/><child link="l{next}"/>
-<origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="{axis}"/>
-<limit lower="-3.1" upper="3.1" effort="100" velocity="1"/>{mimic}</joint>
-<link name="l{next}"><inertial><origin xyz="0.1 0.02 0.05"/><mass value="{mass}"/>
-<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
 NOISE = TrackerNoise(10e-6, 0.3e-6, 15e-6, 6e-6)
 FIGURES = (
     ("0 0 0.3", "0 0 0", "0 0 1"),
@@ -152,13 +142,13 @@ FOLLOWS = {3: '<mimic joint="j2" multiplier="-1" offset="0.3"/>', 4: '<mimic joi
 
 
 def urdf_of_mimic(tmp_path, follows=FOLLOWS):
-    body = "".join(
-        JOINT.format(k=k, next=k + 1, xyz=xyz, rpy=rpy, axis=axis, mass=5.0 / k,
-                     mimic=follows.get(k, ""))
-        for k, (xyz, rpy, axis) in enumerate(FIGURES, start=1)
-    )  # fmt: skip
     path = tmp_path / "arm.urdf"
-    path.write_text(f'<robot name="arm"><link name="l1"/>{body}</robot>')
+    rows = [
+        {"xyz": xyz, "rpy": rpy, "axis": axis, "mass": 5.0 / k, "com": "0.1 0.02 0.05",
+         "mimic": follows.get(k, "")}
+        for k, (xyz, rpy, axis) in enumerate(FIGURES, start=1)
+    ]  # fmt: skip
+    path.write_text(serial_urdf(rows))
     return path
 
 
@@ -185,7 +175,7 @@ def test_it_stands_and_is_pulled_as_pinocchio_says(tmp_path):
     for k in range(len(q)):
         at = q[k, [0, 1, 4]]
         pin.framesForwardKinematics(model, data, at)
-        place = data.oMf[model.getFrameId("l6")]
+        place = data.oMf[model.getFrameId("l5")]
         np.testing.assert_allclose(s.chain.position[-1][k], place.translation, atol=1e-12)
         np.testing.assert_allclose(s.chain.rotation[-1][k], place.rotation, atol=1e-12)
         held = pin.computeGeneralizedGravity(model, data, at) * 9.80665 / 9.81

@@ -26,6 +26,7 @@ from hilcal.store.plan import Plan, Step
 from hilcal.tables.table import read_table, write_table
 from tests.support.cli_cases import ok, refused
 from tests.support.refusals import edited, refusals, refuses
+from tests.support.serial_urdf import serial_urdf
 
 TRACK = """title = "UR10e on a track"
 payload_kg = 12.5
@@ -45,37 +46,23 @@ force_max_N = 2000.0
 
 """
 """A track along x of the base, 0.3 m above it; the arm stands upright on it."""
-GANTRY = """<robot name="gantry"><link name="base_link"/>
-<joint name="x" type="prismatic"><origin xyz="0 0 2.5"/><parent link="base_link"/>
-<child link="bridge"/><axis xyz="1 0 0"/><limit lower="-2" upper="2" effort="3000" velocity="1"/>
-</joint><link name="bridge"/>
-<joint name="y" type="prismatic"><parent link="bridge"/><child link="carriage"/>
-<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="2000" velocity="1"/></joint>
-<link name="carriage"/>
-<joint name="z" type="prismatic"><parent link="carriage"/><child link="column"/>
-<axis xyz="0 0 -1"/><limit lower="0" upper="1.2" effort="2000" velocity="1"/></joint>
-<link name="column"><inertial><origin xyz="0 0 -0.4"/><mass value="30"/>
-<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
-<joint name="c" type="revolute"><origin xyz="0.1 0 -0.8"/><parent link="column"/>
-<child link="head"/><axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="80" velocity="1"/>
-</joint><link name="head"/>
-<joint name="a" type="revolute"><origin xyz="0 0 -0.2" rpy="1.2 0.3 0"/><parent link="head"/>
-<child link="wrist"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="60" velocity="1"/>
-</joint><link name="wrist"/>
-<joint name="f" type="fixed"><origin xyz="0 0.05 -0.15"/><parent link="wrist"/>
-<child link="tool0"/></joint><link name="tool0"/></robot>
-"""
-LIFT = """<robot name="lift"><link name="base_link"/>
-<joint name="first" type="prismatic"><parent link="base_link"/><child link="a"/>
-<axis xyz="0 0 1"/><limit lower="0" upper="0.5" effort="900" velocity="1"/></joint><link name="a"/>
-<joint name="second" type="prismatic"><origin xyz="0 0 0.4"/><parent link="a"/><child link="b"/>
-<axis xyz="0 0 1"/><limit lower="0" upper="0.6" effort="900" velocity="1"/>
-<mimic joint="first" multiplier="1.0" offset="0.1"/></joint><link name="b"/>
-<joint name="turn" type="revolute"><origin xyz="0.2 0 0"/><parent link="b"/><child link="c"/>
-<axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="90" velocity="1"/></joint>
-<link name="c"/><joint name="f" type="fixed"><origin xyz="0.3 0 0"/><parent link="c"/>
-<child link="tool0"/></joint><link name="tool0"/></robot>
-"""
+SLIDE, TOOL = {"type": "prismatic"}, {"link": "tool0", "type": "fixed"}
+GANTRY = serial_urdf([
+    {**SLIDE, "xyz": "0 0 2.5", "axis": "1 0 0", "lower": -2, "upper": 2, "effort": 3000},
+    {**SLIDE, "axis": "0 1 0", "lower": -1, "upper": 1, "effort": 2000},
+    {**SLIDE, "axis": "0 0 -1", "lower": 0, "upper": 1.2, "effort": 2000, "mass": 30,
+     "com": "0 0 -0.4"},
+    {"xyz": "0.1 0 -0.8", "lower": -3, "upper": 3, "effort": 80},
+    {"xyz": "0 0 -0.2", "rpy": "1.2 0.3 0", "axis": "0 1 0", "lower": -2, "upper": 2, "effort": 60},
+    {**TOOL, "xyz": "0 0.05 -0.15"},
+])  # fmt: skip
+MIMIC = '<mimic joint="j1" multiplier="1.0" offset="0.1"/>'
+LIFT = serial_urdf([
+    {**SLIDE, "lower": 0, "upper": 0.5},
+    {**SLIDE, "xyz": "0 0 0.4", "lower": 0, "upper": 0.6, "mimic": MIMIC},
+    {"xyz": "0.2 0 0", "axis": "0 1 0", "lower": -2, "upper": 2},
+    {**TOOL, "xyz": "0.3 0 0"},
+])  # fmt: skip
 """A column of two stages, of which the upper one is taken along."""
 
 
