@@ -9,17 +9,8 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
+from hilcal.design import choice
 from hilcal.design.approximate_design import ApproximateDesign
-from hilcal.design.choice import (
-    EFFORT,
-    canonical,
-    certified,
-    choose_poses,
-    compound_objective,
-    costly_loads,
-    pose_units,
-    promising,
-)
 from hilcal.design.criterion import CandidateSet, Objective
 from hilcal.design.feasible import DrawnPoses, Space, draw
 from hilcal.design.information import DesignProblem, problem, reading_covariance, readings_of
@@ -153,7 +144,7 @@ class Request:
     poses: int = 20  # each read once unloaded and under every load that it bears
     readings: int | None = None  # instead of poses; without those at the reference and repeats
     criterion: str | None = None  # of `[planning]` by default, else I, or D for deflections
-    effort: int = EFFORT  # of the search for integer counts
+    effort: int = choice.EFFORT  # of the search for integer counts
     unloaded: Literal["around", "first"] = "around"  # see `Ordering`
 
 
@@ -196,7 +187,7 @@ def make(
 ) -> Planned:
     """Return a plan of a cell."""
     usual = "I" if config.planning.readings == "absolute" else "D"
-    criterion = canonical(request.criterion or config.planning.criterion or usual)
+    criterion = choice.canonical(request.criterion or config.planning.criterion or usual)
     say("drawing candidate poses")
     space, home = Space(cell, config), reference
     drawn = draw(space, config.planning.candidates, rng, least=2)
@@ -215,17 +206,17 @@ def make(
     if count < 1:
         raise InputError(f"{count} {unit}; valid: a whole number from 1")
     budget = float(count * (len(reduced.candidates.loads) if by_poses else 1))
-    objective = compound_objective(reduced, config, criterion, work, budget, rng)
+    objective = choice.compound_objective(reduced, config, criterion, work, budget, rng)
     costly: tuple[tuple[str, float], ...] = ()
     if by_poses:
         say("weighing what each load costs")
         change = config.planning.load_change_s / seconds_at_rest(config)
-        costly = costly_loads(objective, reduced, budget, change, rng)
+        costly = choice.costly_loads(objective, reduced, budget, change, rng)
     say(f"choosing poses by criterion {criterion}")
     pose_of = np.array([pose for pose, _ in reduced.what])
-    first, relaxed = promising(objective, budget)
+    first, relaxed = choice.promising(objective, budget)
     usable = ~np.isin(pose_of, _unreachable(space, reduced, home, first))
-    candidates = pose_units(objective, reduced) if by_poses else None
+    candidates = choice.pose_units(objective, reduced) if by_poses else None
     reached: set[int] = set()
     over_poses: ApproximateDesign | None = None
     for remaining in reversed(range(ROUNDS)):
@@ -233,7 +224,7 @@ def make(
             usable &= np.isin(pose_of, [*reached])
         if candidates is not None:
             among = np.isin(candidates.poses, pose_of[usable])
-            counts, over_poses = choose_poses(
+            counts, over_poses = choice.choose_poses(
                 objective, candidates, among, request.poses, rng, request.effort, over_poses
             )
         else:
@@ -254,7 +245,7 @@ def make(
             "reference pose reaches; widen the workspace"
         )
     if by_poses:
-        design = certified(objective, counts, usable, relaxed)
+        design = choice.certified(objective, counts, usable, relaxed)
     visited = len({reduced.what[k][0] for k in units}) + 1
     if not cell.registration_known and known is None and visited < MIN_POSES:
         raise CannotAnswerError(

@@ -37,26 +37,8 @@ from hilcal.identification.carried import CarriedPrior
 from hilcal.identification.full_covariance import full_readings
 from hilcal.identification.validation import Acceptance, acceptance, extrapolation
 from hilcal.present.progress import Say
+from hilcal.procedure import state
 from hilcal.procedure.next_plan import Decision, FurtherMeasuring, PredictedError, predicted_error
-from hilcal.procedure.state import (
-    BEGUN,
-    DECIDED,
-    FROZEN,
-    IMPROVED,
-    MEASURE,
-    REFINED,
-    STOP,
-    VALIDATED,
-    Files,
-    ProcedureStep,
-    Settings,
-    identity,
-    next_step,
-    opened,
-    reference_in,
-    reference_of,
-    settings_of,
-)
 from hilcal.procedure.validation_plan import corrected_plan, left_out_of, paired, validation_plan
 from hilcal.readings.covariance import COVERS, INSTRUMENT
 from hilcal.readings.readings import ArmScatter, Readings
@@ -101,7 +83,7 @@ class Procedure:
     config: CellConfig
     base_dir: Path  # that paths in the configuration are relative to
     catalogue: Catalogue  # the effects that a model can have
-    settings: Settings  # goals, sizes and seed
+    settings: state.Settings  # goals, sizes and seed
     known: CarriedPrior | None = None  # the prior of every fit, from `settings.prior`
     _refinements: list[Refinement] = field(default_factory=list, repr=False)  # the latest, if any
 
@@ -118,24 +100,24 @@ class Procedure:
             stored = continued(path, cell, config, effects)
             return replace(stored, settings=replace(stored.settings, **options))
         readings = config.planning.readings if config.loads else "absolute"
-        default = Settings(seed=config.simulation.seed, readings=readings)
+        default = state.Settings(seed=config.simulation.seed, readings=readings)
         return cls(
             path, cell, config, cell.base_dir.absolute(), effects, replace(default, **options)
         )
 
     @property
-    def files(self) -> Files:
+    def files(self) -> state.Files:
         """All files of the calibration."""
-        return Files(self.run)
+        return state.Files(self.run)
 
     def record(self) -> RevisionRecord:
         """Return the revision that the last refinement ended with."""
         with Campaign.open(self.run, self.catalogue, read_only=True) as o:
             return self._record(o)
 
-    def next(self) -> ProcedureStep:
+    def next(self) -> state.ProcedureStep:
         """Return the next step."""
-        return next_step(self.run)
+        return state.next_step(self.run)
 
     def plan(self, say: Say = lambda text: None) -> CheckedPlan:
         """Choose the first plan, unstored; a CannotAnswerError for a cell with too few poses."""
@@ -149,7 +131,7 @@ class Procedure:
         the readings will cover.
         """
         self.check_files()
-        first = entry(BEGUN, {"settings": self.settings.to_json()})
+        first = entry(state.BEGUN, {"settings": self.settings.to_json()})
         texts = {COVERS: covers, ENTRY.format(1): first}
         create_run(self.run, config, self.base_dir, plan, source=self._source(), more=texts).close()
 
@@ -165,11 +147,11 @@ class Procedure:
         """Store the settings in the campaign's log, where they have changed."""
         check_same_cell(campaign, self.config, self.base_dir)
         log, settings = ProcedureLog(campaign), self.settings.to_json()
-        stored = log.last(BEGUN)
+        stored = log.last(state.BEGUN)
         if stored is None or stored["settings"] != settings:
-            log.append(BEGUN, {"settings": settings})
+            log.append(state.BEGUN, {"settings": settings})
 
-    def measure(self, step: ProcedureStep, measure: Measure) -> int:
+    def measure(self, step: state.ProcedureStep, measure: Measure) -> int:
         """Measure the missing readings of a plan; return the number that its campaign then holds.
 
         After a DeviceError or a KeyboardInterrupt, the readings so far are stored.
@@ -212,7 +194,7 @@ class Procedure:
         records = [o.record(s.fit, s.diagnosis, s.added, s.removed) for s in found.steps]
         content = {"readings_sha256": o.data_hash, "verdict": found.verdict}
         self._refinements[:] = [found]
-        return ProcedureLog(o.file).append(REFINED, content, revisions=records)
+        return ProcedureLog(o.file).append(state.REFINED, content, revisions=records)
 
     def decide(self, say: Say = lambda text: None) -> Decision:
         """Decide whether to measure more; a further plan is appended to the campaign."""
@@ -230,16 +212,16 @@ class Procedure:
             plan = decision.plan if decision.measures else None
             if plan is not None:
                 plan = run.with_new_names(plan)  # `run` checks every motion of it
-            action = STOP if plan is None else MEASURE
-            log.append(DECIDED, {"action": action, **decision.to_json()}, plan=plan)
+            action = state.STOP if plan is None else state.MEASURE
+            log.append(state.DECIDED, {"action": action, **decision.to_json()}, plan=plan)
         return decision
 
     def stop(self) -> None:
         """Stop measuring: the last refinement will be tested."""
         with CampaignFile.open(self.run) as campaign:
-            ProcedureLog(campaign).append(DECIDED, {"action": STOP, "reason": "asked"})
+            ProcedureLog(campaign).append(state.DECIDED, {"action": state.STOP, "reason": "asked"})
 
-    def compute(self, step: ProcedureStep, say: Say = lambda text: None) -> object:
+    def compute(self, step: state.ProcedureStep, say: Say = lambda text: None) -> object:
         """Do a step in which nothing moves, other than "plan"; return its result."""
         result: object = getattr(self, step.kind)(say)
         return result
@@ -256,7 +238,7 @@ class Procedure:
             say("restoring the model")
             calibration, record = self._calibration(o)
             fitted, rng = o.fitted_readings(record), self._rng(_VALIDATING)
-            reference = reference_in(o.file)
+            reference = state.reference_in(o.file)
             plan = validation_plan(
                 self.cell, self.config, calibration, fitted, reference, self.settings, rng, say
             )
@@ -267,7 +249,7 @@ class Procedure:
         """Freeze the validation campaign, and predict its readings."""
         with (
             Campaign.open(self.run, self.catalogue) as o,
-            opened(self.files.validation, VALIDATION, self.run) as unseen,
+            state.opened(self.files.validation, VALIDATION, self.run) as unseen,
         ):
             log = ProcedureLog(o.file)
             self._freeze(log, unseen)
@@ -288,16 +270,16 @@ class Procedure:
             total = shares.everything
             content = {"revision": record.number, "error": prediction.error.to_json()}
             content |= {"noise_floor_m": prediction.noise_floor, "stated_m": total.stated_m}
-            log.append(VALIDATED, {**content, "within": total.within})
+            log.append(state.VALIDATED, {**content, "within": total.within})
         return shares
 
     def _freeze(self, log: ProcedureLog, unseen: CampaignFile) -> None:
         """Record the hash of the validation campaign; refuse one that differs from its record."""
-        frozen, readings = log.last(FROZEN), unseen.readings()
+        frozen, readings = log.last(state.FROZEN), unseen.readings()
         hashed = content_hash(readings)
         if frozen is None:
             content = {"file": unseen.path.name, "readings_sha256": hashed}
-            log.append(FROZEN, {**content, "readings": len(readings)})
+            log.append(state.FROZEN, {**content, "readings": len(readings)})
         elif frozen["readings_sha256"] != hashed:
             raise InputError(
                 f"{unseen.path}: other readings than when it was frozen "
@@ -308,14 +290,14 @@ class Procedure:
         """Correct the joint targets of the validation poses, and make the campaign for them."""
         with (
             Campaign.open(self.run, self.catalogue) as o,
-            opened(self.files.validation, VALIDATION, self.run) as unseen,
+            state.opened(self.files.validation, VALIDATION, self.run) as unseen,
         ):
             self._freeze(ProcedureLog(o.file), unseen)
             say("restoring the model")
             calibration, record = self._calibration(o)
             readings = self._readings(o, record, unseen)
             measured_plan = read_plan(unseen.about(PLAN) or "", f"{unseen.path}, its plan")
-            reference, rng = reference_of(measured_plan), self._rng(_CORRECTING)
+            reference, rng = state.reference_of(measured_plan), self._rng(_CORRECTING)
             plan = corrected_plan(
                 self.cell, self.config, calibration, readings, reference, rng, say
             )
@@ -326,8 +308,8 @@ class Procedure:
         """Compare the measured errors at uncorrected and corrected joint targets."""
         with (
             Campaign.open(self.run, self.catalogue) as o,
-            opened(self.files.validation, VALIDATION, self.run) as unseen,
-            opened(self.files.corrected, CORRECTED, self.run) as moved,
+            state.opened(self.files.validation, VALIDATION, self.run) as unseen,
+            state.opened(self.files.corrected, CORRECTED, self.run) as moved,
         ):
             log = ProcedureLog(o.file)
             self._freeze(log, unseen)
@@ -338,9 +320,9 @@ class Procedure:
             left_out = left_out_of(read_plan(moved.about(PLAN) or "", f"{moved.path}, its plan"))
             p = o.predictive(record, *o.restore_model(record))
             gain = improvement(calibration, p, uncorrected, corrected, uncorrected.states, left_out)
-            if log.last(IMPROVED) is None:
+            if log.last(state.IMPROVED) is None:
                 content = {"revision": record.number, "readings_sha256": moved.data_hash()}
-                log.append(IMPROVED, {**content, **gain.to_dict()})
+                log.append(state.IMPROVED, {**content, **gain.to_dict()})
         return gain
 
     def _rng(self, *stream: int) -> np.random.Generator:
@@ -352,7 +334,7 @@ class Procedure:
         return self.config.model_copy(update={"planning": planning})
 
     def _record(self, o: Campaign) -> RevisionRecord:
-        refined = ProcedureLog(o.file).last(REFINED)
+        refined = ProcedureLog(o.file).last(state.REFINED)
         if refined is None:
             raise InputError(f"{self.run}: not refined yet")
         return o.file.revision(int(refined["revisions"][-1]))
@@ -375,7 +357,7 @@ class Procedure:
 
     def _create(self, path: Path, purpose: str, plan: Plan, o: Campaign) -> None:
         covers = o.file.about(COVERS) or INSTRUMENT
-        texts = {PURPOSE: purpose, CALIBRATION: identity(self.run), COVERS: covers}
+        texts = {PURPOSE: purpose, CALIBRATION: state.identity(self.run), COVERS: covers}
         config = CellConfig.from_json(o.file.config_json)
         source = self._source(f"{purpose} campaign of {self.run.name}, ")
         create_run(path, config, self.base_dir, plan, source=source, more=texts).close()
@@ -408,6 +390,6 @@ def checked_plan(
 def continued(run: Path, cell: Cell, config: CellConfig, catalogue: Catalogue) -> Procedure:
     """Return the calibration of a campaign file, with the file's settings."""
     with CampaignFile.open(run, read_only=True) as campaign:
-        settings, base_dir = settings_of(campaign), cell.base_dir.absolute()
+        settings, base_dir = state.settings_of(campaign), cell.base_dir.absolute()
         check_same_cell(campaign, config, base_dir)
     return Procedure(run, cell, config, base_dir, catalogue, settings)
