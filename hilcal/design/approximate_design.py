@@ -110,8 +110,7 @@ def solve(program: BarrierProgram, start: Floats, tolerance: float, order: float
     capped = np.isfinite(program.most)
     m = program.information(w)
     mu = max(min(order, 1.0), tolerance) / n
-    z = mu / w
-    y = mu / (program.most - w) if capped else np.zeros(n)
+    z, y = mu / w, mu / (program.most - w)
     best: Optimum | None = None
     central = False
     for step in range(_STEPS):
@@ -130,29 +129,25 @@ def solve(program: BarrierProgram, start: Floats, tolerance: float, order: float
             surrogate = criterion.surrogate(m, mu)
             smooth = surrogate(m) or smooth
         slope = prices(program.objective.units.rows, smooth.gradient)
-        top = program.most - w if capped else np.ones(n)
-        lean = slope + mu / w - (mu / top if capped else 0.0)
+        top = program.most - w
+        lean = slope + mu / w - mu / top
         move = _newton(program, program.curvature(smooth) + np.diag(z / w + y / top), lean, w)
         if move is None:
             break
-        length = min(1.0, _BACK * _room(w, move))
-        if capped:
-            length = min(length, _BACK * _room(top, -move))
+        length = min(1.0, _BACK * _room(w, move), _BACK * _room(top, -move))
         push = float(lean @ move)
         moved = program.change(move)
         length = _search(program, surrogate, smooth, (w, m), (move, moved), length, mu, push)
         if length == 0.0 and (criterion.kinked or mu <= tolerance / (10 * n)):
             break
         z = _dual(z, mu / w - z - z / w * move)
-        if capped:
-            y = _dual(y, mu / top - y + y / top * move)
+        y = _dual(y, mu / top - y + y / top * move)
         w = w + length * move
-        m = program.information(w)
+        m, top = program.information(w), program.most - w
         z = np.clip(z, mu / (_CLAMP * w), _CLAMP * mu / w)
+        y = np.clip(y, mu / (_CLAMP * top), _CLAMP * mu / top)
         complement = float(z @ w) / n
         if capped:
-            top = program.most - w
-            y = np.clip(y, mu / (_CLAMP * top), _CLAMP * mu / top)
             complement = 0.5 * (complement + float(y @ top) / n)
         if criterion.kinked:  # μ, also the width of the kink, falls at central points only
             central = push <= _CENTRAL * mu
