@@ -10,6 +10,7 @@ import scipy.linalg as sl
 from hilcal.cell import STANDARD_GRAVITY, Cell
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm, robot_names
+from hilcal.robot.chain import Chain
 from hilcal.types import Floats
 
 ODD, RAILS = "odd", "rails"
@@ -77,6 +78,19 @@ def slots_of(arm: Arm, q: Floats) -> Floats:
         pose = pose @ displacement(motion) @ link
         out.append(pose)
     return np.array(out)
+
+
+def flange_at(chain: Chain, state: int, pose: Floats, atol: float = 1e-12) -> None:
+    """Assert where the flange is in a state: a pose (4, 4)."""
+    found = chain.rotation[-1, state], chain.position[-1, state]
+    np.testing.assert_allclose(np.column_stack(found), pose[:3], rtol=0, atol=atol)
+
+
+def same_flange(one: Chain, other: Chain) -> None:
+    """Assert that the flange is at the same poses."""
+    for of in ("position", "rotation"):
+        ends = (getattr(chain, of)[-1] for chain in (one, other))
+        np.testing.assert_allclose(*ends, rtol=0, atol=1e-12)
 
 
 def slope(f: Callable[[float], Floats], h: float) -> Floats:

@@ -201,9 +201,8 @@ every_of_three = pytest.mark.parametrize(
 
 def polynomial(degree, points):
     """Readings of a polynomial at points, one row each."""
-    return CandidateSet(
-        np.vander(points, degree + 1, increasing=True)[:, None, :], np.ones(len(points))
-    )
+    rows = np.vander(points, degree + 1, increasing=True)
+    return CandidateSet(rows[:, None, :], np.ones(len(points)))
 
 
 def random_units(seed, count, size=3, costs=False):
@@ -235,6 +234,8 @@ def largest(criterion, units, weights, prior):
     return float(criterion.value(prior + np.tensordot(weights, each, axes=1)).max())
 
 
+AT_2 = [1.0, 2.0, 4.0]
+BEYOND_A_LINE = Pair(np.array([2]), np.ones(1), np.array([0, 1]))
 GRID = np.linspace(-1, 1, 201)
 LEGENDRE = np.sort(np.concatenate([GRID, [-np.sqrt(0.2), np.sqrt(0.2)]]))
 
@@ -249,17 +250,9 @@ LEGENDRE = np.sort(np.concatenate([GRID, [-np.sqrt(0.2), np.sqrt(0.2)]]))
         # the highest coefficient: Chebyshev points (Kiefer & Wolfowitz 1959)
         (MeanVariance(np.diag([0.0, 0.0, 1.0])), 2, {-1: 1 / 4, 0: 1 / 2, 1: 1 / 4}),
         # the value at 2: Chebyshev points, in proportion to Lagrange's polynomials there
-        (
-            MeanVariance(np.outer([1.0, 2.0, 4.0], [1.0, 2.0, 4.0])),
-            2,
-            {-1: 1 / 7, 0: 3 / 7, 1: 3 / 7},
-        ),
+        (MeanVariance(np.outer(AT_2, AT_2)), 2, {-1: 1 / 7, 0: 3 / 7, 1: 3 / 7}),
         # a parabola beyond a straight line: the highest coefficient again
-        (
-            Separate((Pair(np.array([2]), np.ones(1), np.array([0, 1])),)),
-            2,
-            {-1: 1 / 4, 0: 1 / 2, 1: 1 / 4},
-        ),
+        (Separate((BEYOND_A_LINE,)), 2, {-1: 1 / 4, 0: 1 / 2, 1: 1 / 4}),
     ],
 )
 def test_known_optima(criterion, degree, expected):
@@ -270,15 +263,9 @@ def test_known_optima(criterion, degree, expected):
     for x, share in expected.items():
         near = min(shares, key=lambda y, x=x: abs(y - x))
         assert shares[near] == pytest.approx(share, abs=2e-3)
-    exact_value = float(
-        criterion.value(
-            10.0
-            * polynomial(degree, np.array(list(expected))).information(
-                np.array(list(expected.values()))
-            )
-        )
-    )
-    assert found.value == pytest.approx(exact_value, rel=1e-6)
+    points, exact = (np.array(list(x)) for x in (expected, expected.values()))
+    m = 10.0 * polynomial(degree, points).information(exact)
+    assert found.value == pytest.approx(float(criterion.value(m)), rel=1e-6)
     assert found.value * (1 - 1e-9) <= found.bound <= found.value * (1 + 1e-6)
 
 

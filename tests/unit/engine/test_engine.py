@@ -105,12 +105,10 @@ def test_what_a_killed_worker_held_is_computed_by_another(tmp_path):
         assert engine.map(refuse, range(2)) == (0, 1)  # nothing of it is left
 
 
-@pytest.mark.parametrize("kind", [
-    signal.SIGINT,
-    *(
-        pytest.param(kind, marks=pytest.mark.slow)
-        for kind in (signal.SIGTERM, signal.SIGHUP, signal.SIGKILL)
-    )])  # fmt: skip
+QUICK, SLOW = signal.SIGINT, (signal.SIGTERM, signal.SIGHUP, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("kind", [QUICK, *(pytest.param(k, marks=pytest.mark.slow) for k in SLOW)])
 def test_a_signal_leaves_no_process_and_no_folder(kind, tmp_path):
     process = subprocess.Popen(
         [sys.executable, "-m", "tests.support.engine_cases"],
@@ -178,12 +176,14 @@ def test_certificates_that_are_not_there_are_said_in_one_line(tmp_path):
 
 
 def test_what_is_no_cluster_is_said_in_one_line():
-    with pytest.raises(InputError, match="not an address"), open_engine(scheduler="nowhere"):
-        pass
-    with pytest.raises(InputError, match="from 1"), open_engine(0):
-        pass
-    with pytest.raises(InputError, match="own workers"), open_engine(2, "tcp://127.0.0.1:1"):
-        pass
+    wrong = {
+        (None, "nowhere"): "not an address",
+        (0, None): "from 1",
+        (2, "tcp://x"): "own workers",
+    }
+    for (workers, address), message in wrong.items():
+        with pytest.raises(InputError, match=message), open_engine(workers, scheduler):
+            pass
 
 
 def test_a_scheduler_without_workers_is_refused(monkeypatch):

@@ -13,6 +13,7 @@ from hilcal.robot.chain import evaluate
 from hilcal.robot.scene import pinocchio_model
 from hilcal.robot.statics import Load, slot_wrenches
 from hilcal.robot.urdf import arm_from_urdf
+from tests.support.arm_cases import flange_at
 from tests.support.refusals import edited, refusal, refusals, refuses
 
 PI2 = math.pi / 2
@@ -167,9 +168,7 @@ def test_arms_of_other_makers_are_those_of_their_urdfs(name):
         for (origin, axis), angle in zip(joints, row, strict=True):
             turn = pin.SE3(pin.AngleAxis(angle, np.array(axis)).matrix(), np.zeros(3)).homogeneous
             pose = pose @ origin @ turn
-        pose = pose @ tool
-        np.testing.assert_allclose(found.rotation[-1, i], pose[:3, :3], rtol=0, atol=1e-9)
-        np.testing.assert_allclose(found.position[-1, i], pose[:3, 3], rtol=0, atol=1e-9)
+        flange_at(found, i, pose @ tool, 1e-9)
     assert arm.source
     assert np.isfinite(arm.payload)
     assert np.all((arm.q_max - arm.q_min > 1.0) & (arm.q_max - arm.q_min < 15.0))

@@ -19,6 +19,7 @@ from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import drive_jacobian, evaluate
 from hilcal.robot.urdf import arm_from_urdf
 from hilcal.tables.table import read_table
+from tests.support.arm_cases import flange_at, same_flange
 from tests.support.effect_cases import make
 from tests.support.refusals import refusal, refusals, refuses
 from tests.support.serial_urdf import serial_urdf
@@ -45,8 +46,7 @@ def test_flange_and_masses_are_those_of_the_drawn_arm_at_the_turned_angles():
     q = np.random.default_rng(0).uniform(-2, 2, (20, 6))
     drawn, counted = load_arm("ur10e"), described(**KEYS)
     a, b = evaluate(drawn, turned(q)), evaluate(counted, q)
-    np.testing.assert_allclose(b.position[-1], a.position[-1], atol=1e-12)
-    np.testing.assert_allclose(b.rotation[-1], a.rotation[-1], atol=1e-12)
+    same_flange(b, a)
     np.testing.assert_allclose(b.com, a.com, atol=1e-12)
 
 
@@ -106,8 +106,7 @@ def test_modified_rows_are_those_of_craig(tmp_path):
         at = at @ craig(np.radians(al), a, angle + np.radians(o), d)
         coms.append((at @ [0.1, 0.2, 0.3, 1.0])[:3])
     chain = evaluate(arm, q[None])
-    np.testing.assert_allclose(chain.position[-1][0], at[:3, 3], atol=1e-12)
-    np.testing.assert_allclose(chain.rotation[-1][0], at[:3, :3], atol=1e-12)
+    flange_at(chain, 0, at)
     np.testing.assert_allclose(chain.com[:, 0], coms, atol=1e-12)
 
 
@@ -175,9 +174,7 @@ def test_it_stands_and_is_pulled_as_pinocchio_says(tmp_path):
     for k in range(len(q)):
         at = q[k, [0, 1, 4]]
         pin.framesForwardKinematics(model, data, at)
-        place = data.oMf[model.getFrameId("l5")]
-        np.testing.assert_allclose(s.chain.position[-1][k], place.translation, atol=1e-12)
-        np.testing.assert_allclose(s.chain.rotation[-1][k], place.rotation, atol=1e-12)
+        flange_at(s.chain, k, data.oMf[model.getFrameId("l5")].homogeneous)
         held = pin.computeGeneralizedGravity(model, data, at) * 9.80665 / 9.81
         np.testing.assert_allclose(-s.torque[k, [0, 1, 4]], held, atol=1e-9)
         assert not s.torque[k, [2, 3]].any()
@@ -207,8 +204,7 @@ def test_signs_and_zeros_of_the_controller_go_with_it(tmp_path):
     drawn[:, 4] += 0.5 * q[:, 0]
     drawn = arm.complete(drawn)
     a, b = evaluate(arm, drawn), evaluate(counted, counted.complete(q))
-    np.testing.assert_allclose(b.position[-1], a.position[-1], atol=1e-12)
-    np.testing.assert_allclose(b.rotation[-1], a.rotation[-1], atol=1e-12)
+    same_flange(b, a)
     back = counted.complete(q) * by.joint_sign + np.radians(by.joint_offset_deg)
     np.testing.assert_allclose(back[:, [2, 3]], drawn[:, [2, 3]], atol=1e-12)
 
