@@ -178,10 +178,8 @@ def costly_loads(
     while len(loads) > 1 and current > 0:
         budget += change
         without = {name: tuple(load for load in loads if load != name) for name in loads}
-        value, name = max(
-            (_value(objective, problem, sample, others, budget), name)
-            for name, others in without.items()
-        )
+        values = {n: _value(objective, problem, sample, o, budget) for n, o in without.items()}
+        value, name = max((value, name) for name, value in values.items())
         if not value > current * (1.0 + LOOSE):
             break
         costly.append((name, value / current - 1.0))
@@ -224,8 +222,6 @@ def compound_objective(
     units = CandidateSet(sampled.units.rows[:, :, :size], sampled.units.cost)
     names = tuple(t.name for t in problem.terms[:size])
     model_alone = Objective(units, of_model, objective.prior[:size, :size], names)
-    total, alone = (
-        relax(q, budget, tolerance=LOOSE).value / 2.0
-        for q in (replace(sampled, criterion=of_all), model_alone)
-    )
+    both = replace(sampled, criterion=of_all), model_alone
+    total, alone = (relax(q, budget, tolerance=LOOSE).value / 2.0 for q in both)
     return replace(objective, criterion=MeanVariance(total * c, name, alone * c[:size, :size]))

@@ -64,10 +64,8 @@ class Candidates:
 
     def states(self) -> States:
         """Return all N·(1 + L) states, pose by pose, with nominal times and approach directions."""
-        count = len(self.loads)
-        return nominal_states(
-            np.repeat(self.q, count, axis=0), np.tile(self.wrench, (len(self), 1))
-        )
+        q = np.repeat(self.q, len(self.loads), axis=0)
+        return nominal_states(q, np.tile(self.wrench, (len(self), 1)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,12 +95,9 @@ def reading_derivatives(
         count, per_pose = rows.stop - rows.start, loads * repeats
         p = model.predict(states[slice(rows.start * per_pose, rows.stop * per_pose)], nominal.theta)
         jacobian = model.jacobian_of((*model.effects, *added), p, nominal.theta, nominal.m, live)
-        covariance = arrival_covariance(nominal, config, p)
-        yield ReadingDerivatives(
-            rows,
-            (jacobian * scale).reshape(count, loads, m, len(scale)),
-            covariance.reshape(count, loads, m, m),
-        )
+        jacobian = (jacobian * scale).reshape(count, loads, m, len(scale))
+        covariance = arrival_covariance(nominal, config, p).reshape(count, loads, m, m)
+        yield ReadingDerivatives(rows, jacobian, covariance)
 
 
 def absolute_rows(part: ReadingDerivatives) -> Floats:
@@ -296,13 +291,10 @@ def _terms(
     model = [(e.name, p) for e in nominal.model.effects for p in e.parameters]
     live = ((*model[k], float(nominal.theta[k])) for k in nominal.live)
     extra = [(e.name, p) for e in families for p in e.parameters]
-    return (
-        *(DesignTerm(e, f"{e}.{p.name}", p.unit, p.scale, value, False) for e, p, value in live),
-        *(
-            DesignTerm(e, f"{e}.{p.name}", p.unit, float(s), 0.0, True)
-            for (e, p), s in zip(extra, std, strict=True)
-        ),
-    )
+    terms = [DesignTerm(e, f"{e}.{p.name}", p.unit, p.scale, v, False) for e, p, v in live]
+    for (e, p), s in zip(extra, std, strict=True):
+        terms.append(DesignTerm(e, f"{e}.{p.name}", p.unit, float(s), 0.0, True))
+    return tuple(terms)
 
 
 def _layout(
@@ -337,12 +329,8 @@ def _layout(
             "no candidate pose may be taken"
             + (" both unloaded and under a load" if mode == "deflection" else "")
         )
-    of_pose = [subsets[k] for k in pattern]
-    contents = tuple(
-        (pose, tuple(candidates.loads[k] for k in s))
-        for pose, units in enumerate(of_pose)
-        for s in units
-    )
+    units_of = ((pose, s) for pose, k in enumerate(pattern) for s in subsets[k])
+    contents = tuple((pose, tuple(candidates.loads[k] for k in s)) for pose, s in units_of)
     return contents, height, notes
 
 

@@ -105,9 +105,8 @@ def other_effects(nominal: NominalModel, config: CellConfig) -> tuple[tuple[Effe
     names = () if model.background else potential_names(config, model)
     periodic = [name for name in names if "harmonics" in catalogue[name].option_help]
     finest = {name: {"harmonics": HARMONICS} for name in periodic}
-    effects = tuple(
-        build(catalogue, name, nominal.cell, nominal.m, finest.get(name, {})) for name in names
-    )
+    cell, m = nominal.cell, nominal.m
+    effects = tuple(build(catalogue, name, cell, m, finest.get(name, {})) for name in names)
     return effects, expected_std(model, effects)
 
 
@@ -139,10 +138,8 @@ class _Coordinates:
         full, retained = rows @ self.root, rows @ self.random
         noise = full @ np.swapaxes(full, 1, 2) - retained @ np.swapaxes(retained, 1, 2)
         noise += np.eye(rows.shape[1])
-        low = np.linalg.cholesky(noise)
-        return np.asarray(
-            np.linalg.solve(low, np.concatenate([rows @ self.flat, retained], axis=-1))
-        )
+        both = np.concatenate([rows @ self.flat, retained], axis=-1)
+        return np.asarray(np.linalg.solve(np.linalg.cholesky(noise), both))
 
 
 def _coordinates(

@@ -132,11 +132,10 @@ def _pair_powers(
             if e not in observable:
                 yield PairPower(e, f, LEVEL, LEVEL, True)
                 continue
-            so_far, planned = (
-                expected(problem, (e, f), betas, m) for m in (pairs.prior, information)
-            )
+            now = expected(problem, (e, f), betas, pairs.prior)
+            planned = expected(problem, (e, f), betas, information)
             never = (e, f) in pairs.not_separable and planned < LEAST_POWER
-            yield PairPower(e, f, so_far, planned, never)
+            yield PairPower(e, f, now, planned, never)
 
 
 def _from_reference(
@@ -175,18 +174,12 @@ def reordered(
     """Return a plan with other counts of its units, ordered anew."""
     problem, usable, objective = planned.problem, np.flatnonzero(planned.usable), planned.asked
     information = objective.prior + objective.units.information(counts.astype(float))
-    design = replace(
-        planned.design,
-        counts=counts[usable],
-        value=float(objective.criterion.value(information)),
-        information=information,
-        cost=float(counts @ problem.units.cost),
-    )
+    value, cost = float(objective.criterion.value(information)), counts @ problem.units.cost
+    design = replace(planned.design, counts=counts[usable], value=value, information=information)
+    order = ordered(space, problem, reference, counts, rng, ordering)
+    precision = predicted(problem, counts.astype(float), work=planned.work)
     return replace(
-        planned,
-        ordered=ordered(space, problem, reference, counts, rng, ordering),
-        design=design,
-        predicted=predicted(problem, counts.astype(float), work=planned.work),
+        planned, ordered=order, design=replace(design, cost=float(cost)), predicted=precision
     )
 
 
@@ -208,9 +201,8 @@ def _where(planned: Planned, pair: Pair, information: Floats) -> tuple[dict[str,
             shares[load] = shares.get(load, 0.0) + share
 
     arm, cell = problem.nominal.cell.arm, problem.nominal.cell
-    reaches = np.linalg.norm(
-        evaluate(arm, problem.candidates.q).point(cell.target[:3, 3])[:, :2], axis=1
-    )
+    targets = evaluate(arm, problem.candidates.q).point(cell.target[:3, 3])
+    reaches = np.linalg.norm(targets[:, :2], axis=1)
     poses = np.array([problem.what[k][0] for k in units])
     reach = float(reaches[poses] @ parts) / total
     return shares, reach / float(np.mean(reaches))

@@ -84,19 +84,13 @@ def without_undetermined(
         raise CannotAnswerError(undetermined[0].remark)
     retained = np.setdiff1d(np.arange(len(problem.terms)), list(omitted))
     of_model, carried = retained[retained < size], problem.nominal.carried
-    nominal = replace(
-        problem.nominal,
-        live=problem.nominal.live[of_model],
-        carried=None if carried is None else carried[np.ix_(of_model, of_model)],
-    )
+    carried = None if carried is None else carried[np.ix_(of_model, of_model)]
+    nominal = replace(problem.nominal, live=problem.nominal.live[of_model], carried=carried)
     rows = np.ascontiguousarray(problem.units.rows[:, :, retained])
+    units, terms = CandidateSet(rows, problem.units.cost), tuple(problem.terms[k] for k in retained)
+    prior, measured = (m[np.ix_(retained, retained)] for m in (problem.prior, problem.measured))
     reduced = replace(
-        problem,
-        nominal=nominal,
-        units=CandidateSet(rows, problem.units.cost),
-        terms=tuple(problem.terms[k] for k in retained),
-        prior=problem.prior[np.ix_(retained, retained)],
-        measured=problem.measured[np.ix_(retained, retained)],
+        problem, nominal=nominal, units=units, terms=terms, prior=prior, measured=measured
     )
     return reduced, undetermined
 

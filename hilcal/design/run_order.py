@@ -151,10 +151,8 @@ def confounding(
     floor = 1e-12 * np.linalg.norm(lag) * np.sqrt(len(lag))
     rho = np.abs(lag @ columns) / np.where(size > floor, size, np.inf)
     worst, mean, rms = int(np.argmax(rho)), float(lag.mean()), float(np.sqrt(np.mean(lag**2)))
-    return Confounding(
-        len(pairs), float(rho[worst]), names[worst], mean, rms, drift, drift * rms, drift * mean,
-        slope,
-    )  # fmt: skip
+    most, error, bias = float(rho[worst]), drift * rms, drift * mean
+    return Confounding(len(pairs), most, names[worst], mean, rms, drift, error, bias, slope)
 
 
 def _regressors(q: Floats, wrench: Floats, *, product: bool) -> tuple[list[str], Floats]:
@@ -409,10 +407,8 @@ class OrderDraws:
                 orders[load] = self._walk(seconds, short, spare)
                 continue
             first = set(self.rng.permutation(short)[: (len(short) + 1) // 2].tolist())
-            parts = [
-                tour.improved(seconds, [k for k in short if (k in first) == in_first])
-                for in_first in (True, False)
-            ]
+            halves = ([k for k in short if (k in first) == early] for early in (True, False))
+            parts = [tour.improved(seconds, half_of) for half_of in halves]
             lengths = [tour.length(seconds, part) for part in parts]
             if max(lengths) >= tour.NEVER:  # a pose is in another part than its only access
                 half, orders[load] = False, self._walk(seconds, short, spare)

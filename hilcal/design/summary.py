@@ -288,9 +288,7 @@ def _criteria(
     planned: Planned, config: CellConfig, rng: np.random.Generator
 ) -> Iterator[CriterionResult]:
     problem = planned.problem
-    usable_poses = [
-        pose for (pose, _), usable in zip(problem.what, planned.usable, strict=True) if usable
-    ]
+    usable_poses = [problem.what[k][0] for k in np.flatnonzero(planned.usable)]
     for name in dict.fromkeys((*COMPARED, planned.criterion)):
         if name == planned.criterion:
             yield _result(planned, name, planned.counts, planned.design.efficiency)
@@ -326,17 +324,11 @@ def _result(planned: Planned, name: str, counts: Floats, efficiency: float) -> C
         for t, std in zip(precision.terms, precision.std, strict=True)
         if t.name.startswith(baseline) and t.value
     ]
-    volume = float(np.exp(np.mean(np.log(np.maximum(sigma, 1e-300)))))
-    return CriterionResult(
-        criterion=name,
-        position_std_m=_finite(precision.position),
-        position_open_m=_finite(precision.position_open),
-        joint_share=_finite(max(shares)) if shares else None,
-        o1=volume / np.sqrt(readings),
-        o2=float(alone[0] / alone[-1]),
-        o3=float(sigma[0]),
-        efficiency=efficiency,
-    )
+    share = _finite(max(shares)) if shares else None
+    stds = _finite(precision.position), _finite(precision.position_open)
+    o1 = float(np.exp(np.mean(np.log(np.maximum(sigma, 1e-300))))) / np.sqrt(readings)
+    o2, o3 = float(alone[0] / alone[-1]), float(sigma[0])
+    return CriterionResult(name, *stds, share, o1, o2, o3, efficiency)
 
 
 def _prefixes(problem: DesignProblem, *roles: Role) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from hilcal.errors import InputError
 from hilcal.names import quoted
@@ -15,20 +15,10 @@ from hilcal.store.procedure_log import CALIBRATION, CORRECTED, PURPOSE, VALIDATI
 from hilcal.store.run_log import PLAN, RunLog
 from hilcal.types import Floats
 
-Kind = Literal[
-    "plan",
-    "measure",
-    "refine",
-    "decide",
-    "plan_validation",
-    "measure_validation",
-    "validate",
-    "correct",
-    "measure_corrected",
-    "compare",
-    "done",
-]
-MOVING: tuple[Kind, ...] = ("measure", "measure_validation", "measure_corrected")
+Moving = Literal["measure", "measure_validation", "measure_corrected"]
+Computed = Literal["refine", "decide", "plan_validation", "validate", "correct", "compare"]
+Kind = Literal["plan", "done"] | Moving | Computed
+MOVING: tuple[Kind, ...] = get_args(Moving)
 """Steps in which the arm moves."""
 _VALIDATING: tuple[Kind, Kind, Kind] = ("plan_validation", "measure_validation", "validate")
 _CORRECTING: tuple[Kind, Kind, Kind] = ("correct", "measure_corrected", "compare")
