@@ -73,12 +73,9 @@ def deadly(where: str) -> ClusterError:
 
 def versions() -> Versions:
     """Return the versions of the packages that determine the last bits of a result."""
-    return (
-        ("hilcal", __version__),
-        ("Python", ".".join(platform.python_version_tuple()[:2])),
-        ("numpy", np.__version__),
-        ("scipy", scipy.__version__),
-    )
+    python = ".".join(platform.python_version_tuple()[:2])
+    libraries = (("numpy", np.__version__), ("scipy", scipy.__version__))
+    return ("hilcal", __version__), ("Python", python), *libraries
 
 
 @cache
@@ -135,7 +132,7 @@ def processes(count: int) -> Iterator["Processes"]:
         try:
             yield workers
         finally:
-            workers.end()
+            workers.end(list(workers.all))
 
 
 class Processes:
@@ -144,7 +141,7 @@ class Processes:
     def __init__(self, count: int, scratch: str) -> None:
         """Start no worker yet; `scratch` is the folder of their temporary files."""
         self._count, self._scratch = count, scratch
-        self._all: set[_Worker] = set()
+        self.all: set[_Worker] = set()
         self._idle: list[_Worker] = []
 
     def results(
@@ -166,7 +163,7 @@ class Processes:
                     try:
                         done, result = worker.line.recv()
                     except (EOFError, ConnectionError) as error:
-                        self._end([worker])
+                        self.end([worker])
                         deaths[k] += 1
                         if deaths[k] > DEATHS:
                             raise deadly(f"{self._count} workers of this machine") from error
@@ -177,11 +174,7 @@ class Processes:
                         raise result
                     yield k, result
         finally:
-            self._end([worker for worker, _ in busy.values()])  # their results are not needed
-
-    def end(self) -> None:
-        """Kill all workers."""
-        self._end(list(self._all))
+            self.end([worker for worker, _ in busy.values()])  # their results are not needed
 
     def _start(self) -> None:
         # Only this process handles Ctrl-C: a worker starts with SIGINT blocked. Python 3.11
@@ -190,18 +183,19 @@ class Processes:
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             worker = _Worker(self._scratch)
-            self._all.add(worker)
+            self.all.add(worker)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         self._idle.append(worker)
 
-    def _end(self, workers: list["_Worker"]) -> None:
+    def end(self, workers: list["_Worker"]) -> None:
+        """Kill some workers."""
         for worker in workers:
             worker.process.kill()
         for worker in workers:
             worker.process.join()
             worker.line.close()
-            self._all.discard(worker)  # an abandoned `results` may end its workers again
+            self.all.discard(worker)  # an abandoned `results` may end its workers again
 
 
 class _Worker:
@@ -266,10 +260,9 @@ def _signals_as_exit() -> Iterator[None]:
     def end(number: int, frame: FrameType | None) -> None:
         raise SystemExit(SIGNALLED + number)
 
-    kinds = []
-    if threading.current_thread() is threading.main_thread():
-        endings = (signal.SIGTERM, signal.SIGHUP)
-        kinds = [kind for kind in endings if signal.getsignal(kind) is signal.SIG_DFL]
+    main = threading.current_thread() is threading.main_thread()
+    endings = (signal.SIGTERM, signal.SIGHUP) if main else ()
+    kinds = [kind for kind in endings if signal.getsignal(kind) is signal.SIG_DFL]
     for kind in kinds:
         signal.signal(kind, end)
     try:

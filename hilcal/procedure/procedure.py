@@ -13,7 +13,8 @@ readings is predicted; from then on the file must not change.
 """
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -247,12 +248,7 @@ class Procedure:
 
     def validate(self, say: Say = lambda text: None) -> Acceptance:
         """Freeze the validation campaign, and predict its readings."""
-        with (
-            Campaign.open(self.run, self.catalogue) as o,
-            state.opened(self.files.validation, VALIDATION, self.run) as unseen,
-        ):
-            log = ProcedureLog(o.file)
-            self._freeze(log, unseen)
+        with self._frozen() as (o, unseen):
             record = self._record(o)
             fitted = o.fitted_readings(record)
             readings = self._readings(o, record, unseen)
@@ -270,29 +266,31 @@ class Procedure:
             total = shares.everything
             content = {"revision": record.number, "error": prediction.error.to_json()}
             content |= {"noise_floor_m": prediction.noise_floor, "stated_m": total.stated_m}
-            log.append(state.VALIDATED, {**content, "within": total.within})
+            ProcedureLog(o.file).append(state.VALIDATED, {**content, "within": total.within})
         return shares
 
-    def _freeze(self, log: ProcedureLog, unseen: CampaignFile) -> None:
-        """Record the hash of the validation campaign; refuse one that differs from its record."""
-        frozen, readings = log.last(state.FROZEN), unseen.readings()
-        hashed = content_hash(readings)
-        if frozen is None:
-            content = {"file": unseen.path.name, "readings_sha256": hashed}
-            log.append(state.FROZEN, {**content, "readings": len(readings)})
-        elif frozen["readings_sha256"] != hashed:
-            raise InputError(
-                f"{unseen.path}: other readings than when it was frozen "
-                f"(SHA-256 {frozen['readings_sha256'][:12]}…, now {hashed[:12]}…)"
-            )
-
-    def correct(self, say: Say = lambda text: None) -> Plan:
-        """Correct the joint targets of the validation poses, and make the campaign for them."""
+    @contextmanager
+    def _frozen(self) -> Iterator[tuple[Campaign, CampaignFile]]:
+        """Open the campaign and its validation; record the latter's hash, or refuse another one."""
         with (
             Campaign.open(self.run, self.catalogue) as o,
             state.opened(self.files.validation, VALIDATION, self.run) as unseen,
         ):
-            self._freeze(ProcedureLog(o.file), unseen)
+            log, readings = ProcedureLog(o.file), unseen.readings()
+            frozen, hashed = log.last(state.FROZEN), content_hash(readings)
+            if frozen is None:
+                content = {"file": unseen.path.name, "readings_sha256": hashed}
+                log.append(state.FROZEN, {**content, "readings": len(readings)})
+            elif frozen["readings_sha256"] != hashed:
+                raise InputError(
+                    f"{unseen.path}: other readings than when it was frozen "
+                    f"(SHA-256 {frozen['readings_sha256'][:12]}…, now {hashed[:12]}…)"
+                )
+            yield o, unseen
+
+    def correct(self, say: Say = lambda text: None) -> Plan:
+        """Correct the joint targets of the validation poses, and make the campaign for them."""
+        with self._frozen() as (o, unseen):
             say("restoring the model")
             calibration, record = self._calibration(o)
             readings = self._readings(o, record, unseen)
@@ -306,13 +304,8 @@ class Procedure:
 
     def compare(self, say: Say = lambda text: None) -> Improvement:
         """Compare the measured errors at uncorrected and corrected joint targets."""
-        with (
-            Campaign.open(self.run, self.catalogue) as o,
-            state.opened(self.files.validation, VALIDATION, self.run) as unseen,
-            state.opened(self.files.corrected, CORRECTED, self.run) as moved,
-        ):
-            log = ProcedureLog(o.file)
-            self._freeze(log, unseen)
+        corrected_run = state.opened(self.files.corrected, CORRECTED, self.run)
+        with self._frozen() as (o, unseen), corrected_run as moved:
             say("comparing errors before and after")
             calibration, record = self._calibration(o)
             first, last = (self._readings(o, record, file) for file in (unseen, moved))
@@ -320,6 +313,7 @@ class Procedure:
             left_out = left_out_of(read_plan(moved.about(PLAN) or "", f"{moved.path}, its plan"))
             p = o.predictive(record, *o.restore_model(record))
             gain = improvement(calibration, p, uncorrected, corrected, uncorrected.states, left_out)
+            log = ProcedureLog(o.file)
             if log.last(state.IMPROVED) is None:
                 content = {"revision": record.number, "readings_sha256": moved.data_hash()}
                 log.append(state.IMPROVED, {**content, **gain.to_dict()})

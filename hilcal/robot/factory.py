@@ -105,9 +105,8 @@ def read_factory(path: Path, nominal: Arm, text: str | None = None) -> FactoryKi
 
     The kinematics of another arm are refused.
     """
-    readers = {".conf": _of_conf, ".yaml": _of_yaml, ".yml": _of_yaml, ".toml": _of_toml}
-    reader = readers.get(path.suffix.lower())
-    if reader is None:
+    kind = path.suffix.lower()
+    if kind not in (".conf", ".yaml", ".yml", ".toml"):
         raise InputError(f"{path}: not the kinematics of an arm; valid: {KINDS}")
     try:
         text = limits.read_text(path, limits.PROGRAM) if text is None else text
@@ -115,7 +114,12 @@ def read_factory(path: Path, nominal: Arm, text: str | None = None) -> FactoryKi
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path}: {reason}; expected {KINDS}") from None
     try:
-        factory = reader(text, nominal, str(path))
+        if kind == ".conf":
+            factory = _of_conf(text, nominal, str(path))
+        elif kind == ".toml":
+            factory = of_dict(tomllib.loads(text), str(path))
+        else:
+            factory = _of_yaml(text, str(path))
     except (ValueError, KeyError, TypeError, configparser.Error) as error:
         raise InputError(
             f"{path}: not the kinematics of an arm ({_why(error)}); valid: {KINDS}"
@@ -181,11 +185,7 @@ def _values(text: str) -> list[str]:
     return text.strip().strip("[]").replace(",", " ").split()
 
 
-def _of_toml(text: str, nominal: Arm, source: str) -> FactoryKinematics:
-    return of_dict(tomllib.loads(text), source)
-
-
-def _of_yaml(text: str, nominal: Arm, source: str) -> FactoryKinematics:
+def _of_yaml(text: str, source: str) -> FactoryKinematics:
     """Parse the layout of `ur_calibration`: a mapping of bodies, each with six numbers."""
     places: dict[str, dict[str, float]] = {}
     body = ""
