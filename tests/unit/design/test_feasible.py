@@ -413,10 +413,8 @@ def gaps(shapes, q, load):
         high = np.maximum(high, points.max(axis=0) + radius)
     turns = np.zeros((25, c.arm.n))
     turns[:, 0] = np.linspace(-np.pi, np.pi, 25)
-    mount, upper = (
-        extent([p for p in parts if p.body < 2], c, turns),
-        extent([p for p in parts if p.body == 2], c, q[None]),
-    )
+    mount = extent([p for p in parts if p.body < 2], c, turns)
+    upper = extent([p for p in parts if p.body == 2], c, q[None])
     least = config.limits.workspace_min_m or (-np.inf, -np.inf, 0.0)
     most = config.limits.workspace_max_m or (np.inf, np.inf, np.inf)
     low = np.where(mount[0] >= least, np.minimum(low, upper[0]), low)
@@ -511,9 +509,8 @@ def test_nothing_small_is_passed_between_two_samples(name, seed, share, load):
             cube = {"name": "cube", "center_m": point.tolist(), "size_m": [0.004] * 3}
             found = cell(limits=free.limits.model_dump(), obstacles=[cube])
             assert not Space(c, found).passable(start, end[None], load).any()
-            assert any(
-                "cube collide" in x for x in route_problems(c, found, _way(start, end, load))
-            )
+            problems = route_problems(c, found, _way(start, end, load))
+            assert any("cube collide" in x for x in problems)
         low, _ = extent([p for p in parts if p.body > 2], c, between[None])
         box = free.limits.model_dump() | {"workspace_min_m": [-9.0, -9.0, low[2] + 0.002]}
         assert route_problems(c, cell(limits=box), _way(start, end, load))

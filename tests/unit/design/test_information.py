@@ -325,9 +325,7 @@ def test_a_load_that_no_pose_bears_is_as_good_as_none():
     without = problem_of(CELL, config.model_copy(update={"loads": config.loads[:-1]}), q)
     assert borne.what == without.what
     assert borne.terms == without.terms
-    np.testing.assert_allclose(
-        borne.information(np.ones(len(borne.what))), without.information(np.ones(len(without.what)))
-    )
+    np.testing.assert_allclose(*(p.information(np.ones(len(p.what))) for p in (borne, without)))
 
 
 def test_potential_terms_only_add_uncertainty():
@@ -366,9 +364,8 @@ def test_derivatives_where_the_robot_works():
             step[k] = 1e-2 * scale
             slope = (at(a.theta + step) - at(a.theta - step)) / 2e-2
             # The Jacobian leaves out what is smaller by deflection over reach.
-            assert work.derivative[:, :, k] == pytest.approx(
-                slope, abs=2e-2 * np.abs(slope).max() + 1e-12
-            )
+            near = 2e-2 * np.abs(slope).max() + 1e-12
+            assert work.derivative[:, :, k] == pytest.approx(slope, abs=near)
 
 
 def test_unloaded_work_with_deflections_is_under_each_load():
@@ -489,10 +486,8 @@ def test_a_cell_of_distances_is_planned(tmp_path, capsys):
 
 
 def test_devices_read_positions(tmp_path):
-    text = DEMO.read_text().replace(
-        'frame = "tracker"', 'driver = "geocom"\nport = "x"\nobserves = "distance"'
-    )
-    (tmp_path / "cell.toml").write_text(text)
+    keys = 'driver = "geocom"\nport = "x"\nobserves = "distance"'
+    (tmp_path / "cell.toml").write_text(DEMO.read_text().replace('frame = "tracker"', keys))
     refusal(r'observes = "distance" together with driver', load_config, tmp_path / "cell.toml")
 
 

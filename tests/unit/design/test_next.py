@@ -116,10 +116,8 @@ def test_the_powers_of_a_plan_are_shares_of_rejections():
     """Of what is known and planned for, with the parameters that the readings support."""
     first = doubtful("base_compliance", 2)
     rng, trials = np.random.default_rng(3), 2000
-    found = measure_next(
-        first.rehearsal.cell, SMALL, first.fit, first.suspects, Request(6), rng,
-        reference=first.plan.joints("reference"),
-    )  # fmt: skip
+    asked = (first.rehearsal.cell, SMALL, first.fit, first.suspects, Request(6), rng)
+    found = measure_next(*asked, reference=first.plan.joints("reference"))
     of, known = found.planned.problem, discriminated_pairs(found.planned.problem).prior
     values, vectors = np.linalg.eigh(known)
     before = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
@@ -181,11 +179,9 @@ def test_readings_that_do_not_speak_for_an_effect_tell_no_strength():
 def test_pairs_that_no_measurement_separates_are_said_so():
     """In deflections a scale of the tracker is a common factor on all compliances."""
     first = doubtful(TILT, 1)
-    rng = np.random.default_rng(0)
+    asked = (SMALL, first.fit, ("tracker_scale", LINK), Request(4), np.random.default_rng(0))
     with pytest.raises(CannotAnswerError, match="no measurement separates them"):
-        measure_next(
-            cell_from_config(SMALL), SMALL, first.fit, ("tracker_scale", LINK), Request(4), rng
-        )
+        measure_next(cell_from_config(SMALL), *asked)
     assert not_separable_message([("a", "b"), ("a", "c"), ("b", "a"), ("c", "d")]) == (
         "no measurement in this cell separates a from b or c, nor c from d"
     )
@@ -194,10 +190,9 @@ def test_pairs_that_no_measurement_separates_are_said_so():
 @pytest.mark.parametrize("suspects", [(TILT,), (TILT, TILT)])
 def test_one_suspect_is_refused(suspects):
     first = doubtful(TILT, 1)
+    asked = (SMALL, first.fit, suspects, Request(4), np.random.default_rng(0))
     with pytest.raises(InputError, match="two or more"):
-        measure_next(
-            first.rehearsal.cell, SMALL, first.fit, suspects, Request(4), np.random.default_rng(0)
-        )
+        measure_next(first.rehearsal.cell, *asked)
 
 
 def test_what_was_ambiguous_is_decided():
@@ -319,9 +314,8 @@ def test_information_beside_the_model_and_power_beside_model_and_rival(mode):
     ridge = np.concatenate([linear.projection.ridge, np.zeros(x[LINK].shape[1])])
     with_rival = projection(np.hstack([linear.rows, x[LINK]]), ridge)
     promised = power(pair_of(of, (TILT, LINK), beta), so_far)
-    assert promised == pytest.approx(
-        family_power(with_rival.information(x[TILT]), beta, LEVEL), rel=1e-10
-    )
+    tested = family_power(with_rival.information(x[TILT]), beta, LEVEL)
+    assert promised == pytest.approx(tested, rel=1e-10)
     assert 2 * LEVEL < promised < 0.9
 
 

@@ -166,9 +166,8 @@ def test_says_which_parameters_nothing_determines():
         require_determined(same.T @ same, names)
     refusal_of(CannotAnswerError, "parameter 2", require_determined, blind.T @ blind)
     alike = Separate((Pair(np.array([0]), np.ones(1), np.array([1, 2]), ("backlash", "drift")),))
-    refusal_of(
-        CannotAnswerError, "separates backlash from drift", alike.require, same.T @ same, names
-    )
+    message = "separates backlash from drift"
+    refusal_of(CannotAnswerError, message, alike.require, same.T @ same, names)
     alike.require(a.T @ a, names)
 
 

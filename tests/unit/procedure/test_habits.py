@@ -23,13 +23,10 @@ def in_base_axes():
 
 
 def two_targets():
-    targets = (
-        Target(name="A", target_m=(0.06, 0.02, 0.12)),
-        Target(name="B", target_m=(-0.06, 0.02, 0.12)),
-    )
-    tool = Tool(
-        load_point_m=(0.1, 0.0, 0.15), mass_kg=0.8, com_m=(0.01, 0.0, 0.06), targets=targets
-    )
+    places = {"A": (0.06, 0.02, 0.12), "B": (-0.06, 0.02, 0.12)}
+    targets = tuple(Target(name=name, target_m=at) for name, at in places.items())
+    weight = {"mass_kg": 0.8, "com_m": (0.01, 0.0, 0.06)}
+    tool = Tool(load_point_m=(0.1, 0.0, 0.15), targets=targets, **weight)
     return small().model_copy(update={"tool": tool})
 
 

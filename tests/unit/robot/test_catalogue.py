@@ -38,9 +38,7 @@ PUBLISHED = {
 
 
 def rz(angle):
-    return pin.SE3(
-        pin.AngleAxis(angle, np.array([0.0, 0.0, 1.0])).matrix(), np.zeros(3)
-    ).homogeneous
+    return drawn(0, 0, 0, 0, 0, angle)
 
 
 def dh_frames(name, q):

@@ -83,14 +83,8 @@ HEAD = 'title = "t"\npayload_kg = 5.0\nsource = "s"\nconvention = "modified"\n'
 def craig(alpha, a, theta, d):
     """(4, 4) of a modified row, element by element (Craig, equation 3.6)."""
     ct, st, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha), np.sin(alpha)
-    return np.array(
-        [
-            [ct, -st, 0, a],
-            [st * ca, ct * ca, -sa, -sa * d],
-            [st * sa, ct * sa, ca, ca * d],
-            [0, 0, 0, 1],
-        ]
-    )
+    y, z = [st * ca, ct * ca, -sa, -sa * d], [st * sa, ct * sa, ca, ca * d]
+    return np.array([[ct, -st, 0, a], y, z, [0, 0, 0, 1]])
 
 
 def test_modified_rows_are_those_of_craig(tmp_path):

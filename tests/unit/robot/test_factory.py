@@ -57,9 +57,8 @@ def test_rows_whose_distances_cancel_are_held_exactly_near_the_nominal_frames(na
     assert np.abs(arm.links - nominal.links).max() < 0.01
     q = states()
     # rounding of some km: 1e-16 * 2e3 m, a few times
-    np.testing.assert_allclose(
-        evaluate(arm, q).position[-1], by_rows(factory.rows, q), rtol=0, atol=1e-11
-    )
+    there = by_rows(factory.rows, q)
+    np.testing.assert_allclose(evaluate(arm, q).position[-1], there, rtol=0, atol=1e-11)
     assert flange_difference(arm, measured_arm(name))[1] < 1e-11
     assert flange_difference(arm, nominal)[1] > 1e-3
     np.testing.assert_array_equal(arm.coms, nominal.coms)

@@ -145,9 +145,8 @@ def test_an_arm_of_unknown_shape_gets_links_and_can_move():
     parts = capsules(arm)
     assert {p.body for p in parts} <= set(range(arm.n + 1))
     for part in parts:  # each spans its link
-        assert np.linalg.norm(part.end - part.start) == pytest.approx(
-            np.linalg.norm(arm.links[part.body][:3, 3])
-        )
+        length = np.linalg.norm(arm.links[part.body][:3, 3])
+        assert np.linalg.norm(part.end - part.start) == pytest.approx(length)
     q = np.random.default_rng(0).uniform(-2.0, 2.0, (200, arm.n))
     share = Scene(arm).itself.touching(q, 0.0).mean()
     assert 0.0 < share < 0.9
