@@ -93,6 +93,16 @@ def same_flange(one: Chain, other: Chain) -> None:
         np.testing.assert_allclose(*ends, rtol=0, atol=1e-12)
 
 
+def classic_flange(rows: Floats, q: Floats) -> Floats:
+    """Flange (4, 4) of θ, a, d, α (4, n) at angles (n,), by the closed form of a classic row."""
+    pose = np.eye(4)
+    for (theta, a, d, alpha), angle in zip(rows.T, q, strict=True):
+        c, s, ca, sa = (f(x) for x in (angle + theta, alpha) for f in (np.cos, np.sin))
+        row = [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d]]
+        pose = pose @ np.array([*row, [0, 0, 0, 1]])
+    return pose
+
+
 def slope(f: Callable[[float], Floats], h: float) -> Floats:
     """Central difference of f at 0, of fourth order."""
     return (8 * (f(h) - f(-h)) - (f(2 * h) - f(-2 * h))) / (12 * h)

@@ -13,11 +13,12 @@ from hilcal.robot.chain import evaluate
 from hilcal.robot.scene import pinocchio_model
 from hilcal.robot.statics import Load, slot_wrenches
 from hilcal.robot.urdf import arm_from_urdf
-from tests.support.arm_cases import flange_at
+from tests.support.arm_cases import classic_flange, flange_at
 from tests.support.refusals import edited, refusal, refusals, refuses
+from tests.support.space_cases import frames
 
 PI2 = math.pi / 2
-ALPHA = [PI2, 0.0, 0.0, PI2, -PI2, 0.0]
+ALPHA, Z = [PI2, 0.0, 0.0, PI2, -PI2, 0.0], [0.0] * 6
 # (d1, a2, a3, d4, d5, d6) of the published tables, the weight of the whole arm, the payload, kg
 PUBLISHED = {
     "ur3": (0.1519, -0.24365, -0.21325, 0.11235, 0.08535, 0.0819, 11.0, 3),
@@ -41,23 +42,13 @@ def rz(angle):
     return drawn(0, 0, 0, 0, 0, angle)
 
 
-def dh_frames(name, q):
-    """Frames after each row, from the closed form of a classic DH matrix."""
+def published_flange(name, q):
     d1, a2, a3, d4, d5, d6, *_ = PUBLISHED[name]
-    frames, pose = [], np.eye(4)
-    for t, a, d, al in zip(q, [0, a2, a3, 0, 0, 0], [d1, 0, 0, d4, d5, d6], ALPHA, strict=True):
-        c, s, ca, sa = math.cos(t), math.sin(t), math.cos(al), math.sin(al)
-        row = [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d]]
-        pose = pose @ np.array([*row, [0, 0, 0, 1]], dtype=float)
-        frames.append(pose)
-    return frames
+    return classic_flange(np.array([Z, [0, a2, a3, 0, 0, 0], [d1, 0, 0, d4, d5, d6], ALPHA]), q)
 
 
 def flange(arm, q):
-    pose = arm.links[0]
-    for angle, link in zip(q, arm.links[1:], strict=True):
-        pose = pose @ rz(angle) @ link
-    return pose
+    return frames(arm, q)[-1]
 
 
 def gravity_torques(arm, q):
@@ -185,7 +176,7 @@ def test_pinocchio_agrees(name):
     for q in rng.uniform(-np.pi, np.pi, (20, 6)):
         pin.framesForwardKinematics(model, data, q)
         placement = data.oMf[model.getFrameId("flange")].homogeneous
-        np.testing.assert_allclose(placement, dh_frames(name, q)[-1], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(placement, published_flange(name, q), rtol=0, atol=1e-12)
         torques = pin.computeGeneralizedGravity(model, data, q)
         np.testing.assert_allclose(torques, gravity_torques(arm, q), rtol=0, atol=1e-4)
     np.testing.assert_array_equal(model.lowerPositionLimit, arm.q_min)
@@ -222,7 +213,7 @@ def test_a_dh_table_of_ones_own(tmp_path):
     shifted = rows[1].replace("alpha_deg = 90.0", "alpha_deg = 90.0\noffset_deg = 90.0")
     (tmp_path / "mine.toml").write_text("[[joints]]".join([rows[0], shifted, *rows[2:]]))
     arm, q = load_arm("mine.toml", tmp_path), np.array([0.3, -1.0, 1.2, 0.1, 0.5, 2.0])
-    turned = dh_frames("ur5e", q + np.array([PI2, 0, 0, 0, 0, 0]))[-1]
+    turned = published_flange("ur5e", q + np.array([PI2, 0, 0, 0, 0, 0]))
     np.testing.assert_allclose(flange(arm, q), turned, rtol=0, atol=1e-12)
     assert arm.name == "mine"
 
@@ -370,7 +361,7 @@ def test_continuous_joint_turns_freely(tmp_path):
     path.write_text(text)
     arm, q = arm_from_urdf(path, tip_link="tool0"), np.array([0.3, -1.0, 1.2, 0.1, 0.5, 2.0])
     np.testing.assert_allclose(arm.q_max, 2 * np.pi)
-    np.testing.assert_allclose(flange(arm, q), dh_frames("ur5e", q)[-1], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(flange(arm, q), published_flange("ur5e", q), rtol=0, atol=1e-12)
 
 
 def test_prismatic_joint_in_the_arm_slides(tmp_path):
