@@ -112,8 +112,6 @@ class DrawnPoses:
     q: Floats  # (K, n) joint angles, rad
     loads: tuple[str, ...]  # 1 + L names, "none" first
     allowed: Bools  # (K, 1 + L) loads that each pose bears
-    drawn: int  # number of states
-    left: dict[str, int]  # number of states left after each reason, in the order of checking
     remarks: tuple[str, ...]  # for people
 
 
@@ -165,7 +163,7 @@ def draw(
             remarks.append(_unusable(space, q, load))
     if len(space.loads) > 1 and not allowed[:, 1:].any():
         raise CannotAnswerError("; ".join(remarks[-(len(space.loads) - 1) :]))
-    return DrawnPoses(q, space.loads, allowed, drawn, remaining, tuple(remarks))
+    return DrawnPoses(q, space.loads, allowed, tuple(remarks))
 
 
 def _too_few(

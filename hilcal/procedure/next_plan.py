@@ -95,7 +95,6 @@ def plan_of(chosen: Next, suspects: tuple[str, ...]) -> Plan:
 class NextPlan:
     """The next measurements."""
 
-    doubt: Doubt  # the effects to separate
     found: Next  # the powers, pair by pair
     made: CheckedPlan  # the plan, all motions checked
 
@@ -121,7 +120,7 @@ def next_plan(
     summary = summarise(chosen.planned, config, rng, say, compare=compare, curve=compare)
     say("checking every motion in a dry run")
     checked_plan = checked(numbers, config, plan_of(chosen, doubt.suspects), summary)
-    return NextPlan(doubt, chosen, checked_plan)
+    return NextPlan(chosen, checked_plan)
 
 
 def doubt_to_settle(o: Campaign, d: Diagnosis, say: Say) -> Doubt:

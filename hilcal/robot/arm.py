@@ -134,22 +134,21 @@ class Arm(Brief):
         return np.where(self.slides, wrench[..., :-1, 2], wrench[..., :-1, 5])
 
     def phases(self, q: Floats) -> Floats:
-        """Return phases (..., n) for periodic laws, rad; of a slide, one turn over its travel."""
-        angle, slides = self.drive_angles(q), self.slides
+        """Return phases (..., n) for periodic laws, rad; of a slide, one turn over its travel.
+
+        They are the angles φ of the drives: D φ = C q; q if all couplings are mechanical.
+        """
+        angle, slides = self.chain_angles(q), self.slides
+        if self.drive is not None and np.array_equal(self.drive, self.coupling):
+            angle = q
+        elif self.drive is not None:
+            angle = np.asarray(angle @ np.linalg.pinv(self.drive).T)
         turn = 2 * np.pi / np.where(slides, self.q_max - self.q_min, 1.0)
         return np.where(slides, angle * turn, angle)
 
     def chain_angles(self, q: Floats) -> Floats:
         """Return angles (..., n) θ of the chain's joints, from the controller's values."""
         return q if self.coupling is None else q @ self.coupling.T
-
-    def drive_angles(self, q: Floats) -> Floats:
-        """Return angles (..., n) φ of the drives: D φ = C q; q if all couplings are mechanical."""
-        if self.drive is None:
-            return self.chain_angles(q)
-        if self.coupling is not None and np.array_equal(self.drive, self.coupling):
-            return q
-        return np.asarray(self.chain_angles(q) @ np.linalg.pinv(self.drive).T)
 
     def driven(self, dq: Floats) -> Floats:
         """Return displacements (..., n) of the chain's joints, from those of the drives."""

@@ -40,16 +40,8 @@ class Capsule:
     radius: float  # m
 
 
-@dataclass(frozen=True, slots=True)
-class Figures:
-    """Sizes of an arm of Universal Robots' build, m."""
-
-    shoulder: float  # offset of the upper arm's tube along the shoulder's axis
-    elbow: float  # offset of the forearm's tube along the same direction
-    housings: tuple[float, float, float, float]  # radii on joints 1, 2, 3 and the wrists
-    tubes: tuple[float, float]  # radii of the tubes of upper arm and forearm
-
-
+# Sizes of arms of Universal Robots' build, m: offsets of the tubes of upper arm and forearm along
+# the shoulder's axis; radii of the housings on joints 1, 2, 3 and the wrists, and of the two tubes.
 # Offsets: the manufacturer's ROS 2 description package, config/*/physical_parameters.yaml,
 # `offsets`. Radii of UR5e and UR10e: the collision capsules of the MuJoCo Menagerie
 # (universal_robots_ur5e, universal_robots_ur10e), also for their CB3 predecessors and the UR16e,
@@ -65,14 +57,14 @@ _UR10 = ((0.078, 0.078, 0.058, 0.050), (0.060, 0.043))
 _UR3 = ((0.049, 0.049, 0.041, 0.033), (0.040, 0.030))
 _UR20 = ((0.099, 0.099, 0.084, 0.060), (0.078, 0.062))
 _UR15 = ((0.084, 0.084, 0.069, 0.051), (0.066, 0.050))
-_FIGURES = {
-    "ur3": Figures(0.1198, 0.0275, *_UR3), "ur3e": Figures(0.120, 0.027, *_UR3),
-    "ur5": Figures(0.13585, 0.0165, *_UR5), "ur5e": Figures(0.138, 0.007, *_UR5),
-    "ur7e": Figures(0.138, 0.007, *_UR5), "ur8long": Figures(0.227, 0.046, *_UR15),
-    "ur10": Figures(0.220941, 0.049042, *_UR10), "ur10e": Figures(0.1762, 0.0393, *_UR10),
-    "ur12e": Figures(0.1762, 0.0393, *_UR10), "ur15": Figures(0.227, 0.046, *_UR15),
-    "ur16e": Figures(0.1762, 0.0393, *_UR10), "ur18": Figures(0.227, 0.046, *_UR15),
-    "ur20": Figures(0.260, 0.043, *_UR20), "ur30": Figures(0.260, 0.043, *_UR20),
+_FIGURES: dict[str, tuple[float, float, tuple[float, ...], tuple[float, ...]]] = {
+    "ur3": (0.1198, 0.0275, *_UR3), "ur3e": (0.120, 0.027, *_UR3),
+    "ur5": (0.13585, 0.0165, *_UR5), "ur5e": (0.138, 0.007, *_UR5),
+    "ur7e": (0.138, 0.007, *_UR5), "ur8long": (0.227, 0.046, *_UR15),
+    "ur10": (0.220941, 0.049042, *_UR10), "ur10e": (0.1762, 0.0393, *_UR10),
+    "ur12e": (0.1762, 0.0393, *_UR10), "ur15": (0.227, 0.046, *_UR15),
+    "ur16e": (0.1762, 0.0393, *_UR10), "ur18": (0.227, 0.046, *_UR15),
+    "ur20": (0.260, 0.043, *_UR20), "ur30": (0.260, 0.043, *_UR20),
 }  # fmt: skip
 _GUESSED = frozenset({"ur8long", "ur15", "ur18"})
 
@@ -96,7 +88,7 @@ def capsules(arm: Arm) -> tuple[Capsule, ...]:
     margins of collision checks cover.
     """
     if arm.sign is None:
-        return _of_ur(arm, _FIGURES[arm.name]) if _has_figures(arm) else _of_any(arm)
+        return _of_ur(arm, *_FIGURES[arm.name]) if _has_figures(arm) else _of_any(arm)
     # shapes of the drawn arm; bodies of opposite axes have frames turned about x
     turned = np.append(False, arm.sign < 0)
     return tuple(
@@ -131,12 +123,12 @@ def flange_capsule(arm: Arm, name: str, start: Floats, end: Floats, radius: floa
     return Capsule(name, arm.n, on_flange(arm, start), on_flange(arm, end), radius)
 
 
-def _of_ur(arm: Arm, figures: Figures) -> tuple[Capsule, ...]:
-    r1, r2, r3, r4 = figures.housings
-    upper, fore = figures.tubes
+def _of_ur(
+    arm: Arm, outer: float, inner: float, housings: tuple[float, ...], tubes: tuple[float, ...]
+) -> tuple[Capsule, ...]:
+    (r1, r2, r3, r4), (upper, fore) = housings, tubes
     d1, d4 = (float(arm.links[k][2, 3]) for k in (1, 4))
     x2, x3 = arm.links[2][:3, 3], arm.links[3][:3, 3]
-    inner, outer = figures.elbow, figures.shoulder
     between = 0.5 * (inner + outer)
     lift = arm.links[1][:3, 2]  # the shoulder's axis, in the frame of body 1
     top = np.array([0.0, 0.0, d1])

@@ -164,9 +164,6 @@ def test_enough_candidates_under_every_load_the_same_again_from_the_seed():
     assert np.all(drawn.allowed.mean(axis=0) > [0.99, 0.2, 0.5])
     np.testing.assert_array_equal(drawn.q, drawn_of(config, 300).q)
     assert not np.array_equal(drawn.q, drawn_of(config, 300, seed=1).q)
-    left = list(drawn.left.values())
-    assert left == sorted(left, reverse=True)
-    assert left[-1] >= 300
     spread = drawn.q.std(axis=0) / (drawn.q.max(axis=0) - drawn.q.min(axis=0))
     assert np.all(spread > 0.1)
 
