@@ -101,8 +101,29 @@ class Criterion(ABC):
         return self
 
     def require(self, m: Floats, names: Sequence[str] | None) -> None:
-        """Refuse M, the information of all candidates, if it does not determine φ."""
-        require_determined(m, names)
+        """Refuse M, the information of all candidates, if it does not determine φ.
+
+        The message names the parameters of a singular matrix.
+        """
+        label = tuple(f"parameter {k + 1}" for k in range(len(m))) if names is None else names
+        diagonal = np.diag(m)
+        blind = np.flatnonzero(diagonal <= 0.0)
+        if len(blind):
+            raise CannotAnswerError(
+                f"no candidate changes with {_listed([label[int(k)] for k in blind])}; allow "
+                "other poses or loads, or leave it out of the model"
+            )
+        root = np.sqrt(diagonal)
+        values, vectors = np.linalg.eigh(m / np.outer(root, root))
+        if values[0] > DETERMINED:
+            return
+        share = np.abs(vectors[:, 0])
+        inside = np.flatnonzero(share > 0.1 * share.max())
+        raise CannotAnswerError(
+            "no candidate separates "
+            f"{_listed([label[int(k)] for k in inside[np.argsort(-share[inside])]])}; allow other "
+            "poses or loads, or leave one of them out of the model"
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,29 +174,6 @@ class Objective:
     def information(self, weight: Floats, which: Ints | None = None) -> Floats:
         """Return (P, P) M, of all units or of those with the indices `which`."""
         return np.asarray(self.prior + self.units.information(weight, which))
-
-
-def require_determined(m: Floats, names: Sequence[str] | None = None) -> None:
-    """Refuse a singular information matrix (P, P), and name the undetermined parameters."""
-    label = tuple(f"parameter {k + 1}" for k in range(len(m))) if names is None else names
-    diagonal = np.diag(m)
-    blind = np.flatnonzero(diagonal <= 0.0)
-    if len(blind):
-        raise CannotAnswerError(
-            f"no candidate changes with {_listed([label[int(k)] for k in blind])}; allow "
-            "other poses or loads, or leave it out of the model"
-        )
-    root = np.sqrt(diagonal)
-    values, vectors = np.linalg.eigh(m / np.outer(root, root))
-    if values[0] > DETERMINED:
-        return
-    share = np.abs(vectors[:, 0])
-    inside = np.flatnonzero(share > 0.1 * share.max())
-    raise CannotAnswerError(
-        "no candidate separates "
-        f"{_listed([label[int(k)] for k in inside[np.argsort(-share[inside])]])}; allow other "
-        "poses or loads, or leave one of them out of the model"
-    )
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from hilcal.design.approximate_design import BarrierProgram, relax
 from hilcal.design.criteria import D, E, K, MeanVariance, Separate
-from hilcal.design.criterion import CandidateSet, Objective, Pair, require_determined
+from hilcal.design.criterion import CandidateSet, Objective, Pair
 from hilcal.design.optimum import best
 from hilcal.errors import CannotAnswerError
 from tests.support.refusals import refusal, refusal_of
@@ -157,14 +157,15 @@ def test_says_which_parameters_nothing_determines():
     rng = np.random.default_rng(0)
     a = rng.normal(size=(30, 3)) * [1.0, 1e3, 1e-3]
     names = ("j1", "j2", "offset")
-    require_determined(a.T @ a, names)  # differences in size are no matter
+    require = D().require
+    require(a.T @ a, names)  # differences in size are no matter
     blind = a * [1, 0, 1]
-    refusal_of(CannotAnswerError, "changes with j2;", require_determined, blind.T @ blind, names)
+    refusal_of(CannotAnswerError, "changes with j2;", require, blind.T @ blind, names)
     same = a.copy()
     same[:, 2] = 1e-4 * same[:, 0]
     with pytest.raises(CannotAnswerError, match=r"separates (j1, offset|offset, j1);"):
-        require_determined(same.T @ same, names)
-    refusal_of(CannotAnswerError, "parameter 2", require_determined, blind.T @ blind)
+        require(same.T @ same, names)
+    refusal_of(CannotAnswerError, "parameter 2", require, blind.T @ blind, None)
     alike = Separate((Pair(np.array([0]), np.ones(1), np.array([1, 2]), ("backlash", "drift")),))
     message = "separates backlash from drift"
     refusal_of(CannotAnswerError, message, alike.require, same.T @ same, names)
