@@ -19,7 +19,7 @@ from hilcal.errors import CannotAnswerError
 from hilcal.measuring.route import duration, route, seconds_at_rest
 from hilcal.robot.arm import Arm
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
-from hilcal.types import Bools, Floats, Ints
+from hilcal.types import Bools, Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,22 +202,6 @@ class LoadBlock:
         return sum(map(len, self.loops))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Ways:
-    """Ways under one load between the reference, index 0, and P poses."""
-
-    direct: Floats  # (P + 1, P + 1) times of straight motions, s; `NEVER` if not known to be clear
-    seconds: Floats  # the same, or by the reference with a reading there if that is needed
-
-    def among(self, which: Ints) -> "Ways":
-        """Return the ways between the reference and stops at poses (m,), from 1.
-
-        Between two stops at one pose, the arm moves by the reference, to arrive anew.
-        """
-        grid = np.ix_(*[np.concatenate([[0], which])] * 2)
-        return Ways(self.direct[grid], self.seconds[grid])
-
-
 @dataclass(frozen=True, slots=True)
 class Chosen:
     """Readings to take at a pose."""
@@ -357,7 +341,9 @@ class OrderDraws:
     rng: np.random.Generator
     stops: dict[str, list[PlannedStop]]  # by load
     passable: InitVar[Passable]
-    ways: dict[str, Ways] = field(default_factory=dict)  # between the stops under each load
+    # by load, between the reference and the stops: see `ways`
+    direct: dict[str, Floats] = field(default_factory=dict)
+    seconds: dict[str, Floats] = field(default_factory=dict)
     short: dict[str, list[int]] = field(default_factory=dict)  # shortest tours of stops, from 1
 
     def __post_init__(self, passable: Passable) -> None:
@@ -368,10 +354,12 @@ class OrderDraws:
             poses = np.array([pose for pose, _ in load_stops])
             visited = np.unique(poses)
             between = ways(self.q[[0, *visited]], load, passable, self.pace)
-            self.ways[load] = between.among(np.searchsorted(visited, poses) + 1)
-            self.short[load] = tour.shortest(self.ways[load].seconds, self.rng)
+            # between two stops at one pose, the arm moves by the reference, to arrive anew
+            place = np.concatenate([[0], np.searchsorted(visited, poses) + 1])
+            self.direct[load], seconds = (way[np.ix_(place, place)] for way in between)
+            self.seconds[load], self.short[load] = seconds, tour.shortest(seconds, self.rng)
             order = [0, *self.short[load], 0]
-            legs = self.ways[load].seconds[order[:-1], order[1:]]
+            legs = seconds[order[:-1], order[1:]]
             if legs.max() >= tour.NEVER:
                 k = int(np.argmax(legs >= tour.NEVER))
                 pose = self.names[load_stops[max(order[k], order[k + 1]) - 1][0] - 1]
@@ -401,7 +389,7 @@ class OrderDraws:
         half = self.how.unloaded == "around"
         orders = {}
         for load, short in self.short.items():
-            seconds = self.ways[load].seconds
+            seconds = self.seconds[load]
             spare = extra * len(short) / total
             if load != UNLOADED or not half or len(short) < 2:
                 orders[load] = self._walk(seconds, short, spare)
@@ -426,7 +414,7 @@ class OrderDraws:
         """Cut an order into loops; `mixed` loops are in random order and direction."""
         if not order:
             return LoadBlock(load, (), 0.0)
-        direct, pace = self.ways[load].direct, self.pace
+        direct, pace = self.direct[load], self.pace
         parts = tour.loops(direct, order, pace.reading_s, self.how.reference_every_s)
         if parts is None:  # the loop of a pose without a direct way takes too long
             parts = tour.loops(direct, order, pace.reading_s, np.inf)
@@ -450,8 +438,12 @@ class OrderDraws:
         return time, confounding(plan, times, self.wrenches, how.drift, how.reading_std)
 
 
-def ways(q: Floats, load: str, passable: Passable, pace: Pace) -> Ways:
-    """Return the ways between poses (P + 1, n) under a load, the reference first."""
+def ways(q: Floats, load: str, passable: Passable, pace: Pace) -> tuple[Floats, Floats]:
+    """Return times (P + 1, P + 1) between poses (P + 1, n) under a load, the reference first, s.
+
+    Of straight motions, `NEVER` if not known to be clear; and of the same, or by the reference with
+    a reading there if that is needed.
+    """
     legs = pace.legs(q, q)
     count = len(q)
     close = np.argsort(legs, axis=1, kind="stable")[:, : NEAR + 1]
@@ -467,7 +459,7 @@ def ways(q: Floats, load: str, passable: Passable, pace: Pace) -> Ways:
             clear = ends[passable(q[k], q[ends], load)]
             direct[k, clear] = legs[k, clear]
     around = direct[:, :1] + pace.reading_s + direct[:1]
-    return Ways(direct, np.minimum(np.minimum(direct, around), NEVER))
+    return direct, np.minimum(np.minimum(direct, around), NEVER)
 
 
 def load_order(
