@@ -276,20 +276,9 @@ def test_a_table_of_a_rail_comes_back_and_is_checked(tmp_path):
 def test_a_foreign_table_with_a_rail_goes_through_the_commands(tmp_path, capsys):
     """From a table in mm and degrees to corrected joint values, by the commands alone."""
     r, _ = campaign(tmp_path, "guide_error", 5, 30)
-    s = r.readings
-    rows = [["name", "E1 mm", *(f"A{k}" for k in range(1, 7)), "X", "Y", "Z", "weight"]]
-    for k in range(len(s)):
-        if s.load_names[s.load[k]] == "pull":
-            continue
-        q = s.states.q[k]
-        joints = [1e3 * q[0], *np.degrees(q[1:])]
-        kg = 10.0 if s.load[k] else 0.0
-        figures = [*joints, *(1e3 * s.value[k]), kg]
-        rows.append([s.pose_names[s.pose[k]], *(f"{x:.6f}" for x in figures)])
-    with (tmp_path / "theirs.csv").open("w", newline="") as file:
-        csv.writer(file).writerows(rows)
+    their_table(tmp_path, r, ["E1 mm", *ARM_AXES], ("none", "10kg"))
     (tmp_path / "map.toml").write_text(
-        """pose.column = "name"
+        """pose.column = "pose"
 [joints]
 columns = ["E1 mm", "A1", "A2", "A3", "A4", "A5", "A6"]
 unit = "deg"
@@ -338,27 +327,33 @@ joint_std_rad = 1e-5
     assert "column 'q3_rad' is missing beside its group" in said
 
 
-def plain_table(folder, header, mirrored=False):
-    """Unloaded positions in mm, joints in degrees, the travel in mm; perhaps counted backwards."""
-    r, _ = campaign(folder, "nothing", 2, 24)
-    s = r.readings
+ARM_AXES = [f"A{k}" for k in range(1, 7)]
+ALL_AXES = [f"J{k}" for k in range(1, 8)]
+
+
+def their_table(folder, r, header, loads=("none",), mirrored=False):
+    """Positions and travel in mm, perhaps counted backwards; joints in degrees; weights, if any."""
+    s, weight = r.readings, ["weight"] * (len(loads) > 1)
     with (folder / "theirs.csv").open("w", newline="") as file:
         out = csv.writer(file)
-        out.writerow(["pose", *header, "X", "Y", "Z"])
-        for k in np.flatnonzero(s.load == 0):
-            q = s.states.q[k]
+        out.writerow(["pose", *header, "X", "Y", "Z", *weight])
+        for k, load in enumerate(s.load_names[number] for number in s.load):
+            if load not in loads:
+                continue
+            q, kg = s.states.q[k], [10.0 * (load != "none") for _ in weight]
             travel = 3.0 - q[0] if mirrored else q[0]
-            joints = [1e3 * travel, *np.degrees(q[1:])]
-            figures = [*joints, *(1e3 * s.value[k])]
+            figures = [1e3 * travel, *np.degrees(q[1:]), *(1e3 * s.value[k]), *kg]
             out.writerow([s.pose_names[s.pose[k]], *(f"{x:.6f}" for x in figures)])
-    cell = '[robot]\nmodel = "track.toml"\n[tool]\ntarget_m = [0.06, 0.02, 0.12]\n'
-    (folder / "cell.toml").write_text(cell)
     return folder / "theirs.csv"
 
 
-@pytest.mark.parametrize(
-    "header", [["E1", *(f"A{k}" for k in range(1, 7))], [f"J{k}" for k in range(1, 8)]]
-)
+def plain_table(folder, header, mirrored=False):
+    cell = '[robot]\nmodel = "track.toml"\n[tool]\ntarget_m = [0.06, 0.02, 0.12]\n'
+    (folder / "cell.toml").write_text(cell)
+    return their_table(folder, campaign(folder, "nothing", 2, 24)[0], header, mirrored=mirrored)
+
+
+@pytest.mark.parametrize("header", [["E1", *ARM_AXES], ALL_AXES])
 def test_a_preview_sees_the_travel_in_mm(tmp_path, capsys, header):
     """Also that of an external axis, which controllers name apart from the arm's."""
     table = plain_table(tmp_path, header)
@@ -374,7 +369,7 @@ def test_a_preview_sees_the_travel_in_mm(tmp_path, capsys, header):
 
 
 def test_a_travel_that_is_counted_backwards_is_named(tmp_path, capsys):
-    table = plain_table(tmp_path, [f"J{k}" for k in range(1, 8)], mirrored=True)
+    table = plain_table(tmp_path, ALL_AXES, mirrored=True)
     cell, run = tmp_path / "cell.toml", tmp_path / "run.hilcal"
     mapping = tmp_path / "m.toml"
     ok(capsys, "import", table, "--config", cell, "--preview", "-o", mapping)
