@@ -139,10 +139,9 @@ class Arm(Brief):
         They are the angles φ of the drives: D φ = C q; q if all couplings are mechanical.
         """
         angle, slides = self.chain_angles(q), self.slides
-        if self.drive is not None and np.array_equal(self.drive, self.coupling):
-            angle = q
-        elif self.drive is not None:
-            angle = np.asarray(angle @ np.linalg.pinv(self.drive).T)
+        if self.drive is not None:
+            mechanical = self.coupling is not None and np.array_equal(self.drive, self.coupling)
+            angle = q if mechanical else np.asarray(angle @ np.linalg.pinv(self.drive).T)
         turn = 2 * np.pi / np.where(slides, self.q_max - self.q_min, 1.0)
         return np.where(slides, angle * turn, angle)
 
