@@ -178,7 +178,7 @@ def _newton(program: BarrierProgram, matrix: Floats, lean: Floats, w: Floats) ->
 
 
 def _room(x: Floats, move: Floats) -> float:
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
         return float(np.min(np.where(move < 0.0, -x / move, np.inf), initial=np.inf))
 
 
