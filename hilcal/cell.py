@@ -10,31 +10,24 @@ from hilcal.config import STANDARD_GRAVITY_M_S2, CellConfig, load_config
 from hilcal.config.sections import Gauge, Point
 from hilcal.errors import InputError
 from hilcal.readings.readings import ObserverName
-from hilcal.robot.arm import Arm
+from hilcal.robot import se3
+from hilcal.robot.arm import Arm, as_counted
 from hilcal.robot.catalogue import load_arm
-from hilcal.robot.conventions import as_counted
 from hilcal.robot.factory import FactoryKinematics, read_factory, with_factory
-from hilcal.robot.se3 import rotation
 from hilcal.shown import Brief
 from hilcal.types import Floats, Ints
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observer:
-    """An observer of the target, with the target's position p in the observer's axes.
+    """An observer of the target, with the target's position p in the observer's axes."""
 
-    Attributes:
-        name: kind and name. A station reads p, a point |p| + offset, a gauge p_x.
-        frame: (4, 4) T_observer_sensor.
-        free: estimated elements of the twist of the frame, observer's axes; of a point, whose
-            rotation has no meaning, 3 is the offset (see `Deviation.observer`).
-        offset: offset of a distance, m.
-    """
-
-    name: ObserverName
-    frame: Floats
+    name: ObserverName  # a station reads p, a point |p| + offset, a gauge p_x
+    frame: Floats  # (4, 4) T_observer_sensor
+    # estimated elements of the twist of the frame, observer's axes; of a point, whose rotation has
+    # no meaning, 3 is the offset (see `Deviation.observer`)
     free: tuple[int, ...]
-    offset: float = 0.0
+    offset: float = 0.0  # of a distance, m
 
     @property
     def tied(self) -> bool:
@@ -57,50 +50,29 @@ def plane_frame(direction: Floats, origin: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cell(Brief):
-    """The data that a prediction needs besides states and effects; SI units.
-
-    Attributes:
-        arm: the arm.
-        target: (4, 4) T_flange_target, the tracked target in flange axes.
-        load_point: (3,) where the wrench acts, flange axes, m.
-        tool_mass: mass of what the flange carries permanently, kg.
-        tool_com: (3,) centre of that mass, flange axes, m.
-        gravity: (3,) acceleration of gravity, base axes, m/s².
-        registration: (4, 4) T_sensor_base: maps base into sensor (tracker) coordinates.
-        registration_known: False where it has to be estimated.
-        target_known: False where the target's offset has to be estimated.
-        config: the configuration that the cell was made from: instruments, loads, limits; None
-            for a cell that was made from numbers alone.
-        base_dir: directory that relative paths in `config` refer to.
-        measured_torques: whether effects take measured joint torques, where readings have them,
-            instead of those computed from the described masses and loads.
-        factory: the factory's kinematics of this arm, from a file; `arm` has them where the
-            configuration says so.
-        targets: (T, 4, 4) T_flange_target of several targets, in the order of `target_names`;
-            `target` is the first of them. None where the tool carries one.
-        target_names: names of the targets.
-        observers: the observers of the target, in the order of `Readings.observers`; empty where
-            one tracker reads all.
-        targets_known: whether the offset of each target is known; `target_known` is True where all
-            are.
-    """
+    """The data that a prediction needs besides states and effects; SI units."""
 
     arm: Arm
-    target: Floats
-    load_point: Floats
-    tool_mass: float
-    tool_com: Floats
-    gravity: Floats
-    registration: Floats
-    registration_known: bool
-    target_known: bool
-    config: CellConfig | None = None
-    base_dir: Path = Path()
+    target: Floats  # (4, 4) T_flange_target, the tracked target in flange axes
+    load_point: Floats  # (3,) where the wrench acts, flange axes, m
+    tool_mass: float  # of what the flange carries permanently, kg
+    tool_com: Floats  # (3,) centre of that mass, flange axes, m
+    gravity: Floats  # (3,) acceleration, base axes, m/s²
+    registration: Floats  # (4, 4) T_sensor_base: maps base into sensor (tracker) coordinates
+    registration_known: bool  # False where it has to be estimated
+    target_known: bool  # False where the offset of a target has to be estimated
+    config: CellConfig | None = None  # that it was made from; None if from numbers alone
+    base_dir: Path = Path()  # that relative paths in `config` refer to
+    # whether effects take measured joint torques, where readings have them, instead of those
+    # computed from the described masses and loads
     measured_torques: bool = False
+    # the factory's kinematics, from a file; `arm` has them where the configuration says so
     factory: FactoryKinematics | None = None
+    # (T, 4, 4) T_flange_target of several targets, `target` the first; None where there is one
     targets: Floats | None = None
-    target_names: tuple[str, ...] = ()
-    targets_known: tuple[bool, ...] = ()
+    target_names: tuple[str, ...] = ()  # of several targets
+    targets_known: tuple[bool, ...] = ()  # whether the offset of each is known
+    # in the order of `Readings.observers`; empty where one tracker reads all
     observers: tuple[Observer, ...] = ()
 
     @property
@@ -121,12 +93,9 @@ class Cell(Brief):
         """Return the cell with other T_flange_target (T, 4, 4), and whether each is known."""
         flags = tuple(self.known_targets if known is None else known)
         several = self.targets is not None
+        targets, known = (poses, flags) if several else (None, ())
         return replace(
-            self,
-            target=poses[0],
-            target_known=all(flags),
-            targets=poses if several else None,
-            targets_known=flags if several else (),
+            self, target=poses[0], target_known=all(flags), targets=targets, targets_known=known
         )
 
     def observed_by(self, names: Sequence[ObserverName]) -> "Cell":
@@ -171,18 +140,13 @@ class Cell(Brief):
         >>> hc.Cell.load(CELL).arm.name
         'ur10e'
 
-        Raises:
-            InputError: no such file, an unknown key, a bad value, or an unusable robot.
+        An InputError says what cannot be used: the file, a key, a value, or the robot.
         """
         path = Path(path)
         return cell_from_config(load_config(path), path.absolute().parent)
 
     def configured(self) -> CellConfig:
-        """Return the configuration.
-
-        Raises:
-            InputError: the cell was made from numbers alone.
-        """
+        """Return the configuration; an InputError if the cell was made from numbers alone."""
         if self.config is None:
             raise InputError("the cell has no configuration; make it with Cell.load(CELL.toml)")
         return self.config
@@ -193,24 +157,15 @@ STANDARD_GRAVITY = np.array([0.0, 0.0, -STANDARD_GRAVITY_M_S2])
 
 def cell_from_config(
     config: CellConfig,
-    base_dir: Path | None = None,
-    robot_file: str | None = None,
-    calibration_file: str | None = None,
+    base_dir: Path | None = None,  # that paths of the robot's files are relative to
+    robot_file: str | None = None,  # its text, as a campaign stores it; then no file is read
+    calibration_file: str | None = None,  # the same of the factory's kinematics
 ) -> Cell:
     """Return the cell that a configuration describes.
 
     The target is unknown without `target_m`, the registration where `frame = "tracker"` comes
-    without a pose of the base. Both are the identity then.
-
-    Args:
-        config: the checked configuration.
-        base_dir: directory that a robot's file path is relative to.
-        robot_file: text of the robot's file, as a campaign stores it; then no file is read.
-        calibration_file: the same for the file of the factory's kinematics.
-
-    Raises:
-        InputError: unknown robot, unusable robot file, or a number of joint values that does
-            not fit the arm.
+    without a pose of the base. Both are the identity then. An InputError for an unknown robot, an
+    unusable file, or a number of joint values that does not fit the arm.
     """
     robot, tool, tracker = config.robot, config.tool, config.tracker
     arm = load_arm(
@@ -265,9 +220,5 @@ def tracker_place(cell: Cell, config: CellConfig) -> Floats | None:
 
 def _pose(xyz: tuple[float, ...] | None, rotvec: tuple[float, ...] | None) -> Floats:
     """Return a pose (4, 4); None is no translation, or no rotation."""
-    pose = np.eye(4)
-    if rotvec is not None:
-        pose[:3, :3] = rotation(np.array(rotvec))
-    if xyz is not None:
-        pose[:3, 3] = xyz
-    return pose
+    zero = (0.0, 0.0, 0.0)
+    return se3.of_six([*(xyz or zero), *(rotvec or zero)])

@@ -17,7 +17,7 @@ from hilcal.diagnosis.verdict import diagnose as judge_fit
 from hilcal.discovery.discovery import LawSearch
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import Options
-from hilcal.engine.engine import open_engine
+from hilcal.engine import open_engine
 from hilcal.errors import InputError
 from hilcal.identification import baseline as starting_models
 from hilcal.identification import bootstrap as bootstraps

@@ -24,7 +24,7 @@ from scipy.stats import chi2
 from hilcal.cell import Cell
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.options import Options
-from hilcal.engine.engine import Advance, Engine
+from hilcal.engine import Advance, Engine
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.carried import CarriedPrior, coordinates_of

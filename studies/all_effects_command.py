@@ -20,7 +20,7 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import terminal
 from hilcal.config import CellConfig
-from hilcal.engine.engine import open_engine
+from hilcal.engine import open_engine
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.full_covariance import joint_factors

@@ -12,7 +12,7 @@ from hilcal.cli.demo import CELL
 from hilcal.cli.options import Jobs, Json, Scheduler
 from hilcal.cli.terminal import terminal
 from hilcal.config import load_config
-from hilcal.engine.engine import open_engine
+from hilcal.engine import open_engine
 from hilcal.present.progress import counting
 from hilcal.robot.catalogue import configs_dir
 from studies.carried_bands import BandCase, band_cases

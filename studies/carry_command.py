@@ -14,7 +14,7 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.cell import Cell
 from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import terminal
-from hilcal.engine.engine import open_engine
+from hilcal.engine import open_engine
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.arm_scatter import with_prior_scatter
 from hilcal.identification.baseline import baseline

@@ -20,7 +20,7 @@ from hilcal.calibration.compensation import BAND, ToolPoses, band
 from hilcal.cell import Cell
 from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import terminal
-from hilcal.engine.engine import open_engine
+from hilcal.engine import open_engine
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit

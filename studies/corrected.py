@@ -35,7 +35,7 @@ from hilcal.config import CellConfig, load_config
 from hilcal.config.sections import CellLoad
 from hilcal.drivers.simulated.rehearsal import as_told
 from hilcal.effects.catalogue import installed
-from hilcal.engine.engine import open_engine
+from hilcal.engine import open_engine
 from hilcal.errors import DeviceError
 from hilcal.numbers import length
 from hilcal.procedure.procedure import Procedure, continued

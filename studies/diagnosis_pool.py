@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from hilcal.engine.engine import Advance, open_engine
+from hilcal.engine import Advance, open_engine
 from studies.diagnosis import Asked, Outcome
 
 Run = Callable[[Asked], Outcome]

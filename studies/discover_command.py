@@ -13,7 +13,7 @@ from hilcal.cli.demo import CELL
 from hilcal.cli.options import Jobs, Json, Scheduler
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import CellConfig, load_config
-from hilcal.engine.engine import open_engine
+from hilcal.engine import open_engine
 from hilcal.present.document import table
 from hilcal.present.progress import counting
 from hilcal.readings.whitening import MODES, Mode

@@ -14,7 +14,7 @@ from hilcal.cli.terminal import terminal
 from hilcal.diagnosis.residual_regression import residual_regression
 from hilcal.discovery.discovery import Discovery, discover
 from hilcal.discovery.law import effect_class
-from hilcal.engine.engine import open_engine
+from hilcal.engine import open_engine
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise

@@ -21,12 +21,13 @@ from scipy.stats import chi2
 from hilcal.cell import Cell
 from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import terminal
-from hilcal.design.choice import choose, objective_of
+from hilcal.design.choice import EFFORT, objective_of
 from hilcal.design.information import problem
 from hilcal.design.nominal_model import nominal_model
+from hilcal.design.optimum import best
 from hilcal.design.planner import without_undetermined
 from hilcal.design.predicted import prediction_poses
-from hilcal.engine.engine import open_engine
+from hilcal.engine import open_engine
 from hilcal.identification.arm_scatter import with_arm_scatter
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit
@@ -191,7 +192,7 @@ def _planned(cell: Cell, readings: Readings, case: Case) -> Ints:
     design_problem, _ = without_undetermined(problem(nominal_model(cell, config, m), config, q))
     work = prediction_poses(design_problem.nominal, config, q)
     objective = objective_of(design_problem, config, "I", work)
-    design = choose(objective, float(case.poses), np.random.default_rng(case.draw))
+    design = best(objective, float(case.poses), np.random.default_rng(case.draw), effort=EFFORT)
     return np.flatnonzero(design.counts)
 
 

@@ -9,7 +9,7 @@ import typer
 from hilcal.cli.options import Jobs, Json, Scheduler
 from hilcal.cli.terminal import terminal
 from hilcal.config import load_config
-from hilcal.engine.engine import open_engine
+from hilcal.engine import open_engine
 from hilcal.present.document import table
 from hilcal.present.progress import counting
 from hilcal.robot.catalogue import configs_dir

@@ -31,7 +31,7 @@ from hilcal.readings.covariance import (
 )
 from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import configs_dir
-from hilcal.study.scaling import scaling_study
+from hilcal.study import scaling_study
 from hilcal.types import Floats
 from studies import carry_picture, few_poses_picture
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.engine.engine import ALONE, Engine
+from hilcal.engine import ALONE, Engine
 from studies.plans_errors import Arm, Errors, Prepared, Subject, prepared, run_campaign, subject
 from studies.plans_kinds import Chosen, Scene, at_random, grid, matching, optimal, scene
 from studies.plans_statistics import Measured, Summary, summary

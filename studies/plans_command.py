@@ -17,7 +17,7 @@ from hilcal.design.nominal_model import nominal_tracker_place
 from hilcal.drivers.simulated.injected_effects import nothing_hidden
 from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.drivers.simulated.world import World
-from hilcal.engine.engine import open_engine
+from hilcal.engine import open_engine
 from hilcal.errors import InputError
 from hilcal.present.progress import counting
 from hilcal.readings.readings import Readings, States

@@ -8,10 +8,11 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.design.choice import choose, compound_objective
+from hilcal.design.choice import EFFORT, compound_objective
 from hilcal.design.feasible import Space, draw
 from hilcal.design.information import DesignProblem, problem
 from hilcal.design.nominal_model import NominalModel, nominal_model
+from hilcal.design.optimum import best
 from hilcal.design.predicted import (
     PredictedUncertainty,
     PredictionPoses,
@@ -130,7 +131,7 @@ def optimal(
     if robust and s.robust is not None:
         of_plan, config = s.robust, s.config
     objective = compound_objective(of_plan, config, criterion, s.work, float(budget), rng)
-    design = choose(objective, float(budget), rng)
+    design = best(objective, float(budget), rng, effort=EFFORT)
     counts = np.asarray(design.counts, dtype=float)
     return Chosen(of_plan, counts, predicted(of_plan, counts, work=s.work), design.efficiency)
 

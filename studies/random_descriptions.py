@@ -15,10 +15,9 @@ from hilcal.identification.misdescription import Described, DescriptionFinding, 
 from hilcal.identification.registration import register
 from hilcal.readings.readings import Readings, States
 from hilcal.robot import se3
-from hilcal.robot.arm import Arm
+from hilcal.robot.arm import Arm, may_follow, with_conventions
 from hilcal.robot.catalogue import load_arm, robot_names
 from hilcal.robot.chain import evaluate, joint_jacobian
-from hilcal.robot.conventions import may_follow, with_conventions
 from hilcal.types import Floats
 
 ARMS = tuple(name for name in robot_names() if name.startswith("ur"))

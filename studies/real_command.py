@@ -10,7 +10,7 @@ import typer
 from hilcal.cell import Cell
 from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import terminal
-from hilcal.engine.engine import open_engine
+from hilcal.engine import open_engine
 from hilcal.identification.baseline import baseline
 from hilcal.library import read_table
 from hilcal.numbers import length

@@ -7,10 +7,10 @@ import typer
 
 from hilcal.cli.options import OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import terminal
-from hilcal.engine.engine import open_engine
+from hilcal.engine import open_engine
 from hilcal.present.progress import counting
 from hilcal.readings.whitening import SCALINGS
-from hilcal.study.scaling import check, experiments, scaling_study, table
+from hilcal.study import check, experiments, scaling_study, table
 from studies.records import Figure, Keep, keep
 
 

@@ -257,7 +257,7 @@ def fleet(
     # these import the modules for fitting and reports
     from hilcal.cli.fitting import check_record
     from hilcal.cli.showing import opening
-    from hilcal.engine.engine import open_engine
+    from hilcal.engine import open_engine
     from hilcal.identification.posterior_document import write
     from hilcal.present.comparison import fleet_report
     from hilcal.transfer.fleet import fleet as pool_fleet

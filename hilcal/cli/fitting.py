@@ -15,7 +15,7 @@ from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.options import Options
 from hilcal.effects.written import chosen_options, read_effects_text, write_effect
-from hilcal.engine.engine import open_engine
+from hilcal.engine import open_engine
 from hilcal.errors import InputError
 from hilcal.identification.arm_scatter import with_prior_scatter
 from hilcal.identification.baseline import baseline, with_effects

@@ -194,8 +194,8 @@ def scaling(
     as_json: bool = False,
 ) -> None:  # fmt: skip
     """Show what the scalings none, gu and gc do to the same data."""
-    from hilcal.engine.engine import open_engine
-    from hilcal.study.scaling import check, experiments, scaling_study, table
+    from hilcal.engine import open_engine
+    from hilcal.study import check, experiments, scaling_study, table
 
     t = terminal(as_json)
     check(runs)

@@ -1,19 +1,12 @@
 """The approximate design: optimal real weights of units, with a certified bound of φ."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg as sl
 
-from hilcal.design.criterion import (
-    CandidateSet,
-    Criterion,
-    Smooth,
-    best_first,
-    prices,
-    upper_bound,
-)
+from hilcal.design.criterion import CandidateSet, Objective, Smooth, best_first, prices, upper_bound
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.types import Bools, Floats, Ints
 
@@ -28,33 +21,30 @@ _CLAMP = 1e4  # largest ratio of a dual and μ / w
 class BarrierProgram:
     """Maximise φ(M0 + Σ w_k A_kᵀA_k) over w with Σ w_k c_k ≤ B, 0 ≤ w_k ≤ most."""
 
-    criterion: Criterion  # φ
-    units: CandidateSet  # n of them
+    objective: Objective  # φ and M0, of n units
     budget: float  # B
     most: float  # upper bound of each weight; may be infinite
-    prior: Floats  # (P, P) M0
 
     def information(self, weight: Floats) -> Floats:
         """Return (P, P) M."""
-        return np.asarray(self.prior + self.change(weight))
+        return np.asarray(self.objective.prior + self.change(weight))
 
     def change(self, weight: Floats) -> Floats:
         """Return (P, P) Σ w_k A_kᵀA_k; weights may be negative."""
-        rows = self.units.rows
+        rows = self.objective.units.rows
         flat = rows.reshape(-1, rows.shape[2])
         return np.asarray((flat * np.repeat(weight, rows.shape[1])[:, None]).T @ flat)
 
     def scan(self, smooth: Smooth) -> tuple[Floats, float]:
         """Return tr(Z A_kᵀA_k) of all units, and the bound of φ over them."""
-        rows = self.units.rows
-        above = prices(rows, smooth.above)
-        below = None if smooth.below is None else prices(rows, smooth.below)
-        cost = self.units.cost
-        return above, upper_bound(smooth, self.prior, above, cost, self.budget, self.most, below)
+        units, prior = self.objective.units, self.objective.prior
+        above = prices(units.rows, smooth.above)
+        below = None if smooth.below is None else prices(units.rows, smooth.below)
+        return above, upper_bound(smooth, prior, above, units.cost, self.budget, self.most, below)
 
     def curvature(self, smooth: Smooth) -> Floats:
         """Return (n, n) −∂²f/∂w_k∂w_l, positive semidefinite."""
-        rows = self.units.rows
+        rows = self.objective.units.rows
         n, size, p = rows.shape
         flat = rows.reshape(-1, p)
         out = np.zeros((n, n))
@@ -102,7 +92,6 @@ class Optimum:
     smooth: Smooth  # f at w, with the matrices of the bound
     value: float  # φ
     bound: float  # of φ over these units
-    order: float
 
     @property
     def gap(self) -> float:
@@ -117,21 +106,19 @@ def solve(program: BarrierProgram, start: Floats, tolerance: float, order: float
     z of the bounds as separate variables (Wright 1997, Primal-Dual Interior-Point Methods); μ falls
     to 0 from `order` / n. Criteria with a kink have a surrogate of order μ.
     """
-    w, n = start, len(start)
+    w, n, criterion = start, len(start), program.objective.criterion
     capped = np.isfinite(program.most)
     m = program.information(w)
     mu = max(min(order, 1.0), tolerance) / n
-    z = mu / w
-    y = mu / (program.most - w) if capped else np.zeros(n)
+    z, y = mu / w, mu / (program.most - w)
     best: Optimum | None = None
     central = False
     for step in range(_STEPS):
-        surrogate = program.criterion.surrogate(m, mu)
+        surrogate = criterion.surrogate(m, mu)
         smooth = surrogate(m)
         if smooth is None:
             break
-        value = float(program.criterion.value(m))
-        iterate = Optimum(w, smooth, value, program.scan(smooth)[1], mu)
+        iterate = Optimum(w, smooth, float(criterion.value(m)), program.scan(smooth)[1])
         if best is None or iterate.gap < best.gap:
             best = iterate
         if iterate.gap <= tolerance or step == _STEPS - 1:
@@ -139,40 +126,36 @@ def solve(program: BarrierProgram, start: Floats, tolerance: float, order: float
         if central:
             mu = max(0.2 * mu, 0.1 * tolerance / n)
             central, z, y = False, 0.2 * z, 0.2 * y
-            surrogate = program.criterion.surrogate(m, mu)
+            surrogate = criterion.surrogate(m, mu)
             smooth = surrogate(m) or smooth
-        slope = prices(program.units.rows, smooth.gradient)
-        top = program.most - w if capped else np.ones(n)
-        lean = slope + mu / w - (mu / top if capped else 0.0)
+        slope = prices(program.objective.units.rows, smooth.gradient)
+        top = program.most - w
+        lean = slope + mu / w - mu / top
         move = _newton(program, program.curvature(smooth) + np.diag(z / w + y / top), lean, w)
         if move is None:
             break
-        length = min(1.0, _BACK * _room(w, move))
-        if capped:
-            length = min(length, _BACK * _room(top, -move))
+        length = min(1.0, _BACK * _room(w, move), _BACK * _room(top, -move))
         push = float(lean @ move)
         moved = program.change(move)
         length = _search(program, surrogate, smooth, (w, m), (move, moved), length, mu, push)
-        if length == 0.0 and (program.criterion.kinked or mu <= tolerance / (10 * n)):
+        if length == 0.0 and (criterion.kinked or mu <= tolerance / (10 * n)):
             break
         z = _dual(z, mu / w - z - z / w * move)
-        if capped:
-            y = _dual(y, mu / top - y + y / top * move)
+        y = _dual(y, mu / top - y + y / top * move)
         w = w + length * move
-        m = program.information(w)
+        m, top = program.information(w), program.most - w
         z = np.clip(z, mu / (_CLAMP * w), _CLAMP * mu / w)
+        y = np.clip(y, mu / (_CLAMP * top), _CLAMP * mu / top)
         complement = float(z @ w) / n
         if capped:
-            top = program.most - w
-            y = np.clip(y, mu / (_CLAMP * top), _CLAMP * mu / top)
             complement = 0.5 * (complement + float(y @ top) / n)
-        if program.criterion.kinked:  # μ, also the width of the kink, falls at central points only
+        if criterion.kinked:  # μ, also the width of the kink, falls at central points only
             central = push <= _CENTRAL * mu
         else:
             fall = 0.1 if length > 0.9 else 0.3 if length > 0.5 else 0.8
             mu = max(min(fall * complement, mu), 0.05 * tolerance / n)
     if best is None:
-        return Optimum(w, Smooth(0.0, m * 0.0, (), (), m * 0.0), 0.0, np.inf, mu)
+        return Optimum(w, Smooth(0.0, m * 0.0, (), (), m * 0.0), 0.0, np.inf)
     return best
 
 
@@ -185,7 +168,7 @@ def _newton(program: BarrierProgram, matrix: Floats, lean: Floats, w: Floats) ->
             factor = sl.cho_factor(matrix, lower=True, check_finite=False)
         except (np.linalg.LinAlgError, ValueError):
             continue
-        cost = program.units.cost
+        cost = program.objective.units.cost
         solved = sl.cho_solve(factor, np.column_stack([lean, cost]), check_finite=False)
         if np.isfinite(solved).all():
             unspent = program.budget - float(cost @ w)
@@ -195,7 +178,7 @@ def _newton(program: BarrierProgram, matrix: Floats, lean: Floats, w: Floats) ->
 
 
 def _room(x: Floats, move: Floats) -> float:
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
         return float(np.min(np.where(move < 0.0, -x / move, np.inf), initial=np.inf))
 
 
@@ -267,13 +250,10 @@ class ApproximateDesign:
 
 
 def relax(
-    units: CandidateSet,
-    criterion: Criterion,  # φ
+    objective: Objective,
     budget: float,  # B, in the units of the cost
-    prior: Floats | None = None,  # (P, P) M0; zero by default
     *,
     most: int | None = None,  # largest weight of a unit; unlimited by default
-    names: Sequence[str] | None = None,
     tolerance: float | None = None,  # relative gap to stop at; by default 1e-7, with kinks 1e-3
     start: ApproximateDesign | None = None,  # optimum of a similar problem over the same units
 ) -> ApproximateDesign:
@@ -282,25 +262,25 @@ def relax(
     Column generation: find the optimum over few active units, then scan all units for prices above
     the active ones, until there are none (equivalence theorem). The bound is over all units.
     """
+    objective = checked(objective, budget)
+    units, criterion = objective.units, objective.criterion
     if tolerance is None:
         tolerance = KINKED_TOLERANCE if criterion.kinked else TOLERANCE
     cap = np.inf if most is None else float(most)
-    prior = given_prior(units, budget, prior)
     share = min(budget / float(units.cost.sum()), cap)
-    spread = prior + units.information(np.full(len(units), share))
-    criterion.require(spread, names)
-    criterion = criterion.relevant(units, prior, budget)
+    spread = objective.information(np.full(len(units), share))
+    criterion.require(spread, objective.names)
+    criterion = criterion.relevant(units, objective.prior, budget)
     if share == cap and criterion.monotone:
         value = float(criterion.value(spread))
         index, weight, price = np.arange(len(units)), np.full(len(units), cap), np.ones(len(units))
         return ApproximateDesign(index, weight, value, value, price, spread)
     most_spent = (1.0 - 1e-9) * cap * float(units.cost.sum())
-    program = BarrierProgram(criterion, units, min(budget, most_spent), cap, prior)
-    if start is None or not criterion.value(
-        prior + units.information(start.weight, start.index)
-    ) > 0.0:  # fmt: skip
-        active, weight = _first(program, spread)
-        order = 0.3
+    objective = replace(objective, criterion=criterion)
+    program = BarrierProgram(objective, min(budget, most_spent), cap)
+    begun = spread if start is None else objective.information(start.weight, start.index)
+    if start is None or not criterion.value(begun) > 0.0:
+        (active, weight), order = _first(program, spread), 0.3
     else:
         active, weight, order = start.index, start.weight, 0.03
     best, top = np.inf, None
@@ -326,26 +306,28 @@ def relax(
     return _pruned(program, top[1], top[0].weight, best)
 
 
-def given_prior(units: CandidateSet, budget: float, prior: Floats | None) -> Floats:
-    """Return the prior information (P, P); refuse a budget below the least cost."""
-    least = float(units.cost.min())
+def checked(objective: Objective, budget: float) -> Objective:
+    """Return the objective with a symmetric prior; refuse a budget below the least cost."""
+    least = float(objective.units.cost.min())
     if budget < least * (1.0 - 1e-12):
         raise InputError(f"a budget of {budget:g}; valid: at least {least:g}, the least cost")
-    return np.zeros((units.size, units.size)) if prior is None else 0.5 * (prior + prior.T)
+    return replace(objective, prior=0.5 * (objective.prior + objective.prior.T))
 
 
 def _solved(
     program: BarrierProgram, active: Ints, weight: Floats, goal: float, order: float
 ) -> Optimum:
     """Return the optimum over active units; a criterion that is not monotone may spend less."""
-    rows, cost = program.units.rows[active], program.units.cost[active]
+    units = program.objective.units[active]
+    rows, cost = units.rows, units.cost
     start = _feasible(weight, cost, program.budget, program.most)
-    if not program.criterion.monotone:  # one more unit without information
+    if not program.objective.criterion.monotone:  # one more unit without information
         rows = np.concatenate([rows, np.zeros((1, *rows.shape[1:]))])
         cost = np.append(cost, program.budget)
         unspent = min(max(1.0 - float(weight @ cost[:-1]) / program.budget, 0.01), 0.99)
         start = np.append((1.0 - unspent) * start, unspent)
-    optimum = solve(replace(program, units=CandidateSet(rows, cost)), start, goal, order)
+    objective = replace(program.objective, units=CandidateSet(rows, cost))
+    optimum = solve(replace(program, objective=objective), start, goal, order)
     return replace(optimum, weight=optimum.weight[: len(active)])
 
 
@@ -364,21 +346,22 @@ def _first(program: BarrierProgram, spread: Floats) -> tuple[Ints, Floats]:
     w_k <- w_k (price_k / mean price)^(2/3). Silvey, Titterington & Torsney (1978), Comm. Statistics
     A7.
     """
-    units, budget = program.units, program.budget
+    units, criterion = program.objective.units, program.objective.criterion
+    budget = program.budget
     count = min(len(units), max(_SHORT, int(4 * budget / (program.most * float(units.cost.min())))))
-    smooth = program.criterion.surrogate(spread, 0.1)(spread)
+    smooth = criterion.surrogate(spread, 0.1)(spread)
     if smooth is None or count == len(units):
         short = np.arange(len(units))
     else:
         rate = prices(units.rows, smooth.gradient) / units.cost
         even = np.linspace(0, len(units) - 1, count // 4).astype(np.int64)
         short = np.union1d(best_first(rate, count - len(even)), even)
-    rows, cost = units.rows[short], units.cost[short]
-    shortened = replace(program, units=CandidateSet(rows, cost))
+    shortened = replace(program, objective=program.objective.among(short))
+    rows, cost = shortened.objective.units.rows, units.cost[short]
     w = np.full(len(short), budget / float(cost.sum()))
     for _ in range(_WARM):
         m = shortened.information(w)
-        smooth = program.criterion.surrogate(m, 0.1)(m)
+        smooth = criterion.surrogate(m, 0.1)(m)
         if smooth is None:
             break
         rate = np.maximum(prices(rows, smooth.gradient) / cost, 0.0)
@@ -390,8 +373,8 @@ def _first(program: BarrierProgram, spread: Floats) -> tuple[Ints, Floats]:
     while size < len(short):
         chosen = order[:size]
         m = shortened.information(np.where(np.isin(np.arange(len(w)), chosen), w, 0.0))
-        smooth = program.criterion.surrogate(m, 0.1)(m)
-        if smooth is not None and float(program.criterion.value(m)) > 0.0:
+        smooth = criterion.surrogate(m, 0.1)(m)
+        if smooth is not None and float(criterion.value(m)) > 0.0:
             break
         size *= 2
     chosen = np.sort(order[:size])
@@ -402,18 +385,14 @@ def _exchanged(
     program: BarrierProgram, active: Ints, weight: Floats, rate: Floats
 ) -> tuple[Ints, Floats]:
     """Return the active units and weights: drop units of no weight, add units of best prices."""
-    cost = program.units.cost
-    inner = (
-        weight < 0.99 * program.most
-        if np.isfinite(program.most)
-        else np.ones(len(weight), np.bool_)
-    )
+    units = program.objective.units
+    cost, inner = units.cost, weight < 0.99 * program.most
     price = float(rate[active[inner]].max()) if inner.any() else float(rate[active].min())
     share = weight * cost[active] / program.budget
     retained = (share > 1e-5 / len(active)) | (rate[active] > 0.999 * price)
     outside = rate.copy()
     outside[active] = -np.inf
-    entering = best_first(outside, 2 * program.units.size)
+    entering = best_first(outside, 2 * units.size)
     entering = entering[outside[entering] > price * (1.0 + 1e-12)]
     small = 0.02 * program.budget / (cost[entering] * max(len(entering), 1))
     index = np.concatenate([active[retained], entering])
@@ -425,13 +404,13 @@ def _pruned(
     program: BarrierProgram, active: Ints, weight: Floats, bound: float
 ) -> ApproximateDesign:
     """Return the optimum without negligible weights."""
-    units, criterion = program.units, program.criterion
+    units, criterion = program.objective.units, program.objective.criterion
     share = weight * units.cost[active] / program.budget
     retained = share > 1e-8 * float(share.max())
     index, w = active[retained], weight[retained]
     if criterion.monotone:
         w = np.minimum(w * (program.budget / float(w @ units.cost[index])), program.most)
-    m = program.prior + units.information(w, index)
+    m = program.objective.information(w, index)
     smooth = criterion.surrogate(m, 1e-3)(m)
     value = float(criterion.value(m))
     price = np.ones(len(units)) if smooth is None else prices(units.rows, smooth.gradient)

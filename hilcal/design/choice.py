@@ -18,44 +18,19 @@ import numpy as np
 from hilcal.config import CellConfig
 from hilcal.design.approximate_design import KINKED_TOLERANCE, ApproximateDesign, relax
 from hilcal.design.criteria import D, E, K, MeanVariance, Separate, condensed
-from hilcal.design.criterion import CandidateSet, Criterion
-from hilcal.design.discriminated_pairs import DiscriminatedPairs, discriminated_pairs
+from hilcal.design.criterion import CandidateSet, Objective
+from hilcal.design.discriminated_pairs import discriminated_pairs
 from hilcal.design.information import DesignProblem
 from hilcal.design.mixed_design import balanced, mixed_design
 from hilcal.design.optimum import Design, best
 from hilcal.design.predicted import PredictionPoses
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.types import Bools, Floats, Ints
+from hilcal.types import Bools, Ints
 
 CRITERIA = ("D", "A", "E", "K", "I", "separate")
 LOOSE = 1e-2  # relative duality gap, for a plan's bound and for comparing loads; a choice
 EFFORT = 200  # of the exchange search: 98 % of the bound of the demo's plan in a second
 SAMPLE = 75  # poses at which sets of loads are compared; a choice
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Objective:
-    """A design problem with its criterion.
-
-    D and A judge all parameters, including the potential terms with their priors (nuisance
-    parameters in A); I judges predictions with all effects (`mixed_design`); E and K judge the
-    model's parameters without a prior.
-    """
-
-    criterion: Criterion  # φ
-    units: CandidateSet  # the units, their columns by the parameters of φ
-    prior: Floats  # (P, P) prior information
-    names: tuple[str, ...]  # of the parameters; empty where they are combinations
-    apart: DiscriminatedPairs | None = None  # the pairs of "separate", else None
-
-    def relaxed(
-        self, budget: float, tolerance: float = LOOSE, start: ApproximateDesign | None = None
-    ) -> ApproximateDesign:
-        """Return the continuous optimum of a budget of readings; see `approximate_design.relax`."""
-        return relax(
-            self.units, self.criterion, budget, self.prior, names=self.names,
-            tolerance=tolerance, start=start,
-        )  # fmt: skip
 
 
 def canonical(name: str) -> str:
@@ -66,10 +41,15 @@ def canonical(name: str) -> str:
 def objective_of(
     problem: DesignProblem, config: CellConfig, name: str, work: PredictionPoses | None
 ) -> Objective:
-    """Return a design problem with a criterion by its name; "I" needs prediction poses."""
+    """Return the objective of a design problem by a criterion's name; "I" needs prediction poses.
+
+    D and A judge all parameters, including the potential terms with their priors (nuisance
+    parameters in A); I judges predictions with all effects (`mixed_design`); E and K judge the
+    model's parameters without a prior.
+    """
     name = canonical(name)
     names = tuple(t.name for t in problem.terms)
-    of_all = Objective(D(), problem.units, problem.prior, names)
+    of_all = Objective(problem.units, D(), problem.prior, names)
     if name == "D":
         return of_all
     if name == "A":
@@ -77,36 +57,24 @@ def objective_of(
     if name == "I":
         if work is None:
             raise InputError('criterion "I" needs prediction poses; see [planning] work_q_rad')
-        mixed = balanced(mixed_design(problem, config, work))
-        return Objective(MeanVariance(mixed.c), mixed.units, mixed.prior, mixed.names)
+        return balanced(mixed_design(problem, config, work))
     if name == "separate":
         apart = discriminated_pairs(problem)
         units, pairs, prior = condensed(problem.units, apart.pairs, apart.prior)
-        return Objective(Separate(pairs), units, prior, (), apart)
+        return Objective(units, Separate(pairs), prior, apart=apart)
     if name == "E":
         return replace(of_all, criterion=E(unknown(problem)))
     if name == "K":  # of the model alone: information on other parameters may lower it
         free = unknown(problem)
         rows, prior = problem.units.rows[:, :, free], problem.measured[np.ix_(free, free)]
         units = CandidateSet(np.ascontiguousarray(rows), problem.units.cost)
-        return Objective(K(), units, prior, tuple(names[k] for k in free))
+        return Objective(units, K(), prior, tuple(names[k] for k in free))
     raise InputError(f"criterion {name!r}; valid: {', '.join(CRITERIA)}")
 
 
 def unknown(problem: DesignProblem) -> Ints:
     """Return the indices of the model's parameters that have no prior."""
     return np.flatnonzero(np.isinf(problem.nominal.prior_std[problem.nominal.live]))
-
-
-def choose(
-    objective: Objective, budget: float, rng: np.random.Generator, effort: int = EFFORT,
-    relaxed: ApproximateDesign | None = None,
-) -> Design:  # fmt: skip
-    """Return the exact design; see `optimum.best`."""
-    return best(
-        objective.units, objective.criterion, budget, objective.prior, rng,
-        names=objective.names, effort=effort, relaxed=relaxed,
-    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,12 +119,10 @@ def choose_poses(
     Each of `poses` poses is read once under all its loads; where fewer are usable, some are read
     again.
     """
-    units = CandidateSet(candidates.units.rows[usable], candidates.units.cost[usable])
-    design = best(
-        units, objective.criterion, float(poses), objective.prior, rng,
-        most=-(-poses // max(len(units), 1)), names=objective.names, effort=effort,
-        relaxed=None if start is None else start.among(usable),
-    )  # fmt: skip
+    among = replace(objective, units=candidates.units[usable])
+    most = -(-poses // max(len(among.units), 1))
+    relaxed = None if start is None else start.among(usable)
+    design = best(among, float(poses), rng, most=most, effort=effort, relaxed=relaxed)
     counts = np.zeros(len(objective.units), dtype=np.int64)
     index = np.flatnonzero(usable)
     for k, count in zip(index, design.counts.tolist(), strict=True):
@@ -173,18 +139,19 @@ def certified(
 
     The bound holds for any number of poses and any loads.
     """
-    among, chosen = only(objective, usable), counts[usable]
+    among, chosen = objective.among(usable), counts[usable]
     cost = float(chosen @ among.units.cost)
-    information = objective.prior + among.units.information(chosen.astype(float))
+    information = among.information(chosen.astype(float))
     value = float(objective.criterion.value(information))
-    relaxed = among.relaxed(cost, start=None if start is None else start.among(usable))
+    near = None if start is None else start.among(usable)
+    relaxed = relax(among, cost, tolerance=LOOSE, start=near)
     return Design(chosen, value, max(relaxed.bound, value), information, cost, relaxed)
 
 
 def promising(objective: Objective, budget: float) -> tuple[Ints, ApproximateDesign]:
     """Return the units of the best prices, of which a plan is likely made, and the optimum."""
-    tolerance = min(KINKED_TOLERANCE, LOOSE) if objective.criterion.kinked else LOOSE
-    relaxed = objective.relaxed(budget, tolerance)
+    tolerance = KINKED_TOLERANCE if objective.criterion.kinked else LOOSE
+    relaxed = relax(objective, budget, tolerance=tolerance)
     count = min(2 * len(relaxed.index), len(objective.units))
     best_first = np.argsort(-relaxed.price / objective.units.cost, kind="stable")
     return np.union1d(relaxed.index, best_first[:count]), relaxed
@@ -209,26 +176,15 @@ def costly_loads(
         return ()
     current = _value(objective, problem, sample, loads, budget)
     while len(loads) > 1 and current > 0:
-        trials = [
-            (_value(objective, problem, sample, _without(loads, name), budget + change), name)
-            for name in loads
-        ]
-        value, name = max(trials)
+        budget += change
+        without = {name: tuple(load for load in loads if load != name) for name in loads}
+        values = {n: _value(objective, problem, sample, o, budget) for n, o in without.items()}
+        value, name = max((value, name) for name, value in values.items())
         if not value > current * (1.0 + LOOSE):
             break
         costly.append((name, value / current - 1.0))
-        loads, current, budget = _without(loads, name), value, budget + change
+        loads, current = without[name], value
     return tuple(costly)
-
-
-def _without(loads: tuple[str, ...], name: str) -> tuple[str, ...]:
-    return tuple(load for load in loads if load != name)
-
-
-def only(objective: Objective, subset: Bools) -> Objective:
-    """Return the objective with a subset of the units."""
-    units = objective.units
-    return replace(objective, units=CandidateSet(units.rows[subset], units.cost[subset]))
 
 
 def _value(
@@ -238,9 +194,8 @@ def _value(
     """Return φ of the continuous optimum; 0 where the loads do not determine all parameters."""
     allowed = {*loads, problem.candidates.loads[0]}
     possible = np.array([set(names) <= allowed for _, names in problem.what])
-    sampled = only(objective, sample & possible)
     try:
-        return sampled.relaxed(budget).value
+        return relax(objective.among(sample & possible), budget, tolerance=LOOSE).value
     except (CannotAnswerError, InputError):
         return 0.0
 
@@ -263,10 +218,10 @@ def compound_objective(
     c = problem.mean_variance
     of_all, of_model = MeanVariance(c, name), MeanVariance(c[:size, :size], name)
     poses = np.array([pose for pose, _ in problem.what])
-    sampled = only(objective, np.isin(poses, rng.permutation(len(problem.candidates))[:SAMPLE]))
+    sampled = objective.among(np.isin(poses, rng.permutation(len(problem.candidates))[:SAMPLE]))
     units = CandidateSet(sampled.units.rows[:, :, :size], sampled.units.cost)
-    model_alone = Objective(of_model, units, objective.prior[:size, :size], objective.names[:size])
-    total, alone = (
-        q.relaxed(budget).value / 2.0 for q in (replace(sampled, criterion=of_all), model_alone)
-    )
+    names = tuple(t.name for t in problem.terms[:size])
+    model_alone = Objective(units, of_model, objective.prior[:size, :size], names)
+    both = replace(sampled, criterion=of_all), model_alone
+    total, alone = (relax(q, budget, tolerance=LOOSE).value / 2.0 for q in both)
     return replace(objective, criterion=MeanVariance(total * c, name, alone * c[:size, :size]))

@@ -10,6 +10,7 @@ import numpy as np
 from hilcal.design.criterion import (
     CandidateSet,
     Criterion,
+    Pair,
     Smooth,
     factors,
     inverse_factor,
@@ -237,26 +238,6 @@ def _smooth_least(values: Floats, vectors: Floats, width: float) -> Smooth:
 _WEIGHTY = 1e-5  # weight above which a pair enters the curvature
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Pair:
-    """A present effect, and the parameters that are fitted in its place."""
-
-    effect: Ints  # (E,) indices of the effect's parameters
-    beta: Floats  # (E,) their values
-    nuisance: Ints  # (F,) indices of the parameters of the model and of the rival effect
-    name: str = "an effect from its rival"  # for messages
-
-    def residual(self, m: Floats) -> Floats:
-        """Return the parameters u (P,) of the residual of fitting model and rival, at M.
-
-        u is β at the effect and −M_nn⁻ M_ne β at the nuisance: uᵀ M u = βᵀ S β, S the Schur
-        complement.
-        """
-        u = np.zeros(len(m))
-        u[self.effect] = self.beta
-        return u - nuisance_inverse(m, self.nuisance) @ (m @ u)
-
-
 @dataclass(frozen=True, eq=False)
 class Separate(Criterion):
     """φ(M) = the least over pairs of uᵀ M u: the weakest non-centrality.
@@ -388,8 +369,9 @@ class Separate(Criterion):
             alone = np.zeros(len(m))
             alone[pair.effect] = pair.beta
             if float(u @ m @ u) <= DETERMINED * float(alone @ m @ alone) or not np.any(m @ alone):
+                both = " from ".join(pair.names)
                 raise CannotAnswerError(
-                    f"no candidate separates {pair.name}; allow other poses or loads"
+                    f"no candidate separates {both}; allow other poses or loads"
                 )
 
 
@@ -397,9 +379,8 @@ def _explained(m: Floats, model: Ints, block: Ints) -> Floats:
     """Return (N, R, R) M_rm M_mm⁻ M_mr: the part of the block r that the model m explains."""
     cross = m[:, model[:, None], block]
     # one matrix at a time is faster for large blocks
-    half = np.stack(
-        [inverse_root(b) @ c for b, c in zip(m[:, model[:, None], model], cross, strict=True)]
-    )
+    both = zip(m[:, model[:, None], model], cross, strict=True)
+    half = np.stack([inverse_root(b) @ c for b, c in both])
     return np.asarray(np.swapaxes(half, -1, -2) @ half)
 
 
@@ -443,7 +424,7 @@ def condensed(
         effect = pair.effect.tobytes()
         rival = indices[np.setdiff1d(pair.nuisance, model).tobytes()]
         nuisance = np.concatenate([indices[model.tobytes()], rival])
-        return Pair(indices[effect], to_scaled[effect] @ pair.beta, nuisance, pair.name)
+        return Pair(indices[effect], to_scaled[effect] @ pair.beta, nuisance, pair.names)
 
     rows = np.ascontiguousarray(units.rows @ turn)
     prior = turn.T @ prior @ turn

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.errors import CannotAnswerError
-from hilcal.regression.schur import DETERMINED
+from hilcal.regression.schur import DETERMINED, nuisance_inverse
 from hilcal.types import Bools, Floats, Ints
 
 _CHUNK = 2048
@@ -30,6 +30,10 @@ class CandidateSet:
     def __len__(self) -> int:
         """Return the number of units K."""
         return len(self.rows)
+
+    def __getitem__(self, which: Ints | Bools) -> "CandidateSet":
+        """Return a subset of the units."""
+        return CandidateSet(self.rows[which], self.cost[which])
 
     @property
     def size(self) -> int:
@@ -97,31 +101,79 @@ class Criterion(ABC):
         return self
 
     def require(self, m: Floats, names: Sequence[str] | None) -> None:
-        """Refuse M, the information of all candidates, if it does not determine φ."""
-        require_determined(m, names)
+        """Refuse M, the information of all candidates, if it does not determine φ.
 
-
-def require_determined(m: Floats, names: Sequence[str] | None = None) -> None:
-    """Refuse a singular information matrix (P, P), and name the undetermined parameters."""
-    label = tuple(f"parameter {k + 1}" for k in range(len(m))) if names is None else names
-    diagonal = np.diag(m)
-    blind = np.flatnonzero(diagonal <= 0.0)
-    if len(blind):
+        The message names the parameters of a singular matrix.
+        """
+        label = tuple(f"parameter {k + 1}" for k in range(len(m))) if names is None else names
+        diagonal = np.diag(m)
+        blind = np.flatnonzero(diagonal <= 0.0)
+        if len(blind):
+            raise CannotAnswerError(
+                f"no candidate changes with {_listed([label[int(k)] for k in blind])}; allow "
+                "other poses or loads, or leave it out of the model"
+            )
+        root = np.sqrt(diagonal)
+        values, vectors = np.linalg.eigh(m / np.outer(root, root))
+        if values[0] > DETERMINED:
+            return
+        share = np.abs(vectors[:, 0])
+        inside = np.flatnonzero(share > 0.1 * share.max())
         raise CannotAnswerError(
-            f"no candidate changes with {_listed([label[int(k)] for k in blind])}; allow "
-            "other poses or loads, or leave it out of the model"
+            "no candidate separates "
+            f"{_listed([label[int(k)] for k in inside[np.argsort(-share[inside])]])}; allow other "
+            "poses or loads, or leave one of them out of the model"
         )
-    root = np.sqrt(diagonal)
-    values, vectors = np.linalg.eigh(m / np.outer(root, root))
-    if values[0] > DETERMINED:
-        return
-    share = np.abs(vectors[:, 0])
-    inside = np.flatnonzero(share > 0.1 * share.max())
-    raise CannotAnswerError(
-        "no candidate separates "
-        f"{_listed([label[int(k)] for k in inside[np.argsort(-share[inside])]])}; allow other "
-        "poses or loads, or leave one of them out of the model"
-    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pair:
+    """A present effect, and the parameters that are fitted in its place."""
+
+    effect: Ints  # (E,) indices of the effect's parameters
+    beta: Floats  # (E,) their values
+    nuisance: Ints  # (F,) indices of the parameters of the model and of the rival effect
+    names: tuple[str, str] = ("an effect", "its rival")
+
+    def residual(self, m: Floats) -> Floats:
+        """Return the parameters u (P,) of the residual of fitting model and rival, at M.
+
+        u is β at the effect and −M_nn⁻ M_ne β at the nuisance: uᵀ M u = βᵀ S β, S the Schur
+        complement.
+        """
+        u = np.zeros(len(m))
+        u[self.effect] = self.beta
+        return u - nuisance_inverse(m, self.nuisance) @ (m @ u)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DiscriminatedPairs:
+    """Pairs of effects to discriminate."""
+
+    pairs: tuple[Pair, ...]
+    # (P, P) prior information without that of potential terms, which would favour an assumed effect
+    # and shrink a rival
+    prior: Floats
+    not_separable: tuple[tuple[str, str], ...] = ()  # names of omitted pairs
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Objective:
+    """What a plan of counts n maximises: φ(M),  M = M0 + Σ n_k A_kᵀ A_k."""
+
+    units: CandidateSet  # their columns by the parameters of φ
+    criterion: Criterion  # φ
+    prior: Floats  # (P, P) M0: prior information, or of fixed readings
+    names: tuple[str, ...] | None = None  # of the parameters, for messages
+    apart: DiscriminatedPairs | None = None  # of "separate", before they are condensed
+
+    def among(self, which: Ints | Bools) -> "Objective":
+        """Return the objective with a subset of the units."""
+        return replace(self, units=self.units[which])
+
+    def information(self, weight: Floats, which: Ints | None = None) -> Floats:
+        """Return (P, P) M, of all units or of those with the indices `which`."""
+        return np.asarray(self.prior + self.units.information(weight, which))
 
 
 def _listed(names: Sequence[str]) -> str:

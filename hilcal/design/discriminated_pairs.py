@@ -15,12 +15,13 @@ order. A diagnosis scores the effect by the same evidence, mean and scale.
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 
 from hilcal.design.approximate_design import relax
-from hilcal.design.criteria import Pair, Separate
+from hilcal.design.criteria import Separate
+from hilcal.design.criterion import DiscriminatedPairs, Objective, Pair
 from hilcal.design.information import DesignProblem
 from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError, InputError
@@ -41,18 +42,6 @@ _SEED = 20240609
 SUPPORTED = 3.0  # log evidence above which readings support an effect: odds of e³, 20 : 1
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DiscriminatedPairs:
-    """Pairs of effects to discriminate."""
-
-    pairs: tuple[Pair, ...]  # of the criterion
-    names: tuple[tuple[str, str], ...]  # (present effect, fitted rival) of each pair
-    # (P, P) prior information without that of potential terms, which would favour an assumed effect
-    # and shrink a rival
-    prior: Floats
-    not_separable: tuple[tuple[str, str], ...] = ()  # names of omitted pairs
-
-
 def discriminated_pairs(problem: DesignProblem) -> DiscriminatedPairs:
     """Return the ordered pairs of potential terms that some measurement separates.
 
@@ -65,64 +54,66 @@ def discriminated_pairs(problem: DesignProblem) -> DiscriminatedPairs:
     if len(names) < 2:
         raise InputError(f"{len(names)} effects to tell apart; valid: two or more")
     supported = supported_parameters(problem, DRAWS)
-    pairs, pair_names = [], []
+    pairs: list[Pair] = []
     for e in names:
-        columns = problem.of_effect(e)
         betas = _directions(problem, e)
         if e in supported:
-            betas = [x / problem.scale[columns] for x in supported[e]]
-        for f in names:
-            if f != e:
-                pairs += [pair_of(problem, (e, f), beta) for beta in betas]
-                pair_names += [(e, f)] * len(betas)
+            betas = [x / problem.scale[problem.of_effect(e)] for x in supported[e]]
+        pairs += [pair_of(problem, (e, f), beta) for f in names if f != e for beta in betas]
     prior, size = problem.measured.copy(), problem.model_size
     prior[:size, :size] = problem.prior[:size, :size]
-    return _separable(problem, DiscriminatedPairs(tuple(pairs), tuple(pair_names), prior))
+    spread = prior + problem.units.information(
+        np.full(len(problem.units), MANY / float(problem.units.cost.sum()))
+    )
+    not_separable = []
+    for of_both, alike in groupby(pairs, key=lambda pair: pair.names):
+        first = next(alike)
+        best = power(first, spread)
+        if best < LEAST_POWER:
+            with suppress(CannotAnswerError):
+                alone = Objective(problem.units, Separate((first,)), prior)
+                best = power(first, relax(alone, MANY, tolerance=_LOOSE).information)
+        if best < LEAST_POWER:
+            not_separable.append(of_both)
+    separable = tuple(pair for pair in pairs if pair.names not in not_separable)
+    if not separable:
+        raise CannotAnswerError(not_separable_message(not_separable))
+    return DiscriminatedPairs(separable, prior, tuple(not_separable))
 
 
 def pair_of(problem: DesignProblem, names: tuple[str, str], beta: Floats) -> Pair:
     """Return the pair of an effect with parameters β, over the problem's scales, and a rival."""
     effect, rival = names
     nuisance = np.concatenate([np.arange(problem.model_size), problem.of_effect(rival)])
-    return Pair(problem.of_effect(effect), beta, nuisance, f"{effect} from {rival}")
+    return Pair(problem.of_effect(effect), beta, nuisance, names)
 
 
 def supported_parameters(problem: DesignProblem, count: int) -> dict[str, Floats]:
-    """Return (count, E) draws, SI, of the families that the readings so far support."""
-    fit, out = problem.nominal.fit, {}
+    """Return (count, E) parameters, SI, of the families that the readings so far support."""
+    fit = problem.nominal.fit
     if fit is None:
         return {}
     linear = linearise(fit)
-    for family in problem.families:
-        estimated = estimate(linear, family)
-        if estimated is not None and estimated.supported:
-            out[family.name] = estimated.draws(count, np.random.default_rng(_SEED))
-    return out
+    drawn = {family.name: posterior_draws(linear, family, count) for family in problem.families}
+    return {name: betas for name, betas in drawn.items() if betas is not None}
 
 
-def _separable(problem: DesignProblem, pairs: DiscriminatedPairs) -> DiscriminatedPairs:
-    spread = pairs.prior + problem.units.information(
-        np.full(len(problem.units), MANY / float(problem.units.cost.sum()))
-    )
-    not_separable = []
-    for names in dict.fromkeys(pairs.names):
-        pair = pairs.pairs[pairs.names.index(names)]
-        best = power(pair, spread)
-        if best < LEAST_POWER:
-            with suppress(CannotAnswerError):
-                relaxed = relax(
-                    problem.units, Separate((pair,)), MANY, pairs.prior, tolerance=_LOOSE
-                )
-                best = power(pair, relaxed.information)
-        if best < LEAST_POWER:
-            not_separable.append(names)
-    separable = [k for k, names in enumerate(pairs.names) if names not in not_separable]
-    if not separable:
-        raise CannotAnswerError(not_separable_message(not_separable))
-    return DiscriminatedPairs(
-        tuple(pairs.pairs[k] for k in separable), tuple(pairs.names[k] for k in separable),
-        pairs.prior, tuple(not_separable),
-    )  # fmt: skip
+def posterior_draws(linear: Linearisation, effect: Effect, count: int) -> Floats | None:
+    """Return (count, P) parameters, SI, of an effect beside the model of a gc-scaled fit.
+
+    The mean of the posterior, then draws from it; None where the readings do not support the effect
+    (`SUPPORTED`).
+    """
+    if not computable(linear.fit, effect):
+        return None
+    columns = effect_columns(linear.fit, effect)
+    score = linear.score(columns.white, most=effect.most())
+    if not score.rank or score.log_evidence <= SUPPORTED:
+        return None
+    mean, root = columns.scale * score.step, columns.scale[:, None] * score.root
+    drawn = np.random.default_rng(_SEED).standard_normal((count, len(mean)))
+    drawn[0] = 0.0
+    return np.asarray(mean + drawn @ root.T)
 
 
 def _by_effect(pairs: Sequence[tuple[str, str]]) -> dict[str, str]:
@@ -163,35 +154,3 @@ def _directions(problem: DesignProblem, effect: str) -> list[Floats]:
     gram = flat.T @ flat / elements
     drawn = np.random.default_rng(_SEED).standard_normal((DRAWS, len(columns)))
     return [d / np.sqrt(float(d @ gram @ d)) for d in drawn]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class EffectEstimate:
-    """Posterior of the P parameters of an effect that is not in the model."""
-
-    mean: Floats  # (P,) SI
-    root: Floats  # (P, P) root of the scale matrix, SI
-    log_evidence: float  # gain by adding the effect
-
-    @property
-    def supported(self) -> bool:
-        """Whether the readings support the effect."""
-        return self.log_evidence > SUPPORTED
-
-    def draws(self, count: int, rng: np.random.Generator) -> Floats:
-        """Return (count, P) parameters: the mean, then draws from the posterior."""
-        drawn = self.mean + rng.standard_normal((count, len(self.mean))) @ self.root.T
-        drawn[0] = self.mean
-        return np.asarray(drawn)
-
-
-def estimate(linear: Linearisation, effect: Effect) -> EffectEstimate | None:
-    """Estimate an effect beside the model of a gc-scaled fit; None if its readings cannot."""
-    if not computable(linear.fit, effect):
-        return None
-    columns = effect_columns(linear.fit, effect)
-    score = linear.score(columns.white, most=effect.most())
-    if not score.rank:
-        return None
-    scale = columns.scale
-    return EffectEstimate(scale * score.step, scale[:, None] * score.root, score.log_evidence)

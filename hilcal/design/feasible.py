@@ -44,25 +44,10 @@ class Space(Feasibility):
     def __init__(self, cell: Cell, config: CellConfig, margins: Margins = PLANNED) -> None:
         """Build the shapes once."""
         super().__init__(cell, config, margins)
-
-    @property
-    def low(self) -> Floats:
-        """(n,) lowest usable joint values, rad or m; at most half a turn."""
-        return np.asarray(self.cell.arm.usual_range[0] + self._margin)
-
-    @property
-    def high(self) -> Floats:
-        """(n,) highest usable joint values, rad or m; at most half a turn."""
-        return np.asarray(self.cell.arm.usual_range[1] - self._margin)
-
-    @property
-    def _margin(self) -> float:
-        return self.config.limits.joint_margin_rad + self.margins.joint
-
-    @property
-    def loads(self) -> tuple[str, ...]:
-        """1 + L names of the loads, "none" first."""
-        return (UNLOADED, *(load.name for load in self.config.loads))
+        low, high = cell.arm.usual_range
+        margin = config.limits.joint_margin_rad + margins.joint
+        self.low, self.high = low + margin, high - margin  # (n,) usable joint values, rad or m
+        self.loads = (UNLOADED, *(load.name for load in config.loads))  # names, "none" first
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -77,7 +62,17 @@ class Space(Feasibility):
         """Return (N,) which states pass one of `REASONS` under a load."""
         if kind == "joint limits":
             return np.asarray(np.all((q >= self.low) & (q <= self.high), axis=1))
-        return self._regular(q) if kind == "singularity" else super().keeps(kind, q, load)
+        if kind != "singularity":
+            return super().keeps(kind, q, load)
+        # σ_min ≥ [planning] singularity · σ_max of the flange's Jacobian over the reach
+        least = self.config.planning.singularity
+        if least == 0.0 or not len(q):
+            return np.ones(len(q), dtype=np.bool_)
+        chain = evaluate(self.cell.arm, q)
+        jacobian = np.array(joint_jacobian(chain, chain.position[-1]))
+        jacobian[:, :3] /= self.cell.arm.reach
+        sigma = np.linalg.svd(jacobian, compute_uv=False)
+        return np.asarray(sigma[:, -1] >= least * sigma[:, 0])
 
     def allowed(
         self, q: Floats, load: str = UNLOADED, kinds: tuple[str, ...] = tuple(REASONS)
@@ -101,17 +96,6 @@ class Space(Feasibility):
             for load in loads
         )
 
-    def _regular(self, q: Floats) -> Bools:
-        """Check σ_min ≥ [planning] singularity · σ_max of the flange's Jacobian over the reach."""
-        least = self.config.planning.singularity
-        if least == 0.0 or not len(q):
-            return np.ones(len(q), dtype=np.bool_)
-        chain = evaluate(self.cell.arm, q)
-        jacobian = np.array(joint_jacobian(chain, chain.position[-1]))
-        jacobian[:, :3] /= self.cell.arm.reach
-        sigma = np.linalg.svd(jacobian, compute_uv=False)
-        return np.asarray(sigma[:, -1] >= least * sigma[:, 0])
-
 
 _CHUNK = 1 << 12
 _VAIN = 1 << 15  # drawn states, all rejected, after which drawing stops
@@ -128,8 +112,6 @@ class DrawnPoses:
     q: Floats  # (K, n) joint angles, rad
     loads: tuple[str, ...]  # 1 + L names, "none" first
     allowed: Bools  # (K, 1 + L) loads that each pose bears
-    drawn: int  # number of states
-    left: dict[str, int]  # number of states left after each reason, in the order of checking
     remarks: tuple[str, ...]  # for people
 
 
@@ -150,6 +132,7 @@ def draw(
 
     sequence = qmc.Sobol(len(low), scramble=False)
     shift = rng.random(len(low))
+    # states left after each reason, and samples of those that it rejects
     remaining, lost = dict.fromkeys(REASONS, 0), dict[str, Floats]()
     parts = [np.empty((0, len(low)))]
     drawn = have = 0
@@ -157,9 +140,16 @@ def draw(
     while have < count and drawn < (most if have else _VAIN):
         u = (sequence.random(_CHUNK) + shift) % 1.0
         q = space.cell.arm.complete(low + u * (high - low))
-        parts.append(_allowed_unloaded(space, q, remaining, lost))
+        for reason in REASONS:
+            if len(q):
+                passes = space.keeps(reason, q, UNLOADED)
+                if not passes.all():
+                    lost[reason] = q[~passes][:_LOOK]
+                q = q[passes]
+            remaining[reason] += len(q)
+        parts.append(q)
         drawn += _CHUNK
-        have += len(parts[-1])
+        have += len(q)
     if have < least:
         raise CannotAnswerError(_too_few(space, drawn, remaining, lost, least))
     q = np.vstack(parts)[:count]
@@ -173,21 +163,7 @@ def draw(
             remarks.append(_unusable(space, q, load))
     if len(space.loads) > 1 and not allowed[:, 1:].any():
         raise CannotAnswerError("; ".join(remarks[-(len(space.loads) - 1) :]))
-    return DrawnPoses(q, space.loads, allowed, drawn, remaining, tuple(remarks))
-
-
-def _allowed_unloaded(
-    space: Space, q: Floats, remaining: dict[str, int], lost: dict[str, Floats]
-) -> Floats:
-    """Return the states allowed unloaded; count those left, and keep samples of those rejected."""
-    for reason in REASONS:
-        if len(q):
-            passes = space.keeps(reason, q, UNLOADED)
-            if not passes.all():
-                lost[reason] = q[~passes][:_LOOK]
-            q = q[passes]
-        remaining[reason] += len(q)
-    return q
+    return DrawnPoses(q, space.loads, allowed, tuple(remarks))
 
 
 def _too_few(

@@ -2,7 +2,7 @@
 
 import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -53,9 +53,10 @@ class Goal:
         """Whether the goal is about predictions where the robot will work, not about parameters."""
         return self.what in POSITIONS
 
-    def names(self, parameters: Mapping[str, float]) -> tuple[str, ...]:
+    def names(self, parameters: Iterable[str]) -> tuple[str, ...]:
         """Return the parameters that the goal is about, out of `parameters`."""
-        names = tuple(n for n in parameters if n == self.what or n.split(".")[0] == self.what)
+        parameters = tuple(parameters)
+        names = tuple(n for n in parameters if self.what in (n, n.split(".")[0]))
         if not names:
             effects = dict.fromkeys(name.split(".")[0] for name in parameters)
             raise InputError(
@@ -66,12 +67,8 @@ class Goal:
 
     def check(self, units: Mapping[str, str]) -> None:
         """Refuse a goal that does not fit the parameters of a model, given the SI unit of each."""
-        if self.of_position or self.relative:
-            if not self.of_position:
-                self.names(dict.fromkeys(units, 0.0))
-            return
-        for name in self.names(dict.fromkeys(units, 0.0)):
-            if _plain(units[name]) != self.unit:
+        for name in () if self.of_position else self.names(units):
+            if not self.relative and _plain(units[name]) != self.unit:
                 raise InputError(
                     f'goal "{self.text}": {name} is in {units[name]}; give that unit, or %'
                 )
@@ -182,8 +179,7 @@ class GoalRule:
         now: Callable[[], float] = time.monotonic,  # clock of the people, s
     ) -> None:
         """Parse a goal, and check it against the cell's model."""
-        self.goal: Goal = parse_goal(text)
-        self.status = GoalStatus(text)
+        self.goal, self.status = parse_goal(text), GoalStatus(text)
         self._cell, self._config, self._now = cell, config, now
         self._catalogue = catalogue or installed()
         self._scatter = config.repeatability.per_joint(cell.arm.n)
@@ -214,14 +210,13 @@ class GoalRule:
         """Return the status of the goal, see `measuring.stopping_rule.StoppingRule`."""
         start = self._now()
         if last or (start - self._ended >= self._took / SHARE and self._news(readings)):
-            outcome = self._fit(readings)
-            if outcome is None:
-                self.status, self._good = GoalStatus(self.goal.text), False
-            else:
-                status, fitted = outcome
+            try:
+                status, fitted = self._fit(readings)
                 good = status.met and fitted.solution.converged
                 sure = last or self._good or not fitted.uncertainty.inflated
                 self.status, self._good = replace(status, met=good and sure), good
+            except (HilcalError, np.linalg.LinAlgError):
+                self.status, self._good = GoalStatus(self.goal.text), False
             self._ended = self._now()
             self._took = self._ended - start
         return self.status
@@ -241,21 +236,18 @@ class GoalRule:
         same = (readings.pose == readings.pose[-1]) & (readings.cycle == readings.cycle[-1])
         return bool((same & ~free).any())
 
-    def _fit(self, readings: Readings) -> tuple[GoalStatus, Fit] | None:
-        try:
-            readings, mode = self._fitted(readings)
-            readings = with_joint_scatter(self._cell, readings, self._scatter)
-            effects = planned_effects(self._config, self._catalogue)
-            model = with_effects(self._cell, readings, mode, effects, effects, self._catalogue)
-            fitted = fit(model, readings, mode)
-            std, value = figures(fitted)
-            held = dict(zip(std, fitted.solution.prior == 0, strict=True))
-            std = {name: s for name, s in std.items() if not held[name]}
-            position = self._position(fitted) if self._work_q else None
-            status = self.goal.met(std, value, position, self._predicted)
-            return replace(status, model=fitted.model.named, fitted=fitted.mode), fitted
-        except (HilcalError, np.linalg.LinAlgError):
-            return None
+    def _fit(self, readings: Readings) -> tuple[GoalStatus, Fit]:
+        readings, mode = self._fitted(readings)
+        readings = with_joint_scatter(self._cell, readings, self._scatter)
+        effects = planned_effects(self._config, self._catalogue)
+        model = with_effects(self._cell, readings, mode, effects, effects, self._catalogue)
+        fitted = fit(model, readings, mode)
+        std, value = figures(fitted)
+        held = dict(zip(std, fitted.solution.prior == 0, strict=True))
+        std = {name: s for name, s in std.items() if not held[name]}
+        position = self._position(fitted) if self._work_q else None
+        status = self.goal.met(std, value, position, self._predicted)
+        return replace(status, model=fitted.model.named, fitted=fitted.mode), fitted
 
     def _position(self, fitted: Fit) -> float:
         """Return the RMS standard uncertainty of the predictions where the robot will work, m.

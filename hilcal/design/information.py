@@ -64,10 +64,8 @@ class Candidates:
 
     def states(self) -> States:
         """Return all N·(1 + L) states, pose by pose, with nominal times and approach directions."""
-        count = len(self.loads)
-        return nominal_states(
-            np.repeat(self.q, count, axis=0), np.tile(self.wrench, (len(self), 1))
-        )
+        q = np.repeat(self.q, len(self.loads), axis=0)
+        return nominal_states(q, np.tile(self.wrench, (len(self), 1)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,12 +95,9 @@ def reading_derivatives(
         count, per_pose = rows.stop - rows.start, loads * repeats
         p = model.predict(states[slice(rows.start * per_pose, rows.stop * per_pose)], nominal.theta)
         jacobian = model.jacobian_of((*model.effects, *added), p, nominal.theta, nominal.m, live)
-        covariance = arrival_covariance(nominal, config, p)
-        yield ReadingDerivatives(
-            rows,
-            (jacobian * scale).reshape(count, loads, m, len(scale)),
-            covariance.reshape(count, loads, m, m),
-        )
+        jacobian = (jacobian * scale).reshape(count, loads, m, len(scale))
+        covariance = arrival_covariance(nominal, config, p).reshape(count, loads, m, m)
+        yield ReadingDerivatives(rows, jacobian, covariance)
 
 
 def absolute_rows(part: ReadingDerivatives) -> Floats:
@@ -134,11 +129,9 @@ def arrival_covariance(nominal: NominalModel, config: CellConfig, predicted: Pre
     F = R J Σ_q^½ (see `reading_covariance`).
     """
     single = reading_covariance(nominal, config, predicted)
-    count, m = nominal.each, nominal.m
+    count, m, o, s = nominal.each, nominal.m, predicted.observation, predicted.situation
     if count == 1:
         return single
-    o = predicted.observation
-    s = predicted.situation
     jac = drive_jacobian(s.cell.arm, s.chain, o.base_position)
     joint_std = config.repeatability.per_joint(nominal.cell.arm.n)
     factor = scatter_factor(jac, joint_std, o.axes, m).reshape(-1, count * m, jac.shape[2])
@@ -156,14 +149,12 @@ def reading_covariance(nominal: NominalModel, config: CellConfig, predicted: Pre
     with Σ the tracker's stated covariance of one sample and s its systematic share. Sensor axes;
     m², m·rad, rad².
     """
-    a, o, m = config.acquire, predicted.observation, nominal.m
+    a, o, s, m = config.acquire, predicted.observation, predicted.situation, nominal.m
     stated = _instrument(nominal, config, predicted)
     out = expected_share_of_mean(a.samples, a.systematic_share) * stated
     joint_std = config.repeatability.per_joint(nominal.cell.arm.n)
     if np.any(joint_std):
-        jac = drive_jacobian(
-            predicted.situation.cell.arm, predicted.situation.chain, o.base_position
-        )
+        jac = drive_jacobian(s.cell.arm, s.chain, o.base_position)
         out = out + joint_scatter(jac, joint_std, o.axes, m)
     # elements that a reading of one number lacks: their noise is arbitrary
     unread = np.diagonal(out, axis1=1, axis2=2) == 0
@@ -197,15 +188,6 @@ MOST_BYTES = 600_000_000  # of the rows of all units; a choice
 MOST_PARAMETERS = 200
 SAMPLE = 300  # candidate poses to judge strengths at; a choice
 MOST_TIMES = 5.0  # factor on its expected size at which a family must cause 1 σ; a choice
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Potential:
-    """Potential families, with sizes typical of arms."""
-
-    effects: tuple[Effect, ...]
-    std: Floats  # (F,) standard deviation of each parameter, SI
-    notes: tuple[str, ...]  # on omitted families, one line each
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,40 +265,36 @@ def problem(
         allowed = np.ones((len(q), len(loads)), dtype=np.bool_)
     wrench = np.array([np.zeros(6), *wrenches])
     candidates = Candidates(np.asarray(q, dtype=float), loads, wrench, allowed)
-    none = Potential((), np.zeros(0), ())
-    against = potential(nominal, config, candidates) if len(candidates) else none
-    terms = _terms(nominal, against)
+    families, std, notes = potential(nominal, config, candidates)
+    terms = _terms(nominal, families, std)
     scale = np.array([t.scale for t in terms])
     contents, height, layout_notes = _layout(candidates, mode, nominal.elements, len(terms))
     rows = np.zeros((len(contents), height, len(terms)))
-    parts = reading_derivatives(nominal, config, candidates, against.effects, scale)
+    parts = reading_derivatives(nominal, config, candidates, families, scale)
     for units, block in unit_rows(parts, candidates.loads, contents, mode):
         rows[units, : block.shape[1]] = block
-    measured = information_of(nominal, against.effects, scale)
+    measured = information_of(nominal, families, scale)
     count = len(nominal.live)
     precision = np.ones(len(terms))
     precision[:count] = (scale[:count] / nominal.prior_std[nominal.live]) ** 2
     cost = np.array([float(len(readings_of(unit, mode))) for unit in contents])
     return DesignProblem(
         nominal=nominal, mode=mode, candidates=candidates, units=CandidateSet(rows, cost),
-        what=contents, terms=terms, families=against.effects,
-        prior=measured + np.diag(precision), measured=measured,
-        notes=(*nominal.notes, *against.notes, *layout_notes),
+        what=contents, terms=terms, families=families, prior=measured + np.diag(precision),
+        measured=measured, notes=(*nominal.notes, *notes, *layout_notes),
     )  # fmt: skip
 
 
-def _terms(nominal: NominalModel, against: Potential) -> tuple[DesignTerm, ...]:
+def _terms(
+    nominal: NominalModel, families: tuple[Effect, ...], std: Floats
+) -> tuple[DesignTerm, ...]:
     model = [(e.name, p) for e in nominal.model.effects for p in e.parameters]
-    of_model = [
-        DesignTerm(effect, f"{effect}.{p.name}", p.unit, p.scale, float(nominal.theta[k]), False)
-        for k, (effect, p) in enumerate(model)
-        if k in set(nominal.live.tolist())
-    ]
-    extra = [(e.name, p) for e in against.effects for p in e.parameters]
-    return tuple(of_model) + tuple(
-        DesignTerm(effect, f"{effect}.{p.name}", p.unit, float(std), 0.0, True)
-        for (effect, p), std in zip(extra, against.std, strict=True)
-    )
+    live = ((*model[k], float(nominal.theta[k])) for k in nominal.live)
+    extra = [(e.name, p) for e in families for p in e.parameters]
+    terms = [DesignTerm(e, f"{e}.{p.name}", p.unit, p.scale, v, False) for e, p, v in live]
+    for (e, p), s in zip(extra, std, strict=True):
+        terms.append(DesignTerm(e, f"{e}.{p.name}", p.unit, float(s), 0.0, True))
+    return tuple(terms)
 
 
 def _layout(
@@ -351,12 +329,8 @@ def _layout(
             "no candidate pose may be taken"
             + (" both unloaded and under a load" if mode == "deflection" else "")
         )
-    of_pose = [subsets[k] for k in pattern]
-    contents = tuple(
-        (pose, tuple(candidates.loads[k] for k in s))
-        for pose, units in enumerate(of_pose)
-        for s in units
-    )
+    units_of = ((pose, s) for pose, k in enumerate(pattern) for s in subsets[k])
+    contents = tuple((pose, tuple(candidates.loads[k] for k in s)) for pose, s in units_of)
     return contents, height, notes
 
 
@@ -406,8 +380,15 @@ def readings_of(unit: tuple[int, tuple[str, ...]], mode: Mode) -> tuple[str, ...
     return unit[1] if mode == "absolute" else (UNLOADED, *unit[1])
 
 
-def potential(nominal: NominalModel, config: CellConfig, candidates: Candidates) -> Potential:
-    """Choose the families of `[planning] against`, with sizes typical of arms."""
+def potential(
+    nominal: NominalModel, config: CellConfig, candidates: Candidates
+) -> tuple[tuple[Effect, ...], Floats, tuple[str, ...]]:
+    """Choose the families of `[planning] against`, with sizes typical of arms.
+
+    Also return the standard deviation (F,) of each parameter, SI, and notes on omitted families.
+    """
+    if not len(candidates):
+        return (), np.zeros(0), ()
     names = potential_names(config, nominal.model)
     catalogue = nominal.model.catalogue
     families = tuple(build(catalogue, name, nominal.cell, nominal.m) for name in names)
@@ -433,11 +414,8 @@ def potential(nominal: NominalModel, config: CellConfig, candidates: Candidates)
             chosen.append(k)
     start = np.cumsum([0, *(len(e.parameters) for e in families)])
     stds = [std[start[k] : start[k + 1]] for k in sorted(chosen)]
-    return Potential(
-        tuple(families[k] for k in sorted(chosen)),
-        np.concatenate([np.zeros(0), *stds]),
-        tuple(notes),
-    )
+    effects = tuple(families[k] for k in sorted(chosen))
+    return effects, np.concatenate([np.zeros(0), *stds]), tuple(notes)
 
 
 def _strengths(
@@ -466,8 +444,7 @@ def _strengths(
             squares += np.sum(r**2, axis=(0, 1))
             count += r.shape[0] * r.shape[1]
     ends = len(nominal.live) + np.cumsum([0, *(len(e.parameters) for e in families)])
-    sums = [float(squares[a:b].sum()) for a, b in pairwise(ends)]
-    return [float(np.sqrt(s / max(count, 1))) for s in sums]
+    return [float(np.sqrt(squares[a:b].sum() / max(count, 1))) for a, b in pairwise(ends)]
 
 
 def information_of(nominal: NominalModel, added: tuple[Effect, ...], scale: Floats) -> Floats:

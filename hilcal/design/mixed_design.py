@@ -25,13 +25,9 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from hilcal.config import CellConfig
-from hilcal.design.criterion import CandidateSet, inverse_factor
-from hilcal.design.information import (
-    DesignProblem,
-    information_of,
-    reading_derivatives,
-    unit_rows,
-)
+from hilcal.design.criteria import MeanVariance
+from hilcal.design.criterion import CandidateSet, Objective, inverse_factor
+from hilcal.design.information import DesignProblem, information_of, reading_derivatives, unit_rows
 from hilcal.design.nominal_model import NominalModel, build, expected_std, potential_names
 from hilcal.design.predicted import PredictionPoses, position_derivative
 from hilcal.effects.protocol import Effect
@@ -43,19 +39,11 @@ SAMPLE = 300  # candidate poses that determine Q; a choice
 LEAST = 1e-3  # least motion of the units by a direction of Q, RMS, over the noise
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MixedDesign:
-    """A design problem in the coordinates (b, Qᵀ v)."""
-
-    units: CandidateSet  # the units of the problem
-    prior: Floats  # (P, P) prior information
-    c: Floats  # (P, P) C, m²
-    names: tuple[str, ...]  # of b, then numbers of Qᵀ v; numbers only after `balanced`
-
-
-def mixed_design(problem: DesignProblem, config: CellConfig, work: PredictionPoses) -> MixedDesign:
-    """Return the design problem of predictions with all effects."""
-    nominal, config = problem.nominal, _with_scatter(problem.nominal, config)
+def mixed_design(problem: DesignProblem, config: CellConfig, work: PredictionPoses) -> Objective:
+    """Return the objective of predictions with all effects, in the coordinates (b, Qᵀ v)."""
+    nominal = problem.nominal
+    if not np.any(config.repeatability.per_joint(nominal.cell.arm.n)):  # not stated
+        config = _with_scatter(nominal, config)
     effects, std = other_effects(nominal, config)
     prior_std = nominal.prior_std[nominal.live]
     flat = np.concatenate([np.isinf(prior_std), np.zeros(len(std), dtype=bool)])
@@ -73,26 +61,28 @@ def mixed_design(problem: DesignProblem, config: CellConfig, work: PredictionPos
     coordinates = _coordinates(information, flat, sample)
     count = int(flat.sum()) + coordinates.random.shape[1]
     rows = np.zeros((*problem.units.rows.shape[:2], count))
-    for units, part in all_rows():
-        rows[units, : part.shape[1]] = coordinates.whitened(part)
+    for members, part in all_rows():
+        rows[members, : part.shape[1]] = coordinates.whitened(part)
     v = coordinates.columns(position_derivative(nominal, work, effects, scale)).reshape(-1, count)
     prior = np.eye(count)
     prior[: coordinates.flat.shape[1], : coordinates.flat.shape[1]] = coordinates.prior
     names = [t.name for t, free in zip(problem.terms, flat, strict=False) if free]
     names += [f"direction {k}" for k in range(1, coordinates.random.shape[1] + 1)]
     c = v.T @ v / len(work.q)
-    return MixedDesign(CandidateSet(rows, problem.units.cost), prior, c, tuple(names))
+    units = CandidateSet(rows, problem.units.cost)
+    return Objective(units, MeanVariance(c), prior, tuple(names))
 
 
-def balanced(design: MixedDesign) -> MixedDesign:
-    """Return the problem in coordinates in which the information of all units is the identity.
+def balanced(design: Objective) -> Objective:
+    """Return an objective in coordinates in which the information of all units is the identity.
 
     tr(C M⁻¹) does not depend on coordinates. After a fit, some directions are known 10⁶ times as
-    well as others, and rounding would decide. A problem that leaves a coordinate undetermined is
+    well as others, and rounding would decide. An objective that leaves a coordinate undetermined is
     returned unchanged, with its names.
     """
-    units = design.units
-    total = design.prior + units.information(np.full(len(units), 1.0 / len(units)))
+    units, criterion = design.units, design.criterion
+    assert isinstance(criterion, MeanVariance)  # noqa: S101  (of `mixed_design`)
+    total = design.information(np.full(len(units), 1.0 / len(units)))
     size = np.sqrt(np.diag(total))
     if not np.all(size > 0):
         return design
@@ -100,10 +90,10 @@ def balanced(design: MixedDesign) -> MixedDesign:
     if inverted is None:
         return design
     turn = np.linalg.cholesky(inverted[0] @ inverted[0].T) / size[:, None]
-    rows = units.rows @ turn
+    turned = CandidateSet(units.rows @ turn, units.cost)
     names = tuple(f"direction {k}" for k in range(1, len(size) + 1))
-    prior, c = (0.5 * (m + m.T) for m in (turn.T @ m @ turn for m in (design.prior, design.c)))
-    return MixedDesign(CandidateSet(rows, units.cost), prior, c, names)
+    prior, c = (turn.T @ m @ turn for m in (design.prior, criterion.c))
+    return Objective(turned, MeanVariance(0.5 * (c + c.T)), 0.5 * (prior + prior.T), names)
 
 
 def other_effects(nominal: NominalModel, config: CellConfig) -> tuple[tuple[Effect, ...], Floats]:
@@ -115,17 +105,13 @@ def other_effects(nominal: NominalModel, config: CellConfig) -> tuple[tuple[Effe
     names = () if model.background else potential_names(config, model)
     periodic = [name for name in names if "harmonics" in catalogue[name].option_help]
     finest = {name: {"harmonics": HARMONICS} for name in periodic}
-    effects = tuple(
-        build(catalogue, name, nominal.cell, nominal.m, finest.get(name, {})) for name in names
-    )
+    cell, m = nominal.cell, nominal.m
+    effects = tuple(build(catalogue, name, cell, m, finest.get(name, {})) for name in names)
     return effects, expected_std(model, effects)
 
 
 def _with_scatter(nominal: NominalModel, config: CellConfig) -> CellConfig:
-    """Return the configuration with the arm's repeatability: stated, estimated or ordinary."""
-    stated = config.repeatability.per_joint(nominal.cell.arm.n)
-    if np.any(stated):
-        return config
+    """Return the configuration with the arm's repeatability: estimated or ordinary."""
     std: tuple[float, ...] = (SCATTER_RAD,)
     scatter = None if nominal.fit is None else nominal.fit.readings.arm_scatter
     if scatter is not None and scatter.kind != "isotropic":
@@ -152,10 +138,8 @@ class _Coordinates:
         full, retained = rows @ self.root, rows @ self.random
         noise = full @ np.swapaxes(full, 1, 2) - retained @ np.swapaxes(retained, 1, 2)
         noise += np.eye(rows.shape[1])
-        low = np.linalg.cholesky(noise)
-        return np.asarray(
-            np.linalg.solve(low, np.concatenate([rows @ self.flat, retained], axis=-1))
-        )
+        both = np.concatenate([rows @ self.flat, retained], axis=-1)
+        return np.asarray(np.linalg.solve(np.linalg.cholesky(noise), both))
 
 
 def _coordinates(

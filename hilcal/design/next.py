@@ -7,11 +7,10 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.design.criteria import Pair
+from hilcal.design.criterion import DiscriminatedPairs, Pair
 from hilcal.design.discriminated_pairs import (
     LEAST_POWER,
     LEVEL,
-    DiscriminatedPairs,
     not_ruled_out,
     pair_of,
     power,
@@ -76,18 +75,14 @@ def measure_next(
     names = tuple(dict.fromkeys(suspects))
     if len(names) < 2:
         raise InputError(f"{len(names)} suspects; two or more are needed to separate them")
-    update = {
-        "readings": fit.mode,
-        "against": names,
-        "candidates": min(config.planning.candidates, CANDIDATES),
-    }
+    count = min(config.planning.candidates, CANDIDATES)
+    update = {"readings": fit.mode, "against": names, "candidates": count}
     planning = config.planning.model_copy(update=update)
     config = config.model_copy(update={"planning": planning})
     readings = request.readings or request.poses * (1 + len(config.loads))
+    asked = replace(request, criterion="separate", readings=readings)
     try:
-        planned = make(
-            cell, config, replace(request, criterion="separate", readings=readings), rng, fit, say
-        )
+        planned = make(cell, config, asked, rng, fit, say)
     except InputError as error:
         if "effects to tell apart" not in str(error):
             raise
@@ -123,15 +118,12 @@ def expected(
 
 
 def _pair_powers(
-    problem: DesignProblem,
-    pairs: DiscriminatedPairs,
-    names: tuple[str, ...],
-    information: Floats,
+    problem: DesignProblem, pairs: DiscriminatedPairs, names: tuple[str, ...], information: Floats
 ) -> Iterator[PairPower]:
     observable = {e.name for e in problem.families}
     supported = supported_parameters(problem, DRAWS)
     for e in names:
-        betas = [p.beta for p, n in zip(pairs.pairs, pairs.names, strict=True) if n[0] == e]
+        betas = [p.beta for p in pairs.pairs if p.names[0] == e]
         if e in supported:
             betas = list(supported[e] / problem.scale[problem.of_effect(e)])
         for f in names:
@@ -140,11 +132,10 @@ def _pair_powers(
             if e not in observable:
                 yield PairPower(e, f, LEVEL, LEVEL, True)
                 continue
-            so_far, planned = (
-                expected(problem, (e, f), betas, m) for m in (pairs.prior, information)
-            )
+            now = expected(problem, (e, f), betas, pairs.prior)
+            planned = expected(problem, (e, f), betas, information)
             never = (e, f) in pairs.not_separable and planned < LEAST_POWER
-            yield PairPower(e, f, so_far, planned, never)
+            yield PairPower(e, f, now, planned, never)
 
 
 def _from_reference(
@@ -183,18 +174,12 @@ def reordered(
     """Return a plan with other counts of its units, ordered anew."""
     problem, usable, objective = planned.problem, np.flatnonzero(planned.usable), planned.asked
     information = objective.prior + objective.units.information(counts.astype(float))
-    design = replace(
-        planned.design,
-        counts=counts[usable],
-        value=float(objective.criterion.value(information)),
-        information=information,
-        cost=float(counts @ problem.units.cost),
-    )
+    value, cost = float(objective.criterion.value(information)), counts @ problem.units.cost
+    design = replace(planned.design, counts=counts[usable], value=value, information=information)
+    order = ordered(space, problem, reference, counts, rng, ordering)
+    precision = predicted(problem, counts.astype(float), work=planned.work)
     return replace(
-        planned,
-        ordered=ordered(space, problem, reference, counts, rng, ordering),
-        design=design,
-        predicted=predicted(problem, counts.astype(float), work=planned.work),
+        planned, ordered=order, design=replace(design, cost=float(cost)), predicted=precision
     )
 
 
@@ -216,9 +201,8 @@ def _where(planned: Planned, pair: Pair, information: Floats) -> tuple[dict[str,
             shares[load] = shares.get(load, 0.0) + share
 
     arm, cell = problem.nominal.cell.arm, problem.nominal.cell
-    reaches = np.linalg.norm(
-        evaluate(arm, problem.candidates.q).point(cell.target[:3, 3])[:, :2], axis=1
-    )
+    targets = evaluate(arm, problem.candidates.q).point(cell.target[:3, 3])
+    reaches = np.linalg.norm(targets[:, :2], axis=1)
     poses = np.array([problem.what[k][0] for k in units])
     reach = float(reaches[poses] @ parts) / total
     return shares, reach / float(np.mean(reaches))
@@ -248,9 +232,8 @@ def measure_poses(
     count = max(SPARE * poses, LEAST)
     planning = config.planning.model_copy(update={"readings": fit.mode, "candidates": count})
     config = config.model_copy(update={"loads": [], "planning": planning})
-    planned = make(
-        cell, config, Request(poses, readings=poses, criterion=CRITERION, effort=0), rng, fit, say
-    )
+    request = Request(poses, readings=poses, criterion=CRITERION, effort=0)
+    planned = make(cell, config, request, rng, fit, say)
     say("spreading the poses")
     problem, space = planned.problem, Space(cell, config)
     home = planned.ordered.plan.q[0] if reference is None else reference

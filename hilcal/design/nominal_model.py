@@ -100,13 +100,9 @@ def nominal_model(
     of_prior = {} if prior is None else _effects_of_prior(prior, registered, catalogue, m)
     chosen = {name: options or of_prior.get(name, {}) for name, options in chosen.items()}
     chosen |= {name: o for name, o in of_prior.items() if name not in chosen}
-    frame_prior = FRAME_PRIOR if config.planning.readings == "deflection" else {}
-    effects = tuple(
-        build(
-            catalogue, name, registered, m, {**(frame_prior if name in frames else {}), **options}
-        )
-        for name, options in chosen.items()
-    )
+    if config.planning.readings == "deflection":
+        chosen |= {name: {**FRAME_PRIOR, **chosen[name]} for name in frames}
+    effects = tuple(build(catalogue, name, registered, m, o) for name, o in chosen.items())
     model = Model(registered, effects, catalogue, prior=prior)
     parts = [(e.role == "baseline") * np.array([p.scale for p in e.parameters]) for e in effects]
     notes += random_columns(effects)
@@ -159,15 +155,11 @@ def after(fit: Fit, config: CellConfig) -> NominalModel:
     # the fit scales its priors by the noise factor β
     std = np.where(np.isinf(prior), np.inf, prior / np.sqrt(fit.solution.beta))
     std[fit.solution.space.index] = np.inf
-    names = " + ".join(fit.model.names)
-    count = len(fit.readings) - int(fit.outlier.sum())
-    notes = (
-        f"planned on from {count} readings, fitted with {names}",
-        *random_columns(fit.model.effects),
-    )
-    live = np.flatnonzero(fit.solution.estimated)
+    count, names = len(fit.readings) - int(fit.outlier.sum()), " + ".join(fit.model.names)
+    begun = f"planned on from {count} readings, fitted with {names}"
+    notes = (begun, *random_columns(fit.model.effects))
+    live, m = np.flatnonzero(fit.solution.estimated), fit.readings.m
     carried = carried_information(fit.model, live)
-    m = fit.readings.m
     return NominalModel(fit.model, fit.theta, live, std, station, m, fit, notes, carried)
 
 
@@ -233,13 +225,10 @@ def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:
 
     "catalogue" excludes effects whose variables, such as time, depend on the order of a plan.
     """
-    against = config.planning.against
+    against, cell = config.planning.against, model.cell
     if against == "catalogue":
-        names = tuple(
-            kind.name
-            for kind in model.catalogue.effects
-            if kind.applies(model.cell) and not kind.needs and kind.role != "observer"
-        )
+        kinds = (k for k in model.catalogue.effects if k.applies(cell) and k.role != "observer")
+        names = tuple(kind.name for kind in kinds if not kind.needs)
     else:
         names = known_effects(against, "[planning] against", model.catalogue)
     return tuple(name for name in names if name not in model.names)
@@ -268,12 +257,9 @@ def nominal_tracker_place(cell: Cell, config: CellConfig) -> tuple[Floats, bool]
 def nominal_states(q: Floats, wrench: Floats) -> States:
     """Return N states with random times, temperatures and directions of approach."""
     rng = np.random.default_rng(_SEED)
-    time = rng.uniform(0.0, DURATION_S, len(q))
-    approach = rng.choice([-1.0, 1.0], q.shape)
-    return States(
-        q=q, wrench=wrench, time=time, load_time=rng.uniform(*LOAD_TIMES_S, len(q)),
-        joint_temperature=rng.uniform(*TEMPERATURES, q.shape), approach=approach,
-    )  # fmt: skip
+    time, approach = rng.uniform(0.0, DURATION_S, len(q)), rng.choice([-1.0, 1.0], q.shape)
+    load_time, warm = rng.uniform(*LOAD_TIMES_S, len(q)), rng.uniform(*TEMPERATURES, q.shape)
+    return States(q, wrench, time, load_time, joint_temperature=warm, approach=approach)
 
 
 def _registered(cell: Cell, config: CellConfig, place: Floats) -> tuple[Cell, Floats]:

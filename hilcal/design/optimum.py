@@ -1,14 +1,13 @@
 """Exact designs with a certified lower bound of their efficiency."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg as sl
 
-from hilcal.design.approximate_design import KINKED_TOLERANCE, ApproximateDesign, given_prior, relax
-from hilcal.design.criterion import CandidateSet, Criterion, best_first
+from hilcal.design.approximate_design import KINKED_TOLERANCE, ApproximateDesign, checked, relax
+from hilcal.design.criterion import Objective, best_first
 from hilcal.errors import CannotAnswerError
 from hilcal.types import Floats, Ints
 
@@ -33,14 +32,11 @@ class Design:
 
 
 def best(
-    units: CandidateSet,
-    criterion: Criterion,  # φ
+    objective: Objective,
     budget: float,  # B, in the units of the cost
-    prior: Floats | None = None,  # (P, P) M0: prior information, or of fixed readings
     rng: np.random.Generator | None = None,  # the only source of randomness
     *,
     most: int | None = None,  # largest count of a unit; unlimited by default
-    names: Sequence[str] | None = None,
     effort: int | None = None,  # units put into plans until the search ends; `EFFORT` by default
     relaxed: ApproximateDesign | None = None,  # the continuous optimum, or a start near it
 ) -> Design:
@@ -52,23 +48,21 @@ def best(
     a few random units are removed at once, and slightly worse plans are accepted for a while.
     """
     rng = np.random.default_rng(0) if rng is None else rng
+    units, criterion = objective.units, objective.criterion
     tolerance = KINKED_TOLERANCE if criterion.kinked else TOLERANCE
     if relaxed is None or relaxed.gap > tolerance:
-        relaxed = relax(
-            units, criterion, budget, prior, most=most, names=names, tolerance=tolerance,
-            start=relaxed,
-        )  # fmt: skip
-    prior = given_prior(units, budget, prior)
-    relevant = criterion.relevant(units, prior, budget)
-    search = _Search(units, relevant, budget, prior, relaxed, most)
+        relaxed = relax(objective, budget, most=most, tolerance=tolerance, start=relaxed)
+    objective = checked(objective, budget)
+    relevant = criterion.relevant(units, objective.prior, budget)
+    search = _Search(replace(objective, criterion=relevant), budget, relaxed, most)
     usual, enough = (KINKED_EFFORT, KINKED_ENOUGH) if relevant.kinked else (EFFORT, ENOUGH)
     counts = search.counts(rng, usual if effort is None else effort, relaxed.bound, enough)
     used = np.flatnonzero(counts)
-    information = prior + units.information(counts[used].astype(float), used)
+    information = objective.information(counts[used].astype(float), used)
     value = float(criterion.value(information))
     cost = float(counts @ units.cost)
     try:
-        criterion.require(information, names)
+        criterion.require(information, objective.names)
         determined = value > 0.0
     except CannotAnswerError:
         determined = False
@@ -107,18 +101,19 @@ class _Search:
     """The search for a plan in a pool: the units of positive weight or of the best prices."""
 
     def __init__(
-        self, units: CandidateSet, criterion: Criterion, budget: float, prior: Floats,
-        relaxed: ApproximateDesign, most: int | None,
-    ) -> None:  # fmt: skip
+        self, objective: Objective, budget: float, relaxed: ApproximateDesign, most: int | None
+    ) -> None:
+        units, prior = objective.units, objective.prior
         most_of_one = budget / float(units.cost.min())
         fits = 2 * _TABLE // (units.size * (units.size + 1))
         count = max(min(_POOL, fits), 3 * int(np.ceil(most_of_one)))
         index = np.union1d(best_first(relaxed.price / units.cost, count), relaxed.index)
         weight = np.zeros(len(units))
         weight[relaxed.index] = relaxed.weight
-        self.criterion, self.budget, self.prior = criterion, budget, prior
+        self.criterion, self.budget = objective.criterion, budget
+        self.of_pool = objective.among(index)
         self.count, self.index, self.ideal_weight = len(units), index, weight[index]
-        self.pool = CandidateSet(units.rows[index], units.cost[index])
+        self.pool = self.of_pool.units
         self.most = int(np.floor(most_of_one * (1 + _SLACK))) if most is None else most
         spent = float(units.cost[relaxed.index] @ relaxed.weight)
         # information per cost of the continuous optimum, without M0
@@ -154,7 +149,7 @@ class _Search:
 
     def _information(self, counts: Ints) -> Floats:
         used = np.flatnonzero(counts)
-        return np.asarray(self.prior + self.pool.information(counts[used].astype(float), used))
+        return self.of_pool.information(counts[used].astype(float), used)
 
     def _prices(self, gradient: Floats) -> Floats:
         """Return (S,) tr(G A_kᵀA_k), in single precision."""

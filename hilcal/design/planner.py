@@ -9,38 +9,27 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
+from hilcal.design import choice
 from hilcal.design.approximate_design import ApproximateDesign
-from hilcal.design.choice import (
-    EFFORT,
-    Objective,
-    canonical,
-    certified,
-    choose,
-    choose_poses,
-    compound_objective,
-    costly_loads,
-    only,
-    pose_units,
-    promising,
-)
-from hilcal.design.criterion import CandidateSet
+from hilcal.design.criterion import CandidateSet, Objective
 from hilcal.design.feasible import DrawnPoses, Space, draw
 from hilcal.design.information import DesignProblem, problem, reading_covariance, readings_of
 from hilcal.design.nominal_model import after, nominal_model
-from hilcal.design.optimum import Design
+from hilcal.design.optimum import Design, best
 from hilcal.design.predicted import (
     PredictedUncertainty,
     PredictionPoses,
     predicted,
     prediction_poses,
 )
-from hilcal.design.run_order import Chosen, Ordered, Ordering, order_plan, pace
+from hilcal.design.run_order import Chosen, Ordered, Ordering, order_plan
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.per_joint import PerJoint
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.carried import CarriedPrior
 from hilcal.identification.fit import Fit
 from hilcal.identification.registration import MIN_POSES
+from hilcal.measuring.route import seconds_at_rest
 from hilcal.regression.normal_equations import INFORMATION
 from hilcal.regression.schur import DETERMINED
 from hilcal.store.plan import UNLOADED
@@ -92,33 +81,26 @@ def without_undetermined(
         return problem, ()
     undetermined = tuple(_named(problem, k, confounded) for k, confounded in omitted.items())
     if len(omitted) == int(flat.sum()):
-        raise CannotAnswerError("; ".join(dict.fromkeys(f.remark for f in undetermined[:1])))
+        raise CannotAnswerError(undetermined[0].remark)
     retained = np.setdiff1d(np.arange(len(problem.terms)), list(omitted))
     of_model, carried = retained[retained < size], problem.nominal.carried
-    nominal = replace(
-        problem.nominal,
-        live=problem.nominal.live[of_model],
-        carried=None if carried is None else carried[np.ix_(of_model, of_model)],
-    )
+    carried = None if carried is None else carried[np.ix_(of_model, of_model)]
+    nominal = replace(problem.nominal, live=problem.nominal.live[of_model], carried=carried)
     rows = np.ascontiguousarray(problem.units.rows[:, :, retained])
+    units, terms = CandidateSet(rows, problem.units.cost), tuple(problem.terms[k] for k in retained)
+    prior, measured = (m[np.ix_(retained, retained)] for m in (problem.prior, problem.measured))
     reduced = replace(
-        problem,
-        nominal=nominal,
-        units=CandidateSet(rows, problem.units.cost),
-        terms=tuple(problem.terms[k] for k in retained),
-        prior=problem.prior[np.ix_(retained, retained)],
-        measured=problem.measured[np.ix_(retained, retained)],
+        problem, nominal=nominal, units=units, terms=terms, prior=prior, measured=measured
     )
     return reduced, undetermined
 
 
 def _undetermined(m: Floats, flat: Bools) -> Iterator[tuple[int, Ints]]:
     """Yield the parameters that M (P, P) does not determine, with those confounded with each."""
-    retained = np.arange(len(m))
     blind = np.flatnonzero(flat & (np.diag(m) < INFORMATION**2))
     for k in blind:
         yield int(k), np.zeros(0, dtype=np.int64)
-    retained = np.setdiff1d(retained, blind)
+    retained = np.setdiff1d(np.arange(len(m)), blind)
     while flat[retained].any():
         root = np.sqrt(np.diag(m)[retained])
         values, vectors = np.linalg.eigh(m[np.ix_(retained, retained)] / np.outer(root, root))
@@ -132,8 +114,7 @@ def _undetermined(m: Floats, flat: Bools) -> Iterator[tuple[int, Ints]]:
 
 
 def _named(problem: DesignProblem, k: int, confounded: Ints) -> UndeterminedParameter:
-    term = problem.terms[k]
-    joint = ""
+    term, joint = problem.terms[k], ""
     for e in problem.nominal.model.effects:
         if isinstance(e, PerJoint) and e.role == "baseline" and e.name == term.effect:
             names = [f"{e.name}.{p.name}" for p in e.parameters]
@@ -157,7 +138,7 @@ class Request:
     poses: int = 20  # each read once unloaded and under every load that it bears
     readings: int | None = None  # instead of poses; without those at the reference and repeats
     criterion: str | None = None  # of `[planning]` by default, else I, or D for deflections
-    effort: int = EFFORT  # of the search for integer counts
+    effort: int = choice.EFFORT  # of the search for integer counts
     unloaded: Literal["around", "first"] = "around"  # see `Ordering`
 
 
@@ -200,15 +181,13 @@ def make(
 ) -> Planned:
     """Return a plan of a cell."""
     usual = "I" if config.planning.readings == "absolute" else "D"
-    criterion = canonical(request.criterion or config.planning.criterion or usual)
+    criterion = choice.canonical(request.criterion or config.planning.criterion or usual)
     say("drawing candidate poses")
-    space = Space(cell, config)
+    space, home = Space(cell, config), reference
     drawn = draw(space, config.planning.candidates, rng, least=2)
-    if reference is None:
+    if home is None:
         home, poses = _reference(space, drawn, rng)
         drawn = replace(drawn, q=drawn.q[poses], allowed=drawn.allowed[poses])
-    else:
-        home = reference
     say("computing the information of each pose")
     if known is None:
         model = nominal_model(cell, config, 3, catalogue, prior)
@@ -216,19 +195,22 @@ def make(
         model = after(known, config)
     reduced, undetermined = without_undetermined(problem(model, config, drawn.q, drawn.allowed))
     work = prediction_poses(reduced.nominal, config, drawn.q, space.clear)
-    budget = _budget(request, reduced)
-    objective = compound_objective(reduced, config, criterion, work, budget, rng)
     by_poses = request.readings is None
+    count, unit = (request.poses, "poses") if by_poses else (request.readings or 0, "readings")
+    if count < 1:
+        raise InputError(f"{count} {unit}; valid: a whole number from 1")
+    budget = float(count * (len(reduced.candidates.loads) if by_poses else 1))
+    objective = choice.compound_objective(reduced, config, criterion, work, budget, rng)
     costly: tuple[tuple[str, float], ...] = ()
     if by_poses:
         say("weighing what each load costs")
-        seconds = pace(config)
-        costly = costly_loads(objective, reduced, budget, seconds.change_s / seconds.reading_s, rng)
+        change = config.planning.load_change_s / seconds_at_rest(config)
+        costly = choice.costly_loads(objective, reduced, budget, change, rng)
     say(f"choosing poses by criterion {criterion}")
     pose_of = np.array([pose for pose, _ in reduced.what])
-    first, relaxed = promising(objective, budget)
+    first, relaxed = choice.promising(objective, budget)
     usable = ~np.isin(pose_of, _unreachable(space, reduced, home, first))
-    candidates = pose_units(objective, reduced) if by_poses else None
+    candidates = choice.pose_units(objective, reduced) if by_poses else None
     reached: set[int] = set()
     over_poses: ApproximateDesign | None = None
     for remaining in reversed(range(ROUNDS)):
@@ -236,12 +218,13 @@ def make(
             usable &= np.isin(pose_of, [*reached])
         if candidates is not None:
             among = np.isin(candidates.poses, pose_of[usable])
-            counts, over_poses = choose_poses(
+            counts, over_poses = choice.choose_poses(
                 objective, candidates, among, request.poses, rng, request.effort, over_poses
             )
         else:
             start = relaxed.among(usable)
-            design = choose(only(objective, usable), budget, rng, request.effort, start)
+            asked = objective.among(usable)
+            design = best(asked, budget, rng, effort=request.effort, relaxed=start)
             counts = np.zeros(len(usable), dtype=np.int64)
             counts[usable] = design.counts
         units = np.flatnonzero(counts)
@@ -256,19 +239,17 @@ def make(
             "reference pose reaches; widen the workspace"
         )
     if by_poses:
-        design = certified(objective, counts, usable, relaxed)
+        design = choice.certified(objective, counts, usable, relaxed)
     visited = len({reduced.what[k][0] for k in units}) + 1
     if not cell.registration_known and known is None and visited < MIN_POSES:
         raise CannotAnswerError(
             f"the plan has {visited} poses, the reference among them; an unknown registration "
-            f"needs at least {MIN_POSES}: ask for more {'poses' if by_poses else 'readings'}"
+            f"needs at least {MIN_POSES}: ask for more {unit}"
         )
     say("ordering the readings")
     repeats = max(2, (visited - 1) // 10)
-    sampled = reduced.candidates[slice(0, SAMPLE)].states()
-    covariance = reading_covariance(
-        reduced.nominal, config, reduced.nominal.model.predict(sampled, reduced.nominal.theta)
-    )
+    sampled, nominal = reduced.candidates[slice(0, SAMPLE)].states(), reduced.nominal
+    covariance = reading_covariance(nominal, config, nominal.model.predict(sampled, nominal.theta))
     std = float(np.sqrt(np.mean(np.diagonal(covariance[:, :3, :3], axis1=1, axis2=2))))
     ordering = Ordering(unloaded=request.unloaded, repeats=repeats, reading_std=std)
     order = ordered(space, reduced, home, counts, rng, ordering)
@@ -277,14 +258,6 @@ def make(
         order, design, costly, reduced, objective, usable, work, drawn, budget, criterion,
         precision, undetermined, request.poses if by_poses else None,
     )  # fmt: skip
-
-
-def _budget(request: Request, problem: DesignProblem) -> float:
-    by_poses = request.readings is None
-    count, unit = (request.poses, "poses") if by_poses else (request.readings or 0, "readings")
-    if count < 1:
-        raise InputError(f"{count} {unit}; valid: a whole number from 1")
-    return float(count * (len(problem.candidates.loads) if by_poses else 1))
 
 
 def _reference(space: Space, drawn: DrawnPoses, rng: np.random.Generator) -> tuple[Floats, Ints]:
@@ -317,10 +290,9 @@ def _reference(space: Space, drawn: DrawnPoses, rng: np.random.Generator) -> tup
 def _unreachable(space: Space, problem: DesignProblem, home: Floats, units: Ints) -> Ints:
     """Return the poses of the units that no clear straight motion reaches from home."""
     by_load: dict[str, set[int]] = {}
-    for k in units:
-        pose, loads = problem.what[k]
-        for load in readings_of((pose, loads), problem.mode):
-            by_load.setdefault(load, set()).add(pose)
+    for unit in (problem.what[k] for k in units):
+        for load in readings_of(unit, problem.mode):
+            by_load.setdefault(load, set()).add(unit[0])
     unreachable: set[int] = set()
     for load, poses in by_load.items():
         indices = np.array(sorted(poses))
@@ -338,16 +310,9 @@ def ordered(
     ordering: Ordering,
 ) -> Ordered:
     """Name the poses of the chosen units p1, p2, ..., and put their readings in order."""
-    used = np.flatnonzero(counts)
-    poses = sorted({problem.what[k][0] for k in used})
+    units = [(problem.what[k], int(counts[k])) for k in np.flatnonzero(counts)]
+    poses = sorted({pose for (pose, _), _ in units})
     names = {pose: f"p{k}" for k, pose in enumerate(poses, start=1)}
-    chosen = [
-        Chosen(
-            names[problem.what[k][0]], readings_of(problem.what[k], problem.mode), int(counts[k])
-        )
-        for k in used
-    ]
-    return order_plan(
-        space.cell, space.config, list(names.values()), problem.candidates.q[poses], home, chosen,
-        space.passable, rng, ordering,
-    )  # fmt: skip
+    chosen = [Chosen(names[u[0]], readings_of(u, problem.mode), count) for u, count in units]
+    q, site = problem.candidates.q[poses], (space.cell, space.config)
+    return order_plan(*site, list(names.values()), q, home, chosen, space.passable, rng, ordering)

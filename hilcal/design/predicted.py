@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.config import CellConfig
-from hilcal.design.information import DesignProblem
+from hilcal.design.information import DesignProblem, DesignTerm
 from hilcal.design.nominal_model import NominalModel, nominal_states
 from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError, InputError
@@ -21,6 +21,7 @@ COUNT = 500  # poses drawn where none is named; a choice: a plan overfits 100
 _DRAWN = 4096
 _ROUNDS = 60
 _SEED = 20240608
+Clear = Callable[[Floats], Bools]  # which of (N, n) states are feasible
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,7 +39,7 @@ def prediction_poses(
     nominal: NominalModel,
     config: CellConfig,  # `[planning] work_*`, loads
     feasible: Floats,  # (N, n) feasible states to draw from, rad
-    may: Callable[[Floats], Bools] | None = None,  # which of (N, n) states are feasible, for a box
+    may: Clear | None = None,  # for a box
 ) -> PredictionPoses:
     """Return the prediction poses of `[planning]`: named, within a box, or of the candidates.
 
@@ -83,10 +84,7 @@ def position_derivative(
 
 
 def _poses(
-    nominal: NominalModel,
-    config: CellConfig,
-    feasible: Floats,
-    may: Callable[[Floats], Bools] | None,
+    nominal: NominalModel, config: CellConfig, feasible: Floats, may: Clear | None
 ) -> tuple[Floats, str]:
     """Return prediction poses (T, n), and in words where they are."""
     planning, cell = config.planning, nominal.cell
@@ -141,9 +139,7 @@ class PredictedUncertainty:
     have to be estimated too if any of their effects is present.
     """
 
-    names: tuple[str, ...]  # of the model's live parameters, as identification prints them
-    units: tuple[str, ...]
-    values: Floats  # assumed values, SI
+    terms: tuple[DesignTerm, ...]  # the model's live parameters
     std: Floats  # with the model complete, SI; infinite where not identifiable
     position: float | None  # with the model complete, RMS at the prediction poses, m
     position_open: float | None  # the same with the potential terms
@@ -151,7 +147,7 @@ class PredictedUncertainty:
 
     def by_name(self) -> dict[str, float]:
         """Return standard uncertainties with the model complete, SI."""
-        return dict(zip(self.names, (float(s) for s in self.std), strict=True))
+        return {t.name: float(s) for t, s in zip(self.terms, self.std, strict=True)}
 
 
 def predicted(
@@ -173,17 +169,12 @@ def predicted(
     opened, null_open = covariance(information, flat_all)
     opened, null_open = opened[:size, :size], null_open[:size]
     prior = problem.nominal.prior_std[problem.nominal.live] / scale[:size]
-    terms = problem.terms[:size]
-    positions = np.zeros(0) if work is None else positions_of(work, closed, null)
-    return PredictedUncertainty(
-        names=tuple(t.name for t in terms),
-        units=tuple(t.unit for t in terms),
-        values=np.array([t.value for t in terms]),
-        std=_stated(closed, null, prior) * scale[:size],
-        position=None if work is None else rms(positions),
-        position_open=None if work is None else rms(positions_of(work, opened, null_open)),
-        positions=positions,
-    )
+    terms, std = problem.terms[:size], _stated(closed, null, prior) * scale[:size]
+    if work is None:
+        return PredictedUncertainty(terms, std, None, None, np.zeros(0))
+    positions = positions_of(work, closed, null)
+    position_open = rms(positions_of(work, opened, null_open))
+    return PredictedUncertainty(terms, std, rms(positions), position_open, positions)
 
 
 def covariance(information: Floats, flat: Bools) -> tuple[Floats, Floats]:
@@ -196,17 +187,14 @@ def covariance(information: Floats, flat: Bools) -> tuple[Floats, Floats]:
     columns, held = np.flatnonzero(flat), np.flatnonzero(~flat)
     values, vectors = np.linalg.eigh(information[np.ix_(columns, columns)])
     # eigenvalues are squared singular values, and lose digits to rounding in the product
-    floor = max(INFORMATION**2, ROUNDING * float(values.max(initial=0.0)) * 1e-3)
-    determined = values > floor
-    transform = np.zeros((size, int(determined.sum()) + len(held)))
-    transform[columns, : int(determined.sum())] = vectors[:, determined] / np.sqrt(
-        values[determined]
-    )
-    transform[held, int(determined.sum()) + np.arange(len(held))] = 1.0 / np.sqrt(
-        np.maximum(np.diag(information)[held], 1e-300)
-    )
+    determined = values > max(INFORMATION**2, ROUNDING * float(values.max(initial=0.0)) * 1e-3)
+    count = int(determined.sum())
+    transform = np.zeros((size, count + len(held)))
+    transform[columns, :count] = vectors[:, determined] / np.sqrt(values[determined])
+    own = np.sqrt(np.maximum(np.diag(information)[held], 1e-300))
+    transform[held, count + np.arange(len(held))] = 1.0 / own
     root = transform @ inverse_root(transform.T @ information @ transform).T
-    null = np.zeros((size, int((~determined).sum())))
+    null = np.zeros((size, len(columns) - count))
     null[columns] = vectors[:, ~determined]
     return np.asarray(root @ root.T), null
 

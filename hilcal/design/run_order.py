@@ -1,11 +1,11 @@
 """The order of chosen readings: short, and little correlated with drift.
 
 The poses under one load are a block of loops from the reference, along straight motions that are
-clear; the blocks follow each other in random order.
+clear.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import InitVar, asdict, dataclass, field, replace
 from itertools import pairwise, permutations
 from typing import Literal
 
@@ -19,7 +19,7 @@ from hilcal.errors import CannotAnswerError
 from hilcal.measuring.route import duration, route, seconds_at_rest
 from hilcal.robot.arm import Arm
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
-from hilcal.types import Bools, Floats, Ints
+from hilcal.types import Bools, Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,10 +66,9 @@ def pace(config: CellConfig) -> Pace:
 
 def timeline(plan: Plan, arm: Arm, margin: float, pace: Pace) -> tuple[Duration, Floats]:
     """Return the duration of a plan and the middle (S,) of each step's reading, s."""
-    stops = route(plan, arm, margin)
     motion = readings = changes = 0.0
     times = []
-    for previous, stop in pairwise(stops):
+    for previous, stop in pairwise(route(plan, arm, margin)):
         motion += duration(previous.q, stop.q, pace.speed, pace.acceleration)
         if stop.change_to is not None:
             changes += pace.change_s
@@ -152,10 +151,8 @@ def confounding(
     floor = 1e-12 * np.linalg.norm(lag) * np.sqrt(len(lag))
     rho = np.abs(lag @ columns) / np.where(size > floor, size, np.inf)
     worst, mean, rms = int(np.argmax(rho)), float(lag.mean()), float(np.sqrt(np.mean(lag**2)))
-    return Confounding(
-        len(pairs), float(rho[worst]), names[worst], mean, rms, drift, drift * rms, drift * mean,
-        slope,
-    )  # fmt: skip
+    most, error, bias = float(rho[worst]), drift * rms, drift * mean
+    return Confounding(len(pairs), most, names[worst], mean, rms, drift, error, bias, slope)
 
 
 def _regressors(q: Floats, wrench: Floats, *, product: bool) -> tuple[list[str], Floats]:
@@ -189,12 +186,7 @@ NEAR = 24  # neighbours with tested motions; to others by the reference; a choic
 _ALL = 6  # number of loads up to which every order is tried
 
 
-@dataclass(frozen=True, slots=True)
-class PlannedStop:
-    """A reading at a pose under the load of its block."""
-
-    pose: int  # index from 1; 0 is the reference
-    cycle: int
+PlannedStop = tuple[int, int]  # a reading: pose, from 1 (0 is the reference), and cycle
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,26 +197,9 @@ class LoadBlock:
     loops: tuple[tuple[PlannedStop, ...], ...]  # stops of each loop from the reference
     seconds: float  # of all loops
 
-    @property
-    def count(self) -> int:
-        """Number of stops."""
-        return sum(len(loop) for loop in self.loops)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Ways:
-    """Ways under one load between the reference, index 0, and P poses."""
-
-    direct: Floats  # (P + 1, P + 1) times of straight motions, s; `NEVER` if not known to be clear
-    seconds: Floats  # the same, or by the reference with a reading there if that is needed
-
-    def among(self, which: Ints) -> "Ways":
-        """Return the ways between the reference and stops at poses (m,), from 1.
-
-        Between two stops at one pose, the arm moves by the reference, to arrive anew.
-        """
-        grid = np.ix_(*[np.concatenate([[0], which])] * 2)
-        return Ways(self.direct[grid], self.seconds[grid])
+    def __len__(self) -> int:
+        """Return the number of stops."""
+        return sum(map(len, self.loops))
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,9 +275,9 @@ def order_plan(
     how = how or Ordering()
     used = [name for name in names if any(c.pose == name for c in chosen)]
     indices = np.array([names.index(name) for name in used])
-    draws = OrderDraws(cell, config, tuple(used), np.vstack([reference, q[indices]]), how, rng)
-    draws.prepare(stops_of(used, chosen, how.repeats, rng), passable)
-    shortest = draws.shortest()
+    poses, stops = np.vstack([reference, q[indices]]), stops_of(used, chosen, how.repeats, rng)
+    draws = OrderDraws(cell, config, tuple(used), poses, how, rng, stops, passable)
+    shortest = draws.plan(draws.short, half=False, mixed=False)
     shortest_time, shortest_loss = draws.figures(shortest)
     best = (shortest_loss.correlation, shortest, shortest_time, shortest_loss)
     allowance = how.slack * shortest_time.total
@@ -317,7 +292,7 @@ def order_plan(
                 break
             extra *= _SHRINK
     _, plan, time, loss = best
-    about = {
+    about: dict[str, object] = {
         "duration_s": time.about(),
         "order": {
             **loss.about(),
@@ -327,8 +302,7 @@ def order_plan(
             "correlation_shortest": round(shortest_loss.correlation, 4),
         },
     }
-    plan = Plan(plan.pose_names, plan.q, plan.steps, about)
-    return Ordered(plan, time, shortest_time, loss, shortest_loss)
+    return Ordered(replace(plan, about=about), time, shortest_time, loss, shortest_loss)
 
 
 def stops_of(
@@ -351,11 +325,11 @@ def stops_of(
         cycles_of[int(pose), UNLOADED].add(max(max(cycles) for cycles in of_pose) + 1)
     out: dict[str, list[PlannedStop]] = {}
     for (pose, load), cycles in cycles_of.items():
-        out.setdefault(load, []).extend(PlannedStop(pose, cycle) for cycle in sorted(cycles))
+        out.setdefault(load, []).extend((pose, cycle) for cycle in sorted(cycles))
     return out
 
 
-@dataclass(slots=True)
+@dataclass
 class OrderDraws:
     """Plans of the same readings in different orders: short ones and random ones."""
 
@@ -365,45 +339,40 @@ class OrderDraws:
     q: Floats  # (P + 1, n) joint angles of the reference and of the poses, rad
     how: Ordering
     rng: np.random.Generator
-    stops: dict[str, list[PlannedStop]] = field(default_factory=dict)  # by load
-    ways: dict[str, Ways] = field(default_factory=dict)  # between the stops under each load
-    short: dict[str, list[int]] = field(default_factory=dict)  # order of the stops, from 1
+    stops: dict[str, list[PlannedStop]]  # by load
+    passable: InitVar[Passable]
+    # by load, between the reference and the stops: see `ways`
+    direct: dict[str, Floats] = field(default_factory=dict)
+    seconds: dict[str, Floats] = field(default_factory=dict)
+    short: dict[str, list[int]] = field(default_factory=dict)  # shortest tours of stops, from 1
 
-    @property
-    def pace(self) -> Pace:
-        """Pace of the cell."""
-        return pace(self.config)
-
-    @property
-    def wrenches(self) -> Mapping[str, Floats]:
-        """Wrench (6,) at the load point by load, base axes, N and N·m."""
-        return {load.name: load.wrench(self.cell.gravity) for load in self.config.loads}
-
-    def prepare(self, stops: dict[str, list[PlannedStop]], passable: Passable) -> None:
+    def __post_init__(self, passable: Passable) -> None:
         """Find the ways and the shortest tour under each load."""
-        self.stops = stops
-        for load, load_stops in stops.items():
-            poses = np.array([s.pose for s in load_stops])
+        self.pace = pace(self.config)
+        self.wrenches = {load.name: load.wrench(self.cell.gravity) for load in self.config.loads}
+        for load, load_stops in self.stops.items():
+            poses = np.array([pose for pose, _ in load_stops])
             visited = np.unique(poses)
             between = ways(self.q[[0, *visited]], load, passable, self.pace)
-            self.ways[load] = between.among(np.searchsorted(visited, poses) + 1)
-            self.short[load] = tour.shortest(self.ways[load].seconds, self.rng)
+            # between two stops at one pose, the arm moves by the reference, to arrive anew
+            place = np.concatenate([[0], np.searchsorted(visited, poses) + 1])
+            self.direct[load], seconds = (way[np.ix_(place, place)] for way in between)
+            self.seconds[load], self.short[load] = seconds, tour.shortest(seconds, self.rng)
             order = [0, *self.short[load], 0]
-            legs = self.ways[load].seconds[order[:-1], order[1:]]
+            legs = seconds[order[:-1], order[1:]]
             if legs.max() >= tour.NEVER:
                 k = int(np.argmax(legs >= tour.NEVER))
-                pose = self.names[load_stops[max(order[k], order[k + 1]) - 1].pose - 1]
+                pose = self.names[load_stops[max(order[k], order[k + 1]) - 1][0] - 1]
                 raise CannotAnswerError(
                     f"pose {pose} is not reached from the reference pose along clear straight "
                     f"motions under {load}; leave it out or move the reference"
                 )
 
-    def shortest(self) -> Plan:
-        """Return the plan of the shortest tours, all unloaded readings before the loads."""
-        return self._plan(self.short, half=False, mixed=False)
+    def plan(self, orders: Mapping[str, Sequence[int]], *, half: bool, mixed: bool) -> Plan:
+        """Return the plan for an order of the stops.
 
-    def _plan(self, orders: Mapping[str, Sequence[int]], *, half: bool, mixed: bool) -> Plan:
-        """Return the plan for an order of the stops, with `mixed` loops at random."""
+        With `half`, half of the unloaded readings come after the loads; `mixed` loops are random.
+        """
         loads = [load for load in self.stops if load != UNLOADED]
         free = list(orders.get(UNLOADED, ()))
         cut = (len(free) + 1) // 2 if half else len(free)
@@ -420,23 +389,21 @@ class OrderDraws:
         half = self.how.unloaded == "around"
         orders = {}
         for load, short in self.short.items():
-            seconds = self.ways[load].seconds
+            seconds = self.seconds[load]
             spare = extra * len(short) / total
             if load != UNLOADED or not half or len(short) < 2:
                 orders[load] = self._walk(seconds, short, spare)
                 continue
             first = set(self.rng.permutation(short)[: (len(short) + 1) // 2].tolist())
-            parts = [
-                tour.improved(seconds, [k for k in short if (k in first) == in_first])
-                for in_first in (True, False)
-            ]
+            halves = ([k for k in short if (k in first) == early] for early in (True, False))
+            parts = [tour.improved(seconds, half_of) for half_of in halves]
             lengths = [tour.length(seconds, part) for part in parts]
             if max(lengths) >= tour.NEVER:  # a pose is in another part than its only access
                 half, orders[load] = False, self._walk(seconds, short, spare)
                 continue
             spare -= sum(lengths) - tour.length(seconds, short)
             orders[load] = [k for part in parts for k in self._walk(seconds, part, spare / 2)]
-        return self._plan(orders, half=half, mixed=True)
+        return self.plan(orders, half=half, mixed=True)
 
     def _walk(self, seconds: Floats, order: Sequence[int], spare: float) -> list[int]:
         """Return a random tour of some stops, at most `spare` s longer than `order`."""
@@ -447,7 +414,7 @@ class OrderDraws:
         """Cut an order into loops; `mixed` loops are in random order and direction."""
         if not order:
             return LoadBlock(load, (), 0.0)
-        direct, pace = self.ways[load].direct, self.pace
+        direct, pace = self.direct[load], self.pace
         parts = tour.loops(direct, order, pace.reading_s, self.how.reference_every_s)
         if parts is None:  # the loop of a pose without a direct way takes too long
             parts = tour.loops(direct, order, pace.reading_s, np.inf)
@@ -471,8 +438,12 @@ class OrderDraws:
         return time, confounding(plan, times, self.wrenches, how.drift, how.reading_std)
 
 
-def ways(q: Floats, load: str, passable: Passable, pace: Pace) -> Ways:
-    """Return the ways between poses (P + 1, n) under a load, the reference first."""
+def ways(q: Floats, load: str, passable: Passable, pace: Pace) -> tuple[Floats, Floats]:
+    """Return times (P + 1, P + 1) between poses (P + 1, n) under a load, the reference first, s.
+
+    Of straight motions, `NEVER` if not known to be clear; and of the same, or by the reference with
+    a reading there if that is needed.
+    """
     legs = pace.legs(q, q)
     count = len(q)
     close = np.argsort(legs, axis=1, kind="stable")[:, : NEAR + 1]
@@ -488,7 +459,7 @@ def ways(q: Floats, load: str, passable: Passable, pace: Pace) -> Ways:
             clear = ends[passable(q[k], q[ends], load)]
             direct[k, clear] = legs[k, clear]
     around = direct[:, :1] + pace.reading_s + direct[:1]
-    return Ways(direct, np.minimum(np.minimum(direct, around), NEVER))
+    return direct, np.minimum(np.minimum(direct, around), NEVER)
 
 
 def load_order(
@@ -505,7 +476,7 @@ def load_order(
     if count < 2:
         return list(range(count))
     span = np.array([pace.change_s + block.seconds for block in loaded])
-    n = np.array([float(block.count) for block in loaded])
+    n = np.array([float(len(block)) for block in loaded])
     w = np.array([wrenches[block.load] for block in loaded])
     w = w[:, np.any(w != 0, axis=0)]
     if count <= _ALL:
@@ -515,9 +486,9 @@ def load_order(
         tries = np.array([np.arange(count), *(rng.permutation(count) for _ in range(2000))])
     end = before.seconds + np.cumsum(span[tries], axis=1)
     middle = end - span[tries] / 2
-    free = before.count * before.seconds / 2
-    free += after.count * (before.seconds + span.sum() + pace.change_s + after.seconds / 2)
-    lag = middle - free / max(before.count + after.count, 1)
+    free = len(before) * before.seconds / 2
+    free += len(after) * (before.seconds + span.sum() + pace.change_s + after.seconds / 2)
+    lag = middle - free / max(len(before) + len(after), 1)
     top = np.abs(np.einsum("tl,tlk->tk", n[tries] * lag, w[tries]))
     norm = np.sqrt(np.einsum("tl,tl->t", n[tries], lag**2))[:, None]
     norm = norm * np.sqrt(np.einsum("l,lk->k", n, w**2))
@@ -532,15 +503,13 @@ def assembled(
 
     Its unloaded readings are cycles 0, 1, ...; readings under a load share these cycles.
     """
-    free = (*before.loops, *after.loops)
     passes = max([len(block.loops) + 1 for block in loaded], default=0)
-    natural = 1 + len(free) + (1 if loaded else 0)
-    returns = max(passes, natural)
+    returns = max(passes, 1 + len(before.loops) + len(after.loops) + bool(loaded))
     steps: list[Step] = []
 
     def read(block: LoadBlock, cycles: Iterator[int]) -> None:
         for loop in block.loops:
-            steps.extend(Step(names[s.pose - 1], block.load, s.cycle) for s in loop)
+            steps.extend(Step(names[pose - 1], block.load, cycle) for pose, cycle in loop)
             steps.append(Step(REFERENCE, block.load, next(cycles)))
 
     free_cycles = iter(range(returns))

@@ -11,16 +11,17 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
+from hilcal.design.approximate_design import relax
 from hilcal.design.choice import (
+    LOOSE,
     certified,
-    choose,
     choose_poses,
     compound_objective,
-    only,
     pose_units,
     unknown,
 )
 from hilcal.design.information import DesignProblem, reading_derivatives
+from hilcal.design.optimum import best
 from hilcal.design.planner import Planned, Say
 from hilcal.design.predicted import predicted
 from hilcal.design.run_order import Confounding, Duration
@@ -220,12 +221,10 @@ def position_note(quantity: str) -> str:
 def _parameters(planned: Planned) -> tuple[PredictedParameter, ...]:
     precision, frames = planned.predicted, _prefixes(planned.problem, *FRAME_ROLES)
     by_name = {
-        name: PredictedParameter(name, float(std), float(value) or None, unit)
-        for name, std, value, unit in zip(
-            precision.names, precision.std, precision.values, precision.units, strict=True
-        )
+        t.name: PredictedParameter(t.name, float(std), t.value or None, t.unit)
+        for t, std in zip(precision.terms, precision.std, strict=True)
         # deflections do not determine the origin of a frame
-        if np.isfinite(std) or not name.startswith(frames)
+        if np.isfinite(std) or not t.name.startswith(frames)
     }
     for u in planned.undetermined:
         by_name[u.name] = PredictedParameter(u.name, np.inf, u.value or None, u.unit)
@@ -259,7 +258,7 @@ def remarks(planned: Planned) -> tuple[str, ...]:
             f"as many readings, at the most informative poses and loads (--readings "
             f"{readings}), are up to {100 / efficiency - 100:.0f} % more efficient",
         )
-    undetermined = tuple(u.remark for u in planned.undetermined)
+    undetermined = (u.remark for u in planned.undetermined)
     notes = (*undetermined, *omitted, *planned.drawn.remarks, *planned.problem.notes)
     return tuple(dict.fromkeys(notes))
 
@@ -289,9 +288,7 @@ def _criteria(
     planned: Planned, config: CellConfig, rng: np.random.Generator
 ) -> Iterator[CriterionResult]:
     problem = planned.problem
-    usable_poses = [
-        pose for (pose, _), usable in zip(problem.what, planned.usable, strict=True) if usable
-    ]
+    usable_poses = [problem.what[k][0] for k in np.flatnonzero(planned.usable)]
     for name in dict.fromkeys((*COMPARED, planned.criterion)):
         if name == planned.criterion:
             yield _result(planned, name, planned.counts, planned.design.efficiency)
@@ -304,7 +301,7 @@ def _criteria(
                 chosen, _ = choose_poses(objective, candidates, among, planned.asked_poses, rng, 1)
                 design = certified(objective, chosen, planned.usable)
             else:
-                design = choose(only(objective, planned.usable), planned.budget, rng, 1)
+                design = best(objective.among(planned.usable), planned.budget, rng, effort=1)
         except CannotAnswerError:
             continue
         counts = np.zeros(len(problem.units))
@@ -323,21 +320,15 @@ def _result(planned: Planned, name: str, counts: Floats, efficiency: float) -> C
     readings = float(counts @ problem.units.cost)
     baseline = _prefixes(problem, "baseline")
     shares = [
-        std / abs(value)
-        for name, std, value in zip(precision.names, precision.std, precision.values, strict=True)
-        if name.startswith(baseline) and value
+        std / abs(t.value)
+        for t, std in zip(precision.terms, precision.std, strict=True)
+        if t.name.startswith(baseline) and t.value
     ]
-    volume = float(np.exp(np.mean(np.log(np.maximum(sigma, 1e-300)))))
-    return CriterionResult(
-        criterion=name,
-        position_std_m=_finite(precision.position),
-        position_open_m=_finite(precision.position_open),
-        joint_share=_finite(max(shares)) if shares else None,
-        o1=volume / np.sqrt(readings),
-        o2=float(alone[0] / alone[-1]),
-        o3=float(sigma[0]),
-        efficiency=efficiency,
-    )
+    share = _finite(max(shares)) if shares else None
+    stds = _finite(precision.position), _finite(precision.position_open)
+    o1 = float(np.exp(np.mean(np.log(np.maximum(sigma, 1e-300))))) / np.sqrt(readings)
+    o2, o3 = float(alone[0] / alone[-1]), float(sigma[0])
+    return CriterionResult(name, *stds, share, o1, o2, o3, efficiency)
 
 
 def _prefixes(problem: DesignProblem, *roles: Role) -> tuple[str, ...]:
@@ -346,7 +337,7 @@ def _prefixes(problem: DesignProblem, *roles: Role) -> tuple[str, ...]:
 
 def _curve(planned: Planned) -> Iterator[CurvePoint]:
     problem = planned.problem
-    objective, usable = only(planned.asked, planned.usable), np.flatnonzero(planned.usable)
+    objective, usable = planned.asked.among(planned.usable), np.flatnonzero(planned.usable)
     n_poses = len({problem.what[k][0] for k in np.flatnonzero(planned.counts)})
     last, previous = planned.design.relaxed, 0
     for share in SHARES:
@@ -354,7 +345,7 @@ def _curve(planned: Planned) -> Iterator[CurvePoint]:
         if budget < objective.units.cost.max() or poses == previous:
             continue
         previous = poses
-        last = objective.relaxed(budget, start=last)
+        last = relax(objective, budget, tolerance=LOOSE, start=last)
         information = problem.prior + problem.units.information(last.weight, usable[last.index])
         position = _finite(predicted(problem, information=information, work=planned.work).position)
         if position is not None:
@@ -389,8 +380,7 @@ def detectable_effects(planned: Planned, config: CellConfig) -> Iterator[Detecta
             size_m = float(np.sqrt(3.0 * np.mean((displacement[:, columns] @ beta) ** 2)))
             visible = noncentrality > VISIBLE * len(columns)
             strengths.append(size_m / np.sqrt(noncentrality) if visible else np.inf)
-        smallest = float(np.median(strengths))
-        yield DetectableEffect(effect.name, smallest if np.isfinite(smallest) else None)
+        yield DetectableEffect(effect.name, _finite(float(np.median(strengths))))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -32,7 +32,10 @@ def shortest(seconds: Floats, rng: np.random.Generator) -> list[int]:
     """
     count = len(seconds) - 1
     if count <= _EXACT:
-        return _by_trial(seconds)
+        orders = np.array(list(permutations(range(1, count + 1))), dtype=np.int64)
+        ways = np.pad(orders, ((0, 0), (1, 1)))
+        first = int(np.argmin(seconds[ways[:, :-1], ways[:, 1:]].sum(axis=1)))
+        return [int(k) for k in orders[first]]
     best = improved(seconds, _inserted(seconds))
     least = length(seconds, best)
     for _ in range(_KICKS):
@@ -41,16 +44,6 @@ def shortest(seconds: Floats, rng: np.random.Generator) -> list[int]:
         if (total := length(seconds, order)) < least - _GAIN:
             best, least = order, total
     return best
-
-
-def _by_trial(seconds: Floats) -> list[int]:
-    count = len(seconds) - 1
-    if count == 0:
-        return []
-    orders = np.array(list(permutations(range(1, count + 1))))
-    ways = np.pad(orders, ((0, 0), (1, 1)))
-    best = int(np.argmin(seconds[ways[:, :-1], ways[:, 1:]].sum(axis=1)))
-    return [int(k) for k in orders[best]]
 
 
 def _inserted(seconds: Floats) -> list[int]:

@@ -8,7 +8,7 @@ import numpy as np
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
-from hilcal.robot.conventions import may_follow
+from hilcal.robot.arm import may_follow
 
 ABOUT, ALONG = np.eye(6)[5], np.eye(6)[2]  # twists of a slot about, along its joint's axis
 _PAIR = re.compile(r"([0-9]{1,3}):([0-9]{1,3})")

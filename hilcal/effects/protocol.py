@@ -19,8 +19,8 @@ from hilcal.cell import Cell
 from hilcal.effects.options import Options, prior_of_units
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
-from hilcal.robot.batch import zeros
 from hilcal.robot.chain import Chain, Deviation
+from hilcal.robot.se3 import zeros
 from hilcal.robot.statics import Load
 from hilcal.types import Bools, Floats, Ints
 

@@ -25,7 +25,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from hilcal.engine.engine import Engine
+from hilcal.engine import Engine
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit
 from hilcal.identification.folds import distinct_poses

@@ -43,10 +43,9 @@ from hilcal.identification.solver import minimise
 from hilcal.numbers import length
 from hilcal.readings.readings import Readings
 from hilcal.robot import se3
-from hilcal.robot.arm import Arm
+from hilcal.robot.arm import Arm, as_counted, may_follow, with_conventions
 from hilcal.robot.catalogue import load_arm, other_arms
 from hilcal.robot.chain import evaluate
-from hilcal.robot.conventions import as_counted, may_follow, with_conventions
 from hilcal.types import Bools, Floats, Ints
 
 # All of these are choices.

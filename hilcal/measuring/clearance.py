@@ -9,8 +9,7 @@ from hilcal.cell import Cell, tracker_place
 from hilcal.config import CellConfig, CellLoad, Obstacle
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
-from hilcal.robot.body import Capsule, flange_capsule
-from hilcal.robot.scene import Scene, Segment, on_flange
+from hilcal.robot.scene import Capsule, Scene, Segment, flange_capsule, on_flange
 from hilcal.types import Bools, Floats
 
 TOOL_RADIUS = 0.03

@@ -9,9 +9,8 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig, ForceSensor
 from hilcal.measuring.clearance import Clearance
 from hilcal.robot import se3
-from hilcal.robot.body import body_poses, is_known
 from hilcal.robot.chain import Chain, evaluate
-from hilcal.robot.scene import Pairs, Segment, from_axis, on_flange
+from hilcal.robot.scene import Pairs, Segment, body_poses, from_axis, is_known, on_flange
 from hilcal.robot.statics import Load, slot_wrenches
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Bools, Floats, Ints

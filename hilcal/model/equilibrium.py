@@ -20,8 +20,8 @@ import numpy as np
 from hilcal.effects.protocol import Columns, Effect, Situation
 from hilcal.model.observe import ReadingDerivative, SlotFrames
 from hilcal.robot import se3
-from hilcal.robot.batch import along_states, zeros
 from hilcal.robot.chain import Chain
+from hilcal.robot.se3 import along_states, zeros
 from hilcal.robot.statics import (
     GeometricStiffness,
     Load,

@@ -18,8 +18,8 @@ from hilcal.model.observe import Observation, ReadingDerivative, motion, observe
 from hilcal.readings.readings import Readings, States
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
-from hilcal.robot.batch import along_states, by_field, chunks, take, zeros
 from hilcal.robot.chain import Chain, Deviation
+from hilcal.robot.se3 import along_states, by_field, chunks, take, zeros
 from hilcal.robot.statics import Load, geometric_stiffness, slot_wrenches
 from hilcal.shown import Brief
 from hilcal.types import Floats, Ints

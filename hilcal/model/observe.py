@@ -15,8 +15,8 @@ import numpy as np
 
 from hilcal.cell import Cell, Observer
 from hilcal.robot import se3
-from hilcal.robot.batch import empty, zeros
 from hilcal.robot.chain import Chain, Deviation, joint_jacobian, twist_jacobian
+from hilcal.robot.se3 import empty, zeros
 from hilcal.robot.statics import MotionGradient, rows_times
 from hilcal.shown import Brief
 from hilcal.types import Bools, Floats, Ints

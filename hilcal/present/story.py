@@ -34,7 +34,7 @@ from hilcal.present.document import Block
 from hilcal.present.fit import errors, misses, model_name, parameters
 from hilcal.present.verdict import message
 from hilcal.robot.arm import Arm
-from hilcal.robot.body import body_poses
+from hilcal.robot.scene import body_poses
 from hilcal.store.revision import change
 from hilcal.types import Floats, Ints
 

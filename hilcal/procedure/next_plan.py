@@ -22,7 +22,7 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit
 from hilcal.names import quoted
 from hilcal.present.progress import Say
-from hilcal.procedure.state import Settings, duration_of, reference_in
+from hilcal.procedure.state import Settings, duration_of, reference_in, reference_of
 from hilcal.procedure.validation_plan import recorded
 from hilcal.readings.readings import States
 from hilcal.robot.chain import evaluate
@@ -66,17 +66,13 @@ def separating(
     cell: Cell,
     config: CellConfig,
     doubt: Doubt,
-    poses: int | None,
+    poses: int | None,  # whose readings the plan has; None: as many as the doubt needs
     rng: np.random.Generator,
-    say: Say = lambda text: None,
-    reference: Floats | None = None,
-    usual: int = 20,
+    say: Say,
+    reference: Floats | None,  # (n,) joints of the campaign's reference pose, rad
+    usual: int = POSES,  # poses where the doubt does not determine their number
 ) -> Next:
-    """Plan the measurements that separate the suspects of a doubt, or raise a CannotAnswerError.
-
-    The plan has the readings of `poses` poses; None: of as many as the doubt needs, else of
-    `usual`. `reference` (n,) are the joints of the campaign's reference pose, rad.
-    """
+    """Plan the measurements that separate the suspects of a doubt, or raise a CannotAnswerError."""
     fitted, effects = doubt.fit, doubt.suspects
     if doubt.alone is None:
         request = Request(usual if poses is None else poses)
@@ -99,7 +95,6 @@ def plan_of(chosen: Next, suspects: tuple[str, ...]) -> Plan:
 class NextPlan:
     """The next measurements."""
 
-    doubt: Doubt  # the effects to separate
     found: Next  # the powers, pair by pair
     made: CheckedPlan  # the plan, all motions checked
 
@@ -120,12 +115,12 @@ def next_plan(
     criteria and numbers of poses takes longer. Raises as `separating` does.
     """
     config, numbers = (o.config, o.cell) if cell is None else cell
-    chosen = separating(numbers, config, doubt, poses, rng, say, reference_in(o.file), POSES)
+    chosen = separating(numbers, config, doubt, poses, rng, say, reference_in(o.file))
     compare = compare and not doubt.alone
     summary = summarise(chosen.planned, config, rng, say, compare=compare, curve=compare)
     say("checking every motion in a dry run")
     checked_plan = checked(numbers, config, plan_of(chosen, doubt.suspects), summary)
-    return NextPlan(doubt, chosen, checked_plan)
+    return NextPlan(chosen, checked_plan)
 
 
 def doubt_to_settle(o: Campaign, d: Diagnosis, say: Say) -> Doubt:
@@ -145,45 +140,40 @@ def doubt_to_settle(o: Campaign, d: Diagnosis, say: Say) -> Doubt:
 
 def _settled(o: Campaign, d: Diagnosis) -> str:
     """Return the message that there are no suspects to separate, with the next step."""
-    head = "no suspects to separate:"
-    if d.verdict == "adequate":
-        return (
-            f"{head} the model is adequate; to sharpen it, plan on with: hilcal plan CELL.toml "
-            f"-o PLAN.json --after {quoted(o.path)}, or separate named effects with --suspects A,B"
-        )
-    if d.wrong_figures:
-        return (
-            f"{head} a figure of the cell seems to be wrong, see hilcal diagnose {quoted(o.path)}"
-        )
-    if d.verdict == "noise_misjudged":
-        return (
-            f"{head} the noise is misjudged, see hilcal diagnose {quoted(o.path)}; repeat "
-            "some readings, or state the covariance anew"
-        )
-    if d.reason == "background":
-        return (
-            f"{head} effects of the background are not told apart one by one; measure more poses, "
-            f"spread over all joints, with: hilcal plan CELL.toml "
-            f"-o PLAN.json --after {quoted(o.path)}"
-        )
-    if d.verdict == "missing_effect":
-        lead = d.suspects[0]
-        if lead.coarse:
-            return f"{head} {_differ(o, lead)}"
-        return (
-            f"{head} {lead.effect} alone is missing; add it with: "
-            f"hilcal add {quoted(o.path)} {quoted(lead.effect)}"
-        )
-    why = "no effect of the catalogue explains the misfit"
-    if d.reason == "insufficient_catalogue":
-        why = (
-            f"all effects of the catalogue together do not explain the misfit, and "
-            f"{d.suspects[0].effect} may only resemble the missing effect"
-        )
-    return (
-        f"{head} {why}; see hilcal diagnose {quoted(o.path)}, or give an effect of your own by "
-        "--effects-from"
+    path = quoted(o.path)
+    see, further = (
+        f"see hilcal diagnose {path}",
+        f"hilcal plan CELL.toml -o PLAN.json --after {path}",
     )
+    if d.verdict == "adequate":
+        why = (
+            f"the model is adequate; to sharpen it, plan on with: {further}, or separate named "
+            "effects with --suspects A,B"
+        )
+    elif d.wrong_figures:
+        why = f"a figure of the cell seems to be wrong, {see}"
+    elif d.verdict == "noise_misjudged":
+        why = f"the noise is misjudged, {see}; repeat some readings, or state the covariance anew"
+    elif d.reason == "background":
+        why = (
+            "effects of the background are not told apart one by one; measure more poses, spread "
+            f"over all joints, with: {further}"
+        )
+    elif d.verdict == "missing_effect":
+        lead = d.suspects[0]
+        add = (
+            f"{lead.effect} alone is missing; add it with: hilcal add {path} {quoted(lead.effect)}"
+        )
+        why = _differ(o, lead) if lead.coarse else add
+    else:
+        why = "no effect of the catalogue explains the misfit"
+        if d.reason == "insufficient_catalogue":
+            why = (
+                f"all effects of the catalogue together do not explain the misfit, and "
+                f"{d.suspects[0].effect} may only resemble the missing effect"
+            )
+        why += f"; {see}, or give an effect of your own by --effects-from"
+    return f"no suspects to separate: {why}"
 
 
 def _differ(o: Campaign, s: Suspect) -> str:
@@ -260,7 +250,6 @@ class FurtherMeasuring:
     settings: Settings
     d: Diagnosis  # of the last fit
     plans: tuple[Plan, ...]  # all plans so far
-    reference: Floats | None  # (n,) joints of their reference pose, rad
     rng: np.random.Generator
     say: Say
 
@@ -286,6 +275,9 @@ class FurtherMeasuring:
             return replace(further, reason="time")
         return replace(further, reason="plans") if len(self.plans) >= MOST_PLANS else further
 
+    def _reference(self) -> Floats | None:
+        return reference_of(self.plans[0])
+
     def _separating(self, error: PredictedError) -> Decision | None:
         """Return the decision on the diagnosis' doubt; None without a doubt."""
         doubt = doubt_of(self.d, self.say)
@@ -294,7 +286,7 @@ class FurtherMeasuring:
         nothing = Decision("inseparable", self.d.verdict, error, suspects=doubt.suspects)
         poses, site = self.settings.poses, (self.cell, self.config)
         try:
-            chosen = separating(*site, doubt, None, self.rng, self.say, self.reference, poses)
+            chosen = separating(*site, doubt, None, self.rng, self.say, self._reference(), poses)
         except (CannotAnswerError, InputError):
             return nothing
         separable = [p for p in chosen.powers if not p.not_separable]
@@ -318,7 +310,7 @@ class FurtherMeasuring:
         try:
             planned = make(
                 *(self.cell, config, Request(poses), self.rng, self.d.fit, self.say),
-                reference=self.reference,
+                reference=self._reference(),
             )
         except (CannotAnswerError, InputError):
             return decision

@@ -13,7 +13,8 @@ readings is predicted; from then on the file must not change.
 """
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -37,36 +38,13 @@ from hilcal.identification.carried import CarriedPrior
 from hilcal.identification.full_covariance import full_readings
 from hilcal.identification.validation import Acceptance, acceptance, extrapolation
 from hilcal.present.progress import Say
-from hilcal.procedure.next_plan import (
-    Decision,
-    FurtherMeasuring,
-    PredictedError,
-    predicted_error,
-)
-from hilcal.procedure.state import (
-    BEGUN,
-    DECIDED,
-    FROZEN,
-    IMPROVED,
-    MEASURE,
-    REFINED,
-    STOP,
-    VALIDATED,
-    Files,
-    ProcedureStep,
-    Settings,
-    identity,
-    next_step,
-    opened,
-    reference_in,
-    reference_of,
-    settings_of,
-)
+from hilcal.procedure import state
+from hilcal.procedure.next_plan import Decision, FurtherMeasuring, PredictedError, predicted_error
 from hilcal.procedure.validation_plan import corrected_plan, left_out_of, paired, validation_plan
 from hilcal.readings.covariance import COVERS, INSTRUMENT
 from hilcal.readings.readings import ArmScatter, Readings
 from hilcal.readings.same_readings import already
-from hilcal.readings.whitening import Mode, usual_mode
+from hilcal.readings.whitening import usual_mode
 from hilcal.refinement import Refinement, refine
 from hilcal.refinement import RefinementStep as RefinementStep
 from hilcal.store.campaign_file import CampaignFile
@@ -99,24 +77,15 @@ class Procedure:
     >>> p = hc.Procedure.at("new.hilcal", hc.Cell.load(CELL), poses=6)
     >>> p.next().kind
     'plan'
-
-    Attributes:
-        run: the campaign file that is fitted; the others are in the same directory.
-        cell: the cell as configured.
-        config: its configuration.
-        base_dir: directory that paths in the configuration are relative to.
-        catalogue: the effects that a model can have.
-        settings: goals, sizes and seed.
-        known: the prior of every fit, from `settings.prior`; None without one.
     """
 
-    run: Path
-    cell: Cell
+    run: Path  # the campaign file that is fitted; the others are in the same directory
+    cell: Cell  # as configured
     config: CellConfig
-    base_dir: Path
-    catalogue: Catalogue
-    settings: Settings
-    known: CarriedPrior | None = None
+    base_dir: Path  # that paths in the configuration are relative to
+    catalogue: Catalogue  # the effects that a model can have
+    settings: state.Settings  # goals, sizes and seed
+    known: CarriedPrior | None = None  # the prior of every fit, from `settings.prior`
     _refinements: list[Refinement] = field(default_factory=list, repr=False)  # the latest, if any
 
     @classmethod
@@ -125,37 +94,31 @@ class Procedure:
     ) -> "Procedure":
         """Begin a calibration, or resume that of an existing campaign file.
 
-        Args:
-            run: the campaign file; the others go into the same directory.
-            cell: from `Cell.load`.
-            catalogue: the effects that a model can have; the installed ones unless given.
-            **options: fields of `Settings`; by default those of the existing calibration.
+        The options are fields of `Settings`; by default those of the existing calibration.
         """
         path, config, effects = Path(run), cell.configured(), catalogue or installed()
         if path.exists():
             stored = continued(path, cell, config, effects)
             return replace(stored, settings=replace(stored.settings, **options))
         readings = config.planning.readings if config.loads else "absolute"
-        default = Settings(seed=config.simulation.seed, readings=readings)
+        default = state.Settings(seed=config.simulation.seed, readings=readings)
         return cls(
             path, cell, config, cell.base_dir.absolute(), effects, replace(default, **options)
         )
 
     @property
-    def files(self) -> Files:
+    def files(self) -> state.Files:
         """All files of the calibration."""
-        return Files(self.run)
+        return state.Files(self.run)
 
     def record(self) -> RevisionRecord:
         """Return the revision that the last refinement ended with."""
         with Campaign.open(self.run, self.catalogue, read_only=True) as o:
             return self._record(o)
 
-    def next(self) -> ProcedureStep:
+    def next(self) -> state.ProcedureStep:
         """Return the next step."""
-        return next_step(self.run)
-
-    # the first plan
+        return state.next_step(self.run)
 
     def plan(self, say: Say = lambda text: None) -> CheckedPlan:
         """Choose the first plan, unstored; a CannotAnswerError for a cell with too few poses."""
@@ -169,7 +132,7 @@ class Procedure:
         the readings will cover.
         """
         self.check_files()
-        first = entry(BEGUN, {"settings": self.settings.to_json()})
+        first = entry(state.BEGUN, {"settings": self.settings.to_json()})
         texts = {COVERS: covers, ENTRY.format(1): first}
         create_run(self.run, config, self.base_dir, plan, source=self._source(), more=texts).close()
 
@@ -185,18 +148,14 @@ class Procedure:
         """Store the settings in the campaign's log, where they have changed."""
         check_same_cell(campaign, self.config, self.base_dir)
         log, settings = ProcedureLog(campaign), self.settings.to_json()
-        stored = log.last(BEGUN)
+        stored = log.last(state.BEGUN)
         if stored is None or stored["settings"] != settings:
-            log.append(BEGUN, {"settings": settings})
+            log.append(state.BEGUN, {"settings": settings})
 
-    # measuring
-
-    def measure(self, step: ProcedureStep, measure: Measure) -> int:
+    def measure(self, step: state.ProcedureStep, measure: Measure) -> int:
         """Measure the missing readings of a plan; return the number that its campaign then holds.
 
-        Raises:
-            DeviceError: a device failed; the readings so far are stored.
-            KeyboardInterrupt: interrupted; the readings so far are stored.
+        After a DeviceError or a KeyboardInterrupt, the readings so far are stored.
         """
         epoch = None if step.path == self.run else self._epoch()
         with CampaignFile.open(step.path) as campaign:
@@ -209,8 +168,6 @@ class Procedure:
             details = RunLog(campaign).details() if campaign.about(PLAN) is not None else []
         return float(details[0]["epoch_wall_s"]) if details else None
 
-    # fitting
-
     def refine(
         self,
         say: Say = lambda text: None,
@@ -218,15 +175,11 @@ class Procedure:
     ) -> Refinement:
         """Fit, diagnose, and change the model until it is adequate; all revisions are stored.
 
-        Args:
-            say: takes progress.
-            seen: takes each step as soon as it is diagnosed, after the number of its revision.
-
-        Raises:
-            CannotAnswerError: the readings do not determine the baseline.
+        `seen` takes each step as soon as it is diagnosed, after the number of its revision. A
+        CannotAnswerError where the readings do not determine the baseline.
         """
         with Campaign.open(self.run, self.catalogue) as o:
-            mode = self._mode(o.readings)
+            mode = usual_mode(o.readings, self.settings.readings)
             say("registering")
             model = baseline(o.cell, o.readings, mode, o.catalogue, self.known)
             numbers = itertools.count(len(o.file.revisions()) + 1)
@@ -242,7 +195,7 @@ class Procedure:
         records = [o.record(s.fit, s.diagnosis, s.added, s.removed) for s in found.steps]
         content = {"readings_sha256": o.data_hash, "verdict": found.verdict}
         self._refinements[:] = [found]
-        return ProcedureLog(o.file).append(REFINED, content, revisions=records)
+        return ProcedureLog(o.file).append(state.REFINED, content, revisions=records)
 
     def decide(self, say: Say = lambda text: None) -> Decision:
         """Decide whether to measure more; a further plan is appended to the campaign."""
@@ -255,32 +208,24 @@ class Procedure:
                 say(f"diagnosing revision {record.number}")
                 d = diagnose(o.restore(record), o.history(record.number), say)
             rng = self._rng(_FURTHER, len(run.plans))
-            reference = reference_of(run.plans[0])
             site = (self.cell, self._planned(), self.settings)
-            decision = FurtherMeasuring(*site, d, run.plans, reference, rng, say).decide()
+            decision = FurtherMeasuring(*site, d, run.plans, rng, say).decide()
             plan = decision.plan if decision.measures else None
             if plan is not None:
                 plan = run.with_new_names(plan)  # `run` checks every motion of it
-            action = STOP if plan is None else MEASURE
-            log.append(DECIDED, {"action": action, **decision.to_json()}, plan=plan)
+            action = state.STOP if plan is None else state.MEASURE
+            log.append(state.DECIDED, {"action": action, **decision.to_json()}, plan=plan)
         return decision
 
     def stop(self) -> None:
         """Stop measuring: the last refinement will be tested."""
         with CampaignFile.open(self.run) as campaign:
-            ProcedureLog(campaign).append(DECIDED, {"action": STOP, "reason": "asked"})
+            ProcedureLog(campaign).append(state.DECIDED, {"action": state.STOP, "reason": "asked"})
 
-    def compute(self, step: ProcedureStep, say: Say = lambda text: None) -> object:
+    def compute(self, step: state.ProcedureStep, say: Say = lambda text: None) -> object:
         """Do a step in which nothing moves, other than "plan"; return its result."""
-        steps: dict[str, Callable[[Say], object]] = {
-            "refine": self.refine,
-            "decide": self.decide,
-            "plan_validation": self.plan_validation,
-            "validate": self.validate,
-            "correct": self.correct,
-            "compare": self.compare,
-        }
-        return steps[step.kind](say)
+        result: object = getattr(self, step.kind)(say)
+        return result
 
     def predicted(self) -> PredictedError:
         """Predict the error after compensation with the last model."""
@@ -288,35 +233,22 @@ class Procedure:
             calibration, record = self._calibration(o)
             return predicted_error(calibration, o.fitted_readings(record).states, self.config)
 
-    # testing what is never fitted
-
     def plan_validation(self, say: Say = lambda text: None) -> Plan:
         """Choose poses and loads of the validation campaign, and make its file."""
         with Campaign.open(self.run, self.catalogue, read_only=True) as o:
             say("restoring the model")
             calibration, record = self._calibration(o)
+            fitted, rng = o.fitted_readings(record), self._rng(_VALIDATING)
+            reference = state.reference_in(o.file)
             plan = validation_plan(
-                self.cell,
-                self.config,
-                calibration,
-                o.fitted_readings(record),
-                reference_in(o.file),
-                self.settings.validation,
-                self._rng(_VALIDATING),
-                say,
-                under_load=self.settings.under_load,
+                self.cell, self.config, calibration, fitted, reference, self.settings, rng, say
             )
             self._create(self.files.validation, VALIDATION, plan, o)
         return plan
 
     def validate(self, say: Say = lambda text: None) -> Acceptance:
         """Freeze the validation campaign, and predict its readings."""
-        with (
-            Campaign.open(self.run, self.catalogue) as o,
-            opened(self.files.validation, VALIDATION, self.run) as unseen,
-        ):
-            log = ProcedureLog(o.file)
-            self._freeze(log, unseen)
+        with self._frozen() as (o, unseen):
             record = self._record(o)
             fitted = o.fitted_readings(record)
             readings = self._readings(o, record, unseen)
@@ -327,64 +259,53 @@ class Procedure:
                 )
             say(f"predicting {len(readings)} readings")
             model, theta = o.restore_model(record)
-            mode = self._mode(fitted)
+            mode = usual_mode(fitted, self.settings.readings)
             prediction = validation.validate(model, theta, fitted, readings, mode)
             beyond = extrapolation(o.predictive(record, model, theta), fitted, prediction)
             shares = acceptance(prediction, beyond)
             total = shares.everything
             content = {"revision": record.number, "error": prediction.error.to_json()}
             content |= {"noise_floor_m": prediction.noise_floor, "stated_m": total.stated_m}
-            log.append(VALIDATED, {**content, "within": total.within})
+            ProcedureLog(o.file).append(state.VALIDATED, {**content, "within": total.within})
         return shares
 
-    def _freeze(self, log: ProcedureLog, unseen: CampaignFile) -> None:
-        """Record the hash of the validation campaign; refuse one that differs from its record."""
-        frozen, readings = log.last(FROZEN), unseen.readings()
-        hashed = content_hash(readings)
-        if frozen is None:
-            content = {"file": unseen.path.name, "readings_sha256": hashed}
-            log.append(FROZEN, {**content, "readings": len(readings)})
-        elif frozen["readings_sha256"] != hashed:
-            raise InputError(
-                f"{unseen.path}: other readings than when it was frozen "
-                f"(SHA-256 {frozen['readings_sha256'][:12]}…, now {hashed[:12]}…)"
-            )
+    @contextmanager
+    def _frozen(self) -> Iterator[tuple[Campaign, CampaignFile]]:
+        """Open the campaign and its validation; record the latter's hash, or refuse another one."""
+        with (
+            Campaign.open(self.run, self.catalogue) as o,
+            state.opened(self.files.validation, VALIDATION, self.run) as unseen,
+        ):
+            log, readings = ProcedureLog(o.file), unseen.readings()
+            frozen, hashed = log.last(state.FROZEN), content_hash(readings)
+            if frozen is None:
+                content = {"file": unseen.path.name, "readings_sha256": hashed}
+                log.append(state.FROZEN, {**content, "readings": len(readings)})
+            elif frozen["readings_sha256"] != hashed:
+                raise InputError(
+                    f"{unseen.path}: other readings than when it was frozen "
+                    f"(SHA-256 {frozen['readings_sha256'][:12]}…, now {hashed[:12]}…)"
+                )
+            yield o, unseen
 
     def correct(self, say: Say = lambda text: None) -> Plan:
         """Correct the joint targets of the validation poses, and make the campaign for them."""
-        with (
-            Campaign.open(self.run, self.catalogue) as o,
-            opened(self.files.validation, VALIDATION, self.run) as unseen,
-        ):
-            self._freeze(ProcedureLog(o.file), unseen)
+        with self._frozen() as (o, unseen):
             say("restoring the model")
             calibration, record = self._calibration(o)
             readings = self._readings(o, record, unseen)
             measured_plan = read_plan(unseen.about(PLAN) or "", f"{unseen.path}, its plan")
-            reference = reference_of(measured_plan)
-            time = readings.states.time
+            reference, rng = state.reference_of(measured_plan), self._rng(_CORRECTING)
             plan = corrected_plan(
-                self.cell,
-                self.config,
-                calibration,
-                readings,
-                readings.states.q[0] if reference is None else reference,
-                0.0 if time is None else float(time[-1]),
-                self._rng(_CORRECTING),
-                say,
+                self.cell, self.config, calibration, readings, reference, rng, say
             )
             self._create(self.files.corrected, CORRECTED, plan, o)
         return plan
 
     def compare(self, say: Say = lambda text: None) -> Improvement:
         """Compare the measured errors at uncorrected and corrected joint targets."""
-        with (
-            Campaign.open(self.run, self.catalogue) as o,
-            opened(self.files.validation, VALIDATION, self.run) as unseen,
-            opened(self.files.corrected, CORRECTED, self.run) as moved,
-        ):
-            log = ProcedureLog(o.file)
-            self._freeze(log, unseen)
+        corrected_run = state.opened(self.files.corrected, CORRECTED, self.run)
+        with self._frozen() as (o, unseen), corrected_run as moved:
             say("comparing errors before and after")
             calibration, record = self._calibration(o)
             first, last = (self._readings(o, record, file) for file in (unseen, moved))
@@ -392,12 +313,11 @@ class Procedure:
             left_out = left_out_of(read_plan(moved.about(PLAN) or "", f"{moved.path}, its plan"))
             p = o.predictive(record, *o.restore_model(record))
             gain = improvement(calibration, p, uncorrected, corrected, uncorrected.states, left_out)
-            if log.last(IMPROVED) is None:
+            log = ProcedureLog(o.file)
+            if log.last(state.IMPROVED) is None:
                 content = {"revision": record.number, "readings_sha256": moved.data_hash()}
-                log.append(IMPROVED, {**content, **gain.to_dict()})
+                log.append(state.IMPROVED, {**content, **gain.to_dict()})
         return gain
-
-    # what the steps share
 
     def _rng(self, *stream: int) -> np.random.Generator:
         return np.random.default_rng([self.settings.seed, *stream])
@@ -407,12 +327,8 @@ class Procedure:
         planning = self.config.planning.model_copy(update={"readings": self.settings.readings})
         return self.config.model_copy(update={"planning": planning})
 
-    def _mode(self, readings: Readings) -> Mode:
-        """Return the kind of readings to fit; deflections only where the readings allow."""
-        return usual_mode(readings, self.settings.readings)
-
     def _record(self, o: Campaign) -> RevisionRecord:
-        refined = ProcedureLog(o.file).last(REFINED)
+        refined = ProcedureLog(o.file).last(state.REFINED)
         if refined is None:
             raise InputError(f"{self.run}: not refined yet")
         return o.file.revision(int(refined["revisions"][-1]))
@@ -434,11 +350,8 @@ class Procedure:
         return with_arm_scatter(cell, readings, ArmScatter.from_json(scatter))
 
     def _create(self, path: Path, purpose: str, plan: Plan, o: Campaign) -> None:
-        texts = {
-            PURPOSE: purpose,
-            CALIBRATION: identity(self.run),
-            COVERS: o.file.about(COVERS) or INSTRUMENT,
-        }
+        covers = o.file.about(COVERS) or INSTRUMENT
+        texts = {PURPOSE: purpose, CALIBRATION: state.identity(self.run), COVERS: covers}
         config = CellConfig.from_json(o.file.config_json)
         source = self._source(f"{purpose} campaign of {self.run.name}, ")
         create_run(path, config, self.base_dir, plan, source=source, more=texts).close()
@@ -471,6 +384,6 @@ def checked_plan(
 def continued(run: Path, cell: Cell, config: CellConfig, catalogue: Catalogue) -> Procedure:
     """Return the calibration of a campaign file, with the file's settings."""
     with CampaignFile.open(run, read_only=True) as campaign:
-        settings, base_dir = settings_of(campaign), cell.base_dir.absolute()
+        settings, base_dir = state.settings_of(campaign), cell.base_dir.absolute()
         check_same_cell(campaign, config, base_dir)
     return Procedure(run, cell, config, base_dir, catalogue, settings)

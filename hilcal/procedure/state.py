@@ -1,8 +1,9 @@
 """State of a calibration: its next step, determined by the contents of its files alone."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from hilcal.errors import InputError
 from hilcal.names import quoted
@@ -14,20 +15,10 @@ from hilcal.store.procedure_log import CALIBRATION, CORRECTED, PURPOSE, VALIDATI
 from hilcal.store.run_log import PLAN, RunLog
 from hilcal.types import Floats
 
-Kind = Literal[
-    "plan",
-    "measure",
-    "refine",
-    "decide",
-    "plan_validation",
-    "measure_validation",
-    "validate",
-    "correct",
-    "measure_corrected",
-    "compare",
-    "done",
-]
-MOVING: tuple[Kind, ...] = ("measure", "measure_validation", "measure_corrected")
+Moving = Literal["measure", "measure_validation", "measure_corrected"]
+Computed = Literal["refine", "decide", "plan_validation", "validate", "correct", "compare"]
+Kind = Literal["plan", "done"] | Moving | Computed
+MOVING: tuple[Kind, ...] = get_args(Moving)
 """Steps in which the arm moves."""
 _VALIDATING: tuple[Kind, Kind, Kind] = ("plan_validation", "measure_validation", "validate")
 _CORRECTING: tuple[Kind, Kind, Kind] = ("correct", "measure_corrected", "compare")
@@ -110,7 +101,10 @@ def next_step(run: Path) -> ProcedureStep:
         if log.last(BEGUN) is None:
             raise _not_of_calibrate(run)
         decided = log.last(DECIDED)
-        if decided is not None and not files.validation.exists() and _settings_changed(log):
+        kinds = [entry["kind"] for entry in log.entries() if entry["kind"] in (BEGUN, DECIDED)]
+        changed = kinds[-1] == BEGUN  # the settings, after the last decision
+        stopped = decided is not None and decided["action"] == STOP
+        if stopped and changed and not files.validation.exists():
             return ProcedureStep("decide", run)
         if decided is None or decided["action"] == MEASURE:
             missing = _missing("measure", campaign)
@@ -133,13 +127,6 @@ def next_step(run: Path) -> ProcedureStep:
         if missing is not None or not judged:
             return missing or ProcedureStep(judge, target)
     return ProcedureStep("done", run)
-
-
-def _settings_changed(log: ProcedureLog) -> bool:
-    """Whether settings were entered after the decision to stop measuring."""
-    kinds = [entry["kind"] for entry in log.entries() if entry["kind"] in (BEGUN, DECIDED)]
-    last = log.last(DECIDED)
-    return kinds[-1] == BEGUN and last is not None and last["action"] == STOP
 
 
 def opened(path: Path, purpose: str, run: Path, *, read_only: bool = True) -> CampaignFile:
@@ -187,10 +174,9 @@ def _missing(kind: Kind, campaign: CampaignFile) -> ProcedureStep | None:
     steps = plan.without(done).steps
     if not steps:
         return None
-    loads = [s.load for s in steps]
-    changes = sum(a != b for a, b in zip(["none", *loads], [*loads, "none"], strict=True))
-    share = len(steps) / len(plan.steps)
-    seconds = share * duration_of(plan)
+    loads = ["none", *(s.load for s in steps), "none"]
+    changes = sum(a != b for a, b in pairwise(loads))
+    seconds = len(steps) / len(plan.steps) * duration_of(plan)
     return ProcedureStep(kind, campaign.path, len(steps), len(plan.steps), changes, seconds)
 
 

@@ -23,6 +23,7 @@ from hilcal.errors import CannotAnswerError
 from hilcal.measuring.route import approach_sides, dry_run, duration, route
 from hilcal.present.calibration import refusals
 from hilcal.present.progress import Say
+from hilcal.procedure.state import Settings
 from hilcal.readings.readings import Readings, States
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
@@ -49,24 +50,21 @@ def validation_plan(
     config: CellConfig,
     calibration: Calibration,
     fitted: Readings,
-    reference: Floats | None,
-    count: int,
+    reference: Floats | None,  # (n,) where loads are changed, rad; None: at the first reading
+    settings: Settings,
     rng: np.random.Generator,
-    say: Say = lambda text: None,
-    *,
-    under_load: bool = False,
+    say: Say,
 ) -> Plan:
     """Choose random poses, assign the loads in turn, and order the readings.
 
     The poses are uniform in the measured range of joint angles. Poses that the cell does not allow,
     that cannot be reached, or that are far from all fitted ones (see `identification.validation`)
-    are left out, so there may be fewer than `count`. Each pose is measured under one load, for
-    deflections also unloaded; for positions "unloaded" is one of the loads, unless `under_load`
-    excludes it. Loads are changed at the joints `reference` (n,), rad; None: those of the first
-    reading.
+    are left out, so there may be fewer than `settings.validation`. Each pose is measured under one
+    load, for deflections also unloaded; for positions "unloaded" is one of the loads, unless
+    `settings.under_load` excludes it.
     """
     say("drawing poses within what was measured")
-    loads = _loads(calibration, fitted, under_load)
+    loads, count = _loads(calibration, fitted, settings.under_load), settings.validation
     hung = [load for load in config.loads if load.name in loads]
     tested_config = config.model_copy(update={"loads": tuple(hung)})
     space = Space(_within(cell, config, fitted.states.q), tested_config)
@@ -96,26 +94,22 @@ def validation_plan(
     say("ordering the readings")
     unloaded = (UNLOADED,) if calibration.mode == "deflection" else ()
     chosen = [Chosen(f"v{i}", (*unloaded, name)) for i, (_, name) in enumerate(selected, start=1)]
-    plan = _ordered(space, tested_config, chosen, drawn.q[[k for k, _ in selected]], base, rng)
+    plan = _ordered(space, chosen, drawn.q[[k for k, _ in selected]], base, rng)
     refuse(dry_run(cell, config, plan), "the validation plan")
     return replace(plan, about={**plan.about, "purpose": "validation"})
 
 
 def _ordered(
-    space: Space,
-    config: CellConfig,
-    chosen: Sequence[Chosen],
-    q: Floats,
-    reference: Floats,
-    rng: np.random.Generator,
+    space: Space, chosen: Sequence[Chosen], q: Floats, reference: Floats, rng: np.random.Generator
 ) -> Plan:
     """Order the chosen poses with joint values (P, n), from the reference pose (n,)."""
     names, order = [c.pose for c in chosen], Ordering(repeats=0, draws=DRAWS)
-    best = order_plan(space.cell, config, names, q, reference, chosen, space.passable, rng, order)
-    return fewer_returns(best.plan, space, config)
+    site = (space.cell, space.config)
+    best = order_plan(*site, names, q, reference, chosen, space.passable, rng, order)
+    return fewer_returns(best.plan, space)
 
 
-def fewer_returns(plan: Plan, space: Space, config: CellConfig) -> Plan:
+def fewer_returns(plan: Plan, space: Space) -> Plan:
     """Return the plan without readings at the reference pose where a load is changed.
 
     The arm still moves there. The first and last reference readings stay, which measure the drift;
@@ -130,7 +124,7 @@ def fewer_returns(plan: Plan, space: Space, config: CellConfig) -> Plan:
     ]
     needed = {Step(s.pose, UNLOADED, s.cycle) for s in compress(steps, stays)}
     retained = [s for s, stay in zip(steps, stays, strict=True) if stay or s in needed]
-    shorter = replace(plan, steps=tuple(retained))
+    shorter, config = replace(plan, steps=tuple(retained)), space.config
     margin = config.limits.joint_margin_rad
     durations = timeline(shorter, space.cell.arm, margin, pace(config))[0]
     return replace(shorter, about={**plan.about, "duration_s": durations.about()})
@@ -171,6 +165,7 @@ LEFT_OUT = "left_out"  # Key in a plan's file: the omitted points, with reasons
 class CorrectedPoints:
     """K readings of a validation campaign whose poses are to be corrected."""
 
+    readings: Readings  # of the whole campaign
     rows: Ints  # (K,) rows of the readings
     unloaded: Ints  # (K,) rows of their unloaded readings, for a fit to deflections; else -1
     names: tuple[str, ...]  # K names
@@ -196,12 +191,12 @@ def points_of(readings: Readings, mode: str) -> CorrectedPoints:
             rows.append(k)
             unloaded.append(base)
     loads = tuple(readings.load_names[readings.load[k]] for k in rows)
-    poses = [readings.pose_names[readings.pose[k]] for k in rows]
     names = tuple(
-        pose if load == UNLOADED else f"{pose} {load}"
-        for pose, load in zip(poses, loads, strict=True)
+        readings.pose_names[readings.pose[k]] + ("" if load == UNLOADED else f" {load}")
+        for k, load in zip(rows, loads, strict=True)
     )
-    return CorrectedPoints(np.array(rows, dtype=int), np.array(unloaded, dtype=int), names, loads)
+    unloaded_of = np.array(unloaded, dtype=int)
+    return CorrectedPoints(readings, np.array(rows, dtype=int), unloaded_of, names, loads)
 
 
 def corrected_plan(
@@ -209,21 +204,21 @@ def corrected_plan(
     config: CellConfig,
     calibration: Calibration,
     validation: Readings,
-    reference: Floats,
-    start: float,
+    reference: Floats | None,  # (n,) reference pose of the validation, rad; else its first reading
     rng: np.random.Generator,
-    say: Say = lambda text: None,
+    say: Say,
 ) -> Plan:
     """Return the plan of the corrected joint targets of a validation campaign.
 
     A point is corrected for the expected state of its reading: the wrench measured in the
     validation, approach sides and times from the route, the last measured temperatures. Points that
     cannot be corrected, or whose corrected joint values the cell does not allow, are left out and
-    listed in the plan. `reference` (n,) are the joints of the validation's reference pose, rad;
-    `start` is the time of the campaign at which the plan begins, s.
+    listed in the plan. The plan begins at the time of the last reading.
     """
     say("correcting joint values")
-    points = points_of(validation, calibration.mode)
+    points, time = points_of(validation, calibration.mode), validation.states.time
+    start = 0.0 if time is None else float(time[-1])
+    reference = validation.states.q[0] if reference is None else reference
     space, last = Space(cell, config), validation.states[slice(len(validation) - 1, None)]
     names, q = points.names, validation.states.q[points.rows]
     blocked = _blocked(space, q, reference, points.loads)
@@ -233,13 +228,13 @@ def corrected_plan(
         if not len(keep):
             break
         chosen = [Chosen(names[k], (points.loads[k],)) for k in keep]
-        plan = _ordered(space, config, chosen, q[keep], reference, rng)
+        plan = _ordered(space, chosen, q[keep], reference, rng)
         order = np.array([names.index(s.pose) for s in plan.steps if s.pose != REFERENCE])
         wrenches = {names[k]: validation.states.wrench[points.rows[k]] for k in keep}
         wrench = np.array([wrenches.get(s.pose, np.zeros(6)) for s in plan.steps])
         states = expected_states(plan, cell.arm, config, wrench, last, start)
         at_points = states[np.array([s.pose != REFERENCE for s in plan.steps])]
-        result = _compensated(calibration, at_points, validation, points, order)
+        result = _compensated(calibration, at_points, points, order)
         reasons = refusals(result, allowed_outside=True)
         refused = _blocked(space, result.q, reference, [points.loads[k] for k in order])
         refused |= {k: why for k, why in enumerate(reasons) if why}
@@ -254,19 +249,15 @@ def corrected_plan(
 
 
 def _compensated(
-    calibration: Calibration,
-    states: States,
-    validation: Readings,
-    points: CorrectedPoints,
-    order: Ints,
+    calibration: Calibration, states: States, points: CorrectedPoints, order: Ints
 ) -> Compensation:
     """Correct the points for their expected states, in the order of the plan."""
-    nominal = validation.states[points.rows[order]].q
+    nominal = points.readings.states[points.rows[order]].q
     poses = None
     if calibration.mode == "deflection":
         # The goal is the pose of the unloaded arm, in the state of its reading.
         tool = tool_of(calibration.model, calibration.theta, None)
-        free = replace(validation.states[points.unloaded[order]], target=None)
+        free = replace(points.readings.states[points.unloaded[order]], target=None)
         rotation, position = tool_poses(tool, tool.model.predict(free, tool.theta))
         poses = se3.matrix(rotation, position)
     return calibration.compensate(nominal, states.wrench, wanted=poses, recorded=recorded(states))
@@ -288,27 +279,19 @@ def _blocked(space: Space, q: Floats, reference: Floats, loads: Sequence[str]) -
 
 
 def _with_targets(
-    plan: Plan,
-    points: CorrectedPoints,
-    order: Ints,
-    result: Compensation,
-    left_out: Mapping[str, str],
+    plan: Plan, points: CorrectedPoints, order: Ints, result: Compensation, out: Mapping[str, str]
 ) -> Plan:
-    """Return the plan with corrected joint values in place of the nominal ones."""
+    """Return the plan with corrected joint values, and the points left `out` with reasons."""
     names, loads = points.names, points.loads
     corrected = {names[k]: row for k, row in zip(order, result.q, strict=True)}
     rows = [corrected.get(n, old) for n, old in zip(plan.pose_names, plan.q, strict=True)]
     errors, bands = result.before.error_m.tolist(), result.after.band_m.tolist()
-    expected = zip(order, errors, bands, strict=True)
-    about = {
-        **plan.about,
-        "purpose": "corrected",
-        "points": [
-            {"pose": names[k], "load": loads[k], "expected_before_m": error, "band_m": band}
-            for k, error, band in expected
-        ],
-        LEFT_OUT: [{"point": name, "why": why} for name, why in left_out.items()],
-    }
+    expected = [
+        {"pose": names[k], "load": loads[k], "expected_before_m": error, "band_m": band}
+        for k, error, band in zip(order, errors, bands, strict=True)
+    ]
+    why_not = [{"point": name, "why": why} for name, why in out.items()]
+    about = {**plan.about, "purpose": "corrected", "points": expected, LEFT_OUT: why_not}
     return Plan(plan.pose_names, np.array(rows), plan.steps, about)
 
 
@@ -364,11 +347,8 @@ def expected_states(
             load_times.append(times[-1] - loaded_since)
             time += pacing.reading_s
     repeated = last[np.zeros(len(plan.steps), dtype=np.int64)]
-    columns = {
-        "time": np.array(times),
-        "load_time": np.array(load_times),
-        "approach": approach_sides(stops),
-    }
+    sides = approach_sides(stops)
+    columns = {"time": np.array(times), "load_time": np.array(load_times), "approach": sides}
     recorded_columns = {name: v for name, v in columns.items() if getattr(last, name) is not None}
     q = np.array([plan.joints(step.pose) for step in plan.steps])
     return replace(repeated, q=q, wrench=wrench, q_actual=None, target=None, **recorded_columns)

@@ -23,7 +23,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hilcal.errors import InputError
-from hilcal.robot.batch import by_field
+from hilcal.robot.se3 import by_field
 from hilcal.shown import Brief, Tabular
 from hilcal.types import Bools, Floats, Ints
 

@@ -1,12 +1,27 @@
-"""The arm: constant link transforms, joint axes along z, masses and limits."""
+"""The arm: constant link transforms, joint axes along z, masses, limits and joint conventions.
+
+By the conventions of its controller, the joint j of the chain moves by
+
+    θ_j = s_j q_j + o_j + Σ_i k_ji q_i
+
+with q the controller's values, s = ±1, o the zero offset and k the couplings (a parallelogram: the
+forearm keeps its direction in space while joint 2 moves, k_32 = −1; bevel gears in a wrist).
+
+A coupling is mechanical if the motor of joint i also turns joint j: errors δ of the drives turn the
+joints by D δ, and drive i carries the torque (Dᵀ τ)_i, with D = 1 + K of the mechanical couplings.
+A coupling in the controller only (a forearm angle relative to the horizontal, with the drive in the
+elbow) affects θ only: each drive carries the torque of its joint.
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hilcal import limits
+from hilcal.config.sections import Conventions
 from hilcal.errors import InputError
+from hilcal.robot import se3
 from hilcal.shown import Brief
 from hilcal.types import Bools, Floats
 
@@ -68,7 +83,7 @@ class Arm(Brief):
     joint_names: tuple[str, ...]  # (n,) names
     source: str  # where the figures come from
     # (n, n) C with θ = C q: the angles of the chain from the controller's values, if joints follow
-    # others (see `conventions`); None without couplings
+    # others (see above); None without couplings
     coupling: Floats | None = None
     # (n, n) D with dθ = D dδ: displacements of the chain's joints from those of the drives, if
     # drives turn several joints; None if each drive turns one joint
@@ -116,30 +131,23 @@ class Arm(Brief):
 
     def along(self, wrench: Floats) -> Floats:
         """Return torques or forces (..., n) along the joints, from wrenches (..., n + 1, 6)."""
-        torque = wrench[..., :-1, 5]
-        if self.prismatic is None:
-            return torque
-        return np.where(self.prismatic, wrench[..., :-1, 2], torque)
+        return np.where(self.slides, wrench[..., :-1, 2], wrench[..., :-1, 5])
 
     def phases(self, q: Floats) -> Floats:
-        """Return phases (..., n) for periodic laws, rad; of a slide, one turn over its travel."""
-        angle = self.drive_angles(q)
-        if self.prismatic is None:
-            return angle
-        turn = 2 * np.pi / np.where(self.prismatic, self.q_max - self.q_min, 1.0)
-        return np.where(self.prismatic, angle * turn, angle)
+        """Return phases (..., n) for periodic laws, rad; of a slide, one turn over its travel.
+
+        They are the angles φ of the drives: D φ = C q; q if all couplings are mechanical.
+        """
+        angle, slides = self.chain_angles(q), self.slides
+        if self.drive is not None:
+            mechanical = self.coupling is not None and np.array_equal(self.drive, self.coupling)
+            angle = q if mechanical else np.asarray(angle @ np.linalg.pinv(self.drive).T)
+        turn = 2 * np.pi / np.where(slides, self.q_max - self.q_min, 1.0)
+        return np.where(slides, angle * turn, angle)
 
     def chain_angles(self, q: Floats) -> Floats:
         """Return angles (..., n) θ of the chain's joints, from the controller's values."""
         return q if self.coupling is None else q @ self.coupling.T
-
-    def drive_angles(self, q: Floats) -> Floats:
-        """Return angles (..., n) φ of the drives: D φ = C q; q if all couplings are mechanical."""
-        if self.drive is None:
-            return self.chain_angles(q)
-        if self.coupling is not None and np.array_equal(self.drive, self.coupling):
-            return q
-        return np.asarray(self.chain_angles(q) @ np.linalg.pinv(self.drive).T)
 
     def driven(self, dq: Floats) -> Floats:
         """Return displacements (..., n) of the chain's joints, from those of the drives."""
@@ -165,10 +173,9 @@ class Arm(Brief):
 
     def __post_init__(self) -> None:
         """Refuse too many joints, and a slide without limits."""
-        if self.prismatic is not None:
-            travel = (self.q_max - self.q_min)[self.prismatic]
-            if not np.all(np.isfinite(travel) & (travel > 0.0)):
-                raise InputError(f"{self.name}: a prismatic joint needs two limits, in m")
+        travel = (self.q_max - self.q_min)[self.slides]
+        if not np.all(np.isfinite(travel) & (travel > 0.0)):
+            raise InputError(f"{self.name}: a prismatic joint needs two limits, in m")
         if self.n > limits.JOINTS:
             raise InputError(f"{self.name}: {self.n} joints; valid: at most {limits.JOINTS}")
 
@@ -185,7 +192,102 @@ class Arm(Brief):
     @property
     def travels(self) -> Floats:
         """(n,) largest distances of slides from their zeros, m; 0 of revolute joints."""
-        if self.prismatic is None:
-            return np.zeros(self.n)
-        far = np.maximum(np.abs(self.q_min), np.abs(self.q_max))
-        return np.where(self.prismatic, far, 0.0)
+        return np.where(self.slides, np.maximum(np.abs(self.q_min), np.abs(self.q_max)), 0.0)
+
+
+_HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])  # Rx(π): Rz(−θ) = Rx(π) Rz(θ) Rx(π)
+
+
+def as_counted(arm: Arm, conventions: Conventions) -> Arm:
+    """Return the arm with the controller's joint conventions."""
+    for key in ("joint_sign", "joint_offset_deg"):
+        values = getattr(conventions, key)
+        if values is not None and len(values) != arm.n:
+            raise InputError(
+                f"{key} has {len(values)} values; {arm.name} has {arm.n} joints, one value each"
+            )
+    for c in conventions.joint_coupling:
+        if max(c.joint, c.follows) > arm.n:
+            raise InputError(
+                f"joint_coupling names joint {max(c.joint, c.follows)}; {arm.name} has joints "
+                f"1 to {arm.n}"
+            )
+        if arm.slides[c.joint - 1] != arm.slides[c.follows - 1]:
+            raise InputError(
+                f"joint_coupling: of joints {c.joint} and {c.follows} one slides and one turns; "
+                "valid: two that slide, or two that turn"
+            )
+    for j in np.flatnonzero(
+        arm.slides & (np.array(conventions.joint_offset_deg or (0.0,) * arm.n) != 0)
+    ):
+        raise InputError(
+            f"joint_offset_deg of joint {j + 1}, which slides; valid: 0, with its zero in d_m or "
+            "in the <origin> of the joint"
+        )
+    sign = np.array(conventions.joint_sign or (1,) * arm.n, dtype=float)
+    offset = np.radians(conventions.joint_offset_deg or (0.0,) * arm.n)
+    coupling, counted = np.zeros((2, arm.n, arm.n))
+    for c in conventions.joint_coupling:
+        coupling[c.joint - 1, c.follows - 1] += c.factor
+        counted[c.joint - 1, c.follows - 1] += 0.0 if c.mechanical else c.factor
+    return with_conventions(arm, sign, offset, coupling, counted)
+
+
+def with_conventions(
+    arm: Arm, sign: Floats, offset: Floats, coupling: Floats, counted: Floats | float = 0.0
+) -> Arm:
+    """Return the arm with the controller's joint values: (n,) s and o, (n, n) k.
+
+    Signs and zeros enter the constant links:
+
+        M(s q + o) = M(o) X M(q) X⁻¹,  X = Rx(π) for s = −1, else 1;  M = Rz or Tz
+
+    Limits are unchanged, as they are those of the controller's values. Existing couplings C of the
+    arm apply to the converted values: θ = C (S q + o + K q). `counted` is the part of K that is not
+    mechanical.
+    """
+    links, coms = arm.links.copy(), arm.coms.copy()
+    existing = np.eye(arm.n) if arm.coupling is None else arm.coupling
+    for j, zero in enumerate(existing @ offset):
+        if zero:
+            links[j] = links[j] @ se3.screw(2, *((0.0, zero) if arm.slides[j] else (zero,)))
+        if sign[j] < 0:
+            links[j] = links[j] @ _HALF_TURN
+            links[j + 1] = _HALF_TURN @ links[j + 1]
+            coms[j] = _HALF_TURN[:3, :3] @ coms[j]
+    # θ = C (S q + o + K q), and S θ turns the links
+    combined = sign[:, None] * (existing @ (np.diag(sign) + coupling))
+    existing_drive = np.eye(arm.n) if arm.drive is None else arm.drive
+    drives = sign[:, None] * (existing_drive @ (np.diag(sign) + coupling - counted))
+    signs = sign if arm.sign is None else sign * arm.sign
+    mimic = arm.mimic
+    if mimic is not None:  # v = F v + f for the drawn values v = S q + o + K q
+        factors, constants = mimic[:, :-1], mimic[:, -1]
+        turned = sign[:, None] * (factors @ (np.diag(sign) + coupling) - coupling)
+        moved = sign * (factors @ offset + constants - offset)
+        mimic = np.where(arm.own[:, None], mimic, np.column_stack([turned, moved]))
+    return replace(
+        arm, links=links, coms=coms, coupling=_unless_one(combined), drive=_unless_one(drives),
+        mimic=mimic, sign=signs if np.any(signs < 0) else None,
+    )  # fmt: skip
+
+
+def as_drawn(arm: Arm) -> Arm:
+    """Return the arm with all axes as drawn, for quantities independent of joint values."""
+    if arm.sign is None:
+        return arm
+    zeros = np.zeros((arm.n, arm.n))
+    return with_conventions(replace(arm, coupling=None, drive=None), arm.sign, zeros[0], zeros)
+
+
+def _unless_one(matrix: Floats) -> Floats | None:
+    return None if np.array_equal(matrix, np.eye(len(matrix))) else matrix
+
+
+def may_follow(n: int) -> tuple[tuple[int, int], ...]:
+    """Return pairs of a joint that may follow another, and the other one, counted from 1.
+
+    Each joint may follow the previous one (parallelograms, wrists driven through one another); the
+    last joint may follow the last but two (a wrist with three motors in the forearm).
+    """
+    return tuple((j, j - 1) for j in range(2, n + 1)) + (((n, n - 2),) if n > 2 else ())

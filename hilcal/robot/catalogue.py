@@ -12,8 +12,7 @@ from pydantic import Field, model_validator
 from hilcal.config.sections import Conventions
 from hilcal.errors import InputError
 from hilcal.robot import se3
-from hilcal.robot.arm import Arm, missing
-from hilcal.robot.conventions import as_counted
+from hilcal.robot.arm import Arm, as_counted, missing
 from hilcal.toml import NonNegative, Number, Positive, Section, Vector3, load_section, suggest
 
 _LENGTH = "a finite number in m"

@@ -13,7 +13,7 @@ import numpy as np
 
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
-from hilcal.robot.batch import along_states, by_field, empty
+from hilcal.robot.se3 import along_states, by_field, empty
 from hilcal.types import Bools, Floats
 
 
@@ -52,23 +52,20 @@ class Chain:
         return np.asarray(self.position[-1] + se3.apply(self.rotation[-1], offset))
 
 
-Turns = tuple[Floats, Floats, Floats | None]  # cos, sin (N, n); travel (N, n) of slides
+Turns = tuple[Floats, Floats, Floats]  # cos, sin (N, n); travel (N, n) of slides
 
 
 def turns(arm: Arm, q: Floats) -> Turns:
     """Return the motions of the chain's joints at the controller's values q (N, n)."""
-    angle = along_states(arm.chain_angles(q))
-    slid = None
-    if arm.prismatic is not None:
-        angle, slid = angle * ~arm.prismatic, angle * arm.prismatic
-    return np.cos(angle), np.sin(angle), slid
+    moved = along_states(arm.chain_angles(q))
+    angle = moved * ~arm.slides
+    return np.cos(angle), np.sin(angle), moved * arm.slides
 
 
-def _turned(nominal: Turns, dq: Floats, prismatic: Bools | None) -> Turns:
+def _turned(nominal: Turns, dq: Floats, slides: Bools) -> Turns:
     """Add displacements (N, n), by the addition theorems, which cost less than cos and sin."""
     cos, sin, slid = nominal
-    if prismatic is not None and slid is not None:
-        dq, slid = dq * ~prismatic, slid + dq * prismatic
+    dq, slid = dq * ~slides, slid + dq * slides
     t2 = dq * dq
     b, c = se3.coefficients(t2)
     by_cos, by_sin = 1 - b * t2, dq * (1 - c * t2)
@@ -82,7 +79,7 @@ def evaluate(
     deviation = deviation or Deviation()
     moved = turns(arm, q) if nominal is None else nominal
     if deviation.dq is not None:
-        moved = _turned(moved, along_states(arm.driven(deviation.dq)), arm.prismatic)
+        moved = _turned(moved, along_states(arm.driven(deviation.dq)), arm.slides)
     cos, sin, slid = moved
     twist = deviation.twist
     if twist is not None:
@@ -108,7 +105,7 @@ def evaluate(
                 position[k] += se3.apply(r, se3.exp(twist[k])[1])
             r = np.einsum("nij,njk->nik", linked, step_r, out=rotation[k])
         p = position[k]
-        if k < n and slid is not None and arm.slides[k]:
+        if k < n and arm.slides[k]:
             p = p + r[..., 2] * slid[:, k, None]
             body[...] = r
             com[k] = _offset(p, body, coms[k])

@@ -101,10 +101,12 @@ def _why(error: Exception) -> str:
 
 
 def read_factory(path: Path, nominal: Arm, text: str | None = None) -> FactoryKinematics:
-    """Read a file of one arm's kinematics; a calibration.conf adds to the nominal arm."""
+    """Read a file of one arm's kinematics; a calibration.conf adds to the nominal arm.
+
+    The kinematics of another arm are refused.
+    """
     kind = path.suffix.lower()
-    reader = {".conf": _of_conf, ".yaml": _of_yaml, ".yml": _of_yaml, ".toml": _of_toml}.get(kind)
-    if reader is None:
+    if kind not in (".conf", ".yaml", ".yml", ".toml"):
         raise InputError(f"{path}: not the kinematics of an arm; valid: {KINDS}")
     try:
         text = limits.read_text(path, limits.PROGRAM) if text is None else text
@@ -112,23 +114,23 @@ def read_factory(path: Path, nominal: Arm, text: str | None = None) -> FactoryKi
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path}: {reason}; expected {KINDS}") from None
     try:
-        factory = reader(text, nominal, str(path))
+        if kind == ".conf":
+            factory = _of_conf(text, nominal, str(path))
+        elif kind == ".toml":
+            factory = of_dict(tomllib.loads(text), str(path))
+        else:
+            factory = _of_yaml(text, str(path))
     except (ValueError, KeyError, TypeError, configparser.Error) as error:
         raise InputError(
             f"{path}: not the kinematics of an arm ({_why(error)}); valid: {KINDS}"
         ) from None
-    check_of(factory, nominal)
-    return factory
-
-
-def check_of(factory: FactoryKinematics, nominal: Arm) -> None:
-    """Refuse the kinematics of another arm."""
     difference = flange_difference(with_factory(nominal, factory), nominal)[1]
     if not difference < FAR:
         raise InputError(
             f"{factory.source}: of another arm than {nominal.name}: its flange lies up to "
             f"{1e3 * difference:.0f} mm from where that one's does"
         )
+    return factory
 
 
 def with_factory(nominal: Arm, factory: FactoryKinematics) -> Arm:
@@ -183,11 +185,7 @@ def _values(text: str) -> list[str]:
     return text.strip().strip("[]").replace(",", " ").split()
 
 
-def _of_toml(text: str, nominal: Arm, source: str) -> FactoryKinematics:
-    return of_dict(tomllib.loads(text), source)
-
-
-def _of_yaml(text: str, nominal: Arm, source: str) -> FactoryKinematics:
+def _of_yaml(text: str, source: str) -> FactoryKinematics:
     """Parse the layout of `ur_calibration`: a mapping of bodies, each with six numbers."""
     places: dict[str, dict[str, float]] = {}
     body = ""

@@ -1,8 +1,13 @@
-"""Rigid displacements, batched: exponential, logarithm, adjoint, right Jacobian.
+"""Batches of N states, and rigid displacements: exponential, logarithm, adjoint, Jacobian.
 
-Twists are (v, ω): translation first. All functions take arrays with any leading shape; the
-memory of new arrays runs along the first axis (see `batch`). With θ = |ω|, all formulas use
-b = (1 − cos θ)/θ² and c = (θ − sin θ)/θ³, two functions of θ² without a singularity:
+Arrays (N, ...) are in Fortran order: the states are the first axis, and memory runs along them.
+Every elementwise operation and every `einsum` then works on long contiguous vectors, even for small
+matrices. numpy preserves the order; only new arrays have to be created with it. Chunks keep
+temporaries in the processor's cache.
+
+Twists are (v, ω): translation first. All functions take arrays with any leading shape. With
+θ = |ω|, all formulas use b = (1 − cos θ)/θ² and c = (θ − sin θ)/θ³, two functions of θ² without a
+singularity:
 
     sin θ/θ = 1 − c θ²        cos θ = 1 − b θ²
 
@@ -10,13 +15,66 @@ Source of the closed forms: Lynch and Park, *Modern Robotics*, chapter 3; Barfoo
 *State Estimation for Robotics*, section 7.1.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import Field, fields, replace
 from math import cos, factorial, sin
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 
-from hilcal.robot.batch import empty, zeros
 from hilcal.types import Floats
+
+CHUNK = 8200  # states, by timing; powers of two collide in few cache lines
+BUDGET = 1 << 20  # numbers in a chunk's largest array, 8 MB; a choice by timing
+LEAST_CHUNK = 256  # states, at least: Python's overhead grows with the number of chunks
+
+
+class Record(Protocol):
+    """A dataclass whose fields are arrays over the states, or None."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+
+R = TypeVar("R", bound=Record)
+
+
+def empty(*shape: int) -> Floats:
+    """Return a new array (N, ...) whose memory runs along the states."""
+    return np.empty(shape, order="F")
+
+
+def zeros(*shape: int) -> Floats:
+    """Return a new array (N, ...) of zeros whose memory runs along the states."""
+    return np.zeros(shape, order="F")
+
+
+def along_states(x: Floats) -> Floats:
+    """Return x (N, ...) with memory along the states: itself, or a copy."""
+    return np.asfortranarray(x)
+
+
+def chunks(count: int, numbers: int = 0) -> Iterator[slice]:
+    """Yield slices that cover `count` states, at least one slice; `numbers` per state."""
+    size = CHUNK if numbers == 0 else max(LEAST_CHUNK, min(CHUNK, BUDGET // numbers))
+    for start in range(0, max(count, 1), size):
+        yield slice(start, min(start + size, count))
+
+
+def take(record: R, rows: slice, axis: int = 0) -> R:
+    """Return the states `rows` of a record whose arrays have the states on `axis`."""
+    index = (*(slice(None),) * axis, rows)
+    return by_field([record], lambda arrays: arrays[0][index])
+
+
+def by_field(records: Sequence[R], combine: Callable[[Sequence[Floats]], Floats]) -> R:
+    """Combine records array by array, without None; other fields are those of the first record."""
+    combined = {}
+    for f in fields(records[0]):
+        arrays = [a for r in records if isinstance(a := getattr(r, f.name), np.ndarray)]
+        if arrays:
+            combined[f.name] = combine(arrays)
+    return replace(records[0], **combined)
+
 
 _NEAR = 0.25  # θ² below which b and c are series: the closed forms cancel near zero
 _TERMS = 8
@@ -27,7 +85,7 @@ _B_SLOPE, _C_SLOPE = ([k * c for k, c in enumerate(series)][1:] for series in (_
 
 def cross(a: Floats, b: Floats) -> Floats:
     """Return the cross product a × b over the last axis; (..., 3), broadcast."""
-    out = empty(*_shape(a.shape, b.shape))
+    out = empty(*np.broadcast_shapes(a.shape, b.shape))
     # memory runs along the states, even if a or b is the same in all states
     part = empty(*out.shape[:-1])
     for axis in range(3):
@@ -40,13 +98,13 @@ def cross(a: Floats, b: Floats) -> Floats:
 
 def apply(r: Floats, v: Floats) -> Floats:
     """Return matrices times vectors; (..., 3, 3), (..., 3) -> (..., 3), broadcast."""
-    out = empty(*_shape(r.shape[:-1], v.shape))
+    out = empty(*np.broadcast_shapes(r.shape[:-1], v.shape))
     return np.asarray(np.einsum("...ij,...j->...i", r, v, out=out))
 
 
 def product(a: Floats, b: Floats) -> Floats:
     """Return matrices times matrices; (..., i, j), (..., j, k) -> (..., i, k), broadcast."""
-    lead = _shape(a.shape[:-2], b.shape[:-2])
+    lead = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
     out = empty(*lead, a.shape[-2], b.shape[-1])
     return np.asarray(np.einsum("...ij,...jk->...ik", a, b, out=out))
 
@@ -193,10 +251,6 @@ def right_jacobian_blocks(twist: Floats) -> tuple[Floats, Floats]:
     q += cv[..., :, None] * w[..., None, :]
     q += w[..., :, None] * cv[..., None, :]
     return j, q
-
-
-def _shape(a: tuple[int, ...], b: tuple[int, ...]) -> tuple[int, ...]:
-    return a if a == b else np.broadcast_shapes(a, b)
 
 
 def _square(w: Floats) -> Floats:

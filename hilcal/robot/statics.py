@@ -17,14 +17,13 @@ joint and Cartesian stiffness matrices of robotic hands and fingers*, Int. J. Ro
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import reduce
 
 import numpy as np
 
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
-from hilcal.robot.batch import empty, zeros
 from hilcal.robot.chain import Chain
+from hilcal.robot.se3 import empty, zeros
 from hilcal.types import Floats
 
 
@@ -140,34 +139,27 @@ class GeometricStiffness:
         `form` has coefficients (N, m, 3) by slot, and by whether they are of the moment.
         """
         chain, slots = self.chain, len(self.force)
-        still: list[Floats | None] = [None]
-        along: list[Floats | None] = [None] * (slots + 1)
-        load: Floats | None = None
-        for k in range(slots):
-            by_force, by_moment = (
-                None if b is None else rows_times(b, chain.rotation[k], transposed=True)
-                for b in (form.get((k, False)), form.get((k, True)))
-            )
-            still.append(_sum(still[-1], by_moment))
-            if by_moment is not None:
-                along[k] = rows_times(by_moment, self.carried[k], transposed=True)
-                if self.following is not None:
-                    lever = self.load_point - chain.position[k]
-                    load = _sum(load, se3.cross(by_moment, lever[:, None]))
-            if by_force is not None:
-                along[k] = _sum(along[k], se3.cross(by_force, self.force[k][:, None]))
-                load = _sum(load, by_force) if self.following is not None else None
-        for k in range(slots - 1, -1, -1):
-            of_slot, beyond = along[k], along[k + 1]
-            if of_slot is None or beyond is None:
-                along[k] = _sum(of_slot, beyond)
-            else:
-                of_slot += beyond
-        flange = None
-        if self.following is not None and load is not None and still[-1] is not None:
-            flange = rows_times(np.concatenate([load, still[-1]], axis=2), self.following)
         rows = next(iter(form.values())).shape[:2]
-        return MotionGradient(self, rows, still, along, flange)
+        load, still = zeros(*rows, 3), [zeros(*rows, 3)]
+        along = [zeros(*rows, 3) for _ in range(slots + 1)]
+        for k in range(slots):
+            of = {m: form[k, m] for m in (False, True) if (k, m) in form}
+            base = {m: rows_times(b, chain.rotation[k], transposed=True) for m, b in of.items()}
+            still.append(still[-1])
+            if (by_moment := base.get(True)) is not None:
+                still[-1] = still[-1] + by_moment
+                along[k] += rows_times(by_moment, self.carried[k], transposed=True)
+                if self.following is not None:
+                    load += se3.cross(by_moment, (self.load_point - chain.position[k])[:, None])
+            if (by_force := base.get(False)) is not None:
+                along[k] += se3.cross(by_force, self.force[k][:, None])
+                load += by_force
+        for k in range(slots - 1, -1, -1):
+            along[k] += along[k + 1]
+        flange = None
+        if self.following is not None:
+            flange = rows_times(np.concatenate([load, still[-1]], axis=2), self.following)
+        return MotionGradient(self, still, along, flange)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,48 +167,39 @@ class MotionGradient:
     """Gradient of a linear form of the slot wrenches by motions of the chain."""
 
     stiffness: GeometricStiffness
-    rows: tuple[int, ...]  # N and m
-    # (n + 2,) sums (N, m, 3) of the moments' coefficients over the slots i < k, base axes; None
-    # stands for zero, also below
-    still: list[Floats | None]
-    along: list[Floats | None]  # (n + 2,) gradients (N, m, 3) by a turn of slots i ≥ k
+    # (n + 2,) sums (N, m, 3) of the moments' coefficients over the slots i < k, base axes
+    still: list[Floats]
+    along: list[Floats]  # (n + 2,) gradients (N, m, 3) by a turn of slots i ≥ k
     flange: Floats | None  # (N, m, 6) gradient by the flange's motion through the load's wrench
 
     def joint(self, j: int) -> Floats:
         """Return the gradient (N, m) by the displacement of joint j + 1."""
-        z, stiffness = self.stiffness.chain.rotation[j, :, :, 2], self.stiffness
-        if j in stiffness.chain.slides:
+        s, flange, still = self.stiffness, self.flange, self.still[j + 1]
+        z = s.chain.rotation[j, :, :, 2]
+        if j in s.chain.slides:
             # slot j stands still; the force through it is shifted along z relative to p_j
-            still = self.still[j + 1]
-            out = None if still is None else _rows_dot(still, se3.cross(z, stiffness.force[j]))
-            if self.flange is not None:
-                out = _sum(out, _rows_dot(self.flange[..., :3], z))
-            return zeros(*self.rows) if out is None else out
-        parts = [(self.along[j + 1], z), (self.still[j + 1], stiffness.spun[j])]
-        if self.flange is not None:
-            lever = stiffness.chain.position[-1] - stiffness.chain.position[j]
-            parts += [(self.flange[..., 3:], z), (self.flange[..., :3], se3.cross(z, lever))]
-        out = reduce(_sum, (None if a is None else _rows_dot(a, b) for a, b in parts))
-        return zeros(*self.rows) if out is None else out
-
-    def displacement(self, j: int) -> Floats | None:
-        """Return the gradient (N, m, 3) by the displacement of all beyond slot j, base axes."""
-        out = None if self.flange is None else self.flange[..., :3]
-        still = self.still[j]
-        if still is not None:
-            out = _sum(out, se3.cross(self.stiffness.force[j][:, None], still))
+            out = _rows_dot(still, se3.cross(z, s.force[j]))
+            return out if flange is None else out + _rows_dot(flange[..., :3], z)
+        out = _rows_dot(self.along[j + 1], z) + _rows_dot(still, s.spun[j])
+        if flange is not None:
+            lever = s.chain.position[-1] - s.chain.position[j]
+            out += _rows_dot(flange[..., 3:], z)
+            out += _rows_dot(flange[..., :3], se3.cross(z, lever))
         return out
+
+    def displacement(self, j: int) -> Floats:
+        """Return the gradient (N, m, 3) by the displacement of all beyond slot j, base axes."""
+        out = se3.cross(self.stiffness.force[j][:, None], self.still[j])
+        return out if self.flange is None else self.flange[..., :3] + out
 
     def turn(self, j: int) -> Floats:
         """Return the gradient (N, m, 3) by the turn of all beyond slot j about p_j, base axes."""
-        out, still = self.along[j], self.still[j]
         chain, flange = self.stiffness.chain, self.flange
-        if still is not None:
-            out = _sum(out, rows_times(still, self.stiffness.dyad[j]))
+        out = self.along[j] + rows_times(self.still[j], self.stiffness.dyad[j])
         if flange is not None:
             lever = (chain.position[-1] - chain.position[j])[:, None]
-            out = _sum(out, flange[..., 3:] + se3.cross(lever, flange[..., :3]))
-        return zeros(*self.rows, 3) if out is None else out
+            out = out + (flange[..., 3:] + se3.cross(lever, flange[..., :3]))
+        return out
 
 
 def geometric_stiffness(
@@ -270,12 +253,6 @@ def rows_times_constant(rows: Floats, matrix: Floats) -> Floats:
 def _rows_dot(rows: Floats, vector: Floats) -> Floats:
     """Return rows (N, m, i) times vectors (N, i)."""
     return np.einsum("nmi,ni->nm", rows, vector, out=empty(*rows.shape[:2]))
-
-
-def _sum(a: Floats | None, b: Floats | None) -> Floats | None:
-    if a is None or b is None:
-        return b if a is None else a
-    return np.asarray(a + b)
 
 
 def _outer(a: Floats, b: Floats) -> Floats:

@@ -10,7 +10,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import IO
 from xml.parsers import expat
@@ -171,13 +171,7 @@ def _only_leaf(model: pin.Model, path: Path) -> str:
     return leaves[0]
 
 
-@dataclass(frozen=True, slots=True)
-class Mimic:
-    """A `<mimic>` element: q = multiplier · q of `joint` + offset."""
-
-    joint: str  # name of the joint to follow
-    multiplier: str  # 1 by default
-    offset: str  # rad or m; 0 by default
+Mimic = tuple[str, str, str]  # <mimic>: joint to follow, multiplier, offset (rad or m)
 
 
 @limits.bounded
@@ -193,8 +187,9 @@ def _read(path: Path) -> tuple[pin.Model, dict[str, Mimic]]:
             joints += 1
             moving += attributes.get("type") != "fixed"
         elif tag == "mimic":
-            factor, offset = attributes.get("multiplier", "1"), attributes.get("offset", "0")
-            mimics[within[-1]] = Mimic(attributes.get("joint", ""), factor, offset)
+            keys = {"joint": "", "multiplier": "1", "offset": "0"}
+            leader, factor, offset = (attributes.get(key, usual) for key, usual in keys.items())
+            mimics[within[-1]] = leader, factor, offset
         # Pinocchio recurses for each joint; its memory grows with the cube of the moving joints
         if joints > limits.DESCRIBED or moving > limits.MOVING:
             raise InputError(
@@ -246,20 +241,18 @@ def with_mimics(arm: Arm, mimics: Mapping[str, Mimic], where: str) -> Arm:
         return arm
     independent = [name for j, name in enumerate(names) if j not in follows]
     links, turns, values = arm.links.copy(), np.eye(n), np.eye(n, n + 1)
-    for j, mimic in follows.items():
-        prefix = f'{where}: joint "{names[j]}" of the arm mimics joint "{mimic.joint}"'
-        if mimic.joint not in independent:
-            why = (
-                "which follows another one itself" if mimic.joint in names else "which is not there"
-            )
+    for j, (leader, factor, shift) in follows.items():
+        prefix = f'{where}: joint "{names[j]}" of the arm mimics joint "{leader}"'
+        if leader not in independent:
+            why = "which follows another one itself" if leader in names else "which is not there"
             raise InputError(
-                f"{prefix}, {why}{suggest(mimic.joint, independent)}; valid: a joint between "
+                f"{prefix}, {why}{suggest(leader, independent)}; valid: a joint between "
                 f"base_link and tip_link with a value of its own: {', '.join(independent)}"
             )
-        i = names.index(mimic.joint)
+        i = names.index(leader)
         turns[j], values[j] = 0.0, 0.0
-        turns[j, i] = values[j, i] = float(mimic.multiplier)
-        values[j, n] = offset = float(mimic.offset)
+        turns[j, i] = values[j, i] = float(factor)
+        values[j, n] = offset = float(shift)
         if arm.slides[i] != arm.slides[j]:
             raise InputError(f"{prefix}, of which one slides and one turns; valid: two of a kind")
         links[j] = links[j] @ se3.screw(2, *((0.0, offset) if arm.slides[j] else (offset,)))

@@ -17,7 +17,7 @@ from hilcal.errors import InputError
 from hilcal.readings.covariance import INSTRUMENT, ROUNDING, TrackerNoise
 from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
-from hilcal.robot.batch import CHUNK
+from hilcal.robot.se3 import CHUNK
 from hilcal.tables import checks, columns
 from hilcal.tables.files import is_plain, package, undamaged
 from hilcal.tables.grid import ColumnTable

@@ -22,8 +22,7 @@ from hilcal.identification.mixed_fit import MixedFit, mixed_fit
 from hilcal.identification.registration import register
 from hilcal.mixed.variances import estimate_variances
 from hilcal.readings.readings import Readings
-from hilcal.robot.arm import Arm
-from hilcal.robot.conventions import as_counted
+from hilcal.robot.arm import Arm, as_counted
 from hilcal.robot.factory import FactoryKinematics, with_factory
 from hilcal.shown import Shown
 from hilcal.types import Bools

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hilcal.engine.engine import Advance, Engine
+from hilcal.engine import Advance, Engine
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.carried import SAME_M
 from hilcal.readings.same_readings import shared

@@ -23,7 +23,7 @@ from hilcal.calibration.handover import urdf
 from hilcal.cell import Cell
 from hilcal.design.approximate_design import relax
 from hilcal.design.criteria import D
-from hilcal.design.criterion import CandidateSet
+from hilcal.design.criterion import CandidateSet, Objective
 from hilcal.design.optimum import best
 from hilcal.drivers.simulated.injected_effects import Draw
 from hilcal.identification.baseline import baseline, with_effects
@@ -106,9 +106,10 @@ def test_plan(benchmark: Any, claim: Claim, tmp_path: Path, count: int) -> None:
     done = by_figaroh(benchmark, tmp_path, arm, {"candidates": q.tolist(), "poses": POSES})
     rows, weights = np.array(done["rows"]), np.array(done["weights"])
     units = CandidateSet(rows, np.ones(count))
-    relaxed, relaxed_seconds = timed(lambda: relax(units, D(), 1.0))
-    chosen, seconds = timed(lambda: best(units, D(), float(POSES)))
-    benchmark.pedantic(relax, args=(units, D(), 1.0), rounds=1)
+    objective = Objective(units, D(), np.zeros((units.size, units.size)))
+    relaxed, relaxed_seconds = timed(lambda: relax(objective, 1.0))
+    chosen, seconds = timed(lambda: best(objective, float(POSES)))
+    benchmark.pedantic(relax, args=(objective, 1.0), rounds=1)
 
     def root(information: Floats) -> float:
         return float(np.exp(np.linalg.slogdet(information)[1] / units.size))

@@ -10,6 +10,7 @@ import scipy.linalg as sl
 from hilcal.cell import STANDARD_GRAVITY, Cell
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm, robot_names
+from hilcal.robot.chain import Chain
 from hilcal.types import Floats
 
 ODD, RAILS = "odd", "rails"
@@ -77,6 +78,29 @@ def slots_of(arm: Arm, q: Floats) -> Floats:
         pose = pose @ displacement(motion) @ link
         out.append(pose)
     return np.array(out)
+
+
+def flange_at(chain: Chain, state: int, pose: Floats, atol: float = 1e-12) -> None:
+    """Assert where the flange is in a state: a pose (4, 4)."""
+    found = chain.rotation[-1, state], chain.position[-1, state]
+    np.testing.assert_allclose(np.column_stack(found), pose[:3], rtol=0, atol=atol)
+
+
+def same_flange(one: Chain, other: Chain) -> None:
+    """Assert that the flange is at the same poses."""
+    for of in ("position", "rotation"):
+        ends = (getattr(chain, of)[-1] for chain in (one, other))
+        np.testing.assert_allclose(*ends, rtol=0, atol=1e-12)
+
+
+def classic_flange(rows: Floats, q: Floats) -> Floats:
+    """Flange (4, 4) of θ, a, d, α (4, n) at angles (n,), by the closed form of a classic row."""
+    pose = np.eye(4)
+    for (theta, a, d, alpha), angle in zip(rows.T, q, strict=True):
+        c, s, ca, sa = (f(x) for x in (angle + theta, alpha) for f in (np.cos, np.sin))
+        row = [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d]]
+        pose = pose @ np.array([*row, [0, 0, 0, 1]])
+    return pose
 
 
 def slope(f: Callable[[float], Floats], h: float) -> Floats:

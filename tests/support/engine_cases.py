@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hilcal.engine.engine import open_engine
+from hilcal.engine import open_engine
 
 Ints = NDArray[np.integer[Any]]
 

@@ -1,6 +1,6 @@
 """Small campaigns that leave a doubt, and the measurements that settle it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -14,18 +14,15 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.rehearsal import Rehearsal, SimulationCase, case_of_plan, read_plan
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
-from hilcal.readings.readings import Readings, States
+from hilcal.readings.readings import Readings
 from hilcal.store.plan import Plan, with_new_names
 from tests.support.cli_cases import CELL
+from tests.support.plan_cases import changed
 
 _CONFIG = load_config(CELL)
 STRENGTH = 2.0
-SMALL = _CONFIG.model_copy(
-    update={
-        "planning": _CONFIG.planning.model_copy(update={"candidates": 120, "against": ()}),
-        "simulation": _CONFIG.simulation.model_copy(update={"strength_sigma": STRENGTH}),
-    }
-)
+FEW, SEEN = {"candidates": 120, "against": ()}, {"strength_sigma": STRENGTH}
+SMALL = changed(_CONFIG, planning=FEW, simulation=SEEN)
 
 
 @dataclass(frozen=True)
@@ -78,18 +75,5 @@ def settled(first: Doubtful, poses: int = 20) -> tuple[Diagnosis, Next]:
 def both(a: Readings, b: Readings) -> Readings:
     names = tuple(dict.fromkeys((*a.pose_names, *b.pose_names)))
     place = [np.array([names.index(n) for n in r.pose_names])[r.pose] for r in (a, b)]
-    states = {
-        name: np.concatenate([getattr(a.states, name), getattr(b.states, name)])
-        for name in States.__dataclass_fields__
-        if getattr(a.states, name) is not None
-    }
-    return Readings(
-        states=States(**states),
-        pose=np.concatenate(place),
-        load=np.concatenate([a.load, b.load]),
-        cycle=np.concatenate([a.cycle, b.cycle]),
-        value=np.concatenate([a.value, b.value]),
-        covariance=np.concatenate([a.covariance, b.covariance]),
-        load_names=a.load_names,
-        pose_names=names,
-    )
+    parts = zip((a, b), place, strict=True)
+    return Readings.joined([replace(r, pose=at, pose_names=names) for r, at in parts])

@@ -1,23 +1,36 @@
 """What the tests of the planner's information share."""
 
+from typing import Any
+
 import numpy as np
 
+from hilcal.cell import Cell
 from hilcal.config import CellConfig
+from hilcal.design.information import DesignProblem, problem
+from hilcal.design.nominal_model import nominal_model
 from hilcal.readings.readings import Readings
 from hilcal.types import Floats
 from tests.support.campaigns import configuration, plan
+
+
+def changed(config: CellConfig, **sections: dict[str, object]) -> CellConfig:
+    """The configuration with other keys in some sections."""
+    update = {name: getattr(config, name).model_copy(update=k) for name, k in sections.items()}
+    return config.model_copy(update=update)
 
 
 def config_of(
     mode: str = "deflection", *, against: object = (), noise: str = "single", **planning: object
 ) -> CellConfig:
     """The demo's cell; with `noise` "single" averaging helps nothing, as in the tests' worlds."""
-    config = configuration()
+    acquire = {"systematic_share": 1.0} if noise == "single" else {}
     asked = {"readings": mode, "against": against, **planning}
-    changed = {"planning": config.planning.model_copy(update=asked)}
-    if noise == "single":
-        changed["acquire"] = config.acquire.model_copy(update={"systematic_share": 1.0})
-    return config.model_copy(update=changed)
+    return changed(configuration(), planning=asked, acquire=acquire)
+
+
+def problem_of(cell: Cell, config: CellConfig, q: Floats, **options: Any) -> DesignProblem:
+    """The design problem of poses, before any reading."""
+    return problem(nominal_model(cell, config), config, q, **options)
 
 
 def poses_of(count: int, seed: int = 0) -> Floats:

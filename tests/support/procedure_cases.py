@@ -14,6 +14,7 @@ from hilcal.readings.whitening import Mode
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.run_log import RunLog
+from tests.support.plan_cases import changed
 
 HOUR = 3600.0
 
@@ -25,12 +26,8 @@ class KilledError(BaseException):
 def small(loads: int = 2, **planning: object) -> CellConfig:
     """The cell of the demo with few candidates, so that planning takes a second."""
     config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
-    quick = {"candidates": 60, "against": (), **planning}
-    changes = {
-        "planning": config.planning.model_copy(update=quick),
-        "loads": config.loads[::2][:loads] if loads else (),
-    }
-    return config.model_copy(update=changes)
+    quick = changed(config, planning={"candidates": 60, "against": (), **planning})
+    return quick.model_copy(update={"loads": config.loads[::2][:loads]})
 
 
 @dataclass

@@ -11,7 +11,7 @@ from hilcal.config import CellConfig, Obstacle
 from hilcal.design.feasible import DrawnPoses, Space, draw
 from hilcal.measuring.clearance import Clearance
 from hilcal.robot.arm import Arm
-from hilcal.robot.body import Capsule
+from hilcal.robot.scene import Capsule
 from hilcal.types import Floats
 
 POINTS = 41

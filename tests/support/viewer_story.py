@@ -8,7 +8,7 @@ from hilcal.identification.residual import ErrorBlock
 from hilcal.present.document import table
 from hilcal.present.story import DependenceCurve, Story, StoryRevision
 from hilcal.robot.arm import Arm
-from hilcal.robot.body import body_poses
+from hilcal.robot.scene import body_poses
 
 EFFECTS = ("joint_compliance", "base_compliance", "joint_tilt_compliance", "hysteresis")
 _DH = (  # d, a, alpha of a UR10e (Universal Robots' published DH parameters)

@@ -29,8 +29,7 @@ from hilcal.errors import InputError
 from hilcal.names import escaped
 from hilcal.numbers import length
 from hilcal.robot import se3
-from hilcal.robot.arm import Arm
-from hilcal.robot.conventions import as_drawn
+from hilcal.robot.arm import Arm, as_drawn
 from hilcal.types import Floats
 
 SAME = 1e-6

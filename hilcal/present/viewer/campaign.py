@@ -25,7 +25,7 @@ from hilcal.present.story import (
 )
 from hilcal.present.viewer import recording, style
 from hilcal.present.viewer.recording import along, fixed
-from hilcal.robot.body import capsules
+from hilcal.robot.scene import capsules
 from hilcal.types import Floats, Ints
 
 FOLLOWS = "What the residual follows"

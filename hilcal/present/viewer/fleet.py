@@ -15,7 +15,7 @@ from hilcal.present.document import heading
 from hilcal.present.viewer import recording, style
 from hilcal.present.viewer.recording import along, fixed
 from hilcal.robot.arm import Arm
-from hilcal.robot.body import body_poses, capsules
+from hilcal.robot.scene import body_poses, capsules
 from hilcal.store.revision import seconds_of
 from hilcal.types import Bools, Floats
 

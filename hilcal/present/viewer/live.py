@@ -26,7 +26,7 @@ from hilcal.present.progress import figures, met_words, spoken, status_words
 from hilcal.present.story import LIMITS, Story, levels
 from hilcal.present.viewer import campaign, recording, style
 from hilcal.present.viewer.recording import along, fixed
-from hilcal.robot.body import body_poses
+from hilcal.robot.scene import body_poses
 from hilcal.store.plan import Step
 from hilcal.types import Floats
 

@@ -23,9 +23,8 @@ from hilcal.present.document import Block, Words, heading, load_name, pairs, tab
 from hilcal.present.progress import spoken
 from hilcal.present.viewer import recording, style
 from hilcal.present.viewer.recording import along, fixed
-from hilcal.robot import body
 from hilcal.robot import chain as chains
-from hilcal.robot.body import body_poses
+from hilcal.robot.scene import body_poses, capsules
 from hilcal.store.plan import UNLOADED, Plan
 from hilcal.types import Floats, Ints
 
@@ -182,7 +181,7 @@ class PlanView:
 def _static_scene(rec: rr.RecordingStream, d: PlanView) -> None:
     """Log the static entities: shapes of the arm, surroundings, and a bead per reading."""
     fixed(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-    of_arm, parts = len(body.capsules(d.cell.arm)), d.shapes.scene.parts
+    of_arm, parts = len(capsules(d.cell.arm)), d.shapes.scene.parts
     style.log_shapes(rec, style.shapes(parts[:of_arm], parts[of_arm:]))
     _obstacles(rec, d.config.obstacles)
     _workspace(rec, d)

@@ -16,7 +16,7 @@ from hilcal.present import story
 from hilcal.present.document import Block, Chart, Items, Table, Words, says
 from hilcal.present.viewer.recording import along, fixed
 from hilcal.robot.arm import Arm
-from hilcal.robot.body import Capsule, capsules
+from hilcal.robot.scene import Capsule, capsules
 from hilcal.types import Bools, Floats
 
 Color = tuple[int, int, int]

@@ -20,9 +20,9 @@ from hilcal.identification.fit import fit
 from hilcal.identification.robot_frames import one_of_each
 from hilcal.model.model import Model
 from hilcal.robot import se3
+from hilcal.robot.arm import with_conventions
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
-from hilcal.robot.conventions import with_conventions
 from tests.support.campaigns import campaign, cell_of, plan
 from tests.support.refusals import refusal
 

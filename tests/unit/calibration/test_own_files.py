@@ -14,8 +14,8 @@ from hilcal.calibration.handover import Corrected, matlab
 from hilcal.calibration.own_files.correct import correct_file
 from hilcal.errors import InputError
 from hilcal.robot import se3
+from hilcal.robot.arm import with_conventions
 from hilcal.robot.catalogue import load_arm
-from hilcal.robot.conventions import with_conventions
 from tests.support.description_files import MJCF, SDF
 from tests.support.maker_arms import maker_arm, urdf_of
 from tests.support.refusals import edited, refusal, refusals, refuses

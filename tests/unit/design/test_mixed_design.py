@@ -7,7 +7,7 @@ import pytest
 
 from hilcal.design import mixed_design as condensing
 from hilcal.design.approximate_design import relax
-from hilcal.design.choice import choose, objective_of
+from hilcal.design.choice import EFFORT, objective_of
 from hilcal.design.criteria import MeanVariance
 from hilcal.design.information import (
     absolute_rows,
@@ -18,10 +18,11 @@ from hilcal.design.information import (
 )
 from hilcal.design.mixed_design import balanced, mixed_design, other_effects
 from hilcal.design.nominal_model import after, nominal_model
+from hilcal.design.optimum import best
 from hilcal.design.predicted import position_derivative, prediction_poses
 from tests.support.campaigns import campaign, cell_of
 from tests.support.fit_cases import based
-from tests.support.plan_cases import config_of, poses_of
+from tests.support.plan_cases import changed, config_of, poses_of
 from tests.support.rows import first
 
 AGAINST = ("joint_tilt_compliance", "link_geometry", "transmission_error")
@@ -30,8 +31,7 @@ STD_RAD = 2e-5
 
 def config(mode):
     found = config_of(mode, against=AGAINST, work_load="none" if mode == "absolute" else "10kg")
-    scatter = found.repeatability.model_copy(update={"joint_std_rad": STD_RAD})
-    return found.model_copy(update={"repeatability": scatter})
+    return changed(found, repeatability={"joint_std_rad": STD_RAD})
 
 
 def scene(mode, *, fitted):
@@ -83,7 +83,7 @@ def test_with_all_directions_the_mean_variance_is_that_of_all_parameters(monkeyp
 
 def variance_of(asked, counts):
     m = asked.prior + asked.units.information(counts)
-    return float(np.trace(asked.c @ np.linalg.inv(m)))
+    return float(np.trace(asked.criterion.c @ np.linalg.inv(m)))
 
 
 def test_directions_that_are_left_out_are_noise_and_nothing_is_learnt_of_them(monkeypatch):
@@ -113,19 +113,13 @@ def test_what_is_known_very_well_does_not_hide_what_a_reading_tells():
         plain,
         units=replace(plain.units, rows=plain.units.rows * size),
         prior=plain.prior * np.outer(size, size),
-        c=plain.c * np.outer(size, size),
+        criterion=MeanVariance(plain.criterion.c * np.outer(size, size)),
     )
     counts = np.ones(len(of.units))
-    told = [
-        float(np.trace(d.c @ np.linalg.inv(d.prior + d.units.information(counts))))
-        for d in (plain, balanced(uneven))
-    ]
+    told = [variance_of(d, counts) for d in (plain, balanced(uneven))]
     assert told[1] == pytest.approx(told[0], rel=1e-6)
-    best = [
-        relax(d.units, MeanVariance(d.c), 20.0, d.prior, names=d.names).value
-        for d in (balanced(plain), balanced(uneven))
-    ]
-    assert best[1] == pytest.approx(best[0], rel=1e-4)
+    found = [relax(balanced(d), 20.0).value for d in (plain, uneven)]
+    assert found[1] == pytest.approx(found[0], rel=1e-4)
 
 
 @pytest.mark.long
@@ -135,7 +129,7 @@ def test_a_plan_for_predictions_is_better_than_random_poses_and_certified():
     nominal = replace(nominal, live=nominal.live[:-6])  # no load tells the compliance
     of = problem(nominal, known, poses_of(80))
     asked = objective_of(of, known, "I", prediction_poses(of.nominal, known, poses_of(30, 9)))
-    design = choose(asked, 20.0, np.random.default_rng(0))
+    design = best(asked, 20.0, np.random.default_rng(0), effort=EFFORT)
     # the bound splits precise readings over all poses, which no plan can
     assert 0.1 < design.efficiency <= 1.0
     rng, others = np.random.default_rng(5), []

@@ -8,13 +8,14 @@ import scipy.linalg as sl
 from scipy import stats
 
 from hilcal.cell import cell_from_config
-from hilcal.design.criteria import Pair
+from hilcal.design.criterion import Pair
 from hilcal.design.discriminated_pairs import (
     LEVEL,
+    SUPPORTED,
     discriminated_pairs,
-    estimate,
     not_separable_message,
     pair_of,
+    posterior_draws,
     power,
     supported_parameters,
 )
@@ -115,10 +116,8 @@ def test_the_powers_of_a_plan_are_shares_of_rejections():
     """Of what is known and planned for, with the parameters that the readings support."""
     first = doubtful("base_compliance", 2)
     rng, trials = np.random.default_rng(3), 2000
-    found = measure_next(
-        first.rehearsal.cell, SMALL, first.fit, first.suspects, Request(6), rng,
-        reference=first.plan.joints("reference"),
-    )  # fmt: skip
+    asked = (first.rehearsal.cell, SMALL, first.fit, first.suspects, Request(6), rng)
+    found = measure_next(*asked, reference=first.plan.joints("reference"))
     of, known = found.planned.problem, discriminated_pairs(found.planned.problem).prior
     values, vectors = np.linalg.eigh(known)
     before = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
@@ -152,27 +151,26 @@ def told(effect, strength, seed=2):
 
 def test_an_estimate_holds_the_true_parameters():
     found, true, of = told(TILT, 4.0)
-    made = estimate(linearise(found), next(e for e in of.families if e.name == TILT))
-    assert made.supported
-    off = made.mean - true
-    distance2 = off @ np.linalg.solve(made.root @ made.root.T, off)
-    assert distance2 < stats.chi2.isf(1e-4, len(true))
-    drawn = made.draws(4000, np.random.default_rng(0))
-    assert np.array_equal(drawn[0], made.mean)
-    spread, stated = np.std(drawn, axis=0), np.linalg.norm(made.root, axis=1)
-    np.testing.assert_allclose(spread, stated, rtol=0.06)
+    linear, effect = linearise(found), next(e for e in of.families if e.name == TILT)
+    drawn = posterior_draws(linear, effect, 4000)
+    off, spread = drawn[0] - true, np.cov(drawn[1:].T)
+    assert off @ np.linalg.solve(spread, off) < stats.chi2.isf(1e-4, len(true))
+    columns = effect_columns(found, effect)
+    score = linear.score(columns.white, most=effect.most())
+    np.testing.assert_allclose(drawn[0], columns.scale * score.step, rtol=1e-12)
+    stated = columns.scale * np.linalg.norm(score.root, axis=1)
+    np.testing.assert_allclose(np.sqrt(np.diag(spread)), stated, rtol=0.06)
 
 
 def test_readings_that_do_not_speak_for_an_effect_tell_no_strength():
     found, _, of = told("hysteresis", 0.0)
-    made = estimate(linearise(found), of.families[0])
-    assert not made.supported
+    assert posterior_draws(linearise(found), of.families[0], 3) is None
     blind = replace(found.solution.prediction.situation.states, approach=None)
     situation = replace(found.solution.prediction.situation, states=blind)
     prediction = replace(found.solution.prediction, situation=situation)
     without = replace(found, solution=replace(found.solution, prediction=prediction))
     hysteresis = next(e for e in of.families if e.name == "hysteresis")
-    assert estimate(linearise(without), hysteresis) is None
+    assert posterior_draws(linearise(without), hysteresis, 3) is None
 
 
 # the plan
@@ -181,11 +179,9 @@ def test_readings_that_do_not_speak_for_an_effect_tell_no_strength():
 def test_pairs_that_no_measurement_separates_are_said_so():
     """In deflections a scale of the tracker is a common factor on all compliances."""
     first = doubtful(TILT, 1)
-    rng = np.random.default_rng(0)
+    asked = (SMALL, first.fit, ("tracker_scale", LINK), Request(4), np.random.default_rng(0))
     with pytest.raises(CannotAnswerError, match="no measurement separates them"):
-        measure_next(
-            cell_from_config(SMALL), SMALL, first.fit, ("tracker_scale", LINK), Request(4), rng
-        )
+        measure_next(cell_from_config(SMALL), *asked)
     assert not_separable_message([("a", "b"), ("a", "c"), ("b", "a"), ("c", "d")]) == (
         "no measurement in this cell separates a from b or c, nor c from d"
     )
@@ -194,10 +190,9 @@ def test_pairs_that_no_measurement_separates_are_said_so():
 @pytest.mark.parametrize("suspects", [(TILT,), (TILT, TILT)])
 def test_one_suspect_is_refused(suspects):
     first = doubtful(TILT, 1)
+    asked = (SMALL, first.fit, suspects, Request(4), np.random.default_rng(0))
     with pytest.raises(InputError, match="two or more"):
-        measure_next(
-            first.rehearsal.cell, SMALL, first.fit, suspects, Request(4), np.random.default_rng(0)
-        )
+        measure_next(first.rehearsal.cell, *asked)
 
 
 def test_what_was_ambiguous_is_decided():
@@ -319,9 +314,8 @@ def test_information_beside_the_model_and_power_beside_model_and_rival(mode):
     ridge = np.concatenate([linear.projection.ridge, np.zeros(x[LINK].shape[1])])
     with_rival = projection(np.hstack([linear.rows, x[LINK]]), ridge)
     promised = power(pair_of(of, (TILT, LINK), beta), so_far)
-    assert promised == pytest.approx(
-        family_power(with_rival.information(x[TILT]), beta, LEVEL), rel=1e-10
-    )
+    tested = family_power(with_rival.information(x[TILT]), beta, LEVEL)
+    assert promised == pytest.approx(tested, rel=1e-10)
     assert 2 * LEVEL < promised < 0.9
 
 
@@ -331,8 +325,7 @@ def test_evidence_and_estimates_of_suspects(mode):
     linear = linearise(found)
     ranked = {s.effect: s.score for s in rank_suspects(linear, candidates(found))}
     for family in of.families:
-        made, score = estimate(linear, family), ranked[family.name]
-        assert made.log_evidence == pytest.approx(score.log_evidence, rel=1e-12)
-        scale = np.array([p.scale for p in family.parameters])
-        np.testing.assert_allclose(made.mean, scale * score.step, rtol=1e-10)
-        assert made.supported
+        score, scale = ranked[family.name], np.array([p.scale for p in family.parameters])
+        drawn = posterior_draws(linear, family, 3)  # the diagnosis' evidence supports the effect
+        np.testing.assert_allclose(drawn[0], scale * score.step, rtol=1e-10)
+        assert score.log_evidence > SUPPORTED

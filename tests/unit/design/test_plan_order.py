@@ -68,13 +68,7 @@ def test_every_plan_keeps_its_promises(count, blocked, slack, unloaded, every, s
     for name in (str(x) for x in rng.choice(world.names, count + 2)):  # some poses several times
         some = tuple(str(x) for x in rng.permutation(LOADS)[: rng.integers(0, len(LOADS) + 1)])
         chosen.append(Chosen(name, (UNLOADED, *some), int(rng.integers(1, 3))))
-    how = Ordering(
-        slack=slack,
-        unloaded="first" if unloaded == "first" else "around",
-        reference_every_s=every,
-        repeats=1,
-        draws=3,
-    )
+    how = Ordering(slack, unloaded, every, repeats=1, draws=3)
     made = world.ordered(chosen, seed, how)
     plan = made.plan
     taken = [s for s in plan.steps if s.pose != REFERENCE]
@@ -86,9 +80,8 @@ def test_every_plan_keeps_its_promises(count, blocked, slack, unloaded, every, s
     assert sum(extra.values()) <= 1  # the repeat
     assert all(load == UNLOADED for _, load in extra)
     assert all(Step(s.pose, UNLOADED, s.cycle) in plan.steps for s in plan.steps)
-    cycles = [
-        tuple(sorted(s.load for s in taken if (s.pose, s.cycle) == k)) for k in _cycles(taken)
-    ]
+    arrivals = dict.fromkeys((s.pose, s.cycle) for s in taken)
+    cycles = [tuple(sorted(s.load for s in taken if (s.pose, s.cycle) == k)) for k in arrivals]
     together = Counter(tuple(sorted(c.loads)) for c in chosen for _ in range(c.count))
     assert not together - Counter(cycles)  # what shares an unloaded reading is as it was chosen
 
@@ -117,10 +110,6 @@ def test_every_plan_keeps_its_promises(count, blocked, slack, unloaded, every, s
         )
 
 
-def _cycles(steps):
-    return list(dict.fromkeys((s.pose, s.cycle) for s in steps))
-
-
 def test_the_same_seed_gives_the_same_order_and_another_one_another():
     world = World(9, 0.2, 3)
     made = [world.ordered(everything(world), seed).plan.to_json() for seed in (1, 1, 2)]
@@ -140,19 +129,15 @@ def test_absolute_readings_of_a_pose_share_no_more_than_they_must():
 
 def test_the_pace_is_that_of_the_configuration():
     world = World(4, 0.0, 1)
-    config = CellConfig.model_validate(
-        {**CONFIG.model_dump(), "planning": {"reading_s": 20.0, "load_change_s": 300.0}}
-    )
-    made = order_plan(
-        CELL, config, world.names, world.q, MIDDLE, everything(world), world.passable,
-        np.random.default_rng(0),
-    )  # fmt: skip
+    slow = {"reading_s": 20.0, "load_change_s": 300.0}
+    config = CellConfig.model_validate({**CONFIG.model_dump(), "planning": slow})
+    poses = (world.names, world.q, MIDDLE, everything(world))
+    made = order_plan(CELL, config, *poses, world.passable, np.random.default_rng(0))
     assert made.duration.readings == pytest.approx(20.0 * len(made.plan.steps))
     assert made.duration.load_changes == pytest.approx(300.0 * (len(LOADS) + 1))
     split = made.plan.about["duration_s"]
-    assert split["total"] == pytest.approx(
-        split["motion"] + split["readings"] + split["load_changes"], abs=0.2
-    )
+    parts = sum(split[part] for part in ("motion", "readings", "load_changes"))
+    assert split["total"] == pytest.approx(parts, abs=0.2)
 
 
 def test_a_pose_behind_another_one_is_reached_by_it():
@@ -263,11 +248,9 @@ def test_the_heaviest_of_three_loads_comes_in_the_middle():
     def free(start, ends, load):
         return np.ones(len(ends), dtype=np.bool_)
 
+    poses, how = (world.names, world.q, MIDDLE, chosen), Ordering(slack=0.1)
     for seed in range(3):
-        rng = np.random.default_rng(seed)
-        made = order_plan(
-            CELL, config, world.names, world.q, MIDDLE, chosen, free, rng, Ordering(slack=0.1)
-        )
+        made = order_plan(CELL, config, *poses, free, np.random.default_rng(seed), how)
         assert made.plan.loads[2] == "heavy"
 
 
@@ -277,9 +260,8 @@ def test_the_heaviest_of_three_loads_comes_in_the_middle():
 def test_a_pose_that_is_not_reached_is_named():
     world = World(9, 0.0, 2)
     world.free[LOADS[1]][:, 4] = False
-    refusal_of(
-        CannotAnswerError, f"pose p4 .* under {LOADS[1]}", world.ordered, everything(world), 0
-    )
+    message = f"pose p4 .* under {LOADS[1]}"
+    refusal_of(CannotAnswerError, message, world.ordered, everything(world), 0)
 
 
 def _held_karp(w):

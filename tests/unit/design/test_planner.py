@@ -13,14 +13,8 @@ from hilcal.cell import cell_from_config
 from hilcal.config.reference import to_toml
 from hilcal.config.sections import CellLoad
 from hilcal.design.choice import CRITERIA, costly_loads, objective_of
-from hilcal.design.information import problem
 from hilcal.design.nominal_model import nominal_model, planned_effects
-from hilcal.design.planner import (
-    Request,
-    UndeterminedParameter,
-    make,
-    without_undetermined,
-)
+from hilcal.design.planner import Request, UndeterminedParameter, make, without_undetermined
 from hilcal.design.predicted import predicted
 from hilcal.design.summary import remarks, summarise
 from hilcal.effects.catalogue import installed
@@ -33,7 +27,7 @@ from hilcal.store.run_log import PLAN
 from hilcal.tables.table import write_table
 from tests.support.campaigns import configuration
 from tests.support.cli_cases import ok, quickly_planned, refused, rehearsal, run
-from tests.support.plan_cases import config_of, poses_of
+from tests.support.plan_cases import changed, config_of, poses_of, problem_of
 from tests.support.refusals import check, refusal_of, refusals, refuses
 
 SMALL = {"candidates": 60, "against": ("joint_tilt_compliance",)}
@@ -41,9 +35,7 @@ SMALL = {"candidates": 60, "against": ("joint_tilt_compliance",)}
 
 def small(**planning):
     """The demo's cell with few candidates and one effect to look out for."""
-    config = configuration()
-    changed = config.planning.model_copy(update={**SMALL, **planning})
-    return config.model_copy(update={"planning": changed})
+    return changed(configuration(), planning={**SMALL, **planning})
 
 
 def planned(config, poses=5, seed=1, **wanted):
@@ -176,9 +168,8 @@ def test_a_load_that_is_there_twice_is_said_to_cost_more_than_it_tells():
     assert all(gain > 0 for _, gain in made.costly)
     assert any("is not worth its time" in words for words in remarks(made))
     steps = [s for s in made.ordered.plan.steps if s.pose != REFERENCE]
-    assert Counter(s.load for s in steps if s.load != UNLOADED) == {
-        load.name: 5 for load in config.loads
-    }
+    hung = Counter(s.load for s in steps if s.load != UNLOADED)
+    assert hung == dict.fromkeys((load.name for load in config.loads), 5)
 
 
 def test_no_load_costs_too_much_where_hanging_one_costs_nothing(usual):
@@ -301,13 +292,12 @@ def cell_with(*loads, **planning):
     return config_of(**planning).model_copy(update={"loads": loads})
 
 
-def problem_of(config, count=12):
-    model = nominal_model(cell_from_config(config), config)
-    return problem(model, config, poses_of(count))
+def twelve(config):
+    return problem_of(cell_from_config(config), config, poses_of(12))
 
 
 def test_weights_make_no_torque_about_a_vertical_joint():
-    whole = problem_of(cell_with(WEIGHT))
+    whole = twelve(cell_with(WEIGHT))
     reduced, lost = without_undetermined(whole)
     assert [u.name for u in lost] == [J1]
     assert "joint 1 needs a side pull" in lost[0].remark
@@ -319,15 +309,13 @@ def test_weights_make_no_torque_about_a_vertical_joint():
 
 
 def test_with_a_side_pull_everything_is_determined():
-    whole = problem_of(cell_with(WEIGHT, PULL))
-    reduced, lost = without_undetermined(whole)
-    assert lost == ()
-    assert reduced is whole
+    whole = twelve(cell_with(WEIGHT, PULL))
+    assert without_undetermined(whole) == (whole, ())
 
 
 def test_confounded_parameters_are_named_together():
     """Two columns that are multiples of each other: one of them is left out, both are named."""
-    whole = problem_of(cell_with(WEIGHT, PULL))
+    whole = twelve(cell_with(WEIGHT, PULL))
     a, b = (whole.of_effect("joint_compliance")[k] for k in (1, 2))
     rows = whole.units.rows.copy()
     rows[:, :, a] = 2.0 * rows[:, :, b]
@@ -339,7 +327,7 @@ def test_confounded_parameters_are_named_together():
 
 def test_a_cell_that_determines_nothing_is_refused():
     config = cell_with(WEIGHT, model=("joint_compliance(joints=1)",))
-    refusal_of(CannotAnswerError, "side pull", without_undetermined, problem_of(config))
+    refusal_of(CannotAnswerError, "side pull", without_undetermined, twelve(config))
 
 
 def test_other_parameters_have_plain_words():

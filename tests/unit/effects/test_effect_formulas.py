@@ -12,9 +12,9 @@ from hilcal.effects.link_compliance import long_links
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.model.model import Model
 from hilcal.robot import chain as chains
+from hilcal.robot.arm import as_counted
 from hilcal.robot.catalogue import robot_names
 from hilcal.robot.chain import evaluate
-from hilcal.robot.conventions import as_counted
 from tests.support.arm_cases import arm_of
 from tests.support.effect_cases import (
     CELLS,

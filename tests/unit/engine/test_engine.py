@@ -15,9 +15,7 @@ import numpy as np
 import psutil
 import pytest
 
-from hilcal.engine.cluster import Cluster
-from hilcal.engine.engine import open_engine
-from hilcal.engine.processes import ClusterError
+from hilcal.engine import Cluster, ClusterError, open_engine
 from hilcal.errors import InputError
 from tests.support.cluster import (
     HERE,
@@ -107,12 +105,10 @@ def test_what_a_killed_worker_held_is_computed_by_another(tmp_path):
         assert engine.map(refuse, range(2)) == (0, 1)  # nothing of it is left
 
 
-@pytest.mark.parametrize("kind", [
-    signal.SIGINT,
-    *(
-        pytest.param(kind, marks=pytest.mark.slow)
-        for kind in (signal.SIGTERM, signal.SIGHUP, signal.SIGKILL)
-    )])  # fmt: skip
+QUICK, SLOW = signal.SIGINT, (signal.SIGTERM, signal.SIGHUP, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("kind", [QUICK, *(pytest.param(k, marks=pytest.mark.slow) for k in SLOW)])
 def test_a_signal_leaves_no_process_and_no_folder(kind, tmp_path):
     process = subprocess.Popen(
         [sys.executable, "-m", "tests.support.engine_cases"],
@@ -179,17 +175,21 @@ def test_certificates_that_are_not_there_are_said_in_one_line(tmp_path):
             pass
 
 
-def test_what_is_no_cluster_is_said_in_one_line():
-    with pytest.raises(InputError, match="not an address"), open_engine(scheduler="nowhere"):
-        pass
-    with pytest.raises(InputError, match="from 1"), open_engine(0):
-        pass
-    with pytest.raises(InputError, match="own workers"), open_engine(2, "tcp://127.0.0.1:1"):
+@pytest.mark.parametrize(
+    ("workers", "address", "message"),
+    [
+        (None, "nowhere", "not an address"),
+        (0, None, "from 1"),
+        (2, "tcp://127.0.0.1:1", "own workers"),
+    ],
+)
+def test_what_is_no_cluster_is_said_in_one_line(workers, address, message):
+    with pytest.raises(InputError, match=message), open_engine(workers, address):
         pass
 
 
 def test_a_scheduler_without_workers_is_refused(monkeypatch):
-    monkeypatch.setattr("hilcal.engine.cluster.WORKERS_S", 0.2)
+    monkeypatch.setattr("hilcal.engine.WORKERS_S", 0.2)
     with (
         scheduler() as address,
         pytest.raises(ClusterError, match="dask worker"),

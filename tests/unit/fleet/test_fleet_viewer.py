@@ -6,7 +6,7 @@ import rerun as rr
 
 from hilcal.present.viewer import style
 from hilcal.present.viewer.fleet import DrawnType, places, record_fleet
-from hilcal.robot.body import capsules
+from hilcal.robot.scene import capsules
 from hilcal.transfer.fleet import Fleet
 from hilcal.transfer.pooled import pooled
 from tests.support.picture import Shot, pictures, vulkan_available

@@ -19,8 +19,8 @@ from hilcal.identification.misdescription import (
 )
 from hilcal.identification.registration import register
 from hilcal.identification.table_preview import clearly_best, rank_conventions
+from hilcal.robot.arm import as_counted
 from hilcal.robot.catalogue import load_arm, robot_names
-from hilcal.robot.conventions import as_counted
 from studies.random_descriptions import draw, judge, read
 from studies.random_descriptions import readings_of as table_of
 from tests.support import foreign_tables

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from hilcal.engine.engine import open_engine
+from hilcal.engine import open_engine
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.bootstrap import again, bootstrap
 from hilcal.identification.fit import fit

@@ -10,7 +10,7 @@ from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError
 from hilcal.model.model import Model
 from hilcal.readings.readings import States
-from hilcal.robot import batch
+from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import Deviation
 from hilcal.robot.statics import Load, slot_wrenches
@@ -164,7 +164,7 @@ def test_one_state_at_a_time_gives_the_same_numbers():
 def test_chunks_give_the_same_numbers(size, monkeypatch):
     model, states, theta = case()
     together = everything(model, states, theta)
-    monkeypatch.setattr(batch, "CHUNK", size)
+    monkeypatch.setattr(se3, "CHUNK", size)
     assert_all_close(everything(model, states, theta), together)
 
 

@@ -18,7 +18,7 @@ from hilcal.present.document import table
 from hilcal.present.story import levels
 from hilcal.present.viewer import campaign, save, serve, style
 from hilcal.present.viewer.recording import executable
-from hilcal.robot.body import body_poses
+from hilcal.robot.scene import body_poses
 from tests.support.paths import ROOT
 from tests.support.picture import Shot, pictures, pixels, vulkan_available
 from tests.support.recordings import rows, same, texts

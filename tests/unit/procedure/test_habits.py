@@ -8,6 +8,7 @@ from hilcal.config.cell import Target, Tool
 from hilcal.config.sections import Obstacle
 from hilcal.store.campaign_file import CampaignFile
 from tests.support.campaigns import configuration
+from tests.support.plan_cases import changed
 from tests.support.procedure_cases import drawn, small
 
 
@@ -18,19 +19,14 @@ def weights():
 
 
 def in_base_axes():
-    config = small()
-    tracker = config.tracker.model_copy(update={"frame": "base"})
-    return config.model_copy(update={"tracker": tracker})
+    return changed(small(), tracker={"frame": "base"})
 
 
 def two_targets():
-    targets = (
-        Target(name="A", target_m=(0.06, 0.02, 0.12)),
-        Target(name="B", target_m=(-0.06, 0.02, 0.12)),
-    )
-    tool = Tool(
-        load_point_m=(0.1, 0.0, 0.15), mass_kg=0.8, com_m=(0.01, 0.0, 0.06), targets=targets
-    )
+    places = {"A": (0.06, 0.02, 0.12), "B": (-0.06, 0.02, 0.12)}
+    targets = tuple(Target(name=name, target_m=at) for name, at in places.items())
+    weight = {"mass_kg": 0.8, "com_m": (0.01, 0.0, 0.06)}
+    tool = Tool(load_point_m=(0.1, 0.0, 0.15), targets=targets, **weight)
     return small().model_copy(update={"tool": tool})
 
 
@@ -75,10 +71,8 @@ def test_points_in_the_way_of_something_are_left_out_by_name(tmp_path):
 
 @pytest.mark.slow
 def test_tight_joint_limits_leave_few_poses(tmp_path):
-    config = small()
-    limits = config.limits.model_copy(update={"joint_margin_rad": 1.6})
-    planning = config.planning.model_copy(update={"singularity": 0.0, "candidates": 40})
-    config = config.model_copy(update={"limits": limits, "planning": planning})
+    planning = {"singularity": 0.0, "candidates": 40}
+    config = changed(small(), limits={"joint_margin_rad": 1.6}, planning=planning)
     d = drawn(tmp_path / "run.hilcal", config=config, poses=5, validation=12)
     error = d.to_the_end().everything
     assert 1 <= error.count <= 12

@@ -5,7 +5,7 @@ import pytest
 
 from hilcal.cell import cell_from_config
 from hilcal.design.feasible import Space
-from hilcal.design.run_order import LoadBlock, PlannedStop, assembled
+from hilcal.design.run_order import LoadBlock, assembled
 from hilcal.drivers.simulated.rehearsal import planned_states
 from hilcal.procedure.validation_plan import fewer_returns
 from hilcal.robot.catalogue import configs_dir
@@ -29,13 +29,13 @@ def test_a_loaded_reading_keeps_its_unloaded_one(space, seed):
 
     def loops(poses):
         parts = np.array_split(poses, rng.integers(1, 5))
-        return tuple(tuple(PlannedStop(int(p), 0) for p in part) for part in parts)
+        return tuple(tuple((int(p), 0) for p in part) for part in parts)
 
     before = LoadBlock(UNLOADED, loops(np.arange(1, 13)), 1.0)
     blocks = [LoadBlock(load, loops(own), 1.0) for load, own in zip(loads, each, strict=True)]
     steps = assembled(names, before, blocks, LoadBlock(UNLOADED, (), 0.0))
     plan = Plan((REFERENCE, *names), rng.normal(size=(13, 6)), steps)
-    kept = fewer_returns(plan, space, space.config).steps
+    kept = fewer_returns(plan, space).steps
     unloaded = {(s.pose, s.cycle) for s in kept if s.load == UNLOADED}
     assert {(s.pose, s.cycle) for s in kept} <= unloaded
     assert (kept[0], kept[-1]) == (steps[0], steps[-1])

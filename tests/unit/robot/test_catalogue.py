@@ -13,57 +13,42 @@ from hilcal.robot.chain import evaluate
 from hilcal.robot.scene import pinocchio_model
 from hilcal.robot.statics import Load, slot_wrenches
 from hilcal.robot.urdf import arm_from_urdf
+from tests.support.arm_cases import classic_flange, flange_at
 from tests.support.refusals import edited, refusal, refusals, refuses
+from tests.support.space_cases import frames
 
 PI2 = math.pi / 2
-ALPHA = [PI2, 0.0, 0.0, PI2, -PI2, 0.0]
-# (d1, a2, a3, d4, d5, d6) of the published tables, and the weight of the whole arm, kg
+ALPHA, Z = [PI2, 0.0, 0.0, PI2, -PI2, 0.0], [0.0] * 6
+# (d1, a2, a3, d4, d5, d6) of the published tables, the weight of the whole arm, the payload, kg
 PUBLISHED = {
-    "ur3": (0.1519, -0.24365, -0.21325, 0.11235, 0.08535, 0.0819, 11.0),
-    "ur5": (0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823, 18.4),
-    "ur10": (0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922, 28.9),
-    "ur3e": (0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921, 11.2),
-    "ur5e": (0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, 20.6),
-    "ur7e": (0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, 20.6),
-    "ur8long": (0.2186, -0.8989, -0.7149, 0.1824, 0.1361, 0.1434, None),
-    "ur12e": (0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655, 33.5),
-    "ur15": (0.2186, -0.6475, -0.5164, 0.1824, 0.1361, 0.1434, 40.7),
-    "ur18": (0.2186, -0.475, -0.3389, 0.1824, 0.1361, 0.1434, None),
-    "ur10e": (0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655, 33.5),
-    "ur16e": (0.1807, -0.4784, -0.36, 0.17415, 0.11985, 0.11655, 33.1),
-    "ur20": (0.2363, -0.862, -0.7287, 0.201, 0.1593, 0.1543, 64.0),
-    "ur30": (0.2363, -0.637, -0.5037, 0.201, 0.1593, 0.1543, 63.5),
+    "ur3": (0.1519, -0.24365, -0.21325, 0.11235, 0.08535, 0.0819, 11.0, 3),
+    "ur5": (0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823, 18.4, 5),
+    "ur10": (0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922, 28.9, 10),
+    "ur3e": (0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921, 11.2, 3),
+    "ur5e": (0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, 20.6, 5),
+    "ur7e": (0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, 20.6, 7.5),
+    "ur8long": (0.2186, -0.8989, -0.7149, 0.1824, 0.1361, 0.1434, None, 8),
+    "ur12e": (0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655, 33.5, 12.5),
+    "ur15": (0.2186, -0.6475, -0.5164, 0.1824, 0.1361, 0.1434, 40.7, 15),
+    "ur18": (0.2186, -0.475, -0.3389, 0.1824, 0.1361, 0.1434, None, 18),
+    "ur10e": (0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655, 33.5, 12.5),
+    "ur16e": (0.1807, -0.4784, -0.36, 0.17415, 0.11985, 0.11655, 33.1, 16),
+    "ur20": (0.2363, -0.862, -0.7287, 0.201, 0.1593, 0.1543, 64.0, 20),
+    "ur30": (0.2363, -0.637, -0.5037, 0.201, 0.1593, 0.1543, 63.5, 30),
 }
-PAYLOAD = {
-    "ur3": 3, "ur5": 5, "ur10": 10, "ur3e": 3, "ur5e": 5,
-    "ur10e": 12.5, "ur16e": 16, "ur20": 20, "ur30": 30,
-    "ur7e": 7.5, "ur8long": 8, "ur12e": 12.5, "ur15": 15, "ur18": 18,
-}  # fmt: skip
 
 
 def rz(angle):
-    return pin.SE3(
-        pin.AngleAxis(angle, np.array([0.0, 0.0, 1.0])).matrix(), np.zeros(3)
-    ).homogeneous
+    return drawn(0, 0, 0, 0, 0, angle)
 
 
-def dh_frames(name, q):
-    """Frames after each row, from the closed form of a classic DH matrix."""
-    d1, a2, a3, d4, d5, d6, _ = PUBLISHED[name]
-    frames, pose = [], np.eye(4)
-    for t, a, d, al in zip(q, [0, a2, a3, 0, 0, 0], [d1, 0, 0, d4, d5, d6], ALPHA, strict=True):
-        c, s, ca, sa = math.cos(t), math.sin(t), math.cos(al), math.sin(al)
-        row = [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d]]
-        pose = pose @ np.array([*row, [0, 0, 0, 1]], dtype=float)
-        frames.append(pose)
-    return frames
+def published_flange(name, q):
+    d1, a2, a3, d4, d5, d6, *_ = PUBLISHED[name]
+    return classic_flange(np.array([Z, [0, a2, a3, 0, 0, 0], [d1, 0, 0, d4, d5, d6], ALPHA]), q)
 
 
 def flange(arm, q):
-    pose = arm.links[0]
-    for angle, link in zip(q, arm.links[1:], strict=True):
-        pose = pose @ rz(angle) @ link
-    return pose
+    return frames(arm, q)[-1]
 
 
 def gravity_torques(arm, q):
@@ -172,9 +157,7 @@ def test_arms_of_other_makers_are_those_of_their_urdfs(name):
         for (origin, axis), angle in zip(joints, row, strict=True):
             turn = pin.SE3(pin.AngleAxis(angle, np.array(axis)).matrix(), np.zeros(3)).homogeneous
             pose = pose @ origin @ turn
-        pose = pose @ tool
-        np.testing.assert_allclose(found.rotation[-1, i], pose[:3, :3], rtol=0, atol=1e-9)
-        np.testing.assert_allclose(found.position[-1, i], pose[:3, 3], rtol=0, atol=1e-9)
+        flange_at(found, i, pose @ tool, 1e-9)
     assert arm.source
     assert np.isfinite(arm.payload)
     assert np.all((arm.q_max - arm.q_min > 1.0) & (arm.q_max - arm.q_min < 15.0))
@@ -193,7 +176,7 @@ def test_pinocchio_agrees(name):
     for q in rng.uniform(-np.pi, np.pi, (20, 6)):
         pin.framesForwardKinematics(model, data, q)
         placement = data.oMf[model.getFrameId("flange")].homogeneous
-        np.testing.assert_allclose(placement, dh_frames(name, q)[-1], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(placement, published_flange(name, q), rtol=0, atol=1e-12)
         torques = pin.computeGeneralizedGravity(model, data, q)
         np.testing.assert_allclose(torques, gravity_torques(arm, q), rtol=0, atol=1e-4)
     np.testing.assert_array_equal(model.lowerPositionLimit, arm.q_min)
@@ -203,12 +186,12 @@ def test_pinocchio_agrees(name):
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_masses_and_limits_are_plausible(name):
-    arm, weight = load_arm(name), PUBLISHED[name][-1]
+    arm, (*_, weight, payload) = load_arm(name), PUBLISHED[name]
     # the foot does not move: the rest weighs less than the whole, but is most of it
     if weight is not None:
         assert 0.75 * weight < arm.masses.sum() < weight
     assert np.all(arm.masses > 0)
-    assert arm.payload == PAYLOAD[name]
+    assert arm.payload == payload
     assert np.all(arm.q_min == -arm.q_max)
     assert np.degrees(arm.q_max).round(9).tolist() == [360, 360, 180, 360, 360, 360]
     assert "Universal Robots" in arm.source
@@ -230,7 +213,7 @@ def test_a_dh_table_of_ones_own(tmp_path):
     shifted = rows[1].replace("alpha_deg = 90.0", "alpha_deg = 90.0\noffset_deg = 90.0")
     (tmp_path / "mine.toml").write_text("[[joints]]".join([rows[0], shifted, *rows[2:]]))
     arm, q = load_arm("mine.toml", tmp_path), np.array([0.3, -1.0, 1.2, 0.1, 0.5, 2.0])
-    turned = dh_frames("ur5e", q + np.array([PI2, 0, 0, 0, 0, 0]))[-1]
+    turned = published_flange("ur5e", q + np.array([PI2, 0, 0, 0, 0, 0]))
     np.testing.assert_allclose(flange(arm, q), turned, rtol=0, atol=1e-12)
     assert arm.name == "mine"
 
@@ -378,7 +361,7 @@ def test_continuous_joint_turns_freely(tmp_path):
     path.write_text(text)
     arm, q = arm_from_urdf(path, tip_link="tool0"), np.array([0.3, -1.0, 1.2, 0.1, 0.5, 2.0])
     np.testing.assert_allclose(arm.q_max, 2 * np.pi)
-    np.testing.assert_allclose(flange(arm, q), dh_frames("ur5e", q)[-1], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(flange(arm, q), published_flange("ur5e", q), rtol=0, atol=1e-12)
 
 
 def test_prismatic_joint_in_the_arm_slides(tmp_path):

@@ -14,13 +14,15 @@ from hilcal.design.feasible import Space, draw
 from hilcal.model.model import Model
 from hilcal.readings.covariance import TrackerNoise
 from hilcal.readings.readings import States
+from hilcal.robot.arm import as_counted
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import drive_jacobian, evaluate
-from hilcal.robot.conventions import as_counted
 from hilcal.robot.urdf import arm_from_urdf
 from hilcal.tables.table import read_table
+from tests.support.arm_cases import flange_at, same_flange
 from tests.support.effect_cases import make
 from tests.support.refusals import refusal, refusals, refuses
+from tests.support.serial_urdf import serial_urdf
 
 SIGN = [1, -1, 1, 1, -1, 1]
 OFFSET = [0.0, 90.0, -30.0, 0.0, 180.0, 5.0]
@@ -44,8 +46,7 @@ def test_flange_and_masses_are_those_of_the_drawn_arm_at_the_turned_angles():
     q = np.random.default_rng(0).uniform(-2, 2, (20, 6))
     drawn, counted = load_arm("ur10e"), described(**KEYS)
     a, b = evaluate(drawn, turned(q)), evaluate(counted, q)
-    np.testing.assert_allclose(b.position[-1], a.position[-1], atol=1e-12)
-    np.testing.assert_allclose(b.rotation[-1], a.rotation[-1], atol=1e-12)
+    same_flange(b, a)
     np.testing.assert_allclose(b.com, a.com, atol=1e-12)
 
 
@@ -82,14 +83,8 @@ HEAD = 'title = "t"\npayload_kg = 5.0\nsource = "s"\nconvention = "modified"\n'
 def craig(alpha, a, theta, d):
     """(4, 4) of a modified row, element by element (Craig, equation 3.6)."""
     ct, st, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha), np.sin(alpha)
-    return np.array(
-        [
-            [ct, -st, 0, a],
-            [st * ca, ct * ca, -sa, -sa * d],
-            [st * sa, ct * sa, ca, ca * d],
-            [0, 0, 0, 1],
-        ]
-    )
+    y, z = [st * ca, ct * ca, -sa, -sa * d], [st * sa, ct * sa, ca, ca * d]
+    return np.array([[ct, -st, 0, a], y, z, [0, 0, 0, 1]])
 
 
 def test_modified_rows_are_those_of_craig(tmp_path):
@@ -105,21 +100,14 @@ def test_modified_rows_are_those_of_craig(tmp_path):
         at = at @ craig(np.radians(al), a, angle + np.radians(o), d)
         coms.append((at @ [0.1, 0.2, 0.3, 1.0])[:3])
     chain = evaluate(arm, q[None])
-    np.testing.assert_allclose(chain.position[-1][0], at[:3, 3], atol=1e-12)
-    np.testing.assert_allclose(chain.rotation[-1][0], at[:3, :3], atol=1e-12)
+    flange_at(chain, 0, at)
     np.testing.assert_allclose(chain.com[:, 0], coms, atol=1e-12)
-
-
-URDF = """<robot name="r"><link name="base"/><link name="a"/><link name="b"/>
-<joint name="j1" type="{kind}"><parent link="base"/><child link="a"/><axis xyz="0 0 1"/>
-<limit lower="0" upper="0" effort="1" velocity="1"/></joint>
-<joint name="j2" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0.5 0 0"/>
-<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
 
 
 def urdf(tmp_path, kind="revolute"):
     path = tmp_path / "r.urdf"
-    path.write_text(URDF.format(kind=kind))
+    last = {"xyz": "0.5 0 0", "axis": "0 1 0", "lower": -1, "upper": 1}
+    path.write_text(serial_urdf([{"type": kind, "lower": 0, "upper": 0}, last]))
     return path
 
 
@@ -135,11 +123,6 @@ def test_a_rail_without_ends_is_refused_by_name(tmp_path):
     refusal(r'prismatic joint "j1" has no <limit', arm_from_urdf, urdf(tmp_path, "prismatic"))
 
 
-JOINT = """<joint name="j{k}" type="revolute"><parent link="l{k}"/><child link="l{next}"/>
-<origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="{axis}"/>
-<limit lower="-3.1" upper="3.1" effort="100" velocity="1"/>{mimic}</joint>
-<link name="l{next}"><inertial><origin xyz="0.1 0.02 0.05"/><mass value="{mass}"/>
-<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
 NOISE = TrackerNoise(10e-6, 0.3e-6, 15e-6, 6e-6)
 FIGURES = (
     ("0 0 0.3", "0 0 0", "0 0 1"),
@@ -152,13 +135,13 @@ FOLLOWS = {3: '<mimic joint="j2" multiplier="-1" offset="0.3"/>', 4: '<mimic joi
 
 
 def urdf_of_mimic(tmp_path, follows=FOLLOWS):
-    body = "".join(
-        JOINT.format(k=k, next=k + 1, xyz=xyz, rpy=rpy, axis=axis, mass=5.0 / k,
-                     mimic=follows.get(k, ""))
-        for k, (xyz, rpy, axis) in enumerate(FIGURES, start=1)
-    )  # fmt: skip
     path = tmp_path / "arm.urdf"
-    path.write_text(f'<robot name="arm"><link name="l1"/>{body}</robot>')
+    rows = [
+        {"xyz": xyz, "rpy": rpy, "axis": axis, "mass": 5.0 / k, "com": "0.1 0.02 0.05",
+         "mimic": follows.get(k, "")}
+        for k, (xyz, rpy, axis) in enumerate(FIGURES, start=1)
+    ]  # fmt: skip
+    path.write_text(serial_urdf(rows))
     return path
 
 
@@ -185,9 +168,7 @@ def test_it_stands_and_is_pulled_as_pinocchio_says(tmp_path):
     for k in range(len(q)):
         at = q[k, [0, 1, 4]]
         pin.framesForwardKinematics(model, data, at)
-        place = data.oMf[model.getFrameId("l6")]
-        np.testing.assert_allclose(s.chain.position[-1][k], place.translation, atol=1e-12)
-        np.testing.assert_allclose(s.chain.rotation[-1][k], place.rotation, atol=1e-12)
+        flange_at(s.chain, k, data.oMf[model.getFrameId("l5")].homogeneous)
         held = pin.computeGeneralizedGravity(model, data, at) * 9.80665 / 9.81
         np.testing.assert_allclose(-s.torque[k, [0, 1, 4]], held, atol=1e-9)
         assert not s.torque[k, [2, 3]].any()
@@ -217,8 +198,7 @@ def test_signs_and_zeros_of_the_controller_go_with_it(tmp_path):
     drawn[:, 4] += 0.5 * q[:, 0]
     drawn = arm.complete(drawn)
     a, b = evaluate(arm, drawn), evaluate(counted, counted.complete(q))
-    np.testing.assert_allclose(b.position[-1], a.position[-1], atol=1e-12)
-    np.testing.assert_allclose(b.rotation[-1], a.rotation[-1], atol=1e-12)
+    same_flange(b, a)
     back = counted.complete(q) * by.joint_sign + np.radians(by.joint_offset_deg)
     np.testing.assert_allclose(back[:, [2, 3]], drawn[:, [2, 3]], atol=1e-12)
 

@@ -12,10 +12,9 @@ from hilcal.drivers.simulated.ur_state import GRAVITY, Kinematics
 from hilcal.drivers.simulated.world import SimulatedNoise, World
 from hilcal.identification.full_covariance import joint_factors
 from hilcal.model.model import Model
-from hilcal.robot.body import body_poses, capsules, is_known
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
-from hilcal.robot.scene import Scene, pinocchio_model
+from hilcal.robot.scene import Scene, body_poses, capsules, is_known, pinocchio_model
 from tests.support.campaigns import true_parameters
 from tests.support.effect_cases import make, numeric_jacobian, some_states
 from tests.support.readings_cases import made
@@ -80,9 +79,8 @@ def test_the_torque_of_a_law_is_that_of_the_drive(mechanical):
 
     def energy(chain):
         points = np.einsum("nij,j->ni", chain.rotation[-1], load) + chain.position[-1]
-        held = np.einsum("knj,k->nj", chain.com, cell.arm.masses) + weight * chain.point(
-            cell.tool_com
-        )
+        held = np.einsum("knj,k->nj", chain.com, cell.arm.masses)
+        held += weight * chain.point(cell.tool_com)
         return np.sum(points * states.wrench[:, :3], axis=1) + held @ cell.gravity
 
     for j in range(6):
@@ -151,9 +149,8 @@ def test_shapes_of_turned_and_coupled_joints_are_those_of_the_drawn_arm():
     for mine, other in zip(capsules(arm), capsules(drawn), strict=True):
         assert (mine.name, mine.body, mine.radius) == (other.name, other.body, other.radius)
         for a, b in ((mine.start, other.start), (mine.end, other.end)):
-            np.testing.assert_allclose(
-                places[:, mine.body] @ [*a, 1], expected[:, mine.body] @ [*b, 1], atol=1e-12
-            )
+            here, there = places[:, mine.body] @ [*a, 1], expected[:, mine.body] @ [*b, 1]
+            np.testing.assert_allclose(here, there, atol=1e-12)
     here, there = Scene(arm), Scene(drawn)
     for one, two in zip(q, theta, strict=True):
         assert here.itself.distance(one) == pytest.approx(there.itself.distance(two), abs=1e-9)
@@ -180,6 +177,5 @@ def test_the_arms_scatter_is_that_of_its_drives(mechanical):
     for j in range(6):
         one = np.tile(1e-6 * np.eye(6)[j], (3, 1))
         ahead, back = (world.sight(states, s).position for s in (one, -one))
-        np.testing.assert_allclose(
-            factors[:, :, j], scatter[j] * (ahead - back) / 2e-6, rtol=1e-6, atol=1e-12
-        )
+        expected = scatter[j] * (ahead - back) / 2e-6
+        np.testing.assert_allclose(factors[:, :, j], expected, rtol=1e-6, atol=1e-12)

@@ -1,7 +1,5 @@
 """The kinematics that a factory measured: read from its files, and put into an arm."""
 
-import math
-
 import numpy as np
 import pytest
 
@@ -17,6 +15,7 @@ from hilcal.robot.factory import (
     read_factory,
     with_factory,
 )
+from tests.support.arm_cases import classic_flange
 from tests.support.factory_cases import UR5E_YAML, factory_of, measured_arm
 from tests.support.refusals import edited, refusal, refusals, refuses
 
@@ -32,19 +31,6 @@ calibration_status = 2   # 0 == notInitialized, 1 == notLinearised, 2 == Lineari
 """
 
 
-def by_rows(rows, q):
-    """Flange positions (N, 3) by the closed form of a classic row, one matrix after the other."""
-    out = []
-    for angles in q:
-        pose = np.eye(4)
-        for (theta, a, d, alpha), angle in zip(rows.T, angles, strict=True):
-            c, s, ca, sa = (f(x) for x in (angle + theta, alpha) for f in (math.cos, math.sin))
-            row = [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d]]
-            pose = pose @ np.array([*row, [0, 0, 0, 1]])
-        out.append(pose[:3, 3])
-    return np.array(out)
-
-
 def states(n=50):
     return np.random.default_rng(4).uniform(-np.pi, np.pi, (n, 6))
 
@@ -57,9 +43,8 @@ def test_rows_whose_distances_cancel_are_held_exactly_near_the_nominal_frames(na
     assert np.abs(arm.links - nominal.links).max() < 0.01
     q = states()
     # rounding of some km: 1e-16 * 2e3 m, a few times
-    np.testing.assert_allclose(
-        evaluate(arm, q).position[-1], by_rows(factory.rows, q), rtol=0, atol=1e-11
-    )
+    there = [classic_flange(factory.rows, x)[:3, 3] for x in q]
+    np.testing.assert_allclose(evaluate(arm, q).position[-1], there, rtol=0, atol=1e-11)
     assert flange_difference(arm, measured_arm(name))[1] < 1e-11
     assert flange_difference(arm, nominal)[1] > 1e-3
     np.testing.assert_array_equal(arm.coms, nominal.coms)

@@ -24,8 +24,10 @@ from hilcal.robot.chain import evaluate
 from hilcal.robot.urdf import arm_from_urdf
 from hilcal.store.plan import Plan, Step
 from hilcal.tables.table import read_table, write_table
+from tests.support.arm_cases import flange_at
 from tests.support.cli_cases import ok, refused
 from tests.support.refusals import edited, refusals, refuses
+from tests.support.serial_urdf import serial_urdf
 
 TRACK = """title = "UR10e on a track"
 payload_kg = 12.5
@@ -45,37 +47,23 @@ force_max_N = 2000.0
 
 """
 """A track along x of the base, 0.3 m above it; the arm stands upright on it."""
-GANTRY = """<robot name="gantry"><link name="base_link"/>
-<joint name="x" type="prismatic"><origin xyz="0 0 2.5"/><parent link="base_link"/>
-<child link="bridge"/><axis xyz="1 0 0"/><limit lower="-2" upper="2" effort="3000" velocity="1"/>
-</joint><link name="bridge"/>
-<joint name="y" type="prismatic"><parent link="bridge"/><child link="carriage"/>
-<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="2000" velocity="1"/></joint>
-<link name="carriage"/>
-<joint name="z" type="prismatic"><parent link="carriage"/><child link="column"/>
-<axis xyz="0 0 -1"/><limit lower="0" upper="1.2" effort="2000" velocity="1"/></joint>
-<link name="column"><inertial><origin xyz="0 0 -0.4"/><mass value="30"/>
-<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
-<joint name="c" type="revolute"><origin xyz="0.1 0 -0.8"/><parent link="column"/>
-<child link="head"/><axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="80" velocity="1"/>
-</joint><link name="head"/>
-<joint name="a" type="revolute"><origin xyz="0 0 -0.2" rpy="1.2 0.3 0"/><parent link="head"/>
-<child link="wrist"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="60" velocity="1"/>
-</joint><link name="wrist"/>
-<joint name="f" type="fixed"><origin xyz="0 0.05 -0.15"/><parent link="wrist"/>
-<child link="tool0"/></joint><link name="tool0"/></robot>
-"""
-LIFT = """<robot name="lift"><link name="base_link"/>
-<joint name="first" type="prismatic"><parent link="base_link"/><child link="a"/>
-<axis xyz="0 0 1"/><limit lower="0" upper="0.5" effort="900" velocity="1"/></joint><link name="a"/>
-<joint name="second" type="prismatic"><origin xyz="0 0 0.4"/><parent link="a"/><child link="b"/>
-<axis xyz="0 0 1"/><limit lower="0" upper="0.6" effort="900" velocity="1"/>
-<mimic joint="first" multiplier="1.0" offset="0.1"/></joint><link name="b"/>
-<joint name="turn" type="revolute"><origin xyz="0.2 0 0"/><parent link="b"/><child link="c"/>
-<axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="90" velocity="1"/></joint>
-<link name="c"/><joint name="f" type="fixed"><origin xyz="0.3 0 0"/><parent link="c"/>
-<child link="tool0"/></joint><link name="tool0"/></robot>
-"""
+SLIDE, TOOL = {"type": "prismatic"}, {"link": "tool0", "type": "fixed"}
+GANTRY = serial_urdf([
+    {**SLIDE, "xyz": "0 0 2.5", "axis": "1 0 0", "lower": -2, "upper": 2, "effort": 3000},
+    {**SLIDE, "axis": "0 1 0", "lower": -1, "upper": 1, "effort": 2000},
+    {**SLIDE, "axis": "0 0 -1", "lower": 0, "upper": 1.2, "effort": 2000, "mass": 30,
+     "com": "0 0 -0.4"},
+    {"xyz": "0.1 0 -0.8", "lower": -3, "upper": 3, "effort": 80},
+    {"xyz": "0 0 -0.2", "rpy": "1.2 0.3 0", "axis": "0 1 0", "lower": -2, "upper": 2, "effort": 60},
+    {**TOOL, "xyz": "0 0.05 -0.15"},
+])  # fmt: skip
+MIMIC = '<mimic joint="j1" multiplier="1.0" offset="0.1"/>'
+LIFT = serial_urdf([
+    {**SLIDE, "lower": 0, "upper": 0.5},
+    {**SLIDE, "xyz": "0 0 0.4", "lower": 0, "upper": 0.6, "mimic": MIMIC},
+    {"xyz": "0.2 0 0", "axis": "0 1 0", "lower": -2, "upper": 2},
+    {**TOOL, "xyz": "0.3 0 0"},
+])  # fmt: skip
 """A column of two stages, of which the upper one is taken along."""
 
 
@@ -113,9 +101,7 @@ def test_a_gantry_is_that_of_its_urdf(tmp_path):
     found = evaluate(arm, q)
     for i in range(10):
         pin.framesForwardKinematics(model, data, q[i])
-        tool = data.oMf[model.getFrameId("tool0")]
-        np.testing.assert_allclose(found.position[-1, i], tool.translation, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(found.rotation[-1, i], tool.rotation, rtol=0, atol=1e-12)
+        flange_at(found, i, data.oMf[model.getFrameId("tool0")].homogeneous)
 
 
 def test_a_column_of_two_stages_moves_by_both(tmp_path):
@@ -290,20 +276,9 @@ def test_a_table_of_a_rail_comes_back_and_is_checked(tmp_path):
 def test_a_foreign_table_with_a_rail_goes_through_the_commands(tmp_path, capsys):
     """From a table in mm and degrees to corrected joint values, by the commands alone."""
     r, _ = campaign(tmp_path, "guide_error", 5, 30)
-    s = r.readings
-    rows = [["name", "E1 mm", *(f"A{k}" for k in range(1, 7)), "X", "Y", "Z", "weight"]]
-    for k in range(len(s)):
-        if s.load_names[s.load[k]] == "pull":
-            continue
-        q = s.states.q[k]
-        joints = [1e3 * q[0], *np.degrees(q[1:])]
-        kg = 10.0 if s.load[k] else 0.0
-        figures = [*joints, *(1e3 * s.value[k]), kg]
-        rows.append([s.pose_names[s.pose[k]], *(f"{x:.6f}" for x in figures)])
-    with (tmp_path / "theirs.csv").open("w", newline="") as file:
-        csv.writer(file).writerows(rows)
+    their_table(tmp_path, r, ["E1 mm", *ARM_AXES], ("none", "10kg"))
     (tmp_path / "map.toml").write_text(
-        """pose.column = "name"
+        """pose.column = "pose"
 [joints]
 columns = ["E1 mm", "A1", "A2", "A3", "A4", "A5", "A6"]
 unit = "deg"
@@ -352,27 +327,33 @@ joint_std_rad = 1e-5
     assert "column 'q3_rad' is missing beside its group" in said
 
 
-def plain_table(folder, header, mirrored=False):
-    """Unloaded positions in mm, joints in degrees, the travel in mm; perhaps counted backwards."""
-    r, _ = campaign(folder, "nothing", 2, 24)
-    s = r.readings
+ARM_AXES = [f"A{k}" for k in range(1, 7)]
+ALL_AXES = [f"J{k}" for k in range(1, 8)]
+
+
+def their_table(folder, r, header, loads=("none",), mirrored=False):
+    """Positions and travel in mm, perhaps counted backwards; joints in degrees; weights, if any."""
+    s, weight = r.readings, ["weight"] * (len(loads) > 1)
     with (folder / "theirs.csv").open("w", newline="") as file:
         out = csv.writer(file)
-        out.writerow(["pose", *header, "X", "Y", "Z"])
-        for k in np.flatnonzero(s.load == 0):
-            q = s.states.q[k]
+        out.writerow(["pose", *header, "X", "Y", "Z", *weight])
+        for k, load in enumerate(s.load_names[number] for number in s.load):
+            if load not in loads:
+                continue
+            q, kg = s.states.q[k], [10.0 * (load != "none") for _ in weight]
             travel = 3.0 - q[0] if mirrored else q[0]
-            joints = [1e3 * travel, *np.degrees(q[1:])]
-            figures = [*joints, *(1e3 * s.value[k])]
+            figures = [1e3 * travel, *np.degrees(q[1:]), *(1e3 * s.value[k]), *kg]
             out.writerow([s.pose_names[s.pose[k]], *(f"{x:.6f}" for x in figures)])
-    cell = '[robot]\nmodel = "track.toml"\n[tool]\ntarget_m = [0.06, 0.02, 0.12]\n'
-    (folder / "cell.toml").write_text(cell)
     return folder / "theirs.csv"
 
 
-@pytest.mark.parametrize(
-    "header", [["E1", *(f"A{k}" for k in range(1, 7))], [f"J{k}" for k in range(1, 8)]]
-)
+def plain_table(folder, header, mirrored=False):
+    cell = '[robot]\nmodel = "track.toml"\n[tool]\ntarget_m = [0.06, 0.02, 0.12]\n'
+    (folder / "cell.toml").write_text(cell)
+    return their_table(folder, campaign(folder, "nothing", 2, 24)[0], header, mirrored=mirrored)
+
+
+@pytest.mark.parametrize("header", [["E1", *ARM_AXES], ALL_AXES])
 def test_a_preview_sees_the_travel_in_mm(tmp_path, capsys, header):
     """Also that of an external axis, which controllers name apart from the arm's."""
     table = plain_table(tmp_path, header)
@@ -388,7 +369,7 @@ def test_a_preview_sees_the_travel_in_mm(tmp_path, capsys, header):
 
 
 def test_a_travel_that_is_counted_backwards_is_named(tmp_path, capsys):
-    table = plain_table(tmp_path, [f"J{k}" for k in range(1, 8)], mirrored=True)
+    table = plain_table(tmp_path, ALL_AXES, mirrored=True)
     cell, run = tmp_path / "cell.toml", tmp_path / "run.hilcal"
     mapping = tmp_path / "m.toml"
     ok(capsys, "import", table, "--config", cell, "--preview", "-o", mapping)

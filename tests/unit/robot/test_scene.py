@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 
 from hilcal.config import Obstacle
 from hilcal.measuring.clearance import segment_distance
-from hilcal.robot.body import capsules, is_known
 from hilcal.robot.catalogue import load_arm, robot_names
 from hilcal.robot.chain import evaluate
-from hilcal.robot.scene import Scene, Segment
+from hilcal.robot.scene import Scene, Segment, capsules, is_known
 from tests.support.arm_cases import ODD, arm_of
 from tests.support.fake_bench import POSES
 from tests.support.space_cases import frames, gap, gap_to, placed, self_gap
@@ -146,9 +145,8 @@ def test_an_arm_of_unknown_shape_gets_links_and_can_move():
     parts = capsules(arm)
     assert {p.body for p in parts} <= set(range(arm.n + 1))
     for part in parts:  # each spans its link
-        assert np.linalg.norm(part.end - part.start) == pytest.approx(
-            np.linalg.norm(arm.links[part.body][:3, 3])
-        )
+        length = np.linalg.norm(arm.links[part.body][:3, 3])
+        assert np.linalg.norm(part.end - part.start) == pytest.approx(length)
     q = np.random.default_rng(0).uniform(-2.0, 2.0, (200, arm.n))
     share = Scene(arm).itself.touching(q, 0.0).mean()
     assert 0.0 < share < 0.9

@@ -9,7 +9,7 @@ import pytest
 import scipy.linalg as sl
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.engine.engine import open_engine
+from hilcal.engine import open_engine
 from hilcal.identification import gauss_newton as gauss_newton_steps
 from hilcal.identification.fit import fit
 from hilcal.readings.readings import Readings

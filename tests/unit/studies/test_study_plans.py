@@ -7,7 +7,7 @@ import pytest
 
 from hilcal.cell import cell_from_config
 from hilcal.design.information import reading_covariance
-from hilcal.engine.engine import open_engine
+from hilcal.engine import open_engine
 from studies.plans import DOUBLE, GRID, PARAMETERS, RANDOM, TEST, plans_study
 from studies.plans_command import arms, with_robot
 from studies.plans_errors import Errors, readings_asked

@@ -22,14 +22,14 @@ from rich.text import Text
 from scipy import stats
 from scipy.linalg import solve_triangular
 
-from hilcal.engine.engine import ALONE, Advance, Engine
+from hilcal.engine import ALONE, Advance, Engine
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.readings.covariance import TrackerNoise, joint_scatter, tracker_covariance
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import SCALINGS, Scaling, Whitening, whitening
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
-from hilcal.robot.chain import Chain, evaluate, joint_jacobian
+from hilcal.robot.chain import evaluate, joint_jacobian
 from hilcal.robot.statics import Load, slot_wrenches
 from hilcal.types import Bools, Floats
 
@@ -60,8 +60,7 @@ class StudyDesign:
     q: Floats  # (P, n) joint angles, rad
     wrenches: Floats  # (L, 6) at the target, base axes, N and N·m
     observation: Floats  # (P, L, 6, n) blocks of A_M, m and rad per rad/(N·m)
-    std: Floats
-    """(P, 6) standard deviations of the elements of one reading: tracker and arm, m, rad."""
+    std: Floats  # (P, 6) standard deviations of one reading: tracker and arm, m, rad
     specified: Floats  # (P, 6, 6) correlations of one reading by tracker and arm
     common: Floats  # (P, 6, 6) correlations of the arm's repeatability J Σ_q Jᵀ
 
@@ -96,22 +95,15 @@ def make_design(rng: np.random.Generator, arm: Arm, poses: int) -> StudyDesign:
     arm_noise = joint_scatter(jacobian, np.full(arm.n, JOINT_STD), np.eye(3), 6)
     total = arm_noise + tracker_covariance(target, TRACKER, STATION, 6)
     std = np.sqrt(np.diagonal(total, axis1=-2, axis2=-1))
-    return StudyDesign(
-        arm=arm,
-        q=q,
-        wrenches=WRENCHES,
-        observation=jacobian[:, None] * torque[:, :, None, :],
-        std=std,
-        specified=_correlation(total),
-        common=_correlation(arm_noise),
-    )
+    observation = jacobian[:, None] * torque[:, :, None, :]
+    specified, common = _correlation(total), _correlation(arm_noise)
+    return StudyDesign(arm, q, WRENCHES, observation, std, specified, common)
 
 
 def make_readings(design: StudyDesign, covariance: Floats, shared: bool) -> Readings:
     """Return the readings of the design, unloaded and loaded, pose by pose, with values of zero.
 
-    Args:
-        covariance: (P, 6, 6) of one reading at each pose.
+    `covariance` (P, 6, 6) is that of one reading at each pose.
     """
     poses, loads = design.observation.shape[:2]
     load = np.arange(loads + 1) if shared else np.stack([np.zeros(loads), np.arange(loads) + 1], 1)
@@ -156,15 +148,11 @@ def _feasible(arm: Arm, q: Floats) -> Bools:
     ok &= np.linalg.norm(target[:, :2], axis=1) > 2 * _CLEARANCE
     ok &= np.linalg.svd(joint_jacobian(chain, target), compute_uv=False)[:, -1] > _SINGULAR
     for wrench in WRENCHES:
-        ok &= (np.abs(_torques(arm, chain, wrench)) < arm.torque_max).all(axis=1)
+        wrenches = np.broadcast_to(wrench, (len(q), 6))
+        load = Load(wrenches, TARGET, 0.0, np.zeros(3), np.array([0.0, 0.0, -9.80665]))
+        torques = arm.drive_torques(arm.along(slot_wrenches(arm, chain, load)))
+        ok &= (np.abs(torques) < arm.torque_max).all(axis=1)
     return np.asarray(ok)
-
-
-def _torques(arm: Arm, chain: Chain, wrench: Floats) -> Floats:
-    """Return the static joint torques (N, n) under weight and a wrench at the target, N·m."""
-    wrenches = np.broadcast_to(wrench, (chain.position.shape[1], 6))
-    load = Load(wrenches, TARGET, 0.0, np.zeros(3), np.array([0.0, 0.0, -9.80665]))
-    return arm.drive_torques(arm.along(slot_wrenches(arm, chain, load)))
 
 
 def _correlation(covariance: Floats) -> Floats:
@@ -179,7 +167,7 @@ def _correlation(covariance: Floats) -> Floats:
 _Experiment = tuple[float, bool, np.random.Generator]
 LEVEL = 0.95
 CORRELATIONS = (0.0, 0.3, 0.6, 0.9, 0.99)
-# Name, factor of lengths in m, factor of angles in rad.
+# name, factor of lengths in m, factor of angles in rad
 UNITS: tuple[tuple[str, float, float], ...] = (
     ("m, rad", 1.0, 1.0),
     ("mm, rad", 1e3, 1.0),
@@ -231,10 +219,8 @@ class ScalingStudy:
     runs: int  # Monte-Carlo runs per cell
     poses: int  # number of poses
     loads: int  # wrenches per pose
-    typical_correlation: float
-    """The ρ whose rms correlation is that of a reading by the specified tracker and arm."""
-    cells: tuple[StudyCell, ...]
-    """One for each scaling, correlation, unit, and shared or separate unloaded readings."""
+    typical_correlation: float  # ρ of the rms correlation of a reading by tracker and arm
+    cells: tuple[StudyCell, ...]  # by scaling, correlation, unit, shared or separate unloaded ones
 
     def of(self, scaling: Scaling, unit: str, shared_unloaded: bool) -> tuple[StudyCell, ...]:
         """Return the cells of one curve, by ascending correlation."""
@@ -277,14 +263,9 @@ def scaling_study(
     design = make_design(rng, arm or load_arm("ur10e"), poses)
     tasks = _experiments(rng, design, correlations, runs)
     results = engine.map(partial(_cells, design=design, runs=runs), tasks, advance=advance)
-    return ScalingStudy(
-        arm=design.arm.name,
-        runs=runs,
-        poses=poses,
-        loads=len(design.wrenches),
-        typical_correlation=_off_diagonal(design.specified) / _off_diagonal(design.common),
-        cells=tuple(cell for cells in results for cell in cells),
-    )
+    typical = _off_diagonal(design.specified) / _off_diagonal(design.common)
+    cells = tuple(cell for of_one in results for cell in of_one)
+    return ScalingStudy(design.arm.name, runs, poses, len(design.wrenches), typical, cells)
 
 
 def check(runs: int, correlations: Sequence[float] = CORRELATIONS, poses: int = 30) -> None:
@@ -316,13 +297,9 @@ def _experiments(
     for shared in (False, True):
         for rho in map(float, correlations):
             out.append((rho, shared, deepcopy(rng)))
-            _noise(rng, make_readings(design, design.covariance(rho), shared), runs)
+            readings = make_readings(design, design.covariance(rho), shared)
+            rng.standard_normal((len(readings), 6, runs))
     return out
-
-
-def _noise(rng: np.random.Generator, readings: Readings, runs: int) -> Floats:
-    """Return standard normal numbers (N, 6, R) for the elements of N readings in R runs."""
-    return rng.standard_normal((len(readings), 6, runs))
 
 
 def _cells(experiment: _Experiment, design: StudyDesign, runs: int) -> list[StudyCell]:
@@ -332,7 +309,8 @@ def _cells(experiment: _Experiment, design: StudyDesign, runs: int) -> list[Stud
     limit = np.sqrt(np.diagonal(bound(design, covariance, shared)))[:, None]
     readings = make_readings(design, covariance, shared)
     # A copy, so that the experiment can be repeated after a worker's death.
-    noise = np.linalg.cholesky(covariance)[readings.pose] @ _noise(deepcopy(rng), readings, runs)
+    noise = deepcopy(rng).standard_normal((len(readings), 6, runs))
+    noise = np.linalg.cholesky(covariance)[readings.pose] @ noise
     cells = []
     for scaling in SCALINGS:
         first: Floats | None = None
@@ -347,22 +325,13 @@ def _cells(experiment: _Experiment, design: StudyDesign, runs: int) -> list[Stud
             square, inside = (error / limit) ** 2, np.abs(error) <= half
             square_run, inside_run = square.mean(axis=0), inside.mean(axis=0)
             rms = float(np.sqrt(square_run.mean()))
-            cells.append(
-                StudyCell(
-                    scaling=scaling,
-                    correlation=rho,
-                    unit=unit,
-                    shared_unloaded=shared,
-                    error_over_bound=rms,
-                    error_over_bound_mc=float(stats.sem(square_run)) / (2 * rms),
-                    coverage=float(inside_run.mean()),
-                    coverage_mc=float(stats.sem(inside_run)),
-                    variance_factor=factor,
-                    parameter_error_over_bound=tuple(np.sqrt(square.mean(axis=1)).tolist()),
-                    parameter_coverage=tuple(inside.mean(axis=1).tolist()),
-                    unit_shift=float(np.abs((error - first) / limit).max()),
-                )
-            )
+            rms_mc = float(stats.sem(square_run)) / (2 * rms)
+            coverage, coverage_mc = float(inside_run.mean()), float(stats.sem(inside_run))
+            by_parameter = tuple(np.sqrt(square.mean(axis=1)).tolist())
+            covered = tuple(inside.mean(axis=1).tolist())
+            shift = float(np.abs((error - first) / limit).max())
+            figures = (rms, rms_mc, coverage, coverage_mc, factor, by_parameter, covered, shift)
+            cells.append(StudyCell(scaling, rho, unit, shared, *figures))
     return cells
 
 
@@ -403,24 +372,14 @@ CURVES: tuple[tuple[Scaling, str], ...] = (
 UNLOADED = {False: "own", True: "shared"}
 
 
-def title(study: ScalingStudy) -> str:
-    """Return a line on the simulated campaign."""
-    return (
+def table(study: ScalingStudy) -> Table:
+    """Return error over bound and coverage per scaling, with a row per correlation."""
+    title = (
         f"Joint compliances of a {study.arm}: {study.poses} poses x {study.loads} loads, "
         f"{study.runs} Monte-Carlo runs"
     )
-
-
-def largest_shift(study: ScalingStudy, *scalings: Scaling) -> float:
-    """Return the largest change of an estimate with the units, in units of the bound."""
-    return max(c.unit_shift for c in study.cells if c.scaling in scalings)
-
-
-def table(study: ScalingStudy) -> Table:
-    """Return error over bound and coverage per scaling, with a row per correlation."""
-    out = Table(
-        title=title(study), caption=_caption(study), box=box.SIMPLE_HEAD, caption_justify="left"
-    )
+    caption = _caption(study)
+    out = Table(title=title, caption=caption, box=box.SIMPLE_HEAD, caption_justify="left")
     out.add_column("unloaded\nreading")
     out.add_column("corr.\nrho", justify="right")
     for scaling, unit in CURVES:
@@ -453,6 +412,8 @@ def _caption(study: ScalingStudy) -> str:
     """Return the explanation of the table."""
     error = max(c.error_over_bound_mc / c.error_over_bound for c in study.cells)
     coverage = max(c.coverage_mc for c in study.cells)
+    moved = max(c.unit_shift for c in study.cells if c.scaling == "none")
+    rounded = max(c.unit_shift for c in study.cells if c.scaling != "none")
     return (
         "Each entry: error of the estimated compliances, as a multiple of the smallest that is "
         "possible (Cramér–Rao bound), and the share of the stated 95 % intervals that hold the "
@@ -461,8 +422,8 @@ def _caption(study: ScalingStudy) -> str:
         f"{study.typical_correlation:.2f} is what the arm's repeatability and the tracker specify. "
         "own: each load has its own unloaded reading; shared: the loads of a pose share one, so "
         "that their deflections are correlated as well.\n"
-        f"Changing units moves an estimate by up to {largest_shift(study, 'none'):.0f} standard "
-        f"uncertainties with none, and by {largest_shift(study, 'gu', 'gc'):.0e} with gu and gc. "
+        f"Changing units moves an estimate by up to {moved:.0f} standard "
+        f"uncertainties with none, and by {rounded:.0e} with gu and gc. "
         f"Monte-Carlo standard uncertainty: below {100 * error:.1f} % of an error, "
         f"{100 * coverage:.1f} % in coverage."
     )

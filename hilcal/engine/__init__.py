@@ -1,1 +1,0 @@
-"""Many independent computations, on this machine or on a cluster (Dask)."""

@@ -1,1 +1,0 @@
-"""Monte-Carlo studies of the program's own mathematics."""
