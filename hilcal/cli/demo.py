@@ -56,13 +56,7 @@ from hilcal.identification.linearisation import linearise
 from hilcal.measuring.route import dry_run
 from hilcal.names import quoted
 from hilcal.present.calibration import improvement_report
-from hilcal.present.diagnosis import (
-    compared,
-    refined_laws,
-    step_report,
-    truth_table,
-    verdict_line,
-)
+from hilcal.present.diagnosis import compared, refined_laws, step_report, truth_table, verdict_line
 from hilcal.present.document import heading
 from hilcal.present.fit import model_name
 from hilcal.present.plan import next_report

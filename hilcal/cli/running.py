@@ -16,13 +16,7 @@ import numpy as np
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.options import POSES, catalogue_with, check_seed, command
-from hilcal.cli.planning import (
-    answer_json,
-    dry_checked,
-    make_plan,
-    read_cell,
-    refuse_unready,
-)
+from hilcal.cli.planning import answer_json, dry_checked, make_plan, read_cell, refuse_unready
 from hilcal.cli.showing import followed
 from hilcal.cli.terminal import Terminal, agreed, handled, somebody_there, terminal, told_to_end
 from hilcal.config import CellConfig

@@ -6,9 +6,7 @@ import pytest
 from hilcal.cli.running import TRIES, first_plan, to_the_end
 from hilcal.cli.terminal import terminal
 from hilcal.config import load_config
-from hilcal.drivers.simulated.rehearsal import (
-    choices,
-)
+from hilcal.drivers.simulated.rehearsal import choices
 from hilcal.errors import DeviceError, InputError
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan

@@ -64,8 +64,7 @@ def names():
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=pytest.mark.long if n == "discover" else ()) for n in names()],
+    "name", [pytest.param(n, marks=pytest.mark.long if n == "discover" else ()) for n in names()]
 )
 def test_the_examples_of_a_docstring_run(name, site):
     thing = getattr(hc, name)
