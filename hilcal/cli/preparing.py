@@ -16,8 +16,15 @@ from hilcal.config import CellConfig, load_config
 from hilcal.config.reference import cell_text
 from hilcal.config.sections import GEOMETRY, LOADED
 from hilcal.design.nominal_model import check_effects
-from hilcal.doctor.computer import Finding, computer, program
-from hilcal.doctor.ports import adapters, reachable, serial_ports
+from hilcal.doctor import (
+    Finding,
+    adapters,
+    computer,
+    permanent_names,
+    program,
+    reachable,
+    serial_ports,
+)
 from hilcal.drivers.ur_link.supervision import services
 from hilcal.effects.catalogue import installed
 from hilcal.errors import DeviceError, HilcalError, InputError, StoppedError
@@ -161,17 +168,6 @@ def drivers(group: str) -> list[str]:
     return sorted({point.name for point in entry_points(group=group)})
 
 
-def ports() -> list[str]:
-    """Return the serial ports of this computer, by persistent names where they have one."""
-    from serial.tools import list_ports  # takes a while
-
-    port_names = [p.device for p in list_ports.comports()]
-    folder = Path("/dev/serial/by-id")
-    links = sorted(folder.iterdir()) if folder.is_dir() else []
-    named = {str(p.resolve()): str(p) for p in links}
-    return [named.get(device, device) for device in port_names]
-
-
 @dataclass(frozen=True, slots=True)
 class CellQuestion:
     """A question about the cell."""
@@ -308,7 +304,9 @@ def _ask(t: Terminal, draft: Draft, question: CellQuestion) -> None:
     if question.needs and question.needs not in draft.data:
         return
     if question.parameter.endswith("_port"):
-        t.notice(f"Serial ports here: {', '.join(ports()) or 'none'}.")
+        names = permanent_names()
+        ports = [names.get(path, path) for path in adapters()]
+        t.notice(f"Serial ports here: {', '.join(ports) or 'none'}.")
     prompt = question.text + (f" (Enter: {question.default}):" if question.default else ":")
     while True:
         t.progress.print(prompt, markup=False, highlight=False, style="bold")
