@@ -20,15 +20,7 @@ from typing import Annotated, Any, TextIO
 import typer
 
 from hilcal import __version__
-from hilcal.cli.commands import (
-    COMMANDS,
-    EXIT_CODES,
-    EXIT_CODES_OF_RUN,
-    Command,
-    CommandGroup,
-    InOrderOfWork,
-    load,
-)
+from hilcal.cli import commands
 from hilcal.errors import (
     CannotAnswerError,
     DeviceError,
@@ -128,7 +120,7 @@ def application(
     help_text: str,
     *,
     alone: bool = False,
-    group: type[CommandGroup] = CommandGroup,
+    group: type[commands.CommandGroup] = commands.CommandGroup,
     completion: bool = False,
 ) -> typer.Typer:
     """Return an empty application; with `alone` it can be called without a command."""
@@ -136,7 +128,7 @@ def application(
         cls=group,
         add_completion=completion,
         context_settings={"help_option_names": ["-h", "--help"]},
-        epilog=EXIT_CODES,
+        epilog=commands.EXIT_CODES,
         pretty_exceptions_enable=False,
         no_args_is_help=not alone,
         invoke_without_command=alone,
@@ -147,9 +139,9 @@ def application(
 
 def _hilcal(arguments: Sequence[str]) -> typer.Typer:
     """Return the application; only the command that the arguments name is imported."""
-    app = application(str(_top.__doc__), group=InOrderOfWork, completion=True)
+    app = application(str(_top.__doc__), group=commands.InOrderOfWork, completion=True)
     names = [word for word in arguments if not word.startswith("-")]
-    for name, command in COMMANDS.items():
+    for name, command in commands.COMMANDS.items():
         if names[:1] != [name]:
             app.command(name, help=command.summary)(_placeholder)
         elif command.subcommands:
@@ -157,9 +149,9 @@ def _hilcal(arguments: Sequence[str]) -> typer.Typer:
                 group = _group(command)
             app.add_typer(group, name=name)
         else:
-            epilog = EXIT_CODES_OF_RUN if name == "run" else EXIT_CODES
+            epilog = commands.EXIT_CODES_OF_RUN if name == "run" else commands.EXIT_CODES
             with _loading(name):
-                function = load(command.place)
+                function = commands.load(command.place)
             app.command(name, epilog=epilog)(function)
     app.callback()(_top)
     return app
@@ -189,11 +181,13 @@ def _loading(name: str) -> Iterator[None]:
         print("\r" + " " * (len(name) + 9), end="\r", file=sys.stderr, flush=True)
 
 
-def _group(command: Command) -> typer.Typer:
+def _group(command: commands.Command) -> typer.Typer:
     app = application(command.summary, alone=bool(command.place))
     for name, place in command.subcommands:
-        app.command(name)(load(place))
-    app.callback(help=command.summary)(load(command.place) if command.place else _placeholder)
+        app.command(name)(commands.load(place))
+    app.callback(help=command.summary)(
+        commands.load(command.place) if command.place else _placeholder
+    )
     return app
 
 

@@ -13,18 +13,10 @@ from hilcal.errors import CannotAnswerError, HilcalError, InputError, LimitError
 from hilcal.identification.fit import all_left_out
 from hilcal.identification.full_prediction import full_prediction
 from hilcal.identification.linearisation import linearise
+from hilcal.present import fit as words
 from hilcal.present.calibration import opening, shares_report, validation_failure, validation_report
 from hilcal.present.comparison import comparison_json, comparison_report, next_command
 from hilcal.present.document import heading
-from hilcal.present.fit import (
-    errors,
-    follows,
-    misses,
-    model_name,
-    where_table,
-    worst_poses,
-    worst_table,
-)
 from hilcal.present.progress import working
 from hilcal.tables.units import parse_length
 from hilcal.transfer.compare import compare as compare_campaigns
@@ -58,7 +50,7 @@ def compare(
         comparison = compare_campaigns(
             o, later_run, revision, same_setup=True if same_setup else None, say=say
         )
-    name = model_name(titles(comparison.fit.model, comparison.fit.readings))
+    name = words.model_name(titles(comparison.fit.model, comparison.fit.readings))
     t.show(heading(f"{run.name}: {called(comparison.number)} ({name})"))
     t.show(comparison_report(comparison, run.name, later.name))
     command = next_command(comparison, str(run), str(later))
@@ -78,12 +70,12 @@ def _show_misfit(t: Terminal, run: Path, revision: int | None, catalogue: Catalo
         if left_out:  # a background follows the fitted poses more closely than others
             raw, w = all_left_out(fitted)
             e = replace(e, raw=raw, whitening=w)
-        worst = worst_poses(e)
-    name = model_name(titles(fitted.model, fitted.readings))
+        worst = words.worst_poses(e)
+    name = words.model_name(titles(fitted.model, fitted.readings))
     t.show(heading(f"{called(number)}: {name}"))
-    t.show([misses(fitted), follows(places), "", errors(fitted), ""])
-    t.show([*where_table(places), ""])
-    t.show(worst_table(worst, left_out))
+    t.show([words.misses(fitted), words.follows(places), "", words.errors(fitted), ""])
+    t.show([*words.where_table(places), ""])
+    t.show(words.worst_table(worst, left_out))
     t.document(
         revision=number,
         model=list(fitted.model.named),
@@ -121,7 +113,7 @@ def validate(
     ):
         record = record_of(t, o, say, revision)
         result = validate_campaign(o, unseen, record, limit_m, register=register, say=say)
-        name = model_name(titles(result.model, o.fitted_readings(record)))
+        name = words.model_name(titles(result.model, o.fitted_readings(record)))
     judged, prediction, shares = result.judged, result.prediction, result.shares
     t.show(heading(f"{called(judged.number)}: {name}"))
     t.show(opening(judged, prediction))

@@ -9,18 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from hilcal.calibration import urscript
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensation import Compensation
 from hilcal.calibration.points import Points, on_branch, read_points
 from hilcal.calibration.programs.languages import READERS, UnderstoodProgram, understood
-from hilcal.calibration.urscript import (
-    JOINTS,
-    Waypoint,
-    doubts,
-    movej_program,
-    program_points,
-    with_joints,
-)
 from hilcal.campaign.campaign import Campaign
 from hilcal.cli.options import catalogue_with, check_new, command
 from hilcal.cli.terminal import terminal
@@ -49,11 +42,11 @@ class _Task:
     points: Points
     tool: Floats | None  # (4, 4) T_flange_tool; the tracked target where None
     program: str | None = None  # text of a UR program
-    waypoints: tuple[Waypoint, ...] = ()  # all waypoints of a UR program
+    waypoints: tuple[urscript.Waypoint, ...] = ()  # all waypoints of a UR program
     foreign: UnderstoodProgram | None = None  # a program of another maker than UR
 
     @property
-    def corrected(self) -> list[Waypoint]:
+    def corrected(self) -> list[urscript.Waypoint]:
         """The waypoints that are corrected."""
         return [w for w in self.waypoints if not w.left]
 
@@ -118,7 +111,7 @@ def compensate(
         on_flange = calibration.tool_pose(task.tool)
         begin = calibration.measured.middle(arm.n) if start is None and not task.program else start
         q = on_branch(targets, arm, on_flange, begin)
-        unclear = doubts(arm, on_flange, task.corrected, q, start) or [""] * len(q)
+        unclear = urscript.doubts(arm, on_flange, task.corrected, q, start) or [""] * len(q)
         acting = wrench if targets.sensed is None else calibration.load_wrench(q, targets.sensed)
         poses = _program_poses(task, calibration, q, arm)
         result = calibration.compensate(
@@ -199,9 +192,9 @@ def _task(
             raise InputError(f"{path}: --leave is for waypoints of a program; valid: without it")
         mapping = None if kind == "table" else find_mapping(kind, PointMapping)
         return _Task(read_points(path, arm, calibration.loads, mapping), tool)
-    if arm.n != JOINTS:
+    if arm.n != urscript.JOINTS:
         raise InputError(f"{path}: a UR program, and {arm.name} has {arm.n} joints")
-    program, waypoints, points, tcp = program_points(path, options.leave)
+    program, waypoints, points, tcp = urscript.program_points(path, options.leave)
     if tcp is None and tool is None and points.wanted is not None:
         for k in np.flatnonzero(np.isfinite(points.wanted[:, 0, 0]))[:1].tolist():
             raise InputError(
@@ -296,12 +289,12 @@ def _write(
         content = json.dumps(plain(document), allow_nan=False, indent=2) + "\n"
     elif path.suffix == ".csv":
         content = _csv(names, result, units)
-    elif n != JOINTS:
-        raise InputError(f"{path}: a UR program has {JOINTS} joints, this arm has {n}")
+    elif n != urscript.JOINTS:
+        raise InputError(f"{path}: a UR program has {urscript.JOINTS} joints, this arm has {n}")
     elif task.program is None:
-        content = movej_program(names, result.q)
+        content = urscript.movej_program(names, result.q)
     else:
-        content = with_joints(task.program, task.corrected, result.q)
+        content = urscript.with_joints(task.program, task.corrected, result.q)
     replace_file(path, content)
     return [path]
 

@@ -13,17 +13,11 @@ from hilcal import numbers
 from hilcal.calibration.improvement import Improvement
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.revisions import to_record
+from hilcal.cli import running
 from hilcal.cli.fitting import check_record, finish, record_story
 from hilcal.cli.options import catalogue_with, check_seed, command
 from hilcal.cli.planning import separates
 from hilcal.cli.refining import changed, chapters_of, errors_by_revision, revisions_json
-from hilcal.cli.running import (
-    RehearsalSettings,
-    RehearsedCampaign,
-    first_plan,
-    in_process,
-    on_devices,
-)
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import load_config
 from hilcal.design.next import measure_next
@@ -101,8 +95,8 @@ class Doubted:
 
 
 def doubtful_case(
-    settings: RehearsalSettings, hide: str | None, say: Say, number: int = 0
-) -> tuple[RehearsalSettings, Plan, bool]:
+    settings: running.RehearsalSettings, hide: str | None, say: Say, number: int = 0
+) -> tuple[running.RehearsalSettings, Plan, bool]:
     """Draw an effect to hide and a small campaign that leaves it in doubt.
 
     Both follow from the seed and `number`. A case is doubtful when a rival explains the readings
@@ -125,7 +119,7 @@ def doubtful_case(
         choice = hide or str(rng.choice(HARD_TO_SEPARATE))
         case = replace(settings, config=strong, choice=choice, seed=int(rng.integers(2**31)))
         if k % ARMS == 0:
-            plan = first_plan(case, few, FIRST, lambda text: None)
+            plan = running.first_plan(case, few, FIRST, lambda text: None)
         secret = case_of_plan(strong, plan, choice, case.seed, case.world)
         drawn = [read_plan(secret, plan, [case.seed, 1 + j]) for j in range(DRAWS)]
         if choice == NOTHING or (
@@ -139,7 +133,7 @@ def _fit(r: Rehearsal, catalogue: Catalogue) -> Fit:
     return fit(baseline(r.cell, r.readings, r.mode, catalogue), r.readings, r.mode)
 
 
-def _resembled(r: Rehearsal, case: RehearsalSettings) -> bool:
+def _resembled(r: Rehearsal, case: running.RehearsalSettings) -> bool:
     """Whether the hidden effect or a rival is significant, and a rival fits as well."""
     p = linearise(_fit(r, case.catalogue))
     effects = [e for e in candidates(p.fit) if e.name in (r.hidden, *RESEMBLING)]
@@ -151,7 +145,7 @@ def _resembled(r: Rehearsal, case: RehearsalSettings) -> bool:
     return any(abs(s.score.log_evidence - evidence) < CLOSE for s in suspects.values())
 
 
-def _left_open(r: Rehearsal, case: RehearsalSettings) -> bool:
+def _left_open(r: Rehearsal, case: running.RehearsalSettings) -> bool:
     """Whether the diagnosis leaves the hidden effect in doubt, and all rivals are separable."""
     d = judge(Evidence(_fit(r, case.catalogue)), History())
     return r.hidden in left_open(d) and all(rival.possible for rival in d.separability)
@@ -221,7 +215,7 @@ def demo(
     files = Files(output)
     for path in (output, files.validation, files.corrected):
         may_write(path, True)  # before the planning, which takes a while
-    case = RehearsalSettings(
+    case = running.RehearsalSettings(
         config, hidden or RANDOM, number, output, configs_dir() / "cells", catalogue, world
     )
     laws = None
@@ -306,13 +300,13 @@ def demo(
 
 @contextmanager
 def _campaign(
-    t: Terminal, case: RehearsalSettings, poses: int, without_devices: bool, ambiguous: bool
-) -> Iterator[tuple[RehearsedCampaign, Rehearsal, Doubted | None]]:
+    t: Terminal, case: running.RehearsalSettings, poses: int, without_devices: bool, ambiguous: bool
+) -> Iterator[tuple[running.RehearsedCampaign, Rehearsal, Doubted | None]]:
     """Measure a campaign; its simulated devices run until the block ends.
 
     With `ambiguous`, measure arms until one leaves a doubt, then the readings that settle it.
     """
-    measured = in_process if without_devices else on_devices
+    measured = running.in_process if without_devices else running.on_devices
     existed, first = case.output.exists(), case
     for tries in range(1, CAMPAIGNS + 1):
         another = False
@@ -321,7 +315,7 @@ def _campaign(
                 hidden = None if first.choice == RANDOM else first.choice
                 case, plan, another = doubtful_case(first, hidden, say, tries - 1)
             else:
-                plan = first_plan(case, case.config, poses, say)
+                plan = running.first_plan(case, case.config, poses, say)
         for path in (Files(case.output).validation, Files(case.output).corrected):
             path.unlink(missing_ok=True)
         with measured(t, case, plan) as m:

@@ -8,21 +8,7 @@ from hilcal import numbers
 from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.changes import add_effect, remove_effect
-from hilcal.cli.fitting import (
-    NO_PRIOR,
-    PriorOptions,
-    check_options,
-    check_record,
-    finish,
-    fit_of,
-    mode_of_option,
-    options_json,
-    options_line,
-    record_story,
-    starting_model,
-    stored_fit,
-    wanted_effects,
-)
+from hilcal.cli import fitting
 from hilcal.cli.options import catalogue_with, check_folder, command
 from hilcal.cli.showing import followed
 from hilcal.cli.terminal import terminal
@@ -45,19 +31,7 @@ from hilcal.identification.fit_document import frames_to_json, prior_to_json
 from hilcal.identification.misdescription import other_arm_of
 from hilcal.identification.torques import check_torques
 from hilcal.names import quoted
-from hilcal.present.diagnosis import (
-    addition_lines,
-    curves,
-    diagnosis_report,
-    discovery_report,
-    fell,
-    key,
-    refined_laws,
-    revisions_table,
-    rose,
-    silence,
-    verdict_line,
-)
+from hilcal.present import diagnosis as words
 from hilcal.present.document import Block
 from hilcal.present.fit import follows, model_name, prior_lines, set_aside
 from hilcal.present.progress import working
@@ -85,7 +59,7 @@ def errors_by_revision(chapters: Sequence[Chapter], stored: str = "") -> list[Bl
     `stored` is the verdict of a chapter without a diagnosis.
     """
     rows = [(c.number, changed(c), c.fit, _verdict(c, stored)) for c in chapters]
-    return [revisions_table(rows), key(chapters[-1].fit.readings)]
+    return [words.revisions_table(rows), words.key(chapters[-1].fit.readings)]
 
 
 def changed(c: Chapter) -> str:
@@ -105,12 +79,12 @@ def diagnose(
     """Say which effect the model lacks."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
-        number, fitted = fit_of(t, o, say, revision)
+        number, fitted = fitting.fit_of(t, o, say, revision)
         o.require_gc(number, fitted.scaling, "diagnosing")
         say("diagnosing" if number is None else f"diagnosing revision {number}")
         d = judge(fitted, o.history(number), say)
-        finish(fitted, say)
-    t.show(diagnosis_report(d))
+        fitting.finish(fitted, say)
+    t.show(words.diagnosis_report(d))
     t.show(torque_lines(check_torques(fitted.model.cell, fitted.readings)))
     t.document({"revision": number, **to_json(d)})
 
@@ -156,11 +130,11 @@ def _change(
 ) -> None:
     """Make a revision with an additional effect; without `options`, with the effect removed."""
     t, adds = terminal(as_json), options is not None
-    check_record(record)
+    fitting.check_record(record)
     with Campaign.open(run, catalogue) as o, followed(t, view, run) as live:
-        check_options(o, {effect: options or {}} if adds else {})
+        fitting.check_options(o, {effect: options or {}} if adds else {})
         with working(t.progress) as say:
-            number, previous = stored_fit(t, o, say, revision)
+            number, previous = fitting.stored_fit(t, o, say, revision)
             if live is not None:
                 for chapter in o.chapters(say, number):
                     live.revised(chapter)
@@ -176,13 +150,13 @@ def _change(
         pair = [Chapter(number, old.added, previous, None, old.removed), new]
         t.show(errors_by_revision(pair, verdict))
         named = write_effect(effect, options or {})
-        t.show(fell(previous, c.fit, named) if adds else rose(previous, c.fit, effect))
-        t.show([] if c.expected is None else addition_lines(c.expected))
-        t.show(["", verdict_line(d)])
+        t.show(words.fell(previous, c.fit, named) if adds else words.rose(previous, c.fit, effect))
+        t.show([] if c.expected is None else words.addition_lines(c.expected))
+        t.show(["", words.verdict_line(d)])
         if record is not None:
             with working(t.progress) as say:
                 chapters = o.chapters(say, c.number)
-            record_story(t, chapters, record)
+            fitting.record_story(t, chapters, record)
     t.document(
         revisions=revisions_json(pair, verdict),
         verdict=d.verdict,
@@ -203,14 +177,15 @@ def _change(
     """)
 def refine(
     run: Path, effects: str | None = None, readings: str | None = None, from_latest: bool = False,
-    revision: int | None = None, prior: PriorOptions = NO_PRIOR, discover: bool = False,
-    background: bool = True, record: Path | None = None, view: bool = False, details: bool = False,
-    effects_from: list[Path] | None = None, as_json: bool = False,
+    revision: int | None = None, prior: fitting.PriorOptions = fitting.NO_PRIOR,
+    discover: bool = False, background: bool = True, record: Path | None = None,
+    view: bool = False, details: bool = False, effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:  # fmt: skip
     """Diagnose and add until the model is adequate."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
-    named = wanted_effects(effects, catalogue)
-    check_record(record)
+    named = fitting.wanted_effects(effects, catalogue)
+    fitting.check_record(record)
     start = "--revision" if revision is not None else "--from-latest" if from_latest else ""
     stated = named is not None or readings is not None or prior.prior is not None
     if start and (stated or (from_latest and revision)):
@@ -222,8 +197,8 @@ def refine(
         latest = o.latest() if from_latest else None if not start else o.in_use(revision)
         if start and latest is None:
             raise InputError(f"{run}: no revision yet; leave out {start}")
-        mode = mode_of_option(o, readings)
-        check_options(o, named or {})
+        mode = fitting.mode_of_option(o, readings)
+        fitting.check_options(o, named or {})
         with working(t.progress) as say:
             if latest is not None:
                 say(f"restoring revision {latest.number}")
@@ -231,7 +206,7 @@ def refine(
                 model, fitted = restored.model, restored.readings
             else:
                 say("registering")
-                model, fitted = starting_model(o, mode, named, carried), o.readings
+                model, fitted = fitting.starting_model(o, mode, named, carried), o.readings
             history = NOTHING if latest is None else o.history(latest.number)
             origin = () if latest is None else (latest.number,)
             numbers_to_be = itertools.chain(origin, itertools.count(len(o.file.revisions()) + 1))
@@ -244,7 +219,7 @@ def refine(
             if laws is not None:
                 laws.write(refinement.names)
             for step in refinement.steps:
-                finish(step.fit, say)
+                fitting.finish(step.fit, say)
             records = [
                 o.record(s.fit, s.diagnosis, s.added, s.removed)
                 for s in refinement.steps[len(origin) :]
@@ -253,11 +228,11 @@ def refine(
             numbered = (*origin, *o.append_records(records, *origin))
             chapters = chapters_of(numbered, refinement.steps)
         t.show(errors_by_revision(chapters))
-        t.show(options_line(refinement.fit))
+        t.show(fitting.options_line(refinement.fit))
         if o.noise is not None:
             t.show(numbers.sentence(covariance_words(o.covariance_parts, o.noise)))
         t.show(set_aside(refinement.fit, details))
-        t.show(verdict_line(refinement.diagnosis))
+        t.show(words.verdict_line(refinement.diagnosis))
         if numbered[-1] <= n_revisions:
             t.show(f"Revision {numbered[-1]} is this model already; nothing was stored.")
         t.show([*fitted_lines(refinement.fit)][: None if details else 1])
@@ -273,14 +248,14 @@ def refine(
                 f"{', '.join(refinement.rejected)}."
             )
         if laws is not None:
-            t.show(refined_laws(laws))
+            t.show(words.refined_laws(laws))
         diagnosis = refinement.diagnosis
         if diagnosis.verdict != "adequate" and not diagnosis.dependences:
             t.show(follows(diagnosis.misfit_breakdown))
-        t.show([*curves(diagnosis.dependences, len(diagnosis.dependences) if details else 1)])
+        t.show([*words.curves(diagnosis.dependences, len(diagnosis.dependences) if details else 1)])
         if live is not None:  # its verdict may have changed when further effects were tried
             live.revised(chapters[-1])
-        record_story(t, chapters, record)
+        fitting.record_story(t, chapters, record)
     t.document(
         revisions=revisions_json(chapters),
         verdict=diagnosis.verdict,
@@ -301,7 +276,7 @@ def revisions_json(chapters: Iterable[Chapter], stored: str = "") -> list[dict[s
         {
             "revision": r.number,
             "model": list(r.fit.model.named),
-            "options": options_json(r.fit),
+            "options": fitting.options_json(r.fit),
             "added": r.added,
             "removed": r.removed,
             "readings": r.fit.mode,
@@ -340,17 +315,17 @@ def discover(
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         number: int | None = None
         if effects is None:
-            number, fitted = fit_of(t, o, say, revision)
+            number, fitted = fitting.fit_of(t, o, say, revision)
         else:
-            check_options(o, effects)
-            model = starting_model(o, o.mode(), effects or None)
+            fitting.check_options(o, effects)
+            model = fitting.starting_model(o, o.mode(), effects or None)
             say(f"fitting {model_name(model.named)}")
             fitted = with_serial_noise(fit(model, o.readings, o.mode()))
         d = search(fitted, say, name)
     document = {"revision": number, **discovery_json(d), "written": None}
-    t.show(discovery_report(d))
+    t.show(words.discovery_report(d))
     if not d.laws:
-        t.document(document, CannotAnswerError(silence(d)))
+        t.document(document, CannotAnswerError(words.silence(d)))
     rivals = rival_sources(d) if alternatives else {}
     written = {name: d.source, **rivals}
     places = {effect: output.with_name(f"{effect}.py") for effect in written}
@@ -378,7 +353,7 @@ def _effects_against(
     if model == "baseline":
         return {}
     if model is None or not model.endswith(".json"):
-        return wanted_effects(model, catalogue)
+        return fitting.wanted_effects(model, catalogue)
     return {
         e.name: {key: value for key, value in e.options.items() if not key.startswith("prior_")}
         for e in Calibration.load(model, catalogue).model.effects

@@ -45,14 +45,7 @@ from hilcal.errors import (
 )
 from hilcal.identification.full_covariance import full_readings
 from hilcal.identification.noise_estimate import NOISE, measured_noise
-from hilcal.measuring.connect import (
-    ConnectionResult,
-    Rig,
-    connect,
-    nominal_arm,
-    told_by,
-    with_kinematics,
-)
+from hilcal.measuring import connect
 from hilcal.measuring.devices import Clock
 from hilcal.measuring.route import dry_run
 from hilcal.measuring.run import HOW_ON
@@ -227,11 +220,11 @@ def measure(
     with _ends_as_interrupt(t), ExitStack() as stack:
         with working(t.progress) as say:
             say("connecting to every device")
-            rig, answers = connect(config)
+            rig, answers = connect.connect(config)
             if rig is not None:
                 stack.callback(rig.close)
                 answers = tuple(_sighted(rig, answer, say) for answer in answers)
-        answers = with_kinematics(answers, cell)
+        answers = connect.with_kinematics(answers, cell)
         refuse_unready(answers)
         assert rig is not None  # noqa: S101  (refuse_unready has raised otherwise)
         if viewer is not None:
@@ -256,7 +249,9 @@ def estimate_noise(t: Terminal, config: CellConfig, cell: Cell, campaign: Campai
         log.event(NOISE, {"factors": None})
 
 
-def _sighted(rig: Rig, answer: ConnectionResult, say: Say) -> ConnectionResult:
+def _sighted(
+    rig: connect.Rig, answer: connect.ConnectionResult, say: Say
+) -> connect.ConnectionResult:
     """Let a tracker that has lost its target search for it; the arm does not move."""
     if answer.device != "tracker" or not answer.problems:
         return answer
@@ -552,12 +547,12 @@ def factory_check(
     config: CellConfig,
     cell: Cell,
     catalogue: Catalogue,
-    answers: tuple[ConnectionResult, ...],
+    answers: tuple[connect.ConnectionResult, ...],
     output: Path,
     yes: bool,
 ) -> dict[str, object]:
     """Compare the arm with its factory kinematics on a campaign; measure it unless it exists."""
-    factory = told_by(answers) or cell.factory
+    factory = connect.told_by(answers) or cell.factory
     if factory is None:
         raise InputError(
             "--factory: the arm's controller does not tell its kinematics; give [robot] calibration"
@@ -566,7 +561,9 @@ def factory_check(
         _measure_without_loads(t, config, cell, catalogue, output, yes)
     with Campaign.open(output, catalogue, read_only=True) as run, working(t.progress) as say:
         say("fitting all effects from the factory's kinematics")
-        checked = check_factory(run.cell, nominal_arm(run.cell), factory, run.readings, catalogue)
+        checked = check_factory(
+            run.cell, connect.nominal_arm(run.cell), factory, run.readings, catalogue
+        )
     t.show(factory_words(checked))
     return {**asdict(checked), "campaign": str(output)}
 

@@ -6,23 +6,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, Strict, model_validator
 
-from hilcal.config.sections import (
-    Acquire,
-    CellLoad,
-    CellSection,
-    Conventions,
-    ForceSensor,
-    Gauge,
-    Limits,
-    Motion,
-    Obstacle,
-    Operator,
-    Planning,
-    Point,
-    Sight,
-    Whole,
-    check_distinct,
-)
+from hilcal.config import sections
 from hilcal.errors import InputError
 from hilcal.toml import NonNegative, Positive, Vector3, check_json, load_section, suggest
 from hilcal.types import Floats
@@ -30,7 +14,7 @@ from hilcal.types import Floats
 STANDARD_GRAVITY_M_S2 = 9.80665
 
 
-class Robot(Conventions):
+class Robot(sections.Conventions):
     """[robot]: which arm, how its controller counts the joints, and how it stands in gravity.
 
     model: a catalogue name, e.g. "ur10e", or the path of a .urdf file or of a .toml file with DH
@@ -83,7 +67,7 @@ class Robot(Conventions):
         return self
 
 
-class Target(CellSection):
+class Target(sections.CellSection):
     """[[tool.targets]]: one of several targets that the tool carries (flange axes).
 
     name: the name of a target, e.g. "R1" | "R1"
@@ -113,7 +97,7 @@ def _check_target(xyz: tuple[float, ...] | None, rotvec: tuple[float, ...] | Non
         raise ValueError("target_rotvec_rad without target_m; give both or neither")
 
 
-class Tool(CellSection):
+class Tool(sections.CellSection):
     """[tool]: what the flange carries, where the target sits and the load acts (flange axes).
 
     target_m: $VECTOR_M: the target, flange axes; leave it out to have it estimated | [0.06, 0.02,
@@ -149,11 +133,11 @@ class Tool(CellSection):
                 "target_m together with [[tool.targets]]; give the offset of each target in its "
                 "own section"
             )
-        check_distinct("tool.targets", self.targets)
+        sections.check_distinct("tool.targets", self.targets)
         return self
 
 
-class Tracker(CellSection):
+class Tracker(sections.CellSection):
     """[tracker]: the frame of the readings, its registration, and the tracker's noise.
 
     The noise of a point at the distance d is sqrt(range² + transverse²) with standard
@@ -184,7 +168,7 @@ class Tracker(CellSection):
 
     driver: str | None = Field(None, min_length=1)
     port: str | None = Field(None, min_length=1)
-    baud: Whole | None = None
+    baud: sections.Whole | None = None
     host: str | None = Field(None, min_length=1)
     options: dict[str, Any] = Field(default_factory=dict)
     frame: Literal["tracker", "base"] = "tracker"
@@ -232,7 +216,7 @@ class Tracker(CellSection):
         return self
 
 
-class Repeatability(CellSection):
+class Repeatability(sections.CellSection):
     """[repeatability]: scatter of the joints from one arrival to the next.
 
     joint_std_rad: one standard deviation in rad, 0 or more, or one per joint | 1e-05
@@ -253,7 +237,7 @@ class Repeatability(CellSection):
         return np.broadcast_to(values, n).copy()
 
 
-class Simulation(CellSection):
+class Simulation(sections.CellSection):
     """[simulation]: what a simulated cell hides.
 
     seed: the seed of the random numbers, a whole number, 0 or more | 4
@@ -271,7 +255,7 @@ class Simulation(CellSection):
     controller_version: str = Field("5.11.6.1010327", pattern=r"^\d+\.\d+\.\d+\.\d+$")
 
 
-class CellConfig(CellSection):
+class CellConfig(sections.CellSection):
     """The whole of CELL.toml.
 
     robot: a section [robot] with model = "ur10e" or the like
@@ -302,25 +286,25 @@ class CellConfig(CellSection):
     tool: Tool = Field(default_factory=Tool)
     tracker: Tracker = Field(default_factory=Tracker)
     repeatability: Repeatability = Field(default_factory=Repeatability)
-    loads: tuple[CellLoad, ...] = ()
-    force_sensor: ForceSensor | None = None
-    operator: Operator = Field(default_factory=Operator)
-    motion: Motion = Field(default_factory=Motion)
-    acquire: Acquire = Field(default_factory=Acquire)
-    limits: Limits = Field(default_factory=Limits)
-    planning: Planning = Field(default_factory=Planning)
-    obstacles: tuple[Obstacle, ...] = ()
-    sight: Sight = Field(default_factory=Sight)
-    points: dict[str, Point] = Field(default_factory=dict)
-    gauges: dict[str, Gauge] = Field(default_factory=dict)
+    loads: tuple[sections.CellLoad, ...] = ()
+    force_sensor: sections.ForceSensor | None = None
+    operator: sections.Operator = Field(default_factory=sections.Operator)
+    motion: sections.Motion = Field(default_factory=sections.Motion)
+    acquire: sections.Acquire = Field(default_factory=sections.Acquire)
+    limits: sections.Limits = Field(default_factory=sections.Limits)
+    planning: sections.Planning = Field(default_factory=sections.Planning)
+    obstacles: tuple[sections.Obstacle, ...] = ()
+    sight: sections.Sight = Field(default_factory=sections.Sight)
+    points: dict[str, sections.Point] = Field(default_factory=dict)
+    gauges: dict[str, sections.Gauge] = Field(default_factory=dict)
     simulation: Simulation = Field(default_factory=Simulation)
     ordinary: dict[str, Positive] = Field(default_factory=dict)
     plausible: dict[str, Positive] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _distinct_names(self) -> "CellConfig":
-        check_distinct("loads", self.loads)
-        check_distinct("obstacles", self.obstacles)
+        sections.check_distinct("loads", self.loads)
+        sections.check_distinct("obstacles", self.obstacles)
         return self
 
     @model_validator(mode="after")

@@ -172,11 +172,11 @@ def _hint(missing: Sequence[str], header: Sequence[str], units: Units, arm: str)
     return f"{number}; a table for {arm} needs {', '.join(required_columns(units))}"
 
 
-def covariance_size(path: str, header: Sequence[str]) -> int | None:
-    """Size m of the covariance that the table gives, None where it gives none."""
+def check_covariance_columns(path: str, header: Sequence[str]) -> None:
+    """Refuse a part of a covariance, or one of an orientation that the table lacks."""
     stated = [c for c in header if c in covariance_columns(6)]
     if not stated:
-        return None
+        return
     m = 6 if ROTATION[0] in header else 3
     needed = covariance_columns(m)
     for name in needed:
@@ -189,7 +189,6 @@ def covariance_size(path: str, header: Sequence[str]) -> int | None:
         raise InputError(
             f"{path}: column '{extra[0]}' needs the rotation vector {', '.join(ROTATION)}"
         )
-    return m
 
 
 def following_columns(arm: Arm) -> tuple[str, ...]:

@@ -91,7 +91,7 @@ def open_stream(
             f"{path}: column '{columns.TARGET}': a stream is of one target; import a table of "
             "several with `hilcal import`"
         )
-    columns.covariance_size(str(path), header)
+    columns.check_covariance_columns(str(path), header)
     valid = set(columns.known_columns(arm.units)) - {*NAMES, columns.COVERS}
     meta = file.metadata
     rows = tuple(meta.row_group(k).num_rows for k in range(meta.num_row_groups))

@@ -16,19 +16,6 @@ from hilcal.tables.columns import required_columns
 from hilcal.tables.grid import Grid, joined
 from hilcal.tables.guess_values import guess_axes, guess_by_values, is_quaternion, time_unit
 from hilcal.tables.mapping import UNLOADED
-from hilcal.tables.proposal import (
-    FEWEST_JOINTS,
-    GUESSED,
-    MOST_JOINTS,
-    REPORTED,
-    SHOWN,
-    ColumnName,
-    Guesser,
-    Proposal,
-    angle_unit,
-    length_unit,
-    parse,
-)
 from hilcal.tables.sniff import sniff
 from hilcal.tables.units import ANGLES, LENGTHS, MOMENTS
 
@@ -38,7 +25,7 @@ class Proposed:
     """A table and a proposed mapping for it."""
 
     grid: Grid
-    proposal: Proposal
+    proposal: words.Proposal
 
 
 @limits.bounded
@@ -102,9 +89,9 @@ def _is_key(keys: list[str]) -> bool:
     return bool(np.all(numbers == np.rint(numbers)))
 
 
-def guess(grid: Grid, joints: int | None = None) -> Proposal:
+def guess(grid: Grid, joints: int | None = None) -> words.Proposal:
     """Propose a mapping for a table."""
-    g = Guesser(grid, joints)
+    g = words.Guesser(grid, joints)
     _joints(g)
     guess_axes(g)
     _scalars(g)
@@ -118,7 +105,7 @@ def guess(grid: Grid, joints: int | None = None) -> Proposal:
     if set(required_columns(joints or 6)) <= set(grid.names):
         g.unsure("file", "this is an exchange table: it is imported without --format")
     if g.proposal.open_convention:
-        g.unsure("orientation", GUESSED)
+        g.unsure("orientation", words.GUESSED)
     for section, sentence in (
         ("position", "no position: three columns x, y, z were not found"),
         ("joints", "no joint angles: where they are in a file of their own, give it with --second"),
@@ -132,7 +119,7 @@ def guess(grid: Grid, joints: int | None = None) -> Proposal:
     return g.proposal
 
 
-def _why_unused(g: Guesser, column: ColumnName) -> str:
+def _why_unused(g: words.Guesser, column: words.ColumnName) -> str:
     values = g.values[column.name]
     if values is not None and np.nanmax(values) == np.nanmin(values):
         return f"constant, {np.nanmax(values):g}"
@@ -145,7 +132,7 @@ def _why_unused(g: Guesser, column: ColumnName) -> str:
     return "its name says nothing"
 
 
-def _joints(g: Guesser) -> None:
+def _joints(g: words.Guesser) -> None:
     """Find joint angles: columns named by a joint's word and a number, or by `ARM_JOINTS`."""
     groups: dict[tuple[str, ...], dict[int, str]] = {}
     for c in g.columns:
@@ -155,13 +142,13 @@ def _joints(g: Guesser) -> None:
             continue
         if not c.has(words.STD):
             groups.setdefault(c.words, {}).setdefault(c.numbers[-1], c.name)
-    candidates: list[tuple[ColumnName, list[str]]] = []
+    candidates: list[tuple[words.ColumnName, list[str]]] = []
     for by_number in groups.values():
         names = [by_number[k] for k in sorted(by_number)]
-        first = parse(names[0])
+        first = words.parse(names[0])
         if is_quaternion(g.block(names)) and len(names) == 4:
             continue
-        if sorted(by_number)[0] > 1 or not FEWEST_JOINTS <= len(names) <= MOST_JOINTS:
+        if sorted(by_number)[0] > 1 or not words.FEWEST_JOINTS <= len(names) <= words.MOST_JOINTS:
             continue
         if first.has(words.NO_ANGLE | words.TORQUE) or first.unit in MOMENTS:
             _per_joint(g, first, names)
@@ -169,14 +156,14 @@ def _joints(g: Guesser) -> None:
             candidates.append((first, names))
     named = [_with_words(g, w) for w in words.ARM_JOINTS]
     if all(named):
-        candidates.append((parse("joint"), [str(name) for name in named]))
+        candidates.append((words.parse("joint"), [str(name) for name in named]))
     if not candidates:
         return
     candidates.sort(key=lambda f: (f[0].has(words.MEASURED | {"qa"}), not f[0].has(words.NOMINAL)))
     first, names = candidates[0]
     if first.has(words.MEASURED | {"qa"}):
         g.unsure("joints", f"'{names[0]}' ... are reported angles, used as the commanded ones")
-    unit = angle_unit(g, "joints", names)
+    unit = words.angle_unit(g, "joints", names)
     g.take("joints", names, unit, unit=unit)
     if g.joints is not None and len(names) != g.joints:
         g.unsure("joints", f"{len(names)} columns, the arm has {g.joints} joints")
@@ -188,7 +175,7 @@ def _joints(g: Guesser) -> None:
                 break
 
 
-def _with_words(g: Guesser, parts: tuple[str, ...]) -> str | None:
+def _with_words(g: words.Guesser, parts: tuple[str, ...]) -> str | None:
     for c in g.columns:
         digits = {str(k) for k in c.numbers}
         if set(parts) <= set(c.words) | digits and g.number(c.name) and not c.has(words.NO_ANGLE):
@@ -196,7 +183,7 @@ def _with_words(g: Guesser, parts: tuple[str, ...]) -> str | None:
     return None
 
 
-def _per_joint(g: Guesser, first: ColumnName, names: list[str]) -> None:
+def _per_joint(g: words.Guesser, first: words.ColumnName, names: list[str]) -> None:
     """Find torques, temperatures and sides of approach of the joints."""
     values = g.block(names)
     if (first.has(words.TORQUE) or first.unit in MOMENTS) and not first.has(words.NOMINAL):
@@ -214,7 +201,7 @@ def _per_joint(g: Guesser, first: ColumnName, names: list[str]) -> None:
         g.take("approach", names, "-1 or +1")
 
 
-def _scalars(g: Guesser) -> None:
+def _scalars(g: words.Guesser) -> None:
     """Find distances from points and heights over planes, in rows that have no position."""
     position = g.proposal.sections.get("position", {}).get("columns", [])
     positioned = np.isfinite(g.block(position)).any(axis=1) if position else np.zeros(1, dtype=bool)
@@ -225,7 +212,7 @@ def _scalars(g: Guesser) -> None:
         if not plain:
             continue
         filled = np.isfinite(g.block(plain[:1])[:, 0])
-        unit = length_unit(g, kind, plain[:1])
+        unit = words.length_unit(g, kind, plain[:1])
         section: dict[str, Any] = {"unit": unit}
         for c in named:
             if g.number(c.name) and c.has(words.STD) and "std_column" not in section:
@@ -245,7 +232,7 @@ def _scalars(g: Guesser) -> None:
             g.free.pop(section.get(key, ""), None)
 
 
-def guess_names(g: Guesser) -> None:
+def guess_names(g: words.Guesser) -> None:
     """Find poses, loads, stations, cycles and reflectors."""
     q = g.proposal.sections.get("joints")
     _pick(g, "pose", words.POSE, lambda n: q is None or _names_poses(g, n, q))
@@ -270,14 +257,16 @@ def guess_names(g: Guesser) -> None:
     if (load := g.proposal.sections.get("load")) is not None:
         values = {t.lower() for t in g.grid.text(load["column"])}
         if not values & {*UNLOADED, ""}:
-            shown = ", ".join(sorted(values)[:SHOWN])
+            shown = ", ".join(sorted(values)[: words.SHOWN])
             g.unsure("load", f"which of its values means no load? Set none = [...] ({shown})")
     _pick(g, "station", words.STATION, lambda n: not g.number(n) and _few_values(g, n))
     _pick(g, "cycle", words.CYCLE, lambda n: g.number(n) and _whole_numbers(g, n))
     _pick(g, "target", words.REFLECTOR, lambda n: not g.number(n) and _few_values(g, n))
 
 
-def _pick(g: Guesser, section: str, vocabulary: set[str], fits: Callable[[str], bool]) -> None:
+def _pick(
+    g: words.Guesser, section: str, vocabulary: set[str], fits: Callable[[str], bool]
+) -> None:
     for c in list(g.free.values()):
         named = not g.number(c.name) or _whole_numbers(g, c.name)
         usable = named and c.has(vocabulary) and not c.axis and not c.has(words.STD)
@@ -286,18 +275,18 @@ def _pick(g: Guesser, section: str, vocabulary: set[str], fits: Callable[[str], 
             return
 
 
-def _whole_numbers(g: Guesser, name: str) -> bool:
+def _whole_numbers(g: words.Guesser, name: str) -> bool:
     values = g.block([name])[:, 0]
     finite = values[np.isfinite(values)]
     return bool(np.all(finite == np.rint(finite)))
 
 
-def _few_values(g: Guesser, name: str) -> bool:
+def _few_values(g: words.Guesser, name: str) -> bool:
     count = len(set(g.grid.text(name)))
     return 1 < count <= min(20, len(g.grid.rows) // 2)
 
 
-def _names_poses(g: Guesser, name: str, joints: dict[str, Any]) -> bool:
+def _names_poses(g: words.Guesser, name: str, joints: dict[str, Any]) -> bool:
     """Whether rows of one name have the same joint angles, or nearly so (then: reported angles)."""
     texts = g.grid.text(name)
     if "" in texts:
@@ -306,7 +295,7 @@ def _names_poses(g: Guesser, name: str, joints: dict[str, Any]) -> bool:
     first: dict[str, int] = {}
     rows = [first.setdefault(text, k) for k, text in enumerate(texts)]
     off = np.nan_to_num(np.abs(q - q[rows]))
-    if off.max() > REPORTED:
+    if off.max() > words.REPORTED:
         k = int(np.argmax(off.max(axis=1)))
         g.unsure("joints", f"'{name}' is no pose: '{texts[k]}' stands at different joints")
         return False
@@ -316,7 +305,7 @@ def _names_poses(g: Guesser, name: str, joints: dict[str, Any]) -> bool:
     return True
 
 
-def guess_scalars(g: Guesser) -> None:
+def guess_scalars(g: words.Guesser) -> None:
     """Find times and the temperature of the air."""
     for c in list(g.free.values()):
         dated = all(isinstance(cell, datetime) for cell in g.grid.cells(c.name))

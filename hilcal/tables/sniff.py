@@ -11,19 +11,7 @@ from typing import Any
 import numpy as np
 
 from hilcal.errors import InputError
-from hilcal.tables.files import (
-    BYTE_ORDER_MARKS,
-    content_of,
-    decoded,
-    filled,
-    grid_of_rows,
-    kind_of,
-    length_of,
-    open_grid,
-    records,
-    sheet_names,
-    sheet_rows,
-)
+from hilcal.tables import files
 from hilcal.tables.grid import Cell, Grid, number
 from hilcal.tables.mapping import FileFormat
 
@@ -49,16 +37,16 @@ class Sniffed:
 
 def sniff(path: str | Path) -> Sniffed:
     """Guess how a file is written, and open it."""
-    content = content_of(path)
+    content = files.content_of(path)
     name = str(path)
-    kind = kind_of(name, content)
+    kind = files.kind_of(name, content)
     if kind == "XLSX":
         return _spreadsheet(name, content)
     if kind != "text":
-        return Sniffed({}, open_grid(path, FileFormat()), ())
+        return Sniffed({}, files.open_grid(path, FileFormat()), ())
     how: dict[str, Any] = {}
-    text = decoded(name, content, None)
-    if not content.startswith(tuple(BYTE_ORDER_MARKS)):
+    text = files.decoded(name, content, None)
+    if not content.startswith(tuple(files.BYTE_ORDER_MARKS)):
         try:
             content.decode("utf-8")
         except UnicodeDecodeError:
@@ -71,7 +59,7 @@ def sniff(path: str | Path) -> Sniffed:
             break
     how |= _dialect(name, lines, how.get("comment"))
     how["header_row"] = 0
-    rows = list(records(name, text, FileFormat(**how)))
+    rows = list(files.records(name, text, FileFormat(**how)))
     layout, doubts = _layout(rows, FileFormat(**how))
     how |= layout
     if how["header_row"] == 0 and "comment" in how:
@@ -80,7 +68,7 @@ def sniff(path: str | Path) -> Sniffed:
         del how["header_row"]
     if how.get("separator") == ",":
         del how["separator"]
-    return Sniffed(how, open_grid(path, FileFormat(**how)), doubts)
+    return Sniffed(how, files.open_grid(path, FileFormat(**how)), doubts)
 
 
 def _dialect(path: str, lines: list[str], comment: str | None) -> dict[str, Any]:
@@ -97,7 +85,7 @@ def _dialect(path: str, lines: list[str], comment: str | None) -> dict[str, Any]
         keys |= {"thousands": thousands} if thousands else {}
         form = FileFormat(**{**keys, "comment": comment, "header_row": 0})
         try:
-            rows = [cells for _, cells in records(path, body, form)]
+            rows = [cells for _, cells in files.records(path, body, form)]
         except InputError:
             continue
         length, _ = Counter(map(len, rows)).most_common(1)[0] if rows else (0, 0)
@@ -122,18 +110,18 @@ def _layout(rows: Rows, how: FileFormat) -> tuple[dict[str, Any], tuple[str, ...
     length, _ = Counter(len(cells) for _, cells in rows).most_common(1)[0]
     share = []
     for _, cells in rows:
-        some = list(filter(filled, cells))
+        some = list(filter(files.filled, cells))
         share.append(sum(_is_number(c, how) for c in some) / max(len(some), 1))
     usual = float(np.median([s for s, (_, c) in zip(share, rows, strict=True) if len(c) == length]))
     complete = [len(cells) >= length - 1 for _, cells in rows]
     first = next((k for k in range(len(rows)) if share[k] >= 0.5 * usual and complete[k]), 0)
-    titled = [k for k in range(first) if complete[k] and sum(map(filled, rows[k][1])) > 1]
-    above = [k for k in titled if length_of(rows[k][1]) <= length]
+    titled = [k for k in range(first) if complete[k] and sum(map(files.filled, rows[k][1])) > 1]
+    above = [k for k in titled if files.length_of(rows[k][1]) <= length]
     out: dict[str, Any] = {"header_row": 0}
     doubts: list[str] = []
     if titled and not above:
         row, cells = rows[titled[-1]]
-        named = f"row {row} names {length_of(cells)} columns, the readings have {length}"
+        named = f"row {row} names {files.length_of(cells)} columns, the readings have {length}"
         doubts.append(f"{named}: the columns are numbered")
     header: Sequence[Cell] = ()
     if above:
@@ -143,12 +131,14 @@ def _layout(rows: Rows, how: FileFormat) -> tuple[dict[str, Any], tuple[str, ...
             title = above[-2]
         out["header_row"], header = rows[title]
     width = len(header) or length
-    trimmed = length_of(header) if header else width
+    trimmed = files.length_of(header) if header else width
     odd = []
     for k, (row, cells) in enumerate(rows):
         preamble = k < first and row > out["header_row"] and row != out.get("units_row")
         short = bool(header) and len(cells) < trimmed
-        if preamble or (k >= first and (short or length_of(cells) > width or cells == header)):
+        if preamble or (
+            k >= first and (short or files.length_of(cells) > width or cells == header)
+        ):
             odd.append(row)
     if odd and len(odd) <= 0.1 * len(rows) + 10:
         out["skip_rows"] = odd
@@ -167,7 +157,7 @@ def _commented_header(text: str, how: dict[str, Any], rows: Rows) -> dict[str, A
         return {}
     plain = FileFormat(**{**how, "comment": None, "header_row": 0})
     line = lines[marked[-1] - 1][len(how["comment"]) :]
-    cells = [c for _, c in records("", line, plain)]
+    cells = [c for _, c in files.records("", line, plain)]
     same = bool(cells) and len(cells[0]) == len(rows[0][1])
     return {"header_row": marked[-1]} if same else {}
 
@@ -175,9 +165,9 @@ def _commented_header(text: str, how: dict[str, Any], rows: Rows) -> dict[str, A
 def _spreadsheet(path: str, content: bytes) -> Sniffed:
     """Choose the sheet with most numbers."""
     best: tuple[int, str, Rows] = (0, "", [])
-    names = sheet_names(path, content)
+    names = files.sheet_names(path, content)
     for sheet in names:
-        rows = sheet_rows(path, content, sheet, None)
+        rows = files.sheet_rows(path, content, sheet, None)
         count = sum(isinstance(c, float) for _, cells in rows for c in cells)
         if count > best[0]:
             best = count, sheet, rows
@@ -189,4 +179,4 @@ def _spreadsheet(path: str, content: bytes) -> Sniffed:
     if how["header_row"] == 1:
         del how["header_row"]
     form = FileFormat(**how)
-    return Sniffed(how, grid_of_rows(path, best[2], form), doubts)
+    return Sniffed(how, files.grid_of_rows(path, best[2], form), doubts)

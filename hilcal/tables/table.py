@@ -60,11 +60,7 @@ def import_table(
     targets: Sequence[str] = (),
     std: Mapping[ObserverName, float] | None = None,
 ) -> ImportResult:
-    """Read an exchange table; every unit is SI, every complaint names row and column.
-
-    Args:
-        station: (3,) where the tracker's beam starts, m; the origin where None.
-    """
+    """Read an exchange table: SI units; `station` (3,), m, is where the tracker's beam starts."""
     chosen: list[Sequence[str]] = []
     grid = open_grid(path, FORM, lambda header: chosen.extend(_choose(str(path), header, arm)))
     sparse = columns.sparse_columns(grid.names)
@@ -84,11 +80,9 @@ def readings_of(
 ) -> ImportResult:
     """Check a table with the exchange table's columns, in SI units, and make readings of it.
 
-    Args:
-        station: (3,) where the tracker's beam starts, m; the origin where None.
-        covariance: (K, m, m) of the K rows with a position, in place of the table's columns.
-        rounding: (3,) variance of the positions' rounding, m²; None: from the positions.
-        std: of distances and heights, m, for a table that states none.
+    `covariance` (K, m, m) of the K rows with a position replaces the table's columns; `rounding`
+    (3,), m², is the variance of the positions' rounding, which follows from them where it is None;
+    `std` is that of distances and heights, m, for a table that states none.
     """
     checks.check_names(table)
     pose, pose_names = _index(table.text["pose"])
@@ -100,10 +94,9 @@ def readings_of(
     states = replace(states, target=target, observer=None if observed is None else observed.number)
     checks.check_same_pose(table, pose, pose_names, states.q, arm)
     checks.check_wrenches(table, states.wrench, load, load_names, arm)
-    cov, notes, covers = np.zeros((len(value), 3, 3)), tuple[str, ...](), _covers(table)[0]
-    if positioned.all():
-        cov, notes, covers = covariances_of(table, value, noise, station, covariance, rounding)
-    elif positioned.any():
+    m = value.shape[1]
+    cov, notes, covers = np.zeros((len(value), m, m)), tuple[str, ...](), _covers(table)[0]
+    if positioned.any():
         cov[positioned], notes, covers = covariances_of(
             table.select(positioned), value[positioned], noise, station, covariance, rounding
         )
@@ -167,7 +160,7 @@ def _choose(path: str, header: Sequence[str], arm: Arm) -> tuple[Sequence[str], 
             f"{columns.PREVIEW}"
         )
     columns.check_header(path, header, arm.units, arm.name, following_columns(arm))
-    columns.covariance_size(path, header)
+    columns.check_covariance_columns(path, header)
     named = [name for _, name, _ in columns.SCALAR.values()]
     optional = (columns.TARGET, columns.COVERS, columns.STATION, *named)
     text = (*columns.TEXT, *(name for name in header if name in optional))
@@ -177,7 +170,7 @@ def _choose(path: str, header: Sequence[str], arm: Arm) -> tuple[Sequence[str], 
 def _index(names: list[str]) -> tuple[Ints, list[str]]:
     """Index of each name among the distinct ones, in order of appearance, and these."""
     order = {name: k for k, name in enumerate(dict.fromkeys(names))}
-    return np.fromiter((order[n] for n in names), dtype=np.int64, count=len(names)), list(order)
+    return np.array([order[name] for name in names], dtype=np.int64), list(order)
 
 
 def _targets(table: ColumnTable, names: Sequence[str]) -> Ints | None:
@@ -239,8 +232,7 @@ def check_covers(word: str, where: str) -> None:
 def measured_of(table: ColumnTable, arm: Arm, rows: Bools | None = None) -> tuple[States, Floats]:
     """Return the states of a table's rows, and their measured values (N, m), m and rad.
 
-    Args:
-        rows: (N,) rows with a position, others are zero; all of them where None.
+    Values of rows without a position, those that are not in `rows` (N,), are zero.
     """
     states = _states(table, arm)
     if rows is not None and not rows.all():
@@ -258,13 +250,6 @@ def measured_of(table: ColumnTable, arm: Arm, rows: Bools | None = None) -> tupl
         checks.check_rotations(table, rotation)
         value = np.hstack([value, rotation])
     return states, value
-
-
-_RANGES = (
-    ("air_degC", -50.0, 80.0, "°C"),
-    ("time_s", -LONGEST, LONGEST, "s"),
-    ("load_time_s", 0.0, LONGEST, "s"),
-)
 
 
 def _states(table: ColumnTable, arm: Arm) -> States:
@@ -288,7 +273,11 @@ def _states(table: ColumnTable, arm: Arm) -> States:
         some = lost & ~lost.all(axis=1, keepdims=True)
         table.refuse(some, torques, lambda _: "no value; give all torques of a row, or none")
         _in_range(table, torques, -LARGEST_NM, LARGEST_NM, "N·m or N")
-    for name, low, high, unit in _RANGES:
+    for name, low, high, unit in (
+        ("air_degC", -50.0, 80.0, "°C"),
+        ("time_s", -LONGEST, LONGEST, "s"),
+        ("load_time_s", 0.0, LONGEST, "s"),
+    ):
         if name in number:
             _in_range(table, (name,), low, high, unit)
     return States(
@@ -366,9 +355,8 @@ def write_table(
 ) -> None:
     """Write an exchange table that `read_table` reads back exactly: CSV, or Parquet by its name.
 
-    `covers` says what the covariances cover, see `readings.covariance` and
-    `with_what_rounding_does`; `units` are those of the joints' values (`Arm.units`), all rad where
-    None.
+    `covers` says what the covariances cover, see `with_what_rounding_does`; `units` are those of
+    the joints' values (`Arm.units`), all rad where None.
     """
     about = {"table": "readings", "covers": covers, **(about or {})}
     write_columns(Path(path), exchange_columns(readings, covers, units), about)
@@ -392,11 +380,7 @@ def exchange_columns(
 
 
 def with_what_rounding_does(covers: str, readings: Readings) -> str:
-    """Return the word of column `covers` for complete covariances.
-
-    Where reading the table would add the variance of the positions' rounding, the word says that
-    the covariances include it.
-    """
+    """Return the word of column `covers` that keeps reading from adding rounding's variance."""
     positioned = ~readings.scalar
     if not positioned.any():
         return covers
@@ -417,7 +401,6 @@ def _checked_names(names: Sequence[str], index: Ints, kind: str) -> list[str]:
 
 
 def _number_columns(readings: Readings, units: Sequence[str] | None) -> dict[str, Column]:
-    """(N,) number columns that the readings have, by name."""
     s, m, n = readings.states, readings.m, readings.states.q.shape[1]
     i, j = np.triu_indices(m)
     value, cov = readings.value.copy(), readings.covariance[:, i, j]
