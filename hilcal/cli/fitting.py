@@ -294,14 +294,10 @@ def identify(
     other_arm = other_arm_of(o.cell, o.readings)
     if other_arm is not None:
         t.show(other_arm_line(other_arm))
-    document = {
-        "revision": number,
-        **to_json(stored),
-        "options": options_json(stored),
-        "covariance": o.covariance_parts,
-        **({} if torques is None else {"torques": torques.to_json()}),
-        "other_arm": None if other_arm is None else other_arm.to_json(),
-    }
+    document: dict[str, object] = {"revision": number, **to_json(stored)}
+    document |= {"options": options_json(stored), "covariance": o.covariance_parts}
+    document |= {} if torques is None else {"torques": torques.to_json()}
+    document["other_arm"] = None if other_arm is None else other_arm.to_json()
     if len(fits) > 1:
         t.show(["", *scalings_table(fits)])
         document["scalings"] = {s: to_json(f) for s, f in fits.items()}

@@ -11,7 +11,7 @@ from hilcal.campaign.changes import add_effect, remove_effect
 from hilcal.cli import fitting
 from hilcal.cli.options import catalogue_with, check_folder, command
 from hilcal.cli.showing import followed
-from hilcal.cli.terminal import terminal
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.diagnosis.document import suspect_json, to_json
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.diagnosis.verdict import NOTHING
@@ -47,10 +47,8 @@ from hilcal.whole_file import replace_file
 
 def chapters_of(numbers: Iterable[int], steps: Iterable[RefinementStep]) -> list[Chapter]:
     """Return the steps of a refinement as chapters with the numbers of their revisions."""
-    return [
-        Chapter(number, s.added, s.fit, s.diagnosis, s.removed)
-        for number, s in zip(numbers, steps, strict=True)
-    ]
+    pairs = zip(numbers, steps, strict=True)
+    return [Chapter(n, s.added, s.fit, s.diagnosis, s.removed) for n, s in pairs]
 
 
 def errors_by_revision(chapters: Sequence[Chapter], stored: str = "") -> list[Block]:
@@ -97,12 +95,12 @@ def add(
     view: bool = False, effects_from: list[Path] | None = None, as_json: bool = False,
 ) -> None:  # fmt: skip
     """Add an effect to the model: error before and after."""
-    catalogue = catalogue_with(effects_from)
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     effects = read_effects_text(effect, "EFFECT", catalogue)
     if len(effects) != 1:
         raise InputError(f"EFFECT {effect!r} has {len(effects)} effects; valid: one")
     ((name, options),) = effects.items()
-    _change(run, revision, name, record, view, as_json, catalogue, options)
+    _change(t, run, revision, name, record, view, catalogue, options)
 
 
 @command("""
@@ -113,23 +111,23 @@ def remove(
     view: bool = False, effects_from: list[Path] | None = None, as_json: bool = False,
 ) -> None:  # fmt: skip
     """Take an effect out of the model: error before and after."""
-    catalogue = catalogue_with(effects_from)
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     catalogue[effect]  # an unknown name is refused
-    _change(run, revision, effect, record, view, as_json, catalogue)
+    _change(t, run, revision, effect, record, view, catalogue, None)
 
 
 def _change(
+    t: Terminal,
     run: Path,
     revision: int | None,
     effect: str,
     record: Path | None,
     view: bool,
-    as_json: bool,
     catalogue: Catalogue,
-    options: Options | None = None,
+    options: Options | None,
 ) -> None:
     """Make a revision with an additional effect; without `options`, with the effect removed."""
-    t, adds = terminal(as_json), options is not None
+    adds = options is not None
     fitting.check_record(record)
     with Campaign.open(run, catalogue) as o, followed(t, view, run) as live:
         fitting.check_options(o, {effect: options or {}} if adds else {})
@@ -220,10 +218,8 @@ def refine(
                 laws.write(refinement.names)
             for step in refinement.steps:
                 fitting.finish(step.fit, say)
-            records = [
-                o.record(s.fit, s.diagnosis, s.added, s.removed)
-                for s in refinement.steps[len(origin) :]
-            ]
+            new = refinement.steps[len(origin) :]
+            records = [o.record(s.fit, s.diagnosis, s.added, s.removed) for s in new]
             n_revisions = len(o.file.revisions())
             numbered = (*origin, *o.append_records(records, *origin))
             chapters = chapters_of(numbered, refinement.steps)
@@ -242,11 +238,8 @@ def refine(
             t.show(other_arm_line(other_arm))
         if note := masses_note(refinement.fit):
             t.show(numbers.sentence(note))
-        if refinement.rejected:
-            t.show(
-                f"Tried and left out, since the error on poses left out did not fall: "
-                f"{', '.join(refinement.rejected)}."
-            )
+        if names := ", ".join(refinement.rejected):
+            t.show(f"Tried and left out, since the error on poses left out did not fall: {names}.")
         if laws is not None:
             t.show(words.refined_laws(laws))
         diagnosis = refinement.diagnosis

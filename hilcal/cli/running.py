@@ -297,14 +297,8 @@ class RehearsalSettings:
     seed: int
     output: Path
     base_dir: Path  # directory that paths in the configuration are relative to
-    catalogue: Catalogue
-    lacking: Catalogue | None = None
-    """The catalogue with the hidden law, where the models do not have it."""
-
-    @property
-    def world(self) -> Catalogue:
-        """The effects that can be hidden."""
-        return self.catalogue if self.lacking is None else self.lacking
+    catalogue: Catalogue  # the effects of models
+    world: Catalogue  # the effects that can be hidden
 
     def case(self, plan: Plan) -> SimulationCase:
         """Hide the choice in the simulated cell; see `case_of_plan`."""
@@ -350,11 +344,10 @@ def on_devices(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator
         )
 
         def missing(file: CampaignFile, epoch: float | None = None) -> None:
-            to_the_end(
-                t,
-                lambda: measure(t, world.config, secret.cell, file, epoch=epoch),
-                lambda: file.n_readings,
-            )
+            def work() -> None:
+                measure(t, world.config, secret.cell, file, epoch=epoch)
+
+            to_the_end(t, work, lambda: file.n_readings)
 
         def measured() -> Rehearsal:
             missing(campaign)
@@ -384,19 +377,22 @@ def in_process(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator
         settings.output, text, str(settings.base_dir), source, overwrite=True, more={COVERS: WHOLE}
     ) as campaign:
 
+        def last_time() -> float:
+            time = campaign.readings().states.time
+            return 0.0 if time is None else float(time.max())
+
         def measured(part: Plan, number: int, start: float) -> Rehearsal:
             r = read_plan(secret, part, [settings.seed, number], start)
             _write(t, campaign, r.readings)
             return secret.measured(campaign.readings())
 
         def further(next_plan: Plan) -> Rehearsal:
-            last = last_time(campaign.readings())
-            return measured(with_new_names(next_plan, plan, 2), 2, last + BREAK)
+            return measured(with_new_names(next_plan, plan, 2), 2, last_time() + BREAK)
 
         def missing(file: CampaignFile, epoch: float | None = None) -> None:
             # Campaigns are told apart by the number of letters appended to the first one's name.
             log, number = RunLog(file), 3 + len(file.path.stem) - len(settings.output.stem)
-            start = last_time(campaign.readings()) + number * BREAK
+            start = last_time() + number * BREAK
             drawn = read_plan(secret, log.plan, [settings.seed, number], start).readings
             for k, step in enumerate(log.plan.steps):
                 log.record(drawn[slice(k, k + 1)], step, {"drawn": True})
@@ -404,23 +400,16 @@ def in_process(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator
         yield RehearsedCampaign(measured(plan, 1, 0.0), further, missing)
 
 
-def last_time(readings: Readings) -> float:
-    """Return the time of the last reading, s; 0 where times are unknown."""
-    time = readings.states.time
-    return 0.0 if time is None else float(time.max())
-
-
-def to_the_end(t: Terminal, work: Callable[[], object], count: Callable[[], int]) -> None:
+def to_the_end(t: Terminal, work: Callable[[], None], count: Callable[[], int]) -> None:
     """Measure the missing readings by `work`; try again after a device failure.
 
     On a busy computer a simulated device may stall, which a driver takes for a failure. At most
-    `TRIES` - 1 failures in a row without a new reading are accepted. `count` returns the number of
-    readings.
+    `TRIES` - 1 failures in a row without a new reading, which `count` counts, are accepted.
     """
     tries, stored = TRIES, count()
     while True:
         try:
-            work()
+            return work()
         except DeviceError as error:
             current = count()
             tries, stored = (TRIES if current > stored else tries) - 1, current
@@ -428,8 +417,6 @@ def to_the_end(t: Terminal, work: Callable[[], object], count: Callable[[], int]
                 raise
             t.notice(f"note: {error}")
             t.notice("going on with what is missing")
-        else:
-            return
 
 
 def _write(t: Terminal, campaign: CampaignFile, readings: Readings) -> None:
@@ -488,8 +475,7 @@ def simulate(
     if clock is not None:
         if not 1.0 <= clock <= FASTEST:
             raise InputError(f"--clock {clock:g}; valid: a number from 1 to {FASTEST:g}")
-        simulation = config.simulation.model_copy(update={"clock": clock})
-        config = config.model_copy(update={"simulation": simulation})
+        config = _with(config, "simulation", clock=clock)
     base_dir = cell.absolute().parent
     choice = hide or config.simulation.hide or NOTHING
     as_told(config, choice, catalogue)  # refuses an effect that cannot be hidden, before planning
@@ -526,16 +512,19 @@ def simulate(
 def with_person(config: CellConfig) -> CellConfig:
     """Return the configuration of a simulated cell whose loads a person changes."""
     options = {**config.operator.options, "person": True}
-    operator = config.operator.model_copy(update={"options": options})
-    return config.model_copy(update={"operator": operator})
+    return _with(config, "operator", options=options)
+
+
+def _with(config: CellConfig, section: str, **values: object) -> CellConfig:
+    changed = getattr(config, section).model_copy(update=values)
+    return config.model_copy(update={section: changed})
 
 
 def _placed(config: CellConfig, base_dir: Path) -> CellConfig:
     """Return the configuration with absolute paths of the robot's files."""
     paths = {"model": config.robot.model, "calibration": config.robot.calibration or ""}
     files = {k: str((base_dir / v).absolute()) for k, v in paths.items() if Path(v).suffix}
-    robot = config.robot.model_copy(update=files)
-    return config.model_copy(update={"robot": robot})
+    return _with(config, "robot", **files)
 
 
 FACTORY_POSES = 20
@@ -571,8 +560,8 @@ def factory_check(
 def _measure_without_loads(
     t: Terminal, config: CellConfig, cell: Cell, catalogue: Catalogue, output: Path, yes: bool
 ) -> None:
-    planning = config.planning.model_copy(update={"readings": "absolute"})
-    bare = config.model_copy(update={"loads": (), "planning": planning, "force_sensor": None})
+    bare = _with(config, "planning", readings="absolute")
+    bare = bare.model_copy(update={"loads": (), "force_sensor": None})
     numbers = cell_from_config(bare, cell.base_dir)
     with working(t.progress) as say:
         plan = make_plan(numbers, bare, FACTORY_POSES, config.simulation.seed, catalogue, say)
