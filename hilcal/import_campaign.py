@@ -38,12 +38,7 @@ def import_campaign(
     overwrite: bool = False,
     say: Say = lambda text: None,
 ) -> Imported:
-    """Make a campaign file from a table of readings, measured in a cell.
-
-    Args:
-        kind: "table", "ipa-ur10", the name of a mapping, or the path of one.
-        second: the second file of a mapping that is for two.
-    """
+    """Make a campaign file from a table of readings, as `import_readings` reads it."""
     settings = load_config(config)
     base_dir = config.absolute().parent
     cell = cell_from_config(settings, base_dir)
@@ -56,15 +51,8 @@ def import_campaign(
     texts |= {FROM: TRACKER} if imported.from_tracker else {}
     texts |= {} if noise is None else {NOISE: noise.to_json()}
     say(f"writing {output}")
-    source = f"{table.name} ({Path(kind).name})"
-    CampaignFile.create(
-        output,
-        settings.to_json(),
-        str(base_dir),
-        source,
-        overwrite=overwrite,
-        more=texts,
-        readings=imported.readings,
-    ).close()
+    about = settings.to_json(), str(base_dir), f"{table.name} ({Path(kind).name})"
+    readings = imported.readings
+    CampaignFile.create(output, *about, overwrite=overwrite, more=texts, readings=readings).close()
     parts = covariance_parts(imported.covers, settings)
-    return Imported(settings, cell, imported.readings, noise, parts, imported.notes)
+    return Imported(settings, cell, readings, noise, parts, imported.notes)

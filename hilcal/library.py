@@ -129,9 +129,8 @@ def bootstrap(
 
     Args:
         found: the fit; `ratio` of the result compares its standard uncertainties.
-        seed: seed of the draws; the result does not depend on the workers.
-        workers: processes of this machine; None: one per processor, for scripts that begin with
-            `if __name__ == "__main__"`.
+        workers: processes of this machine, which the result does not depend on; None: one per
+            processor, for scripts that begin with `if __name__ == "__main__"`.
         scheduler: address of a Dask cluster to use instead.
     """
     with open_engine(None if scheduler is not None else workers, scheduler) as engine:
@@ -217,7 +216,6 @@ def fit(
     True
 
     Args:
-        data: the readings, or their campaign.
         readings: "deflection" or "absolute"; None: as the cell plans and the data allow.
         scaling: "none", "gu" or "gc" (whitened by the full covariance).
         prior: the posterior of another campaign of this arm, for the effects that the model shares
@@ -246,7 +244,7 @@ def fit(
 def diagnose(
     fit: Fit | Campaign, history: History = NOTHING, say: Callable[[str], None] = lambda text: None
 ) -> Diagnosis:
-    """Diagnose a fit: what is missing in its model, with a verdict.
+    """Diagnose a fit, or the revision in use of a campaign: what is missing, with a verdict.
 
     >>> with hc.Campaign.open(RUN) as run:
     ...     fit = hc.fit(hc.baseline(run), run)
@@ -255,10 +253,8 @@ def diagnose(
     ('missing_effect', 'joint_tilt_compliance')
 
     Args:
-        fit: the fit; or a campaign, for its revision in use.
         history: effects added to and removed from the model so far; that of the revision where
             `fit` is a campaign.
-        say: takes progress, one line each.
 
     Raises:
         InputError: a fit whose residual is not whitened, or of too many readings; a campaign
@@ -280,7 +276,6 @@ def load_posterior(path: str | Path, catalogue: Catalogue | None = None) -> Post
 
     Args:
         path: a campaign file, for its revision in use, or a JSON file of a posterior.
-        catalogue: the effects; None: the installed ones.
 
     Raises:
         InputError: no such file, a file of another kind, or a campaign without a revision.
@@ -318,14 +313,11 @@ def refine(
 
     Args:
         model: the starting model; or a campaign alone, for its baseline.
-        data: the readings, or their campaign.
-        readings: "deflection" or "absolute"; None: as the cell plans and the data allow.
-        prior: as for `fit`.
+        readings, prior, mode: as for `fit`.
         discover: a folder. Where no effect explains the misfit, a law is searched, as by
             `hilcal refine --discover`; the files of laws in the final model are written there.
         background: whether all effects of the catalogue are fitted together, as a background, where
             the named ones leave more than noise.
-        mode: another name of `readings`.
 
     Raises:
         InputError: another kind of readings, a prior that does not fit them, or no such folder.
@@ -370,7 +362,6 @@ def plan(
         poses: number of poses, each read unloaded and under every load that it bears.
         criterion: "D", "A", "E", "K", "I" or "separate"; None: that of `[planning]`.
         given: a fit of the previous readings.
-        seed: seed of the random candidates.
         prior: the prior from another campaign of this arm, unless `given` is stated, which has its
             prior.
 

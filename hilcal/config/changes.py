@@ -16,10 +16,7 @@ from hilcal.toml import check_section, section_of, suggest
 Changes = Mapping[str, Mapping[str, Any]]  # Values by key, by section
 
 INSTRUMENT_NOISE = (
-    "range_std_m",
-    "range_std_per_m",
-    "transverse_std_m",
-    "transverse_std_per_m",
+    *("range_std_m", "range_std_per_m", "transverse_std_m", "transverse_std_per_m"),
     "orientation_std_rad",
 )
 """Keys of [tracker]: the noise of a tracker."""
@@ -33,11 +30,7 @@ _WHERE = "the cell"
 
 
 def changed(config: CellConfig, changes: Changes) -> CellConfig:
-    """Return a configuration with changes.
-
-    Args:
-        changes: values of keys of `CHANGEABLE`; None removes a key.
-    """
+    """Return a configuration with changes of keys of `CHANGEABLE`; None removes a key."""
     if not changes:
         return config
     content = config.model_dump(mode="json")

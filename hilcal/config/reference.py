@@ -50,11 +50,7 @@ class KeyTable:
 
 
 def tables(options: Mapping[str, type[Section]] | None = None) -> tuple[KeyTable, ...]:
-    """Return all sections, in the order of the configuration.
-
-    Args:
-        options: sections of keys of drivers, by name, e.g. "tracker.options (emscon)".
-    """
+    """Return all sections in order, with `options` of drivers, as "tracker.options (emscon)"."""
     sections: list[KeyTable] = []
     for name, field in CellConfig.model_fields.items():
         inner = section_of(field)

@@ -23,15 +23,12 @@ def import_readings(
 ) -> ImportResult:
     """Read a table; the cell states the tracker's noise and place, gravity, and loads.
 
-    Args:
-        form: "table" (the exchange table), the name of a mapping that comes with the
-            program, the path of a mapping file, or a mapping.
-        second: the second file, for a mapping of two files.
+    `form` is "table" (the exchange table), a mapping, its name or its file; `second` is the second
+    file of a mapping of two.
     """
-    if isinstance(form, Mapping):
-        mapping: Mapping | None = form
-    else:
-        mapping = None if str(form) == TABLE else find_mapping(form, Mapping)
+    mapping: Mapping | None = None
+    if str(form) != TABLE:
+        mapping = form if isinstance(form, Mapping) else find_mapping(form, Mapping)
     tracker, gravity = config.tracker, config.robot.gravity_m_s2
     noise, station = tracker_noise(tracker), tracker.station_m
     targets, std = [target.name for target in config.tool.targets], _std(config)

@@ -136,9 +136,8 @@ def import_mapped(
 ) -> ImportResult:
     """Read a table, or two tables, by a mapping.
 
-    Args:
-        station: (3,) where the tracker's beam starts, m; the origin where None.
-        gravity: (3,) base axes, m/s²: the direction in which a hung mass pulls.
+    The tracker's beam starts at `station` (3,), m, or at the origin; a hung mass pulls along
+    `gravity` (3,), base axes, m/s².
     """
     source = mapped_table(path, mapping, arm, gravity, second)
     mapping, grid, table, notes = source.mapping, source.grid, source.table, source.notes

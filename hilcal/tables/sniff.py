@@ -165,9 +165,10 @@ def _commented_header(text: str, how: dict[str, Any], rows: Rows) -> dict[str, A
 def _spreadsheet(path: str, content: bytes) -> Sniffed:
     """Choose the sheet with most numbers."""
     best: tuple[int, str, Rows] = (0, "", [])
-    names = files.sheet_names(path, content)
+    book = files.workbook(path, content)
+    names = book.sheetnames
     for sheet in names:
-        rows = files.sheet_rows(path, content, sheet, None)
+        rows = files.sheet_rows(path, book, sheet, None)
         count = sum(isinstance(c, float) for _, cells in rows for c in cells)
         if count > best[0]:
             best = count, sheet, rows

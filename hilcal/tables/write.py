@@ -96,11 +96,7 @@ def _arrow(path: Path, columns: Mapping[str, list[Any]], about: Mapping[str, obj
 
 
 def revision_table(records: Sequence[RevisionRecord], in_use: int | None) -> dict[str, Column]:
-    """Return the models and errors of revisions as a table, SI.
-
-    Args:
-        in_use: number of the revision in use.
-    """
+    """Return the models and errors of revisions, of which one is in use, as a table, SI."""
     rows = [_row(r, r.number == in_use) for r in records]
     return {name: [row[name] for row in rows] for name in (rows[0] if rows else {})}
 
