@@ -33,8 +33,7 @@ class Finding:
 
     topic: str  # "program", "computer", "serial ports", "network" or "cell"
     name: str  # of the checked item, e.g. "clock"
-    state: State
-    """"ok"; "warning": a campaign runs but may suffer; "problem": a campaign does not run."""
+    state: State  # "ok"; "warning": a campaign may suffer; "problem": no campaign runs
     said: str  # description of the state
     mend: str = ""  # remedy; empty if none is needed
 
@@ -43,11 +42,9 @@ COMPUTER = partial(Finding, "computer")
 PROGRAM = partial(Finding, "program")
 PORT = partial(Finding, "serial ports")
 NETWORK = partial(Finding, "network")
-LEAST_FREE = 1e9
-"""Least free space, bytes; the recordings of a campaign take up to 0.1 GB."""
+LEAST_FREE = 1e9  # bytes; the recordings of a campaign take up to 0.1 GB
 SLOW_WRITE = 0.1  # duration of a durable write that slows a campaign, s; a reading takes 1 s
-LEAST_MEMORY = 2e9
-"""Least memory for large campaigns, bytes (12,000 readings took 1.84 GB)."""
+LEAST_MEMORY = 2e9  # bytes, for large campaigns (12,000 readings took 1.84 GB)
 FIRST_DAY = datetime(2026, 1, 1).astimezone()  # a clock before this day has never been set
 ON_NETWORK = ("nfs", "nfs4", "cifs", "smb3", "9p", "fuse.sshfs")
 """File systems on which SQLite's locks are unreliable (SQLite FAQ, question 5)."""
@@ -62,18 +59,14 @@ GROUPS = {
     "hilcal.force_sensors": "force sensors",
     "hilcal.operators": "operators",
 }
-NOT_FOR_USERS = ("all", "dev", "docs", "release")
-"""Extras that no command needs: `all` repeats the others."""
-LATE_MS = 1
-"""Largest latency timer for answers within a few milliseconds, ms. The timer is the time for which
-the driver holds bytes back; its default is 16 (FTDI, AN232B-04)."""
+NOT_FOR_USERS = ("all", "dev", "docs", "release")  # Extras that no command needs
+LATE_MS = 1  # Largest latency timer: how long the driver holds bytes; default 16 (FTDI, AN232B-04)
 MEDDLERS = {
     "ModemManager": "it talks to serial adapters that are plugged in",
     "brltty": "it takes adapters for Braille displays",
 }
 """Services that open adapters of other programs."""
-SECONDS = 1.0
-"""Most time for an answer, s. A choice: on a cell's own network it takes a millisecond."""
+SECONDS = 1.0  # Most time for an answer. A choice: on a cell's own network it takes a millisecond
 SLOW = 0.02  # longer than any connection to a controller in the same room takes, s. A choice
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _BELOW = re.compile(r"""python_version\s*<\s*["'](\d+)\.(\d+)["']""")

@@ -17,8 +17,7 @@ from typing import Concatenate, ParamSpec, Self, TextIO, TypeVar
 from hilcal.errors import InputError
 
 SETTINGS = 1 << 19  # Bytes of a TOML file
-DOTS = 100
-"""Dots in a line of a TOML file: the parser's time grows with the square of a key's parts."""
+DOTS = 100  # Dots in a line of TOML: the parser's time grows with the square of a key's parts
 PROGRAM = 1 << 22  # Bytes of a robot's description, a file of effects
 SCRIPT = 1 << 21  # Bytes of a robot program
 STATEMENTS = 100_000  # Statements of a robot program
@@ -26,9 +25,7 @@ STATEMENT = 10_000  # Characters of a statement
 BLOCKS = 100  # Nested blocks around a statement
 NESTED = 100  # Nested expressions in a statement
 DOCUMENT = 1 << 25  # Bytes of a JSON document: plan, calibration, prior
-VALUES = (
-    2_000_000  # Values of a JSON document: Python takes some 100 bytes for an empty list's three
-)
+VALUES = 2_000_000  # Values of a JSON document: Python takes some 100 bytes for an empty list
 TABLE = 1 << 27  # Bytes of a table, as text or compressed
 UNPACKED = 1 << 28  # Bytes of a decompressed table
 LINE = 1 << 20  # Characters of a row of a table
@@ -43,14 +40,12 @@ MOVING = 100  # Joints of a robot's description that are not fixed
 JOINTS = 32  # Joints of an arm
 PARAMETERS = 4000  # Parameters of a model in a file
 NUMBERS = 1 << 26  # Numbers of an array from a file
-SHARED = 1 << 24
-"""Numbers of the joint covariances of readings with a common error: (L m)² for L of m elements."""
+SHARED = 1 << 24  # Numbers of joint covariances of readings with a common error: (L m)² of L
 FITTED = 150_000  # Readings times elements that are fitted together
 PLANNED = 20_000  # Poses of a plan, and steps of a plan: a week of measuring
 MEMORY = 3 << 28  # Bytes that reading a file may take in addition to those of the process
 _RESERVE_BYTES = 1 << 23  # Bytes that are freed first when memory runs out
-_LOCK = threading.RLock()
-"""The memory limit is that of the process, so only one thread at a time may set it."""
+_LOCK = threading.RLock()  # The memory limit is the process's: one thread at a time may set it
 P = ParamSpec("P")
 Q = TypeVar("Q", bound=str | Path)
 T = TypeVar("T")

@@ -44,8 +44,7 @@ from hilcal.store.procedure_log import ProcedureLog
 from hilcal.store.run_log import RunLog
 from hilcal.tables.units import parse_duration, parse_length
 
-VALIDATION = 20
-"""Poses of a validation campaign; a choice: they determine the mean error to 10 %."""
+VALIDATION = 20  # Poses of a validation campaign; a choice: they determine the mean error to 10 %
 FITTED_LATER = ("plan", "measure", "refine", "decide")  # Steps that a fit may follow
 LONGEST = "2 h"  # Longest time for measuring; a choice
 

@@ -70,8 +70,7 @@ class Command:
 
     place: str  # "module:function" in `hilcal.cli`; empty for a group without a function
     summary: str  # first line of the function's docstring, for the list of commands
-    subcommands: tuple[tuple[str, str], ...] = ()
-    """Name and "module:function"; a command that has any is a group."""
+    subcommands: tuple[tuple[str, str], ...] = ()  # name and "module:function" of each
 
 
 def load(place: str) -> Callable[..., Any]:

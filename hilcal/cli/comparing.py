@@ -89,8 +89,7 @@ def _show_misfit(t: Terminal, run: Path, revision: int | None, catalogue: Catalo
     )
 
 
-OVER = 5.0
-"""RMS error, in units of the noise, above which a moved tracker is suspected; a guess."""
+OVER = 5.0  # RMS error, in units of the noise, above which a moved tracker is suspected; a guess
 
 
 @command("""

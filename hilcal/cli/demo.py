@@ -183,8 +183,7 @@ def doubted(
 
 
 CELL = "demo_ur10e.toml"
-POSES = 20
-"""Poses of the plan; a choice: with validation and corrected run it takes 3.5 minutes."""
+POSES = 20  # Poses of the plan; a choice: with validation and corrected run it takes 3.5 minutes
 VALIDATION = 10  # Poses of the validation campaign; a choice for the same reason
 
 

@@ -29,8 +29,7 @@ from hilcal.store.revision import RevisionRecord
 from hilcal.tables.write import check_suffix, revision_table, write_columns
 from hilcal.whole_file import replace_file
 
-MANY = 10.0
-"""Distance along a joint's axis beyond which a note about cancellation is printed, m."""
+MANY = 10.0  # m; distance along a joint's axis beyond which a note about cancellation is printed
 
 
 @dataclass(frozen=True, slots=True)

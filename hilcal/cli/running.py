@@ -310,8 +310,7 @@ class RehearsedCampaign:
     """A first campaign, in a simulated cell that can measure again."""
 
     rehearsal: Rehearsal  # the cell, and all readings
-    further: Callable[[Plan], Rehearsal]
-    """Measures one further plan into the same campaign; returns all readings."""
+    further: Callable[[Plan], Rehearsal]  # measures one more plan into it; returns all readings
     measure: Measure  # measures the missing readings of another campaign in the same cell
 
 
@@ -428,8 +427,7 @@ def _write(t: Terminal, campaign: CampaignFile, readings: Readings) -> None:
             advance(1)
 
 
-NEXT_SEED = 1000
-"""Distance between the seeds of two starts: devices use the seed and the next few numbers."""
+NEXT_SEED = 1000  # Between the seeds of two starts: devices use the seed and the next few numbers
 
 
 @contextmanager
@@ -527,8 +525,7 @@ def _placed(config: CellConfig, base_dir: Path) -> CellConfig:
     return _with(config, "robot", **files)
 
 
-FACTORY_POSES = 20
-"""Poses without a load; a choice: with 12, an encoder offset of 1 mrad may stay in doubt."""
+FACTORY_POSES = 20  # Without a load; a choice: with 12, an encoder offset of 1 mrad may be in doubt
 
 
 def factory_check(

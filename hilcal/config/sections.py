@@ -306,10 +306,8 @@ _Name = Annotated[str, Field(min_length=1)]
 _Joints = Annotated[tuple[Number, ...], Field(min_length=1)]
 _BOX = ("center_m", "size_m")
 _CYLINDER = ("bottom_m", "radius_m", "height_m")
-LOADED = ("joint_compliance",)
-"""Effects under load; the default of `[planning] model`."""
-GEOMETRY = ("encoder_offset",)
-"""Effects of the geometry that a first plan of absolute readings is for, in addition."""
+LOADED = ("joint_compliance",)  # Effects under load; the default of `[planning] model`
+GEOMETRY = ("encoder_offset",)  # Effects that a first plan of absolute readings is for, too
 
 
 class Planning(CellSection):

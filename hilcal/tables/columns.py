@@ -20,9 +20,7 @@ PREVIEW = "hilcal import TABLE --preview proposes a mapping for --format"
 SCALAR = {"point": ("distance_m", "from", "cov_d_d"), "gauge": ("gauge_m", "gauge", "cov_g_g")}
 """Columns of a reading that is one number, by kind of observer: value, observer, variance."""
 OWN_PREFIX = "x_"
-AGREES = 2e-3
-"""Largest difference between a stated value and the arm's description, rad: a tenth of a degree, to
-which tables round. A choice."""
+AGREES = 2e-3  # rad; largest difference from the arm's description: tables round to 0.1°. A choice
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 Units = int | Sequence[str]

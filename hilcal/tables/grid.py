@@ -19,8 +19,7 @@ from hilcal.toml import suggest
 from hilcal.types import Bools, Floats, Ints
 
 Cell = str | float | datetime | None
-Check = Callable[[Sequence[str]], object]
-"""Refuses a wrong header, before any other check."""
+Check = Callable[[Sequence[str]], object]  # Refuses a wrong header, before any other check
 
 BLANK = ("", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "---")
 """Marks of a missing number, in small letters."""

@@ -37,19 +37,14 @@ from hilcal.tables.uncertainty import check_joint_rounding, mapped_covariance, r
 from hilcal.tables.units import defect, rotations
 from hilcal.types import Bools, Floats, Ints
 
-MOST_LOST = 0.5
-"""Share of rows without a value beyond which the mapping is taken for wrong; a choice."""
-UNIT_LENGTH = 0.01
-"""How far a quaternion's length may be from 1, and a matrix from orthogonal; rounding to three
-digits stays below."""
+MOST_LOST = 0.5  # Share of rows without a value beyond which the mapping is wrong; a choice
+UNIT_LENGTH = 0.01  # Of a quaternion from 1, of a matrix from orthogonal; three digits stay below
 MOST_TURN = 2 * np.pi + 1e-3  # rad; a larger angle of an orientation is in another unit
 MOVED = 0.01  # rad; a joint commanded by more is sent to another pose; a choice
 STILL = 1e-4  # rad; a joint commanded by less did not move far enough to arrive from another side
 SIGMAS = 4.0  # Standard deviations within which two readings are the same; a choice
 REPEATED = 2e-4  # rad; rows whose joints differ by less repeat a pose; a choice
-REPEATS_TO = 4e-4
-"""m; ten times an arm's repeatability: of positions of one pose that differ by more, some are
-wrong. A choice."""
+REPEATS_TO = 4e-4  # m; ten times an arm's repeatability: of positions further apart some are wrong
 TOOL = 0.5  # m; the longest tool: with the arm's reach, the lever of its joints; a choice
 GRAVITY = (0.0, 0.0, -9.80665)  # m/s², base axes, of an arm that stands upright
 EPOCH = 1e8  # s; times beyond three years are counted from an epoch, not from the campaign's start

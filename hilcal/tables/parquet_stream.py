@@ -25,8 +25,7 @@ from hilcal.tables.table import check_covers, covariances_of, measured_of
 from hilcal.tables.uncertainty import rounding_variance
 from hilcal.types import Floats
 
-NAMES = ("pose", "load", "cycle")
-"""Columns of the exchange table that a stream may have, but that have no meaning in it."""
+NAMES = ("pose", "load", "cycle")  # Columns that a stream may have, but that mean nothing in it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,13 +35,11 @@ class ReadingStream:
     path: Path
     arm: Arm  # its number of joints, their limits and its reach are checked
     noise: TrackerNoise | None  # gives the covariances where the file has none
-    station: tuple[float, ...] | None
-    """(3,) where the tracker's beam starts, m; the origin where None."""
+    station: tuple[float, ...] | None  # (3,) where the tracker's beam starts, m; None: the origin
     columns: tuple[str, ...]
     rows: tuple[int, ...]  # number of rows of each row group
     covers: str = INSTRUMENT  # what its covariances cover, `INSTRUMENT` or `WHOLE`
-    rounding: Floats = field(default_factory=lambda: np.zeros(3))
-    """(3,) variance of the positions' rounding that is added, m²."""
+    rounding: Floats = field(default_factory=lambda: np.zeros(3))  # (3,) variance that it adds, m²
 
     def __len__(self) -> int:
         """Return the number of readings."""

@@ -24,8 +24,7 @@ from hilcal.types import Bools, Floats, Ints
 
 FROM_TABLE = "covariance: from the table"
 FROM_TRACKER = "covariance: from the tracker's noise in [tracker]"
-LONGEST = 1e12
-"""s; longer than any time of a campaign: seconds since 1970 are 1e9, nanoseconds 1e18."""
+LONGEST = 1e12  # s; longer than a campaign: seconds since 1970 are 1e9, nanoseconds 1e18
 LARGEST_NM = 1e5  # N·m; more than any joint of an arm carries
 FORM = FileFormat(encoding="utf-8")
 

@@ -18,17 +18,11 @@ from hilcal.types import Bools, Floats
 
 FAR = 5.0  # Ratio of stated and instrument's standard deviation that is worth a note; a choice
 NEAR = 3.0  # Ratio within which another interpretation of the figures fits the instrument; a choice
-LEAST = (1e-7, 1e-7)
-"""m, rad; no instrument in air measures an arm to better than 0.1 µm and 0.02": a choice, about
-the resolution of the best."""
-DISTINCT = 10
-"""Distinct values needed to recognise rounding: ten that end in zero by chance have a probability
-of 10^-10."""
-COUNTS = 0.01
-"""Rounding is added where its variance is more than this share of the stated one; a choice."""
+LEAST = (1e-7, 1e-7)  # m, rad; no instrument in air is better than 0.1 µm and 0.02": a choice
+DISTINCT = 10  # Values needed to recognise rounding: ten end in zero by chance once in 10^10
+COUNTS = 0.01  # Rounding is added where its variance is more than this share; a choice
 _FINEST = 1e-9
-_PLAUSIBLE = (1e-6, 1e-3)
-"""m; standard deviations that a tracker or a camera states, to guess what was meant."""
+_PLAUSIBLE = (1e-6, 1e-3)  # m; what trackers and cameras state, to guess what was meant
 
 
 def mapped_covariance(
