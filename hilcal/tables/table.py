@@ -40,17 +40,6 @@ class ImportResult:
     from_tracker: bool = False  # whether the covariances are those of the noise in [tracker]
 
 
-def read_table(
-    path: str | Path,
-    arm: Arm,
-    noise: TrackerNoise | None,
-    station: Floats | Sequence[float] | None = None,
-    targets: Sequence[str] = (),
-) -> Readings:
-    """Return the readings of an exchange table; arguments and errors are `import_table`'s."""
-    return import_table(path, arm, noise, station, targets).readings
-
-
 def import_table(
     path: str | Path,
     arm: Arm,
@@ -352,7 +341,7 @@ def write_table(
     about: Mapping[str, object] | None = None,
     units: Sequence[str] | None = None,
 ) -> None:
-    """Write an exchange table that `read_table` reads back exactly: CSV, or Parquet by its name.
+    """Write an exchange table that `import_table` reads back exactly: CSV, or Parquet by its name.
 
     `covers` says what the covariances cover, see `with_what_rounding_does`; `units` are those of
     the joints' values (`Arm.units`), all rad where None.

@@ -8,6 +8,7 @@ from hypothesis.extra.numpy import arrays
 
 from hilcal.readings.readings import Readings, States
 from hilcal.robot.arm import Arm
+from hilcal.tables.table import import_table
 from hilcal.types import Floats
 
 STATE_FIELDS = (
@@ -20,6 +21,11 @@ STATE_FIELDS = (
     "approach",
     "q_actual",
 )
+
+
+def read_table(*given: Any, **more: Any) -> Readings:
+    """The readings of an exchange table, without the decisions of their import."""
+    return import_table(*given, **more).readings
 
 
 def make_arm(n: int = 6) -> Arm:

@@ -18,8 +18,8 @@ from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import drive_jacobian, evaluate
 from hilcal.robot.conventions import as_counted
 from hilcal.robot.urdf import arm_from_urdf
-from hilcal.tables.table import read_table
 from tests.support.effect_cases import make
+from tests.support.readings_cases import read_table
 from tests.support.refusals import refusal, refusals, refuses
 
 SIGN = [1, -1, 1, 1, -1, 1]

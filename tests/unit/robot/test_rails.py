@@ -23,8 +23,9 @@ from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.robot.chain import evaluate
 from hilcal.robot.urdf import arm_from_urdf
 from hilcal.store.plan import Plan, Step
-from hilcal.tables.table import read_table, write_table
+from hilcal.tables.table import write_table
 from tests.support.cli_cases import ok, refused
+from tests.support.readings_cases import read_table
 from tests.support.refusals import edited, refusals, refuses
 
 TRACK = """title = "UR10e on a track"
