@@ -360,7 +360,7 @@ def _program(proc: Path, number: int) -> str:
         return "a program"
 
 
-def reachable(host: str, services: Mapping[int, str], seconds: float = SECONDS) -> list[Finding]:
+def reachable(host: str, services: Mapping[int, str]) -> list[Finding]:
     """Return whether each service, by TCP port, accepts a connection in time; nothing is sent."""
     try:
         address = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][4][0]
@@ -372,11 +372,11 @@ def reachable(host: str, services: Mapping[int, str], seconds: float = SECONDS) 
     for port, service in services.items():
         name, start = f"{service}, {host} port {port}", time.monotonic()
         try:
-            with socket.create_connection((str(address), port), seconds):
+            with socket.create_connection((str(address), port), SECONDS):
                 took = time.monotonic() - start
         except TimeoutError:
             mend = "check cable, address and network of the cell; is the controller switched on?"
-            out.append(NETWORK(name, "problem", f"no answer in {seconds:g} s", mend))
+            out.append(NETWORK(name, "problem", f"no answer in {SECONDS:g} s", mend))
         except OSError as error:
             mend = "check the address, and that the service is enabled on the controller"
             out.append(NETWORK(name, "problem", f"{error.strerror or error}", mend))
