@@ -30,7 +30,8 @@ class Section(BaseModel):
     """One section of a file: immutable, finite numbers only, unknown keys refused.
 
     The description of a field states what is valid and completes "it must be ...". The class's
-    docstring has it, as "key: description | example in TOML"; `WORDS` are abbreviations in it.
+    docstring has it, as "key: description | example in TOML"; `WORDS` are abbreviations in it. A
+    section without one must be "a section [key]".
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -48,6 +49,9 @@ class Section(BaseModel):
                 field = cls.model_fields[key]
                 field.description = description
                 field.examples = [tomllib.loads(f"x = {example}")["x"]] if example else None
+        for key, field in cls.model_fields.items():
+            if field.description is None and section_of(field) is not None:
+                field.description = f"a section [{key}]"
 
 
 S = TypeVar("S", bound=Section)

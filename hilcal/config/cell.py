@@ -259,23 +259,13 @@ class CellConfig(sections.CellSection):
     """The whole of CELL.toml.
 
     robot: a section [robot] with model = "ur10e" or the like
-    tool: a section [tool]
-    tracker: a section [tracker]
-    repeatability: a section [repeatability]
     loads: sections [[loads]], one per load
     force_sensor: a section [force_sensor] with driver = "ft300" and port or the like
-    operator: a section [operator]
-    motion: a section [motion]
-    acquire: a section [acquire]
-    limits: a section [limits]
-    planning: a section [planning]
     obstacles: sections [[obstacles]], one per thing that stands in the arm's way
-    sight: a section [sight]
     points: sections [points.NAME], one per point that distances are measured from | { P1 = {
         position_m = [1.2, 0.4, 0.0] } }
     gauges: sections [gauges.NAME], one per dial gauge or plane that is touched | { G1 = { direction
         = [0.0, 0.0, 1.0] } }
-    simulation: a section [simulation]
     ordinary: a section [ordinary]: how many times as large as on other arms an effect is expected,
         by its name, e.g. transmission_error = 0.1 of precise gears | { transmission_error = 0.1 }
     plausible: a section [plausible]: how many times as large as stated an effect may be, by its
