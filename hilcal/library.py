@@ -2,14 +2,15 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hilcal.campaign.campaign import Campaign, opened
-from hilcal.cell import Cell
+from hilcal.cell import Cell, cell_from_config
+from hilcal.config import CellConfig, load_config
 from hilcal.diagnosis.diagnosis import Diagnosis, History
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.diagnosis.verdict import NOTHING
@@ -26,22 +27,23 @@ from hilcal.identification import posterior_document
 from hilcal.identification.arm_scatter import with_prior_scatter
 from hilcal.identification.carried import CarriedPrior, carried_prior, check_prior
 from hilcal.identification.fit import Fit
-from hilcal.identification.full_covariance import full_readings
-from hilcal.identification.noise_estimate import with_estimated_noise
+from hilcal.identification.full_covariance import CovarianceParts, covariance_parts, full_readings
+from hilcal.identification.noise_estimate import NOISE, NoiseEstimate, with_estimated_noise
 from hilcal.identification.posterior import Posterior
 from hilcal.model.model import Model
 from hilcal.optional import needed_by
 from hilcal.present.story import build_story
-from hilcal.readings.covariance import tracker_noise
+from hilcal.readings.covariance import COVERS, FROM, TRACKER, tracker_noise
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES, SCALINGS, Mode, usual_mode
 from hilcal.refinement import Refinement
 from hilcal.refinement import refine as refine_model
+from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan
 from hilcal.store.schema import HEADER
 from hilcal.stream import fit as streams
 from hilcal.stream.fit import StreamFit
-from hilcal.tables.importing import import_readings
+from hilcal.tables.mapped import import_readings
 from hilcal.tables.parquet_stream import open_stream
 from hilcal.types import Floats
 
@@ -74,6 +76,48 @@ def read_table(path: str | Path, cell: Cell, mapping: str | Path | None = None) 
     estimated, noise = with_estimated_noise(imported, cell, config)
     readings = full_readings(estimated.readings, estimated.covers, cell, config)
     return replace(readings, noise_stated=noise is None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Imported:
+    """The result of an import."""
+
+    config: CellConfig
+    cell: Cell
+    readings: Readings  # as stored
+    noise: NoiseEstimate | None  # None where the noise is stated, or cannot be estimated
+    parts: CovarianceParts  # components of the covariances
+    notes: tuple[str, ...]  # one sentence for each decision
+
+
+def import_campaign(
+    table: Path,
+    config: Path,
+    output: Path,
+    kind: str = "table",
+    second: Path | None = None,
+    *,
+    overwrite: bool = False,
+    say: Callable[[str], None] = lambda text: None,
+) -> Imported:
+    """Make a campaign file from a table of readings, as `import_readings` reads it."""
+    settings = load_config(config)
+    base_dir = config.absolute().parent
+    cell = cell_from_config(settings, base_dir)
+    say(f"reading {table}")
+    imported = import_readings(table, kind, settings, cell.arm, second)
+    if not imported.noise_stated:
+        say("estimating the noise, which nothing states")
+    imported, noise = with_estimated_noise(imported, cell, settings)
+    texts = {COVERS: imported.covers}
+    texts |= {FROM: TRACKER} if imported.from_tracker else {}
+    texts |= {} if noise is None else {NOISE: noise.to_json()}
+    say(f"writing {output}")
+    about = settings.to_json(), str(base_dir), f"{table.name} ({Path(kind).name})"
+    readings = imported.readings
+    CampaignFile.create(output, *about, overwrite=overwrite, more=texts, readings=readings).close()
+    parts = covariance_parts(imported.covers, settings)
+    return Imported(settings, cell, readings, noise, parts, imported.notes)
 
 
 def fit_stream(

@@ -12,7 +12,7 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.campaign import revisions
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
-from hilcal.config.changes import INSTRUMENT_NOISE, Changes, changed
+from hilcal.config.cell import INSTRUMENT_NOISE, Changes, changed
 from hilcal.diagnosis.background_evidence import background_evidence
 from hilcal.diagnosis.diagnosis import Diagnosis, History
 from hilcal.diagnosis.document import to_json
@@ -166,7 +166,7 @@ class Campaign(Brief):
         an import; no other number of a reading changes.
 
         Args:
-            changes: values by section and key, for the keys of `config.changes.CHANGEABLE`; the
+            changes: values by section and key, for the keys of `config.cell.CHANGEABLE`; the
                 value None removes a key.
 
         Raises:

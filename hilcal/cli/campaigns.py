@@ -18,7 +18,7 @@ from hilcal.identification.misdescription import examine, other_arm
 from hilcal.identification.registration import register
 from hilcal.identification.table_preview import preview_table
 from hilcal.identification.torques import check_torques
-from hilcal.import_campaign import import_campaign
+from hilcal.library import import_campaign
 from hilcal.names import quoted
 from hilcal.present import registration as words
 from hilcal.present.campaign import import_preview, info_report

@@ -30,7 +30,7 @@ repair | campaigns
     | Open a campaign again that a bad revision closes: it is set aside, no reading is.
 Fit, and find what is missing:
 identify | fitting | Fit a model to the readings, and keep it as a revision.
-compare | comparing
+compare | refining
     | Show where the model fails; with a later campaign, what has changed on the arm.
 diagnose | refining | Say which effect the model lacks.
 add | refining | Add an effect to the model: error before and after.
@@ -46,7 +46,7 @@ workbench | showing
 Many arms:
 fleet | campaigns | Pool many campaigns: a prior for other arms, arms unlike their type, drift.
 Use the result:
-validate | comparing | Predict readings of another campaign with the model.
+validate | refining | Predict readings of another campaign with the model.
 compensate | compensating
     | Find the joint values that put the tool where it was asked to be, under a load.
 accept | campaigns

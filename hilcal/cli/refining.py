@@ -1,7 +1,8 @@
-"""`diagnose`, `add`, `remove`, `refine`, `discover`: which effect is missing."""
+"""`compare`, `validate`, `diagnose`, `add`, `remove`, `refine`, `discover`: what a model lacks."""
 
 import itertools
 from collections.abc import Iterable, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from hilcal import numbers
@@ -13,6 +14,7 @@ from hilcal.cli.options import catalogue_with, check_folder, command
 from hilcal.cli.showing import followed
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.diagnosis.document import suspect_json, to_json
+from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.diagnosis.verdict import NOTHING
 from hilcal.diagnosis.verdict import diagnose as judge
@@ -23,16 +25,21 @@ from hilcal.effects.check import NAME
 from hilcal.effects.options import Options
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.effects.written import read_effects_text, write_effect
-from hilcal.errors import CannotAnswerError, InputError
+from hilcal.errors import CannotAnswerError, HilcalError, InputError, LimitError
 from hilcal.identification.background import background_of
 from hilcal.identification.baseline import masses_note
-from hilcal.identification.fit import fit
+from hilcal.identification.fit import all_left_out, fit
 from hilcal.identification.fit_document import frames_to_json, prior_to_json
+from hilcal.identification.full_prediction import full_prediction
+from hilcal.identification.linearisation import linearise
 from hilcal.identification.misdescription import other_arm_of
 from hilcal.identification.torques import check_torques
 from hilcal.names import quoted
 from hilcal.present import diagnosis as words
-from hilcal.present.document import Block
+from hilcal.present import fit as fit_words
+from hilcal.present.calibration import opening, shares_report, validation_failure, validation_report
+from hilcal.present.comparison import comparison_json, comparison_report, next_command
+from hilcal.present.document import Block, heading
 from hilcal.present.fit import follows, model_name, prior_lines, set_aside
 from hilcal.present.progress import working
 from hilcal.present.registration import covariance_words, fitted_lines, other_arm_line, torque_lines
@@ -42,6 +49,9 @@ from hilcal.refinement import RefinementStep as RefinementStep
 from hilcal.refinement import refine as refine_model
 from hilcal.store.procedure_log import refuse_fitting
 from hilcal.store.revision import change
+from hilcal.tables.units import parse_length
+from hilcal.transfer.compare import compare as compare_campaigns
+from hilcal.validation import validate as validate_campaign
 from hilcal.whole_file import replace_file
 
 
@@ -352,3 +362,125 @@ def _effects_against(
         for e in Calibration.load(model, catalogue).model.effects
         if e.role not in FRAME_ROLES
     }
+
+
+@command("""
+    later | [LATER.hilcal] | A later campaign of the same arm, of 15 readings or more: what has
+        changed?
+    same_setup | --same-setup | With LATER: tracker and base stand as they did; else the tracker's
+        place is estimated from the later readings.
+    """)
+def compare(
+    run: Path, later: Path | None = None, same_setup: bool = False, revision: int | None = None,
+    effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
+    """Show where the model fails; with a later campaign, what has changed on the arm."""
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    if later is None:
+        if same_setup:
+            raise InputError("--same-setup goes with a later campaign: compare A.hilcal B.hilcal")
+        _show_misfit(t, run, revision, catalogue)
+        return
+    with (
+        Campaign.open(run, catalogue, read_only=True) as o,
+        Campaign.open(later, catalogue, read_only=True) as later_run,
+        working(t.progress) as say,
+    ):
+        if o.in_use(revision) is None:
+            t.notice(f"{run}: no revision yet, taking the baseline; hilcal refine makes a model")
+        comparison = compare_campaigns(
+            o, later_run, revision, same_setup=True if same_setup else None, say=say
+        )
+    name = model_name(fitting.titles(comparison.fit.model, comparison.fit.readings))
+    t.show(heading(f"{run.name}: {fitting.called(comparison.number)} ({name})"))
+    t.show(comparison_report(comparison, run.name, later.name))
+    command = next_command(comparison, str(run), str(later))
+    if command is not None:
+        t.command(command)
+    t.document(comparison_json(comparison, str(run), str(later)))
+
+
+def _show_misfit(t: Terminal, run: Path, revision: int | None, catalogue: Catalogue) -> None:
+    with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
+        number, fitted = fitting.fit_of(t, o, say, revision)
+        o.require_gc(number, fitted.scaling, "comparing")
+        say("looking where it fails")
+        places = misfit_breakdown(linearise(fitted))
+        fitting.finish(fitted, say)
+        e, left_out = full_prediction(fitted), bool(fitted.model.background)
+        if left_out:  # a background follows the fitted poses more closely than others
+            raw, w = all_left_out(fitted)
+            e = replace(e, raw=raw, whitening=w)
+        worst = fit_words.worst_poses(e)
+    name = model_name(fitting.titles(fitted.model, fitted.readings))
+    t.show(heading(f"{fitting.called(number)}: {name}"))
+    t.show([fit_words.misses(fitted), follows(places), "", fit_words.errors(fitted), ""])
+    t.show([*fit_words.where_table(places), ""])
+    t.show(fit_words.worst_table(worst, left_out))
+    t.document(
+        revision=number,
+        model=list(fitted.model.named),
+        readings=fitted.mode,
+        error={"fit": fitted.error.to_json(), "holdout": fitted.holdout.to_json()},
+        variance_factor=fitted.variance_factor,
+        variance_factor_interval=list(fitted.variance_factor_interval),
+        noise_floor_m=e.noise_floor,
+        where=[{"variable": p.variable, "share": p.share, "p_value": p.p_value} for p in places],
+        worst=[asdict(w) for w in worst],
+    )
+
+
+OVER = 5.0  # RMS error, in units of the noise, above which a moved tracker is suspected; a guess
+
+
+@command("""
+    other | OTHER.hilcal | A campaign that was never fitted.
+    register | --register | The tracker was set up anew: fit its place first.
+    limit | --limit LENGTH | The largest 3-D position error allowed, e.g. "0.1 mm"; exit 5 where it
+        is not kept.
+    """)
+def validate(
+    run: Path, other: Path, register: bool = False, limit: str | None = None,
+    revision: int | None = None, effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
+    """Predict readings of another campaign with the model."""
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    limit_m = None if limit is None else parse_length(limit, "--limit")
+    with (
+        Campaign.open(run, catalogue, read_only=True) as o,
+        Campaign.open(other, read_only=True) as unseen,
+        working(t.progress) as say,
+    ):
+        record = fitting.record_of(t, o, say, revision)
+        result = validate_campaign(o, unseen, record, limit_m, register=register, say=say)
+        name = model_name(fitting.titles(result.model, o.fitted_readings(record)))
+    judged, prediction, shares = result.judged, result.prediction, result.shares
+    t.show(heading(f"{fitting.called(judged.number)}: {name}"))
+    t.show(opening(judged, prediction))
+    t.show(validation_report(judged, prediction, result.beyond))
+    t.show(shares_report(shares))
+    if prediction.error.rms_sigma > OVER and not register:
+        t.show(
+            "Was the tracker set up anew for these readings? Then --register fits its place first."
+        )
+    failed: HilcalError | None = None
+    if shares.passed is False:
+        failure = validation_failure(shares, judged)
+        failed = CannotAnswerError(failure) if shares.undecided else LimitError(failure)
+    t.document(
+        None,
+        failed,
+        revision=judged.number,
+        model=list(result.model.named),
+        readings=judged.mode,
+        registered=register,
+        n_readings=judged.readings,
+        n_fitted=judged.fitted,
+        never_fitted=judged.unseen,
+        n_measurements=len(prediction.raw),
+        error=prediction.error.to_json(),
+        variance_factor=prediction.variance_factor,
+        noise_floor_m=prediction.noise_floor,
+        **result.beyond.to_dict(),
+        **shares.to_dict(),
+    )

@@ -204,7 +204,7 @@ def _import(
             f"{run}: the file exists, and is left as it is; open it with hilcal workbench "
             f"{quoted(run)}, or name another one for the table with -o"
         )
-    from hilcal.import_campaign import import_campaign
+    from hilcal.library import import_campaign
 
     with working(t.progress) as say:
         imported = import_campaign(table, config, run, kind, second, say=say)

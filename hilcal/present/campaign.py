@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hilcal import numbers
-from hilcal.config.changes import Changes, write_value
+from hilcal.config.cell import Changes, write_value
 from hilcal.config.reference import NOT_SET, REQUIRED, KeyTable
 from hilcal.doctor import Finding
 from hilcal.identification.fit import Fit

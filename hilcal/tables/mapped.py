@@ -1,4 +1,4 @@
-"""Readings from a table of any kind, by a mapping that says what its columns hold."""
+"""Readings from a table of any kind: the exchange table, or one that a mapping explains."""
 
 import re
 from collections.abc import Mapping as Mapped
@@ -10,8 +10,10 @@ from typing import Generic
 
 import numpy as np
 
+from hilcal import limits
+from hilcal.config import CellConfig
 from hilcal.errors import InputError
-from hilcal.readings.covariance import TrackerNoise, tracker_covariance
+from hilcal.readings.covariance import WHOLE, TrackerNoise, tracker_covariance, tracker_noise
 from hilcal.readings.readings import SAME_POSE, ObserverName, Readings
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
@@ -20,6 +22,7 @@ from hilcal.tables.columns import independent_columns
 from hilcal.tables.files import open_tables
 from hilcal.tables.grid import ColumnTable, Grid
 from hilcal.tables.mapping import (
+    TABLE,
     Column,
     Joints,
     M,
@@ -31,8 +34,16 @@ from hilcal.tables.mapping import (
     Position,
     Std,
     Time,
+    find_mapping,
 )
-from hilcal.tables.table import ImportResult, readings_of
+from hilcal.tables.table import (
+    FROM_TRACKER,
+    ImportResult,
+    import_table,
+    named_loads,
+    readings_of,
+    without_copies,
+)
 from hilcal.tables.uncertainty import check_joint_rounding, mapped_covariance, rounding_variance
 from hilcal.tables.units import defect, rotations
 from hilcal.types import Bools, Floats, Ints
@@ -528,3 +539,42 @@ def _plausible(
 def _listed(rows: Ints) -> str:
     """Name the first of some rows."""
     return ", ".join(map(str, rows[:_LISTED].tolist())) + ", ..." * (len(rows) > _LISTED)
+
+
+def import_readings(
+    path: Path, form: str | Path | Mapping, config: CellConfig, arm: Arm, second: Path | None = None
+) -> ImportResult:
+    """Read a table; the cell states the tracker's noise and place, gravity, and loads.
+
+    `form` is "table" (the exchange table), a mapping, its name or its file; `second` is the second
+    file of a mapping of two.
+    """
+    mapping: Mapping | None = None
+    if str(form) != TABLE:
+        mapping = form if isinstance(form, Mapping) else find_mapping(form, Mapping)
+    tracker, gravity = config.tracker, config.robot.gravity_m_s2
+    noise, station = tracker_noise(tracker), tracker.station_m
+    targets, std = [target.name for target in config.tool.targets], _std(config)
+    if mapping is not None:
+        result = import_mapped(path, mapping, arm, noise, station, gravity, second, targets, std)
+    elif second is None:
+        result = import_table(path, arm, noise, station, targets, std)
+    else:
+        raise InputError(f"--second {second}: only for a --format with a section [second_file]")
+    limits.check_fitted(len(result.readings), result.readings.m, f"{path}: ")
+    where = "" if tracker.frame == "tracker" or station else ", as if it stood at the arm's base"
+    notes = tuple(note + where * (note == FROM_TRACKER) for note in result.notes)
+    stated = FROM_TRACKER not in result.notes
+    covers = WHOLE if stated and config.repeatability.in_tables else result.covers
+    readings, copies = without_copies(result.readings)
+    readings, named = named_loads(readings, config)
+    return ImportResult(
+        readings, (*notes, *copies, *named), covers, stated or tracker.states_noise, not stated
+    )
+
+
+def _std(config: CellConfig) -> dict[ObserverName, float]:
+    """Return the standard deviations of distances and heights that the cell states."""
+    points = {ObserverName("point", k): p.std_m for k, p in config.points.items()}
+    gauges = {ObserverName("gauge", k): g.std_m for k, g in config.gauges.items()}
+    return {name: std for name, std in (points | gauges).items() if std is not None}

@@ -18,7 +18,7 @@ from hilcal.readings.covariance import INSTRUMENT, ROUNDING, TrackerNoise
 from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
 from hilcal.robot.batch import CHUNK
-from hilcal.tables import checks, columns
+from hilcal.tables import columns
 from hilcal.tables.files import is_plain, package, undamaged
 from hilcal.tables.grid import ColumnTable
 from hilcal.tables.table import check_covers, covariances_of, measured_of
@@ -65,7 +65,7 @@ class ReadingStream:
         table = ColumnTable(str(self.path), rows, {}, number)
         states, value = measured_of(table, self.arm)
         pose, zeros = np.arange(len(rows)), np.zeros(len(rows), dtype=np.int64)
-        checks.check_wrenches(table, states.wrench, zeros, ["as recorded"], self.arm)
+        columns.check_wrenches(table, states.wrench, zeros, ["as recorded"], self.arm)
         covariance, *_ = covariances_of(table, value, self.noise, self.station, None, self.rounding)
         return Readings(states, pose, zeros, zeros, value, covariance, ("as recorded",), ())
 

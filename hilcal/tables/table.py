@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
+from hilcal.config import CellConfig
 from hilcal.errors import InputError
 from hilcal.names import check_name, check_names
 from hilcal.readings.covariance import INSTRUMENT, ROUNDING, WHOLE, TrackerNoise, tracker_covariance
 from hilcal.readings.readings import ObserverName, Readings, States
 from hilcal.robot.arm import Arm
-from hilcal.tables import checks, columns
-from hilcal.tables.checks import observed_of, observer_columns
-from hilcal.tables.columns import following_columns, with_following
+from hilcal.store.plan import UNLOADED
+from hilcal.tables import columns
 from hilcal.tables.files import open_grid
 from hilcal.tables.grid import ColumnTable
 from hilcal.tables.mapping import FileFormat
@@ -72,16 +72,16 @@ def readings_of(
     (3,), m², is the variance of the positions' rounding, which follows from them where it is None;
     `std` is that of distances and heights, m, for a table that states none.
     """
-    checks.check_names(table)
+    columns.check_names(table)
     pose, pose_names = _index(table.text["pose"])
     load, load_names = _index(table.text["load"])
     target = _targets(table, targets)
-    observed = observed_of(table)
+    observed = columns.observed_of(table)
     positioned = np.ones(len(table.rows), dtype=np.bool_) if observed is None else ~observed.scalar
     states, value = measured_of(table, arm, positioned)
     states = replace(states, target=target, observer=None if observed is None else observed.number)
-    checks.check_same_pose(table, pose, pose_names, states.q, arm)
-    checks.check_wrenches(table, states.wrench, load, load_names, arm)
+    columns.check_same_pose(table, pose, pose_names, states.q, arm)
+    columns.check_wrenches(table, states.wrench, load, load_names, arm)
     m = value.shape[1]
     cov, notes, covers = np.zeros((len(value), m, m)), tuple[str, ...](), _covers(table)[0]
     if positioned.any():
@@ -120,7 +120,7 @@ def covariances_of(
         cov = _instrument_covariance(table, value, noise, station)
         notes, covers, included = (FROM_TRACKER,), INSTRUMENT, False
     else:
-        checks.check_covariances(table, stated)
+        columns.check_covariances(table, stated)
         tiny = np.any(np.diagonal(stated, axis1=1, axis2=2) < min(LEAST) ** 2)
         use_spec = bool(tiny) and noise is not None
         spec = _instrument_covariance(table, value, noise, station) if use_spec else None
@@ -147,7 +147,7 @@ def _choose(path: str, header: Sequence[str], arm: Arm) -> tuple[Sequence[str], 
             f"({', '.join(columns.required_columns(arm.units))}); for any other table: "
             f"{columns.PREVIEW}"
         )
-    columns.check_header(path, header, arm.units, arm.name, following_columns(arm))
+    columns.check_header(path, header, arm.units, arm.name, columns.following_columns(arm))
     columns.check_covariance_columns(path, header)
     named = [name for _, name, _ in columns.SCALAR.values()]
     optional = (columns.TARGET, columns.COVERS, columns.STATION, *named)
@@ -232,28 +232,28 @@ def measured_of(table: ColumnTable, arm: Arm, rows: Bools | None = None) -> tupl
     station = np.array(table.text.get(columns.STATION, [""] * len(value)))
     for name in dict.fromkeys(station.tolist()):
         group = station == name
-        checks.check_positions(table.select(group), value[group], states.q[group], arm)
+        columns.check_positions(table.select(group), value[group], states.q[group], arm)
     if columns.ROTATION[0] in table.number:
         rotation = table.matrix(columns.ROTATION)
-        checks.check_rotations(table, rotation)
+        columns.check_rotations(table, rotation)
         value = np.hstack([value, rotation])
     return states, value
 
 
 def _states(table: ColumnTable, arm: Arm) -> States:
-    table = with_following(table, arm)
+    table = columns.with_following(table, arm)
     number, n = table.number, arm.n
     joints, reported = columns.joint_columns(arm.units), columns.actual_columns(arm.units)
     torques, sides = columns.torque_columns(arm.units), columns.approach_columns(n)
     q, zero = table.matrix(joints), np.zeros(len(table.rows))
-    checks.check_joints(table, joints, q, arm)
+    columns.check_joints(table, joints, q, arm)
     wrench = np.stack([number.get(name, zero) for name in columns.WRENCH], axis=1)
     temperature = _group(table, columns.temperature_columns(n))
     approach, actual, torque = (_group(table, names) for names in (sides, reported, torques))
     if approach is not None:
         table.refuse(np.abs(approach) != 1, sides, lambda v: f"{v:g} must be -1 or +1")
     if actual is not None:
-        checks.check_actual_joints(table, reported, actual, q)
+        columns.check_actual_joints(table, reported, actual, q)
     if temperature is not None:
         _in_range(table, columns.temperature_columns(n), -50, 150, "°C")
     if torque is not None:
@@ -334,6 +334,63 @@ def _instrument_covariance(
     return tracker_covariance(value[:, :3], noise, origin, m)
 
 
+def named_loads(readings: Readings, config: CellConfig) -> tuple[Readings, tuple[str, ...]]:
+    """Give the loads of a table without forces the wrench of the cell's `[[loads]]`, by name."""
+
+    def plain(name: str) -> str:
+        return "".join(name.split()).casefold()
+
+    s, gravity = readings.states, np.asarray(config.robot.gravity_m_s2)
+    if s.wrench.any():
+        return readings, ()
+    wrenches = {plain(load.name): load.wrench(gravity) for load in config.loads}
+    wrench, notes = s.wrench.copy(), []
+    for k in np.unique(readings.load):
+        name = readings.load_names[k]
+        if name == UNLOADED:
+            continue
+        where = "is not stated by the table, nor by [[loads]] of the cell: it is taken as none"
+        if plain(name) in wrenches:
+            wrench[readings.load == k] = wrenches[plain(name)]
+            where = "is that of [[loads]] of the cell, since the table states none"
+        notes.append(f"load {name}: its force {where}")
+    return replace(readings, states=replace(s, wrench=wrench)), tuple(notes)
+
+
+def without_copies(readings: Readings) -> tuple[Readings, tuple[str, ...]]:
+    """Leave out rows that are copies of another row to the last digit, with a note.
+
+    A repeated measurement scatters, a copy does not. Equal rows may be measurements, and stay, in
+    different cycles, or where rows have no times and positions are rounded to more than their
+    noise. Copies of another pose's row stay where their pose has rows that are no copies.
+    """
+    s, value = readings.states, readings.value
+    rounding = np.sqrt(12.0 * rounding_variance(value[:, :3], 1.0))
+    noise = np.sqrt(np.median(readings.covariance[:, range(3), range(3)], axis=0))
+    if s.time is None and np.any(rounding > noise):
+        return readings, ()
+    scalars = [s.time, s.load_time, s.air_temperature]
+    columns = [s.q, s.wrench, value, *(x[:, None] for x in scalars if x is not None)]
+    names = np.stack([readings.load, readings.cycle, readings.line], axis=1)
+    keys = np.concatenate([*columns, names], axis=1)
+    _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    original = first[inverse.reshape(-1)]
+    copied = original != np.arange(len(readings))
+    same = readings.pose == readings.pose[original]
+    only_copies = ~np.isin(readings.pose, readings.pose[~copied])
+    copied &= same | only_copies
+    if not copied.any():
+        return readings, ()
+    k = int(np.argmax(copied))
+    name = f"{readings.pose_names[readings.pose[k]]}/{readings.load_names[readings.load[k]]}"
+    note = (
+        f"{int(copied.sum())} of {len(copied)} rows are copies of others to the last digit (the "
+        f"first is of {name}): each is counted once, since a reading that is made again scatters; "
+        "take them out of the table"
+    )
+    return readings[~copied], (note,)
+
+
 def write_table(
     readings: Readings,
     path: str | Path,
@@ -361,7 +418,7 @@ def exchange_columns(
     if readings.states.target is not None:
         out[columns.TARGET] = _checked_names(readings.target_names, readings.target, columns.TARGET)
     if readings.states.observer is not None:
-        out |= observer_columns(readings)
+        out |= columns.observer_columns(readings)
     if covers != INSTRUMENT:
         out[columns.COVERS] = [covers] * len(readings)
     return out | _number_columns(readings, units)

@@ -114,7 +114,7 @@ def test_numerical_warnings_do_not_reach_the_user(monkeypatch, campaign, capsys)
         warnings.warn("divide by zero", RuntimeWarning, stacklevel=1)
         return misfit_breakdown(p)
 
-    monkeypatch.setattr("hilcal.cli.comparing.misfit_breakdown", noisy)
+    monkeypatch.setattr("hilcal.cli.refining.misfit_breakdown", noisy)
     assert "divide" not in ok(capsys, "compare", campaign).err
 
 
