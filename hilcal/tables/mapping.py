@@ -181,17 +181,15 @@ class PoseName(Section):
         return self
 
 
-class LoadName(Section):
+class LoadName(Name):
     """[load]: the load's name."""
 
-    column: Column = Field(description=_COLUMN)
     none: tuple[str, ...] = Field(UNLOADED, description="the names that mean no load")
 
 
-class Time(Section):
+class Time(Name):
     """[time] and [load_time]: seconds, a date and time, or a spreadsheet's day number."""
 
-    column: Column = Field(description=_COLUMN)
     unit: Literal["s", "ms", "min", "h", "iso", "excel", "format"] = Field(
         description='"s", "ms", "min", "h", "iso" (2024-05-31T12:00:00), "excel" (days since '
         '1899-12-30), or "format" with the key format'
@@ -207,10 +205,9 @@ class Time(Section):
         return self
 
 
-class Air(Section):
+class Air(Name):
     """[air]: temperature of the air."""
 
-    column: Column = Field(description=_COLUMN)
     optional: bool = Field(False, description=_OPTIONAL)
     unit: Temperature = Field("degC", description=_UNIT_T)
 
@@ -237,10 +234,9 @@ class Torques(Section):
     )
 
 
-class OneNumber(Section):
+class OneNumber(Name):
     """[distance] from a point, [gauge]: height over a plane; rows without it leave it empty."""
 
-    column: Column = Field(description=_COLUMN)
     unit: Length = Field(description=_LENGTH)
     name_column: Column | None = Field(
         None, description="the column that names the row's point or gauge"
@@ -273,10 +269,9 @@ class Wrench(Section):
     )
 
 
-class HungMass(Section):
+class HungMass(Name):
     """[hung_mass]: a mass that hangs at the load point; its weight is the wrench. Empty is 0."""
 
-    column: Column = Field(description=_COLUMN)
     unit: Literal["kg", "g", "lb"] = Field("kg", description='"kg", "g" or "lb"')
 
 
@@ -314,14 +309,8 @@ class Instrument(Section):
     orientation_std_rad: NonNegative = Field(0.0, description="of an orientation, rad")
 
     def noise(self) -> TrackerNoise:
-        """Return the noise as a specification."""
-        return TrackerNoise(
-            self.range_std_m,
-            self.range_std_per_m,
-            self.transverse_std_m,
-            self.transverse_std_per_m,
-            self.orientation_std_rad,
-        )
+        """Return the noise as a specification, whose fields are these in the same order."""
+        return TrackerNoise(*self.model_dump().values())
 
 
 class Std(Section):
