@@ -8,10 +8,10 @@ beyond the largest measured series; docs/reference/limits.md states them.
 import mmap
 import resource
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from types import TracebackType
 from typing import Concatenate, ParamSpec, Self, TextIO, TypeVar
 
 from hilcal.errors import InputError
@@ -160,55 +160,39 @@ def read_text(path: Path, most: int) -> str:
     return read_bytes(path, most).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
 
 
-class _Memory:
-    """The context manager that `memory` returns.
-
-    It holds a reserve of memory and frees it first at the end, since even a small object may need a
-    new block when memory has run out.
-    """
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self._previous: tuple[int, int] | None = None
-        self._reserve: mmap.mmap | None = None
-
-    def __enter__(self) -> None:
-        _LOCK.acquire()
-        self._previous = soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-        try:
-            self._reserve = mmap.mmap(-1, _RESERVE_BYTES)
-            pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-        except OSError:  # no Linux
-            return
-        most = pages * resource.getpagesize() + MEMORY
-        least = [limit for limit in (soft, hard, most) if limit != resource.RLIM_INFINITY]
-        resource.setrlimit(resource.RLIMIT_AS, (min(least), hard))
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if self._reserve is not None:
-            self._reserve.close()
-        if self._previous is not None:
-            resource.setrlimit(resource.RLIMIT_AS, self._previous)
-        _LOCK.release()
-        if kind is not None and issubclass(kind, MemoryError):
-            raise InputError(
-                f"{self._name}: reading it takes more than {MEMORY / 1e6:.0f} MB of memory; valid: "
-                "a smaller file"
-            ) from None
-
-
-def memory(name: str) -> _Memory:
+@contextmanager
+def memory(name: str) -> Iterator[None]:
     """Limit the memory that the block of a `with` statement may take to `MEMORY`.
+
+    A reserve of memory is freed first at the end, since even a small object may need a new block
+    when memory has run out.
 
     Raises:
         InputError: the block needs more.
     """
-    return _Memory(name)
+    with _LOCK:
+        soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+        try:
+            reserve = mmap.mmap(-1, _RESERVE_BYTES)
+            pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+        except OSError:  # no Linux
+            yield
+            return
+        most, failed = pages * resource.getpagesize() + MEMORY, False
+        least = [limit for limit in (soft, hard, most) if limit != resource.RLIM_INFINITY]
+        resource.setrlimit(resource.RLIMIT_AS, (min(least), hard))
+        try:
+            yield
+        except MemoryError:
+            failed = True
+        finally:
+            reserve.close()
+            resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+    if failed:
+        raise InputError(
+            f"{name}: reading it takes more than {MEMORY / 1e6:.0f} MB of memory; valid: a smaller "
+            "file"
+        )
 
 
 def bounded(read: Callable[Concatenate[Q, P], T]) -> Callable[Concatenate[Q, P], T]:

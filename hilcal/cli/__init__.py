@@ -185,9 +185,8 @@ def _group(command: commands.Command) -> typer.Typer:
     app = application(command.summary, alone=bool(command.place))
     for name, place in command.subcommands:
         app.command(name)(commands.load(place))
-    app.callback(help=command.summary)(
-        commands.load(command.place) if command.place else _placeholder
-    )
+    function = commands.load(command.place) if command.place else _placeholder
+    app.callback(help=command.summary)(function)
     return app
 
 

@@ -93,10 +93,8 @@ def command(text: str = "") -> Callable[[F], F]:
         joint: dict[str, Any] = {p.name: p.annotation for p in params if is_dataclass(p.annotation)}
         flattened = []
         for p in params:
-            parts = (
-                inspect.signature(joint[p.name]).parameters.values() if p.name in joint else (p,)
-            )
-            for part in parts:
+            joined = p.name in joint
+            for part in inspect.signature(joint[p.name]).parameters.values() if joined else (p,):
                 info = declarations.get(part.name)
                 kind = annotated[part.annotation, info] if info else part.annotation
                 flattened.append(part.replace(annotation=kind))

@@ -389,7 +389,7 @@ def compare(
         if o.in_use(revision) is None:
             t.notice(f"{run}: no revision yet, taking the baseline; hilcal refine makes a model")
         comparison = compare_campaigns(
-            o, later_run, revision, same_setup=True if same_setup else None, say=say
+            o, later_run, revision, same_setup=same_setup or None, say=say
         )
     name = model_name(fitting.titles(comparison.fit.model, comparison.fit.readings))
     t.show(heading(f"{run.name}: {fitting.called(comparison.number)} ({name})"))

@@ -399,7 +399,7 @@ def in_process(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator
         yield RehearsedCampaign(measured(plan, 1, 0.0), further, missing)
 
 
-def to_the_end(t: Terminal, work: Callable[[], None], count: Callable[[], int]) -> None:
+def to_the_end(t: Terminal, work: Callable[[], object], count: Callable[[], int]) -> None:
     """Measure the missing readings by `work`; try again after a device failure.
 
     On a busy computer a simulated device may stall, which a driver takes for a failure. At most
@@ -408,7 +408,8 @@ def to_the_end(t: Terminal, work: Callable[[], None], count: Callable[[], int]) 
     tries, stored = TRIES, count()
     while True:
         try:
-            return work()
+            work()
+            return
         except DeviceError as error:
             current = count()
             tries, stored = (TRIES if current > stored else tries) - 1, current

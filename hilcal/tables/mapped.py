@@ -18,32 +18,11 @@ from hilcal.readings.readings import SAME_POSE, ObserverName, Readings
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.tables import columns, units
+from hilcal.tables import mapping as forms
+from hilcal.tables import table as exchange
 from hilcal.tables.columns import independent_columns
 from hilcal.tables.files import open_tables
 from hilcal.tables.grid import ColumnTable, Grid
-from hilcal.tables.mapping import (
-    TABLE,
-    Column,
-    Joints,
-    M,
-    Mapping,
-    Name,
-    Orientation,
-    PointMapping,
-    PoseName,
-    Position,
-    Std,
-    Time,
-    find_mapping,
-)
-from hilcal.tables.table import (
-    FROM_TRACKER,
-    ImportResult,
-    import_table,
-    named_loads,
-    readings_of,
-    without_copies,
-)
 from hilcal.tables.uncertainty import check_joint_rounding, mapped_covariance, rounding_variance
 from hilcal.tables.units import defect, rotations
 from hilcal.types import Bools, Floats, Ints
@@ -68,12 +47,12 @@ _LISTED = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MappedTable(Generic[M]):
+class MappedTable(Generic[forms.M]):
     """The rows of a table, read by a mapping, without their uncertainties."""
 
     table: ColumnTable  # columns of the exchange table, SI
     grid: Grid  # the rows as the file has them
-    mapping: M  # with one target per row, without optional columns that are absent
+    mapping: forms.M  # with one target per row, without optional columns that are absent
     raw: dict[str, Floats]  # (N,) number columns by the file's names, in its units
     angles: Floats | None  # (N, k) numbers of the orientation, in the file's unit; None without
     notes: list[str]  # one sentence for each decision
@@ -81,11 +60,11 @@ class MappedTable(Generic[M]):
 
 def mapped_table(
     path: str | Path,
-    mapping: M,
+    mapping: forms.M,
     arm: Arm,
     gravity: Sequence[float] = GRAVITY,
     second: Path | None = None,
-) -> MappedTable[M]:
+) -> MappedTable[forms.M]:
     """Read the states of one table or two by a mapping; arguments are those of `import_mapped`."""
     grid, lost = open_tables(path, mapping, second)
     notes = [f"{lost} rows left out: they have no partner in the second file"] * bool(lost)
@@ -131,7 +110,7 @@ def mapped_table(
 
 def import_mapped(
     path: str | Path,
-    mapping: Mapping,
+    mapping: forms.Mapping,
     arm: Arm,
     noise: TrackerNoise | None,
     station: Floats | Sequence[float] | None = None,
@@ -139,7 +118,7 @@ def import_mapped(
     second: Path | None = None,
     targets: Sequence[str] = (),
     std: Mapped[ObserverName, float] | None = None,
-) -> ImportResult:
+) -> exchange.ImportResult:
     """Read a table, or two tables, by a mapping.
 
     The tracker's beam starts at `station` (3,), m, or at the origin; a hung mass pulls along
@@ -164,7 +143,7 @@ def import_mapped(
         )
         figures = _block(source.raw, grid, mapping.position.columns)[positioned]
         rounding = rounding_variance(figures, units.LENGTHS[mapping.position.unit])
-    result = readings_of(table, arm, noise, station, covariance, targets, rounding, std)
+    result = exchange.readings_of(table, arm, noise, station, covariance, targets, rounding, std)
     readings = result.readings
     if mapping.rows is not None and mapping.rows.plausible_only:
         scatter = readings.covariance
@@ -179,11 +158,11 @@ def import_mapped(
     names = independent_columns(columns.joint_columns(arm.units), q.shape[1], arm)
     q = q[:, [k for k, column in enumerate(names) if column.endswith("_rad")]]
     notes += check_joint_rounding(q / unit, unit, name, result.readings.covariance, arm.reach)
-    return ImportResult(readings, tuple(notes))
+    return exchange.ImportResult(readings, tuple(notes))
 
 
 def _observers(
-    table: ColumnTable, grid: Grid, mapping: PointMapping, raw: dict[str, Floats]
+    table: ColumnTable, grid: Grid, mapping: forms.PointMapping, raw: dict[str, Floats]
 ) -> None:
     """Add distances and heights in m, their variances, and the observers of the rows."""
     for kind, section in mapping.scalars.items():
@@ -204,7 +183,7 @@ def _observers(
         table.alias[columns.STATION] = grid.name(mapping.station.column)
 
 
-def one_target_per_row(grid: Grid, mapping: M) -> tuple[Grid, M]:
+def one_target_per_row(grid: Grid, mapping: forms.M) -> tuple[Grid, forms.M]:
     """Return the table with a row for each target, and the mapping that reads it.
 
     Row i with the columns x1 y1 z1 x2 y2 z2 becomes two rows, in this order; all other cells are
@@ -217,8 +196,8 @@ def one_target_per_row(grid: Grid, mapping: M) -> tuple[Grid, M]:
     count = len(targets)
     tall = grid.rows_with(np.repeat(np.arange(len(rows)), count))
     tall = tall.with_column(TARGET, [*targets] * len(rows), 1)
-    update: dict[str, object] = {"target": Name(column=TARGET)}
-    sections: dict[str, Position | Std] = {"position": mapping.position}
+    update: dict[str, object] = {"target": forms.Name(column=TARGET)}
+    sections: dict[str, forms.Position | forms.Std] = {"position": mapping.position}
     if mapping.std is not None and len(mapping.std.columns) == 3 * count:
         sections |= {"std": mapping.std}
     for key, section in sections.items():
@@ -232,19 +211,22 @@ def one_target_per_row(grid: Grid, mapping: M) -> tuple[Grid, M]:
     return tall, mapping.model_copy(update=update)
 
 
-def _put(table: ColumnTable, grid: Grid, name: str, column: Column, values: Floats) -> None:
+def _put(table: ColumnTable, grid: Grid, name: str, column: forms.Column, values: Floats) -> None:
     """Add a column, and its name in the file."""
     table.number[name] = values
     table.alias[name] = grid.name(column)
 
 
 def _quantities(
-    table: ColumnTable, grid: Grid, m: PointMapping, raw: dict[str, Floats], arm: Arm
+    table: ColumnTable, grid: Grid, m: forms.PointMapping, raw: dict[str, Floats], arm: Arm
 ) -> None:
     """Add the columns of numbers in SI units."""
 
     def put(
-        names: Sequence[str], keys: Sequence[Column], size: float | Floats = 1.0, zero: float = 0.0
+        names: Sequence[str],
+        keys: Sequence[forms.Column],
+        size: float | Floats = 1.0,
+        zero: float = 0.0,
     ) -> None:
         sizes = np.broadcast_to(size, len(names)).tolist()
         for name, column, factor in zip(names, keys, sizes, strict=True):
@@ -270,16 +252,16 @@ def _quantities(
         put(columns.torque_columns(arm.units), t.columns, sign * sizes)
 
 
-def _joint_units(section: Joints, arm: Arm) -> Floats:
+def _joint_units(section: forms.Joints, arm: Arm) -> Floats:
     """(k,) rad, or m where a joint slides, per unit of each of the section's columns."""
     names = independent_columns(columns.joint_columns(arm.units), len(section.columns), arm)
     angle, length = units.ANGLES[section.unit], units.LENGTHS[section.slide_unit]
     return np.array([length if name.endswith("_m") else angle for name in names])
 
 
-def _raw(grid: Grid, mapping: PointMapping, arm: Arm) -> dict[str, Floats]:
+def _raw(grid: Grid, mapping: forms.PointMapping, arm: Arm) -> dict[str, Floats]:
     """Number columns that every reading needs, by the file's names, in its units."""
-    needed: list[Column] = []
+    needed: list[forms.Column] = []
     per_joint = ("joints", "actual_joints", "approach", "joint_temperatures", "torques")
     for name in (*per_joint, "position", "orientation"):
         section = getattr(mapping, name)
@@ -297,7 +279,9 @@ def _raw(grid: Grid, mapping: PointMapping, arm: Arm) -> dict[str, Floats]:
     return {grid.name(column): grid.numbers(column) for column in needed}
 
 
-def _missing_positions(grid: Grid, section: Position | None, raw: dict[str, Floats]) -> list[str]:
+def _missing_positions(
+    grid: Grid, section: forms.Position | None, raw: dict[str, Floats]
+) -> list[str]:
     """Set positions to NaN that instruments write where they measured none.
 
     These are exactly 0, 0, 0, and a number of nines, such as −9999, in all three columns.
@@ -356,12 +340,12 @@ def _stale(grid: Grid, position: Floats, q: Floats) -> list[str]:
     ]
 
 
-def _block(raw: dict[str, Floats], grid: Grid, names: Sequence[Column]) -> Floats:
+def _block(raw: dict[str, Floats], grid: Grid, names: Sequence[forms.Column]) -> Floats:
     return np.stack([raw[grid.name(name)] for name in names], axis=1)
 
 
 def _rotations(
-    grid: Grid, o: Orientation | None, raw: dict[str, Floats], table: ColumnTable
+    grid: Grid, o: forms.Orientation | None, raw: dict[str, Floats], table: ColumnTable
 ) -> Floats | None:
     """Add rotation vectors; returns the orientation's numbers (N, k) in the file's unit."""
     if o is None:
@@ -386,7 +370,7 @@ def _rotations(
     return angles
 
 
-def _wrench(grid: Grid, mapping: PointMapping, gravity: Floats, table: ColumnTable) -> Floats:
+def _wrench(grid: Grid, mapping: forms.PointMapping, gravity: Floats, table: ColumnTable) -> Floats:
     """(N, 6) wrench, N and N·m; zero where the table has none."""
     wrench = np.zeros((len(grid.rows), 6))
     if (w := mapping.wrench) is not None:
@@ -409,7 +393,7 @@ def _wrench(grid: Grid, mapping: PointMapping, gravity: Floats, table: ColumnTab
     return wrench
 
 
-def _loads(grid: Grid, mapping: PointMapping, wrench: Floats) -> list[str]:
+def _loads(grid: Grid, mapping: forms.PointMapping, wrench: Floats) -> list[str]:
     """Names of the loads: the column's, or by the hung mass, or "load" where a wrench acts."""
     if mapping.load is not None:
         none = {name.lower() for name in (*mapping.load.none, "")}
@@ -434,7 +418,7 @@ def _as_commanded(table: ColumnTable, q: Floats, arm: Arm) -> None:
         table.number[name] = q[rows, k]
 
 
-def _poses(grid: Grid, section: PoseName | None, q: Floats | None) -> list[str]:
+def _poses(grid: Grid, section: forms.PoseName | None, q: Floats | None) -> list[str]:
     """Names of the poses: the column's, or the row where these joints were first commanded."""
     if section is not None and section.column is not None:
         names = grid.text(section.column)
@@ -452,7 +436,7 @@ def _poses(grid: Grid, section: PoseName | None, q: Floats | None) -> list[str]:
     return [f"row {first.setdefault(key, row)}" for row, key in zip(rows, keys, strict=True)]
 
 
-def seconds(grid: Grid, time: Time) -> Floats:
+def seconds(grid: Grid, time: forms.Time) -> Floats:
     """(N,) times in s; dates, and times since an epoch, are counted from the earliest row."""
     import pandas as pd
 
@@ -542,33 +526,37 @@ def _listed(rows: Ints) -> str:
 
 
 def import_readings(
-    path: Path, form: str | Path | Mapping, config: CellConfig, arm: Arm, second: Path | None = None
-) -> ImportResult:
+    path: Path,
+    form: str | Path | forms.Mapping,
+    config: CellConfig,
+    arm: Arm,
+    second: Path | None = None,
+) -> exchange.ImportResult:
     """Read a table; the cell states the tracker's noise and place, gravity, and loads.
 
     `form` is "table" (the exchange table), a mapping, its name or its file; `second` is the second
     file of a mapping of two.
     """
-    mapping: Mapping | None = None
-    if str(form) != TABLE:
-        mapping = form if isinstance(form, Mapping) else find_mapping(form, Mapping)
+    mapping = form if isinstance(form, forms.Mapping) else None
+    if mapping is None and str(form) != forms.TABLE:
+        mapping = forms.find_mapping(str(form), forms.Mapping)
     tracker, gravity = config.tracker, config.robot.gravity_m_s2
     noise, station = tracker_noise(tracker), tracker.station_m
     targets, std = [target.name for target in config.tool.targets], _std(config)
     if mapping is not None:
         result = import_mapped(path, mapping, arm, noise, station, gravity, second, targets, std)
     elif second is None:
-        result = import_table(path, arm, noise, station, targets, std)
+        result = exchange.import_table(path, arm, noise, station, targets, std)
     else:
         raise InputError(f"--second {second}: only for a --format with a section [second_file]")
     limits.check_fitted(len(result.readings), result.readings.m, f"{path}: ")
     where = "" if tracker.frame == "tracker" or station else ", as if it stood at the arm's base"
-    notes = tuple(note + where * (note == FROM_TRACKER) for note in result.notes)
-    stated = FROM_TRACKER not in result.notes
+    notes = tuple(note + where * (note == exchange.FROM_TRACKER) for note in result.notes)
+    stated = exchange.FROM_TRACKER not in result.notes
     covers = WHOLE if stated and config.repeatability.in_tables else result.covers
-    readings, copies = without_copies(result.readings)
-    readings, named = named_loads(readings, config)
-    return ImportResult(
+    readings, copies = exchange.without_copies(result.readings)
+    readings, named = exchange.named_loads(readings, config)
+    return exchange.ImportResult(
         readings, (*notes, *copies, *named), covers, stated or tracker.states_noise, not stated
     )
 
