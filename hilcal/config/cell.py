@@ -65,16 +65,12 @@ class Robot(sections.Conventions):
     tip_link: str | None = None
 
     @model_validator(mode="after")
-    def _has_calibration(self) -> "Robot":
+    def _sound(self) -> "Robot":
         if self.kinematics == "factory" and self.calibration is None:
             raise ValueError(
                 'kinematics = "factory" needs calibration = FILE; hilcal check CELL.toml '
                 "--save-calibration FILE writes what the controller holds"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _plausible_gravity(self) -> "Robot":
         size = float(np.linalg.norm(self.gravity_m_s2))
         if size > 30.0:
             raise ValueError(
@@ -134,16 +130,12 @@ class Tool(sections.CellSection):
     com_m: Vector3 = (0.0, 0.0, 0.0)
 
     @model_validator(mode="after")
-    def _metres(self) -> "Tool":
+    def _sound(self) -> "Tool":
         for key in ("load_point_m", "com_m"):
             value = getattr(self, key)
             if max(map(abs, value)) > 5.0:
                 raise ValueError(f"{key} = {list(value)} lies over 5 m off the flange; is it in m?")
         _check_target(self.target_m, self.target_rotvec_rad)
-        return self
-
-    @model_validator(mode="after")
-    def _one_description(self) -> "Tool":
         if self.targets and (self.target_m or self.target_rotvec_rad):
             raise ValueError(
                 "target_m together with [[tool.targets]]; give the offset of each target in its "
@@ -308,13 +300,9 @@ class CellConfig(sections.CellSection):
     plausible: dict[str, Positive] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _distinct_names(self) -> "CellConfig":
+    def _consistent(self) -> "CellConfig":
         sections.check_distinct("loads", self.loads)
         sections.check_distinct("obstacles", self.obstacles)
-        return self
-
-    @model_validator(mode="after")
-    def _known_work_load(self) -> "CellConfig":
         names = ["none", *(load.name for load in self.loads)]
         load = self.planning.work_load
         if load not in names:
@@ -322,14 +310,8 @@ class CellConfig(sections.CellSection):
                 f'[planning] work_load = "{load}" is not in [[loads]]{suggest(load, names)}; '
                 f"valid: {', '.join(names)}"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _one_place_of_the_tracker(self) -> "CellConfig":
-        if self.sight.tracker_m is None:
-            return self
         for key in ("station_m", "base_xyz_m"):
-            if getattr(self.tracker, key) is not None:
+            if self.sight.tracker_m is not None and getattr(self.tracker, key) is not None:
                 raise ValueError(
                     f"[sight] tracker_m together with [tracker] {key}, which tells the tracker's "
                     "place already; leave tracker_m out"
