@@ -18,7 +18,6 @@ from hilcal.identification.misdescription import examine, other_arm
 from hilcal.identification.registration import register
 from hilcal.identification.table_preview import preview_table
 from hilcal.identification.torques import check_torques
-from hilcal.library import import_campaign
 from hilcal.names import quoted
 from hilcal.present import registration as words
 from hilcal.present.campaign import import_preview, info_report
@@ -59,6 +58,8 @@ def import_(
     if config is None or output is None:
         missing = "--config CELL.toml" if config is None else "-o RUN.hilcal"
         raise InputError(f"{missing} is missing; without it only --preview is possible")
+    from hilcal.library import import_campaign  # imports the whole library
+
     with working(t.progress) as say:
         imported = import_campaign(table, config, output, kind, second, overwrite=force, say=say)
     readings, cell, noise = imported.readings, imported.cell, imported.noise

@@ -452,18 +452,8 @@ def test_the_steps_of_a_refinement_carry_what_it_tried(monkeypatch):
 @pytest.mark.parametrize(("series", "limit_m"), [("Series_B", 0.110e-3), ("Series_C", 0.100e-3)])
 def test_refine_finds_what_the_arm_lacks(series, limit_m, ipa_ur10, tmp_path, capsys):
     (measured,) = (ipa_ur10 / series).glob("measurements_*.csv")
-    run = tmp_path / "ur10.hilcal"
-    ok(
-        capsys,
-        "import",
-        measured,
-        "--format",
-        "ipa-ur10",
-        "--config",
-        CELL.with_name("ipa_ur10.toml"),
-        "-o",
-        run,
-    )
+    run, cell = tmp_path / "ur10.hilcal", CELL.with_name("ipa_ur10.toml")
+    ok(capsys, "import", measured, "--format", "ipa-ur10", "--config", cell, "-o", run)
     d = ok(capsys, "refine", run, "--json").document
     first, last = d["revisions"][0], d["revisions"][-1]
     assert first["model"] == ["base_frame", "target_offset"]  # frames only
