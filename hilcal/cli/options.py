@@ -53,7 +53,6 @@ seed | --seed | Of the random candidates.
 quick | --quick | Without comparing criteria and numbers of poses.
 csv | --csv F.csv | The plan as a table, too.
 workers | --workers N | Processes of this machine; one per processor by default.
-own_workers | --workers N | Processes of this machine; 1 by default.
 jobs | --jobs | Processes; one per processor by default.
 own_jobs | --jobs | Processes; 1 by default.
 force | --force | Replace an existing file.

@@ -16,7 +16,7 @@ from hilcal.errors import InputError
 from hilcal.readings.covariance import smallest_correlation
 from hilcal.readings.readings import SAME_POSE, ObserverKind, ObserverName, Readings
 from hilcal.robot.arm import Arm
-from hilcal.tables.grid import ColumnTable
+from hilcal.tables.grid import ColumnTable, first_true
 from hilcal.tables.uncertainty import LEAST
 from hilcal.types import Bools, Floats, Ints
 
@@ -222,8 +222,7 @@ def with_following(table: ColumnTable, arm: Arm) -> ColumnTable:
         q = np.stack([number.get(name, nothing) for name in names], axis=1)
         full = arm.complete(q)
         off = (np.abs(q - full) > AGREES) & ~arm.own  # False where there is no value
-        if off.any():
-            i, k = divmod(int(np.argmax(off)), len(names))
+        for i, k in first_true(off):
             raise InputError(
                 f"{table.at(i, names[k])}: {q[i, k]:g} {arm.unit(k)}, but by the arm's "
                 f"description {arm.joint_names[k]} follows to {full[i, k]:g}; leave the "
@@ -243,29 +242,24 @@ _G = 9.80665
 
 def check_joints(table: ColumnTable, names: tuple[str, ...], q: Floats, arm: Arm) -> None:
     """Refuse commanded joints beyond the arm's limits; (N, n), rad."""
-    bad = (q < arm.q_min - _LIMIT_MARGIN) | (q > arm.q_max + _LIMIT_MARGIN)
-    if not bad.any():
-        return
-    i, j = divmod(int(np.argmax(bad)), q.shape[1])
     most = np.maximum(np.abs(arm.q_min), np.abs(arm.q_max))
     large, turns = np.abs(q[:, ~arm.slides]), most[~arm.slides]
     seems = " (looks like degrees)" if large.max(initial=0.0) > turns.max(initial=0.0) + 1 else ""
-    if arm.slides[j]:
-        seems = " (looks like millimetres)" if abs(q[i, j]) > 10 * most[j] else ""
-    unit = arm.unit(j)
-    raise InputError(
-        f"{table.at(i, names[j])}: {q[i, j]:g} {unit} is beyond the limits of "
-        f"{arm.joint_names[j]} of {arm.name}, {arm.q_min[j]:g} to {arm.q_max[j]:g} {unit}{seems}"
-    )
+    for i, j in first_true((q < arm.q_min - _LIMIT_MARGIN) | (q > arm.q_max + _LIMIT_MARGIN)):
+        if arm.slides[j]:
+            seems = " (looks like millimetres)" if abs(q[i, j]) > 10 * most[j] else ""
+        unit, limits = arm.unit(j), f"{arm.q_min[j]:g} to {arm.q_max[j]:g}"
+        raise InputError(
+            f"{table.at(i, names[j])}: {q[i, j]:g} {unit} is beyond the limits of "
+            f"{arm.joint_names[j]} of {arm.name}, {limits} {unit}{seems}"
+        )
 
 
 def check_actual_joints(
     table: ColumnTable, names: tuple[str, ...], actual: Floats, q: Floats
 ) -> None:
     """Refuse encoder readings that are not near the commanded joints; (N, n), rad."""
-    bad = np.abs(actual - q) > _TRACKING
-    if bad.any():
-        i, j = divmod(int(np.argmax(bad)), q.shape[1])
+    for i, j in first_true(np.abs(actual - q) > _TRACKING):
         unit = names[j].rsplit("_", 1)[1]
         quantity = "joint angle" if unit == "rad" else "travel"
         raise InputError(
@@ -281,8 +275,7 @@ def check_positions(table: ColumnTable, position: Floats, q: Floats, arm: Arm) -
     other; and joints that move by more than 0.1 rad move the target.
     """
     distance = np.linalg.norm(position, axis=1)
-    if np.any(distance > MAX_DISTANCE):
-        i = int(np.argmax(distance > MAX_DISTANCE))
+    for (i,) in first_true(distance > MAX_DISTANCE):
         j = int(np.argmax(np.abs(position[i])))
         raise InputError(
             f"{table.at(i, POSITION[j])}: {position[i, j]:g} m cannot be right"
@@ -317,8 +310,7 @@ def _looks_like(position: Floats, distance: float) -> str:
 def check_rotations(table: ColumnTable, rotation: Floats) -> None:
     """Refuse rotation vectors (N, 3) of more than a turn."""
     angle = np.linalg.norm(rotation, axis=1)
-    if np.any(angle > 2 * np.pi + 1e-6):
-        i = int(np.argmax(angle > 2 * np.pi + 1e-6))
+    for (i,) in first_true(angle > 2 * np.pi + 1e-6):
         raise InputError(
             f"{table.at(i)}: rotation vector {', '.join(ROTATION)} has a length of {angle[i]:.4g}, "
             f"more than a turn (looks like degrees); expected axis times angle in rad"
@@ -332,35 +324,32 @@ def check_covariances(table: ColumnTable, covariance: Floats) -> None:
     D = diag(V)^-1/2, so that the answer does not depend on units: eigenvalues >= -1e-9.
     """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
-    for i in np.flatnonzero(np.any(variance < 0, axis=1))[:1]:
-        j = int(np.argmax(variance[i] < 0))
+    for i, j in first_true(variance < 0):
         raise InputError(
-            f"{table.at(int(i))}: variance {j + 1} of the covariance is {variance[i, j]:g}; "
+            f"{table.at(i)}: variance {j + 1} of the covariance is {variance[i, j]:g}; "
             f"a variance is >= 0"
         )
-    for i in np.flatnonzero(~np.any(covariance, axis=(1, 2)))[:1]:
+    for (i,) in first_true(~np.any(covariance, axis=(1, 2))):
         raise InputError(
-            f"{table.at(int(i))}: the covariance is zero; give the reading's covariance in m², or "
+            f"{table.at(i)}: the covariance is zero; give the reading's covariance in m², or "
             f"leave out all covariance columns to use the tracker's specification"
         )
     smallest = smallest_correlation(covariance)
-    for i in np.flatnonzero(smallest < -1e-9)[:1]:
+    for (i,) in first_true(smallest < -1e-9):
         why = f"smallest eigenvalue of the correlation matrix {smallest[i]:.3g}"
         if np.isinf(smallest[i]):
             why = "a covariance is larger than its two variances allow"
-        raise InputError(
-            f"{table.at(int(i))}: the covariance is not positive semi-definite ({why})"
-        )
+        raise InputError(f"{table.at(i)}: the covariance is not positive semi-definite ({why})")
     std = np.sqrt(variance[:, :3].max(axis=1))
-    for i in np.flatnonzero(std > MAX_STD)[:1]:
+    for (i,) in first_true(std > MAX_STD):
         raise InputError(
-            f"{table.at(int(i))}: a standard deviation of {std[i]:.3g} m cannot calibrate an arm; "
+            f"{table.at(i)}: a standard deviation of {std[i]:.3g} m cannot calibrate an arm; "
             f"covariances must be in m², m·rad and rad² (1 mm² = 1e-6 m²)"
         )
     turn = np.sqrt(variance[:, 3:].max(axis=1, initial=0.0))
-    for i in np.flatnonzero(turn > MAX_ANGLE_STD)[:1]:
+    for (i,) in first_true(turn > MAX_ANGLE_STD):
         raise InputError(
-            f"{table.at(int(i))}: a standard deviation of {turn[i]:.3g} rad cannot calibrate an "
+            f"{table.at(i)}: a standard deviation of {turn[i]:.3g} rad cannot calibrate an "
             f"arm; covariances must be in m², m·rad and rad² (1 deg² = 3.05e-4 rad²)"
         )
 
@@ -393,11 +382,9 @@ def check_names(table: ColumnTable) -> None:
 
 def check_same_pose(table: ColumnTable, pose: Ints, names: list[str], q: Floats, arm: Arm) -> None:
     """Refuse a pose whose commanded joints (N, n) differ between its rows."""
-    first = np.unique(pose, return_index=True)[1]
-    bad = np.abs(q - q[first][pose]) > SAME_POSE
-    if bad.any():
-        i, j = divmod(int(np.argmax(bad)), q.shape[1])
-        k = int(first[pose[i]])
+    first_row = np.unique(pose, return_index=True)[1]
+    for i, j in first_true(np.abs(q - q[first_row][pose]) > SAME_POSE):
+        k = int(first_row[pose[i]])
         raise InputError(
             f"{table.at(i)}: pose '{names[pose[i]]}' commands joint {j + 1} to {q[i, j]:.9g} "
             f"{arm.unit(j)}, row {table.rows[k]} to {q[k, j]:.9g}; give another pose another name"
@@ -430,7 +417,7 @@ class Observed:
             low = 0.0 if kind == "point" else -MAX_DISTANCE
             for i in rows[(read < low) | (read > MAX_DISTANCE)][:1]:
                 raise InputError(
-                    f"{table.at(int(i), column)}: {table.number[column][i]:g} m cannot be right; "
+                    f"{table.at(i, column)}: {table.number[column][i]:g} m cannot be right; "
                     f"expected {low:g} to {MAX_DISTANCE:g} m"
                 )
             value[rows, 0] = read
@@ -475,10 +462,10 @@ def observed_of(table: ColumnTable) -> Observed | None:
     filled = ~np.isnan(table.matrix(axes)) if axes else np.zeros((count, 1), dtype=np.bool_)
     positioned = filled.any(axis=1)
     readings = np.sum([positioned, *read.values()], axis=0)
-    for i in np.flatnonzero((readings != 1) | (positioned & ~filled.all(axis=1)))[:1]:
+    for (i,) in first_true((readings != 1) | (positioned & ~filled.all(axis=1))):
         valid = ", ".join(["x_m, y_m, z_m"] * bool(axes) + [column[kind] for kind in read])
         why = "a part of a position" if readings[i] == 1 else f"{readings[i]} readings"
-        raise InputError(f"{table.at(int(i))}: {why}; valid: just one of {valid} in each row")
+        raise InputError(f"{table.at(i)}: {why}; valid: just one of {valid} in each row")
     names = []
     for i in range(count):
         kind = next((kind for kind in read if read[kind][i]), None)

@@ -81,9 +81,7 @@ class Grid:
         """(N,) numbers of a column, NaN where a value is missing, which `complete` refuses."""
         cells, how = self.cells(column), self._format(column)
         values = np.fromiter((number(c, how) for c in cells), dtype=float, count=len(cells))
-        bad = ~np.isfinite(values) if complete else np.isinf(values)
-        if bad.any():
-            k = int(np.argmax(bad))
+        for (k,) in first_true(~np.isfinite(values) if complete else np.isinf(values)):
             raise InputError(f"{self.at(k, column)}: {_complaint(cells[k], how, complete)}")
         for mark in how.missing:
             if isinstance(mark, float | int):
@@ -146,10 +144,15 @@ class ColumnTable:
 
     def refuse(self, bad: Bools, names: Sequence[str], message: Callable[[float], str]) -> None:
         """Raise for the first true cell of an (N, k) mask over number columns."""
-        if bad.any():
-            i, j = divmod(int(np.argmax(bad)), bad.shape[1])
+        for i, j in first_true(bad):
             value = float(self.number[names[j]][i])
             raise InputError(f"{self.at(i, names[j])}: {message(value)}")
+
+
+def first_true(bad: Bools) -> list[list[int]]:
+    """Place of the first true element of a mask; none where there is none."""
+    places: list[list[int]] = np.argwhere(bad)[:1].tolist()
+    return places
 
 
 def text_of(cell: Cell) -> str:

@@ -22,7 +22,7 @@ from hilcal.tables import mapping as forms
 from hilcal.tables import table as exchange
 from hilcal.tables.columns import independent_columns
 from hilcal.tables.files import open_tables
-from hilcal.tables.grid import ColumnTable, Grid
+from hilcal.tables.grid import ColumnTable, Grid, first_true
 from hilcal.tables.uncertainty import check_joint_rounding, mapped_covariance, rounding_variance
 from hilcal.tables.units import defect, rotations
 from hilcal.types import Bools, Floats, Ints
@@ -351,14 +351,11 @@ def _rotations(
     if o is None:
         return None
     angles = _block(raw, grid, o.columns)
-    far = defect(o.convention, angles) > UNIT_LENGTH
-    if far.any():
+    for (i,) in first_true(defect(o.convention, angles) > UNIT_LENGTH):
         valid = "a quaternion of length 1" if angles.shape[1] == 4 else "a rotation matrix"
-        raise InputError(f"{grid.at(int(np.argmax(far)), o.columns[0])}: not {valid}")
+        raise InputError(f"{grid.at(i, o.columns[0])}: not {valid}")
     unit = units.ANGLES[o.unit]
-    turn = np.abs(unit * angles) > MOST_TURN
-    if angles.shape[1] == 3 and turn.any():
-        i, k = divmod(int(np.argmax(turn)), 3)
+    for i, k in first_true((np.abs(unit * angles) > MOST_TURN) & (angles.shape[1] == 3)):
         seems = " (looks like degrees)" if o.unit == "rad" else ""
         raise InputError(
             f"{grid.at(i, o.columns[k])}: {angles[i, k]:g} {o.unit} is more than a turn{seems}; "
@@ -381,9 +378,7 @@ def _wrench(grid: Grid, mapping: forms.PointMapping, gravity: Floats, table: Col
             table.alias[columns.WRENCH[k]] = grid.name(column)
     if (hung := mapping.hung_mass) is not None:
         mass = units.MASSES[hung.unit] * np.nan_to_num(grid.numbers(hung.column))
-        bad = mass < 0
-        if bad.any():
-            i = int(np.argmax(bad))
+        for (i,) in first_true(mass < 0):
             raise InputError(f"{grid.at(i, hung.column)}: a mass is 0 or more")
         wrench[:, :3] = mass[:, None] * gravity
         table.alias.update(dict.fromkeys(columns.WRENCH, grid.name(hung.column)))
@@ -452,9 +447,7 @@ def seconds(grid: Grid, time: forms.Time) -> Floats:
         texts = [str(c).strip() if form else str(c).strip().replace(",", ".") for c in cells]
         when = pd.to_datetime(pd.Series(texts), format=form or "ISO8601", errors="coerce", utc=True)
         values = (when - pd.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy(dtype=float)
-    bad = ~np.isfinite(values)
-    if bad.any():
-        k = int(np.argmax(bad))
+    for (k,) in first_true(~np.isfinite(values)):
         raise InputError(
             f"{grid.at(k, time.column)}: '{grid.text(time.column)[k]}' is not "
             f"{expected}; see unit of the times in the mapping"

@@ -20,7 +20,7 @@ from hilcal.robot.arm import Arm
 from hilcal.robot.batch import CHUNK
 from hilcal.tables import columns
 from hilcal.tables.files import is_plain, package, undamaged
-from hilcal.tables.grid import ColumnTable
+from hilcal.tables.grid import ColumnTable, first_true
 from hilcal.tables.table import check_covers, covariances_of, measured_of
 from hilcal.tables.uncertainty import rounding_variance
 from hilcal.types import Floats
@@ -146,9 +146,7 @@ def _numbers(path: Path, name: str, column: Any, row: int) -> Floats:
         values = np.asarray(column.to_numpy(zero_copy_only=False), dtype=float)
     except (TypeError, ValueError) as e:
         raise InputError(f"{path}: column '{name}' is no column of numbers") from e
-    bad = ~np.isfinite(values)
-    if bad.any():
-        k = int(np.argmax(bad))
+    for (k,) in first_true(~np.isfinite(values)):
         raise InputError(
             f"{path}: row {row + k}, column '{name}': not a finite number; leave out the rows that "
             "were not read"

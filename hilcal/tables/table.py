@@ -15,7 +15,7 @@ from hilcal.robot.arm import Arm
 from hilcal.store.plan import UNLOADED
 from hilcal.tables import columns
 from hilcal.tables.files import open_grid
-from hilcal.tables.grid import ColumnTable
+from hilcal.tables.grid import ColumnTable, first_true
 from hilcal.tables.mapping import FileFormat
 from hilcal.tables.uncertainty import LEAST, floored, rounding_variance, with_rounding
 from hilcal.tables.write import Column, write_columns
@@ -326,9 +326,9 @@ def _instrument_covariance(
             f"the section [tracker] of the configuration; give one of them"
         )
     origin = np.zeros(3) if station is None else np.asarray(station, dtype=float)
-    for k in np.flatnonzero(np.linalg.norm(value[:, :3] - origin, axis=1) < 1e-3)[:1]:
+    for (k,) in first_true(np.linalg.norm(value[:, :3] - origin, axis=1) < 1e-3):
         raise InputError(
-            f"{table.at(int(k))}: position lies at the tracker's station; set station_m in the "
+            f"{table.at(k)}: position lies at the tracker's station; set station_m in the "
             f"section [tracker] of the configuration"
         )
     return tracker_covariance(value[:, :3], noise, origin, m)

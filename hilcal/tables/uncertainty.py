@@ -11,7 +11,7 @@ import numpy as np
 from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise, tracker_covariance
 from hilcal.tables import units
-from hilcal.tables.grid import ColumnTable, Grid
+from hilcal.tables.grid import ColumnTable, Grid, first_true
 from hilcal.tables.mapping import Column, CovarianceColumns, Mapping, Std
 from hilcal.tables.units import angle_axes
 from hilcal.types import Bools, Floats
@@ -81,9 +81,7 @@ def mapped_covariance(
 def _block(grid: Grid, columns: Sequence[Column]) -> Floats:
     """(N, k) figures of columns; every row has one."""
     values = np.stack([grid.numbers(column) for column in columns], axis=1)
-    bad = np.isnan(values)
-    if bad.any():
-        i, j = divmod(int(np.argmax(bad)), values.shape[1])
+    for i, j in first_true(np.isnan(values)):
         raise InputError(
             f"{grid.at(i, columns[j])}: no value; every reading needs its uncertainty "
             f"(take the column out of the mapping to use the noise in [tracker])"
@@ -106,9 +104,7 @@ def _of_std(grid: Grid, mapping: Mapping, std: Std, count: int) -> tuple[Floats,
         figures = np.tile(np.array(constants, dtype=float), (count, 1))
     else:
         figures = _block(grid, std.columns)
-        bad = figures < 0
-        if bad.any():
-            i, j = divmod(int(np.argmax(bad)), figures.shape[1])
+        for i, j in first_true(figures < 0):
             quantity = "variance" if std.kind == "variance" else "standard deviation"
             where = grid.at(i, std.columns[j])
             raise InputError(f"{where}: {figures[i, j]:g}: a {quantity} is 0 or more")
@@ -151,7 +147,7 @@ def _of_matrix(grid: Grid, section: CovarianceColumns) -> Floats:
         cov = figures.reshape(count, m, m)
         transposed = np.swapaxes(cov, 1, 2)
         bad = np.abs(cov - transposed).max(axis=(1, 2)) > 1e-3 * np.abs(cov).max(axis=(1, 2))
-        for i in np.flatnonzero(bad)[:1].tolist():
+        for (i,) in first_true(bad):
             raise InputError(f"{grid.at(i, section.columns[0])}: the covariance is not symmetric")
         cov = 0.5 * (cov + transposed)
     else:
