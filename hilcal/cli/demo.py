@@ -109,10 +109,8 @@ def doubtful_case(
     """
     loads = settings.config.loads[1::2] or settings.config.loads
     quick = {"candidates": min(settings.config.planning.candidates, CANDIDATES), "against": ()}
-    planning = settings.config.planning.model_copy(update=quick)
-    few = settings.config.model_copy(update={"loads": loads, "planning": planning})
-    simulation = settings.config.simulation.model_copy(update={"strength_sigma": STRENGTH})
-    strong = settings.config.model_copy(update={"simulation": simulation})
+    few = settings.config.with_keys("planning", **quick).model_copy(update={"loads": loads})
+    strong = settings.config.with_keys("simulation", strength_sigma=STRENGTH)
     say("drawing an arm and a small campaign that leaves its effect in doubt")
     for k in range(TRIES):
         rng = np.random.default_rng([settings.seed, number, k])

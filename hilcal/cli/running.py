@@ -474,7 +474,7 @@ def simulate(
     if clock is not None:
         if not 1.0 <= clock <= FASTEST:
             raise InputError(f"--clock {clock:g}; valid: a number from 1 to {FASTEST:g}")
-        config = _with(config, "simulation", clock=clock)
+        config = config.with_keys("simulation", clock=clock)
     base_dir = cell.absolute().parent
     choice = hide or config.simulation.hide or NOTHING
     as_told(config, choice, catalogue)  # refuses an effect that cannot be hidden, before planning
@@ -510,20 +510,14 @@ def simulate(
 
 def with_person(config: CellConfig) -> CellConfig:
     """Return the configuration of a simulated cell whose loads a person changes."""
-    options = {**config.operator.options, "person": True}
-    return _with(config, "operator", options=options)
-
-
-def _with(config: CellConfig, section: str, **values: object) -> CellConfig:
-    changed = getattr(config, section).model_copy(update=values)
-    return config.model_copy(update={section: changed})
+    return config.with_keys("operator", options={**config.operator.options, "person": True})
 
 
 def _placed(config: CellConfig, base_dir: Path) -> CellConfig:
     """Return the configuration with absolute paths of the robot's files."""
     paths = {"model": config.robot.model, "calibration": config.robot.calibration or ""}
     files = {k: str((base_dir / v).absolute()) for k, v in paths.items() if Path(v).suffix}
-    return _with(config, "robot", **files)
+    return config.with_keys("robot", **files)
 
 
 FACTORY_POSES = 20  # Without a load; a choice: with 12, an encoder offset of 1 mrad may be in doubt
@@ -558,7 +552,7 @@ def factory_check(
 def _measure_without_loads(
     t: Terminal, config: CellConfig, cell: Cell, catalogue: Catalogue, output: Path, yes: bool
 ) -> None:
-    bare = _with(config, "planning", readings="absolute")
+    bare = config.with_keys("planning", readings="absolute")
     bare = bare.model_copy(update={"loads": (), "force_sensor": None})
     numbers = cell_from_config(bare, cell.base_dir)
     with working(t.progress) as say:

@@ -323,6 +323,10 @@ class CellConfig(sections.CellSection):
         """Kind of readings that will be fitted: `[planning] readings`; "absolute" without loads."""
         return self.planning.readings if self.loads else "absolute"
 
+    def with_keys(self, section: str, **values: object) -> "CellConfig":
+        """Return the configuration with other values of a section's keys, which are not checked."""
+        return self.model_copy(update={section: getattr(self, section).model_copy(update=values)})
+
     def to_json(self) -> str:
         """Return the configuration as JSON, defaults included; `from_json` reads it back."""
         return self.model_dump_json()

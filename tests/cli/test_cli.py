@@ -289,9 +289,7 @@ def test_version_and_help(capsys):
     assert "Traceback" not in result.err
 
 
-UR5E = load_config(CELL).model_copy(
-    update={"robot": load_config(CELL).robot.model_copy(update={"model": "ur5e"})}
-)
+UR5E = load_config(CELL).with_keys("robot", model="ur5e")
 
 
 def study(mode, *hidden, seed=1, **options):
