@@ -19,16 +19,8 @@ from typing import Annotated, Any, TextIO
 
 import typer
 
-from hilcal import __version__
+from hilcal import __version__, errors
 from hilcal.cli import commands
-from hilcal.errors import (
-    CannotAnswerError,
-    DeviceError,
-    HilcalError,
-    InputError,
-    LimitError,
-    StoppedError,
-)
 from hilcal.names import escaped
 from hilcal.optional import lacking
 from hilcal.store.kept_texts import typed
@@ -36,7 +28,7 @@ from hilcal.store.kept_texts import typed
 DEBUG = "HILCAL_DEBUG"
 _COMPLETE = "_HILCAL_COMPLETE"
 _BROKEN_PIPE = 141
-_INTERRUPTED = StoppedError.exit_code
+_INTERRUPTED = errors.StoppedError.exit_code
 _USAGE = 2
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LIBRARY = re.compile(r"(\S+): cannot open shared object file")
@@ -44,11 +36,11 @@ _FRAMES = "⠋⠙⠹⠸⠼⠴⠦⠧⠇⠏"
 _FRAME_S = 0.2
 _COMMAND = re.compile(r"(.*:) (hilcal [^,;()]*)$")
 _KINDS = {
-    InputError.exit_code: "input",
-    DeviceError.exit_code: "device",
-    CannotAnswerError.exit_code: "cannot_answer",
-    LimitError.exit_code: "limit",
-    StoppedError.exit_code: "interrupted",
+    errors.InputError.exit_code: "input",
+    errors.DeviceError.exit_code: "device",
+    errors.CannotAnswerError.exit_code: "cannot_answer",
+    errors.LimitError.exit_code: "limit",
+    errors.StoppedError.exit_code: "interrupted",
 }
 
 
@@ -265,7 +257,7 @@ def _run(
         with _computing(), typed((name, *arguments)):
             result = app(arguments, prog_name=name, standalone_mode=False)
         out.flush()
-    except HilcalError as error:
+    except errors.HilcalError as error:
         return failures.tell(error, str(error), error.exit_code)
     except BrokenPipeError:
         # The reader is gone; flushing the buffer at exit must not raise again.
@@ -296,7 +288,7 @@ def _explained(error: Exception, name: str) -> tuple[str, int]:
         file = error.filename or "a file"
         hint = "make room on the disks of output, program and temporary files"
         message = f"{file} cannot be written ({os.strerror(error.errno)}): {hint}"
-        return message, DeviceError.exit_code
+        return message, errors.DeviceError.exit_code
     if isinstance(error, ImportError) and (library := _LIBRARY.match(str(error))):
         package = " (libgomp1 on Debian)" if library[1] == "libgomp.so.1" else ""
         return f"the system library {library[1]} is missing: install its package{package}", _USAGE
