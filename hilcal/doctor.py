@@ -163,7 +163,6 @@ def _durable_write(folder: Path) -> float:
 
 
 def _memory() -> Finding:
-    """Return whether the memory suffices for large campaigns."""
     try:
         pages = (os.sysconf(name) for name in ("SC_AVPHYS_PAGES", "SC_PHYS_PAGES"))
         free, total = (n * os.sysconf("SC_PAGE_SIZE") for n in pages)

@@ -225,7 +225,6 @@ def _readings(data: Readings | Campaign) -> Readings:
 
 
 def _with_prior(model: Model, data: Readings, prior: Posterior | CarriedPrior) -> Model:
-    """Return a model with a prior on those of its effects that the prior has."""
     carried = _carried(prior, model.catalogue)
     if carried is not None:
         check_prior(carried, model.cell.arm, data)
@@ -235,7 +234,6 @@ def _with_prior(model: Model, data: Readings, prior: Posterior | CarriedPrior) -
 def _carried(
     prior: Posterior | CarriedPrior | None, catalogue: Catalogue | None
 ) -> CarriedPrior | None:
-    """Return a posterior as a prior of the same arm."""
     return carried_prior(prior, catalogue=catalogue) if isinstance(prior, Posterior) else prior
 
 

@@ -232,6 +232,5 @@ def section_of(field: FieldInfo | None) -> type[Section] | None:
 
 
 def _show(value: object) -> str:
-    """Return a value as one short line."""
     text = json.dumps(value, default=str)
     return text if len(text) <= 60 else f"{text[:57]}..."

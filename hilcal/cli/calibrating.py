@@ -152,8 +152,6 @@ def calibrate(
 
 @dataclass(frozen=True, slots=True)
 class _Continuation:
-    """The commands that start and resume a calibration."""
-
     t: Terminal
     resume: str
     start: str
@@ -191,7 +189,6 @@ def _procedure(
     stated: dict[str, Any],
     go_on: _Continuation,
 ) -> Procedure:
-    """Begin a calibration, or resume it from its file."""
     hide = (config.simulation.hide or NOTHING) if rehearse else None
     base_dir = path.absolute().parent
     if rehearse:

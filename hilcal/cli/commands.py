@@ -80,14 +80,10 @@ def load(place: str) -> Callable[..., Any]:
     return function
 
 
-_SUBCOMMANDS = {
-    "effects": (("new", "looking_up:new"),),
-    "study": (("scaling", "looking_up:scaling"),),
-}
+_BELOW = {"effects": (("new", "looking_up:new"),), "study": (("scaling", "looking_up:scaling"),)}
 
 
 def _read() -> tuple[dict[str, Command], dict[str, tuple[str, ...]]]:
-    """Return the commands by name, and their names by section."""
     commands: dict[str, Command] = {}
     sections: dict[str, tuple[str, ...]] = {}
     for line in _LISTED.replace("\n    |", " |").strip().splitlines():
@@ -97,7 +93,7 @@ def _read() -> tuple[dict[str, Command], dict[str, tuple[str, ...]]]:
         name, module, summary = (part.strip() for part in line.split(" |"))
         function = {"import": "import_", "next": "next_"}.get(name, name)
         place = f"{module}:{function}" if module else ""
-        commands[name] = Command(place, summary, _SUBCOMMANDS.get(name, ()))
+        commands[name] = Command(place, summary, _BELOW.get(name, ()))
         sections[section] = (*sections.get(section, ()), name)
     return commands, sections
 

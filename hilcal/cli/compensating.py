@@ -37,8 +37,6 @@ NAMED = 5  # Most refused points that an error names
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Task:
-    """The points to compensate, and the program that they come from."""
-
     points: Points
     tool: Floats | None  # (4, 4) T_flange_tool; the tracked target where None
     program: str | None = None  # text of a UR program
@@ -207,7 +205,6 @@ def _task(
 
 
 def _only(task: _Task, retained: list[int], refused: list[str]) -> _Task:
-    """Return the task of a program without its refused waypoints."""
     if task.foreign is not None:
         foreign = task.foreign.without(refused)
         return replace(task, points=foreign.points, foreign=foreign)
@@ -225,7 +222,6 @@ def _only(task: _Task, retained: list[int], refused: list[str]) -> _Task:
 def _wrench(
     points: Points, calibration: Calibration, options: CompensationOptions
 ) -> Floats | None:
-    """Return the wrench at the points, (6,) or (N, 6)."""
     load, wrench = options.load, options.wrench
     if sum(x is not None for x in (load, wrench, points.wrench, points.sensed)) > 1:
         raise InputError("the load is given twice; valid: one of --load, --wrench, columns")
@@ -277,7 +273,6 @@ def _check_output(path: Path, points: Path, force: bool) -> None:
 def _write(
     path: Path, task: _Task, result: Compensation, document: dict[str, object], units: Sequence[str]
 ) -> list[Path]:
-    """Write the joint values in the format of the file's name; return the files."""
     names, n = task.points.names, result.q.shape[1]
     if task.foreign is not None and path.suffix.lower() in READERS:
         files = {path.with_suffix(k): v for k, v in task.foreign.corrected(result.q).items()}

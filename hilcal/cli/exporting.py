@@ -204,7 +204,6 @@ def cell_toml(run: Campaign) -> str:
 def _write_model(
     say: Say, run: Campaign, revision: int | None, record: RevisionRecord, options: ExportOptions
 ) -> Iterator[str]:
-    """Write the files of the model; yield a line on each."""
     number, parameters = record.number, options.parameters
     source: dict[str, object] = {"campaign": run.path.name, "revision": number}
     source["readings_sha256"] = record.data_hash
@@ -319,7 +318,6 @@ def _ur_note(note: str, base: str, arm: Corrected, digest: str | None) -> str:
 
 
 def _dh_words(path: Path, rows: dh_table.DhRows, holds: str, alone: bool) -> Iterator[str]:
-    """Yield lines on what a DH table holds, and what it does not."""
     yield f"{path}: {rows.convention} DH rows with {holds}"
     if max(rows.base_moves, rows.flange_moves) > dh_table.EXACT:
         parts = (

@@ -78,7 +78,6 @@ def _summary(fitted: Fit) -> str:
 
 
 def _tell_accepted(t: Terminal, run: Campaign, revision: int | None) -> None:
-    """Print a notice where the accepted revision is not the latest."""
     accepted, latest = run.file.accepted(), run.latest()
     if revision is None and latest is not None and accepted not in (None, latest.number):
         t.notice(f"using revision {accepted}, which is accepted; the latest is {latest.number}")

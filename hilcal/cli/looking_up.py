@@ -69,7 +69,6 @@ def effects(
 
 
 def _expected(e: Effect) -> str:
-    """Return the expected standard deviation of an effect's parameters, the largest per unit."""
     largest: dict[str, float] = {}
     for _, std, unit in expected_sizes(e):
         largest[unit] = max(largest.get(unit, 0.0), std)

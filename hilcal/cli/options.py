@@ -61,7 +61,6 @@ force | --force | Replace an existing file.
 
 
 def _open_to_others(context: typer.Context, address: str | None) -> str | None:
-    """Warn of an address without TLS."""
     if address and not address.startswith(("tls://", "wss://")) and not context.resilient_parsing:
         warning = f"--scheduler {address}: without TLS, whoever reaches it runs code there and here"
         typer.echo(f"{warning}, as you; tls://host:8786 keeps others out", err=True)

@@ -297,7 +297,6 @@ def _without_suspects(
 
 
 def _named(text: str | None, catalogue: Catalogue) -> tuple[str, ...] | None:
-    """Read `--suspects`: names of effects without options."""
     effects = fitting.wanted_effects(text, catalogue, "--suspects")
     if effects is None:
         return None

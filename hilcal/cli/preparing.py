@@ -273,7 +273,6 @@ def init(
 
 
 def _lacking(draft: Draft) -> str:
-    """Return a clause with the keys that the cell lacks for measuring."""
     connection = "host" if "host" in draft.data.get("tracker", {}) else "port"
     keys = (("robot", "driver"), ("robot", "host"), ("tracker", "driver"), ("tracker", connection))
     missing = [f"[{s}] {key}" for s, key in keys if key not in draft.data.get(s, {})]
@@ -324,7 +323,6 @@ def _shortly(error: InputError) -> str:
 
 
 def _complete(draft: Draft) -> None:
-    """Add the keys that a plan and a rehearsal need, and check the cell."""
     if draft.data.setdefault("planning", {}).setdefault("readings", "absolute") == "absolute":
         loaded = () if not draft.data.get("loads") else LOADED
         draft.set("planning", model=[*GEOMETRY, *loaded])
@@ -373,7 +371,6 @@ def _cell(path: Path | None) -> tuple[CellConfig | None, list[machine.Finding]]:
 
 
 def _ports(config: CellConfig | None) -> dict[str, str]:
-    """Return the serial ports of a cell by device."""
     if config is None:
         return {}
     ports = {"tracker": config.tracker.port}

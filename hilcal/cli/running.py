@@ -420,7 +420,6 @@ def to_the_end(t: Terminal, work: Callable[[], object], count: Callable[[], int]
 
 
 def _write(t: Terminal, campaign: CampaignFile, readings: Readings) -> None:
-    """Append readings in their order, pose by pose."""
     starts = [0, *(np.flatnonzero(np.diff(readings.pose)) + 1).tolist(), len(readings)]
     with counting(t.progress, "measuring poses", len(starts) - 1) as advance:
         for begin, end in pairwise(starts):
@@ -514,7 +513,6 @@ def with_person(config: CellConfig) -> CellConfig:
 
 
 def _placed(config: CellConfig, base_dir: Path) -> CellConfig:
-    """Return the configuration with absolute paths of the robot's files."""
     paths = {"model": config.robot.model, "calibration": config.robot.calibration or ""}
     files = {k: str((base_dir / v).absolute()) for k, v in paths.items() if Path(v).suffix}
     return config.with_keys("robot", **files)

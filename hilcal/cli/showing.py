@@ -198,7 +198,6 @@ def workbench(
 def _import(
     t: Terminal, table: Path, config: Path, run: Path, kind: str, second: Path | None
 ) -> None:
-    """Make the campaign file of a table; refuse to replace a file."""
     if run.exists():
         raise InputError(
             f"{run}: the file exists, and is left as it is; open it with hilcal workbench "

@@ -78,7 +78,6 @@ def table(name: str, sections: tuple[KeyTable, ...]) -> KeyTable:
 
 
 def _tables(name: str, section: type[Section], several: bool) -> Iterator[KeyTable]:
-    """Yield a section and its subsections."""
     yield _table(name, section, several)
     for key, field in section.model_fields.items():
         inner = section_of(field)
@@ -94,7 +93,6 @@ def _table(name: str, section: type[Section], several: bool) -> KeyTable:
 
 
 def _by_name(name: str, field: FieldInfo) -> KeyTable:
-    """Return a section whose keys are names."""
     ((key, value),) = example(field).items()
     valid = f"a number over 0; the key is a name, as {key}"
     column = Key("NAME", "1", "1.0", valid, f"{key} = {inline(value)}")

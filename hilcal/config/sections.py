@@ -36,7 +36,6 @@ def check_distinct(section: str, things: Sequence[Any]) -> None:
 
 
 def _check_box(section: Section, low: str, high: str) -> None:
-    """Refuse a box whose low corner is not below the high one in x, y and z."""
     a, b = getattr(section, low), getattr(section, high)
     if a is not None and b is not None and not np.all(np.less(a, b)):
         raise ValueError(f"{low} = {list(a)} is not below {high} = {list(b)}")

@@ -114,10 +114,8 @@ def check_header(
     for k, name in enumerate(header, start=1):
         if not 0 < len(name) <= 80:
             raise InputError(f"{path}: column {k} has no name, or a long one, in row 1")
-        if header.count(name) > 1:
-            raise InputError(
-                f"{path}: column '{name}' appears {header.count(name)} times; keep one"
-            )
+        if (count := header.count(name)) > 1:
+            raise InputError(f"{path}: column '{name}' appears {count} times; keep one")
     valid, needed = known_columns(units), required_columns(units)
     if any(name in header for kind in SCALAR.values() for name in kind):
         _check_scalar(path, header)
@@ -155,7 +153,6 @@ def _check_scalar(path: str, header: Sequence[str]) -> None:
 
 
 def _advice(name: str, valid: Sequence[str], header: Sequence[str], n: int) -> str:
-    """Return advice on an unknown column."""
     first, _, last = name.partition("_")
     i, _, j = last.partition("_")
     if first == "cov" and f"cov_{j}_{i}" in valid:
@@ -170,7 +167,6 @@ def _advice(name: str, valid: Sequence[str], header: Sequence[str], n: int) -> s
 
 
 def _hint(missing: Sequence[str], header: Sequence[str], units: Units, arm: str) -> str:
-    """Return a hint on missing columns."""
     user_columns = [c for c in header if c.startswith(OWN_PREFIX)]
     close = _closest(missing[0], user_columns) if missing[0] not in TEXT else None
     if close:

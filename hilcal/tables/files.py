@@ -231,7 +231,6 @@ def sheet_rows(
 
 
 def _cell(value: object) -> Cell:
-    """Return a spreadsheet's cell as a number, a date, text or nothing."""
     if value is None or isinstance(value, datetime):
         return value
     if isinstance(value, bool):

@@ -97,9 +97,8 @@ class Grid:
     def with_column(self, name: str, cells: Sequence[Cell], like: str | int) -> "Grid":
         """Return the table with a further column, in the format of the column `like`."""
         names, columns = (*self.names, name), (*self.columns, cells)
-        return replace(
-            self, names=names, columns=columns, formats=(*self.formats, self._format(like))
-        )
+        formats = (*self.formats, self._format(like))
+        return replace(self, names=names, columns=columns, formats=formats)
 
     def _format(self, column: str | int) -> FileFormat:
         return self.formats[self.names.index(self.name(column))]

@@ -212,7 +212,6 @@ def one_target_per_row(grid: Grid, mapping: forms.M) -> tuple[Grid, forms.M]:
 
 
 def _put(table: ColumnTable, grid: Grid, name: str, column: forms.Column, values: Floats) -> None:
-    """Add a column, and its name in the file."""
     table.number[name] = values
     table.alias[name] = grid.name(column)
 
@@ -220,8 +219,6 @@ def _put(table: ColumnTable, grid: Grid, name: str, column: forms.Column, values
 def _quantities(
     table: ColumnTable, grid: Grid, m: forms.PointMapping, raw: dict[str, Floats], arm: Arm
 ) -> None:
-    """Add the columns of numbers in SI units."""
-
     def put(
         names: Sequence[str],
         keys: Sequence[forms.Column],
@@ -514,7 +511,6 @@ def _plausible(
 
 
 def _listed(rows: Ints) -> str:
-    """Name the first of some rows."""
     return ", ".join(map(str, rows[:_LISTED].tolist())) + ", ..." * (len(rows) > _LISTED)
 
 

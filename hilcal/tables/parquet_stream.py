@@ -134,7 +134,6 @@ def _tables(path: Path, group: int, names: tuple[str, ...], count: int = CHUNK) 
 
 
 def _covers(path: Path, group: int) -> str:
-    """What the covariances cover, by the first row."""
     word = str(next(_tables(path, group, (columns.COVERS,), 1)).column(0)[0].as_py())
     check_covers(word, f"{path}: row 1, column '{columns.COVERS}'")
     return word

@@ -227,7 +227,6 @@ class Proposal:
 
 
 def _escaped(value: Any) -> Any:
-    """Return a value with its texts escaped."""
     if isinstance(value, list | tuple):
         return [_escaped(v) for v in value]
     return escaped(value) if isinstance(value, str) else value

@@ -87,7 +87,6 @@ def _match(first: Grid, second: Grid) -> tuple[str, str] | None:
 
 
 def _is_key(keys: list[str]) -> bool:
-    """Whether texts name rows: words, or whole numbers."""
     try:
         numbers = np.array([float(k) for k in keys])
     except ValueError:
@@ -392,7 +391,6 @@ def sniff(path: str | Path) -> Sniffed:
 
 
 def _dialect(path: str, lines: list[str], comment: str | None) -> dict[str, Any]:
-    """Separator, decimal mark and thousands mark that make most cells numbers."""
     best, score = dict[str, Any](), 0.0
     body = "\n".join(lines)
     choices = product((None, "'", ".", ",", " "), ("tab", ";", "|", ",", "blanks"), (".", ","))

@@ -133,7 +133,6 @@ def covariances_of(
 
 
 def _choose(path: str, header: Sequence[str], arm: Arm) -> tuple[Sequence[str], Sequence[str]]:
-    """Check the header; return the text and the number columns to read."""
     check_names(header, f"{path}: row 1, column")
     if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
         raise InputError(

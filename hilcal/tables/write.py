@@ -75,7 +75,6 @@ def unit_of(name: str) -> str | None:
 
 
 def _cell(value: object) -> object:
-    """Return a cell as CSV writes it."""
     if isinstance(value, str):
         return csv_text(value)
     if value is None or value != value:
