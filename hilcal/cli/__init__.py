@@ -1,7 +1,6 @@
 """The command line: one file per group of commands, imported when a command of it is called."""
 
 import errno
-import itertools
 import json
 import os
 import re
@@ -9,7 +8,6 @@ import shlex
 import shutil
 import sys
 import textwrap
-import threading
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -32,8 +30,6 @@ _INTERRUPTED = errors.StoppedError.exit_code
 _USAGE = 2
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LIBRARY = re.compile(r"(\S+): cannot open shared object file")
-_FRAMES = "⠋⠙⠹⠸⠼⠴⠦⠧⠇⠏"
-_FRAME_S = 0.2
 _COMMAND = re.compile(r"(.*:) (hilcal [^,;()]*)$")
 _KINDS = {
     errors.InputError.exit_code: "input",
@@ -155,22 +151,10 @@ def _loading(name: str) -> Iterator[None]:
     if not sys.stderr.isatty() or os.environ.get(_COMPLETE):
         yield
         return
-    ended = threading.Event()
+    from rich.console import Console
 
-    def show() -> None:
-        for frame in itertools.cycle(_FRAMES):
-            print(f"\r{frame} hilcal {name}", end="", file=sys.stderr, flush=True)
-            if ended.wait(_FRAME_S):
-                break
-
-    shown = threading.Thread(target=show, daemon=True)
-    shown.start()
-    try:
+    with Console(stderr=True).status(f"hilcal {name}"):
         yield
-    finally:
-        ended.set()
-        shown.join()
-        print("\r" + " " * (len(name) + 9), end="\r", file=sys.stderr, flush=True)
 
 
 def _group(command: commands.Command) -> typer.Typer:
