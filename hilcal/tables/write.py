@@ -5,8 +5,6 @@ doubles themselves. A unit is the end of its column's name; in Parquet it is als
 metadata, and what the table is about is in the schema's, as JSON under the key `hilcal`.
 """
 
-import csv
-import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -43,9 +41,7 @@ def write_columns(path: Path, columns: Mapping[str, Column], about: Mapping[str,
     `about` says what the table is about, for the metadata of Parquet; CSV has no place for it.
     """
     check_suffix(path)
-    plain = {
-        escaped(k): v.tolist() if isinstance(v, np.ndarray) else list(v) for k, v in columns.items()
-    }
+    plain = {escaped(name): _plain(column) for name, column in columns.items()}
     if path.suffix.lower() == ".parquet":
         table = _arrow(path, plain, about)
         parquet = package(path, "pyarrow.parquet", "Parquet")
@@ -57,12 +53,17 @@ def write_columns(path: Path, columns: Mapping[str, Column], about: Mapping[str,
 
 def csv_of(columns: Mapping[str, Column]) -> str:
     """Return columns of equal length as CSV."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(map(csv_text, columns))
-    values = (v.tolist() if isinstance(v, np.ndarray) else v for v in columns.values())
-    writer.writerows(zip(*([_cell(v) for v in column] for column in values), strict=True))
-    return out.getvalue()
+    import pandas as pd
+
+    cells = {
+        csv_text(name): [csv_text(v) if isinstance(v, str) else v for v in _plain(column)]
+        for name, column in columns.items()
+    }
+    return str(pd.DataFrame(cells, dtype=object).to_csv(index=False, lineterminator="\n"))
+
+
+def _plain(column: Column) -> list[Any]:
+    return column.tolist() if isinstance(column, np.ndarray) else list(column)
 
 
 def unit_of(name: str) -> str | None:
@@ -72,14 +73,6 @@ def unit_of(name: str) -> str | None:
         return f"{parts[0]}2" if parts[0] == parts[1] else "m rad"
     end = name.rpartition("_")[2]
     return end if end in UNITS else None
-
-
-def _cell(value: object) -> object:
-    if isinstance(value, str):
-        return csv_text(value)
-    if value is None or value != value:
-        return ""
-    return repr(value) if isinstance(value, float) else value
 
 
 def _arrow(path: Path, columns: Mapping[str, list[Any]], about: Mapping[str, object]) -> Any:
