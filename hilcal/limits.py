@@ -53,11 +53,7 @@ STREAM = "a longer series is fitted as a stream (docs/how-to/fit-a-stream.md)"
 
 
 def check_size(name: str, size: int, most: int) -> None:
-    """Refuse more than `most` bytes.
-
-    Raises:
-        InputError: over the limit, which the message states.
-    """
+    """Refuse more than `most` bytes by an InputError that states them."""
     if size > most:
         raise InputError(f"{name}: {size / 1e6:.1f} MB; valid: at most {most / 1e6:.1f} MB")
 
@@ -162,13 +158,9 @@ def read_text(path: Path, most: int) -> str:
 
 @contextmanager
 def memory(name: str) -> Iterator[None]:
-    """Limit the memory that the block of a `with` statement may take to `MEMORY`.
+    """Limit the memory that a block may take to `MEMORY`; an InputError where it needs more.
 
-    A reserve of memory is freed first at the end, since even a small object may need a new block
-    when memory has run out.
-
-    Raises:
-        InputError: the block needs more.
+    A reserve is freed first, since even a small object may need memory when that has run out.
     """
     with _LOCK:
         soft, hard = resource.getrlimit(resource.RLIMIT_AS)

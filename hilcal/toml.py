@@ -58,11 +58,7 @@ S = TypeVar("S", bound=Section)
 
 
 def load_section(path: Path, section: type[S]) -> S:
-    """Read a TOML file as `section`.
-
-    Raises:
-        InputError: unreadable file, syntax error (names the line), unknown key, bad value.
-    """
+    """Read a TOML file as `section`; an InputError names the line, the unknown key or bad value."""
     return check_section(read_toml(path), section, path.name)
 
 
@@ -118,20 +114,12 @@ def check_section(data: object, section: type[S], where: str) -> S:
 
 
 def check_json(text: str, section: type[S], where: str) -> S:
-    """Check a JSON document against `section`.
-
-    Raises:
-        InputError: not JSON, unknown key, missing key or bad value.
-    """
+    """Check a JSON document against `section`; InputErrors as of `read_json`, and of its keys."""
     return check_section(read_json(text, where), section, where)
 
 
 def read_json(text: str, where: str) -> Any:
-    """Return the content of a JSON document; `where` names it in messages.
-
-    Raises:
-        InputError: not JSON, nested too deeply, or too large.
-    """
+    """Return what a JSON document holds; an InputError where it is none, too deep or too large."""
     try:
         return parse_json(text)
     except json.JSONDecodeError as error:

@@ -89,10 +89,7 @@ class Failures:
 
 
 def _laid_out(line: str) -> str:
-    """Return a line, on a terminal wrapped between words.
-
-    There, a command at the end of the line is put on a separate line, which can be copied.
-    """
+    """Return a line as a terminal shows it: wrapped, a command at its end on a line of its own."""
     if not sys.stderr.isatty():
         return line
     match = _COMMAND.match(line)

@@ -97,15 +97,11 @@ class Doubted:
 def doubtful_case(
     settings: running.RehearsalSettings, hide: str | None, say: Say, number: int = 0
 ) -> tuple[running.RehearsalSettings, Plan, bool]:
-    """Draw an effect to hide and a small campaign that leaves it in doubt.
+    """Draw an effect to hide and a small campaign that leaves it in doubt, by seed and `number`.
 
-    Both follow from the seed and `number`. A case is doubtful when a rival explains the readings
-    about as well as the hidden effect in each of `DRAWS` draws of the noise, and when the diagnosis
-    of the first draw names both effects and says that further readings would separate them.
-
-    Returns:
-        The settings of the first doubtful case, or of the last one where none of `TRIES` is; the
-        plan of its first campaign; whether the case is doubtful.
+    A case is doubtful when a rival explains the readings about as well as the hidden effect in each
+    of `DRAWS` draws of the noise, and when the diagnosis of the first draw names both and says that
+    further readings would separate them. Returned are settings, plan, and whether it is doubtful.
     """
     loads = settings.config.loads[1::2] or settings.config.loads
     quick = {"candidates": min(settings.config.planning.candidates, CANDIDATES), "against": ()}
@@ -152,10 +148,7 @@ def _left_open(r: Rehearsal, case: running.RehearsalSettings) -> bool:
 def doubted(
     t: Terminal, r: Rehearsal, seed: int, first: Plan, poses: int, catalogue: Catalogue
 ) -> Doubted:
-    """Diagnose a first campaign; where suspects are left in doubt, plan what separates them.
-
-    `poses` is the value of `--poses`, see `SHARE`.
-    """
+    """Diagnose a first campaign; plan what separates the suspects, at a `SHARE` of `poses`."""
     with working(t.progress) as say:
         say("fitting and diagnosing the first readings")
         fitted = _fit(r, catalogue)
@@ -299,10 +292,7 @@ def demo(
 def _campaign(
     t: Terminal, case: running.RehearsalSettings, poses: int, without_devices: bool, ambiguous: bool
 ) -> Iterator[tuple[running.RehearsedCampaign, Rehearsal, Doubted | None]]:
-    """Measure a campaign; its simulated devices run until the block ends.
-
-    With `ambiguous`, measure arms until one leaves a doubt, then the readings that settle it.
-    """
+    """Measure a campaign in a cell that lasts as the block; with `ambiguous` settle a doubt."""
     measured = running.in_process if without_devices else running.on_devices
     existed, first = case.output.exists(), case
     for tries in range(1, CAMPAIGNS + 1):

@@ -188,11 +188,7 @@ def _write_data(run: Campaign, options: ExportOptions, force: bool) -> Iterator[
 
 
 def cell_toml(run: Campaign) -> str:
-    """Return the configuration that a campaign was measured with, as CELL.toml.
-
-    The file of a robot that is not of the catalogue is named by its name alone where the campaign
-    stores it, else by its path.
-    """
+    """Return the cell of a campaign as CELL.toml; a robot that it stores goes by its name."""
     content = run.config.model_dump(mode="json", exclude_none=True)
     robot = Path(run.file.base_dir) / run.config.robot.model
     if robot.suffix:

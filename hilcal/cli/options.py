@@ -80,10 +80,7 @@ Scheduler = Annotated[str | None, SHARED["scheduler"]]
 
 
 def command(text: str = "") -> Callable[[F], F]:
-    """Declare the parameters of a command by entries of a text; those not in it by `SHARED`.
-
-    The fields of a parameter that is a dataclass become options of the command.
-    """
+    """Declare a command's parameters by a text and `SHARED`; fields of a dataclass are options."""
     declarations, annotated = SHARED | _declared(text), cast(Any, Annotated)
 
     def declare(function: F) -> F:

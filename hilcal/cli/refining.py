@@ -62,10 +62,7 @@ def chapters_of(numbers: Iterable[int], steps: Iterable[RefinementStep]) -> list
 
 
 def errors_by_revision(chapters: Sequence[Chapter], stored: str = "") -> list[Block]:
-    """Return the table of errors by revision, and the key of its columns.
-
-    `stored` is the verdict of a chapter without a diagnosis.
-    """
+    """Return the errors by revision, with the verdict `stored` where it has none, and their key."""
     rows = [(c.number, changed(c), c.fit, _verdict(c, stored)) for c in chapters]
     return [words.revisions_table(rows), words.key(chapters[-1].fit.readings)]
 

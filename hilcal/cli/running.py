@@ -315,10 +315,7 @@ class RehearsedCampaign:
 
 
 def first_plan(settings: RehearsalSettings, config: CellConfig, poses: int, say: Say) -> Plan:
-    """Plan a campaign without knowledge of the hidden effect.
-
-    `config` may have only some of the loads of the settings.
-    """
+    """Plan a campaign without knowledge of the hidden effect, in a cell that may lack loads."""
     config = as_told(config, settings.choice, settings.world)
     cell = cell_from_config(config, settings.base_dir)
     plan = make_plan(cell, config, poses, settings.seed, settings.catalogue, say)
@@ -328,10 +325,7 @@ def first_plan(settings: RehearsalSettings, config: CellConfig, poses: int, say:
 
 @contextmanager
 def on_devices(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator[RehearsedCampaign]:
-    """Run a plan on simulated devices, which run until the block ends.
-
-    The real drivers talk to simulated devices of one world; each device is a process.
-    """
+    """Run a plan by the real drivers on simulated devices, processes that end with the block."""
     with ExitStack() as stack:
         with working(t.progress) as say:
             secret = settings.case(plan)
@@ -364,10 +358,7 @@ def on_devices(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator
 
 @contextmanager
 def in_process(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator[RehearsedCampaign]:
-    """Draw the readings of a plan from the simulated world, without devices.
-
-    The readings are stored pose by pose, like those of a real campaign.
-    """
+    """Draw the readings of a plan in the simulated world; they are stored pose by pose."""
     with working(t.progress):
         secret = settings.case(plan)
     source = "rehearsal in a simulated cell, without devices"

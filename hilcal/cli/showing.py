@@ -117,10 +117,7 @@ def _end_of_process() -> threading.Timer:
 
 @contextmanager
 def followed(t: Terminal, requested: bool, run: Path) -> Iterator[LiveViewer | None]:
-    """Start a live viewer for the block if requested; yields None otherwise.
-
-    Its recording is written next to the campaign.
-    """
+    """Start a live viewer for the block if requested; it records beside the campaign."""
     if not requested:
         yield None
         return

@@ -53,10 +53,7 @@ class Terminal:
         /,
         **keys: object,
     ) -> None:
-        """Print the JSON document, with --json.
-
-        The error `failed` becomes the part "error" of the document, and is raised after printing.
-        """
+        """Print the JSON document, with --json; then raise `failed`, which is its part "error"."""
         document = {**(content or {}), **keys}
         if failed is not None:
             document |= error_document(failed, failed.exit_code)
@@ -100,10 +97,7 @@ def somebody_there(t: Terminal) -> bool:
 
 
 def agreed(t: Terminal, question: str) -> bool:
-    """Ask until the answer is yes or no; the end of the input is no.
-
-    Input that was typed before the question is dropped.
-    """
+    """Ask until what is typed after the question is yes or no; the end of the input is no."""
     with contextlib.suppress(termios.error, OSError, ValueError):
         termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
     while True:

@@ -168,10 +168,7 @@ def workbook(path: str, content: bytes) -> Any:
 
 
 def _check_xml(path: str, name: str, stream: IO[bytes]) -> None:
-    """Limit the elements of a part of a workbook: openpyxl needs more memory than their text.
-
-    It holds one row of a sheet, and any other part as a whole.
-    """
+    """Limit a part of a workbook: openpyxl holds a row of a sheet, any other part as a whole."""
     where, sheet = f"{path}: {name}", name.startswith("xl/worksheets/")
     most = limits.COLUMNS * 10 if sheet else limits.ELEMENTS
     depth = elements = rows = cells = 0
@@ -396,10 +393,7 @@ def grid_of_rows(
     how: FileFormat,
     check: Check | None = None,
 ) -> Grid:
-    """Make a grid of rows of cells: header (which is checked), units, and rows of one length.
-
-    Cells that a row has beyond the header must be empty, as trailing separators leave them.
-    """
+    """Make a grid of rows: checked header, units, rows of one length but for empty ends."""
     by_row = dict(numbered)
     if how.header_row and how.header_row not in by_row:
         raise InputError(

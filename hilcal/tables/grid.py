@@ -199,10 +199,7 @@ def _complaint(cell: Cell, how: FileFormat, complete: bool) -> str:
 
 
 def unique(names: Sequence[str]) -> tuple[str, ...]:
-    """Make names unique by a number in brackets: "X", "X (2)".
-
-    The name of a column without one is its number.
-    """
+    """Make names unique, as "X", "X (2)"; that of a column without one is its number."""
     out: dict[str, None] = {}
     for k, title in enumerate(names, start=1):
         first = title or str(k)

@@ -119,11 +119,7 @@ def import_mapped(
     targets: Sequence[str] = (),
     std: Mapped[ObserverName, float] | None = None,
 ) -> exchange.ImportResult:
-    """Read a table, or two tables, by a mapping.
-
-    The tracker's beam starts at `station` (3,), m, or at the origin; a hung mass pulls along
-    `gravity` (3,), base axes, m/s².
-    """
+    """Read one or two tables by a mapping; a hung mass pulls along `gravity` (3,), base, m/s²."""
     source = mapped_table(path, mapping, arm, gravity, second)
     mapping, grid, table, notes = source.mapping, source.grid, source.table, source.notes
     q = _joint_units(mapping.joints, arm) * _block(source.raw, grid, mapping.joints.columns)
@@ -279,10 +275,7 @@ def _raw(grid: Grid, mapping: forms.PointMapping, arm: Arm) -> dict[str, Floats]
 def _missing_positions(
     grid: Grid, section: forms.Position | None, raw: dict[str, Floats]
 ) -> list[str]:
-    """Set positions to NaN that instruments write where they measured none.
-
-    These are exactly 0, 0, 0, and a number of nines, such as −9999, in all three columns.
-    """
+    """Set positions to NaN that mean none: exactly 0, 0, 0, or nines (−9999) in all three."""
     names = [] if section is None else [grid.name(column) for column in section.columns]
     position, notes = _block(raw, grid, names) if names else np.zeros((0, 1)), []
     for value in (0.0, *nines(position)):
@@ -303,10 +296,7 @@ def nines(position: Floats) -> list[float]:
 
 
 def _complete(grid: Grid, raw: dict[str, Floats], sparse: Sequence[str]) -> tuple[Bools, list[str]]:
-    """Rows that have a value in every used column, and a note on the incomplete ones.
-
-    A row needs a value in one of the `sparse` columns only.
-    """
+    """Rows with a value in each used column, of `sparse` ones in one; a note on the others."""
     missing = np.stack([np.isnan(values) for values in raw.values()], axis=1)
     some = [k for k, name in enumerate(raw) if name in sparse]
     missing[:, some] = missing[:, some].all(axis=1, keepdims=True)
@@ -521,11 +511,7 @@ def import_readings(
     arm: Arm,
     second: Path | None = None,
 ) -> exchange.ImportResult:
-    """Read a table; the cell states the tracker's noise and place, gravity, and loads.
-
-    `form` is "table" (the exchange table), a mapping, its name or its file; `second` is the second
-    file of a mapping of two.
-    """
+    """Read a table by `form`, "table", a mapping, its name or file; the cell states the rest."""
     mapping = form if isinstance(form, forms.Mapping) else None
     if mapping is None and str(form) != forms.TABLE:
         mapping = forms.find_mapping(str(form), forms.Mapping)

@@ -73,11 +73,7 @@ class ReadingStream:
 def open_stream(
     path: Path, arm: Arm, noise: TrackerNoise | None, station: tuple[float, ...] | None
 ) -> ReadingStream:
-    """Open a Parquet file of readings; only its metadata and its first rows are read.
-
-    `noise` gives the covariances where the file has none; the tracker's beam starts at `station`
-    (3,), m, or at the origin.
-    """
+    """Open a Parquet file of readings, of which metadata and the first rows are read."""
     file = _opened(path)
     header = list(file.schema_arrow.names)
     # Without the names of poses and loads the header is that of an exchange table.

@@ -191,10 +191,7 @@ def _targets(table: ColumnTable, names: Sequence[str]) -> Ints | None:
 
 
 def _covers(table: ColumnTable) -> tuple[str, bool]:
-    """Return what the covariances cover, by column `covers`, and whether they include rounding.
-
-    Without the column they cover the instrument.
-    """
+    """What the covariances cover, by column `covers`, and whether rounding is in them."""
     stated = table.text.get(columns.COVERS, [INSTRUMENT])
     for k, word in enumerate(stated):
         check_covers(word, table.at(k, columns.COVERS))
@@ -217,10 +214,7 @@ def check_covers(word: str, where: str) -> None:
 
 
 def measured_of(table: ColumnTable, arm: Arm, rows: Bools | None = None) -> tuple[States, Floats]:
-    """Return the states of a table's rows, and their measured values (N, m), m and rad.
-
-    Values of rows without a position, those that are not in `rows` (N,), are zero.
-    """
+    """Return states and values (N, m), m and rad; values are zero in rows not in `rows` (N,)."""
     states = _states(table, arm)
     if rows is not None and not rows.all():
         value = np.zeros((len(table.rows), 3))

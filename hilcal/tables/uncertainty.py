@@ -239,10 +239,7 @@ def _cause(usual: float) -> str:
 
 
 def step(values: Floats) -> float:
-    """Return the power of ten of which all values are whole multiples.
-
-    0 where there is none, or fewer than `DISTINCT` different values.
-    """
+    """Return the power of ten of which all values are multiples; 0 for none, or too few values."""
     if len(np.unique(values)) < DISTINCT:
         return 0.0
     for power in range(3, -10, -1):
@@ -277,10 +274,7 @@ def with_rounding(covariance: Floats, extra: Floats) -> tuple[Floats, tuple[str,
 def check_joint_rounding(
     q: Floats, unit: float, name: str, covariance: Floats, reach: float
 ) -> tuple[str, ...]:
-    """Return a note where rounded joint angles move the target more than the noise does.
-
-    A rounding of Δ displaces the target by up to Δ/√12 times the reach, one standard deviation.
-    """
+    """Return a note where a rounding Δ of the joints, Δ/√12 times the reach, is over the noise."""
     size = max((step(q[:, k]) for k in range(q.shape[1])), default=0.0)
     std = unit * size / np.sqrt(12)
     noise = float(np.sqrt(np.median(covariance[:, range(3), range(3)])))

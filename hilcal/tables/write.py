@@ -36,10 +36,7 @@ def check_suffix(path: Path) -> None:
 
 
 def write_columns(path: Path, columns: Mapping[str, Column], about: Mapping[str, object]) -> None:
-    """Write columns of equal length; a file of that name is replaced when the new one is complete.
-
-    `about` says what the table is about, for the metadata of Parquet; CSV has no place for it.
-    """
+    """Write columns of equal length, as a whole file; `about` is for the metadata of Parquet."""
     check_suffix(path)
     plain = {escaped(name): _plain(column) for name, column in columns.items()}
     if path.suffix.lower() == ".parquet":
