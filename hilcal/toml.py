@@ -145,11 +145,7 @@ def _whole(digits: str) -> int:
 
 
 def suggest(name: str, valid: Sequence[str]) -> str:
-    """Return ' (did you mean "x"?)' for a name close to one of the valid ones, else nothing.
-
-    Long names and those beyond the first thousand are not compared: the time grows with the square
-    of a name's length.
-    """
+    """Return ' (did you mean "x"?)' for a close name; long ones, which take long, are left out."""
     near = [v for v in islice(valid, 1000) if len(v) <= _SHORT]
     close = difflib.get_close_matches(name, near, n=1) if len(name) <= _SHORT else ()
     return f' (did you mean "{close[0]}"?)' if close else ""

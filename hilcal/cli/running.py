@@ -207,10 +207,7 @@ def measure(
     epoch: float | None = None,
     viewer: LiveViewer | None = None,
 ) -> int:
-    """Measure the missing readings of a campaign; return the number that it then holds.
-
-    Measuring ends when `goal` is met. `epoch` is the wall time at zero of the campaign's time, s.
-    """
+    """Measure what a campaign lacks, until a goal is met; `epoch` is the wall time at zero, s."""
     log = RunLog(campaign)
     stored = log.readings()
     if goal is not None and stored is not None and goal(stored, last=True).met:

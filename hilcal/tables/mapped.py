@@ -180,11 +180,7 @@ def _observers(
 
 
 def one_target_per_row(grid: Grid, mapping: forms.M) -> tuple[Grid, forms.M]:
-    """Return the table with a row for each target, and the mapping that reads it.
-
-    Row i with the columns x1 y1 z1 x2 y2 z2 becomes two rows, in this order; all other cells are
-    repeated. Nothing changes where the mapping has no `targets`.
-    """
+    """Return the table with a row for each target (x1 y1 z1 x2 ... are two), and its mapping."""
     rows = range(len(grid.rows))
     if mapping.position is None or not mapping.position.targets:
         return grid, mapping
@@ -445,10 +441,7 @@ def seconds(grid: Grid, time: forms.Time) -> Floats:
 
 
 def approach_by_order(q: Floats) -> Floats:
-    """(N, n) side from which each joint arrived: sign(q_i − q_{i−1}), the last one at rest.
-
-    The first row, and joints that have not yet moved, count as +1. Rows without value are skipped.
-    """
+    """(N, n) sides of arrival, sign(q_i − q_{i−1}): the last one at rest, +1 before any move."""
     import pandas as pd
 
     filled = pd.DataFrame(q).ffill().bfill().to_numpy()

@@ -1,7 +1,4 @@
-"""A mapping file: which column of a table holds what, in which unit and convention.
-
-TOML with the sections of `Mapping`; docs/how-to/import-a-table.md explains it.
-"""
+"""A mapping file, TOML: which column of a table holds what, in which unit and convention."""
 
 from pathlib import Path
 from typing import Annotated, Literal, Self, TypeVar

@@ -1,7 +1,4 @@
-"""A mapping for one or two files whose form is unknown, guessed from names and values.
-
-First how a file is written (`sniff`), then what its columns hold (`guess`).
-"""
+"""How a file of unknown form is written (`sniff`), and what its columns hold (`guess`)."""
 
 import re
 from collections import Counter

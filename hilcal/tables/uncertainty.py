@@ -1,8 +1,4 @@
-"""Covariances of the uncertainties that a table states, and checks of them.
-
-Stated are standard deviations, U95, variances or matrices; checked is whether they are zero, far
-too small, or below the rounding of the values.
-"""
+"""Covariances of the uncertainties that a table states, and checks of what cannot be true."""
 
 from collections.abc import Sequence
 

@@ -125,11 +125,7 @@ def _number(value: Any) -> float | None:
 def plan_csv(
     plan: Plan, wrenches: Mapping[str, Floats] | None = None, units: Sequence[str] | None = None
 ) -> str:
-    """Return a plan as CSV: `x_order` from 1, pose, load, cycle, q1_rad ... (and wrenches).
-
-    The columns are those of the exchange table: who measures by hand adds x_m, y_m, z_m and
-    imports it. `units` are those of the joints' values, all rad where None.
-    """
+    """Return a plan as CSV, an exchange table without positions; joints in `units`, or all rad."""
     columns: dict[str, Column] = {ORDER: list(range(1, 1 + len(plan.steps)))}
     columns |= {name: [getattr(step, name) for step in plan.steps] for name in TEXT}
     columns["cycle"] = [step.cycle for step in plan.steps]
