@@ -300,8 +300,8 @@ def _ask(t: Terminal, draft: Draft, question: CellQuestion) -> None:
         t.notice(f"Serial ports here: {', '.join(ports) or 'none'}.")
     prompt = question.text + (f" (Enter: {question.default}):" if question.default else ":")
     while True:
-        t.progress.print(prompt, style="bold")
-        t.progress.print("> ", end="")
+        t.progress.print(prompt, markup=False, highlight=False, style="bold")
+        t.progress.print("> ", end="", markup=False, highlight=False)
         answer = sys.stdin.readline()
         if not answer:
             raise StoppedError("nothing is written: the input ended")

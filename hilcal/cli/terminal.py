@@ -36,15 +36,17 @@ class Terminal:
         if isinstance(parts, str) or not isinstance(parts, Iterable):
             parts = (parts,)
         for part in parts:
-            self.people.print(part)
+            self.people.print(part, markup=False, highlight=False)
 
     def notice(self, message: str) -> None:
         """Print a remark besides the result; a terminal wraps it between words."""
-        self.progress.print(message, soft_wrap=not self.progress.is_terminal)
+        self.progress.print(
+            message, markup=False, highlight=False, soft_wrap=not self.progress.is_terminal
+        )
 
     def command(self, line: str) -> None:
         """Print a command on one unwrapped line, to be copied."""
-        self.people.print(f"  {line}", soft_wrap=True)
+        self.people.print(f"  {line}", markup=False, highlight=False, soft_wrap=True)
 
     def document(
         self,
@@ -80,9 +82,8 @@ def terminal(as_json: bool) -> Terminal:
 
 
 def _console(stream: TextIO) -> Console:
-    """Return a console that prints texts as they are; 100 columns where it is no terminal."""
-    width = None if stream.isatty() else WIDTH
-    return SafeConsole(file=stream, width=width, markup=False, highlight=False)
+    """Return a console; 100 columns where the stream is not a terminal."""
+    return SafeConsole(file=stream, width=None if stream.isatty() else WIDTH)
 
 
 YES, NO = ("y", "yes"), ("n", "no", "q")
@@ -101,7 +102,9 @@ def agreed(t: Terminal, question: str) -> bool:
     with contextlib.suppress(termios.error, OSError, ValueError):
         termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
     while True:
-        t.progress.print(f"{question} y = yes, n = no: ", end="", style="bold")
+        t.progress.print(
+            f"{question} y = yes, n = no: ", end="", markup=False, highlight=False, style="bold"
+        )
         answer = sys.stdin.readline()
         if not answer:
             t.notice("")

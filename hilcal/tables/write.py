@@ -5,6 +5,8 @@ doubles themselves. A unit is the end of its column's name; in Parquet it is als
 metadata, and what the table is about is in the schema's, as JSON under the key `hilcal`.
 """
 
+import csv
+import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -50,13 +52,20 @@ def write_columns(path: Path, columns: Mapping[str, Column], about: Mapping[str,
 
 def csv_of(columns: Mapping[str, Column]) -> str:
     """Return columns of equal length as CSV."""
-    import pandas as pd
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(map(csv_text, columns))
+    cells = ([_cell(v) for v in _plain(column)] for column in columns.values())
+    writer.writerows(zip(*cells, strict=True))
+    return out.getvalue()
 
-    cells = {
-        csv_text(name): [csv_text(v) if isinstance(v, str) else v for v in _plain(column)]
-        for name, column in columns.items()
-    }
-    return str(pd.DataFrame(cells, dtype=object).to_csv(index=False, lineterminator="\n"))
+
+def _cell(value: object) -> object:
+    if isinstance(value, str):
+        return csv_text(value)
+    if value is None or value != value:
+        return ""
+    return repr(value) if isinstance(value, float) else value
 
 
 def _plain(column: Column) -> list[Any]:
