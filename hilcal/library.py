@@ -2,14 +2,15 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hilcal.campaign.campaign import Campaign, opened
-from hilcal.cell import Cell
+from hilcal.cell import Cell, cell_from_config
+from hilcal.config import CellConfig, load_config
 from hilcal.diagnosis.diagnosis import Diagnosis, History
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.diagnosis.verdict import NOTHING
@@ -26,22 +27,23 @@ from hilcal.identification import posterior_document
 from hilcal.identification.arm_scatter import with_prior_scatter
 from hilcal.identification.carried import CarriedPrior, carried_prior, check_prior
 from hilcal.identification.fit import Fit
-from hilcal.identification.full_covariance import full_readings
-from hilcal.identification.noise_estimate import with_estimated_noise
+from hilcal.identification.full_covariance import CovarianceParts, covariance_parts, full_readings
+from hilcal.identification.noise_estimate import NOISE, NoiseEstimate, with_estimated_noise
 from hilcal.identification.posterior import Posterior
 from hilcal.model.model import Model
 from hilcal.optional import needed_by
 from hilcal.present.story import build_story
-from hilcal.readings.covariance import tracker_noise
+from hilcal.readings.covariance import COVERS, FROM, TRACKER, tracker_noise
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES, SCALINGS, Mode, usual_mode
 from hilcal.refinement import Refinement
 from hilcal.refinement import refine as refine_model
+from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan
 from hilcal.store.schema import HEADER
 from hilcal.stream import StreamFit
 from hilcal.stream import fit_stream as fit_all
-from hilcal.tables.importing import import_readings
+from hilcal.tables.mapped import import_readings
 from hilcal.tables.parquet_stream import open_stream
 from hilcal.types import Floats
 
@@ -74,6 +76,48 @@ def read_table(path: str | Path, cell: Cell, mapping: str | Path | None = None) 
     estimated, noise = with_estimated_noise(imported, cell, config)
     readings = full_readings(estimated.readings, estimated.covers, cell, config)
     return replace(readings, noise_stated=noise is None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Imported:
+    """The result of an import."""
+
+    config: CellConfig
+    cell: Cell
+    readings: Readings  # as stored
+    noise: NoiseEstimate | None  # None where the noise is stated, or cannot be estimated
+    parts: CovarianceParts  # components of the covariances
+    notes: tuple[str, ...]  # one sentence for each decision
+
+
+def import_campaign(
+    table: Path,
+    config: Path,
+    output: Path,
+    kind: str = "table",
+    second: Path | None = None,
+    *,
+    overwrite: bool = False,
+    say: Callable[[str], None] = lambda text: None,
+) -> Imported:
+    """Make a campaign file from a table of readings, as `import_readings` reads it."""
+    settings = load_config(config)
+    base_dir = config.absolute().parent
+    cell = cell_from_config(settings, base_dir)
+    say(f"reading {table}")
+    imported = import_readings(table, kind, settings, cell.arm, second)
+    if not imported.noise_stated:
+        say("estimating the noise, which nothing states")
+    imported, noise = with_estimated_noise(imported, cell, settings)
+    texts = {COVERS: imported.covers}
+    texts |= {FROM: TRACKER} if imported.from_tracker else {}
+    texts |= {} if noise is None else {NOISE: noise.to_json()}
+    say(f"writing {output}")
+    about = settings.to_json(), str(base_dir), f"{table.name} ({Path(kind).name})"
+    readings = imported.readings
+    CampaignFile.create(output, *about, overwrite=overwrite, more=texts, readings=readings).close()
+    parts = covariance_parts(imported.covers, settings)
+    return Imported(settings, cell, readings, noise, parts, imported.notes)
 
 
 def fit_stream(
@@ -129,9 +173,8 @@ def bootstrap(
 
     Args:
         found: the fit; `ratio` of the result compares its standard uncertainties.
-        seed: seed of the draws; the result does not depend on the workers.
-        workers: processes of this machine; None: one per processor, for scripts that begin with
-            `if __name__ == "__main__"`.
+        workers: processes of this machine, which the result does not depend on; None: one per
+            processor, for scripts that begin with `if __name__ == "__main__"`.
         scheduler: address of a Dask cluster to use instead.
     """
     with open_engine(None if scheduler is not None else workers, scheduler) as engine:
@@ -182,7 +225,6 @@ def _readings(data: Readings | Campaign) -> Readings:
 
 
 def _with_prior(model: Model, data: Readings, prior: Posterior | CarriedPrior) -> Model:
-    """Return a model with a prior on those of its effects that the prior has."""
     carried = _carried(prior, model.catalogue)
     if carried is not None:
         check_prior(carried, model.cell.arm, data)
@@ -192,7 +234,6 @@ def _with_prior(model: Model, data: Readings, prior: Posterior | CarriedPrior) -
 def _carried(
     prior: Posterior | CarriedPrior | None, catalogue: Catalogue | None
 ) -> CarriedPrior | None:
-    """Return a posterior as a prior of the same arm."""
     return carried_prior(prior, catalogue=catalogue) if isinstance(prior, Posterior) else prior
 
 
@@ -217,7 +258,6 @@ def fit(
     True
 
     Args:
-        data: the readings, or their campaign.
         readings: "deflection" or "absolute"; None: as the cell plans and the data allow.
         scaling: "none", "gu" or "gc" (whitened by the full covariance).
         prior: the posterior of another campaign of this arm, for the effects that the model shares
@@ -246,7 +286,7 @@ def fit(
 def diagnose(
     fit: Fit | Campaign, history: History = NOTHING, say: Callable[[str], None] = lambda text: None
 ) -> Diagnosis:
-    """Diagnose a fit: what is missing in its model, with a verdict.
+    """Diagnose a fit, or the revision in use of a campaign: what is missing, with a verdict.
 
     >>> with hc.Campaign.open(RUN) as run:
     ...     fit = hc.fit(hc.baseline(run), run)
@@ -255,10 +295,8 @@ def diagnose(
     ('missing_effect', 'joint_tilt_compliance')
 
     Args:
-        fit: the fit; or a campaign, for its revision in use.
         history: effects added to and removed from the model so far; that of the revision where
             `fit` is a campaign.
-        say: takes progress, one line each.
 
     Raises:
         InputError: a fit whose residual is not whitened, or of too many readings; a campaign
@@ -280,7 +318,6 @@ def load_posterior(path: str | Path, catalogue: Catalogue | None = None) -> Post
 
     Args:
         path: a campaign file, for its revision in use, or a JSON file of a posterior.
-        catalogue: the effects; None: the installed ones.
 
     Raises:
         InputError: no such file, a file of another kind, or a campaign without a revision.
@@ -318,14 +355,11 @@ def refine(
 
     Args:
         model: the starting model; or a campaign alone, for its baseline.
-        data: the readings, or their campaign.
-        readings: "deflection" or "absolute"; None: as the cell plans and the data allow.
-        prior: as for `fit`.
+        readings, prior, mode: as for `fit`.
         discover: a folder. Where no effect explains the misfit, a law is searched, as by
             `hilcal refine --discover`; the files of laws in the final model are written there.
         background: whether all effects of the catalogue are fitted together, as a background, where
             the named ones leave more than noise.
-        mode: another name of `readings`.
 
     Raises:
         InputError: another kind of readings, a prior that does not fit them, or no such folder.
@@ -370,7 +404,6 @@ def plan(
         poses: number of poses, each read unloaded and under every load that it bears.
         criterion: "D", "A", "E", "K", "I" or "separate"; None: that of `[planning]`.
         given: a fit of the previous readings.
-        seed: seed of the random candidates.
         prior: the prior from another campaign of this arm, unless `given` is stated, which has its
             prior.
 

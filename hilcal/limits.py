@@ -8,17 +8,16 @@ beyond the largest measured series; docs/reference/limits.md states them.
 import mmap
 import resource
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from types import TracebackType
 from typing import Concatenate, ParamSpec, Self, TextIO, TypeVar
 
 from hilcal.errors import InputError
 
 SETTINGS = 1 << 19  # Bytes of a TOML file
-DOTS = 100
-"""Dots in a line of a TOML file: the parser's time grows with the square of a key's parts."""
+DOTS = 100  # Dots in a line of TOML: the parser's time grows with the square of a key's parts
 PROGRAM = 1 << 22  # Bytes of a robot's description, a file of effects
 SCRIPT = 1 << 21  # Bytes of a robot program
 STATEMENTS = 100_000  # Statements of a robot program
@@ -26,9 +25,7 @@ STATEMENT = 10_000  # Characters of a statement
 BLOCKS = 100  # Nested blocks around a statement
 NESTED = 100  # Nested expressions in a statement
 DOCUMENT = 1 << 25  # Bytes of a JSON document: plan, calibration, prior
-VALUES = (
-    2_000_000  # Values of a JSON document: Python takes some 100 bytes for an empty list's three
-)
+VALUES = 2_000_000  # Values of a JSON document: Python takes some 100 bytes for an empty list
 TABLE = 1 << 27  # Bytes of a table, as text or compressed
 UNPACKED = 1 << 28  # Bytes of a decompressed table
 LINE = 1 << 20  # Characters of a row of a table
@@ -43,14 +40,12 @@ MOVING = 100  # Joints of a robot's description that are not fixed
 JOINTS = 32  # Joints of an arm
 PARAMETERS = 4000  # Parameters of a model in a file
 NUMBERS = 1 << 26  # Numbers of an array from a file
-SHARED = 1 << 24
-"""Numbers of the joint covariances of readings with a common error: (L m)² for L of m elements."""
+SHARED = 1 << 24  # Numbers of joint covariances of readings with a common error: (L m)² of L
 FITTED = 150_000  # Readings times elements that are fitted together
 PLANNED = 20_000  # Poses of a plan, and steps of a plan: a week of measuring
 MEMORY = 3 << 28  # Bytes that reading a file may take in addition to those of the process
 _RESERVE_BYTES = 1 << 23  # Bytes that are freed first when memory runs out
-_LOCK = threading.RLock()
-"""The memory limit is that of the process, so only one thread at a time may set it."""
+_LOCK = threading.RLock()  # The memory limit is the process's: one thread at a time may set it
 P = ParamSpec("P")
 Q = TypeVar("Q", bound=str | Path)
 T = TypeVar("T")
@@ -58,11 +53,7 @@ STREAM = "a longer series is fitted as a stream (docs/how-to/fit-a-stream.md)"
 
 
 def check_size(name: str, size: int, most: int) -> None:
-    """Refuse more than `most` bytes.
-
-    Raises:
-        InputError: over the limit, which the message states.
-    """
+    """Refuse more than `most` bytes by an InputError that states them."""
     if size > most:
         raise InputError(f"{name}: {size / 1e6:.1f} MB; valid: at most {most / 1e6:.1f} MB")
 
@@ -165,55 +156,35 @@ def read_text(path: Path, most: int) -> str:
     return read_bytes(path, most).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
 
 
-class _Memory:
-    """The context manager that `memory` returns.
+@contextmanager
+def memory(name: str) -> Iterator[None]:
+    """Limit the memory that a block may take to `MEMORY`; an InputError where it needs more.
 
-    It holds a reserve of memory and frees it first at the end, since even a small object may need a
-    new block when memory has run out.
+    A reserve is freed first, since even a small object may need memory when that has run out.
     """
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self._previous: tuple[int, int] | None = None
-        self._reserve: mmap.mmap | None = None
-
-    def __enter__(self) -> None:
-        _LOCK.acquire()
-        self._previous = soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    with _LOCK:
+        soft, hard = resource.getrlimit(resource.RLIMIT_AS)
         try:
-            self._reserve = mmap.mmap(-1, _RESERVE_BYTES)
+            reserve = mmap.mmap(-1, _RESERVE_BYTES)
             pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
         except OSError:  # no Linux
+            yield
             return
-        most = pages * resource.getpagesize() + MEMORY
+        most, failed = pages * resource.getpagesize() + MEMORY, False
         least = [limit for limit in (soft, hard, most) if limit != resource.RLIM_INFINITY]
         resource.setrlimit(resource.RLIMIT_AS, (min(least), hard))
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if self._reserve is not None:
-            self._reserve.close()
-        if self._previous is not None:
-            resource.setrlimit(resource.RLIMIT_AS, self._previous)
-        _LOCK.release()
-        if kind is not None and issubclass(kind, MemoryError):
-            raise InputError(
-                f"{self._name}: reading it takes more than {MEMORY / 1e6:.0f} MB of memory; valid: "
-                "a smaller file"
-            ) from None
-
-
-def memory(name: str) -> _Memory:
-    """Limit the memory that the block of a `with` statement may take to `MEMORY`.
-
-    Raises:
-        InputError: the block needs more.
-    """
-    return _Memory(name)
+        try:
+            yield
+        except MemoryError:
+            failed = True
+        finally:
+            reserve.close()
+            resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+    if failed:
+        raise InputError(
+            f"{name}: reading it takes more than {MEMORY / 1e6:.0f} MB of memory; valid: a smaller "
+            "file"
+        )
 
 
 def bounded(read: Callable[Concatenate[Q, P], T]) -> Callable[Concatenate[Q, P], T]:

@@ -30,7 +30,8 @@ class Section(BaseModel):
     """One section of a file: immutable, finite numbers only, unknown keys refused.
 
     The description of a field states what is valid and completes "it must be ...". The class's
-    docstring has it, as "key: description | example in TOML"; `WORDS` are abbreviations in it.
+    docstring has it, as "key: description | example in TOML"; `WORDS` are abbreviations in it. A
+    section without one must be "a section [key]".
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -48,17 +49,16 @@ class Section(BaseModel):
                 field = cls.model_fields[key]
                 field.description = description
                 field.examples = [tomllib.loads(f"x = {example}")["x"]] if example else None
+        for key, field in cls.model_fields.items():
+            if field.description is None and section_of(field) is not None:
+                field.description = f"a section [{key}]"
 
 
 S = TypeVar("S", bound=Section)
 
 
 def load_section(path: Path, section: type[S]) -> S:
-    """Read a TOML file as `section`.
-
-    Raises:
-        InputError: unreadable file, syntax error (names the line), unknown key, bad value.
-    """
+    """Read a TOML file as `section`; an InputError names the line, the unknown key or bad value."""
     return check_section(read_toml(path), section, path.name)
 
 
@@ -114,20 +114,12 @@ def check_section(data: object, section: type[S], where: str) -> S:
 
 
 def check_json(text: str, section: type[S], where: str) -> S:
-    """Check a JSON document against `section`.
-
-    Raises:
-        InputError: not JSON, unknown key, missing key or bad value.
-    """
+    """Check a JSON document against `section`; InputErrors as of `read_json`, and of its keys."""
     return check_section(read_json(text, where), section, where)
 
 
 def read_json(text: str, where: str) -> Any:
-    """Return the content of a JSON document; `where` names it in messages.
-
-    Raises:
-        InputError: not JSON, nested too deeply, or too large.
-    """
+    """Return what a JSON document holds; an InputError where it is none, too deep or too large."""
     try:
         return parse_json(text)
     except json.JSONDecodeError as error:
@@ -153,11 +145,7 @@ def _whole(digits: str) -> int:
 
 
 def suggest(name: str, valid: Sequence[str]) -> str:
-    """Return ' (did you mean "x"?)' for a name close to one of the valid ones, else nothing.
-
-    Long names and those beyond the first thousand are not compared: the time grows with the square
-    of a name's length.
-    """
+    """Return ' (did you mean "x"?)' for a close name; long ones, which take long, are left out."""
     near = [v for v in islice(valid, 1000) if len(v) <= _SHORT]
     close = difflib.get_close_matches(name, near, n=1) if len(name) <= _SHORT else ()
     return f' (did you mean "{close[0]}"?)' if close else ""
@@ -228,6 +216,5 @@ def section_of(field: FieldInfo | None) -> type[Section] | None:
 
 
 def _show(value: object) -> str:
-    """Return a value as one short line."""
     text = json.dumps(value, default=str)
     return text if len(text) <= 60 else f"{text[:57]}..."

@@ -13,7 +13,7 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.campaign import revisions
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
-from hilcal.config.changes import INSTRUMENT_NOISE, Changes, changed
+from hilcal.config.cell import INSTRUMENT_NOISE, Changes, changed
 from hilcal.diagnosis.background_evidence import background_evidence
 from hilcal.diagnosis.diagnosis import Diagnosis, History
 from hilcal.diagnosis.document import to_json
@@ -163,7 +163,7 @@ class Campaign(Brief):
 
         The tracker's noise determines the covariances of readings whose table states none, as in
         an import; no other number of a reading changes. `changes` are values by section and key,
-        for the keys of `config.changes.CHANGEABLE`; the value None removes a key.
+        for the keys of `config.cell.CHANGEABLE`; the value None removes a key.
 
         Raises:
             InputError: a key or a value is not valid, or these readings do not use the key.

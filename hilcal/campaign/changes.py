@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.revisions import carried_of, has_background, mode_of
-from hilcal.config.changes import Changes
+from hilcal.config.cell import Changes
 from hilcal.diagnosis.diagnosis import Diagnosis, History
 from hilcal.diagnosis.effect_ranking import Suspect, addition
 from hilcal.diagnosis.serial_noise import with_serial_noise

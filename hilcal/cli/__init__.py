@@ -1,7 +1,6 @@
 """The command line: one file per group of commands, imported when a command of it is called."""
 
 import errno
-import itertools
 import json
 import os
 import re
@@ -9,7 +8,6 @@ import shlex
 import shutil
 import sys
 import textwrap
-import threading
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -19,24 +17,8 @@ from typing import Annotated, Any, TextIO
 
 import typer
 
-from hilcal import __version__
-from hilcal.cli.commands import (
-    COMMANDS,
-    EXIT_CODES,
-    EXIT_CODES_OF_RUN,
-    Command,
-    CommandGroup,
-    InOrderOfWork,
-    load,
-)
-from hilcal.errors import (
-    CannotAnswerError,
-    DeviceError,
-    HilcalError,
-    InputError,
-    LimitError,
-    StoppedError,
-)
+from hilcal import __version__, errors
+from hilcal.cli import commands
 from hilcal.names import escaped
 from hilcal.optional import lacking
 from hilcal.store.kept_texts import typed
@@ -44,19 +26,17 @@ from hilcal.store.kept_texts import typed
 DEBUG = "HILCAL_DEBUG"
 _COMPLETE = "_HILCAL_COMPLETE"
 _BROKEN_PIPE = 141
-_INTERRUPTED = StoppedError.exit_code
+_INTERRUPTED = errors.StoppedError.exit_code
 _USAGE = 2
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LIBRARY = re.compile(r"(\S+): cannot open shared object file")
-_FRAMES = "⠋⠙⠹⠸⠼⠴⠦⠧⠇⠏"
-_FRAME_S = 0.2
 _COMMAND = re.compile(r"(.*:) (hilcal [^,;()]*)$")
 _KINDS = {
-    InputError.exit_code: "input",
-    DeviceError.exit_code: "device",
-    CannotAnswerError.exit_code: "cannot_answer",
-    LimitError.exit_code: "limit",
-    StoppedError.exit_code: "interrupted",
+    errors.InputError.exit_code: "input",
+    errors.DeviceError.exit_code: "device",
+    errors.CannotAnswerError.exit_code: "cannot_answer",
+    errors.LimitError.exit_code: "limit",
+    errors.StoppedError.exit_code: "interrupted",
 }
 
 
@@ -109,10 +89,7 @@ class Failures:
 
 
 def _laid_out(line: str) -> str:
-    """Return a line, on a terminal wrapped between words.
-
-    There, a command at the end of the line is put on a separate line, which can be copied.
-    """
+    """Return a line as a terminal shows it: wrapped, a command at its end on a line of its own."""
     if not sys.stderr.isatty():
         return line
     match = _COMMAND.match(line)
@@ -128,7 +105,7 @@ def application(
     help_text: str,
     *,
     alone: bool = False,
-    group: type[CommandGroup] = CommandGroup,
+    group: type[commands.CommandGroup] = commands.CommandGroup,
     completion: bool = False,
 ) -> typer.Typer:
     """Return an empty application; with `alone` it can be called without a command."""
@@ -136,7 +113,7 @@ def application(
         cls=group,
         add_completion=completion,
         context_settings={"help_option_names": ["-h", "--help"]},
-        epilog=EXIT_CODES,
+        epilog=commands.EXIT_CODES,
         pretty_exceptions_enable=False,
         no_args_is_help=not alone,
         invoke_without_command=alone,
@@ -147,9 +124,9 @@ def application(
 
 def _hilcal(arguments: Sequence[str]) -> typer.Typer:
     """Return the application; only the command that the arguments name is imported."""
-    app = application(str(_top.__doc__), group=InOrderOfWork, completion=True)
+    app = application(str(_top.__doc__), group=commands.InOrderOfWork, completion=True)
     names = [word for word in arguments if not word.startswith("-")]
-    for name, command in COMMANDS.items():
+    for name, command in commands.COMMANDS.items():
         if names[:1] != [name]:
             app.command(name, help=command.summary)(_placeholder)
         elif command.subcommands:
@@ -157,9 +134,9 @@ def _hilcal(arguments: Sequence[str]) -> typer.Typer:
                 group = _group(command)
             app.add_typer(group, name=name)
         else:
-            epilog = EXIT_CODES_OF_RUN if name == "run" else EXIT_CODES
+            epilog = commands.EXIT_CODES_OF_RUN if name == "run" else commands.EXIT_CODES
             with _loading(name):
-                function = load(command.place)
+                function = commands.load(command.place)
             app.command(name, epilog=epilog)(function)
     app.callback()(_top)
     return app
@@ -171,29 +148,18 @@ def _loading(name: str) -> Iterator[None]:
     if not sys.stderr.isatty() or os.environ.get(_COMPLETE):
         yield
         return
-    ended = threading.Event()
+    from rich.console import Console
 
-    def show() -> None:
-        for frame in itertools.cycle(_FRAMES):
-            print(f"\r{frame} hilcal {name}", end="", file=sys.stderr, flush=True)
-            if ended.wait(_FRAME_S):
-                break
-
-    shown = threading.Thread(target=show, daemon=True)
-    shown.start()
-    try:
+    with Console(stderr=True).status(f"hilcal {name}"):
         yield
-    finally:
-        ended.set()
-        shown.join()
-        print("\r" + " " * (len(name) + 9), end="\r", file=sys.stderr, flush=True)
 
 
-def _group(command: Command) -> typer.Typer:
+def _group(command: commands.Command) -> typer.Typer:
     app = application(command.summary, alone=bool(command.place))
     for name, place in command.subcommands:
-        app.command(name)(load(place))
-    app.callback(help=command.summary)(load(command.place) if command.place else _placeholder)
+        app.command(name)(commands.load(place))
+    function = commands.load(command.place) if command.place else _placeholder
+    app.callback(help=command.summary)(function)
     return app
 
 
@@ -272,7 +238,7 @@ def _run(
         with _computing(), typed((name, *arguments)):
             result = app(arguments, prog_name=name, standalone_mode=False)
         out.flush()
-    except HilcalError as error:
+    except errors.HilcalError as error:
         return failures.tell(error, str(error), error.exit_code)
     except BrokenPipeError:
         # The reader is gone; flushing the buffer at exit must not raise again.
@@ -303,7 +269,7 @@ def _explained(error: Exception, name: str) -> tuple[str, int]:
         file = error.filename or "a file"
         hint = "make room on the disks of output, program and temporary files"
         message = f"{file} cannot be written ({os.strerror(error.errno)}): {hint}"
-        return message, DeviceError.exit_code
+        return message, errors.DeviceError.exit_code
     if isinstance(error, ImportError) and (library := _LIBRARY.match(str(error))):
         package = " (libgomp1 on Debian)" if library[1] == "libgomp.so.1" else ""
         return f"the system library {library[1]} is missing: install its package{package}", _USAGE

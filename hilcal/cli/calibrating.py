@@ -30,14 +30,7 @@ from hilcal.errors import (
 from hilcal.measuring.connect import with_kinematics
 from hilcal.measuring.run import HOW_ON
 from hilcal.names import quoted
-from hilcal.present.calibration import (
-    decision_report,
-    improvement_report,
-    limit_failure,
-    standing,
-    step_heading,
-    validation_lines,
-)
+from hilcal.present import calibration as words
 from hilcal.present.diagnosis import verdict_line
 from hilcal.present.fit import prior_lines
 from hilcal.present.live_viewer import LiveViewer
@@ -51,8 +44,7 @@ from hilcal.store.procedure_log import ProcedureLog
 from hilcal.store.run_log import RunLog
 from hilcal.tables.units import parse_duration, parse_length
 
-VALIDATION = 20
-"""Poses of a validation campaign; a choice: they determine the mean error to 10 %."""
+VALIDATION = 20  # Poses of a validation campaign; a choice: they determine the mean error to 10 %
 FITTED_LATER = ("plan", "measure", "refine", "decide")  # Steps that a fit may follow
 LONGEST = "2 h"  # Longest time for measuring; a choice
 
@@ -141,8 +133,8 @@ def calibrate(
         with working(t.progress) as say:
             improvement = p.compare(say)
     limit_m, files = p.settings.limit_m, p.files
-    t.show(step_heading(ProcedureStep("compare", output)))
-    t.show(improvement_report(improvement, limit_m))
+    t.show(words.step_heading(ProcedureStep("compare", output)))
+    t.show(words.improvement_report(improvement, limit_m))
     t.show(
         f"\nThe calibration is in {output}, its test in {files.validation.name} and "
         f"{files.corrected.name}. Correct your points and programs with:"
@@ -152,7 +144,7 @@ def calibrate(
     t.command(shlex.join(["hilcal", "report", str(output), "--operator", "NAME"]))
     failed: HilcalError | None = None
     if limit_m is not None and improvement.over(limit_m):
-        failure = limit_failure(improvement, limit_m)
+        failure = words.limit_failure(improvement, limit_m)
         undecided = limit_m < improvement.everything.noise_m
         failed = CannotAnswerError(failure) if undecided else LimitError(failure)
     t.document({**_document(p), "improvement": improvement.to_dict(), "limit_m": limit_m}, failed)
@@ -160,8 +152,6 @@ def calibrate(
 
 @dataclass(frozen=True, slots=True)
 class _Continuation:
-    """The commands that start and resume a calibration."""
-
     t: Terminal
     resume: str
     start: str
@@ -199,7 +189,6 @@ def _procedure(
     stated: dict[str, Any],
     go_on: _Continuation,
 ) -> Procedure:
-    """Begin a calibration, or resume it from its file."""
     hide = (config.simulation.hide or NOTHING) if rehearse else None
     base_dir = path.absolute().parent
     if rehearse:
@@ -222,13 +211,13 @@ def _procedure(
         kind = "no rehearsal; leave --rehearse out" if rehearse else "a rehearsal; give --rehearse"
         raise InputError(f"{output}: its calibration is {kind}")
     if not resume:
-        message = f"{output}: a calibration is there already, {standing(p.next())}"
+        message = f"{output}: a calibration is there already, {words.standing(p.next())}"
         raise InputError(f"{message}; go on with: {go_on.resume}")
     _refuse_goal(p.settings.readings, stated, path)
     p = replace(p, settings=replace(p.settings, **stated))
     with CampaignFile.open(output) as campaign:
         p.resume(campaign)
-    go_on.t.notice(f"{output}: a calibration, {standing(p.next())}")
+    go_on.t.notice(f"{output}: a calibration, {words.standing(p.next())}")
     return p
 
 
@@ -282,7 +271,7 @@ class CalibrationOperator:
     def to_the_end(self) -> None:
         """Do all remaining steps before the comparison."""
         while (step := self.p.next()).kind not in ("done", "compare"):
-            self.t.show(step_heading(step, self.clock))
+            self.t.show(words.step_heading(step, self.clock))
             if step.moves:
                 self._moving(step)
             else:
@@ -343,9 +332,9 @@ class CalibrationOperator:
             t.show(prior_lines(result.fit))
         elif step.kind == "decide":
             settings = p.settings
-            t.show(decision_report(result, settings.goal_m, settings.readings, self.clock))
+            t.show(words.decision_report(result, settings.goal_m, settings.readings, self.clock))
         elif step.kind == "validate":
-            t.show(validation_lines(result))
+            t.show(words.validation_lines(result))
 
 
 def _count(path: Path) -> int:

@@ -18,19 +18,12 @@ from hilcal.identification.misdescription import examine, other_arm
 from hilcal.identification.registration import register
 from hilcal.identification.table_preview import preview_table
 from hilcal.identification.torques import check_torques
-from hilcal.import_campaign import import_campaign
 from hilcal.names import quoted
+from hilcal.present import registration as words
 from hilcal.present.campaign import import_preview, info_report
 from hilcal.present.document import Words, heading
 from hilcal.present.fit import model_name, target_words
 from hilcal.present.progress import counting, working
-from hilcal.present.registration import (
-    covariance_words,
-    observed_words,
-    other_arm_line,
-    registration_lines,
-    torque_lines,
-)
 from hilcal.readings.covariance import COVERS
 from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
@@ -65,15 +58,17 @@ def import_(
     if config is None or output is None:
         missing = "--config CELL.toml" if config is None else "-o RUN.hilcal"
         raise InputError(f"{missing} is missing; without it only --preview is possible")
+    from hilcal.library import import_campaign  # imports the whole library
+
     with working(t.progress) as say:
         imported = import_campaign(table, config, output, kind, second, overwrite=force, say=say)
     readings, cell, noise = imported.readings, imported.cell, imported.noise
     model = imported.config.robot.model
-    notes = (*imported.notes, covariance_words(imported.parts, noise), *cell.arm.notes)
+    notes = (*imported.notes, words.covariance_words(imported.parts, noise), *cell.arm.notes)
     loads = [readings.load_names[k] for k in np.unique(readings.load)]
     poses = len(np.unique(readings.pose))
     kind = f"each reading is a position{'' if readings.m == 3 else ' and an orientation'}"
-    kind = observed_words(readings) if readings.observers else kind
+    kind = words.observed_words(readings) if readings.observers else kind
     t.show(heading(f"{len(readings)} readings of {poses} poses"))
     t.show(f"  robot {model}; {kind}\n  loads: {', '.join(loads)}")
     targets = _targets(cell, readings)
@@ -81,16 +76,16 @@ def import_(
         t.show("  targets: " + "; ".join(target_words(**x) for x in targets))
     torques = check_torques(cell, readings)
     registered = misdescription = likely_arm = None
-    lines = [*notes, *torque_lines(torques)]
+    lines = [*notes, *words.torque_lines(torques)]
     with suppress(CannotAnswerError):  # the readings do not determine the registration
         registered = register(cell, readings)
     if registered is not None:
         misdescription = examine(registered, readings)
         if misdescription is None or not misdescription.refused:
-            lines += registration_lines(registered)
+            lines += words.registration_lines(registered)
             likely_arm = other_arm(registered, readings)
     if likely_arm is not None:
-        lines.append(f"Note: {other_arm_line(likely_arm)}")
+        lines.append(f"Note: {words.other_arm_line(likely_arm)}")
     if misdescription is not None:
         begin = "Nothing can be fitted yet" if misdescription.refused else "Note"
         lines.append(f"{begin}: {misdescription.words(cell, readings)}.")
@@ -175,8 +170,8 @@ def info(run: Path, as_json: bool = False) -> None:
         check_robot(run, file.config_json, *robot_texts)
         cell = cell_from_config(content.config, None, *robot_texts)
     torques = None if content.readings is None else check_torques(cell, content.readings)
-    t.show(info_report(content, run.name, covariance_words(parts, noise)))
-    t.show(torque_lines(torques))
+    t.show(info_report(content, run.name, words.covariance_words(parts, noise)))
+    t.show(words.torque_lines(torques))
     extra = {} if torques is None else {"torques": torques.to_json()}
     t.document(to_json(content, str(run), parts), **extra)
 

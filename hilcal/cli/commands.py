@@ -30,7 +30,7 @@ repair | campaigns
     | Open a campaign again that a bad revision closes: it is set aside, no reading is.
 Fit, and find what is missing:
 identify | fitting | Fit a model to the readings, and keep it as a revision.
-compare | comparing
+compare | refining
     | Show where the model fails; with a later campaign, what has changed on the arm.
 diagnose | refining | Say which effect the model lacks.
 add | refining | Add an effect to the model: error before and after.
@@ -46,7 +46,7 @@ workbench | showing
 Many arms:
 fleet | campaigns | Pool many campaigns: a prior for other arms, arms unlike their type, drift.
 Use the result:
-validate | comparing | Predict readings of another campaign with the model.
+validate | refining | Predict readings of another campaign with the model.
 compensate | compensating
     | Find the joint values that put the tool where it was asked to be, under a load.
 accept | campaigns
@@ -70,8 +70,7 @@ class Command:
 
     place: str  # "module:function" in `hilcal.cli`; empty for a group without a function
     summary: str  # first line of the function's docstring, for the list of commands
-    subcommands: tuple[tuple[str, str], ...] = ()
-    """Name and "module:function"; a command that has any is a group."""
+    subcommands: tuple[tuple[str, str], ...] = ()  # name and "module:function" of each
 
 
 def load(place: str) -> Callable[..., Any]:
@@ -81,14 +80,10 @@ def load(place: str) -> Callable[..., Any]:
     return function
 
 
-_SUBCOMMANDS = {
-    "effects": (("new", "looking_up:new"),),
-    "study": (("scaling", "looking_up:scaling"),),
-}
+_BELOW = {"effects": (("new", "looking_up:new"),), "study": (("scaling", "looking_up:scaling"),)}
 
 
 def _read() -> tuple[dict[str, Command], dict[str, tuple[str, ...]]]:
-    """Return the commands by name, and their names by section."""
     commands: dict[str, Command] = {}
     sections: dict[str, tuple[str, ...]] = {}
     for line in _LISTED.replace("\n    |", " |").strip().splitlines():
@@ -98,7 +93,7 @@ def _read() -> tuple[dict[str, Command], dict[str, tuple[str, ...]]]:
         name, module, summary = (part.strip() for part in line.split(" |"))
         function = {"import": "import_", "next": "next_"}.get(name, name)
         place = f"{module}:{function}" if module else ""
-        commands[name] = Command(place, summary, _SUBCOMMANDS.get(name, ()))
+        commands[name] = Command(place, summary, _BELOW.get(name, ()))
         sections[section] = (*sections.get(section, ()), name)
     return commands, sections
 

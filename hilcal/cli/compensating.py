@@ -9,18 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from hilcal.calibration import urscript
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensation import Compensation
 from hilcal.calibration.points import Points, on_branch, read_points
 from hilcal.calibration.programs.languages import READERS, UnderstoodProgram, understood
-from hilcal.calibration.urscript import (
-    JOINTS,
-    Waypoint,
-    doubts,
-    movej_program,
-    program_points,
-    with_joints,
-)
 from hilcal.campaign.campaign import Campaign
 from hilcal.cli.options import catalogue_with, check_new, command
 from hilcal.cli.terminal import terminal
@@ -44,16 +37,14 @@ NAMED = 5  # Most refused points that an error names
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Task:
-    """The points to compensate, and the program that they come from."""
-
     points: Points
     tool: Floats | None  # (4, 4) T_flange_tool; the tracked target where None
     program: str | None = None  # text of a UR program
-    waypoints: tuple[Waypoint, ...] = ()  # all waypoints of a UR program
+    waypoints: tuple[urscript.Waypoint, ...] = ()  # all waypoints of a UR program
     foreign: UnderstoodProgram | None = None  # a program of another maker than UR
 
     @property
-    def corrected(self) -> list[Waypoint]:
+    def corrected(self) -> list[urscript.Waypoint]:
         """The waypoints that are corrected."""
         return [w for w in self.waypoints if not w.left]
 
@@ -118,7 +109,7 @@ def compensate(
         on_flange = calibration.tool_pose(task.tool)
         begin = calibration.measured.middle(arm.n) if start is None and not task.program else start
         q = on_branch(targets, arm, on_flange, begin)
-        unclear = doubts(arm, on_flange, task.corrected, q, start) or [""] * len(q)
+        unclear = urscript.doubts(arm, on_flange, task.corrected, q, start) or [""] * len(q)
         acting = wrench if targets.sensed is None else calibration.load_wrench(q, targets.sensed)
         poses = _program_poses(task, calibration, q, arm)
         result = calibration.compensate(
@@ -199,9 +190,9 @@ def _task(
             raise InputError(f"{path}: --leave is for waypoints of a program; valid: without it")
         mapping = None if kind == "table" else find_mapping(kind, PointMapping)
         return _Task(read_points(path, arm, calibration.loads, mapping), tool)
-    if arm.n != JOINTS:
+    if arm.n != urscript.JOINTS:
         raise InputError(f"{path}: a UR program, and {arm.name} has {arm.n} joints")
-    program, waypoints, points, tcp = program_points(path, options.leave)
+    program, waypoints, points, tcp = urscript.program_points(path, options.leave)
     if tcp is None and tool is None and points.wanted is not None:
         for k in np.flatnonzero(np.isfinite(points.wanted[:, 0, 0]))[:1].tolist():
             raise InputError(
@@ -214,7 +205,6 @@ def _task(
 
 
 def _only(task: _Task, retained: list[int], refused: list[str]) -> _Task:
-    """Return the task of a program without its refused waypoints."""
     if task.foreign is not None:
         foreign = task.foreign.without(refused)
         return replace(task, points=foreign.points, foreign=foreign)
@@ -232,7 +222,6 @@ def _only(task: _Task, retained: list[int], refused: list[str]) -> _Task:
 def _wrench(
     points: Points, calibration: Calibration, options: CompensationOptions
 ) -> Floats | None:
-    """Return the wrench at the points, (6,) or (N, 6)."""
     load, wrench = options.load, options.wrench
     if sum(x is not None for x in (load, wrench, points.wrench, points.sensed)) > 1:
         raise InputError("the load is given twice; valid: one of --load, --wrench, columns")
@@ -284,7 +273,6 @@ def _check_output(path: Path, points: Path, force: bool) -> None:
 def _write(
     path: Path, task: _Task, result: Compensation, document: dict[str, object], units: Sequence[str]
 ) -> list[Path]:
-    """Write the joint values in the format of the file's name; return the files."""
     names, n = task.points.names, result.q.shape[1]
     if task.foreign is not None and path.suffix.lower() in READERS:
         files = {path.with_suffix(k): v for k, v in task.foreign.corrected(result.q).items()}
@@ -296,12 +284,12 @@ def _write(
         content = json.dumps(plain(document), allow_nan=False, indent=2) + "\n"
     elif path.suffix == ".csv":
         content = _csv(names, result, units)
-    elif n != JOINTS:
-        raise InputError(f"{path}: a UR program has {JOINTS} joints, this arm has {n}")
+    elif n != urscript.JOINTS:
+        raise InputError(f"{path}: a UR program has {urscript.JOINTS} joints, this arm has {n}")
     elif task.program is None:
-        content = movej_program(names, result.q)
+        content = urscript.movej_program(names, result.q)
     else:
-        content = with_joints(task.program, task.corrected, result.q)
+        content = urscript.with_joints(task.program, task.corrected, result.q)
     replace_file(path, content)
     return [path]
 

@@ -13,17 +13,11 @@ from hilcal import numbers
 from hilcal.calibration.improvement import Improvement
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.revisions import to_record
+from hilcal.cli import running
 from hilcal.cli.fitting import check_record, finish, record_story
 from hilcal.cli.options import catalogue_with, check_seed, command
 from hilcal.cli.planning import separates
 from hilcal.cli.refining import changed, chapters_of, errors_by_revision, revisions_json
-from hilcal.cli.running import (
-    RehearsalSettings,
-    RehearsedCampaign,
-    first_plan,
-    in_process,
-    on_devices,
-)
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import load_config
 from hilcal.design.next import measure_next
@@ -56,13 +50,7 @@ from hilcal.identification.linearisation import linearise
 from hilcal.measuring.route import dry_run
 from hilcal.names import quoted
 from hilcal.present.calibration import improvement_report
-from hilcal.present.diagnosis import (
-    compared,
-    refined_laws,
-    step_report,
-    truth_table,
-    verdict_line,
-)
+from hilcal.present.diagnosis import compared, refined_laws, step_report, truth_table, verdict_line
 from hilcal.present.document import heading
 from hilcal.present.fit import model_name
 from hilcal.present.plan import next_report
@@ -107,31 +95,25 @@ class Doubted:
 
 
 def doubtful_case(
-    settings: RehearsalSettings, hide: str | None, say: Say, number: int = 0
-) -> tuple[RehearsalSettings, Plan, bool]:
-    """Draw an effect to hide and a small campaign that leaves it in doubt.
+    settings: running.RehearsalSettings, hide: str | None, say: Say, number: int = 0
+) -> tuple[running.RehearsalSettings, Plan, bool]:
+    """Draw an effect to hide and a small campaign that leaves it in doubt, by seed and `number`.
 
-    Both follow from the seed and `number`. A case is doubtful when a rival explains the readings
-    about as well as the hidden effect in each of `DRAWS` draws of the noise, and when the diagnosis
-    of the first draw names both effects and says that further readings would separate them.
-
-    Returns:
-        The settings of the first doubtful case, or of the last one where none of `TRIES` is; the
-        plan of its first campaign; whether the case is doubtful.
+    A case is doubtful when a rival explains the readings about as well as the hidden effect in each
+    of `DRAWS` draws of the noise, and when the diagnosis of the first draw names both and says that
+    further readings would separate them. Returned are settings, plan, and whether it is doubtful.
     """
     loads = settings.config.loads[1::2] or settings.config.loads
     quick = {"candidates": min(settings.config.planning.candidates, CANDIDATES), "against": ()}
-    planning = settings.config.planning.model_copy(update=quick)
-    few = settings.config.model_copy(update={"loads": loads, "planning": planning})
-    simulation = settings.config.simulation.model_copy(update={"strength_sigma": STRENGTH})
-    strong = settings.config.model_copy(update={"simulation": simulation})
+    few = settings.config.with_keys("planning", **quick).model_copy(update={"loads": loads})
+    strong = settings.config.with_keys("simulation", strength_sigma=STRENGTH)
     say("drawing an arm and a small campaign that leaves its effect in doubt")
     for k in range(TRIES):
         rng = np.random.default_rng([settings.seed, number, k])
         choice = hide or str(rng.choice(HARD_TO_SEPARATE))
         case = replace(settings, config=strong, choice=choice, seed=int(rng.integers(2**31)))
         if k % ARMS == 0:
-            plan = first_plan(case, few, FIRST, lambda text: None)
+            plan = running.first_plan(case, few, FIRST, lambda text: None)
         secret = case_of_plan(strong, plan, choice, case.seed, case.world)
         drawn = [read_plan(secret, plan, [case.seed, 1 + j]) for j in range(DRAWS)]
         if choice == NOTHING or (
@@ -145,7 +127,7 @@ def _fit(r: Rehearsal, catalogue: Catalogue) -> Fit:
     return fit(baseline(r.cell, r.readings, r.mode, catalogue), r.readings, r.mode)
 
 
-def _resembled(r: Rehearsal, case: RehearsalSettings) -> bool:
+def _resembled(r: Rehearsal, case: running.RehearsalSettings) -> bool:
     """Whether the hidden effect or a rival is significant, and a rival fits as well."""
     p = linearise(_fit(r, case.catalogue))
     effects = [e for e in candidates(p.fit) if e.name in (r.hidden, *RESEMBLING)]
@@ -157,7 +139,7 @@ def _resembled(r: Rehearsal, case: RehearsalSettings) -> bool:
     return any(abs(s.score.log_evidence - evidence) < CLOSE for s in suspects.values())
 
 
-def _left_open(r: Rehearsal, case: RehearsalSettings) -> bool:
+def _left_open(r: Rehearsal, case: running.RehearsalSettings) -> bool:
     """Whether the diagnosis leaves the hidden effect in doubt, and all rivals are separable."""
     d = judge(Evidence(_fit(r, case.catalogue)), History())
     return r.hidden in left_open(d) and all(rival.possible for rival in d.separability)
@@ -166,10 +148,7 @@ def _left_open(r: Rehearsal, case: RehearsalSettings) -> bool:
 def doubted(
     t: Terminal, r: Rehearsal, seed: int, first: Plan, poses: int, catalogue: Catalogue
 ) -> Doubted:
-    """Diagnose a first campaign; where suspects are left in doubt, plan what separates them.
-
-    `poses` is the value of `--poses`, see `SHARE`.
-    """
+    """Diagnose a first campaign; plan what separates the suspects, at a `SHARE` of `poses`."""
     with working(t.progress) as say:
         say("fitting and diagnosing the first readings")
         fitted = _fit(r, catalogue)
@@ -195,8 +174,7 @@ def doubted(
 
 
 CELL = "demo_ur10e.toml"
-POSES = 20
-"""Poses of the plan; a choice: with validation and corrected run it takes 3.5 minutes."""
+POSES = 20  # Poses of the plan; a choice: with validation and corrected run it takes 3.5 minutes
 VALIDATION = 10  # Poses of the validation campaign; a choice for the same reason
 
 
@@ -227,7 +205,7 @@ def demo(
     files = Files(output)
     for path in (output, files.validation, files.corrected):
         may_write(path, True)  # before the planning, which takes a while
-    case = RehearsalSettings(
+    case = running.RehearsalSettings(
         config, hidden or RANDOM, number, output, configs_dir() / "cells", catalogue, world
     )
     laws = None
@@ -312,13 +290,10 @@ def demo(
 
 @contextmanager
 def _campaign(
-    t: Terminal, case: RehearsalSettings, poses: int, without_devices: bool, ambiguous: bool
-) -> Iterator[tuple[RehearsedCampaign, Rehearsal, Doubted | None]]:
-    """Measure a campaign; its simulated devices run until the block ends.
-
-    With `ambiguous`, measure arms until one leaves a doubt, then the readings that settle it.
-    """
-    measured = in_process if without_devices else on_devices
+    t: Terminal, case: running.RehearsalSettings, poses: int, without_devices: bool, ambiguous: bool
+) -> Iterator[tuple[running.RehearsedCampaign, Rehearsal, Doubted | None]]:
+    """Measure a campaign in a cell that lasts as the block; with `ambiguous` settle a doubt."""
+    measured = running.in_process if without_devices else running.on_devices
     existed, first = case.output.exists(), case
     for tries in range(1, CAMPAIGNS + 1):
         another = False
@@ -327,7 +302,7 @@ def _campaign(
                 hidden = None if first.choice == RANDOM else first.choice
                 case, plan, another = doubtful_case(first, hidden, say, tries - 1)
             else:
-                plan = first_plan(case, case.config, poses, say)
+                plan = running.first_plan(case, case.config, poses, say)
         for path in (Files(case.output).validation, Files(case.output).corrected):
             path.unlink(missing_ok=True)
         with measured(t, case, plan) as m:

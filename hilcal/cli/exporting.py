@@ -29,8 +29,7 @@ from hilcal.store.revision import RevisionRecord
 from hilcal.tables.write import check_suffix, revision_table, write_columns
 from hilcal.whole_file import replace_file
 
-MANY = 10.0
-"""Distance along a joint's axis beyond which a note about cancellation is printed, m."""
+MANY = 10.0  # m; distance along a joint's axis beyond which a note about cancellation is printed
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,11 +188,7 @@ def _write_data(run: Campaign, options: ExportOptions, force: bool) -> Iterator[
 
 
 def cell_toml(run: Campaign) -> str:
-    """Return the configuration that a campaign was measured with, as CELL.toml.
-
-    The file of a robot that is not of the catalogue is named by its name alone where the campaign
-    stores it, else by its path.
-    """
+    """Return the cell of a campaign as CELL.toml; a robot that it stores goes by its name."""
     content = run.config.model_dump(mode="json", exclude_none=True)
     robot = Path(run.file.base_dir) / run.config.robot.model
     if robot.suffix:
@@ -205,7 +200,6 @@ def cell_toml(run: Campaign) -> str:
 def _write_model(
     say: Say, run: Campaign, revision: int | None, record: RevisionRecord, options: ExportOptions
 ) -> Iterator[str]:
-    """Write the files of the model; yield a line on each."""
     number, parameters = record.number, options.parameters
     source: dict[str, object] = {"campaign": run.path.name, "revision": number}
     source["readings_sha256"] = record.data_hash
@@ -320,7 +314,6 @@ def _ur_note(note: str, base: str, arm: Corrected, digest: str | None) -> str:
 
 
 def _dh_words(path: Path, rows: dh_table.DhRows, holds: str, alone: bool) -> Iterator[str]:
-    """Yield lines on what a DH table holds, and what it does not."""
     yield f"{path}: {rows.convention} DH rows with {holds}"
     if max(rows.base_moves, rows.flange_moves) > dh_table.EXACT:
         parts = (

@@ -78,7 +78,6 @@ def _summary(fitted: Fit) -> str:
 
 
 def _tell_accepted(t: Terminal, run: Campaign, revision: int | None) -> None:
-    """Print a notice where the accepted revision is not the latest."""
     accepted, latest = run.file.accepted(), run.latest()
     if revision is None and latest is not None and accepted not in (None, latest.number):
         t.notice(f"using revision {accepted}, which is accepted; the latest is {latest.number}")
@@ -294,14 +293,10 @@ def identify(
     other_arm = other_arm_of(o.cell, o.readings)
     if other_arm is not None:
         t.show(other_arm_line(other_arm))
-    document = {
-        "revision": number,
-        **to_json(stored),
-        "options": options_json(stored),
-        "covariance": o.covariance_parts,
-        **({} if torques is None else {"torques": torques.to_json()}),
-        "other_arm": None if other_arm is None else other_arm.to_json(),
-    }
+    document: dict[str, object] = {"revision": number, **to_json(stored)}
+    document |= {"options": options_json(stored), "covariance": o.covariance_parts}
+    document |= {} if torques is None else {"torques": torques.to_json()}
+    document["other_arm"] = None if other_arm is None else other_arm.to_json()
     if len(fits) > 1:
         t.show(["", *scalings_table(fits)])
         document["scalings"] = {s: to_json(f) for s, f in fits.items()}

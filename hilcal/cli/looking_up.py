@@ -25,7 +25,7 @@ from hilcal.errors import InputError
 from hilcal.identification.fit_document import plain
 from hilcal.mixed.families import expected_sizes
 from hilcal.names import quoted
-from hilcal.present.campaign import reference_page, section_report, sections_overview
+from hilcal.present.campaign import section_report, sections_overview
 from hilcal.present.document import Table, note, table
 from hilcal.present.progress import counting
 from hilcal.toml import Section
@@ -56,24 +56,19 @@ def effects(
         count = len(e.parameters)
         facts = f"{count} parameter{'s' if count != 1 else ''}, {units}{needs}"
         out.add(e.name, f"{e.summary}\n{facts}{_expected(e)}")
-    t.show(out)
     notes = [
         f"parameters: of a {ROBOT} with 30 poses; needs: columns that the readings must have; "
         "expected: their standard deviation before anything is measured, known to a factor of 7; "
-        "[ordinary] of a cell changes it.",
-        *(
-            f"from {file.path}: {', '.join(e.name for e in file.effects)}"
-            for file in catalogue.files
-        ),
+        "[ordinary] of a cell changes it."
     ]
-    t.show(note("\n".join(notes)))
-    t.show(["", _options_table(instances, defaults)])
-    t.show(note(OPTIONS_NOTE))
+    for file in catalogue.files:
+        notes.append(f"from {file.path}: {', '.join(e.name for e in file.effects)}")
+    options = _options_table(instances, defaults)
+    t.show([out, note("\n".join(notes)), "", options, note(OPTIONS_NOTE)])
     t.document({"effects": [_document(e, defaults[e.name], catalogue) for e in instances]})
 
 
 def _expected(e: Effect) -> str:
-    """Return the expected standard deviation of an effect's parameters, the largest per unit."""
     largest: dict[str, float] = {}
     for _, std, unit in expected_sizes(e):
         largest[unit] = max(largest.get(unit, 0.0), std)
@@ -96,6 +91,8 @@ def _options_table(instances: list[Effect], defaults: dict[str, dict[str, object
 
 def _document(e: Effect, defaults: dict[str, object], catalogue: Catalogue) -> dict[str, object]:
     parameters = [{"name": p.name, "unit": p.unit, "meaning": p.meaning} for p in e.parameters]
+    plausible = {q.unit: e.most() * q.scale for q in e.parameters}
+    file = catalogue.file_of(e.name)
     return {
         "name": e.name,
         "law": e.summary,
@@ -105,21 +102,12 @@ def _document(e: Effect, defaults: dict[str, object], catalogue: Catalogue) -> d
         "defaults": plain(defaults),
         "option_help": dict(e.option_help),
         "parameters": parameters,
-        "plausible": None
-        if not np.isfinite(e.most())
-        else {q.unit: e.most() * q.scale for q in e.parameters},
+        "plausible": plausible if np.isfinite(e.most()) else None,
         "expected": [
             {"family": name, "std": std, "unit": unit} for name, std, unit in expected_sizes(e)
         ],
-        "source": _source(type(e), catalogue),
+        "source": file.path if file else "built in" if type(e) in BUILT_IN else "installed",
     }
-
-
-def _source(kind: type[Effect], catalogue: Catalogue) -> str:
-    """Return the source of an effect: "built in", "installed", or a file."""
-    if file := catalogue.file_of(kind.name):
-        return file.path
-    return "built in" if kind in BUILT_IN else "installed"
 
 
 @command("""
@@ -177,11 +165,6 @@ def config(section: str | None = None, as_json: bool = False) -> None:
     sections = tables if section is None else (reference.table(section, tables),)
     t.show(sections_overview(sections) if section is None else section_report(sections[0]))
     t.document(sections=[asdict(s) for s in sections])
-
-
-def write_page(path: str = "docs/reference/cell-configuration.md") -> None:
-    """Write the page of the reference."""
-    replace_file(path, reference_page(reference.tables(DRIVERS_OWN)))
 
 
 @command("""

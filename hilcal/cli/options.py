@@ -53,7 +53,6 @@ seed | --seed | Of the random candidates.
 quick | --quick | Without comparing criteria and numbers of poses.
 csv | --csv F.csv | The plan as a table, too.
 workers | --workers N | Processes of this machine; one per processor by default.
-own_workers | --workers N | Processes of this machine; 1 by default.
 jobs | --jobs | Processes; one per processor by default.
 own_jobs | --jobs | Processes; 1 by default.
 force | --force | Replace an existing file.
@@ -62,7 +61,6 @@ force | --force | Replace an existing file.
 
 
 def _open_to_others(context: typer.Context, address: str | None) -> str | None:
-    """Warn of an address without TLS."""
     if address and not address.startswith(("tls://", "wss://")) and not context.resilient_parsing:
         warning = f"--scheduler {address}: without TLS, whoever reaches it runs code there and here"
         typer.echo(f"{warning}, as you; tls://host:8786 keeps others out", err=True)
@@ -82,10 +80,7 @@ Scheduler = Annotated[str | None, SHARED["scheduler"]]
 
 
 def command(text: str = "") -> Callable[[F], F]:
-    """Declare the parameters of a command by entries of a text; those not in it by `SHARED`.
-
-    The fields of a parameter that is a dataclass become options of the command.
-    """
+    """Declare a command's parameters by a text and `SHARED`; fields of a dataclass are options."""
     declarations, annotated = SHARED | _declared(text), cast(Any, Annotated)
 
     def declare(function: F) -> F:
@@ -93,10 +88,8 @@ def command(text: str = "") -> Callable[[F], F]:
         joint: dict[str, Any] = {p.name: p.annotation for p in params if is_dataclass(p.annotation)}
         flattened = []
         for p in params:
-            parts = (
-                inspect.signature(joint[p.name]).parameters.values() if p.name in joint else (p,)
-            )
-            for part in parts:
+            joined = p.name in joint
+            for part in inspect.signature(joint[p.name]).parameters.values() if joined else (p,):
                 info = declarations.get(part.name)
                 kind = annotated[part.annotation, info] if info else part.annotation
                 flattened.append(part.replace(annotation=kind))

@@ -9,14 +9,7 @@ import numpy as np
 from hilcal import numbers as words_of
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell, cell_from_config
-from hilcal.cli.fitting import (
-    NO_PRIOR,
-    PriorOptions,
-    check_record,
-    fit_of,
-    fitted_with,
-    wanted_effects,
-)
+from hilcal.cli import fitting
 from hilcal.cli.options import POSES, catalogue_with, check_seed, command
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import CellConfig, load_config
@@ -79,13 +72,13 @@ def write(
 def plan(
     cell: Path, output: Path, poses: int = POSES, readings: int | None = None,
     criterion: str | None = None, after: Path | None = None, revision: int | None = None,
-    prior: PriorOptions = NO_PRIOR, seed: int = 0, unloaded_first: bool = False,
+    prior: fitting.PriorOptions = fitting.NO_PRIOR, seed: int = 0, unloaded_first: bool = False,
     quick: bool = False, csv: Path | None = None, record: Path | None = None, details: bool = False,
     effects_from: list[Path] | None = None, as_json: bool = False,
 ) -> None:  # fmt: skip
     """Choose poses, loads and their order, with a proof of how near to the best they are."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
-    check_record(record)
+    fitting.check_record(record)
     if revision is not None and after is None:
         raise InputError("--revision is one of a campaign; give the campaign with --after")
     if prior.prior is not None and after is not None:
@@ -100,7 +93,7 @@ def plan(
         fitted, reference = None, None
         if after is not None:
             with Campaign.open(after, catalogue, read_only=True) as run:
-                fitted, reference = fit_of(t, run, say, revision)[1], reference_in(run.file)
+                fitted, reference = fitting.fit_of(t, run, say, revision)[1], reference_in(run.file)
         rng = np.random.default_rng(check_seed(seed))
         chosen = make(
             numbers, config, request, rng, fitted, say, catalogue, carried, reference=reference
@@ -239,12 +232,13 @@ def refuse_unready(answers: tuple[ConnectionResult, ...]) -> None:
 def next_(
     run: Path, output: Path, poses: int | None = None, suspects: str | None = None,
     cell: Path | None = None, seed: int = 0, quick: bool = False, csv: Path | None = None,
-    revision: int | None = None, prior: PriorOptions = NO_PRIOR, record: Path | None = None,
-    effects_from: list[Path] | None = None, details: bool = False, as_json: bool = False,
+    revision: int | None = None, prior: fitting.PriorOptions = fitting.NO_PRIOR,
+    record: Path | None = None, effects_from: list[Path] | None = None, details: bool = False,
+    as_json: bool = False,
 ) -> None:  # fmt: skip
     """Plan the measurements that separate the leading suspects; exit 4 where none are in doubt."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
-    check_record(record)
+    fitting.check_record(record)
     carried = prior.load(catalogue)
     rng = np.random.default_rng(check_seed(seed))
     if poses is not None and poses < 1:
@@ -291,11 +285,11 @@ def _without_suspects(
     prior: CarriedPrior | None,
 ) -> Doubt:
     """Return the effects to separate, and a fit whose model is without them."""
-    number, newest = fit_of(t, o, say, revision)
+    number, newest = fitting.fit_of(t, o, say, revision)
     o.require_gc(number, newest.scaling, "next")
     if prior is not None:
         say("fitting with the prior")
-        newest = fitted_with(prior, o, newest)
+        newest = fitting.fitted_with(prior, o, newest)
     if named is not None:
         return Doubt(without(newest, named, say), named, None)
     say("diagnosing" if number is None else f"diagnosing revision {number}")
@@ -303,8 +297,7 @@ def _without_suspects(
 
 
 def _named(text: str | None, catalogue: Catalogue) -> tuple[str, ...] | None:
-    """Read `--suspects`: names of effects without options."""
-    effects = wanted_effects(text, catalogue, "--suspects")
+    effects = fitting.wanted_effects(text, catalogue, "--suspects")
     if effects is None:
         return None
     for name in (name for name, options in effects.items() if options):

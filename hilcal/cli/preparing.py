@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import hilcal
+from hilcal import doctor as machine
 from hilcal.cell import cell_from_config
 from hilcal.cli.options import check_folder, check_new, command
 from hilcal.cli.terminal import Terminal, agreed, somebody_there, terminal
@@ -16,8 +17,6 @@ from hilcal.config import CellConfig, load_config
 from hilcal.config.reference import cell_text
 from hilcal.config.sections import GEOMETRY, LOADED
 from hilcal.design.nominal_model import check_effects
-from hilcal.doctor.computer import Finding, computer, program
-from hilcal.doctor.ports import adapters, reachable, serial_ports
 from hilcal.drivers.ur_link.supervision import services
 from hilcal.effects.catalogue import installed
 from hilcal.errors import DeviceError, HilcalError, InputError, StoppedError
@@ -161,17 +160,6 @@ def drivers(group: str) -> list[str]:
     return sorted({point.name for point in entry_points(group=group)})
 
 
-def ports() -> list[str]:
-    """Return the serial ports of this computer, by persistent names where they have one."""
-    from serial.tools import list_ports  # takes a while
-
-    port_names = [p.device for p in list_ports.comports()]
-    folder = Path("/dev/serial/by-id")
-    links = sorted(folder.iterdir()) if folder.is_dir() else []
-    named = {str(p.resolve()): str(p) for p in links}
-    return [named.get(device, device) for device in port_names]
-
-
 @dataclass(frozen=True, slots=True)
 class CellQuestion:
     """A question about the cell."""
@@ -285,7 +273,6 @@ def init(
 
 
 def _lacking(draft: Draft) -> str:
-    """Return a clause with the keys that the cell lacks for measuring."""
     connection = "host" if "host" in draft.data.get("tracker", {}) else "port"
     keys = (("robot", "driver"), ("robot", "host"), ("tracker", "driver"), ("tracker", connection))
     missing = [f"[{s}] {key}" for s, key in keys if key not in draft.data.get(s, {})]
@@ -308,7 +295,9 @@ def _ask(t: Terminal, draft: Draft, question: CellQuestion) -> None:
     if question.needs and question.needs not in draft.data:
         return
     if question.parameter.endswith("_port"):
-        t.notice(f"Serial ports here: {', '.join(ports()) or 'none'}.")
+        names = machine.permanent_names()
+        ports = [names.get(path, path) for path in machine.adapters()]
+        t.notice(f"Serial ports here: {', '.join(ports) or 'none'}.")
     prompt = question.text + (f" (Enter: {question.default}):" if question.default else ":")
     while True:
         t.progress.print(prompt, markup=False, highlight=False, style="bold")
@@ -334,7 +323,6 @@ def _shortly(error: InputError) -> str:
 
 
 def _complete(draft: Draft) -> None:
-    """Add the keys that a plan and a rehearsal need, and check the cell."""
     if draft.data.setdefault("planning", {}).setdefault("readings", "absolute") == "absolute":
         loaded = () if not draft.data.get("loads") else LOADED
         draft.set("planning", model=[*GEOMETRY, *loaded])
@@ -350,19 +338,19 @@ def _complete(draft: Draft) -> None:
 def doctor(cell: Path | None = None, folder: Path = Path("."), as_json: bool = False) -> None:
     """Look at packages, ports, permissions, network, clock and disk of this computer."""
     t = terminal(as_json)
-    findings: list[Finding] = []
+    findings: list[machine.Finding] = []
     with working(t.progress) as say:
         say("looking at what is installed")
-        findings += program(hilcal.__version__)
+        findings += machine.program(hilcal.__version__)
         say("looking at clock and disk")
-        findings += computer(folder.absolute())
+        findings += machine.computer(folder.absolute())
         config, of_cell = _cell(cell)
         findings += of_cell
         say("looking at serial ports")
-        findings += serial_ports(_ports(config), adapters())
+        findings += machine.serial_ports(_ports(config), machine.adapters())
         if config is not None and config.robot.driver == "ur" and config.robot.host:
             say(f"connecting to {config.robot.host}")
-            findings += reachable(config.robot.host, services(config))
+            findings += machine.reachable(config.robot.host, services(config))
     t.show(doctor_report(findings))
     failed: HilcalError | None = None
     if any(f.state == "problem" for f in findings):
@@ -370,7 +358,7 @@ def doctor(cell: Path | None = None, folder: Path = Path("."), as_json: bool = F
     t.document({"ok": failed is None, "findings": [asdict(f) for f in findings]}, failed)
 
 
-def _cell(path: Path | None) -> tuple[CellConfig | None, list[Finding]]:
+def _cell(path: Path | None) -> tuple[CellConfig | None, list[machine.Finding]]:
     if path is None:
         return None, []
     try:
@@ -378,12 +366,11 @@ def _cell(path: Path | None) -> tuple[CellConfig | None, list[Finding]]:
         cell_from_config(config, path.absolute().parent)  # its robot's file, too
     except InputError as error:
         mend = "mend the file; hilcal config explains every key"
-        return None, [Finding("cell", str(path), "problem", str(error), mend)]
-    return config, [Finding("cell", str(path), "ok", "can be read")]
+        return None, [machine.Finding("cell", str(path), "problem", str(error), mend)]
+    return config, [machine.Finding("cell", str(path), "ok", "can be read")]
 
 
 def _ports(config: CellConfig | None) -> dict[str, str]:
-    """Return the serial ports of a cell by device."""
     if config is None:
         return {}
     ports = {"tracker": config.tracker.port}

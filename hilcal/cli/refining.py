@@ -1,32 +1,20 @@
-"""`diagnose`, `add`, `remove`, `refine`, `discover`: which effect is missing."""
+"""`compare`, `validate`, `diagnose`, `add`, `remove`, `refine`, `discover`: what a model lacks."""
 
 import itertools
 from collections.abc import Iterable, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from hilcal import numbers
 from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.changes import add_effect, remove_effect
-from hilcal.cli.fitting import (
-    NO_PRIOR,
-    PriorOptions,
-    check_options,
-    check_record,
-    finish,
-    fit_of,
-    mode_of_option,
-    options_json,
-    options_line,
-    record_story,
-    starting_model,
-    stored_fit,
-    wanted_effects,
-)
+from hilcal.cli import fitting
 from hilcal.cli.options import catalogue_with, check_folder, command
 from hilcal.cli.showing import followed
-from hilcal.cli.terminal import terminal
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.diagnosis.document import suspect_json, to_json
+from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.diagnosis.verdict import NOTHING
 from hilcal.diagnosis.verdict import diagnose as judge
@@ -37,28 +25,21 @@ from hilcal.effects.check import NAME
 from hilcal.effects.options import Options
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.effects.written import read_effects_text, write_effect
-from hilcal.errors import CannotAnswerError, InputError
+from hilcal.errors import CannotAnswerError, HilcalError, InputError, LimitError
 from hilcal.identification.background import background_of
 from hilcal.identification.baseline import masses_note
-from hilcal.identification.fit import fit
+from hilcal.identification.fit import all_left_out, fit
 from hilcal.identification.fit_document import frames_to_json, prior_to_json
+from hilcal.identification.full_prediction import full_prediction
+from hilcal.identification.linearisation import linearise
 from hilcal.identification.misdescription import other_arm_of
 from hilcal.identification.torques import check_torques
 from hilcal.names import quoted
-from hilcal.present.diagnosis import (
-    addition_lines,
-    curves,
-    diagnosis_report,
-    discovery_report,
-    fell,
-    key,
-    refined_laws,
-    revisions_table,
-    rose,
-    silence,
-    verdict_line,
-)
-from hilcal.present.document import Block
+from hilcal.present import diagnosis as words
+from hilcal.present import fit as fit_words
+from hilcal.present.calibration import opening, shares_report, validation_failure, validation_report
+from hilcal.present.comparison import comparison_json, comparison_report, next_command
+from hilcal.present.document import Block, heading
 from hilcal.present.fit import follows, model_name, prior_lines, set_aside
 from hilcal.present.progress import working
 from hilcal.present.registration import covariance_words, fitted_lines, other_arm_line, torque_lines
@@ -68,24 +49,22 @@ from hilcal.refinement import RefinementStep as RefinementStep
 from hilcal.refinement import refine as refine_model
 from hilcal.store.procedure_log import refuse_fitting
 from hilcal.store.revision import change
+from hilcal.tables.units import parse_length
+from hilcal.transfer.compare import compare as compare_campaigns
+from hilcal.validation import validate as validate_campaign
 from hilcal.whole_file import replace_file
 
 
 def chapters_of(numbers: Iterable[int], steps: Iterable[RefinementStep]) -> list[Chapter]:
     """Return the steps of a refinement as chapters with the numbers of their revisions."""
-    return [
-        Chapter(number, s.added, s.fit, s.diagnosis, s.removed)
-        for number, s in zip(numbers, steps, strict=True)
-    ]
+    pairs = zip(numbers, steps, strict=True)
+    return [Chapter(n, s.added, s.fit, s.diagnosis, s.removed) for n, s in pairs]
 
 
 def errors_by_revision(chapters: Sequence[Chapter], stored: str = "") -> list[Block]:
-    """Return the table of errors by revision, and the key of its columns.
-
-    `stored` is the verdict of a chapter without a diagnosis.
-    """
+    """Return the errors by revision, with the verdict `stored` where it has none, and their key."""
     rows = [(c.number, changed(c), c.fit, _verdict(c, stored)) for c in chapters]
-    return [revisions_table(rows), key(chapters[-1].fit.readings)]
+    return [words.revisions_table(rows), words.key(chapters[-1].fit.readings)]
 
 
 def changed(c: Chapter) -> str:
@@ -105,12 +84,12 @@ def diagnose(
     """Say which effect the model lacks."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
-        number, fitted = fit_of(t, o, say, revision)
+        number, fitted = fitting.fit_of(t, o, say, revision)
         o.require_gc(number, fitted.scaling, "diagnosing")
         say("diagnosing" if number is None else f"diagnosing revision {number}")
         d = judge(fitted, o.history(number), say)
-        finish(fitted, say)
-    t.show(diagnosis_report(d))
+        fitting.finish(fitted, say)
+    t.show(words.diagnosis_report(d))
     t.show(torque_lines(check_torques(fitted.model.cell, fitted.readings)))
     t.document({"revision": number, **to_json(d)})
 
@@ -123,12 +102,12 @@ def add(
     view: bool = False, effects_from: list[Path] | None = None, as_json: bool = False,
 ) -> None:  # fmt: skip
     """Add an effect to the model: error before and after."""
-    catalogue = catalogue_with(effects_from)
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     effects = read_effects_text(effect, "EFFECT", catalogue)
     if len(effects) != 1:
         raise InputError(f"EFFECT {effect!r} has {len(effects)} effects; valid: one")
     ((name, options),) = effects.items()
-    _change(run, revision, name, record, view, as_json, catalogue, options)
+    _change(t, run, revision, name, record, view, catalogue, options)
 
 
 @command("""
@@ -139,28 +118,28 @@ def remove(
     view: bool = False, effects_from: list[Path] | None = None, as_json: bool = False,
 ) -> None:  # fmt: skip
     """Take an effect out of the model: error before and after."""
-    catalogue = catalogue_with(effects_from)
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     catalogue[effect]  # an unknown name is refused
-    _change(run, revision, effect, record, view, as_json, catalogue)
+    _change(t, run, revision, effect, record, view, catalogue, None)
 
 
 def _change(
+    t: Terminal,
     run: Path,
     revision: int | None,
     effect: str,
     record: Path | None,
     view: bool,
-    as_json: bool,
     catalogue: Catalogue,
-    options: Options | None = None,
+    options: Options | None,
 ) -> None:
     """Make a revision with an additional effect; without `options`, with the effect removed."""
-    t, adds = terminal(as_json), options is not None
-    check_record(record)
+    adds = options is not None
+    fitting.check_record(record)
     with Campaign.open(run, catalogue) as o, followed(t, view, run) as live:
-        check_options(o, {effect: options or {}} if adds else {})
+        fitting.check_options(o, {effect: options or {}} if adds else {})
         with working(t.progress) as say:
-            number, previous = stored_fit(t, o, say, revision)
+            number, previous = fitting.stored_fit(t, o, say, revision)
             if live is not None:
                 for chapter in o.chapters(say, number):
                     live.revised(chapter)
@@ -176,13 +155,13 @@ def _change(
         pair = [Chapter(number, old.added, previous, None, old.removed), new]
         t.show(errors_by_revision(pair, verdict))
         named = write_effect(effect, options or {})
-        t.show(fell(previous, c.fit, named) if adds else rose(previous, c.fit, effect))
-        t.show([] if c.expected is None else addition_lines(c.expected))
-        t.show(["", verdict_line(d)])
+        t.show(words.fell(previous, c.fit, named) if adds else words.rose(previous, c.fit, effect))
+        t.show([] if c.expected is None else words.addition_lines(c.expected))
+        t.show(["", words.verdict_line(d)])
         if record is not None:
             with working(t.progress) as say:
                 chapters = o.chapters(say, c.number)
-            record_story(t, chapters, record)
+            fitting.record_story(t, chapters, record)
     t.document(
         revisions=revisions_json(pair, verdict),
         verdict=d.verdict,
@@ -203,14 +182,15 @@ def _change(
     """)
 def refine(
     run: Path, effects: str | None = None, readings: str | None = None, from_latest: bool = False,
-    revision: int | None = None, prior: PriorOptions = NO_PRIOR, discover: bool = False,
-    background: bool = True, record: Path | None = None, view: bool = False, details: bool = False,
-    effects_from: list[Path] | None = None, as_json: bool = False,
+    revision: int | None = None, prior: fitting.PriorOptions = fitting.NO_PRIOR,
+    discover: bool = False, background: bool = True, record: Path | None = None,
+    view: bool = False, details: bool = False, effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:  # fmt: skip
     """Diagnose and add until the model is adequate."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
-    named = wanted_effects(effects, catalogue)
-    check_record(record)
+    named = fitting.wanted_effects(effects, catalogue)
+    fitting.check_record(record)
     start = "--revision" if revision is not None else "--from-latest" if from_latest else ""
     stated = named is not None or readings is not None or prior.prior is not None
     if start and (stated or (from_latest and revision)):
@@ -222,8 +202,8 @@ def refine(
         latest = o.latest() if from_latest else None if not start else o.in_use(revision)
         if start and latest is None:
             raise InputError(f"{run}: no revision yet; leave out {start}")
-        mode = mode_of_option(o, readings)
-        check_options(o, named or {})
+        mode = fitting.mode_of_option(o, readings)
+        fitting.check_options(o, named or {})
         with working(t.progress) as say:
             if latest is not None:
                 say(f"restoring revision {latest.number}")
@@ -231,7 +211,7 @@ def refine(
                 model, fitted = restored.model, restored.readings
             else:
                 say("registering")
-                model, fitted = starting_model(o, mode, named, carried), o.readings
+                model, fitted = fitting.starting_model(o, mode, named, carried), o.readings
             history = NOTHING if latest is None else o.history(latest.number)
             origin = () if latest is None else (latest.number,)
             numbers_to_be = itertools.chain(origin, itertools.count(len(o.file.revisions()) + 1))
@@ -244,20 +224,18 @@ def refine(
             if laws is not None:
                 laws.write(refinement.names)
             for step in refinement.steps:
-                finish(step.fit, say)
-            records = [
-                o.record(s.fit, s.diagnosis, s.added, s.removed)
-                for s in refinement.steps[len(origin) :]
-            ]
+                fitting.finish(step.fit, say)
+            new = refinement.steps[len(origin) :]
+            records = [o.record(s.fit, s.diagnosis, s.added, s.removed) for s in new]
             n_revisions = len(o.file.revisions())
             numbered = (*origin, *o.append_records(records, *origin))
             chapters = chapters_of(numbered, refinement.steps)
         t.show(errors_by_revision(chapters))
-        t.show(options_line(refinement.fit))
+        t.show(fitting.options_line(refinement.fit))
         if o.noise is not None:
             t.show(numbers.sentence(covariance_words(o.covariance_parts, o.noise)))
         t.show(set_aside(refinement.fit, details))
-        t.show(verdict_line(refinement.diagnosis))
+        t.show(words.verdict_line(refinement.diagnosis))
         if numbered[-1] <= n_revisions:
             t.show(f"Revision {numbered[-1]} is this model already; nothing was stored.")
         t.show([*fitted_lines(refinement.fit)][: None if details else 1])
@@ -267,20 +245,17 @@ def refine(
             t.show(other_arm_line(other_arm))
         if note := masses_note(refinement.fit):
             t.show(numbers.sentence(note))
-        if refinement.rejected:
-            t.show(
-                f"Tried and left out, since the error on poses left out did not fall: "
-                f"{', '.join(refinement.rejected)}."
-            )
+        if names := ", ".join(refinement.rejected):
+            t.show(f"Tried and left out, since the error on poses left out did not fall: {names}.")
         if laws is not None:
-            t.show(refined_laws(laws))
+            t.show(words.refined_laws(laws))
         diagnosis = refinement.diagnosis
         if diagnosis.verdict != "adequate" and not diagnosis.dependences:
             t.show(follows(diagnosis.misfit_breakdown))
-        t.show([*curves(diagnosis.dependences, len(diagnosis.dependences) if details else 1)])
+        t.show([*words.curves(diagnosis.dependences, len(diagnosis.dependences) if details else 1)])
         if live is not None:  # its verdict may have changed when further effects were tried
             live.revised(chapters[-1])
-        record_story(t, chapters, record)
+        fitting.record_story(t, chapters, record)
     t.document(
         revisions=revisions_json(chapters),
         verdict=diagnosis.verdict,
@@ -301,7 +276,7 @@ def revisions_json(chapters: Iterable[Chapter], stored: str = "") -> list[dict[s
         {
             "revision": r.number,
             "model": list(r.fit.model.named),
-            "options": options_json(r.fit),
+            "options": fitting.options_json(r.fit),
             "added": r.added,
             "removed": r.removed,
             "readings": r.fit.mode,
@@ -340,17 +315,17 @@ def discover(
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         number: int | None = None
         if effects is None:
-            number, fitted = fit_of(t, o, say, revision)
+            number, fitted = fitting.fit_of(t, o, say, revision)
         else:
-            check_options(o, effects)
-            model = starting_model(o, o.mode(), effects or None)
+            fitting.check_options(o, effects)
+            model = fitting.starting_model(o, o.mode(), effects or None)
             say(f"fitting {model_name(model.named)}")
             fitted = with_serial_noise(fit(model, o.readings, o.mode()))
         d = search(fitted, say, name)
     document = {"revision": number, **discovery_json(d), "written": None}
-    t.show(discovery_report(d))
+    t.show(words.discovery_report(d))
     if not d.laws:
-        t.document(document, CannotAnswerError(silence(d)))
+        t.document(document, CannotAnswerError(words.silence(d)))
     rivals = rival_sources(d) if alternatives else {}
     written = {name: d.source, **rivals}
     places = {effect: output.with_name(f"{effect}.py") for effect in written}
@@ -378,9 +353,131 @@ def _effects_against(
     if model == "baseline":
         return {}
     if model is None or not model.endswith(".json"):
-        return wanted_effects(model, catalogue)
+        return fitting.wanted_effects(model, catalogue)
     return {
         e.name: {key: value for key, value in e.options.items() if not key.startswith("prior_")}
         for e in Calibration.load(model, catalogue).model.effects
         if e.role not in FRAME_ROLES
     }
+
+
+@command("""
+    later | [LATER.hilcal] | A later campaign of the same arm, of 15 readings or more: what has
+        changed?
+    same_setup | --same-setup | With LATER: tracker and base stand as they did; else the tracker's
+        place is estimated from the later readings.
+    """)
+def compare(
+    run: Path, later: Path | None = None, same_setup: bool = False, revision: int | None = None,
+    effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
+    """Show where the model fails; with a later campaign, what has changed on the arm."""
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    if later is None:
+        if same_setup:
+            raise InputError("--same-setup goes with a later campaign: compare A.hilcal B.hilcal")
+        _show_misfit(t, run, revision, catalogue)
+        return
+    with (
+        Campaign.open(run, catalogue, read_only=True) as o,
+        Campaign.open(later, catalogue, read_only=True) as later_run,
+        working(t.progress) as say,
+    ):
+        if o.in_use(revision) is None:
+            t.notice(f"{run}: no revision yet, taking the baseline; hilcal refine makes a model")
+        comparison = compare_campaigns(
+            o, later_run, revision, same_setup=same_setup or None, say=say
+        )
+    name = model_name(fitting.titles(comparison.fit.model, comparison.fit.readings))
+    t.show(heading(f"{run.name}: {fitting.called(comparison.number)} ({name})"))
+    t.show(comparison_report(comparison, run.name, later.name))
+    command = next_command(comparison, str(run), str(later))
+    if command is not None:
+        t.command(command)
+    t.document(comparison_json(comparison, str(run), str(later)))
+
+
+def _show_misfit(t: Terminal, run: Path, revision: int | None, catalogue: Catalogue) -> None:
+    with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
+        number, fitted = fitting.fit_of(t, o, say, revision)
+        o.require_gc(number, fitted.scaling, "comparing")
+        say("looking where it fails")
+        places = misfit_breakdown(linearise(fitted))
+        fitting.finish(fitted, say)
+        e, left_out = full_prediction(fitted), bool(fitted.model.background)
+        if left_out:  # a background follows the fitted poses more closely than others
+            raw, w = all_left_out(fitted)
+            e = replace(e, raw=raw, whitening=w)
+        worst = fit_words.worst_poses(e)
+    name = model_name(fitting.titles(fitted.model, fitted.readings))
+    t.show(heading(f"{fitting.called(number)}: {name}"))
+    t.show([fit_words.misses(fitted), follows(places), "", fit_words.errors(fitted), ""])
+    t.show([*fit_words.where_table(places), ""])
+    t.show(fit_words.worst_table(worst, left_out))
+    t.document(
+        revision=number,
+        model=list(fitted.model.named),
+        readings=fitted.mode,
+        error={"fit": fitted.error.to_json(), "holdout": fitted.holdout.to_json()},
+        variance_factor=fitted.variance_factor,
+        variance_factor_interval=list(fitted.variance_factor_interval),
+        noise_floor_m=e.noise_floor,
+        where=[{"variable": p.variable, "share": p.share, "p_value": p.p_value} for p in places],
+        worst=[asdict(w) for w in worst],
+    )
+
+
+OVER = 5.0  # RMS error, in units of the noise, above which a moved tracker is suspected; a guess
+
+
+@command("""
+    other | OTHER.hilcal | A campaign that was never fitted.
+    register | --register | The tracker was set up anew: fit its place first.
+    limit | --limit LENGTH | The largest 3-D position error allowed, e.g. "0.1 mm"; exit 5 where it
+        is not kept.
+    """)
+def validate(
+    run: Path, other: Path, register: bool = False, limit: str | None = None,
+    revision: int | None = None, effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
+    """Predict readings of another campaign with the model."""
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    limit_m = None if limit is None else parse_length(limit, "--limit")
+    with (
+        Campaign.open(run, catalogue, read_only=True) as o,
+        Campaign.open(other, read_only=True) as unseen,
+        working(t.progress) as say,
+    ):
+        record = fitting.record_of(t, o, say, revision)
+        result = validate_campaign(o, unseen, record, limit_m, register=register, say=say)
+        name = model_name(fitting.titles(result.model, o.fitted_readings(record)))
+    judged, prediction, shares = result.judged, result.prediction, result.shares
+    t.show(heading(f"{fitting.called(judged.number)}: {name}"))
+    t.show(opening(judged, prediction))
+    t.show(validation_report(judged, prediction, result.beyond))
+    t.show(shares_report(shares))
+    if prediction.error.rms_sigma > OVER and not register:
+        t.show(
+            "Was the tracker set up anew for these readings? Then --register fits its place first."
+        )
+    failed: HilcalError | None = None
+    if shares.passed is False:
+        failure = validation_failure(shares, judged)
+        failed = CannotAnswerError(failure) if shares.undecided else LimitError(failure)
+    t.document(
+        None,
+        failed,
+        revision=judged.number,
+        model=list(result.model.named),
+        readings=judged.mode,
+        registered=register,
+        n_readings=judged.readings,
+        n_fitted=judged.fitted,
+        never_fitted=judged.unseen,
+        n_measurements=len(prediction.raw),
+        error=prediction.error.to_json(),
+        variance_factor=prediction.variance_factor,
+        noise_floor_m=prediction.noise_floor,
+        **result.beyond.to_dict(),
+        **shares.to_dict(),
+    )

@@ -16,13 +16,7 @@ import numpy as np
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.options import POSES, catalogue_with, check_seed, command
-from hilcal.cli.planning import (
-    answer_json,
-    dry_checked,
-    make_plan,
-    read_cell,
-    refuse_unready,
-)
+from hilcal.cli.planning import answer_json, dry_checked, make_plan, read_cell, refuse_unready
 from hilcal.cli.showing import followed
 from hilcal.cli.terminal import Terminal, agreed, handled, somebody_there, terminal, told_to_end
 from hilcal.config import CellConfig
@@ -51,14 +45,7 @@ from hilcal.errors import (
 )
 from hilcal.identification.full_covariance import full_readings
 from hilcal.identification.noise_estimate import NOISE, measured_noise
-from hilcal.measuring.connect import (
-    ConnectionResult,
-    Rig,
-    connect,
-    nominal_arm,
-    told_by,
-    with_kinematics,
-)
+from hilcal.measuring import connect
 from hilcal.measuring.devices import Clock
 from hilcal.measuring.route import dry_run
 from hilcal.measuring.run import HOW_ON
@@ -220,10 +207,7 @@ def measure(
     epoch: float | None = None,
     viewer: LiveViewer | None = None,
 ) -> int:
-    """Measure the missing readings of a campaign; return the number that it then holds.
-
-    Measuring ends when `goal` is met. `epoch` is the wall time at zero of the campaign's time, s.
-    """
+    """Measure what a campaign lacks, until a goal is met; `epoch` is the wall time at zero, s."""
     log = RunLog(campaign)
     stored = log.readings()
     if goal is not None and stored is not None and goal(stored, last=True).met:
@@ -233,11 +217,11 @@ def measure(
     with _ends_as_interrupt(t), ExitStack() as stack:
         with working(t.progress) as say:
             say("connecting to every device")
-            rig, answers = connect(config)
+            rig, answers = connect.connect(config)
             if rig is not None:
                 stack.callback(rig.close)
                 answers = tuple(_sighted(rig, answer, say) for answer in answers)
-        answers = with_kinematics(answers, cell)
+        answers = connect.with_kinematics(answers, cell)
         refuse_unready(answers)
         assert rig is not None  # noqa: S101  (refuse_unready has raised otherwise)
         if viewer is not None:
@@ -262,7 +246,9 @@ def estimate_noise(t: Terminal, config: CellConfig, cell: Cell, campaign: Campai
         log.event(NOISE, {"factors": None})
 
 
-def _sighted(rig: Rig, answer: ConnectionResult, say: Say) -> ConnectionResult:
+def _sighted(
+    rig: connect.Rig, answer: connect.ConnectionResult, say: Say
+) -> connect.ConnectionResult:
     """Let a tracker that has lost its target search for it; the arm does not move."""
     if answer.device != "tracker" or not answer.problems:
         return answer
@@ -308,14 +294,8 @@ class RehearsalSettings:
     seed: int
     output: Path
     base_dir: Path  # directory that paths in the configuration are relative to
-    catalogue: Catalogue
-    lacking: Catalogue | None = None
-    """The catalogue with the hidden law, where the models do not have it."""
-
-    @property
-    def world(self) -> Catalogue:
-        """The effects that can be hidden."""
-        return self.catalogue if self.lacking is None else self.lacking
+    catalogue: Catalogue  # the effects of models
+    world: Catalogue  # the effects that can be hidden
 
     def case(self, plan: Plan) -> SimulationCase:
         """Hide the choice in the simulated cell; see `case_of_plan`."""
@@ -327,16 +307,12 @@ class RehearsedCampaign:
     """A first campaign, in a simulated cell that can measure again."""
 
     rehearsal: Rehearsal  # the cell, and all readings
-    further: Callable[[Plan], Rehearsal]
-    """Measures one further plan into the same campaign; returns all readings."""
+    further: Callable[[Plan], Rehearsal]  # measures one more plan into it; returns all readings
     measure: Measure  # measures the missing readings of another campaign in the same cell
 
 
 def first_plan(settings: RehearsalSettings, config: CellConfig, poses: int, say: Say) -> Plan:
-    """Plan a campaign without knowledge of the hidden effect.
-
-    `config` may have only some of the loads of the settings.
-    """
+    """Plan a campaign without knowledge of the hidden effect, in a cell that may lack loads."""
     config = as_told(config, settings.choice, settings.world)
     cell = cell_from_config(config, settings.base_dir)
     plan = make_plan(cell, config, poses, settings.seed, settings.catalogue, say)
@@ -346,10 +322,7 @@ def first_plan(settings: RehearsalSettings, config: CellConfig, poses: int, say:
 
 @contextmanager
 def on_devices(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator[RehearsedCampaign]:
-    """Run a plan on simulated devices, which run until the block ends.
-
-    The real drivers talk to simulated devices of one world; each device is a process.
-    """
+    """Run a plan by the real drivers on simulated devices, processes that end with the block."""
     with ExitStack() as stack:
         with working(t.progress) as say:
             secret = settings.case(plan)
@@ -361,11 +334,10 @@ def on_devices(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator
         )
 
         def missing(file: CampaignFile, epoch: float | None = None) -> None:
-            to_the_end(
-                t,
-                lambda: measure(t, world.config, secret.cell, file, epoch=epoch),
-                lambda: file.n_readings,
-            )
+            def work() -> None:
+                measure(t, world.config, secret.cell, file, epoch=epoch)
+
+            to_the_end(t, work, lambda: file.n_readings)
 
         def measured() -> Rehearsal:
             missing(campaign)
@@ -383,10 +355,7 @@ def on_devices(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator
 
 @contextmanager
 def in_process(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator[RehearsedCampaign]:
-    """Draw the readings of a plan from the simulated world, without devices.
-
-    The readings are stored pose by pose, like those of a real campaign.
-    """
+    """Draw the readings of a plan in the simulated world; they are stored pose by pose."""
     with working(t.progress):
         secret = settings.case(plan)
     source = "rehearsal in a simulated cell, without devices"
@@ -395,19 +364,22 @@ def in_process(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator
         settings.output, text, str(settings.base_dir), source, overwrite=True, more={COVERS: WHOLE}
     ) as campaign:
 
+        def last_time() -> float:
+            time = campaign.readings().states.time
+            return 0.0 if time is None else float(time.max())
+
         def measured(part: Plan, number: int, start: float) -> Rehearsal:
             r = read_plan(secret, part, [settings.seed, number], start)
             _write(t, campaign, r.readings)
             return secret.measured(campaign.readings())
 
         def further(next_plan: Plan) -> Rehearsal:
-            last = last_time(campaign.readings())
-            return measured(with_new_names(next_plan, plan, 2), 2, last + BREAK)
+            return measured(with_new_names(next_plan, plan, 2), 2, last_time() + BREAK)
 
         def missing(file: CampaignFile, epoch: float | None = None) -> None:
             # Campaigns are told apart by the number of letters appended to the first one's name.
             log, number = RunLog(file), 3 + len(file.path.stem) - len(settings.output.stem)
-            start = last_time(campaign.readings()) + number * BREAK
+            start = last_time() + number * BREAK
             drawn = read_plan(secret, log.plan, [settings.seed, number], start).readings
             for k, step in enumerate(log.plan.steps):
                 log.record(drawn[slice(k, k + 1)], step, {"drawn": True})
@@ -415,23 +387,17 @@ def in_process(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator
         yield RehearsedCampaign(measured(plan, 1, 0.0), further, missing)
 
 
-def last_time(readings: Readings) -> float:
-    """Return the time of the last reading, s; 0 where times are unknown."""
-    time = readings.states.time
-    return 0.0 if time is None else float(time.max())
-
-
 def to_the_end(t: Terminal, work: Callable[[], object], count: Callable[[], int]) -> None:
     """Measure the missing readings by `work`; try again after a device failure.
 
     On a busy computer a simulated device may stall, which a driver takes for a failure. At most
-    `TRIES` - 1 failures in a row without a new reading are accepted. `count` returns the number of
-    readings.
+    `TRIES` - 1 failures in a row without a new reading, which `count` counts, are accepted.
     """
     tries, stored = TRIES, count()
     while True:
         try:
             work()
+            return
         except DeviceError as error:
             current = count()
             tries, stored = (TRIES if current > stored else tries) - 1, current
@@ -439,12 +405,9 @@ def to_the_end(t: Terminal, work: Callable[[], object], count: Callable[[], int]
                 raise
             t.notice(f"note: {error}")
             t.notice("going on with what is missing")
-        else:
-            return
 
 
 def _write(t: Terminal, campaign: CampaignFile, readings: Readings) -> None:
-    """Append readings in their order, pose by pose."""
     starts = [0, *(np.flatnonzero(np.diff(readings.pose)) + 1).tolist(), len(readings)]
     with counting(t.progress, "measuring poses", len(starts) - 1) as advance:
         for begin, end in pairwise(starts):
@@ -452,8 +415,7 @@ def _write(t: Terminal, campaign: CampaignFile, readings: Readings) -> None:
             advance(1)
 
 
-NEXT_SEED = 1000
-"""Distance between the seeds of two starts: devices use the seed and the next few numbers."""
+NEXT_SEED = 1000  # Between the seeds of two starts: devices use the seed and the next few numbers
 
 
 @contextmanager
@@ -499,8 +461,7 @@ def simulate(
     if clock is not None:
         if not 1.0 <= clock <= FASTEST:
             raise InputError(f"--clock {clock:g}; valid: a number from 1 to {FASTEST:g}")
-        simulation = config.simulation.model_copy(update={"clock": clock})
-        config = config.model_copy(update={"simulation": simulation})
+        config = config.with_keys("simulation", clock=clock)
     base_dir = cell.absolute().parent
     choice = hide or config.simulation.hide or NOTHING
     as_told(config, choice, catalogue)  # refuses an effect that cannot be hidden, before planning
@@ -536,21 +497,16 @@ def simulate(
 
 def with_person(config: CellConfig) -> CellConfig:
     """Return the configuration of a simulated cell whose loads a person changes."""
-    options = {**config.operator.options, "person": True}
-    operator = config.operator.model_copy(update={"options": options})
-    return config.model_copy(update={"operator": operator})
+    return config.with_keys("operator", options={**config.operator.options, "person": True})
 
 
 def _placed(config: CellConfig, base_dir: Path) -> CellConfig:
-    """Return the configuration with absolute paths of the robot's files."""
     paths = {"model": config.robot.model, "calibration": config.robot.calibration or ""}
     files = {k: str((base_dir / v).absolute()) for k, v in paths.items() if Path(v).suffix}
-    robot = config.robot.model_copy(update=files)
-    return config.model_copy(update={"robot": robot})
+    return config.with_keys("robot", **files)
 
 
-FACTORY_POSES = 20
-"""Poses without a load; a choice: with 12, an encoder offset of 1 mrad may stay in doubt."""
+FACTORY_POSES = 20  # Without a load; a choice: with 12, an encoder offset of 1 mrad may be in doubt
 
 
 def factory_check(
@@ -558,12 +514,12 @@ def factory_check(
     config: CellConfig,
     cell: Cell,
     catalogue: Catalogue,
-    answers: tuple[ConnectionResult, ...],
+    answers: tuple[connect.ConnectionResult, ...],
     output: Path,
     yes: bool,
 ) -> dict[str, object]:
     """Compare the arm with its factory kinematics on a campaign; measure it unless it exists."""
-    factory = told_by(answers) or cell.factory
+    factory = connect.told_by(answers) or cell.factory
     if factory is None:
         raise InputError(
             "--factory: the arm's controller does not tell its kinematics; give [robot] calibration"
@@ -572,7 +528,9 @@ def factory_check(
         _measure_without_loads(t, config, cell, catalogue, output, yes)
     with Campaign.open(output, catalogue, read_only=True) as run, working(t.progress) as say:
         say("fitting all effects from the factory's kinematics")
-        checked = check_factory(run.cell, nominal_arm(run.cell), factory, run.readings, catalogue)
+        checked = check_factory(
+            run.cell, connect.nominal_arm(run.cell), factory, run.readings, catalogue
+        )
     t.show(factory_words(checked))
     return {**asdict(checked), "campaign": str(output)}
 
@@ -580,8 +538,8 @@ def factory_check(
 def _measure_without_loads(
     t: Terminal, config: CellConfig, cell: Cell, catalogue: Catalogue, output: Path, yes: bool
 ) -> None:
-    planning = config.planning.model_copy(update={"readings": "absolute"})
-    bare = config.model_copy(update={"loads": (), "planning": planning, "force_sensor": None})
+    bare = config.with_keys("planning", readings="absolute")
+    bare = bare.model_copy(update={"loads": (), "force_sensor": None})
     numbers = cell_from_config(bare, cell.base_dir)
     with working(t.progress) as say:
         plan = make_plan(numbers, bare, FACTORY_POSES, config.simulation.seed, catalogue, say)

@@ -117,10 +117,7 @@ def _end_of_process() -> threading.Timer:
 
 @contextmanager
 def followed(t: Terminal, requested: bool, run: Path) -> Iterator[LiveViewer | None]:
-    """Start a live viewer for the block if requested; yields None otherwise.
-
-    Its recording is written next to the campaign.
-    """
+    """Start a live viewer for the block if requested; it records beside the campaign."""
     if not requested:
         yield None
         return
@@ -198,13 +195,12 @@ def workbench(
 def _import(
     t: Terminal, table: Path, config: Path, run: Path, kind: str, second: Path | None
 ) -> None:
-    """Make the campaign file of a table; refuse to replace a file."""
     if run.exists():
         raise InputError(
             f"{run}: the file exists, and is left as it is; open it with hilcal workbench "
             f"{quoted(run)}, or name another one for the table with -o"
         )
-    from hilcal.import_campaign import import_campaign
+    from hilcal.library import import_campaign
 
     with working(t.progress) as say:
         imported = import_campaign(table, config, run, kind, second, say=say)

@@ -55,10 +55,7 @@ class Terminal:
         /,
         **keys: object,
     ) -> None:
-        """Print the JSON document, with --json.
-
-        The error `failed` becomes the part "error" of the document, and is raised after printing.
-        """
+        """Print the JSON document, with --json; then raise `failed`, which is its part "error"."""
         document = {**(content or {}), **keys}
         if failed is not None:
             document |= error_document(failed, failed.exit_code)
@@ -101,10 +98,7 @@ def somebody_there(t: Terminal) -> bool:
 
 
 def agreed(t: Terminal, question: str) -> bool:
-    """Ask until the answer is yes or no; the end of the input is no.
-
-    Input that was typed before the question is dropped.
-    """
+    """Ask until what is typed after the question is yes or no; the end of the input is no."""
     with contextlib.suppress(termios.error, OSError, ValueError):
         termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
     while True:
@@ -116,10 +110,8 @@ def agreed(t: Terminal, question: str) -> bool:
             t.notice("")
             return False
         answer = answer.strip().lower()
-        if answer in YES:
-            return True
-        if answer in NO:
-            return False
+        if answer in (*YES, *NO):
+            return answer in YES
         t.notice(f"{answer!r} is no answer. Type y or n, and press Enter.")
 
 

@@ -4,7 +4,6 @@ from hilcal.config.cell import STANDARD_GRAVITY_M_S2 as STANDARD_GRAVITY_M_S2
 from hilcal.config.cell import CellConfig as CellConfig
 from hilcal.config.cell import Repeatability as Repeatability
 from hilcal.config.cell import Robot as Robot
-from hilcal.config.cell import Simulation as Simulation
 from hilcal.config.cell import Target as Target
 from hilcal.config.cell import Tool as Tool
 from hilcal.config.cell import Tracker as Tracker
@@ -16,5 +15,3 @@ from hilcal.config.sections import Limits as Limits
 from hilcal.config.sections import Motion as Motion
 from hilcal.config.sections import Obstacle as Obstacle
 from hilcal.config.sections import Operator as Operator
-from hilcal.config.sections import Planning as Planning
-from hilcal.config.sections import Sight as Sight

@@ -1,36 +1,36 @@
-"""CELL.toml as a whole, and the sections that describe the cell."""
+"""CELL.toml as a whole, the sections that describe the cell, and changes after its readings.
 
+A change is a new value of a key of CELL.toml, and is checked like CELL.toml. Keys that determine
+the stored readings and wrenches (the robot, the loads, the frame of the positions, ...) cannot be
+changed: they need a new import or measurement.
+"""
+
+import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, Strict, model_validator
 
-from hilcal.config.sections import (
-    Acquire,
-    CellLoad,
-    CellSection,
-    Conventions,
-    ForceSensor,
-    Gauge,
-    Limits,
-    Motion,
-    Obstacle,
-    Operator,
-    Planning,
-    Point,
-    Sight,
-    Whole,
-    check_distinct,
-)
+from hilcal.config import sections
 from hilcal.errors import InputError
-from hilcal.toml import NonNegative, Positive, Vector3, check_json, load_section, suggest
+from hilcal.toml import (
+    NonNegative,
+    Positive,
+    Vector3,
+    check_json,
+    check_section,
+    load_section,
+    section_of,
+    suggest,
+)
 from hilcal.types import Floats
 
 STANDARD_GRAVITY_M_S2 = 9.80665
 
 
-class Robot(Conventions):
+class Robot(sections.Conventions):
     """[robot]: which arm, how its controller counts the joints, and how it stands in gravity.
 
     model: a catalogue name, e.g. "ur10e", or the path of a .urdf file or of a .toml file with DH
@@ -65,16 +65,12 @@ class Robot(Conventions):
     tip_link: str | None = None
 
     @model_validator(mode="after")
-    def _has_calibration(self) -> "Robot":
+    def _sound(self) -> "Robot":
         if self.kinematics == "factory" and self.calibration is None:
             raise ValueError(
                 'kinematics = "factory" needs calibration = FILE; hilcal check CELL.toml '
                 "--save-calibration FILE writes what the controller holds"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _plausible_gravity(self) -> "Robot":
         size = float(np.linalg.norm(self.gravity_m_s2))
         if size > 30.0:
             raise ValueError(
@@ -83,7 +79,7 @@ class Robot(Conventions):
         return self
 
 
-class Target(CellSection):
+class Target(sections.CellSection):
     """[[tool.targets]]: one of several targets that the tool carries (flange axes).
 
     name: the name of a target, e.g. "R1" | "R1"
@@ -113,7 +109,7 @@ def _check_target(xyz: tuple[float, ...] | None, rotvec: tuple[float, ...] | Non
         raise ValueError("target_rotvec_rad without target_m; give both or neither")
 
 
-class Tool(CellSection):
+class Tool(sections.CellSection):
     """[tool]: what the flange carries, where the target sits and the load acts (flange axes).
 
     target_m: $VECTOR_M: the target, flange axes; leave it out to have it estimated | [0.06, 0.02,
@@ -134,26 +130,22 @@ class Tool(CellSection):
     com_m: Vector3 = (0.0, 0.0, 0.0)
 
     @model_validator(mode="after")
-    def _metres(self) -> "Tool":
+    def _sound(self) -> "Tool":
         for key in ("load_point_m", "com_m"):
             value = getattr(self, key)
             if max(map(abs, value)) > 5.0:
                 raise ValueError(f"{key} = {list(value)} lies over 5 m off the flange; is it in m?")
         _check_target(self.target_m, self.target_rotvec_rad)
-        return self
-
-    @model_validator(mode="after")
-    def _one_description(self) -> "Tool":
         if self.targets and (self.target_m or self.target_rotvec_rad):
             raise ValueError(
                 "target_m together with [[tool.targets]]; give the offset of each target in its "
                 "own section"
             )
-        check_distinct("tool.targets", self.targets)
+        sections.check_distinct("tool.targets", self.targets)
         return self
 
 
-class Tracker(CellSection):
+class Tracker(sections.CellSection):
     """[tracker]: the frame of the readings, its registration, and the tracker's noise.
 
     The noise of a point at the distance d is sqrt(range² + transverse²) with standard
@@ -184,7 +176,7 @@ class Tracker(CellSection):
 
     driver: str | None = Field(None, min_length=1)
     port: str | None = Field(None, min_length=1)
-    baud: Whole | None = None
+    baud: sections.Whole | None = None
     host: str | None = Field(None, min_length=1)
     options: dict[str, Any] = Field(default_factory=dict)
     frame: Literal["tracker", "base"] = "tracker"
@@ -232,7 +224,7 @@ class Tracker(CellSection):
         return self
 
 
-class Repeatability(CellSection):
+class Repeatability(sections.CellSection):
     """[repeatability]: scatter of the joints from one arrival to the next.
 
     joint_std_rad: one standard deviation in rad, 0 or more, or one per joint | 1e-05
@@ -253,7 +245,7 @@ class Repeatability(CellSection):
         return np.broadcast_to(values, n).copy()
 
 
-class Simulation(CellSection):
+class Simulation(sections.CellSection):
     """[simulation]: what a simulated cell hides.
 
     seed: the seed of the random numbers, a whole number, 0 or more | 4
@@ -271,27 +263,17 @@ class Simulation(CellSection):
     controller_version: str = Field("5.11.6.1010327", pattern=r"^\d+\.\d+\.\d+\.\d+$")
 
 
-class CellConfig(CellSection):
+class CellConfig(sections.CellSection):
     """The whole of CELL.toml.
 
     robot: a section [robot] with model = "ur10e" or the like
-    tool: a section [tool]
-    tracker: a section [tracker]
-    repeatability: a section [repeatability]
     loads: sections [[loads]], one per load
     force_sensor: a section [force_sensor] with driver = "ft300" and port or the like
-    operator: a section [operator]
-    motion: a section [motion]
-    acquire: a section [acquire]
-    limits: a section [limits]
-    planning: a section [planning]
     obstacles: sections [[obstacles]], one per thing that stands in the arm's way
-    sight: a section [sight]
     points: sections [points.NAME], one per point that distances are measured from | { P1 = {
         position_m = [1.2, 0.4, 0.0] } }
     gauges: sections [gauges.NAME], one per dial gauge or plane that is touched | { G1 = { direction
         = [0.0, 0.0, 1.0] } }
-    simulation: a section [simulation]
     ordinary: a section [ordinary]: how many times as large as on other arms an effect is expected,
         by its name, e.g. transmission_error = 0.1 of precise gears | { transmission_error = 0.1 }
     plausible: a section [plausible]: how many times as large as stated an effect may be, by its
@@ -302,29 +284,25 @@ class CellConfig(CellSection):
     tool: Tool = Field(default_factory=Tool)
     tracker: Tracker = Field(default_factory=Tracker)
     repeatability: Repeatability = Field(default_factory=Repeatability)
-    loads: tuple[CellLoad, ...] = ()
-    force_sensor: ForceSensor | None = None
-    operator: Operator = Field(default_factory=Operator)
-    motion: Motion = Field(default_factory=Motion)
-    acquire: Acquire = Field(default_factory=Acquire)
-    limits: Limits = Field(default_factory=Limits)
-    planning: Planning = Field(default_factory=Planning)
-    obstacles: tuple[Obstacle, ...] = ()
-    sight: Sight = Field(default_factory=Sight)
-    points: dict[str, Point] = Field(default_factory=dict)
-    gauges: dict[str, Gauge] = Field(default_factory=dict)
+    loads: tuple[sections.CellLoad, ...] = ()
+    force_sensor: sections.ForceSensor | None = None
+    operator: sections.Operator = Field(default_factory=sections.Operator)
+    motion: sections.Motion = Field(default_factory=sections.Motion)
+    acquire: sections.Acquire = Field(default_factory=sections.Acquire)
+    limits: sections.Limits = Field(default_factory=sections.Limits)
+    planning: sections.Planning = Field(default_factory=sections.Planning)
+    obstacles: tuple[sections.Obstacle, ...] = ()
+    sight: sections.Sight = Field(default_factory=sections.Sight)
+    points: dict[str, sections.Point] = Field(default_factory=dict)
+    gauges: dict[str, sections.Gauge] = Field(default_factory=dict)
     simulation: Simulation = Field(default_factory=Simulation)
     ordinary: dict[str, Positive] = Field(default_factory=dict)
     plausible: dict[str, Positive] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _distinct_names(self) -> "CellConfig":
-        check_distinct("loads", self.loads)
-        check_distinct("obstacles", self.obstacles)
-        return self
-
-    @model_validator(mode="after")
-    def _known_work_load(self) -> "CellConfig":
+    def _consistent(self) -> "CellConfig":
+        sections.check_distinct("loads", self.loads)
+        sections.check_distinct("obstacles", self.obstacles)
         names = ["none", *(load.name for load in self.loads)]
         load = self.planning.work_load
         if load not in names:
@@ -332,14 +310,8 @@ class CellConfig(CellSection):
                 f'[planning] work_load = "{load}" is not in [[loads]]{suggest(load, names)}; '
                 f"valid: {', '.join(names)}"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _one_place_of_the_tracker(self) -> "CellConfig":
-        if self.sight.tracker_m is None:
-            return self
         for key in ("station_m", "base_xyz_m"):
-            if getattr(self.tracker, key) is not None:
+            if self.sight.tracker_m is not None and getattr(self.tracker, key) is not None:
                 raise ValueError(
                     f"[sight] tracker_m together with [tracker] {key}, which tells the tracker's "
                     "place already; leave tracker_m out"
@@ -350,6 +322,10 @@ class CellConfig(CellSection):
     def fitted(self) -> Literal["deflection", "absolute"]:
         """Kind of readings that will be fitted: `[planning] readings`; "absolute" without loads."""
         return self.planning.readings if self.loads else "absolute"
+
+    def with_keys(self, section: str, **values: object) -> "CellConfig":
+        """Return the configuration with other values of a section's keys, which are not checked."""
+        return self.model_copy(update={section: getattr(self, section).model_copy(update=values)})
 
     def to_json(self) -> str:
         """Return the configuration as JSON, defaults included; `from_json` reads it back."""
@@ -364,3 +340,81 @@ class CellConfig(CellSection):
 def load_config(path: Path) -> CellConfig:
     """Read CELL.toml, whose paths are relative to its directory; raises as `load_section` does."""
     return load_section(path, CellConfig)
+
+
+Changes = Mapping[str, Mapping[str, Any]]  # Values by key, by section
+
+INSTRUMENT_NOISE = (
+    *("range_std_m", "range_std_per_m", "transverse_std_m", "transverse_std_per_m"),
+    "orientation_std_rad",
+)
+"""Keys of [tracker]: the noise of a tracker."""
+CHANGEABLE: Mapping[str, tuple[str, ...]] = {
+    "tracker": (*INSTRUMENT_NOISE, "base_xyz_m", "base_rotvec_rad", "station_m"),
+    "repeatability": ("joint_std_rad",),
+    "tool": (*("target_m", "target_rotvec_rad", "targets", "load_point_m"), *("mass_kg", "com_m")),
+}
+"""Keys that can be changed, by section."""
+_WHERE = "the cell"
+
+
+def changed(config: CellConfig, changes: Changes) -> CellConfig:
+    """Return a configuration with changes of keys of `CHANGEABLE`; None removes a key."""
+    if not changes:
+        return config
+    content = config.model_dump(mode="json")
+    for section, keys in changes.items():
+        valid = CHANGEABLE.get(section, ())
+        for key, value in keys.items():
+            if key not in valid:
+                valid_keys = [f"[{s}] {k}" for s, names in CHANGEABLE.items() for k in names]
+                raise InputError(
+                    f"{_WHERE}: [{section}] {key} cannot be changed once there are readings"
+                    f"{suggest(f'[{section}] {key}', valid_keys)}; valid: {', '.join(valid_keys)}"
+                )
+            content[section][key] = value
+    merged = check_section(content, CellConfig, _WHERE)
+    names = [[t.name for t in c.tool.targets] for c in (config, merged)]
+    if names[0] != names[1]:
+        raise InputError(
+            f"{_WHERE}: [tool] targets has other names than the readings; valid: "
+            f"{', '.join(names[0]) or 'no targets'}"
+        )
+    return merged
+
+
+def read_value(section: str, key: str, text: str) -> Any:
+    """Return a value from its text in CELL.toml; an empty text is None."""
+    if not text.strip():
+        return None
+    try:
+        parsed = tomllib.loads(f"{key} = {text}")
+    except (tomllib.TOMLDecodeError, RecursionError, ValueError):
+        parsed = {}
+    if list(parsed) != [key]:
+        must = described(section, key)
+        raise InputError(
+            f"{_WHERE}: [{section}] {key} = {' '.join(text.split())[:60]} is not valid: it must be "
+            f"{must}"
+        )
+    return parsed[key]
+
+
+def described(section: str, key: str) -> str:
+    """Return the description of a key's valid values."""
+    fields = getattr(section_of(CellConfig.model_fields[section]), "model_fields", {})
+    return str(fields[key].description)
+
+
+def write_value(value: Any) -> str:
+    """Return a value as text in CELL.toml; None is "not given"."""
+    if value is None:
+        return "not given"
+    if isinstance(value, Mapping):
+        stated = {k: v for k, v in value.items() if v is not None}
+        return "{" + ", ".join(f"{k} = {write_value(v)}" for k, v in stated.items()) + "}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(write_value(v) for v in value)}]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f'"{value}"' if isinstance(value, str) else f"{value:.12g}"

@@ -50,11 +50,7 @@ class KeyTable:
 
 
 def tables(options: Mapping[str, type[Section]] | None = None) -> tuple[KeyTable, ...]:
-    """Return all sections, in the order of the configuration.
-
-    Args:
-        options: sections of keys of drivers, by name, e.g. "tracker.options (emscon)".
-    """
+    """Return all sections in order, with `options` of drivers, as "tracker.options (emscon)"."""
     sections: list[KeyTable] = []
     for name, field in CellConfig.model_fields.items():
         inner = section_of(field)
@@ -82,7 +78,6 @@ def table(name: str, sections: tuple[KeyTable, ...]) -> KeyTable:
 
 
 def _tables(name: str, section: type[Section], several: bool) -> Iterator[KeyTable]:
-    """Yield a section and its subsections."""
     yield _table(name, section, several)
     for key, field in section.model_fields.items():
         inner = section_of(field)
@@ -98,7 +93,6 @@ def _table(name: str, section: type[Section], several: bool) -> KeyTable:
 
 
 def _by_name(name: str, field: FieldInfo) -> KeyTable:
-    """Return a section whose keys are names."""
     ((key, value),) = example(field).items()
     valid = f"a number over 0; the key is a name, as {key}"
     column = Key("NAME", "1", "1.0", valid, f"{key} = {inline(value)}")

@@ -36,7 +36,6 @@ def check_distinct(section: str, things: Sequence[Any]) -> None:
 
 
 def _check_box(section: Section, low: str, high: str) -> None:
-    """Refuse a box whose low corner is not below the high one in x, y and z."""
     a, b = getattr(section, low), getattr(section, high)
     if a is not None and b is not None and not np.all(np.less(a, b)):
         raise ValueError(f"{low} = {list(a)} is not below {high} = {list(b)}")
@@ -306,10 +305,8 @@ _Name = Annotated[str, Field(min_length=1)]
 _Joints = Annotated[tuple[Number, ...], Field(min_length=1)]
 _BOX = ("center_m", "size_m")
 _CYLINDER = ("bottom_m", "radius_m", "height_m")
-LOADED = ("joint_compliance",)
-"""Effects under load; the default of `[planning] model`."""
-GEOMETRY = ("encoder_offset",)
-"""Effects of the geometry that a first plan of absolute readings is for, in addition."""
+LOADED = ("joint_compliance",)  # Effects under load; the default of `[planning] model`
+GEOMETRY = ("encoder_offset",)  # Effects that a first plan of absolute readings is for, too
 
 
 class Planning(CellSection):

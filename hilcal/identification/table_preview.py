@@ -28,7 +28,7 @@ from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
 from hilcal.tables.guess_values import BY_VALUES, RIVALS
-from hilcal.tables.importing import import_readings
+from hilcal.tables.mapped import import_readings
 from hilcal.tables.mapping import Mapping
 from hilcal.tables.proposal import (
     FAR,

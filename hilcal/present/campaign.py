@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hilcal import numbers
-from hilcal.config.changes import Changes, write_value
+from hilcal.config.cell import Changes, write_value
 from hilcal.config.reference import NOT_SET, REQUIRED, KeyTable
-from hilcal.doctor.computer import Finding
+from hilcal.doctor import Finding
 from hilcal.identification.fit import Fit
 from hilcal.measuring.session_state import RepeatabilityEstimate
 from hilcal.present.document import Block, Table, Words, heading, note, pairs, table

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime
 from typing import Any
 
-from hilcal.config.changes import Changes
+from hilcal.config.cell import Changes
 from hilcal.errors import InputError
 from hilcal.names import check_names
 from hilcal.store.stored_schema import REVISION, check
@@ -20,7 +20,7 @@ STORED = "stored_sha256"
 depend on the machine."""
 
 CELL = "cell"
-"""Key in the options of a revision: the changes of the cell, see `config.changes`."""
+"""Key in the options of a revision: the changes of the cell, see `config.cell`."""
 
 
 def utc_now() -> str:

@@ -1,15 +1,24 @@
-"""Columns of the exchange table: names, checks of the header, joints that mimic others."""
+"""Columns of the exchange table: names, joints that mimic others, checks of header and values.
+
+A row has one reading: a position (x_m, y_m, z_m, measured by its `station`), a distance
+(`distance_m` from the point `from`), or a height (`gauge_m` of the `gauge`); the other two are
+empty.
+"""
 
 import re
-from collections.abc import Collection, Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 
 import numpy as np
 
 from hilcal.errors import InputError
+from hilcal.readings.covariance import smallest_correlation
+from hilcal.readings.readings import SAME_POSE, ObserverKind, ObserverName, Readings
 from hilcal.robot.arm import Arm
-from hilcal.tables.grid import ColumnTable
+from hilcal.tables.grid import ColumnTable, first_true
+from hilcal.tables.uncertainty import LEAST
+from hilcal.types import Bools, Floats, Ints
 
 POSITION = ("x_m", "y_m", "z_m")
 ROTATION = ("rx_rad", "ry_rad", "rz_rad")
@@ -20,9 +29,7 @@ PREVIEW = "hilcal import TABLE --preview proposes a mapping for --format"
 SCALAR = {"point": ("distance_m", "from", "cov_d_d"), "gauge": ("gauge_m", "gauge", "cov_g_g")}
 """Columns of a reading that is one number, by kind of observer: value, observer, variance."""
 OWN_PREFIX = "x_"
-AGREES = 2e-3
-"""Largest difference between a stated value and the arm's description, rad: a tenth of a degree, to
-which tables round. A choice."""
+AGREES = 2e-3  # rad; largest difference from the arm's description: tables round to 0.1°. A choice
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 Units = int | Sequence[str]
@@ -107,10 +114,8 @@ def check_header(
     for k, name in enumerate(header, start=1):
         if not 0 < len(name) <= 80:
             raise InputError(f"{path}: column {k} has no name, or a long one, in row 1")
-        if header.count(name) > 1:
-            raise InputError(
-                f"{path}: column '{name}' appears {header.count(name)} times; keep one"
-            )
+        if (count := header.count(name)) > 1:
+            raise InputError(f"{path}: column '{name}' appears {count} times; keep one")
     valid, needed = known_columns(units), required_columns(units)
     if any(name in header for kind in SCALAR.values() for name in kind):
         _check_scalar(path, header)
@@ -148,7 +153,6 @@ def _check_scalar(path: str, header: Sequence[str]) -> None:
 
 
 def _advice(name: str, valid: Sequence[str], header: Sequence[str], n: int) -> str:
-    """Return advice on an unknown column."""
     first, _, last = name.partition("_")
     i, _, j = last.partition("_")
     if first == "cov" and f"cov_{j}_{i}" in valid:
@@ -163,7 +167,6 @@ def _advice(name: str, valid: Sequence[str], header: Sequence[str], n: int) -> s
 
 
 def _hint(missing: Sequence[str], header: Sequence[str], units: Units, arm: str) -> str:
-    """Return a hint on missing columns."""
     user_columns = [c for c in header if c.startswith(OWN_PREFIX)]
     close = _closest(missing[0], user_columns) if missing[0] not in TEXT else None
     if close:
@@ -172,11 +175,11 @@ def _hint(missing: Sequence[str], header: Sequence[str], units: Units, arm: str)
     return f"{number}; a table for {arm} needs {', '.join(required_columns(units))}"
 
 
-def covariance_size(path: str, header: Sequence[str]) -> int | None:
-    """Size m of the covariance that the table gives, None where it gives none."""
+def check_covariance_columns(path: str, header: Sequence[str]) -> None:
+    """Refuse a part of a covariance, or one of an orientation that the table lacks."""
     stated = [c for c in header if c in covariance_columns(6)]
     if not stated:
-        return None
+        return
     m = 6 if ROTATION[0] in header else 3
     needed = covariance_columns(m)
     for name in needed:
@@ -189,7 +192,6 @@ def covariance_size(path: str, header: Sequence[str]) -> int | None:
         raise InputError(
             f"{path}: column '{extra[0]}' needs the rotation vector {', '.join(ROTATION)}"
         )
-    return m
 
 
 def following_columns(arm: Arm) -> tuple[str, ...]:
@@ -216,8 +218,7 @@ def with_following(table: ColumnTable, arm: Arm) -> ColumnTable:
         q = np.stack([number.get(name, nothing) for name in names], axis=1)
         full = arm.complete(q)
         off = (np.abs(q - full) > AGREES) & ~arm.own  # False where there is no value
-        if off.any():
-            i, k = divmod(int(np.argmax(off)), len(names))
+        for i, k in first_true(off):
             raise InputError(
                 f"{table.at(i, names[k])}: {q[i, k]:g} {arm.unit(k)}, but by the arm's "
                 f"description {arm.joint_names[k]} follows to {full[i, k]:g}; leave the "
@@ -225,3 +226,281 @@ def with_following(table: ColumnTable, arm: Arm) -> ColumnTable:
             )
         number |= {names[k]: full[:, k] for k in np.flatnonzero(~arm.own).tolist()}
     return replace(table, number=number)
+
+
+MAX_DISTANCE = 100.0  # m; no instrument measures an arm from further away
+MAX_STD = 3e-3  # m; cameras are below it, micrometres read as millimetres above it
+MAX_ANGLE_STD = 0.05  # rad, 3°; the same for an orientation, a choice
+_LIMIT_MARGIN = 1e-4  # rad; rounding of a limit written with few digits
+_TRACKING = 0.1  # rad; actual and commanded joints of an arm at rest are closer
+_G = 9.80665
+
+
+def check_joints(table: ColumnTable, names: tuple[str, ...], q: Floats, arm: Arm) -> None:
+    """Refuse commanded joints beyond the arm's limits; (N, n), rad."""
+    most = np.maximum(np.abs(arm.q_min), np.abs(arm.q_max))
+    large, turns = np.abs(q[:, ~arm.slides]), most[~arm.slides]
+    seems = " (looks like degrees)" if large.max(initial=0.0) > turns.max(initial=0.0) + 1 else ""
+    for i, j in first_true((q < arm.q_min - _LIMIT_MARGIN) | (q > arm.q_max + _LIMIT_MARGIN)):
+        if arm.slides[j]:
+            seems = " (looks like millimetres)" if abs(q[i, j]) > 10 * most[j] else ""
+        unit, limits = arm.unit(j), f"{arm.q_min[j]:g} to {arm.q_max[j]:g}"
+        raise InputError(
+            f"{table.at(i, names[j])}: {q[i, j]:g} {unit} is beyond the limits of "
+            f"{arm.joint_names[j]} of {arm.name}, {limits} {unit}{seems}"
+        )
+
+
+def check_actual_joints(
+    table: ColumnTable, names: tuple[str, ...], actual: Floats, q: Floats
+) -> None:
+    """Refuse encoder readings that are not near the commanded joints; (N, n), rad."""
+    for i, j in first_true(np.abs(actual - q) > _TRACKING):
+        unit = names[j].rsplit("_", 1)[1]
+        quantity = "joint angle" if unit == "rad" else "travel"
+        raise InputError(
+            f"{table.at(i, names[j])}: {actual[i, j]:g} {unit} is not within {_TRACKING} {unit} of "
+            f"the commanded {q[i, j]:g} {unit}; expected the {quantity} that was reached, in {unit}"
+        )
+
+
+def check_positions(table: ColumnTable, position: Floats, q: Floats, arm: Arm) -> None:
+    """Refuse positions (N, 3) that cannot be metres.
+
+    No reading is further than 100 m from its instrument; all lie within a few reaches of each
+    other; and joints that move by more than 0.1 rad move the target.
+    """
+    distance = np.linalg.norm(position, axis=1)
+    for (i,) in first_true(distance > MAX_DISTANCE):
+        j = int(np.argmax(np.abs(position[i])))
+        raise InputError(
+            f"{table.at(i, POSITION[j])}: {position[i, j]:g} m cannot be right"
+            f"{_looks_like(position[i], distance[i])}; positions must be in m, within "
+            f"{MAX_DISTANCE:g} m"
+        )
+    away = np.linalg.norm(position - np.median(position, axis=0), axis=1)
+    if np.any(away > 5 * arm.reach):
+        i = int(np.argmax(away))
+        raise InputError(
+            f"{table.at(i)}: position is {away[i]:.3g} m from the others, the reach of {arm.name} "
+            f"is {arm.reach:.3g} m{_looks_like(position[i], distance[i])}; positions must be in m"
+        )
+    spread = float(away.max())
+    travel = np.ptp(q, axis=0)
+    joint = int(np.argmax(travel))
+    if spread < 1e-3 * arm.reach and travel[joint] > 0.1 and len(np.unique(q, axis=0)) >= 5:
+        by = f"{travel[joint]:.2g} {arm.unit(joint)}"
+        raise InputError(
+            f"{table.path}: columns {', '.join(POSITION)}: the joints move by {by} but "
+            f"all positions lie within {spread:.2g} m; expected the measured positions in m"
+        )
+
+
+def _looks_like(position: Floats, distance: float) -> str:
+    """Guess why a position (3,) is impossible: millimetres, or -9999 for no value."""
+    if any(re.fullmatch("9{4,}", f"{abs(v):.12g}".replace(".", "")) for v in position):
+        return " (nines for no value? leave the row out, or name them as missing in a mapping)"
+    return " (looks like millimetres)" if 10.0 < distance < 1e3 * MAX_DISTANCE else ""
+
+
+def check_rotations(table: ColumnTable, rotation: Floats) -> None:
+    """Refuse rotation vectors (N, 3) of more than a turn."""
+    angle = np.linalg.norm(rotation, axis=1)
+    for (i,) in first_true(angle > 2 * np.pi + 1e-6):
+        raise InputError(
+            f"{table.at(i)}: rotation vector {', '.join(ROTATION)} has a length of {angle[i]:.4g}, "
+            f"more than a turn (looks like degrees); expected axis times angle in rad"
+        )
+
+
+def check_covariances(table: ColumnTable, covariance: Floats) -> None:
+    """Refuse covariances (N, m, m) that no error can have.
+
+    A covariance is positive semi-definite; tested on the correlation matrix D V D with
+    D = diag(V)^-1/2, so that the answer does not depend on units: eigenvalues >= -1e-9.
+    """
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    for i, j in first_true(variance < 0):
+        raise InputError(
+            f"{table.at(i)}: variance {j + 1} of the covariance is {variance[i, j]:g}; "
+            f"a variance is >= 0"
+        )
+    for (i,) in first_true(~np.any(covariance, axis=(1, 2))):
+        raise InputError(
+            f"{table.at(i)}: the covariance is zero; give the reading's covariance in m², or "
+            f"leave out all covariance columns to use the tracker's specification"
+        )
+    smallest = smallest_correlation(covariance)
+    for (i,) in first_true(smallest < -1e-9):
+        why = f"smallest eigenvalue of the correlation matrix {smallest[i]:.3g}"
+        if np.isinf(smallest[i]):
+            why = "a covariance is larger than its two variances allow"
+        raise InputError(f"{table.at(i)}: the covariance is not positive semi-definite ({why})")
+    std = np.sqrt(variance[:, :3].max(axis=1))
+    for (i,) in first_true(std > MAX_STD):
+        raise InputError(
+            f"{table.at(i)}: a standard deviation of {std[i]:.3g} m cannot calibrate an arm; "
+            f"covariances must be in m², m·rad and rad² (1 mm² = 1e-6 m²)"
+        )
+    turn = np.sqrt(variance[:, 3:].max(axis=1, initial=0.0))
+    for (i,) in first_true(turn > MAX_ANGLE_STD):
+        raise InputError(
+            f"{table.at(i)}: a standard deviation of {turn[i]:.3g} rad cannot calibrate an "
+            f"arm; covariances must be in m², m·rad and rad² (1 deg² = 3.05e-4 rad²)"
+        )
+
+
+def check_wrenches(
+    table: ColumnTable, wrench: Floats, load: Ints, names: list[str], arm: Arm
+) -> None:
+    """Refuse a wrench (N, 6) on an unloaded reading, or one that would break the arm."""
+    unloaded = np.array([name == "none" for name in names])[load]
+    loaded = unloaded[:, None] & (wrench != 0)
+    limit = 20 * arm.payload * _G * np.repeat([1.0, arm.reach], 3)
+    heavy = (np.abs(wrench) > limit) & (arm.payload > 0)
+    beyond = f"beyond 20 times the payload of {arm.name}; expected N and N·m"
+    table.refuse(loaded, WRENCH, lambda v: f"{v:g}: the load is 'none', so the wrench must be 0")
+    table.refuse(heavy, WRENCH, lambda v: f"{v:g}: {beyond}")
+
+
+def check_names(table: ColumnTable) -> None:
+    """Refuse empty poses and loads, and other spellings of `none`."""
+    for column in ("pose", "load"):
+        if "" in table.text[column]:
+            i = table.text[column].index("")
+            valid = "; write 'none' where there is no load" if column == "load" else ""
+            raise InputError(f"{table.at(i, column)}: the cell is empty{valid}")
+    odd = sorted(n for n in set(table.text["load"]) if n != "none" and n.lower() == "none")
+    if odd:
+        i = table.text["load"].index(odd[0])
+        raise InputError(f"{table.at(i, 'load')}: '{odd[0]}' must be spelled 'none'")
+
+
+def check_same_pose(table: ColumnTable, pose: Ints, names: list[str], q: Floats, arm: Arm) -> None:
+    """Refuse a pose whose commanded joints (N, n) differ between its rows."""
+    first_row = np.unique(pose, return_index=True)[1]
+    for i, j in first_true(np.abs(q - q[first_row][pose]) > SAME_POSE):
+        k = int(first_row[pose[i]])
+        raise InputError(
+            f"{table.at(i)}: pose '{names[pose[i]]}' commands joint {j + 1} to {q[i, j]:.9g} "
+            f"{arm.unit(j)}, row {table.rows[k]} to {q[k, j]:.9g}; give another pose another name"
+        )
+
+
+MAIN = ObserverName("station", "tracker")  # The station of positions without a named one
+KINDS: tuple[ObserverKind, ...] = ("point", "gauge")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observed:
+    """The observer of each row."""
+
+    number: Ints  # (N,) index of the observer of each row
+    names: tuple[ObserverName, ...]  # of the observers; stations come first
+    scalar: Bools  # (N,) rows with one number
+
+    def put(
+        self, table: ColumnTable, value: Floats, cov: Floats, std: Mapping[ObserverName, float]
+    ) -> tuple[Floats, Floats]:
+        """Return values (N, m) and covariances (N, m, m) with distances and heights filled in."""
+        value, cov = value.copy(), cov.copy()
+        for kind in KINDS:
+            column, _, variance_column = SCALAR[kind]
+            rows = np.flatnonzero([self.names[k].kind == kind for k in self.number])
+            if not len(rows):
+                continue
+            read = table.number[column][rows]
+            low = 0.0 if kind == "point" else -MAX_DISTANCE
+            for i in rows[(read < low) | (read > MAX_DISTANCE)][:1]:
+                raise InputError(
+                    f"{table.at(i, column)}: {table.number[column][i]:g} m cannot be right; "
+                    f"expected {low:g} to {MAX_DISTANCE:g} m"
+                )
+            value[rows, 0] = read
+            cov[rows, 0, 0] = self._variance(table, rows, variance_column, kind, std)
+        return value, cov
+
+    def _variance(
+        self,
+        table: ColumnTable,
+        rows: Ints,
+        column: str,
+        kind: ObserverKind,
+        std: Mapping[ObserverName, float],
+    ) -> Floats:
+        nothing = np.full(len(table.rows), np.nan)
+        variances = table.number.get(column, nothing)[rows].copy()
+        for k, i in enumerate(rows.tolist()):
+            name = self.names[self.number[i]]
+            if np.isnan(variances[k]):
+                if name not in std:
+                    raise InputError(
+                        f"{table.at(i)}: nothing states the noise of {name}; give column "
+                        f"'{column}', the variance in m², or [{kind}s.{name.name}] std_m"
+                    )
+                variances[k] = std[name] ** 2
+            if not LEAST[0] ** 2 <= variances[k] <= MAX_STD**2:
+                raise InputError(
+                    f"{table.at(i, column)}: a variance of {variances[k]:g} m² cannot be right; "
+                    f"expected standard deviations of {LEAST[0]:g} to {MAX_STD:g} m, squared"
+                )
+        return np.asarray(variances)
+
+
+def observed_of(table: ColumnTable) -> Observed | None:
+    """Return the observers of the rows; None where all are positions measured by one tracker."""
+    count, station = len(table.rows), table.text.get(STATION)
+    column = {kind: SCALAR[kind][0] for kind in KINDS}
+    read = {kind: ~np.isnan(table.number[c]) for kind, c in column.items() if c in table.number}
+    if not read and (station is None or (len(set(station)) == 1 and "" not in station)):
+        return None
+    axes = [c for c in POSITION if c in table.number]
+    filled = ~np.isnan(table.matrix(axes)) if axes else np.zeros((count, 1), dtype=np.bool_)
+    positioned = filled.any(axis=1)
+    readings = np.sum([positioned, *read.values()], axis=0)
+    for (i,) in first_true((readings != 1) | (positioned & ~filled.all(axis=1))):
+        valid = ", ".join(["x_m, y_m, z_m"] * bool(axes) + [column[kind] for kind in read])
+        why = "a part of a position" if readings[i] == 1 else f"{readings[i]} readings"
+        raise InputError(f"{table.at(i)}: {why}; valid: just one of {valid} in each row")
+    names = []
+    for i in range(count):
+        kind = next((kind for kind in read if read[kind][i]), None)
+        if kind is not None:
+            names.append(ObserverName(kind, _name(table, i, SCALAR[kind][1])))
+        elif station is None:
+            names.append(MAIN)
+        else:
+            names.append(ObserverName("station", _name(table, i, STATION)))
+    order = sorted(dict.fromkeys(names), key=lambda n: n.kind != "station")
+    index = {name: k for k, name in enumerate(order)}
+    return Observed(np.array([index[n] for n in names]), tuple(order), np.asarray(~positioned))
+
+
+def _name(table: ColumnTable, row: int, column: str) -> str:
+    name = table.text[column][row]
+    if not name:
+        raise InputError(f"{table.at(row, column)}: the cell is empty; name what observed the row")
+    return name
+
+
+def observer_columns(readings: Readings) -> dict[str, list[str] | Floats]:
+    """Return the columns that name the observers, and those of distances and heights."""
+    kinds = np.array([o.kind for o in readings.observers])[readings.observer]
+    name = [readings.observers[k].name for k in readings.observer.tolist()]
+    out: dict[str, list[str] | Floats] = {}
+    stations = [o for o in readings.observers if o.kind == "station"]
+    if stations and stations != [MAIN]:
+        out[STATION] = _names_in(name, kinds == "station")
+    for kind in KINDS:
+        of_kind = kinds == kind
+        if not of_kind.any():
+            continue
+        value, observer, variance = SCALAR[kind]
+        out[observer] = _names_in(name, of_kind)
+        out[value] = np.where(of_kind, readings.value[:, 0], np.nan)
+        out[variance] = np.where(of_kind, readings.covariance[:, 0, 0], np.nan)
+    return out
+
+
+def _names_in(names: list[str], rows: Bools) -> list[str]:
+    return [name if of_kind else "" for name, of_kind in zip(names, rows.tolist(), strict=True)]

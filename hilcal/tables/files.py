@@ -25,19 +25,23 @@ from hilcal.tables.grid import Cell, Check, Grid, joined, text_of, unique
 from hilcal.tables.mapping import FileFormat, PointMapping
 from hilcal.toml import suggest
 
-READ = {b"PK\x03\x04": "XLSX", b"PAR1": "Parquet", b"MATLAB": "MAT"}
-"""First bytes of files that are no text, and their kind."""
-_PICKLE = "a Python pickle, which is never loaded; save it as CSV"
-REFUSED = {
+MAGIC = {
+    b"PK\x03\x04": "XLSX",
+    b"PAR1": "Parquet",
+    b"MATLAB": "MAT",
     b"SQLite format 3\x00": "an SQLite file (a campaign is opened, not imported)",
     b"\x89HDF": "an HDF5 file (MATLAB's -v7.3); save it with -v7, or as CSV",
     b"\xd0\xcf\x11\xe0": "an old Excel file (XLS); save it as XLSX or CSV",
     b"\x1f\x8b": "a gzip file; unpack it first",
     b"\x93NUMPY": "a NumPy file; save it as CSV",
-    **{b"\x80" + bytes([version]): _PICKLE for version in range(2, 6)},
+    **dict.fromkeys(
+        [b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05"],
+        "a Python pickle, which is never loaded; save it as CSV",
+    ),
     b"%PDF": "a PDF; save the table as CSV",
 }
-"""First bytes of files that are not read, and what they are."""
+"""First bytes of files that are no text: their kind, or why they are not read."""
+KINDS = ("XLSX", "Parquet", "MAT", "text")
 
 
 def open_tables(
@@ -88,20 +92,20 @@ def content_of(path: str | Path) -> bytes:
 
 
 def kind_of(path: str, content: bytes) -> str:
-    """Return the kind of a file by its first bytes: one of `READ`, else "text"."""
+    """Return the kind of a file by its first bytes: one of `KINDS`."""
     if not content.strip(b"\xef\xbb\xbf \t\r\n"):
         raise InputError(f"{path}: the file is empty; expected a table of readings")
-    for magic, description in REFUSED.items():
-        if content.startswith(magic):
-            raise InputError(f"{path}: {description}; expected text, XLSX, MAT or Parquet")
-    return next((kind for magic, kind in READ.items() if content.startswith(magic)), "text")
+    kind = next((kind for magic, kind in MAGIC.items() if content.startswith(magic)), "text")
+    if kind not in KINDS:
+        raise InputError(f"{path}: {kind}; expected text, XLSX, MAT or Parquet")
+    return kind
 
 
 def is_parquet(path: Path) -> bool:
     """Whether a file begins as Parquet does."""
     try:
         with path.open("rb") as stream:
-            return READ.get(stream.read(4)) == "Parquet"
+            return MAGIC.get(stream.read(4)) == "Parquet"
     except OSError:
         return False
 
@@ -126,39 +130,45 @@ def package(path: str | Path, name: str, kind: str) -> Any:
 
 
 def _xlsx(path: str, content: bytes, how: FileFormat, check: Check | None) -> Grid:
-    sheets = sheet_names(path, content)
+    book = workbook(path, content)
+    sheets = book.sheetnames
     if how.sheet is not None and how.sheet not in sheets:
         raise InputError(
             f"{path}: no sheet '{how.sheet}'{suggest(how.sheet, sheets)}; it has "
             f"{', '.join(sheets)}"
         )
     sheet = how.sheet or sheets[0]
-    rows = sheet_rows(path, content, sheet, how.comment)
+    rows = sheet_rows(path, book, sheet, how.comment)
     if not rows:
         raise InputError(f"{path}: sheet '{sheet}' is empty; it has {', '.join(sheets)}")
     return grid_of_rows(path, rows, how, check)
 
 
-def _book(path: str, content: bytes) -> Any:
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        members = archive.infolist()
-        if "xl/workbook.xml" not in [m.filename for m in members]:
-            raise InputError(f"{path}: a zip archive that is no XLSX; unpack it, or save as XLSX")
-        limits.check_size(f"{path}: unpacked", sum(m.file_size for m in members), limits.UNPACKED)
-        for member in members:
-            with archive.open(member) as stream, suppress(expat.ExpatError):  # pictures
-                _check_xml(path, member.filename, stream)
-    openpyxl = package(path, "openpyxl", "XLSX")
-    return openpyxl.load_workbook(
-        io.BytesIO(content), read_only=True, data_only=True, keep_links=False
-    )
+def workbook(path: str, content: bytes) -> Any:
+    """Open an XLSX file with openpyxl, once its parts are known to fit into memory."""
+    with undamaged(path, "damaged, or not an XLSX file"):
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            members = archive.infolist()
+            if "xl/workbook.xml" not in [m.filename for m in members]:
+                raise InputError(
+                    f"{path}: a zip archive that is no XLSX; unpack it, or save as XLSX"
+                )
+            size = sum(m.file_size for m in members)
+            limits.check_size(f"{path}: unpacked", size, limits.UNPACKED)
+            for member in members:
+                with archive.open(member) as stream, suppress(expat.ExpatError):  # pictures
+                    _check_xml(path, member.filename, stream)
+        openpyxl = package(path, "openpyxl", "XLSX")
+        book = openpyxl.load_workbook(
+            io.BytesIO(content), read_only=True, data_only=True, keep_links=False
+        )
+    if len(book.sheetnames) > limits.SHEETS:
+        raise InputError(f"{path}: {len(book.sheetnames)} sheets; valid: at most {limits.SHEETS}")
+    return book
 
 
 def _check_xml(path: str, name: str, stream: IO[bytes]) -> None:
-    """Limit the elements of a part of a workbook: openpyxl needs more memory than their text.
-
-    It holds one row of a sheet, and any other part as a whole.
-    """
+    """Limit a part of a workbook: openpyxl holds a row of a sheet, any other part as a whole."""
     where, sheet = f"{path}: {name}", name.startswith("xl/worksheets/")
     most = limits.COLUMNS * 10 if sheet else limits.ELEMENTS
     depth = elements = rows = cells = 0
@@ -195,23 +205,14 @@ def _check_xml(path: str, name: str, stream: IO[bytes]) -> None:
     parser.Parse(b"", True)
 
 
-def sheet_names(path: str, content: bytes) -> list[str]:
-    """Names of the sheets of an XLSX file."""
-    with undamaged(path, "damaged, or not an XLSX file"):
-        names = list(_book(path, content).sheetnames)
-    if len(names) > limits.SHEETS:
-        raise InputError(f"{path}: {len(names)} sheets; valid: at most {limits.SHEETS}")
-    return names
-
-
 def sheet_rows(
-    path: str, content: bytes, sheet: str, comment: str | None
+    path: str, book: Any, sheet: str, comment: str | None
 ) -> list[tuple[int, list[Cell]]]:
     """Rows of a sheet that are neither empty nor comments, with their numbers from 1."""
     rows: list[tuple[int, list[Cell]]] = []
     count = 0
     with undamaged(path, "damaged, or not an XLSX file"):
-        read = _book(path, content)[sheet]
+        read = book[sheet]
         read.reset_dimensions()  # the stated dimensions would pad every row
         for row, cells in enumerate(read.iter_rows(values_only=True), start=1):
             limits.check_rows(f"{path}: sheet '{sheet}'", row)
@@ -227,7 +228,6 @@ def sheet_rows(
 
 
 def _cell(value: object) -> Cell:
-    """Return a spreadsheet's cell as a number, a date, text or nothing."""
     if value is None or isinstance(value, datetime):
         return value
     if isinstance(value, bool):
@@ -366,8 +366,12 @@ def records(path: str, text: str, how: FileFormat) -> Iterator[tuple[int, list[s
     separator = SEPARATORS.get(how.separator or ",", how.separator or ",")
     blanks = how.separator == "blanks"
     text = text.replace("\t", " ") if blanks else text
-    if how.comment is not None and how.header_row:
-        text = _header_uncommented(text, how.header_row, how.comment)
+    if how.comment is not None and how.header_row:  # a header as numpy.savetxt writes it
+        split = text.splitlines(keepends=True)
+        for line in split[how.header_row - 1 : how.header_row]:
+            if line.lstrip().startswith(how.comment):
+                split[how.header_row - 1] = line.lstrip().removeprefix(how.comment).lstrip()
+        text = "".join(split)
     lines = limits.Lines(path, io.StringIO(text, newline=None))
     reader = csv.reader(lines, delimiter=separator, skipinitialspace=blanks, strict=True)
     try:
@@ -383,24 +387,13 @@ def records(path: str, text: str, how: FileFormat) -> Iterator[tuple[int, list[s
         raise InputError(f"{path}: row {reader.line_num}: not delimited text ({e})") from e
 
 
-def _header_uncommented(text: str, row: int, comment: str) -> str:
-    """Remove the comment mark from the header, as numpy.savetxt writes it."""
-    lines = text.splitlines(keepends=True)
-    if row <= len(lines) and lines[row - 1].lstrip().startswith(comment):
-        lines[row - 1] = lines[row - 1].lstrip()[len(comment) :].lstrip()
-    return "".join(lines)
-
-
 def grid_of_rows(
     path: str,
     numbered: Sequence[tuple[int, Sequence[Cell]]],
     how: FileFormat,
     check: Check | None = None,
 ) -> Grid:
-    """Make a grid of rows of cells: header (which is checked), units, and rows of one length.
-
-    Cells that a row has beyond the header must be empty, as trailing separators leave them.
-    """
+    """Make a grid of rows: checked header, units, rows of one length but for empty ends."""
     by_row = dict(numbered)
     if how.header_row and how.header_row not in by_row:
         raise InputError(

@@ -19,8 +19,7 @@ from hilcal.toml import suggest
 from hilcal.types import Bools, Floats, Ints
 
 Cell = str | float | datetime | None
-Check = Callable[[Sequence[str]], object]
-"""Refuses a wrong header, before any other check."""
+Check = Callable[[Sequence[str]], object]  # Refuses a wrong header, before any other check
 
 BLANK = ("", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "---")
 """Marks of a missing number, in small letters."""
@@ -82,9 +81,7 @@ class Grid:
         """(N,) numbers of a column, NaN where a value is missing, which `complete` refuses."""
         cells, how = self.cells(column), self._format(column)
         values = np.fromiter((number(c, how) for c in cells), dtype=float, count=len(cells))
-        bad = ~np.isfinite(values) if complete else np.isinf(values)
-        if bad.any():
-            k = int(np.argmax(bad))
+        for (k,) in first_true(~np.isfinite(values) if complete else np.isinf(values)):
             raise InputError(f"{self.at(k, column)}: {_complaint(cells[k], how, complete)}")
         for mark in how.missing:
             if isinstance(mark, float | int):
@@ -100,9 +97,8 @@ class Grid:
     def with_column(self, name: str, cells: Sequence[Cell], like: str | int) -> "Grid":
         """Return the table with a further column, in the format of the column `like`."""
         names, columns = (*self.names, name), (*self.columns, cells)
-        return replace(
-            self, names=names, columns=columns, formats=(*self.formats, self._format(like))
-        )
+        formats = (*self.formats, self._format(like))
+        return replace(self, names=names, columns=columns, formats=formats)
 
     def _format(self, column: str | int) -> FileFormat:
         return self.formats[self.names.index(self.name(column))]
@@ -147,10 +143,15 @@ class ColumnTable:
 
     def refuse(self, bad: Bools, names: Sequence[str], message: Callable[[float], str]) -> None:
         """Raise for the first true cell of an (N, k) mask over number columns."""
-        if bad.any():
-            i, j = divmod(int(np.argmax(bad)), bad.shape[1])
+        for i, j in first_true(bad):
             value = float(self.number[names[j]][i])
             raise InputError(f"{self.at(i, names[j])}: {message(value)}")
+
+
+def first_true(bad: Bools) -> list[list[int]]:
+    """Place of the first true element of a mask; none where there is none."""
+    places: list[list[int]] = np.argwhere(bad)[:1].tolist()
+    return places
 
 
 def text_of(cell: Cell) -> str:
@@ -198,10 +199,7 @@ def _complaint(cell: Cell, how: FileFormat, complete: bool) -> str:
 
 
 def unique(names: Sequence[str]) -> tuple[str, ...]:
-    """Make names unique by a number in brackets: "X", "X (2)".
-
-    The name of a column without one is its number.
-    """
+    """Make names unique, as "X", "X (2)"; that of a column without one is its number."""
     out: dict[str, None] = {}
     for k, title in enumerate(names, start=1):
         first = title or str(k)

@@ -10,17 +10,6 @@ import numpy as np
 from hilcal.tables import proposal as words
 from hilcal.tables.grid import Grid
 from hilcal.tables.mapped import nines
-from hilcal.tables.proposal import (
-    FAR,
-    SHOWN,
-    SIDE_BY_SIDE,
-    TURN,
-    ColumnName,
-    Guesser,
-    angle_unit,
-    length_unit,
-    parse,
-)
 from hilcal.tables.units import FORCES, LENGTHS, MOMENTS
 from hilcal.types import Floats
 
@@ -93,7 +82,7 @@ def time_unit(
     return {"unit": "format", "format": fitting[0]}, doubt
 
 
-def guess_by_values(g: Guesser) -> None:
+def guess_by_values(g: words.Guesser) -> None:
     """Find positions and joints among columns whose names say nothing.
 
     Neighbouring columns are tried: positions vary by hundreds (mm) or stay small (m), joint
@@ -127,10 +116,10 @@ def guess_by_values(g: Guesser) -> None:
             continue
         score = 0.1 * ((len(free) - len(joints) - len(position)) % 3 == 0)
         if joints:
-            score += 2.0 if size(joints) <= TURN else 1.0
+            score += 2.0 if size(joints) <= words.TURN else 1.0
         if position:
             far = size(position)
-            score += 2.0 if far > 400 else (1.0 if far < FAR else 0.5)
+            score += 2.0 if far > 400 else (1.0 if far < words.FAR else 0.5)
         ranked.append((score, position, joints))
     if not ranked:
         return
@@ -139,8 +128,8 @@ def guess_by_values(g: Guesser) -> None:
     near = [(p, j) for score, p, j in ranked if score >= best - RIVAL]
     g.proposal.alternatives = near
     for section, names, unit_of in (
-        ("position", position, length_unit),
-        ("joints", joints, angle_unit),
+        ("position", position, words.length_unit),
+        ("joints", joints, words.angle_unit),
     ):
         if names:
             unit = unit_of(g, section, names)
@@ -151,7 +140,7 @@ def guess_by_values(g: Guesser) -> None:
         g.unsure("joints", f"{RIVALS} {' and '.join(pair)}")
 
 
-def _orientation_by_values(g: Guesser, free: list[str]) -> None:
+def _orientation_by_values(g: words.Guesser, free: list[str]) -> None:
     """Find quaternions by their length, rotation matrices by their orthogonality."""
     if "orientation" in g.proposal.sections:
         return
@@ -170,13 +159,13 @@ def _orientation_by_values(g: Guesser, free: list[str]) -> None:
             return
 
 
-def _take_quaternion(g: Guesser, names: list[str]) -> None:
+def _take_quaternion(g: words.Guesser, names: list[str]) -> None:
     """Take four numbers for a quaternion; which of them is w is a guess."""
     g.take("orientation", names, "quaternion, w first", convention="quaternion-wxyz")
     g.proposal.open_convention = True
 
 
-def _kind(c: ColumnName) -> str:
+def _kind(c: words.ColumnName) -> str:
     if c.has(words.STD):
         return "std_angle" if c.has(words.ROTATION) else "std"
     for kind, vocabulary in (
@@ -198,7 +187,7 @@ _KINDS = words.STD | words.ROTATION | words.QUATERNION | words.FORCE | words.MOM
 LARGE = 1e-6  # m²; a larger variance, of more than 1 mm, is in mm²
 
 
-def guess_axes(g: Guesser) -> None:
+def guess_axes(g: words.Guesser) -> None:
     """Find positions, orientations, forces and standard deviations by the axes in their names."""
     sets: Group = {}
     _covariance(g)
@@ -222,20 +211,20 @@ def guess_axes(g: Guesser) -> None:
     side_by_side = _targets_side_by_side(positions, stem)
     if side_by_side:
         names = [positions[s][axis] for s in side_by_side for axis in "xyz"]
-        unit = length_unit(g, "position", names)
+        unit = words.length_unit(g, "position", names)
         targets = [str(s[-1]) for s in side_by_side]
         meaning = f"{unit}, {len(targets)} targets"
         g.take("position", names, meaning, unit=unit, targets=targets)
-        g.unsure("position", SIDE_BY_SIDE)
+        g.unsure("position", words.SIDE_BY_SIDE)
     else:
-        unit = length_unit(g, "position", names)
+        unit = words.length_unit(g, "position", names)
         g.take("position", names, unit, unit=unit)
     ranked = [s for s in ranked if s not in side_by_side]
     unused = [
         positions[s]["x"] for s in ranked if s != stem and not set(map(str, s)) & words.NOMINAL
     ]
     if unused:
-        listed = ", ".join(f"'{name}' ..." for name in unused[:SHOWN])
+        listed = ", ".join(f"'{name}' ..." for name in unused[: words.SHOWN])
         g.unsure("position", f"'{names[0]}' ... are used, not {listed}")
     marks = sentinels(g.block(names))
     if marks:
@@ -263,7 +252,7 @@ def _rank(stem: tuple[object, ...]) -> tuple[int, int]:
     return order, len(stem)
 
 
-def _covariance(g: Guesser) -> None:
+def _covariance(g: words.Guesser) -> None:
     """Covariances "cov_x_y" ...: the upper triangle or all nine."""
     by_axes: dict[str, str] = {}
     for name in g.grid.names:
@@ -278,7 +267,7 @@ def _covariance(g: Guesser) -> None:
         g.take("covariance", names, f"upper triangle, {unit}²", unit=unit)
 
 
-def _orientation(g: Guesser, complete: Group, stem: tuple[object, ...]) -> None:
+def _orientation(g: words.Guesser, complete: Group, stem: tuple[object, ...]) -> None:
     quaternions = {s: a for s, a in complete.get("quaternion", {}).items() if "w" in a}
     best = _columns_like(quaternions, stem)
     if best is not None:
@@ -308,7 +297,7 @@ def _orientation(g: Guesser, complete: Group, stem: tuple[object, ...]) -> None:
         _by_axes(g, [axes[axis] for axis in "xyz"])
 
 
-def _by_axes(g: Guesser, names: list[str]) -> None:
+def _by_axes(g: words.Guesser, names: list[str]) -> None:
     """Angles named by axes: a rotation vector where none is longer than π, else fixed angles."""
     length = np.linalg.norm(g.block(names), axis=1)
     vector = np.nanmax(length) <= np.pi + 1e-3
@@ -325,13 +314,13 @@ def _columns_like(
     return stems[min(usable, key=_rank)] if usable else None
 
 
-def _angles(g: Guesser, names: list[str], convention: str) -> None:
-    unit = angle_unit(g, "orientation", names)
+def _angles(g: words.Guesser, names: list[str], convention: str) -> None:
+    unit = words.angle_unit(g, "orientation", names)
     g.take("orientation", names, f"{convention}, {unit}", convention=convention, unit=unit)
     g.proposal.open_convention = True
 
 
-def _numbered_quaternion(g: Guesser) -> bool:
+def _numbered_quaternion(g: words.Guesser) -> bool:
     """Quaternions q1 ... q4 (ABB) or q0 ... q3, distinguished from joints by their length."""
     groups: dict[tuple[str, ...], dict[int, str]] = {}
     for c in g.columns:
@@ -345,7 +334,7 @@ def _numbered_quaternion(g: Guesser) -> bool:
     return False
 
 
-def _matrix(g: Guesser) -> bool:
+def _matrix(g: words.Guesser) -> bool:
     """Rotation matrices r11 ... r33, R(1,1) ..., and poses T(1,1) ... T(4,4)."""
     for word in ("r", "rot", "t", "m"):
         by_place: dict[tuple[int, int], str] = {}
@@ -362,7 +351,7 @@ def _matrix(g: Guesser) -> bool:
     return False
 
 
-def _forces(g: Guesser, complete: Group) -> None:
+def _forces(g: words.Guesser, complete: Group) -> None:
     force, moment = (next(iter(complete.get(k, {}).values()), None) for k in ("force", "moment"))
     if force is None:
         return
@@ -376,7 +365,7 @@ def _forces(g: Guesser, complete: Group) -> None:
     g.take("wrench", names, ", ".join(map(str, section.values())), **section)
 
 
-def _std(g: Guesser, complete: Group, stem: tuple[object, ...], position_unit: str) -> None:
+def _std(g: words.Guesser, complete: Group, stem: tuple[object, ...], position_unit: str) -> None:
     axes = _columns_like(complete.get("std", {}), stem)
     scalar = words.DISTANCE | words.GAUGE
     columns = [c for c in g.columns if c.name in g.free and c.has(words.STD) and not c.axis]
@@ -384,7 +373,7 @@ def _std(g: Guesser, complete: Group, stem: tuple[object, ...], position_unit: s
     if axes is None and not single:
         return
     names = [axes[axis] for axis in "xyz"] if axes is not None else single[:1]
-    first = parse(names[0])
+    first = words.parse(names[0])
     section: dict[str, object] = {"unit": g.unit(names, LENGTHS) or position_unit}
     turned = _columns_like(complete.get("std_angle", {}), stem)
     orientation = g.proposal.sections.get("orientation")

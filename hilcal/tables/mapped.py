@@ -1,4 +1,4 @@
-"""Readings from a table of any kind, by a mapping that says what its columns hold."""
+"""Readings from a table of any kind: the exchange table, or one that a mapping explains."""
 
 import re
 from collections.abc import Mapping as Mapped
@@ -10,46 +10,31 @@ from typing import Generic
 
 import numpy as np
 
+from hilcal import limits
+from hilcal.config import CellConfig
 from hilcal.errors import InputError
-from hilcal.readings.covariance import TrackerNoise, tracker_covariance
+from hilcal.readings.covariance import WHOLE, TrackerNoise, tracker_covariance, tracker_noise
 from hilcal.readings.readings import SAME_POSE, ObserverName, Readings
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.tables import columns, units
+from hilcal.tables import mapping as forms
+from hilcal.tables import table as exchange
 from hilcal.tables.columns import independent_columns
 from hilcal.tables.files import open_tables
-from hilcal.tables.grid import ColumnTable, Grid
-from hilcal.tables.mapping import (
-    Column,
-    Joints,
-    M,
-    Mapping,
-    Name,
-    Orientation,
-    PointMapping,
-    PoseName,
-    Position,
-    Std,
-    Time,
-)
-from hilcal.tables.table import ImportResult, readings_of
+from hilcal.tables.grid import ColumnTable, Grid, first_true
 from hilcal.tables.uncertainty import check_joint_rounding, mapped_covariance, rounding_variance
 from hilcal.tables.units import defect, rotations
 from hilcal.types import Bools, Floats, Ints
 
-MOST_LOST = 0.5
-"""Share of rows without a value beyond which the mapping is taken for wrong; a choice."""
-UNIT_LENGTH = 0.01
-"""How far a quaternion's length may be from 1, and a matrix from orthogonal; rounding to three
-digits stays below."""
+MOST_LOST = 0.5  # Share of rows without a value beyond which the mapping is wrong; a choice
+UNIT_LENGTH = 0.01  # Of a quaternion from 1, of a matrix from orthogonal; three digits stay below
 MOST_TURN = 2 * np.pi + 1e-3  # rad; a larger angle of an orientation is in another unit
 MOVED = 0.01  # rad; a joint commanded by more is sent to another pose; a choice
 STILL = 1e-4  # rad; a joint commanded by less did not move far enough to arrive from another side
 SIGMAS = 4.0  # Standard deviations within which two readings are the same; a choice
 REPEATED = 2e-4  # rad; rows whose joints differ by less repeat a pose; a choice
-REPEATS_TO = 4e-4
-"""m; ten times an arm's repeatability: of positions of one pose that differ by more, some are
-wrong. A choice."""
+REPEATS_TO = 4e-4  # m; ten times an arm's repeatability: of positions further apart some are wrong
 TOOL = 0.5  # m; the longest tool: with the arm's reach, the lever of its joints; a choice
 GRAVITY = (0.0, 0.0, -9.80665)  # m/s², base axes, of an arm that stands upright
 EPOCH = 1e8  # s; times beyond three years are counted from an epoch, not from the campaign's start
@@ -62,12 +47,12 @@ _LISTED = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MappedTable(Generic[M]):
+class MappedTable(Generic[forms.M]):
     """The rows of a table, read by a mapping, without their uncertainties."""
 
     table: ColumnTable  # columns of the exchange table, SI
     grid: Grid  # the rows as the file has them
-    mapping: M  # with one target per row, without optional columns that are absent
+    mapping: forms.M  # with one target per row, without optional columns that are absent
     raw: dict[str, Floats]  # (N,) number columns by the file's names, in its units
     angles: Floats | None  # (N, k) numbers of the orientation, in the file's unit; None without
     notes: list[str]  # one sentence for each decision
@@ -75,11 +60,11 @@ class MappedTable(Generic[M]):
 
 def mapped_table(
     path: str | Path,
-    mapping: M,
+    mapping: forms.M,
     arm: Arm,
     gravity: Sequence[float] = GRAVITY,
     second: Path | None = None,
-) -> MappedTable[M]:
+) -> MappedTable[forms.M]:
     """Read the states of one table or two by a mapping; arguments are those of `import_mapped`."""
     grid, lost = open_tables(path, mapping, second)
     notes = [f"{lost} rows left out: they have no partner in the second file"] * bool(lost)
@@ -125,7 +110,7 @@ def mapped_table(
 
 def import_mapped(
     path: str | Path,
-    mapping: Mapping,
+    mapping: forms.Mapping,
     arm: Arm,
     noise: TrackerNoise | None,
     station: Floats | Sequence[float] | None = None,
@@ -133,13 +118,8 @@ def import_mapped(
     second: Path | None = None,
     targets: Sequence[str] = (),
     std: Mapped[ObserverName, float] | None = None,
-) -> ImportResult:
-    """Read a table, or two tables, by a mapping.
-
-    Args:
-        station: (3,) where the tracker's beam starts, m; the origin where None.
-        gravity: (3,) base axes, m/s²: the direction in which a hung mass pulls.
-    """
+) -> exchange.ImportResult:
+    """Read one or two tables by a mapping; a hung mass pulls along `gravity` (3,), base, m/s²."""
     source = mapped_table(path, mapping, arm, gravity, second)
     mapping, grid, table, notes = source.mapping, source.grid, source.table, source.notes
     q = _joint_units(mapping.joints, arm) * _block(source.raw, grid, mapping.joints.columns)
@@ -159,7 +139,7 @@ def import_mapped(
         )
         figures = _block(source.raw, grid, mapping.position.columns)[positioned]
         rounding = rounding_variance(figures, units.LENGTHS[mapping.position.unit])
-    result = readings_of(table, arm, noise, station, covariance, targets, rounding, std)
+    result = exchange.readings_of(table, arm, noise, station, covariance, targets, rounding, std)
     readings = result.readings
     if mapping.rows is not None and mapping.rows.plausible_only:
         scatter = readings.covariance
@@ -174,11 +154,11 @@ def import_mapped(
     names = independent_columns(columns.joint_columns(arm.units), q.shape[1], arm)
     q = q[:, [k for k, column in enumerate(names) if column.endswith("_rad")]]
     notes += check_joint_rounding(q / unit, unit, name, result.readings.covariance, arm.reach)
-    return ImportResult(readings, tuple(notes))
+    return exchange.ImportResult(readings, tuple(notes))
 
 
 def _observers(
-    table: ColumnTable, grid: Grid, mapping: PointMapping, raw: dict[str, Floats]
+    table: ColumnTable, grid: Grid, mapping: forms.PointMapping, raw: dict[str, Floats]
 ) -> None:
     """Add distances and heights in m, their variances, and the observers of the rows."""
     for kind, section in mapping.scalars.items():
@@ -199,12 +179,8 @@ def _observers(
         table.alias[columns.STATION] = grid.name(mapping.station.column)
 
 
-def one_target_per_row(grid: Grid, mapping: M) -> tuple[Grid, M]:
-    """Return the table with a row for each target, and the mapping that reads it.
-
-    Row i with the columns x1 y1 z1 x2 y2 z2 becomes two rows, in this order; all other cells are
-    repeated. Nothing changes where the mapping has no `targets`.
-    """
+def one_target_per_row(grid: Grid, mapping: forms.M) -> tuple[Grid, forms.M]:
+    """Return the table with a row for each target (x1 y1 z1 x2 ... are two), and its mapping."""
     rows = range(len(grid.rows))
     if mapping.position is None or not mapping.position.targets:
         return grid, mapping
@@ -212,8 +188,8 @@ def one_target_per_row(grid: Grid, mapping: M) -> tuple[Grid, M]:
     count = len(targets)
     tall = grid.rows_with(np.repeat(np.arange(len(rows)), count))
     tall = tall.with_column(TARGET, [*targets] * len(rows), 1)
-    update: dict[str, object] = {"target": Name(column=TARGET)}
-    sections: dict[str, Position | Std] = {"position": mapping.position}
+    update: dict[str, object] = {"target": forms.Name(column=TARGET)}
+    sections: dict[str, forms.Position | forms.Std] = {"position": mapping.position}
     if mapping.std is not None and len(mapping.std.columns) == 3 * count:
         sections |= {"std": mapping.std}
     for key, section in sections.items():
@@ -227,19 +203,19 @@ def one_target_per_row(grid: Grid, mapping: M) -> tuple[Grid, M]:
     return tall, mapping.model_copy(update=update)
 
 
-def _put(table: ColumnTable, grid: Grid, name: str, column: Column, values: Floats) -> None:
-    """Add a column, and its name in the file."""
+def _put(table: ColumnTable, grid: Grid, name: str, column: forms.Column, values: Floats) -> None:
     table.number[name] = values
     table.alias[name] = grid.name(column)
 
 
 def _quantities(
-    table: ColumnTable, grid: Grid, m: PointMapping, raw: dict[str, Floats], arm: Arm
+    table: ColumnTable, grid: Grid, m: forms.PointMapping, raw: dict[str, Floats], arm: Arm
 ) -> None:
-    """Add the columns of numbers in SI units."""
-
     def put(
-        names: Sequence[str], keys: Sequence[Column], size: float | Floats = 1.0, zero: float = 0.0
+        names: Sequence[str],
+        keys: Sequence[forms.Column],
+        size: float | Floats = 1.0,
+        zero: float = 0.0,
     ) -> None:
         sizes = np.broadcast_to(size, len(names)).tolist()
         for name, column, factor in zip(names, keys, sizes, strict=True):
@@ -265,16 +241,16 @@ def _quantities(
         put(columns.torque_columns(arm.units), t.columns, sign * sizes)
 
 
-def _joint_units(section: Joints, arm: Arm) -> Floats:
+def _joint_units(section: forms.Joints, arm: Arm) -> Floats:
     """(k,) rad, or m where a joint slides, per unit of each of the section's columns."""
     names = independent_columns(columns.joint_columns(arm.units), len(section.columns), arm)
     angle, length = units.ANGLES[section.unit], units.LENGTHS[section.slide_unit]
     return np.array([length if name.endswith("_m") else angle for name in names])
 
 
-def _raw(grid: Grid, mapping: PointMapping, arm: Arm) -> dict[str, Floats]:
+def _raw(grid: Grid, mapping: forms.PointMapping, arm: Arm) -> dict[str, Floats]:
     """Number columns that every reading needs, by the file's names, in its units."""
-    needed: list[Column] = []
+    needed: list[forms.Column] = []
     per_joint = ("joints", "actual_joints", "approach", "joint_temperatures", "torques")
     for name in (*per_joint, "position", "orientation"):
         section = getattr(mapping, name)
@@ -292,11 +268,10 @@ def _raw(grid: Grid, mapping: PointMapping, arm: Arm) -> dict[str, Floats]:
     return {grid.name(column): grid.numbers(column) for column in needed}
 
 
-def _missing_positions(grid: Grid, section: Position | None, raw: dict[str, Floats]) -> list[str]:
-    """Set positions to NaN that instruments write where they measured none.
-
-    These are exactly 0, 0, 0, and a number of nines, such as −9999, in all three columns.
-    """
+def _missing_positions(
+    grid: Grid, section: forms.Position | None, raw: dict[str, Floats]
+) -> list[str]:
+    """Set positions to NaN that mean none: exactly 0, 0, 0, or nines (−9999) in all three."""
     names = [] if section is None else [grid.name(column) for column in section.columns]
     position, notes = _block(raw, grid, names) if names else np.zeros((0, 1)), []
     for value in (0.0, *nines(position)):
@@ -317,10 +292,7 @@ def nines(position: Floats) -> list[float]:
 
 
 def _complete(grid: Grid, raw: dict[str, Floats], sparse: Sequence[str]) -> tuple[Bools, list[str]]:
-    """Rows that have a value in every used column, and a note on the incomplete ones.
-
-    A row needs a value in one of the `sparse` columns only.
-    """
+    """Rows with a value in each used column, of `sparse` ones in one; a note on the others."""
     missing = np.stack([np.isnan(values) for values in raw.values()], axis=1)
     some = [k for k, name in enumerate(raw) if name in sparse]
     missing[:, some] = missing[:, some].all(axis=1, keepdims=True)
@@ -351,25 +323,22 @@ def _stale(grid: Grid, position: Floats, q: Floats) -> list[str]:
     ]
 
 
-def _block(raw: dict[str, Floats], grid: Grid, names: Sequence[Column]) -> Floats:
+def _block(raw: dict[str, Floats], grid: Grid, names: Sequence[forms.Column]) -> Floats:
     return np.stack([raw[grid.name(name)] for name in names], axis=1)
 
 
 def _rotations(
-    grid: Grid, o: Orientation | None, raw: dict[str, Floats], table: ColumnTable
+    grid: Grid, o: forms.Orientation | None, raw: dict[str, Floats], table: ColumnTable
 ) -> Floats | None:
     """Add rotation vectors; returns the orientation's numbers (N, k) in the file's unit."""
     if o is None:
         return None
     angles = _block(raw, grid, o.columns)
-    far = defect(o.convention, angles) > UNIT_LENGTH
-    if far.any():
+    for (i,) in first_true(defect(o.convention, angles) > UNIT_LENGTH):
         valid = "a quaternion of length 1" if angles.shape[1] == 4 else "a rotation matrix"
-        raise InputError(f"{grid.at(int(np.argmax(far)), o.columns[0])}: not {valid}")
+        raise InputError(f"{grid.at(i, o.columns[0])}: not {valid}")
     unit = units.ANGLES[o.unit]
-    turn = np.abs(unit * angles) > MOST_TURN
-    if angles.shape[1] == 3 and turn.any():
-        i, k = divmod(int(np.argmax(turn)), 3)
+    for i, k in first_true((np.abs(unit * angles) > MOST_TURN) & (angles.shape[1] == 3)):
         seems = " (looks like degrees)" if o.unit == "rad" else ""
         raise InputError(
             f"{grid.at(i, o.columns[k])}: {angles[i, k]:g} {o.unit} is more than a turn{seems}; "
@@ -381,7 +350,7 @@ def _rotations(
     return angles
 
 
-def _wrench(grid: Grid, mapping: PointMapping, gravity: Floats, table: ColumnTable) -> Floats:
+def _wrench(grid: Grid, mapping: forms.PointMapping, gravity: Floats, table: ColumnTable) -> Floats:
     """(N, 6) wrench, N and N·m; zero where the table has none."""
     wrench = np.zeros((len(grid.rows), 6))
     if (w := mapping.wrench) is not None:
@@ -392,9 +361,7 @@ def _wrench(grid: Grid, mapping: PointMapping, gravity: Floats, table: ColumnTab
             table.alias[columns.WRENCH[k]] = grid.name(column)
     if (hung := mapping.hung_mass) is not None:
         mass = units.MASSES[hung.unit] * np.nan_to_num(grid.numbers(hung.column))
-        bad = mass < 0
-        if bad.any():
-            i = int(np.argmax(bad))
+        for (i,) in first_true(mass < 0):
             raise InputError(f"{grid.at(i, hung.column)}: a mass is 0 or more")
         wrench[:, :3] = mass[:, None] * gravity
         table.alias.update(dict.fromkeys(columns.WRENCH, grid.name(hung.column)))
@@ -404,7 +371,7 @@ def _wrench(grid: Grid, mapping: PointMapping, gravity: Floats, table: ColumnTab
     return wrench
 
 
-def _loads(grid: Grid, mapping: PointMapping, wrench: Floats) -> list[str]:
+def _loads(grid: Grid, mapping: forms.PointMapping, wrench: Floats) -> list[str]:
     """Names of the loads: the column's, or by the hung mass, or "load" where a wrench acts."""
     if mapping.load is not None:
         none = {name.lower() for name in (*mapping.load.none, "")}
@@ -429,7 +396,7 @@ def _as_commanded(table: ColumnTable, q: Floats, arm: Arm) -> None:
         table.number[name] = q[rows, k]
 
 
-def _poses(grid: Grid, section: PoseName | None, q: Floats | None) -> list[str]:
+def _poses(grid: Grid, section: forms.PoseName | None, q: Floats | None) -> list[str]:
     """Names of the poses: the column's, or the row where these joints were first commanded."""
     if section is not None and section.column is not None:
         names = grid.text(section.column)
@@ -447,7 +414,7 @@ def _poses(grid: Grid, section: PoseName | None, q: Floats | None) -> list[str]:
     return [f"row {first.setdefault(key, row)}" for row, key in zip(rows, keys, strict=True)]
 
 
-def seconds(grid: Grid, time: Time) -> Floats:
+def seconds(grid: Grid, time: forms.Time) -> Floats:
     """(N,) times in s; dates, and times since an epoch, are counted from the earliest row."""
     import pandas as pd
 
@@ -463,9 +430,7 @@ def seconds(grid: Grid, time: Time) -> Floats:
         texts = [str(c).strip() if form else str(c).strip().replace(",", ".") for c in cells]
         when = pd.to_datetime(pd.Series(texts), format=form or "ISO8601", errors="coerce", utc=True)
         values = (when - pd.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy(dtype=float)
-    bad = ~np.isfinite(values)
-    if bad.any():
-        k = int(np.argmax(bad))
+    for (k,) in first_true(~np.isfinite(values)):
         raise InputError(
             f"{grid.at(k, time.column)}: '{grid.text(time.column)[k]}' is not "
             f"{expected}; see unit of the times in the mapping"
@@ -476,10 +441,7 @@ def seconds(grid: Grid, time: Time) -> Floats:
 
 
 def approach_by_order(q: Floats) -> Floats:
-    """(N, n) side from which each joint arrived: sign(q_i − q_{i−1}), the last one at rest.
-
-    The first row, and joints that have not yet moved, count as +1. Rows without value are skipped.
-    """
+    """(N, n) sides of arrival, sign(q_i − q_{i−1}): the last one at rest, +1 before any move."""
     import pandas as pd
 
     filled = pd.DataFrame(q).ffill().bfill().to_numpy()
@@ -532,5 +494,43 @@ def _plausible(
 
 
 def _listed(rows: Ints) -> str:
-    """Name the first of some rows."""
     return ", ".join(map(str, rows[:_LISTED].tolist())) + ", ..." * (len(rows) > _LISTED)
+
+
+def import_readings(
+    path: Path,
+    form: str | Path | forms.Mapping,
+    config: CellConfig,
+    arm: Arm,
+    second: Path | None = None,
+) -> exchange.ImportResult:
+    """Read a table by `form`, "table", a mapping, its name or file; the cell states the rest."""
+    mapping = form if isinstance(form, forms.Mapping) else None
+    if mapping is None and str(form) != forms.TABLE:
+        mapping = forms.find_mapping(str(form), forms.Mapping)
+    tracker, gravity = config.tracker, config.robot.gravity_m_s2
+    noise, station = tracker_noise(tracker), tracker.station_m
+    targets, std = [target.name for target in config.tool.targets], _std(config)
+    if mapping is not None:
+        result = import_mapped(path, mapping, arm, noise, station, gravity, second, targets, std)
+    elif second is None:
+        result = exchange.import_table(path, arm, noise, station, targets, std)
+    else:
+        raise InputError(f"--second {second}: only for a --format with a section [second_file]")
+    limits.check_fitted(len(result.readings), result.readings.m, f"{path}: ")
+    where = "" if tracker.frame == "tracker" or station else ", as if it stood at the arm's base"
+    notes = tuple(note + where * (note == exchange.FROM_TRACKER) for note in result.notes)
+    stated = exchange.FROM_TRACKER not in result.notes
+    covers = WHOLE if stated and config.repeatability.in_tables else result.covers
+    readings, copies = exchange.without_copies(result.readings)
+    readings, named = exchange.named_loads(readings, config)
+    return exchange.ImportResult(
+        readings, (*notes, *copies, *named), covers, stated or tracker.states_noise, not stated
+    )
+
+
+def _std(config: CellConfig) -> dict[ObserverName, float]:
+    """Return the standard deviations of distances and heights that the cell states."""
+    points = {ObserverName("point", k): p.std_m for k, p in config.points.items()}
+    gauges = {ObserverName("gauge", k): g.std_m for k, g in config.gauges.items()}
+    return {name: std for name, std in (points | gauges).items() if std is not None}

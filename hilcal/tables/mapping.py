@@ -1,7 +1,4 @@
-"""A mapping file: which column of a table holds what, in which unit and convention.
-
-TOML with the sections of `Mapping`; docs/how-to/import-a-table.md explains it.
-"""
+"""A mapping file, TOML: which column of a table holds what, in which unit and convention."""
 
 from pathlib import Path
 from typing import Annotated, Literal, Self, TypeVar
@@ -31,6 +28,7 @@ def _columns(*valid: int) -> AfterValidator:
     return AfterValidator(counted)
 
 
+PerJoint = Annotated[tuple[Column, ...], Field(min_length=1, description="one column per joint")]
 Row = Annotated[int, Strict(), Field(ge=1)]
 _UNLOADED = (
     "none|0|no|no load|unloaded|empty|-|ohne|leer|keine|unbelastet|sans|sans charge|vide|"
@@ -144,9 +142,7 @@ class Orientation(Section):
 class Joints(Section):
     """[actual_joints]: joint angles that the encoders reported."""
 
-    columns: Annotated[tuple[Column, ...], Field(min_length=1)] = Field(
-        description="one column per joint"
-    )
+    columns: PerJoint
     slide_unit: Length = Field("m", description=_LENGTH + ", of joints that slide")
     unit: Angle = Field(description=_ANGLE)
 
@@ -182,17 +178,15 @@ class PoseName(Section):
         return self
 
 
-class LoadName(Section):
+class LoadName(Name):
     """[load]: the load's name."""
 
-    column: Column = Field(description=_COLUMN)
     none: tuple[str, ...] = Field(UNLOADED, description="the names that mean no load")
 
 
-class Time(Section):
+class Time(Name):
     """[time] and [load_time]: seconds, a date and time, or a spreadsheet's day number."""
 
-    column: Column = Field(description=_COLUMN)
     unit: Literal["s", "ms", "min", "h", "iso", "excel", "format"] = Field(
         description='"s", "ms", "min", "h", "iso" (2024-05-31T12:00:00), "excel" (days since '
         '1899-12-30), or "format" with the key format'
@@ -208,10 +202,9 @@ class Time(Section):
         return self
 
 
-class Air(Section):
+class Air(Name):
     """[air]: temperature of the air."""
 
-    column: Column = Field(description=_COLUMN)
     optional: bool = Field(False, description=_OPTIONAL)
     unit: Temperature = Field("degC", description=_UNIT_T)
 
@@ -219,18 +212,14 @@ class Air(Section):
 class JointTemperatures(Section):
     """[joint_temperatures]: one per joint."""
 
-    columns: Annotated[tuple[Column, ...], Field(min_length=1)] = Field(
-        description="one column per joint"
-    )
+    columns: PerJoint
     unit: Temperature = Field("degC", description=_UNIT_T)
 
 
 class Torques(Section):
     """[torques]: static torques that the drives were measured to exert; of slides forces."""
 
-    columns: Annotated[tuple[Column, ...], Field(min_length=1)] = Field(
-        description="one column per joint"
-    )
+    columns: PerJoint
     unit: Literal["Nm", "Nmm", "kNm"] = Field("Nm", description='"Nm", "Nmm" or "kNm"')
     slide_unit: Literal["N", "kN", "kgf", "lbf"] = Field(
         "N", description='"N", "kN", "kgf" or "lbf", of joints that slide'
@@ -242,10 +231,9 @@ class Torques(Section):
     )
 
 
-class OneNumber(Section):
+class OneNumber(Name):
     """[distance] from a point, [gauge]: height over a plane; rows without it leave it empty."""
 
-    column: Column = Field(description=_COLUMN)
     unit: Length = Field(description=_LENGTH)
     name_column: Column | None = Field(
         None, description="the column that names the row's point or gauge"
@@ -278,10 +266,9 @@ class Wrench(Section):
     )
 
 
-class HungMass(Section):
+class HungMass(Name):
     """[hung_mass]: a mass that hangs at the load point; its weight is the wrench. Empty is 0."""
 
-    column: Column = Field(description=_COLUMN)
     unit: Literal["kg", "g", "lb"] = Field("kg", description='"kg", "g" or "lb"')
 
 
@@ -319,14 +306,8 @@ class Instrument(Section):
     orientation_std_rad: NonNegative = Field(0.0, description="of an orientation, rad")
 
     def noise(self) -> TrackerNoise:
-        """Return the noise as a specification."""
-        return TrackerNoise(
-            self.range_std_m,
-            self.range_std_per_m,
-            self.transverse_std_m,
-            self.transverse_std_per_m,
-            self.orientation_std_rad,
-        )
+        """Return the noise as a specification, whose fields are these in the same order."""
+        return TrackerNoise(*self.model_dump().values())
 
 
 class Std(Section):
@@ -401,34 +382,32 @@ class CovarianceColumns(Section):
 class PointMapping(Section):
     """A mapping file for points to go to: they have joint values, positions, or both."""
 
-    file: FileFormat = Field(default_factory=FileFormat, description="a section [file]")
-    second_file: SecondFile | None = Field(None, description="a section [second_file]")
+    file: FileFormat = Field(default_factory=FileFormat)
+    second_file: SecondFile | None = None
     position: Position | None = Field(None, description=_POSITION)
-    orientation: Orientation | None = Field(None, description="a section [orientation]")
+    orientation: Orientation | None = None
     joints: CommandedJoints | None = Field(None, description=_JOINTS)
-    actual_joints: Joints | None = Field(None, description="a section [actual_joints]")
+    actual_joints: Joints | None = None
     pose: PoseName | None = Field(None, description="a section [pose] with column")
     load: LoadName | None = Field(None, description="a section [load] with column")
     cycle: Name | None = Field(None, description="a section [cycle] with column")
     target: Name | None = Field(None, description="a section [target] with column")
     station: Name | None = Field(None, description="a section [station] with column")
-    distance: OneNumber | None = Field(None, description="a section [distance]")
-    gauge: OneNumber | None = Field(None, description="a section [gauge]")
-    torques: Torques | None = Field(None, description="a section [torques]")
-    time: Time | None = Field(None, description="a section [time]")
-    load_time: Time | None = Field(None, description="a section [load_time]")
-    air: Air | None = Field(None, description="a section [air]")
-    joint_temperatures: JointTemperatures | None = Field(
-        None, description="a section [joint_temperatures]"
-    )
-    wrench: Wrench | None = Field(None, description="a section [wrench]")
-    hung_mass: HungMass | None = Field(None, description="a section [hung_mass]")
-    approach: Approach | None = Field(None, description="a section [approach]")
-    rows: Rows | None = Field(None, description="a section [rows]")
-    instrument: Instrument | None = Field(None, description="a section [instrument]")
-    std: Std | None = Field(None, description="a section [std]")
-    correlation: Correlation | None = Field(None, description="a section [correlation]")
-    covariance: CovarianceColumns | None = Field(None, description="a section [covariance]")
+    distance: OneNumber | None = None
+    gauge: OneNumber | None = None
+    torques: Torques | None = None
+    time: Time | None = None
+    load_time: Time | None = None
+    air: Air | None = None
+    joint_temperatures: JointTemperatures | None = None
+    wrench: Wrench | None = None
+    hung_mass: HungMass | None = None
+    approach: Approach | None = None
+    rows: Rows | None = None
+    instrument: Instrument | None = None
+    std: Std | None = None
+    correlation: Correlation | None = None
+    covariance: CovarianceColumns | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -445,10 +424,8 @@ class PointMapping(Section):
         targets = () if self.position is None else self.position.targets
         wide = 3 * len(targets)
         figures = 0 if self.std is None else len(self.std.columns or self.std.values)
-        six = (figures == 6 and wide != 6) or (
-            self.covariance is not None and len(self.covariance.columns) > 9
-        )
-        if six and self.orientation is None:
+        matrix = 0 if self.covariance is None else len(self.covariance.columns)
+        if ((figures == 6 and wide != 6) or matrix > 9) and self.orientation is None:
             raise ValueError("uncertainties of six elements need [orientation]")
         reported = self.joints is not None and self.joints.reported
         if reported and (self.pose is None or self.actual_joints is not None):
@@ -460,7 +437,7 @@ class PointMapping(Section):
             )
         if targets and self.target:
             raise ValueError("[target] together with targets in [position]; give one of them")
-        if self.std and len(self.std.columns or self.std.values) > 6 and not targets:
+        if figures > 6 and not targets:
             raise ValueError("[std] has more than 6 figures; it must be 1, 3 or 6")
         if self.load_time and self.load_time.unit not in SECONDS:
             raise ValueError('[load_time] unit must be "s", "ms", "min" or "h"')

@@ -21,11 +21,9 @@ from hilcal import limits
 from hilcal.errors import InputError
 
 LIMIT_S = 60  # Time that reading may take; a choice: 1 GB takes a few seconds
-MEMORY = 8 << 30
-"""Address space of the process, bytes; a choice: the largest file that is read, several times."""
+MEMORY = 8 << 30  # Address space of the process, bytes; a choice: several times the largest file
 
-Block = tuple[str, str, np.ndarray]
-"""Variable, name, and a matrix (N, k) of numbers or a column (N, 1) of texts."""
+Block = tuple[str, str, np.ndarray]  # Variable, name, matrix (N, k) of numbers or (N, 1) of texts
 
 
 def read(path: str) -> tuple[list[str], list[Block]]:

@@ -18,15 +18,14 @@ from hilcal.readings.covariance import INSTRUMENT, ROUNDING, TrackerNoise
 from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
 from hilcal.robot.se3 import CHUNK
-from hilcal.tables import checks, columns
+from hilcal.tables import columns
 from hilcal.tables.files import is_plain, package, undamaged
-from hilcal.tables.grid import ColumnTable
+from hilcal.tables.grid import ColumnTable, first_true
 from hilcal.tables.table import check_covers, covariances_of, measured_of
 from hilcal.tables.uncertainty import rounding_variance
 from hilcal.types import Floats
 
-NAMES = ("pose", "load", "cycle")
-"""Columns of the exchange table that a stream may have, but that have no meaning in it."""
+NAMES = ("pose", "load", "cycle")  # Columns that a stream may have, but that mean nothing in it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,13 +35,11 @@ class ReadingStream:
     path: Path
     arm: Arm  # its number of joints, their limits and its reach are checked
     noise: TrackerNoise | None  # gives the covariances where the file has none
-    station: tuple[float, ...] | None
-    """(3,) where the tracker's beam starts, m; the origin where None."""
+    station: tuple[float, ...] | None  # (3,) where the tracker's beam starts, m; None: the origin
     columns: tuple[str, ...]
     rows: tuple[int, ...]  # number of rows of each row group
     covers: str = INSTRUMENT  # what its covariances cover, `INSTRUMENT` or `WHOLE`
-    rounding: Floats = field(default_factory=lambda: np.zeros(3))
-    """(3,) variance of the positions' rounding that is added, m²."""
+    rounding: Floats = field(default_factory=lambda: np.zeros(3))  # (3,) variance that it adds, m²
 
     def __len__(self) -> int:
         """Return the number of readings."""
@@ -68,7 +65,7 @@ class ReadingStream:
         table = ColumnTable(str(self.path), rows, {}, number)
         states, value = measured_of(table, self.arm)
         pose, zeros = np.arange(len(rows)), np.zeros(len(rows), dtype=np.int64)
-        checks.check_wrenches(table, states.wrench, zeros, ["as recorded"], self.arm)
+        columns.check_wrenches(table, states.wrench, zeros, ["as recorded"], self.arm)
         covariance, *_ = covariances_of(table, value, self.noise, self.station, None, self.rounding)
         return Readings(states, pose, zeros, zeros, value, covariance, ("as recorded",), ())
 
@@ -76,11 +73,7 @@ class ReadingStream:
 def open_stream(
     path: Path, arm: Arm, noise: TrackerNoise | None, station: tuple[float, ...] | None
 ) -> ReadingStream:
-    """Open a Parquet file of readings; only its metadata and its first rows are read.
-
-    `noise` gives the covariances where the file has none; the tracker's beam starts at `station`
-    (3,), m, or at the origin.
-    """
+    """Open a Parquet file of readings, of which metadata and the first rows are read."""
     file = _opened(path)
     header = list(file.schema_arrow.names)
     # Without the names of poses and loads the header is that of an exchange table.
@@ -91,7 +84,7 @@ def open_stream(
             f"{path}: column '{columns.TARGET}': a stream is of one target; import a table of "
             "several with `hilcal import`"
         )
-    columns.covariance_size(str(path), header)
+    columns.check_covariance_columns(str(path), header)
     valid = set(columns.known_columns(arm.units)) - {*NAMES, columns.COVERS}
     meta = file.metadata
     rows = tuple(meta.row_group(k).num_rows for k in range(meta.num_row_groups))
@@ -137,7 +130,6 @@ def _tables(path: Path, group: int, names: tuple[str, ...], count: int = CHUNK) 
 
 
 def _covers(path: Path, group: int) -> str:
-    """What the covariances cover, by the first row."""
     word = str(next(_tables(path, group, (columns.COVERS,), 1)).column(0)[0].as_py())
     check_covers(word, f"{path}: row 1, column '{columns.COVERS}'")
     return word
@@ -149,9 +141,7 @@ def _numbers(path: Path, name: str, column: Any, row: int) -> Floats:
         values = np.asarray(column.to_numpy(zero_copy_only=False), dtype=float)
     except (TypeError, ValueError) as e:
         raise InputError(f"{path}: column '{name}' is no column of numbers") from e
-    bad = ~np.isfinite(values)
-    if bad.any():
-        k = int(np.argmax(bad))
+    for (k,) in first_true(~np.isfinite(values)):
         raise InputError(
             f"{path}: row {row + k}, column '{name}': not a finite number; leave out the rows that "
             "were not read"

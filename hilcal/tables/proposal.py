@@ -173,8 +173,7 @@ TURN = 2 * np.pi + 0.1  # rad; a larger angle is in degrees
 FAR = 50.0  # A position beyond this number is in millimetres: no arm is measured from 50 m
 GUESSED = "the convention is a guess; --config CELL.toml lets the arm decide"
 SIDE_BY_SIDE = "several targets: name them as in the cell's [[tool.targets]]"
-REPORTED = 5e-3
-"""rad; encoders at rest in one pose differ by less, commanded poses by more; a choice."""
+REPORTED = 5e-3  # rad; encoders at rest in one pose differ by less, commanded poses by more
 FEWEST_JOINTS, MOST_JOINTS = 4, 8
 SHOWN = 3
 
@@ -195,12 +194,9 @@ class Proposal:
 
     sections: dict[str, dict[str, Any]] = field(default_factory=dict)  # of the mapping, by name
     understood: list[UnderstoodColumn] = field(default_factory=list)  # quantities of the table
-    unsure: list[tuple[str, str]] = field(default_factory=list)
-    """sentences on what should be checked, by section."""
-    unused: list[tuple[str, str]] = field(default_factory=list)
-    """columns without a meaning, with the reason."""
-    lacking: list[str] = field(default_factory=list)
-    """sentences on quantities that an import needs and the table lacks."""
+    unsure: list[tuple[str, str]] = field(default_factory=list)  # by section: what to check
+    unused: list[tuple[str, str]] = field(default_factory=list)  # columns, and why
+    lacking: list[str] = field(default_factory=list)  # sentences on quantities that an import needs
     open_convention: bool = False  # whether the orientation's convention is a guess
     alternatives: list[tuple[list[str], list[str]]] = field(default_factory=list)
     """columns of the position and of the joints that are as good by their values, the chosen ones
@@ -231,7 +227,6 @@ class Proposal:
 
 
 def _escaped(value: Any) -> Any:
-    """Return a value with its texts escaped."""
     if isinstance(value, list | tuple):
         return [_escaped(v) for v in value]
     return escaped(value) if isinstance(value, str) else value

@@ -1,8 +1,11 @@
-"""A mapping for one or two files whose form is unknown, guessed from names and values."""
+"""How a file of unknown form is written (`sniff`), and what its columns hold (`guess`)."""
 
-from collections.abc import Callable
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -11,25 +14,12 @@ import numpy as np
 from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.readings.readings import SAME_POSE
+from hilcal.tables import files
 from hilcal.tables import proposal as words
 from hilcal.tables.columns import required_columns
-from hilcal.tables.grid import Grid, joined
+from hilcal.tables.grid import Cell, Grid, joined, number
 from hilcal.tables.guess_values import guess_axes, guess_by_values, is_quaternion, time_unit
-from hilcal.tables.mapping import UNLOADED
-from hilcal.tables.proposal import (
-    FEWEST_JOINTS,
-    GUESSED,
-    MOST_JOINTS,
-    REPORTED,
-    SHOWN,
-    ColumnName,
-    Guesser,
-    Proposal,
-    angle_unit,
-    length_unit,
-    parse,
-)
-from hilcal.tables.sniff import sniff
+from hilcal.tables.mapping import UNLOADED, FileFormat
 from hilcal.tables.units import ANGLES, LENGTHS, MOMENTS
 
 
@@ -38,7 +28,7 @@ class Proposed:
     """A table and a proposed mapping for it."""
 
     grid: Grid
-    proposal: Proposal
+    proposal: words.Proposal
 
 
 @limits.bounded
@@ -94,7 +84,6 @@ def _match(first: Grid, second: Grid) -> tuple[str, str] | None:
 
 
 def _is_key(keys: list[str]) -> bool:
-    """Whether texts name rows: words, or whole numbers."""
     try:
         numbers = np.array([float(k) for k in keys])
     except ValueError:
@@ -102,9 +91,9 @@ def _is_key(keys: list[str]) -> bool:
     return bool(np.all(numbers == np.rint(numbers)))
 
 
-def guess(grid: Grid, joints: int | None = None) -> Proposal:
+def guess(grid: Grid, joints: int | None = None) -> words.Proposal:
     """Propose a mapping for a table."""
-    g = Guesser(grid, joints)
+    g = words.Guesser(grid, joints)
     _joints(g)
     guess_axes(g)
     _scalars(g)
@@ -118,7 +107,7 @@ def guess(grid: Grid, joints: int | None = None) -> Proposal:
     if set(required_columns(joints or 6)) <= set(grid.names):
         g.unsure("file", "this is an exchange table: it is imported without --format")
     if g.proposal.open_convention:
-        g.unsure("orientation", GUESSED)
+        g.unsure("orientation", words.GUESSED)
     for section, sentence in (
         ("position", "no position: three columns x, y, z were not found"),
         ("joints", "no joint angles: where they are in a file of their own, give it with --second"),
@@ -132,7 +121,7 @@ def guess(grid: Grid, joints: int | None = None) -> Proposal:
     return g.proposal
 
 
-def _why_unused(g: Guesser, column: ColumnName) -> str:
+def _why_unused(g: words.Guesser, column: words.ColumnName) -> str:
     values = g.values[column.name]
     if values is not None and np.nanmax(values) == np.nanmin(values):
         return f"constant, {np.nanmax(values):g}"
@@ -145,7 +134,7 @@ def _why_unused(g: Guesser, column: ColumnName) -> str:
     return "its name says nothing"
 
 
-def _joints(g: Guesser) -> None:
+def _joints(g: words.Guesser) -> None:
     """Find joint angles: columns named by a joint's word and a number, or by `ARM_JOINTS`."""
     groups: dict[tuple[str, ...], dict[int, str]] = {}
     for c in g.columns:
@@ -155,13 +144,13 @@ def _joints(g: Guesser) -> None:
             continue
         if not c.has(words.STD):
             groups.setdefault(c.words, {}).setdefault(c.numbers[-1], c.name)
-    candidates: list[tuple[ColumnName, list[str]]] = []
+    candidates: list[tuple[words.ColumnName, list[str]]] = []
     for by_number in groups.values():
         names = [by_number[k] for k in sorted(by_number)]
-        first = parse(names[0])
+        first = words.parse(names[0])
         if is_quaternion(g.block(names)) and len(names) == 4:
             continue
-        if sorted(by_number)[0] > 1 or not FEWEST_JOINTS <= len(names) <= MOST_JOINTS:
+        if sorted(by_number)[0] > 1 or not words.FEWEST_JOINTS <= len(names) <= words.MOST_JOINTS:
             continue
         if first.has(words.NO_ANGLE | words.TORQUE) or first.unit in MOMENTS:
             _per_joint(g, first, names)
@@ -169,14 +158,14 @@ def _joints(g: Guesser) -> None:
             candidates.append((first, names))
     named = [_with_words(g, w) for w in words.ARM_JOINTS]
     if all(named):
-        candidates.append((parse("joint"), [str(name) for name in named]))
+        candidates.append((words.parse("joint"), [str(name) for name in named]))
     if not candidates:
         return
     candidates.sort(key=lambda f: (f[0].has(words.MEASURED | {"qa"}), not f[0].has(words.NOMINAL)))
     first, names = candidates[0]
     if first.has(words.MEASURED | {"qa"}):
         g.unsure("joints", f"'{names[0]}' ... are reported angles, used as the commanded ones")
-    unit = angle_unit(g, "joints", names)
+    unit = words.angle_unit(g, "joints", names)
     g.take("joints", names, unit, unit=unit)
     if g.joints is not None and len(names) != g.joints:
         g.unsure("joints", f"{len(names)} columns, the arm has {g.joints} joints")
@@ -188,7 +177,7 @@ def _joints(g: Guesser) -> None:
                 break
 
 
-def _with_words(g: Guesser, parts: tuple[str, ...]) -> str | None:
+def _with_words(g: words.Guesser, parts: tuple[str, ...]) -> str | None:
     for c in g.columns:
         digits = {str(k) for k in c.numbers}
         if set(parts) <= set(c.words) | digits and g.number(c.name) and not c.has(words.NO_ANGLE):
@@ -196,7 +185,7 @@ def _with_words(g: Guesser, parts: tuple[str, ...]) -> str | None:
     return None
 
 
-def _per_joint(g: Guesser, first: ColumnName, names: list[str]) -> None:
+def _per_joint(g: words.Guesser, first: words.ColumnName, names: list[str]) -> None:
     """Find torques, temperatures and sides of approach of the joints."""
     values = g.block(names)
     if (first.has(words.TORQUE) or first.unit in MOMENTS) and not first.has(words.NOMINAL):
@@ -214,7 +203,7 @@ def _per_joint(g: Guesser, first: ColumnName, names: list[str]) -> None:
         g.take("approach", names, "-1 or +1")
 
 
-def _scalars(g: Guesser) -> None:
+def _scalars(g: words.Guesser) -> None:
     """Find distances from points and heights over planes, in rows that have no position."""
     position = g.proposal.sections.get("position", {}).get("columns", [])
     positioned = np.isfinite(g.block(position)).any(axis=1) if position else np.zeros(1, dtype=bool)
@@ -225,7 +214,7 @@ def _scalars(g: Guesser) -> None:
         if not plain:
             continue
         filled = np.isfinite(g.block(plain[:1])[:, 0])
-        unit = length_unit(g, kind, plain[:1])
+        unit = words.length_unit(g, kind, plain[:1])
         section: dict[str, Any] = {"unit": unit}
         for c in named:
             if g.number(c.name) and c.has(words.STD) and "std_column" not in section:
@@ -245,7 +234,7 @@ def _scalars(g: Guesser) -> None:
             g.free.pop(section.get(key, ""), None)
 
 
-def guess_names(g: Guesser) -> None:
+def guess_names(g: words.Guesser) -> None:
     """Find poses, loads, stations, cycles and reflectors."""
     q = g.proposal.sections.get("joints")
     _pick(g, "pose", words.POSE, lambda n: q is None or _names_poses(g, n, q))
@@ -270,14 +259,16 @@ def guess_names(g: Guesser) -> None:
     if (load := g.proposal.sections.get("load")) is not None:
         values = {t.lower() for t in g.grid.text(load["column"])}
         if not values & {*UNLOADED, ""}:
-            shown = ", ".join(sorted(values)[:SHOWN])
+            shown = ", ".join(sorted(values)[: words.SHOWN])
             g.unsure("load", f"which of its values means no load? Set none = [...] ({shown})")
     _pick(g, "station", words.STATION, lambda n: not g.number(n) and _few_values(g, n))
     _pick(g, "cycle", words.CYCLE, lambda n: g.number(n) and _whole_numbers(g, n))
     _pick(g, "target", words.REFLECTOR, lambda n: not g.number(n) and _few_values(g, n))
 
 
-def _pick(g: Guesser, section: str, vocabulary: set[str], fits: Callable[[str], bool]) -> None:
+def _pick(
+    g: words.Guesser, section: str, vocabulary: set[str], fits: Callable[[str], bool]
+) -> None:
     for c in list(g.free.values()):
         named = not g.number(c.name) or _whole_numbers(g, c.name)
         usable = named and c.has(vocabulary) and not c.axis and not c.has(words.STD)
@@ -286,18 +277,18 @@ def _pick(g: Guesser, section: str, vocabulary: set[str], fits: Callable[[str], 
             return
 
 
-def _whole_numbers(g: Guesser, name: str) -> bool:
+def _whole_numbers(g: words.Guesser, name: str) -> bool:
     values = g.block([name])[:, 0]
     finite = values[np.isfinite(values)]
     return bool(np.all(finite == np.rint(finite)))
 
 
-def _few_values(g: Guesser, name: str) -> bool:
+def _few_values(g: words.Guesser, name: str) -> bool:
     count = len(set(g.grid.text(name)))
     return 1 < count <= min(20, len(g.grid.rows) // 2)
 
 
-def _names_poses(g: Guesser, name: str, joints: dict[str, Any]) -> bool:
+def _names_poses(g: words.Guesser, name: str, joints: dict[str, Any]) -> bool:
     """Whether rows of one name have the same joint angles, or nearly so (then: reported angles)."""
     texts = g.grid.text(name)
     if "" in texts:
@@ -306,7 +297,7 @@ def _names_poses(g: Guesser, name: str, joints: dict[str, Any]) -> bool:
     first: dict[str, int] = {}
     rows = [first.setdefault(text, k) for k, text in enumerate(texts)]
     off = np.nan_to_num(np.abs(q - q[rows]))
-    if off.max() > REPORTED:
+    if off.max() > words.REPORTED:
         k = int(np.argmax(off.max(axis=1)))
         g.unsure("joints", f"'{name}' is no pose: '{texts[k]}' stands at different joints")
         return False
@@ -316,7 +307,7 @@ def _names_poses(g: Guesser, name: str, joints: dict[str, Any]) -> bool:
     return True
 
 
-def guess_scalars(g: Guesser) -> None:
+def guess_scalars(g: words.Guesser) -> None:
     """Find times and the temperature of the air."""
     for c in list(g.free.values()):
         dated = all(isinstance(cell, datetime) for cell in g.grid.cells(c.name))
@@ -338,3 +329,170 @@ def guess_scalars(g: Guesser) -> None:
             unit = c.unit or ("K" if np.nanmin(values) > 200 else "degC")
             if unit in ("degC", "degF", "K"):
                 g.take("air", [c.name], unit, column=c.name, unit=unit)
+
+
+HEAD = 400  # Lines that the dialect is guessed from
+COMMENTS = ("//", "#", "%", "!")
+_UNIT = re.compile(
+    r"[\[(<]?\s*(|-|1|m|mm|[uµμ]m|in(ch)?|\"|deg|degrees?|°|rad|mrad|n|kn|nm|n[*·]m|kg|g|s|sec|ms|"
+    r"°c|degc|c|k|string|text|name)\s*[\])>]?",
+    re.IGNORECASE,
+)
+
+Rows = Sequence[tuple[int, Sequence[Cell]]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sniffed:
+    """A file, opened as it seems to be written."""
+
+    how: dict[str, Any]  # keys of [file] that differ from a plain CSV file
+    grid: Grid
+    doubts: tuple[str, ...]  # sentences on what is unsure
+
+
+def sniff(path: str | Path) -> Sniffed:
+    """Guess how a file is written, and open it."""
+    content = files.content_of(path)
+    name = str(path)
+    kind = files.kind_of(name, content)
+    if kind == "XLSX":
+        return _spreadsheet(name, content)
+    if kind != "text":
+        return Sniffed({}, files.open_grid(path, FileFormat()), ())
+    how: dict[str, Any] = {}
+    text = files.decoded(name, content, None)
+    if not content.startswith(tuple(files.BYTE_ORDER_MARKS)):
+        try:
+            content.decode("utf-8")
+        except UnicodeDecodeError:
+            how["encoding"] = "latin-1"
+    lines = [line for line in text.splitlines() if line.strip()][:HEAD]
+    for mark in COMMENTS:
+        count = sum(line.lstrip().startswith(mark) for line in lines)
+        if 0 < count < 0.5 * len(lines):
+            how["comment"] = mark
+            break
+    how |= _dialect(name, lines, how.get("comment"))
+    how["header_row"] = 0
+    rows = list(files.records(name, text, FileFormat(**how)))
+    layout, doubts = _layout(rows, FileFormat(**how))
+    how |= layout
+    if how["header_row"] == 0 and "comment" in how:
+        how |= _commented_header(text, how, rows)
+    if how["header_row"] == 1:
+        del how["header_row"]
+    if how.get("separator") == ",":
+        del how["separator"]
+    return Sniffed(how, files.open_grid(path, FileFormat(**how)), doubts)
+
+
+def _dialect(path: str, lines: list[str], comment: str | None) -> dict[str, Any]:
+    best, score = dict[str, Any](), 0.0
+    body = "\n".join(lines)
+    choices = product((None, "'", ".", ",", " "), ("tab", ";", "|", ",", "blanks"), (".", ","))
+    for thousands, separator, decimal in choices:
+        blank = separator == "blanks" and thousands == " "
+        if decimal == separator or thousands in (decimal, separator) or blank:
+            continue
+        keys = {"separator": separator}
+        keys |= {"decimal": decimal} if decimal != "." else {}
+        keys |= {"thousands": thousands} if thousands else {}
+        form = FileFormat(**{**keys, "comment": comment, "header_row": 0})
+        try:
+            rows = [cells for _, cells in files.records(path, body, form)]
+        except InputError:
+            continue
+        length, _ = Counter(map(len, rows)).most_common(1)[0] if rows else (0, 0)
+        usual = [cells for cells in rows if len(cells) == length >= 3]
+        mean = sum(_is_number(c, form) for cells in usual for c in cells) / max(len(rows), 1)
+        if mean > score + 1e-9:
+            best, score = keys, mean
+    if not best:
+        raise InputError(
+            f"{path}: no columns of numbers; expected a table, one row per reading, or XLSX, MAT "
+            f"or Parquet"
+        )
+    return best
+
+
+def _is_number(cell: Cell, how: FileFormat) -> bool:
+    return bool(np.isfinite(number(cell, how)))
+
+
+def _layout(rows: Rows, how: FileFormat) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Header row, row of units and rows that are no readings."""
+    length, _ = Counter(len(cells) for _, cells in rows).most_common(1)[0]
+    share = []
+    for _, cells in rows:
+        some = list(filter(files.filled, cells))
+        share.append(sum(_is_number(c, how) for c in some) / max(len(some), 1))
+    usual = float(np.median([s for s, (_, c) in zip(share, rows, strict=True) if len(c) == length]))
+    complete = [len(cells) >= length - 1 for _, cells in rows]
+    first = next((k for k in range(len(rows)) if share[k] >= 0.5 * usual and complete[k]), 0)
+    titled = [k for k in range(first) if complete[k] and sum(map(files.filled, rows[k][1])) > 1]
+    above = [k for k in titled if files.length_of(rows[k][1]) <= length]
+    out: dict[str, Any] = {"header_row": 0}
+    doubts: list[str] = []
+    if titled and not above:
+        row, cells = rows[titled[-1]]
+        named = f"row {row} names {files.length_of(cells)} columns, the readings have {length}"
+        doubts.append(f"{named}: the columns are numbered")
+    header: Sequence[Cell] = ()
+    if above:
+        title = above[-1]
+        if len(above) > 1 and all(_UNIT.fullmatch(str(c or "")) for c in rows[title][1]):
+            out["units_row"] = rows[title][0]
+            title = above[-2]
+        out["header_row"], header = rows[title]
+    width = len(header) or length
+    trimmed = files.length_of(header) if header else width
+    odd = []
+    for k, (row, cells) in enumerate(rows):
+        preamble = k < first and row > out["header_row"] and row != out.get("units_row")
+        short = bool(header) and len(cells) < trimmed
+        if preamble or (
+            k >= first and (short or files.length_of(cells) > width or cells == header)
+        ):
+            odd.append(row)
+    if odd and len(odd) <= 0.1 * len(rows) + 10:
+        out["skip_rows"] = odd
+        late = [row for row in odd if row > rows[first][0]]
+        if late:
+            listed = ", ".join(map(str, late[:5])) + ", ..." * (len(late) > 5)
+            doubts.append(f"rows {listed} are left out: they are not of the table's length")
+    return out, tuple(doubts)
+
+
+def _commented_header(text: str, how: dict[str, Any], rows: Rows) -> dict[str, Any]:
+    """Header in the last comment line above the readings, as numpy.savetxt writes it."""
+    lines = [line.lstrip() for line in text.splitlines()[: rows[0][0] - 1]]
+    marked = [row for row, line in enumerate(lines, start=1) if line.startswith(how["comment"])]
+    if not marked:
+        return {}
+    plain = FileFormat(**{**how, "comment": None, "header_row": 0})
+    line = lines[marked[-1] - 1][len(how["comment"]) :]
+    cells = [c for _, c in files.records("", line, plain)]
+    same = bool(cells) and len(cells[0]) == len(rows[0][1])
+    return {"header_row": marked[-1]} if same else {}
+
+
+def _spreadsheet(path: str, content: bytes) -> Sniffed:
+    """Choose the sheet with most numbers."""
+    best: tuple[int, str, Rows] = (0, "", [])
+    book = files.workbook(path, content)
+    names = book.sheetnames
+    for sheet in names:
+        rows = files.sheet_rows(path, book, sheet, None)
+        count = sum(isinstance(c, float) for _, cells in rows for c in cells)
+        if count > best[0]:
+            best = count, sheet, rows
+    if not best[0]:
+        raise InputError(f"{path}: no sheet with numbers; it has {', '.join(names)}")
+    how, doubts = _layout(best[2], FileFormat(header_row=0))
+    if len(names) > 1:
+        how["sheet"] = best[1]
+    if how["header_row"] == 1:
+        del how["header_row"]
+    form = FileFormat(**how)
+    return Sniffed(how, files.grid_of_rows(path, best[2], form), doubts)

@@ -6,16 +6,16 @@ from pathlib import Path
 
 import numpy as np
 
+from hilcal.config import CellConfig
 from hilcal.errors import InputError
 from hilcal.names import check_name, check_names
 from hilcal.readings.covariance import INSTRUMENT, ROUNDING, WHOLE, TrackerNoise, tracker_covariance
 from hilcal.readings.readings import ObserverName, Readings, States
 from hilcal.robot.arm import Arm
-from hilcal.tables import checks, columns
-from hilcal.tables.checks import observed_of, observer_columns
-from hilcal.tables.columns import following_columns, with_following
+from hilcal.store.plan import UNLOADED
+from hilcal.tables import columns
 from hilcal.tables.files import open_grid
-from hilcal.tables.grid import ColumnTable
+from hilcal.tables.grid import ColumnTable, first_true
 from hilcal.tables.mapping import FileFormat
 from hilcal.tables.uncertainty import LEAST, floored, rounding_variance, with_rounding
 from hilcal.tables.write import Column, write_columns
@@ -24,8 +24,7 @@ from hilcal.types import Bools, Floats, Ints
 
 FROM_TABLE = "covariance: from the table"
 FROM_TRACKER = "covariance: from the tracker's noise in [tracker]"
-LONGEST = 1e12
-"""s; longer than any time of a campaign: seconds since 1970 are 1e9, nanoseconds 1e18."""
+LONGEST = 1e12  # s; longer than a campaign: seconds since 1970 are 1e9, nanoseconds 1e18
 LARGEST_NM = 1e5  # N·m; more than any joint of an arm carries
 FORM = FileFormat(encoding="utf-8")
 
@@ -41,17 +40,6 @@ class ImportResult:
     from_tracker: bool = False  # whether the covariances are those of the noise in [tracker]
 
 
-def read_table(
-    path: str | Path,
-    arm: Arm,
-    noise: TrackerNoise | None,
-    station: Floats | Sequence[float] | None = None,
-    targets: Sequence[str] = (),
-) -> Readings:
-    """Return the readings of an exchange table; arguments and errors are `import_table`'s."""
-    return import_table(path, arm, noise, station, targets).readings
-
-
 def import_table(
     path: str | Path,
     arm: Arm,
@@ -60,11 +48,7 @@ def import_table(
     targets: Sequence[str] = (),
     std: Mapping[ObserverName, float] | None = None,
 ) -> ImportResult:
-    """Read an exchange table; every unit is SI, every complaint names row and column.
-
-    Args:
-        station: (3,) where the tracker's beam starts, m; the origin where None.
-    """
+    """Read an exchange table: SI units; `station` (3,), m, is where the tracker's beam starts."""
     chosen: list[Sequence[str]] = []
     grid = open_grid(path, FORM, lambda header: chosen.extend(_choose(str(path), header, arm)))
     sparse = columns.sparse_columns(grid.names)
@@ -84,26 +68,23 @@ def readings_of(
 ) -> ImportResult:
     """Check a table with the exchange table's columns, in SI units, and make readings of it.
 
-    Args:
-        station: (3,) where the tracker's beam starts, m; the origin where None.
-        covariance: (K, m, m) of the K rows with a position, in place of the table's columns.
-        rounding: (3,) variance of the positions' rounding, m²; None: from the positions.
-        std: of distances and heights, m, for a table that states none.
+    `covariance` (K, m, m) of the K rows with a position replaces the table's columns; `rounding`
+    (3,), m², is the variance of the positions' rounding, which follows from them where it is None;
+    `std` is that of distances and heights, m, for a table that states none.
     """
-    checks.check_names(table)
+    columns.check_names(table)
     pose, pose_names = _index(table.text["pose"])
     load, load_names = _index(table.text["load"])
     target = _targets(table, targets)
-    observed = observed_of(table)
+    observed = columns.observed_of(table)
     positioned = np.ones(len(table.rows), dtype=np.bool_) if observed is None else ~observed.scalar
     states, value = measured_of(table, arm, positioned)
     states = replace(states, target=target, observer=None if observed is None else observed.number)
-    checks.check_same_pose(table, pose, pose_names, states.q, arm)
-    checks.check_wrenches(table, states.wrench, load, load_names, arm)
-    cov, notes, covers = np.zeros((len(value), 3, 3)), tuple[str, ...](), _covers(table)[0]
-    if positioned.all():
-        cov, notes, covers = covariances_of(table, value, noise, station, covariance, rounding)
-    elif positioned.any():
+    columns.check_same_pose(table, pose, pose_names, states.q, arm)
+    columns.check_wrenches(table, states.wrench, load, load_names, arm)
+    m = value.shape[1]
+    cov, notes, covers = np.zeros((len(value), m, m)), tuple[str, ...](), _covers(table)[0]
+    if positioned.any():
         cov[positioned], notes, covers = covariances_of(
             table.select(positioned), value[positioned], noise, station, covariance, rounding
         )
@@ -139,7 +120,7 @@ def covariances_of(
         cov = _instrument_covariance(table, value, noise, station)
         notes, covers, included = (FROM_TRACKER,), INSTRUMENT, False
     else:
-        checks.check_covariances(table, stated)
+        columns.check_covariances(table, stated)
         tiny = np.any(np.diagonal(stated, axis1=1, axis2=2) < min(LEAST) ** 2)
         use_spec = bool(tiny) and noise is not None
         spec = _instrument_covariance(table, value, noise, station) if use_spec else None
@@ -152,7 +133,6 @@ def covariances_of(
 
 
 def _choose(path: str, header: Sequence[str], arm: Arm) -> tuple[Sequence[str], Sequence[str]]:
-    """Check the header; return the text and the number columns to read."""
     check_names(header, f"{path}: row 1, column")
     if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
         raise InputError(
@@ -166,8 +146,8 @@ def _choose(path: str, header: Sequence[str], arm: Arm) -> tuple[Sequence[str], 
             f"({', '.join(columns.required_columns(arm.units))}); for any other table: "
             f"{columns.PREVIEW}"
         )
-    columns.check_header(path, header, arm.units, arm.name, following_columns(arm))
-    columns.covariance_size(path, header)
+    columns.check_header(path, header, arm.units, arm.name, columns.following_columns(arm))
+    columns.check_covariance_columns(path, header)
     named = [name for _, name, _ in columns.SCALAR.values()]
     optional = (columns.TARGET, columns.COVERS, columns.STATION, *named)
     text = (*columns.TEXT, *(name for name in header if name in optional))
@@ -177,7 +157,7 @@ def _choose(path: str, header: Sequence[str], arm: Arm) -> tuple[Sequence[str], 
 def _index(names: list[str]) -> tuple[Ints, list[str]]:
     """Index of each name among the distinct ones, in order of appearance, and these."""
     order = {name: k for k, name in enumerate(dict.fromkeys(names))}
-    return np.fromiter((order[n] for n in names), dtype=np.int64, count=len(names)), list(order)
+    return np.array([order[name] for name in names], dtype=np.int64), list(order)
 
 
 def _targets(table: ColumnTable, names: Sequence[str]) -> Ints | None:
@@ -211,10 +191,7 @@ def _targets(table: ColumnTable, names: Sequence[str]) -> Ints | None:
 
 
 def _covers(table: ColumnTable) -> tuple[str, bool]:
-    """Return what the covariances cover, by column `covers`, and whether they include rounding.
-
-    Without the column they cover the instrument.
-    """
+    """What the covariances cover, by column `covers`, and whether rounding is in them."""
     stated = table.text.get(columns.COVERS, [INSTRUMENT])
     for k, word in enumerate(stated):
         check_covers(word, table.at(k, columns.COVERS))
@@ -237,11 +214,7 @@ def check_covers(word: str, where: str) -> None:
 
 
 def measured_of(table: ColumnTable, arm: Arm, rows: Bools | None = None) -> tuple[States, Floats]:
-    """Return the states of a table's rows, and their measured values (N, m), m and rad.
-
-    Args:
-        rows: (N,) rows with a position, others are zero; all of them where None.
-    """
+    """Return states and values (N, m), m and rad; values are zero in rows not in `rows` (N,)."""
     states = _states(table, arm)
     if rows is not None and not rows.all():
         value = np.zeros((len(table.rows), 3))
@@ -252,35 +225,28 @@ def measured_of(table: ColumnTable, arm: Arm, rows: Bools | None = None) -> tupl
     station = np.array(table.text.get(columns.STATION, [""] * len(value)))
     for name in dict.fromkeys(station.tolist()):
         group = station == name
-        checks.check_positions(table.select(group), value[group], states.q[group], arm)
+        columns.check_positions(table.select(group), value[group], states.q[group], arm)
     if columns.ROTATION[0] in table.number:
         rotation = table.matrix(columns.ROTATION)
-        checks.check_rotations(table, rotation)
+        columns.check_rotations(table, rotation)
         value = np.hstack([value, rotation])
     return states, value
 
 
-_RANGES = (
-    ("air_degC", -50.0, 80.0, "°C"),
-    ("time_s", -LONGEST, LONGEST, "s"),
-    ("load_time_s", 0.0, LONGEST, "s"),
-)
-
-
 def _states(table: ColumnTable, arm: Arm) -> States:
-    table = with_following(table, arm)
+    table = columns.with_following(table, arm)
     number, n = table.number, arm.n
     joints, reported = columns.joint_columns(arm.units), columns.actual_columns(arm.units)
     torques, sides = columns.torque_columns(arm.units), columns.approach_columns(n)
     q, zero = table.matrix(joints), np.zeros(len(table.rows))
-    checks.check_joints(table, joints, q, arm)
+    columns.check_joints(table, joints, q, arm)
     wrench = np.stack([number.get(name, zero) for name in columns.WRENCH], axis=1)
     temperature = _group(table, columns.temperature_columns(n))
     approach, actual, torque = (_group(table, names) for names in (sides, reported, torques))
     if approach is not None:
         table.refuse(np.abs(approach) != 1, sides, lambda v: f"{v:g} must be -1 or +1")
     if actual is not None:
-        checks.check_actual_joints(table, reported, actual, q)
+        columns.check_actual_joints(table, reported, actual, q)
     if temperature is not None:
         _in_range(table, columns.temperature_columns(n), -50, 150, "°C")
     if torque is not None:
@@ -288,7 +254,11 @@ def _states(table: ColumnTable, arm: Arm) -> States:
         some = lost & ~lost.all(axis=1, keepdims=True)
         table.refuse(some, torques, lambda _: "no value; give all torques of a row, or none")
         _in_range(table, torques, -LARGEST_NM, LARGEST_NM, "N·m or N")
-    for name, low, high, unit in _RANGES:
+    for name, low, high, unit in (
+        ("air_degC", -50.0, 80.0, "°C"),
+        ("time_s", -LONGEST, LONGEST, "s"),
+        ("load_time_s", 0.0, LONGEST, "s"),
+    ):
         if name in number:
             _in_range(table, (name,), low, high, unit)
     return States(
@@ -349,12 +319,69 @@ def _instrument_covariance(
             f"the section [tracker] of the configuration; give one of them"
         )
     origin = np.zeros(3) if station is None else np.asarray(station, dtype=float)
-    for k in np.flatnonzero(np.linalg.norm(value[:, :3] - origin, axis=1) < 1e-3)[:1]:
+    for (k,) in first_true(np.linalg.norm(value[:, :3] - origin, axis=1) < 1e-3):
         raise InputError(
-            f"{table.at(int(k))}: position lies at the tracker's station; set station_m in the "
+            f"{table.at(k)}: position lies at the tracker's station; set station_m in the "
             f"section [tracker] of the configuration"
         )
     return tracker_covariance(value[:, :3], noise, origin, m)
+
+
+def named_loads(readings: Readings, config: CellConfig) -> tuple[Readings, tuple[str, ...]]:
+    """Give the loads of a table without forces the wrench of the cell's `[[loads]]`, by name."""
+
+    def plain(name: str) -> str:
+        return "".join(name.split()).casefold()
+
+    s, gravity = readings.states, np.asarray(config.robot.gravity_m_s2)
+    if s.wrench.any():
+        return readings, ()
+    wrenches = {plain(load.name): load.wrench(gravity) for load in config.loads}
+    wrench, notes = s.wrench.copy(), []
+    for k in np.unique(readings.load):
+        name = readings.load_names[k]
+        if name == UNLOADED:
+            continue
+        where = "is not stated by the table, nor by [[loads]] of the cell: it is taken as none"
+        if plain(name) in wrenches:
+            wrench[readings.load == k] = wrenches[plain(name)]
+            where = "is that of [[loads]] of the cell, since the table states none"
+        notes.append(f"load {name}: its force {where}")
+    return replace(readings, states=replace(s, wrench=wrench)), tuple(notes)
+
+
+def without_copies(readings: Readings) -> tuple[Readings, tuple[str, ...]]:
+    """Leave out rows that are copies of another row to the last digit, with a note.
+
+    A repeated measurement scatters, a copy does not. Equal rows may be measurements, and stay, in
+    different cycles, or where rows have no times and positions are rounded to more than their
+    noise. Copies of another pose's row stay where their pose has rows that are no copies.
+    """
+    s, value = readings.states, readings.value
+    rounding = np.sqrt(12.0 * rounding_variance(value[:, :3], 1.0))
+    noise = np.sqrt(np.median(readings.covariance[:, range(3), range(3)], axis=0))
+    if s.time is None and np.any(rounding > noise):
+        return readings, ()
+    scalars = [s.time, s.load_time, s.air_temperature]
+    columns = [s.q, s.wrench, value, *(x[:, None] for x in scalars if x is not None)]
+    names = np.stack([readings.load, readings.cycle, readings.line], axis=1)
+    keys = np.concatenate([*columns, names], axis=1)
+    _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    original = first[inverse.reshape(-1)]
+    copied = original != np.arange(len(readings))
+    same = readings.pose == readings.pose[original]
+    only_copies = ~np.isin(readings.pose, readings.pose[~copied])
+    copied &= same | only_copies
+    if not copied.any():
+        return readings, ()
+    k = int(np.argmax(copied))
+    name = f"{readings.pose_names[readings.pose[k]]}/{readings.load_names[readings.load[k]]}"
+    note = (
+        f"{int(copied.sum())} of {len(copied)} rows are copies of others to the last digit (the "
+        f"first is of {name}): each is counted once, since a reading that is made again scatters; "
+        "take them out of the table"
+    )
+    return readings[~copied], (note,)
 
 
 def write_table(
@@ -364,11 +391,10 @@ def write_table(
     about: Mapping[str, object] | None = None,
     units: Sequence[str] | None = None,
 ) -> None:
-    """Write an exchange table that `read_table` reads back exactly: CSV, or Parquet by its name.
+    """Write an exchange table that `import_table` reads back exactly: CSV, or Parquet by its name.
 
-    `covers` says what the covariances cover, see `readings.covariance` and
-    `with_what_rounding_does`; `units` are those of the joints' values (`Arm.units`), all rad where
-    None.
+    `covers` says what the covariances cover, see `with_what_rounding_does`; `units` are those of
+    the joints' values (`Arm.units`), all rad where None.
     """
     about = {"table": "readings", "covers": covers, **(about or {})}
     write_columns(Path(path), exchange_columns(readings, covers, units), about)
@@ -385,18 +411,14 @@ def exchange_columns(
     if readings.states.target is not None:
         out[columns.TARGET] = _checked_names(readings.target_names, readings.target, columns.TARGET)
     if readings.states.observer is not None:
-        out |= observer_columns(readings)
+        out |= columns.observer_columns(readings)
     if covers != INSTRUMENT:
         out[columns.COVERS] = [covers] * len(readings)
     return out | _number_columns(readings, units)
 
 
 def with_what_rounding_does(covers: str, readings: Readings) -> str:
-    """Return the word of column `covers` for complete covariances.
-
-    Where reading the table would add the variance of the positions' rounding, the word says that
-    the covariances include it.
-    """
+    """Return the word of column `covers` that keeps reading from adding rounding's variance."""
     positioned = ~readings.scalar
     if not positioned.any():
         return covers
@@ -417,7 +439,6 @@ def _checked_names(names: Sequence[str], index: Ints, kind: str) -> list[str]:
 
 
 def _number_columns(readings: Readings, units: Sequence[str] | None) -> dict[str, Column]:
-    """(N,) number columns that the readings have, by name."""
     s, m, n = readings.states, readings.m, readings.states.q.shape[1]
     i, j = np.triu_indices(m)
     value, cov = readings.value.copy(), readings.covariance[:, i, j]

@@ -1,8 +1,4 @@
-"""Covariances of the uncertainties that a table states, and checks of them.
-
-Stated are standard deviations, U95, variances or matrices; checked is whether they are zero, far
-too small, or below the rounding of the values.
-"""
+"""Covariances of the uncertainties that a table states, and checks of what cannot be true."""
 
 from collections.abc import Sequence
 
@@ -11,24 +7,18 @@ import numpy as np
 from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise, tracker_covariance
 from hilcal.tables import units
-from hilcal.tables.grid import ColumnTable, Grid
+from hilcal.tables.grid import ColumnTable, Grid, first_true
 from hilcal.tables.mapping import Column, CovarianceColumns, Mapping, Std
 from hilcal.tables.units import angle_axes
 from hilcal.types import Bools, Floats
 
 FAR = 5.0  # Ratio of stated and instrument's standard deviation that is worth a note; a choice
 NEAR = 3.0  # Ratio within which another interpretation of the figures fits the instrument; a choice
-LEAST = (1e-7, 1e-7)
-"""m, rad; no instrument in air measures an arm to better than 0.1 µm and 0.02": a choice, about
-the resolution of the best."""
-DISTINCT = 10
-"""Distinct values needed to recognise rounding: ten that end in zero by chance have a probability
-of 10^-10."""
-COUNTS = 0.01
-"""Rounding is added where its variance is more than this share of the stated one; a choice."""
+LEAST = (1e-7, 1e-7)  # m, rad; no instrument in air is better than 0.1 µm and 0.02": a choice
+DISTINCT = 10  # Values needed to recognise rounding: ten end in zero by chance once in 10^10
+COUNTS = 0.01  # Rounding is added where its variance is more than this share; a choice
 _FINEST = 1e-9
-_PLAUSIBLE = (1e-6, 1e-3)
-"""m; standard deviations that a tracker or a camera states, to guess what was meant."""
+_PLAUSIBLE = (1e-6, 1e-3)  # m; what trackers and cameras state, to guess what was meant
 
 
 def mapped_covariance(
@@ -87,9 +77,7 @@ def mapped_covariance(
 def _block(grid: Grid, columns: Sequence[Column]) -> Floats:
     """(N, k) figures of columns; every row has one."""
     values = np.stack([grid.numbers(column) for column in columns], axis=1)
-    bad = np.isnan(values)
-    if bad.any():
-        i, j = divmod(int(np.argmax(bad)), values.shape[1])
+    for i, j in first_true(np.isnan(values)):
         raise InputError(
             f"{grid.at(i, columns[j])}: no value; every reading needs its uncertainty "
             f"(take the column out of the mapping to use the noise in [tracker])"
@@ -112,9 +100,7 @@ def _of_std(grid: Grid, mapping: Mapping, std: Std, count: int) -> tuple[Floats,
         figures = np.tile(np.array(constants, dtype=float), (count, 1))
     else:
         figures = _block(grid, std.columns)
-        bad = figures < 0
-        if bad.any():
-            i, j = divmod(int(np.argmax(bad)), figures.shape[1])
+        for i, j in first_true(figures < 0):
             quantity = "variance" if std.kind == "variance" else "standard deviation"
             where = grid.at(i, std.columns[j])
             raise InputError(f"{where}: {figures[i, j]:g}: a {quantity} is 0 or more")
@@ -157,7 +143,7 @@ def _of_matrix(grid: Grid, section: CovarianceColumns) -> Floats:
         cov = figures.reshape(count, m, m)
         transposed = np.swapaxes(cov, 1, 2)
         bad = np.abs(cov - transposed).max(axis=(1, 2)) > 1e-3 * np.abs(cov).max(axis=(1, 2))
-        for i in np.flatnonzero(bad)[:1].tolist():
+        for (i,) in first_true(bad):
             raise InputError(f"{grid.at(i, section.columns[0])}: the covariance is not symmetric")
         cov = 0.5 * (cov + transposed)
     else:
@@ -249,10 +235,7 @@ def _cause(usual: float) -> str:
 
 
 def step(values: Floats) -> float:
-    """Return the power of ten of which all values are whole multiples.
-
-    0 where there is none, or fewer than `DISTINCT` different values.
-    """
+    """Return the power of ten of which all values are multiples; 0 for none, or too few values."""
     if len(np.unique(values)) < DISTINCT:
         return 0.0
     for power in range(3, -10, -1):
@@ -287,10 +270,7 @@ def with_rounding(covariance: Floats, extra: Floats) -> tuple[Floats, tuple[str,
 def check_joint_rounding(
     q: Floats, unit: float, name: str, covariance: Floats, reach: float
 ) -> tuple[str, ...]:
-    """Return a note where rounded joint angles move the target more than the noise does.
-
-    A rounding of Δ displaces the target by up to Δ/√12 times the reach, one standard deviation.
-    """
+    """Return a note where a rounding Δ of the joints, Δ/√12 times the reach, is over the noise."""
     size = max((step(q[:, k]) for k in range(q.shape[1])), default=0.0)
     std = unit * size / np.sqrt(12)
     noise = float(np.sqrt(np.median(covariance[:, range(3), range(3)])))

@@ -96,10 +96,7 @@ intrinsic). Rotations about fixed axes are intrinsic ones in the reverse order."
 
 
 def rotations(convention: str, numbers: Floats, unit: float) -> Floats:
-    """(N, 3, 3) rotations of the numbers (N, k) of a convention; `unit` of angles, rad.
-
-    Quaternions and matrices need not be exactly normalised, the nearest rotation is taken.
-    """
+    """(N, 3, 3) rotations nearest to numbers (N, k) of a convention; `unit` of angles, rad."""
     from scipy.spatial.transform import Rotation  # slow to import
 
     kind = CONVENTIONS[convention]

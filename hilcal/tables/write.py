@@ -38,14 +38,9 @@ def check_suffix(path: Path) -> None:
 
 
 def write_columns(path: Path, columns: Mapping[str, Column], about: Mapping[str, object]) -> None:
-    """Write columns of equal length; a file of that name is replaced when the new one is complete.
-
-    `about` says what the table is about, for the metadata of Parquet; CSV has no place for it.
-    """
+    """Write columns of equal length, as a whole file; `about` is for the metadata of Parquet."""
     check_suffix(path)
-    plain = {
-        escaped(k): v.tolist() if isinstance(v, np.ndarray) else list(v) for k, v in columns.items()
-    }
+    plain = {escaped(name): _plain(column) for name, column in columns.items()}
     if path.suffix.lower() == ".parquet":
         table = _arrow(path, plain, about)
         parquet = package(path, "pyarrow.parquet", "Parquet")
@@ -60,9 +55,21 @@ def csv_of(columns: Mapping[str, Column]) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(map(csv_text, columns))
-    values = (v.tolist() if isinstance(v, np.ndarray) else v for v in columns.values())
-    writer.writerows(zip(*([_cell(v) for v in column] for column in values), strict=True))
+    cells = ([_cell(v) for v in _plain(column)] for column in columns.values())
+    writer.writerows(zip(*cells, strict=True))
     return out.getvalue()
+
+
+def _cell(value: object) -> object:
+    if isinstance(value, str):
+        return csv_text(value)
+    if value is None or value != value:
+        return ""
+    return repr(value) if isinstance(value, float) else value
+
+
+def _plain(column: Column) -> list[Any]:
+    return column.tolist() if isinstance(column, np.ndarray) else list(column)
 
 
 def unit_of(name: str) -> str | None:
@@ -72,15 +79,6 @@ def unit_of(name: str) -> str | None:
         return f"{parts[0]}2" if parts[0] == parts[1] else "m rad"
     end = name.rpartition("_")[2]
     return end if end in UNITS else None
-
-
-def _cell(value: object) -> object:
-    """Return a cell as CSV writes it."""
-    if isinstance(value, str):
-        return csv_text(value)
-    if value is None or value != value:
-        return ""
-    return repr(value) if isinstance(value, float) else value
 
 
 def _arrow(path: Path, columns: Mapping[str, list[Any]], about: Mapping[str, object]) -> Any:
@@ -96,11 +94,7 @@ def _arrow(path: Path, columns: Mapping[str, list[Any]], about: Mapping[str, obj
 
 
 def revision_table(records: Sequence[RevisionRecord], in_use: int | None) -> dict[str, Column]:
-    """Return the models and errors of revisions as a table, SI.
-
-    Args:
-        in_use: number of the revision in use.
-    """
+    """Return the models and errors of revisions, of which one is in use, as a table, SI."""
     rows = [_row(r, r.number == in_use) for r in records]
     return {name: [row[name] for row in rows] for name in (rows[0] if rows else {})}
 
@@ -140,11 +134,7 @@ def _number(value: Any) -> float | None:
 def plan_csv(
     plan: Plan, wrenches: Mapping[str, Floats] | None = None, units: Sequence[str] | None = None
 ) -> str:
-    """Return a plan as CSV: `x_order` from 1, pose, load, cycle, q1_rad ... (and wrenches).
-
-    The columns are those of the exchange table: who measures by hand adds x_m, y_m, z_m and
-    imports it. `units` are those of the joints' values, all rad where None.
-    """
+    """Return a plan as CSV, an exchange table without positions; joints in `units`, or all rad."""
     columns: dict[str, Column] = {ORDER: list(range(1, 1 + len(plan.steps)))}
     columns |= {name: [getattr(step, name) for step in plan.steps] for name in TEXT}
     columns["cycle"] = [step.cycle for step in plan.steps]

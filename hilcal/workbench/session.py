@@ -17,7 +17,7 @@ from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.changes import Changed, add_effect, change_cell, refit, remove_effect
 from hilcal.campaign.revisions import chain_in_cell
 from hilcal.config import Target
-from hilcal.config.changes import (
+from hilcal.config.cell import (
     CHANGEABLE,
     INSTRUMENT_NOISE,
     Changes,

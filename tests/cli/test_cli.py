@@ -67,9 +67,6 @@ def test_identify_reports_what_the_contract_asks_for(campaign, capsys):
     assert d["inflated"] is True
     assert d["outliers"] == []
     assert len(d["registration"]) == 4
-
-
-def test_identify_in_words(campaign, capsys):
     words = ok(capsys, "identify", campaign, "--details").out
     for part in ("µrad/(N·m)", "Condition number", "widened", "Not determined", "noise alone"):
         assert part in words
@@ -271,36 +268,28 @@ def test_effects_lists_the_catalogue(capsys):
     assert all(name in words for name in installed().names)
 
 
-def test_study_scaling(capsys):
+def test_study_scaling_and_a_scheduler_that_anybody_can_reach(capsys):
     d = ok(capsys, "study", "scaling", "--runs", "20", "--json").document
     assert d["runs"] == 20
     assert set(d["summary"]) == {"none", "gu", "gc"}
     assert "2 or more" in refused(capsys, 2, "study", "scaling", "--runs", "1")
     both = ("--workers", "2", "--scheduler", "tls://127.0.0.1:1")
     assert "own workers" in refused(capsys, 2, "study", "scaling", *both)
-
-
-def test_a_scheduler_that_anybody_can_reach_is_said(capsys):
     given = ("study", "scaling", "--workers", "2", "--scheduler", "tcp://127.0.0.1:1")
     said, error = run(capsys, *given).err.splitlines()
     assert said.startswith("--scheduler tcp://127.0.0.1:1: without TLS")
     assert error.startswith("error: ")
 
 
-def test_version(capsys):
+def test_version_and_help(capsys):
     assert ok(capsys, "--version").out == f"hilcal {__version__}\n"
-
-
-def test_without_a_command_help_is_shown(capsys):
     result = run(capsys)
     assert result.code == 2
     assert "refine" in result.out + result.err
     assert "Traceback" not in result.err
 
 
-UR5E = load_config(CELL).model_copy(
-    update={"robot": load_config(CELL).robot.model_copy(update={"model": "ur5e"})}
-)
+UR5E = load_config(CELL).with_keys("robot", model="ur5e")
 
 
 def study(mode, *hidden, seed=1, **options):
@@ -455,3 +444,19 @@ def test_the_steps_of_a_refinement_carry_what_it_tried(monkeypatch):
             assert before.diagnosis.suspects[0].effect == after.added
     for step in r.steps:
         assert set(step.diagnosis.significant).isdisjoint(step.diagnosis.history.rejected)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("series", "limit_m"), [("Series_B", 0.110e-3), ("Series_C", 0.100e-3)])
+def test_refine_finds_what_the_arm_lacks(series, limit_m, ipa_ur10, tmp_path, capsys):
+    (measured,) = (ipa_ur10 / series).glob("measurements_*.csv")
+    run, cell = tmp_path / "ur10.hilcal", CELL.with_name("ipa_ur10.toml")
+    ok(capsys, "import", measured, "--format", "ipa-ur10", "--config", cell, "-o", run)
+    d = ok(capsys, "refine", run, "--json").document
+    first, last = d["revisions"][0], d["revisions"][-1]
+    assert first["model"] == ["base_frame", "target_offset"]  # frames only
+    assert first["error"]["holdout"]["mean_m"] > 0.8e-3
+    assert "transmission_error" in [r["added"] for r in d["revisions"]]
+    assert last["error"]["holdout"]["mean_m"] <= limit_m
+    words = ok(capsys, "compare", run).out
+    assert "noise alone" in words

@@ -107,19 +107,20 @@ def test_an_unexpected_error_and_an_interrupt_are_documents(capsys, monkeypatch)
     found = run(capsys, "effects", "--json")
     assert (found.code, found.document["error"]["kind"]) == (1, "unexpected")
     assert "ZeroDivisionError: by zero" in found.document["error"]["message"]
+    assert "Traceback" not in found.err
+    monkeypatch.setenv("HILCAL_DEBUG", "1")
+    found = run(capsys, "effects")
+    assert (found.code, "Traceback" in found.err) == (1, True)
     monkeypatch.setattr(looking_up, "example_cell", fails(KeyboardInterrupt()))
     found = run(capsys, "effects", "--json")
-    assert found.code == 130
-    assert found.document["error"] == {
-        "message": "interrupted",
-        "kind": "interrupted",
-        "exit_code": 130,
-    }
+    error = {"message": "interrupted", "kind": "interrupted", "exit_code": 130}
+    assert (found.code, found.document["error"]) == (130, error)
 
 
 def test_a_usage_error_names_the_help(capsys):
     assert refused(capsys, 2, "run", "x", "--foo").endswith("see hilcal run -h")
     assert refused(capsys, 2, "diagnos").endswith("Did you mean 'diagnose'? See hilcal -h")
+    assert "EFFECT" in refused(capsys, 2, "add", "run.hilcal")
 
 
 HEAVY = ("numpy", "scipy", "pydantic", "pinocchio", "rerun", "sklearn", "rich.console", "dask")

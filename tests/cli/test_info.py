@@ -174,9 +174,8 @@ def test_a_campaign_that_holds_nothing_yet(tmp_path, capsys):
 @pytest.fixture
 def run(tmp_path):
     config = configuration()
-    limits = config.limits.model_copy(update={"accuracy_m": 2e-4})
     readings = campaign("none", "deflection", poses=6).readings
-    config = config.model_copy(update={"limits": limits})
+    config = config.with_keys("limits", accuracy_m=2e-4)
     return stored_readings(tmp_path / "my run.hilcal", readings, config)
 
 
@@ -215,8 +214,7 @@ def sent(tmp_path):
     here.mkdir()
     (there / "own.urdf").write_text(urdf(load_arm("ur10e")), encoding="utf-8")
     config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
-    robot = config.robot.model_copy(update={"model": "own.urdf"})
-    config = config.model_copy(update={"robot": robot})
+    config = config.with_keys("robot", model="own.urdf")
     with CampaignFile.create(there / "run.hilcal", config.to_json(), str(there), "made") as file:
         file.append_readings(simulated().readings)
     shutil.copy(there / "run.hilcal", here)
@@ -279,8 +277,7 @@ def test_a_campaign_reads_no_file_that_it_names(sent, tmp_path):
 def test_info_reads_the_kinematics_that_the_campaign_keeps(tmp_path, capsys, monkeypatch):
     """From whatever folder it is asked, and no file of the same name that is there."""
     config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
-    robot = config.robot.model_copy(update={"calibration": "k.conf"})
-    config = config.model_copy(update={"robot": robot})
+    config = config.with_keys("robot", calibration="k.conf")
     rows = "".join(f"delta_{n} = [0, 0, 0, 0, 0, 0]\n" for n in ("theta", "a", "d", "alpha"))
     (tmp_path / "k.conf").write_text(f"[mounting]\n{rows}", encoding="utf-8")
     path = tmp_path / "run.hilcal"

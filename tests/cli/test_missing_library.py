@@ -135,6 +135,6 @@ def test_a_missing_system_library_is_named(monkeypatch, capsys):
     def load(_):
         raise ImportError("libgomp.so.1: cannot open shared object file: No such file or directory")
 
-    monkeypatch.setattr(cli, "load", load)
+    monkeypatch.setattr(cli.commands, "load", load)
     line = refused(capsys, 2, "doctor")
     assert "the system library libgomp.so.1 is missing: install its package (libgomp1" in line

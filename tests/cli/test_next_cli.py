@@ -203,7 +203,8 @@ def test_the_demo_settles_a_doubt(tmp_path, capsys):
 
 
 def rehearsal_of(seed, path):
-    return RehearsalSettings(load_config(CELL), "random", seed, path, CELL.parent, installed())
+    known = installed()
+    return RehearsalSettings(load_config(CELL), "random", seed, path, CELL.parent, known, known)
 
 
 def in_doubt_at_first(seed, path):

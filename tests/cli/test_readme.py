@@ -6,6 +6,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import time
 import tomllib
 from itertools import pairwise
 from pathlib import Path
@@ -27,7 +28,7 @@ from hilcal.store.run_log import RunLog, create_run
 from hilcal.tables.columns import joint_columns
 from hilcal.tables.table import write_table
 from tests.support import readme
-from tests.support.cli_cases import run
+from tests.support.cli_cases import run, start
 from tests.support.paths import ROOT
 
 FEW = "candidates = 60\nagainst = []\n"
@@ -178,13 +179,72 @@ def others(config, directory):
     book.save(directory / "theirs.xlsx")
 
 
+FAST = "[simulation]\nclock = 20.0\n"
+"""The world of the devices goes twenty times faster than a clock."""
+READY_S = 120.0
+TRIES = 5
+DEVICE_FAILED = 3
+
+
+def measured(capsys, words):
+    """Measure, and go on after a lost link, as an operator would: a busy machine loses some."""
+    result = run(capsys, *words)
+    for _ in range(TRIES):
+        if result.code != DEVICE_FAILED:
+            break
+        plan = words.index("--plan") if "--plan" in words else len(words)
+        words = [*words[:plan], *words[plan + 2 :]]
+        words = [w for w in words if w not in ("--resume", "--append")] + ["--resume"]
+        result = run(capsys, *words)
+    return result
+
+
+@pytest.mark.slow
+def test_every_command_on_devices(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    text = readme.cell().replace("[planning]\n", f"[planning]\n{FEW}") + FAST
+    Path("CELL.toml").write_text(text, encoding="utf-8")
+    others(load_config(Path("CELL.toml")), tmp_path)
+    devices = start("simulate", "CELL.toml", "-o", "DIR", cwd=tmp_path)
+    try:
+        there = Path("DIR/cell.toml")
+        ended = time.monotonic() + READY_S
+        while not there.is_file():
+            assert devices.poll() is None
+            assert time.monotonic() < ended, "no DIR/cell.toml"
+            time.sleep(0.2)
+        separated = True
+        for words in readme.commands(options=True):
+            if words[0] in ELSEWHERE or ("--append" in words and not separated):
+                continue
+            given = [str(there) if w == "CELL.toml" else w for w in words]
+            if words[0] == "compensate" and words[2].endswith(".src"):
+                program(Path(words[2]), Path(words[4]))
+            elif words[0] == "compensate":
+                points(Path(words[1]), Path(words[2]))
+            if words == ["compare", "run.hilcal", "later.hilcal"]:
+                later = ["--plan", "plan.json", "-o", "later.hilcal"]
+                assert measured(capsys, ["run", str(there), *later]).code == 0
+            if words[0] == "validate":
+                plan = ["--plan", "plan.json", "-o", "other.hilcal"]
+                assert measured(capsys, ["run", str(there), *plan]).code == 0
+            result = measured(capsys, given) if words[0] == "run" else run(capsys, *given)
+            if words[0] == "next":
+                separated = result.code == 0
+                assert separated or "no suspects to separate" in result.err
+                continue
+            assert result.code == 0, (words, result.err)
+            if "--until" in words:
+                told = " ".join(result.out.split())
+                assert "standard uncertainty (rms) of the predicted deflection" in told
+    finally:
+        devices.terminate()
+        devices.communicate(timeout=30)  # closes its pipes
+
+
 FOLDER = ROOT / "docs" / "tutorials"
 SHELL = re.compile(r"^# !(.+)$", re.MULTILINE)
 """A line of a script that is a command of the shell in a notebook, as jupytext writes it."""
-
-
-def test_there_are_three():
-    assert len(list(FOLDER.glob("*.py"))) == 3
 
 
 @pytest.mark.slow
@@ -208,6 +268,7 @@ def test_a_tutorial_runs(script, tmp_path):
 
 
 def test_the_table_of_the_other_arm_is_what_the_simulation_gives():
+    assert len(list(FOLDER.glob("*.py"))) == 3
     from hilcal.cell import Cell
     from studies.another_arm import CELL, table
 

@@ -33,10 +33,8 @@ COMPLIANCE = np.array([3e-5, 4e-5, 3e-5, 6e-5, 6e-5, 8e-5])  # rad/(N·m)
 
 def config_of(**planning):
     """The demo's cell; its campaigns in the tests state the repeatability already."""
-    config = configuration()
-    changed = config.planning.model_copy(update=planning)
-    still = Repeatability(joint_std_rad=0.0)
-    return config.model_copy(update={"planning": changed, "repeatability": still})
+    still = {"repeatability": Repeatability(joint_std_rad=0.0)}
+    return configuration().with_keys("planning", **planning).model_copy(update=still)
 
 
 def rule(text, c, **planning):
@@ -237,7 +235,7 @@ def site(tmp_path, monkeypatch):
     rig = made.bench.rig
     devices = [d for d in (rig.arm, rig.tracker, rig.force, rig.operator) if d is not None]
     answers = tuple(ConnectionResult(d.report().device, "fake", d.report()) for d in devices)
-    monkeypatch.setattr(running, "connect", lambda config: (rig, answers))
+    monkeypatch.setattr(running.connect, "connect", lambda config: (rig, answers))
     monkeypatch.setattr(running, "Clock", lambda scale: made.bench.clock)
     monkeypatch.setattr(goal_rule, "SHARE", 1e9)  # judge after every reading, however slow that is
     return made

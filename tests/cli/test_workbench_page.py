@@ -23,7 +23,7 @@ from playwright.sync_api import expect
 from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.campaign import Campaign
 from hilcal.config.reference import to_toml
-from hilcal.import_campaign import import_campaign
+from hilcal.library import import_campaign
 from hilcal.tables.table import write_table
 from hilcal.whole_file import replace_file
 from hilcal.workbench.guard import AccessGuard, Message

@@ -139,12 +139,7 @@ class Bench:
         return path
 
     def reader(
-        self,
-        name: str,
-        file: str,
-        make: Make,
-        read: Callable[[Path], object],
-        limit_s: float = 2.0,
+        self, name: str, file: str, make: Make, read: Callable[[Path], object], limit_s: float = 2.0
     ) -> Parser:
         """Return the parser of a file, which is written where others may lie beside it."""
 

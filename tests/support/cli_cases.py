@@ -28,8 +28,7 @@ POSES = 14
 
 def quickly_planned(config: CellConfig) -> CellConfig:
     """The same cell, whose plans take a second: few candidates, no effect to look out for."""
-    planning = config.planning.model_copy(update={"candidates": 60, "against": ()})
-    return config.model_copy(update={"planning": planning})
+    return config.with_keys("planning", candidates=60, against=())
 
 
 @dataclass(frozen=True)

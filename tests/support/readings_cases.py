@@ -8,7 +8,13 @@ from hypothesis.extra.numpy import arrays
 
 from hilcal.readings.readings import Readings, States
 from hilcal.robot.arm import Arm
+from hilcal.tables.table import import_table
 from hilcal.types import Floats
+
+
+def read_table(*given: Any, **more: Any) -> Readings:
+    """The readings of an exchange table, without the decisions of their import."""
+    return import_table(*given, **more).readings
 
 
 def make_arm(n: int = 6) -> Arm:

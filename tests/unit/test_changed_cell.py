@@ -9,9 +9,9 @@ import pytest
 
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.changes import change_cell
-from hilcal.config.changes import changed, read_value, write_value
+from hilcal.config.cell import changed, read_value, write_value
 from hilcal.config.reference import to_toml
-from hilcal.import_campaign import import_campaign
+from hilcal.library import import_campaign
 from hilcal.robot.se3 import rotation_vector
 from hilcal.tables.table import write_table
 from hilcal.whole_file import replace_file

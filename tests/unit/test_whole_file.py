@@ -14,7 +14,7 @@ from tests.support.refusals import refusal
 STRAIGHT = {
     "hilcal/whole_file.py": "it is what all others use",
     "hilcal/robot/catalogue.py": "a file in a temporary folder",
-    "hilcal/doctor/computer.py": "a file in a temporary folder",
+    "hilcal/doctor.py": "a file in a temporary folder",
     "hilcal/workbench/server.py": "a file in a temporary folder",
     "hilcal/cli/__init__.py": "the null device",
     "hilcal/present/live_viewer.py": "a pipe",

@@ -97,7 +97,7 @@ def test_no_key_is_invented():
 def test_the_page_of_the_reference_is_what_the_program_writes():
     path = ROOT / "docs" / "reference" / "cell-configuration.md"
     assert path.read_text(encoding="utf-8") == reference_page(list(TABLES.values())), (
-        "write it anew: python -c 'from hilcal.cli.looking_up import write_page; write_page()'"
+        "write it anew: `reference_page` makes it"
     )
 
 

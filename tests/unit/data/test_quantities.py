@@ -16,10 +16,10 @@ from hilcal.readings.readings import Range
 from hilcal.readings.same_readings import already, never_fitted
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.rows import content_hash
-from hilcal.tables.table import read_table, write_table
+from hilcal.tables.table import write_table
 from hilcal.tables.units import parse_duration, parse_length
 from tests.support.campaigns import cell_of
-from tests.support.readings_cases import made
+from tests.support.readings_cases import made, read_table
 from tests.support.refusals import refusals, refuses
 
 

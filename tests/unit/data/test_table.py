@@ -11,8 +11,8 @@ from hypothesis import HealthCheck, given, settings
 
 from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise, tracker_covariance
-from hilcal.tables.table import read_table, write_table
-from tests.support.readings_cases import assert_same, make_arm, readings, simple
+from hilcal.tables.table import write_table
+from tests.support.readings_cases import assert_same, make_arm, read_table, readings, simple
 from tests.support.refusals import refusal, refusals, refuses
 
 ARM = make_arm()

@@ -21,12 +21,13 @@ from hilcal.readings.readings import ObserverName
 from hilcal.robot import se3
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.rows import content_hash
-from hilcal.tables.table import read_table, write_table
+from hilcal.tables.table import write_table
 from tests.support.campaigns import campaign, cell_of, configuration, true_parameters
 from tests.support.cli_cases import CELL, ok
 from tests.support.effect_cases import numeric_slopes, random_theta, some_states
 from tests.support.fit_cases import based, named
 from tests.support.observer_cases import NORMAL, POINTS, base_cell, observed, stated
+from tests.support.readings_cases import read_table
 from tests.support.refusals import refusal, refusals, refuses
 from tests.support.rows import first
 

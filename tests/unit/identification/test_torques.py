@@ -14,10 +14,11 @@ from hilcal.identification.torques import check_torques
 from hilcal.readings.covariance import WHOLE
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.rows import content_hash
-from hilcal.tables.table import read_table, write_table
+from hilcal.tables.table import write_table
 from tests.support.campaigns import cell_of, measured, plan, true_parameters, world_of
 from tests.support.cli_cases import CELL, ok
 from tests.support.fit_cases import based, compliances
+from tests.support.readings_cases import read_table
 
 
 def campaign(seed, hung=1.0, friction=2.0):

@@ -17,7 +17,7 @@ from hilcal.robot import se3
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Step
 from hilcal.store.rows import content_hash
-from hilcal.tables.table import read_table, write_table
+from hilcal.tables.table import write_table
 from tests.support.fake_bench import (
     POSES,
     REGISTRATION,
@@ -31,6 +31,7 @@ from tests.support.fake_bench import (
     rows,
     usual_plan,
 )
+from tests.support.readings_cases import read_table
 from tests.support.refusals import refusal_of
 
 

@@ -19,8 +19,8 @@ from hilcal.present.plan import (
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
-from hilcal.tables.table import read_table
 from hilcal.tables.write import plan_csv
+from tests.support.readings_cases import read_table
 from tests.support.viewer_plan import BARE, SUMMARY
 
 

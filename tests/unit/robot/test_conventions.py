@@ -18,9 +18,9 @@ from hilcal.robot.arm import as_counted
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import drive_jacobian, evaluate
 from hilcal.robot.urdf import arm_from_urdf
-from hilcal.tables.table import read_table
 from tests.support.arm_cases import flange_at, same_flange
 from tests.support.effect_cases import make
+from tests.support.readings_cases import read_table
 from tests.support.refusals import refusal, refusals, refuses
 from tests.support.serial_urdf import serial_urdf
 

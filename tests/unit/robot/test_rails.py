@@ -23,9 +23,10 @@ from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.robot.chain import evaluate
 from hilcal.robot.urdf import arm_from_urdf
 from hilcal.store.plan import Plan, Step
-from hilcal.tables.table import read_table, write_table
+from hilcal.tables.table import write_table
 from tests.support.arm_cases import flange_at
 from tests.support.cli_cases import ok, refused
+from tests.support.readings_cases import read_table
 from tests.support.refusals import edited, refusals, refuses
 from tests.support.serial_urdf import serial_urdf
 

@@ -64,11 +64,11 @@ from hilcal.store.rows import text_crc
 from hilcal.tables.files import open_grid, read_text
 from hilcal.tables.mapping import FileFormat
 from hilcal.tables.proposal import Proposal
-from hilcal.tables.table import read_table, write_table
+from hilcal.tables.table import write_table
 from hilcal.tables.write import plan_csv, write_columns
 from hilcal.workbench.elements import plain
 from tests.support.paths import ROOT
-from tests.support.readings_cases import make_arm, simple
+from tests.support.readings_cases import make_arm, read_table, simple
 from tests.support.refusals import refusal
 from tests.support.unguarded import unguarded
 from tests.unit.calibration.test_calibration import calibrated

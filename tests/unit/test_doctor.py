@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from hilcal.doctor import computer as machine
-from hilcal.doctor.computer import NATIVE, clock, disk, load, packages
-from hilcal.doctor.ports import System, reachable, serial_ports
+from hilcal import doctor
+from hilcal.doctor import NATIVE, clock, disk, load, packages, reachable, serial_ports
 
 
 def test_packages_are_told_with_their_versions_and_those_that_lack():
@@ -69,8 +68,8 @@ def test_a_folder_that_can_be_measured_into_and_others(tmp_path, monkeypatch):
     def fails(folder):
         raise PermissionError("Read-only file system")
 
-    monkeypatch.setattr(machine, "_durable_write", fails)
-    writing = disk(tmp_path)[-1]
+    monkeypatch.setattr(doctor, "_durable_write", fails)
+    *_, writing = disk(tmp_path)
     assert writing.state == "problem"
     assert "Read-only file system" in writing.said
 
@@ -80,9 +79,9 @@ def test_the_file_system_is_that_of_the_nearest_mount(tmp_path):
     mounts.write_text(
         f"/dev/sda1 / ext4 rw 0 0\nserver:/x {tmp_path} nfs4 rw 0 0\nother /else cifs rw 0 0\n"
     )
-    assert machine._file_system(tmp_path, mounts) == "nfs4"
-    assert machine._file_system(Path("/"), mounts) == "ext4"
-    assert machine._file_system(tmp_path, tmp_path / "none") == ""
+    assert doctor._file_system(tmp_path, mounts) == "nfs4"
+    assert doctor._file_system(Path("/"), mounts) == "ext4"
+    assert doctor._file_system(tmp_path, tmp_path / "none") == ""
 
 
 def test_a_busy_computer_is_a_warning():
@@ -114,7 +113,7 @@ def system(tmp_path, port):
             timer = tmp_path / "sys" / "bus" / "usb-serial" / "devices" / Path(port).name
             timer.mkdir(parents=True)
             (timer / "latency_timer").write_text(f"{latency}\n")
-        return System(tmp_path / "dev", tmp_path / "sys", tmp_path / "proc")
+        return tmp_path
 
     return made
 
@@ -163,10 +162,10 @@ def test_a_port_without_the_right_to_use_it_and_a_file_that_is_none(
 def test_who_has_a_port_open_and_who_meddles(port, system):
     at = system()
     for number, name in ((4242, "minicom"), (4243, "ModemManager")):
-        folder = at.proc / str(number) / "fd"
+        folder = at / "proc" / str(number) / "fd"
         folder.mkdir(parents=True)
         (folder.parent / "comm").write_text(f"{name}\n")
-    (at.proc / "4242" / "fd" / "3").symlink_to(port)
+    (at / "proc" / "4242" / "fd" / "3").symlink_to(port)
     held, meddler = serial_ports({}, {port: "USB Serial"}, at)
     assert held.state == meddler.state == "warning"
     assert "minicom (process 4242) has it open" in held.said

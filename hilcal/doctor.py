@@ -1,18 +1,22 @@
-"""This computer: clock, disk, memory, load, interpreter, packages and installed drivers."""
+"""Checks of this computer before a campaign: what is installed, clock, disk, ports, network."""
 
 import ctypes
+import grp
 import importlib
 import os
 import platform
 import re
 import shutil
+import socket
 import sqlite3
+import stat
 import statistics
 import struct
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
@@ -29,19 +33,18 @@ class Finding:
 
     topic: str  # "program", "computer", "serial ports", "network" or "cell"
     name: str  # of the checked item, e.g. "clock"
-    state: State
-    """"ok"; "warning": a campaign runs but may suffer; "problem": a campaign does not run."""
+    state: State  # "ok"; "warning": a campaign may suffer; "problem": no campaign runs
     said: str  # description of the state
     mend: str = ""  # remedy; empty if none is needed
 
 
 COMPUTER = partial(Finding, "computer")
 PROGRAM = partial(Finding, "program")
-LEAST_FREE = 1e9
-"""Least free space, bytes; the recordings of a campaign take up to 0.1 GB."""
+PORT = partial(Finding, "serial ports")
+NETWORK = partial(Finding, "network")
+LEAST_FREE = 1e9  # bytes; the recordings of a campaign take up to 0.1 GB
 SLOW_WRITE = 0.1  # duration of a durable write that slows a campaign, s; a reading takes 1 s
-LEAST_MEMORY = 2e9
-"""Least memory for large campaigns, bytes (12,000 readings took 1.84 GB)."""
+LEAST_MEMORY = 2e9  # bytes, for large campaigns (12,000 readings took 1.84 GB)
 FIRST_DAY = datetime(2026, 1, 1).astimezone()  # a clock before this day has never been set
 ON_NETWORK = ("nfs", "nfs4", "cifs", "smb3", "9p", "fuse.sshfs")
 """File systems on which SQLite's locks are unreliable (SQLite FAQ, question 5)."""
@@ -56,11 +59,29 @@ GROUPS = {
     "hilcal.force_sensors": "force sensors",
     "hilcal.operators": "operators",
 }
-NOT_FOR_USERS = ("all", "dev", "docs", "release")
-"""Extras that no command needs: `all` repeats the others."""
+NOT_FOR_USERS = ("all", "dev", "docs", "release")  # Extras that no command needs
+LATE_MS = 1  # Largest latency timer: how long the driver holds bytes; default 16 (FTDI, AN232B-04)
+MEDDLERS = {
+    "ModemManager": "it talks to serial adapters that are plugged in",
+    "brltty": "it takes adapters for Braille displays",
+}
+"""Services that open adapters of other programs."""
+SECONDS = 1.0  # Most time for an answer. A choice: on a cell's own network it takes a millisecond
+SLOW = 0.02  # longer than any connection to a controller in the same room takes, s. A choice
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _BELOW = re.compile(r"""python_version\s*<\s*["'](\d+)\.(\d+)["']""")
 _EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
+
+
+def kernel_clock() -> int | None:
+    """Return the kernel's clock state by adjtimex(2); None if it is not available."""
+    try:
+        ask = ctypes.CDLL(None).adjtimex
+    except (OSError, AttributeError):
+        return None
+    buffer = ctypes.create_string_buffer(struct.calcsize("64q"))  # all zero: changes nothing
+    status = int(ask(buffer))
+    return None if status < 0 else status
 
 
 def computer(folder: Path) -> tuple[Finding, ...]:
@@ -70,7 +91,7 @@ def computer(folder: Path) -> tuple[Finding, ...]:
 
 def clock(
     now: Callable[[], datetime] = lambda: datetime.now().astimezone(),
-    state: Callable[[], int | None] = lambda: _kernel_clock(),
+    state: Callable[[], int | None] = kernel_clock,
 ) -> Finding:
     """Return whether the clock is set and synchronised; readings and revisions have its time."""
     time_now, status = now(), state()
@@ -85,23 +106,8 @@ def clock(
     return COMPUTER("clock", "ok", f"{text}, synchronised")
 
 
-def _kernel_clock() -> int | None:
-    """Return the kernel's clock state by adjtimex(2); None if it is not available."""
-    try:
-        ask = ctypes.CDLL(None).adjtimex
-    except (OSError, AttributeError):
-        return None
-    buffer = ctypes.create_string_buffer(struct.calcsize("64q"))  # all zero: changes nothing
-    status = int(ask(buffer))
-    return None if status < 0 else status
-
-
-def disk(folder: Path) -> tuple[Finding, ...]:
-    """Return the findings on durable and fast storage of campaigns in a folder."""
-    return tuple(_disk(folder))
-
-
-def _disk(folder: Path) -> Iterator[Finding]:
+def disk(folder: Path) -> Iterator[Finding]:
+    """Yield the findings on durable and fast storage of campaigns in a folder."""
     name = f"disk of {folder}"
     if not folder.is_dir():
         mend = "make it, or name another with --folder"
@@ -157,7 +163,6 @@ def _durable_write(folder: Path) -> float:
 
 
 def _memory() -> Finding:
-    """Return whether the memory suffices for large campaigns."""
     try:
         pages = (os.sysconf(name) for name in ("SC_AVPHYS_PAGES", "SC_PHYS_PAGES"))
         free, total = (n * os.sysconf("SC_PAGE_SIZE") for n in pages)
@@ -248,3 +253,134 @@ def _drivers() -> Iterator[Finding]:
             else:
                 names.append(point.name)
         yield PROGRAM(f"drivers of {devices}", "ok", ", ".join(sorted(names)) or "none")
+
+
+def adapters() -> dict[str, str]:
+    """Return the descriptions of connected adapters, by path of the port."""
+    from serial.tools import list_ports  # takes a while
+
+    return {port.device: port.description for port in sorted(list_ports.comports())}
+
+
+def serial_ports(
+    needed: Mapping[str, str], connected: Mapping[str, str], root: Path = Path("/")
+) -> tuple[Finding, ...]:
+    """Return the findings on serial ports.
+
+    `needed` has the path of the port of each device of the cell, `connected` is that of `adapters`;
+    the kernel shows its devices and processes in dev, sys and proc of `root`.
+    """
+    names, proc = permanent_names(root), root / "proc"
+    used = {str(Path(path).resolve()): device for device, path in needed.items()}
+    out = []
+    for device, path in needed.items():
+        if not Path(path).exists():
+            ports = ", ".join(names.get(p, p) for p in connected) or "none"
+            mend = f"plug its adapter in, or name another port in the cell; ports now: {ports}"
+            out.append(PORT(device, "problem", f"there is no {path}", mend))
+    every = {str(Path(p).resolve()): about for p, about in connected.items()}
+    every.update({p: every.get(p, "") for p in used if Path(p).exists()})
+    for path, description in sorted(every.items()):
+        name = ": ".join(filter(None, (used.get(path), names.get(path, path))))
+        out.extend(_port(name, path, description, path in used, root))
+    if not needed and not connected:
+        out.append(PORT("adapters", "ok", "none is plugged in"))
+    if connected:
+        running = {_program(proc, number) for number in _numbers(proc)}
+        for name, why in MEDDLERS.items():
+            if name in running:
+                mend = f"sudo systemctl stop {name}"
+                out.append(PORT(name, "warning", f"it runs: {why}", mend))
+    return tuple(out)
+
+
+def _port(name: str, path: str, about: str, needed: bool, root: Path) -> Iterator[Finding]:
+    worse: State = "problem" if needed else "warning"
+    text = " ".join(filter(None, (path if path not in name else "", about))) or "there"
+    status = os.stat(path)
+    if not stat.S_ISCHR(status.st_mode):
+        yield PORT(name, worse, f"{path} is no serial port", "name another in the cell")
+        return
+    if not os.access(path, os.R_OK | os.W_OK):
+        group = str(status.st_gid)
+        with suppress(KeyError):
+            group = grp.getgrgid(status.st_gid).gr_name
+        mend = f"sudo usermod -aG {group} $USER, then log in again"
+        yield PORT(name, worse, f"{text}; you have no right to use it", mend)
+        return
+    holder = _holder(status.st_rdev, root / "proc")
+    if holder:
+        mend = "end that program before a campaign"
+        yield PORT(name, "warning", f"{text}; {holder} has it open", mend)
+    timer, late = root / "sys/bus/usb-serial/devices" / Path(path).name / "latency_timer", 0
+    with suppress(OSError, ValueError):
+        late = int(timer.read_text(encoding="ascii"))
+    if late > LATE_MS:
+        slow = f"{text}; holds answers back for up to {late} ms (latency timer)"
+        yield PORT(name, "warning", slow, f"echo {LATE_MS} | sudo tee {timer}")
+    elif not holder:
+        yield PORT(name, "ok", f"{text}; free, and you may use it")
+
+
+def permanent_names(root: Path = Path("/")) -> dict[str, str]:
+    """Return the permanent names of adapters, by path of the port."""
+    try:
+        links = sorted((root / "dev/serial/by-id").iterdir())
+        return {str(link.resolve()): str(link) for link in links}
+    except OSError:
+        return {}
+
+
+def _holder(device: int, proc: Path) -> str:
+    """Return the other process that has a device open, if this user may see it; else empty."""
+    for number in _numbers(proc):
+        if number == os.getpid():
+            continue
+        with suppress(OSError):
+            for file in list((proc / str(number) / "fd").iterdir()):
+                with suppress(OSError):
+                    in_dev = str(file.readlink()).startswith("/dev/")
+                    if in_dev and file.stat().st_rdev == device:
+                        return f"{_program(proc, number)} (process {number})"
+    return ""
+
+
+def _numbers(proc: Path) -> list[int]:
+    try:
+        return sorted(int(p.name) for p in proc.iterdir() if re.fullmatch(r"\d+", p.name))
+    except OSError:
+        return []
+
+
+def _program(proc: Path, number: int) -> str:
+    try:
+        return (proc / str(number) / "comm").read_text(encoding="utf-8").strip()
+    except OSError:
+        return "a program"
+
+
+def reachable(host: str, services: Mapping[int, str]) -> list[Finding]:
+    """Return whether each service, by TCP port, accepts a connection in time; nothing is sent."""
+    try:
+        address = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][4][0]
+    except (OSError, UnicodeError) as error:
+        mend = "check the address in the cell, or name the host in /etc/hosts"
+        text = f"its name is not known ({getattr(error, 'strerror', None) or error})"
+        return [NETWORK(host, "problem", text, mend)]
+    out = []
+    for port, service in services.items():
+        name, start = f"{service}, {host} port {port}", time.monotonic()
+        try:
+            with socket.create_connection((str(address), port), SECONDS):
+                took = time.monotonic() - start
+        except TimeoutError:
+            mend = "check cable, address and network of the cell; is the controller switched on?"
+            out.append(NETWORK(name, "problem", f"no answer in {SECONDS:g} s", mend))
+        except OSError as error:
+            mend = "check the address, and that the service is enabled on the controller"
+            out.append(NETWORK(name, "problem", f"{error.strerror or error}", mend))
+        else:
+            mend = "connect by cable, without other networks between" if took > SLOW else ""
+            state: State = "warning" if mend else "ok"
+            out.append(NETWORK(name, state, f"answers in {1e3 * took:.1f} ms", mend))
+    return out

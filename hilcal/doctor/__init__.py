@@ -1,1 +1,0 @@
-"""Checks of this computer before a campaign, without any device."""
