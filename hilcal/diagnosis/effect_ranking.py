@@ -35,14 +35,8 @@ from functools import cache
 
 import numpy as np
 
-from hilcal.diagnosis.minimum_detectable_effect import (
-    LEAST_SHARE as LEAST_SHARE,
-)
-from hilcal.diagnosis.minimum_detectable_effect import (
-    Strength,
-    least_of_family,
-    least_strength,
-)
+from hilcal.diagnosis.minimum_detectable_effect import LEAST_SHARE as LEAST_SHARE
+from hilcal.diagnosis.minimum_detectable_effect import Strength, least_of_family, least_strength
 from hilcal.diagnosis.stepwise import trial
 from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError, InputError

@@ -10,14 +10,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from hilcal.effects.options import Options
-from hilcal.effects.protocol import (
-    Changeable,
-    Columns,
-    Effect,
-    Parameter,
-    Response,
-    Situation,
-)
+from hilcal.effects.protocol import Changeable, Columns, Effect, Parameter, Response, Situation
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Floats, Ints

@@ -56,8 +56,7 @@ def null_p_values(mode, m, seeds):
 @pytest.mark.long
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize(
-    ("m", "seeds"),
-    [(3, 40), *(pytest.param(m, 300, marks=pytest.mark.slow) for m in (3, 6))],
+    ("m", "seeds"), [(3, 40), *(pytest.param(m, 300, marks=pytest.mark.slow) for m in (3, 6))]
 )
 def test_the_factor_is_chi_square_and_so_is_what_is_left(mode, m, seeds):
     for p in null_p_values(mode, m, seeds):

@@ -10,10 +10,7 @@ from scipy.stats import chi2, multivariate_normal
 from hilcal.config import load_config
 from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.effect_ranking import candidates, most, rank_suspects, unloaded_readings
-from hilcal.diagnosis.evidence import (
-    spoken_against,
-    whole_catalogue,
-)
+from hilcal.diagnosis.evidence import spoken_against, whole_catalogue
 from hilcal.diagnosis.noise import MISFIT_ALARM
 from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose

@@ -7,12 +7,7 @@ import pytest
 from scipy.stats import f as f_distribution
 
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
-from hilcal.diagnosis.evidence import (
-    CHANCE,
-    PRICE,
-    StepwiseAlternatives,
-    backward_elimination,
-)
+from hilcal.diagnosis.evidence import CHANCE, PRICE, StepwiseAlternatives, backward_elimination
 from hilcal.diagnosis.minimum_detectable_effect import least_strength
 from hilcal.diagnosis.stepwise import add, exchange, remove, trial
 from hilcal.drivers.simulated.injected_effects import hide
