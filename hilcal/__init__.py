@@ -42,7 +42,7 @@ _PLACES = {
     "compare": "hilcal.transfer.compare",
     "diagnose": "hilcal.library",
     "discover": "hilcal.discovery.discovery",
-    "effect": "hilcal.effects.spec",
+    "effect": "hilcal.effects.protocol",
     "fit": "hilcal.library",
     "fit_stream": "hilcal.library",
     "installed": "hilcal.effects.catalogue",
@@ -70,7 +70,7 @@ if TYPE_CHECKING:
     from hilcal.effects.catalogue import installed as installed
     from hilcal.effects.check import check_effect as check_effect
     from hilcal.effects.protocol import Effect as Effect
-    from hilcal.effects.spec import effect as effect
+    from hilcal.effects.protocol import effect as effect
     from hilcal.errors import CannotAnswerError as CannotAnswerError
     from hilcal.errors import DeviceError as DeviceError
     from hilcal.errors import HilcalError as HilcalError

@@ -6,37 +6,17 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from hilcal.cell import Cell
-from hilcal.effects.backlash import Backlash
-from hilcal.effects.base_compliance import BaseCompliance
-from hilcal.effects.base_frame import BaseFrame
+from hilcal.effects import instrument, joint_compliance
 from hilcal.effects.check import check_effect
-from hilcal.effects.creep import Creep
-from hilcal.effects.encoder_offset import EncoderOffset
+from hilcal.effects.force_sensor import SensorMisalignment, WrenchBias, WrenchGain
 from hilcal.effects.from_file import EffectFile, read_effects
-from hilcal.effects.guide_error import GuideError
-from hilcal.effects.hysteresis import Hysteresis
-from hilcal.effects.joint_compliance import JointCompliance
-from hilcal.effects.joint_coupling import JointCoupling
-from hilcal.effects.joint_stiffening import JointStiffening
-from hilcal.effects.joint_tilt_compliance import JointTiltCompliance
-from hilcal.effects.link_compliance import LinkCompliance
-from hilcal.effects.link_geometry import LinkGeometry
-from hilcal.effects.link_mass import LinkMass
-from hilcal.effects.load_point import LoadPoint
-from hilcal.effects.observer_frame import ObserverFrame
+from hilcal.effects.geometry import EncoderOffset, GuideError, JointCoupling, LinkGeometry
+from hilcal.effects.load import LinkMass, LoadPoint
 from hilcal.effects.options import Options
-from hilcal.effects.periodic_joint_compliance import PeriodicJointCompliance
 from hilcal.effects.protocol import Effect, Role, source_of
-from hilcal.effects.sensor_misalignment import SensorMisalignment
-from hilcal.effects.target_offset import TargetOffset
-from hilcal.effects.thermal_growth import ThermalGrowth
-from hilcal.effects.thermal_joint_drift import ThermalJointDrift
-from hilcal.effects.tool_compliance import ToolCompliance
-from hilcal.effects.tracker_drift import TrackerDrift
-from hilcal.effects.tracker_scale import TrackerScale
-from hilcal.effects.transmission_error import TransmissionError
-from hilcal.effects.wrench_bias import WrenchBias
-from hilcal.effects.wrench_gain import WrenchGain
+from hilcal.effects.structural_compliance import BaseCompliance, LinkCompliance, ToolCompliance
+from hilcal.effects.thermal import ThermalGrowth, ThermalJointDrift
+from hilcal.effects.transmission import Backlash, Hysteresis, TransmissionError
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.toml import suggest
@@ -44,11 +24,13 @@ from hilcal.toml import suggest
 ENTRY_POINT_GROUP = "hilcal.effects"
 
 BUILT_IN: tuple[type[Effect], ...] = (
-    BaseFrame, TargetOffset, EncoderOffset, JointCoupling, LinkGeometry, TransmissionError,
-    GuideError, Hysteresis, JointCompliance, JointStiffening, JointTiltCompliance,
-    LinkCompliance, BaseCompliance, ToolCompliance, PeriodicJointCompliance, Backlash, Creep,
-    ThermalGrowth, ThermalJointDrift, LinkMass, LoadPoint, WrenchBias, WrenchGain,
-    SensorMisalignment, TrackerDrift, TrackerScale, ObserverFrame,
+    instrument.BaseFrame, instrument.TargetOffset, EncoderOffset, JointCoupling, LinkGeometry,
+    TransmissionError, GuideError, Hysteresis, joint_compliance.JointCompliance,
+    joint_compliance.JointStiffening, joint_compliance.JointTiltCompliance, LinkCompliance,
+    BaseCompliance, ToolCompliance, joint_compliance.PeriodicJointCompliance, Backlash,
+    joint_compliance.Creep, ThermalGrowth, ThermalJointDrift, LinkMass, LoadPoint, WrenchBias,
+    WrenchGain, SensorMisalignment, instrument.TrackerDrift, instrument.TrackerScale,
+    instrument.ObserverFrame,
 )  # fmt: skip
 
 

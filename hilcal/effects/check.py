@@ -98,7 +98,7 @@ _FIELDS = Deviation.__slots__
 def check_effect(kind: type[Effect], cell: Cell | None = None) -> None:
     """Check that an effect keeps to the protocol, as scikit-learn's `check_estimator` does.
 
-    >>> from hilcal.effects.backlash import Backlash
+    >>> from hilcal.effects.transmission import Backlash
     >>> hc.check_effect(Backlash)
 
     Checked on 30 states are: class attributes; shapes and finite values of what each method

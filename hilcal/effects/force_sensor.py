@@ -1,4 +1,4 @@
-"""Base of the errors of a force sensor: its axes, and the states in which it measured."""
+"""Errors of a force sensor: zero, gain and mounting."""
 
 from abc import abstractmethod
 from typing import ClassVar
@@ -6,13 +6,13 @@ from typing import ClassVar
 import numpy as np
 
 from hilcal.effects.options import numbers
-from hilcal.effects.protocol import Columns, Effect, Situation
+from hilcal.effects.protocol import Changeable, Columns, Effect, Parameter, Situation
+from hilcal.errors import CannotAnswerError
 from hilcal.readings.readings import States
 from hilcal.robot import se3
 from hilcal.robot.statics import load_wrench_change
 from hilcal.types import Floats
 
-FORCE_AXES = ("x", "y", "z")
 ALONG_FLANGE: Floats = np.eye(3)  # Axes of a force sensor that are those of the flange
 
 
@@ -104,3 +104,90 @@ def _turned(r: Floats, wrench: Floats) -> Floats:
 def _loaded(s: Situation) -> Floats:
     """(N, 1) 1 where a wrench was recorded, 0 where it is exactly zero."""
     return np.asarray(np.any(s.states.wrench != 0, axis=1)[:, None], dtype=float)
+
+
+class WrenchBias(ForceSensorEffect):
+    """Recorded = true + b, so that acting = w − R b; b at the load point, sensor axes [N, N·m]."""
+
+    name = "wrench_bias"
+    summary = "wrench read = true + b: the force sensor has a constant offset, in its own axes"
+    change = Changeable("setup", "force sensor", "the zero of the force sensor")
+    plausible = 30.0  # 30 N, 3 N·m: a sensor that was not zeroed with its tool. A choice.
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Offsets of force and moment."""
+        return tuple(
+            Parameter(f"f{a}", "N", 1.0, f"offset of the force along {a}") for a in "xyz"
+        ) + tuple(Parameter(f"m{a}", "N·m", 0.1, f"offset of the moment about {a}") for a in "xyz")
+
+    def error(self, theta: Floats, recorded: Floats) -> Floats:
+        """Return b."""
+        return np.broadcast_to(theta, recorded.shape)
+
+    def error_columns(self, theta: Floats, recorded: Floats) -> Floats:
+        """Units."""
+        return np.eye(6)[None]
+
+
+class WrenchGain(ForceSensorEffect):
+    """Recorded = (1 + g) true on each of the sensor's axes, exactly [1].
+
+    acting = R diag(1/(1 + g)) Rᵀ w = w − R diag(g/(1 + g)) Rᵀ w. A common gain of all axes
+    is the same as a common factor on all compliances, except for the deflection by weights.
+    """
+
+    name = "wrench_gain"
+    summary = "wrench read = (1 + g) true per axis: the force sensor has a gain error"
+    change = Changeable("setup", "force sensor", "the gain of the force sensor")
+    plausible = 50.0  # 50 %: a wrong calibration matrix, a channel that hardly reads. A choice.
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Gain errors of forces and moments; 1 % is ordinary."""
+        return tuple(
+            Parameter(f"{kind}{a}", "1", 1e-2, f"gain error of the {word} {a}")
+            for kind, word in (("f", "force along"), ("m", "moment about"))
+            for a in "xyz"
+        )
+
+    def error(self, theta: Floats, recorded: Floats) -> Floats:
+        """Return g/(1 + g) w per axis."""
+        if np.any(theta <= -1):
+            raise CannotAnswerError(
+                f"{self.name}: a gain error of {100 * theta.min():.0f} % turns the wrench round; "
+                "measure loads in more directions, or leave the effect out"
+            )
+        return np.asarray(recorded * (theta / (1 + theta)))
+
+    def error_columns(self, theta: Floats, recorded: Floats) -> Floats:
+        """Return w/(1 + g)² on its own axis."""
+        return np.asarray((recorded / (1 + theta) ** 2)[:, :, None] * np.eye(6))
+
+
+class SensorMisalignment(ForceSensorEffect):
+    """The sensor stands turned by δ: acting = R exp([δ]×) Rᵀ w, force and moment, exactly [rad]."""
+
+    name = "sensor_misalignment"
+    summary = "acting = R exp(δ) Rᵀ wrench: the force sensor's axes are turned by δ"
+    plausible = 20.0  # 0.2 rad: bolted on by eye. A choice.
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Turn about the sensor's axes; 10 mrad are ordinary."""
+        return tuple(
+            Parameter(f"r{a}", "rad", 1e-2, f"turn of the sensor about its {a}") for a in "xyz"
+        )
+
+    def error(self, theta: Floats, recorded: Floats) -> Floats:
+        """Return w − exp([δ]×) w."""
+        turn = se3.rotation(theta)
+        parts = [recorded[:, :3], recorded[:, 3:]]
+        return np.concatenate([v - v @ turn.T for v in parts], axis=1)
+
+    def error_columns(self, theta: Floats, recorded: Floats) -> Floats:
+        """Return exp([δ]×) [w]× J_r(δ), the derivative of −exp([δ]×) w."""
+        twist = np.concatenate([np.zeros(3), theta])
+        turn, j = se3.rotation(theta), se3.right_jacobian_blocks(twist)[0]
+        parts = [turn @ se3.skew(v) @ j for v in (recorded[:, :3], recorded[:, 3:])]
+        return np.swapaxes(np.concatenate(parts, axis=1), 1, 2)

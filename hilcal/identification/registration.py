@@ -20,7 +20,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from hilcal.cell import Cell, Observer, plane_frame
-from hilcal.effects.target_offset import TargetOffset
+from hilcal.effects.instrument import TargetOffset
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.data_snooping import off_alike
 from hilcal.identification.least_trimmed_squares import (

@@ -14,12 +14,10 @@ import numpy as np
 import pytest
 import scipy.linalg as sl
 
-from hilcal.effects.base_compliance import BaseCompliance
-from hilcal.effects.base_frame import BaseFrame
-from hilcal.effects.encoder_offset import EncoderOffset
-from hilcal.effects.joint_compliance import JointCompliance
-from hilcal.effects.joint_tilt_compliance import JointTiltCompliance
-from hilcal.effects.target_offset import TargetOffset
+from hilcal.effects.geometry import EncoderOffset
+from hilcal.effects.instrument import BaseFrame, TargetOffset
+from hilcal.effects.joint_compliance import JointCompliance, JointTiltCompliance
+from hilcal.effects.structural_compliance import BaseCompliance
 from hilcal.identification.gauss_newton import (
     NewtonPoint,
     linear_problem,

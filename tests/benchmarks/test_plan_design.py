@@ -17,8 +17,8 @@ from hilcal.design.approximate_design import relax
 from hilcal.design.criteria import D
 from hilcal.design.criterion import CandidateSet
 from hilcal.design.optimum import best
+from hilcal.effects.geometry import LinkGeometry
 from hilcal.effects.joint_compliance import JointCompliance
-from hilcal.effects.link_geometry import LinkGeometry
 from hilcal.identification.priors import scales_of
 from hilcal.model.model import Model
 from hilcal.readings.readings import States

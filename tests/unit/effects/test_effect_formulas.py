@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.config.sections import Conventions, Coupling
 from hilcal.drivers.simulated import truth
-from hilcal.effects.link_compliance import long_links
+from hilcal.effects.structural_compliance import long_links
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.model.model import Model
 from hilcal.robot import chain as chains

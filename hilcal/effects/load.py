@@ -1,4 +1,4 @@
-"""`link_mass`: the links are not as heavy, or not balanced, as configured."""
+"""Weights and load are others than configured; they act through the elastic effects only."""
 
 import numpy as np
 
@@ -11,7 +11,8 @@ from hilcal.effects.protocol import (
     Parameter,
     Situation,
 )
-from hilcal.robot.statics import first_moment_change
+from hilcal.robot import se3
+from hilcal.robot.statics import first_moment_change, slot_wrench_change
 from hilcal.types import Floats
 
 
@@ -33,8 +34,8 @@ def tool_weight(effect: Effect) -> Directions:
 class LinkMass(Effect):
     """First moment (mass × centre of mass) of link k is off by δ_k, link axes [kg·m].
 
-    It acts through the elastic effects only: the weight exerts the moment (R_k δ_k) × g more
-    about the origin of joint k. Link k is what joint k moves; its axes turn with that joint.
+    The weight exerts the moment (R_k δ_k) × g more about the origin of joint k. Link k is what
+    joint k moves; its axes turn with that joint.
     """
 
     name = "link_mass"
@@ -67,3 +68,37 @@ class LinkMass(Effect):
     def most(self) -> float:
         """As usual; infinite where the arm is described without masses."""
         return super().most() if np.any(self.cell.arm.masses) else np.inf
+
+
+class LoadPoint(Effect):
+    """Shift δ of the point where the wrench acts, flange axes [m]; it adds the moment (R δ) × f."""
+
+    name = "load_point"
+    summary = "the load acts elsewhere than configured (flange axes)"
+    change = Changeable("tool", "load point", "where the load acts on the tool")
+    plausible = 10.0  # 10 cm: a hook or an eye instead of the flange. A choice.
+    of_setup = True
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Shift along x, y and z of the flange."""
+        return tuple(Parameter(a, "m", 1e-2, f"shift along flange {a}") for a in "xyz")
+
+    def columns(self, s: Situation) -> tuple[Columns, ...]:
+        """No deviation of its own."""
+        return ()
+
+    def load_change(self, theta: Floats) -> LoadChange:
+        """Shift of the load point."""
+        return LoadChange(point=theta)
+
+    def load_columns(self, theta: Floats, s: Situation) -> Floats:
+        """Moment (R e) × f for a unit shift along each flange axis e."""
+        axes = np.swapaxes(s.chain.rotation[-1], 1, 2)
+        moment = se3.cross(axes, s.load.wrench[:, None, :3])
+        return np.concatenate([np.zeros_like(moment), moment], axis=2)
+
+    def wrench_columns(self, theta: Floats, s: Situation) -> Floats:
+        """Moments of unit shifts, carried by all slots."""
+        change = self.load_columns(theta, s)
+        return slot_wrench_change(s.chain, change[..., :3], change[..., 3:])

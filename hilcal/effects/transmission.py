@@ -1,11 +1,12 @@
-"""`transmission_error`: gears and encoders err periodically with the joint angle."""
+"""Gears and encoders: periodic errors, play, and lost motion."""
 
 from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 
-from hilcal.effects.per_joint import PerJoint, joint_change
+from hilcal.effects.options import positive
+from hilcal.effects.per_joint import PerJoint, TorqueLaw, joint_change
 from hilcal.effects.protocol import OWN_SPREAD, Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
@@ -103,3 +104,44 @@ class TransmissionError(PerJoint):
     def for_scoring(self, states: States) -> Effect:
         """Return the effect with at most `SCORED_HARMONICS`, fewer than a fit tries."""
         return self.with_options(states, harmonics=min(len(self.harmonics), SCORED_HARMONICS))
+
+
+class Backlash(TorqueLaw):
+    """dq_j = b_j sign(τ_j), crossing smoothly: b_j tanh(τ_j/τ0_j) [rad]."""
+
+    name = "backlash"
+    unit, size, meaning = "rad", 5e-5, "half the play of {joint}"
+    summary = "dq_j = b_j sign(τ_j): the joint's play is taken up to the side of the torque"
+    change = joint_change("play", "wear or repair?", listed=True)
+    plausible = 20.0  # 1 mrad; makers of gears state 0.3 mrad at most. A choice.
+    option_help: ClassVar = {
+        **TorqueLaw.option_help,
+        "crossing": "τ0_j as a share of the joint's rated torque, more than 0; unless given, 0.01.",
+    }
+
+    def setup(self, states: States) -> None:
+        """Read how wide the crossing is."""
+        super().setup(states)
+        self.options.setdefault("crossing", 0.01)
+        self.crossing = positive(self.name, self.options, "crossing") * self.cell.arm.ratings
+
+    def of_torque(self, s: Situation) -> tuple[Floats, Floats]:
+        """Return tanh(τ_j/τ0_j), and (1 − tanh²(τ_j/τ0_j))/τ0_j."""
+        side = np.tanh(s.torque / self.crossing)
+        return side, (1 - side**2) / self.crossing
+
+
+class Hysteresis(PerJoint):
+    """dq_j = h_j s_j with s_j = ±1 the side from which joint j arrived [rad]."""
+
+    name = "hysteresis"
+    unit, size, meaning = "rad", 2e-5, "half hysteresis of {joint}"
+    summary = "dq_j = h_j s_j: the joint stops short on the side from which it arrived"
+    change = joint_change("lost motion", "wear or repair?", listed=True)
+    plausible = 50.0  # 1 mrad; makers of gears state 0.3 mrad of lost motion. A choice.
+    needs = ("approach",)
+
+    def columns(self, s: Situation) -> tuple[Columns, ...]:
+        """Sides: ∂dq_j/∂h_j = s_j."""
+        assert s.states.approach is not None  # noqa: S101 - checked at construction
+        return (self.joint_columns("dq", s.states.approach),)

@@ -1,9 +1,9 @@
-"""`link_compliance`: the long links bend and twist like beams."""
+"""Links, the base and the tool give way."""
 
 import numpy as np
 
 from hilcal.effects.options import rated_moments
-from hilcal.effects.protocol import Columns, Effect, Parameter, Response, Situation
+from hilcal.effects.protocol import Changeable, Columns, Effect, Parameter, Response, Situation
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats, Ints
@@ -89,3 +89,91 @@ def long_links(arm: Arm) -> Ints:
     longest = np.argsort(-lengths, kind="stable")[:2]
     long = longest[lengths[longest] > lengths.max() / 3]
     return np.asarray(np.sort(long) + 1)
+
+
+class BaseCompliance(Effect):
+    """Rotation B t_0 of the whole arm about the base origin; B diagonal, rad/(N·m).
+
+    t_0 is the moment about the base origin, base axes. Slot 0 is the frame of the first
+    joint, so moments are carried to the base origin and rotations back by L_0, exactly.
+    """
+
+    name = "base_compliance"
+    summary = "rotation B t_0 about the base origin: the ground gives way"
+    change = Changeable("base", "base", "the ground under the base", "loose bolts?")
+    plausible = 30.0  # 90 µrad/(N·m): an arm on a trolley. A choice.
+    elastic = True
+    local_response = True
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Compliance about x, y and z of the base."""
+        return tuple(
+            Parameter(axis, "rad/(N·m)", 3e-6, f"rotation of the base about {axis}")
+            for axis in "xyz"
+        )
+
+    def _moment(self, wrench: Floats) -> Floats:
+        """Moment about the base origin, base axes, of slot-0 wrenches (..., 6)."""
+        l0 = self.cell.arm.links[0]
+        r, p = l0[:3, :3], l0[:3, 3]
+        f, t = se3.apply(r, wrench[..., :3]), se3.apply(r, wrench[..., 3:])
+        return t + se3.cross(p, f)
+
+    def _twists(self) -> Floats:
+        """(3, 6) twist in slot-0 axes of a unit rotation about each base axis."""
+        back = se3.inverse(self.cell.arm.links[0])
+        ad = se3.adjoint(back[:3, :3], back[:3, 3])
+        return np.asarray(ad[:, 3:].T)
+
+    def columns(self, s: Situation) -> tuple[Columns, ...]:
+        """Twist of slot 0 by t_0."""
+        moment = self._moment(s.wrench[:, 0])
+        values = moment[:, :, None] * self._twists()
+        return (Columns("twist", np.arange(3), np.zeros(3, dtype=np.int64), values),)
+
+    def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
+        """Twist of slot 0 by B dt_0."""
+        twist = np.zeros_like(change)
+        twist[:, :, 0] = (self._moment(change[:, :, 0]) * theta) @ self._twists()
+        return Response(twist=twist)
+
+
+PARTS = np.array([[0, 0, 0, 0, 0, 1.0], [0, 0, 0, 1.0, 1.0, 0]])  # about z, and across it
+
+
+class ToolCompliance(Effect):
+    """Rotation at the flange of a t_z z + c t_⊥, t the moment there: adapter, sensor, changer.
+
+    t is the moment about the flange's origin of tool and load; a (along) and c (across the
+    flange's z axis) in rad/(N·m). Where the last joint turns about z, a is the same as that
+    joint's compliance.
+    """
+
+    name = "tool_compliance"
+    summary = "rotation a t_z + c t_⊥ at the flange: tool or force sensor tilts under the moment"
+    change = Changeable("tool", "tool", "the stiffness of what is bolted to the flange")
+    plausible = 30.0  # 30 mrad at the rated torque of the last joint: a slender tool. A choice.
+    of_setup = True
+    elastic = True
+    local_response = True
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Along and across; 1 mrad at the rated torque of the last joint is ordinary."""
+        scale = 1e-3 / float(rated_moments(self.cell)[-1])
+        return (
+            Parameter("along", "rad/(N·m)", scale, "turn about the flange's z axis"),
+            Parameter("across", "rad/(N·m)", scale, "tilt across the flange's z axis"),
+        )
+
+    def columns(self, s: Situation) -> tuple[Columns, ...]:
+        """Twist of slot n by the moment at the flange."""
+        slot = np.full(2, self.cell.arm.n)
+        return (Columns("twist", np.arange(2), slot, s.wrench[:, -1, None] * PARTS),)
+
+    def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
+        """Twist of slot n by the change of the moment there."""
+        twist = np.zeros_like(change)
+        twist[:, :, -1] = change[:, :, -1] * (theta @ PARTS)
+        return Response(twist=twist)

@@ -1,10 +1,11 @@
-"""`thermal_growth`: the links grow with the temperature."""
+"""Growth of links, and drift of joints, with the temperature."""
 
 from typing import ClassVar
 
 import numpy as np
 
-from hilcal.effects.options import choice, number
+from hilcal.effects.options import choice, number, numbers
+from hilcal.effects.per_joint import PerJoint
 from hilcal.effects.protocol import Changeable, Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
@@ -76,3 +77,33 @@ class ThermalGrowth(Effect):
             f"effect {self.name}: temperature = {self.source!r}, which the readings do not have; "
             f"valid: {SOURCES[self.source == 'air']}"
         )
+
+
+class ThermalJointDrift(PerJoint):
+    """dq_j = κ_j ΔT_j, ΔT_j = T_j − T_ref,j with the joint's own temperature [rad/K]."""
+
+    name = "thermal_joint_drift"
+    unit, size, meaning = "rad/K", 5e-6, "drift of {joint} with the temperature"
+    summary = "dq_j = κ_j ΔT_j: the zero of each joint wanders with its temperature"
+    plausible = 20.0  # 0.1 mrad/K, 2 mrad for the 20 K that a drive warms up. A choice.
+    needs = ("joint_temperature",)
+    option_help: ClassVar = {
+        **PerJoint.option_help,
+        "reference_degC": "T_ref, one number or a list of one per joint; unless given, each "
+        "joint's temperature at the first reading in time.",
+    }
+
+    def setup(self, states: States) -> None:
+        """Take the temperatures at the first reading as the reference unless given."""
+        super().setup(states)
+        warm = states.joint_temperature
+        assert warm is not None  # noqa: S101 - checked at construction
+        if "reference_degC" not in self.options:
+            first = 0 if states.time is None else int(np.argmin(states.time))
+            self.options["reference_degC"] = [float(t) for t in warm[first]]
+        self.reference = numbers(self.name, self.options, "reference_degC", self.cell.arm.n)
+
+    def columns(self, s: Situation) -> tuple[Columns, ...]:
+        """Warming: ∂dq_j/∂κ_j = ΔT_j."""
+        assert s.states.joint_temperature is not None  # noqa: S101 - checked at construction
+        return (self.joint_columns("dq", s.states.joint_temperature - self.reference),)
