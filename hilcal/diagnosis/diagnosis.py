@@ -4,14 +4,13 @@ It holds data only; `hilcal.present.verdict` writes its sentence.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Literal
 
 import numpy as np
 
 from hilcal.diagnosis.background_evidence import BackgroundEffect
-from hilcal.diagnosis.document import to_json
-from hilcal.diagnosis.effect_ranking import Suspect
+from hilcal.diagnosis.effect_ranking import FALSE_ALARM, Suspect
 from hilcal.diagnosis.evidence import Alternative, Insufficiency, Separability
 from hilcal.diagnosis.misfit_breakdown import MisfitShare
 from hilcal.diagnosis.noise import NoiseVerdict, PureError
@@ -21,6 +20,7 @@ from hilcal.diagnosis.wrong_figures import WrongFigure
 from hilcal.identification.fit import Fit
 from hilcal.readings.readings import ArmScatter
 from hilcal.shown import Shown, Tabular, presenter
+from hilcal.store.codec import encode
 
 MOST = 4
 """Most effects to separate at once: each ordered pair is a term of the design; a guess."""
@@ -61,6 +61,11 @@ VERDICTS: dict[Reason, Verdict] = {
     "wrong_figure": "ambiguous",
 }
 """The verdict that each reason leads to."""
+CURVE = (
+    "variable", "unit", "share", "moves", "direction", "labels", "x", "y", "error", "y_unit",
+    "determined",
+)  # fmt: skip
+"""What a document holds of a `Dependence`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +185,44 @@ class Diagnosis(Shown, Tabular):
 
     def to_dict(self) -> dict[str, object]:
         """Return the JSON document of `hilcal diagnose --json`, including the sentence."""
-        return to_json(self)
+        tests = {"count": self.tested, "level": FALSE_ALARM}
+        return {
+            "model": list(self.fit.model.named),
+            "verdict": self.verdict,
+            "message": presenter().message(self),
+            "reason": self.reason,
+            "variance_factor": self.fit.variance_factor,
+            "variance_factor_interval": list(self.fit.variance_factor_interval),
+            "predictable_share": self.predictable_share,
+            "where": [asdict(v) for v in self.misfit_breakdown],
+            "suspects": [s.to_dict() for s in self.suspects],
+            "not_shown": list(self.not_shown),
+            "tests": {**tests, "each": FALSE_ALARM / max(self.tested, 1)},
+            "apart": [
+                {"effect": a.effect, "unlike": a.unlike, "times": a.times if a.possible else None}
+                for a in self.separability
+            ],
+            "beyond": self.insufficiency
+            and _attributes(self.insufficiency, "effects", "refitted", "share", "variance_factor"),
+            "background": [_attributes(b, "effect", "p_value", "rms_m") for b in self.background],
+            "wrong_figures": [asdict(f) for f in self.wrong_figures],
+            "pose_alone": self.pose_alone and asdict(self.pose_alone),
+            "rejected": list(self.history.rejected),
+            "alternatives": [
+                _attributes(a, "effect", "same_as", "others")
+                for a in self.alternatives
+                if a.inseparable
+            ],
+            "needless": list(self.redundant),
+            "carriers": [_attributes(v, *CURVE) for v in self.dependences],
+            "arm_scatter": self.scatter and self.scatter.to_json(),
+            "serial_noise": self.fit.readings.serial and self.fit.readings.serial.to_json(),
+            "pure_error": self.pure_error and self.pure_error.to_dict(),
+        }
+
+
+def _attributes(value: object, *names: str) -> dict[str, object]:
+    return {name: encode(getattr(value, name)) for name in names}
 
 
 def in_doubt(d: Diagnosis, most: int = MOST) -> tuple[str, ...]:

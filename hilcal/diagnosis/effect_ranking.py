@@ -132,6 +132,26 @@ class Suspect(Brief):
         """Whether the exact model keeps the promise of the linearisation."""
         return self.kept >= LEAST_KEPT
 
+    def to_dict(self) -> dict[str, object]:
+        """Return the suspect as JSON, SI."""
+        needs = [{"unit": unit, "rms": rms, "plausible_rms": m} for unit, rms, m in self.needs]
+        return {
+            "effect": self.effect,
+            "finer_than": self.coarse or None,
+            "p_value": self.score.p_value,
+            "share": self.share,
+            "holdout_share": self.holdout_share,
+            "delta_bic": self.score.delta_bic,
+            "log_evidence": self.score.log_evidence,
+            "significant": self.passes,
+            "same_as": list(self.same_as),
+            "least": self.least.to_dict(),
+            "shown": self.shown,
+            "plausible": self.plausible,
+            "needs": needs,
+            "kept_share": self.kept,
+        }
+
 
 def candidates(fit: Fit) -> tuple[Effect, ...]:
     """Effects that can be computed and are not in the model, or refine an effect of the model.

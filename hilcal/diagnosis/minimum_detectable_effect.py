@@ -57,6 +57,20 @@ class Strength:
         """Whether any strength would be revealed."""
         return bool(np.isfinite(self.displacement_m))
 
+    def to_dict(self) -> dict[str, object] | None:
+        """Return it as JSON, SI; None where no strength would be revealed."""
+        if not self.visible:
+            return None
+        finer = None
+        if self.finest_m is not None:
+            visible = bool(np.isfinite(self.finest_m))
+            finer = {"visible": visible, "displacement_m": self.finest_m if visible else None}
+        return {
+            "displacement_m": self.displacement_m,
+            "parameters": [{"unit": unit, "rms": rms} for unit, rms in self.parameters],
+            "finer_than_poses": finer,
+        }
+
 
 def least_strength(
     s: Floats,  # (P, P) information Xᵀ M X of the family in ordinary magnitudes

@@ -43,6 +43,7 @@ from hilcal.readings.readings import ArmScatter, Readings
 from hilcal.readings.whitening import Bucket, Whitening, whitening
 from hilcal.regression.connected import connected, groups_within
 from hilcal.robot.arm import Arm
+from hilcal.store.codec import encode
 from hilcal.types import Floats, Ints
 
 SAME_ANGLE = 1e-6  # commanded joints of repeats agree within this, rad
@@ -102,6 +103,18 @@ class PureError:
     dof: int  # its degrees of freedom
     lack_of_fit_p: float  # p-value of the rest of χ², against pure error
     where: NoiseWhere | None = None  # None where the factor is the same in all directions
+
+    def to_dict(self) -> dict[str, object]:
+        """Return it as JSON."""
+        where = encode(self.where) or {}
+        where = {"variance_factor" if k == "factor" else k: v for k, v in where.items()} or None
+        return {
+            "variance_factor": self.factor,
+            "interval": list(self.interval),
+            "dof": self.dof,
+            "lack_of_fit_p": self.lack_of_fit_p,
+            "where": where,
+        }
 
 
 @dataclass(frozen=True, slots=True)

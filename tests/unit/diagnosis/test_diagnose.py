@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.stats import f as f_distribution
 
-from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.diagnosis.verdict import diagnose
@@ -70,7 +69,7 @@ def test_what_deflections_cannot_show_is_part_of_the_verdict():
         assert headline(d) == "adequate for deflections; geometry is not calibrated"
         assert "Geometry is not calibrated" in message(d)
         assert "No effect of the catalogue" not in message(d)
-        told = to_json(d)
+        told = d.to_dict()
         assert effect in told["not_shown"]
         assert {s["effect"] for s in told["suspects"] if not s["shown"]} >= set(d.not_shown)
         table = "\n".join(str(x) for x in could_have_been_seen(d) if isinstance(x, str))

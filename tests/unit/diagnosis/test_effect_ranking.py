@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from hilcal.config import load_config
-from hilcal.diagnosis.document import suspect_json
 from hilcal.diagnosis.effect_ranking import (
     beyond_geometry,
     candidates,
@@ -182,7 +181,7 @@ def test_the_verdict_is_to_let_joints_differ(arm, joints):
     lead = d.suspects[0]
     assert lead.share > 0.95
     assert message(d).startswith(f"Let joints differ: {EACH} explains")
-    assert suspect_json(lead)["finer_than"] == "joint_compliance"
+    assert lead.to_dict()["finer_than"] == "joint_compliance"
     assert list(finer(d)) == [
         "Let joints differ: joint_compliance has one parameter for several joints; to give each "
         f'its own: hilcal add RUN "{EACH}".'

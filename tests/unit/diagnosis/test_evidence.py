@@ -8,7 +8,6 @@ import pytest
 from scipy.stats import chi2, multivariate_normal
 
 from hilcal.config import load_config
-from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.effect_ranking import candidates, most, rank_suspects, unloaded_readings
 from hilcal.diagnosis.evidence import spoken_against, whole_catalogue
 from hilcal.diagnosis.noise import MISFIT_ALARM
@@ -71,7 +70,7 @@ def check_insufficiency(d):
     assert i.variance_factor > 1.0
     assert 0 <= i.refitted <= len(i.effects)
     assert d.separability == ()
-    assert to_json(d)["beyond"] == {
+    assert d.to_dict()["beyond"] == {
         "effects": list(i.effects),
         "refitted": i.refitted,
         "share": i.share,

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import hilcal as hc
-from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.wrong_figures import wrong_figures
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline
@@ -92,7 +91,7 @@ def test_a_tool_at_twice_its_mass_is_named_and_refine_adds_nothing():
     assert found.verdict == "ambiguous"
     assert message(step.diagnosis).startswith("The tool seems to weigh 0.8")
     assert "correct [tool] mass_kg" in message(step.diagnosis)
-    (figure,) = to_json(step.diagnosis)["wrong_figures"]
+    (figure,) = step.diagnosis.to_dict()["wrong_figures"]
     assert (figure["kind"], figure["unit"]) == ("tool_mass", "kg")
 
 
