@@ -31,7 +31,7 @@ out.
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 
@@ -199,23 +199,13 @@ class Unloaded:
     missed: float  # s, rms of their residual beside the frames, m
 
 
-def frame_effects(fit: Fit) -> tuple[Effect, ...]:
-    """Effects whose columns `unloaded_readings` needs; none for a fit of absolute readings."""
-    if fit.mode == "absolute":
-        return ()
-    states, model = fit.readings[~fit.outlier].states, fit.model
-    kinds = model.catalogue.with_role("registration", "target")
-    return tuple(kind(model.cell, states) for kind in kinds)
-
-
-def unloaded_readings(fit: Fit, frames: Sequence[EffectColumns] | None = None) -> Unloaded | None:
+def unloaded_readings(fit: Fit) -> Unloaded | None:
     """Return the unloaded readings; None for absolute readings, which show all errors."""
     if fit.mode == "absolute":
         return None
-    if frames is None:
-        frames = list(columns_of_each(fit, frame_effects(fit)))
-    readings = fit.readings[~fit.outlier]
-    rows = readings.unloaded
+    readings, model = fit.readings[~fit.outlier], fit.model
+    rows, kinds = readings.unloaded, model.catalogue.with_role("registration", "target")
+    frames = columns_of_each(fit, [kind(model.cell, readings.states) for kind in kinds])
     columns = np.concatenate([frame.unloaded for frame in frames], axis=2)
     u, s, _ = np.linalg.svd(columns.reshape(3 * int(rows.sum()), -1), full_matrices=False)
     u = u[:, s > ROUNDING * s.max(initial=0.0)]
@@ -243,10 +233,10 @@ def rank_suspects(
     refit: Callable[[Fit, str], Fit | None] = trial,  # returns a fit with one more effect
 ) -> tuple[Suspect, ...]:
     """Score all effects; best first, see `ranked`."""
-    suspects = [_suspect(p, s, len(effects)) for part in _scored(p, effects) for s in part]
+    suspects = [_suspect(p, s, len(effects)) for s in _scored(p, effects)]
     tested = max(sum(s.score.rank > 0 for s in suspects), 1)
     no_load = p.fit.mode == "absolute" and not p.fit.solution.prediction.situation.load.wrench.any()
-    geometry = cache(lambda: geometry_columns(p, effects))
+    geometry = cache(partial(geometry_columns, p, effects))
     out: list[Suspect] = []
     for effect, s in zip(effects, suspects, strict=True):
         explains = s.score.p_value * tested < FALSE_ALARM and s.score.log_evidence > 0
@@ -256,7 +246,10 @@ def rank_suspects(
             if no_load and through_load(effect):
                 s = replace(s, refuted=not beyond_geometry(p, family, geometry()))
             if s.passes:
-                s = replace(s, kept=kept(p, family, s.score, refit))
+                kept = kept_by_step(p, family, s.score)
+                if kept < LEAST_KEPT and (after := refit(p.fit, effect.name)) is not None:
+                    kept = max(kept, kept_by_refit(p.fit, after, s.score))
+                s = replace(s, kept=kept)
         out.append(s)
     return ranked(out)
 
@@ -306,24 +299,17 @@ class _Scored:
     held_out: HeldOut | None = None  # None where the fitted readings rule the effect out
 
 
-def _scored(p: Linearisation, effects: Sequence[Effect]) -> Iterator[list[_Scored]]:
-    """Score effects in parts that are whitened together."""
-    frames = frame_effects(p.fit)
-    of_frames: list[EffectColumns] = []
-    bare: Unloaded | None = None
-    for part in columns_in_parts(p.fit, (*frames, *effects)):
-        missing = len(frames) - len(of_frames)
-        of_frames += part[:missing]
-        families = part[missing:]
-        if len(of_frames) == len(frames) and bare is None:
-            bare = unloaded_readings(p.fit, of_frames)
+def _scored(p: Linearisation, effects: Sequence[Effect]) -> Iterator[_Scored]:
+    """Score effects, in parts that are whitened together."""
+    bare = unloaded_readings(p.fit)
+    for families in columns_in_parts(p.fit, effects):
         scored = []
         for family, (s, g) in zip(families, p.families(families), strict=True):
             of_s, largest = spectrum(s), most(family, bare)
             scored.append(_Scored(family, s, of_s, g, largest, p.score_of(of_s, g, largest)))
         able = [c for c in scored if c.score.p_value < FALSE_ALARM and c.score.log_evidence > 0]
         held_out = iter(_left_out(p, [(c.family.white, c.score) for c in able]))
-        yield [replace(c, held_out=next(held_out)) if c in able else c for c in scored]
+        yield from (replace(c, held_out=next(held_out)) if c in able else c for c in scored)
 
 
 def _suspect(p: Linearisation, scored: _Scored, count: int) -> Suspect:
@@ -408,20 +394,6 @@ def kept_by_step(p: Linearisation, family: EffectColumns, score: FamilyScore) ->
     linear = float(np.sum((aim - p.rows @ z) ** 2))
     exact = float(np.sum(w.whiten(residual(readings, prediction, w)) ** 2))
     return (fit.chi2 - exact) / max(fit.chi2 - linear, 1e-300)
-
-
-def kept(
-    p: Linearisation,
-    family: EffectColumns,
-    score: FamilyScore,
-    refit: Callable[[Fit, str], Fit | None],
-) -> float:
-    """Return the share of the promise that the step keeps, or a refit where the step keeps less."""
-    share = kept_by_step(p, family, score)
-    if share >= LEAST_KEPT:
-        return share
-    after = refit(p.fit, family.effect.name)
-    return share if after is None else max(share, kept_by_refit(p.fit, after, score))
 
 
 def through_load(effect: Effect) -> bool:

@@ -1,10 +1,9 @@
 """The statistics of a fit that a judgement needs, each computed once, on first use.
 
-Alternatives. Refits without an effect and with others in its place take seconds to minutes on a
-large campaign, and the others hardly ever explain as much. So the effect is eliminated, and the
-others enter by forward selection, both by algebra (`regression.forward_selection`). An effect that
-was added in place of one found later is often redundant: its F-test against the model without it,
-at the same linearisation, is not significant.
+Alternatives. Refits take seconds to minutes on a large campaign, so an effect is eliminated, and
+others enter by forward selection, by algebra (`regression.forward_selection`). An effect that was
+added in place of one found later is often redundant: its F-test against the model without it, at
+the same linearisation, is not significant.
 
 Separability. Suppose suspect A with the estimated parameters β is the cause. It adds βᵀ S_A β to
 the whitened sum of squares beside the fitted model, S_A the information on A. When suspect B is
@@ -28,16 +27,12 @@ generic regression show that it is not noise.
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import takewhile
 
 import numpy as np
 from scipy.stats import chi2
 
-from hilcal.diagnosis.background_evidence import (
-    TOGETHER,
-    BackgroundEffect,
-    background_evidence,
-    p_value_of_others,
-)
+from hilcal.diagnosis.background_evidence import BackgroundEffect, background_evidence
 from hilcal.diagnosis.effect_ranking import (
     FALSE_ALARM,
     SAME_EVIDENCE,
@@ -74,8 +69,14 @@ from hilcal.identification.linearisation import (
 )
 from hilcal.readings.readings import ArmScatter
 from hilcal.regression.evidence import FamilyScore
-from hilcal.regression.forward_selection import families_beside, forward_selection
+from hilcal.regression.forward_selection import (
+    Addition,
+    CandidateFamilies,
+    families_beside,
+    forward_selection,
+)
 from hilcal.regression.schur import schur_complement
+from hilcal.types import Floats
 
 MOST_INSTEAD = 3  # effects that are tried together in place of one; a choice
 PRICE = 1.0
@@ -202,18 +203,25 @@ def whole_catalogue(fit: Fit) -> tuple[tuple[str, ...], float, float]:
 
     The effect of largest evidence comes first.
     """
-    linear = linearise(fit)
-    x, columns, most = catalogue_columns(fit)
-    information = linear.information(x)
-    families = families_beside(information, linear.residual, fit.dof, x, columns, most)
-    tested = max(len(families.columns), 1)
-    added: list[str] = []
-    for step in forward_selection(families, MOST_TOGETHER):
-        if step.score.log_evidence <= 0 or step.score.p_value * tested >= FALSE_ALARM:
-            break
-        added.append(step.name)
-        families = step.after
-    return tuple(added), families.rss, max(families.dof - families.spent, 1.0)
+    families = beside_catalogue(fit, *catalogue_columns(fit))
+    steps = significant(families)
+    last = steps[-1].after if steps else families
+    return tuple(s.name for s in steps), last.rss, max(last.dof - last.spent, 1.0)
+
+
+def beside_catalogue(
+    fit: Fit, x: Floats, columns: dict[str, slice], most: dict[str, float]
+) -> CandidateFamilies:
+    """Return the effects of `catalogue_columns` beside a fit."""
+    p = linearise(fit)
+    return families_beside(p.information(x), p.residual, fit.dof, x, columns, most)
+
+
+def significant(families: CandidateFamilies) -> list[Addition]:
+    """Return the additions that are significant, each beside the previous ones."""
+    level = FALSE_ALARM / max(len(families.columns), 1)
+    steps = forward_selection(families, MOST_TOGETHER)
+    return list(takewhile(lambda s: s.score.log_evidence > 0 and s.score.p_value < level, steps))
 
 
 def insufficiency(
@@ -301,11 +309,6 @@ class Evidence:
     def background(self) -> tuple[BackgroundEffect, ...]:
         """The effects of the model's background, each tested beside all others."""
         return background_evidence(self.fit) if self._background is None else self._background
-
-    @cached_property
-    def background_proved(self) -> bool:
-        """Whether the readings prove the effects of the background together."""
-        return bool(self.background) and p_value_of_others(self.fit) <= TOGETHER
 
     @cached_property
     def misfit_breakdown(self) -> tuple[MisfitShare, ...]:

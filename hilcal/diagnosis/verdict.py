@@ -56,7 +56,12 @@ from dataclasses import replace
 import numpy as np
 
 from hilcal import limits
-from hilcal.diagnosis.background_evidence import BackgroundEffect, as_suspects
+from hilcal.diagnosis.background_evidence import (
+    TOGETHER,
+    BackgroundEffect,
+    as_suspects,
+    p_value_of_others,
+)
 from hilcal.diagnosis.diagnosis import Diagnosis, History, Reason
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE, ranked
 from hilcal.diagnosis.evidence import Evidence, Separability, separability
@@ -73,11 +78,8 @@ from hilcal.identification.fit import Fit
 NOTHING = History()
 IN_SAMPLE = ("pose", "direction")  # first words of variables whose share is of the fitted poses
 MOST_NAMED = 2  # variables that a sentence names
-BESIDE_A_BACKGROUND: tuple[Reason, ...] = (
-    "residual_is_noise", "inseparable_addition", "arm_scatter", "misjudged_noise",
-)  # fmt: skip
-"""Reasons that the reason "background" overrides where effects are proved together, not one by
-one."""
+BESIDE_A_BACKGROUND = ("residual_is_noise", "inseparable_addition", "arm_scatter")
+"""Reasons that "background" overrides where effects are proved together, not one by one."""
 SAME_IN_POSE = 0.5
 """Share of the misfit that all readings of a pose have in common, above which it is not the scatter
 of single arrivals; a choice."""
@@ -226,8 +228,10 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
         serial = readings.serial
         if reason in ("residual_is_noise", "arm_scatter") and serial and not serial.proved:
             reason = "serial_or_effect"
-        overridden = reason in BESIDE_A_BACKGROUND and bool(e.background)
-        if overridden and (reason == "misjudged_noise" or e.background_proved):
+        if e.background and (
+            reason == "misjudged_noise"
+            or (reason in BESIDE_A_BACKGROUND and p_value_of_others(e.fit) <= TOGETHER)
+        ):
             reason, suspects = "background", (*as_suspects(e.background), *suspects)
     alone = None
     if reason in ("misjudged_noise", "no_suspect") and e.misfit and not _predicted(e, regression):

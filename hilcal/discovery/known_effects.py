@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilcal.diagnosis.effect_ranking import FALSE_ALARM, catalogue_columns
+from hilcal.diagnosis.effect_ranking import catalogue_columns
+from hilcal.diagnosis.evidence import beside_catalogue, significant
 from hilcal.diagnosis.stepwise import add
 from hilcal.discovery.law import Resemblance, form_of
 from hilcal.discovery.problem import SearchProblem
@@ -18,13 +19,9 @@ from hilcal.discovery.refit import exact, left_by, refine
 from hilcal.discovery.search import LEAST, SAME, Selection
 from hilcal.errors import HilcalError
 from hilcal.identification.fit import Fit
-from hilcal.identification.linearisation import linearise
-from hilcal.regression import forward_selection as selection
 from hilcal.regression.forward_selection import families_beside
 from hilcal.regression.leave_out import left_out_residuals
 from hilcal.types import Floats
-
-MOST_TOGETHER = 6  # Most effects that are added; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,20 +42,16 @@ class KnownEffects:
 
 def known_effects(fit: Fit) -> KnownEffects:
     """Add effects of the catalogue to a fit by algebra, as long as they are significant."""
-    linear = linearise(fit)
     x, columns, most = catalogue_columns(fit)
-    families = families_beside(linear.information(x), linear.residual, fit.dof, x, columns, most)
-    tested = max(len(families.columns), 1)
-    names: list[str] = []
-    odds: list[float] = []
-    left: list[float] = []
-    for step in selection.forward_selection(families, MOST_TOGETHER):
-        if step.score.log_evidence <= 0 or step.score.p_value * tested >= FALSE_ALARM:
-            break
-        names.append(step.name)
-        odds.append(step.score.log_evidence - float(np.log(tested)))
-        left.append(step.after.rss / max(fit.dof - step.after.spent, 1.0))
-    return KnownEffects(tuple(names), tuple(odds), tuple(left), x, columns)
+    steps = significant(beside_catalogue(fit, x, columns, most))
+    choice = float(np.log(max(len(columns), 1)))
+    return KnownEffects(
+        tuple(s.name for s in steps),
+        tuple(s.score.log_evidence - choice for s in steps),
+        tuple(s.after.rss / max(fit.dof - s.after.spent, 1.0) for s in steps),
+        x,
+        columns,
+    )
 
 
 @dataclass(frozen=True, slots=True)
