@@ -1,11 +1,9 @@
 """Two campaigns of one arm: the earlier fit completed, its error today, the changes since.
 
-An effect that the arm always had, and that the earlier model lacks, is in the later readings, too,
-and would be taken for a change. So the effects that may change are first scored beside the earlier
-fit on the earlier readings, and those with evidence are added. A residual beyond the stated noise
-is then taken as scatter of the joints, or of the target. A larger multiple of the stated noise
-would look like a change: a tracker's noise has another shape, far smaller along the beam than
-across it.
+An effect that the arm always had, and that the earlier model lacks, would be taken for a change. So
+the effects that may change are first scored on the earlier readings, and those with evidence are
+added. A residual beyond the stated noise is then taken as scatter of the joints, or of the target:
+a multiple of a tracker's noise, which is far smaller along the beam, would look like a change.
 """
 
 from collections.abc import Callable, Collection
@@ -55,11 +53,6 @@ class Today:
         """Rms of the standard deviation of the 3-D position error as the fit states it, m."""
         return float(np.sqrt(np.mean(self.beyond.stated_m**2)))
 
-    @property
-    def better_than_drawn(self) -> bool:
-        """Whether the calibration predicts the readings better than the arm as drawn."""
-        return self.drawing_m is None or self.prediction.error.rms_m < self.drawing_m
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison(Shown):
@@ -98,8 +91,13 @@ class Comparison(Shown):
 
     @property
     def another_arm(self) -> bool:
-        """Whether the later readings seem to be of another arm of the same type."""
-        return not self.changes.explained and not self.today.better_than_drawn
+        """Whether the later readings seem to be of another arm of the same type.
+
+        No change explains them, and the arm as drawn predicts them as well as the calibration.
+        """
+        drawing = self.today.drawing_m
+        worse = drawing is not None and self.today.prediction.error.rms_m >= drawing
+        return worse and not self.changes.explained
 
     def to_dict(self) -> dict[str, object]:
         """Return it as JSON, SI: the document of `compare --json` without its sentences."""

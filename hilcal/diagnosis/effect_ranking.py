@@ -5,10 +5,10 @@ evidence is positive, it explains a share of the misfit on poses left out, the e
 more than it scatters from pose to pose, plausible parameters explain as much as any, and the exact
 model keeps the promise of the linearisation.
 
-Plausible sizes. The standard deviation of the parameters is limited by the effect itself, and by
-absolute positions: deflections show errors of geometry and encoders in the second order only, their
-unloaded readings in the first. With the frames estimated, an effect should hardly displace the
-unloaded readings by more than the model misses there,
+Plausible sizes. The standard deviation of the parameters is limited by the effect itself.
+Deflections show errors of geometry and encoders in the second order only, their unloaded readings
+in the first. With the frames estimated, an effect should hardly displace these by more than the
+model misses there,
 
     t g ≤ `ALLOWED` s,    s² = mean |P y|²,    g² = mean Σ_p |P x_p|²
 
@@ -17,15 +17,14 @@ parameter p, P the projection off the frames. Elastic effects are exempt: a cont
 compensate the effect of gravity. If more than a share `LOST` of the evidence needs larger sizes,
 the effect is implausible, and the size that it needs is stated.
 
-Promise. Columns hold for small parameters. So the exact model is evaluated at the step that the
-score promises, with the model's own parameters adapted. If that loses much of the promise, a refit
-decides. The promise, and the part of it that is kept, are reductions of ‖r‖² − dof.
+Promise. Columns hold for small parameters, so the exact model is evaluated at the step that the
+score promises, with the model's own parameters adapted; if that loses much, a refit decides. The
+promise, and the part of it that is kept, are reductions of ‖r‖² − dof.
 
-Unloaded arms. Absolute readings without a load show a compliance only by the torque of the arm's
-own mass, a smooth function of the joint angles, as the effect of a wrong geometry is. In such
-readings a suspect that acts through loads must explain the readings beside all effects that are
-constant in the arm's axes (link geometry, zero offsets): with evidence at 20 : 1, and on poses left
-out.
+Unloaded arms. Absolute readings without a load show a compliance only by the arm's own weight, a
+smooth function of the joint angles, as a wrong geometry is. There a suspect that acts through loads
+must explain the readings beside all effects that are constant in the arm's axes: with evidence at
+20 : 1, and on poses left out.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -157,8 +156,7 @@ def candidates(fit: Fit) -> tuple[Effect, ...]:
     """Effects that can be computed and are not in the model, or refine an effect of the model.
 
     Raises:
-        InputError: `[plausible]` or `[ordinary]` of the cell names an effect that the catalogue
-            does not hold.
+        InputError: `[plausible]` or `[ordinary]` of the cell names an unknown effect.
     """
     states, model = fit.readings[~fit.outlier].states, fit.model
     config = model.cell.config
@@ -265,13 +263,9 @@ def addition(before: Fit, after: Fit) -> Suspect:
 
 
 def ranked(suspects: Iterable[Suspect], rejected: Collection[str] = ()) -> tuple[Suspect, ...]:
-    """Order suspects, and name those that are inseparable.
+    """Order suspects as in `Diagnosis.suspects`, and name those that are inseparable.
 
-    First come those that pass all tests, then those that explain the misfit but do not surely
-    lower the error on poses left out, then the others; by evidence in each of these groups.
-
-    Args:
-        rejected: names of effects whose addition did not lower the error on poses left out.
+    The addition of the `rejected` effects did not lower the error on poses left out.
     """
     order = [replace(s, refuted=True) if s.effect in rejected else s for s in suspects]
     order.sort(key=lambda s: (-s.passes, -s.explains, -s.score.log_evidence, s.score.p_value))
@@ -288,8 +282,6 @@ def ranked(suspects: Iterable[Suspect], rejected: Collection[str] = ()) -> tuple
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scored:
-    """An effect with its score and the statistics behind it."""
-
     family: EffectColumns
     information: Floats  # (P, P) S
     spectrum: Spectrum  # of S
@@ -313,10 +305,7 @@ def _scored(p: Linearisation, effects: Sequence[Effect]) -> Iterator[_Scored]:
 
 
 def _suspect(p: Linearisation, scored: _Scored, count: int) -> Suspect:
-    """Describe one of `count` effects that are tested together.
-
-    Columns are large, so later statistics compute them again instead of keeping them.
-    """
+    """Describe one of `count` effects that are tested together, without keeping its columns."""
     of_s, result, effect = scored.spectrum, scored.score, scored.family.effect
     s, largest, held_out = scored.information, scored.largest, scored.held_out
 
@@ -333,16 +322,9 @@ def _suspect(p: Linearisation, scored: _Scored, count: int) -> Suspect:
         return least_of_family(p, x, of_s, start, level, largest)
 
     return Suspect(
-        effect=effect.name,
-        coarse=effect.coarse,
-        score=result,
-        share=p.share(result.gain),
-        left_out=left_out,
-        explains=False,
-        needs=_implausible(p, scored),
-        detection=least,
-        most=largest,
-    )
+        effect.name, result, p.share(result.gain), left_out, explains=False, detection=least,
+        needs=_implausible(p, scored), most=largest, coarse=effect.coarse,
+    )  # fmt: skip
 
 
 def _left_out(p: Linearisation, families: Sequence[tuple[Floats, FamilyScore]]) -> list[HeldOut]:
@@ -441,11 +423,10 @@ def beyond_geometry(p: Linearisation, family: EffectColumns, geometry: Floats) -
 def added_variable(fit: Fit, suspect: Suspect) -> tuple[Floats, Floats] | None:
     """Return the points (K,) of the added-variable plot of a suspect: abscissa and ordinate, m.
 
-    With X the suspect's columns, projected off the fitted model, and s its estimated parameters,
-    c = X s is its contribution to each measurement (3-vectors, raw). The abscissa is |c|, the
-    ordinate the residual along c, both with the sign of c along the principal direction of all c.
-    If the suspect is right, the points lie on the line of slope 1. None where it explains nothing,
-    or cannot be added.
+    c = X s is the suspect's contribution to each measurement (3-vectors, raw), X its columns beside
+    the model and s its parameters. The abscissa is |c|, the ordinate the residual along c, both
+    with the sign of c along the principal direction of all c. If the suspect is right, the points
+    lie on the line of slope 1. None where it explains nothing, or cannot be added.
 
     Source: Cook and Weisberg, *Residuals and Influence in Regression*, 1982.
     """

@@ -224,42 +224,6 @@ def significant(families: CandidateFamilies) -> list[Addition]:
     return list(takewhile(lambda s: s.score.log_evidence > 0 and s.score.p_value < level, steps))
 
 
-def insufficiency(
-    fit: Fit,
-    refit: Callable[[Fit, str], Fit | None],
-    say: Callable[[str], None] = lambda text: None,
-    regressions: Regressions | None = None,
-) -> Insufficiency | None:
-    """Return the misfit that the whole catalogue leaves; None if it is noise."""
-    current, names = fit, list[str]()
-    misfit = fit.chi2 - fit.dof
-    while True:
-        effects, square, dof = whole_catalogue(current)
-        is_noise = float(chi2.sf(square, dof)) >= MISFIT_ALARM
-        if is_noise or square - dof < LEAST_REMAINDER * misfit:
-            return None
-        if not effects or len(names) == MOST_REFITS:
-            break
-        say(f"testing the whole catalogue: adding {effects[0]}")
-        larger = refit(current, effects[0])
-        if larger is None:
-            break
-        current = larger
-        names.append(effects[0])
-    regression = (regressions or Regressions()).of(linearise(current))
-    noise = judge_noise(current, pure_error(current), regression.share > PREDICTABLE)
-    if noise.misjudged or not noise.off:
-        return None
-    return Insufficiency(
-        effects=(*names, *effects),
-        refitted=len(names),
-        share=(square - dof) / misfit,
-        variance_factor=square / dof,
-        dependences=regression.dependences,
-        noise=noise,
-    )
-
-
 class Evidence:
     """Statistics of a fit that a judgement combines, independent of the model's history."""
 
@@ -271,11 +235,7 @@ class Evidence:
         regressions: Regressions | None = None,  # cache
         background: tuple[BackgroundEffect, ...] | None = None,  # if tested already
     ) -> None:
-        """Take a fit.
-
-        Raises:
-            InputError: for a fit whose residual is not whitened.
-        """
+        """Take a fit; raises InputError for one whose residual is not whitened."""
         if fit.scaling != "gc":
             raise InputError(f"diagnosis needs scaling gc, this fit has {fit.scaling}")
         self.fit, self._refit, self._say = fit, refit, say
@@ -345,9 +305,8 @@ class Evidence:
     def by_arrivals(self) -> "Evidence | None":
         """The evidence with the arm's estimated scatter in the covariance; None if not needed.
 
-        The arm's scatter displaces all targets that are read in one arrival together. Where
-        nothing states the scatter, tests that treat these readings as independent would find
-        causes in chance.
+        The arm's scatter displaces all targets of one arrival together. Tests that treat these
+        readings as independent would find causes in chance.
         """
         readings, model = self.fit.readings, self.fit.model
         in_covariance = readings.scatter_stated or readings.arm_scatter is not None
@@ -367,7 +326,32 @@ class Evidence:
     @cached_property
     def insufficiency(self) -> Insufficiency | None:
         """The misfit that all effects of the catalogue together leave; None if it is noise."""
-        return insufficiency(self.fit, self._refit, self._say, self._regressions)
+        current, names, misfit = self.fit, list[str](), self.fit.chi2 - self.fit.dof
+        while True:
+            effects, square, dof = whole_catalogue(current)
+            is_noise = float(chi2.sf(square, dof)) >= MISFIT_ALARM
+            if is_noise or square - dof < LEAST_REMAINDER * misfit:
+                return None
+            if not effects or len(names) == MOST_REFITS:
+                break
+            self._say(f"testing the whole catalogue: adding {effects[0]}")
+            larger = self._refit(current, effects[0])
+            if larger is None:
+                break
+            current = larger
+            names.append(effects[0])
+        regression = self._regressions.of(linearise(current))
+        noise = judge_noise(current, pure_error(current), regression.share > PREDICTABLE)
+        if noise.misjudged or not noise.off:
+            return None
+        return Insufficiency(
+            effects=(*names, *effects),
+            refitted=len(names),
+            share=(square - dof) / misfit,
+            variance_factor=square / dof,
+            dependences=regression.dependences,
+            noise=noise,
+        )
 
     def tree_share(self, beyond: float) -> float:
         """Return the share of the misfit that trees predict; see `residual_regression`."""
@@ -388,8 +372,8 @@ class Evidence:
 def backward_elimination(fit: Fit) -> dict[str, FamilyScore]:
     """Return the redundant effects, each scored against the model without it; weakest first.
 
-    Effects with a carried prior are judged by `spoken_against`, since other readings support them;
-    random effects of a model with a background are judged by `background_evidence`.
+    Effects with a carried prior are left to `spoken_against`, those of a background to
+    `background_evidence`.
     """
     carried = fit.solution.space.carried(fit.model.size)
     random = fit.model.random if fit.model.background else ()

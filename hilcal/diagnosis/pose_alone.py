@@ -9,9 +9,8 @@ nearly all of the misfit and leave noise, those effects are listed whose columns
 to nearly all of their square. The parameters of a family can be separated once the poses measure
 about as many elements as the family has parameters. The proposed number of further poses is the
 smallest of `SHARES` at which the first of these effects, as large as the misfit, would pass every
-test of a suspect with the probability `SURE`. To that end campaigns are simulated by algebra, at
-the linearisation of the fit: the readings so far, and unloaded readings at further poses within the
-range of the joints so far; parameters drawn with the size found; noise; all tests.
+test of a suspect with the probability `SURE`, in campaigns simulated by algebra at the
+linearisation of the fit: with further unloaded readings within the range of the joints so far.
 """
 
 from collections.abc import Iterator, Sequence
