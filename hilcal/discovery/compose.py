@@ -164,7 +164,7 @@ def _screened(candidates: CandidateTerms) -> list[_Bent]:
         candidates.evidence, slope, square, across, slope_one[:, None], square_one[:, None]
     )
     cost = screen.grammar.cost[bends.argument]
-    price = screen.grammar.price_of_argument(cost)
+    price = screen.grammar.price_of_argument[cost]
     odds = odds - price
     out: dict[tuple[int, int], _Bent] = {}
     for index in np.argsort(-odds, axis=None)[: 20 * BEST].tolist():
@@ -272,14 +272,15 @@ def _terms(candidates: CandidateTerms, site: SiteSums, b: _Bent) -> list[LawTerm
     screen = candidates.problem.screen
     price_of_number = 0.5 * float(np.log(candidates.dof))
     grid = float(np.log(len(QUANTILES) * len(b.numbers)))
-    sums = b.price - float(screen.grammar.price_of_argument(screen.grammar.cost[b.which[0]]))
+    grammar = screen.grammar
+    sums = b.price - float(grammar.price_of_argument[grammar.cost[b.which[0]]])
     variants = [(b, grid + sums)]
     if b.shape.name in POWERS:
         bent = replace(b, shape=POWERS[b.shape.name], numbers=(*b.numbers, 1.0))
         variants.append((bent, grid + sums + price_of_number))
     out = []
     for x, price in variants:
-        k = screen.grammar.index(_refined(candidates, site, x))
+        k = grammar.index(_refined(candidates, site, x))
         if k is None:
             continue
         out.append(candidates.term(((b.s, k),), price))

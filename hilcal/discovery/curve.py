@@ -25,7 +25,7 @@ from hilcal.discovery.sites import ORDINARY, Place, Site, site_motions
 from hilcal.effects.force_sensor import sensor_error
 from hilcal.effects.protocol import Effect, Situation
 from hilcal.identification.fit import Fit
-from hilcal.types import Bools, Floats, Ints
+from hilcal.types import Floats, Ints
 
 MOST_CURVES = 3
 BINS = 12
@@ -107,18 +107,17 @@ def _curve(
     return _over(site, ordinate, unit, v, order, x, y, std, np.vstack([ends, law(ends)]))
 
 
-def _usable(std: Floats, divisor: Floats) -> Bools:
-    """(N,) which readings determine a motion that is divided by the other factors."""
+def _usable(std: Floats, divisor: Floats) -> Ints:
+    """Indices of the readings that determine a motion that is divided by the other factors."""
     size = np.abs(divisor)
-    return np.asarray(np.isfinite(std) & (size > LEAST * float(size.max())))
+    return np.flatnonzero(np.isfinite(std) & (size > LEAST * float(size.max())))
 
 
-def _points(usable: Bools) -> Ints:
-    """Return which readings are drawn: all usable ones, or some at random."""
-    indices = np.flatnonzero(usable)
-    if len(indices) <= MOST_POINTS:
-        return indices
-    return np.random.default_rng(20261122).choice(indices, MOST_POINTS, replace=False)
+def _points(usable: Ints) -> Ints:
+    """Return which of the usable readings are drawn: all, or some at random."""
+    if len(usable) <= MOST_POINTS:
+        return usable
+    return np.random.default_rng(20261122).choice(usable, MOST_POINTS, replace=False)
 
 
 def _over(
@@ -237,7 +236,7 @@ def _drawn_curve(
 ) -> Curve:
     s = fit.solution.prediction.situation
     partial, std = partial_residuals(fit, motion)
-    candidates: list[tuple[float, int, Variable, Variable | None, Floats, Bools, Floats]] = []
+    candidates: list[tuple[float, int, Variable, Variable | None, Floats, Ints, Floats]] = []
     for v, g in axes:
         divisor = np.ones(len(law)) if g is None else g.read(s)
         usable = _usable(std, divisor)

@@ -57,8 +57,6 @@ Reason = Literal["law", "adequate", "catalogue", "no_law", "unpredictable"]
 """
 LEAST_SHARE = 0.1  # of the misfit on poses left out that a law must explain
 NEAR = 0.7  # Least cosine of an effect of the catalogue that resembles a law; a choice
-
-
 MOST_RIVALS = 2  # Alternatives that can be written as effects; a choice: `next` separates few
 
 
@@ -149,16 +147,15 @@ def discover(
     effects = known_effects(fit)
     explained = instead_of_law(fit, problem, best, effects)
     if explained.names:
-        answer = Discovery(
-            fit, "catalogue", catalogue=explained.names, candidates=screening.candidates
-        )
-        return replace(answer, unfitted=explained.unfitted)
-    say("repeating the search without each fold of poses")
-    folds = search_by_folds(screening)
-    if not folds.sure or folds.share < LEAST_SHARE:
-        answer = _silent(fit, screening, say, folds.share)
+        names, tried = explained.names, screening.candidates
+        answer = Discovery(fit, "catalogue", catalogue=names, candidates=tried)
     else:
-        answer = _laws(fit, problem, selections, folds, effects, say, name)
+        say("repeating the search without each fold of poses")
+        folds = search_by_folds(screening)
+        if not folds.sure or folds.share < LEAST_SHARE:
+            answer = _silent(fit, screening, say, folds.share)
+        else:
+            answer = _laws(fit, problem, selections, folds, effects, say, name)
     return replace(answer, unfitted=explained.unfitted)
 
 
@@ -198,8 +195,7 @@ def _laws(
     misfit = max(float(squares.sum()) - rank, 3.0 * np.sqrt(2.0 * rank))
     likely = structures(problem, selections)
     chance = {x.kind: x.probability for x in likely}
-    fitted: list[tuple[Law, Fit, Floats, str]] = []
-    kinds: list[Hashable] = []
+    fitted: list[tuple[Law, Fit, Floats, str, Hashable]] = []
     refused: list[tuple[str, str]] = []
     for s in selections:
         form, kind = refine(screen, form_of(screen, s.terms)), structure_of(screen, s.terms)
@@ -215,34 +211,39 @@ def _laws(
         squares_after = left_out_by_pose(after)
         share = float(np.clip((squares.sum() - squares_after.sum()) / misfit, -1.0, 1.0))
         law = _law(problem, s, form, name, coefficients, share, after, folds, effects, chance[kind])
-        kinds.append(kind)
         evidence = (
             f"It explains {100 * share:.0f} % of the misfit on poses left out; p-value "
             f"{law.p_value:.1g}, corrected\nfor the size of the search. Among the structures that "
             f"the search met, its own has the probability {law.probability:.2f}."
         )
         source = source_of_form(form, name, coefficients, evidence, f"{name}.py")
-        fitted.append((law, after, squares_after, source))
+        fitted.append((law, after, squares_after, source, kind))
     if not fitted:
         silent = _silent(fit, screen, say, folds.share)
         return replace(silent, reason="no_law", refused=tuple(refused))
-    best = min(range(len(fitted)), key=lambda k: float(fitted[k][2].sum()))
-    # laws that predict poses left out as well as the best, within one standard error
-    excess = [m[2] - fitted[best][2] for m in fitted]
-    root = np.sqrt(max(len(excess[0]) - 1, 1))
-    retained = [k for k, x in enumerate(excess) if float(x.mean()) <= float(np.std(x)) / root]
+    best = min(
+        (squares_after for _, _, squares_after, _, _ in fitted), key=lambda x: float(x.sum())
+    )
+    root = np.sqrt(max(len(best) - 1, 1))
+
+    def as_good(squares_after: Floats) -> bool:
+        """Whether a law predicts poses left out as well as the best, within a standard error."""
+        excess = squares_after - best
+        return float(excess.mean()) <= float(np.std(excess)) / root
+
+    retained = [x for x in fitted if as_good(x[2])]
     say("asking what is predictable at all")
     attainable = residual_regression(screen.linear).share
-    laws = tuple(
-        replace(fitted[k][0], name=name if not rank else f"{name}_{rank + 1}")
-        for rank, k in enumerate(retained)
-    )
-    names = {kinds[k]: law.name for k, law in reversed([*zip(retained, laws, strict=True)])}
+    laws = tuple(replace(x[0], name=_numbered(name, k)) for k, x in enumerate(retained, start=1))
+    names: dict[Hashable, str] = {}
+    for law, (*_, kind) in zip(laws, retained, strict=True):
+        names.setdefault(kind, law.name)
+    _, after, _, source, _ = retained[0]
     return Discovery(
         fit, "law", laws,
         float(np.clip(max(attainable, folds.share, laws[0].holdout_share), 0.0, 1.0)),
-        folds.share, (), screen.candidates, fitted[retained[0]][1], fitted[retained[0]][3],
-        curves(fitted[retained[0]][1], laws[0].form), refused=tuple(refused),
+        folds.share, (), screen.candidates, after, source,
+        curves(after, laws[0].form), refused=tuple(refused),
         structures=tuple(replace(x, law=names.get(x.kind, "")) for x in likely),
     )  # fmt: skip
 
@@ -473,12 +474,10 @@ class LawSearch:
 
     def _free_name(self, fitted: Fit) -> str:
         used = {*fitted.model.catalogue.names, *fitted.model.names, *self._sources}
-        names = (_numbered(self._name, k) for k in range(1, 10_000))
-        free = (n for n in names if n not in used and not self.path(n).exists())
-        try:
-            return next(free)
-        except StopIteration:
-            raise InputError(f"{self._folder}: no free name for a law's file") from None
+        for name in (_numbered(self._name, k) for k in range(1, 10_000)):
+            if name not in used and not self.path(name).exists():
+                return name
+        raise InputError(f"{self._folder}: no free name for a law's file")
 
 
 def _numbered(name: str, k: int) -> str:
@@ -487,14 +486,10 @@ def _numbered(name: str, k: int) -> str:
 
 def laws_json(s: LawSearch) -> dict[str, object]:
     """Return the searches of a refinement as JSON."""
+    written = [s.files.get(d.laws[0].name) if d.laws else None for d in s.found]
     return {
         "discover": [
-            {
-                **discovery_json(d),
-                "written": str(s.files[d.laws[0].name])
-                if d.laws and d.laws[0].name in s.files
-                else None,
-            }
-            for d in s.found
+            {**discovery_json(d), "written": file and str(file)}
+            for d, file in zip(s.found, written, strict=True)
         ]
     }

@@ -1,9 +1,8 @@
 """Comparison of a proposed law with effects of the catalogue as explanations of the misfit.
 
-Effects are added by algebra, at the linearisation of the fit, as the terms of a law are. If that
-prefers the law, both are also refitted in the exact model: a large effect, such as a load point
-that is 20 cm off, is not linear in its parameters, and its deviation from the linearisation looks
-like another law.
+Effects are added by algebra, as the terms of a law are. If that prefers the law, both are also
+refitted in the exact model: the deviation of a large effect, such as a load point that is 20 cm
+off, from its linearisation looks like another law.
 """
 
 from dataclasses import dataclass, replace

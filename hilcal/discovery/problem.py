@@ -84,15 +84,11 @@ class SearchProblem:
         """(R', P) whitened columns of a term in the rows that are used."""
         return self.screen.columns_of(term)[self.rows]
 
-    def beside(self, chosen: Sequence[LawTerm]) -> "CandidateTerms":
-        """Return the candidates beside chosen terms."""
-        return CandidateTerms(self, tuple(chosen))
-
     def scored(self, chosen: tuple[LawTerm, ...] = ()) -> list[Scored]:
         """Return the short list beside chosen terms, the best odds first; cached."""
         key = tuple((t.parts, t.common) for t in chosen)
         if key not in self._scored:
-            candidates = self.beside(chosen)
+            candidates = CandidateTerms(self, chosen)
             scored = candidates.score(candidates.shortlist())
             self._scored[key] = sorted(scored, key=lambda c: -c.odds)
         return self._scored[key]

@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from hilcal.discovery.problem import SHORT_LIST, SearchProblem
+from hilcal.discovery.problem import SHORT_LIST, CandidateTerms, SearchProblem
 from hilcal.discovery.screen import LawTerm, Scored, Screen
 from hilcal.regression.evidence import FamilyScore
 from hilcal.regression.forward_selection import families_beside
@@ -172,7 +172,7 @@ def _pruned(problem: SearchProblem, s: Selection) -> Selection:
         worth = []
         for k, term in enumerate(s.terms):
             remaining = (*s.terms[:k], *s.terms[k + 1 :])
-            worth.append(problem.beside(remaining).score([term])[0].odds)
+            worth.append(CandidateTerms(problem, remaining).score([term])[0].odds)
         weakest = int(np.argmin(worth))
         if worth[weakest] >= LEAST:
             return replace(s, odds=chain(problem, s.terms))
