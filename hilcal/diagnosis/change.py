@@ -316,10 +316,7 @@ def _pooled(minimum: Remeasured) -> tuple[float, float]:
 
 
 def _least_noise(minimum: Remeasured) -> float:
-    """σ² for the uncertainty of sizes, at least that of the earlier fit.
-
-    The earlier fit states it for all directions together; a few lucky readings do not lower it.
-    """
+    """σ² for the uncertainty of sizes; a few lucky readings do not lower it below that stated."""
     rss, dof = _pooled(minimum)
     return max(rss / dof, 1.0)
 

@@ -136,10 +136,7 @@ class Comparison(Shown):
 def completed(
     fit: Fit, names: Collection[str], say: Callable[[str], None] = lambda text: None
 ) -> tuple[Fit, tuple[str, ...]]:
-    """Add those of some effects that the readings of a gc-scaled fit show; the fit and their names.
-
-    The scatter is estimated, too, where it exceeds the stated noise.
-    """
+    """Add effects, and the scatter, that a gc-scaled fit's readings show; the fit, their names."""
     added: list[str] = []
     while len(added) < MOST and (effect := _most_evident(fit, names)) is not None:
         say(f"adding {effect} to the earlier model, as its own readings ask for")
@@ -178,10 +175,7 @@ def _most_evident(fit: Fit, names: Collection[str]) -> str | None:
 
 
 def error_today(setting: Setting, changes: Changes, drawing: float | None) -> Today:
-    """Return the error of the earlier parameters at later readings, with the tracker where it is.
-
-    `drawing` is the rms error with the arm as drawn, m.
-    """
+    """Return the earlier calibration's error; `drawing`: rms error with the arm as drawn, m."""
     minimum, w = remeasure(frames_alone(setting)), setting.w
     white = w.whiten(minimum.raw).reshape(-1)
     prediction = Validation(

@@ -152,10 +152,7 @@ class Diagnosis(Shown, Tabular):
 
     @property
     def not_shown(self) -> tuple[str, ...]:
-        """Names of the effects that these readings would reveal at no plausible size.
-
-        Deflections do not show errors that are the same under every load, such as geometry.
-        """
+        """Effects, such as geometry in deflections, that no plausible size would reveal here."""
         background = {b.effect for b in self.background}
         failed = (s for s in self.suspects if not s.passes and s.effect not in background)
         return tuple(s.effect for s in failed if not s.shown)

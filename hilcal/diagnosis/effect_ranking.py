@@ -72,10 +72,7 @@ left out beside geometry: p = 0.001, since a dozen of them are tested."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Suspect(Brief):
-    """An effect that is not in the model, and the part of the misfit that it would explain.
-
-    Functions stand for statistics that not every verdict needs; they compute on first use.
-    """
+    """An effect that is not in the model; functions stand for statistics computed on first use."""
 
     effect: str  # canonical name
     score: FamilyScore  # the joint test of the whole family

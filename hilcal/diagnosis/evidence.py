@@ -199,10 +199,7 @@ class Insufficiency:
 
 
 def whole_catalogue(fit: Fit) -> tuple[tuple[str, ...], float, float]:
-    """Add all significant effects by algebra; return their names, ‖r‖² and its degrees of freedom.
-
-    The effect of largest evidence comes first.
-    """
+    """Add all significant effects by algebra; return their names, best first, ‖r‖² and dof."""
     families = beside_catalogue(fit, *catalogue_columns(fit))
     steps = significant(families)
     last = steps[-1].after if steps else families
@@ -391,11 +388,7 @@ def backward_elimination(fit: Fit) -> dict[str, FamilyScore]:
 
 
 def spoken_against(fit: Fit) -> tuple[str, ...]:
-    """Return effects of a carried prior that the new readings contradict, the strongest first.
-
-    At odds of 20 : 1 the readings, for instance after a repair, are likelier without the effect
-    than with the carried prior of its parameters.
-    """
+    """Return effects whose carried prior the new readings contradict at 20 : 1, strongest first."""
     names = carried_effects(fit.model) if fit.scaling == "gc" else ()
     evidence = evidence_of_carried(fit.model, fit.solution, fit.whitening, names) if names else {}
     against = [n for n in evidence if evidence[n] < -SAME_EVIDENCE]

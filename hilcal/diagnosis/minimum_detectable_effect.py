@@ -114,10 +114,7 @@ def least_of_family(
     level: float,  # of the test, between 0 and 1
     largest: float,  # largest plausible strength
 ) -> Strength:
-    """Return the smallest strength of a family that all tests would reveal.
-
-    For a family that is small against the degrees of freedom, the F-test alone decides.
-    """
+    """Return the smallest strength that all tests would reveal; of small families the F-test."""
     if not start.visible or s.rank <= LARGE_FAMILY * p.fit.dof:
         return start
     fine = family.effect.fine(p.fit.readings[~p.fit.outlier].states)

@@ -95,7 +95,13 @@ def misfit_breakdown(p: Linearisation) -> tuple[MisfitShare, ...]:
             yield "target", 1e-3 * _times(moves.by_target()[w.reading, :, :3], member)
 
     columns = ((n, w.whiten(raw).reshape(-1, raw.shape[2])) for n, raw in raw_columns())
-    out = [share for batch in _batches(columns) for share in _shares(p, batch)]
+    out: list[MisfitShare] = []
+    for batch in _batches(columns):
+        products = p.products(x for _, x in batch)
+        scores = [p.score(x, p.information(xs)) for (_, x), xs in zip(batch, products, strict=True)]
+        held_out = p.held_out(list(zip(products, scores, strict=True)))
+        for (name, _), score, h in zip(batch, scores, held_out, strict=True):
+            out.append(MisfitShare(name, max(h.share, 0.0), score.p_value))
     # A pose left out cannot predict itself, so its share is in-sample, less the part that as many
     # columns explain by chance.
     if (c := pose_constants(p)) is not None:
@@ -115,17 +121,6 @@ def _batches(columns: Iterable[_Named]) -> Iterator[list[_Named]]:
         batch.append((name, x))
     if batch:
         yield batch
-
-
-def _shares(p: Linearisation, batch: list[_Named]) -> list[MisfitShare]:
-    """Score named columns (R, F)."""
-    products = p.products(x for _, x in batch)
-    scores = [p.score(x, p.information(xs)) for (_, x), xs in zip(batch, products, strict=True)]
-    held_out = p.held_out(list(zip(products, scores, strict=True)))
-    return [
-        MisfitShare(name, max(h.share, 0.0), score.p_value)
-        for (name, _), score, h in zip(batch, scores, held_out, strict=True)
-    ]
 
 
 def _times(motions: Floats, basis: Floats) -> Floats:

@@ -181,7 +181,15 @@ def pure_error(fit: Fit) -> PureError | None:
     lack_dof, p = fit.dof - c.dof, 1.0
     if lack_dof > 0 and pure > 0:
         p = float(f_distribution.sf((lack / lack_dof) / (pure / c.dof), lack_dof, c.dof))
-    off = [v for v in every_direction(fit, c) if v.p_value < CERTAIN and _is_wrong(v, c)]
+    # A direction is wrong itself if it is further off than all together, to the same side.
+    overall = max(pure / c.dof, 1e-300)
+    off = [
+        v
+        for v in every_direction(fit, c)
+        if v.p_value < CERTAIN
+        and (v.factor > overall) == (v.factor > 1)
+        and abs(np.log(max(v.factor, 1e-300))) > abs(np.log(overall))
+    ]
     where = min(off, key=lambda v: v.p_value, default=None)
     return PureError(pure / c.dof, variance_interval(pure, c.dof), c.dof, p, where)
 
@@ -414,13 +422,6 @@ def every_direction(fit: Fit, c: Contrasts) -> list[NoiseWhere]:
             low, high = (factor * dof / float(chi2.isf(q, dof)) for q in (0.025, 0.975))
             out.append(NoiseWhere(kind, name, factor, (low, high), _p(t / square)))
     return [replace(v, p_value=min(v.p_value * len(out), 1.0)) for v in out]
-
-
-def _is_wrong(v: NoiseWhere, c: Contrasts) -> bool:
-    """Whether the direction itself is wrong, not only the other directions."""
-    overall = float(c.y @ c.y) / c.dof / c.bias
-    size = abs(np.log(max(v.factor, 1e-300)))
-    return bool((v.factor > overall) == (v.factor > 1) and size > abs(np.log(max(overall, 1e-300))))
 
 
 def _p(ratio: Floats) -> float:

@@ -203,10 +203,7 @@ class Difference:
 
 
 def recorded_values(fit: Fit) -> tuple[StateVariable, ...]:
-    """Return the variables that vary in the readings of a fit, with load and target's place.
-
-    Their values are those of all readings (N,), NaN where a reading was set aside.
-    """
+    """Return variables (N,) of all readings that vary, load and place too; NaN for outliers."""
     used, readings = ~fit.outlier, fit.readings[~fit.outlier]
     target = fit.solution.prediction.observation.base_position
     varying = list(state_variables(linearise(fit)))
@@ -224,10 +221,7 @@ def recorded_values(fit: Fit) -> tuple[StateVariable, ...]:
 
 
 def distinguish(fit: Fit, picked: Bools) -> tuple[Difference, ...]:
-    """Compare picked readings (N,) with the others in every variable; clearest difference first.
-
-    Only measurements are compared: the unloaded readings of deflections do not count as others.
-    """
+    """Compare picked measurements (N,) with the others in every variable; clearest first."""
     from scipy.stats import rankdata  # slow to import
 
     measured = np.zeros(len(picked), dtype=bool)

@@ -114,11 +114,7 @@ class ResidualRegression:
 
 
 class Regressions:
-    """Cached regressions of the residuals of fits.
-
-    A judgement regresses the residual of a trial fit, which is judged itself if it becomes the next
-    revision.
-    """
+    """Cached regressions of the residuals of fits: a trial fit may become the next revision."""
 
     def __init__(self) -> None:
         """Create an empty cache."""
@@ -319,9 +315,8 @@ def _least_squares(p: Linearisation, x: Floats) -> tuple[Floats, Floats]:
 def tree_share(p: Linearisation, beyond: float = 0.0) -> float:
     """Return the share of the misfit that trees predict on poses left out, within [0, 1].
 
-    Args:
-        beyond: share that is predicted without trees. A smaller share of trees is less precise; 0
-            where no more than `PREDICTABLE` remains beyond it.
+    A share below `beyond`, which is predicted without trees, is less precise; it is 0 where no more
+    than `PREDICTABLE` remains beyond it.
     """
     if beyond >= 1.0 - PREDICTABLE:
         return 0.0
@@ -334,8 +329,20 @@ def tree_share(p: Linearisation, beyond: float = 0.0) -> float:
     chosen = np.arange(len(target))
     if len(chosen) > MOST_MEASUREMENTS:
         chosen = np.random.default_rng(0).choice(chosen, MOST_MEASUREMENTS, replace=False)
+    s, situation = fit.readings[~fit.outlier].states[w.reading], fit.solution.prediction.situation
+    angle = situation.angle[w.reading]
+    order = np.flatnonzero(~fit.outlier).astype(float)[w.reading]
+    narrow = (order if s.time is None else s.time, s.load_time, s.air_temperature)
+    features = np.concatenate(  # everything recorded of the state of each measurement
+        [
+            *(angle, np.cos(angle), np.sin(angle), situation.torque[w.reading], s.wrench),
+            *(x[:, None] for x in narrow if x is not None),
+            *(x for x in (s.joint_temperature, s.approach) if x is not None),
+        ],
+        axis=1,
+    )
     fold, scale = random_folds(fit.pose, FOLDS)[chosen], p.rss / p.misfit()
-    share = predicted(_features(p)[chosen], target[chosen], fold, scale, beyond).share
+    share = predicted(features[chosen], target[chosen], fold, scale, beyond).share
     return float(np.clip(share, 0.0, 1.0))
 
 
@@ -388,31 +395,10 @@ def predicted(
 
 
 def _mean_of_pairs(products: Floats) -> tuple[float, float]:
-    """Mean product of the errors of two different trees, and its standard error by the jackknife.
-
-    `products` (T, T) are those of all pairs of trees, the same tree included.
-    """
+    """Mean product of two trees' errors, and its standard error (jackknife), from all (T, T)."""
     count = len(products)
     squares = np.diag(products)
     total = float(products.sum() - squares.sum())
     without = (total - 2 * (products.sum(axis=1) - squares)) / ((count - 1) * (count - 2))
     variance = (count - 1) / count * float(np.sum((without - without.mean()) ** 2))
     return total / (count * (count - 1)), float(np.sqrt(variance))
-
-
-def _features(p: Linearisation) -> Floats:
-    """(D, F) everything recorded of the state of each measurement."""
-    fit, reading = p.fit, p.fit.whitening.reading
-    s = fit.readings[~fit.outlier].states[reading]
-    situation = fit.solution.prediction.situation
-    angle = situation.angle[reading]
-    order = np.flatnonzero(~fit.outlier).astype(float)[reading]
-    narrow = (order if s.time is None else s.time, s.load_time, s.air_temperature)
-    return np.concatenate(
-        [
-            *(angle, np.cos(angle), np.sin(angle), situation.torque[reading], s.wrench),
-            *(x[:, None] for x in narrow if x is not None),
-            *(x for x in (s.joint_temperature, s.approach) if x is not None),
-        ],
-        axis=1,
-    )

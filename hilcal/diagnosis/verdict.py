@@ -256,10 +256,7 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
 
 
 def _predicted(e: Evidence, regression: ResidualRegression) -> bool:
-    """Whether something recorded predicts the misfit on poses left out.
-
-    If every pose has an error of its own, n poses follow a variable by chance to a share of 1/√n.
-    """
+    """Whether something recorded predicts the misfit on poses left out, beyond chance."""
     shares = (v.share for v in e.misfit_breakdown if v.variable.split()[0] not in IN_SAMPLE)
     chance = 2.0 / np.sqrt(int(e.fit.pose.max()) + 1)
     return regression.share > PREDICTABLE or max(shares, default=0.0) > chance

@@ -157,10 +157,7 @@ class _Figure:
 
 
 def wrong_figures(fit: Fit, suspects: Sequence[Suspect]) -> tuple[WrongFigure, ...]:
-    """Return the figures each of which alone explains the misfit, the best first.
-
-    A model with a background has none: they were tested before the background was fitted.
-    """
+    """Return the figures each of which alone explains the misfit; none beside a background."""
     if fit.model.background:
         return ()
     best = min((s.score.delta_bic for s in suspects if s.score.rank), default=0.0)

@@ -223,10 +223,7 @@ def _extended(candidates: CandidateTerms, site: SiteSums, b: _Bent) -> list[_Ben
 
 
 def _gains(site: SiteSums, x: Floats) -> tuple[Floats, Floats]:
-    """Gain (P,) of each further row of X (2 + P, K) beside the first two, −inf if dependent.
-
-    Also (2, P) coefficients of the first row and of the further one, fitted together.
-    """
+    """Gain (P,) of each further row beside two, −inf if dependent; (2, P) first and last factor."""
     free = (x @ site.free).astype(float)
     slope = (x @ site.slope).astype(float)
     gram = free @ x.T.astype(float)[:, :2]
@@ -369,21 +366,18 @@ def _numbers(candidates: CandidateTerms, f: int) -> list[tuple[Amplitude, float]
     out = []
     for i, factor in enumerate(a.factors):
         for n in factor.shape.free:
-            values = _other_values(factor, n, grammar.read(factor.variable))
+            old = factor.numbers[n]
+            if n in factor.shape.places:
+                tried = np.quantile(grammar.read(factor.variable), QUANTILES).tolist()
+            else:
+                tried = [old * k for k in FACTORS]
+            values = sorted({float(f"{v:.2g}") for v in tried} - {old})
             price = float(np.log(len(values) + 1))
             for value in values:
                 numbers = (*factor.numbers[:n], value, *factor.numbers[n + 1 :])
                 varied = replace(factor, numbers=numbers)
                 out.append((Amplitude((*a.factors[:i], varied, *a.factors[i + 1 :])), price))
     return out
-
-
-def _other_values(factor: Factor, n: int, x: Floats) -> list[float]:
-    if n in factor.shape.places:
-        values = np.quantile(x, QUANTILES).tolist()
-    else:
-        values = [factor.numbers[n] * k for k in FACTORS]
-    return sorted({float(f"{v:.2g}") for v in values} - {factor.numbers[n]})
 
 
 def _best_terms(

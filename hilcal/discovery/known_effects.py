@@ -80,10 +80,7 @@ def instead_of_law(
 
 
 def _exact_effects(fit: Fit, effects: KnownEffects) -> tuple[float, Instead]:
-    """Return the best odds of the first one, two, … effects by exact refits, and these effects.
-
-    Refits that exclude further readings as gross errors do not count.
-    """
+    """Return the best odds of the first effects in exact refits without more gross errors."""
     after, odds, best, explained = fit, 0.0, -np.inf, Instead()
     for k, name in enumerate(effects.names):
         try:

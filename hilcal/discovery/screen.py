@@ -110,10 +110,7 @@ class Screen:
 
     @cached_property
     def alias(self) -> tuple[int, ...]:
-        """(S,) index of the simplest site with the same motion of all readings, up to a factor.
-
-        E.g. a bearing's tilt about the axis of the previous joint is that joint's displacement.
-        """
+        """(S,) index of the simplest site that moves all readings the same way, up to a factor."""
         flat = self.motion.reshape(-1, len(self.sites))
         size = np.linalg.norm(flat, axis=0)
         unit = flat / np.where(size > 0, size, 1.0)

@@ -14,10 +14,7 @@ from hilcal.errors import InputError
 
 
 def failure_of(error: Exception) -> InputError | None:
-    """Return an error raised in a method of a user's effect as one line; None for any other.
-
-    The traceback tells, so that calls of effects need no guard.
-    """
+    """Return an error raised in a user's effect as one line, by its traceback; None for others."""
     for frame, _ in traceback.walk_tb(error.__traceback__):
         effect = frame.f_locals.get("self", frame.f_locals.get("cls"))
         kind = effect if isinstance(effect, type) else type(effect)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.polynomial.legendre import legvander
 
 from hilcal.cell import Cell
-from hilcal.effects.per_joint import PerJoint, joint_change
+from hilcal.effects.per_joint import PerJoint
 from hilcal.effects.protocol import Changeable, Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
@@ -21,8 +21,13 @@ class EncoderOffset(PerJoint):
     unit, size, meaning = "rad", 1e-3, "zero offset of {joint}"
     summary = "dq_j = o_j: the zero of each joint is off"
     kinematic = True
-    change = joint_change(
-        "zero", "repair, crash or a slipped joint?", listed=True, by_frame=True, with_others=True
+    change = Changeable(
+        "joint",
+        words="zero",
+        cause="repair, crash or a slipped joint?",
+        listed=True,
+        by_frame=True,
+        with_others=True,
     )
     plausible = 5.0  # 5 mrad: mastering to a mark, without a gauge, leaves 0.1° to 0.5°. A choice.
 

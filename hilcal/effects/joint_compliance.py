@@ -6,8 +6,8 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.effects.options import Options, choice, ordinary_give, rated_moments
-from hilcal.effects.per_joint import COMMON, EACH, PerJoint, TorqueLaw, joint_change
-from hilcal.effects.protocol import Columns, Parameter, Response, Situation
+from hilcal.effects.per_joint import COMMON, EACH, PerJoint, TorqueLaw
+from hilcal.effects.protocol import Changeable, Columns, Parameter, Response, Situation
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Floats
@@ -19,7 +19,9 @@ class JointCompliance(TorqueLaw):
     name = "joint_compliance"
     unit, meaning = "rad/(N·m)", "compliance of {joint}"
     summary = "dq_j = c_j τ_j: each joint gives way in proportion to its torque"
-    change = joint_change("compliance", "wear, crash or repair?", listed=True, with_others=True)
+    change = Changeable(
+        "joint", words="compliance", cause="wear, crash or repair?", listed=True, with_others=True
+    )
     plausible = 10.0  # 30 mrad at the rated torque; gears state 1 to 5. A choice.
     spread = 0.5  # Springs and oil of one type of gear scatter by a third; a choice
     role = "baseline"
@@ -185,7 +187,7 @@ class JointTiltCompliance(PerJoint):
 
     name = "joint_tilt_compliance"
     summary = "rotation k_j t_j⊥ at joint j: its bearing tilts under the moment across its axis"
-    change = joint_change("tilt compliance", "wear or crash?")
+    change = Changeable("joint", words="tilt compliance", cause="wear or crash?")
     plausible = 10.0  # 10 mrad at the rated torque; cross-roller bearings state under 1. A choice.
     elastic = True
     local_response = True

@@ -90,10 +90,7 @@ class Situation:
 
     @property
     def values(self) -> Floats:
-        """(N, n) the controller's joint values, rad: the actual ones where recorded.
-
-        They differ from `angle` where joints of the arm are coupled.
-        """
+        """(N, n) the controller's joint values, rad: the actual ones where recorded."""
         return self.states.q if self.states.q_actual is None else self.states.q_actual
 
     @property
@@ -255,11 +252,7 @@ class Effect(ABC):
         """Derivative of the deviation by the parameters, at fixed wrenches."""
 
     def checked_columns(self, s: Situation) -> tuple[Columns, ...]:
-        """Return the columns, for use by the model.
-
-        Raises:
-            InputError: a value is not finite, or the values are of another number of states.
-        """
+        """Return the columns; raises InputError for values not finite, or not of N states."""
         columns = self.columns(s)
         for c in columns:
             if len(c.values) not in (1, len(s.angle)):
@@ -294,10 +287,7 @@ class Effect(ABC):
         return None
 
     def wrench_columns(self, theta: Floats, s: Situation) -> Floats | None:
-        """Derivative (N, P, n + 1, 6) of the slot wrenches, for effects that change the load.
-
-        At a fixed configuration.
-        """
+        """(N, P, n + 1, 6) derivative of the slot wrenches by the load, nothing else moving."""
         return None
 
     def load_columns(self, theta: Floats, s: Situation) -> Floats | None:
@@ -312,10 +302,7 @@ class Effect(ABC):
         return None
 
     def compliance_columns(self, theta: Floats, s: Situation) -> tuple[Columns, ...]:
-        """Derivative of the deviation by `s.compliance`, for effects whose law contains it.
-
-        The parameters of these columns are the n joints.
-        """
+        """Derivative by `s.compliance`, its parameters the n joints, for laws that contain it."""
         return ()
 
     def of_compliance(self, columns: Columns) -> Columns:

@@ -79,10 +79,7 @@ class LinkCompliance(Effect):
 
 
 def long_links(arm: Arm) -> Ints:
-    """(b,) numbers k, at most two, of the links L_k that count as beams, ascending.
-
-    Where no link between joints has a length, the last one, to the flange.
-    """
+    """(b,) numbers k, at most two, of the links L_k that bend; n where none has a length."""
     lengths = np.linalg.norm(arm.links[1:-1, :3, 3], axis=1)
     if not np.any(lengths):
         return np.array([arm.n])

@@ -6,8 +6,8 @@ from typing import ClassVar
 import numpy as np
 
 from hilcal.effects.options import positive
-from hilcal.effects.per_joint import PerJoint, TorqueLaw, joint_change
-from hilcal.effects.protocol import OWN_SPREAD, Columns, Effect, Parameter, Situation
+from hilcal.effects.per_joint import PerJoint, TorqueLaw
+from hilcal.effects.protocol import OWN_SPREAD, Changeable, Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Floats, Ints
@@ -30,7 +30,12 @@ class TransmissionError(PerJoint):
 
     name = "transmission_error"
     summary = "dq_j = Σ a_jk cos k q_j + b_jk sin k q_j: gear and encoder error"
-    change = joint_change("transmission error", "another gear or encoder?", harmonics=4)
+    change = Changeable(
+        "joint",
+        words="transmission error",
+        cause="another gear or encoder?",
+        options={"harmonics": 4},
+    )
     """Few readings resolve no more than four harmonics; finer ones act as scatter. A choice."""
     plausible = 30.0  # 1.5 mrad per harmonic; gears state 0.3 to 1 mrad. A choice.
     spread = 2.0**0.5  # Another gear errs as much, but elsewhere: the difference of two
@@ -112,7 +117,7 @@ class Backlash(TorqueLaw):
     name = "backlash"
     unit, size, meaning = "rad", 5e-5, "half the play of {joint}"
     summary = "dq_j = b_j sign(τ_j): the joint's play is taken up to the side of the torque"
-    change = joint_change("play", "wear or repair?", listed=True)
+    change = Changeable("joint", words="play", cause="wear or repair?", listed=True)
     plausible = 20.0  # 1 mrad; makers of gears state 0.3 mrad at most. A choice.
     option_help: ClassVar = {
         **TorqueLaw.option_help,
@@ -137,7 +142,7 @@ class Hysteresis(PerJoint):
     name = "hysteresis"
     unit, size, meaning = "rad", 2e-5, "half hysteresis of {joint}"
     summary = "dq_j = h_j s_j: the joint stops short on the side from which it arrived"
-    change = joint_change("lost motion", "wear or repair?", listed=True)
+    change = Changeable("joint", words="lost motion", cause="wear or repair?", listed=True)
     plausible = 50.0  # 1 mrad; makers of gears state 0.3 mrad of lost motion. A choice.
     needs = ("approach",)
 
