@@ -33,7 +33,7 @@ from hilcal.discovery.refit import exact, refine
 from hilcal.discovery.screen import LawTerm, Screen, screen
 from hilcal.discovery.search import LEAST, Selection, search
 from hilcal.discovery.structures import Structure, averaged, pareto, structure_of, structures
-from hilcal.effects.from_file import effects_of
+from hilcal.effects.catalogue import effects_of
 from hilcal.errors import CannotAnswerError, HilcalError, InputError
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.folds import random_folds

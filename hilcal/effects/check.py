@@ -9,7 +9,6 @@ import numpy as np
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, Robot
-from hilcal.effects.from_file import failure_of
 from hilcal.effects.options import PRIOR_HELP, typical_compliances
 from hilcal.effects.protocol import (
     FRAME_ROLES,
@@ -21,6 +20,7 @@ from hilcal.effects.protocol import (
     Response,
     Role,
     Situation,
+    failure_of,
     source_of,
     total,
 )

@@ -6,6 +6,7 @@ evaluated on the sum of all deviations. A new effect is one small class in one f
 returns `load_change` or `wrench_change`, and their derivative `wrench_columns`.
 """
 
+import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -479,3 +480,25 @@ def effect(kind: str | type[Effect], **options: object) -> EffectSpec:
         **options: those that differ from the usual ones, as `joints="each"`.
     """
     return EffectSpec(kind, options)
+
+
+def failure_of(error: Exception) -> InputError | None:
+    """Return an error raised in a user's effect as one line, by its traceback; None for others."""
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        effect = frame.f_locals.get("self", frame.f_locals.get("cls"))
+        kind = effect if isinstance(effect, type) else type(effect)
+        file = frame.f_code.co_filename
+        module = str(frame.f_globals.get("__name__"))
+        if issubclass(kind, Effect) and not module.startswith("hilcal."):
+            return InputError(
+                f"{file}{line_in(error, file)}: effect {kind.name}: {frame.f_code.co_name} raises "
+                f"{type(error).__name__}: {error}"
+            )
+    return None
+
+
+def line_in(error: BaseException, file: str) -> str:
+    """Return ", line N" with the last line of a file that an exception passed; "" for none."""
+    frames = traceback.extract_tb(error.__traceback__)
+    lines = [frame.lineno for frame in frames if frame.filename == file]
+    return f", line {lines[-1]}" if lines else ""

@@ -268,7 +268,7 @@ TAKEN: dict[str, dict[str, str]] = {
     "cli/showing": {"hilcal workbench": f"{PAGE}a_table_becomes_a_calibration_at_one_page"},
     "config/cell": {"check CELL.toml --save-calibration": KINEMATICS},
     "config/reference": {"hilcal config SECTION": f"{RARE}sections_of_a_cell"},
-    "effects/from_file": {"hilcal effects new NAME": f"{HERE}an_effect_of_ones_own"},
+    "effects/catalogue": {"hilcal effects new NAME": f"{HERE}an_effect_of_ones_own"},
     "identification/later_readings": {
         "hilcal identify again": f"{HERE}another_scaling_or_parameters_of_another_version"
     },

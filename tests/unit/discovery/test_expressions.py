@@ -12,9 +12,8 @@ from hilcal.discovery.amplitudes import Amplitude, Factor, composed, variables
 from hilcal.discovery.curve import drawn_laws
 from hilcal.discovery.law import Coefficient, Form, Law, LawPart, source_of_form
 from hilcal.discovery.sites import sites
-from hilcal.effects.catalogue import installed
+from hilcal.effects.catalogue import effects_of, installed
 from hilcal.effects.check import example_cell, example_situation, example_states
-from hilcal.effects.from_file import effects_of
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import fit
 from hilcal.present.charts import curve_chart

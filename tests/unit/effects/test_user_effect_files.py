@@ -5,9 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilcal.effects.catalogue import BUILT_IN
+from hilcal.effects.catalogue import BUILT_IN, read_effects
 from hilcal.effects.check import check_effect
-from hilcal.effects.from_file import read_effects
 from hilcal.model.model import Model
 from tests.support.campaigns import campaign as simulated
 from tests.support.campaigns import plan
