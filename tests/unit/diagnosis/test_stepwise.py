@@ -40,9 +40,6 @@ def test_an_effect_that_the_readings_cannot_determine_is_rejected():
     assert refine(before.model, few, "absolute").fit.theta.size
 
 
-# --- needless -------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("mode", "effects"),
@@ -72,9 +69,6 @@ def test_what_is_there_is_not_backward_elimination(effect):
     mode = "absolute" if effect == "transmission_error" else "deflection"
     c = campaign(effect, mode, 3, poses=30, strength=1.0)
     assert effect not in backward_elimination(fitted(c, effect))
-
-
-# --- reconsidered ---------------------------------------------------------------------------
 
 
 def test_an_early_addition_that_became_needless_is_removed():
@@ -159,9 +153,6 @@ def test_an_exchange_needs_an_effect_that_is_there_and_one_that_is_not():
         refusal("hysteresis is not in the model", changed)
     with pytest.raises(InputError, match="joint_compliance is in the model already"):
         exchange(found, "backlash", "joint_compliance")
-
-
-# --- what could have been seen --------------------------------------------------------------
 
 
 @pytest.mark.parametrize("effect", ["backlash", "wrench_bias"])

@@ -56,9 +56,6 @@ def test_a_missing_column_is_named(name, column):
     refusal(f"{name} needs {column}", make, name, UR10E, states)
 
 
-# --- temperatures ---------------------------------------------------------------------------
-
-
 def test_growth_needs_one_of_two_temperatures():
     cell, kind = CELLS["ur10e"], effect_class("thermal_growth")
     both = some_states(cell)

@@ -16,7 +16,6 @@ from tests.support.user_effect_cases import CLASS, COLUMNS
 
 NAME = "soft_side"
 
-# --- files that cannot be used --------------------------------------------------------------
 
 ELASTIC = CLASS.replace(COLUMNS, "values = s.torque[:, :1] ** 3").replace(
     "    @property",
@@ -74,9 +73,6 @@ def test_one_parameter_may_move_every_joint(tmp_path):
 @pytest.mark.parametrize("kind", BUILT_IN, ids=lambda kind: kind.name)
 def test_what_is_built_in_passes_the_check(kind):
     check_effect(kind)
-
-
-# --- the file to begin with -----------------------------------------------------------------
 
 
 def test_new_writes_an_effect_that_works(tmp_path, capsys):

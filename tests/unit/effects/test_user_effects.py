@@ -71,9 +71,6 @@ def run_file(case, tmp_path, capsys):
     return path
 
 
-# --- it takes part --------------------------------------------------------------------------
-
-
 @pytest.mark.long
 def test_a_missing_law_is_named_added_and_the_error_falls_to_the_noise(
     case, run_file, file, tmp_path, capsys
@@ -204,9 +201,6 @@ def test_a_plan_is_made_against_it(file, tmp_path, capsys):
     assert f"unknown effect '{NAME}'" in refused(capsys, 2, *arguments)
     d = ok(capsys, *arguments, "--effects-from", file, "--json").document
     assert {seen["effect"] for seen in d["detectable"]} == {NAME}
-
-
-# --- a campaign remembers it ----------------------------------------------------------------
 
 
 @pytest.mark.long
