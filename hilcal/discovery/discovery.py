@@ -115,17 +115,13 @@ def alternatives(d: Discovery, law: Law) -> tuple[Structure, ...]:
 def discover(
     fit: Fit, say: Callable[[str], None] = lambda text: None, name: str = "found"
 ) -> Discovery:
-    """Search laws for the misfit of a fit.
+    """Search laws for the misfit of a gc-scaled fit; `name` is that of the proposed effect.
 
     >>> with hc.Campaign.open(RUN) as run:
     ...     fit = hc.fit(hc.baseline(run.cell, run.readings), run.readings)
     >>> d = hc.discover(fit)
     >>> d.reason, d.catalogue
     ('catalogue', ('joint_tilt_compliance',))
-
-    Args:
-        fit: a gc-scaled fit.
-        name: of the proposed effect.
 
     Raises:
         InputError: the scaling of the fit is not gc.
@@ -261,11 +257,8 @@ def _law(
     near = tuple(r for r in resembling(problem, s, effects) if r.cosine >= NEAR)
     situation = linear.fit.solution.prediction.situation
     factors = (f for p in form.parts for f in p.amplitude.factors)
-    read = {v.symbol: v for f in factors for v in f.variable.recorded}
-    ranges = []
-    for symbol, v in read.items():
-        values = v.read(situation)
-        ranges.append((symbol, float(values.min()), float(values.max()), v.unit))
+    read = {v.symbol: (v.read(situation), v.unit) for f in factors for v in f.variable.recorded}
+    ranges = [(k, float(x.min()), float(x.max()), unit) for k, (x, unit) in read.items()]
     return Law(
         name=name, form=form, parameters=coefficients, p_value=p_value, odds=s.total,
         holdout_share=share, left=after.variance_factor, probability=probability,
@@ -337,10 +330,9 @@ def _causes(
 
 
 def agreement(before: Fit, after: Fit, moved: Floats) -> float:
-    """Return the correlation of a hidden law's motion with that of the added effects.
+    """Return the correlation of a hidden law's motion (N, 3) with that of the last effects added.
 
-    Both are whitened, and projected off the model without the effects. `after` has more effects
-    than `before`, as its last ones; `moved` (N, 3) is the motion by the hidden law, sensor axes, m.
+    Both are whitened, and projected off the model without the effects; sensor axes, m.
     """
     linear, w = linearise(before), before.whitening
     truth = linear.project_out(w.whiten(w.raw(moved[~before.outlier])).reshape(-1))
@@ -400,8 +392,7 @@ def law_json(law: Law, d: Discovery) -> dict[str, object]:
         "alternatives": [x.form.text() for x in alternatives(d, law)],
         "resembles": [asdict(r) for r in law.resembles],
         "ranges": [
-            {"quantity": symbol, "min": low, "max": high, "unit": unit}
-            for symbol, low, high, unit in law.ranges
+            dict(zip(("quantity", "min", "max", "unit"), r, strict=True)) for r in law.ranges
         ],
     }
 

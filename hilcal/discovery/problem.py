@@ -1,9 +1,9 @@
 """The candidates beside a model and chosen terms, on all rows or some, and their odds.
 
 A term is a site, or a few related ones, times one amplitude or two: a periodic function with free
-phase, a factor with free zero, all axes of a site, all joints with a coefficient each. All
-candidates are screened; the short list and the terms that extend it are scored as families are in
-the diagnosis. The log odds of a term are its log evidence minus its price.
+phase, a factor with free zero, all axes of a site, all joints with a coefficient each. The short
+list of the screening, extended to such terms, is scored as families are in the diagnosis. The log
+odds of a term are its log evidence minus its price.
 """
 
 from collections.abc import Iterator, Sequence
@@ -360,11 +360,10 @@ def orthonormal(model: Projection, x: Floats) -> Floats:
 def together(
     square: Floats, slope: Floats, across: Floats, visible: Bools, which: Ints, partner: Ints
 ) -> Floats:
-    """(H,) gain of candidates at a site, each with a partner; zero where the two are dependent.
+    """(H,) gain of candidates `which` (H,), each with a partner; zero where the two are dependent.
 
-    `square`, `slope`, `across` (F,) are xᵀ M x, xᵀ r and xᵀ M x' of all candidates at the site,
-    `visible` (F,) whether they are independent of the model, `which` (H,) the candidates and
-    `partner` (F,) the partner of each.
+    Of all candidates (F,) at a site are xᵀ M x, xᵀ r, xᵀ M x', whether they are independent of the
+    model, and the partner.
     """
     a, b, h = square[which], square[partner[which]], across[which]
     g, k = slope[which], slope[partner[which]]
