@@ -225,7 +225,7 @@ def _laws(
     def as_good(squares_after: Floats) -> bool:
         """Whether a law predicts poses left out as well as the best, within a standard error."""
         excess = squares_after - best
-        return float(excess.mean()) <= float(np.std(excess)) / root
+        return bool(excess.mean() <= np.std(excess) / root)
 
     retained = [x for x in fitted if as_good(x[2])]
     say("asking what is predictable at all")

@@ -76,9 +76,9 @@ def acting_change(s: Situation, error: Floats, axes: Floats = ALONG_FLANGE) -> F
     return -_turned(_sensor(s, axes), error) * _loaded(s)
 
 
-def acting_columns(s: Situation, columns: Floats, axes: Floats = ALONG_FLANGE) -> Floats:
+def acting_columns(s: Situation, columns: Floats) -> Floats:
     """Slot wrenches (N, P, n + 1, 6) by −R h, of the derivative (N or 1, P, 6) of h."""
-    return load_wrench_change(s.chain, s.load, _acting(s, columns, axes))
+    return load_wrench_change(s.chain, s.load, _acting(s, columns, ALONG_FLANGE))
 
 
 def sensor_error(s: Situation, change: Floats) -> Floats:
@@ -114,12 +114,10 @@ class WrenchBias(ForceSensorEffect):
     change = Changeable("setup", "force sensor", "the zero of the force sensor")
     plausible = 30.0  # 30 N, 3 N·m: a sensor that was not zeroed with its tool. A choice.
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Offsets of force and moment."""
-        return tuple(
-            Parameter(f"f{a}", "N", 1.0, f"offset of the force along {a}") for a in "xyz"
-        ) + tuple(Parameter(f"m{a}", "N·m", 0.1, f"offset of the moment about {a}") for a in "xyz")
+    parameters = (
+        *(Parameter(f"f{a}", "N", 1.0, f"offset of the force along {a}") for a in "xyz"),
+        *(Parameter(f"m{a}", "N·m", 0.1, f"offset of the moment about {a}") for a in "xyz"),
+    )
 
     def error(self, theta: Floats, recorded: Floats) -> Floats:
         """Return b."""
@@ -142,14 +140,11 @@ class WrenchGain(ForceSensorEffect):
     change = Changeable("setup", "force sensor", "the gain of the force sensor")
     plausible = 50.0  # 50 %: a wrong calibration matrix, a channel that hardly reads. A choice.
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Gain errors of forces and moments; 1 % is ordinary."""
-        return tuple(
-            Parameter(f"{kind}{a}", "1", 1e-2, f"gain error of the {word} {a}")
-            for kind, word in (("f", "force along"), ("m", "moment about"))
-            for a in "xyz"
-        )
+    parameters = tuple(
+        Parameter(f"{kind}{a}", "1", 1e-2, f"gain error of the {word} {a}")
+        for kind, word in (("f", "force along"), ("m", "moment about"))
+        for a in "xyz"
+    )
 
     def error(self, theta: Floats, recorded: Floats) -> Floats:
         """Return g/(1 + g) w per axis."""
@@ -172,12 +167,9 @@ class SensorMisalignment(ForceSensorEffect):
     summary = "acting = R exp(δ) Rᵀ wrench: the force sensor's axes are turned by δ"
     plausible = 20.0  # 0.2 rad: bolted on by eye. A choice.
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Turn about the sensor's axes; 10 mrad are ordinary."""
-        return tuple(
-            Parameter(f"r{a}", "rad", 1e-2, f"turn of the sensor about its {a}") for a in "xyz"
-        )
+    parameters = tuple(
+        Parameter(f"r{a}", "rad", 1e-2, f"turn of the sensor about its {a}") for a in "xyz"
+    )
 
     def error(self, theta: Floats, recorded: Floats) -> Floats:
         """Return w − exp([δ]×) w."""

@@ -22,12 +22,10 @@ class BaseFrame(Effect):
     option_help: ClassVar = PRIOR_HELP
     role = "registration"
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Displacement along and rotation about the base axes."""
-        return tuple(Parameter(a, "m", 1e-3, f"base shift along {a}") for a in "xyz") + tuple(
-            Parameter(f"r{a}", "rad", 1e-3, f"base turn about {a}") for a in "xyz"
-        )
+    parameters = (
+        *(Parameter(a, "m", 1e-3, f"base shift along {a}") for a in "xyz"),
+        *(Parameter(f"r{a}", "rad", 1e-3, f"base turn about {a}") for a in "xyz"),
+    )
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Unit twists of the base."""
@@ -208,10 +206,8 @@ class TrackerScale(Effect):
     plausible = 100.0  # 1 mm/m: photogrammetry without a bar; refraction makes 0.05. A choice.
     of_setup = True
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """The scale error; 10 µm/m is ordinary (10 °C misjudged in the air)."""
-        return (Parameter("scale", "1", 1e-5, "relative error of the tracker's ranges"),)
+    # 10 µm/m is ordinary: 10 °C misjudged in the air.
+    parameters = (Parameter("scale", "1", 1e-5, "relative error of the tracker's ranges"),)
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Unit scale."""

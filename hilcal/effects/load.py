@@ -79,10 +79,7 @@ class LoadPoint(Effect):
     plausible = 10.0  # 10 cm: a hook or an eye instead of the flange. A choice.
     of_setup = True
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Shift along x, y and z of the flange."""
-        return tuple(Parameter(a, "m", 1e-2, f"shift along flange {a}") for a in "xyz")
+    parameters = tuple(Parameter(a, "m", 1e-2, f"shift along flange {a}") for a in "xyz")
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """No deviation of its own."""

@@ -1,5 +1,7 @@
 """Links, the base and the tool give way."""
 
+from abc import abstractmethod
+
 import numpy as np
 
 from hilcal.effects.options import rated_moments
@@ -9,7 +11,31 @@ from hilcal.robot.arm import Arm
 from hilcal.types import Floats, Ints
 
 
-class LinkCompliance(Effect):
+class SlotCompliance(Effect):
+    """Twist θ_p L_p w of a slot by the wrench w there, for each parameter θ_p."""
+
+    elastic = True
+    local_response = True
+
+    @abstractmethod
+    def laws(self) -> tuple[Ints, Floats]:
+        """Slots (P,) and L (P, 6, 6), in the axes of the slot."""
+
+    def columns(self, s: Situation) -> tuple[Columns, ...]:
+        """Twist of each slot by the wrench there, for a unit of each parameter."""
+        slots, laws = self.laws()
+        values = np.stack([s.wrench[:, k] @ x.T for k, x in zip(slots, laws, strict=True)], axis=1)
+        return (Columns("twist", np.arange(len(slots)), slots, values),)
+
+    def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
+        """Twist of each slot by the change of the wrench there."""
+        twist = np.zeros_like(change)
+        for k, law, t in zip(*self.laws(), theta, strict=True):
+            twist[:, :, k] += change[:, :, k] @ (t * law.T)
+        return Response(twist=twist)
+
+
+class LinkCompliance(SlotCompliance):
     """Each long link is a cantilever from joint k, along L_k, with its tip at slot k.
 
     With d the unit vector along the link, L its length, F and M what everything beyond the
@@ -27,8 +53,6 @@ class LinkCompliance(Effect):
     name = "link_compliance"
     summary = "tip moves L³/3EI F + L²/2EI M, turns L²/2EI F + L/EI M, twists L/GJ M: links bend"
     plausible = 10.0  # Ten times as soft as a link of ordinary section, see `parameters`. A choice.
-    elastic = True
-    local_response = True
 
     @property
     def links(self) -> Ints:
@@ -47,23 +71,8 @@ class LinkCompliance(Effect):
             out.append(Parameter(f"link{k}.twist", "1/(N·m²)", scale, f"1/GJ of link {k}"))
         return tuple(out)
 
-    def columns(self, s: Situation) -> tuple[Columns, ...]:
-        """Twist of slot k by the wrench there, for a unit of each parameter."""
-        laws, slots = self._laws(), np.repeat(self.links, 2)
-        values = np.stack(
-            [s.wrench[:, k] @ law.T for k, law in zip(slots, laws, strict=True)], axis=1
-        )
-        return (Columns("twist", np.arange(len(slots)), slots, values),)
-
-    def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
-        """Twist of slot k by the change of the wrench there."""
-        twist = np.zeros_like(change)
-        for k, law, t in zip(np.repeat(self.links, 2), self._laws(), theta, strict=True):
-            twist[:, :, k] += change[:, :, k] @ (t * law.T)
-        return Response(twist=twist)
-
-    def _laws(self) -> Floats:
-        """(2 b, 6, 6) twist of the tip by its wrench, slot axes: bending and twist of each."""
+    def laws(self) -> tuple[Ints, Floats]:
+        """Twist of the tip by its wrench: bending and twist of each link."""
         out = []
         for k in self.links:
             along = self.cell.arm.links[k, :3, :3].T @ self.cell.arm.links[k, :3, 3]
@@ -75,7 +84,7 @@ class LinkCompliance(Effect):
             bend[3:, :3], bend[3:, 3:] = length**2 / 2 * turn, length * across
             twist[3:, 3:] = length * np.outer(d, d)
             out += [bend, twist]
-        return np.array(out)
+        return np.repeat(self.links, 2), np.array(out)
 
 
 def long_links(arm: Arm) -> Ints:
@@ -88,7 +97,7 @@ def long_links(arm: Arm) -> Ints:
     return np.asarray(np.sort(long) + 1)
 
 
-class BaseCompliance(Effect):
+class BaseCompliance(SlotCompliance):
     """Rotation B t_0 of the whole arm about the base origin; B diagonal, rad/(N·m).
 
     t_0 is the moment about the base origin, base axes. Slot 0 is the frame of the first
@@ -99,47 +108,20 @@ class BaseCompliance(Effect):
     summary = "rotation B t_0 about the base origin: the ground gives way"
     change = Changeable("base", "base", "the ground under the base", "loose bolts?")
     plausible = 30.0  # 90 µrad/(N·m): an arm on a trolley. A choice.
-    elastic = True
-    local_response = True
+    parameters = tuple(
+        Parameter(axis, "rad/(N·m)", 3e-6, f"rotation of the base about {axis}") for axis in "xyz"
+    )
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Compliance about x, y and z of the base."""
-        return tuple(
-            Parameter(axis, "rad/(N·m)", 3e-6, f"rotation of the base about {axis}")
-            for axis in "xyz"
-        )
-
-    def _moment(self, wrench: Floats) -> Floats:
-        """Moment about the base origin, base axes, of slot-0 wrenches (..., 6)."""
+    def laws(self) -> tuple[Ints, Floats]:
+        """Twist of slot 0 by the rotation about each base axis that the moment about it causes."""
         l0 = self.cell.arm.links[0]
-        r, p = l0[:3, :3], l0[:3, 3]
-        f, t = se3.apply(r, wrench[..., :3]), se3.apply(r, wrench[..., 3:])
-        return t + se3.cross(p, f)
-
-    def _twists(self) -> Floats:
-        """(3, 6) twist in slot-0 axes of a unit rotation about each base axis."""
-        back = se3.inverse(self.cell.arm.links[0])
-        ad = se3.adjoint(back[:3, :3], back[:3, 3])
-        return np.asarray(ad[:, 3:].T)
-
-    def columns(self, s: Situation) -> tuple[Columns, ...]:
-        """Twist of slot 0 by t_0."""
-        moment = self._moment(s.wrench[:, 0])
-        values = moment[:, :, None] * self._twists()
-        return (Columns("twist", np.arange(3), np.zeros(3, dtype=np.int64), values),)
-
-    def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
-        """Twist of slot 0 by B dt_0."""
-        twist = np.zeros_like(change)
-        twist[:, :, 0] = (self._moment(change[:, :, 0]) * theta) @ self._twists()
-        return Response(twist=twist)
+        back, r = se3.inverse(l0), l0[:3, :3]
+        moments = np.hstack([se3.skew(l0[:3, 3]) @ r, r])
+        twists = se3.adjoint(back[:3, :3], back[:3, 3])[:, 3:]
+        return np.zeros(3, dtype=np.int64), np.einsum("ia,aj->aij", twists, moments)
 
 
-PARTS = np.array([[0, 0, 0, 0, 0, 1.0], [0, 0, 0, 1.0, 1.0, 0]])  # about z, and across it
-
-
-class ToolCompliance(Effect):
+class ToolCompliance(SlotCompliance):
     """Rotation at the flange of a t_z z + c t_⊥, t the moment there: adapter, sensor, changer.
 
     t is the moment about the flange's origin of tool and load; a (along) and c (across the
@@ -152,8 +134,6 @@ class ToolCompliance(Effect):
     change = Changeable("tool", "tool", "the stiffness of what is bolted to the flange")
     plausible = 30.0  # 30 mrad at the rated torque of the last joint: a slender tool. A choice.
     of_setup = True
-    elastic = True
-    local_response = True
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -164,13 +144,7 @@ class ToolCompliance(Effect):
             Parameter("across", "rad/(N·m)", scale, "tilt across the flange's z axis"),
         )
 
-    def columns(self, s: Situation) -> tuple[Columns, ...]:
-        """Twist of slot n by the moment at the flange."""
-        slot = np.full(2, self.cell.arm.n)
-        return (Columns("twist", np.arange(2), slot, s.wrench[:, -1, None] * PARTS),)
-
-    def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
-        """Twist of slot n by the change of the moment there."""
-        twist = np.zeros_like(change)
-        twist[:, :, -1] = change[:, :, -1] * (theta @ PARTS)
-        return Response(twist=twist)
+    def laws(self) -> tuple[Ints, Floats]:
+        """Twist of slot n by the moment at the flange, about z and across it."""
+        parts = np.diag([0, 0, 0, 0, 0, 1.0]), np.diag([0, 0, 0, 1.0, 1.0, 0])
+        return np.full(2, self.cell.arm.n), np.array(parts)
