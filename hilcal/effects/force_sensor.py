@@ -61,10 +61,6 @@ class ForceSensorEffect(Effect):
         """Derivative of −R h."""
         return _acting(s, self.error_columns(theta, recorded(s, self.axes)), self.axes)
 
-    def wrench_columns(self, theta: Floats, s: Situation) -> Floats:
-        """Slot wrenches by the derivative of −R h."""
-        return load_wrench_change(s.chain, s.load, self.load_columns(theta, s))
-
 
 def recorded(s: Situation, axes: Floats = ALONG_FLANGE) -> Floats:
     """Return the recorded wrench (N, 6) in sensor axes (3, 3) of the flange, N and N·m."""

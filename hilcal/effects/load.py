@@ -12,7 +12,7 @@ from hilcal.effects.protocol import (
     Situation,
 )
 from hilcal.robot import se3
-from hilcal.robot.statics import first_moment_change, slot_wrench_change
+from hilcal.robot.statics import first_moment_change
 from hilcal.types import Floats
 
 
@@ -94,8 +94,3 @@ class LoadPoint(Effect):
         axes = np.swapaxes(s.chain.rotation[-1], 1, 2)
         moment = se3.cross(axes, s.load.wrench[:, None, :3])
         return np.concatenate([np.zeros_like(moment), moment], axis=2)
-
-    def wrench_columns(self, theta: Floats, s: Situation) -> Floats:
-        """Moments of unit shifts, carried by all slots."""
-        change = self.load_columns(theta, s)
-        return slot_wrench_change(s.chain, change[..., :3], change[..., 3:])

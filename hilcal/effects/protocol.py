@@ -22,7 +22,7 @@ from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.robot.batch import zeros
 from hilcal.robot.chain import Chain, Deviation
-from hilcal.robot.statics import Load
+from hilcal.robot.statics import Load, load_wrench_change
 from hilcal.types import Bools, Floats, Ints
 
 Kind = Literal["joint", "link", "base", "tool", "setup", "surroundings"]
@@ -289,10 +289,11 @@ class Effect(ABC):
 
     def wrench_columns(self, theta: Floats, s: Situation) -> Floats | None:
         """(N, P, n + 1, 6) derivative of the slot wrenches by the load, nothing else moving."""
-        return None
+        change = self.load_columns(theta, s)
+        return None if change is None else load_wrench_change(s.chain, s.load, change)
 
     def load_columns(self, theta: Floats, s: Situation) -> Floats | None:
-        """Derivative (N, P, 6) of the load's wrench at the load point, base axes.
+        """(N, P, 6) derivative of the load's wrench at the load point, base axes.
 
         For effects whose `wrench_columns` follow from it; Jacobians then cost less.
         """
