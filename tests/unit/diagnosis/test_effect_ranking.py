@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.config import load_config
 from hilcal.diagnosis.effect_ranking import (
     beyond_geometry,
     candidates,
@@ -30,33 +29,19 @@ from hilcal.identification.linearisation import linearise
 from hilcal.present.diagnosis import finer
 from hilcal.present.verdict import message
 from hilcal.refinement import refine
-from studies.study_cases import study_case
 from tests.support.campaigns import NOTHING, campaign, configuration, measured, plan
-from tests.support.diagnosis_cases import fitted
+from tests.support.diagnosis_cases import fitted, studied
 from tests.support.fit_cases import based
-from tests.support.paths import ROOT
 from tests.support.refusals import refusal
 
 SECOND_ORDER = {"link_geometry", "encoder_offset", "joint_coupling", "link_mass"}
-
-
-def unmodelled(law, robot):
-    case = study_case(
-        load_config(ROOT / "configs/cells/demo_ur10e.toml"),
-        robot,
-        "deflection",
-        (law,),
-        3.0,
-        seed=0,
-    )
-    return based(case.cell, case.readings, "deflection")
 
 
 @pytest.mark.parametrize(
     ("law", "robot"), [("crosswise compliance", "ur5e"), ("compliance by another joint", "ur10e")]
 )
 def test_no_error_of_second_order_is_named_for_deflections(law, robot):
-    d = diagnose(unmodelled(law, robot))
+    d = diagnose(studied("deflection", law, robot=robot, seed=0))
     assert d.verdict == "unknown_effect"
     assert not SECOND_ORDER & set(d.significant)
     geometry = next(s for s in d.suspects if s.effect == "link_geometry")
