@@ -5,12 +5,12 @@ F-test (see `regression.evidence`). The stated strength is the t at which the te
 naming an effect, has the power `POWER` for a typical direction β: the median over random
 directions. The same strength at the tool is the rms displacement of the measured target.
 
-The F-test alone is no measure for a family of many parameters. It rejects the null hypothesis
-before any pose predicts another. If the poses resolve only a part of the family, as of the waves
-of a transmission error, only that part is scored. So campaigns are simulated by algebra, at the
-linearisation of the fit: parameters β ~ N(0, t² 1) of the family, noise of the size found, and
-every test that a suspect must pass, poses left out included. The stated size is the smallest on a
-grid at which nine draws in ten pass; the size for the family at its finest is stated as well.
+The F-test alone is no measure for a family of many parameters: it rejects the null hypothesis
+before any pose predicts another. So campaigns are simulated by algebra, at the linearisation of the
+fit: parameters β ~ N(0, t² 1) of the family, noise of the size found, and every test that a suspect
+must pass, poses left out included. The stated size is the smallest on a grid at which nine draws in
+ten pass. If the poses resolve only a part of the family, as of the waves of a transmission error,
+the size for the family at its finest is stated as well.
 """
 
 from dataclasses import dataclass, replace

@@ -20,12 +20,10 @@ which does not depend on a common factor. Its null distribution, and that of T f
 T / E[T] of the direction, come from simulated contrasts, the same for all directions.
 
 Effects are judged against the actual scatter (F-tests), so a wrong overall size of the noise names
-no effect, but makes χ² too large or too small:
-
-- too small: no model makes residuals smaller than the noise; the stated noise is too large;
-- too large, and repeats scatter as much: the stated noise is too small;
-- too large, and repeats scatter less: the model misses something;
-- too large, with too few repeats: the noise is blamed only where nothing predicts the residual.
+no effect, but makes χ² too large or too small. If it is too small, the stated noise is too large,
+since no model makes residuals smaller than the noise. If it is too large, and repeats scatter as
+much, the stated noise is too small; if they scatter less, the model misses something; with too few
+repeats the noise is blamed only where nothing predicts the residual (see `NoiseReason`).
 """
 
 from dataclasses import dataclass, replace
@@ -196,13 +194,10 @@ def pure_error(fit: Fit) -> PureError | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RepeatGroup:
-    """Measurements with common classes of repeats, or with common unloaded readings.
-
-    Their contrasts are the complement of `explained`, whose basis is far smaller than theirs.
-    """
+    """Measurements with common classes of repeats, or with common unloaded readings."""
 
     rows: Ints  # (r,) whitened rows
-    explained: Floats  # (r, k) orthonormal columns, the span of W C
+    explained: Floats  # (r, k) orthonormal, the span of W C; contrasts are its complement
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -302,8 +297,7 @@ def _pooled(readings: Readings, kind: Ints) -> tuple[Readings, float]:
     return replace(readings, covariance=_class_mean(v, kind)), 1.0 / (1.0 - excess)
 
 
-Group = tuple[Ints, Bucket, int]
-"""Indices of the measurements of a group, their bucket, and the group's index in the bucket."""
+Group = tuple[Ints, Bucket, int]  # measurements of a group, their bucket, and its index in that
 
 
 def _blocks(w: Whitening, kind: Ints) -> tuple[RepeatGroup, ...]:

@@ -1,8 +1,7 @@
 """A misfit that depends on the pose alone, its possible effects, and the poses to identify them.
 
-With few poses a fine transmission error shows no pattern: every pose has an error of its own, and
-no pose predicts another. But all readings of a pose have the same error under every load. So the
-missing effect depends on the pose, and on nothing else that changed within a pose.
+With few poses a fine transmission error shows no pattern: no pose predicts another. But all
+readings of a pose have the same error under every load: the missing effect depends on the pose.
 
 The residual is split by constants of each pose, three displacements of the target. If they explain
 nearly all of the misfit and leave noise, those effects are listed whose columns are such constants

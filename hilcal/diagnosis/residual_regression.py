@@ -18,10 +18,9 @@ left out of its training, the mean over all pairs of trees
 
     L = Σ_{s≠t} e_s·e_t / (T (T − 1))
 
-estimates the squared error of the infinitely large ensemble without bias; the square of the mean
-error, ‖ē‖², would be too large by the variance of a tree over T. So few trees suffice. Trees are
-added until the standard error of the share by the choice of trees (jackknife) is `PRECISE`, or
-until they surely predict no more than is predicted without them (Student's t, `NO_MORE`).
+estimates the squared error of the infinitely large ensemble without bias, so few trees suffice.
+Trees are added until the standard error of the share by the choice of trees (jackknife) is
+`PRECISE`, or until they surely predict no more than without them (Student's t, `NO_MORE`).
 
 Sources: Geurts, Ernst and Wehenkel, *Extremely randomized trees*, Machine Learning 63 (2006) 3-42,
 implementation of scikit-learn; Hoeffding, *A class of statistics with asymptotically normal
@@ -148,8 +147,8 @@ class _Laws:
 
     def __init__(self, p: Linearisation, fold: Ints) -> None:
         self.variables, self.motions = law_variables(p), motions(p)
-        pairs = [(i, k) for i in range(len(self.variables)) for k in range(len(self.motions))]
-        self.variable, self.motion = (tuple(x) for x in zip(*pairs, strict=True))
+        index = np.indices((len(self.variables), len(self.motions))).reshape(2, -1)
+        self.variable, self.motion = index.tolist()
         self._p, self._fold = p, fold
         self._chosen: dict[int, Floats] = {}
         self.ridge = np.maximum(p.projection.ridge, LEAST_RIDGE)

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilcal.effects.options import PRIOR_HELP, Options, number
+from hilcal.effects.options import PRIOR_HELP, Options, number, positive
 from hilcal.effects.protocol import Changeable, Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
@@ -175,9 +175,7 @@ class TrackerDrift(Effect):
         self.options.setdefault("reference_s", float(states.time.min()))
         self.options.setdefault("span_s", max(float(np.ptp(states.time)), 1.0))
         self.reference = number(self.name, self.options, "reference_s")
-        self.span = number(self.name, self.options, "span_s")
-        if self.span <= 0:
-            raise InputError(f"effect {self.name}: span_s = {self.span:g}; valid: more than 0")
+        self.span = positive(self.name, self.options, "span_s")
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
