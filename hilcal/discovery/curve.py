@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.discovery.amplitudes import Variable, variables
+from hilcal.discovery.amplitudes import Amplitude, Variable, variables
 from hilcal.discovery.grammar import HARMONICS
 from hilcal.discovery.law import Form, LawPart
 from hilcal.discovery.sites import ORDINARY, Place, Site, site_motions
@@ -50,7 +50,7 @@ class Curve:
     line: Floats  # (2, L) quantity and law
 
 
-def curves(after: Fit, form: Form, most: int = MOST_CURVES) -> tuple[Curve, ...]:
+def curves(after: Fit, form: Form) -> tuple[Curve, ...]:
     """Return the curves of a law, the last effect of a fit, most significant parts first."""
     rows = after.model.slices()[-1]
     theta, std = after.theta[rows], after.uncertainty.std[rows]
@@ -69,7 +69,7 @@ def curves(after: Fit, form: Form, most: int = MOST_CURVES) -> tuple[Curve, ...]
     sites, motion = site_motions(after)
     situation = after.solution.prediction.situation
     out = []
-    for (site, symbol, _), parts in list(groups.items())[:most]:
+    for (site, symbol, _), parts in list(groups.items())[:MOST_CURVES]:
         of_site = motion[:, :, sites.index(site)] / ORDINARY[site.unit]
         out.append(_curve(after, situation, of_site, parts, symbol, theta))
     return tuple(out)
@@ -80,12 +80,11 @@ def _curve(
 ) -> Curve:
     site, first = parts[0].site, parts[0]
     varying = [(p, f) for p in parts for f in p.amplitude.factors if f.variable.symbol == symbol]
-    cofactors = [f for f in first.amplitude.factors if f.variable.symbol != symbol]
+    others = Amplitude(tuple(f for f in first.amplitude.factors if f.variable.symbol != symbol))
     v = varying[0][1].variable
     orders = {f.numbers[0] if f.shape.name in ("cos", "sin") else 0.0 for _, f in varying}
     order = orders.pop() if len(orders) == 1 else 0.0
-    x = _folded(v.read(s), order)
-    divisor = np.prod([f.values(s) for f in cofactors], axis=0) if cofactors else np.ones(len(x))
+    x, divisor = _folded(v.read(s), order), others.values(s)
 
     def law(x: Floats) -> Floats:
         terms = [theta[p.coefficient] * f.shape.value(x, f.numbers) for p, f in varying]
@@ -96,13 +95,10 @@ def _curve(
     x, divisor = x[drawn], divisor[drawn]
     y, std = law(x) + deviation[drawn] / divisor, std[drawn] / np.abs(divisor)
     ends = np.linspace(float(x.min()), float(x.max()), LINE)
-    inner = "·".join(
-        f.shape.text(f.variable.symbol, [f"{n:g}" for n in f.numbers]) for f in cofactors
-    )
     ordinate, unit = site.symbol, site.unit
-    if cofactors:
+    if others.factors:
+        inner, divided = others.text(), others.unit()
         ordinate = f"{ordinate}/({inner})" if "·" in inner else f"{ordinate}/{inner}"
-        divided = type(first.amplitude)(tuple(cofactors)).unit()
         unit = unit if divided == "1" else f"{unit}/({divided})"
     return _over(site, ordinate, unit, v, order, x, y, std, np.vstack([ends, law(ends)]))
 
