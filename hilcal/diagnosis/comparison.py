@@ -91,10 +91,8 @@ class Comparison(Shown):
 
     @property
     def another_arm(self) -> bool:
-        """Whether the later readings seem to be of another arm of the same type.
-
-        No change explains them, and the arm as drawn predicts them as well as the calibration.
-        """
+        """Whether the later readings seem to be of another arm of the same type."""
+        # No change explains them, and the arm as drawn predicts them as well as the calibration.
         drawing = self.today.drawing_m
         worse = drawing is not None and self.today.prediction.error.rms_m >= drawing
         return worse and not self.changes.explained

@@ -260,10 +260,8 @@ def addition(before: Fit, after: Fit) -> Suspect:
 
 
 def ranked(suspects: Iterable[Suspect], rejected: Collection[str] = ()) -> tuple[Suspect, ...]:
-    """Order suspects as in `Diagnosis.suspects`, and name those that are inseparable.
-
-    The addition of the `rejected` effects did not lower the error on poses left out.
-    """
+    """Order suspects as in `Diagnosis.suspects`, and name those that are inseparable."""
+    # The addition of the `rejected` effects did not lower the error on poses left out.
     order = [replace(s, refuted=True) if s.effect in rejected else s for s in suspects]
     order.sort(key=lambda s: (-s.passes, -s.explains, -s.score.log_evidence, s.score.p_value))
     evident = [s for s in order if s.score.log_evidence > SAME_EVIDENCE]

@@ -84,10 +84,8 @@ class LiveModel:
         self._fitted: _FittedModel | None = None
 
     def __call__(self, readings: Readings) -> LiveResidual:
-        """Compare the last reading with the previous ones; empty while these are too few.
-
-        sigma is sqrt(rᵀ (V + J C Jᵀ)⁻¹ r / m): about 1 where the model is right.
-        """
+        """Compare the last reading with the previous ones; empty while these are too few."""
+        # sigma is sqrt(rᵀ (V + J C Jᵀ)⁻¹ r / m): about 1 where the model is right.
         readings = with_joint_scatter(self._cell, readings, self._scatter)
         try:
             fitted = self._refitted(readings[:-1])

@@ -159,10 +159,8 @@ class SuspectTests:
         return FamilyFolds(p.folds, p.projection), FamilyFolds(p.folds, p.projection, x)
 
     def passed(self, y: Floats, enough: float = 0.0) -> list[bool]:
-        """Whether each of K simulated residuals y (R, K) would reveal the family.
-
-        Once a share of `enough` is out of reach, the remaining residuals count as failed.
-        """
+        """Whether each of K simulated residuals y (R, K) would reveal the family."""
+        # Once a share of `enough` is out of reach, the remaining residuals count as failed.
         p = self.p
         r = p.project_out(y)
         g, rss = self.family.white.T @ r, np.sum(r * y, axis=0)

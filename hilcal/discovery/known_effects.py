@@ -64,10 +64,8 @@ class Instead:
 def instead_of_law(
     fit: Fit, problem: SearchProblem, law: Selection, effects: KnownEffects
 ) -> Instead:
-    """Return the effects that explain the misfit as well as a law, at odds of 20 : 1; or none.
-
-    A law whose exact refit fails is not preferred to effects whose refit does not.
-    """
+    """Return the effects that explain the misfit as well as a law, at odds of 20 : 1; or none."""
+    # A law whose exact refit fails is not preferred to effects whose refit does not.
     if effects.total > law.total - LEAST:
         return Instead(effects.names)
     alike = resembling(problem, law, effects)

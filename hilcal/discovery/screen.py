@@ -249,10 +249,8 @@ def screened(
 
 
 def _across_factors(amplitudes: Grammar, values: Floats, lifted: Floats) -> Floats:
-    """(2, F) xᵀ Q x' of products with the amplitude without first, and second factor.
-
-    With a product f g and Q symmetric, (f g)ᵀ Q g = fᵀ (g ∘ Q g): no product is formed.
-    """
+    """(2, F) xᵀ Q x' of products with the amplitude without first, and second factor."""
+    # With a product f g and Q symmetric, (f g)ᵀ Q g = fᵀ (g ∘ Q g): no product is formed.
     out: Floats = np.zeros((2, len(amplitudes.size)), dtype=np.float32)
     products = np.flatnonzero((amplitudes.less >= 0).all(axis=0))
     if not len(products):
