@@ -210,23 +210,15 @@ def test_only_what_is_finer_takes_the_place_of_an_effect(arm):
         add(halves, "joint_compliance", {"joints": "1-2/3-6"})
 
 
-@pytest.mark.parametrize(
-    ("own", "other", "finer_"),
-    [
-        ("each", "common", True),
-        ("each", "1-3/4-6", True),
-        ("2/3", "2+3", True),
-        ("1/2/3", "2+3", True),
-        ("1-2/3-6", "1-3/4-6", False),
-        ("2/3", "common", False),
-        ("common", "each", False),
-        ("each", "each", False),
-    ],
-)
-def test_finer_is_what_splits_groups_and_keeps_joints(arm, own, other, finer_):
+FINER = ("each common", "each 1-3/4-6", "2/3 2+3", "1/2/3 2+3")
+NOT_FINER = ("1-2/3-6 1-3/4-6", "2/3 common", "common each", "each each")
+
+
+@pytest.mark.parametrize("groups", FINER + NOT_FINER)
+def test_finer_is_what_splits_groups_and_keeps_joints(arm, groups):
     states = arm.readings.states
-    one, two = (JointCompliance(arm.cell, states, {"joints": j}) for j in (own, other))
-    assert one.refines(two) is finer_
+    one, two = (JointCompliance(arm.cell, states, {"joints": j}) for j in groups.split())
+    assert one.refines(two) is (groups in FINER)
     refined = two.refined(states)
     if refined is not None:
         assert refined.refines(two)

@@ -104,17 +104,10 @@ def test_a_tool_elsewhere_than_stated_is_named():
     np.testing.assert_allclose(off, -shift, atol=0.05)
 
 
-@pytest.mark.parametrize(
-    ("effect", "mode"),
-    [
-        ("load_point", "absolute"),
-        ("link_mass", "absolute"),
-        ("wrench_gain", "deflection"),
-        ("joint_stiffening", "absolute"),
-    ],
-)
-def test_effects_are_no_wrong_figures(effect, mode):
+@pytest.mark.parametrize("effect", ["load_point", "link_mass", "wrench_gain", "joint_stiffening"])
+def test_effects_are_no_wrong_figures(effect):
     """Of 63 campaigns with 19 effects of 3 and 6 σ, none was one, nor on the way to the model."""
+    mode = "deflection" if effect == "wrench_gain" else "absolute"
     c = campaign(effect, mode, 1, poses=16)
     d = judged(c.cell, c.readings, mode)
     assert d.suspects[0].effect == effect, message(d)

@@ -238,27 +238,16 @@ def test_nothing_of_it_outlives_a_command(file, capsys):
     assert installed().names == before
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        ["identify", "r"],
-        ["compare", "r"],
-        ["diagnose", "r"],
-        ["add", "r", "e"],
-        ["refine", "r"],
-        ["validate", "r", "r"],
-        ["view", "r"],
-        ["plan", "c", "-o", "p"],
-        ["run", "c", "-o", "r"],
-        ["simulate", "c", "-o", "d"],
-        ["demo"],
-        ["effects"],
-    ],
-    ids=lambda command: command[0],
-)
+COMMANDS = (
+    "identify r", "compare r", "diagnose r", "add r e", "refine r", "validate r r", "view r",
+    "plan c -o p", "run c -o r", "simulate c -o d", "demo", "effects",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_with_models_reads_it_first(command, tmp_path, capsys):
     missing = tmp_path / "nothing.py"
-    said = refused(capsys, 2, *command, "--effects-from", missing)
+    said = refused(capsys, 2, *command.split(), "--effects-from", missing)
     assert said == f"error: {missing}: no such file; expected a Python file of effects"
 
 
