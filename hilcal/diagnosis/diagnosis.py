@@ -91,24 +91,22 @@ class Diagnosis(Shown, Tabular):
         misfit_breakdown: variables that the misfit follows, largest share first.
         predictable_share: largest share of the misfit that a generic regression, one variable or
             one effect predicts on poses left out; 0 where there is no misfit.
-        dependences: variables that carry the predictable share, with the curve of each; where the
-            catalogue is insufficient, those of the residual after the refit.
+        dependences: variables that carry the predictable share, with the curve of each; of the
+            residual after the refit where the catalogue is insufficient.
         follows: names of at most two variables that the unexplained misfit follows.
         pure_error: the scatter of repeated readings, or None without repeats.
         noise: whether the stated covariance is to blame; None where a suspect passes all tests.
         redundant: effects of the model without which the readings are explained as well.
-        separability: how each rival of the first suspect differs from it, where the readings do
-            not separate them.
-        insufficiency: the misfit that all effects of the catalogue together leave, where it is not
-            noise.
+        separability: how each inseparable rival of the first suspect differs from it.
+        insufficiency: the misfit that the whole catalogue leaves, where it is not noise.
         alternatives: for each effect of `history.added`, the effects that could replace it.
-        scatter: estimate of the arm's scatter, where nothing else explains the residual, or where
-            the covariance of the fit includes it.
-        pose_alone: the misfit, where it is the same under every load of a pose, nothing predicts it
+        scatter: the arm's scatter, where nothing else explains the residual, or where the
+            covariance of the fit includes it.
+        pose_alone: a misfit that is the same under every load of a pose, where nothing predicts it
             on poses left out, and more poses would identify its effect.
         background: the effects of the model's background, smallest p-values first.
-        wrong_figures: figures of the cell that seem to be wrong, each of which alone explains the
-            misfit. No effect is a suspect then.
+        wrong_figures: figures of the cell each of which, if wrong, alone explains the misfit. No
+            effect is a suspect then.
     """
 
     fit: Fit
@@ -237,7 +235,7 @@ def in_doubt(d: Diagnosis, most: int = MOST) -> tuple[str, ...]:
 
 
 def effect_probabilities(steps: Sequence[Diagnosis], effects: Iterable[str]) -> dict[str, float]:
-    """Return the marginal probability of each effect to be on the arm.
+    """Return the marginal probability of each effect to be on the arm, from a refinement's steps.
 
     The odds for an effect are the prior odds times exp(L - 1). L is its log evidence at the most
     evident strength, the choice of which costs one unit. L is taken from the last step that has it:
@@ -249,9 +247,6 @@ def effect_probabilities(steps: Sequence[Diagnosis], effects: Iterable[str]) -> 
 
     Where others explain as much as a named effect, they share the probability: the named effect
     has 1 / (1 + exp(L_others - L - (number of others) + 1)), the others have the complement.
-
-    Args:
-        steps: diagnoses of a refinement, in its order; the last one judges the named effects.
     """
     alternatives = steps[-1].alternatives
     evidence = {a.effect: a.own for a in alternatives}
