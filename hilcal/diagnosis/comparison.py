@@ -71,8 +71,7 @@ class Comparison(Shown):
         tool: keys of [tool] that differ.
         today: the error of the earlier calibration.
         changes: the changes since.
-        differences: parameters of both fits, where the later campaign has a fit that no prior ties
-            to the earlier one; else None.
+        differences: parameters of both fits, where no prior ties the later fit to the earlier one.
     """
 
     number: int | None

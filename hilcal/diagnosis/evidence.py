@@ -16,12 +16,11 @@ beyond B, as in planning. k times as many readings like these give k λ, and sep
 k λ reaches `NEEDED`.
 
 Sufficiency. An effect outside the catalogue resembles effects of the catalogue: a base that sways
-with the air temperature looks like a drifting tracker. The best suspect then explains a good part
-of the misfit, passes every test, and is wrong. So all significant effects enter the model, one
-after the other, by algebra. If the residual is then noise, the catalogue is sufficient. Otherwise
-the linearisation may be too coarse: the best effect is added by a refit, and the selection is
-repeated. The catalogue is insufficient if a residual remains after two refits, and repeats or a
-generic regression show that it is not noise.
+with the air temperature looks like a drifting tracker. The best suspect then passes every test, and
+is wrong. So all significant effects enter the model, one after the other, by algebra. If more than
+noise is left, the linearisation may be too coarse: the best effect is added by a refit, and the
+selection is repeated. The catalogue is insufficient if a residual remains after two refits, and
+repeats or a generic regression show that it is not noise.
 """
 
 from collections.abc import Callable, Collection

@@ -1,10 +1,10 @@
 """Wrong figures of the cell: a load's mass, the tool's mass or its centre of mass.
 
 They are tried before any effect is named: a factor of all wrenches of one load, a factor of the
-tool's mass, and a shift of its centre of mass. Gauss-Newton estimates the figure from the
-derivative of the readings by it, projected off the model; the model is refitted in every step. A
-figure is named if it explains nearly all of the misfit, is better than any effect of the catalogue
-by the Bayesian information criterion, and differs from the stated figure by more than rounding.
+tool's mass, and a shift of its centre of mass. Gauss-Newton estimates the figure beside the model,
+which is refitted in every step. A figure is named if it explains nearly all of the misfit, is
+better than any effect of the catalogue by the Bayesian information criterion, and differs from the
+stated figure by more than rounding.
 """
 
 from collections.abc import Iterator, Sequence

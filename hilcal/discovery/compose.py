@@ -12,9 +12,8 @@ single-index model, one step of projection pursuit (Friedman and Stuetzle 1981, 
 The price of such a candidate is that of all arguments of its complexity and of the levels, and
 ½ ln ν for each weight and exponent.
 
-Each of the best candidates of the screening is also multiplied by every function of another
-quantity, up to the complexity `MOST`, and each of its free numbers is varied (`grown`). The price
-is that of all products of the same kind, or of the values that were tried.
+The best of the screening are also multiplied by every function of another quantity, and their free
+numbers are varied (`grown`), at the price of all products of the same kind, or values tried.
 """
 
 from __future__ import annotations

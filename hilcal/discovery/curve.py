@@ -6,11 +6,10 @@ residual of the fit with the law, the partial residual of this reading is
 
     y = Σ_p θ_p f_p(x) + Tᵀ r / (TᵀT g),    std = 1 / (|T| |g|)
 
-Waves of high order are drawn over one period.
-
-For an effect from a file, written by `discover` or a user, the motion m of a site is drawn over a
-quantity x that its formula names, divided by another one g if the formula is a product. Of all such
-pairs (x, g) the one with the smoothest m/g over x is drawn (von Neumann's ratio).
+Waves of high order are drawn over one period. For an effect from a file the motion m of a site is
+drawn over a quantity x that its formula names, divided by another one g if the formula is a
+product. Of all such pairs (x, g) the one with the smoothest m/g over x is drawn (von Neumann's
+ratio).
 """
 
 import re

@@ -2,17 +2,13 @@
 
 1. If the stated noise explains the residual, there is nothing to explain.
 2. All candidates are screened, and laws of one, two and three terms are chosen (`search`).
-3. Effects of the catalogue are added by algebra as long as they are significant, and refitted in
-   the exact model. If they explain the readings as well as the law in either, at odds of 20 : 1,
-   the answer is the catalogue, and no law is proposed; nor is a law that one of its effects
-   describes (`known_effects`).
+3. If effects of the catalogue explain the readings as well, at odds of 20 : 1, the answer is the
+   catalogue, and no law is proposed; nor is a law that an effect describes (`known_effects`).
 4. The search is repeated without each fold of poses. A law is proposed only if the laws of these
-   searches predict the poses left out.
+   searches predict the poses left out, which take no part in the choice of a law, nor in its
+   coefficients: the share of their misfit that it explains is valid for the whole procedure.
 5. Free numbers are refined, and the law is refitted as an effect in the exact model.
 6. A generic regression of the misfit estimates how much can be explained at all.
-
-The poses that are left out take no part in the choice of a law, nor in its coefficients. The share
-of their misfit that the law explains is therefore valid for the whole procedure.
 """
 
 from collections.abc import Callable, Hashable
