@@ -162,8 +162,7 @@ def _screened(candidates: CandidateTerms) -> list[_Bent]:
     odds = _better(
         candidates.evidence, slope, square, across, slope_one[:, None], square_one[:, None]
     )
-    cost = screen.grammar.cost[bends.argument]
-    price = screen.grammar.price_of_argument[cost]
+    price = screen.grammar.price_of_argument[screen.grammar.cost[bends.argument]]
     odds = odds - price
     out: dict[tuple[int, int], _Bent] = {}
     for index in np.argsort(-odds, axis=None)[: 20 * BEST].tolist():

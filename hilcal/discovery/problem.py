@@ -246,15 +246,11 @@ class CandidateTerms:
         out = []
         for start in range(0, len(terms), 64):
             batch = terms[start : start + 64]
-            flat = [part for t in batch for part in t.parts]
-            x = p.screen.columns(flat)[p.rows]
+            x = p.screen.columns([part for t in batch for part in t.parts])[p.rows]
             ends = np.cumsum([0] + [len(t.parts) for t in batch])
-            columns = [
-                x[:, a:b].sum(axis=1, keepdims=True) if t.common else x[:, a:b]
-                for t, a, b in zip(batch, ends[:-1], ends[1:], strict=True)
-            ]
-            for t, x_term in zip(batch, columns, strict=True):
-                out.append(Scored(t, self._score(x_term)))
+            for t, a, b in zip(batch, ends[:-1], ends[1:], strict=True):
+                columns = x[:, a:b].sum(axis=1, keepdims=True) if t.common else x[:, a:b]
+                out.append(Scored(t, self._score(columns)))
         return out
 
     def _score(self, x: Floats) -> FamilyScore:
