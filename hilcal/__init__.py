@@ -26,8 +26,7 @@ _NAMES = {
     "hilcal.discovery.discovery": ("discover",),
     "hilcal.effects.catalogue": ("Catalogue", "installed"),
     "hilcal.effects.check": ("check_effect",),
-    "hilcal.effects.protocol": ("Effect",),
-    "hilcal.effects.spec": ("effect",),
+    "hilcal.effects.protocol": ("Effect", "effect"),
     "hilcal.errors": ("CannotAnswerError", "DeviceError", "HilcalError", "InputError"),
     "hilcal.identification.fit": ("Fit",),
     "hilcal.identification.posterior": ("Posterior",),
@@ -69,7 +68,7 @@ if TYPE_CHECKING:
     from hilcal.effects.catalogue import installed as installed
     from hilcal.effects.check import check_effect as check_effect
     from hilcal.effects.protocol import Effect as Effect
-    from hilcal.effects.spec import effect as effect
+    from hilcal.effects.protocol import effect as effect
     from hilcal.errors import CannotAnswerError as CannotAnswerError
     from hilcal.errors import DeviceError as DeviceError
     from hilcal.errors import HilcalError as HilcalError

@@ -13,7 +13,7 @@ from hilcal.discovery.law import Law
 from hilcal.drivers.simulated.injected_effects import hide, nothing_hidden
 from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.drivers.simulated.world import World
-from hilcal.effects.spec import EffectSpec
+from hilcal.effects.protocol import EffectSpec
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit

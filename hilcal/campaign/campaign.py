@@ -16,7 +16,6 @@ from hilcal.config import CellConfig
 from hilcal.config.cell import INSTRUMENT_NOISE, Changes, changed
 from hilcal.diagnosis.background_evidence import background_evidence
 from hilcal.diagnosis.diagnosis import Diagnosis, History
-from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.evidence import Evidence
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.diagnosis.verdict import diagnose, judge_naming
@@ -452,7 +451,7 @@ class Campaign(Brief):
         hashed = content_hash(found.readings)
         if hashed != content_hash(self.readings):
             raise InputError(f"{self.path}: the fit is of other readings than this campaign's")
-        document = None if diagnosis is None else to_json(diagnosis)
+        document = None if diagnosis is None else diagnosis.to_dict()
         record = revisions.to_record(found, document, added, hashed, removed, parent)
         options = {**record.options, STORED: self.data_hash, **typed_now()}
         if self.changes:

@@ -275,7 +275,7 @@ def _explained(error: Exception, name: str) -> tuple[str, int]:
         return f"the system library {library[1]} is missing: install its package{package}", _USAGE
     if message := lacking(error):
         return message, _USAGE
-    from hilcal.effects.from_file import failure_of
+    from hilcal.effects.protocol import failure_of
 
     if failed := failure_of(error):
         return str(failed), failed.exit_code

@@ -25,7 +25,6 @@ from hilcal.design.planner import Request
 from hilcal.design.summary import refuse
 from hilcal.diagnosis.diagnosis import History
 from hilcal.diagnosis.diagnosis import in_doubt as left_open
-from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.evidence import Evidence
 from hilcal.diagnosis.verdict import diagnose, judge
@@ -169,7 +168,7 @@ def doubted(
     visited = len({s.pose for s in plan.steps} - {REFERENCE})
     t.show(next_report(chosen, visited, len(plan.steps)))
     document |= {"suspects": list(suspects), **separates(chosen)}
-    record = to_record(fitted, to_json(d), None, content_hash(r.readings))
+    record = to_record(fitted, d.to_dict(), None, content_hash(r.readings))
     return Doubted(len(r.readings), record, plan, document)
 
 
@@ -284,7 +283,7 @@ def demo(
             "inside": improved.everything.inside,
             "measured": improved.to_dict(),
         },
-        diagnoses=[to_json(s.diagnosis) for s in refinement.steps],
+        diagnoses=[s.diagnosis.to_dict() for s in refinement.steps],
     )
 
 

@@ -13,7 +13,6 @@ from hilcal.cli import fitting
 from hilcal.cli.options import catalogue_with, check_folder, command
 from hilcal.cli.showing import followed
 from hilcal.cli.terminal import Terminal, terminal
-from hilcal.diagnosis.document import suspect_json, to_json
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.diagnosis.verdict import NOTHING
@@ -91,7 +90,7 @@ def diagnose(
         fitting.finish(fitted, say)
     t.show(words.diagnosis_report(d))
     t.show(torque_lines(check_torques(fitted.model.cell, fitted.readings)))
-    t.document({"revision": number, **to_json(d)})
+    t.document({"revision": number, **d.to_dict()})
 
 
 @command("""
@@ -166,8 +165,8 @@ def _change(
         revisions=revisions_json(pair, verdict),
         verdict=d.verdict,
         message=message(d),
-        **{} if c.expected is None else {"addition": suspect_json(c.expected)},
-        diagnosis=to_json(d),
+        **{} if c.expected is None else {"addition": c.expected.to_dict()},
+        diagnosis=d.to_dict(),
     )
 
 
@@ -266,7 +265,7 @@ def refine(
         frames=frames_to_json(refinement.fit),
         **prior_to_json(refinement.fit),
         other_arm=None if other_arm is None else other_arm.to_json(),
-        diagnosis=to_json(diagnosis),
+        diagnosis=diagnosis.to_dict(),
     )
 
 

@@ -1,23 +1,22 @@
 """Changes of an arm since an earlier campaign, and whether they exceed the uncertainty.
 
 A candidate is something that a repair, a crash or wear can change: a set of directions of an
-effect's parameters beside the earlier fit, whether or not the effect is in its model. A change of a
-fitted effect is a deviation of its own. Three more kinds of candidates are no change of the arm but
-look like one: the target on the tool, the instrument, and the temperature.
+effect's parameters beside the earlier fit, whether or not the effect is in its model. The target on
+the tool, the instrument and the temperature are candidates, too: they look like a change of the
+arm.
 
 At later readings the earlier fit leaves the residual r with rᵀ M r (see
 `identification.later_readings`): its posterior is the prior, and the place of a tracker that was
 set up anew is free. Every candidate is scored by the evidence of its columns beside that, as in the
 diagnosis (`regression.evidence`). The scatter σ² is estimated from r and from the earlier fit,
-whose statement counts as ν_0 degrees of freedom:
+whose statement counts as ν_0 degrees of freedom, so that a few lucky readings make no change:
 
     ‖r‖² = rᵀ M r + ν_0,    ν = dof + ν_0
 
-So neither a scatter that is larger than stated nor a few lucky readings make a change. The
-candidates with most evidence are added to the model and fitted exactly. The best of these is a
-change if its p-value, times the number of candidates tested, is below `LEVEL`; then the next change
-is searched beside it. A change that the others make needless is removed. The readings do not
-separate candidates with nearly the same evidence (odds below 20 : 1).
+The candidates with most evidence are fitted exactly. The best is a change if its p-value, times the
+number of candidates tested, is below `LEVEL`; then the next change is searched beside it. A change
+that the others make needless is removed. The readings do not separate candidates with nearly the
+same evidence (odds below 20 : 1).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -203,24 +202,27 @@ def candidates(
         effect.name = name + SUFFIX
         return effect
 
+    def put(name: str, effect: Effect, change: Changeable, d: Directions, joint: int = 0) -> None:
+        units, moving = (d.parameters, d.units, d.scale), Moving(effect, d.matrix)
+        out.append(Candidate(d.name, name, change.part, joint, change, *units, moving))
+
     for name in changing(catalogue):
         change = catalogue[name].change
         if change is None or (effect := make(name, change.options)) is None:
             continue
         if change.directions is not None:
-            out.append(_candidate(name, effect, change, change.directions(effect)))
+            put(name, effect, change, change.directions(effect))
         elif change.part:
-            out.append(_candidate(name, effect, change, _single(name, effect)))
+            put(name, effect, change, _single(name, effect))
         else:  # a candidate per joint or link, whose parameters begin with "j3" or "link2"
             for label in dict.fromkeys(p.name.split(".")[0] for p in effect.parameters):
                 number = int(label.lstrip("jlink"))
                 part = replace(change, part=f"{change.kind} {number}")
                 joint = number if change.kind == "joint" else 0
-                directions = _single(f"{name}.{label}", effect, label)
-                out.append(_candidate(name, effect, part, directions, joint))
+                put(name, effect, part, _single(f"{name}.{label}", effect, label), joint)
     for kind in () if anew else catalogue.with_role("registration"):
         if (effect := make(kind.name)) is not None:
-            out.append(_candidate(kind.name, effect, PLACE, _single(kind.name, effect)))
+            put(kind.name, effect, PLACE, _single(kind.name, effect))
     return tuple(out)
 
 
@@ -233,15 +235,6 @@ def _single(name: str, effect: Effect, label: str = "") -> Directions:
     matrix[index, np.arange(len(index))] = scale
     names, units = zip(*((parameters[i].name, parameters[i].unit) for i in index), strict=True)
     return Directions(name, names, units, scale, matrix)
-
-
-def _candidate(
-    name: str, effect: Effect, change: Changeable, d: Directions, joint: int = 0
-) -> Candidate:
-    moving = Moving(effect, d.matrix)
-    return Candidate(
-        d.name, name, change.part, joint, change, d.parameters, d.units, d.scale, moving
-    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -316,10 +309,7 @@ def _pooled(minimum: Remeasured) -> tuple[float, float]:
 
 
 def _least_noise(minimum: Remeasured) -> float:
-    """σ² for the uncertainty of sizes, at least that of the earlier fit.
-
-    The earlier fit states it for all directions together; a few lucky readings do not lower it.
-    """
+    """σ² for the uncertainty of sizes; a few lucky readings do not lower it below that stated."""
     rss, dof = _pooled(minimum)
     return max(rss / dof, 1.0)
 
@@ -374,8 +364,8 @@ def _best(
 def _trials(order: Sequence[Candidate]) -> list[tuple[Candidate, ...]]:
     """Return the first candidates, and sets that a repair changes together, to be fitted exactly.
 
-    A joint that was taken apart has another zero and another compliance. If they were fitted one
-    after the other, either of them, or a family of waves, would first absorb both changes.
+    A joint that was taken apart has another zero and another compliance: fitted one after the
+    other, either of them, or a family of waves, would first absorb both changes.
     """
     joints = list(dict.fromkeys(c.joint for c in order[:TRIED] if c.joint))[:TAKEN_APART]
     sets = (

@@ -1,11 +1,9 @@
 """Two campaigns of one arm: the earlier fit completed, its error today, the changes since.
 
-An effect that the arm always had, and that the earlier model lacks, is in the later readings, too,
-and would be taken for a change. So the effects that may change are first scored beside the earlier
-fit on the earlier readings, and those with evidence are added. A residual beyond the stated noise
-is then taken as scatter of the joints, or of the target. A larger multiple of the stated noise
-would look like a change: a tracker's noise has another shape, far smaller along the beam than
-across it.
+An effect that the arm always had, and that the earlier model lacks, would be taken for a change. So
+the effects that may change are first scored on the earlier readings, and those with evidence are
+added. A residual beyond the stated noise is then taken as scatter of the joints, or of the target:
+a multiple of a tracker's noise, which is far smaller along the beam, would look like a change.
 """
 
 from collections.abc import Callable, Collection
@@ -55,11 +53,6 @@ class Today:
         """Rms of the standard deviation of the 3-D position error as the fit states it, m."""
         return float(np.sqrt(np.mean(self.beyond.stated_m**2)))
 
-    @property
-    def better_than_drawn(self) -> bool:
-        """Whether the calibration predicts the readings better than the arm as drawn."""
-        return self.drawing_m is None or self.prediction.error.rms_m < self.drawing_m
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison(Shown):
@@ -78,8 +71,7 @@ class Comparison(Shown):
         tool: keys of [tool] that differ.
         today: the error of the earlier calibration.
         changes: the changes since.
-        differences: parameters of both fits, where the later campaign has a fit that no prior ties
-            to the earlier one; else None.
+        differences: parameters of both fits, where no prior ties the later fit to the earlier one.
     """
 
     number: int | None
@@ -99,7 +91,10 @@ class Comparison(Shown):
     @property
     def another_arm(self) -> bool:
         """Whether the later readings seem to be of another arm of the same type."""
-        return not self.changes.explained and not self.today.better_than_drawn
+        # No change explains them, and the arm as drawn predicts them as well as the calibration.
+        drawing = self.today.drawing_m
+        worse = drawing is not None and self.today.prediction.error.rms_m >= drawing
+        return worse and not self.changes.explained
 
     def to_dict(self) -> dict[str, object]:
         """Return it as JSON, SI: the document of `compare --json` without its sentences."""
@@ -138,10 +133,7 @@ class Comparison(Shown):
 def completed(
     fit: Fit, names: Collection[str], say: Callable[[str], None] = lambda text: None
 ) -> tuple[Fit, tuple[str, ...]]:
-    """Add those of some effects that the readings of a gc-scaled fit show; the fit and their names.
-
-    The scatter is estimated, too, where it exceeds the stated noise.
-    """
+    """Add effects, and the scatter, that a gc-scaled fit's readings show; the fit, their names."""
     added: list[str] = []
     while len(added) < MOST and (effect := _most_evident(fit, names)) is not None:
         say(f"adding {effect} to the earlier model, as its own readings ask for")
@@ -180,10 +172,7 @@ def _most_evident(fit: Fit, names: Collection[str]) -> str | None:
 
 
 def error_today(setting: Setting, changes: Changes, drawing: float | None) -> Today:
-    """Return the error of the earlier parameters at later readings, with the tracker where it is.
-
-    `drawing` is the rms error with the arm as drawn, m.
-    """
+    """Return the earlier calibration's error; `drawing`: rms error with the arm as drawn, m."""
     minimum, w = remeasure(frames_alone(setting)), setting.w
     white = w.whiten(minimum.raw).reshape(-1)
     prediction = Validation(

@@ -4,14 +4,13 @@ It holds data only; `hilcal.present.verdict` writes its sentence.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Literal
 
 import numpy as np
 
 from hilcal.diagnosis.background_evidence import BackgroundEffect
-from hilcal.diagnosis.document import to_json
-from hilcal.diagnosis.effect_ranking import Suspect
+from hilcal.diagnosis.effect_ranking import FALSE_ALARM, Suspect
 from hilcal.diagnosis.evidence import Alternative, Insufficiency, Separability
 from hilcal.diagnosis.misfit_breakdown import MisfitShare
 from hilcal.diagnosis.noise import NoiseVerdict, PureError
@@ -21,6 +20,7 @@ from hilcal.diagnosis.wrong_figures import WrongFigure
 from hilcal.identification.fit import Fit
 from hilcal.readings.readings import ArmScatter
 from hilcal.shown import Shown, Tabular, presenter
+from hilcal.store.codec import encode
 
 MOST = 4
 """Most effects to separate at once: each ordered pair is a term of the design; a guess."""
@@ -61,6 +61,11 @@ VERDICTS: dict[Reason, Verdict] = {
     "wrong_figure": "ambiguous",
 }
 """The verdict that each reason leads to."""
+CURVE = (
+    "variable", "unit", "share", "moves", "direction", "labels", "x", "y", "error", "y_unit",
+    "determined",
+)  # fmt: skip
+"""What a document holds of a `Dependence`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,24 +91,22 @@ class Diagnosis(Shown, Tabular):
         misfit_breakdown: variables that the misfit follows, largest share first.
         predictable_share: largest share of the misfit that a generic regression, one variable or
             one effect predicts on poses left out; 0 where there is no misfit.
-        dependences: variables that carry the predictable share, with the curve of each; where the
-            catalogue is insufficient, those of the residual after the refit.
+        dependences: variables that carry the predictable share, with the curve of each; of the
+            residual after the refit where the catalogue is insufficient.
         follows: names of at most two variables that the unexplained misfit follows.
         pure_error: the scatter of repeated readings, or None without repeats.
         noise: whether the stated covariance is to blame; None where a suspect passes all tests.
         redundant: effects of the model without which the readings are explained as well.
-        separability: how each rival of the first suspect differs from it, where the readings do
-            not separate them.
-        insufficiency: the misfit that all effects of the catalogue together leave, where it is not
-            noise.
+        separability: how each inseparable rival of the first suspect differs from it.
+        insufficiency: the misfit that the whole catalogue leaves, where it is not noise.
         alternatives: for each effect of `history.added`, the effects that could replace it.
-        scatter: estimate of the arm's scatter, where nothing else explains the residual, or where
-            the covariance of the fit includes it.
-        pose_alone: the misfit, where it is the same under every load of a pose, nothing predicts it
+        scatter: the arm's scatter, where nothing else explains the residual, or where the
+            covariance of the fit includes it.
+        pose_alone: a misfit that is the same under every load of a pose, where nothing predicts it
             on poses left out, and more poses would identify its effect.
         background: the effects of the model's background, smallest p-values first.
-        wrong_figures: figures of the cell that seem to be wrong, each of which alone explains the
-            misfit. No effect is a suspect then.
+        wrong_figures: figures of the cell each of which, if wrong, alone explains the misfit. No
+            effect is a suspect then.
     """
 
     fit: Fit
@@ -147,10 +150,7 @@ class Diagnosis(Shown, Tabular):
 
     @property
     def not_shown(self) -> tuple[str, ...]:
-        """Names of the effects that these readings would reveal at no plausible size.
-
-        Deflections do not show errors that are the same under every load, such as geometry.
-        """
+        """Effects, such as geometry in deflections, that no plausible size would reveal here."""
         background = {b.effect for b in self.background}
         failed = (s for s in self.suspects if not s.passes and s.effect not in background)
         return tuple(s.effect for s in failed if not s.shown)
@@ -180,7 +180,44 @@ class Diagnosis(Shown, Tabular):
 
     def to_dict(self) -> dict[str, object]:
         """Return the JSON document of `hilcal diagnose --json`, including the sentence."""
-        return to_json(self)
+        tests = {"count": self.tested, "level": FALSE_ALARM}
+        return {
+            "model": list(self.fit.model.named),
+            "verdict": self.verdict,
+            "message": presenter().message(self),
+            "reason": self.reason,
+            "variance_factor": self.fit.variance_factor,
+            "variance_factor_interval": list(self.fit.variance_factor_interval),
+            "predictable_share": self.predictable_share,
+            "where": [asdict(v) for v in self.misfit_breakdown],
+            "suspects": [s.to_dict() for s in self.suspects],
+            "not_shown": list(self.not_shown),
+            "tests": {**tests, "each": FALSE_ALARM / max(self.tested, 1)},
+            "apart": [
+                {"effect": a.effect, "unlike": a.unlike, "times": a.times if a.possible else None}
+                for a in self.separability
+            ],
+            "beyond": self.insufficiency
+            and _attributes(self.insufficiency, "effects", "refitted", "share", "variance_factor"),
+            "background": [_attributes(b, "effect", "p_value", "rms_m") for b in self.background],
+            "wrong_figures": [asdict(f) for f in self.wrong_figures],
+            "pose_alone": self.pose_alone and asdict(self.pose_alone),
+            "rejected": list(self.history.rejected),
+            "alternatives": [
+                _attributes(a, "effect", "same_as", "others")
+                for a in self.alternatives
+                if a.inseparable
+            ],
+            "needless": list(self.redundant),
+            "carriers": [_attributes(v, *CURVE) for v in self.dependences],
+            "arm_scatter": self.scatter and self.scatter.to_json(),
+            "serial_noise": self.fit.readings.serial and self.fit.readings.serial.to_json(),
+            "pure_error": self.pure_error and self.pure_error.to_dict(),
+        }
+
+
+def _attributes(value: object, *names: str) -> dict[str, object]:
+    return {name: encode(getattr(value, name)) for name in names}
 
 
 def in_doubt(d: Diagnosis, most: int = MOST) -> tuple[str, ...]:
@@ -198,7 +235,7 @@ def in_doubt(d: Diagnosis, most: int = MOST) -> tuple[str, ...]:
 
 
 def effect_probabilities(steps: Sequence[Diagnosis], effects: Iterable[str]) -> dict[str, float]:
-    """Return the marginal probability of each effect to be on the arm.
+    """Return the marginal probability of each effect to be on the arm, from a refinement's steps.
 
     The odds for an effect are the prior odds times exp(L - 1). L is its log evidence at the most
     evident strength, the choice of which costs one unit. L is taken from the last step that has it:
@@ -210,9 +247,6 @@ def effect_probabilities(steps: Sequence[Diagnosis], effects: Iterable[str]) -> 
 
     Where others explain as much as a named effect, they share the probability: the named effect
     has 1 / (1 + exp(L_others - L - (number of others) + 1)), the others have the complement.
-
-    Args:
-        steps: diagnoses of a refinement, in its order; the last one judges the named effects.
     """
     alternatives = steps[-1].alternatives
     evidence = {a.effect: a.own for a in alternatives}

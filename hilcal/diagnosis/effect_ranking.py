@@ -5,10 +5,10 @@ evidence is positive, it explains a share of the misfit on poses left out, the e
 more than it scatters from pose to pose, plausible parameters explain as much as any, and the exact
 model keeps the promise of the linearisation.
 
-Plausible sizes. The standard deviation of the parameters is limited by the effect itself, and by
-absolute positions: deflections show errors of geometry and encoders in the second order only, their
-unloaded readings in the first. With the frames estimated, an effect should hardly displace the
-unloaded readings by more than the model misses there,
+Plausible sizes. The standard deviation of the parameters is limited by the effect itself.
+Deflections show errors of geometry and encoders in the second order only, their unloaded readings
+in the first. With the frames estimated, an effect should hardly displace these by more than the
+model misses there,
 
     t g ≤ `ALLOWED` s,    s² = mean |P y|²,    g² = mean Σ_p |P x_p|²
 
@@ -17,32 +17,25 @@ parameter p, P the projection off the frames. Elastic effects are exempt: a cont
 compensate the effect of gravity. If more than a share `LOST` of the evidence needs larger sizes,
 the effect is implausible, and the size that it needs is stated.
 
-Promise. Columns hold for small parameters. So the exact model is evaluated at the step that the
-score promises, with the model's own parameters adapted. If that loses much of the promise, a refit
-decides. The promise, and the part of it that is kept, are reductions of ‖r‖² − dof.
+Promise. Columns hold for small parameters, so the exact model is evaluated at the step that the
+score promises, with the model's own parameters adapted; if that loses much, a refit decides. The
+promise, and the part of it that is kept, are reductions of ‖r‖² − dof.
 
-Unloaded arms. Absolute readings without a load show a compliance only by the torque of the arm's
-own mass, a smooth function of the joint angles, as the effect of a wrong geometry is. In such
-readings a suspect that acts through loads must explain the readings beside all effects that are
-constant in the arm's axes (link geometry, zero offsets): with evidence at 20 : 1, and on poses left
-out.
+Unloaded arms. Absolute readings without a load show a compliance only by the arm's own weight, a
+smooth function of the joint angles, as a wrong geometry is. There a suspect that acts through loads
+must explain the readings beside all effects that are constant in the arm's axes: with evidence at
+20 : 1, and on poses left out.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 
-from hilcal.diagnosis.minimum_detectable_effect import (
-    LEAST_SHARE as LEAST_SHARE,
-)
-from hilcal.diagnosis.minimum_detectable_effect import (
-    Strength,
-    least_of_family,
-    least_strength,
-)
+from hilcal.diagnosis.minimum_detectable_effect import LEAST_SHARE as LEAST_SHARE
+from hilcal.diagnosis.minimum_detectable_effect import Strength, least_of_family, least_strength
 from hilcal.diagnosis.stepwise import trial
 from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError, InputError
@@ -79,10 +72,7 @@ left out beside geometry: p = 0.001, since a dozen of them are tested."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Suspect(Brief):
-    """An effect that is not in the model, and the part of the misfit that it would explain.
-
-    Functions stand for statistics that not every verdict needs; they compute on first use.
-    """
+    """An effect that is not in the model; functions stand for statistics computed on first use."""
 
     effect: str  # canonical name
     score: FamilyScore  # the joint test of the whole family
@@ -138,13 +128,32 @@ class Suspect(Brief):
         """Whether the exact model keeps the promise of the linearisation."""
         return self.kept >= LEAST_KEPT
 
+    def to_dict(self) -> dict[str, object]:
+        """Return the suspect as JSON, SI."""
+        needs = [{"unit": unit, "rms": rms, "plausible_rms": m} for unit, rms, m in self.needs]
+        return {
+            "effect": self.effect,
+            "finer_than": self.coarse or None,
+            "p_value": self.score.p_value,
+            "share": self.share,
+            "holdout_share": self.holdout_share,
+            "delta_bic": self.score.delta_bic,
+            "log_evidence": self.score.log_evidence,
+            "significant": self.passes,
+            "same_as": list(self.same_as),
+            "least": self.least.to_dict(),
+            "shown": self.shown,
+            "plausible": self.plausible,
+            "needs": needs,
+            "kept_share": self.kept,
+        }
+
 
 def candidates(fit: Fit) -> tuple[Effect, ...]:
     """Effects that can be computed and are not in the model, or refine an effect of the model.
 
     Raises:
-        InputError: `[plausible]` or `[ordinary]` of the cell names an effect that the catalogue
-            does not hold.
+        InputError: `[plausible]` or `[ordinary]` of the cell names an unknown effect.
     """
     states, model = fit.readings[~fit.outlier].states, fit.model
     config = model.cell.config
@@ -185,23 +194,13 @@ class Unloaded:
     missed: float  # s, rms of their residual beside the frames, m
 
 
-def frame_effects(fit: Fit) -> tuple[Effect, ...]:
-    """Effects whose columns `unloaded_readings` needs; none for a fit of absolute readings."""
-    if fit.mode == "absolute":
-        return ()
-    states, model = fit.readings[~fit.outlier].states, fit.model
-    kinds = model.catalogue.with_role("registration", "target")
-    return tuple(kind(model.cell, states) for kind in kinds)
-
-
-def unloaded_readings(fit: Fit, frames: Sequence[EffectColumns] | None = None) -> Unloaded | None:
+def unloaded_readings(fit: Fit) -> Unloaded | None:
     """Return the unloaded readings; None for absolute readings, which show all errors."""
     if fit.mode == "absolute":
         return None
-    if frames is None:
-        frames = list(columns_of_each(fit, frame_effects(fit)))
-    readings = fit.readings[~fit.outlier]
-    rows = readings.unloaded
+    readings, model = fit.readings[~fit.outlier], fit.model
+    rows, kinds = readings.unloaded, model.catalogue.with_role("registration", "target")
+    frames = columns_of_each(fit, [kind(model.cell, readings.states) for kind in kinds])
     columns = np.concatenate([frame.unloaded for frame in frames], axis=2)
     u, s, _ = np.linalg.svd(columns.reshape(3 * int(rows.sum()), -1), full_matrices=False)
     u = u[:, s > ROUNDING * s.max(initial=0.0)]
@@ -229,10 +228,10 @@ def rank_suspects(
     refit: Callable[[Fit, str], Fit | None] = trial,  # returns a fit with one more effect
 ) -> tuple[Suspect, ...]:
     """Score all effects; best first, see `ranked`."""
-    suspects = [_suspect(p, s, len(effects)) for part in _scored(p, effects) for s in part]
+    suspects = [_suspect(p, s, len(effects)) for s in _scored(p, effects)]
     tested = max(sum(s.score.rank > 0 for s in suspects), 1)
     no_load = p.fit.mode == "absolute" and not p.fit.solution.prediction.situation.load.wrench.any()
-    geometry = cache(lambda: geometry_columns(p, effects))
+    geometry = cache(partial(geometry_columns, p, effects))
     out: list[Suspect] = []
     for effect, s in zip(effects, suspects, strict=True):
         explains = s.score.p_value * tested < FALSE_ALARM and s.score.log_evidence > 0
@@ -242,7 +241,10 @@ def rank_suspects(
             if no_load and through_load(effect):
                 s = replace(s, refuted=not beyond_geometry(p, family, geometry()))
             if s.passes:
-                s = replace(s, kept=kept(p, family, s.score, refit))
+                kept = kept_by_step(p, family, s.score)
+                if kept < LEAST_KEPT and (after := refit(p.fit, effect.name)) is not None:
+                    kept = max(kept, kept_by_refit(p.fit, after, s.score))
+                s = replace(s, kept=kept)
         out.append(s)
     return ranked(out)
 
@@ -258,14 +260,8 @@ def addition(before: Fit, after: Fit) -> Suspect:
 
 
 def ranked(suspects: Iterable[Suspect], rejected: Collection[str] = ()) -> tuple[Suspect, ...]:
-    """Order suspects, and name those that are inseparable.
-
-    First come those that pass all tests, then those that explain the misfit but do not surely
-    lower the error on poses left out, then the others; by evidence in each of these groups.
-
-    Args:
-        rejected: names of effects whose addition did not lower the error on poses left out.
-    """
+    """Order suspects as in `Diagnosis.suspects`, and name those that are inseparable."""
+    # The addition of the `rejected` effects did not lower the error on poses left out.
     order = [replace(s, refuted=True) if s.effect in rejected else s for s in suspects]
     order.sort(key=lambda s: (-s.passes, -s.explains, -s.score.log_evidence, s.score.p_value))
     evident = [s for s in order if s.score.log_evidence > SAME_EVIDENCE]
@@ -281,8 +277,6 @@ def ranked(suspects: Iterable[Suspect], rejected: Collection[str] = ()) -> tuple
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scored:
-    """An effect with its score and the statistics behind it."""
-
     family: EffectColumns
     information: Floats  # (P, P) S
     spectrum: Spectrum  # of S
@@ -292,31 +286,21 @@ class _Scored:
     held_out: HeldOut | None = None  # None where the fitted readings rule the effect out
 
 
-def _scored(p: Linearisation, effects: Sequence[Effect]) -> Iterator[list[_Scored]]:
-    """Score effects in parts that are whitened together."""
-    frames = frame_effects(p.fit)
-    of_frames: list[EffectColumns] = []
-    bare: Unloaded | None = None
-    for part in columns_in_parts(p.fit, (*frames, *effects)):
-        missing = len(frames) - len(of_frames)
-        of_frames += part[:missing]
-        families = part[missing:]
-        if len(of_frames) == len(frames) and bare is None:
-            bare = unloaded_readings(p.fit, of_frames)
+def _scored(p: Linearisation, effects: Sequence[Effect]) -> Iterator[_Scored]:
+    """Score effects, in parts that are whitened together."""
+    bare = unloaded_readings(p.fit)
+    for families in columns_in_parts(p.fit, effects):
         scored = []
         for family, (s, g) in zip(families, p.families(families), strict=True):
             of_s, largest = spectrum(s), most(family, bare)
             scored.append(_Scored(family, s, of_s, g, largest, p.score_of(of_s, g, largest)))
         able = [c for c in scored if c.score.p_value < FALSE_ALARM and c.score.log_evidence > 0]
         held_out = iter(_left_out(p, [(c.family.white, c.score) for c in able]))
-        yield [replace(c, held_out=next(held_out)) if c in able else c for c in scored]
+        yield from (replace(c, held_out=next(held_out)) if c in able else c for c in scored)
 
 
 def _suspect(p: Linearisation, scored: _Scored, count: int) -> Suspect:
-    """Describe one of `count` effects that are tested together.
-
-    Columns are large, so later statistics compute them again instead of keeping them.
-    """
+    """Describe one of `count` effects that are tested together, without keeping its columns."""
     of_s, result, effect = scored.spectrum, scored.score, scored.family.effect
     s, largest, held_out = scored.information, scored.largest, scored.held_out
 
@@ -333,16 +317,9 @@ def _suspect(p: Linearisation, scored: _Scored, count: int) -> Suspect:
         return least_of_family(p, x, of_s, start, level, largest)
 
     return Suspect(
-        effect=effect.name,
-        coarse=effect.coarse,
-        score=result,
-        share=p.share(result.gain),
-        left_out=left_out,
-        explains=False,
-        needs=_implausible(p, scored),
-        detection=least,
-        most=largest,
-    )
+        effect.name, result, p.share(result.gain), left_out, explains=False, detection=least,
+        needs=_implausible(p, scored), most=largest, coarse=effect.coarse,
+    )  # fmt: skip
 
 
 def _left_out(p: Linearisation, families: Sequence[tuple[Floats, FamilyScore]]) -> list[HeldOut]:
@@ -396,20 +373,6 @@ def kept_by_step(p: Linearisation, family: EffectColumns, score: FamilyScore) ->
     return (fit.chi2 - exact) / max(fit.chi2 - linear, 1e-300)
 
 
-def kept(
-    p: Linearisation,
-    family: EffectColumns,
-    score: FamilyScore,
-    refit: Callable[[Fit, str], Fit | None],
-) -> float:
-    """Return the share of the promise that the step keeps, or a refit where the step keeps less."""
-    share = kept_by_step(p, family, score)
-    if share >= LEAST_KEPT:
-        return share
-    after = refit(p.fit, family.effect.name)
-    return share if after is None else max(share, kept_by_refit(p.fit, after, score))
-
-
 def through_load(effect: Effect) -> bool:
     """Whether an effect acts through loads or weights."""
     return effect.elastic or effect.load_change(np.zeros(len(effect.parameters))) is not None
@@ -455,11 +418,10 @@ def beyond_geometry(p: Linearisation, family: EffectColumns, geometry: Floats) -
 def added_variable(fit: Fit, suspect: Suspect) -> tuple[Floats, Floats] | None:
     """Return the points (K,) of the added-variable plot of a suspect: abscissa and ordinate, m.
 
-    With X the suspect's columns, projected off the fitted model, and s its estimated parameters,
-    c = X s is its contribution to each measurement (3-vectors, raw). The abscissa is |c|, the
-    ordinate the residual along c, both with the sign of c along the principal direction of all c.
-    If the suspect is right, the points lie on the line of slope 1. None where it explains nothing,
-    or cannot be added.
+    c = X s is the suspect's contribution to each measurement (3-vectors, raw), X its columns beside
+    the model and s its parameters. The abscissa is |c|, the ordinate the residual along c, both
+    with the sign of c along the principal direction of all c. If the suspect is right, the points
+    lie on the line of slope 1. None where it explains nothing, or cannot be added.
 
     Source: Cook and Weisberg, *Residuals and Influence in Regression*, 1982.
     """

@@ -1,10 +1,9 @@
 """The statistics of a fit that a judgement needs, each computed once, on first use.
 
-Alternatives. Refits without an effect and with others in its place take seconds to minutes on a
-large campaign, and the others hardly ever explain as much. So the effect is eliminated, and the
-others enter by forward selection, both by algebra (`regression.forward_selection`). An effect that
-was added in place of one found later is often redundant: its F-test against the model without it,
-at the same linearisation, is not significant.
+Alternatives. Refits take seconds to minutes on a large campaign, so an effect is eliminated, and
+others enter by forward selection, by algebra (`regression.forward_selection`). An effect that was
+added in place of one found later is often redundant: its F-test against the model without it, at
+the same linearisation, is not significant.
 
 Separability. Suppose suspect A with the estimated parameters β is the cause. It adds βᵀ S_A β to
 the whitened sum of squares beside the fitted model, S_A the information on A. When suspect B is
@@ -17,27 +16,22 @@ beyond B, as in planning. k times as many readings like these give k λ, and sep
 k λ reaches `NEEDED`.
 
 Sufficiency. An effect outside the catalogue resembles effects of the catalogue: a base that sways
-with the air temperature looks like a drifting tracker. The best suspect then explains a good part
-of the misfit, passes every test, and is wrong. So all significant effects enter the model, one
-after the other, by algebra. If the residual is then noise, the catalogue is sufficient. Otherwise
-the linearisation may be too coarse: the best effect is added by a refit, and the selection is
-repeated. The catalogue is insufficient if a residual remains after two refits, and repeats or a
-generic regression show that it is not noise.
+with the air temperature looks like a drifting tracker. The best suspect then passes every test, and
+is wrong. So all significant effects enter the model, one after the other, by algebra. If more than
+noise is left, the linearisation may be too coarse: the best effect is added by a refit, and the
+selection is repeated. The catalogue is insufficient if a residual remains after two refits, and
+repeats or a generic regression show that it is not noise.
 """
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import takewhile
 
 import numpy as np
 from scipy.stats import chi2
 
-from hilcal.diagnosis.background_evidence import (
-    TOGETHER,
-    BackgroundEffect,
-    background_evidence,
-    p_value_of_others,
-)
+from hilcal.diagnosis.background_evidence import BackgroundEffect, background_evidence
 from hilcal.diagnosis.effect_ranking import (
     FALSE_ALARM,
     SAME_EVIDENCE,
@@ -74,8 +68,14 @@ from hilcal.identification.linearisation import (
 )
 from hilcal.readings.readings import ArmScatter
 from hilcal.regression.evidence import FamilyScore
-from hilcal.regression.forward_selection import families_beside, forward_selection
+from hilcal.regression.forward_selection import (
+    Addition,
+    CandidateFamilies,
+    families_beside,
+    forward_selection,
+)
 from hilcal.regression.schur import schur_complement
+from hilcal.types import Floats
 
 MOST_INSTEAD = 3  # effects that are tried together in place of one; a choice
 PRICE = 1.0
@@ -198,58 +198,26 @@ class Insufficiency:
 
 
 def whole_catalogue(fit: Fit) -> tuple[tuple[str, ...], float, float]:
-    """Add all significant effects by algebra; return their names, ‖r‖² and its degrees of freedom.
-
-    The effect of largest evidence comes first.
-    """
-    linear = linearise(fit)
-    x, columns, most = catalogue_columns(fit)
-    information = linear.information(x)
-    families = families_beside(information, linear.residual, fit.dof, x, columns, most)
-    tested = max(len(families.columns), 1)
-    added: list[str] = []
-    for step in forward_selection(families, MOST_TOGETHER):
-        if step.score.log_evidence <= 0 or step.score.p_value * tested >= FALSE_ALARM:
-            break
-        added.append(step.name)
-        families = step.after
-    return tuple(added), families.rss, max(families.dof - families.spent, 1.0)
+    """Add all significant effects by algebra; return their names, best first, ‖r‖² and dof."""
+    families = beside_catalogue(fit, *catalogue_columns(fit))
+    steps = significant(families)
+    last = steps[-1].after if steps else families
+    return tuple(s.name for s in steps), last.rss, max(last.dof - last.spent, 1.0)
 
 
-def insufficiency(
-    fit: Fit,
-    refit: Callable[[Fit, str], Fit | None],
-    say: Callable[[str], None] = lambda text: None,
-    regressions: Regressions | None = None,
-) -> Insufficiency | None:
-    """Return the misfit that the whole catalogue leaves; None if it is noise."""
-    current, names = fit, list[str]()
-    misfit = fit.chi2 - fit.dof
-    while True:
-        effects, square, dof = whole_catalogue(current)
-        is_noise = float(chi2.sf(square, dof)) >= MISFIT_ALARM
-        if is_noise or square - dof < LEAST_REMAINDER * misfit:
-            return None
-        if not effects or len(names) == MOST_REFITS:
-            break
-        say(f"testing the whole catalogue: adding {effects[0]}")
-        larger = refit(current, effects[0])
-        if larger is None:
-            break
-        current = larger
-        names.append(effects[0])
-    regression = (regressions or Regressions()).of(linearise(current))
-    noise = judge_noise(current, pure_error(current), regression.share > PREDICTABLE)
-    if noise.misjudged or not noise.off:
-        return None
-    return Insufficiency(
-        effects=(*names, *effects),
-        refitted=len(names),
-        share=(square - dof) / misfit,
-        variance_factor=square / dof,
-        dependences=regression.dependences,
-        noise=noise,
-    )
+def beside_catalogue(
+    fit: Fit, x: Floats, columns: dict[str, slice], most: dict[str, float]
+) -> CandidateFamilies:
+    """Return the effects of `catalogue_columns` beside a fit."""
+    p = linearise(fit)
+    return families_beside(p.information(x), p.residual, fit.dof, x, columns, most)
+
+
+def significant(families: CandidateFamilies) -> list[Addition]:
+    """Return the additions that are significant, each beside the previous ones."""
+    level = FALSE_ALARM / max(len(families.columns), 1)
+    steps = forward_selection(families, MOST_TOGETHER)
+    return list(takewhile(lambda s: s.score.log_evidence > 0 and s.score.p_value < level, steps))
 
 
 class Evidence:
@@ -263,11 +231,7 @@ class Evidence:
         regressions: Regressions | None = None,  # cache
         background: tuple[BackgroundEffect, ...] | None = None,  # if tested already
     ) -> None:
-        """Take a fit.
-
-        Raises:
-            InputError: for a fit whose residual is not whitened.
-        """
+        """Take a fit; raises InputError for one whose residual is not whitened."""
         if fit.scaling != "gc":
             raise InputError(f"diagnosis needs scaling gc, this fit has {fit.scaling}")
         self.fit, self._refit, self._say = fit, refit, say
@@ -301,11 +265,6 @@ class Evidence:
     def background(self) -> tuple[BackgroundEffect, ...]:
         """The effects of the model's background, each tested beside all others."""
         return background_evidence(self.fit) if self._background is None else self._background
-
-    @cached_property
-    def background_proved(self) -> bool:
-        """Whether the readings prove the effects of the background together."""
-        return bool(self.background) and p_value_of_others(self.fit) <= TOGETHER
 
     @cached_property
     def misfit_breakdown(self) -> tuple[MisfitShare, ...]:
@@ -342,9 +301,8 @@ class Evidence:
     def by_arrivals(self) -> "Evidence | None":
         """The evidence with the arm's estimated scatter in the covariance; None if not needed.
 
-        The arm's scatter displaces all targets that are read in one arrival together. Where
-        nothing states the scatter, tests that treat these readings as independent would find
-        causes in chance.
+        The arm's scatter displaces all targets of one arrival together. Tests that treat these
+        readings as independent would find causes in chance.
         """
         readings, model = self.fit.readings, self.fit.model
         in_covariance = readings.scatter_stated or readings.arm_scatter is not None
@@ -364,7 +322,32 @@ class Evidence:
     @cached_property
     def insufficiency(self) -> Insufficiency | None:
         """The misfit that all effects of the catalogue together leave; None if it is noise."""
-        return insufficiency(self.fit, self._refit, self._say, self._regressions)
+        current, names, misfit = self.fit, list[str](), self.fit.chi2 - self.fit.dof
+        while True:
+            effects, square, dof = whole_catalogue(current)
+            is_noise = float(chi2.sf(square, dof)) >= MISFIT_ALARM
+            if is_noise or square - dof < LEAST_REMAINDER * misfit:
+                return None
+            if not effects or len(names) == MOST_REFITS:
+                break
+            self._say(f"testing the whole catalogue: adding {effects[0]}")
+            larger = self._refit(current, effects[0])
+            if larger is None:
+                break
+            current = larger
+            names.append(effects[0])
+        regression = self._regressions.of(linearise(current))
+        noise = judge_noise(current, pure_error(current), regression.share > PREDICTABLE)
+        if noise.misjudged or not noise.off:
+            return None
+        return Insufficiency(
+            effects=(*names, *effects),
+            refitted=len(names),
+            share=(square - dof) / misfit,
+            variance_factor=square / dof,
+            dependences=regression.dependences,
+            noise=noise,
+        )
 
     def tree_share(self, beyond: float) -> float:
         """Return the share of the misfit that trees predict; see `residual_regression`."""
@@ -385,8 +368,8 @@ class Evidence:
 def backward_elimination(fit: Fit) -> dict[str, FamilyScore]:
     """Return the redundant effects, each scored against the model without it; weakest first.
 
-    Effects with a carried prior are judged by `spoken_against`, since other readings support them;
-    random effects of a model with a background are judged by `background_evidence`.
+    Effects with a carried prior are left to `spoken_against`, those of a background to
+    `background_evidence`.
     """
     carried = fit.solution.space.carried(fit.model.size)
     random = fit.model.random if fit.model.background else ()
@@ -404,11 +387,7 @@ def backward_elimination(fit: Fit) -> dict[str, FamilyScore]:
 
 
 def spoken_against(fit: Fit) -> tuple[str, ...]:
-    """Return effects of a carried prior that the new readings contradict, the strongest first.
-
-    At odds of 20 : 1 the readings, for instance after a repair, are likelier without the effect
-    than with the carried prior of its parameters.
-    """
+    """Return effects whose carried prior the new readings contradict at 20 : 1, strongest first."""
     names = carried_effects(fit.model) if fit.scaling == "gc" else ()
     evidence = evidence_of_carried(fit.model, fit.solution, fit.whitening, names) if names else {}
     against = [n for n in evidence if evidence[n] < -SAME_EVIDENCE]

@@ -47,6 +47,26 @@ class _FittedModel:
         covariance = jacobian @ self.covariance @ jacobian.T
         return error, covariance, predicted.observation.axes[0]
 
+    def live_residual(self, last: Readings) -> LiveResidual:
+        """Compare one reading with the model."""
+        error, predicted, axes = self.compared(last)
+        covariance = predicted + last.covariance[0]
+        live = LiveResidual(
+            float(np.linalg.norm(error[:3])),
+            float(np.sqrt(mahalanobis2(error[None], covariance[None])[0] / last.m)),
+            bool(np.trace(predicted[:3, :3]) > np.trace(last.covariance[0, :3, :3])),
+            vector=tuple((axes.T @ error[:3]).tolist()),
+            covariance=tuple((axes.T @ covariance[:3, :3] @ axes).ravel().tolist()),
+        )
+        s = last.states
+        if not np.any(s.wrench):
+            return live
+        unloaded = replace(last, states=replace(s, wrench=np.zeros_like(s.wrench)))
+        deflection, predicted, _ = self.compared(unloaded)
+        std = float(np.sqrt(self.rms**2 + np.trace(predicted[:3, :3])))
+        size = float(np.linalg.norm(deflection[:3]))
+        return replace(live, deflection=size, deflection_std=std)
+
 
 class LiveModel:
     """Predicts each reading from those before it, by the frames and joint compliance.
@@ -64,14 +84,12 @@ class LiveModel:
         self._fitted: _FittedModel | None = None
 
     def __call__(self, readings: Readings) -> LiveResidual:
-        """Compare the last reading with the previous ones; empty while these are too few.
-
-        sigma is sqrt(rᵀ (V + J C Jᵀ)⁻¹ r / m): about 1 where the model is right.
-        """
+        """Compare the last reading with the previous ones; empty while these are too few."""
+        # sigma is sqrt(rᵀ (V + J C Jᵀ)⁻¹ r / m): about 1 where the model is right.
         readings = with_joint_scatter(self._cell, readings, self._scatter)
         try:
             fitted = self._refitted(readings[:-1])
-            return LiveResidual() if fitted is None else _live_residual(fitted, readings[-1:])
+            return LiveResidual() if fitted is None else fitted.live_residual(readings[-1:])
         except HilcalError:
             return LiveResidual()
 
@@ -94,25 +112,3 @@ class LiveModel:
             root = inverse_root(a.T @ a + np.eye(model.size)) * scale
             self._fitted = _FittedModel(model, solution.theta, root.T @ root, rms, count, loaded)
         return self._fitted
-
-
-def _live_residual(fitted: _FittedModel, last: Readings) -> LiveResidual:
-    """Compare one reading with a fitted model."""
-    error, predicted, axes = fitted.compared(last)
-    covariance = predicted + last.covariance[0]
-    live = LiveResidual(
-        float(np.linalg.norm(error[:3])),
-        float(np.sqrt(mahalanobis2(error[None], covariance[None])[0] / last.m)),
-        bool(np.trace(predicted[:3, :3]) > np.trace(last.covariance[0, :3, :3])),
-        vector=tuple((axes.T @ error[:3]).tolist()),
-        covariance=tuple((axes.T @ covariance[:3, :3] @ axes).ravel().tolist()),
-    )
-    if not np.any(last.states.wrench):
-        return live
-    unloaded = replace(last, states=replace(last.states, wrench=np.zeros_like(last.states.wrench)))
-    deflection, predicted, _ = fitted.compared(unloaded)
-    return replace(
-        live,
-        deflection=float(np.linalg.norm(deflection[:3])),
-        deflection_std=float(np.sqrt(fitted.rms**2 + np.trace(predicted[:3, :3]))),
-    )

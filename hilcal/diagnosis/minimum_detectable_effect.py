@@ -5,12 +5,12 @@ F-test (see `regression.evidence`). The stated strength is the t at which the te
 naming an effect, has the power `POWER` for a typical direction β: the median over random
 directions. The same strength at the tool is the rms displacement of the measured target.
 
-The F-test alone is no measure for a family of many parameters. It rejects the null hypothesis
-before any pose predicts another. If the poses resolve only a part of the family, as of the waves
-of a transmission error, only that part is scored. So campaigns are simulated by algebra, at the
-linearisation of the fit: parameters β ~ N(0, t² 1) of the family, noise of the size found, and
-every test that a suspect must pass, poses left out included. The stated size is the smallest on a
-grid at which nine draws in ten pass; the size for the family at its finest is stated as well.
+The F-test alone is no measure for a family of many parameters: it rejects the null hypothesis
+before any pose predicts another. So campaigns are simulated by algebra, at the linearisation of the
+fit: parameters β ~ N(0, t² 1) of the family, noise of the size found, and every test that a suspect
+must pass, poses left out included. The stated size is the smallest on a grid at which nine draws in
+ten pass. If the poses resolve only a part of the family, as of the waves of a transmission error,
+the size for the family at its finest is stated as well.
 """
 
 from dataclasses import dataclass, replace
@@ -57,6 +57,20 @@ class Strength:
         """Whether any strength would be revealed."""
         return bool(np.isfinite(self.displacement_m))
 
+    def to_dict(self) -> dict[str, object] | None:
+        """Return it as JSON, SI; None where no strength would be revealed."""
+        if not self.visible:
+            return None
+        finer = None
+        if self.finest_m is not None:
+            visible = bool(np.isfinite(self.finest_m))
+            finer = {"visible": visible, "displacement_m": self.finest_m if visible else None}
+        return {
+            "displacement_m": self.displacement_m,
+            "parameters": [{"unit": unit, "rms": rms} for unit, rms in self.parameters],
+            "finer_than_poses": finer,
+        }
+
 
 def least_strength(
     s: Floats,  # (P, P) information Xᵀ M X of the family in ordinary magnitudes
@@ -100,10 +114,7 @@ def least_of_family(
     level: float,  # of the test, between 0 and 1
     largest: float,  # largest plausible strength
 ) -> Strength:
-    """Return the smallest strength of a family that all tests would reveal.
-
-    For a family that is small against the degrees of freedom, the F-test alone decides.
-    """
+    """Return the smallest strength that all tests would reveal; of small families the F-test."""
     if not start.visible or s.rank <= LARGE_FAMILY * p.fit.dof:
         return start
     fine = family.effect.fine(p.fit.readings[~p.fit.outlier].states)
@@ -148,10 +159,8 @@ class SuspectTests:
         return FamilyFolds(p.folds, p.projection), FamilyFolds(p.folds, p.projection, x)
 
     def passed(self, y: Floats, enough: float = 0.0) -> list[bool]:
-        """Whether each of K simulated residuals y (R, K) would reveal the family.
-
-        Once a share of `enough` is out of reach, the remaining residuals count as failed.
-        """
+        """Whether each of K simulated residuals y (R, K) would reveal the family."""
+        # Once a share of `enough` is out of reach, the remaining residuals count as failed.
         p = self.p
         r = p.project_out(y)
         g, rss = self.family.white.T @ r, np.sum(r * y, axis=0)

@@ -2,9 +2,9 @@
 
 For a variable x, a generic family tests whether any joint angle, or the target's position, has an
 error that is a smooth function of x: its columns are φ_k(x) times the motion of each joint and of
-the target along each base axis. With several targets, "target" tests whether one of them is
-displaced on the flange. The family is scored like a suspect, so its p-value is exact; its share is
-the part of the misfit that it predicts on poses left out. It names no cause.
+the target along each base axis; "target" tests whether one of several targets is displaced. The
+family is scored like a suspect, so its p-value is exact; its share is the part of the misfit that
+it predicts on poses left out. It names no cause.
 
 Constants of each pose, three displacements of the target, are columns C, whitened and orthonormal;
 each has rows in one pose alone. Beside the model they are M C, with M = 1 − Q Qᵀ (see
@@ -95,8 +95,19 @@ def misfit_breakdown(p: Linearisation) -> tuple[MisfitShare, ...]:
             yield "target", 1e-3 * _times(moves.by_target()[w.reading, :, :3], member)
 
     columns = ((n, w.whiten(raw).reshape(-1, raw.shape[2])) for n, raw in raw_columns())
-    out = [share for batch in _batches(columns) for share in _shares(p, batch)]
-    out += [*_poses(p), *_axes(p)]
+    out: list[MisfitShare] = []
+    for batch in _batches(columns):
+        products = p.products(x for _, x in batch)
+        scores = [p.score(x, p.information(xs)) for (_, x), xs in zip(batch, products, strict=True)]
+        held_out = p.held_out(list(zip(products, scores, strict=True)))
+        for (name, _), score, h in zip(batch, scores, held_out, strict=True):
+            out.append(MisfitShare(name, max(h.share, 0.0), score.p_value))
+    # A pose left out cannot predict itself, so its share is in-sample, less the part that as many
+    # columns explain by chance.
+    if (c := pose_constants(p)) is not None:
+        within = max((p.rss - c.gain) / (fit.dof - c.rank), 1e-300)
+        out.append(MisfitShare("pose", p.share(c.gain - c.rank * within), c.p_value))
+    out += _axes(p)
     return tuple(sorted(out, key=lambda v: (-v.share, v.p_value)))
 
 
@@ -110,17 +121,6 @@ def _batches(columns: Iterable[_Named]) -> Iterator[list[_Named]]:
         batch.append((name, x))
     if batch:
         yield batch
-
-
-def _shares(p: Linearisation, batch: list[_Named]) -> list[MisfitShare]:
-    """Score named columns (R, F)."""
-    products = p.products(x for _, x in batch)
-    scores = [p.score(x, p.information(xs)) for (_, x), xs in zip(batch, products, strict=True)]
-    held_out = p.held_out(list(zip(products, scores, strict=True)))
-    return [
-        MisfitShare(name, max(h.share, 0.0), score.p_value)
-        for (name, _), score, h in zip(batch, scores, held_out, strict=True)
-    ]
 
 
 def _times(motions: Floats, basis: Floats) -> Floats:
@@ -157,19 +157,6 @@ def _powers(x: Floats, centre: float | None = None) -> Floats:
     return np.asarray(scaled[:, None] ** np.arange(1, POLYNOMIAL + 1))
 
 
-def _poses(p: Linearisation) -> list[MisfitShare]:
-    """Share of the misfit that is common to all readings of a pose, where poses have several.
-
-    A pose left out cannot predict itself, so the share is in-sample, less the part that as many
-    columns explain by chance.
-    """
-    c = pose_constants(p)
-    if c is None:
-        return []
-    within = max((p.rss - c.gain) / (p.fit.dof - c.rank), 1e-300)
-    return [MisfitShare("pose", p.share(c.gain - c.rank * within), c.p_value)]
-
-
 def _axes(p: Linearisation) -> list[MisfitShare]:
     """Directions: towards the base axis, around it, and up."""
     fit, w = p.fit, p.fit.whitening
@@ -182,12 +169,9 @@ def _axes(p: Linearisation) -> list[MisfitShare]:
     up = np.tile([0.0, 0.0, 1.0], (len(x), 1))
     radial = np.stack([x[:, 0] / across, x[:, 1] / across, 0 * across], axis=1)
     count = len(fit.raw)
+    directions = {"radial": radial, "tangential": np.cross(up, radial), "vertical": up}
     square = {}
-    for name, direction in (
-        ("radial", radial),
-        ("tangential", np.cross(up, radial)),
-        ("vertical", up),
-    ):
+    for name, direction in directions.items():
         e = np.einsum("dij,dj->di", o.axes[w.reading], direction)
         r = np.sum(e * fit.raw[:, :3], axis=1)
         v = np.einsum("di,dij,dj->d", e, w.covariance[:, :3, :3], e)
@@ -195,10 +179,8 @@ def _axes(p: Linearisation) -> list[MisfitShare]:
     total = sum(max(value - count, 0.0) for value in square.values())
     least = max(total, 3 * np.sqrt(6 * count))
     return [
-        MisfitShare(
-            f"direction {name}", max(value - count, 0.0) / least, float(chi2.sf(value, count))
-        )
-        for name, value in square.items()
+        MisfitShare(f"direction {n}", max(x - count, 0.0) / least, float(chi2.sf(x, count)))
+        for n, x in square.items()
     ]
 
 

@@ -20,12 +20,10 @@ which does not depend on a common factor. Its null distribution, and that of T f
 T / E[T] of the direction, come from simulated contrasts, the same for all directions.
 
 Effects are judged against the actual scatter (F-tests), so a wrong overall size of the noise names
-no effect, but makes χ² too large or too small:
-
-- too small: no model makes residuals smaller than the noise; the stated noise is too large;
-- too large, and repeats scatter as much: the stated noise is too small;
-- too large, and repeats scatter less: the model misses something;
-- too large, with too few repeats: the noise is blamed only where nothing predicts the residual.
+no effect, but makes χ² too large or too small. If it is too small, the stated noise is too large,
+since no model makes residuals smaller than the noise. If it is too large, and repeats scatter as
+much, the stated noise is too small; if they scatter less, the model misses something; with too few
+repeats the noise is blamed only where nothing predicts the residual (see `NoiseReason`).
 """
 
 from dataclasses import dataclass, replace
@@ -43,6 +41,7 @@ from hilcal.readings.readings import ArmScatter, Readings
 from hilcal.readings.whitening import Bucket, Whitening, whitening
 from hilcal.regression.connected import connected, groups_within
 from hilcal.robot.arm import Arm
+from hilcal.store.codec import encode
 from hilcal.types import Floats, Ints
 
 SAME_ANGLE = 1e-6  # commanded joints of repeats agree within this, rad
@@ -102,6 +101,18 @@ class PureError:
     dof: int  # its degrees of freedom
     lack_of_fit_p: float  # p-value of the rest of χ², against pure error
     where: NoiseWhere | None = None  # None where the factor is the same in all directions
+
+    def to_dict(self) -> dict[str, object]:
+        """Return it as JSON."""
+        where = encode(self.where) or {}
+        where = {"variance_factor" if k == "factor" else k: v for k, v in where.items()} or None
+        return {
+            "variance_factor": self.factor,
+            "interval": list(self.interval),
+            "dof": self.dof,
+            "lack_of_fit_p": self.lack_of_fit_p,
+            "where": where,
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,20 +179,25 @@ def pure_error(fit: Fit) -> PureError | None:
     lack_dof, p = fit.dof - c.dof, 1.0
     if lack_dof > 0 and pure > 0:
         p = float(f_distribution.sf((lack / lack_dof) / (pure / c.dof), lack_dof, c.dof))
-    off = [v for v in every_direction(fit, c) if v.p_value < CERTAIN and _is_wrong(v, c)]
+    # A direction is wrong itself if it is further off than all together, to the same side.
+    overall = max(pure / c.dof, 1e-300)
+    off = [
+        v
+        for v in every_direction(fit, c)
+        if v.p_value < CERTAIN
+        and (v.factor > overall) == (v.factor > 1)
+        and abs(np.log(max(v.factor, 1e-300))) > abs(np.log(overall))
+    ]
     where = min(off, key=lambda v: v.p_value, default=None)
     return PureError(pure / c.dof, variance_interval(pure, c.dof), c.dof, p, where)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RepeatGroup:
-    """Measurements with common classes of repeats, or with common unloaded readings.
-
-    Their contrasts are the complement of `explained`, whose basis is far smaller than theirs.
-    """
+    """Measurements with common classes of repeats, or with common unloaded readings."""
 
     rows: Ints  # (r,) whitened rows
-    explained: Floats  # (r, k) orthonormal columns, the span of W C
+    explained: Floats  # (r, k) orthonormal, the span of W C; contrasts are its complement
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -281,8 +297,7 @@ def _pooled(readings: Readings, kind: Ints) -> tuple[Readings, float]:
     return replace(readings, covariance=_class_mean(v, kind)), 1.0 / (1.0 - excess)
 
 
-Group = tuple[Ints, Bucket, int]
-"""Indices of the measurements of a group, their bucket, and the group's index in the bucket."""
+Group = tuple[Ints, Bucket, int]  # measurements of a group, their bucket, and its index in that
 
 
 def _blocks(w: Whitening, kind: Ints) -> tuple[RepeatGroup, ...]:
@@ -401,13 +416,6 @@ def every_direction(fit: Fit, c: Contrasts) -> list[NoiseWhere]:
             low, high = (factor * dof / float(chi2.isf(q, dof)) for q in (0.025, 0.975))
             out.append(NoiseWhere(kind, name, factor, (low, high), _p(t / square)))
     return [replace(v, p_value=min(v.p_value * len(out), 1.0)) for v in out]
-
-
-def _is_wrong(v: NoiseWhere, c: Contrasts) -> bool:
-    """Whether the direction itself is wrong, not only the other directions."""
-    overall = float(c.y @ c.y) / c.dof / c.bias
-    size = abs(np.log(max(v.factor, 1e-300)))
-    return bool((v.factor > overall) == (v.factor > 1) and size > abs(np.log(max(overall, 1e-300))))
 
 
 def _p(ratio: Floats) -> float:

@@ -1,17 +1,15 @@
 """A misfit that depends on the pose alone, its possible effects, and the poses to identify them.
 
-With few poses a fine transmission error shows no pattern: every pose has an error of its own, and
-no pose predicts another. But all readings of a pose have the same error under every load. So the
-missing effect depends on the pose, and on nothing else that changed within a pose.
+With few poses a fine transmission error shows no pattern: no pose predicts another. But all
+readings of a pose have the same error under every load: the missing effect depends on the pose.
 
 The residual is split by constants of each pose, three displacements of the target. If they explain
 nearly all of the misfit and leave noise, those effects are listed whose columns are such constants
 to nearly all of their square. The parameters of a family can be separated once the poses measure
 about as many elements as the family has parameters. The proposed number of further poses is the
 smallest of `SHARES` at which the first of these effects, as large as the misfit, would pass every
-test of a suspect with the probability `SURE`. To that end campaigns are simulated by algebra, at
-the linearisation of the fit: the readings so far, and unloaded readings at further poses within the
-range of the joints so far; parameters drawn with the size found; noise; all tests.
+test of a suspect with the probability `SURE`, in campaigns simulated by algebra at the
+linearisation of the fit: with further unloaded readings within the range of the joints so far.
 """
 
 from collections.abc import Iterator, Sequence

@@ -1,4 +1,8 @@
-"""Recorded variables of the state, smooth functions of them, and motions of the target."""
+"""Recorded variables of the state, smooth functions of them, and what picked readings share.
+
+A difference of picked readings from the others is a description, no test: readings that somebody
+picked for their errors, or for their pose, are no random sample, so a p-value would be meaningless.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -6,10 +10,11 @@ from itertools import combinations
 
 import numpy as np
 
-from hilcal.identification.linearisation import Linearisation
+from hilcal.identification.fit import Fit
+from hilcal.identification.linearisation import Linearisation, linearise
 from hilcal.model.observe import motion
 from hilcal.readings.readings import angle_name, travel_name
-from hilcal.types import Floats, Ints
+from hilcal.types import Bools, Floats, Ints
 
 ROW_ORDER = "row order"
 """Replaces the time where the readings do not state it, so that a drift shows."""
@@ -65,6 +70,7 @@ class StateVariable:
     kind: str  # "angle", "travel", "torque", "approach" or "other"
     values: Floats  # (N,)
     joint: int = 0  # index of the joint, if the variable belongs to one
+    labels: tuple[str, ...] = ()  # names of the values 0, 1, ... where they are not numbers
 
 
 def state_variables(p: Linearisation) -> Iterator[StateVariable]:
@@ -173,3 +179,65 @@ def bins_of(v: RecordedVariable) -> tuple[Floats, Floats]:
     filled = np.unique(index)
     bins = np.searchsorted(filled, index)
     return bins.astype(float), np.array([v.values[bins == k].mean() for k in range(len(filled))])
+
+
+CLEAR = 0.85
+"""Probability from which a difference is clear: that a random picked reading has a larger (or a
+smaller) value than a random one of the others. A choice."""
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """How the picked readings differ from the others in one variable."""
+
+    variable: str  # e.g. "joint 2 torque"; "load 5 kg" for one of several names
+    unit: str  # SI; "" for a share
+    picked: float  # median of the picked readings, or the share of that name among them
+    others: float  # the same of the others
+    larger: float  # probability that a picked reading has the larger value, ties counted half
+
+    @property
+    def clear(self) -> bool:
+        """Whether the difference is worth naming, see `CLEAR`."""
+        return max(self.larger, 1 - self.larger) >= CLEAR
+
+
+def recorded_values(fit: Fit) -> tuple[StateVariable, ...]:
+    """Return variables (N,) of all readings that vary, load and place too; NaN for outliers."""
+    used, readings = ~fit.outlier, fit.readings[~fit.outlier]
+    target = fit.solution.prediction.observation.base_position
+    varying = list(state_variables(linearise(fit)))
+    loads = np.unique(readings.load)
+    if len(loads) > 1:
+        names = tuple(readings.load_names[k] for k in loads)
+        index = np.searchsorted(loads, readings.load).astype(float)
+        varying.append(StateVariable("load", "", "other", index, labels=names))
+    across = np.hypot(target[:, 0], target[:, 1])
+    varying.append(StateVariable("distance from the base axis", "m", "other", across))
+    varying.append(StateVariable("height above the base", "m", "other", target[:, 2]))
+    of_all = np.full((len(varying), len(used)), np.nan)
+    of_all[:, used] = [v.values for v in varying]
+    return tuple(replace(v, values=x) for v, x in zip(varying, of_all, strict=True))
+
+
+def distinguish(fit: Fit, picked: Bools) -> tuple[Difference, ...]:
+    """Compare picked measurements (N,) with the others in every variable; clearest first."""
+    from scipy.stats import rankdata  # slow to import
+
+    measured = np.zeros(len(picked), dtype=bool)
+    measured[np.flatnonzero(~fit.outlier)[fit.whitening.reading]] = True
+    inside, outside = picked & measured, ~picked & measured
+    if not (inside.any() and outside.any()):
+        return ()
+    differences = []
+    for v in recorded_values(fit):
+        members = [
+            (f"{v.name} {name}", (v.values == k).astype(float)) for k, name in enumerate(v.labels)
+        ]
+        middle = np.mean if members else np.median
+        for name, x in members or [(v.name, v.values)]:
+            a, b = x[inside], x[outside]
+            ranks = rankdata(np.concatenate([a, b]))[: len(a)]
+            larger = float((ranks.sum() - len(a) * (len(a) + 1) / 2) / (len(a) * len(b)))
+            differences.append(Difference(name, v.unit, float(middle(a)), float(middle(b)), larger))
+    return tuple(sorted(differences, key=lambda d: -abs(d.larger - 0.5)))

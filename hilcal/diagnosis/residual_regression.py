@@ -18,10 +18,9 @@ left out of its training, the mean over all pairs of trees
 
     L = Σ_{s≠t} e_s·e_t / (T (T − 1))
 
-estimates the squared error of the infinitely large ensemble without bias; the square of the mean
-error, ‖ē‖², would be too large by the variance of a tree over T. So few trees suffice. Trees are
-added until the standard error of the share by the choice of trees (jackknife) is `PRECISE`, or
-until they surely predict no more than is predicted without them (Student's t, `NO_MORE`).
+estimates the squared error of the infinitely large ensemble without bias, so few trees suffice.
+Trees are added until the standard error of the share by the choice of trees (jackknife) is
+`PRECISE`, or until they surely predict no more than without them (Student's t, `NO_MORE`).
 
 Sources: Geurts, Ernst and Wehenkel, *Extremely randomized trees*, Machine Learning 63 (2006) 3-42,
 implementation of scikit-learn; Hoeffding, *A class of statistics with asymptotically normal
@@ -114,11 +113,7 @@ class ResidualRegression:
 
 
 class Regressions:
-    """Cached regressions of the residuals of fits.
-
-    A judgement regresses the residual of a trial fit, which is judged itself if it becomes the next
-    revision.
-    """
+    """Cached regressions of the residuals of fits: a trial fit may become the next revision."""
 
     def __init__(self) -> None:
         """Create an empty cache."""
@@ -152,8 +147,8 @@ class _Laws:
 
     def __init__(self, p: Linearisation, fold: Ints) -> None:
         self.variables, self.motions = law_variables(p), motions(p)
-        pairs = [(i, k) for i in range(len(self.variables)) for k in range(len(self.motions))]
-        self.variable, self.motion = (tuple(x) for x in zip(*pairs, strict=True))
+        index = np.indices((len(self.variables), len(self.motions))).reshape(2, -1)
+        self.variable, self.motion = index.tolist()
         self._p, self._fold = p, fold
         self._chosen: dict[int, Floats] = {}
         self.ridge = np.maximum(p.projection.ridge, LEAST_RIDGE)
@@ -319,9 +314,8 @@ def _least_squares(p: Linearisation, x: Floats) -> tuple[Floats, Floats]:
 def tree_share(p: Linearisation, beyond: float = 0.0) -> float:
     """Return the share of the misfit that trees predict on poses left out, within [0, 1].
 
-    Args:
-        beyond: share that is predicted without trees. A smaller share of trees is less precise; 0
-            where no more than `PREDICTABLE` remains beyond it.
+    A share below `beyond`, which is predicted without trees, is less precise; it is 0 where no more
+    than `PREDICTABLE` remains beyond it.
     """
     if beyond >= 1.0 - PREDICTABLE:
         return 0.0
@@ -334,8 +328,20 @@ def tree_share(p: Linearisation, beyond: float = 0.0) -> float:
     chosen = np.arange(len(target))
     if len(chosen) > MOST_MEASUREMENTS:
         chosen = np.random.default_rng(0).choice(chosen, MOST_MEASUREMENTS, replace=False)
+    s, situation = fit.readings[~fit.outlier].states[w.reading], fit.solution.prediction.situation
+    angle = situation.angle[w.reading]
+    order = np.flatnonzero(~fit.outlier).astype(float)[w.reading]
+    narrow = (order if s.time is None else s.time, s.load_time, s.air_temperature)
+    features = np.concatenate(  # everything recorded of the state of each measurement
+        [
+            *(angle, np.cos(angle), np.sin(angle), situation.torque[w.reading], s.wrench),
+            *(x[:, None] for x in narrow if x is not None),
+            *(x for x in (s.joint_temperature, s.approach) if x is not None),
+        ],
+        axis=1,
+    )
     fold, scale = random_folds(fit.pose, FOLDS)[chosen], p.rss / p.misfit()
-    share = predicted(_features(p)[chosen], target[chosen], fold, scale, beyond).share
+    share = predicted(features[chosen], target[chosen], fold, scale, beyond).share
     return float(np.clip(share, 0.0, 1.0))
 
 
@@ -388,31 +394,10 @@ def predicted(
 
 
 def _mean_of_pairs(products: Floats) -> tuple[float, float]:
-    """Mean product of the errors of two different trees, and its standard error by the jackknife.
-
-    `products` (T, T) are those of all pairs of trees, the same tree included.
-    """
+    """Mean product of two trees' errors, and its standard error (jackknife), from all (T, T)."""
     count = len(products)
     squares = np.diag(products)
     total = float(products.sum() - squares.sum())
     without = (total - 2 * (products.sum(axis=1) - squares)) / ((count - 1) * (count - 2))
     variance = (count - 1) / count * float(np.sum((without - without.mean()) ** 2))
     return total / (count * (count - 1)), float(np.sqrt(variance))
-
-
-def _features(p: Linearisation) -> Floats:
-    """(D, F) everything recorded of the state of each measurement."""
-    fit, reading = p.fit, p.fit.whitening.reading
-    s = fit.readings[~fit.outlier].states[reading]
-    situation = fit.solution.prediction.situation
-    angle = situation.angle[reading]
-    order = np.flatnonzero(~fit.outlier).astype(float)[reading]
-    narrow = (order if s.time is None else s.time, s.load_time, s.air_temperature)
-    return np.concatenate(
-        [
-            *(angle, np.cos(angle), np.sin(angle), situation.torque[reading], s.wrench),
-            *(x[:, None] for x in narrow if x is not None),
-            *(x for x in (s.joint_temperature, s.approach) if x is not None),
-        ],
-        axis=1,
-    )

@@ -18,13 +18,12 @@ of readings. K_f, scaled to a mean variance of 1, is the covariance of a rival:
 
 φ, τ and v_f maximise the restricted likelihood with σ² profiled out, so the tests do not depend on
 the stated size of the noise. The estimate assumes σ² = 1 unless the readings contradict it: little
-else distinguishes a long correlation of large noise from a short correlation of small noise.
+else distinguishes a long correlation of large noise from a short one of small noise. All this is
+computed only if the slope of ℓ by φ at white noise promises a gain, and no rival alone explains the
+readings far better: that rival should enter the model first.
 
-All this is computed only if the slope of ℓ by φ at white noise promises a gain, and no rival alone
-explains the readings far better: that rival should enter the model first.
-
-The serial noise is proved if it gains more than chance beside all rivals, or if it alone explains
-the readings better than all rivals by 20 : 1. If the rivals are better by 20 : 1, they explain the
+The serial noise is proved if it gains more than chance beside all rivals, or alone explains the
+readings better than all rivals by 20 : 1. If the rivals are better by 20 : 1, they explain the
 readings, as a drift does; otherwise the serial noise stays in doubt. Campaigns of more than
 `MOST_ROWS` are judged by some of their runs, those of more than `MOST_READINGS` not at all.
 
@@ -78,11 +77,7 @@ STARTS = (0.3, 0.8, 0.97)  # values of ρ from which the likelihood is maximised
 
 
 def with_serial_noise(white: Fit, prior: Floats | None = None) -> Fit:
-    """Return a fit with the correlation of its noise, if any, in the covariance.
-
-    `prior` are the prior standard deviations (P,) of the fit. A fit whose covariance has the
-    correlation stays as it is.
-    """
+    """Return a fit, with prior stds (P,), with the correlation of its noise in the covariance."""
     noise = serial_noise(white) if white.readings.serial is None else None
     if noise is None:
         return white
@@ -96,10 +91,7 @@ def with_serial_noise(white: Fit, prior: Floats | None = None) -> Fit:
 
 
 def serial_noise(white: Fit) -> SerialNoise | None:
-    """Estimate the serial noise of a gc-scaled fit with white noise; None where there is none.
-
-    `proved` is False where effects explain the readings as well as serial noise does.
-    """
+    """Estimate the serial noise of a gc-scaled fit with white noise; None where there is none."""
     if white.scaling != "gc" or not FEWEST <= len(white.raw) <= MOST_READINGS:
         return None
     by_order = _problem(white, "order")

@@ -34,10 +34,7 @@ def add(before: Fit, effect: str, options: Options | None = None) -> Fit:
 
 
 def trial(before: Fit, effect: str) -> Fit | None:
-    """Refit with one more effect, see `add`; None where the readings do not allow it.
-
-    They are too few to determine its parameters, or the arm has no equilibrium with it.
-    """
+    """Refit with one more effect, see `add`; None where the readings do not allow it."""
     try:
         return add(before, effect)
     except CannotAnswerError:

@@ -11,22 +11,21 @@ The rules, in this order:
 3. No suspect passes, and χ² is not too large: `adequate`; or `ambiguous` where another effect could
    replace an addition to the model.
 4. χ² is too large, and something recorded predicts a share of the misfit on poses left out, or
-   repeats of a pose have it in common: `unknown_effect`, with that share.
-   If instead no variable predicts the misfit on poses left out beyond chance, and the misfit is the
-   same under every load of a pose, more poses would identify it (see `pose_alone`): `ambiguous`.
+   repeats of a pose have it in common: `unknown_effect`, with that share. If no variable predicts
+   it beyond chance, and it is the same under every load of a pose, more poses would identify it
+   (see `pose_alone`): `ambiguous`.
 5. χ² is too large, the arm's own scatter is not in the stated covariance, and nothing predicts the
    residual (no suspect, no regression, no variable), or repeated readings scatter as much. The
    arm's scatter is then estimated (see `arm_scatter`), before rule 4:
    a. the readings prefer a noisier instrument at more than 20 : 1: `noise_misjudged`;
    b. the scatter is larger than the repeatability of any arm (see `noise`): `noise_misjudged`,
       whether the cause is the instrument, a loose arm or a loose target;
-   c. else `adequate`. The fit assumed an arm without scatter, which no arm is. If the readings do
-      not distinguish its scatter from a noisier instrument, the message says so and the verdict
-      stays.
+   c. else `adequate`: the fit assumed an arm without scatter, which no arm is. If the readings do
+      not distinguish it from a noisier instrument, the message says so.
    If a share of the misfit is predicted that is negligible in an uncertainty budget
    (`noise.PREDICTABLE`), c holds as well, with that share; rule 4 applies instead of a and b.
-6. Otherwise the stated noise is too small, or too large: `noise_misjudged` (see `noise`).
-   If the arm's repeatability is stated, the rule holds, too: the noise is then complete, and wrong.
+6. Otherwise the stated noise is too small, or too large: `noise_misjudged` (see `noise`). Where the
+   arm's repeatability is stated, too, the noise is complete, and wrong.
 
 Noise that was estimated from the readings (`Readings.noise_stated`) is too large where an effect
 outside the catalogue is missing, so χ² does not show the effect: rule 4 holds as well where laws
@@ -37,16 +36,15 @@ rules are applied to the fit with the estimated scatter in its covariance (see
 `Evidence.by_arrivals`), and 3 becomes 5b or 5c.
 
 The covariance of a judged fit includes a correlation of the noise along the order of the readings
-(see `serial_noise`). If the correlation is not proved, since effects explain the readings as well,
-3 and 5c become `ambiguous`.
+(see `serial_noise`). If it is not proved, since effects explain the readings as well, 3 and 5c
+become `ambiguous`.
 
-If the model has a background, its residual is noise of any size or the arm's scatter, and the
-readings prove the effects of the background together, then effects of the catalogue are present
-that the readings do not prove one by one: 3, 5 and 6 become `ambiguous`, the suspects are those of
-the background, and the size of the noise is stated.
+If the model has a background that the readings prove, but not effect by effect, 3, 5 and 6 become
+`ambiguous` where the residual is noise of any size or the arm's scatter: the suspects are the
+effects of the background, and the size of the noise is stated.
 
 A fit whose covariance includes the estimated scatter (`Readings.arm_scatter`) is judged by the same
-rules, but its residual may be smaller than its noise: the scatter is never negative, so instrument
+rules. Its residual may be smaller than its noise: the scatter is never negative, so instrument
 noise that is stated too large, in some elements, shows only then. The message says so.
 """
 
@@ -56,7 +54,12 @@ from dataclasses import replace
 import numpy as np
 
 from hilcal import limits
-from hilcal.diagnosis.background_evidence import BackgroundEffect, as_suspects
+from hilcal.diagnosis.background_evidence import (
+    TOGETHER,
+    BackgroundEffect,
+    as_suspects,
+    p_value_of_others,
+)
 from hilcal.diagnosis.diagnosis import Diagnosis, History, Reason
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE, ranked
 from hilcal.diagnosis.evidence import Evidence, Separability, separability
@@ -73,11 +76,8 @@ from hilcal.identification.fit import Fit
 NOTHING = History()
 IN_SAMPLE = ("pose", "direction")  # first words of variables whose share is of the fitted poses
 MOST_NAMED = 2  # variables that a sentence names
-BESIDE_A_BACKGROUND: tuple[Reason, ...] = (
-    "residual_is_noise", "inseparable_addition", "arm_scatter", "misjudged_noise",
-)  # fmt: skip
-"""Reasons that the reason "background" overrides where effects are proved together, not one by
-one."""
+BESIDE_A_BACKGROUND = ("residual_is_noise", "inseparable_addition", "arm_scatter")
+"""Reasons that "background" overrides where effects are proved together, not one by one."""
 SAME_IN_POSE = 0.5
 """Share of the misfit that all readings of a pose have in common, above which it is not the scatter
 of single arrivals; a choice."""
@@ -86,12 +86,7 @@ of single arrivals; a choice."""
 def diagnose(
     fit: Fit, history: History = NOTHING, say: Callable[[str], None] = lambda text: None
 ) -> Diagnosis:
-    """Judge a fit.
-
-    Args:
-        fit: the fit.
-        history: the changes that led to its model.
-        say: takes progress, one line each.
+    """Judge a fit, reached by the changes of `history`; `say` takes progress, one line each.
 
     Raises:
         InputError: for a fit whose residual is not whitened, or of too many readings.
@@ -202,8 +197,12 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
         noise = judge_noise(e.fit, e.pure_error, predictable)
         in_fit = readings.arm_scatter is not None
         little = noise.reason == "predictable" and max(predicted, *patterns, 0.0) <= PREDICTABLE
-        may = e.misfit and (noise.misjudged or little) and _may_scatter(e)
-        estimate = e.arm_scatter if may else None
+        same_in_pose = any(
+            v.variable == "pose" and v.share > SAME_IN_POSE and v.p_value < FALSE_ALARM
+            for v in e.misfit_breakdown
+        )
+        may = e.misfit and (noise.misjudged or little) and not in_fit and not same_in_pose
+        estimate = e.arm_scatter if may and not readings.scatter_stated else None
         by_arm = (
             estimate is not None
             and not instrument_instead(estimate)
@@ -226,8 +225,10 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
         serial = readings.serial
         if reason in ("residual_is_noise", "arm_scatter") and serial and not serial.proved:
             reason = "serial_or_effect"
-        overridden = reason in BESIDE_A_BACKGROUND and bool(e.background)
-        if overridden and (reason == "misjudged_noise" or e.background_proved):
+        if e.background and (
+            reason == "misjudged_noise"
+            or (reason in BESIDE_A_BACKGROUND and p_value_of_others(e.fit) <= TOGETHER)
+        ):
             reason, suspects = "background", (*as_suspects(e.background), *suspects)
     alone = None
     if reason in ("misjudged_noise", "no_suspect") and e.misfit and not _predicted(e, regression):
@@ -254,21 +255,8 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
     )
 
 
-def _may_scatter(e: Evidence) -> bool:
-    """Whether the misfit may be the arm's scatter: not stated, and not the same within a pose."""
-    same = any(
-        v.variable == "pose" and v.share > SAME_IN_POSE and v.p_value < FALSE_ALARM
-        for v in e.misfit_breakdown
-    )
-    readings = e.fit.readings
-    return not readings.scatter_stated and readings.arm_scatter is None and not same
-
-
 def _predicted(e: Evidence, regression: ResidualRegression) -> bool:
-    """Whether something recorded predicts the misfit on poses left out.
-
-    If every pose has an error of its own, n poses follow a variable by chance to a share of 1/√n.
-    """
+    """Whether something recorded predicts the misfit on poses left out, beyond chance."""
     shares = (v.share for v in e.misfit_breakdown if v.variable.split()[0] not in IN_SAMPLE)
     chance = 2.0 / np.sqrt(int(e.fit.pose.max()) + 1)
     return regression.share > PREDICTABLE or max(shares, default=0.0) > chance

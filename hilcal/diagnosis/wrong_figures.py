@@ -1,10 +1,10 @@
 """Wrong figures of the cell: a load's mass, the tool's mass or its centre of mass.
 
 They are tried before any effect is named: a factor of all wrenches of one load, a factor of the
-tool's mass, and a shift of its centre of mass. Gauss-Newton estimates the figure from the
-derivative of the readings by it, projected off the model; the model is refitted in every step. A
-figure is named if it explains nearly all of the misfit, is better than any effect of the catalogue
-by the Bayesian information criterion, and differs from the stated figure by more than rounding.
+tool's mass, and a shift of its centre of mass. Gauss-Newton estimates the figure beside the model,
+which is refitted in every step. A figure is named if it explains nearly all of the misfit, is
+better than any effect of the catalogue by the Bayesian information criterion, and differs from the
+stated figure by more than rounding.
 """
 
 from collections.abc import Iterator, Sequence
@@ -157,10 +157,7 @@ class _Figure:
 
 
 def wrong_figures(fit: Fit, suspects: Sequence[Suspect]) -> tuple[WrongFigure, ...]:
-    """Return the figures each of which alone explains the misfit, the best first.
-
-    A model with a background has none: they were tested before the background was fitted.
-    """
+    """Return the figures each of which alone explains the misfit; none beside a background."""
     if fit.model.background:
         return ()
     best = min((s.score.delta_bic for s in suspects if s.score.rank), default=0.0)

@@ -1,11 +1,9 @@
 """The amplitude of a law: a product of functions of recorded quantities.
 
-The complexity of a function of one quantity is that of its shape; a sum of joint angles as quantity
-adds 1. The complexity of a product is the sum of those of its factors.
-
-A function of a composed quantity u = Σ w_i φ_i is no sum of products: a hose that pulls beyond some
-length, which depends on two joints, is max(u − u0, 0) with u = cos q_5·cos q_6. f(u) depends on the
-transmitted wrenches W by the chain rule, ∂f/∂W = f'(u) Σ w_i ∂φ_i/∂W.
+The complexity of a product is the sum of those of its shapes; a sum of joint angles as quantity
+adds 1. A function of a composed quantity u = Σ w_i φ_i is no sum of products: a hose that pulls
+beyond some length, which depends on two joints, is max(u − u0, 0) with u = cos q_5·cos q_6. f(u)
+depends on the transmitted wrenches W by the chain rule, ∂f/∂W = f'(u) Σ w_i ∂φ_i/∂W.
 """
 
 from collections.abc import Callable, Iterator

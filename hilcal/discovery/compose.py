@@ -12,9 +12,8 @@ single-index model, one step of projection pursuit (Friedman and Stuetzle 1981, 
 The price of such a candidate is that of all arguments of its complexity and of the levels, and
 ½ ln ν for each weight and exponent.
 
-Each of the best candidates of the screening is also multiplied by every function of another
-quantity, up to the complexity `MOST`, and each of its free numbers is varied (`grown`). The price
-is that of all products of the same kind, or of the values that were tried.
+The best of the screening are also multiplied by every function of another quantity, and their free
+numbers are varied (`grown`), at the price of all products of the same kind, or values tried.
 """
 
 from __future__ import annotations
@@ -163,8 +162,7 @@ def _screened(candidates: CandidateTerms) -> list[_Bent]:
     odds = _better(
         candidates.evidence, slope, square, across, slope_one[:, None], square_one[:, None]
     )
-    cost = screen.grammar.cost[bends.argument]
-    price = screen.grammar.price_of_argument(cost)
+    price = screen.grammar.price_of_argument[screen.grammar.cost[bends.argument]]
     odds = odds - price
     out: dict[tuple[int, int], _Bent] = {}
     for index in np.argsort(-odds, axis=None)[: 20 * BEST].tolist():
@@ -223,10 +221,7 @@ def _extended(candidates: CandidateTerms, site: SiteSums, b: _Bent) -> list[_Ben
 
 
 def _gains(site: SiteSums, x: Floats) -> tuple[Floats, Floats]:
-    """Gain (P,) of each further row of X (2 + P, K) beside the first two, −inf if dependent.
-
-    Also (2, P) coefficients of the first row and of the further one, fitted together.
-    """
+    """Gain (P,) of each further row beside two, −inf if dependent; (2, P) first and last factor."""
     free = (x @ site.free).astype(float)
     slope = (x @ site.slope).astype(float)
     gram = free @ x.T.astype(float)[:, :2]
@@ -272,14 +267,15 @@ def _terms(candidates: CandidateTerms, site: SiteSums, b: _Bent) -> list[LawTerm
     screen = candidates.problem.screen
     price_of_number = 0.5 * float(np.log(candidates.dof))
     grid = float(np.log(len(QUANTILES) * len(b.numbers)))
-    sums = b.price - float(screen.grammar.price_of_argument(screen.grammar.cost[b.which[0]]))
+    grammar = screen.grammar
+    sums = b.price - float(grammar.price_of_argument[grammar.cost[b.which[0]]])
     variants = [(b, grid + sums)]
     if b.shape.name in POWERS:
         bent = replace(b, shape=POWERS[b.shape.name], numbers=(*b.numbers, 1.0))
         variants.append((bent, grid + sums + price_of_number))
     out = []
     for x, price in variants:
-        k = screen.grammar.index(_refined(candidates, site, x))
+        k = grammar.index(_refined(candidates, site, x))
         if k is None:
             continue
         out.append(candidates.term(((b.s, k),), price))
@@ -368,21 +364,18 @@ def _numbers(candidates: CandidateTerms, f: int) -> list[tuple[Amplitude, float]
     out = []
     for i, factor in enumerate(a.factors):
         for n in factor.shape.free:
-            values = _other_values(factor, n, grammar.read(factor.variable))
+            old = factor.numbers[n]
+            if n in factor.shape.places:
+                tried = np.quantile(grammar.read(factor.variable), QUANTILES).tolist()
+            else:
+                tried = [old * k for k in FACTORS]
+            values = sorted({float(f"{v:.2g}") for v in tried} - {old})
             price = float(np.log(len(values) + 1))
             for value in values:
                 numbers = (*factor.numbers[:n], value, *factor.numbers[n + 1 :])
                 varied = replace(factor, numbers=numbers)
                 out.append((Amplitude((*a.factors[:i], varied, *a.factors[i + 1 :])), price))
     return out
-
-
-def _other_values(factor: Factor, n: int, x: Floats) -> list[float]:
-    if n in factor.shape.places:
-        values = np.quantile(x, QUANTILES).tolist()
-    else:
-        values = [factor.numbers[n] * k for k in FACTORS]
-    return sorted({float(f"{v:.2g}") for v in values} - {factor.numbers[n]})
 
 
 def _best_terms(

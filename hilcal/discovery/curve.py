@@ -6,11 +6,10 @@ residual of the fit with the law, the partial residual of this reading is
 
     y = Σ_p θ_p f_p(x) + Tᵀ r / (TᵀT g),    std = 1 / (|T| |g|)
 
-Waves of high order are drawn over one period.
-
-For an effect from a file, written by `discover` or a user, the motion m of a site is drawn over a
-quantity x that its formula names, divided by another one g if the formula is a product. Of all such
-pairs (x, g) the one with the smoothest m/g over x is drawn (von Neumann's ratio).
+Waves of high order are drawn over one period. For an effect from a file the motion m of a site is
+drawn over a quantity x that its formula names, divided by another one g if the formula is a
+product. Of all such pairs (x, g) the one with the smoothest m/g over x is drawn (von Neumann's
+ratio).
 """
 
 import re
@@ -18,14 +17,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.discovery.amplitudes import Variable, variables
+from hilcal.discovery.amplitudes import Amplitude, Variable, variables
 from hilcal.discovery.grammar import HARMONICS
 from hilcal.discovery.law import Form, LawPart
 from hilcal.discovery.sites import ORDINARY, Place, Site, site_motions
 from hilcal.effects.force_sensor import sensor_error
 from hilcal.effects.protocol import Effect, Situation
 from hilcal.identification.fit import Fit
-from hilcal.types import Bools, Floats, Ints
+from hilcal.types import Floats, Ints
 
 MOST_CURVES = 3
 BINS = 12
@@ -50,7 +49,7 @@ class Curve:
     line: Floats  # (2, L) quantity and law
 
 
-def curves(after: Fit, form: Form, most: int = MOST_CURVES) -> tuple[Curve, ...]:
+def curves(after: Fit, form: Form) -> tuple[Curve, ...]:
     """Return the curves of a law, the last effect of a fit, most significant parts first."""
     rows = after.model.slices()[-1]
     theta, std = after.theta[rows], after.uncertainty.std[rows]
@@ -69,7 +68,7 @@ def curves(after: Fit, form: Form, most: int = MOST_CURVES) -> tuple[Curve, ...]
     sites, motion = site_motions(after)
     situation = after.solution.prediction.situation
     out = []
-    for (site, symbol, _), parts in list(groups.items())[:most]:
+    for (site, symbol, _), parts in list(groups.items())[:MOST_CURVES]:
         of_site = motion[:, :, sites.index(site)] / ORDINARY[site.unit]
         out.append(_curve(after, situation, of_site, parts, symbol, theta))
     return tuple(out)
@@ -80,12 +79,11 @@ def _curve(
 ) -> Curve:
     site, first = parts[0].site, parts[0]
     varying = [(p, f) for p in parts for f in p.amplitude.factors if f.variable.symbol == symbol]
-    cofactors = [f for f in first.amplitude.factors if f.variable.symbol != symbol]
+    others = Amplitude(tuple(f for f in first.amplitude.factors if f.variable.symbol != symbol))
     v = varying[0][1].variable
     orders = {f.numbers[0] if f.shape.name in ("cos", "sin") else 0.0 for _, f in varying}
     order = orders.pop() if len(orders) == 1 else 0.0
-    x = _folded(v.read(s), order)
-    divisor = np.prod([f.values(s) for f in cofactors], axis=0) if cofactors else np.ones(len(x))
+    x, divisor = _folded(v.read(s), order), others.values(s)
 
     def law(x: Floats) -> Floats:
         terms = [theta[p.coefficient] * f.shape.value(x, f.numbers) for p, f in varying]
@@ -96,29 +94,25 @@ def _curve(
     x, divisor = x[drawn], divisor[drawn]
     y, std = law(x) + deviation[drawn] / divisor, std[drawn] / np.abs(divisor)
     ends = np.linspace(float(x.min()), float(x.max()), LINE)
-    inner = "·".join(
-        f.shape.text(f.variable.symbol, [f"{n:g}" for n in f.numbers]) for f in cofactors
-    )
     ordinate, unit = site.symbol, site.unit
-    if cofactors:
+    if others.factors:
+        inner, divided = others.text(), others.unit()
         ordinate = f"{ordinate}/({inner})" if "·" in inner else f"{ordinate}/{inner}"
-        divided = type(first.amplitude)(tuple(cofactors)).unit()
         unit = unit if divided == "1" else f"{unit}/({divided})"
     return _over(site, ordinate, unit, v, order, x, y, std, np.vstack([ends, law(ends)]))
 
 
-def _usable(std: Floats, divisor: Floats) -> Bools:
-    """(N,) which readings determine a motion that is divided by the other factors."""
+def _usable(std: Floats, divisor: Floats) -> Ints:
+    """Indices of the readings that determine a motion that is divided by the other factors."""
     size = np.abs(divisor)
-    return np.asarray(np.isfinite(std) & (size > LEAST * float(size.max())))
+    return np.flatnonzero(np.isfinite(std) & (size > LEAST * float(size.max())))
 
 
-def _points(usable: Bools) -> Ints:
-    """Return which readings are drawn: all usable ones, or some at random."""
-    indices = np.flatnonzero(usable)
-    if len(indices) <= MOST_POINTS:
-        return indices
-    return np.random.default_rng(20261122).choice(indices, MOST_POINTS, replace=False)
+def _points(usable: Ints) -> Ints:
+    """Return which of the usable readings are drawn: all, or some at random."""
+    if len(usable) <= MOST_POINTS:
+        return usable
+    return np.random.default_rng(20261122).choice(usable, MOST_POINTS, replace=False)
 
 
 def _over(
@@ -237,7 +231,7 @@ def _drawn_curve(
 ) -> Curve:
     s = fit.solution.prediction.situation
     partial, std = partial_residuals(fit, motion)
-    candidates: list[tuple[float, int, Variable, Variable | None, Floats, Bools, Floats]] = []
+    candidates: list[tuple[float, int, Variable, Variable | None, Floats, Ints, Floats]] = []
     for v, g in axes:
         divisor = np.ones(len(law)) if g is None else g.read(s)
         usable = _usable(std, divisor)

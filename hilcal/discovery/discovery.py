@@ -2,17 +2,13 @@
 
 1. If the stated noise explains the residual, there is nothing to explain.
 2. All candidates are screened, and laws of one, two and three terms are chosen (`search`).
-3. Effects of the catalogue are added by algebra as long as they are significant, and refitted in
-   the exact model. If they explain the readings as well as the law in either, at odds of 20 : 1,
-   the answer is the catalogue, and no law is proposed; nor is a law that one of its effects
-   describes (`known_effects`).
+3. If effects of the catalogue explain the readings as well, at odds of 20 : 1, the answer is the
+   catalogue, and no law is proposed; nor is a law that an effect describes (`known_effects`).
 4. The search is repeated without each fold of poses. A law is proposed only if the laws of these
-   searches predict the poses left out.
+   searches predict the poses left out, which take no part in the choice of a law, nor in its
+   coefficients: the share of their misfit that it explains is valid for the whole procedure.
 5. Free numbers are refined, and the law is refitted as an effect in the exact model.
 6. A generic regression of the misfit estimates how much can be explained at all.
-
-The poses that are left out take no part in the choice of a law, nor in its coefficients. The share
-of their misfit that the law explains is therefore valid for the whole procedure.
 """
 
 from collections.abc import Callable, Hashable
@@ -33,7 +29,7 @@ from hilcal.discovery.refit import exact, refine
 from hilcal.discovery.screen import LawTerm, Screen, screen
 from hilcal.discovery.search import LEAST, Selection, search
 from hilcal.discovery.structures import Structure, averaged, pareto, structure_of, structures
-from hilcal.effects.from_file import effects_of
+from hilcal.effects.catalogue import effects_of
 from hilcal.errors import CannotAnswerError, HilcalError, InputError
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.folds import random_folds
@@ -57,8 +53,6 @@ Reason = Literal["law", "adequate", "catalogue", "no_law", "unpredictable"]
 """
 LEAST_SHARE = 0.1  # of the misfit on poses left out that a law must explain
 NEAR = 0.7  # Least cosine of an effect of the catalogue that resembles a law; a choice
-
-
 MOST_RIVALS = 2  # Alternatives that can be written as effects; a choice: `next` separates few
 
 
@@ -117,17 +111,13 @@ def alternatives(d: Discovery, law: Law) -> tuple[Structure, ...]:
 def discover(
     fit: Fit, say: Callable[[str], None] = lambda text: None, name: str = "found"
 ) -> Discovery:
-    """Search laws for the misfit of a fit.
+    """Search laws for the misfit of a gc-scaled fit; `name` is that of the proposed effect.
 
     >>> with hc.Campaign.open(RUN) as run:
     ...     fit = hc.fit(hc.baseline(run.cell, run.readings), run.readings)
     >>> d = hc.discover(fit)
     >>> d.reason, d.catalogue
     ('catalogue', ('joint_tilt_compliance',))
-
-    Args:
-        fit: a gc-scaled fit.
-        name: of the proposed effect.
 
     Raises:
         InputError: the scaling of the fit is not gc.
@@ -149,16 +139,15 @@ def discover(
     effects = known_effects(fit)
     explained = instead_of_law(fit, problem, best, effects)
     if explained.names:
-        answer = Discovery(
-            fit, "catalogue", catalogue=explained.names, candidates=screening.candidates
-        )
-        return replace(answer, unfitted=explained.unfitted)
-    say("repeating the search without each fold of poses")
-    folds = search_by_folds(screening)
-    if not folds.sure or folds.share < LEAST_SHARE:
-        answer = _silent(fit, screening, say, folds.share)
+        names, tried = explained.names, screening.candidates
+        answer = Discovery(fit, "catalogue", catalogue=names, candidates=tried)
     else:
-        answer = _laws(fit, problem, selections, folds, effects, say, name)
+        say("repeating the search without each fold of poses")
+        folds = search_by_folds(screening)
+        if not folds.sure or folds.share < LEAST_SHARE:
+            answer = _silent(fit, screening, say, folds.share)
+        else:
+            answer = _laws(fit, problem, selections, folds, effects, say, name)
     return replace(answer, unfitted=explained.unfitted)
 
 
@@ -198,8 +187,7 @@ def _laws(
     misfit = max(float(squares.sum()) - rank, 3.0 * np.sqrt(2.0 * rank))
     likely = structures(problem, selections)
     chance = {x.kind: x.probability for x in likely}
-    fitted: list[tuple[Law, Fit, Floats, str]] = []
-    kinds: list[Hashable] = []
+    fitted: list[tuple[Law, Fit, Floats, str, Hashable]] = []
     refused: list[tuple[str, str]] = []
     for s in selections:
         form, kind = refine(screen, form_of(screen, s.terms)), structure_of(screen, s.terms)
@@ -215,34 +203,39 @@ def _laws(
         squares_after = left_out_by_pose(after)
         share = float(np.clip((squares.sum() - squares_after.sum()) / misfit, -1.0, 1.0))
         law = _law(problem, s, form, name, coefficients, share, after, folds, effects, chance[kind])
-        kinds.append(kind)
         evidence = (
             f"It explains {100 * share:.0f} % of the misfit on poses left out; p-value "
             f"{law.p_value:.1g}, corrected\nfor the size of the search. Among the structures that "
             f"the search met, its own has the probability {law.probability:.2f}."
         )
         source = source_of_form(form, name, coefficients, evidence, f"{name}.py")
-        fitted.append((law, after, squares_after, source))
+        fitted.append((law, after, squares_after, source, kind))
     if not fitted:
         silent = _silent(fit, screen, say, folds.share)
         return replace(silent, reason="no_law", refused=tuple(refused))
-    best = min(range(len(fitted)), key=lambda k: float(fitted[k][2].sum()))
-    # laws that predict poses left out as well as the best, within one standard error
-    excess = [m[2] - fitted[best][2] for m in fitted]
-    root = np.sqrt(max(len(excess[0]) - 1, 1))
-    retained = [k for k, x in enumerate(excess) if float(x.mean()) <= float(np.std(x)) / root]
+    best = min(
+        (squares_after for _, _, squares_after, _, _ in fitted), key=lambda x: float(x.sum())
+    )
+    root = np.sqrt(max(len(best) - 1, 1))
+
+    def as_good(squares_after: Floats) -> bool:
+        """Whether a law predicts poses left out as well as the best, within a standard error."""
+        excess = squares_after - best
+        return bool(excess.mean() <= np.std(excess) / root)
+
+    retained = [x for x in fitted if as_good(x[2])]
     say("asking what is predictable at all")
     attainable = residual_regression(screen.linear).share
-    laws = tuple(
-        replace(fitted[k][0], name=name if not rank else f"{name}_{rank + 1}")
-        for rank, k in enumerate(retained)
-    )
-    names = {kinds[k]: law.name for k, law in reversed([*zip(retained, laws, strict=True)])}
+    laws = tuple(replace(x[0], name=_numbered(name, k)) for k, x in enumerate(retained, start=1))
+    names: dict[Hashable, str] = {}
+    for law, (*_, kind) in zip(laws, retained, strict=True):
+        names.setdefault(kind, law.name)
+    _, after, _, source, _ = retained[0]
     return Discovery(
         fit, "law", laws,
         float(np.clip(max(attainable, folds.share, laws[0].holdout_share), 0.0, 1.0)),
-        folds.share, (), screen.candidates, fitted[retained[0]][1], fitted[retained[0]][3],
-        curves(fitted[retained[0]][1], laws[0].form), refused=tuple(refused),
+        folds.share, (), screen.candidates, after, source,
+        curves(after, laws[0].form), refused=tuple(refused),
         structures=tuple(replace(x, law=names.get(x.kind, "")) for x in likely),
     )  # fmt: skip
 
@@ -260,11 +253,8 @@ def _law(
     near = tuple(r for r in resembling(problem, s, effects) if r.cosine >= NEAR)
     situation = linear.fit.solution.prediction.situation
     factors = (f for p in form.parts for f in p.amplitude.factors)
-    read = {v.symbol: v for f in factors for v in f.variable.recorded}
-    ranges = []
-    for symbol, v in read.items():
-        values = v.read(situation)
-        ranges.append((symbol, float(values.min()), float(values.max()), v.unit))
+    read = {v.symbol: (v.read(situation), v.unit) for f in factors for v in f.variable.recorded}
+    ranges = [(k, float(x.min()), float(x.max()), unit) for k, (x, unit) in read.items()]
     return Law(
         name=name, form=form, parameters=coefficients, p_value=p_value, odds=s.total,
         holdout_share=share, left=after.variance_factor, probability=probability,
@@ -336,10 +326,9 @@ def _causes(
 
 
 def agreement(before: Fit, after: Fit, moved: Floats) -> float:
-    """Return the correlation of a hidden law's motion with that of the added effects.
+    """Return the correlation of a hidden law's motion (N, 3) with that of the last effects added.
 
-    Both are whitened, and projected off the model without the effects. `after` has more effects
-    than `before`, as its last ones; `moved` (N, 3) is the motion by the hidden law, sensor axes, m.
+    Both are whitened, and projected off the model without the effects; sensor axes, m.
     """
     linear, w = linearise(before), before.whitening
     truth = linear.project_out(w.whiten(w.raw(moved[~before.outlier])).reshape(-1))
@@ -399,8 +388,7 @@ def law_json(law: Law, d: Discovery) -> dict[str, object]:
         "alternatives": [x.form.text() for x in alternatives(d, law)],
         "resembles": [asdict(r) for r in law.resembles],
         "ranges": [
-            {"quantity": symbol, "min": low, "max": high, "unit": unit}
-            for symbol, low, high, unit in law.ranges
+            dict(zip(("quantity", "min", "max", "unit"), r, strict=True)) for r in law.ranges
         ],
     }
 
@@ -473,12 +461,10 @@ class LawSearch:
 
     def _free_name(self, fitted: Fit) -> str:
         used = {*fitted.model.catalogue.names, *fitted.model.names, *self._sources}
-        names = (_numbered(self._name, k) for k in range(1, 10_000))
-        free = (n for n in names if n not in used and not self.path(n).exists())
-        try:
-            return next(free)
-        except StopIteration:
-            raise InputError(f"{self._folder}: no free name for a law's file") from None
+        for name in (_numbered(self._name, k) for k in range(1, 10_000)):
+            if name not in used and not self.path(name).exists():
+                return name
+        raise InputError(f"{self._folder}: no free name for a law's file")
 
 
 def _numbered(name: str, k: int) -> str:
@@ -487,14 +473,10 @@ def _numbered(name: str, k: int) -> str:
 
 def laws_json(s: LawSearch) -> dict[str, object]:
     """Return the searches of a refinement as JSON."""
+    written = [s.files.get(d.laws[0].name) if d.laws else None for d in s.found]
     return {
         "discover": [
-            {
-                **discovery_json(d),
-                "written": str(s.files[d.laws[0].name])
-                if d.laws and d.laws[0].name in s.files
-                else None,
-            }
-            for d in s.found
+            {**discovery_json(d), "written": file and str(file)}
+            for d, file in zip(s.found, written, strict=True)
         ]
     }

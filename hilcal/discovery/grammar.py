@@ -1,13 +1,10 @@
-"""All amplitudes that are tried: products of functions, up to a stated complexity.
+"""All amplitudes that are tried: products of functions of different quantities.
 
-All products of at most `MOST_FACTORS` factors of different quantities up to the complexity `MOST`
-are tried.
-
-The price of a law, for the size of the search, is the logarithm of the number of candidates of its
-complexity, plus log 2 for each unit of complexity: simple laws are few, and cheap.
+A product has at most `MOST_FACTORS` factors and the complexity `MOST`. Its price, for the size of
+the search, is the logarithm of the number of candidates of its complexity, plus log 2 for each unit
+of complexity: simple laws are few, and cheap.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import comb, log
@@ -36,12 +33,11 @@ def functions(v: Variable, x: Floats, most: int) -> list[Factor]:
         return [linear, *waves, *_bent(v, x, most)] if v.kind == "angle" else waves
     if v.kind == "side":
         return [linear]
-    return [linear, *_CURVED[v.kind](v, x), *_bent(v, x, most)]
+    return [linear, *_curved(v, x), *_bent(v, x, most)]
 
 
 WAVES = {"angle": HARMONICS, "sum": 2, "sight": 2}  # multiples of an angle; a choice
 BENDS = (0.3, 0.7)  # Initial bends, as quantiles; a choice
-_Functions = Callable[[Variable, Floats], list[Factor]]
 
 
 def _bent(v: Variable, x: Floats, most: int) -> list[Factor]:
@@ -64,48 +60,34 @@ def _middle(x: Floats) -> float:
     return float(np.median(np.abs(x[x != 0]))) if np.any(x) else 1.0
 
 
-def _wrench(v: Variable, x: Floats) -> list[Factor]:
-    middle = _middle(x)
+def _curved(v: Variable, x: Floats) -> list[Factor]:
+    """Return curved functions of a quantity, by its kind."""
+    both_signs, middle = x.min() < 0 < x.max(), _middle(x)
     near = _round(0.01 * middle)
-    if not x.min() < 0 < x.max():
-        if v.kind == "load":
-            return _grown(v, x)
-        return [Factor(v, shapes.EVEN, (2.0, near)), Factor(v, shapes.ODD, (0.5, near))]
-    out = [Factor(v, shapes.PLUS), Factor(v, shapes.MINUS)]
-    out.append(Factor(v, shapes.SATURATION, (_round(0.05 * middle),)))
-    if v.kind == "torque":
-        out += [Factor(v, shapes.ODD, (p, near)) for p in (0.5, 2.0, 3.0)]
-    return out
 
+    def even(*powers: float) -> list[Factor]:
+        return [Factor(v, shapes.EVEN, (p, near)) for p in powers]
 
-def _read_by_sensor(v: Variable, x: Floats) -> list[Factor]:
-    """Return curvatures, and different gains of the sensor for pull and push."""
-    if not x.min() < 0 < x.max():
-        return _even(v, x, 2.0)
-    return [Factor(v, shapes.PLUS), *_even(v, x, 1.0, 2.0)]
+    def saturation(share: float) -> Factor:
+        return Factor(v, shapes.SATURATION, (_round(share * middle),))
 
-
-def _gravity(v: Variable, x: Floats) -> list[Factor]:
-    return [Factor(v, shapes.SATURATION, (_round(0.05 * _middle(x)),)), *_even(v, x, 1.0, 2.0)]
-
-
-def _temperature(v: Variable, x: Floats) -> list[Factor]:
-    return [*_even(v, x, 2.0, 1.0), Factor(v, shapes.PLUS)]
-
-
-def _even(v: Variable, x: Floats, *powers: float) -> list[Factor]:
-    return [Factor(v, shapes.EVEN, (p, _round(0.01 * _middle(x)))) for p in powers]
-
-
-def _grown(v: Variable, x: Floats) -> list[Factor]:
-    if x.min() < 0:
-        return [Factor(v, shapes.EVEN, (2.0, _round(0.01 * _middle(x))))]
-    return [Factor(v, shapes.POWER, (p,)) for p in (0.5, 2.0)]
-
-
-def _lasting(v: Variable, x: Floats) -> list[Factor]:
+    if v.kind == "gravity":
+        return [saturation(0.05), *even(1.0, 2.0)]
+    if v.kind == "temperature":
+        return [*even(2.0, 1.0), Factor(v, shapes.PLUS)]
+    if v.kind == "sensor":  # curvatures, and different gains of the sensor for pull and push
+        return [Factor(v, shapes.PLUS), *even(1.0, 2.0)] if both_signs else even(2.0)
+    if v.kind in ("torque", "force", "load") and both_signs:
+        powers = (0.5, 2.0, 3.0) if v.kind == "torque" else ()
+        odd = [Factor(v, shapes.ODD, (p, near)) for p in powers]
+        return [Factor(v, shapes.PLUS), Factor(v, shapes.MINUS), saturation(0.05), *odd]
+    if v.kind in ("torque", "force"):
+        return [*even(2.0), Factor(v, shapes.ODD, (0.5, near))]
+    grown = even(2.0) if x.min() < 0 else [Factor(v, shapes.POWER, (p,)) for p in (0.5, 2.0)]
+    if v.kind not in ("time", "hanging"):
+        return grown
     last = float(x.max())
-    out = [*_grown(v, x), Factor(v, shapes.LOG)]
+    out = [*grown, Factor(v, shapes.LOG)]
     out += [Factor(v, shapes.RELAXATION, (_round(k * last),)) for k in (0.03, 0.1, 0.3)]
     if v.kind == "time":
         out += [
@@ -114,13 +96,6 @@ def _lasting(v: Variable, x: Floats) -> list[Factor]:
             for w in (0.02, 0.1)
         ]
     return out
-
-
-_CURVED: dict[str, _Functions] = {
-    "torque": _wrench, "force": _wrench, "load": _wrench, "sensor": _read_by_sensor,
-    "gravity": _gravity, "temperature": _temperature, "time": _lasting, "hanging": _lasting,
-    "place": _grown,
-}  # fmt: skip
 
 
 def _round(x: float) -> float:
@@ -231,7 +206,7 @@ class Grammar:
         """Return the price of any product, as if all of its complexity had been tried."""
         if len(a.factors) == 1 and isinstance(u := a.factors[0].variable, Composed):
             # Further products of a sum are priced where they are added.
-            argument = float(self.price_of_argument(np.array(u.terms[0][1].cost)))
+            argument = float(self.price_of_argument[u.terms[0][1].cost])
             return argument + log(SHAPES * sites) + log(2.0) * a.factors[0].shape.cost
         kind = a.cost, len(a.factors)
         count = self._counts.get(kind, self._counts.get((a.cost, 0), 1))
@@ -249,12 +224,8 @@ class Grammar:
             **{(cost, 0): count for cost, count in enumerate(by_cost)},
         }
 
-    def price_of_argument(self, cost: Ints) -> Floats:
-        """Log of the number of arguments of complexities (…), plus log 2 per unit."""
-        return np.asarray(self._of_argument[cost])
-
     @cached_property
-    def _of_argument(self) -> Floats:
+    def price_of_argument(self) -> Floats:
         """(C,) log of the number of products in arguments, plus log 2 per unit, by complexity."""
         count = np.bincount(self.cost[self.smooth], minlength=ARGUMENT + 1)
         return np.asarray(np.log(np.maximum(count, 1)) + log(2.0) * np.arange(len(count)))

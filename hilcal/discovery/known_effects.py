@@ -1,16 +1,16 @@
 """Comparison of a proposed law with effects of the catalogue as explanations of the misfit.
 
-Effects are added by algebra, at the linearisation of the fit, as the terms of a law are. If that
-prefers the law, both are also refitted in the exact model: a large effect, such as a load point
-that is 20 cm off, is not linear in its parameters, and its deviation from the linearisation looks
-like another law.
+Effects are added by algebra, as the terms of a law are. If that prefers the law, both are also
+refitted in the exact model: the deviation of a large effect, such as a load point that is 20 cm
+off, from its linearisation looks like another law.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilcal.diagnosis.effect_ranking import FALSE_ALARM, catalogue_columns
+from hilcal.diagnosis.effect_ranking import catalogue_columns
+from hilcal.diagnosis.evidence import beside_catalogue, significant
 from hilcal.diagnosis.stepwise import add
 from hilcal.discovery.law import Resemblance, form_of
 from hilcal.discovery.problem import SearchProblem
@@ -18,13 +18,9 @@ from hilcal.discovery.refit import exact, left_by, refine
 from hilcal.discovery.search import LEAST, SAME, Selection
 from hilcal.errors import HilcalError
 from hilcal.identification.fit import Fit
-from hilcal.identification.linearisation import linearise
-from hilcal.regression import forward_selection as selection
 from hilcal.regression.forward_selection import families_beside
 from hilcal.regression.leave_out import left_out_residuals
 from hilcal.types import Floats
-
-MOST_TOGETHER = 6  # Most effects that are added; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,20 +41,16 @@ class KnownEffects:
 
 def known_effects(fit: Fit) -> KnownEffects:
     """Add effects of the catalogue to a fit by algebra, as long as they are significant."""
-    linear = linearise(fit)
     x, columns, most = catalogue_columns(fit)
-    families = families_beside(linear.information(x), linear.residual, fit.dof, x, columns, most)
-    tested = max(len(families.columns), 1)
-    names: list[str] = []
-    odds: list[float] = []
-    left: list[float] = []
-    for step in selection.forward_selection(families, MOST_TOGETHER):
-        if step.score.log_evidence <= 0 or step.score.p_value * tested >= FALSE_ALARM:
-            break
-        names.append(step.name)
-        odds.append(step.score.log_evidence - float(np.log(tested)))
-        left.append(step.after.rss / max(fit.dof - step.after.spent, 1.0))
-    return KnownEffects(tuple(names), tuple(odds), tuple(left), x, columns)
+    steps = significant(beside_catalogue(fit, x, columns, most))
+    choice = float(np.log(max(len(columns), 1)))
+    return KnownEffects(
+        tuple(s.name for s in steps),
+        tuple(s.score.log_evidence - choice for s in steps),
+        tuple(s.after.rss / max(fit.dof - s.after.spent, 1.0) for s in steps),
+        x,
+        columns,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,10 +64,8 @@ class Instead:
 def instead_of_law(
     fit: Fit, problem: SearchProblem, law: Selection, effects: KnownEffects
 ) -> Instead:
-    """Return the effects that explain the misfit as well as a law, at odds of 20 : 1; or none.
-
-    A law whose exact refit fails is not preferred to effects whose refit does not.
-    """
+    """Return the effects that explain the misfit as well as a law, at odds of 20 : 1; or none."""
+    # A law whose exact refit fails is not preferred to effects whose refit does not.
     if effects.total > law.total - LEAST:
         return Instead(effects.names)
     alike = resembling(problem, law, effects)
@@ -88,10 +78,7 @@ def instead_of_law(
 
 
 def _exact_effects(fit: Fit, effects: KnownEffects) -> tuple[float, Instead]:
-    """Return the best odds of the first one, two, … effects by exact refits, and these effects.
-
-    Refits that exclude further readings as gross errors do not count.
-    """
+    """Return the best odds of the first effects in exact refits without more gross errors."""
     after, odds, best, explained = fit, 0.0, -np.inf, Instead()
     for k, name in enumerate(effects.names):
         try:

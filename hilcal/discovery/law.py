@@ -10,8 +10,8 @@ import numpy as np
 from hilcal.discovery.amplitudes import Amplitude, Factor, unit_of
 from hilcal.discovery.screen import LawTerm, Screen
 from hilcal.discovery.sites import ORDINARY, Site
+from hilcal.effects.catalogue import effects_of
 from hilcal.effects.check import NAME
-from hilcal.effects.from_file import effects_of
 from hilcal.effects.protocol import Effect, Situation
 from hilcal.errors import InputError
 from hilcal.names import escaped, quoted

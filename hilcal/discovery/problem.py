@@ -1,9 +1,9 @@
 """The candidates beside a model and chosen terms, on all rows or some, and their odds.
 
 A term is a site, or a few related ones, times one amplitude or two: a periodic function with free
-phase, a factor with free zero, all axes of a site, all joints with a coefficient each. All
-candidates are screened; the short list and the terms that extend it are scored as families are in
-the diagnosis. The log odds of a term are its log evidence minus its price.
+phase, a factor with free zero, all axes of a site, all joints with a coefficient each. The short
+list of the screening, extended to such terms, is scored as families are in the diagnosis. The log
+odds of a term are its log evidence minus its price.
 """
 
 from collections.abc import Iterator, Sequence
@@ -84,15 +84,11 @@ class SearchProblem:
         """(R', P) whitened columns of a term in the rows that are used."""
         return self.screen.columns_of(term)[self.rows]
 
-    def beside(self, chosen: Sequence[LawTerm]) -> "CandidateTerms":
-        """Return the candidates beside chosen terms."""
-        return CandidateTerms(self, tuple(chosen))
-
     def scored(self, chosen: tuple[LawTerm, ...] = ()) -> list[Scored]:
         """Return the short list beside chosen terms, the best odds first; cached."""
         key = tuple((t.parts, t.common) for t in chosen)
         if key not in self._scored:
-            candidates = self.beside(chosen)
+            candidates = CandidateTerms(self, chosen)
             scored = candidates.score(candidates.shortlist())
             self._scored[key] = sorted(scored, key=lambda c: -c.odds)
         return self._scored[key]
@@ -250,15 +246,11 @@ class CandidateTerms:
         out = []
         for start in range(0, len(terms), 64):
             batch = terms[start : start + 64]
-            flat = [part for t in batch for part in t.parts]
-            x = p.screen.columns(flat)[p.rows]
+            x = p.screen.columns([part for t in batch for part in t.parts])[p.rows]
             ends = np.cumsum([0] + [len(t.parts) for t in batch])
-            columns = [
-                x[:, a:b].sum(axis=1, keepdims=True) if t.common else x[:, a:b]
-                for t, a, b in zip(batch, ends[:-1], ends[1:], strict=True)
-            ]
-            for t, x_term in zip(batch, columns, strict=True):
-                out.append(Scored(t, self._score(x_term)))
+            for t, a, b in zip(batch, ends[:-1], ends[1:], strict=True):
+                columns = x[:, a:b].sum(axis=1, keepdims=True) if t.common else x[:, a:b]
+                out.append(Scored(t, self._score(columns)))
         return out
 
     def _score(self, x: Floats) -> FamilyScore:
@@ -364,11 +356,10 @@ def orthonormal(model: Projection, x: Floats) -> Floats:
 def together(
     square: Floats, slope: Floats, across: Floats, visible: Bools, which: Ints, partner: Ints
 ) -> Floats:
-    """(H,) gain of candidates at a site, each with a partner; zero where the two are dependent.
+    """(H,) gain of candidates `which` (H,), each with a partner; zero where the two are dependent.
 
-    `square`, `slope`, `across` (F,) are xᵀ M x, xᵀ r and xᵀ M x' of all candidates at the site,
-    `visible` (F,) whether they are independent of the model, `which` (H,) the candidates and
-    `partner` (F,) the partner of each.
+    Of all candidates (F,) at a site are xᵀ M x, xᵀ r, xᵀ M x', whether they are independent of the
+    model, and the partner.
     """
     a, b, h = square[which], square[partner[which]], across[which]
     g, k = slope[which], slope[partner[which]]

@@ -1,9 +1,8 @@
 """Refinement of a law's free numbers, and its refit in the exact model.
 
-The search takes the numbers in the functions of a law, such as an exponent or a saturation, from a
-coarse grid. They are refined to the least sum of squares, with the coefficients of law and model
-projected out. Refined numbers are used if they gain more evidence than they cost, else those of the
-grid, which are simpler.
+The search takes the numbers in a law's functions, such as an exponent, from a coarse grid. They are
+refined to the least sum of squares, with the coefficients of law and model projected out. Refined
+numbers are used if they gain more evidence than they cost, else those of the grid.
 """
 
 from collections.abc import Sequence
@@ -85,35 +84,29 @@ def _step(linear: Linearisation, x: Floats) -> Floats:
     return np.asarray(step, dtype=float)
 
 
-def at_linearisation(screen: Screen, form: Form) -> tuple[Coefficient, ...]:
-    """Return the coefficients by algebra, without uncertainties."""
-    x = form.columns(screen, screen.linear.fit.solution.prediction.situation)
-    return coefficients(form, _step(screen.linear, x), np.full(form.count, np.nan))
-
-
 def exact(
     screen: Screen, form: Form, name: str
 ) -> tuple[Fit, Form, tuple[Coefficient, ...], type[Effect]]:
     """Refit the exact model with the law as an effect, after checking the effect.
 
     Coefficients that the model absorbs are dropped, e.g. the zero of a compliance that grows with
-    time, beside a compliance of the model.
-
-    Returns:
-        The fit, the law, its coefficients, and the class of its effect.
+    time, beside a compliance of the model. Returns the fit, the law, its coefficients, and the
+    class of its effect.
     """
     before = screen.linear.fit
     s = before.solution.prediction.situation
     while True:
         letters = LETTERS[: form.count]
-        kind = effect_class(source_of_form(form, name, at_linearisation(screen, form)), name)
+        step = _step(screen.linear, form.columns(screen, s))  # by algebra, for the magnitudes
+        values = coefficients(form, step, np.full(form.count, np.nan))
+        kind = effect_class(source_of_form(form, name, values), name)
         check_effect(kind, before.model.cell)
         effect = kind(before.model.cell, s.states)
         model = replace(before.model, effects=(*before.model.effects, effect))
         start = np.concatenate([before.theta, np.zeros(form.count)])
         after = fit(model, before.readings, before.mode, before.scaling, start)
         rows = model.slices()[-1]
-        values, std = after.theta[rows], after.uncertainty.std[rows]
+        theta, std = after.theta[rows], after.uncertainty.std[rows]
         determined = np.isfinite(std)
         if determined.all():
             break
@@ -121,7 +114,7 @@ def exact(
             raise CannotAnswerError("the readings do not determine it beside the model")
         form = with_coefficients(form, np.flatnonzero(determined).tolist())
     estimates = tuple(
-        Coefficient(letter, float(values[k]), float(std[k]), form.unit(k))
+        Coefficient(letter, float(theta[k]), float(std[k]), form.unit(k))
         for k, letter in enumerate(letters)
     )
     return after, form, estimates, kind

@@ -10,8 +10,7 @@ for this; the short list is scored on all readings.
 
 A bend at a level of a function of two quantities, as of a hose that is taut beyond a length that
 depends on two joints, is no product of functions of each. So products φ of two quantities are
-arguments themselves: max(φ − φ0, 0), max(φ0 − φ, 0) and tanh((φ − φ0)/w), at some levels φ0. Their
-sums of squares at every site are formed once, as are those of the products (see `screen`).
+arguments themselves: max(φ − φ0, 0), max(φ0 − φ, 0) and tanh((φ − φ0)/w), at some levels φ0.
 """
 
 from dataclasses import dataclass
@@ -111,10 +110,7 @@ class Screen:
 
     @cached_property
     def alias(self) -> tuple[int, ...]:
-        """(S,) index of the simplest site with the same motion of all readings, up to a factor.
-
-        E.g. a bearing's tilt about the axis of the previous joint is that joint's displacement.
-        """
+        """(S,) index of the simplest site that moves all readings the same way, up to a factor."""
         flat = self.motion.reshape(-1, len(self.sites))
         size = np.linalg.norm(flat, axis=0)
         unit = flat / np.where(size > 0, size, 1.0)
@@ -144,9 +140,34 @@ class Screen:
     @cached_property
     def bends(self) -> Bends:
         """Bends and steps of composed quantities."""
-        return bends(
-            self.grammar, self.sites, self.readings, self.form, self.free, (VISIBLE, LEAST_MOTION)
-        )
+        grammar = self.grammar
+        arguments = grammar.smooth[:MOST_ARGUMENTS].tolist()
+        argument, functions, numbers, rows = [], [], [], []
+        for k in arguments:
+            u = grammar.values[k][self.readings].astype(float) * grammar.size[k]
+            for shape, starts in _starts(u):
+                parameters: list[Any] = [n[:, None] for n in starts]
+                argument += [k] * len(starts[0])
+                functions += [shape] * len(starts[0])
+                numbers += list(zip(*(n.tolist() for n in starts), strict=True))
+                rows.append(unit_rows(shape.value(u, tuple(parameters))))
+        values: Floats = np.vstack([np.zeros((0, len(self.readings)), dtype=np.float32), *rows])
+        elastic = np.array([grammar.at(k).elastic for k in arguments], dtype=np.bool_)
+        bent = np.repeat(elastic, len(values) // max(len(arguments), 1))
+        square: Floats = np.empty((len(self.sites), len(values)), dtype=np.float32)
+        across: Floats = np.empty_like(square)
+        squares = values**2
+        for s, site in enumerate(self.sites):
+            lifted = values @ self.free[s]
+            across[s] = lifted.sum(axis=1)
+            square[s] = np.einsum("ck,ck->c", lifted, values)
+            moved = squares @ np.sum(self.form[s] ** 2, axis=0)
+            square[s, square[s] < VISIBLE * moved + LEAST_MOTION] = 0.0
+            for kind in (False, True):
+                if not site.takes(kind):
+                    square[s, bent == kind] = 0.0
+        index = np.array(argument, dtype=np.int_)
+        return Bends(index, tuple(functions), tuple(numbers), values, square, across)
 
     @cached_property
     def values(self) -> Floats:
@@ -228,10 +249,8 @@ def screened(
 
 
 def _across_factors(amplitudes: Grammar, values: Floats, lifted: Floats) -> Floats:
-    """(2, F) xᵀ Q x' of products with the amplitude without first, and second factor.
-
-    With a product f g and Q symmetric, (f g)ᵀ Q g = fᵀ (g ∘ Q g): no product is formed.
-    """
+    """(2, F) xᵀ Q x' of products with the amplitude without first, and second factor."""
+    # With a product f g and Q symmetric, (f g)ᵀ Q g = fᵀ (g ∘ Q g): no product is formed.
     out: Floats = np.zeros((2, len(amplitudes.size)), dtype=np.float32)
     products = np.flatnonzero((amplitudes.less >= 0).all(axis=0))
     if not len(products):
@@ -264,41 +283,6 @@ LEVELS = (0.2, 0.35, 0.5, 0.65, 0.8)
 STEPS = (0.25, 0.5, 0.75)  # Bends, and steps, as quantiles; a choice, by time
 WIDTH = 0.3  # Width of a step, in standard deviations of the argument; a choice
 MOST_ARGUMENTS = 4000  # Most arguments, the simplest first; a choice, by memory
-
-
-def bends(
-    grammar: Grammar, sites: tuple[Site, ...], readings: Ints, form: Floats, free: Floats,
-    limits: tuple[float, float],
-) -> Bends:  # fmt: skip
-    """Form all bends at readings (K,), with `Screen.form` and `Screen.free`."""
-    arguments = grammar.smooth[:MOST_ARGUMENTS]
-    argument, functions, numbers, rows = [], [], [], []
-    for k in arguments.tolist():
-        u = grammar.values[k][readings].astype(float) * grammar.size[k]
-        for shape, starts in _starts(u):
-            parameters: list[Any] = [n[:, None] for n in starts]
-            argument += [k] * len(starts[0])
-            functions += [shape] * len(starts[0])
-            numbers += list(zip(*(n.tolist() for n in starts), strict=True))
-            rows.append(unit_rows(shape.value(u, tuple(parameters))))
-    values: Floats = np.vstack(rows) if rows else np.zeros((0, len(readings)), dtype=np.float32)
-    elastic = np.array([grammar.at(k).elastic for k in arguments.tolist()], dtype=np.bool_)
-    bent = np.repeat(elastic, len(values) // max(len(arguments), 1))
-    square: Floats = np.empty((len(sites), len(values)), dtype=np.float32)
-    across: Floats = np.empty_like(square)
-    squares = values**2
-    for s, site in enumerate(sites):
-        lifted = values @ free[s]
-        across[s] = lifted.sum(axis=1)
-        square[s] = np.einsum("ck,ck->c", lifted, values)
-        moved = squares @ np.sum(form[s] ** 2, axis=0)
-        square[s, square[s] < limits[0] * moved + limits[1]] = 0.0
-        for kind in (False, True):
-            if not site.takes(kind):
-                square[s, bent == kind] = 0.0
-    return Bends(
-        np.array(argument, dtype=np.int_), tuple(functions), tuple(numbers), values, square, across
-    )
 
 
 def _starts(u: Floats) -> list[tuple[Shape, tuple[Floats, ...]]]:

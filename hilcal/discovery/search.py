@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from hilcal.discovery.problem import SHORT_LIST, SearchProblem
+from hilcal.discovery.problem import SHORT_LIST, CandidateTerms, SearchProblem
 from hilcal.discovery.screen import LawTerm, Scored, Screen
 from hilcal.regression.evidence import FamilyScore
 from hilcal.regression.forward_selection import families_beside
@@ -38,18 +38,24 @@ class Selection:
 
 
 def search(problem: SearchProblem, most: int = MOST_TERMS, beam: int = BEAM) -> list[Selection]:
-    """Return the best selection for each number of terms; none if chance explains the first term.
-
-    A longer selection is returned only if it has odds of 20 : 1 over every shorter one.
-    """
+    """Return the best selection of each number of terms that is worth it; none for chance."""
     ordered = _ordered(problem)
-    if not ordered or not _sure(ordered[0]):
+    if not ordered or ordered[0].odds <= LEAST:
+        return []
+    first = ordered[0]
+    if np.log(max(first.score.p_value, 1e-300)) + first.term.price >= np.log(FALSE_ALARM):
         return []
     starts = _distinct(problem, ordered, beam)
     best: dict[int, Selection] = {}
+
+    def keep(s: Selection) -> None:
+        shorter = best.setdefault(len(s.terms), s)
+        if _better(problem, s, shorter):
+            best[len(s.terms)] = s
+
     for start in starts:
         s = Selection((start.term,), (start.odds,))
-        _keep(problem, best, s)
+        keep(s)
         while len(s.terms) < most:
             further = _ordered(problem, s.terms)
             if not further or further[0].odds < LEAST:
@@ -62,7 +68,7 @@ def search(problem: SearchProblem, most: int = MOST_TERMS, beam: int = BEAM) -> 
                 break
             # The last term is already the best beside the others.
             s = _exchanged(problem, grown, last=len(grown.terms) - 1)
-            _keep(problem, best, s)
+            keep(s)
     return [
         replace(s, terms=tuple(plain(problem.screen, t) for t in s.terms))
         for s in worth_their_length(best[k] for k in sorted(best))
@@ -83,15 +89,14 @@ def _ordered(problem: SearchProblem, chosen: tuple[LawTerm, ...] = ()) -> list[S
     scored = problem.scored(chosen)
     if not scored:
         return []
-    as_good = [c for c in scored if c.odds > scored[0].odds - LEAST]
-    first = min(as_good, key=lambda c: _preference(problem.screen, c))
+
+    def preference(c: Scored) -> tuple[float, ...]:
+        """Sort key of terms that are as good: the simplest, then the likeliest first."""
+        *simple, functions = _simplicity(problem.screen, c.term)
+        return (*simple, -round(c.odds), functions, -c.odds)
+
+    first = min((c for c in scored if c.odds > scored[0].odds - LEAST), key=preference)
     return [first, *(c for c in scored if c is not first)]
-
-
-def _preference(screen: Screen, c: Scored) -> tuple[float, ...]:
-    """Sort key of terms that are as good: the simplest, then the likeliest first."""
-    *simple, functions = _simplicity(screen, c.term)
-    return (*simple, -round(c.odds), functions, -c.odds)
 
 
 def _simplicity(screen: Screen, t: LawTerm) -> tuple[float, ...]:
@@ -119,12 +124,6 @@ def _simplicity(screen: Screen, t: LawTerm) -> tuple[float, ...]:
     return t.count + cost, sites, apart, functions
 
 
-def _keep(problem: SearchProblem, best: dict[int, Selection], s: Selection) -> None:
-    count = len(s.terms)
-    if count not in best or _better(problem, s, best[count]):
-        best[count] = s
-
-
 def plain(screen: Screen, t: LawTerm) -> LawTerm:
     """Replace the site of a term by its simplest alias; terms of several sites keep theirs."""
     places = {place for place, _ in t.parts}
@@ -138,12 +137,6 @@ def _better(problem: SearchProblem, s: Selection, other: Selection) -> bool:
     if abs(s.total - other.total) > LEAST:
         return s.total > other.total
     return _extent(problem, s.terms) < _extent(problem, other.terms)
-
-
-def _sure(c: Scored) -> bool:
-    return c.odds > LEAST and np.log(max(c.score.p_value, 1e-300)) + c.term.price < np.log(
-        FALSE_ALARM
-    )
 
 
 def _distinct(problem: SearchProblem, scored: list[Scored], count: int) -> list[Scored]:
@@ -172,7 +165,7 @@ def _pruned(problem: SearchProblem, s: Selection) -> Selection:
         worth = []
         for k, term in enumerate(s.terms):
             remaining = (*s.terms[:k], *s.terms[k + 1 :])
-            worth.append(problem.beside(remaining).score([term])[0].odds)
+            worth.append(CandidateTerms(problem, remaining).score([term])[0].odds)
         weakest = int(np.argmin(worth))
         if worth[weakest] >= LEAST:
             return replace(s, odds=chain(problem, s.terms))

@@ -91,10 +91,7 @@ def _times(k: str, x: str, sign: str = "·") -> str:
 
 
 def _root(x: str, p: list[str]) -> str:
-    """Return |x|, rounded off at zero by p[1] if the exponent p[0] is below 1.
-
-    With an unbounded slope at zero there would be no equilibrium.
-    """
+    """Return |x|, rounded off by p[1] if the exponent p[0] is below 1: else no equilibrium."""
     if p[0] == "p[0]":
         return f"np.hypot({x}, p[1] * (p[0] < 1))"
     return f"np.hypot({x}, {p[1]})" if float(p[0]) < 1 else f"np.abs({x})"

@@ -138,10 +138,8 @@ class UnitMotions(Effect):
             indices = [k for k, site in enumerate(self.sites) if site.field == field]
             indices.sort(key=lambda k: self.sites[k].element)
             wide = field not in ("dq", "scale")
-            values = np.zeros((1, len(indices), 6)) if wide else np.ones((1, len(indices)))
-            if wide:
-                for column, k in enumerate(indices):
-                    values[0, column, self.sites[k].axis] = 1.0
+            units = np.eye(6)[None, [self.sites[k].axis for k in indices]]
+            values = units if wide else np.ones((1, len(indices)))
             element = np.array([self.sites[k].element for k in indices])
             out.append(Columns(field, np.array(indices), element, values))
         return tuple(out)

@@ -5,8 +5,8 @@ from typing import ClassVar
 import numpy as np
 
 from hilcal.effects.options import positive
-from hilcal.effects.per_joint import TorqueLaw, joint_change
-from hilcal.effects.protocol import Situation
+from hilcal.effects.per_joint import TorqueLaw
+from hilcal.effects.protocol import Changeable, Situation
 from hilcal.readings.readings import States
 from hilcal.types import Floats
 
@@ -17,7 +17,7 @@ class Backlash(TorqueLaw):
     name = "backlash"
     unit, size, meaning = "rad", 5e-5, "half the play of {joint}"
     summary = "dq_j = b_j sign(τ_j): the joint's play is taken up to the side of the torque"
-    change = joint_change("play", "wear or repair?", listed=True)
+    change = Changeable("joint", words="play", cause="wear or repair?", listed=True)
     plausible = 20.0  # 1 mrad; makers of gears state 0.3 mrad at most. A choice.
     option_help: ClassVar = {
         **TorqueLaw.option_help,

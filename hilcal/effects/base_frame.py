@@ -18,12 +18,10 @@ class BaseFrame(Effect):
     option_help: ClassVar = PRIOR_HELP
     role = "registration"
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Displacement along and rotation about the base axes."""
-        return tuple(Parameter(a, "m", 1e-3, f"base shift along {a}") for a in "xyz") + tuple(
-            Parameter(f"r{a}", "rad", 1e-3, f"base turn about {a}") for a in "xyz"
-        )
+    parameters = (
+        *(Parameter(a, "m", 1e-3, f"base shift along {a}") for a in "xyz"),
+        *(Parameter(f"r{a}", "rad", 1e-3, f"base turn about {a}") for a in "xyz"),
+    )
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Unit twists of the base."""

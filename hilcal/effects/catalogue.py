@@ -1,10 +1,15 @@
 """The catalogue: the effects that ship, those of installed packages, and those of files."""
 
+import hashlib
+import sys
+from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
+from types import CodeType, ModuleType
 
+from hilcal import limits
 from hilcal.cell import Cell
 from hilcal.effects.backlash import Backlash
 from hilcal.effects.base_compliance import BaseCompliance
@@ -12,7 +17,6 @@ from hilcal.effects.base_frame import BaseFrame
 from hilcal.effects.check import check_effect
 from hilcal.effects.creep import Creep
 from hilcal.effects.encoder_offset import EncoderOffset
-from hilcal.effects.from_file import EffectFile, read_effects
 from hilcal.effects.guide_error import GuideError
 from hilcal.effects.hysteresis import Hysteresis
 from hilcal.effects.joint_compliance import JointCompliance
@@ -26,7 +30,7 @@ from hilcal.effects.load_point import LoadPoint
 from hilcal.effects.observer_frame import ObserverFrame
 from hilcal.effects.options import Options
 from hilcal.effects.periodic_joint_compliance import PeriodicJointCompliance
-from hilcal.effects.protocol import Effect, Role, source_of
+from hilcal.effects.protocol import Effect, Role, line_in, source_of
 from hilcal.effects.sensor_misalignment import SensorMisalignment
 from hilcal.effects.target_offset import TargetOffset
 from hilcal.effects.thermal_growth import ThermalGrowth
@@ -42,14 +46,78 @@ from hilcal.readings.readings import States
 from hilcal.toml import suggest
 
 ENTRY_POINT_GROUP = "hilcal.effects"
-
 BUILT_IN: tuple[type[Effect], ...] = (
-    BaseFrame, TargetOffset, EncoderOffset, JointCoupling, LinkGeometry, TransmissionError,
-    GuideError, Hysteresis, JointCompliance, JointStiffening, JointTiltCompliance,
-    LinkCompliance, BaseCompliance, ToolCompliance, PeriodicJointCompliance, Backlash, Creep,
-    ThermalGrowth, ThermalJointDrift, LinkMass, LoadPoint, WrenchBias, WrenchGain,
-    SensorMisalignment, TrackerDrift, TrackerScale, ObserverFrame,
+    BaseFrame, TargetOffset, EncoderOffset, JointCoupling, LinkGeometry,
+    TransmissionError, GuideError, Hysteresis, JointCompliance,
+    JointStiffening, JointTiltCompliance, LinkCompliance,
+    BaseCompliance, ToolCompliance, PeriodicJointCompliance, Backlash,
+    Creep, ThermalGrowth, ThermalJointDrift, LinkMass, LoadPoint, WrenchBias,
+    WrenchGain, SensorMisalignment, TrackerDrift, TrackerScale,
+    ObserverFrame,
 )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EffectFile:
+    """A file of effects."""
+
+    path: str  # the file, absolute
+    sha256: str  # hash (hex) of its content
+    effects: tuple[type[Effect], ...]  # the effects that it defines
+
+
+def read_effects(path: Path) -> EffectFile:
+    """Run a Python file and return the effects in it; names that begin with "_" do not count."""
+    try:
+        content = limits.read_bytes(path, limits.PROGRAM)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; expected a Python file of effects") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    return effects_of(content, path)
+
+
+def effects_of(content: bytes, path: Path) -> EffectFile:
+    """Return the effects in the content of a file, see `read_effects`; it need not exist yet."""
+    where = str(path)
+    hashed = hashlib.sha256(content).hexdigest()
+    module = ModuleType(f"effects_from_{hashed[:16]}")
+    module.__file__ = str(path.absolute())
+    code = _compiled(content, where)
+    # Dataclasses look up the module that they are defined in.
+    sys.modules[module.__name__] = module
+    try:
+        with redirect_stdout(sys.stderr):  # stdout may be for one JSON document
+            exec(code, module.__dict__)  # noqa: S102 - a file that the user named
+    except (Exception, SystemExit) as error:
+        line = line_in(error, where)
+        raise InputError(f"{where}{line}: {type(error).__name__}: {error}") from error
+    finally:
+        del sys.modules[module.__name__]
+    effects = dict.fromkeys(
+        kind
+        for kind in vars(module).values()
+        if isinstance(kind, type)
+        and issubclass(kind, Effect)
+        and kind.__module__ == module.__name__
+        and not kind.__name__.startswith("_")
+    )
+    if not effects:
+        raise InputError(
+            f"{where}: defines no effect, a class derived from hilcal.effects.protocol.Effect; "
+            "hilcal effects new NAME writes one to begin with"
+        )
+    return EffectFile(module.__file__, hashed, tuple(effects))
+
+
+def _compiled(content: bytes, where: str) -> CodeType:
+    try:
+        return compile(content, where, "exec", dont_inherit=True)
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        line = getattr(error, "lineno", None)
+        place = where if line is None else f"{where}, line {line}"
+        reason = getattr(error, "msg", None) or str(error)
+        raise InputError(f"{place}: not Python: {reason}") from None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

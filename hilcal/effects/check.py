@@ -9,7 +9,6 @@ import numpy as np
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, Robot
-from hilcal.effects.from_file import failure_of
 from hilcal.effects.options import PRIOR_HELP, typical_compliances
 from hilcal.effects.protocol import (
     FRAME_ROLES,
@@ -21,6 +20,7 @@ from hilcal.effects.protocol import (
     Response,
     Role,
     Situation,
+    failure_of,
     source_of,
     total,
 )
@@ -52,9 +52,9 @@ def example_cell(joints: int | None = None, *, slides: bool = False) -> Cell:
     return longer_cell.observed_by(names)
 
 
-def example_states(cell: Cell, count: int = 30) -> States:
+def example_states(cell: Cell) -> States:
     """Return states drawn at random, the same ones every time, in arrays that cannot be changed."""
-    rng, n = np.random.default_rng(0), cell.arm.n
+    rng, n, count = np.random.default_rng(0), cell.arm.n, 30
     q = rng.uniform(-1.5, 1.5, (count, n))
     wrench = rng.normal(size=(count, 6)) * [60, 60, 60, 8, 8, 8]
     wrench[::3] = 0.0
@@ -104,10 +104,7 @@ def check_effect(kind: type[Effect], cell: Cell | None = None) -> None:
     Checked on 30 states are: class attributes; shapes and finite values of what each method
     returns; that no state depends on the others; `response`, `wrench_columns` and
     `compliance_columns` against difference quotients; that all columns of the readings that are
-    used are named in `needs`.
-
-    Args:
-        cell: the cell that it is made for; unless given, an arm of six joints, or of seven.
+    used are named in `needs`. Unless a cell is given, it is tried on arms of six and seven joints.
 
     Raises:
         InputError: what is wrong, in one line: the file, the class or effect, what would be valid.

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from hilcal.effects.per_joint import PerJoint, joint_change
-from hilcal.effects.protocol import Columns, Situation
+from hilcal.effects.per_joint import PerJoint
+from hilcal.effects.protocol import Changeable, Columns, Situation
 
 
 class EncoderOffset(PerJoint):
@@ -13,8 +13,13 @@ class EncoderOffset(PerJoint):
     unit, size, meaning = "rad", 1e-3, "zero offset of {joint}"
     summary = "dq_j = o_j: the zero of each joint is off"
     kinematic = True
-    change = joint_change(
-        "zero", "repair, crash or a slipped joint?", listed=True, by_frame=True, with_others=True
+    change = Changeable(
+        "joint",
+        words="zero",
+        cause="repair, crash or a slipped joint?",
+        listed=True,
+        by_frame=True,
+        with_others=True,
     )
     plausible = 5.0  # 5 mrad: mastering to a mark, without a gauge, leaves 0.1° to 0.5°. A choice.
 

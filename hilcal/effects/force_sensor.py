@@ -12,7 +12,6 @@ from hilcal.robot import se3
 from hilcal.robot.statics import load_wrench_change
 from hilcal.types import Floats
 
-FORCE_AXES = ("x", "y", "z")
 ALONG_FLANGE: Floats = np.eye(3)  # Axes of a force sensor that are those of the flange
 
 
@@ -61,10 +60,6 @@ class ForceSensorEffect(Effect):
         """Derivative of −R h."""
         return _acting(s, self.error_columns(theta, recorded(s, self.axes)), self.axes)
 
-    def wrench_columns(self, theta: Floats, s: Situation) -> Floats:
-        """Slot wrenches by the derivative of −R h."""
-        return load_wrench_change(s.chain, s.load, self.load_columns(theta, s))
-
 
 def recorded(s: Situation, axes: Floats = ALONG_FLANGE) -> Floats:
     """Return the recorded wrench (N, 6) in sensor axes (3, 3) of the flange, N and N·m."""
@@ -76,9 +71,9 @@ def acting_change(s: Situation, error: Floats, axes: Floats = ALONG_FLANGE) -> F
     return -_turned(_sensor(s, axes), error) * _loaded(s)
 
 
-def acting_columns(s: Situation, columns: Floats, axes: Floats = ALONG_FLANGE) -> Floats:
+def acting_columns(s: Situation, columns: Floats) -> Floats:
     """Slot wrenches (N, P, n + 1, 6) by −R h, of the derivative (N or 1, P, 6) of h."""
-    return load_wrench_change(s.chain, s.load, _acting(s, columns, axes))
+    return load_wrench_change(s.chain, s.load, _acting(s, columns, ALONG_FLANGE))
 
 
 def sensor_error(s: Situation, change: Floats) -> Floats:

@@ -6,13 +6,14 @@ import numpy as np
 from numpy.polynomial.legendre import legvander
 
 from hilcal.cell import Cell
+from hilcal.effects.link_geometry import AXES
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 
-KINDS = ("x", "y", "z", "rx", "ry", "rz")
 USUAL_ORDERS, MOST_ORDERS = 4, 12
 STRAIGHTNESS, SCALE, TILT = 2e-5, 5e-5, 5e-5
+
 """Ordinary amplitudes: 20 µm across the travel, 50 µm along it at either end, 50 µrad. Guides of
 machine tools are better, rack-driven tracks of robots worse; a choice."""
 
@@ -49,7 +50,7 @@ class GuideError(Effect):
             raise InputError(f"effect {self.name}: orders = {k!r}; valid: 1 to {MOST_ORDERS}")
         self.orders = k
         terms = [("x", i) for i in range(2, k + 1)] + [("y", i) for i in range(2, k + 1)]
-        terms += [("z", 1)] + [(turn, i) for turn in KINDS[3:] for i in range(1, k + 1)]
+        terms += [("z", 1)] + [(turn, i) for turn in AXES[3:] for i in range(1, k + 1)]
         self._terms = tuple(terms)
 
     @property
@@ -78,7 +79,7 @@ class GuideError(Effect):
             low, high = arm.q_min[j], arm.q_max[j]
             waves = legvander((2 * s.values[:, j] - low - high) / (high - low), self.orders)
             for p, (kind, k) in enumerate(self._terms, start=n * count):
-                values[:, p, KINDS.index(kind)] = waves[:, k]
+                values[:, p, AXES.index(kind)] = waves[:, k]
             of_slide = values[:, n * count : (n + 1) * count]
             of_slide[..., 0] -= of_slide[..., 4] * travel[:, None, j]
             of_slide[..., 1] += of_slide[..., 3] * travel[:, None, j]

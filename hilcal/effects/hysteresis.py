@@ -1,7 +1,7 @@
 """`hysteresis`: friction and lost motion, by the side from which a joint arrived."""
 
-from hilcal.effects.per_joint import PerJoint, joint_change
-from hilcal.effects.protocol import Columns, Situation
+from hilcal.effects.per_joint import PerJoint
+from hilcal.effects.protocol import Changeable, Columns, Situation
 
 
 class Hysteresis(PerJoint):
@@ -10,7 +10,7 @@ class Hysteresis(PerJoint):
     name = "hysteresis"
     unit, size, meaning = "rad", 2e-5, "half hysteresis of {joint}"
     summary = "dq_j = h_j s_j: the joint stops short on the side from which it arrived"
-    change = joint_change("lost motion", "wear or repair?", listed=True)
+    change = Changeable("joint", words="lost motion", cause="wear or repair?", listed=True)
     plausible = 50.0  # 1 mrad; makers of gears state 0.3 mrad of lost motion. A choice.
     needs = ("approach",)
 

@@ -3,8 +3,8 @@
 import numpy as np
 
 from hilcal.effects.options import ordinary_give
-from hilcal.effects.per_joint import TorqueLaw, joint_change
-from hilcal.effects.protocol import Situation
+from hilcal.effects.per_joint import TorqueLaw
+from hilcal.effects.protocol import Changeable, Situation
 from hilcal.types import Floats
 
 
@@ -14,7 +14,9 @@ class JointCompliance(TorqueLaw):
     name = "joint_compliance"
     unit, meaning = "rad/(N·m)", "compliance of {joint}"
     summary = "dq_j = c_j τ_j: each joint gives way in proportion to its torque"
-    change = joint_change("compliance", "wear, crash or repair?", listed=True, with_others=True)
+    change = Changeable(
+        "joint", words="compliance", cause="wear, crash or repair?", listed=True, with_others=True
+    )
     plausible = 10.0  # 30 mrad at the rated torque; gears state 1 to 5. A choice.
     spread = 0.5  # Springs and oil of one type of gear scatter by a third; a choice
     role = "baseline"

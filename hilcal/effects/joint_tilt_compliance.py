@@ -3,8 +3,8 @@
 import numpy as np
 
 from hilcal.effects.options import rated_moments
-from hilcal.effects.per_joint import PerJoint, joint_change
-from hilcal.effects.protocol import Columns, Parameter, Response, Situation
+from hilcal.effects.per_joint import PerJoint
+from hilcal.effects.protocol import Changeable, Columns, Parameter, Response, Situation
 from hilcal.types import Floats
 
 ACROSS = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 0.0])
@@ -20,7 +20,7 @@ class JointTiltCompliance(PerJoint):
 
     name = "joint_tilt_compliance"
     summary = "rotation k_j t_j⊥ at joint j: its bearing tilts under the moment across its axis"
-    change = joint_change("tilt compliance", "wear or crash?")
+    change = Changeable("joint", words="tilt compliance", cause="wear or crash?")
     plausible = 10.0  # 10 mrad at the rated torque; cross-roller bearings state under 1. A choice.
     elastic = True
     local_response = True

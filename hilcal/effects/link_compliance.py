@@ -3,13 +3,14 @@
 import numpy as np
 
 from hilcal.effects.options import rated_moments
-from hilcal.effects.protocol import Columns, Effect, Parameter, Response, Situation
+from hilcal.effects.protocol import Parameter
+from hilcal.effects.slot_compliance import SlotCompliance
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats, Ints
 
 
-class LinkCompliance(Effect):
+class LinkCompliance(SlotCompliance):
     """Each long link is a cantilever from joint k, along L_k, with its tip at slot k.
 
     With d the unit vector along the link, L its length, F and M what everything beyond the
@@ -27,8 +28,6 @@ class LinkCompliance(Effect):
     name = "link_compliance"
     summary = "tip moves L³/3EI F + L²/2EI M, turns L²/2EI F + L/EI M, twists L/GJ M: links bend"
     plausible = 10.0  # Ten times as soft as a link of ordinary section, see `parameters`. A choice.
-    elastic = True
-    local_response = True
 
     @property
     def links(self) -> Ints:
@@ -47,23 +46,8 @@ class LinkCompliance(Effect):
             out.append(Parameter(f"link{k}.twist", "1/(N·m²)", scale, f"1/GJ of link {k}"))
         return tuple(out)
 
-    def columns(self, s: Situation) -> tuple[Columns, ...]:
-        """Twist of slot k by the wrench there, for a unit of each parameter."""
-        laws, slots = self._laws(), np.repeat(self.links, 2)
-        values = np.stack(
-            [s.wrench[:, k] @ law.T for k, law in zip(slots, laws, strict=True)], axis=1
-        )
-        return (Columns("twist", np.arange(len(slots)), slots, values),)
-
-    def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
-        """Twist of slot k by the change of the wrench there."""
-        twist = np.zeros_like(change)
-        for k, law, t in zip(np.repeat(self.links, 2), self._laws(), theta, strict=True):
-            twist[:, :, k] += change[:, :, k] @ (t * law.T)
-        return Response(twist=twist)
-
-    def _laws(self) -> Floats:
-        """(2 b, 6, 6) twist of the tip by its wrench, slot axes: bending and twist of each."""
+    def laws(self) -> tuple[Ints, Floats]:
+        """Twist of the tip by its wrench: bending and twist of each link."""
         out = []
         for k in self.links:
             along = self.cell.arm.links[k, :3, :3].T @ self.cell.arm.links[k, :3, 3]
@@ -75,14 +59,11 @@ class LinkCompliance(Effect):
             bend[3:, :3], bend[3:, 3:] = length**2 / 2 * turn, length * across
             twist[3:, 3:] = length * np.outer(d, d)
             out += [bend, twist]
-        return np.array(out)
+        return np.repeat(self.links, 2), np.array(out)
 
 
 def long_links(arm: Arm) -> Ints:
-    """(b,) numbers k, at most two, of the links L_k that count as beams, ascending.
-
-    Where no link between joints has a length, the last one, to the flange.
-    """
+    """(b,) numbers k, at most two, of the links L_k that bend; n where none has a length."""
     lengths = np.linalg.norm(arm.links[1:-1, :3, 3], axis=1)
     if not np.any(lengths):
         return np.array([arm.n])

@@ -33,8 +33,8 @@ def tool_weight(effect: Effect) -> Directions:
 class LinkMass(Effect):
     """First moment (mass × centre of mass) of link k is off by δ_k, link axes [kg·m].
 
-    It acts through the elastic effects only: the weight exerts the moment (R_k δ_k) × g more
-    about the origin of joint k. Link k is what joint k moves; its axes turn with that joint.
+    The weight exerts the moment (R_k δ_k) × g more about the origin of joint k. Link k is what
+    joint k moves; its axes turn with that joint.
     """
 
     name = "link_mass"

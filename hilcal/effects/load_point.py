@@ -2,18 +2,20 @@
 
 import numpy as np
 
-from hilcal.effects.protocol import Changeable, Columns, Effect, LoadChange, Parameter, Situation
+from hilcal.effects.protocol import (
+    Changeable,
+    Columns,
+    Effect,
+    LoadChange,
+    Parameter,
+    Situation,
+)
 from hilcal.robot import se3
-from hilcal.robot.statics import slot_wrench_change
 from hilcal.types import Floats
 
 
 class LoadPoint(Effect):
-    """Shift of the point where the wrench acts, flange axes [m].
-
-    It acts through the elastic effects only: a shift δ changes the moment at the flange
-    by (R δ) × f.
-    """
+    """Shift δ of the point where the wrench acts, flange axes [m]; it adds the moment (R δ) × f."""
 
     name = "load_point"
     summary = "the load acts elsewhere than configured (flange axes)"
@@ -21,10 +23,7 @@ class LoadPoint(Effect):
     plausible = 10.0  # 10 cm: a hook or an eye instead of the flange. A choice.
     of_setup = True
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Shift along x, y and z of the flange."""
-        return tuple(Parameter(a, "m", 1e-2, f"shift along flange {a}") for a in "xyz")
+    parameters = tuple(Parameter(a, "m", 1e-2, f"shift along flange {a}") for a in "xyz")
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """No deviation of its own."""
@@ -39,8 +38,3 @@ class LoadPoint(Effect):
         axes = np.swapaxes(s.chain.rotation[-1], 1, 2)
         moment = se3.cross(axes, s.load.wrench[:, None, :3])
         return np.concatenate([np.zeros_like(moment), moment], axis=2)
-
-    def wrench_columns(self, theta: Floats, s: Situation) -> Floats:
-        """Moments of unit shifts, carried by all slots."""
-        change = self.load_columns(theta, s)
-        return slot_wrench_change(s.chain, change[..., :3], change[..., 3:])

@@ -17,7 +17,6 @@ at its rated force, m. Guesses within the 0.3 to 5 mrad of most arms, and for ra
 10 to 100 N/µm."""
 ORDINARY_TWIST, ORDINARY_SHIFT = 3e-3, 1e-4  # the ordinary ones, rad and m
 LEVER = 0.5  # Moment on a carriage per rated force of its drive, m: a choice
-
 PRIOR_HELP = dict.fromkeys(
     ("prior_m", "prior_rad"), "standard deviation of what is known of it already."
 )

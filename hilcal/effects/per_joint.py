@@ -5,19 +5,12 @@ import re
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 
 from hilcal.effects.options import Options
-from hilcal.effects.protocol import (
-    Changeable,
-    Columns,
-    Effect,
-    Parameter,
-    Response,
-    Situation,
-)
+from hilcal.effects.protocol import Columns, Effect, Field, Parameter, Response, Situation
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Floats, Ints
@@ -25,7 +18,6 @@ from hilcal.types import Floats, Ints
 EACH, COMMON = "each", "common"
 OF_SLIDES = {"rad": "m", "rad/(N·m)": "m/N", "rad/(N·m)³": "m/N³", "rad/K": "m/K"}
 """Units of a drive that turns, and of one that slides."""
-JointField = Literal["dq", "twist"]
 _RANGE = re.compile(r"([0-9]{1,3})(?:-([0-9]{1,3}))?")
 
 
@@ -45,10 +37,7 @@ class JointGroups:
 
 
 def joint_groups(effect: str, options: Options, count: int) -> JointGroups:
-    """Read the option `joints` for an arm of `count` joints.
-
-    Groups are separated by "/", the joints of a group by "+" or as a range.
-    """
+    """Read the option `joints`: groups apart by "/", each as a range or joined by "+"."""
     option = options["joints"]
     text = str(option) if type(option) is int else option
     if text == EACH:
@@ -101,17 +90,6 @@ def _label(group: list[int]) -> str:
     ends = [j for j in group if j + 1 not in group]
     pairs = zip(starts, ends, strict=True)
     return "+".join(f"{a + 1}" if a == b else f"{a + 1}-{b + 1}" for a, b in pairs)
-
-
-def joint_change(
-    words: str, cause: str, *, listed: bool = False, by_frame: bool = False,
-    with_others: bool = False, **options: object,
-) -> Changeable:  # fmt: skip
-    """Return how the parameters of a joint may change, each by itself; see `Changeable`."""
-    return Changeable(
-        "joint", words=words, cause=cause, listed=listed, by_frame=by_frame,
-        options={"joints": EACH, **options}, with_others=with_others,
-    )  # fmt: skip
 
 
 class PerJoint(Effect):
@@ -191,7 +169,7 @@ class PerJoint(Effect):
             for kind, phrase in variants
         )
 
-    def joint_columns(self, field: JointField, values: Floats) -> Columns:
+    def joint_columns(self, field: Field, values: Floats) -> Columns:
         """Columns of one parameter per group: values (N, n) for dq, (N, n, 6) for twist."""
         g = self.shared
         return Columns(field, g.group, g.joint, self._of_named(values))

@@ -6,6 +6,7 @@ evaluated on the sum of all deviations. A new effect is one small class in one f
 returns `load_change` or `wrench_change`, and their derivative `wrench_columns`.
 """
 
+import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -21,7 +22,7 @@ from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.robot.chain import Chain, Deviation
 from hilcal.robot.se3 import zeros
-from hilcal.robot.statics import Load
+from hilcal.robot.statics import Load, load_wrench_change
 from hilcal.types import Bools, Floats, Ints
 
 Kind = Literal["joint", "link", "base", "tool", "setup", "surroundings"]
@@ -90,10 +91,7 @@ class Situation:
 
     @property
     def values(self) -> Floats:
-        """(N, n) the controller's joint values, rad: the actual ones where recorded.
-
-        They differ from `angle` where joints of the arm are coupled.
-        """
+        """(N, n) the controller's joint values, rad: the actual ones where recorded."""
         return self.states.q if self.states.q_actual is None else self.states.q_actual
 
     @property
@@ -255,11 +253,7 @@ class Effect(ABC):
         """Derivative of the deviation by the parameters, at fixed wrenches."""
 
     def checked_columns(self, s: Situation) -> tuple[Columns, ...]:
-        """Return the columns, for use by the model.
-
-        Raises:
-            InputError: a value is not finite, or the values are of another number of states.
-        """
+        """Return the columns; raises InputError for values not finite, or not of N states."""
         columns = self.columns(s)
         for c in columns:
             if len(c.values) not in (1, len(s.angle)):
@@ -294,14 +288,12 @@ class Effect(ABC):
         return None
 
     def wrench_columns(self, theta: Floats, s: Situation) -> Floats | None:
-        """Derivative (N, P, n + 1, 6) of the slot wrenches, for effects that change the load.
-
-        At a fixed configuration.
-        """
-        return None
+        """(N, P, n + 1, 6) derivative of the slot wrenches by the load, nothing else moving."""
+        change = self.load_columns(theta, s)
+        return None if change is None else load_wrench_change(s.chain, s.load, change)
 
     def load_columns(self, theta: Floats, s: Situation) -> Floats | None:
-        """Derivative (N, P, 6) of the load's wrench at the load point, base axes.
+        """(N, P, 6) derivative of the load's wrench at the load point, base axes.
 
         For effects whose `wrench_columns` follow from it; Jacobians then cost less.
         """
@@ -312,10 +304,7 @@ class Effect(ABC):
         return None
 
     def compliance_columns(self, theta: Floats, s: Situation) -> tuple[Columns, ...]:
-        """Derivative of the deviation by `s.compliance`, for effects whose law contains it.
-
-        The parameters of these columns are the n joints.
-        """
+        """Derivative by `s.compliance`, its parameters the n joints, for laws that contain it."""
         return ()
 
     def of_compliance(self, columns: Columns) -> Columns:
@@ -466,3 +455,51 @@ def source_of(kind: type) -> str:
         if code := getattr(function, "__code__", None):
             return str(code.co_filename)
     return kind.__module__
+
+
+@dataclass(frozen=True, slots=True)
+class EffectSpec:
+    """An effect that a model builds for its own cell and readings when it is added."""
+
+    kind: str | type[Effect]  # its name in the catalogue of the model, or its class
+    options: Options = field(default_factory=dict)  # those that differ from the usual ones
+
+    @property
+    def name(self) -> str:
+        """Name of the effect."""
+        return self.kind if isinstance(self.kind, str) else self.kind.name
+
+
+def effect(kind: str | type[Effect], **options: object) -> EffectSpec:
+    """Return an effect by name and options, to be added to a model.
+
+    >>> hc.effect("creep", joints="each")
+    EffectSpec(kind='creep', options={'joints': 'each'})
+
+    Args:
+        kind: a name of the model's catalogue, or a class.
+        **options: those that differ from the usual ones, as `joints="each"`.
+    """
+    return EffectSpec(kind, options)
+
+
+def failure_of(error: Exception) -> InputError | None:
+    """Return an error raised in a user's effect as one line, by its traceback; None for others."""
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        effect = frame.f_locals.get("self", frame.f_locals.get("cls"))
+        kind = effect if isinstance(effect, type) else type(effect)
+        file = frame.f_code.co_filename
+        module = str(frame.f_globals.get("__name__"))
+        if issubclass(kind, Effect) and not module.startswith("hilcal."):
+            return InputError(
+                f"{file}{line_in(error, file)}: effect {kind.name}: {frame.f_code.co_name} raises "
+                f"{type(error).__name__}: {error}"
+            )
+    return None
+
+
+def line_in(error: BaseException, file: str) -> str:
+    """Return ", line N" with the last line of a file that an exception passed; "" for none."""
+    frames = traceback.extract_tb(error.__traceback__)
+    lines = [frame.lineno for frame in frames if frame.filename == file]
+    return f", line {lines[-1]}" if lines else ""

@@ -15,12 +15,9 @@ class SensorMisalignment(ForceSensorEffect):
     summary = "acting = R exp(δ) Rᵀ wrench: the force sensor's axes are turned by δ"
     plausible = 20.0  # 0.2 rad: bolted on by eye. A choice.
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Turn about the sensor's axes; 10 mrad are ordinary."""
-        return tuple(
-            Parameter(f"r{a}", "rad", 1e-2, f"turn of the sensor about its {a}") for a in "xyz"
-        )
+    parameters = tuple(
+        Parameter(f"r{a}", "rad", 1e-2, f"turn of the sensor about its {a}") for a in "xyz"
+    )
 
     def error(self, theta: Floats, recorded: Floats) -> Floats:
         """Return w − exp([δ]×) w."""

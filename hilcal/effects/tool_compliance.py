@@ -3,13 +3,12 @@
 import numpy as np
 
 from hilcal.effects.options import rated_moments
-from hilcal.effects.protocol import Changeable, Columns, Effect, Parameter, Response, Situation
-from hilcal.types import Floats
+from hilcal.effects.protocol import Changeable, Parameter
+from hilcal.effects.slot_compliance import SlotCompliance
+from hilcal.types import Floats, Ints
 
-PARTS = np.array([[0, 0, 0, 0, 0, 1.0], [0, 0, 0, 1.0, 1.0, 0]])  # about z, and across it
 
-
-class ToolCompliance(Effect):
+class ToolCompliance(SlotCompliance):
     """Rotation at the flange of a t_z z + c t_⊥, t the moment there: adapter, sensor, changer.
 
     t is the moment about the flange's origin of tool and load; a (along) and c (across the
@@ -22,8 +21,6 @@ class ToolCompliance(Effect):
     change = Changeable("tool", "tool", "the stiffness of what is bolted to the flange")
     plausible = 30.0  # 30 mrad at the rated torque of the last joint: a slender tool. A choice.
     of_setup = True
-    elastic = True
-    local_response = True
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -34,13 +31,7 @@ class ToolCompliance(Effect):
             Parameter("across", "rad/(N·m)", scale, "tilt across the flange's z axis"),
         )
 
-    def columns(self, s: Situation) -> tuple[Columns, ...]:
-        """Twist of slot n by the moment at the flange."""
-        slot = np.full(2, self.cell.arm.n)
-        return (Columns("twist", np.arange(2), slot, s.wrench[:, -1, None] * PARTS),)
-
-    def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
-        """Twist of slot n by the change of the moment there."""
-        twist = np.zeros_like(change)
-        twist[:, :, -1] = change[:, :, -1] * (theta @ PARTS)
-        return Response(twist=twist)
+    def laws(self) -> tuple[Ints, Floats]:
+        """Twist of slot n by the moment at the flange, about z and across it."""
+        parts = np.diag([0, 0, 0, 0, 0, 1.0]), np.diag([0, 0, 0, 1.0, 1.0, 0])
+        return np.full(2, self.cell.arm.n), np.array(parts)

@@ -4,9 +4,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilcal.effects.options import number
+from hilcal.effects.options import number, positive
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
-from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Floats
 
@@ -32,9 +31,7 @@ class TrackerDrift(Effect):
         self.options.setdefault("reference_s", float(states.time.min()))
         self.options.setdefault("span_s", max(float(np.ptp(states.time)), 1.0))
         self.reference = number(self.name, self.options, "reference_s")
-        self.span = number(self.name, self.options, "span_s")
-        if self.span <= 0:
-            raise InputError(f"effect {self.name}: span_s = {self.span:g}; valid: more than 0")
+        self.span = positive(self.name, self.options, "span_s")
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

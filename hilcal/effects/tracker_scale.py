@@ -17,10 +17,8 @@ class TrackerScale(Effect):
     plausible = 100.0  # 1 mm/m: photogrammetry without a bar; refraction makes 0.05. A choice.
     of_setup = True
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """The scale error; 10 µm/m is ordinary (10 °C misjudged in the air)."""
-        return (Parameter("scale", "1", 1e-5, "relative error of the tracker's ranges"),)
+    # 10 µm/m is ordinary: 10 °C misjudged in the air.
+    parameters = (Parameter("scale", "1", 1e-5, "relative error of the tracker's ranges"),)
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Unit scale."""

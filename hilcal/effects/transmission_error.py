@@ -5,8 +5,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilcal.effects.per_joint import PerJoint, joint_change
-from hilcal.effects.protocol import OWN_SPREAD, Columns, Effect, Parameter, Situation
+from hilcal.effects.per_joint import PerJoint
+from hilcal.effects.protocol import OWN_SPREAD, Changeable, Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Floats, Ints
@@ -29,7 +29,12 @@ class TransmissionError(PerJoint):
 
     name = "transmission_error"
     summary = "dq_j = Σ a_jk cos k q_j + b_jk sin k q_j: gear and encoder error"
-    change = joint_change("transmission error", "another gear or encoder?", harmonics=4)
+    change = Changeable(
+        "joint",
+        words="transmission error",
+        cause="another gear or encoder?",
+        options={"harmonics": 4},
+    )
     """Few readings resolve no more than four harmonics; finer ones act as scatter. A choice."""
     plausible = 30.0  # 1.5 mrad per harmonic; gears state 0.3 to 1 mrad. A choice.
     spread = 2.0**0.5  # Another gear errs as much, but elsewhere: the difference of two

@@ -15,12 +15,10 @@ class WrenchBias(ForceSensorEffect):
     change = Changeable("setup", "force sensor", "the zero of the force sensor")
     plausible = 30.0  # 30 N, 3 N·m: a sensor that was not zeroed with its tool. A choice.
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Offsets of force and moment."""
-        return tuple(
-            Parameter(f"f{a}", "N", 1.0, f"offset of the force along {a}") for a in "xyz"
-        ) + tuple(Parameter(f"m{a}", "N·m", 0.1, f"offset of the moment about {a}") for a in "xyz")
+    parameters = (
+        *(Parameter(f"f{a}", "N", 1.0, f"offset of the force along {a}") for a in "xyz"),
+        *(Parameter(f"m{a}", "N·m", 0.1, f"offset of the moment about {a}") for a in "xyz"),
+    )
 
     def error(self, theta: Floats, recorded: Floats) -> Floats:
         """Return b."""

@@ -20,14 +20,11 @@ class WrenchGain(ForceSensorEffect):
     change = Changeable("setup", "force sensor", "the gain of the force sensor")
     plausible = 50.0  # 50 %: a wrong calibration matrix, a channel that hardly reads. A choice.
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Gain errors of forces and moments; 1 % is ordinary."""
-        return tuple(
-            Parameter(f"{kind}{a}", "1", 1e-2, f"gain error of the {word} {a}")
-            for kind, word in (("f", "force along"), ("m", "moment about"))
-            for a in "xyz"
-        )
+    parameters = tuple(
+        Parameter(f"{kind}{a}", "1", 1e-2, f"gain error of the {word} {a}")
+        for kind, word in (("f", "force along"), ("m", "moment about"))
+        for a in "xyz"
+    )
 
     def error(self, theta: Floats, recorded: Floats) -> Floats:
         """Return g/(1 + g) w per axis."""

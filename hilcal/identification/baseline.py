@@ -20,7 +20,7 @@ from hilcal import limits
 from hilcal.cell import Cell
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import Options
-from hilcal.effects.spec import EffectSpec
+from hilcal.effects.protocol import EffectSpec
 from hilcal.identification.carried import CarriedPrior, check_prior
 from hilcal.identification.fit import Fit
 from hilcal.identification.misdescription import refuse_misdescribed

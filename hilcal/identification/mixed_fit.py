@@ -10,8 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilcal.effects.protocol import FRAME_ROLES
-from hilcal.effects.spec import EffectSpec
+from hilcal.effects.protocol import FRAME_ROLES, EffectSpec
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.full_covariance import joint_factors, whitened_blocks
 from hilcal.identification.residual import residual

@@ -10,8 +10,7 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import typical_compliances
-from hilcal.effects.protocol import Columns, Effect, Situation, total
-from hilcal.effects.spec import EffectSpec
+from hilcal.effects.protocol import Columns, Effect, EffectSpec, Situation, total
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.model.equilibrium import ReadingColumns, SlotResponse, at_equilibrium, compliance
 from hilcal.model.observe import Observation, ReadingDerivative, motion, observe

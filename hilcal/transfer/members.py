@@ -26,7 +26,7 @@ import numpy as np
 from hilcal import limits
 from hilcal.campaign.campaign import Campaign
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.effects.from_file import failure_of
+from hilcal.effects.protocol import failure_of
 from hilcal.errors import CannotAnswerError, HilcalError, InputError
 from hilcal.identification.background import MOST_ROWS
 from hilcal.identification.baseline import baseline, with_effects

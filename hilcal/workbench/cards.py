@@ -13,7 +13,7 @@ from nicegui import background_tasks, run, ui
 from nicegui.events import GenericEventArguments, TableSelectionEventArguments
 
 from hilcal import numbers
-from hilcal.diagnosis.distinguish import Difference
+from hilcal.diagnosis.recorded import Difference
 from hilcal.present import charts
 from hilcal.present.campaign import left_out_m, model_words, two_revisions, verdict_of
 from hilcal.present.diagnosis import shown_suspects, suspects_table

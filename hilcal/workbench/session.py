@@ -26,7 +26,7 @@ from hilcal.config.cell import (
     write_value,
 )
 from hilcal.diagnosis.diagnosis import Diagnosis
-from hilcal.diagnosis.distinguish import Difference, Recorded, distinguish, recorded_values
+from hilcal.diagnosis.recorded import Difference, StateVariable, distinguish, recorded_values
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.written import read_effects_text
 from hilcal.errors import InputError
@@ -303,7 +303,7 @@ class WorkbenchSession:
         suspect = next((s for s in snapshot.diagnosis.suspects if s.effect == effect), None)
         return None if suspect is None else regressor(snapshot.fit, suspect)
 
-    def recorded(self, snapshot: Snapshot) -> dict[str, Recorded]:
+    def recorded(self, snapshot: Snapshot) -> dict[str, StateVariable]:
         """Return the recorded variables of the measurements of the story (D,), by name."""
         rows = full_prediction(snapshot.fit).whitening.reading
         return {v.name: replace(v, values=v.values[rows]) for v in recorded_values(snapshot.fit)}

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from hilcal.effects.from_file import failure_of
+from hilcal.effects.protocol import failure_of
 from hilcal.errors import HilcalError
 
 Say = Callable[[str], None]

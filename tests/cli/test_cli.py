@@ -11,7 +11,6 @@ from hilcal import __version__
 from hilcal.campaign.campaign import Campaign
 from hilcal.config import load_config
 from hilcal.diagnosis.diagnosis import in_doubt
-from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.rehearsal import simulate
 from hilcal.effects.catalogue import installed
@@ -401,7 +400,7 @@ def test_one_verdict_through_every_door(case, tmp_path, capsys):
     assert refined["rejected"] == refined["diagnosis"]["rejected"]
     in_file, judged = latest(path)
     assert (in_file["verdict"], in_file["message"]) == (refined["verdict"], refined["message"])
-    assert json.loads(json.dumps(to_json(judged)["rejected"])) == refined["rejected"]
+    assert json.loads(json.dumps(judged.to_dict()["rejected"])) == refined["rejected"]
     check_doors(path, refined, capsys, tmp_path)
     with CampaignFile.open(path) as file:
         for record, row in zip(file.revisions()[1:], refined["revisions"], strict=True):

@@ -19,8 +19,8 @@ from hilcal.discovery.sites import sites
 from hilcal.discovery.structures import Structure
 from hilcal.drivers.simulated.injected_effects import nothing_hidden
 from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
+from hilcal.effects.catalogue import read_effects
 from hilcal.effects.check import check_effect, example_cell, example_situation, example_states
-from hilcal.effects.from_file import read_effects
 from hilcal.readings.covariance import WHOLE
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.table import write_table

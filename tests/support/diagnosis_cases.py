@@ -4,7 +4,9 @@ from hilcal.diagnosis.stepwise import add
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.readings.readings import Readings
-from tests.support.campaigns import Campaign
+from studies.study_cases import study_case
+from tests.support.campaigns import Campaign, configuration
+from tests.support.fit_cases import based
 
 
 def fitted(c: Campaign, *effects: str, readings: Readings | None = None) -> Fit:
@@ -14,3 +16,9 @@ def fitted(c: Campaign, *effects: str, readings: Readings | None = None) -> Fit:
     for name in effects:
         found = add(found, name)
     return found
+
+
+def studied(mode: str, *hidden: str, robot="ur5e", seed=1, strength=3.0, **more) -> Fit:
+    """The baseline of a campaign of the studies, which hides effects or laws."""
+    c = study_case(configuration(), robot, mode, hidden, strength, seed, **more)
+    return based(c.cell, c.readings, mode)

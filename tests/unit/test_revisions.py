@@ -9,7 +9,6 @@ import pytest
 
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.revisions import chain, restore, restore_model, to_record
-from hilcal.diagnosis.document import to_json as diagnosis_json
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
 from hilcal.identification.fit_document import plain, to_json
@@ -40,9 +39,7 @@ def record_of(r, found, added=None):
 def test_the_same_fit_comes_back(effect, held_out):
     r = rehearsal(effect)
     found = add(baseline_fit(r), effect)
-    text = to_text(
-        to_record(found, diagnosis_json(diagnose(found)), effect, content_hash(r.readings))
-    )
+    text = to_text(to_record(found, diagnose(found).to_dict(), effect, content_hash(r.readings)))
     again = restore(from_text(text, 2), r.cell, r.readings)
     assert again.model.names == found.model.names
     assert [e.options for e in again.model.effects] == [e.options for e in found.model.effects]

@@ -10,7 +10,7 @@ from hilcal.diagnosis.change import candidates, find_changes
 from hilcal.drivers.simulated.injected_effects import nothing_hidden
 from hilcal.drivers.simulated.rehearsal import measurement_noise
 from hilcal.drivers.simulated.world import stand
-from hilcal.effects.spec import effect
+from hilcal.effects.protocol import effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.later_readings import earlier_fit, setting

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.stats import f as f_distribution
 
-from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.diagnosis.verdict import diagnose
@@ -44,9 +43,6 @@ def hidden(effect, mode, seed, poses=30, **options):
     return campaign(effect, mode, seed, poses=poses, registration_known=known, **options)
 
 
-# --- nothing is wrong -----------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("mode", MODES)
 def test_nothing_hidden_is_adequate(mode):
     for seed in range(2):
@@ -70,14 +66,11 @@ def test_what_deflections_cannot_show_is_part_of_the_verdict():
         assert headline(d) == "adequate for deflections; geometry is not calibrated"
         assert "Geometry is not calibrated" in message(d)
         assert "No effect of the catalogue" not in message(d)
-        told = to_json(d)
+        told = d.to_dict()
         assert effect in told["not_shown"]
         assert {s["effect"] for s in told["suspects"] if not s["shown"]} >= set(d.not_shown)
         table = "\n".join(str(x) for x in could_have_been_seen(d) if isinstance(x, str))
         assert effect in table.partition("At no plausible size would these readings show")[2]
-
-
-# --- something is ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("effect", "mode"), HIDDEN)
@@ -109,9 +102,6 @@ def test_scores_foretell_what_adding_does(mode):
         assert f_distribution.isf(s.score.p_value, rank, rest) == pytest.approx(ratio, rel=0.03)
 
 
-# --- the noise is ---------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("factor", [2.0, 0.5])
 def test_misjudged_noise_is_told_from_a_missing_effect_by_repeats(mode, factor):
@@ -133,9 +123,6 @@ def test_misjudged_noise_without_repeats_cannot_be_known_to_be_it():
     assert d.verdict == "noise_misjudged"
     assert d.pure_error is None
     assert "Without repeated readings it cannot be known" in message(d)
-
-
-# --- where ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -166,9 +153,6 @@ def test_where_names_each_variable_once_and_in_order():
     assert all(0 <= v.share <= 1 and 0 <= v.p_value <= 1 for v in places)
     assert {f"joint {j} torque" for j in range(2, 7)} <= set(names)
     assert {"time", "load", "joint 1 approach", "joint 6 angle"} <= set(names)
-
-
-# --- form -----------------------------------------------------------------------------------
 
 
 def test_a_diagnosis_needs_whitened_residuals():

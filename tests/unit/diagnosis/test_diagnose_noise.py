@@ -40,9 +40,6 @@ def found(r, readings):
     return pure_error(r.fit(readings))
 
 
-# --- what repeats say is exact --------------------------------------------------------------
-
-
 def null_p_values(mode, m, seeds):
     r, rng = Repeated(mode, 6, m=m), np.random.default_rng(1)
     pure, lack = [], []
@@ -56,8 +53,7 @@ def null_p_values(mode, m, seeds):
 @pytest.mark.long
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize(
-    ("m", "seeds"),
-    [(3, 40), *(pytest.param(m, 300, marks=pytest.mark.slow) for m in (3, 6))],
+    ("m", "seeds"), [(3, 40), *(pytest.param(m, 300, marks=pytest.mark.slow) for m in (3, 6))]
 )
 def test_the_factor_is_chi_square_and_so_is_what_is_left(mode, m, seeds):
     for p in null_p_values(mode, m, seeds):
@@ -98,9 +94,6 @@ def test_drift_and_friction_between_repeats_are_not_noise():
         assert e.factor == pytest.approx(1, abs=4 * np.sqrt(2 / e.dof))
 
 
-# --- where ----------------------------------------------------------------------------------
-
-
 def spoilt(r, what, rng):
     read = with_noise(r.clean, rng)
     value, v = read.value.copy(), r.clean.covariance[:, :3, :3]
@@ -137,9 +130,6 @@ def test_a_common_factor_has_no_direction(mode):
         assert e.where is None
         assert e.interval[0] < 4.5
         assert e.interval[1] > 3.5
-
-
-# --- the rule -------------------------------------------------------------------------------
 
 
 def test_repeats_that_scatter_less_blame_the_model():

@@ -5,8 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.config import load_config
-from hilcal.diagnosis.document import suspect_json
 from hilcal.diagnosis.effect_ranking import (
     beyond_geometry,
     candidates,
@@ -31,33 +29,19 @@ from hilcal.identification.linearisation import linearise
 from hilcal.present.diagnosis import finer
 from hilcal.present.verdict import message
 from hilcal.refinement import refine
-from studies.study_cases import study_case
 from tests.support.campaigns import NOTHING, campaign, configuration, measured, plan
-from tests.support.diagnosis_cases import fitted
+from tests.support.diagnosis_cases import fitted, studied
 from tests.support.fit_cases import based
-from tests.support.paths import ROOT
 from tests.support.refusals import refusal
 
 SECOND_ORDER = {"link_geometry", "encoder_offset", "joint_coupling", "link_mass"}
-
-
-def unmodelled(law, robot):
-    case = study_case(
-        load_config(ROOT / "configs/cells/demo_ur10e.toml"),
-        robot,
-        "deflection",
-        (law,),
-        3.0,
-        seed=0,
-    )
-    return based(case.cell, case.readings, "deflection")
 
 
 @pytest.mark.parametrize(
     ("law", "robot"), [("crosswise compliance", "ur5e"), ("compliance by another joint", "ur10e")]
 )
 def test_no_error_of_second_order_is_named_for_deflections(law, robot):
-    d = diagnose(unmodelled(law, robot))
+    d = diagnose(studied("deflection", law, robot=robot, seed=0))
     assert d.verdict == "unknown_effect"
     assert not SECOND_ORDER & set(d.significant)
     geometry = next(s for s in d.suspects if s.effect == "link_geometry")
@@ -182,7 +166,7 @@ def test_the_verdict_is_to_let_joints_differ(arm, joints):
     lead = d.suspects[0]
     assert lead.share > 0.95
     assert message(d).startswith(f"Let joints differ: {EACH} explains")
-    assert suspect_json(lead)["finer_than"] == "joint_compliance"
+    assert lead.to_dict()["finer_than"] == "joint_compliance"
     assert list(finer(d)) == [
         "Let joints differ: joint_compliance has one parameter for several joints; to give each "
         f'its own: hilcal add RUN "{EACH}".'
@@ -226,23 +210,15 @@ def test_only_what_is_finer_takes_the_place_of_an_effect(arm):
         add(halves, "joint_compliance", {"joints": "1-2/3-6"})
 
 
-@pytest.mark.parametrize(
-    ("own", "other", "finer_"),
-    [
-        ("each", "common", True),
-        ("each", "1-3/4-6", True),
-        ("2/3", "2+3", True),
-        ("1/2/3", "2+3", True),
-        ("1-2/3-6", "1-3/4-6", False),
-        ("2/3", "common", False),
-        ("common", "each", False),
-        ("each", "each", False),
-    ],
-)
-def test_finer_is_what_splits_groups_and_keeps_joints(arm, own, other, finer_):
+FINER = ("each common", "each 1-3/4-6", "2/3 2+3", "1/2/3 2+3")
+NOT_FINER = ("1-2/3-6 1-3/4-6", "2/3 common", "common each", "each each")
+
+
+@pytest.mark.parametrize("groups", FINER + NOT_FINER)
+def test_finer_is_what_splits_groups_and_keeps_joints(arm, groups):
     states = arm.readings.states
-    one, two = (JointCompliance(arm.cell, states, {"joints": j}) for j in (own, other))
-    assert one.refines(two) is finer_
+    one, two = (JointCompliance(arm.cell, states, {"joints": j}) for j in groups.split())
+    assert one.refines(two) is (groups in FINER)
     refined = two.refined(states)
     if refined is not None:
         assert refined.refines(two)

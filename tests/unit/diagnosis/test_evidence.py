@@ -7,13 +7,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, multivariate_normal
 
-from hilcal.config import load_config
-from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.effect_ranking import candidates, most, rank_suspects, unloaded_readings
-from hilcal.diagnosis.evidence import (
-    spoken_against,
-    whole_catalogue,
-)
+from hilcal.diagnosis.evidence import spoken_against, whole_catalogue
 from hilcal.diagnosis.noise import MISFIT_ALARM
 from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
@@ -29,20 +24,9 @@ from hilcal.identification.posterior import Posterior
 from hilcal.identification.priors import names_of
 from hilcal.present.verdict import message
 from hilcal.refinement import refine
-from hilcal.robot.catalogue import configs_dir
-from studies.study_cases import study_case
 from tests.support.campaigns import campaign, measured, plan
-from tests.support.diagnosis_cases import fitted
+from tests.support.diagnosis_cases import fitted, studied
 from tests.support.fit_cases import based
-
-CELL = configs_dir() / "cells" / "demo_ur10e.toml"
-
-
-def studied(mode, *hidden, seed=1, strength=3.0, stated=1.0, cycles=1):
-    c = study_case(
-        load_config(CELL), "ur5e", mode, hidden, strength, seed, stated=stated, cycles=cycles
-    )
-    return based(c.cell, c.readings, mode)
 
 
 @pytest.mark.parametrize("seeds", [(0,), pytest.param((1, 2, 3), marks=pytest.mark.slow)])
@@ -74,7 +58,7 @@ def check_insufficiency(d):
     assert i.variance_factor > 1.0
     assert 0 <= i.refitted <= len(i.effects)
     assert d.separability == ()
-    assert to_json(d)["beyond"] == {
+    assert d.to_dict()["beyond"] == {
         "effects": list(i.effects),
         "refitted": i.refitted,
         "share": i.share,

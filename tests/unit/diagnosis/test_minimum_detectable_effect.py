@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from hilcal.diagnosis.document import least
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.minimum_detectable_effect import least_strength
 from hilcal.diagnosis.verdict import diagnose
@@ -34,7 +33,7 @@ def test_a_family_is_seen_from_where_poses_left_out_show_it_and_not_finer_than_p
     assert s.least.visible
     assert s.least.displacement_m > alone.displacement_m
     assert s.least.finest_m == np.inf
-    assert least(s.least)["finer_than_poses"] == {"visible": False, "displacement_m": None}
+    assert s.least.to_dict()["finer_than_poses"] == {"visible": False, "displacement_m": None}
     said = [line for line in could_have_been_seen(diagnose(f)) if isinstance(line, str)]
     assert f"A {ERROR} finer than these poses resolve would be seen at no size.\n" in said
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from hilcal.diagnosis.diagnosis import in_doubt
-from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.effect_ranking import candidates
 from hilcal.diagnosis.misfit_breakdown import pose_constants
 from hilcal.diagnosis.pose_alone import chance
@@ -74,7 +73,7 @@ def test_a_transmission_error_too_fine_for_thirty_poses_is_ambiguous(seed):
     assert d.pose_alone.chance > 0.9
     assert "130 more poses would decide with a chance of" in message(d)
     assert in_doubt(d)[:2] == ("transmission_error", "link_geometry")
-    assert to_json(d)["pose_alone"]["more"] == 130
+    assert d.to_dict()["pose_alone"]["more"] == 130
 
 
 def test_the_chance_grows_with_the_poses():

@@ -9,7 +9,6 @@ from hilcal.campaign.revisions import restore, to_record
 from hilcal.cli.demo import CELL
 from hilcal.config import load_config
 from hilcal.diagnosis.diagnosis import VERDICTS
-from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.serial_noise import MOST_READINGS, serial_noise, with_serial_noise
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.present.verdict import message
@@ -56,7 +55,7 @@ def test_nothing_is_named_for_it_and_it_is_said(mode):
     said = message(found.diagnosis)
     assert "correlated along their order" in said
     assert "half-time" in said
-    document = to_json(found.diagnosis)["serial_noise"]
+    document = found.diagnosis.to_dict()["serial_noise"]
     assert document["rho"] == serial.rho
     assert document["half"] == pytest.approx(serial.length * np.log(2))
 

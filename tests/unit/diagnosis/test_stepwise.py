@@ -7,12 +7,7 @@ import pytest
 from scipy.stats import f as f_distribution
 
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
-from hilcal.diagnosis.evidence import (
-    CHANCE,
-    PRICE,
-    StepwiseAlternatives,
-    backward_elimination,
-)
+from hilcal.diagnosis.evidence import CHANCE, PRICE, StepwiseAlternatives, backward_elimination
 from hilcal.diagnosis.minimum_detectable_effect import least_strength
 from hilcal.diagnosis.stepwise import add, exchange, remove, trial
 from hilcal.drivers.simulated.injected_effects import hide
@@ -45,9 +40,6 @@ def test_an_effect_that_the_readings_cannot_determine_is_rejected():
     assert refine(before.model, few, "absolute").fit.theta.size
 
 
-# --- needless -------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("mode", "effects"),
@@ -77,9 +69,6 @@ def test_what_is_there_is_not_backward_elimination(effect):
     mode = "absolute" if effect == "transmission_error" else "deflection"
     c = campaign(effect, mode, 3, poses=30, strength=1.0)
     assert effect not in backward_elimination(fitted(c, effect))
-
-
-# --- reconsidered ---------------------------------------------------------------------------
 
 
 def test_an_early_addition_that_became_needless_is_removed():
@@ -164,9 +153,6 @@ def test_an_exchange_needs_an_effect_that_is_there_and_one_that_is_not():
         refusal("hysteresis is not in the model", changed)
     with pytest.raises(InputError, match="joint_compliance is in the model already"):
         exchange(found, "backlash", "joint_compliance")
-
-
-# --- what could have been seen --------------------------------------------------------------
 
 
 @pytest.mark.parametrize("effect", ["backlash", "wrench_bias"])

@@ -8,13 +8,7 @@ import numpy as np
 import pytest
 
 from hilcal.diagnosis.background_evidence import background_evidence, p_value_of_others, proved
-from hilcal.diagnosis.diagnosis import (
-    LARGEST,
-    PRIOR_ODDS,
-    History,
-    effect_probabilities,
-    in_doubt,
-)
+from hilcal.diagnosis.diagnosis import LARGEST, PRIOR_ODDS, History, effect_probabilities, in_doubt
 from hilcal.diagnosis.evidence import Alternative, Evidence
 from hilcal.diagnosis.verdict import diagnose, judge
 from hilcal.identification.background import with_background

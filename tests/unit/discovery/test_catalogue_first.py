@@ -12,7 +12,7 @@ from hilcal.discovery.known_effects import Instead, instead_of_law, known_effect
 from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.screen import LawTerm, screen
 from hilcal.discovery.search import LEAST, Selection
-from hilcal.effects.spec import EffectSpec
+from hilcal.effects.protocol import EffectSpec
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise

@@ -12,9 +12,8 @@ from hilcal.discovery.amplitudes import Amplitude, Factor, composed, variables
 from hilcal.discovery.curve import drawn_laws
 from hilcal.discovery.law import Coefficient, Form, Law, LawPart, source_of_form
 from hilcal.discovery.sites import sites
-from hilcal.effects.catalogue import installed
+from hilcal.effects.catalogue import effects_of, installed
 from hilcal.effects.check import example_cell, example_situation, example_states
-from hilcal.effects.from_file import effects_of
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import fit
 from hilcal.present.charts import curve_chart
@@ -67,22 +66,14 @@ WAVE = Amplitude((Factor(NAMED["q_4"], shapes.COS, (2.0,)), Factor(NAMED["τ_3"]
 BEND = Amplitude((Factor(composed(((1.0, of("q_1")), (-0.5, of("q_5")))), shapes.ABOVE, (0.2,)),))
 
 
-@pytest.mark.parametrize(
-    "amplitude",
-    [
-        of("q_3", shapes.SIN, 3.0),
-        of(SUM, shapes.COS, 1.0),
-        of("(q_1 - q_2)", shapes.COS, 1.0),
-        of("τ_2", shapes.THRESHOLD, 4.0),
-        of("|f|", shapes.ABOVE, 10.0),
-        of("t", shapes.RELAXATION, 600.0),
-        of(AIR),
-        WAVE,
-        BEND,
-        Amplitude(()),
-    ],
-    ids=lambda a: a.text() or "constant",
-)
+AMPLITUDES = (
+    of("q_3", shapes.SIN, 3.0), of(SUM, shapes.COS, 1.0), of("(q_1 - q_2)", shapes.COS, 1.0),
+    of("τ_2", shapes.THRESHOLD, 4.0), of("|f|", shapes.ABOVE, 10.0), of(AIR), WAVE, BEND,
+    of("t", shapes.RELAXATION, 600.0), Amplitude(()),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("amplitude", AMPLITUDES, ids=lambda a: a.text() or "constant")
 def test_an_expression_has_the_value_of_the_law(amplitude):
     text = law(("dq_3", 2e-4, amplitude)).expressions["dq_3"]
     value = Formula.parse(text, COLUMNS).value(COLUMNS)

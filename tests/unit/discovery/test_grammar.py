@@ -65,18 +65,14 @@ def test_every_function_is_an_effect_with_its_derivative():
         accept(LawPart(site, product(factor, other), 0), LawPart(places[1], product(factor), 1))
 
 
+ONE_SIDED = (
+    (shapes.PLUS, ()), (shapes.MINUS, ()), (shapes.ABOVE, (0.0,)), (shapes.SATURATION, (0.05,)),
+    (shapes.ABOVE_POWER, (0.0, 1.5)), (shapes.BELOW_POWER, (0.0, 1.2)),
+)  # fmt: skip
+
+
 @pytest.mark.parametrize("joint", [1, 3])
-@pytest.mark.parametrize(
-    ("shape", "numbers"),
-    [
-        (shapes.PLUS, ()),
-        (shapes.MINUS, ()),
-        (shapes.ABOVE, (0.0,)),
-        (shapes.ABOVE_POWER, (0.0, 1.5)),
-        (shapes.BELOW_POWER, (0.0, 1.2)),
-        (shapes.SATURATION, (0.05,)),
-    ],
-)
+@pytest.mark.parametrize(("shape", "numbers"), ONE_SIDED)
 def test_a_one_sided_law_is_an_effect_also_where_nothing_hangs(shape, numbers, joint):
     """Joint 1 of an unloaded arm has no torque: the states are at the bend itself."""
     torque = named(example())[f"τ_{joint}"]
@@ -97,20 +93,14 @@ def test_fine_waves_are_tried_up_to_the_number_of_poses_and_in_no_product(monkey
 
 
 SIGMA = 6.0
+OF_A_SUM = (
+    (shapes.ABOVE, (3.0,)), (shapes.BELOW, (-2.0,)), (shapes.ABOVE_POWER, (-3.0, 1.6)),
+    (shapes.BELOW_POWER, (4.0, 2.3)), (shapes.THRESHOLD, (2.0,)), (shapes.SATURATION, (9.0,)),
+    (shapes.STEP, (-1.0, 7.0)),
+)  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("shape", "numbers"),
-    [
-        (shapes.ABOVE, (3.0,)),
-        (shapes.BELOW, (-2.0,)),
-        (shapes.ABOVE_POWER, (-3.0, 1.6)),
-        (shapes.BELOW_POWER, (4.0, 2.3)),
-        (shapes.THRESHOLD, (2.0,)),
-        (shapes.SATURATION, (9.0,)),
-        (shapes.STEP, (-1.0, 7.0)),
-    ],
-)
+@pytest.mark.parametrize(("shape", "numbers"), OF_A_SUM)
 def test_a_function_of_a_sum_of_products_is_an_effect_with_its_derivative(shape, numbers):
     known = named(example())
     u = composed(

@@ -12,7 +12,7 @@ from hilcal.discovery.amplitudes import Amplitude, Factor, variables
 from hilcal.discovery.curve import curves
 from hilcal.discovery.discovery import Discovery, alternatives, discover, discovery_json
 from hilcal.discovery.law import Form, LawPart, effect_class
-from hilcal.discovery.problem import SearchProblem
+from hilcal.discovery.problem import CandidateTerms, SearchProblem
 from hilcal.discovery.screen import LawTerm
 from hilcal.discovery.search import search
 from hilcal.discovery.sites import sites
@@ -183,7 +183,7 @@ def test_a_pair_is_found_of_which_neither_part_explains_anything_alone():
     noise = 0.3 * np.random.default_rng(5).standard_normal(len(p.residual))
     p.residual = p._thin_residual = 40.0 * direction + p.model.project_out(noise)
     p.rss = float(p.residual @ p.residual)
-    alone = p.beside(()).score([LawTerm(((place, k),), 0.0) for k in (f, less)])
+    alone = CandidateTerms(p, ()).score([LawTerm(((place, k),), 0.0) for k in (f, less)])
     assert all(c.score.gain < 0.05 * p.rss for c in alone)
     best = search(p, most=1)[0].terms[0]
     x = np.hstack([p.columns(best)])

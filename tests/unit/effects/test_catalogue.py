@@ -9,9 +9,7 @@ import pytest
 import hilcal
 from hilcal.diagnosis.effect_ranking import candidates
 from hilcal.effects.catalogue import installed
-from hilcal.effects.from_file import failure_of
-from hilcal.effects.protocol import Columns, Effect, Parameter, Role
-from hilcal.effects.spec import effect
+from hilcal.effects.protocol import Columns, Effect, Parameter, Role, effect, failure_of
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit

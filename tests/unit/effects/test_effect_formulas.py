@@ -28,8 +28,6 @@ from tests.support.effect_cases import (
     some_states,
 )
 
-# --- elastic --------------------------------------------------------------------------------
-
 
 @pytest.mark.parametrize("name", [*robot_names(), "odd"])
 def test_long_links_are_those_of_the_simulated_world(name):
@@ -66,9 +64,6 @@ def test_creep_without_a_compliance_in_the_model_takes_a_typical_one():
     decades = np.log10(1 + states.load_time)[:, None]
     expected = 0.1 * decades * typical * alone.situation.torque
     np.testing.assert_allclose(alone.deviation.dq, expected, rtol=0, atol=1e-12)
-
-
-# --- temperature, instrument ----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("arm", CELLS)

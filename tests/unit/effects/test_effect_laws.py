@@ -20,8 +20,6 @@ from tests.support.effect_cases import (
     some_states,
 )
 
-# --- laws, against the simulated world ------------------------------------------------------
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Both:

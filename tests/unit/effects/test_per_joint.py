@@ -61,9 +61,6 @@ def spread(effect, groups):
     return np.kron(member, np.eye(len(effect.parameters) // member.shape[1]))
 
 
-# --- how it is written ----------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("given", "text", "labels", "joint", "group"),
     [
@@ -91,9 +88,6 @@ def test_groups_are_read_and_written_in_one_way(given, text, labels, joint, grou
 @refusals("joints")
 def test_other_groups_are_refused_with_what_would_be_valid(case, given):
     refuses(case, lambda: joint_groups("hysteresis", {"joints": json.loads(given)}, 6))
-
-
-# --- what it means --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("groups", GROUPS)
@@ -186,8 +180,6 @@ def test_creep_takes_the_older_name_of_its_groups():
     with pytest.raises(InputError, match="form and joints; valid: joints alone"):
         make("creep", UR10E, states, {"form": "each", "joints": "each"})
 
-
-# --- fits -----------------------------------------------------------------------------------
 
 CHOSEN = {
     "joint_compliance": {"joints": "1/2/3/4-6"},

@@ -5,9 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilcal.effects.catalogue import BUILT_IN
+from hilcal.effects.catalogue import BUILT_IN, read_effects
 from hilcal.effects.check import check_effect
-from hilcal.effects.from_file import read_effects
 from hilcal.model.model import Model
 from tests.support.campaigns import campaign as simulated
 from tests.support.campaigns import plan
@@ -17,7 +16,6 @@ from tests.support.user_effect_cases import CLASS, COLUMNS
 
 NAME = "soft_side"
 
-# --- files that cannot be used --------------------------------------------------------------
 
 ELASTIC = CLASS.replace(COLUMNS, "values = s.torque[:, :1] ** 3").replace(
     "    @property",
@@ -75,9 +73,6 @@ def test_one_parameter_may_move_every_joint(tmp_path):
 @pytest.mark.parametrize("kind", BUILT_IN, ids=lambda kind: kind.name)
 def test_what_is_built_in_passes_the_check(kind):
     check_effect(kind)
-
-
-# --- the file to begin with -----------------------------------------------------------------
 
 
 def test_new_writes_an_effect_that_works(tmp_path, capsys):

@@ -71,9 +71,6 @@ def run_file(case, tmp_path, capsys):
     return path
 
 
-# --- it takes part --------------------------------------------------------------------------
-
-
 @pytest.mark.long
 def test_a_missing_law_is_named_added_and_the_error_falls_to_the_noise(
     case, run_file, file, tmp_path, capsys
@@ -206,9 +203,6 @@ def test_a_plan_is_made_against_it(file, tmp_path, capsys):
     assert {seen["effect"] for seen in d["detectable"]} == {NAME}
 
 
-# --- a campaign remembers it ----------------------------------------------------------------
-
-
 @pytest.mark.long
 def test_a_revision_says_which_file_it_needs(run_file, file, capsys):
     mine = ("--effects-from", file)
@@ -244,27 +238,16 @@ def test_nothing_of_it_outlives_a_command(file, capsys):
     assert installed().names == before
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        ["identify", "r"],
-        ["compare", "r"],
-        ["diagnose", "r"],
-        ["add", "r", "e"],
-        ["refine", "r"],
-        ["validate", "r", "r"],
-        ["view", "r"],
-        ["plan", "c", "-o", "p"],
-        ["run", "c", "-o", "r"],
-        ["simulate", "c", "-o", "d"],
-        ["demo"],
-        ["effects"],
-    ],
-    ids=lambda command: command[0],
-)
+COMMANDS = (
+    "identify r", "compare r", "diagnose r", "add r e", "refine r", "validate r r", "view r",
+    "plan c -o p", "run c -o r", "simulate c -o d", "demo", "effects",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_with_models_reads_it_first(command, tmp_path, capsys):
     missing = tmp_path / "nothing.py"
-    said = refused(capsys, 2, *command, "--effects-from", missing)
+    said = refused(capsys, 2, *command.split(), "--effects-from", missing)
     assert said == f"error: {missing}: no such file; expected a Python file of effects"
 
 

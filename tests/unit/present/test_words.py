@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilcal import numbers
-from hilcal.diagnosis.document import to_json as diagnosis_json
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM
 from hilcal.diagnosis.misfit_breakdown import MisfitShare, misfit_breakdown
 from hilcal.diagnosis.recorded import ROW_ORDER
@@ -160,7 +159,7 @@ def test_before_of_positions_is_the_rigid_arm_in_frames_of_its_own(absolute, sho
 def test_p_values_and_how_many_were_tested_read_the_same_wherever_they_stand(
     absolute, judged, shown
 ):
-    lead, tests = judged.suspects[0], diagnosis_json(judged)["tests"]
+    lead, tests = judged.suspects[0], judged.to_dict()["tests"]
     value, equals = (f(lead.score.p_value) for f in (numbers.chance, numbers.p_equals))
     assert equals in message(judged)
     assert re.search(rf"{lead.effect} .*{re.escape(value)}", shown(suspects_table(judged)))

@@ -8,7 +8,6 @@ import pytest
 from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.campaign import Campaign
 from hilcal.cli.fitting import fitted_with
-from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.carried import carried_prior
@@ -47,7 +46,7 @@ def test_an_operator_adds_removes_and_goes_back(run, session):
     assert (run.read_bytes(), list(run.parent.iterdir())) == (before, [run])  # only looked at
     assert (snapshot.number, snapshot.records, snapshot.in_use) == (None, (), None)
     with Campaign.open(run, few_effects(), read_only=True) as o:
-        assert to_json(snapshot.diagnosis) == to_json(diagnose(o.fit_in_use()[1]))
+        assert snapshot.diagnosis.to_dict() == diagnose(o.fit_in_use()[1]).to_dict()
     assert snapshot.diagnosis.significant[0] == BASE
     assert snapshot.removable == ("joint_compliance",)
 
