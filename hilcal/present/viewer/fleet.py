@@ -202,4 +202,4 @@ def _blueprint(types: list[DrawnType]) -> rrb.Blueprint:
         texts.append(style.text(f"type{i}", f"{title}Unlike the type"))
     left = rrb.Vertical(rrb.Tabs(*scenes), rrb.Tabs(*dates), row_shares=[3, 2])
     right = rrb.Tabs(*texts, style.text("guide", "How to read this"))
-    return style.whole(rrb.Horizontal(left, right, column_shares=[3, 2]), "date")
+    return style.whole(left, right, "date")

@@ -223,7 +223,7 @@ def live_blueprint(d: LiveTally, world: str, series: str) -> rrb.Blueprint:
     texts = (("measuring", "So far"), ("live_guide", "How to read this"))
     left = rrb.Vertical(scene, in_time, row_shares=[11, 4])
     right = rrb.Vertical(rrb.Tabs(*(style.text(*w) for w in texts)), log, row_shares=[3, 2])
-    return style.whole(rrb.Horizontal(left, right, column_shares=[3, 2]), TIMELINE, "following")
+    return style.whole(left, right, TIMELINE, following=True)
 
 
 class LiveScene:

@@ -471,4 +471,4 @@ def blueprint(d: PlanView) -> rrb.Blueprint:
     left = rrb.Vertical(rrb.Tabs(*scenes), times, row_shares=[7, 2])
     tabs = rrb.Tabs(*(style.text(*t) for t in texts))
     right = rrb.Vertical(tabs, style.text("details", "Details"), row_shares=[5, 4])
-    return style.whole(rrb.Horizontal(left, right, column_shares=[3, 2]), "step", fps=_FPS)
+    return style.whole(left, right, "step", fps=_FPS)
