@@ -55,7 +55,6 @@ class SafeConsole(Console):
 
 
 def _line(console: Console, since: float, text: str, width: int = 5) -> None:
-    """Print a line with the seconds since a monotonic time."""
     seconds = f"[{time.monotonic() - since:{width}.1f} s]"
     console.print(f"{seconds} {text}", markup=False, highlight=False, soft_wrap=True)
 
@@ -98,14 +97,15 @@ def status_words(status: GoalStatus) -> str:
     """Return the current value of a goal, e.g. "joint std 4.1 % (j6)"; empty while unknown."""
     if status.worst is None or status.std is None or status.unit is None:
         return ""
-    goal, determined = parse_goal(status.text), isfinite(status.std)
+    goal = parse_goal(status.text)
+    value = _value(status) if isfinite(status.std) else ""
     if goal.of_position:
         kind = "deflection" if "predicted deflection" in status.quantity else "position"
-        return f"predicted {kind} {f'± {_value(status)}' if determined else 'not determined yet'}"
+        return f"predicted {kind} {f'± {value}' if value else 'not determined yet'}"
     match = re.match(r"[\w.]+", status.text.strip())
     name = "" if match is None else match[0]
     worst = "" if status.worst in (name, goal.what) else f" ({status.worst.split('.')[-1]})"
-    return f"{name} std {_value(status) if determined else 'not determined yet'}{worst}"
+    return f"{name} std {value or 'not determined yet'}{worst}"
 
 
 def full_words(status: GoalStatus) -> str:
@@ -120,8 +120,6 @@ def full_words(status: GoalStatus) -> str:
 def _value(status: GoalStatus) -> str:
     if status.std is None or status.unit is None:
         return ""
-    if status.unit == "%":
-        return f"{numbers.digits(status.std, 2)} %"
     unit, factor = numbers.unit_for(status.unit, (status.std,))
     return f"{numbers.digits(factor * status.std, 2)} {unit}"
 
@@ -134,15 +132,14 @@ def met_words(event: GoalMet) -> str:
 
 def missed_words(status: GoalStatus, count: int) -> str:
     """Return a line that states by how much the goal is missed after `count` readings."""
-    head = f'goal "{status.text}" is not met after all {count} readings'
+    line = f'goal "{status.text}" is not met after all {count} readings'
     if not status.quantity:
-        return f"{head}: the model cannot be fitted to them"
-    line = f"{head}: {full_words(status)}"
+        return f"{line}: the model cannot be fitted to them"
+    line += f": {full_words(status)}"
     if status.ratio is None or not isfinite(status.ratio):
         return line
-    if status.ratio <= 1.0:
-        return f"{line}, but the fit did not converge"
-    return f"{line}, {status.ratio:.2g} times what is asked for"
+    missed = f"{status.ratio:.2g} times what is asked for"
+    return f"{line}, {missed if status.ratio > 1.0 else 'but the fit did not converge'}"
 
 
 class _TwoLines(Progress):
@@ -164,8 +161,8 @@ class _Watcher:
 
     def __init__(self, console: Console, total: int, also: Watcher | None) -> None:
         self.console, self._start, self._also = console, time.monotonic(), also
-        self._fields: dict[str, Any] = {"left": "", "last": "", "phase": ""}
-        self._fields |= {"done": 0, "total": total}
+        self._fields: dict[str, Any] = {"left": "", "last": "", "phase": "", "done": 0}
+        self._fields["total"] = total
         self._shown: _TwoLines | None = None
 
     def begin(self) -> None:

@@ -138,8 +138,8 @@ def target_shapes(arm: Arm, targets: Floats) -> Shapes:
 def drawn_capsules(start: Floats, end: Floats, radius: Floats, colors: Any) -> rr.Capsules3D:
     """Return capsules between ends (K, 3); rerun's lie along z from the origin."""
     length, turn = _along(end - start)
-    place = {"translations": start, "quaternions": turn}
-    return rr.Capsules3D(lengths=length, radii=radius, **place, colors=colors, fill_mode="solid")
+    look: dict[str, Any] = {"radii": radius, "colors": colors, "fill_mode": "solid"}
+    return rr.Capsules3D(lengths=length, translations=start, quaternions=turn, **look)
 
 
 def _along(way: Floats) -> tuple[Floats, Floats]:
@@ -182,7 +182,7 @@ class MovingArm:
         self._body = np.array([p.body for p, _ in parts], dtype=np.int64)
         self._start, self._end, radius, colors = _arrays(parts)
         lengths, _ = _along(self._end - self._start)
-        look = {"radii": radius, "colors": colors, "fill_mode": "solid"}
+        look: dict[str, Any] = {"radii": radius, "colors": colors, "fill_mode": "solid"}
         fixed(rec, path, rr.Capsules3D.from_fields(lengths=lengths, **look))
 
     def send(self, timeline: str, walls: list[float], bodies: Floats) -> None:
@@ -234,8 +234,9 @@ def labels(places: Sequence[Floats] | Floats, texts: Sequence[str]) -> rr.Points
 def label_columns(places: Floats, texts: Sequence[str]) -> rr.ComponentColumnList:
     """Return labels at points (K, 3), one per time."""
     count = len(places)
-    look = {"colors": [LABEL] * count, "radii": [1e-4] * count, "show_labels": [True] * count}
-    return rr.Points3D.columns(positions=places, labels=[safe(t) for t in texts], **look)
+    text, colors = [safe(t) for t in texts], np.full((count, 3), LABEL, dtype=np.uint8)
+    look: dict[str, Any] = {"radii": np.full(count, 1e-4), "show_labels": [True] * count}
+    return rr.Points3D.columns(positions=places, labels=text, colors=colors, **look)
 
 
 def hidden(eye: Floats, points: Floats, things: tuple[Obstacle, ...]) -> Bools:

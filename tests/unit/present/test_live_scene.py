@@ -123,7 +123,7 @@ def test_every_target_of_an_arrival_is_drawn_where_it_is(tmp_path):
 
 def test_a_long_campaign_is_a_small_file(tmp_path):
     path = tmp_path / "long.rrd"
-    outlet = live._Outlet("long", print, "file", file=path)
+    outlet = live._Outlet("long", print, file=path)
     for wall, what in events(measuring(plan(250))):
         outlet.tell(wall, what)
     outlet.end()
