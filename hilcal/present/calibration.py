@@ -13,17 +13,9 @@ from hilcal.calibration.improvement import Improvement
 from hilcal.calibration.measured import WORDS, Outside
 from hilcal.calibration.programs.program import ProgramPoint
 from hilcal.calibration.urscript import Waypoint
+from hilcal.identification import validation
 from hilcal.identification.bootstrap import Bootstrap
 from hilcal.identification.priors import names_of
-from hilcal.identification.validation import BAND as REGION
-from hilcal.identification.validation import (
-    Acceptance,
-    Beyond,
-    Extrapolation,
-    Judged,
-    Share,
-    Validation,
-)
 from hilcal.numbers import length
 from hilcal.present.document import Block, Table, heading, load_name, note, table
 from hilcal.present.fit import error_words, kind, model_name
@@ -143,7 +135,7 @@ def decision_report(
     yield f"{reasons[d.reason]}\n"
 
 
-def validation_lines(test: Acceptance) -> Iterator[str]:
+def validation_lines(test: validation.Acceptance) -> Iterator[str]:
     """Yield how well the model predicts readings that were never fitted."""
     e = test.everything
     rms, most, stated, noise = map(length, (e.rms_m, e.max_m, e.stated_m, test.noise_m))
@@ -324,7 +316,7 @@ def waypoints_table(outcomes: Sequence[Fate]) -> Iterator[Block]:
         yield "Of a blended waypoint the corner of the path is corrected; the radius stays."
 
 
-def opening(judged: Judged, test: Validation) -> Iterator[str]:
+def opening(judged: validation.Judged, test: validation.Validation) -> Iterator[str]:
     """Yield the number of readings that were fitted, and the error of the tested ones."""
     error = f"{length(test.error.rms_m)} rms"
     noise = f"noise alone would leave {length(test.noise_floor)}.\n"
@@ -345,7 +337,9 @@ def opening(judged: Judged, test: Validation) -> Iterator[str]:
     yield f"{count} that were never fitted are predicted to {error}; {noise}"
 
 
-def validation_report(judged: Judged, test: Validation, beyond: Extrapolation) -> Iterator[Block]:
+def validation_report(
+    judged: validation.Judged, test: validation.Validation, beyond: validation.Extrapolation
+) -> Iterator[Block]:
     """Yield the errors inside and outside of the measured range, and variables that leave it."""
     out = table(error_words(test.readings), "rms", "mean", "largest", "rms in σ", "stated", "z")
     inside, outside = beyond.inside_error, beyond.outside_error
@@ -376,7 +370,7 @@ def validation_report(judged: Judged, test: Validation, beyond: Extrapolation) -
         yield f"These readings are {z_all:.2g} times as far off as the fit states.\n"
 
 
-def _beyond(v: Beyond) -> str:
+def _beyond(v: validation.Beyond) -> str:
     if v.variable == "leverage":
         return f"leverage: {v.count}, far from all fitted poses in several joints together"
     if v.unit == "rad":
@@ -388,7 +382,7 @@ def _beyond(v: Beyond) -> str:
     return f"{v.variable}: {v.count}, by up to {most} (measured: {low} to {high})"
 
 
-def shares_report(test: Acceptance) -> Iterator[Block]:
+def shares_report(test: validation.Acceptance) -> Iterator[Block]:
     """Yield the errors by load, the worst poses, and the verdict on a limit."""
     yield from loads_report(test)
     yield from (worst_table(test), "")
@@ -404,20 +398,22 @@ def shares_report(test: Acceptance) -> Iterator[Block]:
     yield f"{found}; {largest}.\n"
 
 
-def loads_report(test: Acceptance) -> Iterator[Block]:
+def loads_report(test: validation.Acceptance) -> Iterator[Block]:
     """Yield the errors by load."""
     every = () if len(test.loads) == 1 else (test.everything,)
     yield _shares_table("load", "at", (*test.loads, *every), test.limit_m)
-    region = f"{100 * REGION:.0f} % region"
+    region = f"{100 * validation.BAND:.0f} % region"
     yield note(f"in 95 %: share of the readings inside of their stated {region}.\n")
 
 
-def worst_table(test: Acceptance) -> Table:
+def worst_table(test: validation.Acceptance) -> Table:
     """Return the errors of the worst poses."""
     return _shares_table("worst poses", "load", test.poses[:WORST], test.limit_m)
 
 
-def _shares_table(head: str, worst: str, shares: Iterable[Share], limit: float | None) -> Table:
+def _shares_table(
+    head: str, worst: str, shares: Iterable[validation.Share], limit: float | None
+) -> Table:
     heads = (head, "n", "rms", "largest", worst, "stated", "z", "in 95 %")
     out = table(*heads, *(() if limit is None else ("limit",)), left=(0, 4))
     for s in shares:
@@ -428,11 +424,11 @@ def _shares_table(head: str, worst: str, shares: Iterable[Share], limit: float |
     return out
 
 
-def _place(worst: Share) -> str:
+def _place(worst: validation.Share) -> str:
     return f"{worst.name} {load_name(worst.worst, 'under ')}"
 
 
-def validation_failure(test: Acceptance, judged: Judged) -> str:
+def validation_failure(test: validation.Acceptance, judged: validation.Judged) -> str:
     """Return the error message for a limit that is exceeded."""
     worst = test.poses[0]
     head = (

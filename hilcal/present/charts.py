@@ -272,7 +272,6 @@ def residual_by_time(story: Story, revision: StoryRevision) -> go.Figure:
 
 
 def _extremes(story: Story, revision: StoryRevision, group: str) -> str:
-    """Return a sentence on the worst and the best pose, or load."""
     poses = [story.pose_name(i) for i in range(len(story))]
     names, row = np.unique(poses if group == "pose" else story.load_names, return_inverse=True)
     rms = np.sqrt(np.bincount(row, revision.sigma**2 / 3) / np.bincount(row))

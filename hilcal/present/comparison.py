@@ -198,7 +198,6 @@ def _least(limit: Limit) -> str:
 
 
 def _parameters(d: Differences | None) -> Iterator[Block]:
-    """Yield the parameters of both fits, the largest differences first."""
     if d is None:
         return
     yield from ("", heading("Both campaigns' own fits, as far as they can be compared"))

@@ -92,7 +92,6 @@ def set_aside(fit: Fit, details: bool) -> Iterator[str]:
 
 
 def _listed(lines: Sequence[str], most: int) -> Iterator[str]:
-    """Yield the first lines and the number of the others."""
     yield from lines[:most]
     if len(lines) > most:
         yield f"  ... and {len(lines) - most} more; --json lists all"
@@ -137,7 +136,6 @@ def parameters(fit: Fit, most: int = ALL_ROWS, where: str = "--details") -> Iter
 
 
 def _family(fit: Fit, effect: Effect, index: Ints) -> str:
-    """Return a summary of a family of many parameters."""
     theta, live = fit.theta[index], fit.solution.estimated[index]
     units = {p.unit for p in effect.parameters}
     unit, factor = numbers.unit_for(units.pop(), list(theta)) if len(units) == 1 else ("", 1.0)
@@ -228,7 +226,6 @@ def _variance_factor(fit: Fit | StreamFit) -> str:
 
 
 def _scaling_remark(fit: Fit) -> str:
-    """Return a sentence on whether parameter scaling was needed."""
     basis = fit.solution.equations.basis
     unscaled, scaled = basis.condition_unscaled, basis.condition_scaled
     if not (np.isfinite(unscaled) and np.isfinite(scaled)):

@@ -183,7 +183,6 @@ def _by_effect(
 
 
 def _criteria_table(s: PlanSummary) -> Iterator[Block]:
-    """Yield the predicted results of plans by other criteria with as many readings."""
     heads = ("criterion", "predicted ±", "open ±", "joint ±", "O1 (D)", "O2 (K)", "O3 (E)")
     out = table(*heads, "certified")
     for c in s.criteria:
@@ -235,7 +234,6 @@ def _detectable(s: PlanSummary) -> list[tuple[str, str]]:
 
 
 def _undetectable(s: PlanSummary) -> Iterator[str]:
-    """Yield a sentence on the effects that the readings cannot detect, if any."""
     if names := [d.effect for d in s.detectable if d.least_m is None]:
         yield f"These readings cannot detect {numbers.names(names, 'or')}."
 
@@ -325,7 +323,6 @@ def powers_summary(powers: Sequence[PairPower], poses: int, readings: int) -> st
 
 
 def _difference(plan: Next) -> str:
-    """Return a sentence on the loads and poses that separate the weakest pair."""
     shares = sorted(plan.shares.items(), key=lambda item: -item[1])
     named = [
         f"{'the unloaded readings' if load == UNLOADED else load} ({numbers.percent(share)})"

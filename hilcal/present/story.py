@@ -22,14 +22,7 @@ from hilcal.identification.fit import Fit, all_left_out, mahalanobis2
 from hilcal.identification.full_prediction import FullPrediction, full_prediction
 from hilcal.identification.residual import ErrorBlock
 from hilcal.model.model import Model
-from hilcal.present.diagnosis import (
-    coefficient,
-    diagnosis_report,
-    moves,
-    revision_cells,
-    shown_suspects,
-    suspects_table,
-)
+from hilcal.present import diagnosis
 from hilcal.present.document import Block
 from hilcal.present.fit import errors, misses, model_name, parameters
 from hilcal.present.verdict import message
@@ -278,8 +271,11 @@ def _revision(c: Chapter, e: FullPrediction, residual: Floats, measured: Floats)
     details: list[Block] = [misses(c.fit)]
     if d is not None:
         judged, drawn = d.verdict, follows(d)
-        verdict = [message(d), *([suspects_table(d, MOST_SUSPECTS)] if d.significant else [])]
-        details = list(diagnosis_report(d))
+        verdict = [
+            message(d),
+            *([diagnosis.suspects_table(d, MOST_SUSPECTS)] if d.significant else []),
+        ]
+        details = list(diagnosis.diagnosis_report(d))
         if drawn is not None:
             details.append(f"Drawn: {drawn.y_label} against {drawn.x_label}. {drawn.says}")
     return StoryRevision(
@@ -291,7 +287,7 @@ def _revision(c: Chapter, e: FullPrediction, residual: Floats, measured: Floats)
         whitened_norm2=mahalanobis2(e.raw[:, :3], e.whitening.covariance[:, :3, :3]),
         error=c.fit.error,
         holdout=c.fit.holdout,
-        cells=revision_cells(c.number, changed, c.fit, judged),
+        cells=diagnosis.revision_cells(c.number, changed, c.fit, judged),
         panels={
             "verdict": (*verdict, f"Model: {model_name(c.fit.model.named)}."),
             "details": (*details, errors(c.fit)),
@@ -309,7 +305,7 @@ def follows(d: Diagnosis) -> DependenceCurve | None:
     carried = [v for v in d.dependences if v.share >= LEAST_CARRIED and v.determined]
     if carried and d.verdict != "adequate" and not explained:
         return curve(carried[0])
-    suspects = [] if d.lead is None else shown_suspects(d)
+    suspects = [] if d.lead is None else diagnosis.shown_suspects(d)
     return regressor(d.fit, suspects[0]) if suspects else None
 
 
@@ -319,7 +315,7 @@ def laws(fit: Fit) -> tuple[DependenceCurve, ...]:
     for law in drawn_laws(fit):
         values = ", ".join(
             f"{p.name.partition('.')[2]} = "
-            + coefficient(Coefficient(p.name, p.value, p.std or 0.0, p.unit))
+            + diagnosis.coefficient(Coefficient(p.name, p.value, p.std or 0.0, p.unit))
             for p in fit.parameters
             if p.name.startswith(f"{law.name}.") and p.value is not None
         )
@@ -345,7 +341,7 @@ def curve(d: Dependence) -> DependenceCurve:
     y_unit, y_factor = numbers.unit_for(d.y_unit, list(d.y))
     says = f"{numbers.percent(d.share)} of the misfit on poses left out follows {d.variable}."
     over = f"{d.variable} [{x_unit}]" if x_unit else d.variable
-    error, x, y = f"error of {moves(d)} [{y_unit}]", x_factor * d.x, y_factor * d.y
+    error, x, y = f"error of {diagnosis.moves(d)} [{y_unit}]", x_factor * d.x, y_factor * d.y
     return DependenceCurve(d.variable, says, x, y, over, error, y_factor * d.error, d.labels)
 
 

@@ -13,11 +13,10 @@ from nicegui import ui
 from hilcal import numbers
 from hilcal.present.campaign import refitted
 from hilcal.present.diagnosis import addition_lines, fell, rose
+from hilcal.present.progress import Say
 from hilcal.workbench import cards
-from hilcal.workbench.elements import Status
-from hilcal.workbench.session import Snapshot, WorkbenchSession
+from hilcal.workbench.session import Answer, Snapshot, Work, WorkbenchSession
 from hilcal.workbench.viewer import WebViewer
-from hilcal.workbench.work import Answer, Say, Work
 
 TICK, LOOK = 0.2, 2.0  # intervals at which a tab checks the session and the file for changes, s
 CSS = Path(__file__).with_name("page.css")
@@ -105,7 +104,7 @@ class View:
         ui.colors(primary="#1f6f9f", positive="#00785a", negative="#c0274b", warning="#8a5a00")
         ui.add_css(CSS)
         ui.add_body_html(f"<script>{SCRIPT.read_text(encoding='utf-8')}</script>")
-        self.status = Status(self)
+        self.status = cards.Status(self)
         self.body, self.places["viewer"] = (ui.column().classes("bench") for _ in range(2))
         ui.timer(TICK, self.tick)
         ui.timer(LOOK, self.look)
@@ -197,10 +196,9 @@ class View:
             act(snapshot, effect, say)
             if (c := self.session.changed) is None:
                 return ""
-            sentence = fell if c.added else rose
-            lines = [sentence(c.before, c.fit, c.added or c.removed or "")]
-            lines.append(f"It is revision {c.number}.")
-            return " ".join(lines + ([] if c.expected is None else [*addition_lines(c.expected)]))
+            error = (fell if c.added else rose)(c.before, c.fit, c.added or c.removed or "")
+            warnings = () if c.expected is None else addition_lines(c.expected)
+            return " ".join([error, f"It is revision {c.number}.", *warnings])
 
         self._do(place, f"{verb} {effect}", do)
 
@@ -270,11 +268,11 @@ class View:
         """Plan the next measurements."""
         output = self.session.path.parent / Path(file).name
         count = None if poses is None else int(poses)
-        self._do(
-            "next",
-            "Planning the next measurements",
-            lambda snapshot, say: self.session.plan(snapshot, count, output, say, quick=quick),
-        )
+
+        def act(snapshot: Snapshot, say: Say) -> None:
+            self.session.plan(snapshot, count, output, say, quick=quick)
+
+        self._do("next", "Planning the next measurements", act)
 
     def open_viewer(self) -> None:
         """Prepare the 3-D view, unless another tab has done so."""
@@ -312,7 +310,6 @@ class View:
             self._pick(readings, f"The readings of pose {story.pose_name(measurement)}")
 
     def _pick(self, measurements: list[int], title: str) -> None:
-        """Show some readings and the differences from the others."""
         self.tab.picked, self.tab.picked_title = measurements, title
         self.redraw("readings")
 

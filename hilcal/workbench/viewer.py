@@ -15,8 +15,8 @@ from http.client import HTTPConnection, HTTPException
 from pathlib import Path
 
 from hilcal.errors import HilcalError
+from hilcal.present.progress import Say
 from hilcal.present.story import Story
-from hilcal.workbench.work import Say
 
 FILES = {
     "index.html": "text/html; charset=utf-8",
@@ -59,10 +59,7 @@ class WebViewer:
         """Record a story, and return the names of its files for the viewer.
 
         The layout is a separate file, since a web viewer treats one in a recording as a proposal
-        only. `count` distinguishes the names from earlier ones.
-
-        Raises:
-            HilcalError: the viewer is not available, or the story cannot be recorded.
+        only. `count` distinguishes the names from earlier ones; HilcalError without a viewer.
         """
         # slow imports of the viewer's library
         from hilcal.present.viewer.campaign import blueprint, save
@@ -90,7 +87,6 @@ class WebViewer:
 
 
 def _fetched() -> dict[str, bytes]:
-    """Return the files of the web viewer in rerun-sdk."""
     from hilcal.present.viewer.recording import executable  # loads the viewer's library
 
     with socket.socket() as probe:

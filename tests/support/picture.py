@@ -6,17 +6,16 @@ import ctypes.util
 import json
 import os
 import socket
-import struct
 import subprocess
 import tempfile
 import time
-import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from PIL import Image
 
 from hilcal.present.viewer.recording import executable
 
@@ -49,12 +48,10 @@ class ViewReport:
 
 def vulkan_available() -> bool:
     """Return whether the Vulkan loader and at least one driver description are installed."""
-    named = os.environ.get("VK_DRIVER_FILES") or os.environ.get("VK_ICD_FILENAMES")
-    if named:
-        drivers = any(Path(p).is_file() for p in named.split(os.pathsep))
-    else:
-        drivers = any(any(Path(d).glob("*.json")) for d in _ICD_DIRS)
-    if not drivers:
+    named = os.environ.get("VK_DRIVER_FILES") or os.environ.get("VK_ICD_FILENAMES") or ""
+    files = [Path(p) for p in named.split(os.pathsep) if p]
+    files = files or [file for d in _ICD_DIRS for file in Path(d).glob("*.json")]
+    if not any(file.is_file() for file in files):
         return False
     try:
         ctypes.CDLL(ctypes.util.find_library("vulkan") or "libvulkan.so.1")
@@ -85,22 +82,19 @@ def opened(rrd: Path, size: tuple[int, int]) -> Iterator[tuple["ViewerClient", i
     """A headless viewer that has shown a recording, and the number of its process."""
     with _headless(size) as (viewer, process):
         viewer.open([str(Path(rrd).resolve())])
-        _wait_until_loaded(viewer)
-        _draw_first(viewer)
+        end = time.monotonic() + _LOAD_TIMEOUT
+        while not (state := viewer.get_state()).views or state.loading:
+            assert time.monotonic() < end, f"recording not loaded within {_LOAD_TIMEOUT:g} s"
+            time.sleep(0.05)
+        while True:  # the first picture compiles shaders and loads meshes: it may take its time
+            try:
+                viewer.take_screenshot(max_size=64)
+            except TimeoutError:
+                if time.monotonic() > end:
+                    raise
+            else:
+                break
         yield viewer, process
-
-
-def _draw_first(viewer: "ViewerClient") -> None:
-    """Draw the first picture, which compiles shaders and loads meshes: it may take its time."""
-    end = time.monotonic() + _LOAD_TIMEOUT
-    while True:
-        try:
-            viewer.take_screenshot(max_size=64)
-        except TimeoutError:
-            if time.monotonic() > end:
-                raise
-        else:
-            return
 
 
 def _take(viewer: "ViewerClient", shot: Shot, longest: int | None) -> None:
@@ -128,13 +122,6 @@ def _bring_forward(viewer: "ViewerClient", view_id: str) -> None:
             return
 
 
-def _wait_until_loaded(viewer: "ViewerClient") -> None:
-    end = time.monotonic() + _LOAD_TIMEOUT
-    while not (state := viewer.get_state()).views or state.loading:
-        assert time.monotonic() < end, f"recording not loaded within {_LOAD_TIMEOUT:g} s"
-        time.sleep(0.05)
-
-
 @contextlib.contextmanager
 def _headless(size: tuple[int, int]) -> Iterator[tuple["ViewerClient", int]]:
     """Run a viewer of our own in a home of its own, with analytics off; end it afterwards."""
@@ -143,13 +130,11 @@ def _headless(size: tuple[int, int]) -> Iterator[tuple["ViewerClient", int]]:
         port = probe.getsockname()[1]
         probe.close()
         log = Path(home, "viewer.log")
-        command = [executable(), "--headless", "--hide-welcome-screen"]
-        command += ["--bind", "127.0.0.1", "--port", str(port)]
-        command += ["--window-size", f"{size[0]}x{size[1]}"]
+        command = [executable(), "--headless", "--hide-welcome-screen", "--bind", "127.0.0.1"]
+        command += ["--port", str(port), "--window-size", f"{size[0]}x{size[1]}"]
+        env = _environment(Path(home))
         with log.open("wb") as sink:
-            process = subprocess.Popen(
-                command, env=_environment(Path(home)), stdout=sink, stderr=subprocess.STDOUT
-            )
+            process = subprocess.Popen(command, env=env, stdout=sink, stderr=subprocess.STDOUT)
         try:
             yield _connect(process, port), process.pid
         except (ConnectionError, RuntimeError) as error:
@@ -203,45 +188,9 @@ def _environment(home: Path) -> dict[str, str]:
 
 
 def pixels(png: Path) -> np.ndarray:
-    """Decode an 8-bit PNG without interlace into (height, width, channels)."""
-    data, at, body = png.read_bytes(), 8, b""
-    while at < len(data):
-        size, kind = struct.unpack(">I4s", data[at : at + 8])
-        chunk = data[at + 8 : at + 8 + size]
-        if kind == b"IHDR":
-            width, height, depth, color = struct.unpack(">IIBB", chunk[:10])
-        elif kind == b"IDAT":
-            body += chunk
-        at += size + 12
-    assert depth == 8
-    channels = {2: 3, 6: 4}[color]
-    raw = np.frombuffer(zlib.decompress(body), np.uint8).reshape(height, width * channels + 1)
-    out = np.zeros((height, width * channels), dtype=np.uint8)
-    above = np.zeros(width * channels, dtype=np.uint8)
-    for i, line in enumerate(raw):
-        above = out[i] = unfilter(int(line[0]), line[1:], above, channels)
-    return out.reshape(height, width, channels)
-
-
-def unfilter(kind: int, line: np.ndarray, above: np.ndarray, step: int) -> np.ndarray:
-    """Undo one PNG line filter."""
-    if kind == 0:
-        return line
-    if kind == 1:
-        return np.cumsum(line.reshape(-1, step), axis=0, dtype=np.uint8).reshape(-1)
-    if kind == 2:
-        return line + above
-    done = [0] * step
-    corner = [0] * step + above.tolist()
-    for k, (value, up) in enumerate(zip(line.tolist(), above.tolist(), strict=True)):
-        left, diagonal = done[k], corner[k]
-        if kind == 3:
-            guess = (left + up) // 2
-        else:
-            p = left + up - diagonal
-            guess = min((left, up, diagonal), key=lambda c: abs(p - c))
-        done.append((value + guess) & 255)
-    return np.array(done[step:], dtype=np.uint8)
+    """(height, width, channels) of a PNG."""
+    with Image.open(png) as image:
+        return np.asarray(image)
 
 
 def contrast(a: Sequence[int], b: Sequence[int]) -> float:

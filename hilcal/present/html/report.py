@@ -20,6 +20,7 @@ from hilcal.identification.residual import CONFIDENCE, ErrorBlock
 from hilcal.identification.validation import CampaignValidation
 from hilcal.numbers import length, percent
 from hilcal.present import charts
+from hilcal.present import fit as fit_words
 from hilcal.present.calibration import loads_report, opening, validation_report, worst_table
 from hilcal.present.campaign import info_report, utc
 from hilcal.present.diagnosis import REVISION_HEADS, could_have_been_seen, doubtful, redundant_line
@@ -35,17 +36,6 @@ from hilcal.present.document import (
     load_name,
     note,
     table,
-)
-from hilcal.present.fit import (
-    background_line,
-    errors,
-    follows,
-    misses,
-    parameters,
-    prior_lines,
-    remarks,
-    scalings_table,
-    where_table,
 )
 from hilcal.present.html import FirstScreen, render
 from hilcal.present.registration import base_line, covariance_words
@@ -121,7 +111,7 @@ def sections(m: ReportContent) -> tuple[PageSection, ...]:
 
 def first_screen(m: ReportContent) -> FirstScreen:
     """Return the contents of the first screen."""
-    d, verdict, tone, good = m.diagnosis, None, "doubt", misses(m.fit)
+    d, verdict, tone, good = m.diagnosis, None, "doubt", fit_words.misses(m.fit)
     text = "not judged: only a model fitted with scaling gc can be"
     missing = "Not judged; hilcal identify --scaling gc, then hilcal diagnose, say it."
     if (prior := m.fit.model.prior) is not None:
@@ -162,7 +152,7 @@ def where_wrong(m: ReportContent) -> str:
     if d is None:
         return worst
     if not d.residual_is_noise:
-        return f"{worst} {follows(d.misfit_breakdown)}"
+        return f"{worst} {fit_words.follows(d.misfit_breakdown)}"
     # The sum of squares of R whitened elements of standard deviation 1 is distributed as χ²(R).
     count = fit.whitening.rank
     if fit.holdout.rms_sigma**2 * count <= chi2.isf((1 - CONFIDENCE) / 2, count):
@@ -226,7 +216,7 @@ def left_out_errors(fit: Fit) -> Floats:
 
 
 def _certificate(m: ReportContent) -> PageSection:
-    parts: list[Block] = [replace(errors(m.fit), caption="Error before and after")]
+    parts: list[Block] = [replace(fit_words.errors(m.fit), caption="Error before and after")]
     if m.corrected is not None:
         heads = ("load", "n", "before, rms", "largest", "corrected, rms", "largest", "in 95 % band")
         out = table(*heads, caption="Measured at uncorrected and at corrected joint targets")
@@ -260,7 +250,11 @@ def _uncertainty(fit: Fit) -> Iterator[Block]:
     yield Words(f"{accuracy}: {expanded}{within * bool(len(error))}.", "strong")
     repeats = repeatability_source(b.scatter_source, fit.model.cell.arm)
     parts = (
-        ("estimated parameters", "type A: errors of poses left out", b.parameters),
+        (
+            "estimated parameters",
+            "type A: errors of poses left out",
+            b.parameters,
+        ),
         ("misfit at fitted poses", "type A: residuals beyond the noise", b.misfit),
         ("repeatability of the arm", repeats, b.scatter),
         ("noise of the instrument", "type B: as stated", b.instrument),
@@ -296,7 +290,7 @@ def _conditions(m: ReportContent) -> Iterator[Block]:
     outliers, poses = int(m.fit.outlier.sum()), len(np.unique(r.pose))
     gross = f"; {outliers} set aside as gross errors" if outliers else ""
     yield f"{len(r)} readings of {poses} poses{gross}. Loads (readings): {loads}."
-    yield from prior_lines(m.fit)
+    yield from fit_words.prior_lines(m.fit)
     about = {} if m.plan is None else m.plan.about
     efficiency, criterion = about.get("efficiency"), about.get("criterion")
     if m.plan is None:
@@ -425,7 +419,7 @@ def _where(m: ReportContent) -> PageSection:
         if d.verdict != "adequate":
             curves = [curve(v) for v in d.dependences if v.determined][:MOST_CURVES]
             parts += [Chart(c.title, charts.curve_chart(c)) for c in curves]
-        blocks = captioned(where_table(d.misfit_breakdown), "What the error follows")
+        blocks = captioned(fit_words.where_table(d.misfit_breakdown), "What the error follows")
         parts += [replace(p, narrow=True) if isinstance(p, Table) else p for p in blocks]
     return PageSection("where", "Where it fails", (*parts, _noise(m)))
 
@@ -502,7 +496,7 @@ def _parameters(m: ReportContent) -> PageSection:
     effects = [name for name in fit.model.named if name in catalogue.names]
     parts: list[Block] = [note(f"{name}: {catalogue[name].summary}.") for name in effects]
     command = "hilcal report --appendix"
-    for part in captioned(parameters(fit, MOST_PARAMETERS, command), "Parameters"):
+    for part in captioned(fit_words.parameters(fit, MOST_PARAMETERS, command), "Parameters"):
         if not isinstance(part, Table):
             parts.append(part)
             continue
@@ -512,14 +506,14 @@ def _parameters(m: ReportContent) -> PageSection:
                 cut, caption = [row[:-1] for row in rows], f"{part.caption}{suffix}"
                 heads = part.heads[:-1]
                 parts.append(replace(part, caption=caption, heads=heads, rows=cut, narrow=True))
-    parts += background_line(fit)
+    parts += fit_words.background_line(fit)
     if sizes := family_sizes(fit):
         parts.append(Chart("What this arm is made of", charts.made_of(sizes), wide=True, height=0))
     return PageSection("parameters", "Parameters", tuple(parts))
 
 
 def _appendix(m: ReportContent) -> Iterator[PageSection]:
-    scalings = scalings_table(m.scalings) if len(m.scalings) > 1 else ()
+    scalings = fit_words.scalings_table(m.scalings) if len(m.scalings) > 1 else ()
     for name, title, parts in (
         ("joints", "Over each joint", _joints(m)),
         ("rejected", "Rejected suspects", _rejected(m)),
@@ -555,8 +549,8 @@ def _rejected(m: ReportContent) -> Iterator[Block]:
 
 
 def _all_parameters(m: ReportContent) -> Iterator[Block]:
-    yield from captioned(parameters(m.fit), "Parameters with standard uncertainties")
-    yield from captioned(remarks(m.fit))
+    yield from captioned(fit_words.parameters(m.fit), "Parameters with standard uncertainties")
+    yield from captioned(fit_words.remarks(m.fit))
     yield Chart("Correlations", charts.correlations(m.fit), wide=True, height=0)
 
 

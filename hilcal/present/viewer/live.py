@@ -295,7 +295,6 @@ class LiveScene:
         self._show(live_blueprint(d, self._world, self._series))
 
     def _move(self) -> None:
-        """Send the motion of the arm since the last call."""
         passed, self._passed, self._since = self._passed, [], 0
         if passed and self._arm is not None and self._tally is not None:
             bodies = body_poses(self._tally.measured.arm, np.array([q for _, q in passed]))
@@ -321,7 +320,6 @@ class LiveScene:
             self._send_summary(d)
 
     def _reading(self, d: LiveTally, event: ReadingStored) -> None:
-        """Draw a reading: each target's arrow, ball and point in time, and a label."""
         rec, count = self._rec, d.judged
         dots, arrows, balls, last = [], [], [], []
         judgements = d.add(event)
@@ -415,7 +413,6 @@ class _Outlet:
     def __init__(
         self, identifier: str, reply: Callable[..., None], file: Path | None = None, port: int = 0
     ) -> None:
-        """Open a file or a port."""
         self._reply, self._file = reply, file
         self._name = f"recording {file}" if file else f"live viewer at port {port}"
         self._scene: LiveScene | None = None

@@ -77,9 +77,7 @@ def write(
     """Write what `tell` logs to a file, atomically, and close the stream.
 
     The recording is encoded in memory, since rerun's file sink can wait forever on a full disk.
-
-    Raises:
-        InputError: the folder is missing, or the file cannot be written.
+    Raises InputError if the folder is missing, or the file cannot be written.
     """
     if not path.parent.is_dir():
         raise InputError(f"recording {path}: no folder {path.parent}; make it first")
@@ -93,11 +91,7 @@ def write(
 
 
 def flush(rec: rr.RecordingStream) -> None:
-    """Send everything logged so far to the sinks; a slow viewer costs at most the time-out.
-
-    Raises:
-        HilcalError: a sink has failed, e.g. because the disk is full.
-    """
+    """Send what was logged to the sinks; HilcalError if one has failed, a slow one may time out."""
     try:
         rec.flush(timeout_sec=_FLUSH_TIMEOUT)
     except (ValueError, RuntimeError, OSError) as error:

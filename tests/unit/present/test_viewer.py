@@ -5,7 +5,6 @@ import re
 import socket
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +21,7 @@ from hilcal.robot.body import body_poses
 from tests.support.paths import ROOT
 from tests.support.picture import Shot, pictures, pixels, vulkan_available
 from tests.support.recordings import rows, same, texts
+from tests.support.timing import wait_until
 from tests.support.viewer_story import ANGLE, LOAD, doubtful, story, ur10e
 
 pytestmark = pytest.mark.usefixtures("strict")
@@ -57,12 +57,11 @@ def by_revision(recording):
 def bars(path, entity, revision):
     """Left and right edges and heights of the bars of a revision."""
     left, width, height = (
-        np.array(rows(path, entity, f"BarChart:{name}", "revision")[revision])
-        if name == "widths"
-        else np.array(rows(path, entity, f"BarChart:{name}", "revision")[revision][0]["buffer"])
+        rows(path, entity, f"BarChart:{name}", "revision")[revision]
         for name in ("abscissa", "widths", "values")
     )
-    return left, left + width, height
+    left, height = (np.array(x[0]["buffer"]) for x in (left, height))
+    return left, left + np.array(width), height
 
 
 def test_every_revision_has_its_errors_in_micrometres(told, recording):
@@ -326,10 +325,8 @@ def test_a_viewer_that_joins_late_gets_the_whole_story(told, tmp_path, monkeypat
             stderr=subprocess.DEVNULL,
         )
         try:
-            end = time.monotonic() + 30
-            while not {"/errors/fit", "/bars/zcurrent"} <= entities(late):
-                assert time.monotonic() < end, "the late viewer did not receive the story"
-                time.sleep(0.1)
+            story_ends = {"/errors/fit", "/bars/zcurrent"}
+            wait_until(lambda: story_ends <= entities(late), "received by the late viewer")
         finally:
             client.terminate()
             client.wait(10)

@@ -27,12 +27,12 @@ from tests.support.viewer_plan import (
     recording,
     rgb,
     shadowed,
-    strict,
     target,
     turned,
 )
 
-__all__ = ["recording", "shadowed", "strict"]  # fixtures
+__all__ = ["recording", "shadowed"]  # fixtures
+pytestmark = pytest.mark.usefixtures("strict")
 POWERS = (
     PairPower("joint_tilt_compliance", "link_compliance", 0.744, 0.98, False),
     PairPower("link_compliance", "joint_tilt_compliance", 0.56, 0.1, True),

@@ -7,7 +7,7 @@ import psutil
 
 from hilcal.errors import InputError
 from hilcal.workbench import viewer
-from hilcal.workbench.work import Work
+from hilcal.workbench.session import Work
 
 
 def test_only_one_thing_is_done_at_a_time():
