@@ -250,11 +250,7 @@ def _uncertainty(fit: Fit) -> Iterator[Block]:
     yield Words(f"{accuracy}: {expanded}{within * bool(len(error))}.", "strong")
     repeats = repeatability_source(b.scatter_source, fit.model.cell.arm)
     parts = (
-        (
-            "estimated parameters",
-            "type A: errors of poses left out",
-            b.parameters,
-        ),
+        ("estimated parameters", "type A: errors of poses left out", b.parameters),
         ("misfit at fitted poses", "type A: residuals beyond the noise", b.misfit),
         ("repeatability of the arm", repeats, b.scatter),
         ("noise of the instrument", "type B: as stated", b.instrument),
