@@ -57,10 +57,10 @@ def _part(name: str = "") -> Iterator[ui.column]:
 
 def snapshot(view: View, d: Snapshot) -> None:
     """Draw all cards."""
-    kind = "deflections" if d.fit.mode == "deflection" else "absolute readings"
+    kind, arm = "deflections" if d.fit.mode == "deflection" else "absolute readings", d.story.arm
     with ui.row().classes("items-baseline").style("gap: 4px 16px; padding-top: 16px"):
-        ui.html(f"<h1 class='verdict'>{plain(d.name)}</h1>", sanitize=False)
-        soft(f"{d.arm} · {d.n_readings} readings, judged as {kind} · from {d.source}")
+        ui.html(f"<h1 class='verdict'>{plain(view.session.path.name)}</h1>", sanitize=False)
+        soft(f"{arm.name} · {d.n_readings} readings, judged as {kind} · from {d.source}")
     _verdict(view, d)
     with ui.element("div").classes("two"):
         _fails(view, d)
@@ -104,11 +104,14 @@ def _verdict(view: View, d: Snapshot) -> None:
         ui.label(message(judged))
         low, high = fit.variance_factor_interval
         with ui.element("div").classes("numbers"):
-            number("error on poses left out", numbers.length(fit.holdout.rms_m))
-            number("error on fitted poses", numbers.length(fit.error.rms_m))
-            number("noise alone would leave", numbers.length(d.story.noise_floor_m))
-            interval = f"95 %: {low:.2f} to {high:.2f}"
-            number(f"variance factor, {interval}", f"{fit.variance_factor:.2f}")
+            for name, value in (
+                ("error on poses left out", numbers.length(fit.holdout.rms_m)),
+                ("error on fitted poses", numbers.length(fit.error.rms_m)),
+                ("noise alone would leave", numbers.length(d.story.noise_floor_m)),
+                (f"variance factor, 95 %: {low:.2f} to {high:.2f}", f"{fit.variance_factor:.2f}"),
+            ):
+                text = f"<b>{plain(value)}</b><span>{plain(name)}</span>"
+                ui.html(text, sanitize=False).classes("number")
         name = "Baseline, not kept yet" if d.number is None else f"Revision {d.number}"
         with ui.row().classes("items-center").style("gap: 6px 10px"):
             soft(f"{name}: {model_name(fit.model.named)}")
@@ -421,11 +424,6 @@ class Status:
 def answer(view: View, place: str) -> None:
     """Draw the label for progress and answer of the buttons above."""
     view.answers[place] = ui.label().classes("answer").props(f"role=status data-answer={place}")
-
-
-def number(name: str, value: str) -> None:
-    """Draw a number with its name."""
-    ui.html(f"<b>{plain(value)}</b><span>{plain(name)}</span>", sanitize=False).classes("number")
 
 
 def title(text: str) -> None:

@@ -75,13 +75,14 @@ def install(app: FastAPI, session: WorkbenchSession) -> None:
 
 def read_file(shared: TabsShared) -> None:
     """Start to read the file."""
+    name = shared.session.path.name
 
     def read(say: Say) -> str:
         again = shared.session.snapshot is not None
-        name = shared.session.load(say).name
+        shared.session.load(say)
         return f"{name} was read again." if again else ""
 
-    shared.work.start(f"Reading {shared.session.path.name}", read)
+    shared.work.start(f"Reading {name}", read)
 
 
 class View:
@@ -94,8 +95,7 @@ class View:
         self.places: dict[str, ui.column] = {}  # of the parts in `REDRAWN`
         self.adder: ui.button | None = None
         self.answers: dict[str, ui.label] = {}
-        self._drawn = -1, False
-        self._ready = False
+        self._drawn, self._ready = (-1, False), False
         self._file: tuple[str, bytes] | None = None
         self._planned: object = None
 

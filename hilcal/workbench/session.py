@@ -71,8 +71,6 @@ class Figure:
 class Snapshot:
     """A campaign with the shown revision and its predecessors; created after every change."""
 
-    name: str  # of the file
-    arm: str
     n_readings: int  # including those set aside
     records: tuple[RevisionRecord, ...]  # all revisions, oldest first
     accepted: int | None  # the revision that every command uses; None: the latest
@@ -93,8 +91,7 @@ class Snapshot:
     @property
     def diagnosis(self) -> Diagnosis:
         """The diagnosis of the shown revision."""
-        judged = self.chapters[-1].diagnosis
-        if judged is None:
+        if (judged := self.chapters[-1].diagnosis) is None:
             raise ValueError("a snapshot without a diagnosis")
         return judged
 
@@ -274,9 +271,8 @@ class WorkbenchSession:
         """Return the command that measures the plan into the same campaign."""
         if self.planned is None:
             return ""
-        return (
-            f"hilcal run CELL.toml -o {quoted(self.path)} --append --plan {quoted(self.planned[1])}"
-        )
+        run, plan = quoted(self.path), quoted(self.planned[1])
+        return f"hilcal run CELL.toml -o {run} --append --plan {plan}"
 
     @property
     def stale(self) -> bool:
@@ -321,9 +317,8 @@ class WorkbenchSession:
         if snapshot is not self.snapshot:
             raise InputError("the workbench has gone on since that click; nothing was changed")
         if self.stale and not changed:
-            raise InputError(
-                f"{self.path.name} was changed by another command; read it again first"
-            )
+            name = self.path.name
+            raise InputError(f"{name} was changed by another command; read it again first")
 
     def _chapters(self, o: Campaign, revision: int | None, say: Say) -> tuple[Chapter, ...]:
         """Return a revision and its predecessors, diagnosed unless they are in the cache."""
@@ -366,8 +361,6 @@ class WorkbenchSession:
     ) -> Snapshot:
         """Show a revision; `stamp` is that of the file when it was read, None: its current one."""
         self.snapshot = Snapshot(
-            name=self.path.name,
-            arm=o.cell.arm.name,
             n_readings=len(o.readings),
             records=o.file.revisions(),
             accepted=o.file.accepted(),

@@ -22,7 +22,7 @@ from tests.support.paths import ROOT
 from tests.support.picture import Shot, pictures, pixels, vulkan_available
 from tests.support.recordings import rows, same, texts
 from tests.support.timing import wait_until
-from tests.support.viewer_story import ANGLE, LOAD, doubtful, story, ur10e
+from tests.support.viewer_story import ANGLE, LOAD, doubtful, story
 
 pytestmark = pytest.mark.usefixtures("strict")
 FORBIDDEN = "█▏░─│⟂∥∈∝ᵀ✘漢"
@@ -244,7 +244,8 @@ def test_levels_hold_the_share_of_noise_they_name():
 
 
 def test_arm_of_another_shape_is_drawn(tmp_path):
-    six, told, path = ur10e(), story(poses=3), tmp_path / "four.rrd"
+    told, path = story(poses=3), tmp_path / "four.rrd"
+    six = told.arm
     cut = {k: getattr(six, k)[:4] for k in ("masses", "coms", "joint_names")}
     four = replace(six, links=six.links[:5], **cut)
     save(replace(told, arm=four, q=told.q[:, :4]), path)
