@@ -335,7 +335,7 @@ def viewer(view: View, d: Snapshot) -> None:
 def _cell(view: View, d: Snapshot) -> None:
     """Draw the values of the cell that can be changed; typed values stay until they are used."""
 
-    def keep(key: tuple[str, str], e: events.ValueChangeEventArguments) -> None:
+    def keep(key: tuple[str, str], e: events.ValueChangeEventArguments[Any]) -> None:
         view.tab.texts[key] = e.value or ""
 
     with _part("Noise and cell"):

@@ -476,7 +476,7 @@ def _laws(m: ReportContent) -> Iterator[PageSection]:
         return
     facts = {f"{law.title}, an effect of a file": law.facts for law in law_curves}
     shown = law_curves[:MOST_LAWS]
-    parts = (
+    parts: tuple[Block, ...] = (
         *(table("", "", rows=rows, caption=caption) for caption, rows in facts.items()),
         *(Chart(f"{law.title}: {law.y_label}", charts.curve_chart(law)) for law in shown),
         note(

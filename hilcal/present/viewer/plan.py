@@ -305,8 +305,9 @@ def _loads(rec: rr.RecordingStream, d: PlanView) -> None:
             load: rr.AsComponents = rr.Clear(recursive=False)
             pull: rr.AsComponents = rr.Clear(recursive=False)
             if hung:
-                ends = (np.array([getattr(x, side)[i] for x in hung]) for side in ("start", "end"))
-                load = style.drawn_capsules(*ends, np.array([x.radius for x in hung]), [color])
+                start, end = (np.array([getattr(x, k)[i] for x in hung]) for k in ("start", "end"))
+                radius = np.array([x.radius for x in hung])
+                load = style.drawn_capsules(start, end, radius, [color])
             if force.any():
                 look: dict[str, Any] = {"colors": [color], "radii": [0.006 * d.reach]}
                 way = [_FORCE_LENGTH * force / most]
