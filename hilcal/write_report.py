@@ -126,7 +126,7 @@ def content_of(
     say("preparing the story")
     fitted, story, name = chapters[-1].fit, build_story(chapters), quoted(run.path.name)
     number = "" if record is None else f" --revision {record.number}"
-    commands = [f"hilcal info {name}"]
+    commands = [f"hilcal info {quoted(run.path.name)}"]
     commands += [f"hilcal {c} {name}{number}" for c in ("compare", "diagnose")]
     tested = corrected = None
     if validation is not None:
