@@ -67,11 +67,6 @@ class LiveViewer:
         self._threads: list[threading.Thread] = []
         self._ready, self._closing, self._arm_sent = threading.Event(), False, 0.0
 
-    @property
-    def pid(self) -> int | None:
-        """Number of the process; None before `start`."""
-        return None if self._process is None else self._process.pid
-
     def start(self) -> None:
         """Start the process and wait until it serves; problems go to `say`."""
         path = filter(None, (str(_ROOT), os.environ.get("PYTHONPATH")))

@@ -7,7 +7,6 @@ second click, the change is refused and nothing is appended.
 
 import tempfile
 import threading
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -440,10 +439,3 @@ class Work:
         """Return the error of the last task at a place; empty if it succeeded."""
         answer = self.answers.get(place)
         return "" if answer is None or answer.done else answer.text
-
-    def wait(self, timeout: float) -> bool:
-        """Wait up to `timeout`, s, for the end of the task; return whether it has ended."""
-        end = time.monotonic() + timeout
-        while self.task is not None and time.monotonic() < end:
-            time.sleep(0.01)
-        return self.task is None

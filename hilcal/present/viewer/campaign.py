@@ -23,7 +23,7 @@ from hilcal.present.story import (
     worst_and_even,
 )
 from hilcal.present.viewer import recording, style
-from hilcal.present.viewer.recording import along, fixed
+from hilcal.present.viewer.recording import LOOPBACK, along, fixed
 from hilcal.robot.body import capsules
 from hilcal.types import Floats, Ints
 
@@ -79,26 +79,26 @@ def save(story: Story, path: Path) -> None:
 
 
 @contextlib.contextmanager
-def serve(story: Story, ip: str = "127.0.0.1", port: int = PORT) -> Iterator[str]:
+def serve(story: Story, port: int = PORT) -> Iterator[str]:
     """Serve a story at the yielded address until the block ends.
 
     Viewers (`rerun ADDRESS`) may join late and rejoin; their analytics are disabled for this user.
     Raises InputError if the port is occupied, HilcalError if it cannot be served.
     """
-    server = f"viewer server {ip}:{port}"
+    server = f"viewer server {LOOPBACK}:{port}"
     recording.disable_analytics()
-    if (why := recording.refused(ip, port)) is not None:
+    if (why := recording.refused(port)) is not None:
         raise InputError(f"{server}: {why}; choose a free port of this machine")
     try:
         rec = _opened(story)
-        rec.set_sinks(rr.GrpcServerSink(bind_ip=ip, port=port))
+        rec.set_sinks(rr.GrpcServerSink(bind_ip=LOOPBACK, port=port))
         # Active, too: a viewer that showed another recording would keep its layout.
         rec.send_blueprint(blueprint(story), make_active=True, make_default=True)
         tell(rec, story)
     except (OSError, RuntimeError) as error:
         raise HilcalError(f"{server}: {error}") from error
     try:
-        yield f"rerun+http://{ip}:{port}/proxy"
+        yield f"rerun+http://{LOOPBACK}:{port}/proxy"
     finally:
         rec.disconnect()
 

@@ -390,13 +390,13 @@ def follow(messages: BinaryIO, reply: Callable[..., None], record: Path, port: i
     with contextlib.suppress(OSError):
         recording.disable_analytics()
     ports = range(port, port + PORTS)
-    free = next((p for p in ports if recording.refused("127.0.0.1", p) is None), None)
+    free = next((p for p in ports if recording.refused(p) is None), None)
     if free is None:
         reply(problem=f"no free port from {port} to {ports[-1]}: no live viewer is served")
         reply(url=None)
     else:
         outlets.append(_Outlet(identifier, reply, port=free))
-        reply(url=f"rerun+http://127.0.0.1:{free}/proxy")
+        reply(url=f"rerun+http://{recording.LOOPBACK}:{free}/proxy")
     with contextlib.suppress(EOFError, pickle.UnpicklingError):
         while True:
             wall, event = pickle.load(messages)  # noqa: S301 - of the command that started us
@@ -423,7 +423,7 @@ class _Outlet:
             self._rec.set_sinks(
                 rr.FileSink(str(file))
                 if file
-                else rr.GrpcServerSink("127.0.0.1", port, server_memory_limit=MEMORY)
+                else rr.GrpcServerSink(recording.LOOPBACK, port, server_memory_limit=MEMORY)
             )
             self._scene = LiveScene(self._rec, batches=file is not None)
         except (OSError, RuntimeError, ValueError) as error:

@@ -17,17 +17,17 @@ import rerun.blueprint as rrb
 from hilcal.errors import HilcalError, InputError
 from hilcal.whole_file import replace_file
 
-APPLICATION = "hilcal"
+APPLICATION, LOOPBACK = "hilcal", "127.0.0.1"
 _FLUSH_TIMEOUT = 10.0
 _LOG = logging.getLogger(__name__)
 
 
-def refused(ip: str, port: int) -> Exception | None:
+def refused(port: int) -> Exception | None:
     """Return why a port cannot be bound, None if it can; a server would only log the error."""
     try:
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind((ip, port))
+            probe.bind((LOOPBACK, port))
     except (OSError, OverflowError) as error:
         return error
     return None

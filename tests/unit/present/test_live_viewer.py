@@ -102,7 +102,7 @@ def test_a_viewer_that_comes_late_gets_all_and_the_recording_has_it_too(home, sa
     try:
         assert live.url.startswith("rerun+http://127.0.0.1:")
         assert str(port) not in live.url
-        process = psutil.Process(live.pid)
+        process = psutil.Process(live._process.pid)
         listening = [c.laddr.ip for c in process.net_connections() if c.status == "LISTEN"]
         assert listening == ["127.0.0.1"]
         assert process.nice() > 0
@@ -124,10 +124,10 @@ def test_a_frozen_viewer_costs_nothing(live, said, home):
     with client(live.url, home / "frozen.rrd") as frozen:
         time.sleep(1.0)
         frozen.send_signal(signal.SIGSTOP)
-        before = psutil.Process(live.pid).memory_info().rss
+        before = psutil.Process(live._process.pid).memory_info().rss
         assert tell(live, 490, paced=True) < SOON
         wait_until(lambda: readings(live.record) >= 0.95 * 980, "recorded", 60.0)
-        grown = psutil.Process(live.pid).memory_info().rss - before
+        grown = psutil.Process(live._process.pid).memory_info().rss - before
         assert grown < 400e6  # what the server keeps for late viewers, and what it is kept in
     live.close()
     assert readings(live.record) == 980 - BLIND  # up to a thousand each is drawn
@@ -138,7 +138,7 @@ def test_a_frozen_viewer_costs_nothing(live, said, home):
 @posix
 def test_a_process_that_is_frozen_is_dropped_and_ended(live, said, monkeypatch):
     monkeypatch.setattr(live_viewer, "END_S", 1.0)
-    pid = live.pid
+    pid = live._process.pid
     os.kill(pid, signal.SIGSTOP)
     assert tell(live, 1500) < SOON
     assert live._queue.qsize() <= live_viewer.MOST
@@ -155,7 +155,7 @@ def test_a_process_that_is_frozen_is_dropped_and_ended(live, said, monkeypatch):
 @posix
 def test_a_process_that_is_killed_is_told_once_and_left_behind(live, said):
     tell(live, 6)
-    os.kill(live.pid, signal.SIGKILL)
+    os.kill(live._process.pid, signal.SIGKILL)
     wait_until(lambda: said, "said that it has ended")
     assert tell(live, 1500) < SOON
     live.close()
@@ -193,7 +193,7 @@ KILLED = PROGRAM.format(
     before="",
     poses=24,
     after="while live._queue.qsize():\n    time.sleep(0.01)\n"
-    "print(live.pid, flush=True)\nos.kill(os.getpid(), signal.SIGKILL)",
+    "print(live._process.pid, flush=True)\nos.kill(os.getpid(), signal.SIGKILL)",
 )
 
 
@@ -229,4 +229,4 @@ def test_what_has_no_process_is_silent(tmp_path, said):
     live = LiveViewer(tmp_path / "x.rrd", said.append)
     live.notify(ReadingStored(plan().steps[0], 1, 2, 0.0, 0.0))
     live.close()
-    assert (said, live.dropped, live.pid) == ([], 0, None)
+    assert (said, live.dropped, live._process) == ([], 0, None)
