@@ -308,14 +308,13 @@ def target_words(name: str, n_readings: int, known: bool) -> str:
     return f"{name} ({n_readings} readings, its offset {'known' if known else 'estimated'})"
 
 
-def worst_poses(e: FullPrediction, most: int = MOST_LISTED) -> list[Worst]:
+def worst_poses(e: FullPrediction) -> list[Worst]:
     """Return the worst measurement of each of the worst poses, in units of the noise."""
     distance, out = np.sqrt(e.mahalanobis2), dict[str, Worst]()
     for k in np.argsort(-distance, kind="stable").tolist():
         (pose, load), target = e.name(k), e.target_name(k)
-        if pose not in out and len(out) < most:
-            error = float(np.linalg.norm(e.raw[k, :3]))
-            name = f"{pose} {target}" if target else pose
+        if pose not in out and len(out) < MOST_LISTED:
+            name, error = f"{pose} {target or ''}".rstrip(), float(np.linalg.norm(e.raw[k, :3]))
             out[pose] = Worst(name, load, error, float(distance[k]))
     return list(out.values())
 

@@ -111,23 +111,24 @@ def sections(m: ReportContent) -> tuple[PageSection, ...]:
 
 def first_screen(m: ReportContent) -> FirstScreen:
     """Return the contents of the first screen."""
-    d, verdict, tone, good = m.diagnosis, None, "doubt", fit_words.misses(m.fit)
-    text = "not judged: only a model fitted with scaling gc can be"
-    missing = "Not judged; hilcal identify --scaling gc, then hilcal diagnose, say it."
+    d, good = m.diagnosis, fit_words.misses(m.fit)
+    verdict = None if d is None else d.verdict
     if (prior := m.fit.model.prior) is not None:
         good += f" It also rests on a prior: {prior.posterior.source.campaign or 'a posterior'}."
-    if d is not None:
-        verdict, text, missing = d.verdict, headline(d), message(d)
+    if d is None:
+        title, tone = "not judged: only a model fitted with scaling gc can be", "doubt"
+        missing = "Not judged; hilcal identify --scaling gc, then hilcal diagnose, say it."
+    else:
+        title, missing = headline(d), message(d)
         if verdict == "missing_effect" and d.lead is not None:
-            text = f"{text}: {d.lead.effect}"
-        if verdict not in ("ambiguous", "noise_misjudged") or d.wrong_figures:
-            tone = "good" if verdict == "adequate" else "bad"
-        answer = "Not yet."
+            title += f": {d.lead.effect}"
+        doubt = verdict in ("ambiguous", "noise_misjudged") and not d.wrong_figures
+        tone = "doubt" if doubt else "good" if verdict == "adequate" else "bad"
         if verdict == "noise_misjudged":
-            answer = "It cannot be told, for the stated noise is wrong."
-        elif verdict == "adequate" or d.reason == "inseparable_addition":
-            answer = "Yes."
-        good = f"{answer} {good}"
+            good = f"It cannot be told, for the stated noise is wrong. {good}"
+        else:
+            yes = verdict == "adequate" or d.reason == "inseparable_addition"
+            good = f"{'Yes' if yes else 'Not yet'}. {good}"
         if verdict == "adequate":
             missing = "Nothing that these readings could show."
         elif d.lead is not None and not d.wrong_figures:
@@ -138,7 +139,7 @@ def first_screen(m: ReportContent) -> FirstScreen:
         ("Where is it wrong?", where_wrong(m)),
         ("What is missing?", missing),
     )
-    title, cards = f"{text[0].upper()}{text[1:]}", tuple(_cards(m))
+    title, cards = f"{title[0].upper()}{title[1:]}", tuple(_cards(m))
     return FirstScreen(title, tone, answers, cards, *limit_words(m), verdict)
 
 
