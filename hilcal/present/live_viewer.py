@@ -108,8 +108,7 @@ class LiveViewer:
         stored = (d for d in log.details() if "wall_s" in d)
         steps = tuple((float(d["wall_s"]), Step(**d["step"])) for d in stored)
         targets, names = cell.all_targets[:, :3, 3], cell.target_names
-        start = Measuring(name, cell.arm, targets, log.plan, steps, names)
-        self._send(time.time(), start)
+        self._send(time.time(), Measuring(name, cell.arm, targets, log.plan, steps, names))
 
     def revised(self, chapter: Chapter) -> None:
         """Send a revision; a failure to draw it goes to `say` and is not raised."""

@@ -268,8 +268,7 @@ def poses_report(plan: Next, poses: int, readings: int, details: bool = True) ->
         f"{readings} unloaded readings at {poses} poses, spread over the joints' range.\n"
     )
     if plan.powers:
-        some = plan.powers if details else _weakest(plan.powers)
-        yield power_table(some, "and this is fitted")
+        yield power_table(plan.powers if details else _weakest(plan.powers), "and this is fitted")
         yield note(
             "now, then: chance that it passes every test of a missing effect, poses left out "
             "included, with the readings so far and with those planned as well.\n"

@@ -169,8 +169,7 @@ def _missing(view: View, d: Snapshot) -> None:
         effects, view.adder = [s.effect for s in d.diagnosis.suspects], None
         if effects:
             kind = "unelevated" if rows else "outline"
-            text = f"Add {view.tab.suspect}"
-            view.adder = button(view, text, view.add, f"{kind} data-part=add")
+            view.adder = button(view, f"Add {view.tab.suspect}", view.add, f"{kind} data-part=add")
             view.adder.set_visibility(view.tab.suspect is not None)
         answer(view, "missing")
         if effects:
@@ -384,8 +383,7 @@ def planned(view: View, d: Snapshot) -> None:
         return
     next_, path = view.session.planned
     summary, powers = next_.made.summary, next_.found.powers
-    sentence = powers_summary(powers, summary.poses, summary.readings)
-    ui.label(sentence).props("data-part=planned")
+    ui.label(powers_summary(powers, summary.poses, summary.readings)).props("data-part=planned")
     for effect, rival, power_now, power_then in power_rows(powers):
         soft(f"If {effect} is there, {rival} is ruled out: {power_now} now, {power_then} then.")
     ui.label(f"The plan is in {path.name}. Measure it into the same campaign with:")

@@ -143,9 +143,8 @@ def comparison_screen(c: Comparison, earlier: str) -> FirstScreen:
         f"The calibration of {earlier} is off by {numbers.length(error.rms_m)} rms today, "
         f"{numbers.digits(t.z, 2)} times what it states: {beyond} than its uncertainty."
     )
-    largest = f"rms; largest {numbers.length(error.max_m)}"
     cards = [
-        ("Error today", numbers.length(error.rms_m), largest),
+        ("Error today", numbers.length(error.rms_m), f"rms; largest {numbers.length(error.max_m)}"),
         ("Expected", numbers.length(t.stated_m), "rms that the calibration states"),
     ]
     if t.drawing_m is not None:

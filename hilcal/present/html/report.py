@@ -182,8 +182,7 @@ def _cards(m: ReportContent) -> Iterator[tuple[str, str, str]]:
         text = f"rms; {uncorrected} without correction; {error['count']} points"
         yield "Measured at corrected targets", corrected, text
     yield card("After, poses left out", m.fit.holdout)
-    floor = length(m.story.noise_floor_m)
-    yield "Noise alone", floor, "rms that the stated noise would leave"
+    yield "Noise alone", length(m.story.noise_floor_m), "rms that the stated noise would leave"
 
 
 def limit_words(m: ReportContent) -> tuple[str, bool | None]:
@@ -364,7 +363,6 @@ def _instruments(m: ReportContent) -> Iterator[Block]:
         imported = ": the readings were imported from a table" if o.planned is None else ""
         yield f"The file names no instrument{imported}."
     yield note(f"Noise of the readings: {covariance_words(m.covariance)}.")
-    revision = str(m.chapters[-1].number) if m.stored else "none stored: the baseline"
     yield identity(
         ("Robot", o.config.robot.model),
         ("Base", base_line(m.fit.model.cell, m.fit.frames, m.fit.mode)),
@@ -372,7 +370,7 @@ def _instruments(m: ReportContent) -> Iterator[Block]:
         ("Campaign", f"{m.name}, made {utc(o.created)} UTC"),
         ("SHA-256", m.sha256),
         *([("Validation SHA-256", m.tested.sha256)] if m.tested else []),
-        ("Revision", revision),
+        ("Revision", str(m.chapters[-1].number) if m.stored else "none stored: the baseline"),
         ("Report made", f"{utc(m.made)} UTC by hilcal {m.version}"),
     )
 

@@ -288,8 +288,7 @@ def _curve_bars(rec: rr.RecordingStream, entity: str, c: DependenceCurve | None)
             rec.log(f"{entity}/{part}", rr.Clear(recursive=False))
             continue
         width = np.diff(edges) / len(bars)
-        left = edges[:-1] + k * width
-        bar = rr.BarChart(bars[part], abscissa=left, widths=width, color=color)
+        bar = rr.BarChart(bars[part], abscissa=edges[:-1] + k * width, widths=width, color=color)
         rec.log(f"{entity}/{part}", bar)
 
 

@@ -193,5 +193,4 @@ def _blueprint(types: list[DrawnType]) -> rrb.Blueprint:
             dates.append(view)
         texts.append(style.text(f"type{i}", f"{title}Unlike the type"))
     left = rrb.Vertical(rrb.Tabs(*scenes), rrb.Tabs(*dates), row_shares=[3, 2])
-    right = rrb.Tabs(*texts, style.text("guide", "How to read this"))
-    return style.whole(left, right, "date")
+    return style.whole(left, rrb.Tabs(*texts, style.text("guide", "How to read this")), "date")

@@ -287,8 +287,7 @@ class LiveScene:
                 colors=np.tile(np.array(style.MEASURED, dtype=np.uint8), (len(steps), 1)),
                 radii=np.full(len(steps), 0.01),
             )
-            time = rr.TimeColumn(TIMELINE, timestamp=list(walls))
-            along(rec, f"{self._world}/dots", time, dots)
+            along(rec, f"{self._world}/dots", rr.TimeColumn(TIMELINE, timestamp=list(walls)), dots)
         self._passed.append((wall, tuple(start.plan.q[0].tolist())))
         self._move()
         self._send_summary(d)
@@ -340,8 +339,7 @@ class LiveScene:
                 balls.append(place)
             rec.log(f"{self._series}/{style.LEVEL_NAMES[j.level]}", rr.Scalars(j.sigma))
         if dots:
-            points = rr.Points3D(dots, colors=[style.MEASURED], radii=[0.01])
-            rec.log(f"{self._world}/dots", points)
+            rec.log(f"{self._world}/dots", rr.Points3D(dots, colors=[style.MEASURED], radii=[0.01]))
         if arrows:
             rec.log(f"{self._world}/arrows", style.residual_arrows(*zip(*arrows, strict=True)))
         if balls:

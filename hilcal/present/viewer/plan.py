@@ -178,8 +178,7 @@ def _static_scene(rec: rr.RecordingStream, d: PlanView) -> None:
     _beads(rec, d)
     if d.tracker is not None:
         low, high = ((d.tracker + k * _HEAD * _UP)[None] for k in (-1.2, 0.2))
-        head = style.drawn_capsules(low, high, np.array([_HEAD]), [_TRACKER])
-        fixed(rec, "world/tracker", head)
+        fixed(rec, "world/tracker", style.drawn_capsules(low, high, np.array([_HEAD]), [_TRACKER]))
         above = d.tracker + 2.2 * _HEAD * _UP
         fixed(rec, "world/tracker/name", style.labels([above], ["tracker"]))
 
@@ -306,8 +305,7 @@ def _loads(rec: rr.RecordingStream, d: PlanView) -> None:
             pull: rr.AsComponents = rr.Clear(recursive=False)
             if hung:
                 start, end = (np.array([getattr(x, k)[i] for x in hung]) for k in ("start", "end"))
-                radius = np.array([x.radius for x in hung])
-                load = style.drawn_capsules(start, end, radius, [color])
+                load = style.drawn_capsules(start, end, np.array([x.radius for x in hung]), [color])
             if force.any():
                 look: dict[str, Any] = {"colors": [color], "radii": [0.006 * d.reach]}
                 way = [_FORCE_LENGTH * force / most]
@@ -390,8 +388,7 @@ def step_card(d: PlanView, k: int) -> str:
         sight = Words(f"✓ The tracker sees the target {way}.")
         if d.sight[k] != SEEN:
             sight = Words(f"✗ The tracker does not see the target {way}: {d.why(k)}.", "strong")
-    joints = table("joint", "deg", rows=rows)
-    return style.markdown([head, when, *by_hand, sight, joints, place])
+    return style.markdown([head, when, *by_hand, sight, table("joint", "deg", rows=rows), place])
 
 
 def _schedule(rec: rr.RecordingStream, d: PlanView) -> None:
@@ -408,8 +405,7 @@ def _schedule(rec: rr.RecordingStream, d: PlanView) -> None:
         look: dict[str, Any] = {"colors": [color], "markers": [marker], "marker_sizes": [size]}
         fixed(rec, f"schedule/{entity}", rr.SeriesPoints(names=[named], **look))
         time = rr.TimeColumn("step", sequence=np.flatnonzero(members) + 1)
-        minutes = rr.Scalars.columns(scalars=d.time[members] / 60.0)
-        along(rec, f"schedule/{entity}", time, minutes)
+        along(rec, f"schedule/{entity}", time, rr.Scalars.columns(scalars=d.time[members] / 60.0))
 
 
 def blueprint(d: PlanView) -> rrb.Blueprint:

@@ -39,9 +39,8 @@ def opened(*content: object) -> rr.RecordingStream:
     for part in content:
         array = isinstance(part, np.ndarray)
         sha.update(np.ascontiguousarray(part).tobytes() if array else repr(part).encode())
-    identifier = str(uuid.UUID(bytes=sha.digest()[:16]))
     # Chunks end at a flush, not at a clock tick, so that equal content gives equal files.
-    return stream(identifier, rr.ChunkBatcherConfig.NEVER())
+    return stream(str(uuid.UUID(bytes=sha.digest()[:16])), rr.ChunkBatcherConfig.NEVER())
 
 
 def stream(identifier: str, batches: rr.ChunkBatcherConfig | None) -> rr.RecordingStream:
