@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from hilcal.present.viewer.recording import executable
@@ -58,6 +59,9 @@ def vulkan_available() -> bool:
     except OSError:
         return False
     return True
+
+
+needs_vulkan = pytest.mark.skipif(not vulkan_available(), reason="no Vulkan driver installed")
 
 
 def pictures(
@@ -175,8 +179,7 @@ def _environment(home: Path) -> dict[str, str]:
     (config / "rerun" / "analytics.json").write_text(
         json.dumps({"analytics_enabled": False, "analytics_id": "off", "metadata": {}})
     )
-    env = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
-    return env | {
+    return {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")} | {
         "HOME": str(home),
         "XDG_CONFIG_HOME": str(config),
         "XDG_DATA_HOME": str(home / "data"),

@@ -30,8 +30,7 @@ def story(
     # the noise of a tracker: 16 µm along its beam, 26 µm across
     away = target + np.array([0.0, 2.2, 0.4])
     ray = away / np.linalg.norm(away, axis=1, keepdims=True)
-    outer = ray[:, :, None] * ray[:, None]
-    covariance = 2.6e-5**2 * np.eye(3) + (1.6e-5**2 - 2.6e-5**2) * outer
+    covariance = 2.6e-5**2 * np.eye(3) + (1.6e-5**2 - 2.6e-5**2) * (ray[:, :, None] * ray[:, None])
     noise = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.standard_normal((n, 3)))
     truth, offset = sum(parts) + noise, target if mode == "absolute" else 0.0
     return Story(

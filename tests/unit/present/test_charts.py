@@ -83,8 +83,7 @@ def test_residuals_are_mahalanobis_distances_with_their_names_colours_and_marks(
                 charts.SYMBOLS[k],
             )
             assert ((y >= limits[k] - 1e-5) & (y <= limits[k + 1] + 1e-5)).all()
-    angles = np.sort(np.degrees(told.q[:, 1]))
-    np.testing.assert_allclose(points(by_joint, "x"), angles, rtol=1e-6)
+    np.testing.assert_allclose(points(by_joint, "x"), np.sort(np.degrees(told.q[:, 1])), rtol=1e-6)
     worst = int(np.argmax(r.whitened_norm2))
     size = 1e6 * np.linalg.norm(r.residual[worst])
     name = f"{told.pose_name(worst)}, {told.load_names[worst]}: {size:.0f} µm"

@@ -19,7 +19,7 @@ from hilcal.present.viewer import campaign, save, serve, style
 from hilcal.present.viewer.recording import executable
 from hilcal.robot.body import body_poses
 from tests.support.paths import ROOT
-from tests.support.picture import Shot, pictures, pixels, vulkan_available
+from tests.support.picture import Shot, needs_vulkan, pictures, pixels
 from tests.support.recordings import rows, same, texts
 from tests.support.timing import wait_until
 from tests.support.viewer_story import ANGLE, LOAD, doubtful, story
@@ -33,7 +33,6 @@ LONG = (
     "would), link_compliance (2.1 times as many readings like these would); hilcal next plans what "
     "separates them, or add one and judge on new poses."
 )
-needs_vulkan = pytest.mark.skipif(not vulkan_available(), reason="no Vulkan driver installed")
 
 
 @pytest.fixture(scope="module")
@@ -160,8 +159,7 @@ def test_a_pose_has_its_own_name_in_every_label_and_text(told, tmp_path):
     name = f"p{told.pose[np.argmax(told.revisions[-1].whitened_norm2)] + 40}a"
     worst = rows(path, "/world/residual/worst", "Points3D:labels", "revision")
     assert f"pose {name}," in worst[3][0]
-    details = rows(path, "/words/details", "TextDocument:text", "revision")
-    assert f"pose {name}," in details[3][0]
+    assert f"pose {name}," in rows(path, "/words/details", "TextDocument:text", "revision")[3][0]
     cards = rows(path, "/words/verdict", "TextDocument:text", "pose")
     assert cards[7][0].startswith("### Pose p47a:")
 
@@ -182,8 +180,7 @@ def test_the_arm_moves_through_poses_and_stands_in_the_worst_one(told, recording
     moves = rows(recording, "/world/arm/body6", "Transform3D:translation", "pose")
     assert sorted(moves) == list(range(30))
     read = np.array([moves[k][0] for k in range(30)])
-    bodies = body_poses(told.arm, told.q[::3])
-    np.testing.assert_allclose(read, bodies[:, 6, :3, 3], atol=1e-6)
+    np.testing.assert_allclose(read, body_poses(told.arm, told.q[::3])[:, 6, :3, 3], atol=1e-6)
     stands = by_revision("/world/arm/body7", "Transform3D:translation")
     for r in told.revisions:
         i = int(np.argmax(r.whitened_norm2))
@@ -247,8 +244,7 @@ def test_arm_of_another_shape_is_drawn(tmp_path):
     told, path = story(poses=3), tmp_path / "four.rrd"
     six = told.arm
     cut = {k: getattr(six, k)[:4] for k in ("masses", "coms", "joint_names")}
-    four = replace(six, links=six.links[:5], **cut)
-    save(replace(told, arm=four, q=told.q[:, :4]), path)
+    save(replace(told, arm=replace(six, links=six.links[:5], **cut), q=told.q[:, :4]), path)
     assert len(rows(path, "/world/arm/body5", "Transform3D:translation", "pose")) == 3
 
 
@@ -269,8 +265,7 @@ def colors(png):
 def test_the_picture_shows_the_red_vanish(told, recording, tmp_path):
     reached = [levels(r.whitened_norm2).max() for r in told.revisions]
     assert (reached[0], reached[3] < 2) == (2, True)  # red at first, none in the end
-    view = campaign.titles(told)[0]
-    shots = [Shot(tmp_path / f"{k}.png", "revision", k, view) for k in (0, 3)]
+    shots = [Shot(tmp_path / f"{k}.png", "revision", k, campaign.titles(told)[0]) for k in (0, 3)]
     reports = pictures(recording, shots, SIZE, LONGEST)
     assert len(reports) >= 10
     assert [v for v in reports if v.problems] == []
