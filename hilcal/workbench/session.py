@@ -49,6 +49,7 @@ from hilcal.procedure.next_plan import NextPlan, doubt_to_settle, next_plan
 from hilcal.store.procedure_log import refuse_fitting
 from hilcal.store.revision import RevisionRecord
 from hilcal.types import Ints
+from hilcal.workbench.viewer import WebViewer
 from hilcal.write_report import Asked, write_report
 
 Stamp = tuple[int, int, int]
@@ -143,6 +144,7 @@ class WorkbenchSession:
 
     def __init__(self, path: str | Path, catalogue: Catalogue | None = None) -> None:
         self.path, self._catalogue = Path(path), catalogue
+        self.work, self.viewer = Work(), WebViewer()
         self.snapshot: Snapshot | None = None  # current one; None before `load`
         self.changed: Changed | None = None  # the change that led to it; None for other actions
         self.planned: tuple[NextPlan, Path] | None = None  # the last plan, and its file
