@@ -508,28 +508,29 @@ def _parameters(m: ReportContent) -> PageSection:
 
 
 def _appendix(m: ReportContent) -> Iterator[PageSection]:
+    joints: list[Block] = [
+        Chart(f"Over joint {j + 1}", charts.residual_by_joint(m.story, m.left_out, j))
+        for j in range(m.story.arm.n)
+    ]
+    if m.tested is not None:
+        joints.append(replace(worst_table(m.tested.validation.shares), caption="Worst poses"))
+    explained = (
+        *captioned(fit_words.parameters(m.fit), "Parameters with standard uncertainties"),
+        *captioned(fit_words.remarks(m.fit)),
+        Chart("Correlations", charts.correlations(m.fit), wide=True, height=0),
+    )
     scalings = fit_words.scalings_table(m.scalings) if len(m.scalings) > 1 else ()
+    by_scaling = captioned(scalings, "The same model with each scaling")
     for name, title, parts in (
-        ("joints", "Over each joint", _joints(m)),
+        ("joints", "Over each joint", joints),
         ("rejected", "Rejected suspects", _rejected(m)),
-        ("all", "Parameters and what they mean", _all_parameters(m)),
-        (
-            "scalings",
-            "Scaling none, gu and gc",
-            captioned(scalings, "The same model with each scaling"),
-        ),
+        ("all", "Parameters and what they mean", explained),
+        ("scalings", "Scaling none, gu and gc", by_scaling),
         ("planned", "As planned and as reached", _planned(m)),
         ("provenance", "Provenance", _provenance(m)),
     ):
         if blocks := tuple(parts):
             yield PageSection(name, f"Appendix: {title}", blocks)
-
-
-def _joints(m: ReportContent) -> Iterator[Block]:
-    for j in range(m.story.arm.n):
-        yield Chart(f"Over joint {j + 1}", charts.residual_by_joint(m.story, m.left_out, j))
-    if m.tested is not None:
-        yield replace(worst_table(m.tested.validation.shares), caption="Worst poses")
 
 
 def _rejected(m: ReportContent) -> Iterator[Block]:
@@ -541,12 +542,6 @@ def _rejected(m: ReportContent) -> Iterator[Block]:
     rejected = [s for s in d.suspects if not s.passes and s.plausible and s.share >= LEAST_SHARE]
     yield from _added_variables(d, rejected)
     yield from captioned(could_have_been_seen(d), "What could have been seen")
-
-
-def _all_parameters(m: ReportContent) -> Iterator[Block]:
-    yield from captioned(fit_words.parameters(m.fit), "Parameters with standard uncertainties")
-    yield from captioned(fit_words.remarks(m.fit))
-    yield Chart("Correlations", charts.correlations(m.fit), wide=True, height=0)
 
 
 def _planned(m: ReportContent) -> Iterator[Block]:
