@@ -324,8 +324,8 @@ def discovery_report(d: Discovery) -> Iterator[Block]:
             x, y, std, _ = c.binned
             if len(x) >= LEAST_BINS:
                 head = c.quantity if c.quantity_unit == "1" else f"{c.quantity} [{c.quantity_unit}]"
-                heads, law_line = (head, c.of), np.interp(x, *c.line)
-                yield from ("", _binned(heads, c.unit, (x, y, std), law=law_line))
+                law_line = np.interp(x, *c.line)
+                yield from ("", _binned((head, c.of), c.unit, (x, y, std), law=law_line))
     best = pareto(d.structures)
     rows = table("law", "probability", "complexity", "on poses left out", "")
     for s in d.structures:
@@ -344,10 +344,8 @@ def discovery_report(d: Discovery) -> Iterator[Block]:
 
 def silence(d: Discovery) -> str:
     """Return the reason why no law is proposed, and the effects that could not be tried."""
-    tried, helps = (
-        f"{d.candidates} candidates were tried",
-        "measure more poses, or record what else may matter",
-    )
+    tried = f"{d.candidates} candidates were tried"
+    helps = "measure more poses, or record what else may matter"
     if any(c.variable == ROW_ORDER for c in d.carried[:1]):
         helps = (
             "it depends mostly on the order of the readings, whose times are missing: without "

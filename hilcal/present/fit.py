@@ -43,9 +43,8 @@ GROUPS: dict[Group, str] = {
 }
 """Groups of the table of variables in their order, with the format of a row's name."""
 CERTAIN = 0.005
-TELL_P, MOST_TOLD = 1e-3, 5
-"""Bonferroni-corrected p-value below which a disagreement with the prior is reported, and how many.
-"""
+TELL_P = 1e-3  # Bonferroni-corrected p-value of a disagreement with the prior that is reported
+MOST_TOLD = 5
 
 
 def model_name(names: Sequence[str]) -> str:
