@@ -76,7 +76,7 @@ class WebViewer:
         if not self._files:
             say("preparing the viewer")
             self._files = _fetched()
-        self.story, self.recorded = story, recorded
+        self.recorded, self.story = recorded, story  # the page looks at the story first
 
     def file(self, name: str) -> tuple[bytes, str] | None:
         """Return content and media type of a file; None for an unknown name."""
