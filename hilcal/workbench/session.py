@@ -272,8 +272,9 @@ class WorkbenchSession:
         """Return the command that measures the plan into the same campaign."""
         if self.planned is None:
             return ""
-        run, plan = quoted(self.path), quoted(self.planned[1])
-        return f"hilcal run CELL.toml -o {run} --append --plan {plan}"
+        return (
+            f"hilcal run CELL.toml -o {quoted(self.path)} --append --plan {quoted(self.planned[1])}"
+        )
 
     @property
     def stale(self) -> bool:

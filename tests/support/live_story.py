@@ -6,9 +6,8 @@ import numpy as np
 
 from hilcal.measuring.progress import ArmAt, LiveResidual, Phase, ReadingStored, Remark
 from hilcal.present.live_viewer import Measuring
-from hilcal.robot.catalogue import load_arm
 from hilcal.store.plan import Plan, Step
-from tests.support.viewer_story import HIGH, LOW
+from tests.support.viewer_story import ur10e
 
 BEGUN = 1_800_000_000.0  # the time of day at which it begins, s
 BLIND = 8  # readings before there is a model
@@ -17,15 +16,15 @@ BLIND = 8  # readings before there is a model
 def plan(poses: int = 24, loads: tuple[str, ...] = ("none", "10kg"), seed: int = 3) -> Plan:
     """A plan of so many poses, each under every load."""
     rng = np.random.default_rng(seed)
+    low, high = np.array([-1.6, -2.3, 0.3, -2.4, -2.0, -1.0]), np.array([1.6, -0.5, 2.0, 0, -1, 1])
     names = tuple(f"p{k + 1}" for k in range(poses))
     steps = tuple(Step(name, load, 0) for load in loads for name in names)
-    return Plan(names, rng.uniform(LOW, HIGH, (poses, 6)), steps)
+    return Plan(names, rng.uniform(low, high, (poses, 6)), steps)
 
 
 def measuring(made: Plan | None = None, earlier: tuple[tuple[float, Step], ...] = ()) -> Measuring:
     """The beginning of a campaign."""
-    arm, target = load_arm("ur10e"), np.array([[0.03, 0.0, 0.12]])
-    return Measuring("RUN.hilcal", arm, target, made or plan(), earlier)
+    return Measuring("RUN.hilcal", ur10e(), np.array([[0.03, 0.0, 0.12]]), made or plan(), earlier)
 
 
 def residual(rng: np.random.Generator, wrong: float) -> LiveResidual:

@@ -4,46 +4,95 @@ from dataclasses import replace
 
 import numpy as np
 
-from hilcal.identification.fit import mahalanobis2
 from hilcal.identification.residual import ErrorBlock
 from hilcal.present.document import table
 from hilcal.present.story import DependenceCurve, Story, StoryRevision
+from hilcal.robot.arm import Arm
 from hilcal.robot.body import body_poses
-from hilcal.robot.catalogue import load_arm
 
 EFFECTS = ("joint_compliance", "base_compliance", "joint_tilt_compliance", "hysteresis")
-SIZES = (1.2e-3, 3e-4, 1.5e-4, 1e-4)  # rms of what each explains along an axis, m
-LOW, HIGH = np.array([-1.6, -2.3, 0.3, -2.4, -2.0, -1.0]), np.array([1.6, -0.5, 2.0, 0, -1, 1])
-"""Range of the joint angles, rad: the arm is neither stretched out nor folded."""
+_DH = (  # d, a, alpha of a UR10e (Universal Robots' published DH parameters)
+    (0.1807, 0.0, np.pi / 2),
+    (0.0, -0.6127, 0.0),
+    (0.0, -0.57155, 0.0),
+    (0.17415, 0.0, np.pi / 2),
+    (0.11985, 0.0, -np.pi / 2),
+    (0.11655, 0.0, 0.0),
+)
+
+
+def ur10e() -> Arm:
+    """Build the arm from its DH table."""
+    links = np.stack([np.eye(4)] * 7)
+    for k, (d, a, alpha) in enumerate(_DH):
+        c, s = np.cos(alpha), np.sin(alpha)
+        links[k + 1] = [[1, 0, 0, a], [0, c, -s, 0], [0, s, c, d], [0, 0, 0, 1]]
+    return Arm(
+        name="ur10e",
+        links=links,
+        masses=np.array([7.369, 13.051, 3.989, 2.1, 1.98, 0.615]),
+        coms=np.zeros((6, 3)),
+        q_min=np.full(6, -2 * np.pi),
+        q_max=np.full(6, 2 * np.pi),
+        torque_max=np.array([330.0, 330, 150, 54, 54, 54]),
+        payload=12.5,
+        joint_names=tuple(f"joint{i}" for i in range(1, 7)),
+        source="UR10e DH parameters, Universal Robots",
+    )
 
 
 def story(
     poses: int = 30, loads: int = 3, seed: int = 1, mode: str = "deflection", names: str = ""
 ) -> Story:
     """Build a story of `poses` x `loads` readings and 4 revisions with falling residuals."""
-    rng, arm, n = np.random.default_rng(seed), load_arm("ur10e"), poses * loads
-    q = np.repeat(rng.uniform(LOW, HIGH, (poses, 6)), loads, axis=0)
-    flange = body_poses(arm, q)[:, -1]
-    target = flange[:, :3, 3] + flange[:, :3, :3] @ np.array([0.03, 0.0, 0.12])
+    rng = np.random.default_rng(seed)
+    arm = ur10e()
+    n = poses * loads
+    low, high = np.array([-1.6, -2.3, 0.3, -2.4, -2.0, -1.0]), np.array([1.6, -0.5, 2.0, 0, -1, 1])
+    q = np.repeat(rng.uniform(low, high, (poses, 6)), loads, axis=0)
+    pose = np.repeat(np.arange(poses), loads)
+    frames = body_poses(arm, q)
+    tool = np.array([0.03, 0.0, 0.12])
+    target = frames[:, -1, :3, 3] + frames[:, -1, :3, :3] @ tool
     mass = np.tile(np.linspace(5, 12, loads), poses)
-    parts = [size * mass[:, None] / 9 * rng.standard_normal((n, 3)) for size in SIZES]
-    # the noise of a tracker: 16 µm along its beam, 26 µm across
+    force = np.zeros((n, 3))
+    force[:, 2] = -9.80665 * mass
+    axis, arms = frames[:, 1:7, :3, 2], target[:, None] - frames[:, 1:7, :3, 3]
+    jacobian = np.cross(axis, arms)
+    torque = np.einsum("nij,nj->ni", jacobian, force)
+    compliance = np.array([2.2, 2.6, 4.5, 12, 14, 20]) * 1e-6
+    dq = torque * compliance
+    moment = np.cross(target, force)
+    parts = [
+        np.einsum("nij,ni->nj", jacobian, dq),
+        np.cross(moment * np.array([1.1e-6, 1.1e-6, 0]), target),
+        np.einsum("nij,ni->nj", np.roll(jacobian, 1, axis=1), dq * 0.06),
+        np.einsum("nij,ni->nj", jacobian, 3e-5 * np.sign(torque)) * (rng.random((n, 1)) < 0.5),
+    ]
     away = target + np.array([0.0, 2.2, 0.4])
     ray = away / np.linalg.norm(away, axis=1, keepdims=True)
-    covariance = 2.6e-5**2 * np.eye(3) + (1.6e-5**2 - 2.6e-5**2) * (ray[:, :, None] * ray[:, None])
+    across, along = (2.6e-5) ** 2, (1.6e-5) ** 2
+    eye = np.eye(3)
+    outer = ray[:, :, None] * ray[:, None]
+    covariance = across * eye + (along - across) * outer
     noise = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.standard_normal((n, 3)))
-    truth, offset = sum(parts) + noise, target if mode == "absolute" else 0.0
+    truth = sum(parts) + noise
+    floor = float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean()))
+    offset = target if mode == "absolute" else 0.0
+    revisions = tuple(
+        _revision(k, parts, truth, offset, covariance, torque, names) for k in range(len(parts))
+    )
     return Story(
         arm=arm,
         mode="absolute" if mode == "absolute" else "deflection",
         q=q,
-        pose=np.repeat(np.arange(poses), loads),
+        pose=pose,
         load_names=tuple(f"{m:.1f} kg{names}" for m in mass),
         anchor=target,
         measured=truth + offset,
         covariance=covariance,
-        noise_floor_m=float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean())),
-        revisions=tuple(_revision(k, parts, truth, offset, covariance, names) for k in range(4)),
+        noise_floor_m=floor,
+        revisions=revisions,
     )
 
 
@@ -77,23 +126,29 @@ def doubtful(names: str = "") -> Story:
     return replace(told, revisions=(first, second, third, last))
 
 
-def _revision(k, parts, truth, offset, covariance, names):
+def _revision(k, parts, truth, offset, covariance, torque, names):
     predicted = sum(parts[: k + 1])
-    residual, left = truth - predicted, EFFECTS[k + 1 :]
-    norm2, length = mahalanobis2(residual, covariance), np.linalg.norm(residual, axis=1)
-    rms, rms_sigma = (float(np.sqrt(np.mean(x))) for x in (length**2, norm2 / 3))
-    error = ErrorBlock(rms, float(length.mean()), float(length.max()), rms_sigma)
+    residual = truth - predicted
+    norm2 = np.einsum(
+        "ni,ni->n", residual, np.linalg.solve(covariance, residual[..., None])[..., 0]
+    )
+    length = np.linalg.norm(residual, axis=1)
+    error = ErrorBlock(
+        rms_m=float(np.sqrt((length**2).mean())),
+        mean_m=float(length.mean()),
+        max_m=float(length.max()),
+        rms_sigma=float(np.sqrt(norm2.mean() / 3)),
+    )
+    left = EFFECTS[k + 1 :]
     shares = [(e + names, f"{86 * 0.13**i:.0f} %", "84 %") for i, e in enumerate(left)]
-    suspects = table("missing effect?", "explains", "left out", rows=shares)
-    verdict, words, follows = "adequate", "What is left looks like noise.", None
+    words = "What is left looks like noise."
     if left:
-        verdict = "missing_effect"
         words = f"{left[0]} is missing: it explains 86 % of what is left."
-        x, y = 1e6 * parts[k + 1][:, 2], 1e6 * residual[:, 2]
-        follows = DependenceCurve(left[0], "", x, y, f"{left[0]} along z [µm]", "z [µm]")
+    verdict = "missing_effect" if left else "adequate"
+    suspects = table("missing effect?", "explains", "left out", rows=shares)
     return StoryRevision(
         revision=k,
-        change="" if k == 0 else f"+ {EFFECTS[k]}{names}",
+        change="" if k == 0 else "+ " + EFFECTS[k] + names,
         verdict=verdict,
         residual=residual,
         predicted=predicted + offset,
@@ -102,5 +157,9 @@ def _revision(k, parts, truth, offset, covariance, names):
         holdout=ErrorBlock(**{key: 1.06 * v for key, v in error.to_json().items()}),
         cells=(str(k), EFFECTS[k], "", "", "", "", "", verdict),
         panels={"verdict": (words, *([suspects] if left else [])), "parameters": (suspects, words)},
-        follows=follows,
+        follows=DependenceCurve(
+            left[0], "", torque[:, 1], 1e6 * residual[:, 2], "torque of joint 2 [Nm]", "z [µm]"
+        )
+        if left
+        else None,
     )

@@ -22,7 +22,7 @@ from tests.support.paths import ROOT
 from tests.support.picture import Shot, needs_vulkan, pictures, pixels
 from tests.support.recordings import rows, same, texts
 from tests.support.timing import wait_until
-from tests.support.viewer_story import ANGLE, LOAD, doubtful, story
+from tests.support.viewer_story import ANGLE, LOAD, doubtful, story, ur10e
 
 pytestmark = pytest.mark.usefixtures("strict")
 FORBIDDEN = "█▏░─│⟂∥∈∝ᵀ✘漢"
@@ -241,8 +241,7 @@ def test_levels_hold_the_share_of_noise_they_name():
 
 
 def test_arm_of_another_shape_is_drawn(tmp_path):
-    told, path = story(poses=3), tmp_path / "four.rrd"
-    six = told.arm
+    six, told, path = ur10e(), story(poses=3), tmp_path / "four.rrd"
     cut = {k: getattr(six, k)[:4] for k in ("masses", "coms", "joint_names")}
     save(replace(told, arm=replace(six, links=six.links[:5], **cut), q=told.q[:, :4]), path)
     assert len(rows(path, "/world/arm/body5", "Transform3D:translation", "pose")) == 3
