@@ -11,9 +11,7 @@ Every name is imported when it is first used, so that `import hilcal` costs noth
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, cast
-
-from hilcal.shown import Presenter
+from typing import TYPE_CHECKING
 
 __version__ = "1.0.0"
 
@@ -104,11 +102,6 @@ def __getattr__(name: str) -> object:
     value = getattr(import_module(_PLACES[name]), name)
     globals()[name] = value
     return value
-
-
-def presenter() -> Presenter:
-    """Return the presenter of values, see `shown.Presenter`."""
-    return cast(Presenter, import_module("hilcal.present"))
 
 
 def __dir__() -> list[str]:

@@ -1,11 +1,9 @@
-"""Display of values: a few lines at a console, text and tables in a notebook.
-
-`hilcal.present`, a higher layer, writes the texts; `hilcal.presenter` imports it when needed.
-"""
+"""Display of values: a few lines at a console, text and tables in a notebook."""
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -15,22 +13,6 @@ WIDTH = 70  # characters of a value in a `repr`; longer values are named by type
 FEW = 7  # numbers of an array that are written out
 
 
-class Presenter(Protocol):
-    """Writes values for people; `hilcal.presenter` returns it."""
-
-    def html_of(self, value: object) -> str:
-        """Return a value as a notebook shows it."""
-        ...
-
-    def message(self, of: object) -> str:
-        """Return a diagnosis in a sentence."""
-        ...
-
-    def frame_of(self, value: object) -> "pd.DataFrame":
-        """Return a value as a data frame."""
-        ...
-
-
 def brief(value: Any) -> str:
     """Return a dataclass in at most `MOST_LINES` lines: by its `_brief`, else by its fields."""
     if (describe := getattr(value, "_brief", None)) is not None:
@@ -38,8 +20,7 @@ def brief(value: Any) -> str:
     else:
         texts = {f.name: shortened(getattr(value, f.name)) for f in fields(value) if f.repr}
     lines = [f"  {name}: {text}" for name, text in texts.items()]
-    if len(lines) > MOST_LINES - 2:
-        hidden = len(lines) - (MOST_LINES - 3)
+    if (hidden := len(lines) - (MOST_LINES - 3)) > 1:
         lines = [*lines[: MOST_LINES - 3], f"  ... and {hidden} more"]
     return "\n".join([f"{type(value).__name__}(", *lines, ")"])
 
@@ -90,7 +71,7 @@ class Shown(Brief):
     __slots__ = ()
 
     def _repr_html_(self) -> str:
-        return presenter().html_of(self)
+        return str(presenter().html_of(self))
 
 
 class Tabular(Brief):
@@ -104,15 +85,11 @@ class Tabular(Brief):
         Readings have the columns of the exchange table. A fit has a row per reading with pose,
         load, residual, and residual of the fit without the pose. A diagnosis has a row per suspect,
         best first. A plan has a row per reading in the order of measuring.
-
-        Raises:
-            InputError: pandas is not installed.
         """
-        return presenter().frame_of(self)
+        frame: pd.DataFrame = presenter().frame_of(self)
+        return frame
 
 
-def presenter() -> Presenter:
-    """Return the presenter of values."""
-    import hilcal
-
-    return hilcal.presenter()
+def presenter() -> Any:
+    """Return `hilcal.present`, a higher layer that writes the texts: imported when needed."""
+    return import_module("hilcal.present")

@@ -1,7 +1,6 @@
 """`report`: collects the results of a campaign, and writes them as one HTML page."""
 
 import hashlib
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from hilcal.identification.fit import Fit, fit
 from hilcal.names import quoted
 from hilcal.present.html import FirstScreen
 from hilcal.present.html.report import ReportContent, Tested, first_screen, page
+from hilcal.present.progress import Say
 from hilcal.present.story import build_story, of_left_out
 from hilcal.procedure.state import IMPROVED, Files
 from hilcal.readings.whitening import SCALINGS, Scaling
@@ -23,8 +23,6 @@ from hilcal.store.run_log import PLAN, RunLog
 from hilcal.transfer.fleet import Fleet
 from hilcal.validation import validate
 from hilcal.whole_file import replace_file
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,11 +122,9 @@ def content_of(
     """Collect the content of a report of one campaign; raises as `report` does."""
     options = options or Asked()
     validation, limit_m, revision = options.validation, options.limit_m, options.revision
-    record = run.in_use(revision)
-    chapters = run.chapters(say, revision)
-    fitted = chapters[-1].fit
+    record, chapters = run.in_use(revision), run.chapters(say, revision)
     say("preparing the story")
-    name = quoted(run.path.name)
+    fitted, story, name = chapters[-1].fit, build_story(chapters), quoted(run.path.name)
     number = "" if record is None else f" --revision {record.number}"
     commands = [f"hilcal info {quoted(run.path.name)}"]
     commands += [f"hilcal {c} {name}{number}" for c in ("compare", "diagnose")]
@@ -140,7 +136,6 @@ def content_of(
     gain = ProcedureLog(run.file).last(IMPROVED)
     if gain and record and gain["revision"] == record.number:
         corrected = gain  # measured with this revision
-    story = build_story(chapters)
     return ReportContent(
         name=run.path.name,
         sha256=_sha256(run.path),
@@ -164,18 +159,13 @@ def content_of(
 
 
 def write_fleet_report(fleet: Fleet, directory: Path, path: Path) -> None:
-    """Write the results of a fleet as one HTML page.
-
-    Raises:
-        InputError: the page cannot be written.
-    """
+    """Write the results of a fleet as one HTML page."""
     from hilcal.present.html.other_pages import fleet_page
 
     replace_file(path, fleet_page(fleet, directory.resolve().name, utc_now(), hilcal.__version__))
 
 
 def _scalings(last: Fit, say: Say) -> dict[Scaling, Fit]:
-    """Fit the last model with each scaling, where its scaling is gc."""
     out: dict[Scaling, Fit] = {}
     for s in SCALINGS if last.scaling == "gc" else ():
         say(f"fitting with scaling {s}")
@@ -187,6 +177,5 @@ def _scalings(last: Fit, say: Say) -> dict[Scaling, Fit]:
 
 
 def _sha256(path: Path) -> str:
-    """Return the hash of a campaign file on the disk."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import pandas as pd
 
+    from hilcal.diagnosis.diagnosis import Diagnosis
+
 
 def html_of(value: object) -> str:
     """Return the HTML of a result for a notebook."""
@@ -20,11 +22,8 @@ def frame_of(value: object) -> "pd.DataFrame":
     return notebook.frame_of(value)
 
 
-def message(diagnosis: object) -> str:
+def message(d: "Diagnosis") -> str:
     """Return the verdict of a diagnosis in a sentence."""
-    from hilcal.diagnosis.diagnosis import Diagnosis
     from hilcal.present import verdict
 
-    if not isinstance(diagnosis, Diagnosis):
-        raise TypeError(f"no sentence for a {type(diagnosis).__name__}")
-    return verdict.message(diagnosis)
+    return verdict.message(d)

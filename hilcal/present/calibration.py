@@ -9,21 +9,13 @@ import numpy as np
 from hilcal import numbers
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensation import BAND, Compensation
-from hilcal.calibration.improvement import Improved, Improvement
+from hilcal.calibration.improvement import Improvement
 from hilcal.calibration.measured import WORDS, Outside
 from hilcal.calibration.programs.program import ProgramPoint
 from hilcal.calibration.urscript import Waypoint
+from hilcal.identification import validation
 from hilcal.identification.bootstrap import Bootstrap
 from hilcal.identification.priors import names_of
-from hilcal.identification.validation import BAND as REGION
-from hilcal.identification.validation import (
-    Acceptance,
-    Beyond,
-    Extrapolation,
-    Judged,
-    Share,
-    Validation,
-)
 from hilcal.numbers import length
 from hilcal.present.document import Block, Table, heading, load_name, note, table
 from hilcal.present.fit import error_words, kind, model_name
@@ -66,13 +58,11 @@ DOES: Mapping[str, str] = {
 """Steps that compute, with their duration for a campaign of some hundred readings."""
 MOST_LEFT, LISTED = 6, 12  # listed points without a correction; listed compensated points
 MOST, WORST = 4, 6  # listed variables; listed poses
-DOUBTED = 1.5
-"""Least rms ratio of error to stated standard deviation that is reported."""
+DOUBTED = 1.5  # least rms ratio of error to stated standard deviation that is reported
 WIDER = 1.5
 """Ratio of drawn to stated standard uncertainty above which the stated one is called too small; a
 choice. 200 draws determine a standard deviation to 5 %, few poses much less well."""
-CROWDED = 0.5
-"""Effective parameters per pose above which the draws scatter too widely; a choice."""
+CROWDED = 0.5  # effective parameters per pose above which the draws scatter too widely; a choice
 
 
 def step_heading(step: "ProcedureStep", clock: float = 1.0) -> Iterator[Block]:
@@ -145,22 +135,26 @@ def decision_report(
     yield f"{reasons[d.reason]}\n"
 
 
-def validation_lines(test: Acceptance) -> Iterator[str]:
+def validation_lines(test: validation.Acceptance) -> Iterator[str]:
     """Yield how well the model predicts readings that were never fitted."""
     e = test.everything
+    rms, most, stated, noise = map(length, (e.rms_m, e.max_m, e.stated_m, test.noise_m))
     yield (
-        f"{e.count} measurements that nothing was fitted to are predicted to "
-        f"{length(e.rms_m)} rms, {length(e.max_m)} at most; the fit states "
-        f"{length(e.stated_m)}, noise alone would leave {length(test.noise_m)}. "
-        f"{100 * e.within:.0f} % lie inside of their 95 % region.\n"
+        f"{e.count} measurements that nothing was fitted to are predicted to {rms} rms, {most} at "
+        f"most; the fit states {stated}, noise alone would leave {noise}. {100 * e.within:.0f} % "
+        "lie inside of their 95 % region.\n"
     )
 
 
 def improvement_report(gain: Improvement, limit_m: float | None) -> Iterator[Block]:
     """Yield the measured errors before and after the correction, and the verdict on a limit."""
-    heads = ("load", "error", "mean", "rms", "max", "95 % within", "inside")
-    parts = (*gain.by_load, *([gain.everything] if len(gain.by_load) > 1 else []))
-    yield table(*heads, rows=(row for part in parts for row in _rows(part)), left=(0, 1))
+    out = table("load", "error", "mean", "rms", "max", "95 % within", "inside", left=(0, 1))
+    for p in (*gain.by_load, *[gain.everything] * (len(gain.by_load) > 1)):
+        before, after = (map(length, (s.mean_m, s.rms_m, s.max_m)) for s in (p.before, p.after))
+        out.add(load_name(p.name), "before", *before, "", "")
+        out.add("", "after", *after, length(p.band_m), f"{p.inside} of {p.count}")
+        out.add("", "noise alone", "", length(p.noise_m), "", "", "")
+    yield out
     goal = (
         "A point is where the nominal arm has the tool, in the tracker's frame by the fitted "
         "registration."
@@ -198,14 +192,6 @@ def improvement_report(gain: Improvement, limit_m: float | None) -> Iterator[Blo
         yield f"{verdict} over {length(limit_m)}{';' if over else ','} {largest}."
 
 
-def _rows(part: Improved) -> Iterator[tuple[str, ...]]:
-    before, after = (map(length, (s.mean_m, s.rms_m, s.max_m)) for s in (part.before, part.after))
-    band, inside = length(part.band_m), f"{part.inside} of {part.count}"
-    yield (load_name(part.name), "before", *before, "", "")
-    yield ("", "after", *after, band, inside)
-    yield ("", "noise alone", "", length(part.noise_m), "", "", "")
-
-
 def limit_failure(gain: Improvement, limit_m: float) -> str:
     """Return the error message for a limit that is exceeded."""
     e = gain.everything
@@ -239,7 +225,6 @@ def refusals(c: Compensation, allowed_outside: bool) -> list[str]:
 
 
 def _outside(o: Outside, k: int) -> str:
-    """Return how point k lies outside of the measured range."""
     value, r = float(o.values[k]), o.of
     if r.unit == "rad" or (r.unit == "m" and r.variable.endswith(" travel")):
         at_point, low, high = (numbers.joint_value(x, r.unit) for x in (value, r.low, r.high))
@@ -287,18 +272,15 @@ def compensation_report(
 
 
 def _contributions(calibration: Calibration, untold: Sequence[str]) -> Iterator[str]:
-    """Yield the contributions to the stated error after compensation."""
     yield "the parameters"
     for name in untold:
         moved = length(float(np.sqrt(3 * calibration.conditions[name].variance_m2)))
         yield f"{WORDS[name]}, which the points do not tell ({moved} rms)"
     if calibration.misfit > 0:
         yield f"what the model leaves ({length(float(np.sqrt(3 * calibration.misfit)))} rms)"
-    source, arm = calibration.scatter.source, calibration.model.cell.arm
-    if source == "unknown":
-        yield "no repeatability, which is not known"
-    else:
-        yield f"the arm's repeatability ({repeatability_source(source, arm)})"
+    source = repeatability_source(calibration.scatter.source, calibration.model.cell.arm)
+    known = calibration.scatter.source != "unknown"
+    yield f"the arm's repeatability ({source})" if known else "no repeatability, which is not known"
 
 
 @dataclass(frozen=True, slots=True)
@@ -334,7 +316,7 @@ def waypoints_table(outcomes: Sequence[Fate]) -> Iterator[Block]:
         yield "Of a blended waypoint the corner of the path is corrected; the radius stays."
 
 
-def opening(judged: Judged, test: Validation) -> Iterator[str]:
+def opening(judged: validation.Judged, test: validation.Validation) -> Iterator[str]:
     """Yield the number of readings that were fitted, and the error of the tested ones."""
     error = f"{length(test.error.rms_m)} rms"
     noise = f"noise alone would leave {length(test.noise_floor)}.\n"
@@ -355,7 +337,9 @@ def opening(judged: Judged, test: Validation) -> Iterator[str]:
     yield f"{count} that were never fitted are predicted to {error}; {noise}"
 
 
-def validation_report(judged: Judged, test: Validation, beyond: Extrapolation) -> Iterator[Block]:
+def validation_report(
+    judged: validation.Judged, test: validation.Validation, beyond: validation.Extrapolation
+) -> Iterator[Block]:
     """Yield the errors inside and outside of the measured range, and variables that leave it."""
     out = table(error_words(test.readings), "rms", "mean", "largest", "rms in σ", "stated", "z")
     inside, outside = beyond.inside_error, beyond.outside_error
@@ -374,10 +358,10 @@ def validation_report(judged: Judged, test: Validation, beyond: Extrapolation) -
         "stated: standard deviation that the fit states for these readings, what it does not know "
         "where nothing was measured included; z: error over it.\n"
     )
-    count, total = int(beyond.outside.sum()), len(beyond.outside)
-    if not count:
+    if not (count := int(beyond.outside.sum())):
         yield "All of them lie inside of what was measured.\n"
     else:
+        total = len(beyond.outside)
         yield f"Extrapolation: {count} of {total} lie outside of what was measured:"
         yield from (f"  {_beyond(v)}" for v in beyond.variables[:MOST])
         unlisted = len(beyond.variables) - MOST
@@ -386,7 +370,7 @@ def validation_report(judged: Judged, test: Validation, beyond: Extrapolation) -
         yield f"These readings are {z_all:.2g} times as far off as the fit states.\n"
 
 
-def _beyond(v: Beyond) -> str:
+def _beyond(v: validation.Beyond) -> str:
     if v.variable == "leverage":
         return f"leverage: {v.count}, far from all fitted poses in several joints together"
     if v.unit == "rad":
@@ -398,7 +382,7 @@ def _beyond(v: Beyond) -> str:
     return f"{v.variable}: {v.count}, by up to {most} (measured: {low} to {high})"
 
 
-def shares_report(test: Acceptance) -> Iterator[Block]:
+def shares_report(test: validation.Acceptance) -> Iterator[Block]:
     """Yield the errors by load, the worst poses, and the verdict on a limit."""
     yield from loads_report(test)
     yield from (worst_table(test), "")
@@ -406,31 +390,30 @@ def shares_report(test: Acceptance) -> Iterator[Block]:
         return
     size, a, worst = length(test.limit_m), test.everything, test.poses[0]
     largest = f"the largest error is {length(a.max_m)}, at {_place(worst)}"
-    if test.passed:
-        yield f"PASSED: no error is over the limit of {size}; {largest}.\n"
-        return
     poses = sum(not s.passes(test.limit_m) for s in test.poses)
-    yield (
-        f"FAILED: {test.over} of {a.count} errors are over the limit of {size}, at {poses} of "
-        f"{len(test.poses)} poses; {largest}.\n"
-    )
+    found = f"FAILED: {test.over} of {a.count} errors are over the limit of {size}"
+    found += f", at {poses} of {len(test.poses)} poses"
+    if test.passed:
+        found = f"PASSED: no error is over the limit of {size}"
+    yield f"{found}; {largest}.\n"
 
 
-def loads_report(test: Acceptance) -> Iterator[Block]:
+def loads_report(test: validation.Acceptance) -> Iterator[Block]:
     """Yield the errors by load."""
     every = () if len(test.loads) == 1 else (test.everything,)
     yield _shares_table("load", "at", (*test.loads, *every), test.limit_m)
-    yield note(
-        f"in 95 %: share of the readings inside of their stated {100 * REGION:.0f} % region.\n"
-    )
+    region = f"{100 * validation.BAND:.0f} % region"
+    yield note(f"in 95 %: share of the readings inside of their stated {region}.\n")
 
 
-def worst_table(test: Acceptance) -> Table:
+def worst_table(test: validation.Acceptance) -> Table:
     """Return the errors of the worst poses."""
     return _shares_table("worst poses", "load", test.poses[:WORST], test.limit_m)
 
 
-def _shares_table(head: str, worst: str, shares: Iterable[Share], limit: float | None) -> Table:
+def _shares_table(
+    head: str, worst: str, shares: Iterable[validation.Share], limit: float | None
+) -> Table:
     heads = (head, "n", "rms", "largest", worst, "stated", "z", "in 95 %")
     out = table(*heads, *(() if limit is None else ("limit",)), left=(0, 4))
     for s in shares:
@@ -441,12 +424,11 @@ def _shares_table(head: str, worst: str, shares: Iterable[Share], limit: float |
     return out
 
 
-def _place(worst: Share) -> str:
-    """Return a pose and the load of its largest error."""
+def _place(worst: validation.Share) -> str:
     return f"{worst.name} {load_name(worst.worst, 'under ')}"
 
 
-def validation_failure(test: Acceptance, judged: Judged) -> str:
+def validation_failure(test: validation.Acceptance, judged: validation.Judged) -> str:
     """Return the error message for a limit that is exceeded."""
     worst = test.poses[0]
     head = (
@@ -475,24 +457,19 @@ def bootstrap_report(draws: Bootstrap) -> Iterator[Block]:
         f"{draws.poses}, with replacement.\n"
     )
     heads = ("parameter", "value", "± stated", "± drawn", "ratio", "95 % of the draws", "unit")
-    out = table(*heads, left=(0, 6))
+    out, names = table(*heads, left=(0, 6)), names_of(fit.model)
     units = [p.unit for e in fit.model.effects for p in e.parameters]
-    for k, name in enumerate(names_of(fit.model)):
-        if not draws.compared[k]:
-            continue
+    for k in np.flatnonzero(draws.compared):
         theta, std = float(fit.theta[k]), float(fit.uncertainty.std[k])
         unit, factor = numbers.unit_for(units[k], [theta])
         value, stated = numbers.with_std(factor * theta, factor * std)
         drawn = numbers.with_std(0.0, factor * float(draws.std[k]))[1]
         places = len(stated.partition(".")[2])
         between = " to ".join(f"{factor * float(end[k]):.{places}f}" for end in ends)
-        out.add(name, value, stated, drawn, f"{draws.ratio[k]:.2f}", between, unit)
+        out.add(names[k], value, stated, drawn, f"{draws.ratio[k]:.2f}", between, unit)
     if out.rows:
-        yield out
-        yield note(
-            "± stated: standard uncertainty of the fit. ± drawn: standard deviation over the draws."
-            "\n"
-        )
+        meaning = "± drawn: standard deviation over the draws."
+        yield from (out, note(f"± stated: standard uncertainty of the fit. {meaning}\n"))
     yield from bootstrap_remarks(draws)
 
 

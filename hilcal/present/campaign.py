@@ -33,8 +33,7 @@ page to the code. Every key that is not "required" may be left out. `hilcal init
 begin with.
 """
 MARKS = {"ok": "✓", "warning": "!", "problem": "✗"}
-WIDEST, LISTED = 34, 12
-"""Largest width of a table cell, in characters; most unused columns that are listed."""
+WIDEST, LISTED = 34, 12  # most characters of a table cell; most unused columns that are listed
 SHOWN = ("start", "load", "doubted", "goal", "interrupted", "failed", "finished")
 """Kinds of events that are always listed; drift is listed only above its limit."""
 MOST_EVENTS = 30
@@ -136,13 +135,12 @@ def check_report(answers: "tuple[ConnectionResult, ...]", dry: "DryRun | None") 
             out.add("", "", "!", problem)
     if answers:
         yield from ("", out, "")
-    count = sum(len(a.problems) for a in answers)
+    count, found = sum(len(a.problems) for a in answers), "All devices are ready"
     if not answers:
-        yield "The cell does not name all its devices: none was asked. Nothing was moved."
+        found = "The cell does not name all its devices: none was asked"
     elif count:
-        yield f"{count} problem{'s' * (count > 1)}. Nothing was moved."
-    else:
-        yield "All devices are ready. Nothing was moved."
+        found = f"{count} problem{'s' * (count > 1)}"
+    yield f"{found}. Nothing was moved."
     if dry is None:
         return
     if dry.problems:
@@ -158,7 +156,8 @@ def check_report(answers: "tuple[ConnectionResult, ...]", dry: "DryRun | None") 
 
 def factory_words(check: "FactoryCheck") -> Iterator[Block]:
     """Yield whether the geometry of an arm differs from its factory calibration."""
-    moved, std = numbers.length(check.moved_m), numbers.length(check.moved_std_m)
+    lengths = (check.moved_m, check.moved_std_m, check.factory_m, check.nominal_m, check.noise_m)
+    moved, std, factory, nominal, noise = map(numbers.length, lengths)
     conclusion = (
         "The arm is what its factory measured, as far as these readings tell "
         f"(p = {check.p_value:.2g}): what they leave of its geometry"
@@ -170,10 +169,8 @@ def factory_words(check: "FactoryCheck") -> Iterator[Block]:
         )
     yield from ("", f"{conclusion} moves the target by {moved} (rms, ± {std}).")
     yield (
-        f"From the factory's kinematics {check.readings} readings are "
-        f"{numbers.length(check.factory_m)} off (rms, the arm's own weight in it), from the "
-        f"maker's nominal ones {numbers.length(check.nominal_m)}; "
-        f"their noise is {numbers.length(check.noise_m)}."
+        f"From the factory's kinematics {check.readings} readings are {factory} off (rms, the "
+        f"arm's own weight in it), from the maker's nominal ones {nominal}; their noise is {noise}."
     )
 
 
@@ -183,12 +180,12 @@ def info_report(o: Overview, name: str, covariance: str) -> Iterator[Block]:
     yield heading(f"{name}: {count} readings of {o.poses} poses, {o.config.robot.model}")
     yield from (pairs(_head(o, covariance)), "")
     if o.planned is not None:
-        instruments = [
-            (i.device, i.name if i.serial_number is None or i.serial_number in i.name
-             else f"{i.name}, serial number {i.serial_number}")
-            for i in o.instruments
-        ]  # fmt: skip
-        yield from (heading("Instruments"), pairs(instruments), "")
+        instruments = pairs(())
+        for i in o.instruments:
+            number = i.serial_number
+            told = number is None or number in i.name
+            instruments.add(i.device, i.name if told else f"{i.name}, serial number {number}")
+        yield from (heading("Instruments"), instruments, "")
         yield from (heading("Checks on the way"), pairs(_checks(o)), "")
         yield from (heading("Events (UTC)"), *_events(o), "")
     yield heading("Revisions")
@@ -226,20 +223,29 @@ def _head(o: Overview, covariance: str) -> Iterator[tuple[str, str]]:
     if o.targets:
         yield "targets", ", ".join(f"{name} {n}" for name, n in o.targets.items())
     kind = "positions" if o.readings.m == 3 else "positions and orientations"
-    if o.readings.observers:
-        kind = observed_words(o.readings)
+    kind = observed_words(o.readings) if o.readings.observers else kind
     yield "readings", f"{kind}; {covariance}"
 
 
 def _checks(o: Overview) -> Iterator[tuple[str, str]]:
     if o.tares:
         moved = np.array([t.wrench for t in o.tares]) - o.tares[0].wrench
-        sizes = (np.linalg.norm(m, axis=1).max() for m in np.split(moved, 2, axis=1))
-        force, moment = (numbers.digits(size, 2) for size in sizes)
+        largest = (np.linalg.norm(m, axis=1).max() for m in np.split(moved, 2, axis=1))
+        force, moment = (numbers.digits(size, 2) for size in largest)
         yield "tares", f"{len(o.tares)}; the zero moved by up to {force} N and {moment} N·m"
     else:
         yield "tares", "none: no force sensor, or nothing measured yet"
-    yield "drift", _drift(o)
+    drift = "no return to the reference pose"
+    if count := len(o.returns):
+        sizes = [float(np.linalg.norm(r.shift_m)) for r in o.returns]
+        k, over = int(np.argmax(sizes)), sum(r.over for r in o.returns)
+        drift = (
+            f"{count} return{'s' * (count > 1)} to the reference pose: at most "
+            f"{numbers.length(sizes[k])} ({o.returns[k].sigma:.1f} σ), "
+            f"{numbers.length(sizes[-1])} at the last; {over or 'none'} over the limit of "
+            f"{o.config.acquire.drift_limit_sigma:g} σ"
+        )
+    yield "drift", drift
     if o.tool is not None:
         com = ", ".join(f"{1e3 * x + 0.0:z.1f}" for x in o.tool["com_m"])
         yield "tool", f"{o.tool['mass_kg']:.3f} kg, its centre at {com} mm in flange axes"
@@ -251,19 +257,6 @@ def _checks(o: Overview) -> Iterator[tuple[str, str]]:
         scatter, alone = numbers.length(r.scatter), numbers.length(r.instrument)
         returns = f"{r.returns} scatter{'s' * (r.dof == 1)} by {scatter}"
         yield "repeatability", f"{returns}, the instrument alone by {alone}; {joints}"
-
-
-def _drift(o: Overview) -> str:
-    if not o.returns:
-        return "no return to the reference pose"
-    sizes = [float(np.linalg.norm(r.shift_m)) for r in o.returns]
-    k, over = int(np.argmax(sizes)), sum(r.over for r in o.returns)
-    several = f"{len(o.returns)} return{'s' * (len(o.returns) > 1)} to the reference pose"
-    return (
-        f"{several}: at most {numbers.length(sizes[k])} ({o.returns[k].sigma:.1f} σ), "
-        f"{numbers.length(sizes[-1])} at the last; {over or 'none'} over the limit of "
-        f"{o.config.acquire.drift_limit_sigma:g} σ"
-    )
 
 
 def _events(o: Overview) -> Iterator[Block]:
@@ -363,9 +356,7 @@ def two_revisions(a: RevisionRecord, b: RevisionRecord) -> Table:
         add(name, numbers.length(rms_a), numbers.length(rms_b), gain)
     add("variance factor", *(numbers.digits(float(f["variance_factor"])) for f in fits))
     add("readings", *(str(f["n_readings"]) for f in fits))
-    parameters: list[dict[str, Mapping[str, Any]]] = [
-        {p["name"]: p for p in f["parameters"]} for f in fits
-    ]
+    parameters = [{str(p["name"]): p for p in f["parameters"]} for f in fits]
     for name in dict.fromkeys([*parameters[0], *parameters[1]]):
         both = [p.get(name) for p in parameters]
         values = [0.0 if p is None or p["value"] is None else float(p["value"]) for p in both]
@@ -402,12 +393,9 @@ def cell_words(changes: Changes) -> str:
 
 def refitted(before: Fit, after: Fit) -> str:
     """Return the change of error and variance factor by a fit in a changed cell."""
-    errors = (numbers.length(f.holdout.rms_m) for f in (before, after))
-    factors = (f"{f.variance_factor:.2f}" for f in (before, after))
-    return (
-        f"The error on poses left out goes {' → '.join(errors)}, the variance factor "
-        f"{' → '.join(factors)}."
-    )
+    errors = " → ".join(numbers.length(f.holdout.rms_m) for f in (before, after))
+    factors = " → ".join(f"{f.variance_factor:.2f}" for f in (before, after))
+    return f"The error on poses left out goes {errors}, the variance factor {factors}."
 
 
 def _value(p: Mapping[str, Any] | None, factor: float) -> str:

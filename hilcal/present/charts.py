@@ -33,7 +33,7 @@ from hilcal.present.story import (
     worst_and_even,
 )
 from hilcal.store.plan import UNLOADED
-from hilcal.types import Bools, Floats, Ints
+from hilcal.types import Floats, Ints
 
 MEASURED = "#3a96d0"
 NOISE = "#009e73"
@@ -41,21 +41,17 @@ HOLDOUT = "#cc79a7"
 GREY = "#888b94"
 AMBER = "#c07f00"
 RED = "#e0325c"
-LIGHT, DARK = "#ffffff", "#15171c"
-"""Background colours of charts."""
+LIGHT, DARK = "#ffffff", "#15171c"  # backgrounds
 LEVELS = (GREY, AMBER, RED)
-SYMBOLS = ("circle", "diamond", "x")
-"""Marks of the levels, distinct without colours."""
+SYMBOLS = ("circle", "diamond", "x")  # of the levels, distinct without colours
 CONFIG: dict[str, object] = {"displayModeBar": False, "responsive": True, "scrollZoom": False}
 """Options for plotly.js: no toolbar, and the wheel scrolls the page."""
 SIGMA_LIMITS = np.sqrt(chi2.ppf(LIMITS, 3)).tolist()
 """Mahalanobis distances above which a reading is doubtful, and outside."""
 _INK = {False: ("#24272e", "#d9dbe0"), True: ("#e4e5e9", "#3b3f48")}
 MOST = 1500  # points of a chart; a choice that limits a page to 8 MB
-MOST_POSES, LONGEST_NAME = 16, 12
-"""Most poses that are all named at the axis; most characters of such a name; choices."""
-LONGEST, MOST_ARROWS = 0.25, 300
-"""Drawn length of the largest residual, m; most arrows of a level; choices."""
+MOST_POSES, LONGEST_NAME = 16, 12  # poses that are all named at the axis; characters of a name
+LONGEST, MOST_ARROWS = 0.25, 300  # drawn length of the largest residual, m; arrows of a level
 MOST_VARIABLES, MOST_CORRELATED, MOST_FAMILIES = 12, 30, 16
 RANGE, WIDEST, BINS = 5.0, 50.0, 40
 """Least and largest range of the histogram, σ; its outermost bins include all values beyond."""
@@ -180,11 +176,6 @@ class ChartReadings:
     index: Ints
 
     @property
-    def sigma(self) -> Floats:
-        """(K,) Mahalanobis distance, σ."""
-        return self.revision.sigma[self.index]
-
-    @property
     def note(self) -> str:
         """A sentence on the choice of readings; empty if all are drawn."""
         if len(self.index) == len(self.story):
@@ -195,12 +186,12 @@ class ChartReadings:
             "and an even choice of the others."
         )
 
-    def by_level(self) -> Iterator[tuple[int, Bools]]:
-        """Yield each occurring level with the mask of its readings (K,)."""
+    def by_level(self) -> Iterator[tuple[int, Ints]]:
+        """Yield each occurring level with the positions of its readings in `index`."""
         level = self.revision.level[self.index]
-        yield from ((int(k), level == k) for k in np.unique(level))
+        yield from ((int(k), np.flatnonzero(level == k)) for k in np.unique(level))
 
-    def named(self, members: Bools | slice = slice(None)) -> list[str]:
+    def named(self, members: Ints | slice = slice(None)) -> list[str]:
         """Return the hover text of readings: pose, load, target if there are several, distance."""
         story, size, sigma = self.story, self.revision.size_m, self.revision.sigma
         out = []
@@ -208,12 +199,11 @@ class ChartReadings:
             name = f"{story.pose_name(i)}, {load_name(story.load_names[i])}"
             if story.target is not None and len(story.target_names) > 1:
                 name += f", {story.target_names[int(story.target[i])]}"
-            distance = f"{numbers.length(float(size[i]))}, {sigma[i]:.1f} σ"
-            out.append(f"{label(name)}: {distance}")
+            out.append(f"{label(name)}: {numbers.length(float(size[i]))}, {sigma[i]:.1f} σ")
         return out
 
-    def marks(self, x: Floats, y: Floats, level: int, members: Bools, **more: Any) -> go.Scatter:
-        """Return the members (K,) of a level as points at x, y (K,)."""
+    def marks(self, x: Floats, y: Floats, level: int, members: Ints, **more: Any) -> go.Scatter:
+        """Return the members of a level as points at x, y (K,)."""
         points = x[members], y[members], LEVELS[level], SYMBOLS[level]
         more |= {"name": LEVEL_NAMES[level], "text": self.named(members)}
         return marks(*points, **more, hovertemplate="%{text}<extra></extra>")
@@ -282,26 +272,20 @@ def residual_by_time(story: Story, revision: StoryRevision) -> go.Figure:
 
 
 def _extremes(story: Story, revision: StoryRevision, group: str) -> str:
-    """Return a sentence on the worst and the best pose, or load."""
-    names: Sequence[str] = story.load_names
-    if group == "pose":
-        names = [story.pose_name(i) for i in range(len(story))]
-    labels, label_index = np.unique(names, return_inverse=True)
-    rms = np.sqrt(np.bincount(label_index, revision.sigma**2 / 3) / np.bincount(label_index))
-    worst = int(np.argmax(rms))
-    name = "the unloaded readings" if labels[worst] == UNLOADED else f"{group} {labels[worst]}"
-    if len(labels) == 1:
+    poses = [story.pose_name(i) for i in range(len(story))]
+    names, row = np.unique(poses if group == "pose" else story.load_names, return_inverse=True)
+    rms = np.sqrt(np.bincount(row, revision.sigma**2 / 3) / np.bincount(row))
+    worst = names[int(np.argmax(rms))]
+    name = "the unloaded readings" if worst == UNLOADED else f"{group} {worst}"
+    if len(names) == 1:
         return f"All readings are of {name}: {rms[0]:.2g} times the noise rms."
-    return (
-        f"Worst is {name} with {rms[worst]:.2g} times the noise rms; best, {rms.min():.2g} times."
-    )
+    return f"Worst is {name} with {rms.max():.2g} times the noise rms; best, {rms.min():.2g} times."
 
 
 def _residuals(d: ChartReadings, x: Floats, title: str, sentence: str) -> go.Figure:
     """Draw residuals over x (K,); `customdata` of each point is the number of its reading."""
-    traces = [
-        d.marks(x, d.sigma, k, members, customdata=d.index[members]) for k, members in d.by_level()
-    ]
+    y = d.revision.sigma[d.index]
+    traces = [d.marks(x, y, k, rows, customdata=d.index[rows]) for k, rows in d.by_level()]
     out = figure(sentence + d.note, x=title, y="residual [σ]", traces=traces, height=320)
     for limit, color in zip(SIGMA_LIMITS, (AMBER, RED), strict=True):
         out.add_hline(limit, line={"color": color, "dash": "dot", "width": 1})
@@ -342,19 +326,20 @@ def workspace(
     times = round_factor(LONGEST / largest, _NICE) if largest > 0 else 1.0
     traces: list[object] = []
     for k, members in d.by_level():
-        worst = np.flatnonzero(members)[np.argsort(-d.sigma[members])][:MOST_ARROWS]
+        worst = members[np.argsort(-revision.sigma[d.index[members]])][:MOST_ARROWS]
         start, end = target[worst], target[worst] + times * residual[worst]
         gap = np.full_like(start, np.nan)  # between one line and the next
         lines = np.stack([start, end, gap], axis=1).reshape(-1, 2)
         traces.append(line(lines[:, 0], lines[:, 1], color=LEVELS[k]))
         traces.append(d.marks(target[:, 0], target[:, 1], k, members, size=5, showlegend=False))
     outside = int((revision.level == len(LEVELS) - 1).sum())
-    says = (
-        f"Targets with their errors, {times:g} times enlarged: {outside} of {len(story)} readings "
-        f"are outside the noise (crosses, red); the largest error is "
-        f"{numbers.length(largest)}.{d.note}"
-    )
-    says = "The same from the side." if plane == "xz" else says
+    says = "The same from the side."
+    if plane == "xy":
+        says = (
+            f"Targets with their errors, {times:g} times enlarged: {outside} of {len(story)} "
+            "readings are outside the noise (crosses, red); the largest error is "
+            f"{numbers.length(largest)}.{d.note}"
+        )
     x, y = (f"base {a} [m]" for a in plane)
     out = figure(says, x=x, y=y, traces=traces, height=280)
     out.update_yaxes(scaleanchor="x", constrain="domain")
@@ -469,8 +454,7 @@ def noise_check(fit: Fit) -> go.Figure:
     ]
     factor, (low, high) = fit.variance_factor, fit.variance_factor_interval
     fits = f"the residual is {'larger' if factor > 1 else 'smaller'} than the stated noise"
-    if low <= 1 <= high:
-        fits = "the stated noise explains the residual"
+    fits = "the stated noise explains the residual" if low <= 1 <= high else fits
     beyond = int(np.sum(np.abs(white) > RANGE))
     says = (
         f"Variance factor {factor:.2f}, 95 % interval {low:.2f} to {high:.2f}: {fits}. "
@@ -494,22 +478,20 @@ def error_per_revision(story: Story) -> go.Figure:
         hover = "%{y}: %{text} µm, " + name + "<extra></extra>"
         text = [numbers.digits(v) for v in rms]
         traces.append(bar(rms, names, color, text, name=name, hovertemplate=hover))
-    floor, noise = 1e6 * story.noise_floor_m, numbers.length(story.noise_floor_m)
-    first, last = steps[0], steps[-1]
+    floor, first, last = 1e6 * story.noise_floor_m, steps[0], steps[-1]
     holdout, fitted = (
         [numbers.length(e.rms_m) for e in errors]
         for errors in ((first.holdout, last.holdout), (first.error, last.error))
     )
-    says = (
-        f"One revision: {holdout[0]} rms error on poses left out; noise alone would leave {noise}"
-    )
+    says = f"One revision: {holdout[0]} rms error on poses left out"
     if len(steps) > 1:
         says = (
             f"The rms error {'fell' if last.holdout.rms_m < first.holdout.rms_m else 'went'} from "
             f"{' to '.join(holdout)} on poses left out, and from {' to '.join(fitted)} on the "
-            f"fitted ones, over {len(steps)} revisions; noise alone would leave {noise}"
+            f"fitted ones, over {len(steps)} revisions"
         )
-    out = figure(f"{says}.", x="error, rms [µm]", traces=traces, height=130 + 26 * len(names))
+    says += f"; noise alone would leave {numbers.length(story.noise_floor_m)}."
+    out = figure(says, x="error, rms [µm]", traces=traces, height=130 + 26 * len(names))
     dashed = {"color": NOISE, "dash": "dash", "width": 2}
     out.add_vline(floor, line=dashed, layer="below")
     # for the legend alone: a shape has no entry there

@@ -38,11 +38,8 @@ def words_of(c: Candidate) -> str:
 
 def comparison_report(c: Comparison, earlier: str, later: str) -> Iterator[Block]:
     """Yield the report of a comparison; `earlier` and `later` are the names of the two files."""
-    yield from (*_setup(c, earlier, later), "")
-    yield from (*_today(c, earlier), "")
-    yield from _changes(c)
-    yield from _parameters(c.differences)
-    yield from ("", f"Next: {next_step(c, earlier)}")
+    yield from (*_setup(c, earlier, later), "", *_today(c, earlier), "", *_changes(c))
+    yield from (*_parameters(c.differences), "", f"Next: {next_step(c, earlier)}")
 
 
 def _setup(c: Comparison, earlier: str, later: str) -> Iterator[str]:
@@ -60,14 +57,11 @@ def _setup(c: Comparison, earlier: str, later: str) -> Iterator[str]:
             f"The model of {earlier} lacks {numbers.names(c.lacked)} by its own readings; added "
             "for this comparison alone (hilcal refine EARLIER keeps it)."
         )
+    place = f"that of {earlier} ({'as told' if c.told else 'both cells configure the same place'})"
     if c.anew:
-        yield (
-            "The tracker's place is estimated from them, as if it had been set up anew"
-            + ("." if c.told else " (--same-setup: nobody moved tracker or base).")
-        )
-    else:
-        reason = "as told" if c.told else "both cells configure the same place"
-        yield f"The tracker's place is that of {earlier} ({reason})."
+        unless = "" if c.told else " (--same-setup: nobody moved tracker or base)"
+        place = f"estimated from them, as if it had been set up anew{unless}"
+    yield f"The tracker's place is {place}."
     if c.tool:
         yield f"[tool] {numbers.names(c.tool)} of {later} differ; those of {later} are used."
 
@@ -84,11 +78,8 @@ def _today(c: Comparison, earlier: str) -> Iterator[Block]:
     )
     # The expected error includes the distance of the poses from the measured ones (leverage).
     variables = (v for v in t.beyond.variables if v.variable != "leverage")
-    if ranges := [f"{v.variable} ({v.count})" for v in variables]:
-        yield (
-            f"Outside of what {earlier} measured: {numbers.few(ranges, 3)}; an error there need "
-            "not be a change."
-        )
+    if ranges := numbers.few([f"{v.variable} ({v.count})" for v in variables], 3):
+        yield f"Outside of what {earlier} measured: {ranges}; an error there need not be a change."
 
 
 def headline(c: Comparison) -> str:
@@ -98,8 +89,7 @@ def headline(c: Comparison) -> str:
         return "Nothing has changed beyond the uncertainty"
     if c.another_arm:
         return "This looks like another arm of the same type"
-    if changes.found:
-        parts = numbers.names(list(dict.fromkeys(x.candidate.part for x in changes.found)))
+    if parts := numbers.names(list(dict.fromkeys(x.candidate.part for x in changes.found))):
         return f"Something has changed: {parts}"
     return "Something has changed, and no single candidate explains it"
 
@@ -174,7 +164,7 @@ def _remainder(c: Comparison) -> str:
     if changes.explained:
         return f"What is left after that is scatter as stated ({scatter} times)."
     outside = any(v.variable != "leverage" for v in c.today.beyond.variables)
-    extrapolated = ", or the earlier model is wrong where it was not measured" if outside else ""
+    extrapolated = ", or the earlier model is wrong where it was not measured" * outside
     return (
         f"What is left is {scatter} times the stated scatter "
         f"({numbers.p_equals(changes.unexplained)}): more has changed than the candidates explain, "
@@ -184,12 +174,12 @@ def _remainder(c: Comparison) -> str:
 
 def _limits(c: Comparison) -> Iterator[Block]:
     changes = c.changes
-    by_joint: dict[str, dict[str, Limit]] = {}
+    by_joint: dict[str, dict[str, str]] = {}
     for limit in changes.limits:
         if limit.change.listed:
-            by_joint.setdefault(limit.part, {})[limit.change.words] = limit
+            by_joint.setdefault(limit.part, {})[limit.change.words] = _least(limit)
     shown = list(dict.fromkeys(name for row in by_joint.values() for name in row))
-    rows = ((part, *(_least(row.get(name)) for name in shown)) for part, row in by_joint.items())
+    rows = ((part, *(row.get(name, "-") for name in shown)) for part, row in by_joint.items())
     yield table("would have been seen", *shown, rows=rows)
     yield (
         f"The smallest change that these readings would have shown in {POWER * 10:.0f} cases of "
@@ -203,14 +193,11 @@ def _limits(c: Comparison) -> Iterator[Block]:
         yield f"Not to be seen: the zero of {numbers.names(zeros)}; {frames} absorbs it."
 
 
-def _least(limit: Limit | None) -> str:
-    if limit is None or limit.size == float("inf"):
-        return "-"
-    return numbers.sizes([(limit.unit, limit.size)])
+def _least(limit: Limit) -> str:
+    return "-" if limit.size == float("inf") else numbers.sizes([(limit.unit, limit.size)])
 
 
 def _parameters(d: Differences | None) -> Iterator[Block]:
-    """Yield the parameters of both fits, the largest differences first."""
     if d is None:
         return
     yield from ("", heading("Both campaigns' own fits, as far as they can be compared"))
@@ -256,8 +243,7 @@ def next_command(c: Comparison, earlier: str, later: str) -> str | None:
     """Return the command line for the next step; None without one."""
     if c.another_arm:
         return f"hilcal refine {quoted(later)}"
-    arm = any(x.candidate.of_arm for x in c.changes.found)
-    changed = arm or not c.changes.explained
+    changed = any(x.candidate.of_arm for x in c.changes.found) or not c.changes.explained
     return f"hilcal refine {quoted(later)} --prior {quoted(earlier)}" if changed else None
 
 

@@ -9,14 +9,12 @@ from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE, Suspect
 from hilcal.diagnosis.live_model import LEAST
-from hilcal.diagnosis.noise import PureError
 from hilcal.diagnosis.recorded import ROW_ORDER
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.stepwise import predicts_better
-from hilcal.discovery.curve import Curve
 from hilcal.discovery.discovery import Discovery, LawSearch
 from hilcal.discovery.law import Coefficient, Law
-from hilcal.discovery.structures import Structure, pareto
+from hilcal.discovery.structures import pareto
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_prediction import full_prediction
 from hilcal.numbers import length, percent
@@ -36,8 +34,7 @@ NEAR = 0.99  # least component of a direction that is named after its axis; a ch
 BARS = "▁▂▃▄▅▆▇█"
 CURVES = 2
 COMPARED = 24  # most parameters that are compared with the true ones
-FEW, LEAST_BINS = 3, 3
-"""Most effects that a law is said to resemble; least bins of a curve; choices."""
+FEW, LEAST_BINS = 3, 3  # most effects that a law is said to resemble; least bins of a curve
 RARE = 0.01  # probability below which only "< 1 %" is written
 NOT_TRIED = "could not be tried in the exact model"
 NEWCOMER = f"""\
@@ -95,7 +92,12 @@ def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
             f"{numbers.many_tests(d.tested, FALSE_ALARM)}\n"
         )
     if d.verdict != "adequate":
-        yield from finer(d)
+        for s in d.suspects:
+            if s.passes and s.coarse:
+                yield (
+                    f"Let joints differ: {s.coarse} has one parameter for several joints; to give "
+                    f'each its own: hilcal add RUN "{s.effect}".'
+                )
         yield from doubtful(d)
         yield from (*where_table(d.misfit_breakdown), "")
     if d.verdict in ("unknown_effect", "noise_misjudged"):
@@ -111,20 +113,17 @@ def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
             "An effect of your own: hilcal effects new NAME writes one to begin with, and "
             "--effects-from FILE.py tries it."
         )
-    if d.pure_error is not None:
-        yield from _repeats(d.pure_error)
+    if (e := d.pure_error) is not None:
+        scatter = f"Repeated readings scatter {e.factor**0.5:.2f} times as much as stated"
+        yield f"{scatter} ({e.dof:.0f} degrees of freedom)."
+        if (w := e.where) is not None:
+            low, high = (v**0.5 for v in w.interval)
+            yield (
+                f"Most of all {w.name}: {w.factor**0.5:.2f} times as much as stated (95 % interval "
+                f"{low:.2f} to {high:.2f}; {numbers.p_equals(w.p_value)})."
+            )
     yield from redundant_line(d)
     yield from could_have_been_seen(d)
-
-
-def finer(d: Diagnosis) -> Iterator[str]:
-    """Yield the command that gives each joint its parameters, where a suspect asks for it."""
-    for s in d.suspects:
-        if s.passes and s.coarse:
-            yield (
-                f"Let joints differ: {s.coarse} has one parameter for several joints; to give each "
-                f'its own: hilcal add RUN "{s.effect}".'
-            )
 
 
 def revisions_table(rows: Sequence[tuple[int, str, Fit, str]]) -> Table:
@@ -153,7 +152,7 @@ def key(readings: Readings) -> Words:
 
 def fell(before: Fit, after: Fit, effect: str) -> str:
     """Return a sentence on the change of the error on poses left out by an added effect."""
-    change = _from_to(before, after)
+    change = f"from {length(before.holdout.rms_m)} to {length(after.holdout.rms_m)}"
     if after.holdout.rms_sigma < before.holdout.rms_sigma:
         return f"With {effect} the error on poses left out falls {change}."
     return (
@@ -166,12 +165,8 @@ def rose(before: Fit, after: Fit, effect: str) -> str:
     """Return a sentence on the change of the error on poses left out by a removed effect."""
     needed = predicts_better(after, before)
     verb, end = ("rises", "it belongs there") if needed else ("goes", "it is not needed")
-    change = _from_to(before, after)
+    change = f"from {length(before.holdout.rms_m)} to {length(after.holdout.rms_m)}"
     return f"Without {effect} the error on poses left out {verb} {change}: {end}."
-
-
-def _from_to(before: Fit, after: Fit) -> str:
-    return f"from {length(before.holdout.rms_m)} to {length(after.holdout.rms_m)}"
 
 
 def could_have_been_seen(d: Diagnosis) -> Iterator[Block]:
@@ -211,19 +206,6 @@ def redundant_line(d: Diagnosis) -> Iterator[str]:
         yield (
             f"These readings are explained as well without {', '.join(d.redundant)}; to remove "
             f"{it}: hilcal remove RUN {d.redundant[0]}."
-        )
-
-
-def _repeats(e: PureError) -> Iterator[str]:
-    yield (
-        f"Repeated readings scatter {e.factor**0.5:.2f} times as much as stated "
-        f"({e.dof:.0f} degrees of freedom)."
-    )
-    if e.where is not None:
-        low, high = (v**0.5 for v in e.where.interval)
-        yield (
-            f"Most of all {e.where.name}: {e.where.factor**0.5:.2f} times as much as stated "
-            f"(95 % interval {low:.2f} to {high:.2f}; {numbers.p_equals(e.where.p_value)})."
         )
 
 
@@ -339,8 +321,18 @@ def discovery_report(d: Discovery) -> Iterator[Block]:
         yield ""
         yield from _law(law, d, first=k == 0)
         for c in d.curves if k == 0 else ():
-            yield from _law_table(c)
-    yield from ("", _structures(d.structures))
+            x, y, std, _ = c.binned
+            if len(x) >= LEAST_BINS:
+                head = c.quantity if c.quantity_unit == "1" else f"{c.quantity} [{c.quantity_unit}]"
+                law_line = np.interp(x, *c.line)
+                yield from ("", _binned((head, c.of), c.unit, (x, y, std), law=law_line))
+    best = pareto(d.structures)
+    rows = table("law", "probability", "complexity", "on poses left out", "")
+    for s in d.structures:
+        remark = ", ".join(filter(None, (s.law, "best of its size" if s in best else "")))
+        likely = percent(s.probability) if s.probability >= RARE else f"< {100 * RARE:g} %"
+        rows.add(s.form.text(), likely, str(s.form.complexity), percent(s.holdout_share), remark)
+    yield from ("", rows)
     moved, std = map(length, d.average_m())
     yield (
         f"Averaged over them by their probability, laws move the readings by {moved} rms; what is "
@@ -352,39 +344,36 @@ def discovery_report(d: Discovery) -> Iterator[Block]:
 
 def silence(d: Discovery) -> str:
     """Return the reason why no law is proposed, and the effects that could not be tried."""
-    return _silence(d) + "".join(f"; {e} {NOT_TRIED} ({why})" for e, why in d.unfitted)
-
-
-def _silence(d: Discovery) -> str:
     tried = f"{d.candidates} candidates were tried"
-    if d.reason == "adequate":
-        return (
-            f"no law: the stated noise explains the residual (variance factor "
-            f"{d.fit.variance_factor:.2f}), so there is nothing to explain"
-        )
-    if d.reason == "catalogue":
-        return (
-            f"no law: {tried}, and none explains the misfit better than effects of the catalogue "
-            f"do ({numbers.names(d.catalogue)}); hilcal refine adds them"
-        )
-    if d.refused:
-        law, why = d.refused[0]
-        return (
-            f"no law is proposed: {tried}; {law} predicts {percent(d.searched_share)} of "
-            f"the misfit on poses left out, but the exact model cannot be fitted with it ({why})"
-        )
-    if d.reason != "no_law":
-        return f"no law: {tried}, and nothing recorded predicts the misfit on poses left out"
     helps = "measure more poses, or record what else may matter"
     if any(c.variable == ROW_ORDER for c in d.carried[:1]):
         helps = (
             "it depends mostly on the order of the readings, whose times are missing: without "
             "them no law of time can be searched, so add them"
         )
-    return (
+    why = (
         f"no law: {percent(d.attainable)} of the misfit is predictable on poses left out, but "
         f"{tried}, and no law of this size predicts it; {helps}"
     )
+    if d.reason == "adequate":
+        why = (
+            f"no law: the stated noise explains the residual (variance factor "
+            f"{d.fit.variance_factor:.2f}), so there is nothing to explain"
+        )
+    elif d.reason == "catalogue":
+        why = (
+            f"no law: {tried}, and none explains the misfit better than effects of the catalogue "
+            f"do ({numbers.names(d.catalogue)}); hilcal refine adds them"
+        )
+    elif d.refused:
+        law, refusal = d.refused[0]
+        why = (
+            f"no law is proposed: {tried}; {law} predicts {percent(d.searched_share)} of the "
+            f"misfit on poses left out, but the exact model cannot be fitted with it ({refusal})"
+        )
+    elif d.reason != "no_law":
+        why = f"no law: {tried}, and nothing recorded predicts the misfit on poses left out"
+    return why + "".join(f"; {e} {NOT_TRIED} ({because})" for e, because in d.unfitted)
 
 
 def _law(law: Law, d: Discovery, first: bool) -> Iterator[Block]:
@@ -411,25 +400,6 @@ def _law(law: Law, d: Discovery, first: bool) -> Iterator[Block]:
     ]
     if ranges:
         yield f"  seen for     {', '.join(ranges)}; nothing is known outside"
-
-
-def _structures(structures: Sequence[Structure]) -> Table:
-    best = pareto(structures)
-    rows = table("law", "probability", "complexity", "on poses left out", "")
-    for x in structures:
-        remarks = [x.law or "", "best of its size" if x in best else ""]
-        chance = percent(x.probability) if x.probability >= RARE else f"< {100 * RARE:g} %"
-        sizes = chance, str(x.form.complexity), percent(x.holdout_share)
-        rows.add(x.form.text(), *sizes, ", ".join(filter(None, remarks)))
-    return rows
-
-
-def _law_table(c: Curve) -> Iterator[Block]:
-    """Yield a table of a law and the binned means of the readings, over a quantity."""
-    x, y, std, _ = c.binned
-    if len(x) >= LEAST_BINS:
-        head = c.quantity if c.quantity_unit == "1" else f"{c.quantity} [{c.quantity_unit}]"
-        yield from ("", _binned((head, c.of), c.unit, (x, y, std), law=np.interp(x, *c.line)))
 
 
 def coefficient(c: Coefficient) -> str:

@@ -100,8 +100,9 @@ class Table:
             return
         least, natural = [], []
         for k, (head, *cells) in enumerate(zip(self.heads, *self.rows, strict=True)):
-            words = [word for cell in cells for word in cell.split()]
-            unbroken = words if k in self.left else cells
+            unbroken = (
+                [word for cell in cells for word in cell.split()] if k in self.left else cells
+            )
             least.append(_longest(*head.split(), *unbroken))
             natural.append(max(least[-1], _longest(head, *cells)))
         for gap in GAPS:
@@ -109,7 +110,14 @@ class Table:
             if sum(natural) <= room or (gap == GAPS[-1] and sum(least) <= room):
                 yield self._columns(gap, shared(least, natural, room))
                 return
-        yield from self._lists()
+        heads = [" ".join(head.split()) for head in self.heads]
+        for row in self.rows:
+            cells = [" ".join(cell.split()) for cell in row]
+            first = next((k for k, cell in enumerate(cells) if cell), 0)
+            yield Text(f"{heads[first]} {cells[first]}".strip(), style="bold")
+            for head, cell in list(zip(heads, cells, strict=True))[first + 1 :]:
+                if cell:
+                    yield Padding(Text(f"{head}: {cell}" if head else cell), (0, 0, 0, 2))
 
     def _columns(self, gap: int, widths: Sequence[int]) -> RichTable:
         # one more blank than the padding is the column's edge
@@ -124,16 +132,6 @@ class Table:
                 out.add_section()
             out.add_row(*row, style=STYLES[self.tones.get(k, "text")])
         return out
-
-    def _lists(self) -> RenderResult:
-        heads = [" ".join(head.split()) for head in self.heads]
-        for row in self.rows:
-            cells = [" ".join(cell.split()) for cell in row]
-            first = next((k for k, cell in enumerate(cells) if cell), 0)
-            yield Text(f"{heads[first]} {cells[first]}".strip(), style="bold")
-            for head, cell in list(zip(heads, cells, strict=True))[first + 1 :]:
-                if cell:
-                    yield Padding(Text(f"{head}: {cell}" if head else cell), (0, 0, 0, 2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

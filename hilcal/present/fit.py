@@ -11,7 +11,6 @@ from hilcal.diagnosis.misfit_breakdown import Group, MisfitShare
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.identification.background import background_of
 from hilcal.identification.baseline import masses_note
-from hilcal.identification.carried import DriftGroup
 from hilcal.identification.fit import Fit
 from hilcal.identification.fit_document import notes
 from hilcal.identification.full_prediction import (
@@ -31,8 +30,7 @@ from hilcal.readings.whitening import Scaling
 from hilcal.stream import StreamFit
 from hilcal.types import Ints
 
-ALL_ROWS = 60
-SCREEN = 6  # parameters on the first screen
+ALL_ROWS, SCREEN = 60, 6  # parameters in detail, and on the first screen
 PARAMETER_COLUMNS = ("parameter", "value", "±", "unit", "meaning")
 STRONGEST, DIRECTIONS, GROSS, MOST_LISTED = 5, 8, 8, 6
 POSE = "pose"
@@ -45,8 +43,7 @@ GROUPS: dict[Group, str] = {
 }
 """Groups of the table of variables in their order, with the format of a row's name."""
 CERTAIN = 0.005
-TELL_P = 1e-3
-"""Bonferroni-corrected p-value below which a disagreement with the prior is reported."""
+TELL_P = 1e-3  # Bonferroni-corrected p-value of a disagreement with the prior that is reported
 MOST_TOLD = 5
 
 
@@ -94,7 +91,6 @@ def set_aside(fit: Fit, details: bool) -> Iterator[str]:
 
 
 def _listed(lines: Sequence[str], most: int) -> Iterator[str]:
-    """Yield the first lines and the number of the others."""
     yield from lines[:most]
     if len(lines) > most:
         yield f"  ... and {len(lines) - most} more; --json lists all"
@@ -102,8 +98,7 @@ def _listed(lines: Sequence[str], most: int) -> Iterator[str]:
 
 def parameters(fit: Fit, most: int = ALL_ROWS, where: str = "--details") -> Iterator[Block]:
     """Yield a table of `most` parameters, omitting frames first, and families; `where`: of all."""
-    rows: list[tuple[str, ...]] = []
-    frames: list[tuple[str, ...]] = []
+    rows, frames = list[tuple[str, ...]](), list[tuple[str, ...]]()
     families, undetermined = [], []
     for effect, s in zip(fit.model.effects, fit.model.slices(), strict=True):
         if effect.name in fit.model.background:
@@ -123,9 +118,10 @@ def parameters(fit: Fit, most: int = ALL_ROWS, where: str = "--details") -> Iter
                 section.append((f"{effect.name}.{p.name}", *shown, p.meaning))
         missing = [p.name for k, p in zip(identifiable, effect.parameters, strict=True) if not k]
         if missing:
-            which = " ".join(missing) if len(missing) <= 6 else f"({len(missing)} of {len(index)})"
-            if len(missing) > 6 and not identifiable.any():
-                which = "(none of it)"
+            which = " ".join(missing)
+            if len(missing) > 6:
+                some = f"({len(missing)} of {len(index)})"
+                which = some if identifiable.any() else "(none of it)"
             undetermined.append(f"{effect.name} {which}")
     omitted = len(frames) + len(rows) - most
     if frames or rows:
@@ -139,7 +135,6 @@ def parameters(fit: Fit, most: int = ALL_ROWS, where: str = "--details") -> Iter
 
 
 def _family(fit: Fit, effect: Effect, index: Ints) -> str:
-    """Return a summary of a family of many parameters."""
     theta, live = fit.theta[index], fit.solution.estimated[index]
     units = {p.unit for p in effect.parameters}
     unit, factor = numbers.unit_for(units.pop(), list(theta)) if len(units) == 1 else ("", 1.0)
@@ -161,11 +156,8 @@ def _family(fit: Fit, effect: Effect, index: Ints) -> str:
 
 def errors(fit: Fit) -> Table:
     """Return the table of errors: nominal arm, fitted poses, poses left out, noise alone."""
-    rows = {
-        "before: rigid nominal arm": error_before(fit),
-        "poses fitted": fit.error,
-        "poses left out": fit.holdout,
-    }
+    rows = {"before: rigid nominal arm": error_before(fit)}
+    rows |= {"poses fitted": fit.error, "poses left out": fit.holdout}
     return _errors(rows, full_prediction(fit).noise_floor, error_words(fit.readings))
 
 
@@ -233,7 +225,6 @@ def _variance_factor(fit: Fit | StreamFit) -> str:
 
 
 def _scaling_remark(fit: Fit) -> str:
-    """Return a sentence on whether parameter scaling was needed."""
     basis = fit.solution.equations.basis
     unscaled, scaled = basis.condition_unscaled, basis.condition_scaled
     if not (np.isfinite(unscaled) and np.isfinite(scaled)):
@@ -248,11 +239,9 @@ def _scaling_remark(fit: Fit) -> str:
 
 def misses(fit: Fit) -> str:
     """Return a sentence on the error on poses left out."""
-    return (
-        f"On poses left out, predicted {measurements(fit.mode, fit.readings)} are off by "
-        f"{length(fit.holdout.rms_m)} rms; noise alone would leave "
-        f"{length(full_prediction(fit).noise_floor)}."
-    )
+    what, floor = measurements(fit.mode, fit.readings), length(full_prediction(fit).noise_floor)
+    error = f"are off by {length(fit.holdout.rms_m)} rms"
+    return f"On poses left out, predicted {what} {error}; noise alone would leave {floor}."
 
 
 def measurements(mode: str, readings: Readings) -> str:
@@ -268,12 +257,10 @@ def follows(places: Sequence[MisfitShare]) -> str:
     sides = [p for p in clear if p.variable.startswith("direction") and p.share > 0.5]
     same = [p for p in clear if p.variable == POSE and p.share > 0.5]
     causes = [p for p in clear if p.variable != POSE and not p.variable.startswith("direction")][:3]
-    if not causes and not sides and not same:
-        return (
-            "The misfit follows none of the variables: neither joints nor load, time or direction."
-        )
     named = numbers.names([f"{p.variable} ({percent(p.share)})" for p in causes])
     statement = f"The misfit follows {named or 'none of the variables'}"
+    if not causes and not sides and not same:
+        return f"{statement}: neither joints nor load, time or direction."
     if sides:
         side = sides[0].variable.removeprefix("direction ")
         statement += f"; {percent(sides[0].share)} of it is {side}"
@@ -294,9 +281,8 @@ def where_table(places: Sequence[MisfitShare]) -> Iterator[Block]:
                 out.add(name, percent(p.share), numbers.chance(p.p_value))
     if shown:
         yield out
-    tested = [p for p in places if p.group not in ("pose", "direction")]
-    tests = numbers.many_tests(len(tested), FALSE_ALARM, "variables")
-    remainder = ""
+    tested = sum(p.group not in ("pose", "direction") for p in places)
+    tests, remainder = numbers.many_tests(tested, FALSE_ALARM, "variables"), ""
     if small := len(places) - len(shown):
         remainder = f"; {small} more {'is' if small == 1 else 'are'} below {percent(LEAST_SHARE)}"
     yield note(
@@ -321,14 +307,13 @@ def target_words(name: str, n_readings: int, known: bool) -> str:
     return f"{name} ({n_readings} readings, its offset {'known' if known else 'estimated'})"
 
 
-def worst_poses(e: FullPrediction, most: int = MOST_LISTED) -> list[Worst]:
+def worst_poses(e: FullPrediction) -> list[Worst]:
     """Return the worst measurement of each of the worst poses, in units of the noise."""
     distance, out = np.sqrt(e.mahalanobis2), dict[str, Worst]()
     for k in np.argsort(-distance, kind="stable").tolist():
         (pose, load), target = e.name(k), e.target_name(k)
-        if pose not in out and len(out) < most:
-            error = float(np.linalg.norm(e.raw[k, :3]))
-            name = f"{pose} {target}" if target else pose
+        if pose not in out and len(out) < MOST_LISTED:
+            name, error = f"{pose} {target or ''}".rstrip(), float(np.linalg.norm(e.raw[k, :3]))
             out[pose] = Worst(name, load, error, float(distance[k]))
     return list(out.values())
 
@@ -342,6 +327,12 @@ def worst_table(worst: Sequence[Worst], left_out: bool = False) -> Table:
 
 def scalings_table(fits: Mapping[Scaling, Fit]) -> Iterator[Block]:
     """Yield a table of parameters, errors and condition numbers, with a column per scaling."""
+
+    def entry(f: Fit, k: int, factor: float) -> str:
+        sizes = factor * float(f.theta[k]), factor * float(f.uncertainty.std[k])
+        written = " ± ".join(filter(None, numbers.with_std(*sizes)))
+        return written if f.uncertainty.identifiable[k] else "-"
+
     yield heading("The same readings with every scaling")
     columns, model = list(fits.values()), next(iter(fits.values())).model
     out = table("", *fits, "unit", left=(0, len(fits) + 1))
@@ -351,7 +342,7 @@ def scalings_table(fits: Mapping[Scaling, Fit]) -> Iterator[Block]:
         for k, p in zip(range(s.start, s.stop), effect.parameters, strict=True):
             if values := [float(f.theta[k]) for f in columns if f.uncertainty.identifiable[k]]:
                 unit, factor = numbers.unit_for(p.unit, values)
-                out.add(f"{effect.name}.{p.name}", *(_entry(f, k, factor) for f in columns), unit)
+                out.add(f"{effect.name}.{p.name}", *(entry(f, k, factor) for f in columns), unit)
     out.rule()
     bases = [f.solution.equations.basis for f in columns]
     for name, cells in (
@@ -367,13 +358,6 @@ def scalings_table(fits: Mapping[Scaling, Fit]) -> Iterator[Block]:
         "none: least squares as is; gu: weighted by standard deviations; gc: whitened by the full "
         "covariance, pose by pose. The revision that is kept is that of gc."
     )
-
-
-def _entry(fit: Fit, k: int, factor: float) -> str:
-    if not fit.uncertainty.identifiable[k]:
-        return "-"
-    sizes = factor * float(fit.theta[k]), factor * float(fit.uncertainty.std[k])
-    return " ± ".join(filter(None, numbers.with_std(*sizes)))
 
 
 def stream_report(fit: StreamFit) -> Iterator[Block]:
@@ -419,11 +403,12 @@ def prior_lines(fit: Fit) -> list[str]:
     lines = [f"Prior: {name} ({source.n_readings} readings{arm})."]
     # groups of parameters in which prior and readings disagree beyond chance, worst first
     moved = [c for c in fit.conflicts if c.p_value * len(fit.conflicts) < TELL_P]
-    lines += [
-        f"  {_group_name(c.group)} has moved by {min(c.moved_sigma, 37):.1f} σ of what the prior "
-        "allows: wear, a crash or a repair?"
-        for c in moved[:MOST_TOLD]
-    ]
+    for c in moved[:MOST_TOLD]:
+        g, effect = c.group, c.group.effect.replace("_", " ")
+        name = f"the {effect} of {g.part}" if g.part else f"the {effect}"
+        name = name if g.joint is None else f"joint {g.joint}'s {effect}"
+        sigma = f"{min(c.moved_sigma, 37):.1f} σ of what the prior allows"
+        lines.append(f"  {name} has moved by {sigma}: wear, a crash or a repair?")
     if len(moved) > MOST_TOLD:
         lines.append(f"  … and {len(moved) - MOST_TOLD} more (--json lists them)")
     in_prior = {e.name for e in prior.posterior.effects}
@@ -436,10 +421,3 @@ def prior_lines(fit: Fit) -> list[str]:
     elif not moved:
         lines.append("  The readings agree with it.")
     return lines
-
-
-def _group_name(group: DriftGroup) -> str:
-    effect = group.effect.replace("_", " ")
-    if group.joint is not None:
-        return f"joint {group.joint}'s {effect}"
-    return f"the {effect} of {group.part}" if group.part else f"the {effect}"

@@ -47,11 +47,8 @@ class Measuring:
 
 PORT = 9877  # not 9876, on which a viewer itself listens; it opens no window if that is occupied
 MOST = 2000  # most messages in the queue, some 500 bytes each; a choice
-ARM_S = 0.2
-"""Interval between two recorded arm positions, s; a choice: smooth motion, small files."""
-START_S, END_S = 20.0, 10.0
-"""Most time for the process to start, which loads the viewer's library, and to finish the
-recording, s; choices."""
+ARM_S = 0.2  # between two recorded arm positions: smooth motion, small files; a choice
+START_S, END_S = 20.0, 10.0  # most time of the process to load its library, and to finish; choices
 NICE = 15  # low priority, so that the arm's watchdog never waits for a picture; a choice
 _ROOT = Path(__file__).resolve().parents[2]
 
@@ -69,11 +66,6 @@ class LiveViewer:
         self._process: subprocess.Popen[bytes] | None = None
         self._threads: list[threading.Thread] = []
         self._ready, self._closing, self._arm_sent = threading.Event(), False, 0.0
-
-    @property
-    def pid(self) -> int | None:
-        """Number of the process; None before `start`."""
-        return None if self._process is None else self._process.pid
 
     def start(self) -> None:
         """Start the process and wait until it serves; problems go to `say`."""
@@ -115,9 +107,8 @@ class LiveViewer:
         """Send the start of a measurement, with the steps of earlier sessions."""
         stored = (d for d in log.details() if "wall_s" in d)
         steps = tuple((float(d["wall_s"]), Step(**d["step"])) for d in stored)
-        targets = cell.all_targets[:, :3, 3]
-        start = Measuring(name, cell.arm, targets, log.plan, steps, cell.target_names)
-        self._send(time.time(), start)
+        targets, names = cell.all_targets[:, :3, 3], cell.target_names
+        self._send(time.time(), Measuring(name, cell.arm, targets, log.plan, steps, names))
 
     def revised(self, chapter: Chapter) -> None:
         """Send a revision; a failure to draw it goes to `say` and is not raised."""

@@ -14,15 +14,9 @@ from hilcal.identification.fit import Fit
 from hilcal.identification.full_prediction import residual_table
 from hilcal.identification.validation import CampaignValidation
 from hilcal.optional import needed_by
+from hilcal.present import diagnosis
 from hilcal.present.calibration import bootstrap_report, opening, shares_report, validation_report
 from hilcal.present.comparison import comparison_report
-from hilcal.present.diagnosis import (
-    diagnosis_report,
-    discovery_report,
-    key,
-    revisions_table,
-    verdict_line,
-)
 from hilcal.present.document import Block
 from hilcal.present.fit import fit_report, stream_report
 from hilcal.present.plan import plan_report
@@ -46,14 +40,13 @@ def html_of(value: object) -> str:
 
 @singledispatch
 def _blocks(value: object) -> Iterable[Block]:
-    """Return the report of a result."""
     raise TypeError(f"nothing is said of a {type(value).__name__}")
 
 
 _blocks.register(Fit, lambda fit: fit_report(fit, details=False))
 _blocks.register(StreamFit, stream_report)
-_blocks.register(Diagnosis, diagnosis_report)
-_blocks.register(Discovery, discovery_report)
+_blocks.register(Diagnosis, diagnosis.diagnosis_report)
+_blocks.register(Discovery, diagnosis.discovery_report)
 _blocks.register(Bootstrap, bootstrap_report)
 _blocks.register(CheckedPlan, lambda plan: plan_report(plan.summary))
 _blocks.register(
@@ -74,7 +67,11 @@ def _(path: Refinement) -> Iterator[Block]:
     for k, s in enumerate(path.steps, start=1):
         changed = change(s.added, s.removed, s.fit.readings.arm_scatter is not None)
         rows.append((k, changed, s.fit, s.diagnosis.verdict))
-    yield from (revisions_table(rows), key(path.fit.readings), verdict_line(path.diagnosis))
+    yield from (
+        diagnosis.revisions_table(rows),
+        diagnosis.key(path.fit.readings),
+        diagnosis.verdict_line(path.diagnosis),
+    )
 
 
 def frame_of(value: object) -> "pd.DataFrame":

@@ -22,11 +22,10 @@ CRITERIA = {
 }
 BAR = 30
 SCREEN = 4  # remarks on the first screen; the most important come first
-UNCERTAIN = 1e-3
-"""Least certified efficiency that is reported. A choice: the last printed digit."""
+UNCERTAIN = 1e-3  # least certified efficiency that is reported: the last printed digit
 LIKE = 1.1
-"""A number of poses is enough if its predicted uncertainty is at most this multiple of that at the
-end of the curve. A choice."""
+"""Poses are enough if their predicted uncertainty is at most this multiple of that at the end of
+the curve. A choice."""
 _STRETCHED, _MOST_LOADS, _LEAST_SHARE = 1.15, 2, 0.1
 
 
@@ -41,8 +40,8 @@ def plan_facts(s: PlanSummary) -> Iterator[Block]:
 def plan_screen(s: PlanSummary) -> Iterator[Block]:
     """Yield the summary of a plan on one screen; `plan_report` is the full report."""
     yield from plan_facts(s)
-    heads = ("predicted for", "parameters", "±", "unit", "± in %, worst")
     if s.parameters:
+        heads = ("predicted for", "parameters", "±", "unit", "± in %, worst")
         yield from (table(*heads, rows=_effect_rows(s.parameters), left=(0, 3)), "")
     if detectable := _detectable(s):
         (first, least), (last, most) = detectable[0], detectable[-1]
@@ -56,10 +55,7 @@ def plan_screen(s: PlanSummary) -> Iterator[Block]:
 
 def _effect_rows(parameters: Sequence[PredictedParameter]) -> Iterator[tuple[str, ...]]:
     """Yield a row for all parameters of an effect with the same unit."""
-    groups: dict[tuple[str, str], list[PredictedParameter]] = {}
-    for p in parameters:
-        groups.setdefault((_effect(p), p.unit), []).append(p)
-    for (effect, si), members in groups.items():
+    for (effect, si), members in _by_effect(parameters).items():
         determined = [p for p in members if math.isfinite(p.std)]
         count = f"{f'{len(determined)} of ' * (len(determined) < len(members))}{len(members)}"
         if not determined:
@@ -135,27 +131,26 @@ def cost_rows(s: PlanSummary) -> Iterator[tuple[str, str]]:
 
 def order_remark(s: PlanSummary) -> str:
     """Return sentences on the cost of the order and on the effect of a linear drift."""
-    c, randomised = s.confounding, s.longer >= 5e-4
+    c, order, in_shortest, returns = s.confounding, "The order is the shortest one.", "", ""
     if c is None:
         return ""
-    out = "The order is the shortest one. "
-    if randomised:
-        out = (
+    if s.longer >= 5e-4:
+        order = (
             "The order is randomised, so that drift is little correlated with joints and loads, "
-            f"and takes {100 * s.longer:.1f} % longer than the shortest one. "
+            f"and takes {100 * s.longer:.1f} % longer than the shortest one."
         )
-    out += f"Estimating a drift as well costs up to about {_loss(c)} of a parameter's information"
-    if randomised and s.shortest is not None:
-        out += f" ({_loss(s.shortest)} in the shortest order)"
-    mean = length(abs(c.bias_m)) if abs(c.bias_m) >= 1e-7 else "less than 0.1 µm"
-    out += (
-        f". Without it in the fit, a drift of {digits(3.6e9 * c.drift, 2)} µm/h shifts "
-        f"deflections by {length(c.error_m)} rms and {mean} on average"
-    )
+        if s.shortest is not None:
+            in_shortest = f" ({_loss(s.shortest)} in the shortest order)"
     if c.drift_std is not None:
         rate = digits(3.6e9 * c.drift_std, 2)
-        out += f"; the returns to the reference pose determine it to ± {rate} µm/h"
-    return f"{out}."
+        returns = f"; the returns to the reference pose determine it to ± {rate} µm/h"
+    mean = length(abs(c.bias_m)) if abs(c.bias_m) >= 1e-7 else "less than 0.1 µm"
+    return (
+        f"{order} Estimating a drift as well costs up to about {_loss(c)} of a parameter's "
+        f"information{in_shortest}. Without it in the fit, a drift of "
+        f"{digits(3.6e9 * c.drift, 2)} µm/h shifts deflections by {length(c.error_m)} rms and "
+        f"{mean} on average{returns}."
+    )
 
 
 def _loss(c: Confounding) -> str:
@@ -165,8 +160,9 @@ def _loss(c: Confounding) -> str:
 
 def _parameter_rows(parameters: Sequence[PredictedParameter]) -> Iterator[tuple[str, ...]]:
     """Yield a row per parameter; parameters of one effect and unit share a prefix of the unit."""
+    groups = _by_effect(parameters)
     for p in parameters:
-        alike = [o for o in parameters if (o.unit, _effect(o)) == (p.unit, _effect(p))]
+        alike = groups[p.name.split(".")[0], p.unit]
         sizes = [o.std if o.value is None else o.value for o in alike]
         unit, factor = numbers.unit_for(p.unit, sizes)
         magnitude = "" if p.value is None else digits(factor * p.value)
@@ -177,12 +173,16 @@ def _parameter_rows(parameters: Sequence[PredictedParameter]) -> Iterator[tuple[
         yield p.name, std, magnitude, unit, share
 
 
-def _effect(p: PredictedParameter) -> str:
-    return p.name.split(".")[0]
+def _by_effect(
+    parameters: Sequence[PredictedParameter],
+) -> dict[tuple[str, str], list[PredictedParameter]]:
+    groups: dict[tuple[str, str], list[PredictedParameter]] = {}
+    for p in parameters:
+        groups.setdefault((p.name.split(".")[0], p.unit), []).append(p)
+    return groups
 
 
 def _criteria_table(s: PlanSummary) -> Iterator[Block]:
-    """Yield the predicted results of plans by other criteria with as many readings."""
     heads = ("criterion", "predicted ±", "open ±", "joint ±", "O1 (D)", "O2 (K)", "O3 (E)")
     out = table(*heads, "certified")
     for c in s.criteria:
@@ -222,11 +222,9 @@ def enough(curve: Sequence[CurvePoint]) -> str:
     first = next(p for p in curve if p.position_std_m <= LIKE * last.position_std_m)
     if first is last:
         return f"More than {last.poses} poses still improve the prediction."
-    gain = 100 * (1.0 - last.position_std_m / first.position_std_m)
-    return (
-        f"From {first.poses} to {last.poses} poses the prediction's uncertainty falls by "
-        f"{gain:.0f} % only."
-    )
+    gain = numbers.percent(1.0 - last.position_std_m / first.position_std_m)
+    what = "the prediction's uncertainty falls by"
+    return f"From {first.poses} to {last.poses} poses {what} {gain} only."
 
 
 def _detectable(s: PlanSummary) -> list[tuple[str, str]]:
@@ -236,7 +234,6 @@ def _detectable(s: PlanSummary) -> list[tuple[str, str]]:
 
 
 def _undetectable(s: PlanSummary) -> Iterator[str]:
-    """Yield a sentence on the effects that the readings cannot detect, if any."""
     if names := [d.effect for d in s.detectable if d.least_m is None]:
         yield f"These readings cannot detect {numbers.names(names, 'or')}."
 
@@ -271,8 +268,7 @@ def poses_report(plan: Next, poses: int, readings: int, details: bool = True) ->
         f"{readings} unloaded readings at {poses} poses, spread over the joints' range.\n"
     )
     if plan.powers:
-        some = plan.powers if details else _weakest(plan.powers)
-        yield power_table(some, "and this is fitted")
+        yield power_table(plan.powers if details else _weakest(plan.powers), "and this is fitted")
         yield note(
             "now, then: chance that it passes every test of a missing effect, poses left out "
             "included, with the readings so far and with those planned as well.\n"
@@ -318,20 +314,14 @@ def powers_summary(powers: Sequence[PairPower], poses: int, readings: int) -> st
             f"which they rule out with a chance of {_chance(least.then)} ({_chance(least.now)} "
             "now); more poses raise it."
         )
-    at_least = f"at least {min(int(100 * least.then + 1e-9), 99)} %"  # rounded down
+    what = "what can be separated in this cell: each of these pairs"
     if len(able) == len(powers):
-        return (
-            f"{head} separate the suspects: whichever is there, each of the others is ruled out "
-            f"with a chance of {at_least}."
-        )
-    return (
-        f"{head} separate what can be separated in this cell: each of these pairs with a chance of "
-        f"{at_least}."
-    )
+        what = "the suspects: whichever is there, each of the others is ruled out"
+    at_least = min(int(100 * least.then + 1e-9), 99)  # rounded down
+    return f"{head} separate {what} with a chance of at least {at_least} %."
 
 
 def _difference(plan: Next) -> str:
-    """Return a sentence on the loads and poses that separate the weakest pair."""
     shares = sorted(plan.shares.items(), key=lambda item: -item[1])
     named = [
         f"{'the unloaded readings' if load == UNLOADED else load} ({numbers.percent(share)})"

@@ -7,30 +7,14 @@ from contextlib import contextmanager
 from math import isfinite
 from typing import Any
 
+from rich import progress as bars
 from rich.console import Console, ConsoleOptions, RenderableType
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.segment import Segment
 from rich.text import Text
 
 from hilcal import numbers
 from hilcal.design.goal import parse_goal
-from hilcal.measuring.progress import (
-    Answered,
-    GoalMet,
-    GoalStatus,
-    Phase,
-    Question,
-    ReadingStored,
-    Remark,
-    Watcher,
-)
+from hilcal.measuring import progress as events
 from hilcal.names import escaped
 
 Say = Callable[[str], None]
@@ -55,7 +39,6 @@ class SafeConsole(Console):
 
 
 def _line(console: Console, since: float, text: str, width: int = 5) -> None:
-    """Print a line with the seconds since a monotonic time."""
     seconds = f"[{time.monotonic() - since:{width}.1f} s]"
     console.print(f"{seconds} {text}", markup=False, highlight=False, soft_wrap=True)
 
@@ -78,10 +61,10 @@ def counting(console: Console, task_name: str, total: int) -> Iterator[Advance]:
         console.print(f"{task_name}: {total}", markup=False, highlight=False)
         yield lambda step: None
         return
-    name = TextColumn("{task.description}", markup=False)
-    times = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
-    columns = (name, BarColumn(), MofNCompleteColumn(), *times)
-    with Progress(*columns, console=console, transient=True) as bar:
+    name = bars.TextColumn("{task.description}", markup=False)
+    times = (bars.TimeElapsedColumn(), bars.TextColumn("left"), bars.TimeRemainingColumn())
+    columns = (name, bars.BarColumn(), bars.MofNCompleteColumn(), *times)
+    with bars.Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(task_name, total=total)
         yield lambda step: bar.advance(task, step)
 
@@ -94,21 +77,22 @@ def spoken(seconds: float) -> str:
     return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
-def status_words(status: GoalStatus) -> str:
+def status_words(status: events.GoalStatus) -> str:
     """Return the current value of a goal, e.g. "joint std 4.1 % (j6)"; empty while unknown."""
     if status.worst is None or status.std is None or status.unit is None:
         return ""
-    goal, determined = parse_goal(status.text), isfinite(status.std)
+    goal = parse_goal(status.text)
+    value = _value(status) if isfinite(status.std) else ""
     if goal.of_position:
         kind = "deflection" if "predicted deflection" in status.quantity else "position"
-        return f"predicted {kind} {f'± {_value(status)}' if determined else 'not determined yet'}"
+        return f"predicted {kind} {f'± {value}' if value else 'not determined yet'}"
     match = re.match(r"[\w.]+", status.text.strip())
     name = "" if match is None else match[0]
     worst = "" if status.worst in (name, goal.what) else f" ({status.worst.split('.')[-1]})"
-    return f"{name} std {_value(status) if determined else 'not determined yet'}{worst}"
+    return f"{name} std {value or 'not determined yet'}{worst}"
 
 
-def full_words(status: GoalStatus) -> str:
+def full_words(status: events.GoalStatus) -> str:
     """Return the judged quantity and its value, e.g. "standard uncertainty of X: 4.1 µm"."""
     if not status.quantity:
         return status_words(status)
@@ -117,35 +101,32 @@ def full_words(status: GoalStatus) -> str:
     return f"{status.quantity}: {_value(status)}{' of its value' * (status.unit == '%')}"
 
 
-def _value(status: GoalStatus) -> str:
+def _value(status: events.GoalStatus) -> str:
     if status.std is None or status.unit is None:
         return ""
-    if status.unit == "%":
-        return f"{numbers.digits(status.std, 2)} %"
     unit, factor = numbers.unit_for(status.unit, (status.std,))
     return f"{numbers.digits(factor * status.std, 2)} {unit}"
 
 
-def met_words(event: GoalMet) -> str:
+def met_words(event: events.GoalMet) -> str:
     """Return a line that states that the goal is met."""
     count = f"after {event.readings} of {event.planned} readings"
     return f"goal met {count}: {full_words(event.status)}"
 
 
-def missed_words(status: GoalStatus, count: int) -> str:
+def missed_words(status: events.GoalStatus, count: int) -> str:
     """Return a line that states by how much the goal is missed after `count` readings."""
-    head = f'goal "{status.text}" is not met after all {count} readings'
+    line = f'goal "{status.text}" is not met after all {count} readings'
     if not status.quantity:
-        return f"{head}: the model cannot be fitted to them"
-    line = f"{head}: {full_words(status)}"
+        return f"{line}: the model cannot be fitted to them"
+    line += f": {full_words(status)}"
     if status.ratio is None or not isfinite(status.ratio):
         return line
-    if status.ratio <= 1.0:
-        return f"{line}, but the fit did not converge"
-    return f"{line}, {status.ratio:.2g} times what is asked for"
+    missed = f"{status.ratio:.2g} times what is asked for"
+    return f"{line}, {missed if status.ratio > 1.0 else 'but the fit did not converge'}"
 
 
-class _TwoLines(Progress):
+class _TwoLines(bars.Progress):
     """A bar with the current phase, and below it the last reading; both fit 80 columns."""
 
     def get_renderables(self) -> Iterator[RenderableType]:
@@ -162,10 +143,10 @@ class _Watcher:
     every event, too.
     """
 
-    def __init__(self, console: Console, total: int, also: Watcher | None) -> None:
+    def __init__(self, console: Console, total: int, also: events.Watcher | None) -> None:
         self.console, self._start, self._also = console, time.monotonic(), also
-        self._fields: dict[str, Any] = {"left": "", "last": "", "phase": ""}
-        self._fields |= {"done": 0, "total": total}
+        self._fields: dict[str, Any] = {"left": "", "last": "", "phase": "", "done": 0}
+        self._fields["total"] = total
         self._shown: _TwoLines | None = None
 
     def begin(self) -> None:
@@ -173,10 +154,10 @@ class _Watcher:
         if not self.console.is_terminal:
             return
         columns = (
-            BarColumn(bar_width=20),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[left]}", style="bold", markup=False),
-            TextColumn("{task.fields[phase]}", style="dim", markup=False),
+            bars.BarColumn(bar_width=20),
+            bars.MofNCompleteColumn(),
+            bars.TextColumn("{task.fields[left]}", style="bold", markup=False),
+            bars.TextColumn("{task.fields[phase]}", style="dim", markup=False),
         )
         self._shown = _TwoLines(*columns, console=self.console, transient=True)
         self._shown.add_task("", completed=self._fields["done"], **self._fields)
@@ -192,23 +173,23 @@ class _Watcher:
         """Show an event of `measuring.progress`."""
         if self._also is not None:
             self._also.notify(event)
-        if isinstance(event, Question):
+        if isinstance(event, events.Question):
             self.end()
             if self.console.is_terminal and self._fields["done"]:
                 left, done, total = (self._fields[key] for key in ("left", "done", "total"))
                 text = f"\n{done} of {total} readings are stored{', ' * bool(left)}{left}."
                 self.console.print(text, style="dim", markup=False)
-        elif isinstance(event, Answered):
+        elif isinstance(event, events.Answered):
             self.begin()
-        elif isinstance(event, Remark | GoalMet):
-            text = f"note: {event.text if isinstance(event, Remark) else met_words(event)}"
+        elif isinstance(event, events.Remark | events.GoalMet):
+            text = f"note: {event.text if isinstance(event, events.Remark) else met_words(event)}"
             if self.console.is_terminal:
                 self.console.print(text, markup=False, highlight=False)
             else:
                 _line(self.console, self._start, text, width=6)
-        elif isinstance(event, Phase):
+        elif isinstance(event, events.Phase):
             self._update(event.text, phase=event.text)
-        elif isinstance(event, ReadingStored):
+        elif isinstance(event, events.ReadingStored):
             left = f"{spoken(event.left_real)} left" if event.left_real > 0 else ""
             last = f"{event.step}{figures(event)}"
             text = f"{event.done}/{event.total} {last}{', ' * bool(left)}{left}"
@@ -224,7 +205,9 @@ class _Watcher:
 
 
 @contextmanager
-def watching(console: Console, total: int, also: Watcher | None = None) -> Iterator[_Watcher]:
+def watching(
+    console: Console, total: int, also: events.Watcher | None = None
+) -> Iterator[_Watcher]:
     """Yield a watcher that shows a campaign of `total` readings and passes events to `also`."""
     watcher = _Watcher(console, total, also)
     watcher.begin()
@@ -234,7 +217,7 @@ def watching(console: Console, total: int, also: Watcher | None = None) -> Itera
         watcher.end()
 
 
-def figures(event: ReadingStored) -> str:
+def figures(event: events.ReadingStored) -> str:
     """Return deflection (≈: from a predicted unloaded position) and residual of a reading."""
     parts, live = [], event.live
     if event.deflection is not None:

@@ -20,23 +20,16 @@ from hilcal.robot import se3
 from hilcal.types import Floats
 
 PLACES = 5, 4  # decimals of a position in m and of an angle in degrees. A choice
-ALONG = 0.98
-"""Least component of a unit vector that is named after its axis."""
+ALONG = 0.98  # least component of a unit vector that is named after its axis
 WORDS: dict[CovarianceParts, str] = {
-    "instrument": (
-        "the instrument alone; the arm's own scatter is not in it ([repeatability] "
-        "joint_std_rad states it)"
-    ),
-    "instrument and repeatability": (
-        "the instrument, and the arm's scatter as [repeatability] states it"
-    ),
-    "instrument and arm as stated": (
-        "instrument and arm's scatter together; [repeatability] is not added again"
-    ),
-    "as imported": (
-        "as an older version of hilcal imported it; [repeatability] is not added (import the "
-        "table again for that)"
-    ),
+    "instrument": "the instrument alone; the arm's own scatter is not in it ([repeatability] "
+    "joint_std_rad states it)",
+    "instrument and repeatability": "the instrument, and the arm's scatter as [repeatability] "
+    "states it",
+    "instrument and arm as stated": "instrument and arm's scatter together; [repeatability] is not "
+    "added again",
+    "as imported": "as an older version of hilcal imported it; [repeatability] is not added "
+    "(import the table again for that)",
 }
 
 
@@ -46,7 +39,7 @@ def registration_lines(registration: Registration) -> Iterator[str]:
         rad = registration.turn_rms
         turn = "" if rad is None else f" and {np.degrees(rad):.3g}°"
         cell = registration.cell
-        base = f"the base is {_at(cell.registration)}"
+        base = f"the base is at {_place(cell.registration)} in the tracker frame"
         if cell.observers and np.array_equal(cell.registration, np.eye(4)):
             base = "positions are in the axes of the base, which nothing else fixes"
         places = "".join(f"; {_observer(o)}" for o in cell.observers if o.free)
@@ -104,7 +97,7 @@ def base_line(cell: Cell, frames: RobotFrames, mode: Mode = "absolute") -> str:
         why = "the nominal arm on it has the axis of joint 1 where the readings have it"
         if mode == "deflection":
             why, places = f"{why}; deflections tell it no better", (3, 2)
-    return f"The robot's base: {_at(frames.base, places)}; {why}."
+    return f"The robot's base: at {_place(frames.base, places)} in the tracker frame; {why}."
 
 
 def undetermined_lines(registration: Registration) -> Iterator[str]:
@@ -154,10 +147,6 @@ def _axis_words(v: Floats, axes: str) -> str:
     return f"{axes} direction ({', '.join(f'{x:.2f}' for x in unit)})"
 
 
-def _at(t: Floats, places: tuple[int, int] = PLACES) -> str:
-    return f"at {_place(t, places)} in the tracker frame"
-
-
 def _targets(cell: Cell) -> str:
     if cell.targets is None:
         return f"the target is at {_place(cell.target)} on the flange"
@@ -184,11 +173,9 @@ def covariance_words(parts: CovarianceParts, noise: NoiseEstimate | None = None)
     if noise.joint_std_rad is not None:
         scatter = f"{1e6 * noise.joint_std_rad:.2g} µrad"
         arm = f"; each joint scatters by {scatter} from arrival to arrival"
-    why = "neither the table nor [tracker] states the noise"
-    if noise.factors is not None:
-        why = (
-            "[tracker] does not state the noise, and the samples of each pose do not show all of it"
-        )
+    why = "[tracker] does not state the noise, and the samples of each pose do not show all of it"
+    if noise.factors is None:
+        why = "neither the table nor [tracker] states the noise"
     return (
         f"{why}; it was estimated from the readings, together with all effects: "
         f"{numbers.length(noise.along_m)} along the beam, "

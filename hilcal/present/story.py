@@ -22,14 +22,7 @@ from hilcal.identification.fit import Fit, all_left_out, mahalanobis2
 from hilcal.identification.full_prediction import FullPrediction, full_prediction
 from hilcal.identification.residual import ErrorBlock
 from hilcal.model.model import Model
-from hilcal.present.diagnosis import (
-    coefficient,
-    diagnosis_report,
-    moves,
-    revision_cells,
-    shown_suspects,
-    suspects_table,
-)
+from hilcal.present import diagnosis
 from hilcal.present.document import Block
 from hilcal.present.fit import errors, misses, model_name, parameters
 from hilcal.present.verdict import message
@@ -40,9 +33,7 @@ from hilcal.types import Floats, Ints
 
 Mode = Literal["deflection", "absolute"]
 LEVEL_NAMES = ("inside the noise", "doubtful", "outside the noise")
-LIMITS = (0.99, 0.9999)
-"""Quantiles of χ²(3) above which a reading is doubtful, and outside. Noise alone exceeds them once
-in 100, and once in 10,000 readings."""
+LIMITS = (0.99, 0.9999)  # quantiles of χ²(3) above which a reading is doubtful, and outside
 MOST_NUMBER = 10**9
 UNDIAGNOSED = "not diagnosed"
 LITTLE = 0.2
@@ -201,22 +192,18 @@ class Chapter:
 def build_story(chapters: Sequence[Chapter]) -> Story:
     """Build the story of successive revisions of one campaign, in axes of the last one's base.
 
-    The story includes readings that were set aside as gross errors. `anchor` is the position of
-    the target on the rigid nominal arm.
-
-    Raises:
-        InputError: no revision, or revisions of different readings.
+    The story includes readings that were set aside as gross errors. Raises InputError without a
+    revision, and for revisions of different readings.
     """
     if not chapters:
         raise InputError("no revision to show; run hilcal identify first")
     parts = [full_prediction(c.fit) for c in chapters]
     last, fit = parts[-1], chapters[-1].fit
-    for c, part in zip(chapters, parts, strict=True):
-        same = np.array_equal(part.whitening.reading, last.whitening.reading)
+    for c, p in zip(chapters, parts, strict=True):
+        same = np.array_equal(p.whitening.reading, last.whitening.reading)
         if c.fit.mode != fit.mode or not same:
-            raise InputError(
-                f"revision {c.number} was fitted to other readings; nothing to compare"
-            )
+            why = "was fitted to other readings; nothing to compare"
+            raise InputError(f"revision {c.number} {why}")
     readings, rows, frames = last.readings, last.whitening.reading, fit.frames
     to_base, states = frames.base[:3, :3], readings.states  # v @ to_base is a vector v in base axes
     rigid = Model(fit.model.cell.with_targets(frames.declared), ()).predict(states, np.zeros(0))
@@ -255,10 +242,7 @@ def of_left_out(revision: StoryRevision, fit: Fit) -> StoryRevision:
 
 
 def round_factor(limit: float, steps: Sequence[float]) -> float:
-    """Return the largest of `steps` (1 to 10) times a power of ten that is at most `limit`.
-
-    The result is 1 if `limit` is not positive or not finite.
-    """
+    """Return the largest of `steps` (1 to 10) times a power of ten ≤ `limit`; 1 without one."""
     if not (math.isfinite(limit) and limit > 0):
         return 1.0
     power = 10.0 ** math.floor(math.log10(limit))
@@ -281,16 +265,17 @@ def pose_numbers(names: Sequence[str]) -> Ints:
 
 
 def _revision(c: Chapter, e: FullPrediction, residual: Floats, measured: Floats) -> StoryRevision:
-    d, named = c.diagnosis, f"Model: {model_name(c.fit.model.named)}."
+    d, judged, drawn = c.diagnosis, UNDIAGNOSED, None
     changed = change(c.added, c.removed, c.fit.readings.arm_scatter is not None)
-    judged = UNDIAGNOSED if d is None else d.verdict
-    drawn = None if d is None else follows(d)
     verdict: list[Block] = [f"{UNDIAGNOSED.capitalize()}: run hilcal diagnose for a verdict."]
     details: list[Block] = [misses(c.fit)]
     if d is not None:
-        verdict = [message(d)]
-        verdict += [suspects_table(d, MOST_SUSPECTS)] if d.significant else []
-        details = list(diagnosis_report(d))
+        judged, drawn = d.verdict, follows(d)
+        verdict = [
+            message(d),
+            *([diagnosis.suspects_table(d, MOST_SUSPECTS)] if d.significant else []),
+        ]
+        details = list(diagnosis.diagnosis_report(d))
         if drawn is not None:
             details.append(f"Drawn: {drawn.y_label} against {drawn.x_label}. {drawn.says}")
     return StoryRevision(
@@ -302,9 +287,9 @@ def _revision(c: Chapter, e: FullPrediction, residual: Floats, measured: Floats)
         whitened_norm2=mahalanobis2(e.raw[:, :3], e.whitening.covariance[:, :3, :3]),
         error=c.fit.error,
         holdout=c.fit.holdout,
-        cells=revision_cells(c.number, changed, c.fit, judged),
+        cells=diagnosis.revision_cells(c.number, changed, c.fit, judged),
         panels={
-            "verdict": (*verdict, named),
+            "verdict": (*verdict, f"Model: {model_name(c.fit.model.named)}."),
             "details": (*details, errors(c.fit)),
             "parameters": tuple(parameters(c.fit, MOST_PARAMETERS)),
         },
@@ -320,7 +305,7 @@ def follows(d: Diagnosis) -> DependenceCurve | None:
     carried = [v for v in d.dependences if v.share >= LEAST_CARRIED and v.determined]
     if carried and d.verdict != "adequate" and not explained:
         return curve(carried[0])
-    suspects = [] if d.lead is None else shown_suspects(d)
+    suspects = [] if d.lead is None else diagnosis.shown_suspects(d)
     return regressor(d.fit, suspects[0]) if suspects else None
 
 
@@ -330,7 +315,7 @@ def laws(fit: Fit) -> tuple[DependenceCurve, ...]:
     for law in drawn_laws(fit):
         values = ", ".join(
             f"{p.name.partition('.')[2]} = "
-            + coefficient(Coefficient(p.name, p.value, p.std or 0.0, p.unit))
+            + diagnosis.coefficient(Coefficient(p.name, p.value, p.std or 0.0, p.unit))
             for p in fit.parameters
             if p.name.startswith(f"{law.name}.") and p.value is not None
         )
@@ -356,14 +341,13 @@ def curve(d: Dependence) -> DependenceCurve:
     y_unit, y_factor = numbers.unit_for(d.y_unit, list(d.y))
     says = f"{numbers.percent(d.share)} of the misfit on poses left out follows {d.variable}."
     over = f"{d.variable} [{x_unit}]" if x_unit else d.variable
-    error, x, y = f"error of {moves(d)} [{y_unit}]", x_factor * d.x, y_factor * d.y
+    error, x, y = f"error of {diagnosis.moves(d)} [{y_unit}]", x_factor * d.x, y_factor * d.y
     return DependenceCurve(d.variable, says, x, y, over, error, y_factor * d.error, d.labels)
 
 
 def regressor(fit: Fit, suspect: Suspect) -> DependenceCurve | None:
     """Return the added-variable curve of a suspect; None where `added_variable` is."""
-    added = added_variable(fit, suspect)
-    if added is None:
+    if (added := added_variable(fit, suspect)) is None:
         return None
     says = f"Where {suspect.effect} is right, the readings lie on the line of slope 1."
     x, y = (1e6 * v for v in added)

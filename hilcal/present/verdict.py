@@ -7,7 +7,7 @@ from hilcal.calibration.scatter import ScatterSource
 from hilcal.diagnosis.background_evidence import LIKELY
 from hilcal.diagnosis.diagnosis import Diagnosis, Verdict
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE, Suspect
-from hilcal.diagnosis.evidence import Alternative, Separability
+from hilcal.diagnosis.evidence import Separability
 from hilcal.diagnosis.noise import (
     INDUSTRIAL,
     RP_PER_RMS,
@@ -22,8 +22,7 @@ from hilcal.numbers import few, length, p_equals, percent, sizes
 from hilcal.readings.readings import ArmScatter, SerialNoise
 from hilcal.robot.arm import Arm
 
-MOST_LIKELY, MOST_HIDDEN = 4, 4
-"""Most effects of a background, and most undetectable effects, that the message names."""
+MOST_LIKELY, MOST_HIDDEN = 4, 4  # effects of a background, and undetectable ones, that are named
 HEADLINES: Mapping[Verdict, str] = {
     "adequate": "adequate: the residual is noise",
     "missing_effect": "an effect is missing",
@@ -51,8 +50,10 @@ def message(d: Diagnosis) -> str:
 
 
 def _verdict(d: Diagnosis) -> list[str]:
-    if d.wrong_figures:
-        return _wrong_figures(d.wrong_figures)
+    if d.wrong_figures:  # each alone explains the misfit
+        first, *alternatives = map(_wrong_figure, d.wrong_figures)
+        others = (f"Or else {figure}." for figure in alternatives)
+        return [numbers.sentence(first), *others, "Until that is settled no effect is looked for."]
     if d.reason == "readings_disagree":
         return [numbers.sentence(disagreement_words(d.fit))]
     of_reason = {
@@ -73,20 +74,15 @@ def _verdict(d: Diagnosis) -> list[str]:
         factor = f"variance factor {d.fit.variance_factor:.2f}"
         adequate = [f"Residuals are what the noise explains: {factor}.", *_nothing_missing(d)]
         adequate += _misstated_noise(d.pure_error)
-    doubts = [_alternative(a) for a in d.alternatives if a.inseparable]
     if d.reason != "inseparable_addition":
         return adequate
+    doubts = []
+    for a in d.alternatives:
+        if a.inseparable:
+            several = len(a.others) > 1 and a.as_good
+            names = [*a.same_as, *[f"{numbers.names(a.others)} together"] * several]
+            doubts.append(f"{a.effect} could as well be {', or '.join(names)}")
     return [*adequate, f"But {'; '.join(doubts)}. Measure what separates them."]
-
-
-def _wrong_figures(figures: tuple[WrongFigure, ...]) -> list[str]:
-    """Return sentences on figures of the cell that may be wrong; each alone explains the misfit."""
-    first, *alternatives = map(_wrong_figure, figures)
-    return [
-        numbers.sentence(first),
-        *(f"Or else {figure}." for figure in alternatives),
-        "Until that is settled no effect is looked for.",
-    ]
 
 
 def _wrong_figure(f: WrongFigure) -> str:
@@ -112,7 +108,6 @@ def _wrong_figure(f: WrongFigure) -> str:
 
 
 def _nothing_missing(d: Diagnosis) -> list[str]:
-    """Return sentences that no effect is missing, of those detectable at a plausible size."""
     if d.fit.mode == "deflection":
         return [
             "No effect that deflections show is missing.",
@@ -125,7 +120,6 @@ def _nothing_missing(d: Diagnosis) -> list[str]:
 
 
 def _background(d: Diagnosis) -> list[str]:
-    """Return sentences on the likely effects of the background, and on what to measure."""
     likely = [b for b in d.background if b.p_value < LIKELY][:MOST_LIKELY]
     names = ", ".join(f"{b.effect} ({p_equals(b.p_value)})" for b in likely)
     noise = []
@@ -146,10 +140,8 @@ def _one_suspect(d: Diagnosis) -> list[str]:
     s = d.suspects[0]
     if not s.coarse:
         return [f"{s.effect} is missing: it {_explains(s)}."]
-    return [
-        f"Let joints differ: {s.effect} {_explains(s)}.",
-        f"The model has one {s.coarse} for several joints.",
-    ]
+    coarse = f"The model has one {s.coarse} for several joints."
+    return [f"Let joints differ: {s.effect} {_explains(s)}.", coarse]
 
 
 def _explains(s: Suspect) -> str:
@@ -190,12 +182,6 @@ def _separable(r: Separability) -> str:
     if r.times <= 1.0:
         return r.effect
     return f"{r.effect} ({r.times:.2g} times as many readings like these would)"
-
-
-def _alternative(a: Alternative) -> str:
-    """Return a clause on the effects that could replace one of the model."""
-    several = [f"{numbers.names(a.others)} together"] if len(a.others) > 1 and a.as_good else []
-    return f"{a.effect} could as well be {', or '.join((*a.same_as, *several))}"
 
 
 def _insufficient(d: Diagnosis) -> list[str]:
@@ -265,11 +251,20 @@ def _pose_alone(d: Diagnosis) -> list[str]:
 def _misjudged(d: Diagnosis) -> list[str]:
     assert d.noise is not None  # noqa: S101  (by the reason)
     repeats = d.pure_error
-    if d.scatter is not None and d.fit.readings.arm_scatter is None:
-        return [
-            f"Residuals are {_spread(d)} and nothing predicts them.",
-            *_no_repeatability(d.scatter, d.fit.model.cell.arm),
-        ]
+    unpredicted = f"Residuals are {_spread(d)} and nothing predicts them."
+    if (s := d.scatter) is not None and d.fit.readings.arm_scatter is None:
+        why = (
+            f"The arm would have to scatter by {length(s.size_m)} rms"
+            f"{_rp_comparison(s, d.fit.model.cell.arm)}, more than an arm's repeatability: the "
+            "instrument is noisier than stated, or the arm or the target was loose."
+        )
+        if instrument_instead(s):
+            why = (
+                f"They are as if the instrument were {s.instrument_factor:.2g} times as noisy as "
+                "stated, and not as if the arm scattered: mend the stated noise, or repeat some "
+                "readings to be sure."
+            )
+        return [unpredicted, why]
     if d.noise.reason == "repeats" and repeats is not None:
         compared = "less" if d.fit.variance_factor < 1 else "more"
         return [
@@ -286,7 +281,7 @@ def _misjudged(d: Diagnosis) -> list[str]:
         ]
     few = "Without repeated readings" if repeats is None else "With so few repeated readings"
     return [
-        f"Residuals are {_spread(d)} and nothing predicts them.",
+        unpredicted,
         f"{few} it cannot be known whether the noise is larger than stated: repeat some readings.",
     ]
 
@@ -297,27 +292,21 @@ def _spread(d: Diagnosis) -> str:
 
 
 def _repeats_scatter_less(noise: NoiseVerdict | None, repeats: PureError | None) -> list[str]:
-    """Return a sentence if the repeats scatter less than the residuals."""
     if noise is None or noise.reason != "lack_of_fit" or repeats is None:
         return []
     return [f"Repeated readings scatter only {repeats.factor**0.5:.2g} times what is stated."]
 
 
 def _misstated_noise(repeats: PureError | None) -> list[str]:
-    """Return a sentence on where the noise differs most from the stated one."""
-    if repeats is None or repeats.where is None:
+    if repeats is None or (w := repeats.where) is None:
         return []
-    w = repeats.where
     under = "of unloaded readings" if w.name == "unloaded" else f"under {w.name}"
     place = {"axis": w.name, "joint": f"along the motion of {w.name}"}.get(w.kind, under)
-    return [
-        f"The noise differs most {place}: the repeats scatter {w.factor**0.5:.2g} times as much "
-        "there as stated."
-    ]
+    times = f"{w.factor**0.5:.2g} times as much there as stated"
+    return [f"The noise differs most {place}: the repeats scatter {times}."]
 
 
 def _arm_scatter(d: Diagnosis) -> list[str]:
-    """Return sentences that the rest is the arm's repeatability, and that no effect is missing."""
     s = d.scatter
     assert s is not None  # noqa: S101  (by the reason)
     predicted = "Nothing recorded predicts it (0 % on poses left out)."
@@ -330,15 +319,10 @@ def _arm_scatter(d: Diagnosis) -> list[str]:
         )
     doubt = []
     if not separated(s):
-        doubt = [
-            "These readings cannot separate it from an instrument "
-            f"{s.instrument_factor:.2g} times as noisy as stated."
-        ]
-    if (
-        d.fit.readings.arm_scatter is not None
-        and d.noise is not None
-        and d.noise.reason == "too_large"
-    ):
+        noisy = f"an instrument {s.instrument_factor:.2g} times as noisy as stated"
+        doubt = [f"These readings cannot separate it from {noisy}."]
+    too_large = d.noise is not None and d.noise.reason == "too_large"
+    if d.fit.readings.arm_scatter is not None and too_large:
         doubt += [
             f"With it the residuals are {d.fit.variance_factor**0.5:.2g} times the noise: the "
             "instrument's is stated too large in some of its elements."
@@ -353,21 +337,6 @@ def _arm_scatter(d: Diagnosis) -> list[str]:
     ]
 
 
-def _no_repeatability(s: ArmScatter, arm: Arm) -> list[str]:
-    """Return a sentence on why the scatter is not the arm's repeatability."""
-    if instrument_instead(s):
-        return [
-            f"They are as if the instrument were {s.instrument_factor:.2g} times as noisy as "
-            "stated, and not as if the arm scattered: mend the stated noise, or repeat some "
-            "readings to be sure."
-        ]
-    return [
-        f"The arm would have to scatter by {length(s.size_m)} rms{_rp_comparison(s, arm)}, more "
-        "than an arm's repeatability: the instrument is noisier than stated, or the arm or the "
-        "target was loose."
-    ]
-
-
 def sigmas(s: ArmScatter) -> str:
     """Return the standard deviations of the arm's scatter with their uncertainties."""
     pairs = [numbers.with_std(1e6 * v, 1e6 * e) for v, e in zip(s.std, s.std_error, strict=True)]
@@ -375,11 +344,8 @@ def sigmas(s: ArmScatter) -> str:
         return f"the target scatters by σ = {' ± '.join(pairs[0])} µm along each axis"
     if s.kind == "joints":
         return f"each joint scatters by σ_q = {' ± '.join(pairs[0])} µrad"
-    clear = ", ".join(
-        f"joint {j + 1} {' ± '.join(pair)}"
-        for j, pair in enumerate(pairs)
-        if s.std[j] > s.std_error[j]
-    )
+    told = [j for j in range(len(pairs)) if s.std[j] > s.std_error[j]]
+    clear = ", ".join(f"joint {j + 1} {' ± '.join(pairs[j])}" for j in told)
     return f"the joints scatter by σ_q [µrad] = {clear}, the others by less than can be told"
 
 

@@ -1,53 +1,39 @@
-"""The cards of the page: verdict, misfit, suspects, revisions, cell, next plan."""
+"""The cards of the page: verdict, misfit, suspects, revisions, cell, next plan; their elements."""
 
 from __future__ import annotations
 
+import html
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from nicegui import background_tasks, run, ui
-from nicegui.events import GenericEventArguments, TableSelectionEventArguments
+import plotly.graph_objects as go
+from nicegui import background_tasks, events, run, ui
 
 from hilcal import numbers
 from hilcal.diagnosis.recorded import Difference
+from hilcal.names import escaped
 from hilcal.present import charts
 from hilcal.present.campaign import left_out_m, model_words, two_revisions, verdict_of
 from hilcal.present.diagnosis import shown_suspects, suspects_table
-from hilcal.present.document import load_name
+from hilcal.present.document import Table, load_name, says
 from hilcal.present.document import table as block
 from hilcal.present.fit import follows, misses, model_name
 from hilcal.present.plan import power_rows, powers_summary
 from hilcal.present.story import laws as curves_of_laws
 from hilcal.present.verdict import headline, message
 from hilcal.store.plan import UNLOADED
-from hilcal.store.revision import RevisionRecord
-from hilcal.workbench.elements import (
-    answer,
-    button,
-    chart,
-    drawn,
-    number,
-    plain,
-    point,
-    soft,
-    title,
-)
-from hilcal.workbench.session import Snapshot
+from hilcal.workbench.session import Snapshot, Work
 
 if TYPE_CHECKING:
     from hilcal.workbench.page import View
 
-FURTHEST = 8
-FURTHEST_SHARE = 0.05
-"""Share of the readings that counts as furthest off; a choice."""
+FURTHEST, FURTHEST_SHARE = 8, 0.05  # least number, and share, of readings "furthest off"; choices
 DIFFERENCES = 4
 DOWNLOADS = {"report": "Report", "calibration": "Calibration", "table": "Table of readings"}
-NONE_PASSES = "No effect passes the tests by itself; what that means, the verdict says."
-"""This text does not say whether an effect is missing; only the verdict does."""
 
 
 def waiting(view: View) -> None:
@@ -63,7 +49,6 @@ def waiting(view: View) -> None:
 
 @contextmanager
 def _part(name: str = "") -> Iterator[ui.column]:
-    """Open a card with a title, if any."""
     with ui.column().classes("part") as column:
         if name:
             title(name)
@@ -72,10 +57,10 @@ def _part(name: str = "") -> Iterator[ui.column]:
 
 def snapshot(view: View, d: Snapshot) -> None:
     """Draw all cards."""
-    kind = "deflections" if d.fit.mode == "deflection" else "absolute readings"
+    kind, arm = "deflections" if d.fit.mode == "deflection" else "absolute readings", d.story.arm
     with ui.row().classes("items-baseline").style("gap: 4px 16px; padding-top: 16px"):
-        ui.html(f"<h1 class='verdict'>{plain(d.name)}</h1>", sanitize=False)
-        soft(f"{d.arm} · {d.n_readings} readings, judged as {kind} · from {d.source}")
+        ui.html(f"<h1 class='verdict'>{plain(view.session.path.name)}</h1>", sanitize=False)
+        soft(f"{arm.name} · {d.n_readings} readings, judged as {kind} · from {d.source}")
     _verdict(view, d)
     with ui.element("div").classes("two"):
         _fails(view, d)
@@ -110,7 +95,6 @@ def snapshot(view: View, d: Snapshot) -> None:
 
 
 def _verdict(view: View, d: Snapshot) -> None:
-    """Draw the verdict, the errors, and the effects of the model with buttons to remove them."""
     judged, fit = d.diagnosis, d.fit
     kind, mark = ("good", "✓") if judged.verdict == "adequate" else ("bad", "!")
     with _part() as part:
@@ -120,11 +104,14 @@ def _verdict(view: View, d: Snapshot) -> None:
         ui.label(message(judged))
         low, high = fit.variance_factor_interval
         with ui.element("div").classes("numbers"):
-            number("error on poses left out", numbers.length(fit.holdout.rms_m))
-            number("error on fitted poses", numbers.length(fit.error.rms_m))
-            number("noise alone would leave", numbers.length(d.story.noise_floor_m))
-            interval = f"95 %: {low:.2f} to {high:.2f}"
-            number(f"variance factor, {interval}", f"{fit.variance_factor:.2f}")
+            for name, value in (
+                ("error on poses left out", numbers.length(fit.holdout.rms_m)),
+                ("error on fitted poses", numbers.length(fit.error.rms_m)),
+                ("noise alone would leave", numbers.length(d.story.noise_floor_m)),
+                (f"variance factor, 95 %: {low:.2f} to {high:.2f}", f"{fit.variance_factor:.2f}"),
+            ):
+                text = f"<b>{plain(value)}</b><span>{plain(name)}</span>"
+                ui.html(text, sanitize=False).classes("number")
         name = "Baseline, not kept yet" if d.number is None else f"Revision {d.number}"
         with ui.row().classes("items-center").style("gap: 6px 10px"):
             soft(f"{name}: {model_name(fit.model.named)}")
@@ -134,7 +121,6 @@ def _verdict(view: View, d: Snapshot) -> None:
 
 
 def _fails(view: View, d: Snapshot) -> None:
-    """Draw the variables that the misfit follows."""
     with _part("Where it fails"):
         if d.diagnosis.residual_is_noise:
             soft("Nowhere beyond the noise: what is left is what it explains.")
@@ -142,7 +128,7 @@ def _fails(view: View, d: Snapshot) -> None:
         soft(follows(d.diagnosis.misfit_breakdown))
         names = [v.variable for v in d.diagnosis.misfit_breakdown]
 
-        def clicked(e: GenericEventArguments) -> None:
+        def clicked(e: events.GenericEventArguments) -> None:
             if (name := str(point(e).get("y", ""))) in names:
                 view.pick_variable(name)
 
@@ -152,11 +138,25 @@ def _fails(view: View, d: Snapshot) -> None:
 
 
 def _missing(view: View, d: Snapshot) -> None:
-    """Draw the ranked missing effects."""
     rows = shown_suspects(d.diagnosis) if d.diagnosis.significant else []
     with _part("What is missing"):
         if rows:
-            _suspects(view, d)
+            shown = suspects_table(d.diagnosis)  # the last column is a sentence below
+            shown = replace(shown, heads=shown.heads[:4], rows=[row[:4] for row in shown.rows])
+            table = drawn(shown, selection="single")
+            table.props("hide-selected-banner data-part=missing").classes("choice")
+            table.selected = [row for row in table.rows if row["0"] == view.tab.suspect]
+
+            def clicked(e: events.GenericEventArguments) -> None:
+                table.selected = [e.args[1]]
+                view.choose(e.args[1]["0"])
+
+            def ticked(e: events.TableSelectionEventArguments) -> None:
+                for row in e.selection:
+                    view.choose(row["0"])
+
+            table.on("row-click", clicked)
+            table.on_select(ticked)
             if same := rows[0].same_as if rows[0].passes else ():
                 soft(f"These readings do not separate {rows[0].effect} from {numbers.few(same)}.")
             soft(
@@ -164,12 +164,12 @@ def _missing(view: View, d: Snapshot) -> None:
                 "that much if it were not there."
             )
         else:
-            soft(NONE_PASSES)
+            # whether an effect is missing, only the verdict says
+            soft("No effect passes the tests by itself; what that means, the verdict says.")
         effects, view.adder = [s.effect for s in d.diagnosis.suspects], None
         if effects:
             kind = "unelevated" if rows else "outline"
-            text = f"Add {view.tab.suspect}"
-            view.adder = button(view, text, view.add, f"{kind} data-part=add")
+            view.adder = button(view, f"Add {view.tab.suspect}", view.add, f"{kind} data-part=add")
             view.adder.set_visibility(view.tab.suspect is not None)
         answer(view, "missing")
         if effects:
@@ -179,26 +179,6 @@ def _missing(view: View, d: Snapshot) -> None:
                 value=view.tab.suspect,
                 on_change=lambda e: view.choose(e.value),
             ).props("dense outlined options-dense").style("width: 100%")
-
-
-def _suspects(view: View, d: Snapshot) -> None:
-    """Draw the table of suspects; a click chooses one."""
-    suspects = suspects_table(d.diagnosis)  # without the last column: a sentence below has it
-    suspects = replace(suspects, heads=suspects.heads[:4], rows=[row[:4] for row in suspects.rows])
-    table = drawn(suspects, selection="single")
-    table.props("hide-selected-banner data-part=missing").classes("choice")
-    table.selected = [row for row in table.rows if row["0"] == view.tab.suspect]
-
-    def clicked(e: GenericEventArguments) -> None:
-        table.selected = [e.args[1]]
-        view.choose(e.args[1]["0"])
-
-    def ticked(e: TableSelectionEventArguments) -> None:
-        for row in e.selection:
-            view.choose(row["0"])
-
-    table.on("row-click", clicked)
-    table.on_select(ticked)
 
 
 def evidence(view: View, d: Snapshot) -> None:
@@ -244,9 +224,8 @@ def readings(view: View, d: Snapshot) -> None:
         return
     ui.label(f"{view.tab.picked_title}:").style("font-weight: 500")
     clear = [difference(x) for x in view.session.differences(d, np.array(picked)) if x.clear]
-    text = "Nothing recorded sets them apart from the others."
-    if clear:
-        text = f"What sets them apart: {'; '.join(clear[:DIFFERENCES])}."
+    apart = f"What sets them apart: {'; '.join(clear[:DIFFERENCES])}."
+    text = apart if clear else "Nothing recorded sets them apart from the others."
     ui.label(text).props("data-part=differences")
     sigma, size = d.revision.sigma, d.revision.size_m
     rows = block("pose", "load", "error", "in noise", left=(0, 1, 2, 3))
@@ -277,34 +256,29 @@ def furthest(d: Snapshot) -> list[int]:
 
 
 def _revisions(view: View, d: Snapshot) -> None:
-    """Draw all revisions, with buttons to look at them and to go back to them."""
     with _part("Revisions"):
         if not d.records:
             soft("None yet: the baseline is kept when something is added to it.")
-        for record in reversed(d.records):
-            _one_revision(view, d, record)
+        for r in reversed(d.records):
+            marks = ["shown"] * (r.number == d.number)
+            marks += ["used by every command"] * (r.number == d.in_use)
+            with ui.element("div").classes("line").props(f"data-revision={r.number}"):
+                with ui.column().style("gap: 0"):
+                    ui.label(f"{r.number}: {model_words(r)}").style("font-weight: 500")
+                    error = f"{numbers.length(left_out_m(r))} on poses left out"
+                    soft(" · ".join([error, verdict_of(r), *marks]))
+                if r.number != d.number:
+                    button(view, "Look", partial(view.show, r.number), "flat dense")
+                if r.number not in (d.number, d.in_use) or d.number != d.in_use:
+                    text = "Go back to it" if r.number != d.number else "Use it"
+                    button(view, text, partial(view.go_back, r.number), "outline dense")
         if d.accepted is not None:
             soft(f"Revision {d.accepted} is accepted: every command uses it.")
         answer(view, "revisions")
         soft("Revisions are only appended: nothing that was tried is lost.")
 
 
-def _one_revision(view: View, d: Snapshot, r: RevisionRecord) -> None:
-    marks = ["shown"] * (r.number == d.number) + ["used by every command"] * (r.number == d.in_use)
-    with ui.element("div").classes("line").props(f"data-revision={r.number}"):
-        with ui.column().style("gap: 0"):
-            ui.label(f"{r.number}: {model_words(r)}").style("font-weight: 500")
-            error = f"{numbers.length(left_out_m(r))} on poses left out"
-            soft(" · ".join([error, verdict_of(r), *marks]))
-        if r.number != d.number:
-            button(view, "Look", partial(view.show, r.number), "flat dense")
-        if r.number not in (d.number, d.in_use) or d.number != d.in_use:
-            text = "Go back to it" if r.number != d.number else "Use it"
-            button(view, text, partial(view.go_back, r.number), "outline dense")
-
-
 def _side_by_side(view: View, d: Snapshot) -> None:
-    """Draw two revisions side by side."""
     with _part("Two revisions side by side"):
         if len(d.records) < 2:
             soft("There are two to compare once something was added, removed or changed.")
@@ -337,7 +311,6 @@ def _side_by_side(view: View, d: Snapshot) -> None:
 
 
 def _laws(view: View, d: Snapshot) -> None:
-    """Draw the laws of the model that the catalogue lacks."""
     if not (curves := curves_of_laws(d.fit)):
         return
     with _part("Laws beyond the catalogue"):
@@ -361,8 +334,8 @@ def viewer(view: View, d: Snapshot) -> None:
 def _cell(view: View, d: Snapshot) -> None:
     """Draw the values of the cell that can be changed; typed values stay until they are used."""
 
-    def keep(key: tuple[str, str], field: ui.input) -> Callable[[], None]:
-        return lambda: view.tab.texts.update({key: field.value or ""})
+    def keep(key: tuple[str, str], e: events.ValueChangeEventArguments[Any]) -> None:
+        view.tab.texts[key] = e.value or ""
 
     with _part("Noise and cell"):
         soft(
@@ -380,13 +353,12 @@ def _cell(view: View, d: Snapshot) -> None:
                     value = view.tab.texts.get(key, f.text)
                     field = ui.input(f"[{f.section}] {f.key}", value=value).props("dense outlined")
                     field.props["hint"] = f.valid
-                    field.on_value_change(keep(key, field))
+                    field.on_value_change(partial(keep, key))
         button(view, "Fit with these values", view.change_cell, "unelevated data-part=change")
         answer(view, "cell")
 
 
 def _next_measurement(view: View, d: Snapshot) -> None:
-    """Draw the form that plans the next measurement."""
     with _part("Measure next"):
         soft("Plan the poses and loads that tell apart what these readings leave open.")
         with ui.row().classes("items-center").style("gap: 12px; width: 100%"):
@@ -411,10 +383,88 @@ def planned(view: View, d: Snapshot) -> None:
         return
     next_, path = view.session.planned
     summary, powers = next_.made.summary, next_.found.powers
-    sentence = powers_summary(powers, summary.poses, summary.readings)
-    ui.label(sentence).props("data-part=planned")
+    ui.label(powers_summary(powers, summary.poses, summary.readings)).props("data-part=planned")
     for effect, rival, power_now, power_then in power_rows(powers):
         soft(f"If {effect} is there, {rival} is ruled out: {power_now} now, {power_then} then.")
     ui.label(f"The plan is in {path.name}. Measure it into the same campaign with:")
     ui.label(view.session.run_line()).classes("code")
     soft("Then read the file again here.")
+
+
+class Status:
+    """The strip that shows the current task and the state of the file."""
+
+    def __init__(self, view: View) -> None:
+        with ui.column().classes("strip").style("gap: 0"):
+            rows = [ui.row().classes("bench items-center").style("gap: 12px") for _ in range(3)]
+        self.busy, self.answered, self.stale = rows
+        with self.busy.classes("no-wrap"):
+            ui.spinner(size="1.3em")
+            self.doing = ui.label().classes("soft").props("aria-live=polite")
+        with self.answered:
+            self.message = ui.label().classes("answer").props("role=alert data-answer=file")
+            self.refit = button(view, "Fit anew to all readings", view.fit_anew, "outline dense")
+        with self.stale:
+            ui.label("Another command has changed the file.").classes("bad")
+            button(view, "Read it again", view.again, "outline dense")
+        for row in rows:
+            row.set_visibility(False)
+
+    def show(self, work: Work) -> None:
+        """Show the current task, or the answer of the last one."""
+        line = work.line
+        self.busy.set_visibility(bool(line))
+        self.doing.set_text(f"{line} …")
+        self.answered.set_visibility("file" in work.answers and not line)
+        self.refit.set_visibility("readings were appended" in work.failure())
+
+
+def answer(view: View, place: str) -> None:
+    """Draw the label for progress and answer of the buttons above."""
+    view.answers[place] = ui.label().classes("answer").props(f"role=status data-answer={place}")
+
+
+def title(text: str) -> None:
+    """Draw the title of a part."""
+    ui.html(f"<h2>{plain(text)}</h2>", sanitize=False)
+
+
+def soft(text: str) -> ui.label:
+    """Draw an explanation."""
+    return ui.label(text).classes("soft")
+
+
+def drawn(table: Table, selection: Literal["single"] | None = None) -> ui.table:
+    """Draw a table of a document; the keys of a row are the numbers of the columns."""
+    columns = []
+    for k, head in enumerate(table.heads):
+        side = "left" if k in table.left else "right"
+        columns.append({"name": str(k), "label": head, "field": str(k), "align": side})
+    rows = [{"at": i, **{str(k): x for k, x in enumerate(r)}} for i, r in enumerate(table.rows)]
+    element = ui.table(columns=columns, rows=rows, row_key="at", selection=selection)
+    return element.props("flat dense").style("width: 100%")
+
+
+def button(view: View, text: str, act: Callable[[], object], props: str) -> ui.button:
+    """Draw a button that is disabled during a task."""
+    color = None if "outline" in props or "flat" in props else "primary"
+    element = ui.button(text, on_click=act, color=color).props(f"no-caps {props}")
+    return element.bind_enabled_from(view.work, "task", backward=lambda task: task is None)
+
+
+def chart(view: View, figure: go.Figure) -> ui.plotly:
+    """Draw a chart in the page's scheme, with its sentence for screen readers."""
+    content = charts.in_scheme(figure, view.tab.dark).to_plotly_json()
+    element = ui.plotly({**content, "config": charts.CONFIG}).classes("chart")
+    element.props["role"], element.props["aria-label"] = "img", says(figure)
+    return element
+
+
+def point(e: events.GenericEventArguments) -> dict[str, Any]:
+    """Return the clicked point of a chart, as plotly.js describes it."""
+    return dict((e.args.get("points") or [{}])[0])
+
+
+def plain(text: str) -> str:
+    """Return a text escaped for HTML."""
+    return html.escape(escaped(text))

@@ -131,7 +131,6 @@ class AccessGuard:
         return cookie is not None and _same(cookie.value, self._secret)
 
     def _has_token(self, scope: Scope) -> bool:
-        """Return whether a request for the page has the token."""
         if scope["type"] != "http" or (scope["method"], scope["path"]) != ("GET", "/"):
             return False
         tokens = parse_qs(scope["query_string"].decode("latin-1")).get(TOKEN, [""])
@@ -161,7 +160,6 @@ class AccessGuard:
 
 
 def _heads(scope: Scope, name: bytes) -> list[str]:
-    """Return all headers of a name."""
     return [value.decode("latin-1") for key, value in scope["headers"] if key.lower() == name]
 
 

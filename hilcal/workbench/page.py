@@ -13,11 +13,9 @@ from nicegui import ui
 from hilcal import numbers
 from hilcal.present.campaign import refitted
 from hilcal.present.diagnosis import addition_lines, fell, rose
+from hilcal.present.progress import Say
 from hilcal.workbench import cards
-from hilcal.workbench.elements import Status
-from hilcal.workbench.session import Snapshot, WorkbenchSession
-from hilcal.workbench.viewer import WebViewer
-from hilcal.workbench.work import Answer, Say, Work
+from hilcal.workbench.session import Answer, Snapshot, WorkbenchSession
 
 TICK, LOOK = 0.2, 2.0  # intervals at which a tab checks the session and the file for changes, s
 CSS = Path(__file__).with_name("page.css")
@@ -42,23 +40,12 @@ class Tab:
     viewer: str = ""  # address of the 3-D view; empty before it was opened
 
 
-@dataclass
-class TabsShared:
-    """State that all tabs share."""
-
-    session: WorkbenchSession
-    work: Work = field(default_factory=Work)
-    viewer: WebViewer = field(default_factory=WebViewer)
-    drawing: tuple[Snapshot, tuple[str, ...]] | None = None
-
-
 def install(app: FastAPI, session: WorkbenchSession) -> None:
     """Add page and 3-D viewer to an application, and start to read the file."""
-    shared = TabsShared(session)
 
     @app.get("/viewer/{name:path}")
     def viewer(name: str) -> Response:
-        file = shared.viewer.file(name)
+        file = session.viewer.file(name)
         if file is None:
             return PlainTextResponse("nothing here\n", status_code=404)
         content, kind = file
@@ -66,37 +53,37 @@ def install(app: FastAPI, session: WorkbenchSession) -> None:
 
     @ui.page("/")
     async def page(request: Request) -> None:
-        view = View(shared, str(request.base_url))
+        view = View(session, str(request.base_url))
         view.build()
         await ui.context.client.connected()
         view.begin(dark=bool(await ui.run_javascript(DARK, timeout=5.0)))
 
-    bench.on_startup(lambda: read_file(shared))
+    bench.on_startup(lambda: read_file(session))
 
 
-def read_file(shared: TabsShared) -> None:
+def read_file(session: WorkbenchSession) -> None:
     """Start to read the file."""
+    name = session.path.name
 
     def read(say: Say) -> str:
-        again = shared.session.snapshot is not None
-        name = shared.session.load(say).name
+        again = session.snapshot is not None
+        session.load(say)
         return f"{name} was read again." if again else ""
 
-    shared.work.start(f"Reading {shared.session.path.name}", read)
+    session.work.start(f"Reading {name}", read)
 
 
 class View:
     """One tab of the page."""
 
-    def __init__(self, shared: TabsShared, address: str) -> None:
+    def __init__(self, session: WorkbenchSession, address: str) -> None:
         """Create an empty tab; `address` is this server's, as the browser calls it."""
-        self.shared, self.session, self.work = shared, shared.session, shared.work
+        self.session, self.work = session, session.work
         self.address, self.tab = address, Tab()
         self.places: dict[str, ui.column] = {}  # of the parts in `REDRAWN`
         self.adder: ui.button | None = None
         self.answers: dict[str, ui.label] = {}
-        self._drawn = -1, False
-        self._ready = False
+        self._drawn, self._ready = (-1, False), False
         self._file: tuple[str, bytes] | None = None
         self._planned: object = None
 
@@ -105,7 +92,7 @@ class View:
         ui.colors(primary="#1f6f9f", positive="#00785a", negative="#c0274b", warning="#8a5a00")
         ui.add_css(CSS)
         ui.add_body_html(f"<script>{SCRIPT.read_text(encoding='utf-8')}</script>")
-        self.status = Status(self)
+        self.status = cards.Status(self)
         self.body, self.places["viewer"] = (ui.column().classes("bench") for _ in range(2))
         ui.timer(TICK, self.tick)
         ui.timer(LOOK, self.look)
@@ -131,11 +118,10 @@ class View:
         self._drawn = state
         if self.session.planned is not self._planned:
             self.redraw("planned")
-        drawing = self.shared.drawing
         pending = self.tab.viewer_requested and not self.tab.viewer
-        if pending and drawing is not None and drawing[0] is self.tab.snapshot:
+        if pending and self._recorded:
             folder = f"{self.address}viewer/"
-            files = "".join(f"&url={folder}{name}" for name in drawing[1])
+            files = "".join(f"&url={folder}{name}" for name in self.session.viewer.recorded)
             self.tab.viewer = f"{folder}?persist=0&notebook=0&theme=dark{files}"
             self.redraw("viewer")
 
@@ -197,10 +183,9 @@ class View:
             act(snapshot, effect, say)
             if (c := self.session.changed) is None:
                 return ""
-            sentence = fell if c.added else rose
-            lines = [sentence(c.before, c.fit, c.added or c.removed or "")]
-            lines.append(f"It is revision {c.number}.")
-            return " ".join(lines + ([] if c.expected is None else [*addition_lines(c.expected)]))
+            error = (fell if c.added else rose)(c.before, c.fit, c.added or c.removed or "")
+            warnings = () if c.expected is None else addition_lines(c.expected)
+            return " ".join([error, f"It is revision {c.number}.", *warnings])
 
         self._do(place, f"{verb} {effect}", do)
 
@@ -232,7 +217,7 @@ class View:
 
     def again(self) -> None:
         """Read the file again."""
-        read_file(self.shared)
+        read_file(self.session)
 
     def fit_anew(self) -> None:
         """Fit the model of the revision in use to all readings."""
@@ -270,23 +255,27 @@ class View:
         """Plan the next measurements."""
         output = self.session.path.parent / Path(file).name
         count = None if poses is None else int(poses)
-        self._do(
-            "next",
-            "Planning the next measurements",
-            lambda snapshot, say: self.session.plan(snapshot, count, output, say, quick=quick),
-        )
+
+        def act(snapshot: Snapshot, say: Say) -> None:
+            self.session.plan(snapshot, count, output, say, quick=quick)
+
+        self._do("next", "Planning the next measurements", act)
 
     def open_viewer(self) -> None:
         """Prepare the 3-D view, unless another tab has done so."""
         self.tab.viewer_requested = True
-        if self.shared.drawing is not None and self.shared.drawing[0] is self.tab.snapshot:
+        if self._recorded:
             return
 
         def act(snapshot: Snapshot, say: Say) -> None:
-            names = self.shared.viewer.prepare(snapshot.story, self.session.count, say)
-            self.shared.drawing = snapshot, names
+            self.session.viewer.prepare(snapshot.story, self.session.count, say)
 
         self._do("viewer", "Opening the 3-D view", act)
+
+    @property
+    def _recorded(self) -> bool:
+        snapshot = self.tab.snapshot
+        return snapshot is not None and self.session.viewer.story is snapshot.story
 
     def choose(self, effect: str) -> None:
         """Show the evidence of a suspect."""
@@ -312,7 +301,6 @@ class View:
             self._pick(readings, f"The readings of pose {story.pose_name(measurement)}")
 
     def _pick(self, measurements: list[int], title: str) -> None:
-        """Show some readings and the differences from the others."""
         self.tab.picked, self.tab.picked_title = measurements, title
         self.redraw("readings")
 

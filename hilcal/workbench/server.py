@@ -74,10 +74,8 @@ def serve(
     """Serve the workbench of a campaign until Ctrl-C; return whether somebody opened it.
 
     The server also ends when its token expires unused. It calls `announce` with its address once it
-    serves; `browser` opens the address in the default browser.
-
-    Raises:
-        InputError: NiceGUI is not installed, or the port is not available.
+    serves; `browser` opens the address in the default browser. Raises InputError if NiceGUI is not
+    installed, or the port is not available.
     """
     require_nicegui()
     _quiet_environment()

@@ -1,13 +1,14 @@
 """State and actions of a workbench; all computations are those of the library.
 
-One session serves all tabs. Its methods take seconds, and `work` runs one at a time. Each change
+One session serves all tabs. Its methods take seconds, and `Work` runs one at a time. Each change
 names the snapshot that it is based on. If the session has a newer snapshot, by another tab or a
 second click, the change is refused and nothing is appended.
 """
 
 import tempfile
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +29,13 @@ from hilcal.config.cell import (
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.recorded import Difference, StateVariable, distinguish, recorded_values
 from hilcal.effects.catalogue import Catalogue
+from hilcal.effects.protocol import failure_of
 from hilcal.effects.written import read_effects_text
-from hilcal.errors import InputError
+from hilcal.errors import HilcalError, InputError
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_prediction import full_prediction
 from hilcal.names import quoted
+from hilcal.present.progress import Say
 from hilcal.present.registration import covariance_words
 from hilcal.present.story import (
     Chapter,
@@ -46,7 +49,7 @@ from hilcal.procedure.next_plan import NextPlan, doubt_to_settle, next_plan
 from hilcal.store.procedure_log import refuse_fitting
 from hilcal.store.revision import RevisionRecord
 from hilcal.types import Ints
-from hilcal.workbench.work import Say
+from hilcal.workbench.viewer import WebViewer
 from hilcal.write_report import Asked, write_report
 
 Stamp = tuple[int, int, int]
@@ -68,8 +71,6 @@ class Figure:
 class Snapshot:
     """A campaign with the shown revision and its predecessors; created after every change."""
 
-    name: str  # of the file
-    arm: str
     n_readings: int  # including those set aside
     records: tuple[RevisionRecord, ...]  # all revisions, oldest first
     accepted: int | None  # the revision that every command uses; None: the latest
@@ -90,8 +91,7 @@ class Snapshot:
     @property
     def diagnosis(self) -> Diagnosis:
         """The diagnosis of the shown revision."""
-        judged = self.chapters[-1].diagnosis
-        if judged is None:
+        if (judged := self.chapters[-1].diagnosis) is None:
             raise ValueError("a snapshot without a diagnosis")
         return judged
 
@@ -114,7 +114,6 @@ class Snapshot:
 
 
 def _figures(o: Campaign) -> tuple[Figure, ...]:
-    """Return the values of the cell of a campaign that can be changed."""
     # with the instrument's noise, so that keys that need a stated noise are shown, too
     fixed, out = o.unchangeable({"tracker": dict.fromkeys(INSTRUMENT_NOISE)}), []
     for section, keys in CHANGEABLE.items():
@@ -144,8 +143,8 @@ class WorkbenchSession:
     """
 
     def __init__(self, path: str | Path, catalogue: Catalogue | None = None) -> None:
-        """Store the path of a file, without reading the file."""
         self.path, self._catalogue = Path(path), catalogue
+        self.work, self.viewer = Work(), WebViewer()
         self.snapshot: Snapshot | None = None  # current one; None before `load`
         self.changed: Changed | None = None  # the change that led to it; None for other actions
         self.planned: tuple[NextPlan, Path] | None = None  # the last plan, and its file
@@ -156,19 +155,14 @@ class WorkbenchSession:
     def load(self, say: Say = silent, revision: int | None = None) -> Snapshot:
         """Read the file, diagnose a revision and its predecessors, and show it.
 
-        Nothing is written. `revision` None is the one in use.
-
-        Raises:
-            InputError: no valid campaign, no such revision, or one that cannot be restored.
-            CannotAnswerError: the readings do not determine the baseline.
+        Nothing is written. `revision` None is the one in use. Raises as `Campaign.chapters`.
         """
         stamp = self._stamp()
         with self._open(read_only=True) as o:
             self._check_cache(o)
             chapters, record = self._chapters(o, revision, say), o.in_use(revision)
-            if record is None:
-                return self._show(o.at({}), None, chapters, stamp=stamp)
-            return self._show(o.at(record.cell), record.number, chapters, stamp=stamp)
+            cell, number = ({}, None) if record is None else (record.cell, record.number)
+            return self._show(o.at(cell), number, chapters, stamp=stamp)
 
     def add(self, snapshot: Snapshot, effect: str, say: Say = silent) -> Snapshot:
         """Add an effect, in the syntax of `hilcal add`, to the shown model; see `changes`."""
@@ -211,11 +205,7 @@ class WorkbenchSession:
         """Fit the shown model in a changed cell, and show that revision; see `changes`.
 
         `texts` are values by section and key, in the syntax of CELL.toml; unchanged texts have no
-        effect, an empty text omits the key.
-
-        Raises:
-            InputError: no value is changed, or a value is invalid.
-            CannotAnswerError: the readings do not determine the model.
+        effect, an empty text omits the key. Raises InputError for no change or an invalid value.
         """
         changes: dict[str, dict[str, Any]] = {}
         for f in snapshot.figures:
@@ -265,11 +255,7 @@ class WorkbenchSession:
         """Plan the measurements that resolve the doubt of the shown diagnosis, and save the plan.
 
         `poses` None is the number that the doubt needs; `quick` omits the comparison of criteria
-        and numbers of poses.
-
-        Raises:
-            InputError: the file exists or cannot be written, or the plan must not be run.
-            CannotAnswerError: nothing is in doubt, or no measurement would resolve the doubt.
+        and numbers of poses. Raises InputError if the file exists, and as `next_plan`.
         """
         if output.exists():
             raise InputError(f"{output}: the file exists; choose another name")
@@ -333,9 +319,8 @@ class WorkbenchSession:
         if snapshot is not self.snapshot:
             raise InputError("the workbench has gone on since that click; nothing was changed")
         if self.stale and not changed:
-            raise InputError(
-                f"{self.path.name} was changed by another command; read it again first"
-            )
+            name = self.path.name
+            raise InputError(f"{name} was changed by another command; read it again first")
 
     def _chapters(self, o: Campaign, revision: int | None, say: Say) -> tuple[Chapter, ...]:
         """Return a revision and its predecessors, diagnosed unless they are in the cache."""
@@ -353,7 +338,6 @@ class WorkbenchSession:
         return out
 
     def _check_cache(self, o: Campaign) -> None:
-        """Clear the cache if it belongs to other readings."""
         if (stored := o.data_hash) != self._hash:
             self._cache, self._hash = {}, stored
 
@@ -379,8 +363,6 @@ class WorkbenchSession:
     ) -> Snapshot:
         """Show a revision; `stamp` is that of the file when it was read, None: its current one."""
         self.snapshot = Snapshot(
-            name=self.path.name,
-            arm=o.cell.arm.name,
             n_readings=len(o.readings),
             records=o.file.revisions(),
             accepted=o.file.accepted(),
@@ -398,9 +380,65 @@ class WorkbenchSession:
         return self.snapshot
 
     def _stamp(self) -> Stamp:
-        """Return the stamp of the file; InputError if the file cannot be read."""
         try:
             status = self.path.stat()
         except OSError as error:
             raise InputError(f"{self.path}: cannot be read ({error.strerror})") from None
         return status.st_size, status.st_mtime_ns, status.st_ino
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The outcome of a task: a text, and whether the task succeeded."""
+
+    text: str
+    done: bool = True
+
+
+@dataclass(slots=True)
+class Work:
+    """The current task and the last answers."""
+
+    task: str | None = None  # its description; None without a task
+    place: str = ""  # the part of the page that started it
+    progress: str = ""  # the last line of its progress
+    answers: dict[str, Answer] = field(default_factory=dict)  # the last answer at each place
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def start(self, task: str, do: Callable[[Say], object], place: str = "file") -> bool:
+        """Start a task in a thread unless one is running; its text or its error is the answer."""
+        with self._lock:
+            if self.task is not None:
+                return False
+            self.task, self.progress, self.place = task, "", place
+            self.answers.pop(place, None)
+        threading.Thread(target=self._run, args=(do,), name="workbench", daemon=True).start()
+        return True
+
+    def _run(self, do: Callable[[Say], object]) -> None:
+        try:
+            result = do(lambda text: setattr(self, "progress", text))
+            answer = Answer(result) if isinstance(result, str) and result else None
+        except HilcalError as error:
+            answer = Answer(str(error), done=False)
+        except Exception as error:
+            text = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            why = failure_of(error) or f"unexpected {text}; please report it"
+            answer = Answer(str(why), done=False)
+        with self._lock:
+            if answer is not None:
+                self.answers[self.place] = answer
+            self.task, self.progress = None, ""
+
+    @property
+    def line(self) -> str:
+        """The current task and its progress in a line; empty without a task."""
+        task, progress = self.task, self.progress
+        if task is None:
+            return ""
+        return task if progress.lower() in ("", task.lower()) else f"{task}: {progress}"
+
+    def failure(self, place: str = "file") -> str:
+        """Return the error of the last task at a place; empty if it succeeded."""
+        answer = self.answers.get(place)
+        return "" if answer is None or answer.done else answer.text

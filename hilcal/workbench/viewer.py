@@ -15,8 +15,8 @@ from http.client import HTTPConnection, HTTPException
 from pathlib import Path
 
 from hilcal.errors import HilcalError
+from hilcal.present.progress import Say
 from hilcal.present.story import Story
-from hilcal.workbench.work import Say
 
 FILES = {
     "index.html": "text/html; charset=utf-8",
@@ -49,20 +49,18 @@ _NOBODY = "rerun+http://127.0.0.1:9/proxy"
 
 
 class WebViewer:
-    """The viewer's files and its recordings, in memory."""
+    """The viewer's files and the recording of a story, in memory."""
 
     def __init__(self) -> None:
+        self.story: Story | None = None  # that is recorded
+        self.recorded: dict[str, bytes] = {}  # recording and layout, by name
         self._files: dict[str, bytes] = {}
-        self._recorded: dict[str, bytes] = {}
 
-    def prepare(self, story: Story, count: int, say: Say) -> tuple[str, ...]:
-        """Record a story, and return the names of its files for the viewer.
+    def prepare(self, story: Story, count: int, say: Say) -> None:
+        """Record a story.
 
         The layout is a separate file, since a web viewer treats one in a recording as a proposal
-        only. `count` distinguishes the names from earlier ones.
-
-        Raises:
-            HilcalError: the viewer is not available, or the story cannot be recorded.
+        only. `count` distinguishes the names from earlier ones; HilcalError without a viewer.
         """
         # slow imports of the viewer's library
         from hilcal.present.viewer.campaign import blueprint, save
@@ -78,19 +76,17 @@ class WebViewer:
         if not self._files:
             say("preparing the viewer")
             self._files = _fetched()
-        self._recorded = recorded
-        return names
+        self.recorded, self.story = recorded, story  # the page looks at the story first
 
     def file(self, name: str) -> tuple[bytes, str] | None:
         """Return content and media type of a file; None for an unknown name."""
         name = name or "index.html"
-        if name in self._recorded:
-            return self._recorded[name], RECORDING
+        if name in self.recorded:
+            return self.recorded[name], RECORDING
         return (self._files[name], FILES[name]) if name in self._files else None
 
 
 def _fetched() -> dict[str, bytes]:
-    """Return the files of the web viewer in rerun-sdk."""
     from hilcal.present.viewer.recording import executable  # loads the viewer's library
 
     with socket.socket() as probe:

@@ -43,7 +43,7 @@ def finished(readings: int, path: Path) -> None:
 
 def followed(readings: int, path: Path) -> None:
     """Write what a live viewer was told of a campaign, as `--view` does."""
-    outlet = live._Outlet("speed", print, "file", file=path)
+    outlet = live._Outlet("speed", print, file=path)
     for wall, what in events(measuring(plan(readings // 2))):
         tell = partial(LiveScene.tell, wall=wall, what=what)
         outlet.tell(tell, not isinstance(what, ArmAt), now=isinstance(what, Measuring))

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from hilcal.present.viewer.recording import executable
@@ -48,18 +49,19 @@ class ViewReport:
 
 def vulkan_available() -> bool:
     """Return whether the Vulkan loader and at least one driver description are installed."""
-    named = os.environ.get("VK_DRIVER_FILES") or os.environ.get("VK_ICD_FILENAMES")
-    if named:
-        drivers = any(Path(p).is_file() for p in named.split(os.pathsep))
-    else:
-        drivers = any(any(Path(d).glob("*.json")) for d in _ICD_DIRS)
-    if not drivers:
+    named = os.environ.get("VK_DRIVER_FILES") or os.environ.get("VK_ICD_FILENAMES") or ""
+    files = [Path(p) for p in named.split(os.pathsep) if p]
+    files = files or [file for d in _ICD_DIRS for file in Path(d).glob("*.json")]
+    if not any(file.is_file() for file in files):
         return False
     try:
         ctypes.CDLL(ctypes.util.find_library("vulkan") or "libvulkan.so.1")
     except OSError:
         return False
     return True
+
+
+needs_vulkan = pytest.mark.skipif(not vulkan_available(), reason="no Vulkan driver installed")
 
 
 def pictures(
@@ -84,22 +86,19 @@ def opened(rrd: Path, size: tuple[int, int]) -> Iterator[tuple["ViewerClient", i
     """A headless viewer that has shown a recording, and the number of its process."""
     with _headless(size) as (viewer, process):
         viewer.open([str(Path(rrd).resolve())])
-        _wait_until_loaded(viewer)
-        _draw_first(viewer)
+        end = time.monotonic() + _LOAD_TIMEOUT
+        while not (state := viewer.get_state()).views or state.loading:
+            assert time.monotonic() < end, f"recording not loaded within {_LOAD_TIMEOUT:g} s"
+            time.sleep(0.05)
+        while True:  # the first picture compiles shaders and loads meshes: it may take its time
+            try:
+                viewer.take_screenshot(max_size=64)
+            except TimeoutError:
+                if time.monotonic() > end:
+                    raise
+            else:
+                break
         yield viewer, process
-
-
-def _draw_first(viewer: "ViewerClient") -> None:
-    """Draw the first picture, which compiles shaders and loads meshes: it may take its time."""
-    end = time.monotonic() + _LOAD_TIMEOUT
-    while True:
-        try:
-            viewer.take_screenshot(max_size=64)
-        except TimeoutError:
-            if time.monotonic() > end:
-                raise
-        else:
-            return
 
 
 def _take(viewer: "ViewerClient", shot: Shot, longest: int | None) -> None:
@@ -127,13 +126,6 @@ def _bring_forward(viewer: "ViewerClient", view_id: str) -> None:
             return
 
 
-def _wait_until_loaded(viewer: "ViewerClient") -> None:
-    end = time.monotonic() + _LOAD_TIMEOUT
-    while not (state := viewer.get_state()).views or state.loading:
-        assert time.monotonic() < end, f"recording not loaded within {_LOAD_TIMEOUT:g} s"
-        time.sleep(0.05)
-
-
 @contextlib.contextmanager
 def _headless(size: tuple[int, int]) -> Iterator[tuple["ViewerClient", int]]:
     """Run a viewer of our own in a home of its own, with analytics off; end it afterwards."""
@@ -142,13 +134,11 @@ def _headless(size: tuple[int, int]) -> Iterator[tuple["ViewerClient", int]]:
         port = probe.getsockname()[1]
         probe.close()
         log = Path(home, "viewer.log")
-        command = [executable(), "--headless", "--hide-welcome-screen"]
-        command += ["--bind", "127.0.0.1", "--port", str(port)]
-        command += ["--window-size", f"{size[0]}x{size[1]}"]
+        command = [executable(), "--headless", "--hide-welcome-screen", "--bind", "127.0.0.1"]
+        command += ["--port", str(port), "--window-size", f"{size[0]}x{size[1]}"]
+        env = _environment(Path(home))
         with log.open("wb") as sink:
-            process = subprocess.Popen(
-                command, env=_environment(Path(home)), stdout=sink, stderr=subprocess.STDOUT
-            )
+            process = subprocess.Popen(command, env=env, stdout=sink, stderr=subprocess.STDOUT)
         try:
             yield _connect(process, port), process.pid
         except (ConnectionError, RuntimeError) as error:
@@ -189,8 +179,7 @@ def _environment(home: Path) -> dict[str, str]:
     (config / "rerun" / "analytics.json").write_text(
         json.dumps({"analytics_enabled": False, "analytics_id": "off", "metadata": {}})
     )
-    env = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
-    return env | {
+    return {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")} | {
         "HOME": str(home),
         "XDG_CONFIG_HOME": str(config),
         "XDG_DATA_HOME": str(home / "data"),
@@ -202,9 +191,9 @@ def _environment(home: Path) -> dict[str, str]:
 
 
 def pixels(png: Path) -> np.ndarray:
-    """Return a picture as (height, width, channels)."""
+    """(height, width, channels) of a PNG."""
     with Image.open(png) as image:
-        return np.array(image)
+        return np.asarray(image)
 
 
 def contrast(a: Sequence[int], b: Sequence[int]) -> float:

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rerun as rr
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config
@@ -79,13 +78,6 @@ SUMMARY = PlanSummary(
     remarks=("only 3 candidates are left of load 10kg.",),
 )
 BARE = PlanSummary(3, 10, {UNLOADED: 10}, Duration(1.0, 2.0, 0.0), "made by hand", None, (), None)
-
-
-@pytest.fixture(autouse=True)
-def strict():
-    rr.set_strict_mode(True)
-    yield
-    rr.set_strict_mode(False)
 
 
 def configured(**sections: object) -> tuple[Cell, CellConfig]:

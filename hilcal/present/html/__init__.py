@@ -68,7 +68,6 @@ def in_script(json: str) -> str:
 
 
 def _figure(chart: Chart) -> dict[str, object]:
-    """Return the data of a chart for the template: figure, sentence and height."""
     bare = go.Figure(chart.figure)
     bare.layout.template = None
     bare.layout.height = chart.height or chart.figure.layout.height

@@ -9,19 +9,8 @@ from hilcal import numbers
 from hilcal.diagnosis.change import LEVEL
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.names import quoted
-from hilcal.present import charts
+from hilcal.present import charts, comparison
 from hilcal.present.campaign import utc
-from hilcal.present.comparison import (
-    FAR,
-    closing,
-    comparison_report,
-    headline,
-    next_step,
-    sentence,
-    type_report,
-    unlike_words,
-    words_of,
-)
 from hilcal.present.document import (
     Block,
     Chart,
@@ -59,11 +48,10 @@ def error_by_pose(c: Comparison) -> go.Figure:
         charts.marks(poses, error, charts.MEASURED, "circle", 7, name="error today", **options),
         charts.marks(poses, stated, charts.NOISE, "line-ew-open", 7, name=states, **options),
     ]
-    worst = int(np.argmax(error))
+    k, rms, expected = int(np.argmax(error)), p.error.rms_m, c.today.stated_m
     says = (
-        f"The error today is {error[worst]:.0f} µm at most, at {names[worst]} ({loads[worst]}); "
-        f"{numbers.length(p.error.rms_m)} rms, where the calibration states "
-        f"{numbers.length(c.today.stated_m)}."
+        f"The error today is {error[k]:.0f} µm at most, at {names[k]} ({loads[k]}); "
+        f"{numbers.length(rms)} rms, where the calibration states {numbers.length(expected)}."
     )
     kind = "error" if r.scalar.any() else "3-D error"
     return charts.figure(says, x="pose", y=f"{kind} [µm]", traces=traces)
@@ -72,7 +60,7 @@ def error_by_pose(c: Comparison) -> go.Figure:
 def changes_chart(c: Comparison) -> go.Figure:
     """Draw the rms displacement of the target by each change in the later readings."""
     moved = [1e6 * x.moved_m for x in c.changes.found]
-    names = [words_of(x.candidate) for x in c.changes.found]
+    names = [comparison.words_of(x.candidate) for x in c.changes.found]
     hover = [f"{n}: {m:.0f} µm rms" for n, m in zip(names, moved, strict=True)]
     says = f"{names[0]} moves the target most: {moved[0]:.0f} µm rms." if names else "No change."
     return charts.bars(names, moved, hover, says, "moves the target by, rms [µm]")
@@ -88,23 +76,23 @@ def arms_chart(t: "Pooled") -> go.Figure:
         (True, "unlike its type", charts.RED, "x"),
     ):
         chosen = [
-            (off[a, k], name, f"{arm}, {name}: {off[a, k]:+.1f} σ")
+            (float(off[a, k]), name, f"{arm}, {name}: {off[a, k]:+.1f} σ")
             for k, name in enumerate(names)
             for a, arm in enumerate(t.arms)
             if np.isfinite(off[a, k]) and ((arm, name) in odd) == unlike
         ]
         if chosen:
             x, y, hover = zip(*chosen, strict=True)
-            points = (np.array(x), list(map(charts.label, y)), color, symbol, 9)
-            options: dict[str, Any] = {"name": group, "opacity": 0.8, "hoverinfo": "text"}
-            text = list(map(charts.label, hover))
-            traces.append(charts.marks(*points, **options, hovertext=text))
-    arms = sorted({arm for arm, _ in odd})
+            look: dict[str, Any] = {"name": group, "opacity": 0.8, "hoverinfo": "text"}
+            look["hovertext"] = list(map(charts.label, hover))
+            y_names = list(map(charts.label, y))
+            traces.append(charts.marks(np.array(x), y_names, color, symbol, 9, **look))
     says = f"The {len(t.arms)} arms of the type are alike within what they scatter by."
-    if arms:
+    if arms := sorted({arm for arm, _ in odd}):
         verb = "is" if len(arms) == 1 else "are"
         says = f"{', '.join(arms)} {verb} unlike the others of the type."
-    band = {"type": "rect", "x0": -FAR, "x1": FAR, "y0": 0, "y1": 1, "yref": "paper"}
+    low, high = -comparison.FAR, comparison.FAR
+    band = {"type": "rect", "x0": low, "x1": high, "y0": 0, "y1": 1, "yref": "paper"}
     look = {"fillcolor": charts.NOISE, "opacity": 0.12, "line": {"width": 0}, "layer": "below"}
     return charts.figure(
         says,
@@ -137,7 +125,9 @@ def comparison_page(
         Words(f"hilcal compare {quoted(earlier)} {quoted(later)}", "code"),
     )
     sections = (
-        PageSection("changes", "What has changed", tuple(comparison_report(c, earlier, later))),
+        PageSection(
+            "changes", "What has changed", tuple(comparison.comparison_report(c, earlier, later))
+        ),
         PageSection("today", "The earlier calibration today", tuple(drawn)),
         PageSection("provenance", "Provenance", provenance),
     )
@@ -153,20 +143,22 @@ def comparison_screen(c: Comparison, earlier: str) -> FirstScreen:
         f"The calibration of {earlier} is off by {numbers.length(error.rms_m)} rms today, "
         f"{numbers.digits(t.z, 2)} times what it states: {beyond} than its uncertainty."
     )
-    largest = f"rms; largest {numbers.length(error.max_m)}"
     cards = [
-        ("Error today", numbers.length(error.rms_m), largest),
+        ("Error today", numbers.length(error.rms_m), f"rms; largest {numbers.length(error.max_m)}"),
         ("Expected", numbers.length(t.stated_m), "rms that the calibration states"),
     ]
     if t.drawing_m is not None:
         cards.append(("Uncalibrated", numbers.length(t.drawing_m), "rms of the arm as drawn"))
     answers = (
         ("Is the calibration still good?", accuracy),
-        ("What has changed?", " ".join(map(sentence, changes.found)) or f"{headline(c)}."),
-        ("What to do?", numbers.sentence(next_step(c, earlier))),
+        (
+            "What has changed?",
+            " ".join(map(comparison.sentence, changes.found)) or f"{comparison.headline(c)}.",
+        ),
+        ("What to do?", numbers.sentence(comparison.next_step(c, earlier))),
     )
     tone = "good" if not changes.found and changes.explained else "bad"
-    return FirstScreen(headline(c), tone, answers, tuple(cards))
+    return FirstScreen(comparison.headline(c), tone, answers, tuple(cards))
 
 
 def fleet_page(fleet: "Fleet", directory: str, made: str, version: str) -> str:
@@ -174,12 +166,12 @@ def fleet_page(fleet: "Fleet", directory: str, made: str, version: str) -> str:
     sections = []
     for k, t in enumerate(fleet.types):
         drawn: tuple[Block, ...] = (Chart("Arms of the type", arms_chart(t), wide=True, height=0),)
-        report = captioned(list(type_report(t))[1:], f"Parameters of the {t.type}")
+        report = captioned(list(comparison.type_report(t))[1:], f"Parameters of the {t.type}")
         sections.append(PageSection(f"type{k}", f"{t.type}: {len(t.arms)} arms", drawn + report))
     rows = [(m.name, m.arm, m.date[:10], m.verdict, numbers.length(m.rms_m)) for m in fleet.members]
     heads = ("campaign", "arm", "date", "verdict", "rms on poses left out")
     campaigns = table(*heads, rows=rows, caption="Campaigns")
-    sections.append(PageSection("campaigns", "Campaigns", (campaigns, *closing(fleet))))
+    sections.append(PageSection("campaigns", "Campaigns", (campaigns, *comparison.closing(fleet))))
     about = f"{directory}, {made[:10]}, hilcal {version}"
     return render("A fleet of arms", about, _fleet_screen(fleet), tuple(sections))
 
@@ -192,12 +184,12 @@ def _fleet_screen(fleet: "Fleet") -> FirstScreen:
     if arms:
         headline = f"Unlike their type: {numbers.names(arms)}"
         todo = "Measure these arms again, and look at these joints."
-    cards = (
-        ("Arms", str(sum(len(t.arms) for t in fleet.types)), "that were pooled"),
-        ("Campaigns", str(len(fleet.members)), f"used; not used: {len(fleet.failures)}"),
-    )
+    pooled = sum(len(t.arms) for t in fleet.types)
+    used = ("Campaigns", str(len(fleet.members)), f"used; not used: {len(fleet.failures)}")
+    cards = (("Arms", str(pooled), "that were pooled"), used)
+    unlike = "; ".join(map(comparison.unlike_words, odd)) or "None."
     answers = (
-        ("Which arms are unlike, and by how much?", "; ".join(map(unlike_words, odd)) or "None."),
+        ("Which arms are unlike, and by how much?", unlike),
         ("What wears?", wear or "No drift that the arms have in common."),
         ("What to do?", todo),
     )

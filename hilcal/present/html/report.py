@@ -16,10 +16,11 @@ from hilcal.identification.background import family_sizes
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_covariance import CovarianceParts
 from hilcal.identification.full_prediction import error_before, names
-from hilcal.identification.residual import CONFIDENCE
+from hilcal.identification.residual import CONFIDENCE, ErrorBlock
 from hilcal.identification.validation import CampaignValidation
 from hilcal.numbers import length, percent
 from hilcal.present import charts
+from hilcal.present import fit as fit_words
 from hilcal.present.calibration import loads_report, opening, validation_report, worst_table
 from hilcal.present.campaign import info_report, utc
 from hilcal.present.diagnosis import REVISION_HEADS, could_have_been_seen, doubtful, redundant_line
@@ -35,17 +36,6 @@ from hilcal.present.document import (
     load_name,
     note,
     table,
-)
-from hilcal.present.fit import (
-    background_line,
-    errors,
-    follows,
-    misses,
-    parameters,
-    prior_lines,
-    remarks,
-    scalings_table,
-    where_table,
 )
 from hilcal.present.html import FirstScreen, render
 from hilcal.present.registration import base_line, covariance_words
@@ -121,39 +111,36 @@ def sections(m: ReportContent) -> tuple[PageSection, ...]:
 
 def first_screen(m: ReportContent) -> FirstScreen:
     """Return the contents of the first screen."""
+    d, good = m.diagnosis, fit_words.misses(m.fit)
+    verdict = None if d is None else d.verdict
+    if (prior := m.fit.model.prior) is not None:
+        good += f" It also rests on a prior: {prior.posterior.source.campaign or 'a posterior'}."
+    if d is None:
+        title, tone = "not judged: only a model fitted with scaling gc can be", "doubt"
+        missing = "Not judged; hilcal identify --scaling gc, then hilcal diagnose, say it."
+    else:
+        title, missing = headline(d), message(d)
+        if verdict == "missing_effect" and d.lead is not None:
+            title += f": {d.lead.effect}"
+        doubt = verdict in ("ambiguous", "noise_misjudged") and not d.wrong_figures
+        tone = "doubt" if doubt else "good" if verdict == "adequate" else "bad"
+        if verdict == "noise_misjudged":
+            good = f"It cannot be told, for the stated noise is wrong. {good}"
+        else:
+            yes = verdict == "adequate" or d.reason == "inseparable_addition"
+            good = f"{'Yes' if yes else 'Not yet'}. {good}"
+        if verdict == "adequate":
+            missing = "Nothing that these readings could show."
+        elif d.lead is not None and not d.wrong_figures:
+            name = d.lead.coarse or d.lead.effect
+            missing += f" {name} is: {d.fit.model.catalogue[name].summary}."
     answers = (
-        ("Is the model good?", _how_good(m)),
+        ("Is the model good?", good),
         ("Where is it wrong?", where_wrong(m)),
-        ("What is missing?", _missing(m.diagnosis)),
+        ("What is missing?", missing),
     )
-    verdict = None if m.diagnosis is None else m.diagnosis.verdict
-    cards = tuple(_cards(m))
-    return FirstScreen(*_headline(m.diagnosis), answers, cards, *limit_words(m), verdict)
-
-
-def _headline(d: Diagnosis | None) -> tuple[str, str]:
-    """Return the verdict in a few words, with its tone."""
-    if d is None:
-        return "Not judged: only a model fitted with scaling gc can be", "doubt"
-    text = headline(d)
-    if d.verdict == "missing_effect" and d.lead is not None:
-        text = f"{text}: {d.lead.effect}"
-    good, doubt = d.verdict == "adequate", d.verdict in ("ambiguous", "noise_misjudged")
-    tone = "good" if good else "doubt" if doubt and not d.wrong_figures else "bad"
-    return f"{text[0].upper()}{text[1:]}", tone
-
-
-def _how_good(m: ReportContent) -> str:
-    """Return a sentence on how well the model predicts."""
-    d, prior, text = m.diagnosis, m.fit.model.prior, misses(m.fit)
-    if prior is not None:
-        text += f" It also rests on a prior: {prior.posterior.source.campaign or 'a posterior'}."
-    if d is None:
-        return text
-    if d.verdict == "noise_misjudged":
-        return f"It cannot be told, for the stated noise is wrong. {text}"
-    good = d.verdict == "adequate" or d.reason == "inseparable_addition"
-    return f"{'Yes' if good else 'Not yet'}. {text}"
+    title, cards = f"{title[0].upper()}{title[1:]}", tuple(_cards(m))
+    return FirstScreen(title, tone, answers, cards, *limit_words(m), verdict)
 
 
 def where_wrong(m: ReportContent) -> str:
@@ -166,7 +153,7 @@ def where_wrong(m: ReportContent) -> str:
     if d is None:
         return worst
     if not d.residual_is_noise:
-        return f"{worst} {follows(d.misfit_breakdown)}"
+        return f"{worst} {fit_words.follows(d.misfit_breakdown)}"
     # The sum of squares of R whitened elements of standard deviation 1 is distributed as χ²(R).
     count = fit.whitening.rank
     if fit.holdout.rms_sigma**2 * count <= chi2.isf((1 - CONFIDENCE) / 2, count):
@@ -178,40 +165,24 @@ def where_wrong(m: ReportContent) -> str:
     )
 
 
-def _missing(d: Diagnosis | None) -> str:
-    """Return sentences on the missing effect."""
-    if d is None:
-        return "Not judged; hilcal identify --scaling gc, then hilcal diagnose, say it."
-    if d.verdict == "adequate":
-        return "Nothing that these readings could show."
-    text = message(d)
-    if d.lead is None or d.wrong_figures:
-        return text
-    name = d.lead.coarse or d.lead.effect
-    return f"{text} {name} is: {d.fit.model.catalogue[name].summary}."
-
-
 def _cards(m: ReportContent) -> Iterator[tuple[str, str, str]]:
-    def card(label: str, rms_m: float, max_m: float, remark: str = "") -> tuple[str, str, str]:
-        return label, length(rms_m), f"rms; largest {length(max_m)}{remark}"
+    def card(label: str, e: ErrorBlock, remark: str = "") -> tuple[str, str, str]:
+        return label, length(e.rms_m), f"rms; largest {length(e.max_m)}{remark}"
 
-    nominal, held = error_before(m.fit), m.fit.holdout
     model = "nominal arm, only its frames fitted"
     if m.fit.mode == "deflection":
         model = "deflection under load; a rigid arm has none"
-    yield card("Before", nominal.rms_m, nominal.max_m, f"; {model}")
+    yield card("Before", error_before(m.fit), f"; {model}")
     if m.tested is not None:
-        e, unseen = m.tested.validation.prediction.error, m.tested.validation.judged.unseen
-        kind = "never fitted" if unseen else "fitted, so no test"
-        yield card("After, validation", e.rms_m, e.max_m, f"; {kind}")
+        kind = "never fitted" if m.tested.validation.judged.unseen else "fitted, so no test"
+        yield card("After, validation", m.tested.validation.prediction.error, f"; {kind}")
     if m.corrected is not None:
         error = m.corrected["error"]
         uncorrected, corrected = (length(float(error[k]["rms_m"])) for k in ("before", "after"))
         text = f"rms; {uncorrected} without correction; {error['count']} points"
         yield "Measured at corrected targets", corrected, text
-    yield card("After, poses left out", held.rms_m, held.max_m)
-    noise = "rms that the stated noise would leave"
-    yield "Noise alone", length(m.story.noise_floor_m), noise
+    yield card("After, poses left out", m.fit.holdout)
+    yield "Noise alone", length(m.story.noise_floor_m), "rms that the stated noise would leave"
 
 
 def limit_words(m: ReportContent) -> tuple[str, bool | None]:
@@ -245,9 +216,15 @@ def left_out_errors(fit: Fit) -> Floats:
 
 
 def _certificate(m: ReportContent) -> PageSection:
-    parts: list[Block] = [replace(errors(m.fit), caption="Error before and after")]
+    parts: list[Block] = [replace(fit_words.errors(m.fit), caption="Error before and after")]
     if m.corrected is not None:
-        parts.append(_corrected(m.corrected))
+        heads = ("load", "n", "before, rms", "largest", "corrected, rms", "largest", "in 95 % band")
+        out = table(*heads, caption="Measured at uncorrected and at corrected joint targets")
+        for part in (*m.corrected["loads"], m.corrected["error"]):
+            sizes = [part[when][k] for when in ("before", "after") for k in ("rms_m", "max_m")]
+            name, within = load_name(str(part["name"])), f"{part['inside']} of {part['count']}"
+            out.add(name, str(part["count"]), *(length(float(x)) for x in sizes), within)
+        parts.append(out)
     for title, blocks in (
         ("Uncertainty", _uncertainty(m.fit)),
         ("Limit", _limit(m)),
@@ -259,16 +236,6 @@ def _certificate(m: ReportContent) -> PageSection:
     return PageSection("certificate", "Certificate", tuple(parts))
 
 
-def _corrected(document: Mapping[str, Any]) -> Table:
-    heads = ("load", "n", "before, rms", "largest", "corrected, rms", "largest", "in 95 % band")
-    out = table(*heads, caption="Measured at uncorrected and at corrected joint targets")
-    for part in (*document["loads"], document["error"]):
-        sizes = [part[when][k] for when in ("before", "after") for k in ("rms_m", "max_m")]
-        name, within = load_name(str(part["name"])), f"{part['inside']} of {part['count']}"
-        out.add(name, str(part["count"]), *(length(float(x)) for x in sizes), within)
-    return out
-
-
 def _uncertainty(fit: Fit) -> Iterator[Block]:
     if fit.scaling != "gc":
         yield "No uncertainty is stated: the fit is not weighted by the full covariance."
@@ -278,12 +245,9 @@ def _uncertainty(fit: Fit) -> Iterator[Block]:
     inside = int(np.sum(error <= b.expanded))
     quantity = "deflection" if fit.mode == "deflection" else "position"
     within = f"; {inside} of {len(error)} {quantity}s of poses left out are within it"
-    yield Words(
-        f"Expected accuracy of a predicted {quantity} at a pose that was not fitted: expanded "
-        f"uncertainty U = {length(b.expanded)} (3-D, k = {COVERAGE:.0f})"
-        f"{within * bool(len(error))}.",
-        "strong",
-    )
+    accuracy = f"Expected accuracy of a predicted {quantity} at a pose that was not fitted"
+    expanded = f"expanded uncertainty U = {length(b.expanded)} (3-D, k = {COVERAGE:.0f})"
+    yield Words(f"{accuracy}: {expanded}{within * bool(len(error))}.", "strong")
     repeats = repeatability_source(b.scatter_source, fit.model.cell.arm)
     parts = (
         ("estimated parameters", "type A: errors of poses left out", b.parameters),
@@ -319,15 +283,14 @@ def _limit(m: ReportContent) -> Iterator[Block]:
 def _conditions(m: ReportContent) -> Iterator[Block]:
     o, r = m.overview, m.fit.readings
     loads = ", ".join(f"{load_name(name)} ({n})" for name, n in o.loads.items())
-    outliers = int(m.fit.outlier.sum())
+    outliers, poses = int(m.fit.outlier.sum()), len(np.unique(r.pose))
     gross = f"; {outliers} set aside as gross errors" if outliers else ""
-    poses = len(np.unique(r.pose))
     yield f"{len(r)} readings of {poses} poses{gross}. Loads (readings): {loads}."
-    yield from prior_lines(m.fit)
+    yield from fit_words.prior_lines(m.fit)
     about = {} if m.plan is None else m.plan.about
     efficiency, criterion = about.get("efficiency"), about.get("criterion")
     if m.plan is None:
-        yield ("The readings were imported; the file holds no plan, so nothing proves the choice.")
+        yield "The readings were imported; the file holds no plan, so nothing proves the choice."
     elif not isinstance(efficiency, int | float):
         yield "They were planned."
     else:
@@ -342,29 +305,24 @@ def _conditions(m: ReportContent) -> Iterator[Block]:
     ]
     heads = ("joint", *(str(j + 1) for j in range(q.shape[1])))
     yield table(*heads, caption="Joint angles that were measured", rows=rows)
-    if m.tested is None:
-        yield _by_load(m)
-
-
-def _by_load(m: ReportContent) -> Table:
-    fit, error = m.fit, left_out_errors(m.fit)
-    fitted = fit.readings[~fit.outlier][fit.whitening.reading]
+    if m.tested is not None:
+        return
+    error, fitted = left_out_errors(m.fit), r[~m.fit.outlier][m.fit.whitening.reading]
     heads = ("load", "n", "rms", "largest", "at pose", *["limit"] * (m.limit_m is not None))
     out = table(*heads, caption="Error of poses left out, by load")
     for k in np.unique(fitted.load):
         of_load = np.flatnonzero(fitted.load == k)
         worst = of_load[int(np.argmax(error[of_load]))]
         rms, most = float(np.sqrt(np.mean(error[of_load] ** 2))), float(error[worst])
-        row = [load_name(fit.readings.load_names[k]), str(len(of_load)), length(rms), length(most)]
-        row.append(fit.readings.pose_names[fitted.pose[worst]])
+        row = [load_name(r.load_names[k]), str(len(of_load)), length(rms), length(most)]
+        row.append(r.pose_names[fitted.pose[worst]])
         if m.limit_m is not None:
-            row.append("kept" if error[worst] <= m.limit_m else "over")
+            row.append("kept" if most <= m.limit_m else "over")
         out.add(*row)
-    return out
+    yield out
 
 
 def _not_tested(m: ReportContent) -> Iterator[str]:
-    """Yield the conditions that these readings do not test."""
     s, fit, d = m.fit.readings.states, m.fit, m.diagnosis
     if m.tested is None:
         yield "No validation campaign: the errors are those of poses left out in turn."
@@ -405,7 +363,6 @@ def _instruments(m: ReportContent) -> Iterator[Block]:
         imported = ": the readings were imported from a table" if o.planned is None else ""
         yield f"The file names no instrument{imported}."
     yield note(f"Noise of the readings: {covariance_words(m.covariance)}.")
-    revision = str(m.chapters[-1].number) if m.stored else "none stored: the baseline"
     yield identity(
         ("Robot", o.config.robot.model),
         ("Base", base_line(m.fit.model.cell, m.fit.frames, m.fit.mode)),
@@ -413,7 +370,7 @@ def _instruments(m: ReportContent) -> Iterator[Block]:
         ("Campaign", f"{m.name}, made {utc(o.created)} UTC"),
         ("SHA-256", m.sha256),
         *([("Validation SHA-256", m.tested.sha256)] if m.tested else []),
-        ("Revision", revision),
+        ("Revision", str(m.chapters[-1].number) if m.stored else "none stored: the baseline"),
         ("Report made", f"{utc(m.made)} UTC by hilcal {m.version}"),
     )
 
@@ -438,9 +395,9 @@ def _revisions(m: ReportContent) -> PageSection:
 
 def _where(m: ReportContent) -> PageSection:
     held_out, d = (m.story, m.left_out), m.diagnosis
+    gross = " Readings set aside as gross errors are drawn, too." * bool(m.fit.outlier.any())
     parts: list[Block] = [
-        "Errors are those of poses left out: each is predicted by a fit to the others."
-        + (" Readings set aside as gross errors are drawn, too." * bool(m.fit.outlier.any())),
+        f"Errors are those of poses left out: each is predicted by a fit to the others.{gross}",
         Chart("By pose", charts.residual_by_pose(*held_out), wide=True),
         Chart("Measured against predicted", charts.measured_predicted(*held_out)),
     ]
@@ -457,13 +414,12 @@ def _where(m: ReportContent) -> PageSection:
         if d.verdict != "adequate":
             curves = [curve(v) for v in d.dependences if v.determined][:MOST_CURVES]
             parts += [Chart(c.title, charts.curve_chart(c)) for c in curves]
-        blocks = captioned(where_table(d.misfit_breakdown), "What the error follows")
+        blocks = captioned(fit_words.where_table(d.misfit_breakdown), "What the error follows")
         parts += [replace(p, narrow=True) if isinstance(p, Table) else p for p in blocks]
     return PageSection("where", "Where it fails", (*parts, _noise(m)))
 
 
 def _noise(m: ReportContent) -> str:
-    """Return a sentence on the noise of repeated readings."""
     e = None if m.diagnosis is None else m.diagnosis.pure_error
     if e is not None:
         low, high = e.interval
@@ -515,21 +471,19 @@ def _suspects_table(rows: Sequence[Suspect], caption: str) -> Table:
 
 
 def _laws(m: ReportContent) -> Iterator[PageSection]:
-    law_curves = laws(m.fit)
-    if not law_curves:
+    if not (law_curves := laws(m.fit)):
         return
-    parts: list[Block] = []
-    for name, facts in {law.title: law.facts for law in law_curves}.items():
-        parts.append(table("", "", rows=facts, caption=f"{name}, an effect of a file"))
-    for law in law_curves[:MOST_LAWS]:
-        parts.append(Chart(f"{law.title}: {law.y_label}", charts.curve_chart(law)))
-    parts.append(
+    facts = {f"{law.title}, an effect of a file": law.facts for law in law_curves}
+    shown = law_curves[:MOST_LAWS]
+    parts: tuple[Block, ...] = (
+        *(table("", "", rows=rows, caption=caption) for caption, rows in facts.items()),
+        *(Chart(f"{law.title}: {law.y_label}", charts.curve_chart(law)) for law in shown),
         note(
             "Each point is the mean over readings of the law's value plus what it leaves of them. "
             "Nothing is known outside of the range that is drawn, nor within its gaps."
-        )
+        ),
     )
-    yield PageSection("laws", "Laws beyond the catalogue", tuple(parts))
+    yield PageSection("laws", "Laws beyond the catalogue", parts)
 
 
 def _parameters(m: ReportContent) -> PageSection:
@@ -537,41 +491,46 @@ def _parameters(m: ReportContent) -> PageSection:
     effects = [name for name in fit.model.named if name in catalogue.names]
     parts: list[Block] = [note(f"{name}: {catalogue[name].summary}.") for name in effects]
     command = "hilcal report --appendix"
-    for part in captioned(parameters(fit, MOST_PARAMETERS, command), "Parameters"):
-        parts += _halves(part) if isinstance(part, Table) else (part,)
-    parts += background_line(fit)
+    for part in captioned(fit_words.parameters(fit, MOST_PARAMETERS, command), "Parameters"):
+        if not isinstance(part, Table):
+            parts.append(part)
+            continue
+        middle = -(-len(part.rows) // 2)  # two halves, without the column of meanings
+        for rows, suffix in ((part.rows[:middle], ""), (part.rows[middle:], ", continued")):
+            if rows:
+                cut, caption = [row[:-1] for row in rows], f"{part.caption}{suffix}"
+                heads = part.heads[:-1]
+                parts.append(replace(part, caption=caption, heads=heads, rows=cut, narrow=True))
+    parts += fit_words.background_line(fit)
     if sizes := family_sizes(fit):
         parts.append(Chart("What this arm is made of", charts.made_of(sizes), wide=True, height=0))
     return PageSection("parameters", "Parameters", tuple(parts))
 
 
-def _halves(t: Table) -> Iterator[Table]:
-    """Yield the two halves of a table of parameters, without the column of meanings."""
-    middle = -(-len(t.rows) // 2)
-    for rows, suffix in ((t.rows[:middle], ""), (t.rows[middle:], ", continued")):
-        if rows:
-            cut, caption = [row[:-1] for row in rows], f"{t.caption}{suffix}"
-            yield replace(t, caption=caption, heads=t.heads[:-1], rows=cut, narrow=True)
-
-
 def _appendix(m: ReportContent) -> Iterator[PageSection]:
+    joints: list[Block] = [
+        Chart(f"Over joint {j + 1}", charts.residual_by_joint(m.story, m.left_out, j))
+        for j in range(m.story.arm.n)
+    ]
+    if m.tested is not None:
+        joints.append(replace(worst_table(m.tested.validation.shares), caption="Worst poses"))
+    explained = (
+        *captioned(fit_words.parameters(m.fit), "Parameters with standard uncertainties"),
+        *captioned(fit_words.remarks(m.fit)),
+        Chart("Correlations", charts.correlations(m.fit), wide=True, height=0),
+    )
+    scalings = fit_words.scalings_table(m.scalings) if len(m.scalings) > 1 else ()
+    by_scaling = captioned(scalings, "The same model with each scaling")
     for name, title, parts in (
-        ("joints", "Over each joint", _joints(m)),
+        ("joints", "Over each joint", joints),
         ("rejected", "Rejected suspects", _rejected(m)),
-        ("all", "Parameters and what they mean", _all_parameters(m)),
-        ("scalings", "Scaling none, gu and gc", _scalings(m)),
+        ("all", "Parameters and what they mean", explained),
+        ("scalings", "Scaling none, gu and gc", by_scaling),
         ("planned", "As planned and as reached", _planned(m)),
         ("provenance", "Provenance", _provenance(m)),
     ):
         if blocks := tuple(parts):
             yield PageSection(name, f"Appendix: {title}", blocks)
-
-
-def _joints(m: ReportContent) -> Iterator[Block]:
-    for j in range(m.story.arm.n):
-        yield Chart(f"Over joint {j + 1}", charts.residual_by_joint(m.story, m.left_out, j))
-    if m.tested is not None:
-        yield replace(worst_table(m.tested.validation.shares), caption="Worst poses")
 
 
 def _rejected(m: ReportContent) -> Iterator[Block]:
@@ -583,17 +542,6 @@ def _rejected(m: ReportContent) -> Iterator[Block]:
     rejected = [s for s in d.suspects if not s.passes and s.plausible and s.share >= LEAST_SHARE]
     yield from _added_variables(d, rejected)
     yield from captioned(could_have_been_seen(d), "What could have been seen")
-
-
-def _all_parameters(m: ReportContent) -> Iterator[Block]:
-    yield from captioned(parameters(m.fit), "Parameters with standard uncertainties")
-    yield from captioned(remarks(m.fit))
-    yield Chart("Correlations", charts.correlations(m.fit), wide=True, height=0)
-
-
-def _scalings(m: ReportContent) -> Iterator[Block]:
-    if len(m.scalings) > 1:
-        yield from captioned(scalings_table(m.scalings), "The same model with each scaling")
 
 
 def _planned(m: ReportContent) -> Iterator[Block]:

@@ -3,7 +3,6 @@
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import rerun as rr
@@ -24,7 +23,7 @@ from hilcal.present.story import (
     worst_and_even,
 )
 from hilcal.present.viewer import recording, style
-from hilcal.present.viewer.recording import along, fixed
+from hilcal.present.viewer.recording import LOOPBACK, along, fixed
 from hilcal.robot.scene import capsules
 from hilcal.types import Floats, Ints
 
@@ -74,39 +73,32 @@ it, over the recorded variable that carries most of it; the line above names bot
 
 
 def save(story: Story, path: Path) -> None:
-    """Write a story as a recording file, atomically; an existing file is replaced.
-
-    Raises:
-        InputError: the folder is missing, or the file cannot be written.
-    """
+    """Write a story as a recording file; see `recording.write`."""
     rec = _opened(story)
     recording.write(rec, blueprint(story), lambda: tell(rec, story), Path(path))
 
 
 @contextlib.contextmanager
-def serve(story: Story, ip: str = "127.0.0.1", port: int = PORT) -> Iterator[str]:
+def serve(story: Story, port: int = PORT) -> Iterator[str]:
     """Serve a story at the yielded address until the block ends.
 
     Viewers (`rerun ADDRESS`) may join late and rejoin; their analytics are disabled for this user.
-
-    Raises:
-        InputError: the port is occupied.
-        HilcalError: the port cannot be served.
+    Raises InputError if the port is occupied, HilcalError if it cannot be served.
     """
-    server = f"viewer server {ip}:{port}"
+    server = f"viewer server {LOOPBACK}:{port}"
     recording.disable_analytics()
-    if (why := recording.refused(ip, port)) is not None:
+    if (why := recording.refused(port)) is not None:
         raise InputError(f"{server}: {why}; choose a free port of this machine")
     try:
         rec = _opened(story)
-        rec.set_sinks(rr.GrpcServerSink(bind_ip=ip, port=port))
+        rec.set_sinks(rr.GrpcServerSink(bind_ip=LOOPBACK, port=port))
         # Active, too: a viewer that showed another recording would keep its layout.
         rec.send_blueprint(blueprint(story), make_active=True, make_default=True)
         tell(rec, story)
     except (OSError, RuntimeError) as error:
         raise HilcalError(f"{server}: {error}") from error
     try:
-        yield f"rerun+http://{ip}:{port}/proxy"
+        yield f"rerun+http://{LOOPBACK}:{port}/proxy"
     finally:
         rec.disconnect()
 
@@ -150,27 +142,50 @@ def tell_revision(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> No
     _curve_bars(rec, "follows", r.follows)
     if any(x.laws for x in story.revisions):
         _curve_bars(rec, "law", r.laws[0] if r.laws else None)
-    parameters = style.markdown(r.panels.get("parameters", ()))
     for name, text in (
         ("verdict", verdict(story, r)),
-        ("parameters", parameters),
+        ("parameters", style.markdown(r.panels.get("parameters", ()))),
         ("revisions", revisions(story, r.revision)),
         ("details", details(story, r)),
     ):
         rec.log(f"words/{name}", style.document(text))
-    rec.log("log", rr.TextLog(log_line(story, r), level="INFO"))
+    line = (
+        f"revision {r.revision} ({r.name}): {numbers.length(r.error.rms_m)} rms, "
+        f"poses left out {numbers.length(r.holdout.rms_m)}, "
+        f"noise {numbers.length(story.noise_floor_m)}: {r.verdict.replace('_', ' ')}"
+    )
+    rec.log("log", rr.TextLog(style.safe(line), level="INFO"))
 
 
 def _poses(rec: rr.RecordingStream, story: Story) -> None:
     """Log the last revision on the timeline `pose`, and move the arm along it."""
+    r, time = story.revisions[-1], rr.TimeColumn("pose", sequence=story.poses)
     rec.set_time("pose", sequence=int(story.poses[0]))
-    tell_revision(rec, story, story.revisions[-1])
+    tell_revision(rec, story, r)
     rec.reset_time()
-    _pose_scene(rec, story)
-    time = rr.TimeColumn("pose", sequence=story.poses)
+    style.send_stands(rec, time, story.bodies)
+    far = story.last_of_poses(r.whitened_norm2)
+    place, (half, quaternions) = story.anchor[far], noise_balls(story, far)
+    current = rr.Arrows3D.columns(
+        origins=place,
+        vectors=arrows(story, r, far),
+        colors=style.LEVEL_COLORS[r.level[far]],
+        radii=np.full(len(far), 0.012),
+    )
+    along(rec, "world/residual/current", time, current)
+    bright = np.tile(np.array(style.PREDICTED, dtype=np.uint8), (len(far), 1))
+    ball = rr.Ellipsoids3D.columns(
+        centers=place, half_sizes=half, quaternions=quaternions, colors=bright
+    )
+    along(rec, "world/residual/ball", time, ball)
+    dots = [leader(p, h) for p, h in zip(place, half, strict=True)]
+    strips = rr.LineStrips3D.columns(strips=np.concatenate(dots))
+    along(rec, "world/residual/leader", time, strips.partition([len(x) for x in dots]))
+    labels = [f"pose {story.pose_name(i)}: {_size(story, r, i)}" for i in far.tolist()]
+    along(rec, "world/residual/worst", time, style.label_columns(place + _LABEL_ABOVE, labels))
     along(rec, "words/verdict", time, style.documents(pose_cards(story)))
     # the bar of the current pose; its entity's name, last in order, puts it in front
-    for pose, left, width, height in zip(*_bar_places(story, story.revisions[-1]), strict=True):
+    for pose, left, width, height in zip(*_bar_places(story, r), strict=True):
         rec.set_time("pose", sequence=int(pose))
         bar = rr.BarChart([height], abscissa=[left], widths=[width], color=style.MEASURED)
         rec.log("bars/zcurrent", bar)
@@ -198,9 +213,7 @@ def blueprint(story: Story) -> rrb.Blueprint:
         ),
         row_shares=[5, 4],
     )
-    play: Literal["following", "paused"] = "following" if story.growing else "paused"
-    views = rrb.Horizontal(left, right, column_shares=[3, 2])
-    return style.whole(views, "revision", play, fps=1.0)
+    return style.whole(left, right, "revision", following=story.growing, fps=1.0)
 
 
 def titles(story: Story) -> tuple[str, str, str]:
@@ -275,8 +288,7 @@ def _curve_bars(rec: rr.RecordingStream, entity: str, c: DependenceCurve | None)
             rec.log(f"{entity}/{part}", rr.Clear(recursive=False))
             continue
         width = np.diff(edges) / len(bars)
-        left = edges[:-1] + k * width
-        bar = rr.BarChart(bars[part], abscissa=left, widths=width, color=color)
+        bar = rr.BarChart(bars[part], abscissa=edges[:-1] + k * width, widths=width, color=color)
         rec.log(f"{entity}/{part}", bar)
 
 
@@ -358,15 +370,6 @@ def revisions(story: Story, upto: int) -> str:
     return style.markdown([table(*REVISION_HEADS, rows=rows, left=(0, 1, 7)), floor])
 
 
-def log_line(story: Story, r: StoryRevision) -> str:
-    """Return a revision in one line."""
-    return style.safe(
-        f"revision {r.revision} ({r.name}): {numbers.length(r.error.rms_m)} rms, "
-        f"poses left out {numbers.length(r.holdout.rms_m)}, "
-        f"noise {numbers.length(story.noise_floor_m)}: {r.verdict.replace('_', ' ')}"
-    )
-
-
 def residual_scale(story: Story) -> float:
     """Return the drawn length per length of a residual."""
     sigma = float(np.sqrt(np.median(np.trace(story.covariance, axis1=1, axis2=2)) / 3))
@@ -435,31 +438,6 @@ def _scene(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
     colors, thin = style.LEVEL_COLORS[r.level[some]], rr.Radius.ui_points(1.6)
     missed = rr.LineStrips3D(np.stack(tips, 1), colors=colors, radii=thin)
     rec.log("world/deflection/missed", missed)
-
-
-def _pose_scene(rec: rr.RecordingStream, story: Story) -> None:
-    """Send the arm and the highlighted arrow of every pose as columns on `pose`."""
-    r, time = story.revisions[-1], rr.TimeColumn("pose", sequence=story.poses)
-    style.send_stands(rec, time, story.bodies)
-    far = story.last_of_poses(r.whitened_norm2)
-    place, (half, quaternions) = story.anchor[far], noise_balls(story, far)
-    current = rr.Arrows3D.columns(
-        origins=place,
-        vectors=arrows(story, r, far),
-        colors=style.LEVEL_COLORS[r.level[far]],
-        radii=np.full(len(far), 0.012),
-    )
-    along(rec, "world/residual/current", time, current)
-    bright = np.tile(np.array(style.PREDICTED, dtype=np.uint8), (len(far), 1))
-    ball = rr.Ellipsoids3D.columns(
-        centers=place, half_sizes=half, quaternions=quaternions, colors=bright
-    )
-    along(rec, "world/residual/ball", time, ball)
-    dots = [leader(p, h) for p, h in zip(place, half, strict=True)]
-    strips = rr.LineStrips3D.columns(strips=np.concatenate(dots))
-    along(rec, "world/residual/leader", time, strips.partition([len(x) for x in dots]))
-    labels = [f"pose {story.pose_name(i)}: {_size(story, r, i)}" for i in far.tolist()]
-    along(rec, "world/residual/worst", time, style.label_columns(place + _LABEL_ABOVE, labels))
 
 
 def _size(story: Story, r: StoryRevision, i: int) -> str:

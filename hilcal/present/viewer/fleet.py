@@ -25,11 +25,9 @@ if TYPE_CHECKING:  # above this layer
     from hilcal.transfer.pooled import Pooled
 
 _JOINT = re.compile(r"\.j(\d+)\b")
-_STANDS = (0.0, -1.4, 1.0, -1.2, -1.57, 0.0)
-"""Joint values of the drawn arms, rad: upright, so that many fit side by side; a choice."""
+_STANDS = (0.0, -1.4, 1.0, -1.2, -1.57, 0.0)  # joint values of the drawn arms, rad: upright
 _APART = (0.62, 0.95)  # distances of arms and of their rows, shares of the reach; a choice
-_NAMED, _ROWS = 40, 12
-"""Most arms that are all labelled; most parameters that are drawn; choices."""
+_NAMED, _ROWS = 40, 12  # most arms that are all labelled; most parameters that are drawn; choices
 _LEAST_RANGE_S = 86400.0
 GUIDE = """### How to read this
 - **Arms**: one of each, side by side. A red joint is unlike the others of the type; its arm stands
@@ -139,7 +137,6 @@ def _rows(d: DrawnType) -> list[int]:
 
 
 def _drift(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
-    """Send each arm's campaigns along `date`, with an entity per parameter."""
     for k in _rows(d):
         for a, arm in enumerate(d.pooled.arms):
             determined = (d.owner == a) & np.isfinite(d.campaigns[:, k])
@@ -154,11 +151,7 @@ def _drift(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
 
 
 def record_fleet(fleet: "Fleet", path: Path) -> None:
-    """Write a fleet as a recording file; equal fleets give equal recordings.
-
-    Raises:
-        InputError: the folder is missing, or the file cannot be written.
-    """
+    """Write a fleet as a recording file; equal fleets give equal recordings."""
     types = [DrawnType(t, fleet.members) for t in fleet.types]
     names = [(d.pooled.type, d.pooled.arms, d.pooled.odd, d.names) for d in types]
     content = (a for d in types for a in (d.pooled.distance, d.seconds, d.campaigns))
@@ -182,7 +175,6 @@ def _log(rec: rr.RecordingStream, types: list[DrawnType]) -> None:
 
 
 def _blueprint(types: list[DrawnType]) -> rrb.Blueprint:
-    """Return the blueprint: left the arms over the dates, right the verdict and the parameters."""
     scenes, dates, texts = [], [], []
     for i, d in enumerate(types):
         title = f"{d.pooled.type}: " if len(types) > 1 else ""
@@ -201,5 +193,4 @@ def _blueprint(types: list[DrawnType]) -> rrb.Blueprint:
             dates.append(view)
         texts.append(style.text(f"type{i}", f"{title}Unlike the type"))
     left = rrb.Vertical(rrb.Tabs(*scenes), rrb.Tabs(*dates), row_shares=[3, 2])
-    right = rrb.Tabs(*texts, style.text("guide", "How to read this"))
-    return style.whole(rrb.Horizontal(left, right, column_shares=[3, 2]), "date")
+    return style.whole(left, rrb.Tabs(*texts, style.text("guide", "How to read this")), "date")

@@ -31,26 +31,20 @@ from hilcal.store.plan import Step
 from hilcal.types import Floats
 
 PORTS = 20  # number of ports that are tried; a choice
-MEMORY = "256MiB"
-"""Most memory of the server for viewers that join late; a choice, some 5000 readings."""
-SHARE = 0.02
-"""The file is flushed when it has grown by this share, so that it consists of few, large pieces. A
-killed process loses at most this share. A choice."""
+MEMORY = "256MiB"  # of the server for viewers that join late; a choice, some 5000 readings
+SHARE = 0.02  # growth at which the file is flushed, in large pieces; a killed process loses that
 _FLUSH_S, _END_S = 5.0, 8.0
-SIGMA_LENGTH, ARROW_CAP = 0.02, 0.4
-"""Drawn length of one σ of a residual, and largest length of an arrow, m; choices."""
-BALL = SIGMA_LENGTH * style.BALL_SIGMAS
+BALL = campaign.SIGMA_LENGTH * style.BALL_SIGMAS
 """Radius of the ball that holds 99 % of the readings if the model is right, m."""
 LIMIT = style.BALL_SIGMAS / 3**0.5  # the same in the σ of a reading
-ALARM = 0.001
-"""Probability of so many readings outside their balls below which the model is called wrong."""
+ALARM = 0.001  # chance of so many readings outside their balls that calls the model wrong
 WORST, REMARKS = 3, 3  # listed readings and remarks
 BALLS, MANY = 60, 300
 """Number of readings above which balls, and above which arrows, are drawn only for arrows that
 leave their balls; choices, for legibility."""
 FLUENT = 1000
-"""Most residuals that a viewer draws one by one. A picture of 10,000 took 3.5 times the processor
-time of one of 100 (tests/benchmarks/test_viewer_speed.py), one of 1000 some 1.2 times."""
+"""Most residuals that a viewer draws one by one; 10,000 take it 3.5 times the time of 100, 1000
+some 1.2 times (tests/benchmarks/test_viewer_speed.py)."""
 GROUPS = 150  # number of groups of more residuals; the number of bars of a finished recording
 TIMELINE = "time"
 RESIDUALS = "in σ: an arrow that leaves its noise ball = model wrong"
@@ -90,7 +84,7 @@ class LiveJudgement:
     @property
     def sigma(self) -> float:
         """sqrt(rᵀ V⁻¹ r / 3), as on the terminal: 1 on average if the model is right."""
-        return float(np.sqrt(self.norm2 / 3))
+        return math.sqrt(self.norm2 / 3)
 
     @property
     def level(self) -> int:
@@ -156,12 +150,6 @@ class LiveTally:
         self._group_worst = max(j.norm2, 0.0 if begins else self._group_worst)
         return j
 
-    @property
-    def wrong(self) -> bool:
-        """Whether more readings are outside of their balls than noise explains, see `ALARM`."""
-        chance = stats.binom.sf(self.outside - 1, self.judged, 1.0 - LIMITS[0])
-        return bool(chance < ALARM)
-
     def words(self) -> Iterator[Block]:
         """Yield the progress of the campaign and the verdict so far."""
         if self.judged == 0:
@@ -169,7 +157,7 @@ class LiveTally:
             yield "The first readings tell where tracker and target are; then each one is compared."
         else:
             title, advice = "✓ So far noise explains the readings", ""
-            if self.wrong:
+            if stats.binom.sf(self.outside - 1, self.judged, 1.0 - LIMITS[0]) < ALARM:
                 title = "✗ The simple model fails: look at the red arrows"
                 advice = " Something is missing in it: hilcal refine says what, after measuring."
             yield heading(title)
@@ -183,13 +171,16 @@ class LiveTally:
         if goal is not None and (value := status_words(goal)):
             yield f"Goal: {value}."
         if len(self.loads) > 1 and self.outside:
-            rows = [(n, str(a), str(b), numbers.percent(b / a)) for n, (a, b) in self.loads.items()]
-            yield table("load", "compared", "outside", "", rows=rows)
+            shares = ((n, a, b, numbers.percent(b / a)) for n, (a, b) in self.loads.items())
+            yield table(
+                "load", "compared", "outside", "", rows=(tuple(map(str, x)) for x in shares)
+            )
         if worst := [j for j in self.worst if j.level > 0]:
-            names = (f"{j.step.pose} {j.target}".rstrip() for j in worst)
-            sizes = ((j.step.load, numbers.length(j.length), f"{j.sigma:.1f}") for j in worst)
-            rows = [(name, *size) for name, size in zip(names, sizes, strict=True)]
-            yield table("worst so far", "load", "residual", "in σ", rows=rows, left=(0, 1))
+            rows = table("worst so far", "load", "residual", "in σ", left=(0, 1))
+            for j in worst:
+                name, size = f"{j.step.pose} {j.target}".rstrip(), numbers.length(j.length)
+                rows.add(name, j.step.load, size, f"{j.sigma:.1f}")
+            yield rows
         yield Items(tuple(f"note: {text}" for text in self.remarks[-REMARKS:]))
 
 
@@ -200,14 +191,10 @@ def live_blueprint(d: LiveTally, world: str, series: str) -> rrb.Blueprint:
     drawn = "Residual of each reading," if d.group == 1 else f"Worst of every {d.group} residuals,"
     middle, size = style.center(d.targets, 0.3 * d.measured.arm.reach)
     points = np.vstack([d.targets, d.bodies[0, :, :3, 3]])
-    scene = style.view3d(
-        "world",
-        f"{drawn} {RESIDUALS}",
-        style.near(middle, style.EYE * size, points),
-        middle,
-        [f"+ {world}/**"],
-        overrides={f"{world}/{name}": so_far for name in ("arrows", "balls", "dots")},
-    )
+    place, more = style.near(middle, style.EYE * size, points), ("arrows", "balls", "dots")
+    overrides = {f"{world}/{name}": so_far for name in more}
+    name = f"{drawn} {RESIDUALS}"
+    scene = style.view3d("world", name, place, middle, [f"+ {world}/**"], overrides=overrides)
     in_time = rrb.TimeSeriesView(
         origin=series,
         name=f"{drawn} {IN_TIME}",
@@ -223,7 +210,7 @@ def live_blueprint(d: LiveTally, world: str, series: str) -> rrb.Blueprint:
     texts = (("measuring", "So far"), ("live_guide", "How to read this"))
     left = rrb.Vertical(scene, in_time, row_shares=[11, 4])
     right = rrb.Vertical(rrb.Tabs(*(style.text(*w) for w in texts)), log, row_shares=[3, 2])
-    return style.whole(rrb.Horizontal(left, right, column_shares=[3, 2]), TIMELINE, "following")
+    return style.whole(left, right, TIMELINE, following=True)
 
 
 class LiveScene:
@@ -300,15 +287,13 @@ class LiveScene:
                 colors=np.tile(np.array(style.MEASURED, dtype=np.uint8), (len(steps), 1)),
                 radii=np.full(len(steps), 0.01),
             )
-            time = rr.TimeColumn(TIMELINE, timestamp=list(walls))
-            along(rec, f"{self._world}/dots", time, dots)
+            along(rec, f"{self._world}/dots", rr.TimeColumn(TIMELINE, timestamp=list(walls)), dots)
         self._passed.append((wall, tuple(start.plan.q[0].tolist())))
         self._move()
         self._send_summary(d)
         self._show(live_blueprint(d, self._world, self._series))
 
     def _move(self) -> None:
-        """Send the motion of the arm since the last call."""
         passed, self._passed, self._since = self._passed, [], 0
         if passed and self._arm is not None and self._tally is not None:
             bodies = body_poses(self._tally.measured.arm, np.array([q for _, q in passed]))
@@ -334,7 +319,6 @@ class LiveScene:
             self._send_summary(d)
 
     def _reading(self, d: LiveTally, event: ReadingStored) -> None:
-        """Draw a reading: each target's arrow, ball and point in time, and a label."""
         rec, count = self._rec, d.judged
         dots, arrows, balls, last = [], [], [], []
         judgements = d.add(event)
@@ -344,7 +328,7 @@ class LiveScene:
                 dots.append(place)
                 continue
             # along r, of length sqrt(rᵀ V⁻¹ r) in σ
-            length = min(SIGMA_LENGTH * float(np.sqrt(j.norm2)), ARROW_CAP)
+            length = min(campaign.SIGMA_LENGTH * math.sqrt(j.norm2), campaign.ARROW_CAP)
             arrow = (place, length / (j.length or 1.0) * np.array(live.vector), j.level)
             last.append(arrow)
             if not j.stands_out:
@@ -355,8 +339,7 @@ class LiveScene:
                 balls.append(place)
             rec.log(f"{self._series}/{style.LEVEL_NAMES[j.level]}", rr.Scalars(j.sigma))
         if dots:
-            points = rr.Points3D(dots, colors=[style.MEASURED], radii=[0.01])
-            rec.log(f"{self._world}/dots", points)
+            rec.log(f"{self._world}/dots", rr.Points3D(dots, colors=[style.MEASURED], radii=[0.01]))
         if arrows:
             rec.log(f"{self._world}/arrows", style.residual_arrows(*zip(*arrows, strict=True)))
         if balls:
@@ -401,17 +384,17 @@ class LiveScene:
 def follow(messages: BinaryIO, reply: Callable[..., None], record: Path, port: int) -> None:
     """Draw pickled messages (time of day in s, event) into a file, and at a port from `port` on."""
     identifier = str(uuid.uuid4())
-    outlets = [_Outlet(identifier, reply, f"recording {record}", file=record)]
+    outlets = [_Outlet(identifier, reply, file=record)]
     with contextlib.suppress(OSError):
         recording.disable_analytics()
     ports = range(port, port + PORTS)
-    free = next((p for p in ports if recording.refused("127.0.0.1", p) is None), None)
+    free = next((p for p in ports if recording.refused(p) is None), None)
     if free is None:
         reply(problem=f"no free port from {port} to {ports[-1]}: no live viewer is served")
         reply(url=None)
     else:
-        outlets.append(_Outlet(identifier, reply, f"live viewer at port {free}", port=free))
-        reply(url=f"rerun+http://127.0.0.1:{free}/proxy")
+        outlets.append(_Outlet(identifier, reply, port=free))
+        reply(url=f"rerun+http://{recording.LOOPBACK}:{free}/proxy")
     with contextlib.suppress(EOFError, pickle.UnpicklingError):
         while True:
             wall, event = pickle.load(messages)  # noqa: S301 - of the command that started us
@@ -426,15 +409,10 @@ class _Outlet:
     """A file or a port that gets the drawing; a failure is reported once, other outlets go on."""
 
     def __init__(
-        self,
-        identifier: str,
-        reply: Callable[..., None],
-        name: str,
-        file: Path | None = None,
-        port: int = 0,
+        self, identifier: str, reply: Callable[..., None], file: Path | None = None, port: int = 0
     ) -> None:
-        """Open a file or a port."""
-        self._reply, self._name, self._file = reply, name, file
+        self._reply, self._file = reply, file
+        self._name = f"recording {file}" if file else f"live viewer at port {port}"
         self._scene: LiveScene | None = None
         self._drawn, self._written = 0, 0
         config = rr.ChunkBatcherConfig(flush_tick=timedelta(days=1)) if file else None
@@ -443,7 +421,7 @@ class _Outlet:
             self._rec.set_sinks(
                 rr.FileSink(str(file))
                 if file
-                else rr.GrpcServerSink("127.0.0.1", port, server_memory_limit=MEMORY)
+                else rr.GrpcServerSink(recording.LOOPBACK, port, server_memory_limit=MEMORY)
             )
             self._scene = LiveScene(self._rec, batches=file is not None)
         except (OSError, RuntimeError, ValueError) as error:

@@ -3,6 +3,7 @@
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -28,25 +29,20 @@ from hilcal.robot.scene import body_poses, capsules
 from hilcal.store.plan import UNLOADED, Plan
 from hilcal.types import Floats, Ints
 
-SEEN, TURNED, HIDDEN, UNKNOWN = range(4)
-"""Sight of the target by the tracker: free; turned too far away; occluded; unknown, since the
-tracker's position is unknown."""
+SEEN, TURNED, HIDDEN, UNKNOWN = range(4)  # sight of the target; unknown without a tracker's place
 SIGHT_COLORS = np.array([style.NOISE, style.AMBER, style.RED, style.GREY], dtype=np.uint8)
 SIGHT_WORDS = ("seen", "turned too far away", "hidden", "sight not checked")
 NOT_FIRST = ("", "takes about")  # rows of the cost of a plan that belong to the details
 STEPS = "Plan step by step: a bead per pose and load, beam green = seen"
 TRACKER = "From the tracker"
 SCHEDULE = "Schedule: minute of each reading by step, colour by load"
-BEAD, BEAD_GAP = 0.0075, 0.016
-"""Radius of a bead, and distance of two beads in a stack, shares of the reach."""
+BEAD, BEAD_GAP = 0.0075, 0.016  # radius of a bead, distance of two in a stack, shares of the reach
 # Colours with a contrast of about 3 to the labels' background in both themes.
 _UNLOADED: style.Color = (225, 226, 230)
 # After Okabe & Ito's palette for colour-blind readers, without the colours of the sight.
-_LOADS = np.array(
-    [
-        *((86, 180, 233), (240, 228, 66), (204, 121, 167), (70, 110, 235)),
-        *((205, 150, 110), (120, 220, 215), (165, 120, 245)),
-    ]
+_LOADS = (
+    *((86, 180, 233), (240, 228, 66), (204, 121, 167), (70, 110, 235)),
+    *((205, 150, 110), (120, 220, 215), (165, 120, 245)),
 )
 _FADED = 0.62
 _OBSTACLE, _BOX, _TRACKER = (122, 112, 104), (64, 82, 108), (235, 235, 240)
@@ -82,10 +78,8 @@ load changes by hand.
 class PlanView:
     """A plan in its cell: positions of everything at each of the S steps, base axes, SI.
 
-    `powers` are those of the pairs of suspects that the plan separates.
-
-    Raises:
-        InputError: the plan's poses do not have as many joints as the arm.
+    `powers` are those of the pairs of suspects that the plan separates. Raises InputError if the
+    plan's poses do not have as many joints as the arm.
     """
 
     def __init__(
@@ -97,11 +91,9 @@ class PlanView:
         powers: tuple[PairPower, ...] = (),
     ) -> None:
         arm, loads, steps = cell.arm, plan.loads, plan.steps
-        if plan.q.shape[1] != arm.n:
-            raise InputError(
-                f"the plan has {plan.q.shape[1]} joint angles per pose; {arm.name} has {arm.n} "
-                "joints"
-            )
+        if (has := plan.q.shape[1]) != arm.n:
+            why = f"{has} joint angles per pose; {arm.name} has {arm.n} joints"
+            raise InputError(f"the plan has {why}")
         self.cell, self.config, self.plan = cell, config, plan
         self.summary, self.powers = summary, powers
         self.reach = max(arm.reach, 0.1)  # m, scale of drawn sizes
@@ -132,15 +124,13 @@ class PlanView:
         self.time = timeline(plan, arm, config.limits.joint_margin_rad, pace(config))[1]
         # (L, 3) a colour of each load; after seven they repeat, darker
         hung = [name for name in loads if name != UNLOADED]
-        rgb = {n: _LOADS[k % 7] * _FADED ** (k // 7) for k, n in enumerate(hung)}
-        colors = [rgb.get(n, np.array(_UNLOADED)) for n in loads]
-        self.colors = np.array(colors).round().astype(np.uint8)
+        rgb = {n: np.array(_LOADS[k % 7]) * _FADED ** (k // 7) for k, n in enumerate(hung)}
+        self.colors = np.array([rgb.get(n, _UNLOADED) for n in loads]).round().astype(np.uint8)
 
     def __len__(self) -> int:
         return len(self.plan.steps)
 
     def _sight(self) -> Ints:
-        """Return the sight (S,) of the target at each step."""
         if self.view is None:
             return np.full(len(self), UNKNOWN)
         free = np.zeros(len(self), dtype=np.bool_)
@@ -179,7 +169,6 @@ class PlanView:
 
 
 def _static_scene(rec: rr.RecordingStream, d: PlanView) -> None:
-    """Log the static entities: shapes of the arm, surroundings, and a bead per reading."""
     fixed(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     of_arm, parts = len(capsules(d.cell.arm)), d.shapes.scene.parts
     style.log_shapes(rec, style.shapes(parts[:of_arm], parts[of_arm:]))
@@ -188,21 +177,17 @@ def _static_scene(rec: rr.RecordingStream, d: PlanView) -> None:
     _beads(rec, d)
     if d.tracker is not None:
         low, high = ((d.tracker + k * _HEAD * _UP)[None] for k in (-1.2, 0.2))
-        head = style.drawn_capsules(low, high, np.array([_HEAD]), [_TRACKER])
-        fixed(rec, "world/tracker", head)
+        fixed(rec, "world/tracker", style.drawn_capsules(low, high, np.array([_HEAD]), [_TRACKER]))
         above = d.tracker + 2.2 * _HEAD * _UP
         fixed(rec, "world/tracker/name", style.labels([above], ["tracker"]))
 
 
 def _obstacles(rec: rr.RecordingStream, things: tuple[Obstacle, ...]) -> None:
     if boxes := [x for x in things if x.center_m is not None]:
+        centers, sizes = [x.center_m or () for x in boxes], [x.size_m or () for x in boxes]
         for part, mode, alpha in (("body", "solid", _SOLID), ("edge", "majorwireframe", 255)):
-            drawn = rr.Boxes3D(
-                centers=[x.center_m or () for x in boxes],
-                sizes=[x.size_m or () for x in boxes],
-                colors=[(*_OBSTACLE, alpha)],
-                fill_mode=mode,  # type: ignore[arg-type]
-            )
+            look: dict[str, Any] = {"colors": [(*_OBSTACLE, alpha)], "fill_mode": mode}
+            drawn = rr.Boxes3D(centers=centers, sizes=sizes, **look)
             fixed(rec, f"world/obstacles/box/{part}", drawn)
     if stood := [x for x in things if x.bottom_m is not None]:
         height = np.array([x.height_m for x in stood], dtype=float)
@@ -231,13 +216,8 @@ def _named_at(thing: Obstacle) -> Floats:
 def _workspace(rec: rr.RecordingStream, d: PlanView) -> None:
     """Log the outlines of the sides of the workspace, for stated limits only."""
     limits, reach = d.config.limits, 1.1 * d.reach
-    ends = np.array(
-        [
-            limits.workspace_min_m or (-reach, -reach, 0.0),
-            limits.workspace_max_m or (reach, reach, reach),
-        ],
-        dtype=float,
-    )
+    least = limits.workspace_min_m or (-reach, -reach, 0.0)
+    ends = np.array([least, limits.workspace_max_m or (reach, reach, reach)], dtype=float)
     low, high = ends.min(0), ends.max(0)
     sides = []
     for stated, corner in ((limits.workspace_min_m, low), (limits.workspace_max_m, high)):
@@ -263,7 +243,7 @@ def _beads(rec: rr.RecordingStream, d: PlanView) -> None:
     if lost.any():
         cages = rr.Ellipsoids3D(
             centers=center[lost],
-            half_sizes=np.full((int(lost.sum()), 3), 1.9 * BEAD * d.reach),
+            half_sizes=np.full_like(center[lost], 1.9 * BEAD * d.reach),
             colors=SIGHT_COLORS[d.sight[steps[lost]]],
             fill_mode="majorwireframe",
             line_radii=rr.Radius.ui_points(0.5),
@@ -276,9 +256,9 @@ def _step_scene(rec: rr.RecordingStream, d: PlanView) -> None:
     style.send_stands(rec, d.steps, d.bodies[:, :-1])
     colors, beams = d.colors[d.load], SIGHT_COLORS[d.sight]
 
-    def lines(path: str, strips: object, colors: object, radius: float) -> None:
+    def lines(path: str, strips: Any, colors: Any, radius: float) -> None:
         radii = np.full(len(d), radius * d.reach)
-        drawn = rr.LineStrips3D.columns(strips=strips, colors=colors, radii=radii)  # type: ignore[arg-type]
+        drawn = rr.LineStrips3D.columns(strips=strips, colors=colors, radii=radii)
         along(rec, path, d.steps, drawn)
 
     radii = np.full(len(d), 1.7 * BEAD * d.reach)
@@ -323,15 +303,12 @@ def _loads(rec: rr.RecordingStream, d: PlanView) -> None:
             load: rr.AsComponents = rr.Clear(recursive=False)
             pull: rr.AsComponents = rr.Clear(recursive=False)
             if hung:
-                start, end = (
-                    np.array([getattr(x, side)[i] for x in hung]) for side in ("start", "end")
-                )
+                start, end = (np.array([getattr(x, k)[i] for x in hung]) for k in ("start", "end"))
                 load = style.drawn_capsules(start, end, np.array([x.radius for x in hung]), [color])
             if force.any():
+                look: dict[str, Any] = {"colors": [color], "radii": [0.006 * d.reach]}
                 way = [_FORCE_LENGTH * force / most]
-                pull = rr.Arrows3D(
-                    origins=[hook[step]], vectors=way, colors=[color], radii=[0.006 * d.reach]
-                )
+                pull = rr.Arrows3D(origins=[hook[step]], vectors=way, **look)
             rec.log("world/load/capsules", load)
             rec.log("world/load/arrow", pull)
     rec.reset_time()
@@ -349,11 +326,8 @@ def record_plan(
 
     The timeline `step` counts the readings in their order from 1: the arm in its pose, the hanging
     load, and the beam of the tracker, coloured by the sight of the target. Equal plans give equal
-    recordings. `powers` of the pairs of suspects that the plan separates are shown first.
-
-    Raises:
-        InputError: the folder is missing, the file cannot be written, or the plan's poses do not
-            fit the arm.
+    recordings. `powers` of the pairs of suspects that the plan separates are shown first. Raises as
+    `PlanView` and `recording.write`.
     """
     d = PlanView(cell, config, plan, summary, powers)
     rec = recording.opened(d.config.to_json(), d.plan.to_json(), d.summary, d.powers)
@@ -380,8 +354,7 @@ def overview(d: PlanView) -> str:
     s, tracker = d.summary, NO_TRACKER
     title = f"Plan: {s.poses} poses, {s.readings} readings, {spoken(s.duration.total)}"
     if d.tracker is not None:
-        lost = int(d.unseen.sum())
-        tracker = f"✓ sees the target in all {len(d)} readings"
+        lost, tracker = int(d.unseen.sum()), f"✓ sees the target in all {len(d)} readings"
         if lost:
             tracker = f"✗ does not see the target in {lost} of {len(d)} readings"
     rows = [row for row in plan_blocks.cost_rows(s) if row[0] not in NOT_FIRST]
@@ -406,20 +379,15 @@ def step_card(d: PlanView, k: int) -> str:
     x, y, z = d.target[k]
     name = "Target" if d.cell.target_known else "Flange (the target's place is not known)"
     place = f"{name} at {x:.3f}, {y:.3f}, {z:.3f} m, base axes."
-    return style.markdown(
-        [head, when, *by_hand, _sight(d, k), table("joint", "deg", rows=rows), place]
-    )
-
-
-def _sight(d: PlanView, k: int) -> Words:
-    if d.tracker is None:
-        return Words(numbers.sentence(NO_TRACKER))
-    way = f"at {float(np.linalg.norm(d.tracker - d.target[k])):.2f} m"
-    if d.incidence is not None:
-        way += f", {np.rad2deg(d.incidence[k]):.0f}° off the reflector's normal"
-    if d.sight[k] == SEEN:
-        return Words(f"✓ The tracker sees the target {way}.")
-    return Words(f"✗ The tracker does not see the target {way}: {d.why(k)}.", "strong")
+    sight = Words(numbers.sentence(NO_TRACKER))
+    if d.tracker is not None:
+        way = f"at {float(np.linalg.norm(d.tracker - d.target[k])):.2f} m"
+        if d.incidence is not None:
+            way += f", {np.rad2deg(d.incidence[k]):.0f}° off the reflector's normal"
+        sight = Words(f"✓ The tracker sees the target {way}.")
+        if d.sight[k] != SEEN:
+            sight = Words(f"✗ The tracker does not see the target {way}: {d.why(k)}.", "strong")
+    return style.markdown([head, when, *by_hand, sight, table("joint", "deg", rows=rows), place])
 
 
 def _schedule(rec: rr.RecordingStream, d: PlanView) -> None:
@@ -432,16 +400,11 @@ def _schedule(rec: rr.RecordingStream, d: PlanView) -> None:
         name = "not seen by the tracker"
         series.append(("unseen", name, d.unseen, style.RED, "cross", 2 * _DOT))
     for entity, name, members, color, marker, size in series:
-        points = rr.SeriesPoints(
-            names=[f"{style.safe(name)}: {int(members.sum())}"],
-            colors=[color],
-            markers=[marker],  # type: ignore[list-item]
-            marker_sizes=[size],
-        )
-        fixed(rec, f"schedule/{entity}", points)
+        named = f"{style.safe(name)}: {int(members.sum())}"
+        look: dict[str, Any] = {"colors": [color], "markers": [marker], "marker_sizes": [size]}
+        fixed(rec, f"schedule/{entity}", rr.SeriesPoints(names=[named], **look))
         time = rr.TimeColumn("step", sequence=np.flatnonzero(members) + 1)
-        minutes = rr.Scalars.columns(scalars=d.time[members] / 60.0)
-        along(rec, f"schedule/{entity}", time, minutes)
+        along(rec, f"schedule/{entity}", time, rr.Scalars.columns(scalars=d.time[members] / 60.0))
 
 
 def blueprint(d: PlanView) -> rrb.Blueprint:
@@ -470,4 +433,4 @@ def blueprint(d: PlanView) -> rrb.Blueprint:
     left = rrb.Vertical(rrb.Tabs(*scenes), times, row_shares=[7, 2])
     tabs = rrb.Tabs(*(style.text(*t) for t in texts))
     right = rrb.Vertical(tabs, style.text("details", "Details"), row_shares=[5, 4])
-    return style.whole(rrb.Horizontal(left, right, column_shares=[3, 2]), "step", fps=_FPS)
+    return style.whole(left, right, "step", fps=_FPS)

@@ -17,17 +17,17 @@ import rerun.blueprint as rrb
 from hilcal.errors import HilcalError, InputError
 from hilcal.whole_file import replace_file
 
-APPLICATION = "hilcal"
+APPLICATION, LOOPBACK = "hilcal", "127.0.0.1"
 _FLUSH_TIMEOUT = 10.0
 _LOG = logging.getLogger(__name__)
 
 
-def refused(ip: str, port: int) -> Exception | None:
+def refused(port: int) -> Exception | None:
     """Return why a port cannot be bound, None if it can; a server would only log the error."""
     try:
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind((ip, port))
+            probe.bind((LOOPBACK, port))
     except (OSError, OverflowError) as error:
         return error
     return None
@@ -39,9 +39,8 @@ def opened(*content: object) -> rr.RecordingStream:
     for part in content:
         array = isinstance(part, np.ndarray)
         sha.update(np.ascontiguousarray(part).tobytes() if array else repr(part).encode())
-    identifier = str(uuid.UUID(bytes=sha.digest()[:16]))
     # Chunks end at a flush, not at a clock tick, so that equal content gives equal files.
-    return stream(identifier, rr.ChunkBatcherConfig.NEVER())
+    return stream(str(uuid.UUID(bytes=sha.digest()[:16])), rr.ChunkBatcherConfig.NEVER())
 
 
 def stream(identifier: str, batches: rr.ChunkBatcherConfig | None) -> rr.RecordingStream:
@@ -77,9 +76,7 @@ def write(
     """Write what `tell` logs to a file, atomically, and close the stream.
 
     The recording is encoded in memory, since rerun's file sink can wait forever on a full disk.
-
-    Raises:
-        InputError: the folder is missing, or the file cannot be written.
+    Raises InputError if the folder is missing, or the file cannot be written.
     """
     if not path.parent.is_dir():
         raise InputError(f"recording {path}: no folder {path.parent}; make it first")
@@ -93,11 +90,7 @@ def write(
 
 
 def flush(rec: rr.RecordingStream) -> None:
-    """Send everything logged so far to the sinks; a slow viewer costs at most the time-out.
-
-    Raises:
-        HilcalError: a sink has failed, e.g. because the disk is full.
-    """
+    """Send what was logged to the sinks; HilcalError if one has failed, a slow one may time out."""
     try:
         rec.flush(timeout_sec=_FLUSH_TIMEOUT)
     except (ValueError, RuntimeError, OSError) as error:

@@ -135,17 +135,11 @@ def target_shapes(arm: Arm, targets: Floats) -> Shapes:
     return [*((p, DARK) for p in rods), *((p, MEASURED) for p in balls)]
 
 
-def drawn_capsules(start: Floats, end: Floats, radius: Floats, colors: object) -> rr.Capsules3D:
+def drawn_capsules(start: Floats, end: Floats, radius: Floats, colors: Any) -> rr.Capsules3D:
     """Return capsules between ends (K, 3); rerun's lie along z from the origin."""
-    length, quaternions = _along(end - start)
-    return rr.Capsules3D(
-        lengths=length,
-        radii=radius,
-        translations=start,
-        quaternions=quaternions,
-        colors=colors,  # type: ignore[arg-type]
-        fill_mode="solid",
-    )
+    length, turn = _along(end - start)
+    look: dict[str, Any] = {"radii": radius, "colors": colors, "fill_mode": "solid"}
+    return rr.Capsules3D(lengths=length, translations=start, quaternions=turn, **look)
 
 
 def _along(way: Floats) -> tuple[Floats, Floats]:
@@ -187,11 +181,9 @@ class MovingArm:
         self._rec, self._path = rec, path
         self._body = np.array([p.body for p, _ in parts], dtype=np.int64)
         self._start, self._end, radius, colors = _arrays(parts)
-        lengths = np.linalg.norm(self._end - self._start, axis=1)
-        look = rr.Capsules3D.from_fields(
-            lengths=lengths, radii=radius, colors=colors, fill_mode="solid"
-        )
-        fixed(rec, path, look)
+        lengths, _ = _along(self._end - self._start)
+        look: dict[str, Any] = {"radii": radius, "colors": colors, "fill_mode": "solid"}
+        fixed(rec, path, rr.Capsules3D.from_fields(lengths=lengths, **look))
 
     def send(self, timeline: str, walls: list[float], bodies: Floats) -> None:
         """Send the poses of the bodies (K, n + 2, 4, 4) at K times of day, s."""
@@ -242,13 +234,9 @@ def labels(places: Sequence[Floats] | Floats, texts: Sequence[str]) -> rr.Points
 def label_columns(places: Floats, texts: Sequence[str]) -> rr.ComponentColumnList:
     """Return labels at points (K, 3), one per time."""
     count = len(places)
-    return rr.Points3D.columns(
-        positions=places,
-        labels=[safe(t) for t in texts],
-        colors=np.tile(np.array(LABEL, dtype=np.uint8), (count, 1)),
-        radii=np.full(count, 1e-4),
-        show_labels=[True] * count,
-    )
+    text, colors = [safe(t) for t in texts], np.full((count, 3), LABEL, dtype=np.uint8)
+    look: dict[str, Any] = {"radii": np.full(count, 1e-4), "show_labels": [True] * count}
+    return rr.Points3D.columns(positions=places, labels=text, colors=colors, **look)
 
 
 def hidden(eye: Floats, points: Floats, things: tuple[Obstacle, ...]) -> Bools:
@@ -296,14 +284,16 @@ def near(look: Floats, way: Floats, points: Floats) -> Floats:
 
 
 def whole(
-    contents: rrb.Container,
+    left: rrb.Container,
+    right: rrb.Container,
     timeline: str,
-    play: Literal["paused", "following"] = "paused",
+    following: bool = False,
     fps: float | None = None,
 ) -> rrb.Blueprint:
-    """Return a blueprint of these views, with a time panel and without other panels."""
+    """Return a blueprint of views beside each other, with a time panel and without other panels."""
+    play: Literal["paused", "following"] = "following" if following else "paused"
     return rrb.Blueprint(
-        contents,
+        rrb.Horizontal(left, right, column_shares=[3, 2]),
         rrb.TimePanel(timeline=timeline, state="collapsed", fps=fps, play_state=play),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),

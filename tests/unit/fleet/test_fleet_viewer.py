@@ -9,7 +9,7 @@ from hilcal.present.viewer.fleet import DrawnType, places, record_fleet
 from hilcal.robot.scene import capsules
 from hilcal.transfer.fleet import Fleet
 from hilcal.transfer.pooled import pooled
-from tests.support.picture import Shot, pictures, vulkan_available
+from tests.support.picture import Shot, needs_vulkan, pictures
 from tests.support.recordings import chunks, entities, rows
 from tests.support.viewer_plan import rgb
 from tests.unit.fleet.test_fleet import ARMS, ODD, members, posterior_of, readings_of
@@ -80,7 +80,7 @@ def test_an_ordinary_fleet_has_nothing_red(one, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not vulkan_available(), reason="no Vulkan driver installed")
+@needs_vulkan
 def test_the_viewer_draws_it_without_a_complaint(one, tmp_path):
     path = recorded(one, tmp_path / "fleet.rrd", 1.5)
     told = pictures(path, [Shot(tmp_path / "fleet.png")], (960, 540), 480)

@@ -10,8 +10,6 @@ from hilcal import numbers
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.background import FamilySize
 from hilcal.present import charts
-from hilcal.present import charts as style
-from hilcal.present.charts import MOST_FAMILIES
 from hilcal.present.document import says
 from hilcal.present.story import LEVEL_NAMES, regressor, round_factor
 from tests.support.campaigns import campaign
@@ -68,7 +66,7 @@ def test_residuals_are_mahalanobis_distances_with_their_names_colours_and_marks(
     told, r = first
     timed = replace(told, time_s=60.0 * np.arange(len(told)))
     by_joint = charts.residual_by_joint(told, r, 1)
-    limits = (0.0, *style.SIGMA_LIMITS, np.inf)
+    limits = (0.0, *charts.SIGMA_LIMITS, np.inf)
     for figure in (
         charts.residual_by_pose(told, r),
         charts.residual_by_load(told, r),
@@ -80,10 +78,12 @@ def test_residuals_are_mahalanobis_distances_with_their_names_colours_and_marks(
         assert says(figure)
         for trace in figure.data:
             k, y = LEVEL_NAMES.index(trace.name), np.asarray(trace.y, float)
-            assert (trace.marker.color, trace.marker.symbol) == (style.LEVELS[k], style.SYMBOLS[k])
+            assert (trace.marker.color, trace.marker.symbol) == (
+                charts.LEVELS[k],
+                charts.SYMBOLS[k],
+            )
             assert ((y >= limits[k] - 1e-5) & (y <= limits[k + 1] + 1e-5)).all()
-    angles = np.sort(np.degrees(told.q[:, 1]))
-    np.testing.assert_allclose(points(by_joint, "x"), angles, rtol=1e-6)
+    np.testing.assert_allclose(points(by_joint, "x"), np.sort(np.degrees(told.q[:, 1])), rtol=1e-6)
     worst = int(np.argmax(r.whitened_norm2))
     size = 1e6 * np.linalg.norm(r.residual[worst])
     name = f"{told.pose_name(worst)}, {told.load_names[worst]}: {size:.0f} µm"
@@ -175,8 +175,8 @@ def test_the_noise_check_counts_every_element():
     assert "larger than the stated noise" in says(charts.noise_check(f))
 
 
-@pytest.mark.parametrize("color", [style.MEASURED, style.NOISE, style.HOLDOUT, *style.LEVELS])
-@pytest.mark.parametrize("paper", [style.LIGHT, style.DARK])
+@pytest.mark.parametrize("color", [charts.MEASURED, charts.NOISE, charts.HOLDOUT, *charts.LEVELS])
+@pytest.mark.parametrize("paper", [charts.LIGHT, charts.DARK])
 def test_colours_stand_out_on_both_papers(color, paper):
     rgb = (tuple(bytes.fromhex(c.removeprefix("#"))) for c in (color, paper))
     assert contrast(*rgb) >= 3.0
@@ -184,7 +184,7 @@ def test_colours_stand_out_on_both_papers(color, paper):
 
 def test_a_scheme_changes_the_look_and_nothing_else(told):
     figure = charts.error_per_revision(told)
-    dark = style.in_scheme(figure, dark=True)
+    dark = charts.in_scheme(figure, dark=True)
     assert dark.layout.template.layout.font.color != figure.layout.template.layout.font.color
     assert (dark.data, says(dark)) == (figure.data, says(figure))
 
@@ -192,15 +192,15 @@ def test_a_scheme_changes_the_look_and_nothing_else(told):
 def test_the_sizes_of_families_are_drawn_by_those_of_an_ordinary_arm_with_their_intervals():
     sizes = [
         FamilySize(f"f{k}", f"f{k}", k == 0, 2.0, 1.0, 6.0, 4.0, "rad", 1e-3 / (k + 1))
-        for k in range(MOST_FAMILIES + 3)
+        for k in range(charts.MOST_FAMILIES + 3)
     ]
     figure = charts.made_of(sizes)
     named, other = figure.data
-    assert [*named.y, *other.y] == [s.name for s in sizes[:MOST_FAMILIES]]
+    assert [*named.y, *other.y] == [s.name for s in sizes[: charts.MOST_FAMILIES]]
     for trace in figure.data:
         np.testing.assert_allclose(trace.x, 0.5)
         np.testing.assert_allclose(trace.x + trace.error_x.array, 1.5)
         np.testing.assert_allclose(trace.x - trace.error_x.arrayminus, 0.25)
     assert figure.layout.yaxis.categoryarray[-1] == "f0"  # on top
     assert "f0 moves the target most, by 1.00 mm rms" in says(figure)
-    assert f"The {MOST_FAMILIES} of {MOST_FAMILIES + 3} families" in says(figure)
+    assert f"The {charts.MOST_FAMILIES} of {charts.MOST_FAMILIES + 3} families" in says(figure)

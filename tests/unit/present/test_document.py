@@ -3,16 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilcal.present.document import (
-    Table,
-    Words,
-    captioned,
-    heading,
-    note,
-    pairs,
-    shared,
-    table,
-)
+from hilcal.present.document import Table, Words, captioned, heading, note, pairs, shared, table
 
 WORD = st.text("abcdefghij_", min_size=1, max_size=26)
 WORDS = st.lists(WORD, min_size=1, max_size=6).map(" ".join)

@@ -10,7 +10,7 @@ from hilcal.measuring.progress import ArmAt, LiveResidual, ReadingStored, Remark
 from hilcal.present.viewer import live, style
 from hilcal.present.viewer.live import BALL, FLUENT, GROUPS, LIMIT, MANY, LiveTally, judged
 from tests.support.live_story import BLIND, events, measuring, plan, residual
-from tests.support.picture import Shot, contrast, pictures, vulkan_available
+from tests.support.picture import Shot, contrast, needs_vulkan, pictures
 from tests.support.recordings import chunks, values
 from tests.support.viewer_story import story
 
@@ -56,8 +56,7 @@ def refined(tmp_path_factory):
 
 
 def test_each_reading_has_its_arrow_and_leaves_its_ball_where_the_model_is_wrong(measured):
-    read = stored(measuring())
-    found = [judged(e.step, e.live) for e in read[BLIND:]]
+    found = [judged(e.step, e.live) for e in stored(measuring())[BLIND:]]
     levels = np.array([j.level for j in found])
     arrows = np.array(values(measured, "/world/live/1/arrows", "Arrows3D:vectors"))[:, 0]
     assert len(values(measured, "/world/live/1/dots", "Points3D:positions")) == BLIND
@@ -123,7 +122,7 @@ def test_every_target_of_an_arrival_is_drawn_where_it_is(tmp_path):
 
 def test_a_long_campaign_is_a_small_file(tmp_path):
     path = tmp_path / "long.rrd"
-    outlet = live._Outlet("long", print, "file", file=path)
+    outlet = live._Outlet("long", print, file=path)
     for wall, what in events(measuring(plan(250))):
         outlet.tell(wall, what)
     outlet.end()
@@ -202,7 +201,7 @@ def test_words_in_pictures_are_legible_in_both_themes(refined):
 
 @pytest.mark.vulkan
 @pytest.mark.slow
-@pytest.mark.skipif(not vulkan_available(), reason="no Vulkan driver installed")
+@needs_vulkan
 def test_pictures_of_both_acts_are_drawn_without_a_report(measured, refined, tmp_path):
     for path in (measured, refined):
         reports = pictures(path, [Shot(tmp_path / "x.png")], (960, 540), 480)

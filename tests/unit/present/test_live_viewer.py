@@ -19,6 +19,7 @@ from hilcal.present.viewer.recording import executable
 from hilcal.present.viewer.style import LEVEL_NAMES
 from tests.support.live_story import BLIND, events, measuring, plan
 from tests.support.paths import ROOT
+from tests.support.timing import wait_until
 
 SOON = 0.05
 """A call that only puts something into a queue takes less, s, on a machine that is busy, too."""
@@ -86,13 +87,6 @@ def readings(path):
         return 0
 
 
-def until(what, words, seconds=30.0):
-    end = time.monotonic() + seconds
-    while not what():
-        assert time.monotonic() < end, words
-        time.sleep(0.05)
-
-
 def alive(pid):
     return psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
 
@@ -108,14 +102,14 @@ def test_a_viewer_that_comes_late_gets_all_and_the_recording_has_it_too(home, sa
     try:
         assert live.url.startswith("rerun+http://127.0.0.1:")
         assert str(port) not in live.url
-        process = psutil.Process(live.pid)
+        process = psutil.Process(live._process.pid)
         listening = [c.laddr.ip for c in process.net_connections() if c.status == "LISTEN"]
         assert listening == ["127.0.0.1"]
         assert process.nice() > 0
         assert tell(live, 24) < SOON
-        until(lambda: readings(live.record) >= 0.9 * (48 - BLIND), "not recorded")  # in batches
+        wait_until(lambda: readings(live.record) >= 0.9 * (48 - BLIND), "recorded")  # in batches
         with client(live.url, late := home / "late.rrd"):
-            until(lambda: readings(late) == 48 - BLIND, "the late viewer lacks some")
+            wait_until(lambda: readings(late) == 48 - BLIND, "all with the late viewer")
     finally:
         live.close()
     assert readings(live.record) == 48 - BLIND
@@ -130,10 +124,10 @@ def test_a_frozen_viewer_costs_nothing(live, said, home):
     with client(live.url, home / "frozen.rrd") as frozen:
         time.sleep(1.0)
         frozen.send_signal(signal.SIGSTOP)
-        before = psutil.Process(live.pid).memory_info().rss
+        before = psutil.Process(live._process.pid).memory_info().rss
         assert tell(live, 490, paced=True) < SOON
-        until(lambda: readings(live.record) >= 0.95 * 980, "not recorded", 60.0)
-        grown = psutil.Process(live.pid).memory_info().rss - before
+        wait_until(lambda: readings(live.record) >= 0.95 * 980, "recorded", 60.0)
+        grown = psutil.Process(live._process.pid).memory_info().rss - before
         assert grown < 400e6  # what the server keeps for late viewers, and what it is kept in
     live.close()
     assert readings(live.record) == 980 - BLIND  # up to a thousand each is drawn
@@ -144,7 +138,7 @@ def test_a_frozen_viewer_costs_nothing(live, said, home):
 @posix
 def test_a_process_that_is_frozen_is_dropped_and_ended(live, said, monkeypatch):
     monkeypatch.setattr(live_viewer, "END_S", 1.0)
-    pid = live.pid
+    pid = live._process.pid
     os.kill(pid, signal.SIGSTOP)
     assert tell(live, 1500) < SOON
     assert live._queue.qsize() <= live_viewer.MOST
@@ -161,8 +155,8 @@ def test_a_process_that_is_frozen_is_dropped_and_ended(live, said, monkeypatch):
 @posix
 def test_a_process_that_is_killed_is_told_once_and_left_behind(live, said):
     tell(live, 6)
-    os.kill(live.pid, signal.SIGKILL)
-    until(lambda: said, "nobody says that it has ended")
+    os.kill(live._process.pid, signal.SIGKILL)
+    wait_until(lambda: said, "said that it has ended")
     assert tell(live, 1500) < SOON
     live.close()
     assert said == ["the live viewer has ended; everything else goes on"]
@@ -199,7 +193,7 @@ KILLED = PROGRAM.format(
     before="",
     poses=24,
     after="while live._queue.qsize():\n    time.sleep(0.01)\n"
-    "print(live.pid, flush=True)\nos.kill(os.getpid(), signal.SIGKILL)",
+    "print(live._process.pid, flush=True)\nos.kill(os.getpid(), signal.SIGKILL)",
 )
 
 
@@ -226,7 +220,7 @@ def test_a_full_disk_ends_the_recording_only(home, free_port):
 def test_the_recording_is_whole_although_the_command_was_killed(home, free_port):
     path = home / "killed.live.rrd"
     pid = int(run(KILLED, path, free_port).split()[-1])
-    until(lambda: not alive(pid), "the process has stayed behind")
+    wait_until(lambda: not alive(pid), "ended")
     assert RrdReader(path).store() is not None
     assert readings(path) == 48 - BLIND
 
@@ -235,4 +229,4 @@ def test_what_has_no_process_is_silent(tmp_path, said):
     live = LiveViewer(tmp_path / "x.rrd", said.append)
     live.notify(ReadingStored(plan().steps[0], 1, 2, 0.0, 0.0))
     live.close()
-    assert (said, live.dropped, live.pid) == ([], 0, None)
+    assert (said, live.dropped, live._process) == ([], 0, None)

@@ -5,7 +5,6 @@ import re
 import socket
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -20,8 +19,9 @@ from hilcal.present.viewer import campaign, save, serve, style
 from hilcal.present.viewer.recording import executable
 from hilcal.robot.scene import body_poses
 from tests.support.paths import ROOT
-from tests.support.picture import Shot, pictures, pixels, vulkan_available
+from tests.support.picture import Shot, needs_vulkan, pictures, pixels
 from tests.support.recordings import rows, same, texts
+from tests.support.timing import wait_until
 from tests.support.viewer_story import ANGLE, LOAD, doubtful, story, ur10e
 
 pytestmark = pytest.mark.usefixtures("strict")
@@ -33,7 +33,6 @@ LONG = (
     "would), link_compliance (2.1 times as many readings like these would); hilcal next plans what "
     "separates them, or add one and judge on new poses."
 )
-needs_vulkan = pytest.mark.skipif(not vulkan_available(), reason="no Vulkan driver installed")
 
 
 @pytest.fixture(scope="module")
@@ -57,12 +56,11 @@ def by_revision(recording):
 def bars(path, entity, revision):
     """Left and right edges and heights of the bars of a revision."""
     left, width, height = (
-        np.array(rows(path, entity, f"BarChart:{name}", "revision")[revision])
-        if name == "widths"
-        else np.array(rows(path, entity, f"BarChart:{name}", "revision")[revision][0]["buffer"])
+        rows(path, entity, f"BarChart:{name}", "revision")[revision]
         for name in ("abscissa", "widths", "values")
     )
-    return left, left + width, height
+    left, height = (np.array(x[0]["buffer"]) for x in (left, height))
+    return left, left + np.array(width), height
 
 
 def test_every_revision_has_its_errors_in_micrometres(told, recording):
@@ -161,8 +159,7 @@ def test_a_pose_has_its_own_name_in_every_label_and_text(told, tmp_path):
     name = f"p{told.pose[np.argmax(told.revisions[-1].whitened_norm2)] + 40}a"
     worst = rows(path, "/world/residual/worst", "Points3D:labels", "revision")
     assert f"pose {name}," in worst[3][0]
-    details = rows(path, "/words/details", "TextDocument:text", "revision")
-    assert f"pose {name}," in details[3][0]
+    assert f"pose {name}," in rows(path, "/words/details", "TextDocument:text", "revision")[3][0]
     cards = rows(path, "/words/verdict", "TextDocument:text", "pose")
     assert cards[7][0].startswith("### Pose p47a:")
 
@@ -183,8 +180,7 @@ def test_the_arm_moves_through_poses_and_stands_in_the_worst_one(told, recording
     moves = rows(recording, "/world/arm/body6", "Transform3D:translation", "pose")
     assert sorted(moves) == list(range(30))
     read = np.array([moves[k][0] for k in range(30)])
-    bodies = body_poses(told.arm, told.q[::3])
-    np.testing.assert_allclose(read, bodies[:, 6, :3, 3], atol=1e-6)
+    np.testing.assert_allclose(read, body_poses(told.arm, told.q[::3])[:, 6, :3, 3], atol=1e-6)
     stands = by_revision("/world/arm/body7", "Transform3D:translation")
     for r in told.revisions:
         i = int(np.argmax(r.whitened_norm2))
@@ -247,8 +243,7 @@ def test_levels_hold_the_share_of_noise_they_name():
 def test_arm_of_another_shape_is_drawn(tmp_path):
     six, told, path = ur10e(), story(poses=3), tmp_path / "four.rrd"
     cut = {k: getattr(six, k)[:4] for k in ("masses", "coms", "joint_names")}
-    four = replace(six, links=six.links[:5], **cut)
-    save(replace(told, arm=four, q=told.q[:, :4]), path)
+    save(replace(told, arm=replace(six, links=six.links[:5], **cut), q=told.q[:, :4]), path)
     assert len(rows(path, "/world/arm/body5", "Transform3D:translation", "pose")) == 3
 
 
@@ -269,8 +264,7 @@ def colors(png):
 def test_the_picture_shows_the_red_vanish(told, recording, tmp_path):
     reached = [levels(r.whitened_norm2).max() for r in told.revisions]
     assert (reached[0], reached[3] < 2) == (2, True)  # red at first, none in the end
-    view = campaign.titles(told)[0]
-    shots = [Shot(tmp_path / f"{k}.png", "revision", k, view) for k in (0, 3)]
+    shots = [Shot(tmp_path / f"{k}.png", "revision", k, campaign.titles(told)[0]) for k in (0, 3)]
     reports = pictures(recording, shots, SIZE, LONGEST)
     assert len(reports) >= 10
     assert [v for v in reports if v.problems] == []
@@ -326,10 +320,8 @@ def test_a_viewer_that_joins_late_gets_the_whole_story(told, tmp_path, monkeypat
             stderr=subprocess.DEVNULL,
         )
         try:
-            end = time.monotonic() + 30
-            while not {"/errors/fit", "/bars/zcurrent"} <= entities(late):
-                assert time.monotonic() < end, "the late viewer did not receive the story"
-                time.sleep(0.1)
+            story_ends = {"/errors/fit", "/bars/zcurrent"}
+            wait_until(lambda: story_ends <= entities(late), "received by the late viewer")
         finally:
             client.terminate()
             client.wait(10)

@@ -14,7 +14,7 @@ from hilcal.present.viewer import plan, style
 from hilcal.present.viewer.plan import HIDDEN, SEEN, TURNED, UNKNOWN, PlanView, record_plan
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
-from tests.support.picture import Shot, pictures, vulkan_available
+from tests.support.picture import Shot, needs_vulkan, pictures
 from tests.support.recordings import entities, rows, same, texts
 from tests.support.refusals import refusal
 from tests.support.viewer_plan import (
@@ -27,12 +27,12 @@ from tests.support.viewer_plan import (
     recording,
     rgb,
     shadowed,
-    strict,
     target,
     turned,
 )
 
-__all__ = ["recording", "shadowed", "strict"]  # fixtures
+__all__ = ["recording", "shadowed"]  # fixtures
+pytestmark = pytest.mark.usefixtures("strict")
 POWERS = (
     PairPower("joint_tilt_compliance", "link_compliance", 0.744, 0.98, False),
     PairPower("link_compliance", "joint_tilt_compliance", 0.56, 0.1, True),
@@ -83,8 +83,7 @@ def test_arm_and_target_are_in_the_pose_of_every_step(shadowed, recording):
         chain = evaluate(arm, PLAN.joints(step.pose)[None])
         flange = chain.rotation[-1][0] @ (link[:3, :3].T @ np.array(link[:3, 3]))
         np.testing.assert_allclose(moves[k][0], chain.point(np.zeros(3))[0] - flange, atol=1e-6)
-        at = chain.point(shadowed[0].target[:3, 3])[0]
-        np.testing.assert_allclose(now[k][0], at, atol=1e-6)
+        np.testing.assert_allclose(now[k][0], chain.point(shadowed[0].target[:3, 3])[0], atol=1e-6)
 
 
 def test_the_beam_is_red_where_a_screen_stands_and_green_elsewhere(shadowed, recording):
@@ -153,8 +152,7 @@ def test_one_bead_per_pose_and_load_in_the_loads_colour(d, shadowed, recording):
     by_load = {n: tuple(c) for n, c in zip(PLAN.loads, d.colors.tolist(), strict=True)}
     assert colors == [by_load[load] for _, load in pairs]
     assert (len(places), len(set(by_load.values()))) == (8, 3)
-    at = [target(shadowed[0], PLAN.pose_names.index(pose)) for pose, _ in pairs]
-    off = places - at
+    off = places - [target(shadowed[0], PLAN.pose_names.index(pose)) for pose, _ in pairs]
     np.testing.assert_allclose(off[:, :2], 0.0, atol=1e-6)
     assert (off[:, 2] > -1e-6).all()
     assert [z < 1e-6 for z in off[:, 2]] == [load == UNLOADED for _, load in pairs]
@@ -339,7 +337,7 @@ def test_the_eye_is_as_near_as_shows_everything():
 
 @pytest.mark.vulkan
 @pytest.mark.slow
-@pytest.mark.skipif(not vulkan_available(), reason="no Vulkan driver installed")
+@needs_vulkan
 def test_every_view_is_drawn_without_a_report(recording, tmp_path):
     names = [plan.STEPS, plan.SCHEDULE, "Plan", "This step", "How to read this", "Details"]
     shots = [Shot(tmp_path / f"{i}.png", "step", 6, name) for i, name in enumerate(names)]

@@ -151,8 +151,7 @@ def test_before_of_positions_is_the_rigid_arm_in_frames_of_its_own(absolute, sho
     assert 0.1 * np.abs(turned).max() < before.rms_m < 3.0 * np.abs(turned).sum(axis=1).max()
     report = shown(*fit_report(absolute))
     assert "The rigid nominal arm, its frames fitted alone, is off by" in report
-    row = f"before: rigid nominal arm {numbers.length(before.rms_m)}"
-    assert row in shown(errors(absolute))
+    assert f"before: rigid nominal arm {numbers.length(before.rms_m)}" in shown(errors(absolute))
     assert to_json(absolute)["error"]["before"] == before.to_json()
 
 
@@ -208,8 +207,7 @@ def test_variables_stand_in_groups_and_those_without_a_share_are_counted(shown):
 def test_a_curve_is_shown_only_where_it_is_determined_and_carries_something(shown):
     def told(error, share=0.3):
         x, y = np.arange(5.0), 1e-5 * np.arange(-2.0, 3.0)
-        std = np.full(5, error)
-        of = Dependence("time", "s", share, "joint 2", np.zeros(3), x, y, std, "rad")
+        of = Dependence("time", "s", share, "joint 2", np.zeros(3), x, y, np.full(5, error), "rad")
         return shown(*curves([of]))
 
     assert "joint 2 errs by" in told(2e-6)

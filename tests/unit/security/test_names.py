@@ -66,7 +66,7 @@ from hilcal.tables.mapping import FileFormat
 from hilcal.tables.proposal import Proposal
 from hilcal.tables.table import write_table
 from hilcal.tables.write import plan_csv, write_columns
-from hilcal.workbench.elements import plain
+from hilcal.workbench.cards import plain
 from tests.support.paths import ROOT
 from tests.support.readings_cases import make_arm, read_table, simple
 from tests.support.refusals import refusal

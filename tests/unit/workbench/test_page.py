@@ -12,7 +12,7 @@ from nicegui.testing import User, user_simulation
 
 from hilcal.diagnosis.diagnosis import Reason
 from hilcal.present.verdict import HEADLINES
-from hilcal.workbench.page import TabsShared, View
+from hilcal.workbench.page import View
 from hilcal.workbench.session import WorkbenchSession
 from tests.support.bench_cases import few_effects, stored
 
@@ -25,9 +25,9 @@ def session(tmp_path_factory):
 
 
 @asynccontextmanager
-async def opened(shared: TabsShared) -> AsyncIterator[User]:
+async def opened(session: WorkbenchSession) -> AsyncIterator[User]:
     def page():
-        view = View(shared, "http://test/")
+        view = View(session, "http://test/")
         view.build()
         view.begin(dark=False)
 
@@ -58,7 +58,7 @@ def test_nothing_but_the_verdict_says_whether_an_effect_is_missing(session, reas
     shown.snapshot = replace(snapshot, chapters=(*snapshot.chapters[:-1], last))
 
     async def look() -> None:
-        async with opened(TabsShared(shown)) as user:
+        async with opened(shown) as user:
             await user.should_see("No effect passes the tests by itself")
             said = " ".join(seen(user, ui.html, "innerHTML") + seen(user, ui.label, "")).lower()
             first = {v: words.split(":")[0] for v, words in HEADLINES.items()}
@@ -72,9 +72,8 @@ def test_nothing_but_the_verdict_says_whether_an_effect_is_missing(session, reas
 
 def test_an_answer_appears_at_its_button_and_stays(session):
     async def look() -> None:
-        shared = TabsShared(session)
         before = session.path.read_bytes()
-        async with opened(shared) as user:
+        async with opened(session) as user:
             for label, text in (("[tool] mass_kg", "two kilos"), ("[tool] com_m", "[0, 0, 0.07]")):
                 field = next(iter(user.find(kind=ui.input, content=label).elements))
                 field.set_value(text)
@@ -87,7 +86,7 @@ def test_an_answer_appears_at_its_button_and_stays(session):
             assert [line in t for t in seen(user, ui.label, "cell")] == [True]
             values = {e.value for e in user.find(kind=ui.input).elements}
             assert {"two kilos", "[0, 0, 0.07]"} <= values  # nothing that was typed is lost
-            shared.work.start("Waiting", lambda say: None, "missing")
+            session.work.start("Waiting", lambda say: None, "missing")
             await asyncio.sleep(0.5)
             assert [line in t for t in seen(user, ui.label, "cell")] == [True]
         assert session.path.read_bytes() == before

@@ -7,7 +7,8 @@ import psutil
 
 from hilcal.errors import InputError
 from hilcal.workbench import viewer
-from hilcal.workbench.work import Work
+from hilcal.workbench.session import Work
+from tests.support.timing import wait_until
 
 
 def test_only_one_thing_is_done_at_a_time():
@@ -21,7 +22,7 @@ def test_only_one_thing_is_done_at_a_time():
     assert not work.start("Adding creep", slow)  # the second of a double click
     assert work.line == "Adding creep"
     go.set()
-    assert work.wait(10)
+    wait_until(lambda: work.task is None, "done")
     assert (done, work.line, work.failure()) == (["slow"], "", "")
 
 
@@ -32,7 +33,7 @@ def test_progress_and_failures_are_lines():
 
         work = Work()
         assert work.start("Reading", do)
-        assert work.wait(10)
+        wait_until(lambda: work.task is None, "done")
         return work.failure()
 
     assert fails(InputError("no such file")) == "no such file"
@@ -50,7 +51,6 @@ def test_progress_and_failures_are_lines():
     assert seen.wait(10)
     assert work.line == "Adding creep: diagnosing"
     go.set()
-    assert work.wait(10)
 
 
 def test_the_viewers_files_come_by_the_loopback_address_alone():
