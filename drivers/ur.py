@@ -19,20 +19,21 @@ import numpy as np
 from hilcal.config import CellConfig
 from hilcal.drivers.ur_link import control as command
 from hilcal.drivers.ur_link import probe, states
-from hilcal.drivers.ur_link.lines import LinkError
+from hilcal.drivers.ur_link.probe import LinkError
 from hilcal.drivers.ur_link.reading import (
     OPTIONAL,
     OUTPUTS,
     PATIENCE_S,
     STALE_S,
+    TORQUE,
     N,
     Reading,
     Receiver,
+    TorqueReader,
     survey,
 )
 from hilcal.drivers.ur_link.states import CHECK_LINK, CONTROL, HOLD_ON, failure
-from hilcal.drivers.ur_link.supervision import Generation, UrOptions, generation, why_silent
-from hilcal.drivers.ur_link.torque_reader import TORQUE, TorqueReader
+from hilcal.drivers.ur_link.supervision import Controller, UrOptions
 from hilcal.drivers.ur_link.worker import WorkerError
 from hilcal.errors import InputError
 from hilcal.measuring.devices import ArmSample, Report
@@ -58,20 +59,17 @@ class UrArm:
     def __init__(
         self,
         config: CellConfig,
-        host: str,
-        hz: float,
-        controller: probe.ControllerFacts,
-        generation: Generation,
+        controller: Controller,
         silent: str,
         receiver: Receiver,
         torques: TorqueReader | None = None,
     ) -> None:
-        self._torques = torques
-        self._host, self._hz, self._model = host, hz, config.robot.model
+        """`silent`: why the supervision does not answer; empty if it does."""
+        self._controller, self._silent = controller, silent
+        self._receiver, self._torques = receiver, torques
+        self._host, self._model = controller.host, config.robot.model
         self._arrival, self._clock = config.motion.arrival_rad, config.simulation.clock
-        self._controller, self._generation, self._silent = controller, generation, silent
-        self._receiver = receiver
-        self._brakes = command.Brakes(host, receiver, generation)
+        self._brakes = command.Brakes(controller, receiver)
         self._control: command.Control | None = None
         self._motion: command.MotionInProgress | None = None
         self._brake = command.deceleration(config.motion.speed_rad_s)
@@ -98,15 +96,7 @@ class UrArm:
         return replace(report, problems=problems)
 
     def _survey(self) -> Report:
-        return survey(
-            self._host,
-            self._model,
-            self._hz,
-            self._controller,
-            self._receiver,
-            self._generation,
-            self._silent,
-        )
+        return survey(self._controller, self._receiver, self._model, self._silent)
 
     def sample(self) -> ArmSample:
         """Return a sample newer than the call; see `ArmDevice.sample`."""
@@ -129,11 +119,11 @@ class UrArm:
                 raise failure(self._host, str(error), CHECK_LINK) from None
         if self._torques is not None:
             self._torques.renew()
-        self._silent = why_silent(self._generation.supervision, _ASK_S)
+        self._silent = self._controller.why_silent(_ASK_S)
         if self._silent:
             raise failure(self._host, f"cannot take control: {self._silent}")
         self._end_program()
-        self._control = command.take(self._host, self._receiver, self._generation)
+        self._control = command.take(self._controller, self._receiver)
         self._was_ours = True
         self._fault = ""
         try:
@@ -279,7 +269,7 @@ class UrArm:
         """End our program, which ur_rtde may have uploaded again after a lost link."""
         if self._was_ours and not self._silent:
             with contextlib.suppress(LinkError):
-                self._generation.supervision.stop(_ASK_S)
+                self._controller.supervision.stop(_ASK_S)
                 self._was_ours = False
 
     def _stands_already(self) -> bool:
@@ -315,7 +305,7 @@ class UrArm:
         """Stop the arm, then find the cause and raise DeviceError."""
         halt = self._brakes.halt(self._control, self._brake, lost)
         self._control = self._motion = None
-        self._fault, advice = command.cause_of(self._generation.supervision, halt, symptom)
+        self._fault, advice = command.cause_of(self._controller, halt, symptom)
         if not halt.stands:
             advice = f"{HOLD_ON}; {advice}"
         raise failure(self._host, self._fault, advice)
@@ -353,21 +343,19 @@ def open_arm(config: CellConfig) -> UrArm:
     options = check_section(dict(config.robot.options), UrOptions, "[robot.options]")
     if importlib.util.find_spec("rtde_control") is None:
         raise InputError(_lacking(sys.version_info[:2]))
-    receiver = None
     try:
-        controller = probe.controller(host, (*OUTPUTS, TORQUE), _PROBE_S)
-        outputs = tuple(name for name in controller.outputs if name != TORQUE)
-        missing = set(OUTPUTS) - OPTIONAL - set(controller.outputs)
+        version, available = probe.controller(host, (*OUTPUTS, TORQUE), _PROBE_S)
+        outputs = tuple(name for name in available if name != TORQUE)
+        missing = set(OUTPUTS) - OPTIONAL - set(outputs)
         if missing:
-            version = states.version_word(controller.version)
-            raise failure(host, f"its version {version} lacks {', '.join(sorted(missing))}")
-        kind = generation(host, controller.version, options.robot_api_port)
-        silent = why_silent(kind.supervision, _ASK_S)
+            word = states.version_word(version)
+            raise failure(host, f"its version {word} lacks {', '.join(sorted(missing))}")
+        controller = Controller.of(host, version, options.robot_api_port)
+        silent = controller.why_silent(_ASK_S)
         receiver = Receiver(host, options.receive_hz, outputs, _RECEIVE_S)
     except LinkError as error:
         raise failure(
             host, str(error), "check that the controller is on and [robot] host"
         ) from None
-    has_torque = TORQUE in controller.outputs
-    torques = TorqueReader(host, options.receive_hz) if has_torque else None
-    return UrArm(config, host, options.receive_hz, controller, kind, silent, receiver, torques)
+    torques = TorqueReader(host, options.receive_hz) if TORQUE in available else None
+    return UrArm(config, controller, silent, receiver, torques)

@@ -29,8 +29,8 @@ from hilcal.drivers.force_stream import RING, ForceStream
 from hilcal.drivers.geocom import GeoComOptions, GeoComTracker, Link
 from hilcal.drivers.natnet import NatNetTracker
 from hilcal.drivers.simulated.natnet_server import BODY, Cameras
-from hilcal.drivers.ur_link import lines, probe, reading, supervision
-from hilcal.drivers.ur_link.lines import LinkError
+from hilcal.drivers.ur_link import probe, reading, supervision
+from hilcal.drivers.ur_link.probe import LinkError
 from hilcal.measuring.devices import Clock
 from tests.fuzz.damage import NUMBERS, bytes_damaged
 from tests.fuzz.harness import Accepted, Parser, passed
@@ -103,13 +103,13 @@ class Socket:
 
 
 def network(data: bytes) -> Any:
-    """In place of the sockets of `ur_link.lines`: every connection gives these bytes."""
+    """In place of the sockets of `ur_link.probe`: every connection gives these bytes."""
     fake = SimpleNamespace(
         create_connection=lambda *_, **__: Socket(data),
         gaierror=socket.gaierror,
         SHUT_WR=socket.SHUT_WR,
     )
-    return mock.patch.object(lines, "socket", fake)
+    return mock.patch.object(probe, "socket", fake)
 
 
 def finite(rng: Random) -> float:

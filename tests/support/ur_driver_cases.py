@@ -12,7 +12,7 @@ import pytest
 from hilcal.config import CellConfig
 from hilcal.drivers.simulated.ur_server import API
 from hilcal.drivers.ur import UrArm, open_arm
-from hilcal.drivers.ur_link.supervision import Dashboard, RobotApi, Supervision, ask
+from hilcal.drivers.ur_link.supervision import Dashboard, RobotApi, ask
 from hilcal.errors import DeviceError
 from tests.support import sim_ur_cases
 
@@ -83,7 +83,7 @@ def error_of(call: Callable[[], Any], seconds: float = 20.0) -> str:
     return text
 
 
-def supervision(sim: Sim) -> Supervision:
+def supervision(sim: Sim) -> Dashboard | RobotApi:
     return RobotApi(sim.host, API) if sim.is_x else Dashboard(sim.host)
 
 
@@ -98,7 +98,7 @@ def children() -> list[psutil.Process]:
         mine = psutil.Process().children(recursive=True)
         ours = [(p, " ".join(_words(p))) for p in mine]
         relays = sum("ur_link.relay" in words for _, words in ours)
-        commands = sum("ur_link.control_worker" in words for _, words in ours)
+        commands = sum("ur_link.children" in words and " control " in words for _, words in ours)
         if relays <= commands or time.monotonic() > end:
             assert relays <= commands
             return [p for p, words in ours if "ur_link" in words and "relay" not in words]

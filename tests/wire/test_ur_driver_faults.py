@@ -299,7 +299,7 @@ HANGING = """
 import sys, threading
 from hilcal.drivers.ur_link.worker import Worker
 arguments = (sys.argv[1], "125.0", "timestamp")
-start = lambda: Worker("hilcal.drivers.ur_link.receive_worker", arguments, 60.0)
+start = lambda: Worker("receive", arguments, 60.0)
 thread = threading.Thread(target=start)
 thread.start()
 thread.join()

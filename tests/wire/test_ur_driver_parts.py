@@ -22,11 +22,11 @@ from hilcal.drivers.simulated.ur_state import line
 from hilcal.drivers.ur import open_arm
 from hilcal.drivers.ur_link import states
 from hilcal.drivers.ur_link.control import MARGIN_S, MotionInProgress, deceleration, program_ended
-from hilcal.drivers.ur_link.lines import LinkError
-from hilcal.drivers.ur_link.probe import controller
+from hilcal.drivers.ur_link.probe import LinkError, controller
 from hilcal.drivers.ur_link.reading import (
     OUTPUTS,
     PRIMARY_PORT,
+    TORQUE,
     N,
     ReadingError,
     read,
@@ -34,7 +34,6 @@ from hilcal.drivers.ur_link.reading import (
     settled_rate,
 )
 from hilcal.drivers.ur_link.supervision import RobotApi
-from hilcal.drivers.ur_link.torque_reader import TORQUE
 from hilcal.drivers.ur_link.worker import Worker, WorkerError
 from hilcal.identification.torques import check_torques
 from hilcal.measuring.route import duration
@@ -132,7 +131,7 @@ def test_a_pause_that_the_watchdog_bears_does_not_hide_another_program():
 
 def test_worker_that_cannot_start_says_so():
     with pytest.raises(WorkerError, match="exit code 1"):
-        Worker("hilcal.drivers.ur_link.no_such_worker", (), 10.0)
+        Worker("no such kind", (), 10.0)
 
 
 def test_a_moment_without_packets_is_no_slow_line() -> None:
@@ -168,7 +167,7 @@ def test_versions_that_tell_torques(version: tuple[int, int, int, int], told: bo
 
 def test_an_older_controller_is_read_without(tmp_path) -> None:
     with closing(cases.start(tmp_path)) as sim:
-        assert controller(sim.host, ("timestamp", TORQUE), 2.0).outputs == ("timestamp",)
+        assert controller(sim.host, ("timestamp", TORQUE), 2.0)[1] == ("timestamp",)
         arm = open_arm(cases.config(sim.host))
         assert arm.sample().torque is None
         assert len(arm.workers) == 1
