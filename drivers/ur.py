@@ -85,18 +85,15 @@ class UrArm:
 
     def report(self) -> Report:
         """Report identity, versions, state and every problem; moves nothing."""
-        report = self._survey()
-        if self._control is None:
-            end = time.monotonic() + _ORPHAN_S
-            while any(map(_is_foreign, report.problems)) and time.monotonic() < end:
-                time.sleep(0.2)  # the program of a killed hilcal ends by its watchdog
-                report = self._survey()
-            return report
-        problems = tuple(p for p in report.problems if not _is_foreign(p))
-        return replace(report, problems=problems)
-
-    def _survey(self) -> Report:
-        return survey(self._controller, self._receiver, self._model, self._silent)
+        end = time.monotonic() + _ORPHAN_S
+        while True:
+            report = survey(self._controller, self._receiver, self._model, self._silent)
+            others = tuple(p for p in report.problems if not p.startswith("a program runs"))
+            if self._control is not None:  # the program is ours
+                return replace(report, problems=others)
+            if others == report.problems or time.monotonic() >= end:
+                return report
+            time.sleep(0.2)  # the program of a killed hilcal ends by its watchdog
 
     def sample(self) -> ArmSample:
         """Return a sample newer than the call; see `ArmDevice.sample`."""
@@ -211,10 +208,10 @@ class UrArm:
         if reading.runtime != states.PLAYING:
             self._fail(_why_ended(reading, control))
         try:
-            pulse = control.alive()
+            expired, _ = control.alive()
         except WorkerError as error:
             self._fail(command.not_commanded(error))
-        if pulse.expired:
+        if expired:
             self._fail(command.UNWATCHED)
         if motion.arrived(reading):
             self._motion = None
@@ -314,14 +311,10 @@ class UrArm:
 def _why_ended(reading: Reading, control: command.Control) -> str:
     """Return why the robot's program ended, from the controller and the control process."""
     try:
-        pulse = control.alive(_PULSE_S)
+        expired, late = control.alive(_PULSE_S)
     except WorkerError:
         return command.program_ended(reading, 0.0)
-    return command.UNWATCHED if pulse.expired else command.program_ended(reading, pulse.late)
-
-
-def _is_foreign(problem: str) -> bool:
-    return problem.startswith("a program runs")
+    return command.UNWATCHED if expired else command.program_ended(reading, late)
 
 
 def _lacking(python: tuple[int, ...]) -> str:
@@ -354,8 +347,7 @@ def open_arm(config: CellConfig) -> UrArm:
         silent = controller.why_silent(_ASK_S)
         receiver = Receiver(host, options.receive_hz, outputs, _RECEIVE_S)
     except LinkError as error:
-        raise failure(
-            host, str(error), "check that the controller is on and [robot] host"
-        ) from None
+        advice = "check that the controller is on and [robot] host"
+        raise failure(host, str(error), advice) from None
     torques = TorqueReader(host, options.receive_hz) if TORQUE in available else None
     return UrArm(config, controller, silent, receiver, torques)

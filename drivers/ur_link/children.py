@@ -151,15 +151,15 @@ def _next_stamp(link: Any, seconds: float) -> float:
         time.sleep(_POLL)
 
 
-def _getter(output: str) -> str:
-    return "get" + "".join(part[0].upper() + part[1:] for part in output.split("_"))
-
-
 def _sample(link: Any, names: list[str], stale: float) -> dict[str, Any]:
     """Return all fields, read from a single packet."""
+    getters = {
+        name: "get" + "".join(part[0].upper() + part[1:] for part in name.split("_"))
+        for name in names
+    }
     stamp = _next_stamp(link, stale)
     for _ in range(_TRIES):
-        fields = {name: getattr(link, _getter(name))() for name in names}
+        fields = {name: getattr(link, getter)() for name, getter in getters.items()}
         host_ns = time.monotonic_ns()
         newest = link.getTimestamp()
         if newest == stamp == fields["timestamp"]:

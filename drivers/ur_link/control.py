@@ -108,14 +108,6 @@ _NO_COG = 1e-6
 """z of a centre of mass at the flange, m: ur_rtde's script takes (0, 0, 0) for "unchanged"."""
 
 
-@dataclass(frozen=True, slots=True)
-class Pulse:
-    """State of the control worker."""
-
-    expired: bool  # the motion was stopped because its lease was not renewed
-    late: float  # the longest pause between two signs of life, if too long, s; else 0
-
-
 class Control(Worker):
     """Commands the arm; every call has a deadline, and may raise WorkerError.
 
@@ -128,10 +120,14 @@ class Control(Worker):
         arguments = repr(_HZ), repr(LEASE_S), *(str(int(flag)) for flag in flags)
         super().__init__("control", (controller.host, *arguments), seconds)
 
-    def alive(self, seconds: float = COMMAND_S) -> Pulse:
-        """Renew the lease of the motion; `seconds`: deadline of the answer, real s."""
+    def alive(self, seconds: float = COMMAND_S) -> tuple[bool, float]:
+        """Renew the lease of the motion; `seconds`: deadline of the answer, real s.
+
+        Return whether the motion was stopped because its lease had expired, and the longest pause
+        between two signs of life, if too long, s; else 0.
+        """
         answer = self.call("alive", seconds)
-        return Pulse(bool(answer["expired"]), float(answer["late"]))
+        return bool(answer["expired"]), float(answer["late"])
 
     def move(self, q: Floats, speed: float, acceleration: float, brake: float) -> bool:
         """Start a motion, rad; False if the controller does not take it."""
@@ -274,7 +270,9 @@ class Brakes:
                 pass
             finally:
                 control.kill()  # the robot's watchdog then stops the arm, whatever else fails
-        if not self._by_supervision():
+        try:
+            self.controller.supervision.stop(ASK_S)
+        except LinkError:
             self._by_script(brake)
         try:
             if not lost:
@@ -294,12 +292,6 @@ class Brakes:
             self._by_script(brake)
             reading = self._until_still(_SURE_S - _AGAIN_S, program=True)
         return Halt(reading or self.receiver.read(STALE_S), reading is not None, "")
-
-    def _by_supervision(self) -> bool:
-        with contextlib.suppress(LinkError):
-            self.controller.supervision.stop(ASK_S)
-            return True
-        return False
 
     def _by_script(self, brake: float) -> None:
         """Send a program that brakes the arm along its path; `brake`: leading joint, rad/s²."""

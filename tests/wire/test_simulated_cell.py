@@ -220,7 +220,8 @@ def broken(monkeypatch, module, *arguments):
 
     def replaced(world, made, directory, *more):
         wrong = DeviceProcess("tracker", module, directory, arguments)
-        return {**devices(world, made, directory, *more), "tracker": wrong}
+        made_devices, connected = devices(world, made, directory, *more)
+        return {**made_devices, "tracker": wrong}, connected
 
     monkeypatch.setattr(cell_processes, "_devices", replaced)
 
