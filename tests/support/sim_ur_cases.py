@@ -65,10 +65,7 @@ def command(directory: Path, host: str, *arguments: str) -> list[str]:
 
 
 def start(
-    directory: Path,
-    scale: float = 1.0,
-    truth: dict[str, Any] | None = None,
-    *arguments: str,
+    directory: Path, scale: float = 1.0, truth: dict[str, Any] | None = None, *arguments: str
 ) -> SimulatedUr:
     """Start a controller in a world of its own; `truth` are fields of the blackboard's section."""
     board = Blackboard.create(directory / "world.bin", scale)

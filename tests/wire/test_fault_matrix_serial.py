@@ -91,10 +91,7 @@ OVERCOME = {
     "tracker": (
         once("tracker", "lock_lost"),
         Fault(
-            "tracker warns",
-            act("tracker", "warn", code=1283),
-            act("tracker", "warn", code=0),
-            (),
+            "tracker warns", act("tracker", "warn", code=1283), act("tracker", "warn", code=0), ()
         ),
         once("tracker", "wrong_trid", count=1),
         once("tracker", "delay", rpc=2167, seconds=1.5),  # the answer comes too late

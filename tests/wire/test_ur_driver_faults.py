@@ -222,10 +222,7 @@ def test_interrupt_from_the_terminal_does_not_end_the_children(arm, sim):
 def program(code, host):
     """Another program that uses the arm at a host."""
     parent = subprocess.Popen(
-        [sys.executable, "-c", code, host],
-        stdout=subprocess.PIPE,
-        cwd=ROOT,
-        env=environment(),
+        [sys.executable, "-c", code, host], stdout=subprocess.PIPE, cwd=ROOT, env=environment()
     )
     try:
         yield parent
