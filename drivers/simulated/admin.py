@@ -94,10 +94,10 @@ class Operations:
 
 
 def setter(target: object, name: str, kind: Callable[[Any], Any] = bool) -> Callable[..., None]:
-    """Return the operation that sets an attribute to its single argument, of any name."""
+    """Return the operation that sets an attribute to its single argument, of any name, or True."""
 
     def store(**arguments: Any) -> None:
-        (value,) = arguments.values()
+        (value,) = arguments.values() or (True,)
         setattr(target, name, kind(value))
 
     return store

@@ -224,11 +224,15 @@ def hide(
         world = softened(nothing_hidden(cell, rng), effect)
     if effect == "none" or strength_sigma == 0.0:
         return world
-    hidden, reference = (
-        _user_effect(effect, world, rng)
-        if isinstance(effect, OwnLaw)
-        else _shipped_effect(effect, world, states, harmonics, rng)
-    )
+    if isinstance(effect, OwnLaw):
+        name, reference, direction = effect.effect.name, world, effect.drawn(rng)
+
+        def hidden(factor: float) -> World:
+            return replace(reference, own=replace(effect, theta=factor * direction))
+
+    else:
+        name = effect
+        hidden, reference = _shipped_effect(effect, world, states, harmonics, rng)
     baseline = reference.sight(states)
     pairs = None if readings_mode == "absolute" else _pairs(states, pose, cycle)
     covariance = reference.covariance(baseline, m)
@@ -242,20 +246,7 @@ def hide(
             change = change[pairs[0]] - change[pairs[1]]
         return float(np.sqrt(np.mean((whiten @ change[:, :, None]) ** 2)))
 
-    name = effect.effect.name if isinstance(effect, OwnLaw) else effect
     return hidden(_scaled(strength, strength_sigma, name, readings_mode))
-
-
-def _user_effect(
-    law: OwnLaw, world: World, rng: np.random.Generator
-) -> tuple[Callable[[float], World], World]:
-    """Return the world with a user's effect as a function of its strength, and without."""
-    direction = law.drawn(rng)
-
-    def hidden(factor: float) -> World:
-        return replace(world, own=replace(law, theta=factor * direction))
-
-    return hidden, world
 
 
 def _shipped_effect(
@@ -276,9 +267,12 @@ def _shipped_effect(
     draw = Draw(world.cell.arm, world.physics.joint_compliance, torque, harmonics)
     direction = draw.effect(effect, rng)
     start = getattr(world.physics, effect)
-    if effect == "transmission_error":
+    if effect == "transmission_error":  # pad with zeros to the same number of harmonics
         order = max(start.shape[1], direction.shape[1])
-        start, direction = _padded(start, order), _padded(direction, order)
+        start, direction = (
+            np.pad(value, ((0, 0), (0, order - value.shape[1]), (0, 0)))
+            for value in (start, direction)
+        )
     if effect == "joint_compliance":  # always present; hiding it sets its size
         start = np.zeros_like(start)
     clean = world.physics.with_effect(effect, start)
@@ -339,11 +333,6 @@ def _change(changed: IdealReading, baseline: IdealReading, m: int) -> Floats:
         return shift
     turn = rotation_vector(changed.rotation @ np.swapaxes(baseline.rotation, 1, 2))
     return np.hstack([shift, turn])
-
-
-def _padded(value: Floats, order: int) -> Floats:
-    """Return (n, order, 2) harmonics, padded with zeros."""
-    return np.pad(value, ((0, 0), (0, order - value.shape[1]), (0, 0)))
 
 
 def _scaled(strength: Callable[[float], float], goal: float, effect: str, mode: str) -> float:

@@ -28,16 +28,6 @@ def rotation_vector(matrix: Floats) -> Floats:
     return np.array([pin.log3(r) for r in matrix]).reshape(-1, 3)
 
 
-def inverse(transform: Floats) -> Floats:
-    """Return the inverse of rigid transforms (..., 4, 4)."""
-    out = np.zeros_like(transform)
-    turn = np.swapaxes(transform[..., :3, :3], -1, -2)
-    out[..., :3, :3] = turn
-    out[..., :3, 3] = -(turn @ transform[..., :3, 3:])[..., 0]
-    out[..., 3, 3] = 1.0
-    return out
-
-
 def skew(vector: Floats) -> Floats:
     """Return the (..., 3, 3) matrices of the cross product with (..., 3) vectors."""
     out = np.zeros((*vector.shape, 3))

@@ -68,10 +68,10 @@ class SimulationCase:
     home: Floats | None = field(default=None, kw_only=True)
     """(n,) joint values at the start; None without a plan."""
 
-    def measured(self, readings: Readings, config: CellConfig | None = None) -> "Rehearsal":
-        """Return the campaign with these readings; `config`: None for that of the case."""
+    def measured(self, readings: Readings) -> "Rehearsal":
+        """Return the campaign with these readings."""
         case = {f.name: getattr(self, f.name) for f in fields(SimulationCase)}
-        return Rehearsal(**{**case, "config": config or self.config}, readings=readings)
+        return Rehearsal(**case, readings=readings)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

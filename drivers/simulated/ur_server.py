@@ -23,6 +23,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ from hilcal.drivers.simulated.ur_state import ArmState, Kinematics, Trajectory, 
 from hilcal.errors import DeviceError, InputError
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
-from hilcal.robot.factory import FactoryKinematics, read_factory, with_factory
+from hilcal.robot.factory import FactoryKinematics, nominal_rows, read_factory, with_factory
 from hilcal.types import Floats
 
 DASHBOARD, PRIMARY, SCRIPT, RTDE = 29999, 30001, 30003, 30004
@@ -74,8 +75,8 @@ class UrServer:
         board: Blackboard,
         host: str,
         rng: np.random.Generator,
-        api_port: int = API,
-        factory: FactoryKinematics | None = None,
+        api_port: int,
+        factory: FactoryKinematics | None,
     ) -> None:
         self.arm = state
         self.controller = control.Controller(state, board)
@@ -86,11 +87,10 @@ class UrServer:
         self.is_x = state.version[0] >= POLYSCOPE_X
         supervision = control.RobotApiServer if self.is_x else control.DashboardServer
         self.dashboard = supervision(self.controller, arm.name)
-        status = control.NOT_INITIALISED if factory is None else factory.status
-        rows = None if factory is None else factory.rows
-        self.primary = control.PrimaryPort(
-            self.controller, _rows(arm) if rows is None else rows, status
-        )
+        rows, status = nominal_rows(arm), control.NOT_INITIALISED
+        if factory is not None:
+            rows, status = factory.rows, factory.status
+        self.primary = control.PrimaryPort(self.controller, rows, status)
         self._host, self._supervised = host, api_port if self.is_x else DASHBOARD
         self._rtde_server: asyncio.Server | None = None
         self._servers: list[asyncio.Server] = []
@@ -108,7 +108,9 @@ class UrServer:
     async def accept(self, on: bool) -> None:
         """Accept new RTDE clients, or refuse them; connected ones stay."""
         if on and self._rtde_server is None:
-            self._rtde_server = await self._listen(self._run_rtde, RTDE)
+            self._rtde_server = await self._listen(
+                lambda reader, writer: RtdeLink(self.rtde, reader, writer).run(), RTDE
+            )
         elif not on and self._rtde_server is not None:
             closing, self._rtde_server = self._rtde_server, None
             loop = asyncio.get_running_loop()
@@ -136,22 +138,11 @@ class UrServer:
                 f"({error.strerror}); each simulated arm needs an address 127.x.y.z of its own"
             ) from None
 
-    async def _run_rtde(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        await RtdeLink(self.rtde, reader, writer).run()
-
     async def _run_script(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
             await self.controller.take_programs(reader)
         finally:
             writer.close()
-
-
-def _rows(arm: Arm) -> Floats:
-    """(4, 6) θ, a, d, α of an arm, as its controller reports them."""
-    from hilcal.calibration.dh_table import dh_rows  # slow to import
-
-    rows = dh_rows(arm)
-    return np.stack([rows.offset, rows.a, rows.d, rows.alpha])
 
 
 def read_version(text: str) -> Version:
@@ -171,9 +162,6 @@ def operations(server: UrServer, loop: asyncio.AbstractEventLoop) -> admin.Handl
     """Return the admin operations, which other threads than the loop's may call."""
     arm, controller, links = server.arm, server.controller, server.rtde.links
 
-    def switch(name: str) -> Callable[..., object]:
-        return lambda on=True: setattr(arm, name, bool(on))
-
     def for_all(do: Callable[[RtdeLink], None]) -> Callable[[], None]:
         def all_links() -> None:
             for link in list(links):
@@ -184,9 +172,6 @@ def operations(server: UrServer, loop: asyncio.AbstractEventLoop) -> admin.Handl
     def freeze(on: bool = True) -> None:
         arm.frozen_q = arm.trajectory.q.copy() if on else None
 
-    def state() -> dict[str, Any]:
-        return _state(server)
-
     requests = admin.Operations(
         {
             "protective_stop": lambda: controller.protective_stop("admin"),
@@ -196,19 +181,18 @@ def operations(server: UrServer, loop: asyncio.AbstractEventLoop) -> admin.Handl
             "remote_mode": lambda: controller.set_remote(True),
             "kill_script": lambda: controller.stop_program("killed"),
             "rtde_drop": for_all(lambda link: link.writer.transport.abort()),
-            "rtde_stall": switch("rtde_stall"),
-            "rtde_mute": switch("rtde_mute"),
+            **{name: admin.setter(arm, name) for name in ("rtde_stall", "rtde_mute")},
             "rtde_half_frame": for_all(RtdeLink.half),
-            "dashboard_mute": switch("dashboard_mute"),
+            "dashboard_mute": admin.setter(arm, "dashboard_mute"),
             "dashboard_drop": server.dashboard.drop,
             "refuse": lambda on=True: server.accept(not on),
-            "refuse_motion": switch("refuses_motion"),
+            "refuse_motion": admin.setter(arm, "refuses_motion"),
             "freeze": freeze,
             "jog": lambda q: arm.trajectory.place(_joints(q)),
             "set": lambda **settings: _set(server, settings),
             "log": lambda: list(arm.log),
         },
-        state,
+        partial(_state, server),
     )
 
     async def do(op: str, arguments: dict[str, Any]) -> Any:
@@ -219,7 +203,7 @@ def operations(server: UrServer, loop: asyncio.AbstractEventLoop) -> admin.Handl
         result = requests(op, arguments)
         if inspect.isawaitable(result):
             await result
-            return state()
+            return _state(server)
         return result
 
     def handler(op: str, arguments: dict[str, Any]) -> Any:

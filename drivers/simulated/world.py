@@ -225,8 +225,8 @@ class World:
         slip = self.joint_std * rng.standard_normal((int(k.max()) + 1, states.q.shape[1]))[k]
         sight = self.sight(states, slip)
         observed = self.noise.observe(self._from_station(sight.position), rng)
-        T = mech.inverse(self.station)  # T_sensor_station
-        position = observed @ T[:3, :3].T + T[:3, 3]
+        axes, origin = self.station[:3, :3], self.station[:3, 3:]
+        position = observed @ axes - (axes.T @ origin)[:, 0]
         if m == 3:
             return position
         turn = mech.turned(self.noise.orientation_std * rng.standard_normal((len(states), 3)))
@@ -237,13 +237,14 @@ class World:
         return np.asarray(position @ self.station[:3, :3].T + self.station[:3, 3])
 
 
-def stand(cell: Cell, rng: np.random.Generator, distance: float = 3.0) -> tuple[Floats, Floats]:
+def stand(cell: Cell, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """Place the tracker: return the true T_sensor_base and T_station_sensor, (4, 4) each.
 
-    An unknown registration is drawn: the station is `distance`, m, away from the base, at a height
-    near the arm's, turned about the vertical at random. A known registration is true; if its origin
-    lies within the arm's reach (readings in base axes), the instrument stands `distance` away.
+    An unknown registration is drawn: the station is 3 m away from the base, at a height near the
+    arm's, turned about the vertical at random. A known registration is true; if its origin lies
+    within the arm's reach (readings in base axes), the instrument stands 3 m away.
     """
+    distance = 3.0
     if cell.arm.slides.any():  # beside the rail, wherever on it the arm stands
         distance = max(distance, cell.arm.reach + 1.0)
     side, turn = rng.uniform(0.0, 2.0 * np.pi, 2)
