@@ -19,9 +19,8 @@ import serial
 
 from hilcal.config import CellConfig
 from hilcal.drivers import force_stream as fs
-from hilcal.drivers.checksums import crc_modbus
 from hilcal.drivers.force_stream import DEVICE
-from hilcal.drivers.links import close_port, drain, line_failures, open_port
+from hilcal.drivers.links import close_port, crc_modbus, drain, line_failures, open_port
 from hilcal.errors import DeviceError
 from hilcal.measuring.devices import ForceSensorDevice
 from hilcal.types import Floats

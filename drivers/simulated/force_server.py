@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.drivers.checksums import crc_modbus, crc_x25
+from hilcal.drivers.links import crc_modbus, crc_x25
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.drivers.simulated.pty_port import PtyPort

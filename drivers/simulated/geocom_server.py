@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.drivers.checksums import crc16
+from hilcal.drivers.links import crc16
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.admin import setter
 from hilcal.drivers.simulated.blackboard import Blackboard, settled_truth

@@ -11,7 +11,7 @@ Admin operations: `beam {on}` hides the rigid body, `stall {on}` sends no frames
 repeats one frame, `lose {share}` of the frames, `forget` all clients, `rename {name}`, `bodies
 {count}` adds other bodies, `insist {on}` ignores the version that a client requests, `state`.
 
-Source: as `hilcal.drivers.natnet_frames`. natnet, an independent client, is tested against it.
+Source: as `hilcal.drivers.natnet`. natnet, an independent client, is tested against it.
 """
 
 import argparse
@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hilcal.drivers import natnet_frames as nn
+from hilcal.drivers import natnet as nn
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.blackboard import Blackboard, settled_truth
 from hilcal.types import Floats

@@ -23,7 +23,7 @@ from geocompy.geo import GeoCom
 from hilcal.config.cell import Tracker
 from hilcal.drivers import bota, emscon, ft300, geocom, netft, onrobot_hex
 from hilcal.drivers import emscon_packets as es
-from hilcal.drivers import natnet_frames as nn
+from hilcal.drivers import natnet as nn
 from hilcal.drivers.emscon import EmsconConnection, EmsconTracker
 from hilcal.drivers.force_stream import RING, ForceStream
 from hilcal.drivers.geocom import GeoComOptions, GeoComTracker, Link
