@@ -4,8 +4,8 @@
         --seed N [--on S] [--host 127.A.B.C --port 49152 --web-port 8081]
 
 Admin operations: `overload {force}` adds a wrench (6 numbers, N and N·m), `freeze {on}` repeats one
-reading, `stall {on}` stops sending while the sensor's clock goes on, `state`; Bota: `saturate {on}`
-and `clock {us}`; on a serial line those of `PtyPort.faults`.
+reading, `stall {on}` stops sending while its clock goes on, `state`; on a serial line those of
+`PtyPort.faults`.
 
 An ATI Net F/T sends records by RDT on UDP and has a page on HTTP. Its additional operations:
 `restart` as after a power cut (resets the counters and waits for a request), `lose {share}` of the
@@ -110,10 +110,6 @@ class SensorProtocol:
         """Return the answer to bytes of the client, empty if none."""
         return b""
 
-    def operations(self) -> dict[str, Callable[..., object]]:
-        """Return the admin operations of this kind of sensor."""
-        return {}
-
 
 class Bota(SensorProtocol):
     """Bota Systems Rokubi and SensONE; the frame is described in `hilcal.drivers.bota`."""
@@ -124,24 +120,13 @@ class Bota(SensorProtocol):
     full = np.array([500.0, 500.0, 1200.0, 15.0, 15.0, 10.0])  # full scale of a SensONE, N and N·m
     _body = struct.Struct("<H6fIf")
 
-    def __init__(self) -> None:
-        self.saturated = False
-        self._start_us = 0
-
     def frame(self, number: int, wrench: Floats, temperature: float) -> bytes:
         """Return one frame, see `SensorProtocol.frame`."""
         clipped = np.clip(wrench, -self.full, self.full)
-        over = self.saturated or bool(np.any(clipped != wrench))
-        time_us = (self._start_us + round(number * 1e6 / self.rate)) & 0xFFFFFFFF
-        body = self._body.pack(self.over_range if over else 0, *clipped, time_us, temperature)
+        status = self.over_range if np.any(clipped != wrench) else 0
+        time_us = round(number * 1e6 / self.rate) & 0xFFFFFFFF
+        body = self._body.pack(status, *clipped, time_us, temperature)
         return b"\xaa" + body + crc_x25(body)
-
-    def operations(self) -> dict[str, Callable[..., object]]:
-        """`saturate {on}` sets the status; `clock {us}` sets the time of frame 0."""
-        return {
-            "saturate": admin.setter(self, "saturated"),
-            "clock": admin.setter(self, "_start_us", int),
-        }
 
 
 class Hex(SensorProtocol):
@@ -321,8 +306,7 @@ class Stream:
 
     def operations(self) -> admin.Operations:
         """Return the admin operations."""
-        functions = self.gauge.faults(self) | self.sensor.operations() | self.port.faults()
-        return admin.Operations(functions, self.state)
+        return admin.Operations(self.gauge.faults(self) | self.port.faults(), self.state)
 
     def state(self) -> dict[str, Any]:
         """Return sensor, line and faults."""

@@ -18,18 +18,8 @@ import numpy as np
 from hilcal.measuring.route import dry_run
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.run_log import RunLog
+from tests.support import campaign_cases as cases
 from tests.support.calibrate_process import Calibration
-from tests.support.campaign_cases import (
-    BEGUN,
-    STARVED,
-    EndedError,
-    Fault,
-    Run,
-    Site,
-    right,
-    site,
-    stopped_on_its_way,
-)
 from tests.support.spread_plan import spread_plan
 from tests.support.timing import wait_until
 from tests.wire import test_fault_matrix_person as person
@@ -69,7 +59,7 @@ class Soak:
     starved: int = 0  # runs that ended because this computer gave a process no turn
     slowest: dict[str, float] = field(default_factory=dict)
     _stack: ExitStack = field(default_factory=ExitStack)
-    _site: Site | None = None
+    _site: cases.Site | None = None
     _path: Path | None = None
     _calibration: Calibration | None = None
     _number: int = 0
@@ -78,14 +68,14 @@ class Soak:
     # --- cells ---
 
     @property
-    def site(self) -> Site:
+    def site(self) -> cases.Site:
         """The cell; built where there is none."""
         if self._site is None:
             self._number += 1
             here = self.folder / str(self._number)
             here.mkdir()
             seed = self.rng.randrange(1000)
-            self._site = self._stack.enter_context(site(here, poses=8, seed=seed))
+            self._site = self._stack.enter_context(cases.site(here, poses=8, seed=seed))
             self._path = None
         return self._site
 
@@ -130,13 +120,13 @@ class Soak:
             way()
         except Exception as error:
             runs = self._site.runs if self._site is not None else []
-            if isinstance(error, EndedError) and runs and runs[-1].process.poll() == 0:
+            if isinstance(error, cases.EndedError) and runs and runs[-1].process.poll() == 0:
                 self.counts["done before the fault"] += 1
                 self.site.slider(1.0)
                 return
             words = "".join(traceback.format_exception_only(error)).strip()
             at = traceback.extract_tb(error.__traceback__)[-1]
-            if STARVED.search(words):
+            if cases.STARVED.search(words):
                 self.starved += 1
             else:
                 where = f"{way.__name__} {self._met} (after {before}): {at.name}:{at.lineno}"
@@ -188,7 +178,7 @@ class Soak:
             self.counts["faults"] += 1
             if name is not None:  # else it was being taken off just then
                 run.wait_until(lambda: NOTICED.search(run.words[since:]), "words about the load")
-        except EndedError:
+        except cases.EndedError:
             self._ended(run)  # the campaign was done before
         else:
             run.interrupt()
@@ -207,7 +197,7 @@ class Soak:
             self.counts["faults"] += 1
         try:
             run.some_readings()
-        except EndedError:
+        except cases.EndedError:
             self._ended(run)
         else:
             run.interrupt()
@@ -248,7 +238,7 @@ class Soak:
         code, words = run.end()
         assert code in ((-signal.SIGKILL, 0) if hard else (130, 0)), words
         if goal is not None and code:
-            stopped_on_its_way(self.site, since, goal)
+            cases.stopped_on_its_way(self.site, since, goal)
         self._still()
         self._gone(run)
         self._sound()
@@ -296,7 +286,7 @@ class Soak:
 
     # --- parts ---
 
-    def _run(self) -> Run:
+    def _run(self) -> cases.Run:
         """Begin, resume, or append to a campaign that is done."""
         how: tuple[str, ...] = ()
         if self.path.exists() and self._done():
@@ -307,7 +297,7 @@ class Soak:
                 self.counts["appends"] += 1
             else:
                 self._path = None
-        return Run(self.site, self.path, how=how)
+        return cases.Run(self.site, self.path, how=how)
 
     def _further(self) -> Path:
         """A plan of two more poses."""
@@ -323,7 +313,7 @@ class Soak:
         path.write_text(plan.to_json(), encoding="utf-8")
         return path
 
-    def _begun(self) -> tuple[Run, str]:
+    def _begun(self) -> tuple[cases.Run, str]:
         """Start or resume a run; returns the moment at which something is to happen, too."""
         run, moment = self._run(), self.rng.choice(("moving", "measuring", "any"))
         if moment == "any":
@@ -331,16 +321,16 @@ class Soak:
             return run, moment
         try:
             run.some_readings()
-        except EndedError:
+        except cases.EndedError:
             self._ended(run)
             if run.process.poll() == 0:
                 return self._begun()
             raise
         return run, moment
 
-    def _drawn(self, moment: str) -> Fault:
+    def _drawn(self, moment: str) -> cases.Fault:
         """A fault; a person's and a device's that repeats itself come after the tare only."""
-        kinds: list[tuple[Fault, ...]] = [
+        kinds: list[tuple[cases.Fault, ...]] = [
             MOTION if moment == "moving" else REST,
             (*TRACKER, *FORCE, *OVERCOME["tracker"], *OVERCOME["force"]),
         ]
@@ -348,12 +338,18 @@ class Soak:
             kinds.append(person.MOTION if moment == "moving" else person.REST)
         return self.rng.choice(self.rng.choice(kinds))
 
-    def _count(self, fault: Fault) -> None:
+    def _count(self, fault: cases.Fault) -> None:
         self.counts["faults"] += 1
         self.counts[f"fault: {fault.name}"] += 1
 
     def _meets(
-        self, run: Run, faults: tuple[Fault, ...], goal: object, *, exact: bool, undo: bool = True
+        self,
+        run: cases.Run,
+        faults: tuple[cases.Fault, ...],
+        goal: object,
+        *,
+        exact: bool,
+        undo: bool = True,
     ) -> None:
         since = time.monotonic()
         self._met = ", ".join(fault.name for fault in faults)
@@ -370,7 +366,7 @@ class Soak:
                 self._stands(fault, since)
             ended = self._ends(run, faults, exact=exact)
             if ended and any(f in MOTION for f in in_motion):
-                stopped_on_its_way(self.site, since, goal)  # type: ignore[arg-type]
+                cases.stopped_on_its_way(self.site, since, goal)  # type: ignore[arg-type]
             for fault in alone:
                 assert ended or run.process.returncode == 0, f"{fault.name}: not noticed"
         finally:
@@ -384,19 +380,19 @@ class Soak:
         self._sound()
         self.site.slider(1.0)
 
-    def _undo(self, faults: tuple[Fault, ...]) -> None:
+    def _undo(self, faults: tuple[cases.Fault, ...]) -> None:
         """Mend everything; twice, since a protective stop is not unlocked in local mode."""
         for fault in (*faults, *faults):
             fault.undo(self.site)
 
-    def _stands(self, fault: Fault, since: float) -> None:
+    def _stands(self, fault: cases.Fault, since: float) -> None:
         """Wait until an arm that was in motion stands, and keep how long that took."""
         wait_until(lambda: not self.site.ask("arm", "state")["moving"], "at rest")
         took = self.site.ask("arm", "state")["rest_ns"] * 1e-9 - since
         self.slowest[fault.name] = round(max(took, self.slowest.get(fault.name, 0.0)), 3)
         assert took <= IN_MOTION, f"{fault.name}: the arm stood after {took:.2f} s"
 
-    def _ends(self, run: Run, faults: tuple[Fault, ...], *, exact: bool) -> bool:
+    def _ends(self, run: cases.Run, faults: tuple[cases.Fault, ...], *, exact: bool) -> bool:
         """Wait until a run has ended with one line, or is seen to go on in spite of the fault."""
         end = time.monotonic() + PATIENCE
         while run.process.poll() is None and time.monotonic() < end:
@@ -408,7 +404,7 @@ class Soak:
         self._ended(run, faults if exact else ())
         return run.process.returncode == 3
 
-    def _ended(self, run: Run, faults: tuple[Fault, ...] = ()) -> None:
+    def _ended(self, run: cases.Run, faults: tuple[cases.Fault, ...] = ()) -> None:
         code, words = run.end()
         assert "Traceback" not in words, words[-2000:]
         if code == -signal.SIGINT and DONE in words:
@@ -418,7 +414,7 @@ class Soak:
         assert len(lines) == (code != 0), words[-2000:]
         self.counts[f"exit {code}"] += 1
         if code == 3:
-            if STARVED.search(lines[0]) and not all(
+            if cases.STARVED.search(lines[0]) and not all(
                 re.search(says, lines[0]) for fault in faults for says in fault.says
             ):
                 self.starved += 1
@@ -426,7 +422,7 @@ class Soak:
                 for fault in faults:
                     for says in fault.says:
                         assert re.search(says, lines[0]), f"{fault.name}: {lines[0]}"
-            if BEGUN in words:  # before that nothing is there to go on with
+            if cases.BEGUN in words:  # before that nothing is there to go on with
                 assert "--resume" in lines[0], lines[0]
             assert len(lines[0]) > 40, f"too short to name cause and mend: {lines[0]}"
         assert not self.site.ask("arm", "state")["moving"], "the arm moves after the program's end"
@@ -439,7 +435,7 @@ class Soak:
             assert time.monotonic() < end, "the arm moves though no program commands it"
             time.sleep(0.02)
 
-    def _gone(self, run: Run) -> None:
+    def _gone(self, run: cases.Run) -> None:
         assert run.left_behind() == [], "a process is left"
         end = time.monotonic() + 3.0
         while self.site.ask("arm", "state")["rtde_clients"]:
@@ -455,7 +451,7 @@ class Soak:
             count = campaign.n_readings
         assert len(steps) == len(set(steps)) == count, "a reading is lost or doubled"
         if count:
-            right(self.site, self.path)
+            cases.right(self.site, self.path)
 
     def _count_stored(self) -> int:
         """Readings of the campaign that is measured now."""
