@@ -8,7 +8,7 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.drivers.simulated.mechanics import rotation_vector
 from hilcal.drivers.simulated.own_law import OwnLaw
-from hilcal.drivers.simulated.truth import Truth, joint_temperature, long_links
+from hilcal.drivers.simulated.truth import Truth, joint_temperature, long_links, rated_torque
 from hilcal.drivers.simulated.world import IdealReading, SimulatedNoise, World, stand
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
@@ -36,9 +36,7 @@ def typical_compliance(arm: Arm) -> Floats:
 
 def typical_torque(arm: Arm) -> Floats:
     """Return the (n,) torque or force limits of the drives; 100 N·m, 1500 N if unknown."""
-    limit = np.asarray(arm.torque_max, dtype=float)
-    unknown = np.where(arm.slides, 1500.0, 100.0)
-    return np.asarray(np.where(np.isfinite(limit) & (limit > 0.0), limit, unknown))
+    return rated_torque(arm, unknown=100.0)
 
 
 def typical_tilt(arm: Arm) -> Floats:

@@ -12,7 +12,7 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.drivers.simulated import injected_effects as injected
 from hilcal.drivers.simulated.cell_processes import SimulatedCell
-from hilcal.drivers.simulated.own_law import own_law, own_names
+from hilcal.drivers.simulated.own_law import own_law
 from hilcal.drivers.simulated.truth import warm_up
 from hilcal.drivers.simulated.world import SimulatedNoise, World
 from hilcal.effects.catalogue import Catalogue
@@ -40,7 +40,8 @@ def choices() -> tuple[str, ...]:
 
 def own_choices(catalogue: Catalogue | None) -> tuple[str, ...]:
     """User's effects that can be hidden; see `own_law`."""
-    return () if catalogue is None else own_names(catalogue, injected.ALL_EFFECTS)
+    effects = () if catalogue is None else catalogue.with_role("effect")
+    return tuple(k.name for k in effects if k.name not in injected.ALL_EFFECTS)
 
 
 def invented_law(catalogue: Catalogue) -> Catalogue:
@@ -67,11 +68,6 @@ class SimulationCase:
     strength_sigma: float  # rms of its change of the readings, in units of their noise
     home: Floats | None = field(default=None, kw_only=True)
     """(n,) joint values at the start; None without a plan."""
-
-    def measured(self, readings: Readings) -> "Rehearsal":
-        """Return the campaign with these readings."""
-        case = {f.name: getattr(self, f.name) for f in fields(SimulationCase)}
-        return Rehearsal(**case, readings=readings)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -295,7 +291,8 @@ def read_plan(s: SimulationCase, plan: Plan, seed: Sequence[int], start: float =
     names = (UNLOADED, *(load.name for load in config.loads))
     rng = np.random.default_rng(seed)
     readings = simulate(world, v.states, v.pose, v.load, v.cycle, names, rng)
-    return replace(s, world=world).measured(replace(readings, pose_names=plan.pose_names))
+    case = {f.name: getattr(s, f.name) for f in fields(SimulationCase)} | {"world": world}
+    return Rehearsal(**case, readings=replace(readings, pose_names=plan.pose_names))
 
 
 @contextmanager

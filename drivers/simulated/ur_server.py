@@ -86,7 +86,7 @@ class UrServer:
         arm = state.kinematics.arm
         self.is_x = state.version[0] >= POLYSCOPE_X
         supervision = control.RobotApiServer if self.is_x else control.DashboardServer
-        self.dashboard = supervision(self.controller, arm.name)
+        self.dashboard = supervision(self.controller)
         rows, status = nominal_rows(arm), control.NOT_INITIALISED
         if factory is not None:
             rows, status = factory.rows, factory.status

@@ -131,24 +131,11 @@ class World:
         causes = ("tracker_drift", "creep", "thermal_growth", "thermal_joint_drift")
         return self.own is not None or any(np.any(getattr(self.physics, c)) for c in causes)
 
-    def joint_errors(self, states: States) -> Floats:
-        """Return the joint displacements (N, n) that do not depend on the load, rad.
-
-        dq_j = o_j + h_j s_j + kappa_j (T_j - reference) + sum_i k_ji q_i
-               + sum_k a_jk cos k q_j + b_jk sin k q_j
-        """
-        arm, hidden = self.cell.arm, self.physics
-        drive = laws.drive_errors(hidden, arm, states, self.joint_reference)
-        error = np.asarray(arm.driven(drive) + states.q @ hidden.joint_coupling.T)
-        guided = laws.guide_motion(hidden, arm, states)
-        if guided is not None:
-            error[:, arm.slides] += guided[:, :, 2]
-        return error
-
     def rest(self, states: States, slip: Floats | None = None) -> mech.Equilibrium:
         """Return the equilibrium of N states; `slip` (N, n): error of the drives at rest, rad."""
         arm, hidden = self.cell.arm, self.physics
-        q = arm.chain_angles(states.q) + self.joint_errors(states)
+        errors = laws.joint_errors(hidden, arm, states, self.joint_reference)
+        q = arm.chain_angles(states.q) + errors
         guided = laws.guide_motion(hidden, arm, states)
         extra = laws.further_compliance(hidden, arm, states)
         return mech.equilibrium(
