@@ -454,7 +454,6 @@ class EmsconTracker:
 
 
 def _positive_definite(covariance: Floats) -> bool:
-    """Whether a covariance is finite and positive definite."""
     return bool(np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0.0)
 
 

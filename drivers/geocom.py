@@ -220,7 +220,6 @@ class Link:
         close_port(self._port)
 
     def _greet(self) -> GeoCom:
-        """Let geocompy connect to the instrument."""
         with line_failures(DEVICE, self._path):
             try:
                 return GeoCom(self._connection, attempts=2, checksum=True)

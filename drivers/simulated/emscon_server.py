@@ -140,7 +140,6 @@ class SimulatedTracker:
         return (air if air != 0.0 else ROOM), MBAR, HUMIDITY
 
     def _answers(self, query: int) -> list[bytes]:
-        """Return the packets of the answer to a query."""
         if query == es.GET_ENVIRONMENT:
             return [struct.pack("<3d", *self.environment())]
         if query == es.GET_REFLECTORS:

@@ -235,7 +235,6 @@ class Sensors:
 
     @property
     def _has_truth(self) -> bool:
-        """Whether the world has written the truth."""
         return bool(self._truth["flange"][3, 3] == 1.0)
 
     def _q(self) -> Floats:

@@ -111,7 +111,6 @@ class World:
     _tree: mech.ElasticTree = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Build the elastic arm once."""
         object.__setattr__(self, "_tree", mech.build(self.cell, self.physics))
 
     @property

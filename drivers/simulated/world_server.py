@@ -255,7 +255,6 @@ class WorldState:
         return np.asarray(start * np.exp(-time / decay) * np.cos(2.0 * np.pi * time / period))
 
     def _variable_fields(self, arm: Any, now: float | None = None) -> dict[str, Any]:
-        """Return the fields that change while the arm rests."""
         time = self._board.time if now is None else now
         return {
             "time": time,

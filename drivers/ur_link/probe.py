@@ -166,7 +166,6 @@ def _greeted(host: str, seconds: float) -> Connection:
 
 
 def _agreed(line: Connection, hz: float, outputs: tuple[str, ...]) -> bytes:
-    """Ask for packets of these outputs and return the answer."""
     _send(line, "O", struct.pack(">d", hz) + ",".join(outputs).encode())
     return _reply(line, "O", None)
 

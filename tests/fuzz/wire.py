@@ -534,7 +534,7 @@ def _modbus() -> Parser:
             mock.patch.multiple(ft300, drain=lambda *_: True),
             mock.patch.object(minimalmodbus, "time", clock),
         ):
-            got = ft300.read_registers(port, 9, 500, 4)  # type: ignore[arg-type]
+            got = ft300.read_registers(port, 500, 4)  # type: ignore[arg-type]
         if len(got) != 4 or not all(0 <= word < 65536 for word in got):
             raise Accepted("modbus: registers that cannot be")
         if not data[0] and got not in sound:

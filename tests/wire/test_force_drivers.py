@@ -16,7 +16,7 @@ from pymodbus.exceptions import ModbusIOException
 
 from hilcal.config import CellConfig
 from hilcal.drivers import bota, ft300, onrobot_hex
-from hilcal.drivers.ft300 import STREAM, write_register
+from hilcal.drivers.ft300 import STREAM, start_stream
 from hilcal.drivers.links import close_port, open_port
 from hilcal.drivers.simulated.force_server import DRIFT_STD, ROOM
 from hilcal.errors import DeviceError, InputError
@@ -108,7 +108,7 @@ def test_an_ft300_is_silent_after_close(instruments):
 def test_an_ft300_that_streams_for_a_dead_program_is_taken_over(instruments):
     simulated = instruments("ft300")
     port = open_port("force sensor", str(simulated.port), ft300.BAUD)
-    write_register(port, ft300.SLAVE, ft300.STREAM_REGISTER, ft300.STREAM)
+    start_stream(port)
     close_port(port)  # and nobody stopped it
     wait_until(lambda: simulated.admin("state")["streaming"], "streaming")
     with cases.opened("ft300", simulated.port) as sensor:
