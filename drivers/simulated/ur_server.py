@@ -87,8 +87,9 @@ class UrServer:
         self.is_x = state.version[0] >= POLYSCOPE_X
         supervision = control.RobotApiServer if self.is_x else control.DashboardServer
         self.dashboard = supervision(self.controller)
-        rows, status = nominal_rows(arm), control.NOT_INITIALISED
-        if factory is not None:
+        if factory is None:
+            rows, status = nominal_rows(arm), control.NOT_INITIALISED
+        else:
             rows, status = factory.rows, factory.status
         self.primary = control.PrimaryPort(self.controller, rows, status)
         self._host, self._supervised = host, api_port if self.is_x else DASHBOARD

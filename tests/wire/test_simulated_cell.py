@@ -358,6 +358,6 @@ def test_the_simulated_arm_listens_on_loopback_alone(arm: SimulatedUr) -> None:
 
 
 def test_admin_lines_are_of_the_user_who_started_them(arm: SimulatedUr) -> None:
-    line = arm.directory / "arm.sock"
+    line = arm.process.socket
     assert stat.S_IMODE(line.stat().st_mode) == 0o600
     assert line.stat().st_uid == os.getuid()

@@ -14,11 +14,11 @@ import pytest
 
 from hilcal.drivers.simulated.cell_processes import free_host
 from hilcal.drivers.ur_link import supervision
+from hilcal.drivers.ur_link.worker import environment
 from hilcal.errors import DeviceError
 from tests.support import ur_driver_cases as cases
 from tests.support.paths import ROOT
 from tests.support.rows import first
-from tests.support.sim_ur_cases import environment
 from tests.support.timing import wait_until
 from tests.support.ur_driver_cases import arm, sim
 
