@@ -19,7 +19,7 @@ from hilcal.errors import DeviceError
 from tests.support import ur_driver_cases as cases
 from tests.support.paths import ROOT
 from tests.support.rows import first
-from tests.support.timing import wait_until
+from tests.support.timing import runs, wait_until
 from tests.support.ur_driver_cases import arm, sim
 
 __all__ = ["arm", "sim"]  # fixtures
@@ -232,13 +232,6 @@ def program(code, host):
         parent.stdout.close()
 
 
-def _runs(pid):
-    try:
-        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
-    except psutil.NoSuchProcess:
-        return False
-
-
 MOVING = """
 import sys, time
 import numpy as np
@@ -264,7 +257,7 @@ def test_kill_9_of_the_program_stops_the_arm_and_leaves_no_process(sim):
         state = sim.wait("moving", False)
         assert state["rest_ns"] - killed < cases.STOP_NS
         parent.wait()
-        wait_until(lambda: not any(map(_runs, pids)), "ended: the children", 5.0)
+        wait_until(lambda: not any(map(runs, pids)), "ended: the children", 5.0)
     cases.controlled(sim).close()  # and the next program takes over
 
 
@@ -315,4 +308,4 @@ def test_child_that_hangs_in_the_client_library_ends_with_the_program():
                 (child,) = psutil.Process(parent.pid).children()
                 parent.kill()
                 parent.wait()
-                wait_until(lambda: not _runs(child.pid), "ended: the child", 5.0)
+                wait_until(lambda: not runs(child.pid), "ended: the child", 5.0)
