@@ -223,11 +223,7 @@ def hide(
     if effect == "none" or strength_sigma == 0.0:
         return world
     if isinstance(effect, OwnLaw):
-        name, reference, direction = effect.effect.name, world, effect.drawn(rng)
-
-        def hidden(factor: float) -> World:
-            return replace(reference, own=replace(effect, theta=factor * direction))
-
+        name, hidden, reference = effect.effect.name, _user_effect(effect, world, rng), world
     else:
         name = effect
         hidden, reference = _shipped_effect(effect, world, states, harmonics, rng)
@@ -245,6 +241,12 @@ def hide(
         return float(np.sqrt(np.mean((whiten @ change[:, :, None]) ** 2)))
 
     return hidden(_scaled(strength, strength_sigma, name, readings_mode))
+
+
+def _user_effect(law: OwnLaw, world: World, rng: np.random.Generator) -> Callable[[float], World]:
+    """Return the world with a user's effect as a function of its strength."""
+    direction = law.drawn(rng)
+    return lambda factor: replace(world, own=replace(law, theta=factor * direction))
 
 
 def _shipped_effect(

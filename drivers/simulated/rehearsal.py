@@ -69,6 +69,11 @@ class SimulationCase:
     home: Floats | None = field(default=None, kw_only=True)
     """(n,) joint values at the start; None without a plan."""
 
+    def measured(self, readings: Readings, config: CellConfig | None = None) -> "Rehearsal":
+        """Return the campaign with these readings; `config`: None for that of the case."""
+        case = {f.name: getattr(self, f.name) for f in fields(SimulationCase)}
+        return Rehearsal(**{**case, "config": config or self.config}, readings=readings)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rehearsal(SimulationCase):
@@ -291,8 +296,7 @@ def read_plan(s: SimulationCase, plan: Plan, seed: Sequence[int], start: float =
     names = (UNLOADED, *(load.name for load in config.loads))
     rng = np.random.default_rng(seed)
     readings = simulate(world, v.states, v.pose, v.load, v.cycle, names, rng)
-    case = {f.name: getattr(s, f.name) for f in fields(SimulationCase)} | {"world": world}
-    return Rehearsal(**case, readings=replace(readings, pose_names=plan.pose_names))
+    return replace(s, world=world).measured(replace(readings, pose_names=plan.pose_names))
 
 
 @contextmanager

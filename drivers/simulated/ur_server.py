@@ -37,7 +37,7 @@ from hilcal.drivers.simulated.ur_state import ArmState, Kinematics, Trajectory, 
 from hilcal.errors import DeviceError, InputError
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
-from hilcal.robot.factory import FactoryKinematics, nominal_rows, read_factory, with_factory
+from hilcal.robot.factory import FactoryKinematics, read_factory, with_factory
 from hilcal.types import Floats
 
 DASHBOARD, PRIMARY, SCRIPT, RTDE = 29999, 30001, 30003, 30004
@@ -87,11 +87,11 @@ class UrServer:
         self.is_x = state.version[0] >= POLYSCOPE_X
         supervision = control.RobotApiServer if self.is_x else control.DashboardServer
         self.dashboard = supervision(self.controller)
-        if factory is None:
-            rows, status = nominal_rows(arm), control.NOT_INITIALISED
-        else:
-            rows, status = factory.rows, factory.status
-        self.primary = control.PrimaryPort(self.controller, rows, status)
+        status = control.NOT_INITIALISED if factory is None else factory.status
+        rows = None if factory is None else factory.rows
+        self.primary = control.PrimaryPort(
+            self.controller, _rows(arm) if rows is None else rows, status
+        )
         self._host, self._supervised = host, api_port if self.is_x else DASHBOARD
         self._rtde_server: asyncio.Server | None = None
         self._servers: list[asyncio.Server] = []
@@ -144,6 +144,14 @@ class UrServer:
             await self.controller.take_programs(reader)
         finally:
             writer.close()
+
+
+def _rows(arm: Arm) -> Floats:
+    """(4, 6) θ, a, d, α of an arm, as its controller reports them."""
+    from hilcal.calibration.dh_table import dh_rows  # slow to import
+
+    rows = dh_rows(arm)
+    return np.stack([rows.offset, rows.a, rows.d, rows.alpha])
 
 
 def read_version(text: str) -> Version:
