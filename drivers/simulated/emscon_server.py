@@ -12,12 +12,10 @@ of state, `transform {on}` sets an object's coordinate system, `drop` closes the
 Source: as `hilcal.drivers.emscon_packets`. CESAPI, an independent client, is tested against it.
 """
 
-import argparse
 import contextlib
 import select
 import socket
 import struct
-import sys
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -292,7 +290,7 @@ def serve(t: SimulatedTracker, door: socket.socket) -> None:
     t.client = None
 
 
-def start(options: argparse.Namespace) -> admin.Device:
+def start(options: admin.Arguments) -> admin.Device:
     """Return the tracker, listening."""
     polar, orientation = np.random.default_rng(options.seed).spawn(2)
     along, across = tuple(options.range_std), tuple(options.transverse_std)
@@ -311,4 +309,4 @@ OPTIONS: dict[str, dict[str, Any]] = {
 }
 
 if __name__ == "__main__":
-    sys.exit(admin.run(__doc__, "tracker", start, OPTIONS))
+    admin.run(__doc__, "tracker", start, OPTIONS)

@@ -14,12 +14,10 @@ status, `page {words}` changes elements of the page. Source: as `hilcal.drivers.
 independent client, is tested against it.
 """
 
-import argparse
 import contextlib
 import select
 import socket
 import struct
-import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -463,7 +461,7 @@ def serve_page(sensor: NetFt, host: str, port: int) -> None:
     threading.Thread(target=server.serve_forever, daemon=True).start()
 
 
-def start(options: argparse.Namespace) -> admin.Device:
+def start(options: admin.Arguments) -> admin.Device:
     """Return a sensor in the network, with its page served, or on a serial line."""
     board = Blackboard(options.directory / "world.bin")
     noise, faults = np.random.default_rng(options.seed).spawn(2)
@@ -490,4 +488,4 @@ OPTIONS: dict[str, dict[str, Any]] = {
 }
 
 if __name__ == "__main__":
-    sys.exit(admin.run(__doc__, "force", start, OPTIONS))
+    admin.run(__doc__, "force", start, OPTIONS)

@@ -14,9 +14,7 @@ lines `%R1Q,<rpc>,<trid>[,<crc>]:<p>` and `%R1P,<com>,<trid>[,<crc>]:<rc>,<p>`. 
 CRC-16/ARC over the line without the checksum and its comma.
 """
 
-import argparse
 import re
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -506,7 +504,7 @@ def serve(station: Station, port: PtyPort, buffer: bytearray) -> None:
     port.pump()
 
 
-def start(options: argparse.Namespace) -> admin.Device:
+def start(options: admin.Arguments) -> admin.Device:
     """Return the station on its serial line."""
     measuring, faults = np.random.default_rng(options.seed).spawn(2)
     beam = Beam(tuple(options.range_std), tuple(options.transverse_std))
@@ -518,4 +516,4 @@ def start(options: argparse.Namespace) -> admin.Device:
 OPTIONS: dict[str, dict[str, Any]] = {**admin.NOISE, "--baud": {"type": int, "default": 115200}}
 
 if __name__ == "__main__":
-    sys.exit(admin.run(__doc__, "tracker", start, OPTIONS))
+    admin.run(__doc__, "tracker", start, OPTIONS)

@@ -14,12 +14,10 @@ repeats one frame, `lose {share}` of the frames, `forget` all clients, `rename {
 Source: as `hilcal.drivers.natnet`. natnet, an independent client, is tested against it.
 """
 
-import argparse
 import contextlib
 import select
 import socket
 import struct
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -194,7 +192,7 @@ def operations(cameras: Cameras) -> admin.Operations:
     return admin.Operations(functions, state)
 
 
-def start(options: argparse.Namespace) -> admin.Device:
+def start(options: admin.Arguments) -> admin.Device:
     """Return the cameras, listening, and the step that sends frames at their rate."""
     noise, distortion = np.random.default_rng(options.seed).spawn(2)
     board = Blackboard(options.directory / "world.bin")
@@ -234,4 +232,4 @@ OPTIONS: dict[str, dict[str, Any]] = {
 }
 
 if __name__ == "__main__":
-    sys.exit(admin.run(__doc__, "tracker", start, OPTIONS))
+    admin.run(__doc__, "tracker", start, OPTIONS)

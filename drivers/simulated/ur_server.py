@@ -16,11 +16,9 @@ by hand; `set {version, slider, speed_scaling, unlock_s}`, `die`,
 `log`
 """
 
-import argparse
 import asyncio
 import inspect
 import os
-import sys
 import time
 from collections.abc import Callable
 from functools import partial
@@ -275,7 +273,7 @@ def _share(key: str, value: Any) -> float:
     return float(value)
 
 
-def start(options: argparse.Namespace) -> admin.Device:
+def start(options: admin.Arguments) -> admin.Device:
     """Return the controller, listening."""
     arm, factory = load_arm(options.robot), None
     if arm.n != len(HOME):
@@ -305,4 +303,4 @@ OPTIONS: dict[str, dict[str, Any]] = {
 }
 
 if __name__ == "__main__":
-    sys.exit(admin.run(__doc__, "arm", start, OPTIONS))
+    admin.run(__doc__, "arm", start, OPTIONS)

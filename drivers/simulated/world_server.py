@@ -14,10 +14,8 @@
 The JSON file holds the world without rounding.
 """
 
-import argparse
 import contextlib
 import json
-import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -375,7 +373,7 @@ def open_board(directory: Path, scale: float, start: float = 0.0, joints: int = 
     return Blackboard(path)
 
 
-def start(options: argparse.Namespace) -> admin.Device:
+def start(options: admin.Arguments) -> admin.Device:
     """Return the world of DIR/world.json, and its step."""
     world, config = read_world(options.directory / "world.json")
     board = open_board(options.directory, config.simulation.clock, joints=world.cell.arm.n)
@@ -391,4 +389,4 @@ def start(options: argparse.Namespace) -> admin.Device:
 
 
 if __name__ == "__main__":
-    sys.exit(admin.run(__doc__, "world", start))
+    admin.run(__doc__, "world", start)

@@ -103,19 +103,16 @@ def _sound(path: Path) -> None:
         assert campaign.n_readings == len(log.done()) == len(log.details())
 
 
-@pytest.mark.long
-def test_kill_minus_nine_at_random_moments(cell: cases.Site, tmp_path: Path) -> None:
-    short = cell.shorter(tmp_path, poses=2)
+@pytest.mark.parametrize(
+    ("kills", "poses"),
+    [pytest.param(2, 2, marks=pytest.mark.long), pytest.param(100, 25, marks=pytest.mark.slow)],
+)
+def test_kill_minus_nine_at_random_moments(
+    cell: cases.Site, tmp_path: Path, kills: int, poses: int
+) -> None:
+    long = cell.shorter(tmp_path, poses=poses)
     path = tmp_path / "killed.hilcal"
-    _kill_at_random(short, path, 2, 1)
-    cases.finish(short, path)
-
-
-@pytest.mark.slow
-def test_kill_minus_nine_at_a_hundred_random_moments(cell: cases.Site, tmp_path: Path) -> None:
-    long = cell.shorter(tmp_path, poses=25)
-    path = tmp_path / "killed.hilcal"
-    assert _kill_at_random(long, path, 100, 2) > 10
+    assert _kill_at_random(long, path, kills, seed=poses) > (10 if kills > 10 else -1)
     cases.finish(long, path)
 
 
