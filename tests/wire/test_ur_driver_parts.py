@@ -4,10 +4,8 @@ import os
 import signal
 import socket
 import struct
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -44,6 +42,7 @@ from tests.support import ur_driver_cases as cases
 from tests.support.cli_cases import ok
 from tests.support.factory_cases import write
 from tests.support.living_cell import config, world_of
+from tests.support.ur_driver_cases import server
 
 FIELDS = {
     **{name: [0.1 * k for k in range(6)] for name in OUTPUTS},
@@ -244,37 +243,6 @@ JSON = b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\nContent-Length: %d
 
 def answer(body: bytes) -> bytes:
     return JSON % (len(body), body)
-
-
-@contextmanager
-def server(port: int, says: Callable[[bytes], bytes]) -> Iterator[tuple[str, list[bytes]]]:
-    """Something that listens on a port, and what it was asked, one connection after the other."""
-    host, asked = free_host(), []
-    with socket.socket() as door:
-        door.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        door.bind((host, port))
-        door.listen(8)
-
-        def serve() -> None:
-            while True:
-                try:
-                    line, _ = door.accept()
-                except OSError:
-                    return
-                with line:
-                    line.settimeout(0.3)
-                    data = b""
-                    with suppress(TimeoutError):  # an order's body comes in a packet of its own
-                        while not data or (data.startswith(b"PUT") and not data.endswith(b"}")):
-                            data += line.recv(65536)
-                    asked.append(data)
-                    line.sendall(says(asked[-1]))
-
-        thread = threading.Thread(target=serve, daemon=True)
-        thread.start()
-        yield host, asked
-        door.shutdown(socket.SHUT_RDWR)
-    thread.join(2.0)
 
 
 def test_what_is_asked_goes_over_the_wire_as_the_maker_says() -> None:
