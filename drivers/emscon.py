@@ -115,11 +115,9 @@ class EmsconConnection:
 
     def drain(self) -> None:
         """Read what the server has sent by itself; old results are dropped."""
-        while True:
-            try:
+        with contextlib.suppress(BlockingIOError):
+            while True:
                 self._packet(0.0)
-            except BlockingIOError:
-                return
 
     def unpack(self, layout: str, body: bytes) -> tuple[Any, ...]:
         """Unpack the content of an answer, which may be longer than the layout."""

@@ -297,7 +297,10 @@ class NatNetTracker:
         line = self._data or self._line
         with network_failures(DEVICE, self.where):
             self._send(message(KEEP_ALIVE))
-            _drain(line)
+            line.setblocking(False)
+            with contextlib.suppress(BlockingIOError):  # drop what came before
+                while True:
+                    line.recv(LARGEST)
             self._newest = -1
             start = heard = tracked = requested = time.monotonic()
             until = start + DEADLINE_S + count / SLOWEST_HZ
@@ -428,15 +431,6 @@ class NatNetTracker:
         except (TimeoutError, struct.error):
             return None
         return content if number == kind else None
-
-
-def _drain(line: socket.socket) -> None:
-    line.setblocking(False)
-    while True:
-        try:
-            line.recv(LARGEST)
-        except BlockingIOError:
-            return
 
 
 def open_tracker(config: CellConfig) -> NatNetTracker:
