@@ -4,8 +4,8 @@
         --seed N [--on S] [--host 127.A.B.C --port 49152 --web-port 8081]
 
 Admin operations: `overload {force}` adds a wrench (6 numbers, N and N·m), `freeze {on}` repeats one
-reading, `stall {on}` stops sending while its clock goes on, `state`; on a serial line those of
-`PtyPort.faults`.
+reading, `stall {on}` stops sending while its clock goes on, `state`; Bota: `saturate {on}` and
+`clock {us}`; on a serial line those of `PtyPort.faults`.
 
 An ATI Net F/T sends records by RDT on UDP and has a page on HTTP. Its additional operations:
 `restart` as after a power cut (resets the counters and waits for a request), `lose {share}` of the
@@ -72,7 +72,10 @@ class StrainGauge:
 
     def add(self, force: Sequence[float]) -> None:
         """Set the added wrench (6,), N and N·m."""
-        self._overload = np.asarray(force, dtype=np.float64).reshape(6)
+        wrench = np.asarray(force, dtype=np.float64)
+        if wrench.shape != (6,):
+            raise ValueError(f"force has the shape {wrench.shape}; valid: 6 numbers")
+        self._overload = wrench
 
     def freeze(self, on: bool) -> None:
         """Repeat the present reading, or stop repeating."""
@@ -108,6 +111,10 @@ class SensorProtocol:
         """Return the answer to bytes of the client, empty if none."""
         return b""
 
+    def faults(self) -> dict[str, Callable[..., object]]:
+        """Return the faults of this kind of sensor, by name."""
+        return {}
+
 
 class Bota(SensorProtocol):
     """Bota Systems Rokubi and SensONE; the frame is described in `hilcal.drivers.bota`."""
@@ -118,13 +125,21 @@ class Bota(SensorProtocol):
     full = np.array([500.0, 500.0, 1200.0, 15.0, 15.0, 10.0])  # full scale of a SensONE, N and N·m
     _body = struct.Struct("<H6fIf")
 
+    def __init__(self) -> None:
+        self.saturated, self.start_us = False, 0
+
     def frame(self, number: int, wrench: Floats, temperature: float) -> bytes:
         """Return one frame, see `SensorProtocol.frame`."""
         clipped = np.clip(wrench, -self.full, self.full)
-        status = self.over_range if np.any(clipped != wrench) else 0
-        time_us = round(number * 1e6 / self.rate) & 0xFFFFFFFF
+        status = self.over_range if self.saturated or np.any(clipped != wrench) else 0
+        time_us = (self.start_us + round(number * 1e6 / self.rate)) & 0xFFFFFFFF
         body = self._body.pack(status, *clipped, time_us, temperature)
         return b"\xaa" + body + crc_x25(body)
+
+    def faults(self) -> dict[str, Callable[..., object]]:
+        """`saturate {on}` sets the status; `clock {us}` sets the time of frame 0."""
+        clock = admin.setter(self, "start_us", int)
+        return {"saturate": admin.setter(self, "saturated"), "clock": clock}
 
 
 class Hex(SensorProtocol):
@@ -304,7 +319,8 @@ class Stream:
 
     def operations(self) -> admin.Operations:
         """Return the admin operations."""
-        return admin.Operations(self.gauge.faults(self) | self.port.faults(), self.state)
+        faults = self.gauge.faults(self) | self.sensor.faults() | self.port.faults()
+        return admin.Operations(faults, self.state)
 
     def state(self) -> dict[str, Any]:
         """Return sensor, line and faults."""

@@ -410,3 +410,25 @@ def test_the_zero_drifts_as_the_sensor_warms_up() -> None:
     assert np.all(drift < 5 * DRIFT_STD * 7.0 + 0.03)
     noise = np.array(state["noise"]) / np.sqrt(warm.frames)
     assert np.any(drift > 0.1 * DRIFT_STD * 7.0 + 5 * noise)
+
+
+@pytest.mark.parametrize("kind", ["bota"])
+def test_a_saturated_gauge_is_no_reading_and_a_clock_that_wraps_loses_nothing(
+    kind, simulated
+) -> None:
+    with cases.opened(kind, simulated.port) as sensor:
+        cases.steady(sensor, 0.1)
+        simulated.admin("saturate", on=True)
+        cases.fails(sensor.latest, OVERLOADED)
+        simulated.admin("saturate", on=False)
+        cases.steady(sensor, 0.1)
+        number = simulated.admin("state")["frames"]
+        simulated.admin("clock", us=2**32 - 1000 * number - 500_000)
+        time.sleep(0.2)
+        lost = sensor.losses().lost
+        wait_until(  # it wraps after half a second
+            lambda: simulated.admin("state")["frames"] > number + 700, "wrapped"
+        )
+        cases.steady(sensor, 0.1)
+        assert sensor.losses().lost == lost
+        simulated.admin("clock", us=0)
