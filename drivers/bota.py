@@ -9,7 +9,7 @@ import numpy as np
 
 from hilcal.config import CellConfig
 from hilcal.drivers import force_stream as fs
-from hilcal.drivers.checksums import crc_x25
+from hilcal.drivers.links import crc_x25
 from hilcal.measuring.devices import ForceSensorDevice
 from hilcal.types import Floats
 

@@ -115,11 +115,9 @@ class EmsconConnection:
 
     def drain(self) -> None:
         """Read what the server has sent by itself; old results are dropped."""
-        while True:
-            try:
+        with contextlib.suppress(BlockingIOError):
+            while True:
                 self._packet(0.0)
-            except BlockingIOError:
-                return
 
     def unpack(self, layout: str, body: bytes) -> tuple[Any, ...]:
         """Unpack the content of an answer, which may be longer than the layout."""
@@ -204,12 +202,13 @@ class EmsconTracker:
     ) -> None:
         """Connect and set units, axes and mode; nothing turns."""
         self._connect, self._config, self._options, self._clock = connect, config, options, clock
+        self._moving_s = max(_LEAST_S, clock.real(SEARCHING_S))
         self._reflector: tuple[int, str] | None = None
         self._remarks: list[str] = []
         self._distance = 2.0
         self._line = connect()
         try:
-            self._set_up(self._soon())
+            self._set_up(time.monotonic() + DEADLINE_S)
         except BaseException:
             self._line.close()
             raise
@@ -232,28 +231,22 @@ class EmsconTracker:
 
     def aim(self, position: Floats, radius: float) -> None:
         """Turn to an expected reflector and hold it; see `PointingTracker.aim`."""
-        moving = max(_LEAST_S, self._clock.real(SEARCHING_S))
-        until = self._ready(moving)
+        until = self._ready(self._moving_s)
         self._search(min(radius, self._options.search_m), until)
         place = struct.pack("<3di", *map(float, position), 1)
         self._find("turning to the target", es.GO_POSITION, place, until)
 
     def find_target(self) -> None:
         """Find the zeros again if they are lost, and search for the reflector."""
-        moving = max(_LEAST_S, self._clock.real(SEARCHING_S))
-        until = self._ready(moving)
+        until = self._ready(self._moving_s)
         if self._system(until)[1] != es.INITIALIZED:
             homing = until + max(_LEAST_S, self._clock.real(HOMING_S))
             self._do("finding its zeros", es.INITIALIZE, until=homing)
             self._remarks.append(HOMED)
-            until = self._ready(moving)
+            until = self._ready(self._moving_s)
         self._search(self._options.search_m, until)
-        self._find(
-            "searching for the reflector",
-            es.FIND_REFLECTOR,
-            struct.pack("<d", self._distance),
-            until,
-        )
+        distance = struct.pack("<d", self._distance)
+        self._find("searching for the reflector", es.FIND_REFLECTOR, distance, until)
 
     def report(self) -> Report:
         """Report identity and state of the tracker, and measure once; nothing turns."""
@@ -280,9 +273,15 @@ class EmsconTracker:
             ("emScon", firmware, "emscon", firmware),
             ("weather station", station, "weather_station", station),
         ]
+        holds = self._options.target == "pose"
+        if state == es.INITIALIZED and not holds:
+            body = self._do("reading its state", es.GET_STATUS_INFO, until=until)
+            holds = bool(self._line.unpack("<Ii", body)[1] & es.REFLECTOR_FOUND)
         if state != es.INITIALIZED:
             problems.append("it has not found its zeros (it is not initialised); initialise it")
-        elif self._options.target == "pose" or self._holds_reflector(until):
+        elif not holds:
+            problems.append("it holds no reflector; put the beam on it")
+        else:
             try:
                 sample = self.measure()
                 std = 1e6 * float(np.sqrt(np.trace(sample.covariance[:3, :3])))
@@ -294,8 +293,6 @@ class EmsconTracker:
                 if not self._line.open:
                     raise
                 problems.append(str(error).removeprefix(f"{DEVICE}: "))
-        else:
-            problems.append("it holds no reflector; put the beam on it")
         full = f"{name}, serial {serial}" if serial else name
         return report_of(DEVICE, full, rows, problems)
 
@@ -304,12 +301,10 @@ class EmsconTracker:
         self._line.close()
 
     def _measure(self) -> es.Measurement:
+        """Return a plausible result; raise DeviceError for a failed or impossible one."""
         until = self._ready(self._clock.real(self._options.measuring_s))
         self._do("measuring", es.START_MEASUREMENT, until=until)
-        return self._checked(*self._line.result(until=until))
-
-    def _checked(self, kind: int, status: int, body: bytes) -> es.Measurement:
-        """Return a plausible result; raise DeviceError for a failed or impossible one."""
+        kind, status, body = self._line.result(until=until)
         if status != es.OK or kind == es.ERROR:
             raise es.failure("measuring", status)
         try:
@@ -344,12 +339,9 @@ class EmsconTracker:
                 return np.asarray(0.5 * (C + C.T))
         return float(np.linalg.eigvalsh(stated)[-1]) * np.eye(3)  # unknown order of the angles
 
-    def _soon(self, seconds: float = 0.0) -> float:
-        return time.monotonic() + DEADLINE_S + seconds
-
     def _ready(self, seconds: float = 0.0) -> float:
         """Restore connection and settings where lost; return a deadline, extended by `seconds`."""
-        until = self._soon(seconds)
+        until = time.monotonic() + DEADLINE_S + seconds
         again = not self._line.open
         if again:
             self._line = self._connect()
@@ -440,13 +432,8 @@ class EmsconTracker:
         body = self._do("reading its state", es.GET_SYSTEM_STATUS, until=until)
         return self._line.unpack("<4I3iI2i", body)
 
-    def _holds_reflector(self, until: float) -> bool:
-        body = self._do("reading its state", es.GET_STATUS_INFO, until=until)
-        return bool(self._line.unpack("<Ii", body)[1] & es.REFLECTOR_FOUND)
-
     def _search(self, radius: float, until: float) -> None:
-        seconds = max(_LEAST_S, self._clock.real(SEARCHING_S))
-        packed = struct.pack("<di", radius, math.ceil(1e3 * seconds))
+        packed = struct.pack("<di", radius, math.ceil(1e3 * self._moving_s))
         self._do("setting the search", es.SET_SEARCH, packed, until=until)
 
     def _find(self, doing: str, command: int, parameters: bytes, until: float) -> None:
@@ -465,7 +452,6 @@ class EmsconTracker:
 
 
 def _positive_definite(covariance: Floats) -> bool:
-    """Whether a covariance is finite and positive definite."""
     return bool(np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0.0)
 
 

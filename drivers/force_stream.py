@@ -426,7 +426,6 @@ class ForceStream:
             time.sleep(POLL_S)
 
     def _check_load(self, wrench: Floats, status: int) -> None:
-        """Refuse a frame that the sensor could not measure."""
         if wrong := self._sensor.overload(wrench, status):
             raise DeviceError(f"{DEVICE}: {wrong}")
 

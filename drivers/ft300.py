@@ -19,9 +19,8 @@ import serial
 
 from hilcal.config import CellConfig
 from hilcal.drivers import force_stream as fs
-from hilcal.drivers.checksums import crc_modbus
 from hilcal.drivers.force_stream import DEVICE
-from hilcal.drivers.links import close_port, drain, line_failures, open_port
+from hilcal.drivers.links import close_port, crc_modbus, drain, line_failures, open_port
 from hilcal.errors import DeviceError
 from hilcal.measuring.devices import ForceSensorDevice
 from hilcal.types import Floats
@@ -51,19 +50,19 @@ class RefusedError(DeviceError):
     """The device answered that it refuses the request."""
 
 
-def read_registers(port: serial.Serial, slave: int, address: int, count: int) -> tuple[int, ...]:
+def read_registers(port: serial.Serial, address: int, count: int) -> tuple[int, ...]:
     """Return `count` holding registers (16 bits each) from `address` on."""
-    return tuple(_ask(port, slave, lambda device: device.read_registers(address, count)))
+    return tuple(_ask(port, lambda device: device.read_registers(address, count)))
 
 
-def write_register(port: serial.Serial, slave: int, address: int, value: int) -> None:
-    """Write one register; raises as `read_registers` does."""
-    _ask(port, slave, lambda device: device.write_register(address, value, 0, WRITE_MULTIPLE))
+def start_stream(port: serial.Serial) -> None:
+    """Start the stream; raises as `read_registers` does."""
+    _ask(port, lambda device: device.write_register(STREAM_REGISTER, STREAM, 0, WRITE_MULTIPLE))
 
 
-def _ask(port: serial.Serial, slave: int, request: Callable[[minimalmodbus.Instrument], T]) -> T:
+def _ask(port: serial.Serial, request: Callable[[minimalmodbus.Instrument], T]) -> T:
     heard = False
-    device = minimalmodbus.Instrument(port, slave)
+    device = minimalmodbus.Instrument(port, SLAVE)
     for _ in range(TRIES):
         drain(port, QUIET_S, 4 * QUIET_S)
         try:
@@ -126,7 +125,7 @@ def _begin(port: serial.Serial) -> tuple[str, str]:
         try:
             firmware = _text(port, *FIRMWARE)
             number = _text(port, *SERIAL_NUMBER)
-            write_register(port, SLAVE, STREAM_REGISTER, STREAM)
+            start_stream(port)
             return firmware, number
         except NoAnswerError as error:
             heard = heard or error.heard
@@ -145,7 +144,7 @@ def _begin(port: serial.Serial) -> tuple[str, str]:
 def _text(port: serial.Serial, address: int, count: int) -> str:
     """Registers as text, two letters in each; as hexadecimal digits where they are not ASCII."""
     try:
-        registers = read_registers(port, SLAVE, address, count)
+        registers = read_registers(port, address, count)
     except RefusedError:
         return "unknown"
     data = b"".join(value.to_bytes(2, "big") for value in registers)

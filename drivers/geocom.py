@@ -121,6 +121,8 @@ _QUIET_S, _DRAIN_S = 0.03, 0.4
 _REPLY = re.compile(r"%R1P,(\d+),\d+,\d+:(\d+)(?:,.*)?$")
 _UNPROTECTED = re.compile(rb"%R1P,\d+,\d+:\d+(,.*)?\r\n$")
 _MISMATCH, _CLIENT_CHECKSUM = 3093, 3102
+Values = Sequence[int | float]
+Parsers = Sequence[Callable[[str], Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,11 +159,10 @@ class _Connection(SerialConnection):
             raise TimeoutError
         return self.received.removesuffix(self.eoabytes)
 
-    @property
-    def broken(self) -> Exception | None:
-        """What the port raised in the last exchange, if anything."""
-        quiet = isinstance(self.failure, TimeoutError | UnicodeDecodeError)
-        return None if quiet else self.failure
+    def raise_if_broken(self) -> None:
+        """Raise what the port raised in the last exchange, if anything but a timeout."""
+        if self.failure and not isinstance(self.failure, TimeoutError | UnicodeDecodeError):
+            raise self.failure
 
 
 class Link:
@@ -187,8 +188,8 @@ class Link:
     def ask(
         self,
         request: int,
-        values: Sequence[int | float] = (),
-        parsers: Sequence[Callable[[str], Any]] = (),
+        values: Values = (),
+        parsers: Parsers = (),
         *,
         until: float,
         seconds: float = ANSWER_S,
@@ -208,7 +209,9 @@ class Link:
             damaged += 1
             if isinstance(self._connection.failure, TimeoutError):
                 silent += 1
-                if silent > 1 or self._mute(until):
+                if silent == 1:  # does even the simplest request get no reply?
+                    self._once(NULL, (), (), ANSWER_S, until)
+                if isinstance(self._connection.failure, TimeoutError):
                     break
         raise DeviceError(f"{DEVICE} at {self._path}: {complaint or 'no answer in time'}")
 
@@ -217,28 +220,22 @@ class Link:
         close_port(self._port)
 
     def _greet(self) -> GeoCom:
-        """Let geocompy connect to the instrument."""
         with line_failures(DEVICE, self._path):
             try:
                 return GeoCom(self._connection, attempts=2, checksum=True)
             except ConnectionRefusedError:
-                self._raise_if_broken()
+                self._connection.raise_if_broken()
         raise DeviceError(f"{DEVICE} at {self._path}: {self._silence()}")
 
     def _once(
-        self,
-        request: int,
-        values: Sequence[int | float],
-        parsers: Sequence[Callable[[str], Any]],
-        seconds: float,
-        until: float,
+        self, request: int, values: Values, parsers: Parsers, seconds: float, until: float
     ) -> tuple[Reply | None, str]:
         """One exchange: a valid reply or None, and the complaint about an invalid one."""
         with line_failures(DEVICE, self._path):
             self._port.timeout = max(0.05, min(seconds, until - time.monotonic()))
             response = self._instrument.request(request, values, parsers)
             host_ns = time.monotonic_ns()
-            self._raise_if_broken()
+            self._connection.raise_if_broken()
             reply = _REPLY.match(response.response)
             code = 0 if reply is None else int(reply[1]) or int(reply[2])
             local = int(response.error)  # geocompy's error, or the instrument's
@@ -256,15 +253,6 @@ class Link:
         if self._connection.failure is not None or reply is None:
             return None, self._silence()
         return None, f"answers stay damaged or out of step ({words(code or local)}); {self._hint()}"
-
-    def _mute(self, until: float) -> bool:
-        """Whether even the simplest request gets no reply."""
-        self._once(NULL, (), (), ANSWER_S, until)
-        return isinstance(self._connection.failure, TimeoutError)
-
-    def _raise_if_broken(self) -> None:
-        if self._connection.broken is not None:
-            raise self._connection.broken
 
     def _silence(self) -> str:
         received = self._connection.received
@@ -331,6 +319,7 @@ class GeoComTracker:
         self, link: Link, config: TrackerConfig, options: GeoComOptions, clock: Clock
     ) -> None:
         self._link, self._config, self._options, self._clock = link, config, options, clock
+        self._moving_s = max(_LEAST_S, clock.real(SEARCHING_S))
         self._has_full = True
         self._last_ms = 0.0
 
@@ -353,11 +342,10 @@ class GeoComTracker:
     def aim(self, position: Floats, radius: float) -> None:
         """Turn to an expected target, aim at it, lock on it; see `PointingTracker.aim`."""
         x, y, z = (float(v) for v in position)
-        moving = max(_LEAST_S, self._clock.real(SEARCHING_S))
         hz, v = np.arctan2(x, y) % (2 * np.pi), np.arctan2(np.hypot(x, y), z)
-        until = time.monotonic() + DEADLINE_S + moving
+        until = time.monotonic() + DEADLINE_S + self._moving_s
         answer = self._link.ask(
-            TURN, (float(hz), float(v), 0, 0, 0), until=until, seconds=ANSWER_S + moving
+            TURN, (float(hz), float(v), 0, 0, 0), until=until, seconds=ANSWER_S + self._moving_s
         )
         if answer.code != OK:
             raise failure("turning to the target", answer.code)
@@ -369,12 +357,11 @@ class GeoComTracker:
         self._find(self._options.search_rad, search=True)
 
     def _find(self, window: float, search: bool) -> None:
-        moving = max(_LEAST_S, self._clock.real(SEARCHING_S))
-        until = time.monotonic() + DEADLINE_S + 4 * moving
+        until = time.monotonic() + DEADLINE_S + 4 * self._moving_s
+        seconds = ANSWER_S + self._moving_s
 
         def do(request: int, *values: float) -> int:
-            answer = self._link.ask(request, values, until=until, seconds=ANSWER_S + moving)
-            return answer.code
+            return self._link.ask(request, values, until=until, seconds=seconds).code
 
         code = do(FINE_ADJUST, window, window, 0)
         if code in LOST and search:
@@ -426,8 +413,11 @@ class GeoComTracker:
         try:
             rows += self._sight(self._measure())
         except DeviceError as error:
-            if not isinstance(error, TargetLostError) and not self._answers(until):
-                raise
+            if not isinstance(error, TargetLostError):
+                try:  # does it answer at all?
+                    self._link.ask(NULL, until=until)
+                except DeviceError:
+                    raise error from None
             problems.append(str(error).removeprefix(f"{DEVICE}: "))
         full_name = f"{name[0]}, serial {serial[0]}" if serial else str(name[0])
         return report_of(DEVICE, full_name, rows, problems)
@@ -451,7 +441,13 @@ class GeoComTracker:
                 f"{DEVICE}: measuring: the distance {polar.distance:.4g} m is not within "
                 f"{nearest:g} to {farthest:g} m; does it aim at something else?"
             )
-        return plausible(polar)
+        if not (abs(polar.hz) <= CIRCLE and 0.0 <= polar.v <= CIRCLE):
+            _strange(f"angles of {polar.hz:.6g} and {polar.v:.6g} rad")
+        if not 0.0 <= polar.angle_std <= LARGEST_STD:
+            _strange(f"a standard deviation of its angles of {polar.angle_std:.3g} rad")
+        if polar.tilt is not None and max(map(abs, polar.tilt)) > LARGEST_TILT:
+            _strange(f"an inclination of {max(map(abs, polar.tilt)):.3g} rad")
+        return polar
 
     def _full(self, until: float, measuring: float) -> PolarReading | None:
         """Measure, with the standard deviation of the angles; None if the request is unknown."""
@@ -525,13 +521,6 @@ class GeoComTracker:
         answer = self._link.ask(request, (), parsers, until=until)
         return answer.values if answer.code == OK and answer.values else None
 
-    def _answers(self, until: float) -> bool:
-        try:
-            self._link.ask(NULL, until=until)
-        except DeviceError:
-            return False
-        return True
-
 
 def open_tracker(config: CellConfig) -> GeoComTracker:
     """Connect to the instrument that [tracker] names; nothing turns."""
@@ -564,17 +553,6 @@ def numbers(answer: Reply, count: int) -> Floats:
     if not np.all(np.isfinite(numbers)):
         _strange("values that are no numbers")
     return numbers
-
-
-def plausible(polar: PolarReading) -> PolarReading:
-    """Return the measurement; raise DeviceError for impossible angles, accuracy or tilt."""
-    if not (abs(polar.hz) <= CIRCLE and 0.0 <= polar.v <= CIRCLE):
-        _strange(f"angles of {polar.hz:.6g} and {polar.v:.6g} rad")
-    if not 0.0 <= polar.angle_std <= LARGEST_STD:
-        _strange(f"a standard deviation of its angles of {polar.angle_std:.3g} rad")
-    if polar.tilt is not None and max(map(abs, polar.tilt)) > LARGEST_TILT:
-        _strange(f"an inclination of {max(map(abs, polar.tilt)):.3g} rad")
-    return polar
 
 
 def _strange(data: str) -> NoReturn:

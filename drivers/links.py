@@ -1,4 +1,4 @@
-"""Serial ports and network addresses of instruments; every failure becomes an error of one line.
+"""Serial ports, their checksums, and network addresses; every failure becomes an error of one line.
 
 Drivers read and write inside `with line_failures(device, path):` or `network_failures`. pyserial
 reports an unplugged adapter as SerialException (read, write), OSError (in_waiting) or termios.error
@@ -7,6 +7,7 @@ reports an unplugged adapter as SerialException (read, write), OSError (in_waiti
 
 import contextlib
 import errno
+import functools
 import os
 import re
 import termios
@@ -101,6 +102,35 @@ def _ports() -> str:
     """Names of the adapters that are plugged in, for a message."""
     names = sorted(map(str, BY_ID.iterdir())) if BY_ID.is_dir() else []
     return f"plugged in: {', '.join(names[:4])}" if names else f"{BY_ID} lists no adapter"
+
+
+@functools.cache
+def _table(polynomial: int) -> tuple[int, ...]:
+    """Return the remainders of the 256 values of a byte."""
+    table = []
+    for value in range(256):
+        for _ in range(8):
+            value = (value >> 1) ^ (polynomial if value & 1 else 0)
+        table.append(value)
+    return tuple(table)
+
+
+def crc16(data: bytes, start: int = 0, polynomial: int = 0xA001) -> int:
+    """Return the CRC-16 with a reflected polynomial, byte by byte; the defaults give CRC-16/ARC."""
+    crc, table = start, _table(polynomial)
+    for byte in data:
+        crc = (crc >> 8) ^ table[(crc ^ byte) & 0xFF]
+    return crc
+
+
+def crc_modbus(data: bytes) -> bytes:
+    """Return the two bytes of CRC-16/MODBUS: initial value FFFF."""
+    return crc16(data, 0xFFFF).to_bytes(2, "little")
+
+
+def crc_x25(data: bytes) -> bytes:
+    """Return the two bytes of CRC-16/X-25: polynomial 1021, initial value FFFF, inverted."""
+    return (crc16(data, 0xFFFF, 0x8408) ^ 0xFFFF).to_bytes(2, "little")
 
 
 _ADDRESS = re.compile(r"([\w.-]+)(?::(\d{1,5}))?")

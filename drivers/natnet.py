@@ -4,9 +4,12 @@ A measurement is the mean of the frames that come after the request; its covaria
 these frames, divided by their number. The covariance does not state the accuracy: a camera system
 has the same error in all frames of one pose. Leave the noise in [tracker] open, so that it is
 estimated from the campaign. Reads frames of 3.0 to 4.2; a server of a later version is asked for
-4.2.
+4.2. The simulated cameras (`simulated.natnet_server`) write the same messages.
 
-Source: see `natnet_frames`.
+A message is little-endian: number (uint16), bytes that follow (uint16), content. From 4.1 on each
+list in a frame or in the descriptions also states its length in bytes.
+
+Source: OptiTrack, NatNet SDK 4.x (NatNetTypes.h and the depacketization samples).
 """
 
 import contextlib
@@ -14,7 +17,7 @@ import socket
 import struct
 import time
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -23,11 +26,168 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.config import CellConfig
 from hilcal.config.sections import Whole
-from hilcal.drivers import natnet_frames as nn
 from hilcal.drivers.links import address, check_own_axes, network_failures
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import Report, Row, TargetLostError, TrackerSample, report_of
 from hilcal.toml import Section, check_section
+from hilcal.types import Floats
+
+PORT, DATA_PORT = 1510, 1511
+GROUP = "239.255.42.99"
+CONNECT, SERVER_INFO, REQUEST, RESPONSE = 0, 1, 2, 3
+REQUEST_DESCRIPTIONS, DESCRIPTIONS, FRAME, KEEP_ALIVE = 4, 5, 7, 10
+Version = tuple[int, int]
+OLDEST: Version = (3, 0)
+NEWEST: Version = (4, 2)
+SIZED: Version = (4, 1)  # first version whose lists state their length in bytes
+LARGEST = 1 << 16
+MARKER_SET, RIGID_BODY = 0, 1
+_HEAD = struct.Struct("<HH")
+_COUNT = struct.Struct("<I")
+_BODY = struct.Struct("<I3f4ffH")
+_SERVER = struct.Struct("<256s4B4B")
+_CONNECTION = struct.Struct("<QHB4B")
+
+
+def message(number: int, content: bytes = b"") -> bytes:
+    """Return a message."""
+    return _HEAD.pack(number, len(content)) + content
+
+
+def opened(data: bytes) -> tuple[int, bytes]:
+    """Return number and content of a message; raises struct.error if cut short."""
+    number, size = _HEAD.unpack_from(data)
+    if len(data) < _HEAD.size + size:
+        raise struct.error("cut short")
+    return number, data[_HEAD.size :]
+
+
+def connect(version: Version) -> bytes:
+    """Return the request to connect and to receive frames of a version."""
+    content = bytearray(271)
+    content[:4] = b"Ping"
+    content[265:267] = bytes(version)
+    return message(CONNECT, bytes(content))
+
+
+@dataclass(frozen=True, slots=True)
+class NatNetServer:
+    """Who answered, and how it sends frames."""
+
+    name: str
+    program: str
+    version: Version  # of NatNet, of its frames
+    data_port: int  # to which it sends frames; 0 if not stated
+    group: str  # multicast address; empty where it sends to each client
+
+
+def server(content: bytes) -> NatNetServer:
+    """Parse the answer to `connect`; raises struct.error if cut short."""
+    name, *numbers = _SERVER.unpack_from(content)
+    version = numbers[4], numbers[5]
+    called = name.split(b"\0")[0].decode("utf-8", "replace")
+    port, where = 0, ""
+    if len(content) >= _SERVER.size + _CONNECTION.size:
+        _, port, multicast, *group = _CONNECTION.unpack_from(content, _SERVER.size)
+        where = ".".join(map(str, group)) if multicast else ""
+    return NatNetServer(called, ".".join(map(str, numbers[:4])), version, port, where)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Body:
+    """A rigid body in a frame."""
+
+    number: int
+    position: Floats  # (3,) of its pivot, m
+    quaternion: Floats  # (4,) scalar last
+    tracked: bool
+
+
+class Reader:
+    """Reads a content from its beginning; raises struct.error at a premature end."""
+
+    def __init__(self, content: bytes, version: Version) -> None:
+        self.content, self.version, self.at = content, version, 0
+
+    def take(self, layout: struct.Struct) -> tuple[float, ...]:
+        """Return the next numbers."""
+        values = layout.unpack_from(self.content, self.at)
+        self.at += layout.size
+        return values
+
+    def count(self) -> int:
+        """Return the next number."""
+        return int(self.take(_COUNT)[0])
+
+    def listed(self) -> tuple[int, int]:
+        """Return the number of elements of a list, and where it ends (0: not stated)."""
+        count = self.count()
+        size = self.count() if self.version >= SIZED else 0
+        return count, self.at + size if size else 0
+
+    def text(self) -> str:
+        """Return the next text."""
+        end = self.content.find(b"\0", self.at)
+        if end < 0:
+            raise struct.error("a text without an end")
+        text = self.content[self.at : end].decode("utf-8", "replace")
+        self.at = end + 1
+        return text
+
+    def skip(self, size: int) -> None:
+        """Skip bytes."""
+        self.at += size
+        if not 0 <= self.at <= len(self.content):
+            raise struct.error("cut short")
+
+
+def frame(content: bytes, version: Version) -> tuple[int, list[Body]]:
+    """Return a frame's number and its rigid bodies."""
+    r = Reader(content, version)
+    number = r.count()
+    sets, end = r.listed()
+    if end:
+        r.skip(end - r.at)
+    else:
+        for _ in range(sets):
+            r.text()
+            r.skip(12 * r.count())
+    markers, _ = r.listed()  # unlabelled
+    r.skip(12 * markers)
+    bodies = []
+    for _ in range(r.listed()[0]):
+        v = r.take(_BODY)
+        tracked = bool(int(v[9]) & 1)
+        bodies.append(Body(int(v[0]), np.array(v[1:4]), np.array(v[4:8]), tracked))
+    return number, bodies
+
+
+def names(content: bytes, version: Version) -> dict[int, str]:
+    """Return the names of the rigid bodies by their streaming IDs, from the descriptions."""
+    r = Reader(content, version)
+    out: dict[int, str] = {}
+    for _ in range(r.count()):
+        kind = r.count()
+        end = r.count() + r.at if version >= SIZED else 0
+        if kind == RIGID_BODY:
+            name = r.text()
+            out[r.count()] = name
+            if not end:
+                r.skip(16)
+                markers = r.count()
+                r.skip(16 * markers)
+                for _ in range(markers if version >= (4, 0) else 0):
+                    r.text()
+        elif kind == MARKER_SET and not end:
+            r.text()
+            for _ in range(r.count()):
+                r.text()
+        elif not end:
+            break  # skeletons, plates, cameras: they come last, without a length
+        if end:
+            r.skip(end - r.at)
+    return out
+
 
 DEVICE = "tracker"
 ANSWER_S, TRIES = 0.5, 4
@@ -132,16 +292,19 @@ class NatNetTracker:
         if self._data is not None:
             self._data.close()
 
-    def _frames(self, count: int) -> list[nn.Body]:
+    def _frames(self, count: int) -> list[Body]:
         """Return the rigid body in the next `count` frames in which it is seen."""
         line = self._data or self._line
         with network_failures(DEVICE, self.where):
-            self._send(nn.message(nn.KEEP_ALIVE))
-            _drain(line)
+            self._send(message(KEEP_ALIVE))
+            line.setblocking(False)
+            with contextlib.suppress(BlockingIOError):  # drop what came before
+                while True:
+                    line.recv(LARGEST)
             self._newest = -1
             start = heard = tracked = requested = time.monotonic()
             until = start + DEADLINE_S + count / SLOWEST_HZ
-            out: list[nn.Body] = []
+            out: list[Body] = []
             foreign: set[int] = set()
             while len(out) < count:
                 now = time.monotonic()
@@ -152,7 +315,7 @@ class NatNetTracker:
                     )
                 if now - max(heard, requested) > ANSWER_S:  # the server may have dropped us
                     requested = now
-                    self._send(nn.connect(nn.NEWEST))
+                    self._send(connect(NEWEST))
                 if now - tracked > LOST_S and heard > tracked:
                     listed = f"; in the frames: {sorted(foreign)}" if foreign else ""
                     raise TargetLostError(
@@ -169,14 +332,14 @@ class NatNetTracker:
                         out.append(body)
         return out
 
-    def _next(self, line: socket.socket) -> list[nn.Body] | None:
+    def _next(self, line: socket.socket) -> list[Body] | None:
         """Return the rigid bodies of the next new frame; None where none came."""
-        content = self._receive(line, nn.FRAME, 0.1)
+        content = self._receive(line, FRAME, 0.1)
         if content is None:
             return None
         wrong = f"frames are not of NatNet {self._version}; was the version changed in Motive?"
         with self._parsing(wrong):
-            number, bodies = nn.frame(content, self._server.version)
+            number, bodies = frame(content, self._server.version)
         if number == self._newest:
             return None
         self._newest = number
@@ -184,24 +347,24 @@ class NatNetTracker:
             return None
         return bodies
 
-    def _greet(self) -> nn.NatNetServer:
-        content = self._ask(nn.connect(nn.NEWEST), nn.SERVER_INFO)
+    def _greet(self) -> NatNetServer:
+        content = self._ask(connect(NEWEST), SERVER_INFO)
         with self._parsing("what answers is no NatNet server; is this its command port?"):
-            server = nn.server(content)
-        if server.version > nn.NEWEST:
-            command = f"Bitstream,{nn.NEWEST[0]}.{nn.NEWEST[1]}".encode() + b"\0"
-            answer = self._ask(nn.message(nn.REQUEST, command), nn.RESPONSE)
-            if server.group or answer[:4] not in (bytes(4), command[:4]):
-                self._refuse(server)
-            server = replace(server, version=nn.NEWEST)
-        if server.version < nn.OLDEST:
-            self._refuse(server)
-        return server
+            found = server(content)
+        if found.version > NEWEST:
+            command = f"Bitstream,{NEWEST[0]}.{NEWEST[1]}".encode() + b"\0"
+            answer = self._ask(message(REQUEST, command), RESPONSE)
+            if found.group or answer[:4] not in (bytes(4), command[:4]):
+                self._refuse(found)
+            found = replace(found, version=NEWEST)
+        if found.version < OLDEST:
+            self._refuse(found)
+        return found
 
-    def _refuse(self, server: nn.NatNetServer) -> None:
+    def _refuse(self, server: NatNetServer) -> None:
         raise self._error(
             f"it sends frames of NatNet {server.version[0]}.{server.version[1]}; valid: 3.0 to "
-            f"{nn.NEWEST[0]}.{nn.NEWEST[1]} (set it in Motive)"
+            f"{NEWEST[0]}.{NEWEST[1]} (set it in Motive)"
         )
 
     @property
@@ -219,11 +382,11 @@ class NatNetTracker:
         except struct.error:
             raise self._error(wrong) from None
 
-    def _joined(self, server: nn.NatNetServer) -> socket.socket:
+    def _joined(self, server: NatNetServer) -> socket.socket:
         line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             line.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            line.bind((server.group, server.data_port or nn.DATA_PORT))
+            line.bind((server.group, server.data_port or DATA_PORT))
             member = socket.inet_aton(server.group) + socket.inet_aton(self._options.local)
             line.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
         except BaseException:
@@ -232,16 +395,16 @@ class NatNetTracker:
         return line
 
     def _rigid_body(self) -> tuple[int, str]:
-        content = self._ask(nn.message(nn.REQUEST_DESCRIPTIONS), nn.DESCRIPTIONS)
+        content = self._ask(message(REQUEST_DESCRIPTIONS), DESCRIPTIONS)
         with self._parsing(f"its descriptions are not of NatNet {self._version}"):
-            names = nn.names(content, self._server.version)
+            found = names(content, self._server.version)
         body = self._options.rigid_body
-        if body is None and len(names) == 1:
-            return next(iter(names.items()))
-        for number, name in names.items():
+        if body is None and len(found) == 1:
+            return next(iter(found.items()))
+        for number, name in found.items():
             if body in (name, str(number)):
                 return number, name
-        listed = ", ".join(f'"{name}"' for name in names.values()) or "none is streamed"
+        listed = ", ".join(f'"{name}"' for name in found.values()) or "none is streamed"
         wrong = "rigid_body is missing" if body is None else f'no rigid body "{body}"'
         raise InputError(f"[tracker] options: {wrong}; valid: {listed}")
 
@@ -264,25 +427,16 @@ class NatNetTracker:
         """Return the content of the next message if it is of the kind, else None."""
         line.settimeout(max(seconds, 1e-3))
         try:
-            number, content = nn.opened(line.recv(nn.LARGEST))
+            number, content = opened(line.recv(LARGEST))
         except (TimeoutError, struct.error):
             return None
         return content if number == kind else None
 
 
-def _drain(line: socket.socket) -> None:
-    line.setblocking(False)
-    while True:
-        try:
-            line.recv(nn.LARGEST)
-        except BlockingIOError:
-            return
-
-
 def open_tracker(config: CellConfig) -> NatNetTracker:
     """Connect to the server that [tracker] names."""
     tracker = config.tracker
-    host, port = address("[tracker]", "natnet", tracker.host, nn.PORT)
+    host, port = address("[tracker]", "natnet", tracker.host, PORT)
     check_own_axes(tracker)
     options = check_section(tracker.options, NatNetOptions, "[tracker] options")
     if options.frames < 2:

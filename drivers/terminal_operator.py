@@ -91,7 +91,6 @@ class TerminalOperator:
         """Nothing to close."""
 
     def _request(self, load: CellLoad | None) -> list[str]:
-        """Return the lines of the request to hang a load."""
         if load is None:
             return ["Take every load off the tool, and do not touch the arm."]
         out = [f"Hang the load {load.name} at the load point {_numbers(self._point)} m (flange)."]
@@ -116,7 +115,6 @@ def open_operator(config: CellConfig) -> TerminalOperator:
 
 
 def _is_terminal() -> bool:
-    """Whether a person can answer on standard input."""
     try:
         return sys.stdin.isatty()
     except (AttributeError, ValueError):  # no standard input, or a closed one

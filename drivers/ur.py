@@ -19,20 +19,21 @@ import numpy as np
 from hilcal.config import CellConfig
 from hilcal.drivers.ur_link import control as command
 from hilcal.drivers.ur_link import probe, states
-from hilcal.drivers.ur_link.lines import LinkError
+from hilcal.drivers.ur_link.probe import LinkError
 from hilcal.drivers.ur_link.reading import (
     OPTIONAL,
     OUTPUTS,
     PATIENCE_S,
     STALE_S,
+    TORQUE,
     N,
     Reading,
     Receiver,
+    TorqueReader,
     survey,
 )
 from hilcal.drivers.ur_link.states import CHECK_LINK, CONTROL, HOLD_ON, failure
-from hilcal.drivers.ur_link.supervision import Generation, UrOptions, generation, why_silent
-from hilcal.drivers.ur_link.torque_reader import TORQUE, TorqueReader
+from hilcal.drivers.ur_link.supervision import Controller, UrOptions
 from hilcal.drivers.ur_link.worker import WorkerError
 from hilcal.errors import InputError
 from hilcal.measuring.devices import ArmSample, Report
@@ -58,20 +59,17 @@ class UrArm:
     def __init__(
         self,
         config: CellConfig,
-        host: str,
-        hz: float,
-        controller: probe.ControllerFacts,
-        generation: Generation,
+        controller: Controller,
         silent: str,
         receiver: Receiver,
         torques: TorqueReader | None = None,
     ) -> None:
-        self._torques = torques
-        self._host, self._hz, self._model = host, hz, config.robot.model
+        """`silent`: why the supervision does not answer; empty if it does."""
+        self._controller, self._silent = controller, silent
+        self._receiver, self._torques = receiver, torques
+        self._host, self._model = controller.host, config.robot.model
         self._arrival, self._clock = config.motion.arrival_rad, config.simulation.clock
-        self._controller, self._generation, self._silent = controller, generation, silent
-        self._receiver = receiver
-        self._brakes = command.Brakes(host, receiver, generation)
+        self._brakes = command.Brakes(controller, receiver)
         self._control: command.Control | None = None
         self._motion: command.MotionInProgress | None = None
         self._brake = command.deceleration(config.motion.speed_rad_s)
@@ -87,26 +85,15 @@ class UrArm:
 
     def report(self) -> Report:
         """Report identity, versions, state and every problem; moves nothing."""
-        report = self._survey()
-        if self._control is None:
-            end = time.monotonic() + _ORPHAN_S
-            while any(map(_is_foreign, report.problems)) and time.monotonic() < end:
-                time.sleep(0.2)  # the program of a killed hilcal ends by its watchdog
-                report = self._survey()
-            return report
-        problems = tuple(p for p in report.problems if not _is_foreign(p))
-        return replace(report, problems=problems)
-
-    def _survey(self) -> Report:
-        return survey(
-            self._host,
-            self._model,
-            self._hz,
-            self._controller,
-            self._receiver,
-            self._generation,
-            self._silent,
-        )
+        end = time.monotonic() + _ORPHAN_S
+        while True:
+            report = survey(self._controller, self._receiver, self._model, self._silent)
+            others = tuple(p for p in report.problems if not p.startswith("a program runs"))
+            if self._control is not None:  # the program is ours
+                return replace(report, problems=others)
+            if others == report.problems or time.monotonic() >= end:
+                return report
+            time.sleep(0.2)  # the program of a killed hilcal ends by its watchdog
 
     def sample(self) -> ArmSample:
         """Return a sample newer than the call; see `ArmDevice.sample`."""
@@ -129,11 +116,11 @@ class UrArm:
                 raise failure(self._host, str(error), CHECK_LINK) from None
         if self._torques is not None:
             self._torques.renew()
-        self._silent = why_silent(self._generation.supervision, _ASK_S)
+        self._silent = self._controller.why_silent(_ASK_S)
         if self._silent:
             raise failure(self._host, f"cannot take control: {self._silent}")
         self._end_program()
-        self._control = command.take(self._host, self._receiver, self._generation)
+        self._control = command.take(self._controller, self._receiver)
         self._was_ours = True
         self._fault = ""
         try:
@@ -221,10 +208,10 @@ class UrArm:
         if reading.runtime != states.PLAYING:
             self._fail(_why_ended(reading, control))
         try:
-            pulse = control.alive()
+            expired, _ = control.alive()
         except WorkerError as error:
             self._fail(command.not_commanded(error))
-        if pulse.expired:
+        if expired:
             self._fail(command.UNWATCHED)
         if motion.arrived(reading):
             self._motion = None
@@ -279,7 +266,7 @@ class UrArm:
         """End our program, which ur_rtde may have uploaded again after a lost link."""
         if self._was_ours and not self._silent:
             with contextlib.suppress(LinkError):
-                self._generation.supervision.stop(_ASK_S)
+                self._controller.supervision.stop(_ASK_S)
                 self._was_ours = False
 
     def _stands_already(self) -> bool:
@@ -315,7 +302,7 @@ class UrArm:
         """Stop the arm, then find the cause and raise DeviceError."""
         halt = self._brakes.halt(self._control, self._brake, lost)
         self._control = self._motion = None
-        self._fault, advice = command.cause_of(self._generation.supervision, halt, symptom)
+        self._fault, advice = command.cause_of(self._controller, halt, symptom)
         if not halt.stands:
             advice = f"{HOLD_ON}; {advice}"
         raise failure(self._host, self._fault, advice)
@@ -324,14 +311,10 @@ class UrArm:
 def _why_ended(reading: Reading, control: command.Control) -> str:
     """Return why the robot's program ended, from the controller and the control process."""
     try:
-        pulse = control.alive(_PULSE_S)
+        expired, late = control.alive(_PULSE_S)
     except WorkerError:
         return command.program_ended(reading, 0.0)
-    return command.UNWATCHED if pulse.expired else command.program_ended(reading, pulse.late)
-
-
-def _is_foreign(problem: str) -> bool:
-    return problem.startswith("a program runs")
+    return command.UNWATCHED if expired else command.program_ended(reading, late)
 
 
 def _lacking(python: tuple[int, ...]) -> str:
@@ -353,21 +336,18 @@ def open_arm(config: CellConfig) -> UrArm:
     options = check_section(dict(config.robot.options), UrOptions, "[robot.options]")
     if importlib.util.find_spec("rtde_control") is None:
         raise InputError(_lacking(sys.version_info[:2]))
-    receiver = None
     try:
-        controller = probe.controller(host, (*OUTPUTS, TORQUE), _PROBE_S)
-        outputs = tuple(name for name in controller.outputs if name != TORQUE)
-        missing = set(OUTPUTS) - OPTIONAL - set(controller.outputs)
+        version, available = probe.controller(host, (*OUTPUTS, TORQUE), _PROBE_S)
+        outputs = tuple(name for name in available if name != TORQUE)
+        missing = set(OUTPUTS) - OPTIONAL - set(outputs)
         if missing:
-            version = states.version_word(controller.version)
-            raise failure(host, f"its version {version} lacks {', '.join(sorted(missing))}")
-        kind = generation(host, controller.version, options.robot_api_port)
-        silent = why_silent(kind.supervision, _ASK_S)
+            word = states.version_word(version)
+            raise failure(host, f"its version {word} lacks {', '.join(sorted(missing))}")
+        controller = Controller.of(host, version, options.robot_api_port)
+        silent = controller.why_silent(_ASK_S)
         receiver = Receiver(host, options.receive_hz, outputs, _RECEIVE_S)
     except LinkError as error:
-        raise failure(
-            host, str(error), "check that the controller is on and [robot] host"
-        ) from None
-    has_torque = TORQUE in controller.outputs
-    torques = TorqueReader(host, options.receive_hz) if has_torque else None
-    return UrArm(config, host, options.receive_hz, controller, kind, silent, receiver, torques)
+        advice = "check that the controller is on and [robot] host"
+        raise failure(host, str(error), advice) from None
+    torques = TorqueReader(host, options.receive_hz) if TORQUE in available else None
+    return UrArm(config, controller, silent, receiver, torques)

@@ -12,7 +12,7 @@ import sys
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from hilcal.errors import DeviceError, HilcalError
 
@@ -94,10 +94,10 @@ class Operations:
 
 
 def setter(target: object, name: str, kind: Callable[[Any], Any] = bool) -> Callable[..., None]:
-    """Return the operation that sets an attribute to its single argument, of any name."""
+    """Return the operation that sets an attribute to its single argument, of any name, or True."""
 
     def store(**arguments: Any) -> None:
-        (value,) = arguments.values()
+        (value,) = arguments.values() or (True,)
         setattr(target, name, kind(value))
 
     return store
@@ -110,6 +110,7 @@ NOISE: dict[str, dict[str, Any]] = {
 }
 
 
+Arguments = argparse.Namespace
 Device = tuple[Handler, Callable[[], None]]
 """The operations of a device, and the step that it repeats."""
 
@@ -117,14 +118,14 @@ Device = tuple[Handler, Callable[[], None]]
 def run(
     doc: str | None,
     name: str,
-    start: Callable[[argparse.Namespace], Device],
+    start: Callable[[Arguments], Device],
     options: Mapping[str, dict[str, Any]] | None = None,
-) -> int:
+) -> NoReturn:
     """Run the process of a device; its admin line is DIR/NAME.sock.
 
     It ends at once when standard input closes, whose other end the parent holds. `options`:
     arguments of `add_argument` by option. `start` makes the device from the parsed options; if it
-    cannot, its exit code is returned.
+    cannot, the process ends with the error's exit code.
     """
     parser = argparse.ArgumentParser(
         description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -146,7 +147,7 @@ def run(
         handler, step = start(parsed)
     except HilcalError as error:
         sys.stderr.write(f"{error}\n")
-        return error.exit_code
+        sys.exit(error.exit_code)
     serve(parsed.directory / f"{name}.sock", handler)
     while True:
         step()

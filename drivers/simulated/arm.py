@@ -9,9 +9,7 @@ runs the controller of the arm in DIR/world.json. It speaks no maker's protocol:
 controller, which speaks their protocols.
 """
 
-import argparse
 import contextlib
-import sys
 import threading
 import time
 from pathlib import Path
@@ -220,7 +218,7 @@ def open_arm(config: CellConfig) -> SimulatedArm:
     return arm
 
 
-def start(options: argparse.Namespace) -> admin.Device:
+def start(options: admin.Arguments) -> admin.Device:
     """Return the controller of the arm in DIR/world.json."""
     world, _ = read_world(options.directory / "world.json")
     board = Blackboard(options.directory / "world.bin")
@@ -236,4 +234,4 @@ def start(options: argparse.Namespace) -> admin.Device:
 
 
 if __name__ == "__main__":
-    sys.exit(admin.run(__doc__, "arm", start))
+    admin.run(__doc__, "arm", start)

@@ -163,8 +163,7 @@ class SimulatedCell:
             ) from None
         for attempt in range(1, _HOSTS + 1):
             host = free_host()
-            devices = _devices(world, config, directory, seed, host, base_dir or Path())
-            connected = _connected(config, directory, host, is_ur(world.cell.arm))
+            devices, connected = _devices(world, config, directory, seed, host, base_dir or Path())
             cell = cls(connected, directory, devices, board)
             try:
                 cell._start(devices.values())
@@ -291,8 +290,43 @@ def _check(world: World, config: CellConfig, directory: Path) -> None:
 
 def _devices(
     world: World, config: CellConfig, directory: Path, seed: int, host: str, base_dir: Path
-) -> dict[str, DeviceProcess]:
-    noise, arm, sensor = world.noise, config.robot, config.force_sensor
+) -> tuple[dict[str, DeviceProcess], CellConfig]:
+    """Return the processes, and the configuration whose drivers connect to them."""
+    from hilcal.drivers.simulated.ur_server import API, POLYSCOPE_X  # loads asyncio
+
+    here, noise, sensor = directory.absolute(), world.noise, config.force_sensor
+    changes: dict[str, dict[str, Any]] = {}
+
+    def device(name: str, server: str, stream: int, options: dict[str, Any]) -> DeviceProcess:
+        command = ["--seed", str(seed + stream)]
+        for key, value in options.items():
+            values = value if isinstance(value, tuple) else (value,)
+            command += [f"--{key.replace('_', '-')}", *map(str, values)]
+        return DeviceProcess(name, f"hilcal.drivers.simulated.{server}", directory, tuple(command))
+
+    out = {"world": device("world", "world_server", 0, {})}
+    socket = str(here / "world.sock")
+    changes["operator"] = {
+        "driver": "simulated",
+        "options": {**config.operator.options, "socket": socket},
+    }
+    if is_ur(world.cell.arm):
+        version, options = config.simulation.controller_version, {**config.robot.options}
+        facts: dict[str, Any] = {"host": host, "robot": config.robot.model, "version": version}
+        if config.robot.calibration is not None:
+            facts["calibration"] = base_dir / config.robot.calibration
+        out["arm"] = device("arm", "ur_server", 3, facts)
+        if int(version.partition(".")[0]) >= POLYSCOPE_X:
+            options["robot_api_port"] = API
+        driver = config.robot.driver or "ur"
+        changes["robot"] = {"host": host, "driver": driver, "options": options}
+    else:
+        out["arm"] = device("arm", "arm", 3, {})
+        changes["robot"] = {
+            "driver": "hilcal.drivers.simulated.arm:open_arm",
+            "options": {"socket": str(here / "arm.sock")},
+        }
+    tracker = config.tracker.driver or TRACKERS[0]
     std = {"range_std": noise.range_std, "transverse_std": noise.transverse_std}
     trackers: dict[str, dict[str, Any]] = {
         "geocom": std,
@@ -302,75 +336,24 @@ def _devices(
         },
         "natnet": {"host": host, "port": NATNET_PORT},  # with its own default errors
     }
-    tracker = config.tracker.driver or TRACKERS[0]
-
-    def device(name: str, server: str, stream: int, options: dict[str, Any]) -> DeviceProcess:
-        command = ["--seed", str(seed + stream)]
-        for key, value in options.items():
-            values = value if isinstance(value, tuple) else (value,)
-            command += [f"--{key.replace('_', '-')}", *map(str, values)]
-        return DeviceProcess(name, f"hilcal.drivers.simulated.{server}", directory, tuple(command))
-
-    controller, facts = "arm", dict[str, Any]()
-    if is_ur(world.cell.arm):
-        version = config.simulation.controller_version
-        controller, facts = "ur_server", {"host": host, "robot": arm.model, "version": version}
-        if arm.calibration is not None:
-            facts["calibration"] = base_dir / arm.calibration
-    out = {
-        "world": device("world", "world_server", 0, {}),
-        "arm": device("arm", controller, 3, facts),
-        "tracker": device("tracker", f"{tracker}_server", 1, trackers[tracker]),
-    }
+    facts = trackers[tracker]
+    out["tracker"] = device("tracker", f"{tracker}_server", 1, facts)
+    in_network = {"host": f"{host}:{facts['port']}"} if "port" in facts else None
+    changes["tracker"] = {"driver": tracker, **(in_network or {"port": str(here / "tracker")})}
     if sensor is not None:
-        kind: dict[str, Any] = {"kind": sensor.driver}
+        facts = {"kind": sensor.driver}
+        changes["force_sensor"] = {"port": str(here / "force")}
         if sensor.driver == "netft":
-            kind |= {"host": host, "port": RDT_PORT, "web_port": WEB_PORT}
-        out["force"] = device("force", "force_server", 2, kind)
-    return out
+            facts |= {"host": host, "port": RDT_PORT, "web_port": WEB_PORT}
+            web = {**sensor.options, "web_port": WEB_PORT}
+            changes["force_sensor"] = {"host": f"{host}:{RDT_PORT}", "options": web}
+        out["force"] = device("force", "force_server", 2, facts)
+    sections = {
+        name: getattr(config, name).model_copy(update=change) for name, change in changes.items()
+    }
+    return out, config.model_copy(update=sections)
 
 
 def is_ur(arm: Arm) -> bool:
     """Whether an arm is one of Universal Robots in the catalogue, whose protocols are simulated."""
     return arm.name.startswith("ur") and arm.joint_names == UR_JOINTS
-
-
-def _connected(config: CellConfig, directory: Path, host: str, ur: bool) -> CellConfig:
-    """Return the configuration whose drivers connect to the simulated devices."""
-    from hilcal.drivers.simulated.ur_server import API, POLYSCOPE_X  # loads asyncio
-
-    directory = directory.absolute()
-    tracker = config.tracker.driver or TRACKERS[0]
-    ports = {"emscon": EMSCON_PORT, "natnet": NATNET_PORT}
-    line = (
-        {"host": f"{host}:{ports[tracker]}"}
-        if tracker in ports
-        else {"port": str(directory / "tracker")}
-    )
-    changes: dict[str, dict[str, Any]] = {
-        "robot": {
-            "driver": "hilcal.drivers.simulated.arm:open_arm",
-            "options": {"socket": str(directory / "arm.sock")},
-        },
-        "tracker": {"driver": tracker, **line},
-        "operator": {
-            "driver": "simulated",
-            "options": {**config.operator.options, "socket": str(directory / "world.sock")},
-        },
-    }
-    if ur:
-        options: dict[str, Any] = {**config.robot.options}
-        if int(config.simulation.controller_version.partition(".")[0]) >= POLYSCOPE_X:
-            options["robot_api_port"] = API
-        driver = config.robot.driver or "ur"
-        changes["robot"] = {"host": host, "driver": driver, "options": options}
-    sensor = config.force_sensor
-    if sensor is not None:
-        changes["force_sensor"] = {"port": str(directory / "force")}
-        if sensor.driver == "netft":
-            web = {**sensor.options, "web_port": WEB_PORT}
-            changes["force_sensor"] = {"host": f"{host}:{RDT_PORT}", "options": web}
-    sections = {
-        name: getattr(config, name).model_copy(update=change) for name, change in changes.items()
-    }
-    return config.model_copy(update=sections)

@@ -12,12 +12,10 @@ of state, `transform {on}` sets an object's coordinate system, `drop` closes the
 Source: as `hilcal.drivers.emscon_packets`. CESAPI, an independent client, is tested against it.
 """
 
-import argparse
 import contextlib
 import select
 import socket
 import struct
-import sys
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -61,6 +59,10 @@ SETS = {
     es.SET_SEARCH: (44, 4),
 }
 """By command: the command that reads the setting, and the change of state reported."""
+_QUERIES = (es.GET_SYSTEM_STATUS, es.GET_REFLECTORS, es.GET_TRACKER_INFO, es.GET_ENVIRONMENT,
+            es.GET_STATUS_INFO)  # fmt: skip
+INFO = struct.pack("<iiiidddiiddIii", 1, 1, 1, 1, 0.0, 160.0, 0.8, 10, 2, 3.14, 3.14, 1, 1, 0)
+"""Of the tracker, after its type, name and number: what it has, and its limits."""
 
 
 @dataclass(slots=True, eq=False)
@@ -113,7 +115,7 @@ class SimulatedTracker:
                 changed = change if self.settings[reader] != body else None
                 self.settings[reader] = body
         elif command in _QUERIES:
-            answers = _QUERIES[command](self)
+            answers = self._answers(command)
         elif command == es.INITIALIZE:
             self.station.wait(5.0)
             self.initialized, changed = True, es.INITIALIZATION_CHANGED
@@ -134,6 +136,22 @@ class SimulatedTracker:
         """Return temperature °C, pressure mbar, relative humidity %."""
         air = float(self.station.board.read("truth")["air_temperature"])
         return (air if air != 0.0 else ROOM), MBAR, HUMIDITY
+
+    def _answers(self, query: int) -> list[bytes]:
+        if query == es.GET_ENVIRONMENT:
+            return [struct.pack("<3d", *self.environment())]
+        if query == es.GET_REFLECTORS:
+            return [
+                struct.pack("<iiId64s", len(REFLECTORS), number, 5, 0, _text(name))
+                for number, name in REFLECTORS.items()
+            ]
+        if query == es.GET_TRACKER_INFO:
+            return [struct.pack("<I64si", 70, _text(NAME), SERIAL) + INFO]
+        if query == es.GET_SYSTEM_STATUS:
+            state = es.INITIALIZED if self.initialized else es.BOOTED
+            return [struct.pack("<4I3iI2i", es.OK, state, 3, 2, 3, 8, 900, 2, 0, SERIAL)]
+        held = es.REFLECTOR_FOUND if self.station.held() is not None else 0
+        return [struct.pack("<Ii", es.OK, 15 | 4096 | es.LEVELLED | held)]
 
     def _acquire(self, command: int, body: bytes) -> int:
         """Turn to the expected reflector, and search for it; return the status."""
@@ -191,38 +209,6 @@ def _rates(angles: Floats) -> Floats:
 
 def _text(text: str) -> bytes:
     return text.encode("utf-16-le").ljust(64, b"\0")
-
-
-def _reflectors(t: SimulatedTracker) -> list[bytes]:
-    return [
-        struct.pack("<iiId64s", len(REFLECTORS), number, 5, 0, _text(name))
-        for number, name in REFLECTORS.items()
-    ]
-
-
-def _info(t: SimulatedTracker) -> list[bytes]:
-    facts = struct.pack("<iiiidddiiddIii", 1, 1, 1, 1, 0.0, 160.0, 0.8, 10, 2, 3.14, 3.14, 1, 1, 0)
-    return [struct.pack("<I64si", 70, _text(NAME), SERIAL) + facts]
-
-
-def _system(t: SimulatedTracker) -> list[bytes]:
-    state = es.INITIALIZED if t.initialized else es.BOOTED
-    return [struct.pack("<4I3iI2i", es.OK, state, 3, 2, 3, 8, 900, 2, 0, SERIAL)]
-
-
-def _status(t: SimulatedTracker) -> list[bytes]:
-    held = es.REFLECTOR_FOUND if t.station.held() is not None else 0
-    return [struct.pack("<Ii", es.OK, 15 | 4096 | es.LEVELLED | held)]
-
-
-_QUERIES: dict[int, Callable[[SimulatedTracker], list[bytes]]] = {
-    es.GET_SYSTEM_STATUS: _system,
-    es.GET_REFLECTORS: _reflectors,
-    es.GET_TRACKER_INFO: _info,
-    es.GET_ENVIRONMENT: lambda t: [struct.pack("<3d", *t.environment())],
-    es.GET_STATUS_INFO: _status,
-}
-"""By query command: the packets of its answer."""
 
 
 def operations(t: SimulatedTracker) -> admin.Operations:
@@ -304,7 +290,7 @@ def serve(t: SimulatedTracker, door: socket.socket) -> None:
     t.client = None
 
 
-def start(options: argparse.Namespace) -> admin.Device:
+def start(options: admin.Arguments) -> admin.Device:
     """Return the tracker, listening."""
     polar, orientation = np.random.default_rng(options.seed).spawn(2)
     along, across = tuple(options.range_std), tuple(options.transverse_std)
@@ -316,8 +302,11 @@ def start(options: argparse.Namespace) -> admin.Device:
     return operations(tracker), partial(serve, tracker, door)
 
 
-ORIENTATION: dict[str, dict[str, Any]] = {"--orientation-std": {"type": float, "default": 8.7e-5}}
+OPTIONS: dict[str, dict[str, Any]] = {
+    **admin.NETWORK,
+    **admin.NOISE,
+    "--orientation-std": {"type": float, "default": 8.7e-5},
+}
 
 if __name__ == "__main__":
-    options = {**admin.NETWORK, **admin.NOISE, **ORIENTATION}
-    sys.exit(admin.run(__doc__, "tracker", start, options))
+    admin.run(__doc__, "tracker", start, OPTIONS)

@@ -1,11 +1,11 @@
 """A simulated force sensor: on a pseudo-terminal `DIR/force`, or in a network; admin `force.sock`.
 
     python -m hilcal.drivers.simulated.force_server --directory DIR --kind ft300|bota|hex|netft
-        --seed N [--rate HZ] [--on S] [--host 127.A.B.C --port 49152 --web-port 8081]
+        --seed N [--on S] [--host 127.A.B.C --port 49152 --web-port 8081]
 
 Admin operations: `overload {force}` adds a wrench (6 numbers, N and N·m), `freeze {on}` repeats one
-reading, `stall {on}` stops sending while the sensor's clock goes on, `state`; Bota: `saturate {on}`
-and `clock {us}`; on a serial line those of `PtyPort.faults`.
+reading, `stall {on}` stops sending while its clock goes on, `state`; Bota: `saturate {on}` and
+`clock {us}`; on a serial line those of `PtyPort.faults`.
 
 An ATI Net F/T sends records by RDT on UDP and has a page on HTTP. Its additional operations:
 `restart` as after a power cut (resets the counters and waits for a request), `lose {share}` of the
@@ -14,12 +14,10 @@ status, `page {words}` changes elements of the page. Source: as `hilcal.drivers.
 independent client, is tested against it.
 """
 
-import argparse
 import contextlib
 import select
 import socket
 import struct
-import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -29,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.drivers.checksums import crc_modbus, crc_x25
+from hilcal.drivers.links import crc_modbus, crc_x25
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.drivers.simulated.pty_port import PtyPort
@@ -45,51 +43,43 @@ WARM_K, WARM_S = 7.0, 600.0  # final temperature above the air, and its time con
 ROOM = 22.0  # air temperature if the world has none, °C
 
 
-@dataclass(slots=True, eq=False)
 class StrainGauge:
     """The measuring bridge: wrench = true + bias + drift (T - T_start) + overload + noise."""
 
-    board: Blackboard
-    rng: np.random.Generator
-    bias: Floats  # (6,) at the world's start, N and N·m
-    drift: Floats  # (6,) per K
-    noise: Floats  # (6,) standard deviation of one frame
-    overload: Floats  # (6,) wrench added by a fault
-    on: float  # time since power-on at the world's start, s
-    frozen: Floats | None = None  # (6,) reading that is repeated; None: the truth
-
-    @staticmethod
-    def draw(
-        board: Blackboard, noise: tuple[float, float], rng: np.random.Generator, on: float
-    ) -> "StrainGauge":
-        """Return a sensor with a drawn zero; `noise`: of force (N) and moment (N·m)."""
-        bias, drift = (std * rng.standard_normal(6) for std in (BIAS_STD, DRIFT_STD))
-        return StrainGauge(board, rng, bias, drift, np.repeat(noise, 3), np.zeros(6), on)
+    def __init__(
+        self, board: Blackboard, noise: tuple[float, float], rng: np.random.Generator, on: float
+    ) -> None:
+        """Draw a zero; `noise`: of a frame's force (N) and moment (N·m); `on`: for so many s."""
+        self._board, self._rng, self._on = board, rng, on
+        self._bias, self._drift = (std * rng.standard_normal(6) for std in (BIAS_STD, DRIFT_STD))
+        self._noise = np.repeat(noise, 3)
+        self._overload = np.zeros(6)
+        self._frozen: Floats | None = None  # (6,) reading that is repeated
 
     def temperature(self) -> float:
         """Return the sensor's temperature, °C, which rises above that of the air."""
-        air = float(self.board.read("truth")["air_temperature"])
-        return float((air if air != 0.0 else ROOM) + self._self_heating(self.board.time))
+        air = float(self._board.read("truth")["air_temperature"])
+        return float((air if air != 0.0 else ROOM) + self._self_heating(self._board.time))
 
     def read(self, count: int) -> Floats:
         """Return (count, 6) wrenches of the frames now due, N and N·m."""
-        if self.frozen is not None:
-            return np.tile(self.frozen, (count, 1))
-        truth = self.board.read("truth")["sensor_wrench"]
-        warming = self._self_heating(self.board.time) - self._self_heating(0.0)
-        mean = truth + self.bias + self.drift * warming + self.overload
-        return np.asarray(mean + self.noise * self.rng.standard_normal((count, 6)))
+        if self._frozen is not None:
+            return np.tile(self._frozen, (count, 1))
+        truth = self._board.read("truth")["sensor_wrench"]
+        warming = self._self_heating(self._board.time) - self._self_heating(0.0)
+        mean = truth + self._bias + self._drift * warming + self._overload
+        return np.asarray(mean + self._noise * self._rng.standard_normal((count, 6)))
 
     def add(self, force: Sequence[float]) -> None:
         """Set the added wrench (6,), N and N·m."""
         wrench = np.asarray(force, dtype=np.float64)
         if wrench.shape != (6,):
             raise ValueError(f"force has the shape {wrench.shape}; valid: 6 numbers")
-        self.overload = wrench
+        self._overload = wrench
 
     def freeze(self, on: bool) -> None:
         """Repeat the present reading, or stop repeating."""
-        self.frozen = self.read(1)[0] if on else None
+        self._frozen = self.read(1)[0] if on else None
 
     def faults(self, stream: object) -> dict[str, Callable[..., object]]:
         """Return the faults of the sensor and of its stream, by name."""
@@ -98,11 +88,11 @@ class StrainGauge:
 
     def state(self) -> dict[str, Any]:
         """Return zero and noise."""
-        return {"bias": list(self.bias), "noise": list(self.noise)}
+        return {"bias": list(self._bias), "noise": list(self._noise)}
 
     def _self_heating(self, time: float) -> float:
         """Return the temperature above the air at a world time (s), K."""
-        return float(WARM_K * (1.0 - np.exp(-(time + self.on) / WARM_S)))
+        return float(WARM_K * (1.0 - np.exp(-(time + self._on) / WARM_S)))
 
 
 class SensorProtocol:
@@ -110,11 +100,8 @@ class SensorProtocol:
 
     baud = 0
     noise = (0.0, 0.0)
-    usual_rate = 1000.0
-
-    def __init__(self, rate: float | None = None) -> None:
-        self.rate = self.usual_rate if rate is None else rate
-        self.streaming = True
+    rate = 1000.0  # frames per second
+    streaming = True
 
     def frame(self, number: int, wrench: Floats, temperature: float) -> bytes:
         """Return frame `number` since power-on, with a wrench (6,) and a temperature, °C."""
@@ -124,8 +111,8 @@ class SensorProtocol:
         """Return the answer to bytes of the client, empty if none."""
         return b""
 
-    def operations(self) -> dict[str, Callable[..., object]]:
-        """Return the admin operations of this kind of sensor."""
+    def faults(self) -> dict[str, Callable[..., object]]:
+        """Return the faults of this kind of sensor, by name."""
         return {}
 
 
@@ -138,25 +125,21 @@ class Bota(SensorProtocol):
     full = np.array([500.0, 500.0, 1200.0, 15.0, 15.0, 10.0])  # full scale of a SensONE, N and N·m
     _body = struct.Struct("<H6fIf")
 
-    def __init__(self, rate: float | None = None) -> None:
-        super().__init__(rate)
-        self.saturated = False
-        self._start_us = 0
+    def __init__(self) -> None:
+        self.saturated, self.start_us = False, 0
 
     def frame(self, number: int, wrench: Floats, temperature: float) -> bytes:
         """Return one frame, see `SensorProtocol.frame`."""
         clipped = np.clip(wrench, -self.full, self.full)
-        over = self.saturated or bool(np.any(clipped != wrench))
-        time_us = (self._start_us + round(number * 1e6 / self.rate)) & 0xFFFFFFFF
-        body = self._body.pack(self.over_range if over else 0, *clipped, time_us, temperature)
+        status = self.over_range if self.saturated or np.any(clipped != wrench) else 0
+        time_us = (self.start_us + round(number * 1e6 / self.rate)) & 0xFFFFFFFF
+        body = self._body.pack(status, *clipped, time_us, temperature)
         return b"\xaa" + body + crc_x25(body)
 
-    def operations(self) -> dict[str, Callable[..., object]]:
+    def faults(self) -> dict[str, Callable[..., object]]:
         """`saturate {on}` sets the status; `clock {us}` sets the time of frame 0."""
-        return {
-            "saturate": admin.setter(self, "saturated"),
-            "clock": admin.setter(self, "_start_us", int),
-        }
+        clock = admin.setter(self, "start_us", int)
+        return {"saturate": admin.setter(self, "saturated"), "clock": clock}
 
 
 class Hex(SensorProtocol):
@@ -189,12 +172,11 @@ class Ft300(SensorProtocol):
 
     baud = 19200
     noise = (0.1, 0.005)
-    usual_rate = 100.0
+    rate = 100.0
     full = np.repeat((300.0, 30.0), 3)  # full scale, N and N·m
     scale = np.repeat((100.0, 1000.0), 3)
 
-    def __init__(self, rate: float | None = None) -> None:
-        super().__init__(rate)
+    def __init__(self) -> None:
         self.streaming = False
         self._stop_bytes = 0
         self._inbox = bytearray()
@@ -337,8 +319,8 @@ class Stream:
 
     def operations(self) -> admin.Operations:
         """Return the admin operations."""
-        functions = self.gauge.faults(self) | self.sensor.operations() | self.port.faults()
-        return admin.Operations(functions, self.state)
+        faults = self.gauge.faults(self) | self.sensor.faults() | self.port.faults()
+        return admin.Operations(faults, self.state)
 
     def state(self) -> dict[str, Any]:
         """Return sensor, line and faults."""
@@ -359,7 +341,7 @@ class Stream:
 COUNTS = np.repeat((1_000_000.0, 1_000_000.0), 3)
 RDT_NOISE = (0.02, 0.0005)
 FULL = np.array([660.0, 660.0, 1980.0, 60.0, 60.0, 60.0])  # full scale, N and N·m; a Delta's
-MEASURING_HZ = 7000
+RDT_HZ, MEASURING_HZ = 1000, 7000
 SATURATED = 0x80020000
 _FACTORS = {"N": 1.0, "lbf": 1.0 / 4.4482216152605}
 
@@ -370,7 +352,6 @@ class NetFt:
 
     gauge: StrainGauge
     rng: np.random.Generator
-    rate: float
     line: socket.socket
     client: tuple[str, int] | None = None  # address to which records are sent; None: none
     remaining: int = 0  # number of records still to send; 0: endless
@@ -398,7 +379,7 @@ class NetFt:
             "cfgcpf": f"{COUNTS[0]:.0f}",
             "cfgcpt": f"{COUNTS[3]:.0f}",
             "comrdte": "Enabled",
-            "comrdtrate": f"{self.rate:.0f}",
+            "comrdtrate": f"{RDT_HZ}",
             "comrdtbsiz": "1",
             **self.elements,
         }
@@ -415,8 +396,8 @@ class NetFt:
         now = time.monotonic()
         if self.client is None or now < self.due:
             return
-        count = int((now - self.due) * self.rate) + 1
-        late = count - int(LATE_S * self.rate)
+        count = int((now - self.due) * RDT_HZ) + 1
+        late = count - int(LATE_S * RDT_HZ)
         if late > 0:
             self._skip(late)
             count -= late
@@ -436,7 +417,7 @@ class NetFt:
 
     def _skip(self, count: int) -> None:
         self.number += count
-        self.due += count / self.rate
+        self.due += count / RDT_HZ
 
     def _send(self, wrench: Any) -> None:
         clipped = np.clip(wrench, -FULL, FULL)
@@ -496,7 +477,7 @@ def serve_page(sensor: NetFt, host: str, port: int) -> None:
     threading.Thread(target=server.serve_forever, daemon=True).start()
 
 
-def start(options: argparse.Namespace) -> admin.Device:
+def start(options: admin.Arguments) -> admin.Device:
     """Return a sensor in the network, with its page served, or on a serial line."""
     board = Blackboard(options.directory / "world.bin")
     noise, faults = np.random.default_rng(options.seed).spawn(2)
@@ -504,12 +485,11 @@ def start(options: argparse.Namespace) -> admin.Device:
     if options.kind == "netft":
         line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         line.bind((options.host, options.port or 49152))
-        gauge = StrainGauge.draw(board, RDT_NOISE, noise, options.on)
-        sensor = NetFt(gauge, faults, options.rate or 1000.0, line)
+        sensor = NetFt(StrainGauge(board, RDT_NOISE, noise, options.on), faults, line)
         serve_page(sensor, options.host, options.web_port)
     else:
-        protocol = KINDS[options.kind](options.rate)
-        gauge = StrainGauge.draw(board, protocol.noise, noise, options.on)
+        protocol = KINDS[options.kind]()
+        gauge = StrainGauge(board, protocol.noise, noise, options.on)
         port = PtyPort(options.directory / "force", protocol.baud, faults)
         sensor = Stream(protocol, gauge, port, due=time.monotonic())
     return sensor.operations(), sensor.step
@@ -520,9 +500,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--host": {},
     "--port": {"type": int},
     "--web-port": {"type": int, "default": 8081},
-    "--rate": {"type": float, "help": "frames per second"},
     "--on": {"type": float, "default": 1200.0, "help": "s that it has been on"},
 }
 
 if __name__ == "__main__":
-    sys.exit(admin.run(__doc__, "force", start, OPTIONS))
+    admin.run(__doc__, "force", start, OPTIONS)

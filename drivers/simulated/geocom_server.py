@@ -14,9 +14,7 @@ lines `%R1Q,<rpc>,<trid>[,<crc>]:<p>` and `%R1P,<com>,<trid>[,<crc>]:<rc>,<p>`. 
 CRC-16/ARC over the line without the checksum and its comma.
 """
 
-import argparse
 import re
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -27,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.drivers.checksums import crc16
+from hilcal.drivers.links import crc16
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.admin import setter
 from hilcal.drivers.simulated.blackboard import Blackboard, settled_truth
@@ -286,102 +284,98 @@ def reply(
 
 Answer = tuple[int, list[str]]
 Parameters = tuple[str, ...]
-Procedure = Callable[[Station, Parameters], Answer | None]  # None: `OK` without values
+_CONSTANT: dict[int, list[str]] = {
+    **{0: [], 11001: [], 11004: [], 110: ["1", "50", "0"], 2007: ["1"], 2026: ["0"]},
+    **{5003: [str(SERIAL)], 5004: [f'"{NAME}"'], 5034: ["6", "20", "0"], 5039: ["100", "1", "1"]},
+}
+_STORED = {2021: 2020, 17009: 17008, 17018: 17019, 17022: 17021}
+"""By the procedure that reads a plain setting: the one that sets it."""
 
 
 def answer(station: Station, rpc: int, parameters: Parameters) -> Answer:
     """Carry out a procedure, in its world time."""
-    procedure = _PROCEDURES.get(rpc)
-    if procedure is None:
-        return UNKNOWN_PROCEDURE, []
     try:
-        return procedure(station, parameters) or (OK, [])
+        return _carried_out(station, rpc, parameters)
     except (ValueError, IndexError):  # too few parameters or no numbers
         return INVALID_PARAMETER, []
 
 
-def _number(station: Station, *values: float) -> list[str]:
+def _carried_out(s: Station, rpc: int, p: Parameters) -> Answer:
+    values: list[str] = []
+    match rpc:
+        case 107:  # COM_SetDoublePrecision
+            if not 0 <= int(p[0]) <= 15:
+                raise ValueError
+            s.digits = int(p[0])
+        case 108:
+            values = [str(s.digits)]
+        case 2008 | 2107 | 2108 | 2167 | 17017 if s.busy:
+            return BUSY, []
+        case 2008:
+            _start_measuring(s, int(p[0]))
+        case 2022:
+            values = [*_numbers(s, 80.0), str(int(s.board.time))]
+        case 2028:  # TMC_SetAtmCorr
+            wavelength, pressure, dry, wet = map(float, p)
+            s.atmosphere = (wavelength, pressure, dry, wet)
+        case 2029:
+            values = _numbers(s, *s.atmosphere)
+        case 2107:
+            polar = s.look() or s.pointing
+            return s.warning, _numbers(s, polar.hz, polar.v)
+        case 2108 | 2167:
+            return _with_distance(s, int(p[0]), full=rpc == 2167)
+        case 5008:  # CSV_GetDateTime
+            now = datetime.now(UTC)
+            parts = (now.month, now.day, now.hour, now.minute, now.second)
+            values = [str(now.year), *(f"'{value:02x}'" for value in parts)]
+        case 5011:
+            values = _numbers(s, s.temperature())
+        case 6021:  # 0 not locked, 1 locked, 2 prediction: the target is out of sight
+            values = ["0" if not s.locked else "1" if s.target() is not None else "2"]
+        case 9013:
+            return (_acquired(s), []) if s.lock_enabled else (NOT_ENABLED, [])
+        case 9018:
+            s.atr_enabled = bool(int(p[0]))
+        case 9019:
+            values = [str(int(s.atr_enabled))]
+        case 9020:
+            s.lock_enabled = bool(int(p[0]))
+            s.locked = s.locked and s.lock_enabled
+        case 9021:
+            values = [str(int(s.locked))]
+        case 9027:
+            s.turn(float(p[0]), float(p[1]))
+            if len(p) > 3 and int(p[3]) == 1:  # AUT_TARGET: acquire the target there
+                return _acquired(s), []
+            s.wait(AIM_S)
+        case 9037:  # AUT_FineAdjust: within a window, rad; the parameters are full widths
+            return _acquired(s, 0.5 * max(float(p[0]), float(p[1]))), []
+        case 17017:
+            return _measure(s, int(p[0]))
+        case 17020:
+            return _acquired(s), []
+        case _ if rpc in s.settings:
+            s.settings[rpc] = str(int(p[0]))
+        case _ if rpc in _STORED:
+            values = [s.settings[_STORED[rpc]]]
+        case _ if rpc in _CONSTANT:
+            values = _CONSTANT[rpc]
+        case _:
+            return UNKNOWN_PROCEDURE, []
+    return OK, values
+
+
+def _numbers(station: Station, *values: float) -> list[str]:
     return [f"{value:.{station.digits}f}" for value in values]
 
 
-def _constant(*values: str) -> Procedure:
-    return lambda station, parameters: (OK, list(values))
+def _acquired(station: Station, window: float = np.inf) -> int:
+    return OK if station.acquire(window) else NO_TARGET
 
 
-def _setting(number: int) -> Procedure:
-    def store(station: Station, parameters: Parameters) -> None:
-        station.settings[number] = str(int(parameters[0]))
-
-    return store
-
-
-def _stored(number: int) -> Procedure:
-    return lambda station, parameters: (OK, [station.settings[number]])
-
-
-def _query(values: Callable[[Station], list[str]]) -> Procedure:
-    return lambda station, parameters: (OK, values(station))
-
-
-def _set_precision(station: Station, parameters: Parameters) -> None:
-    digits = int(parameters[0])
-    if not 0 <= digits <= 15:
-        raise ValueError
-    station.digits = digits
-
-
-def _date(station: Station, parameters: Parameters) -> Answer:
-    now = datetime.now(UTC)
-    values = (now.month, now.day, now.hour, now.minute, now.second)
-    return OK, [str(now.year), *(f"'{value:02x}'" for value in values)]
-
-
-def _set_atmosphere(station: Station, parameters: Parameters) -> None:
-    wavelength, pressure, dry, wet = map(float, parameters)
-    station.atmosphere = (wavelength, pressure, dry, wet)
-
-
-def _switch_atr(station: Station, parameters: Parameters) -> None:
-    station.atr_enabled = bool(int(parameters[0]))
-
-
-def _switch_lock(station: Station, parameters: Parameters) -> None:
-    station.lock_enabled = bool(int(parameters[0]))
-    station.locked = station.locked and station.lock_enabled
-
-
-def _lock_in(station: Station, parameters: Parameters) -> Answer:
-    return _acquire(station, parameters) if station.lock_enabled else (NOT_ENABLED, [])
-
-
-def _acquire(station: Station, parameters: Parameters, window: float = np.inf) -> Answer:
-    return (OK if station.acquire(window) else NO_TARGET), []
-
-
-def _fine_adjust(station: Station, parameters: Parameters) -> Answer:
-    """AUT_FineAdjust: within a window, rad; the parameters are full widths."""
-    window = 0.5 * max(float(parameters[0]), float(parameters[1]))
-    return _acquire(station, parameters, window)
-
-
-def _turn(station: Station, parameters: Parameters) -> Answer | None:
-    station.turn(float(parameters[0]), float(parameters[1]))
-    if len(parameters) > 3 and int(parameters[3]) == 1:  # AUT_TARGET: acquire the target there
-        return _acquire(station, parameters)
-    station.wait(AIM_S)
-    return None
-
-
-def _lock_quality(station: Station, parameters: Parameters) -> Answer:
-    """0 not locked, 1 locked, 2 prediction: the target is out of sight."""
-    return OK, ["0" if not station.locked else "1" if station.target() is not None else "2"]
-
-
-def _start_measuring(station: Station, parameters: Parameters) -> Answer | None:
+def _start_measuring(station: Station, command: int) -> None:
     """TMC_DoMeasure: 0 stop, 1 distance, 2 track, 3 clear, 6 restart."""
-    if station.busy:
-        return BUSY, []
-    command = int(parameters[0])
     station.tracking = command == 2
     if command in (1, 2, 6):
         station.start_ranging()
@@ -389,54 +383,37 @@ def _start_measuring(station: Station, parameters: Parameters) -> Answer | None:
         station.stop_ranging(clear=command == 3)
     else:
         raise ValueError
-    return None
 
 
-def _angles(station: Station, parameters: Parameters) -> Answer:
-    if station.busy:
-        return BUSY, []
-    polar = station.look() or station.pointing
-    return station.warning, _number(station, polar.hz, polar.v)
-
-
-def _with_distance(full: bool) -> Procedure:
+def _with_distance(station: Station, patience_ms: int, *, full: bool) -> Answer:
     """TMC_GetSimpleMea, and TMC_GetFullMeas: of the measurement started by 2008.
 
     Values: hz, v; if full, their accuracy, the inclinations and their accuracy; distance; if full,
     its time, ms.
     """
-
-    def measured(station: Station, parameters: Parameters) -> Answer:
-        if station.busy:
-            return BUSY, []
-        if station.tracking and station.ranging is None:
-            station.start_ranging()
-        station.finish_ranging(int(parameters[0]) * 1e-3)
-        if station.dist_error:
-            return DISTANCE_ERROR, []
-        polar, distance = station.look() or station.pointing, station.distance
-        code = station.warning if distance > 0.0 else ANGLES_ONLY
-        if not full:
-            return code, _number(station, polar.hz, polar.v, distance)
-        accuracy = station.beam.angle_std(distance) if distance > 0.0 else 0.0
-        values = (polar.hz, polar.v, accuracy, *station.inclination(), distance)
-        return code, [*_number(station, *values), str(station.distance_ms)]
-
-    return measured
+    if station.tracking and station.ranging is None:
+        station.start_ranging()
+    station.finish_ranging(patience_ms * 1e-3)
+    if station.dist_error:
+        return DISTANCE_ERROR, []
+    polar, distance = station.look() or station.pointing, station.distance
+    code = station.warning if distance > 0.0 else ANGLES_ONLY
+    if not full:
+        return code, _numbers(station, polar.hz, polar.v, distance)
+    accuracy = station.beam.angle_std(distance) if distance > 0.0 else 0.0
+    values = (polar.hz, polar.v, accuracy, *station.inclination(), distance)
+    return code, [*_numbers(station, *values), str(station.distance_ms)]
 
 
-def _measure(station: Station, parameters: Parameters) -> Answer:
+def _measure(station: Station, mode: int) -> Answer:
     """BAP_MeasDistanceAngle: 0 last values, 1 angles, 2 to 4 distance, 5 clear, 6 stop."""
-    if station.busy:
-        return BUSY, []
-    mode = int(parameters[0])
     if not 0 <= mode <= 6:
         raise ValueError
     polar, distance = station.pointing, 0.0
     if mode in (5, 6):
         station.stop_ranging(clear=mode == 5)
         station.tracking = False
-        return OK, [*_number(station, polar.hz, polar.v, 0.0), str(mode)]
+        return OK, [*_numbers(station, polar.hz, polar.v, 0.0), str(mode)]
     if mode >= 2:
         if not station.locked:
             station.wait(AIM_S)
@@ -450,50 +427,7 @@ def _measure(station: Station, parameters: Parameters) -> Answer:
         polar = station.look() or station.pointing
         distance = station.distance if mode == 0 else 0.0
     code = station.warning if distance > 0.0 or mode == 1 else ANGLES_ONLY
-    return code, [*_number(station, polar.hz, polar.v, distance), str(mode)]
-
-
-_PROCEDURES: dict[int, Procedure] = {
-    0: _constant(),
-    107: _set_precision,
-    108: _query(lambda s: [str(s.digits)]),
-    110: _constant("1", "50", "0"),
-    2007: _constant("1"),
-    2008: _start_measuring,
-    2020: _setting(2020),
-    2021: _stored(2020),
-    2022: _query(lambda s: [*_number(s, 80.0), str(int(s.board.time))]),
-    2026: _constant("0"),
-    2028: _set_atmosphere,
-    2029: _query(lambda s: _number(s, *s.atmosphere)),
-    2107: _angles,
-    2108: _with_distance(full=False),
-    2167: _with_distance(full=True),
-    5003: _constant(str(SERIAL)),
-    5004: _constant(f'"{NAME}"'),
-    5008: _date,
-    5011: _query(lambda s: _number(s, s.temperature())),
-    5034: _constant("6", "20", "0"),
-    5039: _constant("100", "1", "1"),
-    6021: _lock_quality,
-    9013: _lock_in,
-    9018: _switch_atr,
-    9019: _query(lambda s: [str(int(s.atr_enabled))]),
-    9020: _switch_lock,
-    9021: _query(lambda s: [str(int(s.locked))]),
-    9027: _turn,
-    9037: _fine_adjust,
-    11001: _constant(),
-    11004: _constant(),
-    17008: _setting(17008),
-    17009: _stored(17008),
-    17017: _measure,
-    17018: _stored(17019),
-    17019: _setting(17019),
-    17020: _acquire,
-    17021: _setting(17021),
-    17022: _stored(17021),
-}
+    return code, [*_numbers(station, polar.hz, polar.v, distance), str(mode)]
 
 
 LONGEST_LINE = 1024
@@ -570,7 +504,7 @@ def serve(station: Station, port: PtyPort, buffer: bytearray) -> None:
     port.pump()
 
 
-def start(options: argparse.Namespace) -> admin.Device:
+def start(options: admin.Arguments) -> admin.Device:
     """Return the station on its serial line."""
     measuring, faults = np.random.default_rng(options.seed).spawn(2)
     beam = Beam(tuple(options.range_std), tuple(options.transverse_std))
@@ -582,4 +516,4 @@ def start(options: argparse.Namespace) -> admin.Device:
 OPTIONS: dict[str, dict[str, Any]] = {**admin.NOISE, "--baud": {"type": int, "default": 115200}}
 
 if __name__ == "__main__":
-    sys.exit(admin.run(__doc__, "tracker", start, OPTIONS))
+    admin.run(__doc__, "tracker", start, OPTIONS)

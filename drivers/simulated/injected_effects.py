@@ -8,7 +8,7 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.drivers.simulated.mechanics import rotation_vector
 from hilcal.drivers.simulated.own_law import OwnLaw
-from hilcal.drivers.simulated.truth import Truth, joint_temperature, long_links
+from hilcal.drivers.simulated.truth import Truth, joint_temperature, long_links, rated_torque
 from hilcal.drivers.simulated.world import IdealReading, SimulatedNoise, World, stand
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
@@ -36,9 +36,7 @@ def typical_compliance(arm: Arm) -> Floats:
 
 def typical_torque(arm: Arm) -> Floats:
     """Return the (n,) torque or force limits of the drives; 100 N·m, 1500 N if unknown."""
-    limit = np.asarray(arm.torque_max, dtype=float)
-    unknown = np.where(arm.slides, 1500.0, 100.0)
-    return np.asarray(np.where(np.isfinite(limit) & (limit > 0.0), limit, unknown))
+    return rated_torque(arm, unknown=100.0)
 
 
 def typical_tilt(arm: Arm) -> Floats:
@@ -224,11 +222,11 @@ def hide(
         world = softened(nothing_hidden(cell, rng), effect)
     if effect == "none" or strength_sigma == 0.0:
         return world
-    hidden, reference = (
-        _user_effect(effect, world, rng)
-        if isinstance(effect, OwnLaw)
-        else _shipped_effect(effect, world, states, harmonics, rng)
-    )
+    if isinstance(effect, OwnLaw):
+        name, hidden, reference = effect.effect.name, _user_effect(effect, world, rng), world
+    else:
+        name = effect
+        hidden, reference = _shipped_effect(effect, world, states, harmonics, rng)
     baseline = reference.sight(states)
     pairs = None if readings_mode == "absolute" else _pairs(states, pose, cycle)
     covariance = reference.covariance(baseline, m)
@@ -242,20 +240,13 @@ def hide(
             change = change[pairs[0]] - change[pairs[1]]
         return float(np.sqrt(np.mean((whiten @ change[:, :, None]) ** 2)))
 
-    name = effect.effect.name if isinstance(effect, OwnLaw) else effect
     return hidden(_scaled(strength, strength_sigma, name, readings_mode))
 
 
-def _user_effect(
-    law: OwnLaw, world: World, rng: np.random.Generator
-) -> tuple[Callable[[float], World], World]:
-    """Return the world with a user's effect as a function of its strength, and without."""
+def _user_effect(law: OwnLaw, world: World, rng: np.random.Generator) -> Callable[[float], World]:
+    """Return the world with a user's effect as a function of its strength."""
     direction = law.drawn(rng)
-
-    def hidden(factor: float) -> World:
-        return replace(world, own=replace(law, theta=factor * direction))
-
-    return hidden, world
+    return lambda factor: replace(world, own=replace(law, theta=factor * direction))
 
 
 def _shipped_effect(
@@ -276,9 +267,12 @@ def _shipped_effect(
     draw = Draw(world.cell.arm, world.physics.joint_compliance, torque, harmonics)
     direction = draw.effect(effect, rng)
     start = getattr(world.physics, effect)
-    if effect == "transmission_error":
+    if effect == "transmission_error":  # pad with zeros to the same number of harmonics
         order = max(start.shape[1], direction.shape[1])
-        start, direction = _padded(start, order), _padded(direction, order)
+        start, direction = (
+            np.pad(value, ((0, 0), (0, order - value.shape[1]), (0, 0)))
+            for value in (start, direction)
+        )
     if effect == "joint_compliance":  # always present; hiding it sets its size
         start = np.zeros_like(start)
     clean = world.physics.with_effect(effect, start)
@@ -339,11 +333,6 @@ def _change(changed: IdealReading, baseline: IdealReading, m: int) -> Floats:
         return shift
     turn = rotation_vector(changed.rotation @ np.swapaxes(baseline.rotation, 1, 2))
     return np.hstack([shift, turn])
-
-
-def _padded(value: Floats, order: int) -> Floats:
-    """Return (n, order, 2) harmonics, padded with zeros."""
-    return np.pad(value, ((0, 0), (0, order - value.shape[1]), (0, 0)))
 
 
 def _scaled(strength: Callable[[float], float], goal: float, effect: str, mode: str) -> float:

@@ -28,16 +28,6 @@ def rotation_vector(matrix: Floats) -> Floats:
     return np.array([pin.log3(r) for r in matrix]).reshape(-1, 3)
 
 
-def inverse(transform: Floats) -> Floats:
-    """Return the inverse of rigid transforms (..., 4, 4)."""
-    out = np.zeros_like(transform)
-    turn = np.swapaxes(transform[..., :3, :3], -1, -2)
-    out[..., :3, :3] = turn
-    out[..., :3, 3] = -(turn @ transform[..., :3, 3:])[..., 0]
-    out[..., 3, 3] = 1.0
-    return out
-
-
 def skew(vector: Floats) -> Floats:
     """Return the (..., 3, 3) matrices of the cross product with (..., 3) vectors."""
     out = np.zeros((*vector.shape, 3))
@@ -179,18 +169,13 @@ class Elasticity:
     cubic: Floats  # (v,) s, rad/(N·m)³; negative for a gear that stiffens under load
     play: Floats  # (v,) b, rad: half of the play
     crossing: Floats  # (v,) tau_0 > 0, torque at which 76 % of b are reached, N·m
-    extra: Floats | None = None
-    """(N, v) x, additional compliance in each of N states, rad/(N·m); None: 0."""
-    turns: Floats | None = None  # (v, v) T; None: identity
+    extra: Floats | None  # (N, v) x, additional compliance in each of N states, rad/(N·m); None: 0
+    turns: Floats | None  # (v, v) T; None: identity
 
     def deflection(self, tau: Floats, states: Ints) -> tuple[Floats, Floats]:
         """Return delta (K, v) and its derivative by tau (K, v, v) for K of the states."""
-        if self.turns is None:
-            return self._of_drives(tau, states)
-        delta, slope = self._of_drives(tau @ self.turns, states)
-        return delta @ self.turns.T, self.turns @ slope @ self.turns.T
-
-    def _of_drives(self, tau: Floats, states: Ints) -> tuple[Floats, Floats]:
+        if self.turns is not None:
+            tau = tau @ self.turns
         delta, slope = tau @ self.linear.T, np.zeros_like(tau)
         if self.extra is not None:
             slope += self.extra[states]
@@ -210,7 +195,10 @@ class Elasticity:
             share = np.tanh(tau / self.crossing)
             delta += self.play * share
             slope += self.play / self.crossing * (1.0 - share**2)
-        return delta, self.linear + slope[:, :, None] * np.eye(len(self.linear))
+        slope = self.linear + slope[:, :, None] * np.eye(len(self.linear))
+        if self.turns is None:
+            return delta, slope
+        return delta @ self.turns.T, self.turns @ slope @ self.turns.T
 
 
 def elasticity(

@@ -11,15 +11,13 @@ Admin operations: `beam {on}` hides the rigid body, `stall {on}` sends no frames
 repeats one frame, `lose {share}` of the frames, `forget` all clients, `rename {name}`, `bodies
 {count}` adds other bodies, `insist {on}` ignores the version that a client requests, `state`.
 
-Source: as `hilcal.drivers.natnet_frames`. natnet, an independent client, is tested against it.
+Source: as `hilcal.drivers.natnet`. natnet, an independent client, is tested against it.
 """
 
-import argparse
 import contextlib
 import select
 import socket
 import struct
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -28,7 +26,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hilcal.drivers import natnet_frames as nn
+from hilcal.drivers import natnet as nn
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.blackboard import Blackboard, settled_truth
 from hilcal.types import Floats
@@ -194,7 +192,7 @@ def operations(cameras: Cameras) -> admin.Operations:
     return admin.Operations(functions, state)
 
 
-def start(options: argparse.Namespace) -> admin.Device:
+def start(options: admin.Arguments) -> admin.Device:
     """Return the cameras, listening, and the step that sends frames at their rate."""
     noise, distortion = np.random.default_rng(options.seed).spawn(2)
     board = Blackboard(options.directory / "world.bin")
@@ -234,4 +232,4 @@ OPTIONS: dict[str, dict[str, Any]] = {
 }
 
 if __name__ == "__main__":
-    sys.exit(admin.run(__doc__, "tracker", start, OPTIONS))
+    admin.run(__doc__, "tracker", start, OPTIONS)

@@ -100,11 +100,6 @@ def check_hash(path: Path, sha256: str) -> None:
         raise InputError(f"{path}: changed since the simulated world was made")
 
 
-def own_names(catalogue: Catalogue, known: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the effects of a catalogue that are not `known`, without mechanics in the world."""
-    return tuple(k.name for k in catalogue.with_role("effect") if k.name not in known)
-
-
 def own_law(catalogue: Catalogue, name: str, cell: Cell, states: States) -> OwnLaw:
     """Return an effect with all parameters 0, set up for the states of a campaign."""
     effect = catalogue.make(name, cell, states)

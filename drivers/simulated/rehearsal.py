@@ -12,7 +12,7 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.drivers.simulated import injected_effects as injected
 from hilcal.drivers.simulated.cell_processes import SimulatedCell
-from hilcal.drivers.simulated.own_law import own_law, own_names
+from hilcal.drivers.simulated.own_law import own_law
 from hilcal.drivers.simulated.truth import warm_up
 from hilcal.drivers.simulated.world import SimulatedNoise, World
 from hilcal.effects.catalogue import Catalogue
@@ -40,7 +40,8 @@ def choices() -> tuple[str, ...]:
 
 def own_choices(catalogue: Catalogue | None) -> tuple[str, ...]:
     """User's effects that can be hidden; see `own_law`."""
-    return () if catalogue is None else own_names(catalogue, injected.ALL_EFFECTS)
+    effects = () if catalogue is None else catalogue.with_role("effect")
+    return tuple(k.name for k in effects if k.name not in injected.ALL_EFFECTS)
 
 
 def invented_law(catalogue: Catalogue) -> Catalogue:

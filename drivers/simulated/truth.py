@@ -126,7 +126,6 @@ def _labels(effect: str, arm: Arm, harmonics: int) -> tuple[Sequence[str], ...]:
 
 LINK_REFERENCE = 20.0  # temperature at which links have their nominal length, °C (ISO 1)
 
-_UNKNOWN_TORQUE, _UNKNOWN_FORCE = 150.0, 1500.0  # N·m and N, for a drive of unknown limit
 _CROSSING = 0.01  # share of the rated torque within which a joint crosses its play
 
 
@@ -154,13 +153,14 @@ def needed(effect: str, name: str, values: Floats | None, lack: str) -> Floats:
     return values
 
 
-def drive_errors(hidden: Truth, arm: Arm, states: States, reference: float) -> Floats:
-    """Return the displacements (N, n) of the drives that do not depend on the load, rad.
+def joint_errors(hidden: Truth, arm: Arm, states: States, reference: float) -> Floats:
+    """Return the joint displacements (N, n) that do not depend on the load, rad.
 
-    dq_j = o_j + h_j s_j + kappa_j (T_j - reference)
-           + sum_k a_jk cos k q_j + b_jk sin k q_j
+    dq_j = o_j + h_j s_j + kappa_j (T_j - reference) + sum_k a_jk cos k q_j + b_jk sin k q_j
+           + sum_i k_ji q_i
 
-    `reference` is the temperature without drift, °C.
+    where the errors of the first line are the drives'; `reference` is the temperature without
+    drift, °C. A slide's guide adds its displacement along the travel.
     """
     error = np.broadcast_to(hidden.encoder_offset, states.q.shape).copy()
     if np.any(hidden.hysteresis):
@@ -172,6 +172,10 @@ def drive_errors(hidden: Truth, arm: Arm, states: States, reference: float) -> F
     phase = arm.phases(states.q)[:, :, None] * order
     error += (np.cos(phase) * hidden.transmission_error[:, :, 0]).sum(axis=2)
     error += (np.sin(phase) * hidden.transmission_error[:, :, 1]).sum(axis=2)
+    error = np.asarray(arm.driven(error) + states.q @ hidden.joint_coupling.T)
+    guided = guide_motion(hidden, arm, states)
+    if guided is not None:
+        error[:, arm.slides] += guided[:, :, 2]
     return error
 
 
@@ -215,12 +219,16 @@ def further_compliance(hidden: Truth, arm: Arm, states: States) -> Floats | None
     return extra
 
 
+def rated_torque(arm: Arm, unknown: float) -> Floats:
+    """Return the (n,) torque or force limits of the drives; `unknown` N·m, 1500 N if unknown."""
+    limit = np.asarray(arm.torque_max, dtype=float)
+    known = np.isfinite(limit) & (limit > 0.0)
+    return np.where(known, limit, np.where(arm.slides, 1500.0, unknown))
+
+
 def crossing_torque(arm: Arm) -> Floats:
     """Return the (n,) torques tau_0 in b tanh(tau / tau_0), N·m: 1 % of the rated torque."""
-    limit = np.asarray(arm.torque_max, dtype=float)
-    unknown = np.where(arm.slides, _UNKNOWN_FORCE, _UNKNOWN_TORQUE)
-    rated = np.where(np.isfinite(limit) & (limit > 0.0), limit, unknown)
-    return np.asarray(_CROSSING * rated)
+    return np.asarray(_CROSSING * rated_torque(arm, unknown=150.0))
 
 
 def link_growth(hidden: Truth, states: States) -> Floats | None:

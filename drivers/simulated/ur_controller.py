@@ -264,9 +264,9 @@ SERIAL_NUMBER = "20235500001"
 class ClientServer:
     """Serves the clients of a controller, each until it disconnects."""
 
-    def __init__(self, controller: Controller, model: str) -> None:
+    def __init__(self, controller: Controller) -> None:
         self._controller = controller
-        self._model = model.upper().replace("E", "e")
+        self._model = controller.arm.kinematics.arm.name.upper().replace("E", "e")
         self._writers: set[asyncio.StreamWriter] = set()
 
     @property
@@ -460,21 +460,21 @@ _VERSION_MESSAGE = 3
 _PERIOD = 0.1  # s between states
 
 
-class PrimaryPort:
+class PrimaryPort(ClientServer):
     """Sends states to every client, and takes programs from them."""
 
     def __init__(self, controller: Controller, rows: Floats, status: int) -> None:
         """Serve a controller whose kinematics are `rows` (4, 6): theta, a, d, alpha, rad and m."""
-        self._controller, self._rows, self._status = controller, rows, status
+        super().__init__(controller)
+        self._rows, self._status = rows, status
 
-    async def run(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Serve a client until it disconnects."""
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Send states, and run the programs that come."""
         sending = asyncio.create_task(self._send_states(writer))
         try:
             await self._controller.take_programs(reader)
         finally:
             sending.cancel()
-            writer.close()
 
     async def _send_states(self, writer: asyncio.StreamWriter) -> None:
         with contextlib.suppress(OSError):

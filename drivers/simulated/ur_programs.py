@@ -95,7 +95,7 @@ class ControlScript:
         """Delay of the command register beyond the watchdog's limit, s; 0 if in time."""
         if not self.watchdog:
             return 0.0
-        silence = (time.monotonic_ns() - self._arm.registers.written_ns[self.register]) * 1e-9
+        silence = (time.monotonic_ns() - self._arm.written_ns[self.register]) * 1e-9
         return max(0.0, silence - 1.0 / self.watchdog)
 
     def poll(self) -> bool:
@@ -108,7 +108,7 @@ class ControlScript:
                 return True
             self._work = None
             self._signal(_DONE)
-        number = self._arm.registers.in_int[self.register]
+        number = self._arm.in_int[self.register]
         if number == 0:
             self._executing = False
             self._signal(_READY)
@@ -167,10 +167,10 @@ class ControlScript:
                 self._answer(six(flange @ of_six(self._doubles(6, 6).tolist())))
             case ScriptCommand.IS_STEADY:
                 steady = not motion.moving and now - motion.rest_time > _STEADY
-                arm.registers.out_int[self.register + 1] = int(steady)
+                arm.out_int[self.register + 1] = int(steady)
             case ScriptCommand.JOINTS_SAFE:
                 safe = np.all(np.abs(self._doubles(0, 6)) <= _JOINT_LIMIT)
-                arm.registers.out_int[self.register + 1] = int(safe)
+                arm.out_int[self.register + 1] = int(safe)
             case ScriptCommand.WATCHDOG:
                 self.watchdog = float(self._doubles(0, 1)[0])
                 arm.note(f"watchdog {self.watchdog:g} Hz")
@@ -200,21 +200,21 @@ class ControlScript:
         word = self._async_count << 16 | self._async_number << 24
         if value is not None:
             word |= 1 << 15 | value
-        self._arm.registers.out_int[self.register + 2] = word
+        self._arm.out_int[self.register + 2] = word
 
     def _signal(self, value: int) -> None:
-        self._arm.registers.out_int[self.register] = value
+        self._arm.out_int[self.register] = value
 
     def _answer(self, values: Sequence[float] | Floats) -> None:
         part = slice(self.register, self.register + len(values))
-        self._arm.registers.out_double[part] = [float(value) for value in values]
+        self._arm.out_double[part] = [float(value) for value in values]
 
     def _int(self, k: int) -> int:
-        return self._arm.registers.in_int[self.register + k]
+        return self._arm.in_int[self.register + k]
 
     def _doubles(self, k: int, count: int) -> Floats:
         start = self.register + k
-        return np.array(self._arm.registers.in_double[start : start + count])
+        return np.array(self._arm.in_double[start : start + count])
 
 
 def _moves(text: str) -> Iterator[Goal]:

@@ -154,7 +154,6 @@ class Sensors:
 
     def __init__(self, arm: ur.ArmState, board: Blackboard, rng: np.random.Generator) -> None:
         self._arm, self._board, self._rng = arm, board, rng
-        self._places: dict[bytes, Floats] = {}
         self._readers = self._table()
         self.refresh()
 
@@ -180,8 +179,7 @@ class Sensors:
             return self._readers[name]()
         register = _REGISTER.fullmatch(name)
         if register:
-            registers = self._arm.registers
-            file = registers.out_int if register[1] == "int" else registers.out_double
+            file = self._arm.out_int if register[1] == "int" else self._arm.out_double
             return (file[int(register[2])],)
         return _FIXED.get(name) or (0.0,) * int(FORMATS[OUTPUTS[name]][:-1] or 1)
 
@@ -235,7 +233,6 @@ class Sensors:
 
     @property
     def _has_truth(self) -> bool:
-        """Whether the world has written the truth."""
         return bool(self._truth["flange"][3, 3] == 1.0)
 
     def _q(self) -> Floats:
@@ -267,20 +264,20 @@ class Sensors:
         return np.asarray(torque + _TORQUE_PER_AMPERE * self._noise(_CURRENT_STD))
 
     def _tool_pose(self, q: Floats) -> Numbers:
-        return tuple(six(self._flange(q) @ of_six(self._arm.tcp.tolist())))
+        return tuple(six(self._arm.kinematics.flange(q) @ of_six(self._arm.tcp.tolist())))
 
     def _tool_speed(self, qd: Floats) -> Floats:
         if not qd.any():
             return qd
         q = self._arm.trajectory.q
-        flange = self._flange(q)
+        flange = self._arm.kinematics.flange(q)
         point = flange[:3, 3] + flange[:3, :3] @ self._arm.tcp[:3]
         return np.asarray(self._arm.kinematics.jacobian(q, point) @ qd)
 
     def _weight(self) -> Floats:
         """Wrench of the payload as set, at the flange, flange axes."""
         arm = self._arm
-        force = arm.payload * (self._flange(arm.trajectory.q)[:3, :3].T @ ur.GRAVITY)
+        force = arm.payload * (self._arm.kinematics.flange(arm.trajectory.q)[:3, :3].T @ ur.GRAVITY)
         return np.concatenate([force, np.cross(arm.payload_com, force)])
 
     def _wrench(self) -> Floats:
@@ -291,18 +288,9 @@ class Sensors:
     def _tool_force(self) -> Floats:
         """Reading minus the payload's wrench, at the tool point, base axes."""
         excess = self._array("ft_raw_wrench") - self._weight()
-        turn = self._flange(self._arm.trajectory.q)[:3, :3]
+        turn = self._arm.kinematics.flange(self._arm.trajectory.q)[:3, :3]
         moment = excess[3:] - np.cross(self._arm.tcp[:3], excess[:3])
         return np.concatenate([turn @ excess[:3], turn @ moment])
-
-    def _flange(self, q: Floats) -> Floats:
-        """T_base_flange, cached: some variables of an instant need the same one."""
-        key = q.tobytes()
-        if key not in self._places:
-            if len(self._places) > 4:
-                self._places.clear()
-            self._places[key] = self._arm.kinematics.flange(q)
-        return self._places[key]
 
     def _noise(self, std: float) -> Floats:
         return np.asarray(std * self._rng.standard_normal(6))
@@ -461,9 +449,9 @@ class RtdeLink:
         for name, value in values.items():
             if name.startswith(_INT):
                 k = int(name.removeprefix(_INT))
-                arm.registers.in_int[k], arm.registers.written_ns[k] = int(value), now
+                arm.in_int[k], arm.written_ns[k] = int(value), now
             elif name.startswith(_DOUBLE):
-                arm.registers.in_double[int(name.removeprefix(_DOUBLE))] = value
+                arm.in_double[int(name.removeprefix(_DOUBLE))] = value
         if values.get("speed_slider_mask") and "speed_slider_fraction" in values:
             arm.slider = min(1.0, max(0.0, values["speed_slider_fraction"]))
         for group, (first, bits) in _DIGITAL_OUTPUTS.items():

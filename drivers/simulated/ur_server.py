@@ -16,13 +16,12 @@ by hand; `set {version, slider, speed_scaling, unlock_s}`, `die`,
 `log`
 """
 
-import argparse
 import asyncio
 import inspect
 import os
-import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -74,8 +73,8 @@ class UrServer:
         board: Blackboard,
         host: str,
         rng: np.random.Generator,
-        api_port: int = API,
-        factory: FactoryKinematics | None = None,
+        api_port: int,
+        factory: FactoryKinematics | None,
     ) -> None:
         self.arm = state
         self.controller = control.Controller(state, board)
@@ -85,7 +84,7 @@ class UrServer:
         arm = state.kinematics.arm
         self.is_x = state.version[0] >= POLYSCOPE_X
         supervision = control.RobotApiServer if self.is_x else control.DashboardServer
-        self.dashboard = supervision(self.controller, arm.name)
+        self.dashboard = supervision(self.controller)
         status = control.NOT_INITIALISED if factory is None else factory.status
         rows = None if factory is None else factory.rows
         self.primary = control.PrimaryPort(
@@ -108,7 +107,9 @@ class UrServer:
     async def accept(self, on: bool) -> None:
         """Accept new RTDE clients, or refuse them; connected ones stay."""
         if on and self._rtde_server is None:
-            self._rtde_server = await self._listen(self._run_rtde, RTDE)
+            self._rtde_server = await self._listen(
+                lambda reader, writer: RtdeLink(self.rtde, reader, writer).run(), RTDE
+            )
         elif not on and self._rtde_server is not None:
             closing, self._rtde_server = self._rtde_server, None
             loop = asyncio.get_running_loop()
@@ -135,9 +136,6 @@ class UrServer:
                 f"simulated arm: {self._host}:{port} is in use or cannot be had "
                 f"({error.strerror}); each simulated arm needs an address 127.x.y.z of its own"
             ) from None
-
-    async def _run_rtde(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        await RtdeLink(self.rtde, reader, writer).run()
 
     async def _run_script(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
@@ -171,9 +169,6 @@ def operations(server: UrServer, loop: asyncio.AbstractEventLoop) -> admin.Handl
     """Return the admin operations, which other threads than the loop's may call."""
     arm, controller, links = server.arm, server.controller, server.rtde.links
 
-    def switch(name: str) -> Callable[..., object]:
-        return lambda on=True: setattr(arm, name, bool(on))
-
     def for_all(do: Callable[[RtdeLink], None]) -> Callable[[], None]:
         def all_links() -> None:
             for link in list(links):
@@ -184,9 +179,6 @@ def operations(server: UrServer, loop: asyncio.AbstractEventLoop) -> admin.Handl
     def freeze(on: bool = True) -> None:
         arm.frozen_q = arm.trajectory.q.copy() if on else None
 
-    def state() -> dict[str, Any]:
-        return _state(server)
-
     requests = admin.Operations(
         {
             "protective_stop": lambda: controller.protective_stop("admin"),
@@ -196,19 +188,18 @@ def operations(server: UrServer, loop: asyncio.AbstractEventLoop) -> admin.Handl
             "remote_mode": lambda: controller.set_remote(True),
             "kill_script": lambda: controller.stop_program("killed"),
             "rtde_drop": for_all(lambda link: link.writer.transport.abort()),
-            "rtde_stall": switch("rtde_stall"),
-            "rtde_mute": switch("rtde_mute"),
+            **{name: admin.setter(arm, name) for name in ("rtde_stall", "rtde_mute")},
             "rtde_half_frame": for_all(RtdeLink.half),
-            "dashboard_mute": switch("dashboard_mute"),
+            "dashboard_mute": admin.setter(arm, "dashboard_mute"),
             "dashboard_drop": server.dashboard.drop,
             "refuse": lambda on=True: server.accept(not on),
-            "refuse_motion": switch("refuses_motion"),
+            "refuse_motion": admin.setter(arm, "refuses_motion"),
             "freeze": freeze,
             "jog": lambda q: arm.trajectory.place(_joints(q)),
             "set": lambda **settings: _set(server, settings),
             "log": lambda: list(arm.log),
         },
-        state,
+        partial(_state, server),
     )
 
     async def do(op: str, arguments: dict[str, Any]) -> Any:
@@ -219,7 +210,7 @@ def operations(server: UrServer, loop: asyncio.AbstractEventLoop) -> admin.Handl
         result = requests(op, arguments)
         if inspect.isawaitable(result):
             await result
-            return state()
+            return _state(server)
         return result
 
     def handler(op: str, arguments: dict[str, Any]) -> Any:
@@ -282,7 +273,7 @@ def _share(key: str, value: Any) -> float:
     return float(value)
 
 
-def start(options: argparse.Namespace) -> admin.Device:
+def start(options: admin.Arguments) -> admin.Device:
     """Return the controller, listening."""
     arm, factory = load_arm(options.robot), None
     if arm.n != len(HOME):
@@ -312,4 +303,4 @@ OPTIONS: dict[str, dict[str, Any]] = {
 }
 
 if __name__ == "__main__":
-    sys.exit(admin.run(__doc__, "arm", start, OPTIONS))
+    admin.run(__doc__, "arm", start, OPTIONS)

@@ -283,18 +283,6 @@ class WorldClock:
         return seconds / self._scale
 
 
-@dataclass(slots=True)
-class Registers:
-    """General-purpose registers; `in_` are written by RTDE clients, `out_` by scripts."""
-
-    in_int: list[int] = field(default_factory=lambda: [0] * REGISTERS)
-    in_double: list[float] = field(default_factory=lambda: [0.0] * REGISTERS)
-    out_int: list[int] = field(default_factory=lambda: [0] * REGISTERS)
-    out_double: list[float] = field(default_factory=lambda: [0.0] * REGISTERS)
-    written_ns: list[int] = field(default_factory=lambda: [0] * REGISTERS)
-    """Time of the last write to each of `in_int`, `time.monotonic_ns`."""
-
-
 @dataclass(slots=True, eq=False)
 class ArmState:
     """State of controller and arm."""
@@ -303,7 +291,13 @@ class ArmState:
     kinematics: Kinematics
     trajectory: Trajectory
     version: tuple[int, int, int, int]
-    registers: Registers = field(default_factory=Registers)
+    in_int: list[int] = field(default_factory=lambda: [0] * REGISTERS)
+    """General-purpose registers; `in_` are written by RTDE clients, `out_` by scripts."""
+    in_double: list[float] = field(default_factory=lambda: [0.0] * REGISTERS)
+    out_int: list[int] = field(default_factory=lambda: [0] * REGISTERS)
+    out_double: list[float] = field(default_factory=lambda: [0.0] * REGISTERS)
+    written_ns: list[int] = field(default_factory=lambda: [0] * REGISTERS)
+    """Time of the last write to each of `in_int`, `time.monotonic_ns`."""
     payload: float = 0.0  # as set, kg
     payload_com: Floats = field(default_factory=lambda: np.zeros(3))  # (3,) flange axes, m
     tcp: Floats = field(default_factory=lambda: np.zeros(6))  # (6,) on the flange, m and rad

@@ -111,7 +111,6 @@ class World:
     _tree: mech.ElasticTree = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Build the elastic arm once."""
         object.__setattr__(self, "_tree", mech.build(self.cell, self.physics))
 
     @property
@@ -131,24 +130,11 @@ class World:
         causes = ("tracker_drift", "creep", "thermal_growth", "thermal_joint_drift")
         return self.own is not None or any(np.any(getattr(self.physics, c)) for c in causes)
 
-    def joint_errors(self, states: States) -> Floats:
-        """Return the joint displacements (N, n) that do not depend on the load, rad.
-
-        dq_j = o_j + h_j s_j + kappa_j (T_j - reference) + sum_i k_ji q_i
-               + sum_k a_jk cos k q_j + b_jk sin k q_j
-        """
-        arm, hidden = self.cell.arm, self.physics
-        drive = laws.drive_errors(hidden, arm, states, self.joint_reference)
-        error = np.asarray(arm.driven(drive) + states.q @ hidden.joint_coupling.T)
-        guided = laws.guide_motion(hidden, arm, states)
-        if guided is not None:
-            error[:, arm.slides] += guided[:, :, 2]
-        return error
-
     def rest(self, states: States, slip: Floats | None = None) -> mech.Equilibrium:
         """Return the equilibrium of N states; `slip` (N, n): error of the drives at rest, rad."""
         arm, hidden = self.cell.arm, self.physics
-        q = arm.chain_angles(states.q) + self.joint_errors(states)
+        errors = laws.joint_errors(hidden, arm, states, self.joint_reference)
+        q = arm.chain_angles(states.q) + errors
         guided = laws.guide_motion(hidden, arm, states)
         extra = laws.further_compliance(hidden, arm, states)
         return mech.equilibrium(
@@ -225,8 +211,8 @@ class World:
         slip = self.joint_std * rng.standard_normal((int(k.max()) + 1, states.q.shape[1]))[k]
         sight = self.sight(states, slip)
         observed = self.noise.observe(self._from_station(sight.position), rng)
-        T = mech.inverse(self.station)  # T_sensor_station
-        position = observed @ T[:3, :3].T + T[:3, 3]
+        axes, origin = self.station[:3, :3], self.station[:3, 3:]
+        position = observed @ axes - (axes.T @ origin)[:, 0]
         if m == 3:
             return position
         turn = mech.turned(self.noise.orientation_std * rng.standard_normal((len(states), 3)))
@@ -237,13 +223,14 @@ class World:
         return np.asarray(position @ self.station[:3, :3].T + self.station[:3, 3])
 
 
-def stand(cell: Cell, rng: np.random.Generator, distance: float = 3.0) -> tuple[Floats, Floats]:
+def stand(cell: Cell, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """Place the tracker: return the true T_sensor_base and T_station_sensor, (4, 4) each.
 
-    An unknown registration is drawn: the station is `distance`, m, away from the base, at a height
-    near the arm's, turned about the vertical at random. A known registration is true; if its origin
-    lies within the arm's reach (readings in base axes), the instrument stands `distance` away.
+    An unknown registration is drawn: the station is 3 m away from the base, at a height near the
+    arm's, turned about the vertical at random. A known registration is true; if its origin lies
+    within the arm's reach (readings in base axes), the instrument stands 3 m away.
     """
+    distance = 3.0
     if cell.arm.slides.any():  # beside the rail, wherever on it the arm stands
         distance = max(distance, cell.arm.reach + 1.0)
     side, turn = rng.uniform(0.0, 2.0 * np.pi, 2)

@@ -14,14 +14,12 @@
 The JSON file holds the world without rounding.
 """
 
-import argparse
 import contextlib
 import json
-import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,24 +43,6 @@ ENCODER_STD = 2e-6  # noise of a motor-side encoder, at the joint, rad
 
 _REFRESH_NS = 10_000_000  # real time between two publications of an unchanged arm
 _STRONGEST = 2000.0  # largest push or swing, N and N·m
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Swing:
-    """The decaying swing of a load after hanging."""
-
-    wrench: Floats  # (6,) at the start, base axes, N and N·m
-    period: float  # s
-    decay: float  # time constant, s
-
-    def at(self, time: float) -> Floats:
-        """Return the (6,) wrench at `time` s after hanging."""
-        phase = 2.0 * np.pi * time / self.period
-        return np.asarray(self.wrench * np.exp(-time / self.decay) * np.cos(phase))
-
-    def lasts(self, time: float) -> bool:
-        """Whether the swing is over a millionth of its start at `time` s after hanging."""
-        return time < 14.0 * self.decay
 
 
 class WorldState:
@@ -95,7 +75,7 @@ class WorldState:
         truth = board.read("truth")
         self._load, self._since = int(truth["load"]), float(truth["load_since"])
         self._push = np.zeros(6)
-        self._swing: Swing | None = None
+        self._swing: tuple[Floats, float, float] | None = None  # wrench, period, decay
         self._mistakes: list[int] = []
         self._log: list[dict[str, Any]] = []
         self._published: tuple[bytes, bytes, bool, int, bool] | None = None
@@ -110,7 +90,7 @@ class WorldState:
             if number == self._handled and now_ns - self._written_ns < _REFRESH_NS:
                 return
             arm = self._read_arm()
-            pose = (arm["q"].tobytes(), arm["side"].tobytes(), self._swings())
+            pose = (arm["q"].tobytes(), arm["side"].tobytes(), self._swinging() is not None)
             state = (*pose, int(arm["arrivals"]), bool(arm["moving"]))
             published = self._published
             due = now_ns - self._computed_ns >= _REFRESH_NS
@@ -172,7 +152,7 @@ class WorldState:
         if not (period > 0.0 and decay > 0.0):
             raise InputError(f"swing: period {period} s, decay {decay} s; valid: over 0")
         with self._lock:
-            self._swing = Swing(start, period, decay) if start.any() else None
+            self._swing = (start, period, decay) if start.any() else None
 
     def state(self) -> dict[str, Any]:
         """Return the present truth, for JSON."""
@@ -203,8 +183,9 @@ class WorldState:
         """Compute the present equilibrium, and write the whole truth."""
         world, now = self._world, self._board.time
         wrench = self._push.copy()
-        if self._swing is not None and self._swings():
-            wrench += self._swing.at(now - self._since)
+        swinging = self._swinging()
+        if swinging is not None:
+            wrench += swinging
         if self._load:
             wrench += self._loads[self._load - 1].wrench(world.cell.gravity)
         states = States(
@@ -262,15 +243,16 @@ class WorldState:
             self._arm = self._board.read("arm")
         return self._arm
 
-    def _swings(self) -> bool:
-        """Whether the load still swings."""
-        swing = self._swing
-        if swing is None or self._load == 0:
-            return False
-        return swing.lasts(self._board.time - self._since)
+    def _swinging(self) -> Floats | None:
+        """Return what the swing of the load adds to it (6,); None when it has come to rest."""
+        if self._swing is None or self._load == 0:
+            return None
+        (start, period, decay), time = self._swing, self._board.time - self._since
+        if time >= 14.0 * decay:  # below a millionth of its start
+            return None
+        return np.asarray(start * np.exp(-time / decay) * np.cos(2.0 * np.pi * time / period))
 
     def _variable_fields(self, arm: Any, now: float | None = None) -> dict[str, Any]:
-        """Return the fields that change while the arm rests."""
         time = self._board.time if now is None else now
         return {
             "time": time,
@@ -391,7 +373,7 @@ def open_board(directory: Path, scale: float, start: float = 0.0, joints: int = 
     return Blackboard(path)
 
 
-def start(options: argparse.Namespace) -> admin.Device:
+def start(options: admin.Arguments) -> admin.Device:
     """Return the world of DIR/world.json, and its step."""
     world, config = read_world(options.directory / "world.json")
     board = open_board(options.directory, config.simulation.clock, joints=world.cell.arm.n)
@@ -407,4 +389,4 @@ def start(options: argparse.Namespace) -> admin.Device:
 
 
 if __name__ == "__main__":
-    sys.exit(admin.run(__doc__, "world", start))
+    admin.run(__doc__, "world", start)

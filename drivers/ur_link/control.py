@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.drivers.ur_link import probe, states
-from hilcal.drivers.ur_link.control_worker import WATCHDOG_HZ
-from hilcal.drivers.ur_link.lines import Connection, LinkError
+from hilcal.drivers.ur_link.children import WATCHDOG_HZ
+from hilcal.drivers.ur_link.probe import Connection, LinkError
 from hilcal.drivers.ur_link.reading import STALE_S, Reading, Receiver
 from hilcal.drivers.ur_link.states import CHECK_LINK, RESUME, failure
-from hilcal.drivers.ur_link.supervision import PRIMARY_PORT, Generation, Supervision
+from hilcal.drivers.ur_link.supervision import PRIMARY_PORT, Controller
 from hilcal.drivers.ur_link.worker import Worker, WorkerError
 from hilcal.measuring.route import duration
 from hilcal.types import Floats
@@ -99,16 +99,13 @@ COMMAND_S = 0.5  # deadline of a command, real s
 CONNECT_S = 8.0  # deadline for taking control, real s
 _ORPHAN_S = 1.6
 _HZ = 125.0
+_IN_USE = "already in use"  # in ur_rtde's message
+_CONTROLLED = (
+    "another program controls it (its RTDE input registers are in use)",
+    "end the other program, or the fieldbus that uses the registers",
+)
 _NO_COG = 1e-6
 """z of a centre of mass at the flange, m: ur_rtde's script takes (0, 0, 0) for "unchanged"."""
-
-
-@dataclass(frozen=True, slots=True)
-class Pulse:
-    """State of the control worker."""
-
-    expired: bool  # the motion was stopped because its lease was not renewed
-    late: float  # the longest pause between two signs of life, if too long, s; else 0
 
 
 class Control(Worker):
@@ -117,16 +114,20 @@ class Control(Worker):
     If the process is killed, the robot's watchdog stops the arm.
     """
 
-    def __init__(self, host: str, generation: Generation, seconds: float) -> None:
+    def __init__(self, controller: Controller, seconds: float) -> None:
         """Take control of the arm within a deadline."""
-        flags = generation.script_port == PRIMARY_PORT, generation.upper
-        arguments = (host, repr(_HZ), repr(LEASE_S), *(str(int(flag)) for flag in flags))
-        super().__init__("hilcal.drivers.ur_link.control_worker", arguments, seconds)
+        flags = controller.script_port == PRIMARY_PORT, controller.upper
+        arguments = repr(_HZ), repr(LEASE_S), *(str(int(flag)) for flag in flags)
+        super().__init__("control", (controller.host, *arguments), seconds)
 
-    def alive(self, seconds: float = COMMAND_S) -> Pulse:
-        """Renew the lease of the motion; `seconds`: deadline of the answer, real s."""
+    def alive(self, seconds: float = COMMAND_S) -> tuple[bool, float]:
+        """Renew the lease of the motion; `seconds`: deadline of the answer, real s.
+
+        Return whether the motion was stopped because its lease had expired, and the longest pause
+        between two signs of life, if too long, s; else 0.
+        """
         answer = self.call("alive", seconds)
-        return Pulse(bool(answer["expired"]), float(answer["late"]))
+        return bool(answer["expired"]), float(answer["late"])
 
     def move(self, q: Floats, speed: float, acceleration: float, brake: float) -> bool:
         """Start a motion, rad; False if the controller does not take it."""
@@ -153,24 +154,19 @@ class Control(Worker):
         self.kill()
 
 
-def take(host: str, receiver: Receiver, generation: Generation) -> Control:
+def take(controller: Controller, receiver: Receiver) -> Control:
     """Take control of an arm that is ready for it."""
-    end = time.monotonic() + CONNECT_S
+    host, end = controller.host, time.monotonic() + CONNECT_S
     try:
-        _ready(host, receiver)
-        if probe.in_use(host, generation.registers, 1.0):
-            raise _controlled(host)
-        _no_program(host, receiver, generation)
-        if generation.supervision.in_remote_control(1.0) is False:
-            raise failure(host, "it is in local mode", "switch it to remote control on the pendant")
+        _check_ready(controller, receiver)
     except LinkError as error:
         raise failure(host, str(error), CHECK_LINK) from None
     try:
-        control = _start(host, generation, end)
+        control = _start(controller, end)
     except WorkerError as error:
         text = str(error)
-        if "already in use" in text:
-            raise _controlled(host) from None
+        if _IN_USE in text:
+            raise failure(host, *_CONTROLLED) from None
         if "remote control" in text:
             text = "it is in local mode; switch it to remote control on the pendant"
         raise failure(host, f"cannot take control: {text}") from None
@@ -182,46 +178,38 @@ def take(host: str, receiver: Receiver, generation: Generation) -> Control:
     return control
 
 
-def _start(host: str, generation: Generation, end: float) -> Control:
+def _start(controller: Controller, end: float) -> Control:
     """Start the worker; try twice: our query of the registers may still hold them."""
     try:
-        return Control(host, generation, end - time.monotonic())
+        return Control(controller, end - time.monotonic())
     except WorkerError as error:
-        if "already in use" not in str(error):
+        if _IN_USE not in str(error):
             raise
     time.sleep(0.3)
-    return Control(host, generation, end - time.monotonic())
+    return Control(controller, end - time.monotonic())
 
 
-def _controlled(host: str) -> Exception:
-    return failure(
-        host,
-        "another program controls it (its RTDE input registers are in use)",
-        "end the other program, or the fieldbus that uses the registers",
-    )
-
-
-def _ready(host: str, receiver: Receiver) -> None:
-    """Refuse a robot that is not running, or not in a normal safety state."""
-    reading = receiver.read()
+def _check_ready(controller: Controller, receiver: Receiver) -> None:
+    """Refuse a robot that cannot be controlled; end a paused program, which a stop may leave."""
+    host, reading = controller.host, receiver.read()
     if reading.sample.safety != states.NORMAL:
         raise failure(host, reading.sample.safety, states.safety_advice(reading.safety_bits))
     if reading.mode != states.RUNNING:
         word = states.mode_word(reading.mode)
         raise failure(host, f"it is not running ({word})", "switch it on and release the brakes")
-
-
-def _no_program(host: str, receiver: Receiver, generation: Generation) -> None:
-    """Refuse a robot with a running program; end a paused one, which a stop may leave."""
+    if probe.in_use(host, controller.registers, 1.0):
+        raise failure(host, *_CONTROLLED)
     with contextlib.suppress(LinkError):  # the watchdog ends a program left by us
         _wait_for(receiver, (states.STOPPED, states.PAUSED), _ORPHAN_S)
     runtime = receiver.read().runtime
     if runtime == states.PAUSED:
-        generation.supervision.stop(1.0)
+        controller.supervision.stop(1.0)
         _wait_for(receiver, (states.STOPPED,), 2.0)
     elif runtime != states.STOPPED:
         word = states.runtime_word(runtime)
         raise failure(host, f"a program is on the robot ({word})", "stop it on the pendant")
+    if controller.supervision.in_remote_control(1.0) is False:
+        raise failure(host, "it is in local mode", "switch it to remote control on the pendant")
 
 
 def _wait_for(receiver: Receiver, runtimes: tuple[int, ...], seconds: float) -> None:
@@ -256,9 +244,8 @@ class Halt:
 class Brakes:
     """The ways to stop one arm."""
 
-    host: str
+    controller: Controller
     receiver: Receiver
-    generation: Generation
 
     def ease(self, control: Control, brake: float) -> bool:
         """Stop through the control worker and keep control; return whether the arm stands."""
@@ -283,7 +270,9 @@ class Brakes:
                 pass
             finally:
                 control.kill()  # the robot's watchdog then stops the arm, whatever else fails
-        if not self._by_supervision():
+        try:
+            self.controller.supervision.stop(ASK_S)
+        except LinkError:
             self._by_script(brake)
         try:
             if not lost:
@@ -304,18 +293,14 @@ class Brakes:
             reading = self._until_still(_SURE_S - _AGAIN_S, program=True)
         return Halt(reading or self.receiver.read(STALE_S), reading is not None, "")
 
-    def _by_supervision(self) -> bool:
-        with contextlib.suppress(LinkError):
-            self.generation.supervision.stop(ASK_S)
-            return True
-        return False
-
     def _by_script(self, brake: float) -> None:
         """Send a program that brakes the arm along its path; `brake`: leading joint, rad/s²."""
         program = f"def stop_arm():\n  stopj({brake:.3f})\nend\n"
         with (
             contextlib.suppress(LinkError),
-            Connection(self.host, self.generation.script_port, "script port", ASK_S) as line,
+            Connection(
+                self.controller.host, self.controller.script_port, "script port", ASK_S
+            ) as line,
         ):
             line.send(program.encode())
             time.sleep(_TAKEN_S)
@@ -333,7 +318,7 @@ class Brakes:
         return None
 
 
-def cause_of(supervision: Supervision, halt: Halt, symptom: str) -> tuple[str, str]:
+def cause_of(controller: Controller, halt: Halt, symptom: str) -> tuple[str, str]:
     """Return cause and advice, after the arm has been stopped.
 
     A safety stop also ends the program, and a lost link the process that commands the arm. So the
@@ -346,7 +331,7 @@ def cause_of(supervision: Supervision, halt: Halt, symptom: str) -> tuple[str, s
         word = states.mode_word(reading.mode)
         return f"it does not run any more ({word})", f"switch it on, {RESUME}"
     with contextlib.suppress(LinkError):
-        if supervision.in_remote_control(ASK_S) is False:
+        if controller.supervision.in_remote_control(ASK_S) is False:
             return "it was switched to local mode", f"switch it to remote control, {RESUME}"
     if halt.lost:
         return f"the link is lost: {halt.lost}", CHECK_LINK

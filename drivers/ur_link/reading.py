@@ -1,4 +1,4 @@
-"""State and kinematics of the arm: checked packets from the receive worker; the survey.
+"""State, kinematics and torques of the arm, each from a checked source; the survey of all.
 
 The kinematics come from the controller's primary port. A package there has a size (i32, header
 included), a type (u8) and a body. The body of type 16, a robot state, is a sequence of parts of the
@@ -8,6 +8,7 @@ it to each client that connects. All is big-endian. Source: Universal Robots, "R
 TCP/IP", and `KinematicsInfo` of the Universal Robots Client Library.
 """
 
+import contextlib
 import math
 import re
 import struct
@@ -19,10 +20,10 @@ from typing import Any
 import numpy as np
 
 from hilcal.drivers.ur_link import probe, states
-from hilcal.drivers.ur_link.lines import Connection, LinkError
-from hilcal.drivers.ur_link.probe import ControllerFacts
-from hilcal.drivers.ur_link.receive_worker import OUTPUTS as OUTPUTS
-from hilcal.drivers.ur_link.supervision import PRIMARY_PORT, Generation
+from hilcal.drivers.ur_link.children import OUTPUTS as OUTPUTS
+from hilcal.drivers.ur_link.children import TORQUE as TORQUE
+from hilcal.drivers.ur_link.probe import Connection, LinkError
+from hilcal.drivers.ur_link.supervision import PRIMARY_PORT, Controller
 from hilcal.drivers.ur_link.worker import Worker, WorkerError
 from hilcal.errors import InputError
 from hilcal.measuring.devices import ArmSample, Report, Row, report_of
@@ -99,7 +100,7 @@ the largest arm; a packet damaged on the way is as a rule far outside."""
 STALE_S = 0.2
 """Age of the controller's timestamp at which the link counts as lost in a motion, real s."""
 PATIENCE_S = 0.8  # longest wait for new data at rest, real s
-_ANSWER_S = 0.3
+_CONNECT_S, _ANSWER_S = 4.0, 0.3
 
 
 class ReadingError(Exception):
@@ -141,7 +142,7 @@ class Receiver:
 
     def __init__(self, host: str, hz: float, outputs: tuple[str, ...], seconds: float) -> None:
         """Connect within `seconds`; each call raises LinkError if no new data come."""
-        self._host = host
+        self._host, self.hz = host, hz
         self._arguments = (host, repr(hz), ",".join(outputs))
         self._worker = self._start(seconds)
 
@@ -183,9 +184,56 @@ class Receiver:
 
     def _start(self, seconds: float) -> Worker:
         try:
-            return Worker("hilcal.drivers.ur_link.receive_worker", self._arguments, seconds)
+            return Worker("receive", self._arguments, seconds)
         except WorkerError as error:
             raise LinkError(f"no data over RTDE: {error}") from None
+
+
+_LARGEST = 1e5  # N·m; no drive exerts as much
+
+
+class TorqueReader:
+    """Mean torques of the drives; None if the link is lost."""
+
+    def __init__(self, host: str, hz: float) -> None:
+        """Connect to a controller that has the output; after a failure, `mean` is None."""
+        self._arguments = (host, repr(hz))
+        self._worker: Worker | None = None
+        self.renew()
+
+    @property
+    def pids(self) -> tuple[int, ...]:
+        """Number of the child process, if there is one."""
+        return () if self._worker is None else (self._worker.pid,)
+
+    def renew(self) -> None:
+        """Connect again if the link is lost."""
+        if self._worker is None:
+            with contextlib.suppress(WorkerError):
+                self._worker = Worker("torques", self._arguments, _CONNECT_S)
+
+    def mean(self) -> Floats | None:
+        """(6,) mean torque of each drive since the last call, N·m; of the last second at most.
+
+        Positive in the direction in which the joint's angle grows, as the drive pushes.
+        """
+        if self._worker is None:
+            return None
+        try:
+            torque = np.asarray(self._worker.call("mean", _ANSWER_S)["torque"], dtype=np.float64)
+        except WorkerError:
+            self.close()
+            return None
+        if torque.shape != (6,) or not (np.abs(torque) <= _LARGEST).all():
+            self.close()
+            return None
+        return torque
+
+    def close(self) -> None:
+        """End the process; may be called twice."""
+        if self._worker is not None:
+            self._worker.kill()
+            self._worker = None
 
 
 _RATE_S = (0.4, 2.0)  # time of counting packets, and of a second count if few; choices
@@ -194,29 +242,22 @@ _SHARE = 0.5
 _ASK_S = 1.5
 
 
-def survey(
-    host: str,
-    model: str,
-    hz: float,
-    controller: ControllerFacts,
-    receiver: Receiver,
-    generation: Generation,
-    silent: str,
-) -> Report:
+def survey(controller: Controller, receiver: Receiver, model: str, silent: str) -> Report:
     """Ask all that needs no motion; `silent`: why the supervision does not answer, else empty."""
-    supervision, version = generation.supervision, states.version_word(controller.version)
+    supervision, hz = controller.supervision, receiver.hz
+    version = states.version_word(controller.version)
     rows: list[Row] = [
-        ("address", host, "address", host),
+        ("address", controller.host, "address", controller.host),
         ("controller version", version, "controller_version", version),
     ]
     problems: list[str] = []
     name, kinematics = "Universal Robots arm", None
     try:
-        kinematics = read_kinematics(host, _ASK_S)
+        kinematics = read_kinematics(controller.host, _ASK_S)
         rows.append(("", "", "kinematics", kinematics.to_dict()))
     except LinkError as error:
         rows.append(("its kinematics", f"not told: {error}", "", None))
-        if generation.script_port == PRIMARY_PORT:
+        if controller.script_port == PRIMARY_PORT:
             problems.append(
                 f"{error}; programs go by it, so that the arm cannot be controlled without it: "
                 "enable the primary client interface in the controller's settings, under services"

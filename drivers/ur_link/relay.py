@@ -19,7 +19,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from hilcal.drivers.ur_link.lines import LinkError
+from hilcal.drivers.ur_link.probe import LinkError
 
 _RTDE, _REALTIME, _PRIMARY = 30004, 30003, 30001
 _TRIES = 50

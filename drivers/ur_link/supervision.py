@@ -15,14 +15,14 @@ import http.client
 import json
 import time
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 from urllib.parse import urlsplit
 
 from pydantic import Field, Strict
 
 from hilcal.config import CellConfig
 from hilcal.drivers.ur_link import probe
-from hilcal.drivers.ur_link.lines import Connection, LinkError
+from hilcal.drivers.ur_link.probe import Connection, LinkError
 from hilcal.toml import Section, check_section
 
 DASHBOARD_PORT = 29999
@@ -214,19 +214,25 @@ POLYSCOPE_X = 10
 REALTIME_PORT, PRIMARY_PORT = 30003, 30001
 
 
-Supervision = Dashboard | RobotApi
-
-
 @dataclass(frozen=True, slots=True)
-class Generation:
-    """How a controller of one generation is supervised and commanded."""
+class Controller:
+    """A controller, and how one of its version is supervised and commanded."""
 
-    supervision: Supervision
+    host: str
+    version: tuple[int, ...]  # major, minor, bugfix, build
+    supervision: Dashboard | RobotApi
     script_port: int  # for programs: the real-time port; of PolyScope X the primary port
     upper: bool
     """Whether commands use the upper half of the registers (24 to 47), which no fieldbus uses.
     ur_rtde 1.6.5 supports them up to PolyScope 5.22; on newer versions its program uses the lower
     half, so the flag for the upper half would separate program and client."""
+
+    @classmethod
+    def of(cls, host: str, version: tuple[int, ...], api_port: int) -> Self:
+        """Return the controller of this version."""
+        if version[0] >= POLYSCOPE_X:
+            return cls(host, version, RobotApi(host, api_port), PRIMARY_PORT, upper=False)
+        return cls(host, version, Dashboard(host), REALTIME_PORT, upper=version[:2] < (5, 23))
 
     @property
     def registers(self) -> tuple[str, str]:
@@ -234,21 +240,13 @@ class Generation:
         first = 24 if self.upper else 0
         return f"input_int_register_{first}", f"input_double_register_{first}"
 
-
-def generation(host: str, version: tuple[int, ...], api_port: int) -> Generation:
-    """Return the `Generation` of a controller of this version."""
-    if version[0] >= POLYSCOPE_X:
-        return Generation(RobotApi(host, api_port), PRIMARY_PORT, upper=False)
-    return Generation(Dashboard(host), REALTIME_PORT, upper=version[:2] < (5, 23))
-
-
-def why_silent(supervision: Supervision, seconds: float) -> str:
-    """Return why the supervision, which control needs, does not answer; empty if it does."""
-    try:
-        supervision.check(seconds)
-    except LinkError as error:
-        return str(error)
-    return ""
+    def why_silent(self, seconds: float) -> str:
+        """Return why the supervision, which control needs, does not answer; empty if it does."""
+        try:
+            self.supervision.check(seconds)
+        except LinkError as error:
+            return str(error)
+        return ""
 
 
 RTDE = {probe.PORT: "real-time interface (RTDE)"}
@@ -271,7 +269,7 @@ def services(config: CellConfig) -> dict[int, str]:
     """Return the services that a cell's controller must offer, by port; asks for its version."""
     options = check_section(dict(config.robot.options), UrOptions, "[robot.options]")
     try:
-        version = probe.controller(config.robot.host or "", ("timestamp",), _ASK_S).version
+        version = probe.controller(config.robot.host or "", ("timestamp",), _ASK_S)[0]
     except LinkError:
         return SERVICES
     if version[0] < POLYSCOPE_X:

@@ -1,14 +1,6 @@
-"""A child process that may hang or crash without harm: first the parent's side, then the child's.
-
-In the child the client library can hold the interpreter's lock for ever, so that no thread and no
-signal handler in Python can notice the end of the parent. The kernel therefore ends the child: the
-parent holds the writing end of a pipe on which nothing is sent; when the parent ends, in any way,
-the pipe closes and SIGIO ends the child (fcntl(2), O_ASYNC; signal(7)). Unlike PR_SET_PDEATHSIG
-this does not depend on the thread that started the child.
-"""
+"""A child process that may hang or crash without harm; the other side is `children`."""
 
 import contextlib
-import fcntl
 import json
 import os
 import select
@@ -18,7 +10,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -40,12 +31,12 @@ class WorkerError(Exception):
 
 
 class Worker:
-    """A child process `python -m MODULE` that answers requests in JSON lines, one at a time.
+    """A child process of a kind that answers requests in JSON lines, one at a time.
 
     It ends with this process. Output of the client library is dropped.
     """
 
-    def __init__(self, module: str, arguments: tuple[str, ...], seconds: float) -> None:
+    def __init__(self, kind: str, arguments: tuple[str, ...], seconds: float) -> None:
         """Start the process; wait at most `seconds` until it reports that it is ready."""
         self._lock = threading.RLock()
         self._number = 0
@@ -54,7 +45,10 @@ class Worker:
         life, self._life = os.pipe()
         try:
             self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
-                [sys.executable, "-P", "-m", module, str(life), str(os.getpid()), *arguments],
+                [
+                    *(sys.executable, "-P", "-m", "hilcal.drivers.ur_link.children"),
+                    *(str(life), str(os.getpid()), kind, *arguments),
+                ],
                 stdin=child_socket.fileno(),
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
@@ -139,96 +133,3 @@ class Worker:
         if self._life >= 0:
             life, self._life = self._life, -1
             os.close(life)
-
-
-_NICE = -10
-
-
-def end_with_parent(life: int, parent: int) -> None:
-    """End this process with the parent, whose end closes the pipe `life`; ignore Ctrl-C."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGIO, signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGIO})
-    fcntl.fcntl(life, fcntl.F_SETOWN, os.getpid())
-    fcntl.fcntl(life, fcntl.F_SETFL, fcntl.fcntl(life, fcntl.F_GETFL) | os.O_ASYNC)
-    if select.select([life], [], [], 0)[0] or os.getppid() != parent:
-        os._exit(0)  # the parent has ended meanwhile
-
-
-@contextlib.contextmanager
-def outliving(seconds: float) -> Iterator[None]:
-    """Finish an indivisible task although the parent ends meanwhile.
-
-    The end of this process is postponed by at most `seconds`; then SIGALRM, which no lock delays,
-    ends the process, finished or not.
-    """
-    signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGIO})
-    signal.setitimer(signal.ITIMER_REAL, seconds)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGIO})
-
-
-class Line:
-    """Requests from the parent and answers, over the socket at standard input."""
-
-    def __init__(self, parent: int) -> None:
-        self._parent = parent
-        self._socket = socket.socket(fileno=os.dup(sys.stdin.fileno()))
-        self._buffer = b""
-
-    def next(self, seconds: float) -> dict[str, Any] | None:
-        """Return the next request, None if none comes in time; at the end of the line, exit."""
-        while b"\n" not in self._buffer:
-            if os.getppid() != self._parent:
-                os._exit(0)
-            if not select.select([self._socket], [], [], max(0.0, seconds))[0]:
-                return None
-            try:
-                data = self._socket.recv(65536)
-            except ConnectionError:
-                data = b""
-            if not data:
-                os._exit(0)
-            self._buffer += data
-        request, _, self._buffer = self._buffer.partition(b"\n")
-        out: dict[str, Any] = json.loads(request)
-        return out
-
-    def answer(self, number: int, **content: Any) -> None:
-        """Answer the request with this number; 0 reports the start."""
-        try:
-            self._socket.sendall(json.dumps({"number": number, **content}).encode() + b"\n")
-        except OSError:
-            os._exit(0)
-
-
-def answered(
-    line: Line, request: dict[str, Any], do: Callable[[dict[str, Any]], dict[str, Any]]
-) -> bool:
-    """Answer a request with the result or the exception of `do`; return whether it succeeded."""
-    try:
-        result = do(request)
-    except Exception as error:
-        line.answer(request["number"], error=words(error))
-        return False
-    line.answer(request["number"], **result)
-    return True
-
-
-def words(error: BaseException) -> str:
-    """Return an exception in one line."""
-    text = " ".join(str(error).split())
-    return text or type(error).__name__
-
-
-def start() -> tuple[Line, list[str]]:
-    """Set up a worker process; return the line to the parent and the other arguments."""
-    life, parent = int(sys.argv[1]), int(sys.argv[2])
-    end_with_parent(life, parent)
-    with contextlib.suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, 0, _NICE)
-    return Line(parent), sys.argv[3:]

@@ -23,14 +23,14 @@ from geocompy.geo import GeoCom
 from hilcal.config.cell import Tracker
 from hilcal.drivers import bota, emscon, ft300, geocom, netft, onrobot_hex
 from hilcal.drivers import emscon_packets as es
-from hilcal.drivers import natnet_frames as nn
+from hilcal.drivers import natnet as nn
 from hilcal.drivers.emscon import EmsconConnection, EmsconTracker
 from hilcal.drivers.force_stream import RING, ForceStream
 from hilcal.drivers.geocom import GeoComOptions, GeoComTracker, Link
 from hilcal.drivers.natnet import NatNetTracker
 from hilcal.drivers.simulated.natnet_server import BODY, Cameras
-from hilcal.drivers.ur_link import lines, probe, reading, supervision
-from hilcal.drivers.ur_link.lines import LinkError
+from hilcal.drivers.ur_link import probe, reading, supervision
+from hilcal.drivers.ur_link.probe import LinkError
 from hilcal.measuring.devices import Clock
 from tests.fuzz.damage import NUMBERS, bytes_damaged
 from tests.fuzz.harness import Accepted, Parser, passed
@@ -103,13 +103,13 @@ class Socket:
 
 
 def network(data: bytes) -> Any:
-    """In place of the sockets of `ur_link.lines`: every connection gives these bytes."""
+    """In place of the sockets of `ur_link.probe`: every connection gives these bytes."""
     fake = SimpleNamespace(
         create_connection=lambda *_, **__: Socket(data),
         gaierror=socket.gaierror,
         SHUT_WR=socket.SHUT_WR,
     )
-    return mock.patch.object(lines, "socket", fake)
+    return mock.patch.object(probe, "socket", fake)
 
 
 def finite(rng: Random) -> float:
@@ -534,7 +534,7 @@ def _modbus() -> Parser:
             mock.patch.multiple(ft300, drain=lambda *_: True),
             mock.patch.object(minimalmodbus, "time", clock),
         ):
-            got = ft300.read_registers(port, 9, 500, 4)  # type: ignore[arg-type]
+            got = ft300.read_registers(port, 500, 4)  # type: ignore[arg-type]
         if len(got) != 4 or not all(0 <= word < 65536 for word in got):
             raise Accepted("modbus: registers that cannot be")
         if not data[0] and got not in sound:

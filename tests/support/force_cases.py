@@ -4,7 +4,7 @@ import re
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, suppress
 
 import numpy as np
 import pytest
@@ -31,13 +31,8 @@ def config(kind, port, **keys):
     return CellConfig.model_validate({"robot": {"model": "ur10e"}, "force_sensor": section})
 
 
-@contextmanager
 def opened(kind, port, **keys):
-    sensor = OPEN[kind](config(kind, port, **keys))
-    try:
-        yield sensor
-    finally:
-        sensor.close()
+    return closing(OPEN[kind](config(kind, port, **keys)))
 
 
 def truth_of(simulated):

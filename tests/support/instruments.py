@@ -1,11 +1,8 @@
 """Simulated instruments for tests: a process each, in a world that the test writes."""
 
-import subprocess
-import sys
 import tempfile
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,9 +12,14 @@ import numpy as np
 from hilcal.config import CellConfig
 from hilcal.drivers.simulated.admin import ask
 from hilcal.drivers.simulated.blackboard import Blackboard
-from hilcal.drivers.simulated.cell_processes import EMSCON_PORT, WEB_PORT, free_host
+from hilcal.drivers.simulated.cell_processes import (
+    EMSCON_PORT,
+    WEB_PORT,
+    DeviceProcess,
+    free_host,
+)
+from tests.support.timing import wait_until
 
-START_S = 30.0
 TRACKER_NOISE = ("--range-std", "5e-6", "0.15e-6", "--transverse-std", "7.5e-6", "3e-6")
 TARGET = (0.5, 2.8, 0.4)
 TURNED = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -28,30 +30,33 @@ WARM = ("--on", "1e6")
 
 @dataclass(eq=False)
 class Instrument:
-    """A running simulated instrument."""
+    """A running simulated device in a world that the test writes."""
 
-    port: Path  # the name to open
-    socket: Path  # its admin socket
+    process: DeviceProcess  # the server
     board: Blackboard  # the shared world; the test is its writer
-    process: subprocess.Popen[bytes]  # the server
 
-    def admin(self, op: str, **arguments: Any) -> Any:
-        return ask(self.socket, op, **arguments)
+    @property
+    def port(self) -> Path:
+        """The serial port to open."""
+        return self.process.socket.with_suffix("")
+
+    def admin(self, op: str = "state", **arguments: Any) -> Any:
+        """Switch a fault, or ask for the state."""
+        return ask(self.process.socket, op, **arguments)
 
     def truth(self, **fields: Any) -> None:
         """Write what is true in the world, e.g. `target` or `sensor_wrench`."""
         self.board.write("truth", time=self.board.time, **fields)
 
+    def start(self) -> None:
+        """Start the server, and wait until it answers."""
+        self.process.start()
+        wait_until(lambda: self.process.socket.exists() or self.process.ended, "started")
+        self.process.check()
+
     def close(self) -> None:
         """End the server as the end of its parent would."""
-        assert self.process.stdin is not None
-        self.process.stdin.close()
-        try:
-            self.process.wait(5.0)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-            raise
+        self.process.end()
 
 
 @contextmanager
@@ -60,23 +65,16 @@ def running(
 ) -> Iterator[Instrument]:
     """Run `hilcal.drivers.simulated.<module>` in a world that says `truth` from the beginning."""
     with tempfile.TemporaryDirectory() as directory:
+        arguments = ("--seed", str(seed), *options)
+        server = f"hilcal.drivers.simulated.{module}"
+        process = DeviceProcess(name, server, Path(directory), arguments)
         board = Blackboard.create(Path(directory) / "world.bin", scale)
-        command = [sys.executable, "-m", f"hilcal.drivers.simulated.{module}"]
-        command += ["--directory", directory, "--seed", str(seed), *options]
+        instrument = Instrument(process, board)
         if truth:  # before it starts: no frame of an empty world is on its way then
-            board.write("truth", time=board.time, **truth)
-        process = subprocess.Popen(command, stdin=subprocess.PIPE)
-        port = Path(directory) / name
-        instrument = Instrument(port, port.with_suffix(".sock"), board, process)
-        try:
-            deadline = time.monotonic() + START_S
-            while not instrument.socket.exists():
-                assert process.poll() is None, f"{module} ended with {process.returncode}"
-                assert time.monotonic() < deadline, f"{module} did not start"
-                time.sleep(0.01)
+            instrument.truth(**truth)
+        with closing(instrument):
+            instrument.start()
             yield instrument
-        finally:
-            instrument.close()
 
 
 @contextmanager

@@ -34,6 +34,7 @@ class AtTerminal:
         lines: int = 30,
         home: Path | None = None,
         paper: int | None = None,
+        command: tuple[str, ...] = ("-m", "hilcal"),
     ) -> None:
         """Start it, in the directory `home`; on wider paper, lines that are too long show."""
         self.columns = paper or columns
@@ -46,7 +47,7 @@ class AtTerminal:
         fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", lines, columns, 0, 0))
         hidden = ("COLUMNS", "LINES", "HILCAL_DEBUG")
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "hilcal", *map(str, arguments)],
+            [sys.executable, *command, *map(str, arguments)],
             stdin=slave,
             stdout=slave,
             stderr=slave,

@@ -1,7 +1,6 @@
 """A running simulated UR controller for tests, and the real client library in its own process."""
 
 import json
-import os
 import socket
 import struct
 import subprocess
@@ -15,28 +14,19 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.blackboard import Blackboard
-from hilcal.drivers.simulated.cell_processes import free_host
+from hilcal.drivers.simulated.cell_processes import DeviceProcess, free_host
+from hilcal.drivers.ur_link.worker import environment
+from tests.support.instruments import Instrument
 from tests.support.paths import ROOT
 
-_READY = 20.0  # s
 
+@dataclass(eq=False)
+class SimulatedUr(Instrument):
+    """A running controller."""
 
-def environment() -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-
-
-@dataclass
-class SimulatedUr:
-    directory: Path
     host: str
-    board: Blackboard
-    process: subprocess.Popen[bytes]
-    is_x: bool = False
-
-    def admin(self, op: str = "state", **arguments: Any) -> Any:
-        return admin.ask(self.directory / "arm.sock", op, **arguments)
+    is_x: bool
 
     def wait(self, what: str, value: Any, timeout: float = 5.0) -> dict[str, Any]:
         """Wait until a field of the state has a value; returns the state."""
@@ -46,41 +36,31 @@ class SimulatedUr:
             time.sleep(0.005)
         return state
 
-    def close(self) -> None:
-        self.process.stdin.close()
-        try:
-            self.process.wait(5)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
 
-
-def command(directory: Path, host: str, *arguments: str) -> list[str]:
-    return [
-        *(sys.executable, "-m", "hilcal.drivers.simulated.ur_server"),
-        *("--directory", str(directory), "--host", host, "--robot", "ur10e", *arguments),
-    ]
+def server(directory: Path, host: str, *arguments: str) -> DeviceProcess:
+    """The process of a controller, to be started."""
+    arguments = ("--host", host, "--robot", "ur10e", *arguments)
+    return DeviceProcess("arm", "hilcal.drivers.simulated.ur_server", directory, arguments)
 
 
 def start(
-    directory: Path, scale: float = 1.0, truth: dict[str, Any] | None = None, *arguments: str
+    directory: Path,
+    scale: float = 1.0,
+    truth: dict[str, Any] | None = None,
+    *arguments: str,
 ) -> SimulatedUr:
     """Start a controller in a world of its own; `truth` are fields of the blackboard's section."""
     board = Blackboard.create(directory / "world.bin", scale)
     if truth is not None:
         board.write("truth", **{"flange": np.eye(4), "time": 1e-6, **truth})
     host = free_host()
-    process = subprocess.Popen(
-        command(directory, host, *arguments), stdin=subprocess.PIPE, env=environment()
-    )
     is_x = any(argument.startswith("10.") for argument in arguments)
-    running = SimulatedUr(directory, host, board, process, is_x)
-    deadline = time.monotonic() + _READY
-    while not (directory / "arm.sock").exists():
-        if process.poll() is not None or time.monotonic() > deadline:
-            running.close()
-            raise AssertionError(f"the controller is not ready, exit code {process.returncode}")
-        time.sleep(0.005)
+    running = SimulatedUr(server(directory, host, *arguments), board, host, is_x)
+    try:
+        running.start()
+    except BaseException:
+        running.close()
+        raise
     return running
 
 
@@ -97,7 +77,7 @@ class Client:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            env=environment(),
+            env={**environment(), "OMP_NUM_THREADS": "1"},
         )
 
     def __call__(self, part: str, call: str, *arguments: Any) -> Any:

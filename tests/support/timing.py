@@ -3,6 +3,8 @@
 import time
 from collections.abc import Callable
 
+import psutil
+
 
 def shortest(works: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
     """Return the shortest processor time of each piece of work, s; they are done in turn."""
@@ -13,6 +15,14 @@ def shortest(works: dict[str, Callable[[], object]], rounds: int) -> dict[str, f
             work()
             times[name].append(time.process_time() - start)
     return {name: min(seconds) for name, seconds in times.items()}
+
+
+def runs(pid: int) -> bool:
+    """Whether a process is there, and no zombie."""
+    try:
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
 
 
 def wait_until(holds: Callable[[], object], what: str, seconds: float = 30.0) -> None:

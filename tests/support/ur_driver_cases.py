@@ -1,7 +1,10 @@
 """The UR driver on a simulated controller: how tests open it, move it, and put faults right."""
 
+import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +13,10 @@ import psutil
 import pytest
 
 from hilcal.config import CellConfig
+from hilcal.drivers.simulated.cell_processes import free_host
 from hilcal.drivers.simulated.ur_server import API
 from hilcal.drivers.ur import UrArm, open_arm
-from hilcal.drivers.ur_link.supervision import Dashboard, RobotApi, Supervision, ask
+from hilcal.drivers.ur_link.supervision import Dashboard, RobotApi, ask
 from hilcal.errors import DeviceError
 from tests.support import sim_ur_cases
 
@@ -83,7 +87,7 @@ def error_of(call: Callable[[], Any], seconds: float = 20.0) -> str:
     return text
 
 
-def supervision(sim: Sim) -> Supervision:
+def supervision(sim: Sim) -> Dashboard | RobotApi:
     return RobotApi(sim.host, API) if sim.is_x else Dashboard(sim.host)
 
 
@@ -98,7 +102,7 @@ def children() -> list[psutil.Process]:
         mine = psutil.Process().children(recursive=True)
         ours = [(p, " ".join(_words(p))) for p in mine]
         relays = sum("ur_link.relay" in words for _, words in ours)
-        commands = sum("ur_link.control_worker" in words for _, words in ours)
+        commands = sum("ur_link.children" in words and " control " in words for _, words in ours)
         if relays <= commands or time.monotonic() > end:
             assert relays <= commands
             return [p for p, words in ours if "ur_link" in words and "relay" not in words]
@@ -135,6 +139,37 @@ def check_resting(sim: Sim, since: int) -> None:
     assert state["rest_ns"] - since < STOP_NS
     time.sleep(0.05)
     assert sim.admin()["q"] == state["q"]
+
+
+@contextmanager
+def server(port: int, says: Callable[[bytes], bytes]) -> Iterator[tuple[str, list[bytes]]]:
+    """Something that listens on a port, and what it was asked, one connection after the other."""
+    host, asked = free_host(), []
+    with socket.socket() as door:
+        door.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        door.bind((host, port))
+        door.listen(8)
+
+        def serve() -> None:
+            while True:
+                try:
+                    line, _ = door.accept()
+                except OSError:
+                    return
+                with line:
+                    line.settimeout(0.3)
+                    data = b""
+                    with suppress(TimeoutError):  # an order's body comes in a packet of its own
+                        while not data or (data.startswith(b"PUT") and not data.endswith(b"}")):
+                            data += line.recv(65536)
+                    asked.append(data)
+                    line.sendall(says(asked[-1]))
+
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        yield host, asked
+        door.shutdown(socket.SHUT_RDWR)
+    thread.join(2.0)
 
 
 GENERATIONS = ("5.11.6.1010327", "10.14.0.0")

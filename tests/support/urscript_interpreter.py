@@ -4,18 +4,22 @@ It shares no code with the reader of programs that it tests: lines are executed 
 other, with the values that variables have then.
 """
 
+import ast
 import math
+import operator
 import random
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 
 MOTIONS = ("movej", "movel", "movep", "servoj", "movec", "servoc", "speedj", "speedl")
-TOKEN = re.compile(
-    r'\s*("[^"]*"|(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|p\[|[A-Za-z_]\w*|[=!<>]=|[-+*/%()\[\],=<>])'
-)
-POWER = {"or": 1, "and": 2, "==": 4, "!=": 4, "<": 4, ">": 4, "<=": 4, ">=": 4, "+": 5, "-": 5}
-POWER |= {"*": 6, "/": 6, "%": 6}
+OPERATORS: dict[type, Callable] = {
+    **{ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul},
+    **{ast.Div: operator.truediv, ast.Mod: operator.mod, ast.Eq: operator.eq},
+    **{ast.NotEq: operator.ne, ast.Lt: operator.lt, ast.LtE: operator.le},
+    **{ast.Gt: operator.gt, ast.GtE: operator.ge},
+}
 
 
 class Stopped(Exception):
@@ -161,7 +165,60 @@ class Machine:
         raise Stopped
 
     def _evaluate(self, text, scopes, line):
-        return _Expression(self, list(_tokens(text.rstrip())), scopes, line).value(0)
+        return self._value(_parsed(text.strip()), scopes, line)
+
+    def _value(self, node, scopes, line):
+        """The value of an expression, which Python's grammar reads; p[…] is P[…] there."""
+
+        def of(inner):
+            return self._value(inner, scopes, line)
+
+        match node:
+            case ast.Constant(value=bool() | str()):
+                return node.value
+            case ast.Constant():
+                return float(node.value)
+            case ast.Name():
+                return self._read(node.id, scopes)
+            case ast.List():
+                return [of(part) for part in node.elts]
+            case ast.Subscript(value=ast.Name(id="P"), slice=ast.Tuple() as inner):
+                return Pose(
+                    of(x) for x in (inner.elts if isinstance(inner, ast.Tuple) else [inner])
+                )
+            case ast.Subscript():
+                out, at = of(node.value), of(node.slice)
+                if not isinstance(out, list) or not 0 <= at < len(out):
+                    raise Stopped
+                return out[int(at)]
+            case ast.Call(func=ast.Name(id=name)):
+                given = [of(x) for x in node.args]
+                named = {x.arg: of(x.value) for x in node.keywords}
+                return self.called(name, given, named, scopes, line)
+            case ast.UnaryOp():
+                inner = of(node.operand)
+                if isinstance(node.op, ast.Not):
+                    return not inner
+                if not isinstance(inner, int | float):
+                    raise Stopped
+                return -inner
+            case ast.BoolOp(values=[a, b]):
+                a, b = of(a), of(b)
+                return (a and b) if isinstance(node.op, ast.And) else (a or b)
+            case (
+                ast.BinOp(left=a, op=sign, right=b)
+                | ast.Compare(left=a, ops=[sign], comparators=[b])
+            ):
+                a, b = of(a), of(b)
+                if not isinstance(sign, ast.Eq | ast.NotEq) and not (
+                    isinstance(a, int | float) and isinstance(b, int | float)
+                ):
+                    raise Stopped
+                try:
+                    return OPERATORS[type(sign)](a, b)
+                except ZeroDivisionError:
+                    raise Stopped from None
+        raise AssertionError(f"line {line}: {ast.unparse(node)} is not understood")
 
     def called(self, name, given, named, scopes, line):
         if name in MOTIONS:
@@ -206,94 +263,5 @@ def _numbers(values):
 
 
 @cache
-def _tokens(text):
-    out, at = [], 0
-    while at < len(text):
-        found = TOKEN.match(text, at)
-        out.append(found[1])
-        at = found.end()
-    return out
-
-
-class _Expression:
-    """One expression, by precedence climbing."""
-
-    def __init__(self, machine, tokens, scopes, line) -> None:
-        self.machine, self.tokens, self.scopes, self.line = machine, tokens, scopes, line
-
-    def take(self, sign=None):
-        if not self.tokens or sign not in (None, self.tokens[0]):
-            raise AssertionError(f"line {self.line}: {self.tokens} where {sign} was expected")
-        return self.tokens.pop(0)
-
-    def value(self, power):
-        left = self.one()
-        while self.tokens and POWER.get(self.tokens[0], 0) > power:
-            sign = self.take()
-            right = self.value(POWER[sign])
-            left = self.of_two(sign, left, right)
-        return left
-
-    def of_two(self, sign, a, b):
-        if sign in ("and", "or"):
-            return (a and b) if sign == "and" else (a or b)
-        if sign in ("==", "!="):
-            return (a == b) == (sign == "==")
-        if not (isinstance(a, int | float) and isinstance(b, int | float)) or (
-            sign in "/%" and not b
-        ):
-            raise Stopped
-        return {
-            "+": lambda: a + b, "-": lambda: a - b, "*": lambda: a * b, "/": lambda: a / b,
-            "%": lambda: a % b, "<": lambda: a < b, ">": lambda: a > b, "<=": lambda: a <= b,
-            ">=": lambda: a >= b,
-        }[sign]()  # fmt: skip
-
-    def one(self):
-        token = self.take()
-        if token == "-":
-            inner = self.value(6)
-            if not isinstance(inner, int | float):
-                raise Stopped
-            return -inner
-        if token == "not":
-            return not self.value(3)
-        if token == "(":
-            out = self.value(0)
-            self.take(")")
-        elif token in ("[", "p["):
-            out = (Pose if token == "p[" else list)(self.several("]")[0])
-        elif token[0] == '"':
-            out = token[1:-1]
-        elif token[0].isdigit() or token[0] == ".":
-            out = float(token)
-        elif token in ("True", "False"):
-            out = token == "True"
-        elif self.tokens and self.tokens[0] == "(":
-            self.take()
-            given, named = self.several(")")
-            out = self.machine.called(token, given, named, self.scopes, self.line)
-        else:
-            out = self.machine._read(token, self.scopes)
-        while self.tokens and self.tokens[0] == "[":
-            self.take()
-            at = self.value(0)
-            self.take("]")
-            if not isinstance(out, list) or not 0 <= at < len(out):
-                raise Stopped
-            out = out[int(at)]
-        return out
-
-    def several(self, end):
-        given, named = [], {}
-        while self.tokens[0] != end:
-            if len(self.tokens) > 1 and self.tokens[1] == "=":
-                name = self.take()
-                self.take()
-                named[name] = self.value(0)
-            else:
-                given.append(self.value(0))
-            if self.tokens[0] == ",":
-                self.take()
-        self.take(end)
-        return given, named
+def _parsed(text):
+    return ast.parse(re.sub(r"\bp\[", "P[", text), mode="eval").body

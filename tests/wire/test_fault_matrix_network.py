@@ -6,28 +6,14 @@ from pathlib import Path
 import pytest
 
 from hilcal.drivers import emscon_packets as es
-from tests.support.campaign_cases import (
-    Fault,
-    Run,
-    Site,
-    act,
-    begin,
-    each,
-    failed,
-    finish,
-    meets,
-    nothing,
-    right,
-    site,
-    switch,
-)
+from tests.support import campaign_cases as cases
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("nothing_goes_on")]
 
 
 @pytest.fixture(scope="module")
-def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
-    with site(
+def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[cases.Site]:
+    with cases.site(
         tmp_path_factory.mktemp("cell"),
         poses=12,
         tracker={"driver": "emscon"},
@@ -36,51 +22,53 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
         yield made
 
 
-PRISM = Fault(
+PRISM = cases.Fault(
     "another prism",
-    act("tracker", "reflector", number=2),
-    act("tracker", "reflector", number=1),
+    cases.act("tracker", "reflector", number=2),
+    cases.act("tracker", "reflector", number=1),
     ("tracker", "changed to .RRR 0.5in"),
     fast=True,
 )
-DROP = Fault("dropped", act("tracker", "drop"), nothing, ("tracker", "closed the connection"))
-SHAKEN = Fault(
+DROP = cases.Fault(
+    "dropped", cases.act("tracker", "drop"), cases.nothing, ("tracker", "closed the connection")
+)
+SHAKEN = cases.Fault(
     "does not stand firmly",
-    act("tracker", "fail", command=es.START_MEASUREMENT, status=10013, count=99),
-    act("tracker", "fail", command=es.START_MEASUREMENT, status=0, count=0),
+    cases.act("tracker", "fail", command=es.START_MEASUREMENT, status=10013, count=99),
+    cases.act("tracker", "fail", command=es.START_MEASUREMENT, status=0, count=0),
     ("tracker", "does not stand firmly"),
 )
 AT_REST = (
-    switch(
+    cases.switch(
         "beam broken", "tracker", "beam", "tracker", "not found|no measurement", "searched 2 times"
     ),
-    switch("tracker mute", "tracker", "mute", "tracker", "no answer"),
+    cases.switch("tracker mute", "tracker", "mute", "tracker", "no answer"),
     PRISM,
     DROP,
     SHAKEN,
-    switch("force sensor stalled", "force", "stall", "force", "nothing came"),
+    cases.switch("force sensor stalled", "force", "stall", "force", "nothing came"),
 )
-ERROR = Fault(
+ERROR = cases.Fault(
     "error of the sensor",
-    act("force", "status", word=0x80000008),
-    act("force", "status", word=None),
+    cases.act("force", "status", word=0x80000008),
+    cases.act("force", "status", word=None),
     ("force sensor", "reports an error"),
 )
 
 
-@each(AT_REST)
-def test_a_fault_while_the_arm_rests(fault: Fault, cell: Site, path: Path) -> None:
-    meets(fault, cell, path, moving=False)
+@cases.each(AT_REST)
+def test_a_fault_while_the_arm_rests(fault: cases.Fault, cell: cases.Site, path: Path) -> None:
+    cases.meets(fault, cell, path, moving=False)
 
 
 @pytest.mark.slow
-def test_an_error_of_the_force_sensor_stops_the_arm(cell: Site, path: Path) -> None:
-    meets(ERROR, cell, path, moving=True)
+def test_an_error_of_the_force_sensor_stops_the_arm(cell: cases.Site, path: Path) -> None:
+    cases.meets(ERROR, cell, path, moving=True)
 
 
-def test_faults_that_are_overcome_cost_nothing(cell: Site, path: Path) -> None:
+def test_faults_that_are_overcome_cost_nothing(cell: cases.Site, path: Path) -> None:
     """A lock and zeros that are lost, axes of an object, lost records."""
-    run, _ = begin(cell, path, Run.measuring)
+    run, _ = cases.begin(cell, path, cases.Run.measuring)
     cell.ask("force", "lose", share=0.05)
     for device, op, arguments in (
         ("tracker", "lock_lost", {}),
@@ -92,11 +80,11 @@ def test_faults_that_are_overcome_cost_nothing(cell: Site, path: Path) -> None:
         run.next_reading(op)
     cell.ask("force", "lose", share=0.0)
     run.interrupt()
-    failed(run, 130)
-    right(cell, path)
+    cases.failed(run, 130)
+    cases.right(cell, path)
     assert cell.ask("tracker", "state")["initialized"]
 
 
 @pytest.mark.slow
-def test_the_campaign_has_every_reading_exactly_once(cell: Site, path: Path) -> None:
-    finish(cell, path)
+def test_the_campaign_has_every_reading_exactly_once(cell: cases.Site, path: Path) -> None:
+    cases.finish(cell, path)

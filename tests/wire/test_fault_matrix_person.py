@@ -11,20 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.support.campaign_cases import (
-    Fault,
-    Run,
-    Site,
-    act,
-    begin,
-    each,
-    failed,
-    finish,
-    meets,
-    nothing,
-    right,
-    switch,
-)
+from tests.support import campaign_cases as cases
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("nothing_goes_on")]
 
@@ -34,13 +21,13 @@ NOBODY = [0.0] * 6
 MORE_READINGS = 8
 
 
-def somebody_jogs(s: Site) -> None:
+def somebody_jogs(s: cases.Site) -> None:
     """Move the arm by hand, a little, from where it is."""
     q = s.ask("arm", "state")["q"]
     s.ask("arm", "jog", q=[q[0] + 0.1, *q[1:5], q[5] + 0.2])
 
 
-def another_program(s: Site) -> None:
+def another_program(s: cases.Site) -> None:
     """Send the arm elsewhere by the script port, as any program of the network may."""
     q = np.array(s.ask("arm", "state")["q"]) + np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.5])
     text = f"def other():\n  movej([{', '.join(map(str, q))}], a=1.4, v=1.0)\nend\n"
@@ -49,39 +36,41 @@ def another_program(s: Site) -> None:
         line.sendall(text.encode())
 
 
-LEANING = Fault(
+LEANING = cases.Fault(
     "somebody leans on the tool",
-    act("world", "push", wrench=HAND),
-    act("world", "push", wrench=NOBODY),
+    cases.act("world", "push", wrench=HAND),
+    cases.act("world", "push", wrench=NOBODY),
     ("asked 3 times|max_moment_Nm|max_force_N", "touch the tool|hangs|pulls|felt|touches"),
 )
 FOREIGN = "another program"
 MOTION = (
-    switch("joint angles stand still", "arm", "freeze", "stood still|its angle is old", fast=True),
-    Fault("another program", another_program, nothing, (FOREIGN,)),
+    cases.switch(
+        "joint angles stand still", "arm", "freeze", "stood still|its angle is old", fast=True
+    ),
+    cases.Fault("another program", another_program, cases.nothing, (FOREIGN,)),
     LEANING,
 )
 REST = (
-    Fault("jogged", somebody_jogs, nothing, ("moved it|has commanded it",)),
-    Fault("another program", another_program, nothing, (FOREIGN,), fast=True),
-    switch("tracker stands still", "tracker", "freeze", "same to the last digit", fast=True),
-    switch("another reflector", "tracker", "stray", "follows a reflector|sees its target"),
-    switch("force sensor stands still", "force", "freeze", "same to the last digit"),
+    cases.Fault("jogged", somebody_jogs, cases.nothing, ("moved it|has commanded it",)),
+    cases.Fault("another program", another_program, cases.nothing, (FOREIGN,), fast=True),
+    cases.switch("tracker stands still", "tracker", "freeze", "same to the last digit", fast=True),
+    cases.switch("another reflector", "tracker", "stray", "follows a reflector|sees its target"),
+    cases.switch("force sensor stands still", "force", "freeze", "same to the last digit"),
     LEANING,
 )
 
 
-@each(MOTION)
-def test_in_motion(fault: Fault, cell: Site, path: Path) -> None:
-    meets(fault, cell, path, moving=True)
+@cases.each(MOTION)
+def test_in_motion(fault: cases.Fault, cell: cases.Site, path: Path) -> None:
+    cases.meets(fault, cell, path, moving=True)
 
 
-@each(REST)
-def test_at_rest(fault: Fault, cell: Site, path: Path) -> None:
-    meets(fault, cell, path, moving=False)
+@cases.each(REST)
+def test_at_rest(fault: cases.Fault, cell: cases.Site, path: Path) -> None:
+    cases.meets(fault, cell, path, moving=False)
 
 
-def loaded(run: Run) -> str:
+def loaded(run: cases.Run) -> str:
     """Wait for a reading under a load; returns its name."""
     found: list[str] = []
 
@@ -96,31 +85,31 @@ def loaded(run: Run) -> str:
 
 
 def test_a_load_that_falls_off_is_asked_for_again_and_no_reading_is_without_it(
-    cell: Site, path: Path
+    cell: cases.Site, path: Path
 ) -> None:
-    run, name = begin(cell, path, loaded)
+    run, name = cases.begin(cell, path, loaded)
     cell.ask("world", "hang", name=None)
     run.wait_until(lambda: "touch the tool" in run.words, "words about the load")
     run.wait_until(lambda: cell.ask("world", "state")["load"] == name, "the load again")
     run.next_reading("the load that was hung again")
     run.interrupt()
-    failed(run, 130)
-    right(cell, path)
+    cases.failed(run, 130)
+    cases.right(cell, path)
 
 
 @pytest.mark.slow
-def test_an_arm_jogged_before_a_campaign_goes_on_is_asked_for(cell: Site, path: Path) -> None:
-    run, _ = begin(cell, path, Run.measuring)
+def test_an_arm_jogged_before_a_campaign_goes_on_is_asked_for(cell: cases.Site, path: Path) -> None:
+    run, _ = cases.begin(cell, path, cases.Run.measuring)
     run.kill()
     run.end()
     somebody_jogs(cell)
-    again = Run(cell, path)
+    again = cases.Run(cell, path)
     again.wait_until(lambda: "does not stand where it was left" in again.words, "a question")
     again.interrupt()
     again.end()
 
 
 @pytest.mark.slow
-def test_the_campaign_is_finished(cell: Site, path: Path) -> None:
-    finish(cell, path)
+def test_the_campaign_is_finished(cell: cases.Site, path: Path) -> None:
+    cases.finish(cell, path)
     assert re.search("doubted", path.with_suffix(".hilcal").read_bytes().decode("latin-1"))

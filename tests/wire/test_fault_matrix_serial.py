@@ -11,21 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.campaign_cases import (
-    Fault,
-    Run,
-    Site,
-    act,
-    begin,
-    each,
-    failed,
-    finish,
-    meets,
-    nothing,
-    right,
-    stopped_on_its_way,
-    switch,
-)
+from tests.support import campaign_cases as cases
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("nothing_goes_on")]
 
@@ -34,66 +20,68 @@ HIT = [0.0, 0.0, -280.0, 0.0, 0.0, 0.0]
 TOO_MUCH = "max_force_N|over its range"  # with a load on the hook it may be beyond the range
 
 
-def unplugged(device: str) -> Fault:
+def unplugged(device: str) -> cases.Fault:
     name = f"{device} unplugged"
     says = (device, "unplugged")
-    return Fault(name, act(device, "unplug"), act(device, "replug"), says)
+    return cases.Fault(name, cases.act(device, "unplug"), cases.act(device, "replug"), says)
 
 
-def rate(device: str, wrong: int, good: int, says: str) -> Fault:
-    on, off = act(device, "baud", baud=wrong), act(device, "baud", baud=good)
-    return Fault(f"{device} at another rate", on, off, (device, says))
+def rate(device: str, wrong: int, good: int, says: str) -> cases.Fault:
+    on, off = cases.act(device, "baud", baud=wrong), cases.act(device, "baud", baud=good)
+    return cases.Fault(f"{device} at another rate", on, off, (device, says))
 
 
 TRACKER = (
-    switch("beam broken", "tracker", "beam", "tracker", "no target in sight", "searched 2 times"),
-    Fault(
+    cases.switch(
+        "beam broken", "tracker", "beam", "tracker", "no target in sight", "searched 2 times"
+    ),
+    cases.Fault(
         "angles only, distance 0.0 (1285)",
-        act("tracker", "meas_s", seconds=10.0),  # longer than it is waited for
-        act("tracker", "meas_s", seconds=0.3),
+        cases.act("tracker", "meas_s", seconds=10.0),  # longer than it is waited for
+        cases.act("tracker", "meas_s", seconds=0.3),
         ("tracker", "only angles", "1285", "searched 2 times"),
         fast=True,
     ),
-    switch("no distance (1292)", "tracker", "dist_error", "tracker", "distance", "1292"),
-    switch("tracker mute", "tracker", "mute", "tracker", "no answer"),
-    switch("tracker busy", "tracker", "busy", "tracker", "1293"),
+    cases.switch("no distance (1292)", "tracker", "dist_error", "tracker", "distance", "1292"),
+    cases.switch("tracker mute", "tracker", "mute", "tracker", "no answer"),
+    cases.switch("tracker busy", "tracker", "busy", "tracker", "1293"),
     unplugged("tracker"),
     rate("tracker", 9600, 115200, "no answer|what comes is no GeoCOM"),
 )
 
 FORCE = (
     unplugged("force"),
-    switch("force sensor stalled", "force", "stall", "force", "nothing came"),
-    switch("force sensor mute", "force", "mute", "force", "nothing came"),
+    cases.switch("force sensor stalled", "force", "stall", "force", "nothing came"),
+    cases.switch("force sensor mute", "force", "mute", "force", "nothing came"),
     rate("force", 57600, 19200, "no whole frame|nothing came"),
-    Fault(
+    cases.Fault(
         "overload",
-        act("force", "overload", force=HIT),
-        act("force", "overload", force=NO_FORCE),
+        cases.act("force", "overload", force=HIT),
+        cases.act("force", "overload", force=NO_FORCE),
         ("force sensor", TOO_MUCH),
         fast=True,
     ),
 )
 
 
-def damage(device: str, op: str) -> Fault:
+def damage(device: str, op: str) -> cases.Fault:
     """The line flips or cuts for a while."""
-    on, off = act(device, op, probability=0.02), act(device, op, probability=0.0)
-    return Fault(f"{device} {op}", on, off, ())
+    on, off = cases.act(device, op, probability=0.02), cases.act(device, op, probability=0.0)
+    return cases.Fault(f"{device} {op}", on, off, ())
 
 
-def once(device: str, op: str, **arguments: object) -> Fault:
+def once(device: str, op: str, **arguments: object) -> cases.Fault:
     """What is over after once."""
-    return Fault(f"{device} {op}", act(device, op, **arguments), nothing, ())
+    return cases.Fault(f"{device} {op}", cases.act(device, op, **arguments), cases.nothing, ())
 
 
 OVERCOME = {
     "tracker": (
         once("tracker", "lock_lost"),
-        Fault(
+        cases.Fault(
             "tracker warns",
-            act("tracker", "warn", code=1283),
-            act("tracker", "warn", code=0),
+            cases.act("tracker", "warn", code=1283),
+            cases.act("tracker", "warn", code=0),
             (),
         ),
         once("tracker", "wrong_trid", count=1),
@@ -116,39 +104,43 @@ START = {
 }
 
 
-@each(TRACKER)
-def test_a_fault_of_the_tracker(fault: Fault, cell: Site, path: Path) -> None:
-    meets(fault, cell, path, moving=False)
+@cases.each(TRACKER)
+def test_a_fault_of_the_tracker(fault: cases.Fault, cell: cases.Site, path: Path) -> None:
+    cases.meets(fault, cell, path, moving=False)
 
 
-@each(FORCE)
-def test_a_fault_of_the_force_sensor_in_motion(fault: Fault, cell: Site, path: Path) -> None:
-    meets(fault, cell, path, moving=True)
-
-
-@pytest.mark.slow
-@each(FORCE)
-def test_a_fault_of_the_force_sensor_at_rest(fault: Fault, cell: Site, path: Path) -> None:
-    meets(fault, cell, path, moving=False)
+@cases.each(FORCE)
+def test_a_fault_of_the_force_sensor_in_motion(
+    fault: cases.Fault, cell: cases.Site, path: Path
+) -> None:
+    cases.meets(fault, cell, path, moving=True)
 
 
 @pytest.mark.slow
-def test_a_hit_stops_the_arm(cell: Site, path: Path) -> None:
+@cases.each(FORCE)
+def test_a_fault_of_the_force_sensor_at_rest(
+    fault: cases.Fault, cell: cases.Site, path: Path
+) -> None:
+    cases.meets(fault, cell, path, moving=False)
+
+
+@pytest.mark.slow
+def test_a_hit_stops_the_arm(cell: cases.Site, path: Path) -> None:
     """A collision is over after a moment, for the arm bounces off."""
-    run, goal = begin(cell, path, Run.moving)
+    run, goal = cases.begin(cell, path, cases.Run.moving)
     since = time.monotonic()
     cell.ask("force", "overload", force=HIT)
     time.sleep(0.1)
     cell.ask("force", "overload", force=NO_FORCE)
-    line = failed(run)
-    stopped_on_its_way(cell, since, goal)
+    line = cases.failed(run)
+    cases.stopped_on_its_way(cell, since, goal)
     assert re.search(TOO_MUCH, line), line
-    right(cell, path)
+    cases.right(cell, path)
 
 
-def test_faults_that_are_overcome_cost_nothing(cell: Site, path: Path) -> None:
+def test_faults_that_are_overcome_cost_nothing(cell: cases.Site, path: Path) -> None:
     """All of them in one run, each for a whole reading, at both lines at a time."""
-    run, _ = begin(cell, path, Run.measuring)
+    run, _ = cases.begin(cell, path, cases.Run.measuring)
     for row in zip_longest(*OVERCOME.values()):
         faults = [fault for fault in row if fault is not None]
         for fault in faults:
@@ -158,20 +150,20 @@ def test_faults_that_are_overcome_cost_nothing(cell: Site, path: Path) -> None:
         for fault in faults:
             fault.undo(cell)
     run.interrupt()
-    failed(run, 130)
-    right(cell, path)
+    cases.failed(run, 130)
+    cases.right(cell, path)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("what", START)
 def test_instruments_that_are_not_ready_are_named_at_once(
-    what: str, cell: Site, path: Path
+    what: str, cell: cases.Site, path: Path
 ) -> None:
     arrivals = cell.ask("arm", "state")["arrivals"]
     for fault in START[what]:
         fault.do(cell)
     try:
-        line = failed(Run(cell, path))
+        line = cases.failed(cases.Run(cell, path))
         assert cell.ask("arm", "state")["arrivals"] == arrivals
     finally:
         for fault in START[what]:
@@ -181,33 +173,33 @@ def test_instruments_that_are_not_ready_are_named_at_once(
 
 
 @pytest.mark.slow
-def test_the_operator_hangs_the_wrong_load_and_is_told(cell: Site, tmp_path: Path) -> None:
+def test_the_operator_hangs_the_wrong_load_and_is_told(cell: cases.Site, tmp_path: Path) -> None:
     path = tmp_path / "loads.hilcal"
     short = cell.shorter(tmp_path, poses=1)
     cell.ask("world", "mistake", name="10kg")  # instead of nothing, at the start
-    run = Run(short, path)
+    run = cases.Run(short, path)
     code, words = run.end()
     assert code == 0, words
     assert "asked to take everything off: the force sensor feels" in words
-    right(short, path)
+    cases.right(short, path)
 
 
 @pytest.mark.slow
 def test_an_operator_who_keeps_hanging_the_wrong_load_ends_the_run(
-    cell: Site, tmp_path: Path
+    cell: cases.Site, tmp_path: Path
 ) -> None:
     path = tmp_path / "loads.hilcal"
     short = cell.shorter(tmp_path, poses=1)
-    run, _ = begin(short, path, Run.measuring)
+    run, _ = cases.begin(short, path, cases.Run.measuring)
     for _ in range(3):
         cell.ask("world", "mistake", name="10kg")
-    line = failed(run)
+    line = cases.failed(run)
     assert "asked 3 times to hang 5kg" in line
     assert "10.0 kg" in line
-    right(short, path)
-    finish(short, path)
+    cases.right(short, path)
+    cases.finish(short, path)
 
 
 @pytest.mark.slow
-def test_the_campaign_has_every_reading_exactly_once(cell: Site, path: Path) -> None:
-    finish(cell, path)
+def test_the_campaign_has_every_reading_exactly_once(cell: cases.Site, path: Path) -> None:
+    cases.finish(cell, path)

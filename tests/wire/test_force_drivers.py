@@ -16,37 +16,24 @@ from pymodbus.exceptions import ModbusIOException
 
 from hilcal.config import CellConfig
 from hilcal.drivers import bota, ft300, onrobot_hex
-from hilcal.drivers.ft300 import STREAM, write_register
+from hilcal.drivers.ft300 import STREAM, start_stream
 from hilcal.drivers.links import close_port, open_port
 from hilcal.drivers.simulated.force_server import DRIFT_STD, ROOM
 from hilcal.errors import DeviceError, InputError
-from tests.support.force_cases import (
-    ALL,
-    BOTH,
-    OPEN,
-    OPTIONS,
-    config,
-    fails,
-    instruments,
-    opened,
-    readers,
-    settled,
-    simulated,
-    steady,
-    truth_of,
-)
+from tests.support import force_cases as cases
+from tests.support.force_cases import instruments, simulated
 from tests.support.instruments import WRENCH, force_sensor
 from tests.support.timing import wait_until
 
 __all__ = ["instruments", "simulated"]  # fixtures
 
 
-@ALL
+@cases.ALL
 def test_readings_are_what_the_sensor_feels(kind, simulated):
-    with opened(kind, simulated.port) as sensor:
-        mean, noise, off = truth_of(simulated)
+    with cases.opened(kind, simulated.port) as sensor:
+        mean, noise, off = cases.truth_of(simulated)
         before = time.monotonic_ns()
-        sample = steady(sensor, 1.0)
+        sample = cases.steady(sensor, 1.0)
         after = time.monotonic_ns()
         std = np.sqrt(np.diagonal(sample.covariance))
         K = sample.frames
@@ -64,22 +51,22 @@ def test_readings_are_what_the_sensor_feels(kind, simulated):
             assert newest.temperature is None
 
 
-@ALL
+@cases.ALL
 def test_no_frame_is_lost_at_full_rate(kind, simulated):
-    with opened(kind, simulated.port) as sensor:
+    with cases.opened(kind, simulated.port) as sensor:
         rate = simulated.admin("state")["rate"]
         first, dropped = sensor.losses().frames, simulated.admin("state")["dropped"]
-        sample = steady(sensor, 2.0)
-        count = settled(sensor, lambda count: count.lost == 0)
+        sample = cases.steady(sensor, 2.0)
+        count = cases.settled(sensor, lambda count: count.lost == 0)
         assert count.lost == count.corrupt == count.skipped == 0
         assert simulated.admin("state")["dropped"] == dropped
         assert sample.frames <= count.frames - first
         assert sample.frames == pytest.approx(2.0 * rate, rel=0.05)
 
 
-@BOTH
+@cases.BOTH
 def test_the_report_says_who_answered(kind, simulated):
-    with opened(kind, simulated.port) as sensor:
+    with cases.opened(kind, simulated.port) as sensor:
         time.sleep(0.3)
         report = sensor.report()
         facts = dict(report.facts)
@@ -94,36 +81,26 @@ def test_the_report_says_who_answered(kind, simulated):
             assert facts["temperature"] == "29.0 °C"
 
 
-@BOTH
-def test_a_second_program_on_the_port_is_refused_and_disturbs_nothing(kind, simulated):
-    with opened(kind, simulated.port) as sensor:
-        with pytest.raises(DeviceError, match="in use by another program") as caught:
-            OPEN[kind](config(kind, simulated.port))
-        assert str(simulated.port) in str(caught.value)
-        time.sleep(0.3)
-        assert sensor.losses().corrupt == 0
-
-
-@BOTH
+@cases.BOTH
 def test_close_leaves_nothing_behind_and_never_fails(kind, simulated):
     files = len(os.listdir("/proc/self/fd"))
-    sensor = OPEN[kind](config(kind, simulated.port))
-    assert len(readers()) == 1
+    sensor = cases.OPEN[kind](cases.config(kind, simulated.port))
+    assert len(cases.readers()) == 1
     sensor.close()
     sensor.close()
-    assert readers() == []
-    fails(sensor.latest, "closed")
-    sensor = OPEN[kind](config(kind, simulated.port))
+    assert cases.readers() == []
+    cases.fails(sensor.latest, "closed")
+    sensor = cases.OPEN[kind](cases.config(kind, simulated.port))
     simulated.admin("unplug")
     sensor.close()
-    assert readers() == []
-    fails(lambda: OPEN[kind](config(kind, simulated.port)), "there is no port")
+    assert cases.readers() == []
+    cases.fails(lambda: cases.OPEN[kind](cases.config(kind, simulated.port)), "there is no port")
     assert len(os.listdir("/proc/self/fd")) <= files + 1
 
 
 def test_an_ft300_is_silent_after_close(instruments):
     simulated = instruments("ft300")
-    with opened("ft300", simulated.port):
+    with cases.opened("ft300", simulated.port):
         assert simulated.admin("state")["streaming"]
     wait_until(lambda: not simulated.admin("state")["streaming"], "silent")
 
@@ -131,12 +108,12 @@ def test_an_ft300_is_silent_after_close(instruments):
 def test_an_ft300_that_streams_for_a_dead_program_is_taken_over(instruments):
     simulated = instruments("ft300")
     port = open_port("force sensor", str(simulated.port), ft300.BAUD)
-    write_register(port, ft300.SLAVE, ft300.STREAM_REGISTER, ft300.STREAM)
+    start_stream(port)
     close_port(port)  # and nobody stopped it
     wait_until(lambda: simulated.admin("state")["streaming"], "streaming")
-    with opened("ft300", simulated.port) as sensor:
+    with cases.opened("ft300", simulated.port) as sensor:
         assert "serial number F3004242" in sensor.report().name
-        assert steady(sensor, 0.3).frames > 20
+        assert cases.steady(sensor, 0.3).frames > 20
 
 
 @pytest.mark.parametrize(
@@ -146,13 +123,15 @@ def test_a_cell_without_force_sensor_or_with_a_strange_option(start):
     with pytest.raises(InputError, match=r"\[force_sensor\] is missing"):
         start(CellConfig.model_validate({"robot": {"model": "ur10e"}}))
     with pytest.raises(InputError, match='driver "x" has no option "colour"'):
-        start(config("x", "/dev/null", options={"colour": "red"}))
+        start(cases.config("x", "/dev/null", options={"colour": "red"}))
 
 
-@pytest.mark.parametrize("options", [{}, {"counts_per_N": 50.0}, {**OPTIONS["hex"], "rate_hz": 0}])
+@pytest.mark.parametrize(
+    "options", [{}, {"counts_per_N": 50.0}, {**cases.OPTIONS["hex"], "rate_hz": 0}]
+)
 def test_a_hex_needs_its_scale(options):
     with pytest.raises(InputError, match=r"it must be .*over 0"):
-        onrobot_hex.open_force_sensor(config("hex", "/dev/null", options=options))
+        onrobot_hex.open_force_sensor(cases.config("hex", "/dev/null", options=options))
 
 
 @pytest.mark.parametrize("bit", [1, 2, 3, 9])
@@ -173,49 +152,49 @@ def test_an_ft300_at_the_end_of_its_range(index, value):
 OVERLOADED = r"loaded over its range|overloaded"
 
 
-@ALL
+@cases.ALL
 def test_unplugged_while_streaming_and_replugged(kind, simulated):
-    with opened(kind, simulated.port) as sensor:
+    with cases.opened(kind, simulated.port) as sensor:
         sensor.latest()
         simulated.admin("unplug")
-        fails(sensor.latest, "is gone; was its adapter unplugged")
-        fails(lambda: sensor.average(1.0), "is gone; was its adapter unplugged")
+        cases.fails(sensor.latest, "is gone; was its adapter unplugged")
+        cases.fails(lambda: sensor.average(1.0), "is gone; was its adapter unplugged")
         assert "unplugged" in sensor.report().problems[0]
-    fails(lambda: OPEN[kind](config(kind, simulated.port)), "there is no port")
+    cases.fails(lambda: cases.OPEN[kind](cases.config(kind, simulated.port)), "there is no port")
     simulated.admin("replug")
-    with opened(kind, simulated.port) as sensor:
-        assert steady(sensor, 0.2).frames > 10
+    with cases.opened(kind, simulated.port) as sensor:
+        assert cases.steady(sensor, 0.2).frames > 10
 
 
-@BOTH
+@cases.BOTH
 def test_unplugged_in_the_middle_of_a_mean(kind, simulated):
-    with opened(kind, simulated.port) as sensor:
+    with cases.opened(kind, simulated.port) as sensor:
         timer = threading.Timer(0.3, lambda: simulated.admin("unplug"))
         timer.start()
-        fails(lambda: sensor.average(30.0), "unplugged")
+        cases.fails(lambda: sensor.average(30.0), "unplugged")
         timer.join()
 
 
-@BOTH
+@cases.BOTH
 @pytest.mark.parametrize("fault", ["mute", "stall"])
 def test_a_stream_that_stops_is_stale_and_comes_back(kind, simulated, fault):
-    with opened(kind, simulated.port) as sensor:
+    with cases.opened(kind, simulated.port) as sensor:
         time.sleep(0.2)
         simulated.admin(fault, on=True)
-        fails(sensor.latest, "nothing came for .* s; check the sensor's power and cable")
-        fails(lambda: sensor.average(0.1), "nothing came")
+        cases.fails(sensor.latest, "nothing came for .* s; check the sensor's power and cable")
+        cases.fails(lambda: sensor.average(0.1), "nothing came")
         stopped = time.monotonic()
         assert "nothing came" in sensor.report().problems[0]
         time.sleep(0.2)
         simulated.admin(fault, on=False)
         missing = (time.monotonic() - stopped) * simulated.admin("state")["rate"]
-        assert settled(sensor, lambda count: count.lost > 0.9 * missing).lost > 0.9 * missing
+        assert cases.settled(sensor, lambda count: count.lost > 0.9 * missing).lost > 0.9 * missing
 
 
-@BOTH
+@cases.BOTH
 def test_frames_that_come_late_are_waited_for(kind, simulated):
     """As on a busy computer: nothing comes during the whole window, all of it soon after."""
-    with opened(kind, simulated.port) as sensor:
+    with cases.opened(kind, simulated.port) as sensor:
         time.sleep(0.2)
         os.kill(simulated.process.pid, signal.SIGSTOP)
         timer = threading.Timer(0.25, os.kill, (simulated.process.pid, signal.SIGCONT))
@@ -227,32 +206,34 @@ def test_frames_that_come_late_are_waited_for(kind, simulated):
         assert mean.frames >= 5  # half of what 100 Hz, the slowest, gives in the window
 
 
-@BOTH
+@cases.BOTH
 def test_a_mute_sensor_and_a_wrong_rate_are_told_when_opening(kind, simulated):
-    fails(
-        lambda: OPEN[kind](config(kind, simulated.port, baud=57600)),
+    cases.fails(
+        lambda: cases.OPEN[kind](cases.config(kind, simulated.port, baud=57600)),
         f"{simulated.port}.* at 57600 Bd.*rate",
     )
     simulated.admin("mute", on=True)
-    fails(lambda: OPEN[kind](config(kind, simulated.port)), "check the sensor's power")
+    cases.fails(
+        lambda: cases.OPEN[kind](cases.config(kind, simulated.port)), "check the sensor's power"
+    )
     simulated.admin("mute", on=False)
-    assert readers() == []
-    with opened(kind, simulated.port) as sensor:
+    assert cases.readers() == []
+    with cases.opened(kind, simulated.port) as sensor:
         sensor.latest()
 
 
-@BOTH
+@cases.BOTH
 def test_a_rate_that_changes_while_streaming_is_told(kind, simulated):
-    with opened(kind, simulated.port) as sensor:
+    with cases.opened(kind, simulated.port) as sensor:
         sensor.latest()
         simulated.admin("baud", baud=57600)
-        fails(sensor.latest, "bytes come at .* Bd, but no whole frame")
+        cases.fails(sensor.latest, "bytes come at .* Bd, but no whole frame")
 
 
-@ALL
+@cases.ALL
 def test_damage_on_the_line_lets_no_wrong_reading_through(kind, simulated):
-    with opened(kind, simulated.port) as sensor:
-        mean, noise, off = truth_of(simulated)
+    with cases.opened(kind, simulated.port) as sensor:
+        mean, noise, off = cases.truth_of(simulated)
         time.sleep(0.3)
         simulated.admin("flip", probability=0.02)
         simulated.admin("cut", probability=0.02)
@@ -260,7 +241,7 @@ def test_damage_on_the_line_lets_no_wrong_reading_through(kind, simulated):
         seen = 0
         while time.monotonic() < end:
             try:
-                sample = steady(sensor, 0.3)
+                sample = cases.steady(sensor, 0.3)
             except DeviceError:
                 continue  # a machine that does other work; no reading is no wrong reading
             seen += sample.frames
@@ -275,43 +256,43 @@ def test_damage_on_the_line_lets_no_wrong_reading_through(kind, simulated):
         assert any("frames lost on port" in problem for problem in sensor.report().problems)
 
 
-@BOTH
+@cases.BOTH
 def test_half_a_frame_and_garbage_cost_a_frame_or_two(kind, simulated):
-    with opened(kind, simulated.port) as sensor:
+    with cases.opened(kind, simulated.port) as sensor:
         time.sleep(0.2)
         simulated.admin("half_frame")
         time.sleep(0.2)
         simulated.admin("garbage", count=200)
         time.sleep(1.2)  # at 19200 Bd it holds up the frames behind it for 0.1 s
-        count = settled(sensor, lambda count: 1 <= count.lost <= 4 and count.skipped >= 200)
+        count = cases.settled(sensor, lambda count: 1 <= count.lost <= 4 and count.skipped >= 200)
         assert 1 <= count.lost <= 4
         assert count.skipped >= 200
 
 
-@ALL
+@cases.ALL
 def test_overload_is_no_reading(kind, simulated):
     force = [0.0, 0.0, 5000.0, 0.0, 0.0, 0.0]
-    with opened(kind, simulated.port) as sensor:
-        steady(sensor, 0.1)
+    with cases.opened(kind, simulated.port) as sensor:
+        cases.steady(sensor, 0.1)
         simulated.admin("overload", force=force)
-        fails(lambda: sensor.average(0.2), OVERLOADED)
-        fails(sensor.latest, OVERLOADED)
+        cases.fails(lambda: sensor.average(0.2), OVERLOADED)
+        cases.fails(sensor.latest, OVERLOADED)
         assert "load" in sensor.report().problems[0]
         simulated.admin("overload", force=[0.0] * 6)
         wait_until(
-            lambda: np.linalg.norm(steady(sensor, 0.1).wrench) < 100.0, "free of the overload"
+            lambda: np.linalg.norm(cases.steady(sensor, 0.1).wrench) < 100.0, "free of the overload"
         )
 
 
 def test_the_wrong_sensor_is_told(instruments):
     port = instruments("bota").port
-    fails(
-        lambda: ft300.open_force_sensor(config("ft300", port, baud=460800)),
+    cases.fails(
+        lambda: ft300.open_force_sensor(cases.config("ft300", port, baud=460800)),
         "what comes is no answer; .* or it is no FT 300",
     )
     port = instruments("hex").port
-    fails(
-        lambda: bota.open_force_sensor(config("bota", port, baud=1_000_000)),
+    cases.fails(
+        lambda: bota.open_force_sensor(cases.config("bota", port, baud=1_000_000)),
         "no whole frame .* or it is no Bota sensor",
     )
 
@@ -360,14 +341,14 @@ def test_values_that_cannot_be_never_pass(tmp_path, bad):
     wrong = (1.0, 2.0, bad, 0.1, 0.2, 0.3)
     with (
         talker(tmp_path, lambda k: bota_frame(k, good if k % 10 else wrong)) as path,
-        opened("bota", path) as sensor,
+        cases.opened("bota", path) as sensor,
     ):
-        sample = steady(sensor, 0.2)
+        sample = cases.steady(sensor, 0.2)
         assert sample.wrench == pytest.approx(good)
         assert sensor.losses().corrupt > 0
     with talker(tmp_path, lambda k: bota_frame(k, wrong)) as path:
-        fails(
-            lambda: OPEN["bota"](config("bota", path)),
+        cases.fails(
+            lambda: cases.OPEN["bota"](cases.config("bota", path)),
             "their values or their clock were impossible",
         )
 
@@ -417,11 +398,11 @@ def test_each_sensor_has_a_zero_of_its_own() -> None:
 def test_the_zero_drifts_as_the_sensor_warms_up() -> None:
     with (
         force_sensor("bota", "--on", "0", scale=2000.0) as sensor,
-        opened("bota", sensor.port) as device,
+        cases.opened("bota", sensor.port) as device,
     ):
         cold = device.latest().temperature
         time.sleep(1.5)  # 3000 s of the world
-        warm = steady(device, 0.2)
+        warm = cases.steady(device, 0.2)
         state = sensor.admin("state")
         assert device.latest().temperature > cold
     assert state["temperature"] - ROOM > 6.0
@@ -432,19 +413,15 @@ def test_the_zero_drifts_as_the_sensor_warms_up() -> None:
 
 
 @pytest.mark.parametrize("kind", ["bota"])
-def test_a_saturated_gauge_is_no_reading(kind, simulated) -> None:
-    with opened(kind, simulated.port) as sensor:
-        steady(sensor, 0.1)
+def test_a_saturated_gauge_is_no_reading_and_a_clock_that_wraps_loses_nothing(
+    kind, simulated
+) -> None:
+    with cases.opened(kind, simulated.port) as sensor:
+        cases.steady(sensor, 0.1)
         simulated.admin("saturate", on=True)
-        fails(sensor.latest, "loaded over its range|overloaded")
+        cases.fails(sensor.latest, OVERLOADED)
         simulated.admin("saturate", on=False)
-        steady(sensor, 0.1)
-
-
-@pytest.mark.parametrize("kind", ["bota"])
-def test_a_clock_that_wraps_loses_nothing(kind, simulated) -> None:
-    with opened(kind, simulated.port) as sensor:
-        steady(sensor, 0.1)
+        cases.steady(sensor, 0.1)
         number = simulated.admin("state")["frames"]
         simulated.admin("clock", us=2**32 - 1000 * number - 500_000)
         time.sleep(0.2)
@@ -452,6 +429,6 @@ def test_a_clock_that_wraps_loses_nothing(kind, simulated) -> None:
         wait_until(  # it wraps after half a second
             lambda: simulated.admin("state")["frames"] > number + 700, "wrapped"
         )
-        steady(sensor, 0.1)
+        cases.steady(sensor, 0.1)
         assert sensor.losses().lost == lost
         simulated.admin("clock", us=0)

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilcal.drivers import bota, ft300, onrobot_hex
-from hilcal.drivers.checksums import crc_x25
 from hilcal.drivers.force_stream import ByArrival, ByDeviceClock, Deframer
+from hilcal.drivers.links import crc_x25
 
 FORMATS = {
     "ft300": ft300.SENSOR.frame,

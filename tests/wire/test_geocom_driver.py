@@ -1,6 +1,5 @@
 """The GeoCOM driver against a simulated station: readings, reports, and what goes wrong."""
 
-import contextlib
 import time
 
 import numpy as np
@@ -197,16 +196,6 @@ def test_half_a_reply_is_not_a_reading(device, station):
     assert device.measure().value == pytest.approx(TARGET, abs=1e-3)
 
 
-def test_flipped_bits_and_cuts_are_repaired_or_refused(device, station):
-    station.admin("flip", probability=0.02)
-    for _ in range(60):
-        assert device.measure().value == pytest.approx(TARGET, abs=1e-3)
-    station.admin("flip", probability=0.5)
-    for _ in range(10):
-        with contextlib.suppress(DeviceError):
-            assert device.measure().value == pytest.approx(TARGET, abs=1e-3)
-
-
 @pytest.mark.long
 def test_mute_instrument_is_given_up_in_time_and_heard_again(device, station):
     station.admin("mute", on=True)
@@ -351,22 +340,7 @@ def test_unplugged_adapter_is_named_and_a_new_opening_works():
         again.close()
 
 
-def test_instrument_that_dies_is_noticed():
-    with simulated.tracker() as station:
-        device = open_tracker(cell(station.port))
-        station.admin("die")
-        station.process.wait(30.0)
-        with pytest.raises(DeviceError):
-            device.measure()
-        device.close()
-
-
 # odd instruments
-
-
-def test_cartesian_axes_of_an_instrument(opened):
-    device, _ = opened({2167: full()})
-    assert device.measure().value == pytest.approx(POINT, abs=1e-15)
 
 
 def test_second_face_gives_the_same_point(opened):

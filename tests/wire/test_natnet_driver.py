@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -38,13 +38,8 @@ def there(running: There) -> Iterator[There]:
     cameras.admin("bodies", count=0)
 
 
-@contextmanager
-def opened(host: str, **options: Any) -> Iterator[NatNetTracker]:
-    device = open_tracker(cell(host, "natnet", **options))
-    try:
-        yield device
-    finally:
-        device.close()
+def opened(host: str, **options: Any) -> closing[NatNetTracker]:
+    return closing(open_tracker(cell(host, "natnet", **options)))
 
 
 def right(sample: Any) -> None:

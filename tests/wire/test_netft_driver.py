@@ -4,7 +4,7 @@ import itertools
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -42,13 +42,8 @@ def there(running: There) -> Iterator[There]:
     sensor.admin("overload", force=[0.0] * 6)
 
 
-@contextmanager
-def opened(host: str) -> Iterator[ForceSensorDevice]:
-    sensor = open_force_sensor(force_cell(host))
-    try:
-        yield sensor
-    finally:
-        sensor.close()
+def opened(host: str) -> closing[ForceSensorDevice]:
+    return closing(open_force_sensor(force_cell(host)))
 
 
 def test_readings_are_what_the_sensor_feels(there: There) -> None:
@@ -62,10 +57,8 @@ def test_readings_are_what_the_sensor_feels(there: There) -> None:
         assert std == pytest.approx(noise, rel=5 / np.sqrt(2 * K) + 0.05)
         assert sensor.latest().frames == 1
         report = sensor.report()
-    facts = dict(report.facts)
-    assert (report.name, facts["calibration"], facts["rate"]) == (
-        "SIM NET F/T", "FT31415", "1000 Hz",
-    )  # fmt: skip
+    facts, said = dict(report.facts), ("SIM NET F/T", "FT31415", "1000 Hz")
+    assert (report.name, facts["calibration"], facts["rate"]) == said
     assert report.problems == ()
     assert readers() == []
 

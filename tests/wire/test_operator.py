@@ -1,12 +1,9 @@
 """The person at the terminal and in the simulated cell."""
 
-import fcntl
 import json
 import os
-import pty
 import subprocess
 import sys
-import termios
 import time
 from pathlib import Path
 
@@ -114,131 +111,81 @@ from hilcal.config import CellConfig
 from hilcal.errors import DeviceError
 made = CellConfig.model_validate_json(sys.argv[2])
 person = open_operator(made)
-print(json.dumps(person.report().problems), flush=True)
+print("problems:", *person.report().problems, flush=True)
 loads = {load.name: load for load in made.loads}
 for request in json.loads(sys.argv[1]):
     try:
         person.hang(loads.get(request[0]), request[1])
-        print("done", flush=True)
+        print("hung", flush=True)
     except DeviceError as error:
         print("error:", error, flush=True)
-    except KeyboardInterrupt:
-        print("interrupted", flush=True)
 person.close()
 """
+ASKED = "Enter = done, q = give up:"
 
 
-class Person:
-    """Sits at a pseudo-terminal; stdout is what the program found, stderr what it showed."""
-
-    def __init__(self, *requests, stdin=None):
-        self.master, slave = pty.openpty()
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", PROGRAM, json.dumps(requests), config().model_dump_json()],
-            stdin=slave if stdin is None else stdin,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-            start_new_session=True,
-            preexec_fn=lambda: fcntl.ioctl(slave, termios.TIOCSCTTY, 0),
-        )
-        os.close(slave)
-        self.shown = ""
-
-    def sees(self, words):
-        """Wait until the person sees the words."""
-        os.set_blocking(self.process.stderr.fileno(), False)
-        end = time.monotonic() + 20.0
-        while words not in self.shown:
-            assert time.monotonic() < end, f"never shown: {words!r}\n{self.shown}"
-            self.shown += (self.process.stderr.read() or b"").decode()
-            time.sleep(0.01)
-        at = self.shown.index(words) + len(words)
-        before, self.shown = self.shown[:at], self.shown[at:]
-        return before
-
-    def types(self, text):
-        os.write(self.master, text.encode())
-
-    def found(self):
-        """Wait for the program's end, and return what it found."""
-        os.set_blocking(self.process.stderr.fileno(), True)
-        out, rest = self.process.communicate(timeout=20.0)
-        assert b"Traceback" not in rest
-        assert self.process.returncode == 0
-        problems, *lines = out.decode().splitlines()
-        return json.loads(problems), lines
+def program(*requests):
+    return "-c", PROGRAM, json.dumps(requests), config().model_dump_json()
 
 
-@pytest.fixture
-def sit():
-    people = []
-
-    def make(*requests, **more):
-        people.append(Person(*requests, **more))
-        return people[-1]
-
-    yield make
-    for person in people:
-        person.process.kill()
-        person.process.wait()
-        for stream in (person.process.stdout, person.process.stderr):
-            stream.close()
-        os.close(person.master)
+def sits(*requests):
+    return AtTerminal(command=program(*requests), columns=120)
 
 
-END = "q = give up: "
-
-
-def test_the_person_is_asked_and_presses_enter(sit):
-    person = sit(["5kg", ""], ["pull", "the sensor feels 49.0 N instead"], [None, ""])
-    asked = person.sees(END)
-    assert "Hang the load 5kg at the load point [0.1, -0.03, 0.15] m" in asked
-    assert "5 kg, 49.0 N" in asked
-    person.types("\n")
-    asked = person.sees(END)
-    assert "the sensor feels 49.0 N instead" in asked
-    assert "[80, 10, 0] N, base axes" in asked
-    assert "[0, 6, -3] N·m, base axes" in asked
-    assert "weight" not in asked
-    person.types("\n")
-    assert "Take every load off" in person.sees(END)
-    person.types("\n")
-    assert person.found() == ([], ["done", "done", "done"])
-
-
-def test_what_was_typed_before_the_question_is_no_answer(sit):
-    person = sit(["5kg", ""])
-    person.types("q\n")  # typed ahead, while the program starts
-    person.sees(END)
-    person.types("\n")
-    assert person.found() == ([], ["done"])
-
-
-def test_a_closed_terminal_is_no_answer(sit):
-    person = sit(["5kg", ""])
-    person.sees(END)
-    person.types("\x04")  # end of file
-    assert person.found() == (
-        [],
-        ["error: operator: the terminal was closed before it was answered"],
+def test_the_person_is_asked_and_presses_enter():
+    asked = (["5kg", ""], ["pull", "the sensor feels 49.0 N instead"], [None, ""])
+    told = (
+        ("Hang the load 5kg at the load point [0.1, -0.03, 0.15] m", "5 kg, 49.0 N"),
+        ("feels 49.0 N instead", "[80, 10, 0] N, base axes", "[0, 6, -3] N·m, base axes"),
+        ("Take every load off",),
     )
+    with sits(*asked) as person:
+        for k, words in enumerate(told):
+            person.sees(ASKED, k + 1)
+            question = person.text.rpartition("hung")[2]
+            assert all(part in question for part in words)
+            assert ("weight" in question) == (k == 0)
+            person.types("\n")
+        assert person.ends() == 0
+        assert person.text.count("hung") == 3
+        assert person.lines[0] == "problems:"
 
 
-def test_without_a_terminal_nobody_is_asked(sit):
-    person = sit(["5kg", ""], [None, ""], stdin=subprocess.DEVNULL)
-    problems, lines = person.found()
+def test_what_was_typed_before_the_question_is_no_answer():
+    with sits(["5kg", ""]) as person:
+        person.types("q\n")  # typed ahead, while the program starts
+        person.sees(ASKED)
+        person.types("\n")
+        assert person.ends() == 0
+        assert person.lines[-1] == "hung"
+
+
+def test_a_closed_terminal_is_no_answer():
+    with sits(["5kg", ""]) as person:
+        person.sees(ASKED)
+        person.types("\x04")  # end of file
+        assert person.ends() == 0
+        assert "error: operator: the terminal was closed before it was answered" in person.lines
+
+
+def test_without_a_terminal_nobody_is_asked():
+    done = subprocess.run(
+        [sys.executable, *program(["5kg", ""], [None, ""])],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        check=True,
+    )
     want = "operator: standard input is not a terminal"
-    assert [p[: len(want)] for p in problems] == [want]
+    problems, *lines = done.stdout.splitlines()
+    assert problems.startswith(f"problems: {want}")
     assert [line[: len(want) + 7] for line in lines] == [f"error: {want}"] * 2
 
 
 def test_the_terminal_has_no_options():
     with pytest.raises(InputError, match="has socket"):
         open_terminal(config(operator={"options": {"socket": "x"}}))
-
-
-ASKED = "Enter = done, q = give up:"
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilcal.drivers import checksums
-from hilcal.drivers.checksums import crc_modbus, crc_x25
+from hilcal.drivers.links import crc16 as crc16_of
+from hilcal.drivers.links import crc_modbus, crc_x25
 from hilcal.drivers.simulated.force_server import Ft300
 from tests.support.geocom_cases import crc16
 from tests.support.sim_ur_cases import ClientError, SimulatedUr, Wire, client, start
@@ -160,4 +160,4 @@ def test_check_values_of_the_checksums() -> None:
     """Of "123456789", as the catalogue of parametrised CRC algorithms (reveng) gives them."""
     assert crc_modbus(b"123456789") == bytes.fromhex("374B")
     assert crc_x25(b"123456789") == bytes.fromhex("6E90")
-    assert checksums.crc16(b"123456789") == 0xBB3D
+    assert crc16_of(b"123456789") == 0xBB3D

@@ -1,6 +1,7 @@
 """Several targets, and instruments that agree about where they are."""
 
 import time
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from tests.support.cli_cases import Capsys
 from tests.support.cli_cases import run as command
 from tests.support.living_cell import WEIGHT, Q, config, world_of
 from tests.support.reflector_cases import NAMES, OFFSETS
+from tests.support.timing import wait_until
 
 RADIUS = 0.05
 OPEN = {"geocom": geocom.open_tracker, "emscon": emscon.open_tracker}
@@ -35,24 +37,23 @@ def made(driver):
 def test_the_station_measures_the_reflector_that_it_is_pointed_to(
     driver: str, tmp_path: Path
 ) -> None:
-    with SimulatedCell.start(world_of(made(driver)), made(driver), tmp_path, 3) as cell:
-        tracker = OPEN[driver](cell.config)
-        try:
-            assert isinstance(tracker, PointingTracker)
-            true = np.array(cell.ask("world", "state")["targets"])
-            assert true.shape == (3, 3)
-            for k in (2, 0, 1):
-                tracker.aim(true[k] + [0.004, -0.003, 0.002], RADIUS)
-                assert np.linalg.norm(tracker.measure().value - true[k]) < 5e-4
-            cell.ask("tracker", "hide", targets=[1])
-            with pytest.raises(TargetLostError):
-                tracker.measure()
-            with pytest.raises(TargetLostError, match=r"no target in sight|not found"):
-                tracker.aim(true[1], RADIUS)
-            tracker.aim(true[2], RADIUS)
-            assert np.linalg.norm(tracker.measure().value - true[2]) < 5e-4
-        finally:
-            tracker.close()
+    with (
+        SimulatedCell.start(world_of(made(driver)), made(driver), tmp_path, 3) as cell,
+        closing(OPEN[driver](cell.config)) as tracker,
+    ):
+        assert isinstance(tracker, PointingTracker)
+        true = np.array(cell.ask("world", "state")["targets"])
+        assert true.shape == (3, 3)
+        for k in (2, 0, 1):
+            tracker.aim(true[k] + [0.004, -0.003, 0.002], RADIUS)
+            assert np.linalg.norm(tracker.measure().value - true[k]) < 5e-4
+        cell.ask("tracker", "hide", targets=[1])
+        with pytest.raises(TargetLostError):
+            tracker.measure()
+        with pytest.raises(TargetLostError, match=r"no target in sight|not found"):
+            tracker.aim(true[1], RADIUS)
+        tracker.aim(true[2], RADIUS)
+        assert np.linalg.norm(tracker.measure().value - true[2]) < 5e-4
 
 
 @pytest.mark.slow
@@ -119,33 +120,22 @@ def measured(tracker):
     return mean, np.mean([s.covariance for s in samples], axis=0) / MEASUREMENTS
 
 
-def closed_after(test, *devices):
-    try:
-        return test(*devices)
-    finally:
-        for device in devices:
-            device.close()
-
-
 def chi_square(difference, covariance):
     return float(difference @ np.linalg.solve(covariance, difference))
 
 
 def test_the_tracker_sees_the_sag_under_the_load_that_the_force_sensor_feels(cell):
-    tracker, force = open_tracker(cell.config), open_force_sensor(cell.config)
-    person = open_operator(cell.config)
-    load = cell.config.loads[0]
-
-    def readings(tracker, force, person):
-        out = []
-        for hung in (None, load):
+    person, readings = open_operator(cell.config), []
+    with (
+        closing(open_tracker(cell.config)) as tracker,
+        closing(open_force_sensor(cell.config)) as force,
+    ):
+        for hung in (None, cell.config.loads[0]):
             person.hang(hung, "")
-            state = cell.ask("world", "state")
-            out.append((*measured(tracker), force.average(0.5), np.array(state["sensor_wrench"])))
+            wrench = np.array(cell.ask("world", "state")["sensor_wrench"])
+            readings.append((*measured(tracker), force.average(0.5), wrench))
         person.hang(None, "")
-        return out
-
-    empty, loaded = closed_after(readings, tracker, force, person)
+    empty, loaded = readings
     arm = cell._board.read("arm")
     both = States(
         q=np.tile(arm["q"], (2, 1)),
@@ -168,28 +158,16 @@ def test_the_tracker_sees_the_sag_under_the_load_that_the_force_sensor_feels(cel
 
 def test_the_tracker_sees_the_arm_arrive_where_it_was_sent(cell):
     world = world_of(made_cell(), hysteresis=np.full(6, 5e-5))
-    arm, tracker = open_arm(cell.config), open_tracker(cell.config)
-
-    def visit(arm, tracker):
-        seen = []
+    with closing(open_arm(cell.config)) as arm, closing(open_tracker(cell.config)) as tracker:
         arm.take_control(0.8, np.array([0.01, 0.02, 0.06]))
         for goal in (Q, Q + TURN):
             arm.start_move(goal, 0.5, 0.5)
-            end = time.monotonic() + 15.0
-            while arm.moving():
-                assert time.monotonic() < end
-                time.sleep(0.02)
+            wait_until(lambda: not arm.moving(), "arrived")
             time.sleep(0.1)
             np.testing.assert_allclose(arm.sample().q, goal, atol=1e-4)
-            seen.append((goal, *measured(tracker), cell.ask("world", "state")))
-        return seen
-
-    (goal_a, *_), (goal_b, value, covariance, state) = closed_after(visit, arm, tracker)
-    last = States(
-        q=goal_b[None],
-        wrench=np.zeros((1, 6)),
-        approach=np.sign(goal_b - goal_a)[None],  # the side from which it arrived
-    )
+        (value, covariance), state = measured(tracker), cell.ask("world", "state")
+    side = np.sign(TURN)[None]  # from which it arrived
+    last = States(q=goal[None], wrench=np.zeros((1, 6)), approach=side)
     want = world.sight(last, np.array([state["slip"]])).position[0]
     assert chi_square(value - want, covariance) < 28.0
-    np.testing.assert_allclose(state["encoder"], goal_b, atol=2e-5)
+    np.testing.assert_allclose(state["encoder"], goal, atol=2e-5)

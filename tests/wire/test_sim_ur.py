@@ -2,9 +2,9 @@
 
 import socket
 import struct
-import subprocess
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -28,9 +28,8 @@ from tests.support.sim_ur_cases import (
     SimulatedUr,
     Wire,
     client,
-    command,
-    environment,
     send_script,
+    server,
     start,
 )
 from tests.support.timing import wait_until
@@ -340,22 +339,13 @@ def test_an_address_in_use_is_refused(tmp_path, port):
     with socket.socket() as taken:
         taken.bind((host, port))
         taken.listen()
-        keep = subprocess.Popen(
-            command(tmp_path, host),
-            stdin=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            env=environment(),
-        )
-        try:
-            assert keep.wait(20) == 3
-            text = keep.stderr.read().decode()
-        finally:
-            keep.kill()
-            keep.stdin.close()
-            keep.stderr.close()
-            keep.wait()
-    assert text.count("\n") == 1
-    assert f"{host}:{port} is in use" in text
+        process = server(tmp_path, host)
+        process.start()
+        wait_until(lambda: process.ended, "ended")
+        with pytest.raises(DeviceError, match=rf"exit code 3: .*{host}:{port} is in use"):
+            process.check()
+        process.end()
+    assert process.log.read_text().count("\n") == 1
     assert not (tmp_path / "arm.sock").exists()
 
 
@@ -364,22 +354,14 @@ def test_a_restarted_controller_finds_its_arm_where_it_was(tmp_path):
     sim = start(tmp_path)
     q = sim.admin()["q"]
     sim.close()
-    (tmp_path / "arm.sock").unlink()
-    board = Blackboard(tmp_path / "world.bin")
     q[2] += 0.5
-    board.write("arm", q=q, moving=1.0, arrivals=41)
-    process = subprocess.Popen(
-        command(tmp_path, sim.host), stdin=subprocess.PIPE, env=environment()
-    )
-    try:
-        wait_until((tmp_path / "arm.sock").exists, "started")
+    sim.board.write("arm", q=q, moving=1.0, arrivals=41)
+    with closing(sim):
+        sim.start()
         state = sim.admin()
         assert state["q"] == q
         assert state["arrivals"] == 42
-        assert board.read("arm")["arrivals"] == 42
-    finally:
-        process.stdin.close()
-        process.wait(10)
+        assert sim.board.read("arm")["arrivals"] == 42
 
 
 GOAL = np.array([1.0, -0.5, 0.0, 0.2, 0.0, -1.5])

@@ -33,7 +33,7 @@ from tests.support.paths import ROOT
 from tests.support.rows import first
 from tests.support.sim_ur_cases import SimulatedUr
 from tests.support.sim_ur_cases import start as start_server
-from tests.support.timing import wait_until
+from tests.support.timing import runs, wait_until
 
 DEVICES = ("world", "arm", "tracker", "force")
 SENSOR = {"driver": "ft300", "port": "to be filled in", "origin_m": [0.0, 0.0, 0.04]}
@@ -58,13 +58,6 @@ def answers(host, port):
     with socket.socket() as line:
         line.settimeout(2.0)
         return line.connect_ex((host, port)) == 0
-
-
-def running(pid):
-    try:
-        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
-    except psutil.NoSuchProcess:
-        return False
 
 
 def children():
@@ -113,14 +106,14 @@ def test_two_cells_have_arms_of_their_own(cell, tmp_path):
         other.ask("world", "hang", name="5kg")
         assert cell.ask("world", "state")["load"] is None
         pids = other.processes().values()
-    assert not any(map(running, pids))
-    assert all(map(running, cell.processes().values()))
+    assert not any(map(runs, pids))
+    assert all(map(runs, cell.processes().values()))
 
 
 def test_a_directory_in_use_is_refused(cell):
     with pytest.raises(InputError, match="another one runs in"):
         start(cell.directory)
-    assert all(map(running, cell.processes().values()))
+    assert all(map(runs, cell.processes().values()))
 
 
 @pytest.mark.parametrize("device", first(1, DEVICES))
@@ -128,7 +121,7 @@ def test_a_killed_device_comes_back_at_the_same_place(cell, device):
     before = cell.processes()
     cell.ask("world", "hang", name="5kg")
     cell.kill(device)
-    assert not running(before[device])
+    assert not runs(before[device])
     assert device not in cell.processes()
     with pytest.raises(DeviceError):
         cell.ask(device, "state")
@@ -163,7 +156,7 @@ def test_nothing_is_left_behind(tmp_path):
     pids = list(cell.processes().values())
     with pytest.raises(KeyError, match="the campaign"), cell:
         raise KeyError("the campaign")
-    assert not any(map(running, pids))
+    assert not any(map(runs, pids))
     assert children() == before
     assert psutil.Process().num_threads() == threads
     assert not list(tmp_path.glob("*.sock"))
@@ -192,10 +185,10 @@ def test_the_devices_end_with_a_parent_that_is_killed(tmp_path, how):
     ) as parent:
         pids = [int(word) for word in parent.stdout.readline().split()]
         assert len(pids) == 4
-        assert all(map(running, pids))
+        assert all(map(runs, pids))
         parent.send_signal(how)
         parent.wait(10.0)
-        wait_until(lambda: not any(map(running, pids)), "ended", 15.0)
+        wait_until(lambda: not any(map(runs, pids)), "ended", 15.0)
 
 
 # what goes wrong at the start
@@ -220,7 +213,8 @@ def broken(monkeypatch, module, *arguments):
 
     def replaced(world, made, directory, *more):
         wrong = DeviceProcess("tracker", module, directory, arguments)
-        return {**devices(world, made, directory, *more), "tracker": wrong}
+        made_devices, connected = devices(world, made, directory, *more)
+        return {**made_devices, "tracker": wrong}, connected
 
     monkeypatch.setattr(cell_processes, "_devices", replaced)
 
@@ -357,6 +351,6 @@ def test_the_simulated_arm_listens_on_loopback_alone(arm: SimulatedUr) -> None:
 
 
 def test_admin_lines_are_of_the_user_who_started_them(arm: SimulatedUr) -> None:
-    line = arm.directory / "arm.sock"
+    line = arm.process.socket
     assert stat.S_IMODE(line.stat().st_mode) == 0o600
     assert line.stat().st_uid == os.getuid()

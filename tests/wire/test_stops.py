@@ -14,20 +14,7 @@ import pytest
 
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.run_log import RunLog
-from tests.support.campaign_cases import (
-    BEGUN,
-    STARVED,
-    EndedError,
-    Run,
-    Site,
-    begin,
-    failed,
-    finish,
-    right,
-    stopped_on_its_way,
-    stopped_within,
-    whole,
-)
+from tests.support import campaign_cases as cases
 
 pytestmark = pytest.mark.usefixtures("nothing_goes_on")
 
@@ -43,23 +30,25 @@ SLOW = 0.3  # position of the speed slider meanwhile: the arm moves for about ha
         pytest.param(signal.SIGHUP, marks=pytest.mark.slow),
     ],
 )
-def test_a_plea_to_end_stops_the_arm_first(kind: signal.Signals, cell: Site, path: Path) -> None:
-    run, goal = begin(cell, path, Run.moving)
+def test_a_plea_to_end_stops_the_arm_first(
+    kind: signal.Signals, cell: cases.Site, path: Path
+) -> None:
+    run, goal = cases.begin(cell, path, cases.Run.moving)
     since = time.monotonic()
     if kind == signal.SIGINT:
         run.interrupt()  # a terminal sends it to the whole group
     else:
         run.process.send_signal(kind)
-    assert "interrupted" in failed(run, 130)
-    stopped_on_its_way(cell, since, goal)
-    right(cell, path)
+    assert "interrupted" in cases.failed(run, 130)
+    cases.stopped_on_its_way(cell, since, goal)
+    cases.right(cell, path)
     with CampaignFile.open(path) as campaign:
         assert RunLog(campaign).events()[-1]["kind"] == "interrupted"
 
 
 @pytest.mark.slow
-def test_ctrl_c_twice_in_a_row_stops_it_too(cell: Site, path: Path) -> None:
-    run, goal = begin(cell, path, Run.moving)
+def test_ctrl_c_twice_in_a_row_stops_it_too(cell: cases.Site, path: Path) -> None:
+    run, goal = cases.begin(cell, path, cases.Run.moving)
     since = time.monotonic()
     run.interrupt()
     time.sleep(0.05)
@@ -69,27 +58,27 @@ def test_ctrl_c_twice_in_a_row_stops_it_too(cell: Site, path: Path) -> None:
     assert code in (3, 130, -signal.SIGINT)
     assert words.splitlines()[-1].startswith("error: ")
     assert "Traceback" not in words
-    stopped_on_its_way(cell, since, goal)
+    cases.stopped_on_its_way(cell, since, goal)
     assert run.left_behind() == []
-    right(cell, path)
+    cases.right(cell, path)
 
 
-def _kill_at_random(cell: Site, path: Path, kills: int, seed: int) -> int:
+def _kill_at_random(cell: cases.Site, path: Path, kills: int, seed: int) -> int:
     """Kill one run after the other; returns in how many of them the arm moved."""
     rng = np.random.default_rng(seed)
     killed = moved = starved = 0
     cell.slider(SLOW)
     while killed < kills:
-        run = Run(cell, path)
+        run = cases.Run(cell, path)
         moment = rng.uniform(0.0, LONGEST)
         try:
             if killed % 2 == 1:
-                run.wait_until(lambda run=run: BEGUN in run.words, "a beginning")
+                run.wait_until(lambda run=run: cases.BEGUN in run.words, "a beginning")
             end = time.monotonic() + moment
             run.wait_until(lambda end=end: time.monotonic() >= end, "it was killed")
-        except EndedError as error:
+        except cases.EndedError as error:
             starved += 1
-            if starved > 1 + kills // 20 or not STARVED.search(str(error)):
+            if starved > 1 + kills // 20 or not cases.STARVED.search(str(error)):
                 raise
             continue
         killed += 1
@@ -100,7 +89,7 @@ def _kill_at_random(cell: Site, path: Path, kills: int, seed: int) -> int:
         assert run.left_behind() == []
         assert "error:" not in run.words
         if moves:
-            stopped_within(cell, since)
+            cases.stopped_within(cell, since)
         moved += moves
         if path.exists():
             _sound(path)
@@ -114,58 +103,55 @@ def _sound(path: Path) -> None:
         assert campaign.n_readings == len(log.done()) == len(log.details())
 
 
-@pytest.mark.long
-def test_kill_minus_nine_at_random_moments(cell: Site, tmp_path: Path) -> None:
-    short = cell.shorter(tmp_path, poses=2)
+@pytest.mark.parametrize(
+    ("kills", "poses"),
+    [pytest.param(2, 2, marks=pytest.mark.long), pytest.param(100, 25, marks=pytest.mark.slow)],
+)
+def test_kill_minus_nine_at_random_moments(
+    cell: cases.Site, tmp_path: Path, kills: int, poses: int
+) -> None:
+    long = cell.shorter(tmp_path, poses=poses)
     path = tmp_path / "killed.hilcal"
-    _kill_at_random(short, path, 2, 1)
-    finish(short, path)
+    assert _kill_at_random(long, path, kills, seed=poses) > (10 if kills > 10 else -1)
+    cases.finish(long, path)
 
 
 @pytest.mark.slow
-def test_kill_minus_nine_at_a_hundred_random_moments(cell: Site, tmp_path: Path) -> None:
-    long = cell.shorter(tmp_path, poses=25)
-    path = tmp_path / "killed.hilcal"
-    assert _kill_at_random(long, path, 100, 2) > 10
-    finish(long, path)
-
-
-@pytest.mark.slow
-def test_a_full_disk_stops_the_arm_and_loses_nothing(cell: Site, tmp_path: Path) -> None:
+def test_a_full_disk_stops_the_arm_and_loses_nothing(cell: cases.Site, tmp_path: Path) -> None:
     short = cell.shorter(tmp_path, poses=1)
     path = tmp_path / "full.hilcal"
-    run = Run(short, path, limit=56 << 10)
-    line = failed(run)
+    run = cases.Run(short, path, limit=56 << 10)
+    line = cases.failed(run)
     assert "make room on the disk" in line
     assert not cell.ask("arm", "state")["moving"]
-    finish(short, path)
+    cases.finish(short, path)
 
 
 @pytest.mark.slow
-def test_two_programs_at_one_cell(cell: Site, tmp_path: Path) -> None:
+def test_two_programs_at_one_cell(cell: cases.Site, tmp_path: Path) -> None:
     short = cell.shorter(tmp_path, poses=2)
-    first, _ = begin(short, tmp_path / "first.hilcal", Run.measuring)
-    second = Run(short, tmp_path / "second.hilcal")
-    line = failed(second)
+    first, _ = cases.begin(short, tmp_path / "first.hilcal", cases.Run.measuring)
+    second = cases.Run(short, tmp_path / "second.hilcal")
+    line = cases.failed(second)
     assert line.count("in use by another program") == 2  # both serial ports
     code, words = first.end()
     assert code == 0, words
-    whole(short, tmp_path / "first.hilcal")
+    cases.whole(short, tmp_path / "first.hilcal")
 
 
 @pytest.mark.slow
-def test_two_programs_at_one_campaign_file(cell: Site, tmp_path: Path) -> None:
+def test_two_programs_at_one_campaign_file(cell: cases.Site, tmp_path: Path) -> None:
     short = cell.shorter(tmp_path, poses=1)
     path = tmp_path / "locked.hilcal"
-    run, _ = begin(short, path, Run.measuring)
+    run, _ = cases.begin(short, path, cases.Run.measuring)
     with sqlite3.connect(path, isolation_level=None) as other:
         other.execute("BEGIN EXCLUSIVE")
-        line = failed(run, 2)
+        line = cases.failed(run, 2)
         other.execute("ROLLBACK")
     other.close()
     assert "another program" in line
     assert not cell.ask("arm", "state")["moving"]
-    finish(short, path)
+    cases.finish(short, path)
 
 
 @pytest.mark.slow
@@ -174,12 +160,12 @@ def test_two_programs_at_one_campaign_file(cell: Site, tmp_path: Path) -> None:
     [("deleted", False), ("deleted", True), ("moved", False), ("replaced", False)],
 )
 def test_a_campaign_that_is_gone_is_said_and_found(
-    cell: Site, tmp_path: Path, how: str, interrupted: bool
+    cell: cases.Site, tmp_path: Path, how: str, interrupted: bool
 ) -> None:
     """Deleted, moved or replaced by another program: the arm stops, and nothing is lost."""
     short = cell.shorter(tmp_path, poses=2)
     path = tmp_path / "gone.hilcal"
-    run, _ = begin(short, path, Run.measuring)
+    run, _ = cases.begin(short, path, cases.Run.measuring)
     with CampaignFile.open(path, read_only=True) as campaign:
         measured = campaign.n_readings
     if how == "moved":
@@ -191,7 +177,7 @@ def test_a_campaign_that_is_gone_is_said_and_found(
         path.with_name("other").replace(path)
     if interrupted:
         run.interrupt()
-    line = failed(run)
+    line = cases.failed(run)
     assert "gone.hilcal: deleted, replaced or moved while it was open; all" in line
     assert "then go on with: hilcal run" in line
     assert not cell.ask("arm", "state")["moving"]
@@ -200,9 +186,9 @@ def test_a_campaign_that_is_gone_is_said_and_found(
     with CampaignFile.open(place) as campaign:
         assert campaign.n_readings >= measured > 0
     place.replace(path)  # as the line says
-    finish(short, path)
+    cases.finish(short, path)
 
 
 @pytest.mark.slow
-def test_the_stopped_campaign_has_every_reading_exactly_once(cell: Site, path: Path) -> None:
-    finish(cell, path)
+def test_the_stopped_campaign_has_every_reading_exactly_once(cell: cases.Site, path: Path) -> None:
+    cases.finish(cell, path)

@@ -1,7 +1,5 @@
 """The UR driver on a simulated controller: connecting, state, payload, motion, stop, end."""
 
-import socket
-import threading
 import time
 from contextlib import closing
 
@@ -303,18 +301,5 @@ def test_mute_dashboard(sim):
 
 @pytest.mark.parametrize("says", [b"", b"\x00\x05V\x01", b"SSH-2.0-OpenSSH_9\r\n", b"\x00\x01V"])
 def test_something_else_on_the_port(says):
-    host = free_host()
-    with socket.socket() as server:
-        server.bind((host, 30004))
-        server.listen(4)
-
-        def answer():
-            line, _ = server.accept()
-            with line:
-                line.sendall(says)
-                line.recv(100)
-
-        thread = threading.Thread(target=answer)
-        thread.start()
+    with cases.server(30004, lambda asked: says) as (host, _):
         fails_to_open(host)
-        thread.join()

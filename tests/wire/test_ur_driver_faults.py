@@ -14,12 +14,12 @@ import pytest
 
 from hilcal.drivers.simulated.cell_processes import free_host
 from hilcal.drivers.ur_link import supervision
+from hilcal.drivers.ur_link.worker import environment
 from hilcal.errors import DeviceError
 from tests.support import ur_driver_cases as cases
 from tests.support.paths import ROOT
 from tests.support.rows import first
-from tests.support.sim_ur_cases import environment
-from tests.support.timing import wait_until
+from tests.support.timing import runs, wait_until
 from tests.support.ur_driver_cases import arm, sim
 
 __all__ = ["arm", "sim"]  # fixtures
@@ -222,10 +222,7 @@ def test_interrupt_from_the_terminal_does_not_end_the_children(arm, sim):
 def program(code, host):
     """Another program that uses the arm at a host."""
     parent = subprocess.Popen(
-        [sys.executable, "-c", code, host],
-        stdout=subprocess.PIPE,
-        cwd=ROOT,
-        env=environment(),
+        [sys.executable, "-c", code, host], stdout=subprocess.PIPE, cwd=ROOT, env=environment()
     )
     try:
         yield parent
@@ -233,13 +230,6 @@ def program(code, host):
         parent.kill()
         parent.wait()
         parent.stdout.close()
-
-
-def _runs(pid):
-    try:
-        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
-    except psutil.NoSuchProcess:
-        return False
 
 
 MOVING = """
@@ -267,7 +257,7 @@ def test_kill_9_of_the_program_stops_the_arm_and_leaves_no_process(sim):
         state = sim.wait("moving", False)
         assert state["rest_ns"] - killed < cases.STOP_NS
         parent.wait()
-        wait_until(lambda: not any(map(_runs, pids)), "ended: the children", 5.0)
+        wait_until(lambda: not any(map(runs, pids)), "ended: the children", 5.0)
     cases.controlled(sim).close()  # and the next program takes over
 
 
@@ -299,7 +289,7 @@ HANGING = """
 import sys, threading
 from hilcal.drivers.ur_link.worker import Worker
 arguments = (sys.argv[1], "125.0", "timestamp")
-start = lambda: Worker("hilcal.drivers.ur_link.receive_worker", arguments, 60.0)
+start = lambda: Worker("receive", arguments, 60.0)
 thread = threading.Thread(target=start)
 thread.start()
 thread.join()
@@ -318,4 +308,4 @@ def test_child_that_hangs_in_the_client_library_ends_with_the_program():
                 (child,) = psutil.Process(parent.pid).children()
                 parent.kill()
                 parent.wait()
-                wait_until(lambda: not _runs(child.pid), "ended: the child", 5.0)
+                wait_until(lambda: not runs(child.pid), "ended: the child", 5.0)

@@ -4,10 +4,8 @@ import os
 import signal
 import socket
 import struct
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -22,11 +20,11 @@ from hilcal.drivers.simulated.ur_state import line
 from hilcal.drivers.ur import open_arm
 from hilcal.drivers.ur_link import states
 from hilcal.drivers.ur_link.control import MARGIN_S, MotionInProgress, deceleration, program_ended
-from hilcal.drivers.ur_link.lines import LinkError
-from hilcal.drivers.ur_link.probe import controller
+from hilcal.drivers.ur_link.probe import LinkError, controller
 from hilcal.drivers.ur_link.reading import (
     OUTPUTS,
     PRIMARY_PORT,
+    TORQUE,
     N,
     ReadingError,
     read,
@@ -34,7 +32,6 @@ from hilcal.drivers.ur_link.reading import (
     settled_rate,
 )
 from hilcal.drivers.ur_link.supervision import RobotApi
-from hilcal.drivers.ur_link.torque_reader import TORQUE
 from hilcal.drivers.ur_link.worker import Worker, WorkerError
 from hilcal.identification.torques import check_torques
 from hilcal.measuring.route import duration
@@ -45,6 +42,7 @@ from tests.support import ur_driver_cases as cases
 from tests.support.cli_cases import ok
 from tests.support.factory_cases import write
 from tests.support.living_cell import config, world_of
+from tests.support.ur_driver_cases import server
 
 FIELDS = {
     **{name: [0.1 * k for k in range(6)] for name in OUTPUTS},
@@ -132,7 +130,7 @@ def test_a_pause_that_the_watchdog_bears_does_not_hide_another_program():
 
 def test_worker_that_cannot_start_says_so():
     with pytest.raises(WorkerError, match="exit code 1"):
-        Worker("hilcal.drivers.ur_link.no_such_worker", (), 10.0)
+        Worker("no such kind", (), 10.0)
 
 
 def test_a_moment_without_packets_is_no_slow_line() -> None:
@@ -168,7 +166,7 @@ def test_versions_that_tell_torques(version: tuple[int, int, int, int], told: bo
 
 def test_an_older_controller_is_read_without(tmp_path) -> None:
     with closing(cases.start(tmp_path)) as sim:
-        assert controller(sim.host, ("timestamp", TORQUE), 2.0).outputs == ("timestamp",)
+        assert controller(sim.host, ("timestamp", TORQUE), 2.0)[1] == ("timestamp",)
         arm = open_arm(cases.config(sim.host))
         assert arm.sample().torque is None
         assert len(arm.workers) == 1
@@ -245,37 +243,6 @@ JSON = b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\nContent-Length: %d
 
 def answer(body: bytes) -> bytes:
     return JSON % (len(body), body)
-
-
-@contextmanager
-def server(port: int, says: Callable[[bytes], bytes]) -> Iterator[tuple[str, list[bytes]]]:
-    """Something that listens on a port, and what it was asked, one connection after the other."""
-    host, asked = free_host(), []
-    with socket.socket() as door:
-        door.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        door.bind((host, port))
-        door.listen(8)
-
-        def serve() -> None:
-            while True:
-                try:
-                    line, _ = door.accept()
-                except OSError:
-                    return
-                with line:
-                    line.settimeout(0.3)
-                    data = b""
-                    with suppress(TimeoutError):  # an order's body comes in a packet of its own
-                        while not data or (data.startswith(b"PUT") and not data.endswith(b"}")):
-                            data += line.recv(65536)
-                    asked.append(data)
-                    line.sendall(says(asked[-1]))
-
-        thread = threading.Thread(target=serve, daemon=True)
-        thread.start()
-        yield host, asked
-        door.shutdown(socket.SHUT_RDWR)
-    thread.join(2.0)
 
 
 def test_what_is_asked_goes_over_the_wire_as_the_maker_says() -> None:

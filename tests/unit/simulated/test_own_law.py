@@ -7,9 +7,14 @@ import pytest
 
 from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.drivers.simulated.injected_effects import ALL_EFFECTS, nothing_hidden
-from hilcal.drivers.simulated.own_law import own_law, own_names
-from hilcal.drivers.simulated.rehearsal import case_of_plan, check_choice, read_plan
+from hilcal.drivers.simulated.injected_effects import nothing_hidden
+from hilcal.drivers.simulated.own_law import own_law
+from hilcal.drivers.simulated.rehearsal import (
+    case_of_plan,
+    check_choice,
+    own_choices,
+    read_plan,
+)
 from hilcal.drivers.simulated.world_server import read_world, write_world
 from hilcal.effects.catalogue import installed
 from hilcal.errors import InputError
@@ -96,8 +101,8 @@ def test_what_the_simulated_cell_does_not_measure_is_named(file):
 
 
 def test_only_effects_of_ones_own_are_added_to_the_choices(law):
-    assert own_names(law.catalogue, ALL_EFFECTS) == ("mine",)
-    assert own_names(installed(), ALL_EFFECTS) == ()  # all that ship have mechanics of their own
+    assert own_choices(law.catalogue) == ("mine",)
+    assert own_choices(installed()) == ()  # all that ship have mechanics of their own
     check_choice("mine", law.catalogue)
     refusal("hide 'mine'", check_choice, "mine", installed())
     refusal(r"hide 'mime' \(did you mean \"mine\"\?\)", check_choice, "mime", law.catalogue)

@@ -76,18 +76,6 @@ def test_a_resting_arm_is_not_computed_anew_but_its_encoders_are_read(cell, tmp_
     assert second["time"] > first["time"]
 
 
-def test_a_drifting_tracker_moves_the_target_while_the_arm_rests(tmp_path):
-    rate = np.array([1e-3, -2e-3, 3e-3, 1e-3, 0.0, 0.0])
-    cell = life(tmp_path, tracker_drift=rate)
-    first = cell.rest_at(Q)
-    time.sleep(0.02)
-    second = cell.look()
-    assert second["time"] - first["time"] >= 0.02 * 20.0
-    want = cell.world.sight(states(Q, np.zeros(6), float(second["time"])), slip_of(cell))
-    assert same(second["target"], want.position[0])
-    assert not same(second["target"], first["target"])
-
-
 def slip_of(cell):
     return cell.living.slip(cell.arrivals)[None]
 
@@ -196,17 +184,20 @@ def test_pushing_adds_to_the_load(cell, tmp_path):
     assert same(cell.board.read("truth")["flange"], want.flange[0])
 
 
-def test_what_the_arm_does_not_bear_is_refused_and_changes_nothing(tmp_path):
+def yielding(tmp_path, *places):
+    """A cell whose joint 2 bears the torque of the first state, but not that of the second."""
     made = config()
     world = world_of(made)
-    lift = [
-        abs(world.drive_torque(states(Q, wrench, 0.0))[0, 1]) for wrench in (np.zeros(6), WEIGHT)
-    ]
+    lift = [abs(world.drive_torque(states(*place, 0.0))[0, 1]) for place in places]
     assert lift[0] < 0.9 * lift[1]
-    # c + 3 s tau² is 0 between the two torques: the gear has no equilibrium under the load
+    # c + 3 s tau² is 0 between the two torques: the gear has no equilibrium beyond
     hidden = np.zeros(6)
     hidden[1] = -world.physics.joint_compliance[1] / 3.0 / np.mean(lift) ** 2
-    cell = Life(world_of(made, joint_stiffening=hidden), made, tmp_path)
+    return Life(world_of(made, joint_stiffening=hidden), made, tmp_path)
+
+
+def test_what_the_arm_does_not_bear_is_refused_and_changes_nothing(tmp_path):
+    cell = yielding(tmp_path, (Q, np.zeros(6)), (Q, WEIGHT))
     before = cell.rest_at(Q)
     refusal("spring back", cell.living.hang, "5kg")
     refusal("spring back", cell.living.push, WEIGHT.tolist())
@@ -219,13 +210,8 @@ def test_what_the_arm_does_not_bear_is_refused_and_changes_nothing(tmp_path):
 
 
 def test_a_pose_without_equilibrium_is_logged_and_the_world_lives_on(tmp_path):
-    made = config()
-    world = world_of(made)
     upright = np.array([0.0, -np.pi / 2, 0.0, 0.0, 0.0, 0.0])
-    lift = [abs(world.drive_torque(states(q, np.zeros(6), 0.0))[0, 1]) for q in (upright, 0 * Q)]
-    hidden = np.zeros(6)
-    hidden[1] = -world.physics.joint_compliance[1] / 3.0 / np.mean(lift) ** 2
-    cell = Life(world_of(made, joint_stiffening=hidden), made, tmp_path)
+    cell = yielding(tmp_path, (upright, np.zeros(6)), (0 * Q, np.zeros(6)))
     before = cell.rest_at(upright)
     stretched = cell.rest_at(0 * Q)
     assert same(stretched["flange"], before["flange"])
@@ -265,26 +251,10 @@ def test_an_arm_of_seven_joints_is_refused(tmp_path):
     made = config()
     usual = world_of(made)
     arm = arm_of(ODD)
-    odd = World(
-        cell=replace(usual.cell, arm=arm),
-        physics=Truth.rigid(arm),
-        registration=np.eye(4),
-        station=np.eye(4),
-        noise=usual.noise,
-        joint_std=np.zeros(7),
-    )
+    cell, places = replace(usual.cell, arm=arm), (np.eye(4), np.eye(4))
+    odd = World(cell, Truth.rigid(arm), *places, usual.noise, np.zeros(7))
     board = Blackboard.create(tmp_path / "world.bin", 1.0)
     refusal("arm odd has 7 joints, the shared world one of 6", WorldState, odd, made, board, 1)
-
-
-MOUNTED = {
-    "force_sensor": {
-        "driver": "ft300",
-        "port": "x",
-        "origin_m": [0.01, -0.02, 0.045],
-        "rotvec_rad": [0.3, -0.9, 2.1],
-    }
-}
 
 
 def state_of(cell, truth, wrench):
@@ -297,52 +267,44 @@ def state_of(cell, truth, wrench):
     )
 
 
-def slip_at(cell):
-    return cell.living.slip(cell.arrivals)[None]
-
-
 def test_every_effect_shows_in_the_truth(tmp_path):
-    cell = life(tmp_path, sections=MOUNTED, **everything(np.random.default_rng(2)), **further(3))
+    cell = life(tmp_path, sections=SENSOR, **everything(np.random.default_rng(2)), **further(3))
     cell.living.hang("pull")
     truth = cell.rest_at(Q)
-    want = cell.world.sight(state_of(cell, truth, PULL), slip_at(cell))
+    want = cell.world.sight(state_of(cell, truth, PULL), slip_of(cell))
     assert same(truth["target"], want.position[0])
     for effect in further(3):
         gone = np.zeros_like(getattr(cell.world.physics, effect))
         less = replace(cell.world, physics=cell.world.physics.with_effect(effect, gone))
-        seen = less.sight(state_of(cell, truth, PULL), slip_at(cell)).position[0]
+        seen = less.sight(state_of(cell, truth, PULL), slip_of(cell)).position[0]
         # Creep has only begun; equilibria are exact to 1e-12 rad.
         assert np.linalg.norm(seen - truth["target"]) > 1e-9, effect
 
 
-@pytest.mark.parametrize("effect", ["creep", "thermal_growth", "thermal_joint_drift"])
+SLOW = {
+    "tracker_drift": np.array([1e-3, -2e-3, 3e-3, 1e-3, 0.0, 0.0]),
+    **{e: 100.0 * further(3)[e] for e in ("creep", "thermal_growth", "thermal_joint_drift")},
+}
+
+
+@pytest.mark.parametrize("effect", SLOW)
 def test_what_goes_on_with_time_or_warmth_moves_a_resting_arm(tmp_path, effect):
-    cell = life(tmp_path, **{effect: 100.0 * further(3)[effect]})
+    cell = life(tmp_path, **{effect: SLOW[effect]})
     cell.living.hang("5kg")
     first = cell.rest_at(Q)
     time.sleep(0.02)
     second = cell.look()
     assert second["time"] - first["time"] >= 0.02 * 20.0
-    want = cell.world.sight(state_of(cell, second, WEIGHT), slip_at(cell))
+    want = cell.world.sight(state_of(cell, second, WEIGHT), slip_of(cell))
     assert same(second["target"], want.position[0])
     assert not same(second["target"], first["target"])
 
 
-def test_the_joints_are_as_warm_as_the_world_takes_them_to_be(tmp_path):
-    cell = life(tmp_path, thermal_joint_drift=np.full(6, 1e-4))
-    truth = cell.rest_at(Q)
-    told = replace(
-        states(Q, np.zeros(6), float(truth["time"])),
-        joint_temperature=truth["joint_temperature"][None],
-    )
-    assert same(truth["target"], cell.world.sight(told, slip_at(cell)).position[0])
-
-
 def test_a_sensor_that_misreads_says_what_hangs_while_the_arm_bears_another_load(tmp_path):
     bias = np.array([5.0, -4.0, 6.0, 0.5, 0.3, -0.2])
-    wrong = life(tmp_path, sections=MOUNTED, wrench_bias=bias)
+    wrong = life(tmp_path, sections=SENSOR, wrench_bias=bias)
     (tmp_path / "right").mkdir()
-    right = life(tmp_path / "right", sections=MOUNTED)
+    right = life(tmp_path / "right", sections=SENSOR)
     for cell in (wrong, right):
         cell.rest_at(Q)
         cell.living.hang("5kg")
