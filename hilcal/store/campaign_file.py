@@ -58,7 +58,6 @@ class CampaignFile:
     """
 
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
-        """Take an open connection; use `create` or `open` instead."""
         self.path, self.connection = path, connection
         self._identity = identity(path)
         self._new_place: Path | None = None
@@ -86,7 +85,7 @@ class CampaignFile:
         path = Path(path)
         meta = {"config": config_json, "base_dir": base_dir, "source": source}
         meta |= {"created": utc_now(), "program_version": __version__, **typed_now()}
-        meta |= {**robot_file_of(config_json, base_dir), **(more or {})}
+        meta |= robot_file_of(config_json, base_dir) | dict(more or {})
         with new_campaign(path, meta, overwrite) as connection:
             if readings is not None:
                 cls(path, connection).insert(readings)
@@ -130,7 +129,6 @@ class CampaignFile:
         self.connection.close()
 
     def __enter__(self) -> Self:
-        """Return the campaign."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -163,6 +161,13 @@ class CampaignFile:
             self.check_place()  # the cause
             raise
         self.check_place()
+
+    def numbered(self, key: str, first: int = 1) -> list[str]:
+        """Return the texts about the campaign under a key with successive numbers."""
+        with schema.sqlite_errors(self.path):
+            meta = self._read_meta()
+        keys = itertools.takewhile(meta.__contains__, map(key.format, itertools.count(first)))
+        return [meta[k] for k in keys]
 
     def check_place(self) -> None:
         """Raise a MovedFileError where the path does not lead to the open file."""
@@ -206,7 +211,7 @@ class CampaignFile:
         return content_hash(self.readings()[:count])
 
     def append_revision(self, record: RevisionRecord) -> int:
-        """Append a model revision; return its new number, 1, 2, ...."""
+        """Append a model revision; return its number, from 1."""
         with self.transaction():
             return self.insert_revision(record)
 
@@ -244,14 +249,9 @@ class CampaignFile:
 
     def acceptances(self) -> list[int | None]:
         """Return all acceptances, in order."""
-        with schema.sqlite_errors(self.path):
-            meta = self._read_meta()
-        numbers: list[int | None] = []
-        while (text := meta.get(ACCEPTED.format(len(numbers) + 1))) is not None:
-            number = rows.stored_json(self.path, text)
-            if number is not None and not isinstance(number, int):
-                raise self._damaged("an acceptance")
-            numbers.append(number)
+        numbers = [rows.stored_json(self.path, text) for text in self.numbered(ACCEPTED)]
+        if any(not isinstance(n, int | None) for n in numbers):
+            raise self._damaged("an acceptance")
         return numbers
 
     def revisions(self) -> tuple[RevisionRecord, ...]:
