@@ -294,7 +294,11 @@ def _frames(
         for k in range(len(turning)):
             g = se3.inverse(old[k]) @ left[-1] @ drawn[k]
             if k > 0 and not _near(g):
-                left[-1], zeros = _with_zero(old[k], left[-1], drawn[k]), zeros + 1
+                # another zero: H turns about z until the next axis agrees (parallel: its place)
+                column = 3 if np.hypot(*old[k][:2, 2]) <= NEAR_RAD else 2
+                of_arm, of_file = old[k][:2, column], (left[-1] @ drawn[k])[:2, column]
+                turn = np.arctan2(*of_arm[::-1]) - np.arctan2(*of_file[::-1])
+                left[-1], zeros = se3.screw(2, float(turn)) @ left[-1], zeros + 1
                 g = se3.inverse(old[k]) @ left[-1] @ drawn[k]
             if not _near(g):
                 misses.append((k, *_off(g)))
@@ -326,16 +330,6 @@ def _near(g: Floats) -> bool:
 def _off(g: Floats) -> tuple[float, float]:
     """Distance and angle between the z axes of a frame and its reference, m and rad."""
     return float(np.hypot(*g[:2, 3])), float(np.arctan2(np.hypot(g[0, 2], g[1, 2]), g[2, 2]))
-
-
-def _with_zero(link: Floats, h: Floats, drawn: Floats) -> Floats:
-    """Return H with the turn about z that aligns the next axis of the file with that of the arm."""
-    of_file = h @ drawn
-    parallel = np.hypot(link[0, 2], link[1, 2]) <= NEAR_RAD
-    column = 3 if parallel else 2  # parallel axes: by their position
-    turn = np.arctan2(link[1, column], link[0, column])
-    turn -= np.arctan2(of_file[1, column], of_file[0, column])
-    return se3.screw(2, float(turn)) @ h
 
 
 def edits_of(steps: Sequence[ChainStep], places: Sequence[Floats]) -> tuple[Edits, list[str]]:

@@ -37,7 +37,6 @@ class SdfModel:
     """Links, joints and frames of a model, and its chain from a base link to a tip link."""
 
     def __init__(self, document: Document, node: Node):
-        """Collect the frames of a model; `sdf_chain` sets the chain."""
         self.document = document
         self.steps: list[ChainStep] = []
         self.chain: list[Node] = []
@@ -139,8 +138,13 @@ class SdfModel:
             node = self.nodes[name]
             pose = se3.inverse(self.place(self.reference(name), new)) @ frame
             if moved(self.written_pose(name), pose) > LEFT:
-                xyz, rpy = origin_of(pose)
-                out.append(_pose_edit(node, f"{numbers(xyz)} {numbers(rpy)}"))
+                element, text = node.first("pose"), " ".join(map(numbers, origin_of(pose)))
+                if element is None:
+                    out.append((Span(0, node.end, node.end), f"<pose>{text}</pose>"))
+                elif element.close < element.end:  # <pose/>
+                    out.append((Span(0, element.begin, element.end), f"<pose>{text}</pose>"))
+                else:
+                    out.append((Span(0, element.end, element.close), text))
                 names.append(name)
             along, axis_frame = self.axis(node)
             if along is not None and axis_frame:  # an axis in another frame turns with its joint
@@ -165,15 +169,6 @@ def sdf_chain(document: Document, base: str | None, tip: str | None) -> SdfModel
         raise InputError(f"{document.name}: no chain from '{base}' down to its tip")
     model.steps = [_step(model, j) for j in model.chain]
     return model
-
-
-def _pose_edit(node: Node, text: str) -> tuple[Span, str]:
-    """Edit that sets the pose of a link or joint, or adds it."""
-    pose = node.first("pose")
-    if pose is None or pose.close < pose.end:  # <pose/>
-        begin = node.end if pose is None else pose.begin
-        return Span(0, begin, begin if pose is None else pose.end), f"<pose>{text}</pose>"
-    return Span(0, pose.end, pose.close), text
 
 
 def _step(model: SdfModel, joint: Node) -> ChainStep:

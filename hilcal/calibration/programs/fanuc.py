@@ -146,7 +146,7 @@ class _FanucReader(ProgramReader):
         if isinstance(stated, str):
             return replace(bare, left=stated)
         base = self.controller.pose("bases", frame[1], f"frame {frame[1]}")
-        return bare.at_pose(numbers, values, tool_pose, base, flags=stated)
+        return replace(bare, flags=stated).at_pose(numbers, values, tool_pose, base)
 
     def _flags(self, config: re.Match[str]) -> tuple[int, ...] | str:
         """Flags of a CONFIG, or why they are unknown."""

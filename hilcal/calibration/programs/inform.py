@@ -141,4 +141,4 @@ class _InformReader(ProgramReader):
             frame = "no ///USER"
         stated = [int(n) for n in re.findall(r"\d+", head.get("RCONF", ""))][:JOINTS]
         flags_ = tuple(stated) if len(stated) == JOINTS else (UNSTATED,) * JOINTS
-        return bare.at_pose(spans, values, tool, frame, flags=flags_)
+        return replace(bare, flags=flags_).at_pose(spans, values, tool, frame)

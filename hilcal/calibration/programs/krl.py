@@ -16,7 +16,7 @@ Integrators*, chapters 10 to 12; *Expert Programming*, status and turn.
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -115,8 +115,7 @@ def read_krl(path: Path, frames_file: Path | None, tool: Floats | None) -> Progr
     if len(set(encodings)) > 1:
         texts = tuple(p.read_bytes().decode(encoding) for p in paths)
     config = frames_file is not None and frames_file.suffix.lower() == ".dat"
-    controller = controller_frames(None if config else frames_file, KRL, tool)
-    reader = _KrlReader(path, controller)
+    reader = _KrlReader(path, controller_frames(None if config else frames_file, KRL, tool))
     reader.text, reader.encoding = texts[0], encoding
     reader.files = [p.name for p in paths]
     for k, text in enumerate(texts):
@@ -185,14 +184,6 @@ class _State:
         )
 
 
-@dataclass(slots=True, eq=False)
-class _Block:
-    """An open block: the state at its beginning, and at the ends of its branches."""
-
-    begin: _State
-    ends: list[_State] = field(default_factory=list)
-
-
 class _KrlReader(ProgramReader):
     """Reader of the statements of a `.src` file, in the order of its text."""
 
@@ -214,22 +205,21 @@ class _KrlReader(ProgramReader):
         """Read the statements of the first text."""
         lines = list(_code(texts[0]))
         self.used = self._used_otherwise(lines)
-        blocks: list[_Block] = []
+        blocks: list[list[_State]] = []  # states at the beginning and after branches of open blocks
         for k, (line, offset, code) in enumerate(lines):
             word = _word(code)
             if word in ("DEF", "DEFFCT", "GLOBAL") and re.search(r"\bDEF(FCT)?\b", code, re.I):
                 self.state, blocks = _State(), []
             elif word in _ELSE and blocks:
-                blocks[-1].ends.append(self.state)
-                self.state = blocks[-1].begin
+                blocks[-1].append(self.state)
+                self.state = blocks[-1][0]
             elif word in _CLOSES and blocks:
-                block = blocks.pop()
-                if not all(s.same(self.state) for s in (*block.ends, block.begin)):
+                if not all(s.same(self.state) for s in blocks.pop()):
                     self._forget(f"the block that ends in line {line} sets them on some ways only")
             elif word in _OPENS:
                 if word in _LOOPS and _sets(lines[k + 1 :]):
                     self._forget(f"the loop of line {line} sets them later")
-                blocks.append(_Block(self.state))
+                blocks.append([self.state])
             elif word and re.fullmatch(r"\s*\w+\s*:\s*", code):
                 self._forget(f"line {line} is a label, which may be reached from elsewhere")
             else:
@@ -370,8 +360,8 @@ class _KrlReader(ProgramReader):
         status = [UNSTATED] * 2 if s is None else [int(s[0]) & OVERHEAD, int(s[0]) // ELBOW & 1]
         turn = [UNSTATED] * JOINTS if t is None else [int(t[0]) >> k & 1 for k in range(JOINTS)]
         config = () if t is None else value.spans([TURN])
-        stated = {"flags": (*status, *turn), "config": config, "obeyed": obeyed}
-        return bare.at_pose(spans, numbers, tool, self.state.base, **stated)
+        bare = replace(bare, flags=(*status, *turn), config=config, obeyed=obeyed)
+        return bare.at_pose(spans, numbers, tool, self.state.base)
 
     def _used_otherwise(self, lines: Sequence[tuple[int, int, str]]) -> dict[str, int]:
         """Names of points that statements other than motions use, with their lines."""

@@ -260,7 +260,7 @@ class _RapidReader(ProgramReader):
                 name = f"{text} (line {line_of(self.text, place)})"
                 new = self._value(value, place, name, kind == "jointtarget")
         if not new.left and not joints:
-            new = new.at_pose(new.numbers, new.values, *frames, obeyed=obeyed)
+            new = replace(new, obeyed=obeyed).at_pose(new.numbers, new.values, *frames)
         self.record(key, new, line)
 
     def _value(self, text: str, offset: int, name: str, joints: bool) -> ProgramPoint:
