@@ -97,12 +97,6 @@ def invert_nominal(
     return invert(arm, lambda joints, _: nominal_pose(arm, tool, joints), q, *goal)
 
 
-def singular(arm: Arm, chain: Chain, position: Floats) -> Bools:
-    """(N,) whether poses with the tool at points (N, 3) are singular."""
-    s = np.linalg.svd(_jacobian(arm, chain, position), compute_uv=False)
-    return np.asarray(s[:, -1] < LEAST_SINGULAR * s[:, 0])
-
-
 def _jacobian(arm: Arm, chain: Chain, position: Floats) -> Floats:
     """(N, 6, n) derivative of displacement/reach and rotation by the controller's joint values."""
     jacobian = joint_jacobian(chain, position)
@@ -219,10 +213,8 @@ class Compensation(Brief):
     @property
     def inside(self) -> Bools:
         """(N,) whether the point lies within the measured ranges."""
-        out = np.ones(len(self.q), dtype=bool)
-        for o in self.after.outside:
-            out &= ~o.points
-        return out
+        nowhere = np.zeros(len(self.q), dtype=bool)
+        return ~np.any([nowhere, *(o.points for o in self.after.outside)], axis=0)
 
     @cached_property
     def before(self) -> ToolPoses:
@@ -250,16 +242,17 @@ class Compensation(Brief):
     def singular(self) -> Bools:
         """(N,) whether the pose is singular."""
         arm = self._tool.model.cell.arm
-        return singular(arm, evaluate(arm, self.q), self.after.position)
+        jacobian = _jacobian(arm, evaluate(arm, self.q), self.after.position)
+        s = np.linalg.svd(jacobian, compute_uv=False)
+        return np.asarray(s[:, -1] < LEAST_SINGULAR * s[:, 0])
 
     @property
     def turned_on(self) -> tuple[Outside, ...]:
         """Joint angles that lie within the measured ranges only after whole turns."""
         by_angle = self._calibration.measured.turned_on(replace(self._states, q=self.q))
-        outside = {o.of.variable: o.points for o in self.after.outside}
-        nowhere = np.zeros(len(self.q), dtype=np.bool_)
+        inside: dict[str, Bools | bool] = {o.of.variable: ~o.points for o in self.after.outside}
         remaining = [
-            replace(o, points=o.points & ~outside.get(o.of.variable, nowhere)) for o in by_angle
+            replace(o, points=o.points & inside.get(o.of.variable, True)) for o in by_angle
         ]
         return tuple(o for o in remaining if o.points.any())
 

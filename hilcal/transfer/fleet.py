@@ -12,22 +12,10 @@ from hilcal.engine.engine import Advance, Engine
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.carried import SAME_M
 from hilcal.readings.same_readings import shared
-from hilcal.transfer.members import (
-    Entry,
-    Failure,
-    Member,
-    entries,
-    member_of,
-    prints_of,
-)
+from hilcal.transfer.members import Entry, Failure, Member, entries, member_of, prints_of
 from hilcal.transfer.pooled import Pooled, effects_seen, pooled
 
 Counting = Callable[[str, int], AbstractContextManager[Advance]]
-
-
-def _silent(label: str, total: int) -> AbstractContextManager[Advance]:
-    """Show no progress."""
-    return nullcontext(lambda step: None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +33,11 @@ class Fleet:
         return fragment(fleet_report(self))
 
 
-def fleet(directory: Path, engine: Engine, counting: Counting = _silent) -> Fleet:
+def fleet(
+    directory: Path,
+    engine: Engine,
+    counting: Counting = lambda label, total: nullcontext(lambda step: None),
+) -> Fleet:
     """Fit and diagnose the campaigns in a directory and below it, and pool them by type of arm.
 
     Nothing is stored in the campaigns. Campaigns that fail are listed with the reason, and so are

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from operator import attrgetter
 
 import numpy as np
 from scipy.stats import norm
@@ -142,7 +142,10 @@ def pooled(members: Sequence[Member], diagnosed: Sequence[DiagnosedEffect]) -> P
         raise CannotAnswerError(
             f"no parameter of an arm of the type {first.arm} is determined by campaigns of two arms"
         )
-    scales, units = _by_name(members, "scale"), _by_name(members, "units")
+    scales, units = (
+        {k: v for m in members for k, v in zip(m.posterior.names, of(m.posterior), strict=True)}
+        for of in (attrgetter("scale"), attrgetter("units"))
+    )
     scale = np.array([scales[name] for name in names])
     estimates = _estimates(members, arms, names, scale)
     h, unlike_arms = hierarchy(estimates)
@@ -204,14 +207,6 @@ def _common(members: Sequence[Member]) -> tuple[tuple[PosteriorEffect, ...], tup
     names = tuple(name for name in order if len(arms.get(name, ())) > 1)
     used = {name.split(".", 1)[0] for name in names}
     return tuple(e for e in effects if e.name in used), names
-
-
-def _by_name(members: Sequence[Member], field: str) -> dict[str, Any]:
-    """Values of a field of the posteriors, by the names of the parameters."""
-    values: dict[str, Any] = {}
-    for m in members:
-        values |= dict(zip(m.posterior.names, getattr(m.posterior, field), strict=True))
-    return values
 
 
 def _estimates(
