@@ -16,8 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from hilcal.calibration.points import Points, solutions
-from hilcal.calibration.programs.fanuc import read_ls
-from hilcal.calibration.programs.inform import read_jbi
+from hilcal.calibration.programs.fanuc_inform import read_jbi, read_ls
 from hilcal.calibration.programs.krl import read_krl
 from hilcal.calibration.programs.program import JOINTS, UNSTATED, Language, Program, ProgramPoint
 from hilcal.calibration.programs.rapid import read_rapid

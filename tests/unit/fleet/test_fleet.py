@@ -14,9 +14,8 @@ from hilcal.identification.posterior import Posterior
 from hilcal.present.html.other_pages import arms_chart, fleet_page
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.transfer.fleet import Fleet
+from hilcal.transfer.fleet import Fleet, effects_seen, pooled
 from hilcal.transfer.members import Failure, Member, entries, member_of
-from hilcal.transfer.pooled import effects_seen, pooled
 from tests.support.calibrate_process import CELL
 from tests.support.campaigns import cell_of, configuration, noiseless, plan, with_noise, world_of
 from tests.support.cli_cases import ok, refused
