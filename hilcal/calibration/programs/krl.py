@@ -176,12 +176,9 @@ class _State:
     base: Floats | str = f"the program does not set $BASE {_BEFORE}"
 
     def same(self, other: "_State") -> bool:
-        """Whether tool and base are the same as in another state, or unknown in both."""
-        return all(
-            a is b
-            or (isinstance(a, np.ndarray) and isinstance(b, np.ndarray) and np.array_equal(a, b))
-            for a, b in ((self.tool, other.tool), (self.base, other.base))
-        )
+        """Whether tool and base are the same as in another state, or unknown for one reason."""
+        pairs = (self.tool, other.tool), (self.base, other.base)
+        return all(np.array_equal(a, b) for a, b in pairs)
 
 
 class _KrlReader(ProgramReader):
@@ -314,9 +311,8 @@ class _KrlReader(ProgramReader):
             left = f"{word} is not corrected"
         elif "CIRC" in word and re.search(r"\bCA\b", head, re.I):
             left = "a circle with CA does not end at the point that is stated"
-        targets = [
-            (b, t) for b, t in arguments_of(head) if not re.match(r"\s*(CA|C_\w+)\b", t, re.I)
-        ]
+        approximation = re.compile(r"\s*(CA|C_\w+)\b", re.IGNORECASE)
+        targets = [(b, t) for b, t in arguments_of(head) if not approximation.match(t)]
         for begin, target in targets[: 2 if "CIRC" in word else 1]:
             self._target(line, offset + m.end() + begin, target, word in ("PTP", "SPTP"), left)
         self.state = previous
@@ -345,7 +341,8 @@ class _KrlReader(ProgramReader):
 
     def _point(self, bare: ProgramPoint, value: _Value, obeyed: bool) -> ProgramPoint:
         """Return the point of an aggregate."""
-        moving = [k for k, f in value.fields.items() if re.fullmatch(r"E[1-6]", k) and _moves(f[0])]
+        axes = (k for k in value.fields if re.fullmatch(r"E[1-6]", k))
+        moving = [k for k in axes if value.numbers([k]) is None or value.numbers([k]) != 0]
         if moving:
             return replace(bare, left=f"{moving[0]} moves, and it is not known what that carries")
         keys = AXES if AXES[0] in value.fields else POSE
@@ -388,13 +385,6 @@ def _value(text: str) -> float:
     if text.startswith("'"):
         return int(text[2:-1], 2 if text[1] in "Bb" else 16)
     return float(text)
-
-
-def _moves(text: str) -> bool:
-    try:
-        return _value(text) != 0
-    except ValueError:
-        return True
 
 
 def _word(code: str) -> str:
