@@ -53,7 +53,7 @@ _PLACES = {
     "refine": "hilcal.library",
     "report": "hilcal.write_report",
     "simulate": "hilcal.library",
-    "validate": "hilcal.validation",
+    "validate": "hilcal.transfer.compare",
     "view": "hilcal.library",
 }
 
@@ -95,7 +95,7 @@ if TYPE_CHECKING:
     from hilcal.readings.readings import States as States
     from hilcal.refinement import Refinement as Refinement
     from hilcal.transfer.compare import compare as compare
-    from hilcal.validation import validate as validate
+    from hilcal.transfer.compare import validate as validate
     from hilcal.write_report import report as report
 
 

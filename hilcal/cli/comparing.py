@@ -28,7 +28,7 @@ from hilcal.present.fit import (
 from hilcal.present.progress import working
 from hilcal.tables.units import parse_length
 from hilcal.transfer.compare import compare as compare_campaigns
-from hilcal.validation import validate as validate_campaign
+from hilcal.transfer.compare import validate as validate_campaign
 
 
 @command("""

@@ -190,7 +190,15 @@ class CampaignFile:
         cov = readings.covariance
         readings = replace(readings, covariance=0.5 * (cov + np.swapaxes(cov, -1, -2)))
         if len(readings):
-            self._claim_layout(layout_of(readings))
+            layout, stored = layout_of(readings), self._layout()
+            if stored is None:
+                rows.insert_meta(self.connection, "layout", json.dumps(layout))
+            elif stored != layout:
+                differ = sorted({name for name, _ in set(stored) ^ set(layout)})
+                raise InputError(
+                    f"{self.path}: the readings differ from those before in {', '.join(differ)}; "
+                    f"a campaign holds one kind of reading, start another for these"
+                )
             readings = self._numbered_targets(readings)
             self._claim_observers(readings)
             limits.check_fitted(self.n_readings + len(readings), readings.m, f"{self.path}: ")
@@ -207,7 +215,7 @@ class CampaignFile:
             return rows.fetch_readings(self.connection, self.path, layout, names, observers)
 
     def data_hash(self, count: int | None = None) -> str:
-        """Return the SHA-256 of the first `count` readings, or of all; see `content_hash`."""
+        """Return the `content_hash` of the first `count` readings, or of all."""
         return content_hash(self.readings()[:count])
 
     def append_revision(self, record: RevisionRecord) -> int:
@@ -242,10 +250,10 @@ class CampaignFile:
         """Make a revision the one that is used; None: always the latest."""
         if number is not None:
             self.revision(number)
-        with self.transaction():
+        with self.transaction() as connection:
             key = ACCEPTED.format(len(self.acceptances()) + 1)
-            rows.insert_meta(self.connection, key, json.dumps(number))
-            schema.require(self.connection, schema.CHOSEN_REVISION)
+            rows.insert_meta(connection, key, json.dumps(number))
+            schema.require(connection, schema.CHOSEN_REVISION)
 
     def acceptances(self) -> list[int | None]:
         """Return all acceptances, in order."""
@@ -275,9 +283,9 @@ class CampaignFile:
                 except InputError as error:
                     return tuple(records), (expected, str(error))
                 except (ValueError, TypeError, AttributeError) as error:
-                    defect = f"the campaign is damaged at revision {expected}"
                     why = f" ({error})" if str(error) else ""
-                    return tuple(records), (expected, defect + why)
+                    defect = f"the campaign is damaged at revision {expected}{why}"
+                    return tuple(records), (expected, defect)
         return tuple(records), None
 
     def revision(self, number: int) -> RevisionRecord:
@@ -335,18 +343,6 @@ class CampaignFile:
             return decode(kind, content)
         except (TypeError, ValueError):
             raise self._damaged(f"its {key}") from None
-
-    def _claim_layout(self, layout: Layout) -> None:
-        """Fix the layout by the first readings; refuse other layouts later."""
-        stored = self._layout()
-        if stored is None:
-            rows.insert_meta(self.connection, "layout", json.dumps(layout))
-        elif stored != layout:
-            differ = sorted({name for name, _ in set(stored) ^ set(layout)})
-            raise InputError(
-                f"{self.path}: the readings differ from those before in {', '.join(differ)}; "
-                f"a campaign holds one kind of reading, start another for these"
-            )
 
     def _observers(self) -> tuple[ObserverName, ...]:
         stored = self._stored(_OBSERVERS, tuple[tuple[ObserverKind, str], ...])

@@ -17,7 +17,7 @@ from hilcal.store import rows, schema
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan
 from hilcal.store.revision import RevisionRecord, utc_now
-from hilcal.store.run_log import FURTHER_PLAN, RunLog
+from hilcal.store.run_log import RunLog
 from hilcal.store.stored_schema import check_entry
 
 ENTRY = "calibrate {}"
@@ -56,8 +56,7 @@ class ProcedureLog:
             number = len(self.entries()) + 1
             stored = tuple(self._campaign.insert_revision(r) for r in revisions)
             if log is not None and plan is not None:
-                key = FURTHER_PLAN.format(len(log.plans) + 1)
-                rows.insert_meta(connection, key, plan.to_json())
+                log.insert(plan)
             document = {**content, "revisions": list(stored)} if stored else content
             rows.insert_meta(connection, ENTRY.format(number), entry(kind, document))
         return stored

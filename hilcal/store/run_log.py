@@ -116,9 +116,13 @@ class RunLog:
 
     def append(self, plan: Plan) -> None:
         """Append a further plan, see `with_new_names`; missing steps of other plans are dropped."""
-        with self._campaign.transaction() as connection:
-            key = FURTHER_PLAN.format(len(self.plans) + 1)
-            rows.insert_meta(connection, key, plan.to_json())
+        with self._campaign.transaction():
+            self.insert(plan)
+
+    def insert(self, plan: Plan) -> None:
+        """Append a further plan within the caller's transaction."""
+        key = FURTHER_PLAN.format(len(self.plans) + 1)
+        rows.insert_meta(self._campaign.connection, key, plan.to_json())
         self.plans = (*self.plans, plan)
 
     def record(
