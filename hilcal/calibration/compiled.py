@@ -44,9 +44,9 @@ class CompiledForm:
         self.a, self.linear, self.by_wrench = np.zeros(n), np.zeros((n, n)), np.zeros((n, 6))
         self.b, self.compliance = np.zeros((n + 1, 6)), np.zeros((n + 1, 6, 6))
         self.by_values: Floats = np.zeros((0, 6, n))
-        self.by_angle: Floats = np.zeros((0, NODES))
-        self.soft: Floats = np.zeros((0, NODES))
-        self.by_torque: Floats = np.zeros((0, TORQUE_NODES))
+        self.by_angle: Floats = np.zeros((0, NODES - 1, 4))
+        self.soft: Floats = np.zeros((0, NODES - 1, 4))
+        self.by_torque: Floats = np.zeros((0, TORQUE_NODES - 1, 4))
         self.torque = np.ones(n)
         self.gain: Floats = np.zeros((0, 6))
         self.bias = np.zeros(6)
@@ -56,20 +56,9 @@ class CompiledForm:
         return self.a, self.linear, self.by_wrench, self.b, self.compliance, self.by_values
 
     def tables(self) -> tuple[Any, ...]:
-        """Return the tables with their slopes, as the kernel takes them."""
-        angle = np.linspace(-TURN, TURN, NODES)
-        steps = 2 * self.torque / (TORQUE_NODES - 1)
-        slopes, soft_slopes = (
-            _spline(angle, x, axis=1)(angle, 1) if len(x) else np.zeros_like(x)
-            for x in (self.by_angle, self.soft)
-        )
-        torque_slopes = np.zeros_like(self.by_torque)
-        for j, values in enumerate(self.by_torque):
-            grid = np.linspace(-self.torque[j], self.torque[j], TORQUE_NODES)
-            torque_slopes[j] = _spline(grid, values)(grid, 1)
-        grids = -TURN, float(angle[1] - angle[0]), -self.torque, steps
-        angles, soft = (self.by_angle, packed(slopes)), (self.soft, packed(soft_slopes))
-        return grids, (*angles, self.by_torque, torque_slopes, *soft)
+        """Return first nodes, steps and polynomials of the tables, as the kernel takes them."""
+        grids = -TURN, 2 * TURN / (NODES - 1), -self.torque, 2 * self.torque / (TORQUE_NODES - 1)
+        return grids, (self.by_angle, self.by_torque, self.soft)
 
     def take(self, e: Effect, theta: Floats, s: Situation) -> bool:
         """Add an effect; return False where it has another form."""
@@ -121,10 +110,10 @@ class CompiledForm:
 
     def _soft(self, e: Effect, theta: Floats, s: Situation, dq: Floats) -> bool:
         """Add compliances of joints that depend on the joint's own angle."""
-        values, compliance = _waves(e, theta, replace(s, wrench=_unit_torque(s)))
+        waves, compliance = _waves(e, theta, replace(s, wrench=_unit_torque(s)))
         if not _same(Deviation(dq=dq), compliance * s.wrench[:, :-1, 5]):
             return False
-        self.soft = _added(self.soft, values.T)
+        self.soft = _added(self.soft, waves)
         return True
 
     def _by_torque(self, e: Effect, theta: Floats, s: Situation, deviation: Deviation) -> bool:
@@ -143,7 +132,7 @@ class CompiledForm:
         if not _same(deviation, dq):
             return False
         self.torque = torque
-        self.by_torque = _added(self.by_torque, values.T)
+        self.by_torque = _added(self.by_torque, np.stack([f.c.T for f in splines]))
         return True
 
     def _rigid(self, e: Effect, theta: Floats, s: Situation, deviation: Deviation) -> bool:
@@ -155,14 +144,14 @@ class CompiledForm:
                 return False
             slopes = np.moveaxis(coefficients[:-1].reshape(-1, *shape), 0, -1)
         if dq is not None:
-            values, by_angle = _waves(e, theta, s)
+            waves, by_angle = _waves(e, theta, s)
             # The remainder may be linear in the other joints.
             by_others, left = _affine(s.angle, dq - by_angle)
             if not _same(Deviation(dq=dq), dq - left):
                 return False
             self.a += by_others[-1]
             self.linear += by_others[:-1].T
-            self.by_angle = _added(self.by_angle, values.T)
+            self.by_angle = _added(self.by_angle, waves)
         if twist is not None:
             self.b += coefficients[-1].reshape(shape)
             self.by_values = _added(self.by_values, slopes) if slopes.any() else self.by_values
@@ -201,10 +190,10 @@ def _affine(x: Floats, y: Floats) -> tuple[Floats, Floats]:
     return coefficients, y - rows @ coefficients
 
 
-def _spline(x: Floats, y: Floats, axis: int = 0) -> Any:
+def _spline(x: Floats, y: Floats) -> Any:
     from scipy.interpolate import CubicSpline  # slow to import
 
-    return CubicSpline(x, y, axis=axis)
+    return CubicSpline(x, y)
 
 
 def _added(rows: Floats, added: Any) -> Floats:
@@ -212,15 +201,15 @@ def _added(rows: Floats, added: Any) -> Floats:
 
 
 def _waves(e: Effect, theta: Floats, s: Situation) -> tuple[Floats, Floats]:
-    """Displacements (NODES, n) with all joints at the angle of each node, and (N, n) at s."""
+    """Polynomials (n, NODES − 1, 4) of the displacements over one angle, and (N, n) those at s."""
     angle, parts = np.linspace(-TURN, TURN, NODES), []
     for part in np.array_split(angle, 16):
         grid, q = repeated(s, len(part)), np.repeat(part[:, None], s.angle.shape[1], axis=1)
         dq = e.deviation(theta, replace(grid, states=replace(grid.states, q=q), angle=q)).dq
         parts.append(np.zeros_like(q) if dq is None else dq)
-    values = np.concatenate(parts)
-    waves = _spline(angle, values)
-    return values, np.stack([waves(a)[:, j] for j, a in enumerate(s.angle.T)], axis=1)
+    waves = _spline(angle, np.concatenate(parts))
+    at_states = np.stack([waves(a)[:, j] for j, a in enumerate(s.angle.T)], axis=1)
+    return waves.c.T, at_states
 
 
 def repeated(s: Situation, count: int) -> Situation:

@@ -28,19 +28,14 @@ SETTLED = 1e-12
 
 
 @njit(cache=True)
-def _interpolate(x: float, low: float, step: float, value: Floats, slope: Floats) -> float:
-    """Cubic Hermite interpolation in a table with equal steps; linear outside."""
-    last = len(value) - 1
-    position = (x - low) / step
-    k = math.floor(position)
-    if k < 0:
-        return float(value[0] + (x - low) * slope[0])
-    if k >= last:
-        return float(value[last] + (x - low - last * step) * slope[last])
-    t = position - k
-    u = 1.0 - t
-    ends = value[k] * u * u * (1.0 + 2.0 * t) + value[k + 1] * t * t * (3.0 - 2.0 * t)
-    return float(ends + step * t * u * (slope[k] * u - slope[k + 1] * t))
+def _interpolate(x: float, low: float, step: float, table: Floats) -> float:
+    """Value of cubic polynomials (K, 4) on equal steps; linear outside."""
+    k = min(max(math.floor((x - low) / step), 0), len(table) - 1)
+    t = x - low - k * step
+    inside = min(max(t, 0.0), step)
+    a, b, c = table[k, 0], table[k, 1], table[k, 2]
+    value = ((a * inside + b) * inside + c) * inside + table[k, 3]
+    return float(value + ((3.0 * a * inside + 2.0 * b) * inside + c) * (t - inside))
 
 
 @njit(cache=True)
@@ -196,7 +191,7 @@ def _deviations(
     a, linear, by_wrench, b, compliance, by_values = laws
     point_dq, point_twist, point_soft = by_point
     angle_low, angle_step, torque_low, torque_step = tables[0]
-    by_angle, angle_slopes, by_torque, torque_slopes, soft, soft_slopes = tables[1]
+    by_angle, by_torque, soft = tables[1]
     n, change = len(q), 0.0
     for j in range(n):
         new = a[j] + point_dq[j] + point_soft[j] * wrench[j, 5]
@@ -205,14 +200,11 @@ def _deviations(
         for e in range(6):
             new += by_wrench[j, e] * wrench[j, e]
         if len(by_angle) > 0:
-            new += _interpolate(q[j], angle_low, angle_step, by_angle[j], angle_slopes[j])
+            new += _interpolate(q[j], angle_low, angle_step, by_angle[j])
         if len(soft) > 0:
-            joint_compliance = _interpolate(q[j], angle_low, angle_step, soft[j], soft_slopes[j])
-            new += joint_compliance * wrench[j, 5]
+            new += _interpolate(q[j], angle_low, angle_step, soft[j]) * wrench[j, 5]
         if len(by_torque) > 0:
-            new += _interpolate(
-                wrench[j, 5], torque_low[j], torque_step[j], by_torque[j], torque_slopes[j]
-            )
+            new += _interpolate(wrench[j, 5], torque_low[j], torque_step[j], by_torque[j])
         change = max(change, abs(new - dq[j]))
         dq[j] = new
     for k in range(n + 1):
