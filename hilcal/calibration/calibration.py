@@ -23,12 +23,21 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.calibration.compensation import Compensation, Inverse, Pose, ToolPoses, invert
+from hilcal.calibration.compensation import (
+    Compensation,
+    Inverse,
+    Pose,
+    ToolPose,
+    ToolPoses,
+    in_chain,
+    invert,
+    tool_of,
+    tool_poses,
+)
 from hilcal.calibration.compiled import Compiled, compiled
 from hilcal.calibration.covariance_source import CovarianceSource
 from hilcal.calibration.measured import Condition, Measured, SensorMount, conditions_of, needed
 from hilcal.calibration.scatter import Scatter, scatter_of
-from hilcal.calibration.tool import ToolPose, in_chain, tool_of, tool_poses
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import InputError

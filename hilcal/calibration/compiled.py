@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.calibration.compensation import MOST_TURN, TOLERANCE
-from hilcal.calibration.tool import ToolPose, in_chain
+from hilcal.calibration.compensation import MOST_TURN, TOLERANCE, ToolPose, in_chain
 from hilcal.effects.protocol import FRAME_ROLES, Effect, Situation
 from hilcal.optional import install
 from hilcal.readings.readings import States

@@ -23,8 +23,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.compensation import BAND, ErrorSize, band
-from hilcal.calibration.tool import tool_of, tool_poses
+from hilcal.calibration.compensation import BAND, ErrorSize, band, tool_of, tool_poses
 from hilcal.identification.predictive import Predictive
 from hilcal.identification.residual import noise_floor, residual
 from hilcal.readings.readings import Readings, States

@@ -9,7 +9,7 @@ from hilcal.drivers.simulated.rehearsal import case_of_plan, read_plan
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError
 from hilcal.robot.catalogue import load_arm
-from hilcal.transfer.factory import check_factory
+from hilcal.transfer.compare import check_factory
 from tests.support.factory_cases import factory_of, write
 
 CELL = {
