@@ -233,7 +233,6 @@ def _only(d: Deviation) -> bool:
 
 
 def _same(d: Deviation, dq: Floats, twist: Floats | None = None) -> bool:
-    """Whether a deviation equals that of the form."""
     a = (0.0 if d.dq is None else d.dq) - dq
     b = (0.0 if d.twist is None else d.twist) - (0.0 if twist is None else twist)
     size = max(np.abs(dq).max(initial=0.0), 1e-3)
@@ -356,7 +355,6 @@ def compiled(tool: ToolPose, mode: Mode) -> Compiled | tuple[str, ...]:
 
 
 def _zeros(n: int) -> tuple[Floats, Floats, Floats]:
-    """Return zero displacements, twists and compliances for one point."""
     return np.zeros((1, n)), np.zeros((1, n + 1, 6)), np.zeros((1, n))
 
 

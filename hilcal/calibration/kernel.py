@@ -48,14 +48,12 @@ def _product(a: Floats, b: Floats, out: Floats) -> None:
 
 @njit(cache=True)
 def _add_turned(r: Floats, v: Floats, out: Floats) -> None:
-    """Add r v to a vector."""
     for i in range(3):
         out[i] += r[i, 0] * v[0] + r[i, 1] * v[1] + r[i, 2] * v[2]
 
 
 @njit(cache=True)
 def _add_cross(a: Floats, b: Floats, out: Floats) -> None:
-    """Add a × b to a vector."""
     out[0] += a[1] * b[2] - a[2] * b[1]
     out[1] += a[2] * b[0] - a[0] * b[2]
     out[2] += a[0] * b[1] - a[1] * b[0]

@@ -328,7 +328,6 @@ def _checked(
 
 
 def _load(table: ColumnTable, row: int, loads: Mapping[str, Floats]) -> Floats:
-    """(6,) wrench of a named load."""
     name = table.text["load"][row]
     if name in (NO_LOAD, ""):
         return np.zeros(6)

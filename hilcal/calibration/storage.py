@@ -179,7 +179,6 @@ def _observer(content: Mapping[str, Any]) -> Observer:
 
 
 def _check_arm(arm: Arm) -> None:
-    """Refuse an arm with impossible values."""
     n = arm.links.shape[0] - 1
     if n < 1:
         raise ValueError("the arm has no joints")
@@ -200,7 +199,6 @@ def _check_arm(arm: Arm) -> None:
 
 
 def _check(c: Calibration, n: int) -> None:
-    """Refuse impossible numbers in a calibration of n joints."""
     numbers("misfit_m2", c.misfit, least=0.0)
     numbers("joint_std", c.scatter.joint_std, (n,), least=0.0)
     numbers("std_m", c.scatter.std_m, least=0.0)

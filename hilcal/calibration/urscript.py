@@ -326,7 +326,6 @@ def _waypoints(p: _Program) -> tuple[Waypoint, ...]:
 
 
 def _waypoint(p: _Program, k: int, setup: Mapping[str, tuple[int, list[Value | None]]]) -> Waypoint:
-    """Return the waypoint of a motion."""
     s = p.statements[k]
     assert s.call is not None  # noqa: S101 - see `_check_calls`
     name, named = s.called[s.call], {n.arg: n.value for n in s.call.keywords}
@@ -379,7 +378,6 @@ def _set_up(
 
 
 def _check_calls(p: _Program, s: Statement) -> None:
-    """Refuse unknown functions, and motions within expressions."""
     moves = s.call is not None and s.called[s.call] in MOVES
     targets = [*s.call.args[:1], *(n.value for n in s.call.keywords)] if moves and s.call else []
     for call, name in s.called.items():

@@ -124,7 +124,6 @@ def _as_python(body: str, word: str) -> tuple[str, int]:
 
 
 def _parsed(text: str, number: int, word: str) -> ast.stmt:
-    """Parse one line, which begins with a word."""
     for sign in _OTHER_SIGN.findall(_STRING_OR_COMMENT.sub("", text)):
         raise _refused(number, f"the sign {sign!a} outside of a comment")
     reason, header = f"'{text[:40]}' is not understood", word in (*_OPENS, "elif")

@@ -129,7 +129,6 @@ def _poses(data: object, where: str) -> tuple[tuple[str, ...], Floats]:
 
 
 def _steps(data: object, names: tuple[str, ...], where: str) -> tuple[Step, ...]:
-    """Return the steps in order."""
     steps: dict[Step, int] = {}
     for k, step in enumerate(_entries(data, "step", where), start=1):
         keys = set(step) if isinstance(step, dict) else set()

@@ -342,7 +342,6 @@ def sdf_chain(document: Document, base: str | None, tip: str | None) -> SdfModel
 
 
 def _sdf_step(model: SdfModel, joint: Node) -> ChainStep:
-    """Return the step of a joint; raises as `sdf_chain` does."""
     kind, name = joint.attributes.get("type", ""), joint.attributes.get("name", "")
     parent, child = model.ends(joint)
     place = se3.inverse(model.place(parent)) @ model.place(child)

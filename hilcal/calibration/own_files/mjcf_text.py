@@ -69,7 +69,6 @@ def _named(document: Document, world: Node, name: str, tags: tuple[str, ...]) ->
 
 
 def _step(document: Document, node: Node) -> ChainStep:
-    """Return the step of a body or a site; raises as `mjcf_steps` does."""
     joints = [c for c in node.children if c.tag in ("joint", "freejoint")]
     if node.tag == "frame" or len(joints) > 1:
         reason = f"{_name(node)} is a frame or has several joints; valid: one hinge in a body"

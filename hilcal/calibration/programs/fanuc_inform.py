@@ -238,7 +238,6 @@ class _InformReader(ProgramReader):
         return self.program()
 
     def _instruction(self, code: str, line: int) -> None:
-        """Process an instruction."""
         if r := _CHANGES.match(code):
             raise self.refused(line, f"{r[1]} changes what points mean", "a job without it")
         m = _MOV.match(code)

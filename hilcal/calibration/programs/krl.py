@@ -228,7 +228,6 @@ class _KrlReader(ProgramReader):
         self.state = _State(reason, reason)
 
     def _statement(self, line: int, offset: int, code: str) -> None:
-        """Process one statement."""
         if m := _MOTION.match(code):
             self._motion(line, offset, code, m)
         elif m := _SET.match(code):
@@ -266,7 +265,6 @@ class _KrlReader(ProgramReader):
                 self._set(kind, f"{kind}_DATA[{number}]", line, 0)
 
     def _set(self, kind: str, value: str, line: int, offset: int) -> None:
-        """Set `$TOOL` or `$BASE`."""
         out = self._frame(kind, value, line, offset)
         self.state = replace(self.state, **{kind.lower(): out})
 
@@ -293,7 +291,6 @@ class _KrlReader(ProgramReader):
         return self.controller.pose(group, m[2], name)
 
     def _motion(self, line: int, offset: int, code: str, m: re.Match[str]) -> None:
-        """Record the targets of a motion."""
         word = m[1].upper()
         head, *with_ = re.split(r"\bWITH\b", code[m.end() :], maxsplit=1, flags=re.I)
         previous = self.state
@@ -318,7 +315,6 @@ class _KrlReader(ProgramReader):
         self.state = previous
 
     def _target(self, line: int, offset: int, text: str, obeyed: bool, left: str) -> None:
-        """Record one target."""
         body = re.sub(r"\s+C_(PTP|DIS|VEL|ORI|SPL)\b.*", "", text, flags=re.I).strip()
         offset += len(text) - len(text.lstrip())
         key, name, value = _key(body), f"line {line}", _Value(0, line, "", {})
@@ -340,7 +336,6 @@ class _KrlReader(ProgramReader):
         self.record(key, bare if left else self._point(bare, value, obeyed), line, obeyed)
 
     def _point(self, bare: ProgramPoint, value: _Value, obeyed: bool) -> ProgramPoint:
-        """Return the point of an aggregate."""
         axes = (k for k in value.fields if re.fullmatch(r"E[1-6]", k))
         moving = [k for k in axes if value.numbers([k]) is None or value.numbers([k]) != 0]
         if moving:

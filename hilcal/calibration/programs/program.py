@@ -235,7 +235,6 @@ def line_of(text: str, offset: int) -> int:
 
 @lru_cache(maxsize=4)
 def _ends(text: str) -> list[int]:
-    """Offsets of the ends of lines."""
     return [m.start() for m in re.finditer("\n", text)]
 
 

@@ -195,7 +195,6 @@ class _RapidReader(ProgramReader):
         return arguments[:count], arguments[-1][1] if len(arguments) >= LEAST else "", options
 
     def _motion(self, offset: int, code: str, m: re.Match[str], obeyed: bool) -> None:
-        """Record the targets of a motion."""
         line = line_of(self.text, offset + m.start())
         targets, tool, options = self._targets(code, m)
         if not tool:
