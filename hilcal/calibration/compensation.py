@@ -301,7 +301,7 @@ class Compensation(Brief):
     def inside(self) -> Bools:
         """(N,) whether the point lies within the measured ranges."""
         nowhere = np.zeros(len(self.q), dtype=bool)
-        return ~np.any([nowhere, *(o.points for o in self.after.outside)], axis=0)
+        return np.asarray(~np.any([nowhere, *(o.points for o in self.after.outside)], axis=0))
 
     @cached_property
     def before(self) -> ToolPoses:

@@ -185,8 +185,8 @@ def _affine(x: Floats, y: Floats) -> tuple[Floats, Floats]:
     if np.ptp(y, axis=0).max() <= EXACT:
         return np.vstack([np.zeros((x.shape[1], y.shape[1])), y[:1]]), y - y[0]
     rows = np.hstack([x, np.ones((len(x), 1))])
-    coefficients = np.linalg.lstsq(rows, y, rcond=None)[0]
-    return coefficients, y - rows @ coefficients
+    coefficients: Floats = np.asarray(np.linalg.lstsq(rows, y, rcond=None)[0], dtype=float)
+    return coefficients, np.asarray(y - rows @ coefficients)
 
 
 def _spline(x: Floats, y: Floats) -> Any:

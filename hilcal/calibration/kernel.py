@@ -96,10 +96,7 @@ def _chain(
         for i in range(3):
             p[i] = 0.0 if k == 0 else position[k - 1, i]
         _add_turned(previous, link_p[k], p)
-        moved = False
-        for i in range(6):
-            moved = moved or twist[k, i] != 0.0
-        if moved:
+        if twist[k].any():
             _product(previous, link_r[k], frame)
             _exp(twist[k], step_r, step_p)
             _add_turned(frame, step_p, p)
@@ -143,17 +140,15 @@ def _wrenches(load: Any, applied: Floats, frames: Arrays, out: Floats, scratch: 
     point, tool_mass, tool_com, gravity, masses, moments, gain, bias = load
     n = len(com)
     f, t, lever, weight = scratch[0, 0], scratch[0, 1], scratch[0, 2], scratch[1, 0]
-    for i in range(3):
-        f[i] = applied[i]
-        t[i] = applied[3 + i]
+    f[:] = applied[:3]
+    t[:] = applied[3:]
     if len(gain) > 0:
         _add_sensed(gain, bias, rotation[n], applied, f, t)
-    for i in range(3):
-        lever[i] = 0.0
+    lever[:] = 0.0
     _add_turned(rotation[n], point, lever)
     _add_cross(lever, f, t)
+    lever[:] = 0.0
     for i in range(3):
-        lever[i] = 0.0
         weight[i] = tool_mass * gravity[i]
         f[i] += weight[i]
     _add_turned(rotation[n], tool_com, lever)
@@ -223,16 +218,12 @@ def _solve(matrix: Floats, right: Floats) -> bool:
     """Solve a small system in place by elimination with pivots; False where it is singular."""
     n = len(right)
     for c in range(n):
-        best = c
-        for r in range(c + 1, n):
-            if abs(matrix[r, c]) > abs(matrix[best, c]):
-                best = r
+        best = c + np.argmax(np.abs(matrix[c:, c]))
         if abs(matrix[best, c]) < 1e-12:
             return False
-        if best != c:
-            for k in range(n):
-                matrix[c, k], matrix[best, k] = matrix[best, k], matrix[c, k]
-            right[c], right[best] = right[best], right[c]
+        for k in range(n):
+            matrix[c, k], matrix[best, k] = matrix[best, k], matrix[c, k]
+        right[c], right[best] = right[best], right[c]
         for r in range(c + 1, n):
             factor = matrix[r, c] / matrix[c, c]
             for k in range(c, n):
@@ -343,10 +334,5 @@ def invert_all(
                 jacobian[:3, j] = column
             if not _solve(jacobian, e):
                 break
-            longest = 0.0
-            for j in range(n):
-                longest = max(longest, abs(e[j]))
-            share = min(1.0, most_turn / max(longest, 1e-300))
-            for j in range(n):
-                joints[j] += share * e[j]
+            joints += min(1.0, most_turn / max(np.abs(e).max(), 1e-300)) * e
         out_q[point] = joints
