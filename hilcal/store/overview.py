@@ -159,10 +159,7 @@ def to_json(o: Overview, path: str, covariance: str) -> dict[str, object]:
         "covariance": covariance,
         **encoded("plans", "planned", "measured", "instruments"),
         "tares": [{"utc": t.utc, "zero": t.wrench.tolist()} for t in o.tares],
-        "drift": {
-            "limit_sigma": o.config.acquire.drift_limit_sigma,
-            "returns": encode(o.returns),
-        },
+        "drift": {"limit_sigma": o.config.acquire.drift_limit_sigma, "returns": encode(o.returns)},
         **encoded("tool", "repeatability", "events", "accepted", "in_use"),
         "revisions": [_revision_json(r, o) for r in o.revisions],
     }

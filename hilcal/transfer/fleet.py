@@ -320,11 +320,11 @@ class Fleet:
         return fragment(fleet_report(self))
 
 
-def fleet(
-    directory: Path,
-    engine: Engine,
-    counting: Counting = lambda label, total: nullcontext(lambda step: None),
-) -> Fleet:
+def _silent(label: str, total: int) -> AbstractContextManager[Advance]:
+    return nullcontext(lambda step: None)
+
+
+def fleet(directory: Path, engine: Engine, counting: Counting = _silent) -> Fleet:
     """Fit and diagnose the campaigns in a directory and below it, and pool them by type of arm.
 
     Nothing is stored in the campaigns. Campaigns that fail are listed with the reason, and so are
