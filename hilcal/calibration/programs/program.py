@@ -261,7 +261,8 @@ class ControllerFrames:
 
     def stated(self, group: str, name: str) -> Floats | None:
         """Pose (4, 4) of one of the "tools" or "bases" in the file of --frames."""
-        return {key.upper(): pose for key, pose in self.poses[group].items()}.get(name.upper())
+        named = (pose for key, pose in self.poses[group].items() if key.upper() == name.upper())
+        return next(named, None)
 
     def pose(self, group: str, name: str, label: str, identity: str = "0") -> Floats | str:
         """Pose (4, 4) of a tool or base, or why it is unknown; `label` names it for people.
