@@ -62,7 +62,7 @@ class CampaignFile:
         self._identity = identity(path)
         self._new_place: Path | None = None
         self._written = False
-        self._meta = self._read_meta()
+        self._meta = self.texts()
         self.config_json, self.base_dir = self._meta["config"], self._meta["base_dir"]
         self.source, self.created = self._meta["source"], self._meta["created"]
 
@@ -164,8 +164,7 @@ class CampaignFile:
 
     def numbered(self, key: str, first: int = 1) -> list[str]:
         """Return the texts about the campaign under a key with successive numbers."""
-        with schema.sqlite_errors(self.path):
-            meta = self._read_meta()
+        meta = self.texts()
         keys = itertools.takewhile(meta.__contains__, map(key.format, itertools.count(first)))
         return [meta[k] for k in keys]
 
@@ -230,7 +229,7 @@ class CampaignFile:
             record = replace(record, parent=None)
         record, key, posterior = split(record)
         text = to_text(record)
-        if key is not None and key not in self._read_meta():
+        if key is not None and key not in self.texts():
             rows.insert_meta(self.connection, key, posterior)
         schema.require(
             self.connection,
@@ -274,7 +273,7 @@ class CampaignFile:
         records: list[RevisionRecord] = []
         with schema.sqlite_errors(self.path), limits.memory(str(self.path)):
             stored = self.connection.execute("SELECT id, content, crc FROM revisions ORDER BY id")
-            meta = self._read_meta()
+            meta = self.texts()
             for expected, (number, text, crc) in enumerate(stored.fetchall(), start=1):
                 try:
                     if number != expected or rows.text_crc(str(number), text) != crc:
@@ -319,8 +318,10 @@ class CampaignFile:
                 return number, _OTHER_READINGS.format(number)
         return damaged
 
-    def _read_meta(self) -> dict[str, str]:
-        meta = rows.fetch_meta(self.connection, self.path)
+    def texts(self) -> dict[str, str]:
+        """Return all texts about the campaign by key, as the file has them now."""
+        with schema.sqlite_errors(self.path):
+            meta = rows.fetch_meta(self.connection, self.path)
         if missing := sorted(set(_META) - set(meta)):
             raise self._damaged(f"no {missing[0]}")
         return meta
@@ -329,8 +330,7 @@ class CampaignFile:
         return InputError(f"{self.path}: the campaign file is damaged ({detail})")
 
     def _layout(self) -> Layout | None:
-        with schema.sqlite_errors(self.path):
-            text = self._read_meta().get("layout")
+        text = self.texts().get("layout")
         try:
             return None if text is None else read_layout(text)
         except ValueError as e:
@@ -338,7 +338,7 @@ class CampaignFile:
 
     def _stored(self, key: str, kind: Any) -> Any:
         """Return the list, of type `kind`, in a text about the campaign; empty without the text."""
-        content = rows.stored_json(self.path, self._read_meta().get(key, "[]"))
+        content = rows.stored_json(self.path, self.texts().get(key, "[]"))
         try:
             return decode(kind, content)
         except (TypeError, ValueError):
@@ -356,7 +356,7 @@ class CampaignFile:
             schema.require(self.connection, schema.MORE_COLUMNS)
         if readings.states.observer is None:
             return
-        if self._read_meta().get(_OBSERVERS) is None:
+        if self.texts().get(_OBSERVERS) is None:
             text = json.dumps([[o.kind, o.name] for o in readings.observers])
             rows.insert_meta(self.connection, _OBSERVERS, text)
         if self._observers() != readings.observers:
@@ -366,7 +366,7 @@ class CampaignFile:
         """Return the readings with targets numbered as in the file, by the first readings."""
         if readings.states.target is None:
             return readings
-        if self._read_meta().get(_TARGETS) is None:
+        if self.texts().get(_TARGETS) is None:
             rows.insert_meta(self.connection, _TARGETS, json.dumps(readings.target_names))
             schema.require(self.connection, schema.SEVERAL_TARGETS)
         names: tuple[str, ...] = self._stored(_TARGETS, tuple[str, ...])

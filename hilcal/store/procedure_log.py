@@ -13,7 +13,7 @@ from typing import Any
 
 from hilcal.errors import InputError
 from hilcal.names import quoted
-from hilcal.store import rows, schema
+from hilcal.store import rows
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan
 from hilcal.store.revision import RevisionRecord, utc_now
@@ -85,9 +85,7 @@ def purpose_of(campaign: CampaignFile) -> str | None:
 
 def _only_tests(campaign: CampaignFile) -> bool:
     """Whether a campaign was measured to test a model, and has not been released for fitting."""
-    with schema.sqlite_errors(campaign.path):
-        released = RELEASED in rows.fetch_meta(campaign.connection, campaign.path)
-    return purpose_of(campaign) is not None and not released
+    return purpose_of(campaign) is not None and RELEASED not in campaign.texts()
 
 
 def release(campaign: CampaignFile, why: str) -> None:
