@@ -17,7 +17,7 @@ which costs a step or two more; each step reduces e about 10³ times.
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -361,35 +361,33 @@ class Compensation(Brief):
         `expected_error_m` is the root sum square of the inversion's residual and the position's
         standard deviation.
         """
-        calibration, after, inside = self._calibration, self.after, self.inside
-        expected = np.hypot(self.inverse.residual_m, after.std_m)
+        calibration, before, after = self._calibration, self.before, self.after
+        columns: dict[str, Sequence[Any]] = {
+            "name": names,
+            "q_command": self.given.tolist(),
+            "q_corrected": self.q.tolist(),
+            "expected_error_m": np.hypot(self.inverse.residual_m, after.std_m).tolist(),
+            "inside": self.inside.tolist(),
+            "q_rad": self.q.tolist(),
+            "before_m": before.error_m.tolist(),
+            "before_rad": before.error_rad.tolist(),
+            "residual_m": self.inverse.residual_m.tolist(),
+            "std_m": after.std_m.tolist(),
+            "band_m": after.band_m.tolist(),
+            "refused": [None] * len(names),
+        }
+        rows = zip(*columns.values(), strict=True)
         return {
             "calibration": dict(calibration.source),
             "readings": calibration.mode,
             "base_in_tracker": se3.six(calibration.base_in_tracker()),
             "base_is": calibration.frames.base_is,
             "n_points": len(names),
-            "error_before": asdict(ErrorSize.of(self.before.error_m)),
+            "error_before": asdict(ErrorSize.of(before.error_m)),
             "error_after": {
                 "std_m": ErrorSize.of(after.std_m).rms_m,
                 "band_m": float(after.band_m.max()),
                 "band_share": BAND,
             },
-            "points": [
-                {
-                    "name": name,
-                    "q_command": self.given[k].tolist(),
-                    "q_corrected": self.q[k].tolist(),
-                    "expected_error_m": float(expected[k]),
-                    "inside": bool(inside[k]),
-                    "q_rad": self.q[k].tolist(),
-                    "before_m": float(self.before.error_m[k]),
-                    "before_rad": float(self.before.error_rad[k]),
-                    "residual_m": float(self.inverse.residual_m[k]),
-                    "std_m": float(after.std_m[k]),
-                    "band_m": float(after.band_m[k]),
-                    "refused": None,
-                }
-                for k, name in enumerate(names)
-            ],
+            "points": [dict(zip(columns, row, strict=True)) for row in rows],
         }
