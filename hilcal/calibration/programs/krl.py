@@ -39,6 +39,7 @@ from hilcal.calibration.programs.program import (
 )
 from hilcal.types import Floats, Ints
 
+KINDS = ("TOOL", "BASE")
 POSE, AXES, TURN = ("X", "Y", "Z", "A", "B", "C"), tuple(f"A{k}" for k in range(1, 7)), "T"
 OVERHEAD, ELBOW = 1, 2
 """Bits of S."""
@@ -231,13 +232,13 @@ class _KrlReader(ProgramReader):
         if m := _MOTION.match(code):
             self._motion(line, offset, code, m)
         elif m := _SET.match(code):
-            self._set(m[1].upper(), m[2].strip(), line, offset + m.start(2))
+            self._set(m[1].upper(), m[2].strip(), line)
         elif m := _FDAT.match(code):
             self.form = m[1]
         elif m := _BAS.match(code):
             topic, number = m[1].upper(), (m[2] or "").strip()
-            if topic in ("TOOL", "BASE"):
-                self._set(topic, f"{topic}_DATA[{number}]", line, offset)
+            if topic in KINDS:
+                self._set(topic, f"{topic}_DATA[{number}]", line)
             elif topic in ("PTP_PARAMS", "CP_PARAMS", "PTP_DAT", "CP_DAT", "FRAMES"):
                 self._of_form(self.form, line)
             elif topic == "INITMOV":
@@ -248,7 +249,7 @@ class _KrlReader(ProgramReader):
         elif (m := _CALL.match(code)) and m[1].upper() not in _NO_CALLS:
             self._forget(f"{m[1][:40]} of line {line} may set them")
 
-    def _of_form(self, name: str | None, line: int, only: str = "") -> None:
+    def _of_form(self, name: str | None, line: int, kinds: Sequence[str] = KINDS) -> None:
         """Set tool and base of an inline form."""
         values = self.data.get(_key(name or ""), [])
         if len(values) != 1 or "TOOL_NO" not in values[0].fields:
@@ -259,26 +260,23 @@ class _KrlReader(ProgramReader):
         if fields.get("IPO_FRAME", ("#BASE",))[0].upper() != "#BASE":
             reason = f"{name} has its tool outside of the arm (IPO_FRAME #TCP)"
             raise self.refused(line, reason, "a tool on the flange")
-        for kind in ("TOOL", "BASE"):
-            if only in ("", kind):
-                number = fields.get(f"{kind}_NO", ("0",))[0]
-                self._set(kind, f"{kind}_DATA[{number}]", line, 0)
+        for kind in kinds:
+            self._set(kind, f"{kind}_DATA[{fields.get(f'{kind}_NO', ('0',))[0]}]", line)
 
-    def _set(self, kind: str, value: str, line: int, offset: int) -> None:
-        out = self._frame(kind, value, line, offset)
-        self.state = replace(self.state, **{kind.lower(): out})
+    def _set(self, kind: str, value: str, line: int) -> None:
+        self.state = replace(self.state, **{kind.lower(): self._frame(kind, value, line)})
 
     def _numbers(self, name: str) -> Floats | None:
         """Numbers of the pose of a name; None if it has none, or several."""
         values = self.data.get(_key(name), [])
         return values[0].numbers(POSE) if len(values) == 1 else None
 
-    def _frame(self, kind: str, value: str, line: int, offset: int) -> Floats | str:
+    def _frame(self, kind: str, value: str, line: int) -> Floats | str:
         """Pose of a value, or why it is unknown."""
         if value.upper() == "$NULLFRAME":
             return np.eye(4)
         if value.startswith("{"):
-            numbers = _Value.of(value, offset, 0, line).numbers(POSE)
+            numbers = _Value.of(value, 0, 0, line).numbers(POSE)
             return f"${kind} of line {line} is not whole" if numbers is None else of_euler(numbers)
         m = _INDEX.match(value)
         if m is None or m[1].upper() != kind:
@@ -294,15 +292,15 @@ class _KrlReader(ProgramReader):
         word = m[1].upper()
         head, *with_ = re.split(r"\bWITH\b", code[m.end() :], maxsplit=1, flags=re.I)
         previous = self.state
-        for kind in ("TOOL", "BASE"):
+        for kind in KINDS:
             setting = re.search(rf"\${kind}\s*=\s*(.+?)(?=,\s*\$|$)", "".join(with_), re.I)
             if setting:
                 text = setting[1].strip()
                 form = re.match(r"\w+\s*\(.*?\b(\w+)(?:\.\w+)?\s*\)", text)
                 if form and _key(form[1]) in self.data:
-                    self._of_form(form[1], line, kind)
+                    self._of_form(form[1], line, [kind])
                 else:
-                    self._set(kind, text, line, 0)
+                    self._set(kind, text, line)
         left = ""
         if word.endswith("_REL") or word == "ASYPTP":
             left = f"{word} is not corrected"
