@@ -63,7 +63,7 @@ class Plan(Brief):
 
     def to_json(self) -> str:
         """Return the plan as a JSON document; `read_plan` reads it back exactly."""
-        rows = zip(self.pose_names, self.q.astype(float).tolist(), strict=True)
+        rows = zip(self.pose_names, np.asarray(self.q, dtype=float).tolist(), strict=True)
         poses = [{"name": name, "q_rad": q} for name, q in rows]
         steps = [asdict(step) for step in self.steps]
         head = {"format": FORMAT, "version": VERSION}
