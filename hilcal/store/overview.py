@@ -11,7 +11,7 @@ import numpy as np
 from hilcal.config import CellConfig
 from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.codec import decode, encode
+from hilcal.store.codec import encode
 from hilcal.store.kept_texts import COMMAND
 from hilcal.store.revision import RevisionRecord
 from hilcal.store.run_log import PLAN, RunLog
@@ -107,7 +107,11 @@ def overview(file: CampaignFile) -> Overview:
             for e in events
             if e["kind"] == "tare"
         ),
-        returns=tuple(decode(Return, e) for e in events if e["kind"] == "drift"),
+        returns=tuple(
+            Return(e["utc"], np.array(e["shift_m"]), float(e["sigma"]), bool(e["over"]))
+            for e in events
+            if e["kind"] == "drift"
+        ),
         tool=_last(events, "tool"),
         repeatability=_last(events, "repeatability"),
         events=events,
