@@ -46,8 +46,7 @@ _NAMES = {
     "hilcal.procedure.procedure": ("Procedure",),
     "hilcal.readings.readings": ("Readings", "States"),
     "hilcal.refinement": ("Refinement",),
-    "hilcal.transfer.compare": ("compare",),
-    "hilcal.validation": ("validate",),
+    "hilcal.transfer.compare": ("compare", "validate"),
     "hilcal.write_report": ("report",),
 }
 """Names of the library, by module."""
@@ -91,7 +90,7 @@ if TYPE_CHECKING:
     from hilcal.readings.readings import States as States
     from hilcal.refinement import Refinement as Refinement
     from hilcal.transfer.compare import compare as compare
-    from hilcal.validation import validate as validate
+    from hilcal.transfer.compare import validate as validate
     from hilcal.write_report import report as report
 
 

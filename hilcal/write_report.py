@@ -20,8 +20,8 @@ from hilcal.store.overview import overview
 from hilcal.store.procedure_log import ProcedureLog
 from hilcal.store.revision import utc_now
 from hilcal.store.run_log import PLAN, RunLog
+from hilcal.transfer.compare import validate
 from hilcal.transfer.fleet import Fleet
-from hilcal.validation import validate
 from hilcal.whole_file import replace_file
 
 

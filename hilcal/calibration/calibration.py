@@ -23,12 +23,21 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.calibration.compensation import Compensation, Inverse, Pose, ToolPoses, invert
+from hilcal.calibration.compensation import (
+    Compensation,
+    Inverse,
+    Pose,
+    ToolPose,
+    ToolPoses,
+    in_chain,
+    invert,
+    tool_of,
+    tool_poses,
+)
 from hilcal.calibration.compiled import Compiled, compiled
 from hilcal.calibration.covariance_source import CovarianceSource
 from hilcal.calibration.measured import Condition, Measured, SensorMount, conditions_of, needed
 from hilcal.calibration.scatter import Scatter, scatter_of
-from hilcal.calibration.tool import ToolPose, in_chain, tool_of, tool_poses
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import InputError
@@ -84,22 +93,13 @@ class Calibration(Brief):
 
     @classmethod
     def of(cls, fit: Fit, source: Mapping[str, Any] | None = None) -> "Calibration":
-        """Make the calibration of a fit.
-
-        Args:
-            source: origin of the calibration, for people.
-
-        Raises:
-            InputError: the scaling of the fit is not gc.
-        """
+        """Make the calibration of a fit; an InputError where its scaling is not gc."""
         if fit.scaling != "gc":
             raise InputError(f"a calibration needs scaling gc, this fit has {fit.scaling}")
         used, model = fit.readings[~fit.outlier], fit.model
         if not model.cell.measured_torques:  # nothing follows from them
             used = replace(used, states=replace(used.states, torque=None))
-        left_out = fit.holdout.rms_sigma
-        prior = fit.solution.prior
-        p = predictive(model, fit.theta, prior, used, fit.mode, left_out)
+        p = predictive(model, fit.theta, fit.solution.prior, used, fit.mode, fit.holdout.rms_sigma)
         values, vectors = np.linalg.eigh(p.covariance)
         noise = np.trace(p.of_noise(fit.whitening)[:, :3, :3], axis1=1, axis2=2)
         kappa = position_factor(p, fit.holdout.rms_m)
@@ -129,9 +129,7 @@ class Calibration(Brief):
     def load(cls, path: str | Path, catalogue: Catalogue | None = None) -> "Calibration":
         """Read a calibration file, or make the calibration of a campaign's revision in use.
 
-        Args:
-            path: a calibration, or a campaign.
-            catalogue: effects to choose from; the installed ones if None.
+        `catalogue` has the effects to choose from; None: the installed ones.
 
         Raises:
             InputError: no calibration, or the catalogue lacks an effect.
@@ -211,7 +209,15 @@ class Calibration(Brief):
             solution, residual = kernel.compensate(states, goal)
             inverse = Inverse(solution, residual[:, 0], residual[:, 1])
         else:
-            inverse = self._invert(tool_pose, states, goal or self.nominal(tool_pose, states))
+            model, theta = tool_pose.model, tool_pose.theta
+
+            def poses(q: Floats, points: Ints) -> Pose:
+                prediction = model.predict(replace(states[points], q=q), theta)
+                pose = in_chain(tool_pose, *tool_poses(tool_pose, prediction))
+                return (*pose, prediction.situation.chain)
+
+            target = in_chain(tool_pose, *(goal or self.nominal(tool_pose, states)))
+            inverse = invert(self.model.cell.arm, poses, states.q, *target)
         return Compensation(inverse, self, tool_pose, states, goal, std, untold)
 
     @cached_property
@@ -236,23 +242,13 @@ class Calibration(Brief):
         kernel = self._kernel(self._tool(tool))
         return () if isinstance(kernel, Compiled) else kernel
 
-    def _invert(self, tool: ToolPose, states: States, goal: tuple[Floats, Floats]) -> Inverse:
-        def poses(q: Floats, points: Ints) -> Pose:
-            prediction = tool.model.predict(replace(states[points], q=q), tool.theta)
-            return (*in_chain(tool, *tool_poses(tool, prediction)), prediction.situation.chain)
-
-        return invert(self.model.cell.arm, poses, states.q, *in_chain(tool, *goal))
-
     def load_wrench(self, q: Floats, reading: Floats) -> Floats:
-        """Convert a reading of the force sensor to the load's wrench for `predict`, `compensate`.
+        """Return the load's wrench (N, 6) for `predict` from readings of the force sensor.
 
         Args:
             q: (n,) or (N, n) joint values of the reading, rad.
             reading: (6,) or (N, 6) reading with the load minus reading without, sensor axes, N and
                 N·m.
-
-        Returns:
-            (N, 6) force and moment at the load point, base axes.
 
         Raises:
             InputError: the cell has no force sensor, or a wrong shape.
@@ -315,8 +311,8 @@ class Calibration(Brief):
         for name, column in {"q": q, **columns}.items():
             if not np.isfinite(column).all():
                 raise InputError(f"{name} has values that are not finite")
-        states = States(q, **columns)
-        untold = tuple(c for c in needed(self.model, states) if c in self.conditions)
+        missing = needed(self.model, States(q, **columns))
+        untold = tuple(c for c in missing if c in self.conditions)
         for name in untold:
             mean = self.conditions[name].mean
             columns[name] = np.broadcast_to(mean, (len(q), *mean.shape)).copy()
@@ -353,7 +349,11 @@ class Calibration(Brief):
         rotation, position = tool_poses(tool, prediction)
         std_m = covariance = None
         if std:
-            by_parameters = self._by_parameters(tool, states, prediction)
+            spread = self._spread(tool, prediction)
+            if self.mode == "deflection":
+                unloaded = tool.model.predict(_unloaded(states), tool.theta)
+                spread = spread - self._spread(tool, unloaded)
+            by_parameters = spread @ np.swapaxes(spread, 1, 2)
             turn, chain = tool.base[:3, :3], prediction.situation.chain
             point = (position - tool.base[:3, 3]) @ turn
             scatter = self.scatter.covariance(tool.model.cell, chain, point)
@@ -370,13 +370,6 @@ class Calibration(Brief):
             return self.root
         assert self.learnt is not None  # noqa: S101  (`root` or `learnt` is there)
         return self.learnt.root(self.model, self.theta, self.mode)
-
-    def _by_parameters(self, tool: ToolPose, states: States, prediction: Prediction) -> Floats:
-        """(N, 3, 3) κ J C Jᵀ of the position, in axes of the chain, m²."""
-        spread = self._spread(tool, prediction)
-        if self.mode == "deflection":
-            spread = spread - self._spread(tool, tool.model.predict(_unloaded(states), tool.theta))
-        return spread @ np.swapaxes(spread, 1, 2)
 
     def _moves(self, states: States) -> tuple[Floats, Floats]:
         """Position (N, 3) of the tool and J R (N, 3, K); changes by the load for deflections."""

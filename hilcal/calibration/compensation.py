@@ -1,7 +1,12 @@
-"""The inverse of an identified model: joint values that put the tool at its target pose.
+"""The pose of the tool by a model, and its inverse: joint values that put it at its target pose.
 
-Newton's method on the pose of the tool, T(q) = T_wanted, starts from the commanded joint values
-and stays on their branch:
+The tool in base axes, without the instruments (effects with fields "station" and "scale"):
+
+    T_base_tool = T_base_chain T_chain_flange(q, w) T_chainflange_flange T_flange_tool
+
+`identification.robot_frames` declares base and flange.
+
+Newton's method on T(q) = T_wanted starts from the commanded joint values and stays on their branch:
 
     q ← q + J⁺ e,   e = (p_wanted − p, Log(R_wanted Rᵀ)),   J = ∂(p, ω)/∂q by the chain alone
 
@@ -12,14 +17,16 @@ which costs a step or two more; each step reduces e about 10³ times.
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.stats import chi2
 
 from hilcal.calibration.measured import Outside
-from hilcal.calibration.tool import ToolPose
+from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.errors import InputError
+from hilcal.identification.robot_frames import one_of_each, robot_frames
+from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import States
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
@@ -42,6 +49,86 @@ which a pose is singular: joints may turn a thousand times as far as the tool. A
 
 Pose = tuple[Floats, Floats, Chain]
 """Orientation (N, 3, 3) and position (N, 3) of the tool, base axes, with the chain."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ToolPose:
+    """A tool on the flange of a fitted arm."""
+
+    model: Model  # its target is the tool; without effects that place another target
+    theta: Floats  # (P,) its parameters
+    columns: Ints  # (P,) indices of these parameters in the fitted model
+    nominal: Floats  # (4, 4) T_flange_tool
+    pose: Floats  # (4, 4) T_chainflange_tool, the same on the flange of the fitted chain
+    registered: Floats  # (4, 4) from the axes of the registration to those of the base
+    base: Floats  # (4, 4) from the axes of the chain to those of the base, constant effects alone
+    frames: tuple[tuple[Effect, slice], ...]
+    """Effects that place the base, with the slices of their parameters."""
+    moving: tuple[tuple[Effect, slice], ...]
+    """Other effects that move base or target, with the slices of their parameters."""
+
+
+def tool_of(model: Model, theta: Floats, pose: Floats | None) -> ToolPose:
+    """Return the tracked target as fitted, or a tool with another pose T_flange_tool (4, 4)."""
+    index = np.arange(model.size)
+    robot = robot_frames(model, theta)
+    if pose is None:
+        nominal, tool_model, columns = robot.declared[0], model, index
+    else:
+        nominal, used = pose, [e for e in model.effects if e.role != "target"]
+        parts = [index[s] for e, s in zip(model.effects, model.slices(), strict=True) if e in used]
+        columns = np.concatenate([index[:0], *parts])
+        cell = replace(model.cell, targets=None, target_names=(), targets_known=())
+        cell = replace(cell, target=robot.flange @ pose, target_known=True)
+        tool_model = replace(model, cell=cell, effects=tuple(used))
+    state = one_of_each(tool_model.cell)
+    if tool_model.cell.targets is not None:
+        state = replace(state, target=np.zeros(1, dtype=np.int64))
+    situation = tool_model.predict(state, theta[columns]).situation
+    pairs = list(zip(tool_model.effects, tool_model.slices(), strict=True))
+    moving = [
+        (e, part)
+        for e, part in pairs
+        if e.role not in FRAME_ROLES
+        and any(c.field in ("target", "base") for c in e.columns(situation))
+    ]
+    return ToolPose(
+        model=tool_model,
+        theta=theta[columns],
+        columns=columns,
+        nominal=nominal,
+        pose=robot.flange @ nominal,
+        registered=robot.registered,
+        base=robot.chain,
+        frames=tuple((e, part) for e, part in pairs if e.role == "registration"),
+        moving=tuple(moving),
+    )
+
+
+def tool_poses(tool: ToolPose, prediction: Prediction) -> tuple[Floats, Floats]:
+    """Orientation (N, 3, 3) and position (N, 3) of the tool in base axes, m."""
+    chain, s = prediction.situation.chain, prediction.situation
+    deviations = [e.deviation(tool.theta[part], s) for e, part in tool.moving]
+    offsets = sum((d.target for d in deviations if d.target is not None), np.zeros((1, 6)))
+    flange, offset = chain.rotation[-1], tool.pose[:3, 3] + offsets[:, :3]
+    position = chain.point(offset if len(offsets) > 1 else offset[0])
+    turned_flange = se3.product(flange, se3.rotation(offsets[:, 3:])) if offsets.any() else flange
+    rotation = se3.product(turned_flange, tool.pose[:3, :3])
+    if not any(d.base is not None for d in deviations):
+        r, p = tool.base[:3, :3], tool.base[:3, 3]
+        return se3.product(r, rotation), p + se3.apply(r, position)
+    deviations += [e.deviation(tool.theta[part], s) for e, part in tool.frames]
+    base = [d.base for d in deviations if d.base is not None]
+    r, p = se3.exp(sum(base[1:], base[0]))
+    turn = tool.registered[:3, :3]
+    r, p = se3.product(turn, r), tool.registered[:3, 3] + se3.apply(turn, p)
+    return se3.product(r, rotation), p + se3.apply(r, position)
+
+
+def in_chain(tool: ToolPose, rotation: Floats, position: Floats) -> tuple[Floats, Floats]:
+    """Convert poses (N, 3, 3) and (N, 3) from base axes to the axes of the fitted chain."""
+    turn = tool.base[:3, :3].T
+    return se3.product(turn, rotation), se3.apply(turn, position - tool.base[:3, 3])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,12 +182,6 @@ def invert_nominal(
     """Find joint values of the nominal arm for one target pose or N; else as `invert`."""
     goal = np.broadcast_to(rotation, (len(q), 3, 3)), np.broadcast_to(position, (len(q), 3))
     return invert(arm, lambda joints, _: nominal_pose(arm, tool, joints), q, *goal)
-
-
-def singular(arm: Arm, chain: Chain, position: Floats) -> Bools:
-    """(N,) whether poses with the tool at points (N, 3) are singular."""
-    s = np.linalg.svd(_jacobian(arm, chain, position), compute_uv=False)
-    return np.asarray(s[:, -1] < LEAST_SINGULAR * s[:, 0])
 
 
 def _jacobian(arm: Arm, chain: Chain, position: Floats) -> Floats:
@@ -219,10 +300,8 @@ class Compensation(Brief):
     @property
     def inside(self) -> Bools:
         """(N,) whether the point lies within the measured ranges."""
-        out = np.ones(len(self.q), dtype=bool)
-        for o in self.after.outside:
-            out &= ~o.points
-        return out
+        nowhere = np.zeros(len(self.q), dtype=bool)
+        return np.asarray(~np.any([nowhere, *(o.points for o in self.after.outside)], axis=0))
 
     @cached_property
     def before(self) -> ToolPoses:
@@ -250,16 +329,17 @@ class Compensation(Brief):
     def singular(self) -> Bools:
         """(N,) whether the pose is singular."""
         arm = self._tool.model.cell.arm
-        return singular(arm, evaluate(arm, self.q), self.after.position)
+        jacobian = _jacobian(arm, evaluate(arm, self.q), self.after.position)
+        s = np.linalg.svd(jacobian, compute_uv=False)
+        return np.asarray(s[:, -1] < LEAST_SINGULAR * s[:, 0])
 
     @property
     def turned_on(self) -> tuple[Outside, ...]:
         """Joint angles that lie within the measured ranges only after whole turns."""
         by_angle = self._calibration.measured.turned_on(replace(self._states, q=self.q))
-        outside = {o.of.variable: o.points for o in self.after.outside}
-        nowhere = np.zeros(len(self.q), dtype=np.bool_)
+        inside: dict[str, Bools | bool] = {o.of.variable: ~o.points for o in self.after.outside}
         remaining = [
-            replace(o, points=o.points & ~outside.get(o.of.variable, nowhere)) for o in by_angle
+            replace(o, points=o.points & inside.get(o.of.variable, True)) for o in by_angle
         ]
         return tuple(o for o in remaining if o.points.any())
 
@@ -281,35 +361,33 @@ class Compensation(Brief):
         `expected_error_m` is the root sum square of the inversion's residual and the position's
         standard deviation.
         """
-        calibration, after, inside = self._calibration, self.after, self.inside
-        expected = np.hypot(self.inverse.residual_m, after.std_m)
+        calibration, before, after = self._calibration, self.before, self.after
+        columns: dict[str, Sequence[Any]] = {
+            "name": names,
+            "q_command": self.given.tolist(),
+            "q_corrected": self.q.tolist(),
+            "expected_error_m": np.hypot(self.inverse.residual_m, after.std_m).tolist(),
+            "inside": self.inside.tolist(),
+            "q_rad": self.q.tolist(),
+            "before_m": before.error_m.tolist(),
+            "before_rad": before.error_rad.tolist(),
+            "residual_m": self.inverse.residual_m.tolist(),
+            "std_m": after.std_m.tolist(),
+            "band_m": after.band_m.tolist(),
+            "refused": [None] * len(names),
+        }
+        rows = zip(*columns.values(), strict=True)
         return {
             "calibration": dict(calibration.source),
             "readings": calibration.mode,
             "base_in_tracker": se3.six(calibration.base_in_tracker()),
             "base_is": calibration.frames.base_is,
             "n_points": len(names),
-            "error_before": asdict(ErrorSize.of(self.before.error_m)),
+            "error_before": asdict(ErrorSize.of(before.error_m)),
             "error_after": {
                 "std_m": ErrorSize.of(after.std_m).rms_m,
                 "band_m": float(after.band_m.max()),
                 "band_share": BAND,
             },
-            "points": [
-                {
-                    "name": name,
-                    "q_command": self.given[k].tolist(),
-                    "q_corrected": self.q[k].tolist(),
-                    "expected_error_m": float(expected[k]),
-                    "inside": bool(inside[k]),
-                    "q_rad": self.q[k].tolist(),
-                    "before_m": float(self.before.error_m[k]),
-                    "before_rad": float(self.before.error_rad[k]),
-                    "residual_m": float(self.inverse.residual_m[k]),
-                    "std_m": float(after.std_m[k]),
-                    "band_m": float(after.band_m[k]),
-                    "refused": None,
-                }
-                for k, name in enumerate(names)
-            ],
+            "points": [dict(zip(columns, row, strict=True)) for row in rows],
         }

@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.calibration.compensation import MOST_TURN, TOLERANCE
-from hilcal.calibration.tool import ToolPose, in_chain
+from hilcal.calibration.compensation import MOST_TURN, TOLERANCE, ToolPose, in_chain
 from hilcal.effects.protocol import FRAME_ROLES, Effect, Situation
 from hilcal.optional import install
 from hilcal.readings.readings import States
@@ -41,13 +40,12 @@ class CompiledForm:
     """The sum of the effects so far; arrays that no effect has filled have no rows."""
 
     def __init__(self, n: int) -> None:
-        """Begin with an arm of n joints without any effect."""
         self.a, self.linear, self.by_wrench = np.zeros(n), np.zeros((n, n)), np.zeros((n, 6))
         self.b, self.compliance = np.zeros((n + 1, 6)), np.zeros((n + 1, 6, 6))
         self.by_values: Floats = np.zeros((0, 6, n))
-        self.by_angle: Floats = np.zeros((0, NODES))
-        self.soft: Floats = np.zeros((0, NODES))
-        self.by_torque: Floats = np.zeros((0, TORQUE_NODES))
+        self.by_angle: Floats = np.zeros((0, NODES - 1, 4))
+        self.soft: Floats = np.zeros((0, NODES - 1, 4))
+        self.by_torque: Floats = np.zeros((0, TORQUE_NODES - 1, 4))
         self.torque = np.ones(n)
         self.gain: Floats = np.zeros((0, 6))
         self.bias = np.zeros(6)
@@ -57,20 +55,9 @@ class CompiledForm:
         return self.a, self.linear, self.by_wrench, self.b, self.compliance, self.by_values
 
     def tables(self) -> tuple[Any, ...]:
-        """Return the tables with their slopes, as the kernel takes them."""
-        angle = np.linspace(-TURN, TURN, NODES)
-        steps = 2 * self.torque / (TORQUE_NODES - 1)
-        slopes, soft_slopes = (
-            _spline(angle, x, axis=1)(angle, 1) if len(x) else np.zeros_like(x)
-            for x in (self.by_angle, self.soft)
-        )
-        torque_slopes = np.zeros_like(self.by_torque)
-        for j, values in enumerate(self.by_torque):
-            grid = np.linspace(-self.torque[j], self.torque[j], TORQUE_NODES)
-            torque_slopes[j] = _spline(grid, values)(grid, 1)
-        grids = -TURN, float(angle[1] - angle[0]), -self.torque, steps
-        angles, soft = (self.by_angle, packed(slopes)), (self.soft, packed(soft_slopes))
-        return grids, (*angles, self.by_torque, torque_slopes, *soft)
+        """Return first nodes, steps and polynomials of the tables, as the kernel takes them."""
+        grids = -TURN, 2 * TURN / (NODES - 1), -self.torque, 2 * self.torque / (TORQUE_NODES - 1)
+        return grids, (self.by_angle, self.by_torque, self.soft)
 
     def take(self, e: Effect, theta: Floats, s: Situation) -> bool:
         """Add an effect; return False where it has another form."""
@@ -113,9 +100,8 @@ class CompiledForm:
             np.einsum("nij,nki->nkj", r, x.reshape(-1, 2, 3)).reshape(-1, 6)
             for x in (s.states.wrench, change)
         )
-        rows = np.hstack([w, np.ones((TRIALS, 1))])
-        coefficients = np.linalg.lstsq(rows, y, rcond=None)[0]
-        if np.abs(rows @ coefficients - y).max() > 1e3 * EXACT * max(np.abs(y).max(), 1.0):
+        coefficients, left = _affine(w, y)
+        if np.abs(left).max() > 1e3 * EXACT * max(np.abs(y).max(), 1.0):
             return False
         self.gain = _added(self.gain, coefficients[:-1].T)
         self.bias = self.bias + coefficients[-1]
@@ -123,12 +109,10 @@ class CompiledForm:
 
     def _soft(self, e: Effect, theta: Floats, s: Situation, dq: Floats) -> bool:
         """Add compliances of joints that depend on the joint's own angle."""
-        n, unit = s.angle.shape[1], np.zeros_like(s.wrench)
-        unit[:, :n, 5] = 1.0
-        values, compliance = _waves(e, theta, replace(s, wrench=unit))
-        if not _same(Deviation(dq=dq), compliance * s.wrench[:, :n, 5], None):
+        waves, compliance = _waves(e, theta, replace(s, wrench=_unit_torque(s)))
+        if not _same(Deviation(dq=dq), compliance * s.wrench[:, :-1, 5]):
             return False
-        self.soft = _added(self.soft, values.T)
+        self.soft = _added(self.soft, waves)
         return True
 
     def _by_torque(self, e: Effect, theta: Floats, s: Situation, deviation: Deviation) -> bool:
@@ -144,42 +128,32 @@ class CompiledForm:
             return False
         splines = [_spline(share * torque[j], values[:, j]) for j in range(n)]
         dq = np.stack([splines[j](s.wrench[:, j, 5]) for j in range(n)], axis=1)
-        if not _same(deviation, dq, None):
+        if not _same(deviation, dq):
             return False
         self.torque = torque
-        self.by_torque = _added(self.by_torque, values.T)
+        self.by_torque = _added(self.by_torque, np.stack([f.c.T for f in splines]))
         return True
 
     def _rigid(self, e: Effect, theta: Floats, s: Situation, deviation: Deviation) -> bool:
-        twist = np.zeros(self.b.shape) if deviation.twist is None else deviation.twist[0]
-        n = s.angle.shape[1]
-        if deviation.dq is None and deviation.twist is not None:
-            rows = np.hstack([s.values, np.ones((TRIALS, 1))])
-            flat = np.broadcast_to(deviation.twist, (TRIALS, *twist.shape)).reshape(TRIALS, -1)
-            coefficients = np.linalg.lstsq(rows, flat, rcond=None)[0]
-            if np.ptp(flat, axis=0).max() <= EXACT:
-                coefficients[:-1], coefficients[-1] = 0.0, flat[0]
-            if np.abs(rows @ coefficients - flat).max() > EXACT:
+        dq, twist, shape = deviation.dq, deviation.twist, self.b.shape
+        if twist is not None:
+            flat = np.broadcast_to(twist, (TRIALS, *shape)).reshape(TRIALS, -1)
+            coefficients, left = _affine(s.angle, flat)
+            if np.abs(left).max() > EXACT:
                 return False
-            self.b += coefficients[-1].reshape(twist.shape)
-            if coefficients[:-1].any():
-                by_values = np.moveaxis(coefficients[:-1].reshape(n, *twist.shape), 0, -1)
-                self.by_values = _added(self.by_values, by_values)
-            return True
-        values, by_angle = _waves(e, theta, s)
-        # The remainder may be linear in the other joints.
-        remainder = np.asarray(deviation.dq) - by_angle
-        rows = np.hstack([s.angle, np.ones((TRIALS, 1))])
-        coefficients = np.linalg.lstsq(rows, remainder, rcond=None)[0]
-        if np.abs(remainder).max() < EXACT:
-            coefficients = np.zeros_like(coefficients)
-        dq = by_angle + rows @ coefficients
-        if not _same(deviation, dq, np.broadcast_to(twist, (TRIALS, *twist.shape))):
-            return False
-        self.b += twist
-        self.a += coefficients[-1]
-        self.linear += coefficients[:-1].T
-        self.by_angle = _added(self.by_angle, values.T)
+            slopes = np.moveaxis(coefficients[:-1].reshape(-1, *shape), 0, -1)
+        if dq is not None:
+            waves, by_angle = _waves(e, theta, s)
+            # The remainder may be linear in the other joints.
+            by_others, left = _affine(s.angle, dq - by_angle)
+            if not _same(Deviation(dq=dq), dq - left):
+                return False
+            self.a += by_others[-1]
+            self.linear += by_others[:-1].T
+            self.by_angle = _added(self.by_angle, waves)
+        if twist is not None:
+            self.b += coefficients[-1].reshape(shape)
+            self.by_values = _added(self.by_values, slopes) if slopes.any() else self.by_values
         return True
 
 
@@ -187,24 +161,38 @@ def given_the_columns(e: Effect, theta: Floats, s: Situation) -> bool:
     """Whether an effect, at fixed columns, is a constant or a compliance of joints."""
     turned = np.roll(s.angle, 1, axis=0)
     permuted = replace(s, states=replace(s.states, q=turned), angle=turned)
-    n = s.angle.shape[1]
-    unit, d = np.zeros_like(s.wrench), e.deviation(theta, s)
-    unit[..., 5] = 1.0
-    if e.elastic:
-        soft, other = (e.deviation(theta, replace(x, wrench=unit)) for x in (s, permuted))
-        if d.twist is not None or soft.dq is None or other.dq is None or not _only(d):
-            return False
-        return _same(other, soft.dq, None) and _same(d, soft.dq * s.wrench[:, :n, 5], None)
+    d = e.deviation(theta, s)
     if not _only(d) or (d.dq is None and d.twist is None):
         return False
-    dq = np.zeros((TRIALS, n)) if d.dq is None else d.dq
-    return _same(e.deviation(theta, permuted), dq, d.twist)
+    if not e.elastic:
+        dq = np.zeros_like(s.angle) if d.dq is None else d.dq
+        return _same(e.deviation(theta, permuted), dq, d.twist)
+    soft, other = (e.deviation(theta, replace(x, wrench=_unit_torque(s))).dq for x in (s, permuted))
+    if d.twist is not None or soft is None or other is None:
+        return False
+    return _same(Deviation(dq=other), soft) and _same(d, soft * s.wrench[:, :-1, 5])
 
 
-def _spline(x: Floats, y: Floats, axis: int = 0) -> Any:
+def _unit_torque(s: Situation) -> Floats:
+    """Return wrenches of 1 N·m about the axes alone."""
+    unit = np.zeros_like(s.wrench)
+    unit[..., 5] = 1.0
+    return unit
+
+
+def _affine(x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """Coefficients (n + 1, K) of y (N, K) by x (N, n) and 1, and the remainder (N, K)."""
+    if np.ptp(y, axis=0).max() <= EXACT:
+        return np.vstack([np.zeros((x.shape[1], y.shape[1])), y[:1]]), y - y[0]
+    rows = np.hstack([x, np.ones((len(x), 1))])
+    coefficients: Floats = np.asarray(np.linalg.lstsq(rows, y, rcond=None)[0], dtype=float)
+    return coefficients, np.asarray(y - rows @ coefficients)
+
+
+def _spline(x: Floats, y: Floats) -> Any:
     from scipy.interpolate import CubicSpline  # slow to import
 
-    return CubicSpline(x, y, axis=axis)
+    return CubicSpline(x, y)
 
 
 def _added(rows: Floats, added: Any) -> Floats:
@@ -212,15 +200,15 @@ def _added(rows: Floats, added: Any) -> Floats:
 
 
 def _waves(e: Effect, theta: Floats, s: Situation) -> tuple[Floats, Floats]:
-    """Displacements (NODES, n) with all joints at the angle of each node, and (N, n) at s."""
+    """Polynomials (n, NODES − 1, 4) of the displacements over one angle, and (N, n) those at s."""
     angle, parts = np.linspace(-TURN, TURN, NODES), []
     for part in np.array_split(angle, 16):
         grid, q = repeated(s, len(part)), np.repeat(part[:, None], s.angle.shape[1], axis=1)
         dq = e.deviation(theta, replace(grid, states=replace(grid.states, q=q), angle=q)).dq
         parts.append(np.zeros_like(q) if dq is None else dq)
-    values = np.concatenate(parts)
-    waves = _spline(angle, values)
-    return values, np.stack([waves(a)[:, j] for j, a in enumerate(s.angle.T)], axis=1)
+    waves = _spline(angle, np.concatenate(parts))
+    at_states = np.stack([waves(a)[:, j] for j, a in enumerate(s.angle.T)], axis=1)
+    return waves.c.T, at_states
 
 
 def repeated(s: Situation, count: int) -> Situation:
@@ -244,8 +232,7 @@ def _only(d: Deviation) -> bool:
     return all(f is None for f in (d.base, d.station, d.target, d.scale, d.observer))
 
 
-def _same(d: Deviation, dq: Floats, twist: Floats | None) -> bool:
-    """Whether a deviation equals that of the form."""
+def _same(d: Deviation, dq: Floats, twist: Floats | None = None) -> bool:
     a = (0.0 if d.dq is None else d.dq) - dq
     b = (0.0 if d.twist is None else d.twist) - (0.0 if twist is None else twist)
     size = max(np.abs(dq).max(initial=0.0), 1e-3)
@@ -359,9 +346,8 @@ def compiled(tool: ToolPose, mode: Mode) -> Compiled | tuple[str, ...]:
     links = (packed(arm.links[:, :3, :3]), packed(arm.links[:, :3, 3]), packed(arm.coms))
     bare = CompiledForm(arm.n)
     nominal = bare.laws(), bare.tables()
-    unit = np.zeros_like(s.wrench[:1])
-    unit[..., 5] = 1.0
-    one = replace(repeated(s, 1), wrench=unit)
+    one = repeated(s, 1)
+    one = replace(one, wrench=_unit_torque(one))
     return Compiled(
         links, load, form.laws(), form.tables(), tool, nominal, float(arm.reach), mode,
         tuple(by_point), one,
@@ -369,7 +355,6 @@ def compiled(tool: ToolPose, mode: Mode) -> Compiled | tuple[str, ...]:
 
 
 def _zeros(n: int) -> tuple[Floats, Floats, Floats]:
-    """Return zero displacements, twists and compliances for one point."""
     return np.zeros((1, n)), np.zeros((1, n + 1, 6)), np.zeros((1, n))
 
 

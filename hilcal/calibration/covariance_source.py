@@ -13,7 +13,7 @@ its eigenvectors take seconds to compute, once, when an uncertainty is first nee
 import base64
 import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -108,33 +108,29 @@ class CovarianceSource:
         pose, load, cycle = _unpacked(content["index"])
         i, j = np.triu_indices(m)
 
-        def square(packed: Mapping[str, Any] | None) -> Floats | None:
-            if packed is None:
-                return None
+        def square(packed: Mapping[str, Any]) -> Floats:
             full = np.zeros((len(states), m, m))
             full[:, i, j] = full[:, j, i] = _unpacked(packed)
             return full
 
-        covariance = square(content["covariance"])
-        if covariance is None:
-            raise ValueError("no covariance")
-        serial, along = content.get("serial_noise"), content.get("along")
-        common = content["common"]
+        def maybe(name: str, read: Callable[[Any], Any]) -> Any:
+            return None if content.get(name) is None else read(content[name])
+
         readings = Readings(
             states=states,
             pose=pose,
             load=load,
             cycle=cycle,
             value=np.zeros((len(states), m)),
-            covariance=covariance,
+            covariance=square(content["covariance"]),
             load_names=tuple(content["load_names"]),
             pose_names=tuple(f"p{k + 1}" for k in range(min(int(content["poses"]), len(states)))),
             target_names=tuple(content["target_names"]),
             observers=tuple(ObserverName(*o) for o in content.get("observers", ())),
-            common=None if common is None else _unpacked(common),
-            stated=square(content.get("stated")),
-            serial=None if serial is None else SerialNoise.from_json(serial),
-            along=None if along is None else _unpacked(along),
+            common=maybe("common", _unpacked),
+            stated=maybe("stated", square),
+            serial=maybe("serial_noise", SerialNoise.from_json),
+            along=maybe("along", _unpacked),
         )
         prior = np.array(content["prior"], dtype=float)
         return cls(readings, prior, float(content["noise"]), float(content["factor"]))

@@ -21,6 +21,7 @@ parameter estimation", IEEE CDC 1983, for parallel axes.
 import csv
 import io
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import Literal
 
 import numpy as np
@@ -77,7 +78,7 @@ def dh_rows(arm: Arm, convention: Convention = "standard") -> DhRows:
         start, across[0], z_after[0] = _common_normal(first)
         base = se3.screw(2, *start)
     else:
-        z_after[0] = _twist_last(first)
+        z_after[0] = _about_z(first), first[:3, 2] @ first[:3, 3]
         base = first @ se3.screw(2, *-z_after[0])
     if convention == "standard" and _tilt(last) > CROSSED:
         z_before[n], across[n], end = _common_normal(last)
@@ -88,10 +89,10 @@ def dh_rows(arm: Arm, convention: Convention = "standard") -> DhRows:
     along = z_after[:n] + z_before[1:]
     shift = 1 if convention == "standard" else 0
     a, alpha = across[shift : n + shift].T
+    offset = along[:, 0] - 2 * np.pi * np.rint(along[:, 0] / (2 * np.pi))
+    offset[np.abs(offset) < 1e-15] = 0.0  # rounding errors
     slides = tuple(np.flatnonzero(arm.slides).tolist())
-    rows = DhRows(
-        convention, a, along[:, 1], alpha, _wrapped(along[:, 0]), base, flange, slides=slides
-    )
+    rows = DhRows(convention, a, along[:, 1], alpha, offset, base, flange, slides=slides)
     return _judged(rows, arm)
 
 
@@ -109,10 +110,8 @@ def row_transforms(rows: DhRows, q: Floats) -> Floats:
 
 def flange_poses(rows: DhRows, q: Floats, *, whole: bool = True) -> Floats:
     """(N, 4, 4) poses of the flange by the rows, with B and E if `whole`."""
-    place = np.broadcast_to(rows.base if whole else np.eye(4), (len(q), 4, 4))
-    for part in np.moveaxis(row_transforms(rows, q), 1, 0):
-        place = place @ part
-    return np.asarray(place @ rows.flange if whole else place)
+    place = reduce(np.matmul, np.moveaxis(row_transforms(rows, q), 1, 0))
+    return np.asarray(rows.base @ place @ rows.flange if whole else place)
 
 
 def to_csv(rows: DhRows, arm: Arm) -> str:
@@ -129,9 +128,10 @@ def to_csv(rows: DhRows, arm: Arm) -> str:
 def to_toml(rows: DhRows, arm: Arm, title: str) -> str:
     """Return a robot file with the rows, and masses, limits and payload of an arm."""
     com = _centres(rows, arm)
-    content: dict[str, object] = {
-        "title": escaped(title),
-        **({"payload_kg": float(arm.payload)} if np.isfinite(arm.payload) else {}),
+    content: dict[str, object] = {"title": escaped(title)}
+    if np.isfinite(arm.payload):
+        content["payload_kg"] = float(arm.payload)
+    content |= {
         "source": escaped(f"{arm.source}; corrected by calibration"),
         "convention": rows.convention,
         "base_m_rad": se3.six(rows.base),
@@ -152,12 +152,11 @@ def to_toml(rows: DhRows, arm: Arm, title: str) -> str:
         }
         for k in range(arm.n)
     ]
-    law = {
-        "standard": "B * product of Rz(q + offset) Tz(d) Tx(a) Rx(alpha) * E",
-        "modified": "B * product of Rx(alpha) Tx(a) Rz(q + offset) Tz(d) * E",
-    }[rows.convention]
+    parts = ["Rz(q + offset) Tz(d)", "Tx(a) Rx(alpha)"]
+    if rows.convention == "modified":
+        parts = ["Rx(alpha) Tx(a)", parts[0]]
     head = (
-        f"# T_base_flange = {law},\n"
+        f"# T_base_flange = B * product of {' '.join(parts)} * E,\n"
         "# B = base_m_rad and E = flange_m_rad: x, y, z and rotation vector, m and rad. Programs\n"
         "# that read the rows alone put the flange up to "
         f"{1e3 * rows.table_moves:.4f} mm elsewhere.\n"
@@ -234,11 +233,6 @@ def twist_first(link: Floats) -> Floats:
     return np.array([_about_z(link), link[2, 3]])
 
 
-def _twist_last(link: Floats) -> Floats:
-    """Angle and distance of Rz Tz at the end of a transform."""
-    return np.array([_about_z(link), link[:3, 2] @ link[:3, 3]])
-
-
 def _about_z(link: Floats) -> float:
     """Angle about z of a rotation that is one about z and one about a horizontal axis."""
     from scipy.spatial.transform import Rotation  # slow to import
@@ -249,9 +243,3 @@ def _about_z(link: Floats) -> float:
 
 def _tilt(link: Floats) -> float:
     return float(np.arctan2(np.hypot(link[0, 2], link[1, 2]), abs(link[2, 2])))
-
-
-def _wrapped(angle: Floats) -> Floats:
-    """Wrap angles to half a turn; rounding errors become zero."""
-    out = angle - 2 * np.pi * np.rint(angle / (2 * np.pi))
-    return np.where(np.abs(out) < 1e-15, 0.0, out)

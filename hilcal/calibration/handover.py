@@ -70,8 +70,12 @@ def urdf(arm: Arm, note: str = "") -> str:
     links = ["base_link", *(f"link_{k}" for k in range(1, arm.n + 1)), "tool0"]
     for k in range(arm.n):
         link = SubElement(root, "link", name=links[k + 1])
-        if arm.masses[k] > 0:
-            _inertial(link, float(arm.masses[k]), arm.coms[k])
+        if arm.masses[k] > 0:  # moments of inertia are those of a ball of 10 cm
+            inertial, ball = SubElement(link, "inertial"), f"{0.4 * arm.masses[k] * 0.1**2:.6g}"
+            SubElement(inertial, "origin", xyz=_numbers(arm.coms[k]), rpy="0 0 0")
+            SubElement(inertial, "mass", value=f"{arm.masses[k]:.17g}")
+            moments = dict.fromkeys(("ixx", "iyy", "izz"), ball)
+            SubElement(inertial, "inertia", moments | dict.fromkeys(("ixy", "ixz", "iyz"), "0"))
     SubElement(root, "link", name="tool0")
     for k, transform in enumerate(arm.links):
         fixed = k == arm.n
@@ -84,7 +88,13 @@ def urdf(arm: Arm, note: str = "") -> str:
         SubElement(joint, "child", link=links[k + 1])
         if not fixed:
             SubElement(joint, "axis", xyz="0 0 1")
-            _limit(joint, arm, k)
+            values = float(arm.q_min[k]), float(arm.q_max[k]), float(arm.torque_max[k])
+            # `arm_from_urdf` reads 0 as an unknown torque
+            low, high, torque = (
+                f"{v if np.isfinite(v) else unknown:.17g}"
+                for v, unknown in zip(values, (-FULL_TURN, FULL_TURN, 0.0), strict=True)
+            )
+            SubElement(joint, "limit", lower=low, upper=high, effort=torque, velocity="3.14")
     indent(root)
     comment = f"<!-- {re.sub('-(?=-)', '- ', escaped(note))} -->\n" if note else ""
     return f'<?xml version="1.0"?>\n{comment}{tostring(root, encoding="unicode")}\n'
@@ -121,7 +131,7 @@ def matlab(arm: Arm, name: str, note: str = "") -> str:
                 f"joint.PositionLimits = [{limits[0]:.17g} {limits[1]:.17g}];",
                 f"joint.HomePosition = {home:.17g};",
             ]
-        mass, com = (float(arm.masses[k]), arm.coms[k]) if moving else (0.0, np.zeros(3))
+        mass, com = (arm.masses[k], arm.coms[k]) if moving else (0.0, np.zeros(3))
         square = mass * (com @ com * np.eye(3) - np.outer(com, com)) + 0.4 * mass * 0.01 * np.eye(3)
         inertia = square[[0, 1, 2, 1, 0, 0], [0, 1, 2, 2, 2, 1]]
         out += [
@@ -228,26 +238,3 @@ def _yaml(value: float) -> str:
 
 def _numbers(values: Floats) -> str:
     return " ".join(f"{v:.17g}" for v in values)
-
-
-def _inertial(link: Element, mass: float, com: Floats) -> None:
-    """Add mass, centre of mass, and as moments of inertia those of a ball of 10 cm."""
-    inertial = SubElement(link, "inertial")
-    SubElement(inertial, "origin", xyz=_numbers(com), rpy="0 0 0")
-    SubElement(inertial, "mass", value=f"{mass:.17g}")
-    ball = f"{0.4 * mass * 0.1**2:.6g}"
-    zeros = dict.fromkeys(("ixy", "ixz", "iyz"), "0")
-    SubElement(inertial, "inertia", {"ixx": ball, "iyy": ball, "izz": ball, **zeros})
-
-
-def _limit(joint: Element, arm: Arm, k: int) -> None:
-    """Add limits; 0 for an unknown torque, as `arm_from_urdf` reads it."""
-    low, high, torque = (float(x[k]) for x in (arm.q_min, arm.q_max, arm.torque_max))
-    SubElement(
-        joint,
-        "limit",
-        lower=f"{low if np.isfinite(low) else -FULL_TURN:.17g}",
-        upper=f"{high if np.isfinite(high) else FULL_TURN:.17g}",
-        effort=f"{torque if np.isfinite(torque) else 0.0:.17g}",
-        velocity="3.14",
-    )

@@ -28,19 +28,14 @@ SETTLED = 1e-12
 
 
 @njit(cache=True)
-def _interpolate(x: float, low: float, step: float, value: Floats, slope: Floats) -> float:
-    """Cubic Hermite interpolation in a table with equal steps; linear outside."""
-    last = len(value) - 1
-    position = (x - low) / step
-    k = math.floor(position)
-    if k < 0:
-        return float(value[0] + (x - low) * slope[0])
-    if k >= last:
-        return float(value[last] + (x - low - last * step) * slope[last])
-    t = position - k
-    u = 1.0 - t
-    ends = value[k] * u * u * (1.0 + 2.0 * t) + value[k + 1] * t * t * (3.0 - 2.0 * t)
-    return float(ends + step * t * u * (slope[k] * u - slope[k + 1] * t))
+def _interpolate(x: float, low: float, step: float, table: Floats) -> float:
+    """Value of cubic polynomials (K, 4) on equal steps; linear outside."""
+    k = min(max(math.floor((x - low) / step), 0), len(table) - 1)
+    t = x - low - k * step
+    inside = min(max(t, 0.0), step)
+    a, b, c = table[k, 0], table[k, 1], table[k, 2]
+    value = ((a * inside + b) * inside + c) * inside + table[k, 3]
+    return float(value + ((3.0 * a * inside + 2.0 * b) * inside + c) * (t - inside))
 
 
 @njit(cache=True)
@@ -53,14 +48,12 @@ def _product(a: Floats, b: Floats, out: Floats) -> None:
 
 @njit(cache=True)
 def _add_turned(r: Floats, v: Floats, out: Floats) -> None:
-    """Add r v to a vector."""
     for i in range(3):
         out[i] += r[i, 0] * v[0] + r[i, 1] * v[1] + r[i, 2] * v[2]
 
 
 @njit(cache=True)
 def _add_cross(a: Floats, b: Floats, out: Floats) -> None:
-    """Add a × b to a vector."""
     out[0] += a[1] * b[2] - a[2] * b[1]
     out[1] += a[2] * b[0] - a[0] * b[2]
     out[2] += a[0] * b[1] - a[1] * b[0]
@@ -103,10 +96,7 @@ def _chain(
         for i in range(3):
             p[i] = 0.0 if k == 0 else position[k - 1, i]
         _add_turned(previous, link_p[k], p)
-        moved = False
-        for i in range(6):
-            moved = moved or twist[k, i] != 0.0
-        if moved:
+        if twist[k].any():
             _product(previous, link_r[k], frame)
             _exp(twist[k], step_r, step_p)
             _add_turned(frame, step_p, p)
@@ -150,17 +140,15 @@ def _wrenches(load: Any, applied: Floats, frames: Arrays, out: Floats, scratch: 
     point, tool_mass, tool_com, gravity, masses, moments, gain, bias = load
     n = len(com)
     f, t, lever, weight = scratch[0, 0], scratch[0, 1], scratch[0, 2], scratch[1, 0]
-    for i in range(3):
-        f[i] = applied[i]
-        t[i] = applied[3 + i]
+    f[:] = applied[:3]
+    t[:] = applied[3:]
     if len(gain) > 0:
         _add_sensed(gain, bias, rotation[n], applied, f, t)
-    for i in range(3):
-        lever[i] = 0.0
+    lever[:] = 0.0
     _add_turned(rotation[n], point, lever)
     _add_cross(lever, f, t)
+    lever[:] = 0.0
     for i in range(3):
-        lever[i] = 0.0
         weight[i] = tool_mass * gravity[i]
         f[i] += weight[i]
     _add_turned(rotation[n], tool_com, lever)
@@ -196,7 +184,7 @@ def _deviations(
     a, linear, by_wrench, b, compliance, by_values = laws
     point_dq, point_twist, point_soft = by_point
     angle_low, angle_step, torque_low, torque_step = tables[0]
-    by_angle, angle_slopes, by_torque, torque_slopes, soft, soft_slopes = tables[1]
+    by_angle, by_torque, soft = tables[1]
     n, change = len(q), 0.0
     for j in range(n):
         new = a[j] + point_dq[j] + point_soft[j] * wrench[j, 5]
@@ -205,14 +193,11 @@ def _deviations(
         for e in range(6):
             new += by_wrench[j, e] * wrench[j, e]
         if len(by_angle) > 0:
-            new += _interpolate(q[j], angle_low, angle_step, by_angle[j], angle_slopes[j])
+            new += _interpolate(q[j], angle_low, angle_step, by_angle[j])
         if len(soft) > 0:
-            joint_compliance = _interpolate(q[j], angle_low, angle_step, soft[j], soft_slopes[j])
-            new += joint_compliance * wrench[j, 5]
+            new += _interpolate(q[j], angle_low, angle_step, soft[j]) * wrench[j, 5]
         if len(by_torque) > 0:
-            new += _interpolate(
-                wrench[j, 5], torque_low[j], torque_step[j], by_torque[j], torque_slopes[j]
-            )
+            new += _interpolate(wrench[j, 5], torque_low[j], torque_step[j], by_torque[j])
         change = max(change, abs(new - dq[j]))
         dq[j] = new
     for k in range(n + 1):
@@ -233,16 +218,12 @@ def _solve(matrix: Floats, right: Floats) -> bool:
     """Solve a small system in place by elimination with pivots; False where it is singular."""
     n = len(right)
     for c in range(n):
-        best = c
-        for r in range(c + 1, n):
-            if abs(matrix[r, c]) > abs(matrix[best, c]):
-                best = r
+        best = c + np.argmax(np.abs(matrix[c:, c]))
         if abs(matrix[best, c]) < 1e-12:
             return False
-        if best != c:
-            for k in range(n):
-                matrix[c, k], matrix[best, k] = matrix[best, k], matrix[c, k]
-            right[c], right[best] = right[best], right[c]
+        for k in range(n):
+            matrix[c, k], matrix[best, k] = matrix[best, k], matrix[c, k]
+        right[c], right[best] = right[best], right[c]
         for r in range(c + 1, n):
             factor = matrix[r, c] / matrix[c, c]
             for k in range(c, n):
@@ -353,10 +334,5 @@ def invert_all(
                 jacobian[:3, j] = column
             if not _solve(jacobian, e):
                 break
-            longest = 0.0
-            for j in range(n):
-                longest = max(longest, abs(e[j]))
-            share = min(1.0, most_turn / max(longest, 1e-300))
-            for j in range(n):
-                joints[j] += share * e[j]
+            joints += min(1.0, most_turn / max(np.abs(e).max(), 1e-300)) * e
         out_q[point] = joints

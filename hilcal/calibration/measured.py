@@ -61,10 +61,7 @@ class Measured:
     def of(cls, states: States, p: Predictive, noise: Floats, units: Sequence[str]) -> "Measured":
         """Return the ranges of fitted states.
 
-        Args:
-            noise: (D,) trace of the position covariance of each measurement by noise and misfit,
-                m².
-            units: (n,) units of the joint values.
+        `noise` (D,) are traces of the measurements' position covariances by noise and misfit, m².
         """
         spread = noise * p.leverage / (1 - p.leverage)
         return cls(ranges_of(states, units), float(np.sqrt(FAR * np.quantile(spread, 0.99))))
@@ -132,11 +129,10 @@ def conditions_of(
     """Return the conditions that effects of a model need, by column."""
     names = needed(model, States(states.q, states.wrench))
     sample = states[:: -(-len(states) // MOST)]
-    reference = moves(sample) if names else None
-    out = {}
+    reference, out = moves(sample) if names else (np.zeros(0), np.zeros(0)), {}
     for name in names:
         column = getattr(states, name)
-        if column is None or reference is None:
+        if column is None:
             continue
         mean = column.mean(axis=0)
         constant: dict[str, Any] = {name: np.broadcast_to(mean, getattr(sample, name).shape).copy()}

@@ -51,8 +51,6 @@ from hilcal.tables.units import LENGTHS
 from hilcal.types import Floats
 
 NO_LOAD = "none"
-
-
 NEAR = 0.5
 """rad; a solution within this distance of the start counts as the nearest. A choice."""
 STARTS = 300
@@ -89,12 +87,12 @@ def read_points(
     path: Path, arm: Arm, loads: Mapping[str, Floats], mapping: PointMapping | None = None
 ) -> Points:
     """Read a table of points; `loads` are wrenches (6,) by name of the load."""
-    table, guess = (None, "") if mapping is not None else _plain(path, arm)
+    groups, guess = _groups(arm), ""
+    table = None if mapping is not None else _plain(path, arm, groups)
     if table is None:
         if mapping is None:
             mapping, guess = _guessed(path, arm)
         table = _mapped(path, arm, mapping)
-    groups = _groups(arm)
     present = [group for group in groups if group[1][0] in table.number]
     columns = {quantity: table.matrix(names) * factor for quantity, names, factor in present}
     q = columns.pop("q", None)
@@ -121,18 +119,17 @@ def read_points(
     return Points(names, q, poses, wrench, sensed, recorded, guess)
 
 
-def _plain(path: Path, arm: Arm) -> tuple[ColumnTable | None, str]:
+def _plain(path: Path, arm: Arm, groups: "_Groups") -> ColumnTable | None:
     """Return a table with the columns listed above; None if it has none of them."""
-    groups = _groups(arm)
     chosen: list[Sequence[str]] = []
 
     def check(header: Sequence[str]) -> None:
         chosen.extend(_checked(path, header, groups, arm))
 
     try:
-        return ColumnTable.of(open_grid(path, _form(path), check), *chosen), ""
+        return ColumnTable.of(open_grid(path, _form(path), check), *chosen)
     except _OtherNamesError:
-        return None, ""
+        return None
 
 
 def on_branch(points: Points, arm: Arm, tool: Floats, near: Floats | None) -> Floats:
@@ -143,7 +140,6 @@ def on_branch(points: Points, arm: Arm, tool: Floats, near: Floats | None) -> Fl
     """
     if points.wanted is None:
         return points.q
-
     out: list[Floats] = []
     for name, q, goal in zip(points.names, points.q, points.wanted, strict=True):
         start = q if np.isfinite(q).all() else out[-1] if out else near
@@ -170,9 +166,8 @@ def solutions(arm: Arm, tool: Floats, near: Floats | None, goal: Floats) -> Floa
     q = solved.q[solved.solved]
     if near is not None:
         return q
-    q = (q + np.pi) % (2 * np.pi) - np.pi
     distinct: list[Floats] = []
-    for solution in q:
+    for solution in (q + np.pi) % (2 * np.pi) - np.pi:
         if all(np.abs(np.sin((solution - previous) / 2)).max() > 1e-6 for previous in distinct):
             distinct.append(solution)
     return np.array(distinct).reshape(-1, arm.n)
@@ -332,7 +327,6 @@ def _checked(
 
 
 def _load(table: ColumnTable, row: int, loads: Mapping[str, Floats]) -> Floats:
-    """(6,) wrench of a named load."""
     name = table.text["load"][row]
     if name in (NO_LOAD, ""):
         return np.zeros(6)

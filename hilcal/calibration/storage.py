@@ -10,6 +10,7 @@ import base64
 import json
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -53,8 +54,7 @@ def to_json(c: Calibration) -> dict[str, object]:
         text = base64.b64encode(scaled.astype("<f4").tobytes()).decode("ascii")
         covariance = {"covariance_root": text}
     observers = [
-        {"kind": o.name.kind, "name": o.name.name, "free": o.free, "offset_m": o.offset}
-        | {"frame": o.frame}
+        encode(o.name) | {"free": o.free, "offset_m": o.offset, "frame": o.frame}
         for o in cell.observers
     ]
     content = {
@@ -82,18 +82,12 @@ def to_json(c: Calibration) -> dict[str, object]:
 
 def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) -> Calibration:
     """Return the calibration that `to_json` wrote."""
-    return read_document(
-        content,
-        "calibration",
-        FORMAT,
-        (BY_FACTOR, VERSION),
-        lambda stored: _read(stored, catalogue or installed()),
-    )
+    read = partial(_read, catalogue=catalogue or installed())
+    return read_document(content, "calibration", FORMAT, (BY_FACTOR, VERSION), read)
 
 
 def _read(content: Mapping[str, Any], catalogue: Catalogue) -> Calibration:
-    cell = _cell(content["cell"], decode(Arm, content["arm"]))
-    n, effects = cell.arm.n, []
+    cell, effects = _cell(content["cell"], decode(Arm, content["arm"])), []
     for e in content["effects"]:
         if e["name"] not in catalogue.names:
             raise InputError(
@@ -134,7 +128,7 @@ def _read(content: Mapping[str, Any], catalogue: Catalogue) -> Calibration:
         sensor=decode(SensorMount | None, content.get("force_sensor")),
         conditions=decode(Mapping[str, Condition], content.get("conditions", {})),
     )
-    _check(calibration, n)
+    _check(calibration, cell.arm.n)
     return calibration
 
 
@@ -158,19 +152,18 @@ def _small(c: Calibration) -> dict[str, object] | None:
 def _cell(content: Mapping[str, Any], arm: Arm) -> Cell:
     """Return a stored cell; refuse impossible values."""
     _check_arm(arm)
-    vectors: dict[str, Any] = {
-        name: numbers(name, content[name], (3,)) for name in ("load_point", "tool_com", "gravity")
-    }
     cell = Cell(
         arm=arm,
         target=frames("target", content["target"]),
         registration=frames("registration", content["registration"]),
         tool_mass=float(numbers("tool_mass", content["tool_mass"], least=0.0)),
+        load_point=numbers("load_point", content["load_point"], (3,)),
+        tool_com=numbers("tool_com", content["tool_com"], (3,)),
+        gravity=numbers("gravity", content["gravity"], (3,)),
         registration_known=bool(content["registration_known"]),
         target_known=all(content["known_targets"]),
         measured_torques=bool(content.get("measured_torques", False)),
         observers=tuple(map(_observer, content.get("observers", ()))),
-        **vectors,
     )
     if content["targets"] is None:
         return cell
@@ -186,7 +179,6 @@ def _observer(content: Mapping[str, Any]) -> Observer:
 
 
 def _check_arm(arm: Arm) -> None:
-    """Refuse an arm with impossible values."""
     n = arm.links.shape[0] - 1
     if n < 1:
         raise ValueError("the arm has no joints")
@@ -207,7 +199,6 @@ def _check_arm(arm: Arm) -> None:
 
 
 def _check(c: Calibration, n: int) -> None:
-    """Refuse impossible numbers in a calibration of n joints."""
     numbers("misfit_m2", c.misfit, least=0.0)
     numbers("joint_std", c.scatter.joint_std, (n,), least=0.0)
     numbers("std_m", c.scatter.std_m, least=0.0)

@@ -121,7 +121,7 @@ def waypoints(program: str) -> tuple[Waypoint, ...]:
 def program_points(
     path: Path, leave: bool = False
 ) -> tuple[str, tuple[Waypoint, ...], Points, Floats | None]:
-    """Read a program: its text, its waypoints, the understood ones as points, and T_flange_tool."""
+    """Return a program's text, its waypoints, the understood ones as points, and T_flange_tool."""
     try:
         # ends of lines stay as they are
         program = limits.read_bytes(path, limits.SCRIPT).decode("utf-8-sig")
@@ -218,10 +218,10 @@ class _Program:
                 return float(number) if abs(number) < _LARGEST else None
             case ast.Name(name):
                 return self._variable(name, k)
-            case ast.List(elts=parts):
-                return self._vector("", parts, k)
-            case ast.Subscript(slice=ast.Tuple(elts=parts)) if _is_pose(node):
-                return self._vector("p", parts, k)
+            case ast.List(elts=parts) | ast.Subscript(slice=ast.Tuple(elts=parts)):
+                values = [self.value(part, k) for part in parts]
+                numbers = tuple(v for v in values if isinstance(v, float) and math.isfinite(v))
+                return ("p" * _is_pose(node), numbers) if len(numbers) == len(parts) else None
             case ast.UnaryOp(op=ast.USub() | ast.UAdd() as sign, operand=inner):
                 x = self.value(inner, k)
                 if isinstance(x, float):
@@ -235,11 +235,6 @@ class _Program:
                 x = self.value(inner, k)
                 return math.radians(x) if isinstance(x, float) else None
         return None
-
-    def _vector(self, kind: str, parts: Sequence[ast.expr], k: int) -> Value | None:
-        values = [self.value(part, k) for part in parts]
-        numbers = tuple(v for v in values if isinstance(v, float) and math.isfinite(v))
-        return (kind, numbers) if len(numbers) == len(parts) else None
 
     def _variable(self, name: str, k: int) -> Value | None:
         bound = self.bound.get(name, [])
@@ -271,7 +266,7 @@ class _Program:
                 return branch, stated
         value = self.value(node, k)
         q, goal = _six(value), _pose(value)
-        return None if q is None and goal is None else (q, goal)
+        return None if q is goal is None else (q, goal)
 
     def why_not(self, node: ast.expr, s: Statement) -> str:
         """Say why a target is not understood."""
@@ -331,7 +326,6 @@ def _waypoints(p: _Program) -> tuple[Waypoint, ...]:
 
 
 def _waypoint(p: _Program, k: int, setup: Mapping[str, tuple[int, list[Value | None]]]) -> Waypoint:
-    """Return the waypoint of a motion."""
     s = p.statements[k]
     assert s.call is not None  # noqa: S101 - see `_check_calls`
     name, named = s.called[s.call], {n.arg: n.value for n in s.call.keywords}
@@ -384,7 +378,6 @@ def _set_up(
 
 
 def _check_calls(p: _Program, s: Statement) -> None:
-    """Refuse unknown functions, and motions within expressions."""
     moves = s.call is not None and s.called[s.call] in MOVES
     targets = [*s.call.args[:1], *(n.value for n in s.call.keywords)] if moves and s.call else []
     for call, name in s.called.items():

@@ -124,14 +124,15 @@ def _as_python(body: str, word: str) -> tuple[str, int]:
 
 
 def _parsed(text: str, number: int, word: str) -> ast.stmt:
-    """Parse one line, which begins with a word."""
     for sign in _OTHER_SIGN.findall(_STRING_OR_COMMENT.sub("", text)):
         raise _refused(number, f"the sign {sign!a} outside of a comment")
     reason, header = f"'{text[:40]}' is not understood", word in (*_OPENS, "elif")
     try:
         (node,) = ast.parse(text + "\n pass" * header).body
-        _check_depth(node)
-        supported = all(_means_the_same(n, text) for n in _parts(node))
+        level: list[ast.AST] = [node]  # the depth that Python itself reads varies
+        for _ in range(limits.NESTED):
+            level = [part for parent in level for part in ast.iter_child_nodes(parent)]
+        supported = not level and all(_means_the_same(n, text) for n in _parts(node))
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         raise _refused(number, reason) from None
     bare_name = isinstance(node, ast.Expr) and isinstance(node.value, ast.Name)
@@ -139,15 +140,6 @@ def _parsed(text: str, number: int, word: str) -> ast.stmt:
     if not supported or isinstance(node, ast.If | ast.While | ast.FunctionDef) != header:
         raise _refused(number, reason)
     return node
-
-
-def _check_depth(node: ast.AST) -> None:
-    """Refuse deeply nested expressions: the depth that Python itself reads varies."""
-    level: list[ast.AST] = [node]
-    for _ in range(limits.NESTED):
-        level = [part for parent in level for part in ast.iter_child_nodes(parent)]
-    if level:
-        raise ValueError
 
 
 def _parts(node: ast.stmt) -> Iterator[ast.AST]:

@@ -50,7 +50,7 @@ from hilcal.store.procedure_log import refuse_fitting
 from hilcal.store.revision import change
 from hilcal.tables.units import parse_length
 from hilcal.transfer.compare import compare as compare_campaigns
-from hilcal.validation import validate as validate_campaign
+from hilcal.transfer.compare import validate as validate_campaign
 from hilcal.whole_file import replace_file
 
 

@@ -66,7 +66,7 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, load_plan, with_new_names
 from hilcal.store.procedure_log import ProcedureLog
 from hilcal.store.run_log import RunLog, check_same_cell, create_run
-from hilcal.transfer.factory import check_factory
+from hilcal.transfer.compare import check_factory
 from hilcal.whole_file import replace_file
 
 

@@ -23,7 +23,7 @@ from hilcal.tables.proposal import Proposal
 if TYPE_CHECKING:
     from hilcal.measuring.connect import ConnectionResult
     from hilcal.measuring.route import DryRun
-    from hilcal.transfer.factory import FactoryCheck
+    from hilcal.transfer.compare import FactoryCheck
 
 _HEAD = """\
 # Keys of CELL.toml

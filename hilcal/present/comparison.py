@@ -12,9 +12,8 @@ from hilcal.present.document import Block, Table, heading, note, table
 from hilcal.present.fit import error_words, measurements
 
 if TYPE_CHECKING:
-    from hilcal.transfer.fleet import Fleet
+    from hilcal.transfer.fleet import Fleet, Odd, Pooled
     from hilcal.transfer.members import TypeSize
-    from hilcal.transfer.pooled import Odd, Pooled
 
 MOST_PARAMETERS, MOST_ROWS = 6, 12  # listed parameters of a change; of both fits
 CLEAR = 2.0  # least σ of a listed parameter of a change that has several

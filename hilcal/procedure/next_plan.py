@@ -5,8 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.compensation import band
-from hilcal.calibration.tool import tool_of
+from hilcal.calibration.compensation import band, tool_of
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
 from hilcal.config import CellConfig

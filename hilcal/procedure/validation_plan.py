@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.compensation import Compensation
-from hilcal.calibration.tool import tool_of, tool_poses
+from hilcal.calibration.compensation import Compensation, tool_of, tool_poses
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.design.feasible import REASONS, Space, draw

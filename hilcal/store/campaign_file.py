@@ -58,12 +58,11 @@ class CampaignFile:
     """
 
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
-        """Take an open connection; use `create` or `open` instead."""
         self.path, self.connection = path, connection
         self._identity = identity(path)
         self._new_place: Path | None = None
         self._written = False
-        self._meta = self._read_meta()
+        self._meta = self.texts()
         self.config_json, self.base_dir = self._meta["config"], self._meta["base_dir"]
         self.source, self.created = self._meta["source"], self._meta["created"]
 
@@ -86,7 +85,7 @@ class CampaignFile:
         path = Path(path)
         meta = {"config": config_json, "base_dir": base_dir, "source": source}
         meta |= {"created": utc_now(), "program_version": __version__, **typed_now()}
-        meta |= {**robot_file_of(config_json, base_dir), **(more or {})}
+        meta |= robot_file_of(config_json, base_dir) | dict(more or {})
         with new_campaign(path, meta, overwrite) as connection:
             if readings is not None:
                 cls(path, connection).insert(readings)
@@ -130,7 +129,6 @@ class CampaignFile:
         self.connection.close()
 
     def __enter__(self) -> Self:
-        """Return the campaign."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -164,6 +162,12 @@ class CampaignFile:
             raise
         self.check_place()
 
+    def numbered(self, key: str, first: int = 1) -> list[str]:
+        """Return the texts about the campaign under a key with successive numbers."""
+        meta = self.texts()
+        keys = itertools.takewhile(meta.__contains__, map(key.format, itertools.count(first)))
+        return [meta[k] for k in keys]
+
     def check_place(self) -> None:
         """Raise a MovedFileError where the path does not lead to the open file."""
         if identity(self.path) == self._identity:
@@ -185,7 +189,15 @@ class CampaignFile:
         cov = readings.covariance
         readings = replace(readings, covariance=0.5 * (cov + np.swapaxes(cov, -1, -2)))
         if len(readings):
-            self._claim_layout(layout_of(readings))
+            layout, stored = layout_of(readings), self._layout()
+            if stored is None:
+                rows.insert_meta(self.connection, "layout", json.dumps(layout))
+            elif stored != layout:
+                differ = sorted({name for name, _ in set(stored) ^ set(layout)})
+                raise InputError(
+                    f"{self.path}: the readings differ from those before in {', '.join(differ)}; "
+                    f"a campaign holds one kind of reading, start another for these"
+                )
             readings = self._numbered_targets(readings)
             self._claim_observers(readings)
             limits.check_fitted(self.n_readings + len(readings), readings.m, f"{self.path}: ")
@@ -202,11 +214,11 @@ class CampaignFile:
             return rows.fetch_readings(self.connection, self.path, layout, names, observers)
 
     def data_hash(self, count: int | None = None) -> str:
-        """Return the SHA-256 of the first `count` readings, or of all; see `content_hash`."""
+        """Return the `content_hash` of the first `count` readings, or of all."""
         return content_hash(self.readings()[:count])
 
     def append_revision(self, record: RevisionRecord) -> int:
-        """Append a model revision; return its new number, 1, 2, ...."""
+        """Append a model revision; return its number, from 1."""
         with self.transaction():
             return self.insert_revision(record)
 
@@ -217,7 +229,7 @@ class CampaignFile:
             record = replace(record, parent=None)
         record, key, posterior = split(record)
         text = to_text(record)
-        if key is not None and key not in self._read_meta():
+        if key is not None and key not in self.texts():
             rows.insert_meta(self.connection, key, posterior)
         schema.require(
             self.connection,
@@ -237,21 +249,16 @@ class CampaignFile:
         """Make a revision the one that is used; None: always the latest."""
         if number is not None:
             self.revision(number)
-        with self.transaction():
+        with self.transaction() as connection:
             key = ACCEPTED.format(len(self.acceptances()) + 1)
-            rows.insert_meta(self.connection, key, json.dumps(number))
-            schema.require(self.connection, schema.CHOSEN_REVISION)
+            rows.insert_meta(connection, key, json.dumps(number))
+            schema.require(connection, schema.CHOSEN_REVISION)
 
     def acceptances(self) -> list[int | None]:
         """Return all acceptances, in order."""
-        with schema.sqlite_errors(self.path):
-            meta = self._read_meta()
-        numbers: list[int | None] = []
-        while (text := meta.get(ACCEPTED.format(len(numbers) + 1))) is not None:
-            number = rows.stored_json(self.path, text)
-            if number is not None and not isinstance(number, int):
-                raise self._damaged("an acceptance")
-            numbers.append(number)
+        numbers = [rows.stored_json(self.path, text) for text in self.numbered(ACCEPTED)]
+        if any(not isinstance(n, int | None) for n in numbers):
+            raise self._damaged("an acceptance")
         return numbers
 
     def revisions(self) -> tuple[RevisionRecord, ...]:
@@ -266,7 +273,7 @@ class CampaignFile:
         records: list[RevisionRecord] = []
         with schema.sqlite_errors(self.path), limits.memory(str(self.path)):
             stored = self.connection.execute("SELECT id, content, crc FROM revisions ORDER BY id")
-            meta = self._read_meta()
+            meta = self.texts()
             for expected, (number, text, crc) in enumerate(stored.fetchall(), start=1):
                 try:
                     if number != expected or rows.text_crc(str(number), text) != crc:
@@ -275,9 +282,9 @@ class CampaignFile:
                 except InputError as error:
                     return tuple(records), (expected, str(error))
                 except (ValueError, TypeError, AttributeError) as error:
-                    defect = f"the campaign is damaged at revision {expected}"
                     why = f" ({error})" if str(error) else ""
-                    return tuple(records), (expected, defect + why)
+                    defect = f"the campaign is damaged at revision {expected}{why}"
+                    return tuple(records), (expected, defect)
         return tuple(records), None
 
     def revision(self, number: int) -> RevisionRecord:
@@ -311,8 +318,10 @@ class CampaignFile:
                 return number, _OTHER_READINGS.format(number)
         return damaged
 
-    def _read_meta(self) -> dict[str, str]:
-        meta = rows.fetch_meta(self.connection, self.path)
+    def texts(self) -> dict[str, str]:
+        """Return all texts about the campaign by key, as the file has them now."""
+        with schema.sqlite_errors(self.path):
+            meta = rows.fetch_meta(self.connection, self.path)
         if missing := sorted(set(_META) - set(meta)):
             raise self._damaged(f"no {missing[0]}")
         return meta
@@ -321,8 +330,7 @@ class CampaignFile:
         return InputError(f"{self.path}: the campaign file is damaged ({detail})")
 
     def _layout(self) -> Layout | None:
-        with schema.sqlite_errors(self.path):
-            text = self._read_meta().get("layout")
+        text = self.texts().get("layout")
         try:
             return None if text is None else read_layout(text)
         except ValueError as e:
@@ -330,23 +338,11 @@ class CampaignFile:
 
     def _stored(self, key: str, kind: Any) -> Any:
         """Return the list, of type `kind`, in a text about the campaign; empty without the text."""
-        content = rows.stored_json(self.path, self._read_meta().get(key, "[]"))
+        content = rows.stored_json(self.path, self.texts().get(key, "[]"))
         try:
             return decode(kind, content)
         except (TypeError, ValueError):
             raise self._damaged(f"its {key}") from None
-
-    def _claim_layout(self, layout: Layout) -> None:
-        """Fix the layout by the first readings; refuse other layouts later."""
-        stored = self._layout()
-        if stored is None:
-            rows.insert_meta(self.connection, "layout", json.dumps(layout))
-        elif stored != layout:
-            differ = sorted({name for name, _ in set(stored) ^ set(layout)})
-            raise InputError(
-                f"{self.path}: the readings differ from those before in {', '.join(differ)}; "
-                f"a campaign holds one kind of reading, start another for these"
-            )
 
     def _observers(self) -> tuple[ObserverName, ...]:
         stored = self._stored(_OBSERVERS, tuple[tuple[ObserverKind, str], ...])
@@ -360,7 +356,7 @@ class CampaignFile:
             schema.require(self.connection, schema.MORE_COLUMNS)
         if readings.states.observer is None:
             return
-        if self._read_meta().get(_OBSERVERS) is None:
+        if self.texts().get(_OBSERVERS) is None:
             text = json.dumps([[o.kind, o.name] for o in readings.observers])
             rows.insert_meta(self.connection, _OBSERVERS, text)
         if self._observers() != readings.observers:
@@ -370,7 +366,7 @@ class CampaignFile:
         """Return the readings with targets numbered as in the file, by the first readings."""
         if readings.states.target is None:
             return readings
-        if self._read_meta().get(_TARGETS) is None:
+        if self.texts().get(_TARGETS) is None:
             rows.insert_meta(self.connection, _TARGETS, json.dumps(readings.target_names))
             schema.require(self.connection, schema.SEVERAL_TARGETS)
         names: tuple[str, ...] = self._stored(_TARGETS, tuple[str, ...])

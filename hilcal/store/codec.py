@@ -9,7 +9,7 @@ import base64
 import json
 import types
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, Field, fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -24,6 +24,7 @@ from hilcal.types import Floats
 from hilcal.whole_file import replace_file
 
 T = TypeVar("T")
+_hints = cache(get_type_hints)
 LARGEST = 1e9
 """Upper bound of all lengths, angles, masses, forces and parameters, in SI units."""
 
@@ -59,22 +60,14 @@ def decode(kind: Any, content: Any) -> Any:
         return {str(k): decode(arguments[1], v) for k, v in content.items()}
     if isinstance(kind, type) and is_dataclass(kind):
         hints = _hints(kind)
-        present = [f for f in fields(kind) if f.init and (f.name in content or _required(f))]
-        return kind(**{f.name: decode(hints[f.name], content[f.name]) for f in present})
+        required = {f.name for f in fields(kind) if f.default is f.default_factory is MISSING}
+        names = [f.name for f in fields(kind) if f.init and f.name in {*content, *required}]
+        return kind(**{name: decode(hints[name], content[name]) for name in names})
     if kind is float:
         return float(content)
     if kind in (str, int, bool) and type(content) is not kind:
         raise TypeError(f"{content!r} is no {kind.__name__}")
     return content
-
-
-@cache
-def _hints(kind: Any) -> Mapping[str, Any]:
-    return get_type_hints(kind)
-
-
-def _required(f: Field[Any]) -> bool:
-    return f.default is MISSING and f.default_factory is MISSING
 
 
 def numbers(

@@ -148,25 +148,23 @@ def _last(events: Sequence[Mapping[str, Any]], kind: str) -> Mapping[str, Any] |
 
 def to_json(o: Overview, path: str, covariance: str) -> dict[str, object]:
     """Return the document of `info --json`."""
+
+    def encoded(*names: str) -> dict[str, object]:
+        return {name: encode(getattr(o, name)) for name in names}
+
     return {
         "campaign": path,
-        **{name: encode(getattr(o, name)) for name in ("created", "program_version", "source")},
+        **encoded("created", "program_version", "source"),
         "robot": o.config.robot.model,
         "n_readings": 0 if o.readings is None else len(o.readings),
         "n_poses": o.poses,
         "elements": None if o.readings is None else o.readings.m,
-        **{name: encode(getattr(o, name)) for name in ("loads", "targets")},
+        **encoded("loads", "targets"),
         "covariance": covariance,
-        **{name: encode(getattr(o, name)) for name in ("plans", "planned", "measured")},
-        "instruments": encode(o.instruments),
+        **encoded("plans", "planned", "measured", "instruments"),
         "tares": [{"utc": t.utc, "zero": t.wrench.tolist()} for t in o.tares],
-        "drift": {
-            "limit_sigma": o.config.acquire.drift_limit_sigma,
-            "returns": encode(o.returns),
-        },
-        **{name: encode(getattr(o, name)) for name in ("tool", "repeatability", "events")},
-        "accepted": o.accepted,
-        "in_use": o.in_use,
+        "drift": {"limit_sigma": o.config.acquire.drift_limit_sigma, "returns": encode(o.returns)},
+        **encoded("tool", "repeatability", "events", "accepted", "in_use"),
         "revisions": [_revision_json(r, o) for r in o.revisions],
     }
 

@@ -2,7 +2,7 @@
 
 import itertools
 import json
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -63,11 +63,9 @@ class Plan(Brief):
 
     def to_json(self) -> str:
         """Return the plan as a JSON document; `read_plan` reads it back exactly."""
-        poses = [
-            {"name": name, "q_rad": [float(x) for x in q]}
-            for name, q in zip(self.pose_names, self.q, strict=True)
-        ]
-        steps = [{"pose": s.pose, "load": s.load, "cycle": s.cycle} for s in self.steps]
+        rows = zip(self.pose_names, np.asarray(self.q, dtype=float).tolist(), strict=True)
+        poses = [{"name": name, "q_rad": q} for name, q in rows]
+        steps = [asdict(step) for step in self.steps]
         head = {"format": FORMAT, "version": VERSION}
         return json.dumps({**head, **self.about, "poses": poses, "steps": steps}, indent=1)
 
@@ -131,7 +129,6 @@ def _poses(data: object, where: str) -> tuple[tuple[str, ...], Floats]:
 
 
 def _steps(data: object, names: tuple[str, ...], where: str) -> tuple[Step, ...]:
-    """Return the steps in order."""
     steps: dict[Step, int] = {}
     for k, step in enumerate(_entries(data, "step", where), start=1):
         keys = set(step) if isinstance(step, dict) else set()
@@ -167,20 +164,17 @@ def with_new_names(plan: Plan, campaign: Plan, number: int) -> Plan:
     if (REFERENCE in plan.pose_names) != (REFERENCE in campaign.pose_names):
         side = "the plan" if REFERENCE in plan.pose_names else "the campaign"
         raise InputError(f'only {side} has a pose "{REFERENCE}"; valid: both or none')
-    campaign_joints = dict(zip(campaign.pose_names, campaign.q, strict=True))
-    used = {*campaign_joints, *plan.pose_names}
+    there = dict(zip(campaign.pose_names, campaign.q, strict=True))
+    used = {*there, *plan.pose_names}
     names, q = [], []
     for name, joints in zip(plan.pose_names, plan.q, strict=True):
-        if name == REFERENCE:
-            joints = campaign_joints[name]
-        elif name in campaign_joints and np.abs(joints - campaign_joints[name]).max() > SAME_POSE:
+        same = name == REFERENCE or np.abs(joints - there.get(name, joints)).max() <= SAME_POSE
+        q.append(there.get(name, joints) if same else joints)
+        if not same:
             free = (f"{name}-{number}{f'-{k}' * (k > 1)}" for k in itertools.count(1))
             name = next(new for new in free if new not in used)
             used.add(name)
-        elif name in campaign_joints:
-            joints = campaign_joints[name]
         names.append(name)
-        q.append(joints)
     new = dict(zip(plan.pose_names, names, strict=True))
     last: dict[str, int] = {}
     for step in campaign.steps:

@@ -13,11 +13,11 @@ from typing import Any
 
 from hilcal.errors import InputError
 from hilcal.names import quoted
-from hilcal.store import rows, schema
+from hilcal.store import rows
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan
 from hilcal.store.revision import RevisionRecord, utc_now
-from hilcal.store.run_log import PLAN, RunLog
+from hilcal.store.run_log import RunLog
 from hilcal.store.stored_schema import check_entry
 
 ENTRY = "calibrate {}"
@@ -28,17 +28,12 @@ class ProcedureLog:
     """The entries of a campaign; an appended entry survives a kill of the process."""
 
     def __init__(self, campaign: CampaignFile) -> None:
-        """Use the log of an open campaign."""
         self._campaign = campaign
 
     def entries(self) -> tuple[dict[str, Any], ...]:
         """Return all entries in order: "kind", "utc" and the content."""
-        with schema.sqlite_errors(self._campaign.path):
-            meta = rows.fetch_meta(self._campaign.connection, self._campaign.path)
-        entries: list[dict[str, Any]] = []
-        while (text := meta.get(ENTRY.format(len(entries) + 1))) is not None:
-            entries.append(rows.stored_json(self._campaign.path, text, check_entry))
-        return tuple(entries)
+        texts = self._campaign.numbered(ENTRY)
+        return tuple(rows.stored_json(self._campaign.path, text, check_entry) for text in texts)
 
     def last(self, kind: str) -> dict[str, Any] | None:
         """Return the last entry of a kind; None without any."""
@@ -52,18 +47,16 @@ class ProcedureLog:
         plan: Plan | None = None,
         revisions: Sequence[RevisionRecord] = (),
     ) -> tuple[int, ...]:
-        """Append an entry with its further plan and revisions, or nothing.
+        """Append an entry with a further plan (`RunLog.with_new_names`) and revisions, or nothing.
 
-        The plan has names that are new in the campaign. Returns the numbers of the revisions, which
-        the entry has as "revisions".
+        Returns the numbers of the revisions, which the entry has as "revisions".
         """
         log = None if plan is None else RunLog(self._campaign)
         with self._campaign.transaction() as connection:
             number = len(self.entries()) + 1
             stored = tuple(self._campaign.insert_revision(r) for r in revisions)
             if log is not None and plan is not None:
-                key = f"{PLAN} {len(log.plans) + 1}"
-                rows.insert_meta(connection, key, plan.to_json())
+                log.insert(plan)
             document = {**content, "revisions": list(stored)} if stored else content
             rows.insert_meta(connection, ENTRY.format(number), entry(kind, document))
         return stored
@@ -92,9 +85,7 @@ def purpose_of(campaign: CampaignFile) -> str | None:
 
 def _only_tests(campaign: CampaignFile) -> bool:
     """Whether a campaign was measured to test a model, and has not been released for fitting."""
-    with schema.sqlite_errors(campaign.path):
-        released = RELEASED in rows.fetch_meta(campaign.connection, campaign.path)
-    return purpose_of(campaign) is not None and not released
+    return purpose_of(campaign) is not None and RELEASED not in campaign.texts()
 
 
 def release(campaign: CampaignFile, why: str) -> None:

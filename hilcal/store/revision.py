@@ -71,22 +71,21 @@ class RevisionRecord:
     @property
     def follows(self) -> bool:
         """Whether it was made from another revision."""
-        changed = self.added is not None or self.removed is not None or self.scatter_alone
-        return changed or self.parent is not None
+        changes = self.added, self.removed, self.parameters_json.get("arm_scatter"), self.parent
+        return any(change is not None for change in changes)
 
     @property
     def scatter_alone(self) -> bool:
         """Whether it only adds the estimated scatter of the arm to the covariance."""
         scatter = self.parameters_json.get("arm_scatter") is not None
-        return scatter and self.added is None and self.removed is None
+        return scatter and self.added is self.removed is None
 
 
 def change(added: str | None, removed: str | None, scatter: bool = False) -> str:
     """Return the change of a revision as "+ a", "− b" or "+ a − b"; empty for a first model."""
     if scatter and added is None and removed is None:
         return "arm's scatter"
-    parts = [f"+ {added}"] if added else []
-    return " ".join([*parts, f"− {removed}"] if removed else parts)
+    return " ".join(f"{sign} {effect}" for sign, effect in (("+", added), ("−", removed)) if effect)
 
 
 def to_text(record: RevisionRecord) -> str:

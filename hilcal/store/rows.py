@@ -6,6 +6,7 @@ import sqlite3
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from hilcal.names import check_name, check_names
 from hilcal.readings.covariance import is_covariance
 from hilcal.readings.readings import SAME_POSE, ObserverName, Readings, States
 from hilcal.toml import parse_json
-from hilcal.types import Bools, Floats, Ints
+from hilcal.types import Floats, Ints
 
 Layout = tuple[tuple[str, int], ...]
 """Fields of a record in order, with their number of doubles; absent quantities are left out."""
@@ -80,15 +81,10 @@ def pack(readings: Readings) -> Floats:
     return np.ascontiguousarray(np.hstack(parts), dtype="<f8")
 
 
-def _lacking(records: Floats, layout: Layout) -> Bools:
-    """Return which numbers (N, K) are NaN because the reading lacks the quantity `MAY_LACK`."""
-    out, column = np.zeros(records.shape, dtype=np.bool_), 0
-    for name, width in layout:
-        if name == MAY_LACK:
-            missing = np.isnan(records[:, column : column + width])
-            out[:, column : column + width] = missing.all(axis=1, keepdims=True)
-        column += width
-    return out
+def _columns(layout: Layout) -> dict[str, slice]:
+    """Return the columns of each field in the records."""
+    ends = accumulate(width for _, width in layout)
+    return {name: slice(end - width, end) for (name, width), end in zip(layout, ends, strict=True)}
 
 
 def _unpacked(
@@ -100,11 +96,10 @@ def _unpacked(
 ) -> Readings:
     """Return readings of records (N, K), `index` (N, 3); `names` are of poses, loads, targets."""
     fields: dict[str, Any] = {}
-    column, single_widths = 0, _widths(0, 0)
-    for name, width in layout:
-        block = np.array(records[:, column : column + width], dtype=np.float64)
+    single_widths = _widths(0, 0)
+    for name, columns in _columns(layout).items():
+        block = np.array(records[:, columns], dtype=np.float64)
         fields[name] = block[:, 0] if single_widths[name] == 1 else block
-        column += width
     for name in ("target", "observer"):
         if name in fields:
             fields[name] = fields[name].astype(np.int64)
@@ -262,7 +257,9 @@ def fetch_readings(
                 raise damaged(f" at reading {number}")
             records[number - 1] = np.frombuffer(record, "<f8")
             index[number - 1] = where
-        plausible = (np.abs(records) < LARGEST) | _lacking(records, layout)
+        plausible = np.abs(records) < LARGEST
+        if (lacking := _columns(layout).get(MAY_LACK)) is not None:
+            plausible[:, lacking] |= np.isnan(records[:, lacking]).all(axis=1, keepdims=True)
         if bad := np.flatnonzero(~plausible.all(axis=1))[:1].tolist():
             raise damaged(f" at reading {bad[0] + 1}")
         counts = [len(names[0]), len(names[1])]

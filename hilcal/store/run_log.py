@@ -2,7 +2,8 @@
 
 import json
 import sqlite3
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial, reduce
 from pathlib import Path
 from typing import Any
@@ -22,9 +23,9 @@ from hilcal.store.revision import utc_now
 from hilcal.store.stored_schema import DETAIL, check, check_event
 
 PLAN = "plan"
-"""Key of the first plan among the texts of a campaign; further ones have "plan 2" and so on."""
-
-
+"""Key of the first plan among the texts of a campaign ..."""
+FURTHER_PLAN = "plan {}"
+"""... and of further ones, numbered from 2."""
 SAME = ("robot", "tool", "loads")
 """Sections of the configuration that must not change during a campaign ..."""
 ADDRESSES = {"driver", "host", "port", "baud", "options"}
@@ -41,7 +42,7 @@ def create_run(
     source: str = "measured by hilcal run",
     more: Mapping[str, str] | None = None,
 ) -> CampaignFile:
-    """Make the campaign file of a run, with its plan and further texts `more`, without readings."""
+    """Make the campaign file of a run, with its plan and further texts, without readings."""
     texts = {PLAN: plan.to_json(), COVERS: INSTRUMENT, **(more or {})}
     return CampaignFile.create(
         path, config.to_json(), str(base_dir), source, overwrite=overwrite, more=texts
@@ -77,7 +78,6 @@ class RunLog:
     """
 
     def __init__(self, campaign: CampaignFile) -> None:
-        """Read the plans of an open campaign; refuse one without."""
         text = campaign.about(PLAN)
         if text is None:
             raise InputError(
@@ -85,25 +85,28 @@ class RunLog:
                 "it cannot be resumed"
             )
         self._campaign = campaign
-        plans = [read_plan(text, f"{campaign.path}, its plan")]
-        with schema.sqlite_errors(campaign.path):
-            meta = rows.fetch_meta(campaign.connection, campaign.path)
-        while (text := meta.get(f"{PLAN} {len(plans) + 1}")) is not None:
-            plans.append(read_plan(text, f"{campaign.path}, its plan {len(plans) + 1}"))
+        where = f"{campaign.path}, its plan"
+        further = enumerate(campaign.numbered(FURTHER_PLAN, 2), start=2)
+        plans = [read_plan(text, where), *(read_plan(t, f"{where} {k}") for k, t in further)]
         self.plans: tuple[Plan, ...] = tuple(plans)
 
     @property
     def plan(self) -> Plan:
         """The joined plans; of all but the last one only the measured steps."""
+        return self._joined(self.plans)
+
+    def _joined(self, plans: Sequence[Plan]) -> Plan:
         done = self.done() if len(self.plans) > 1 else frozenset()
-        return reduce(lambda a, b: joined(a, done, b), self.plans)
+        return reduce(lambda a, b: joined(a, done, b), plans)
 
     def with_new_names(self, plan: Plan) -> Plan:
         """Return a further plan with names and cycles that are new in the campaign."""
         last, planned = self.plans[-1], self.plan
         missing = len(last.without(self.done()).steps)
         renamed = with_new_names(plan, planned, len(self.plans) + 1)
-        resumed = with_new_names(plan, self._before_last(), len(self.plans))
+        before = self._joined(self.plans[:-1] or self.plans)
+        measured = tuple(s for s in before.steps if s in self.done() and len(self.plans) > 1)
+        resumed = with_new_names(plan, replace(before, steps=measured), len(self.plans))
         if missing and resumed.steps == last.steps and np.array_equal(resumed.q, last.q):
             raise InputError(
                 f"{self._campaign.path}: this plan is in the campaign already, and {missing} of "
@@ -111,26 +114,21 @@ class RunLog:
             )
         return renamed
 
-    def _before_last(self) -> Plan:
-        """Return the measured steps and all poses of the plans before the last one."""
-        done = self.done() if len(self.plans) > 1 else frozenset()
-        planned = reduce(lambda a, b: joined(a, done, b), self.plans[1:-1], self.plans[0])
-        return Plan(planned.pose_names, planned.q, tuple(s for s in planned.steps if s in done))
-
     def append(self, plan: Plan) -> None:
         """Append a further plan, see `with_new_names`; missing steps of other plans are dropped."""
-        with self._campaign.transaction() as connection:
-            rows.insert_meta(connection, f"{PLAN} {len(self.plans) + 1}", plan.to_json())
+        with self._campaign.transaction():
+            self.insert(plan)
+
+    def insert(self, plan: Plan) -> None:
+        """Append a further plan within the caller's transaction."""
+        key = FURTHER_PLAN.format(len(self.plans) + 1)
+        rows.insert_meta(self._campaign.connection, key, plan.to_json())
         self.plans = (*self.plans, plan)
 
     def record(
         self, reading: Readings, step: Step, detail: dict[str, Any], *more: dict[str, Any]
     ) -> None:
-        """Append the reading of a step, with its raw details.
-
-        With several targets, the readings of all targets at one arrival are stored together, with
-        one detail each. The file is unchanged where the disk fails.
-        """
+        """Append the readings of a step: of each target one, with its raw details."""
         details = (detail, *more)
         if len(reading) != len(details):
             raise ValueError(f"{len(reading)} readings of one step, {len(details)} details")
@@ -138,7 +136,9 @@ class RunLog:
             last = self._campaign.insert(reading)
             for k, content in enumerate(details):
                 number, text = last - len(details) + 1 + k, json.dumps(content, allow_nan=False)
-                key = _key(step, reading, k)
+                several = reading.states.target is not None
+                target = [reading.target_names[reading.target[k]]] if several else []
+                key = json.dumps([step.pose, step.load, step.cycle, *target])
                 try:
                     crc = rows.text_crc(f"{number}{key}", text)
                     rows.insert(connection, "details", [(number, key, text, crc)])
@@ -180,9 +180,8 @@ class RunLog:
 
     def last(self, kind: str) -> dict[str, Any] | None:
         """Return the last event of a kind, see `events`; None without one."""
-        of_kind = f'{{"kind": "{kind}", %'
         statement = "SELECT * FROM events WHERE content LIKE ? ORDER BY id DESC LIMIT 1"
-        return next(iter(self._events(statement, of_kind)), None)
+        return next(iter(self._events(statement, f'{{"kind": "{kind}", %')), None)
 
     def _events(self, statement: str, *values: str) -> list[dict[str, Any]]:
         out = []
@@ -208,10 +207,3 @@ class RunLog:
         path = self._campaign.path
         with schema.sqlite_errors(path), limits.memory(str(path)):
             return self._campaign.connection.execute(statement, values).fetchall()
-
-
-def _key(step: Step, reading: Readings, row: int) -> str:
-    """Return the key of a stored detail: the step, and the target's name if there are several."""
-    several = reading.states.target is not None
-    target = [reading.target_names[reading.target[row]]] if several else []
-    return json.dumps([step.pose, step.load, step.cycle, *target])

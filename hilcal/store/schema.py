@@ -28,9 +28,8 @@ from the previous one; a revision with a prior of another campaign, or in a chan
 with joint torques, or of several observers. Older programs would misread a file of a newer one."""
 VERSION = MORE_COLUMNS
 HEADER = b"SQLite format 3\x00"
-_JOURNAL = bytes.fromhex(
-    "d9d505f920a163d7"
-)  # magic number; also ends a journal that ends in a name
+_JOURNAL = bytes.fromhex("d9d505f920a163d7")
+"""Magic number of a journal; it ends a journal that ends in a name, too."""
 
 _TABLES = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, crc INTEGER NOT NULL) WITHOUT ROWID;
@@ -124,10 +123,8 @@ def sqlite_errors(path: Path) -> Iterator[None]:
 def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
     """Open an existing file; every commit is durable before it returns.
 
-    Args:
-        read_only: write neither the file nor files next to it. A file with the journal of a killed
-            program is opened for writing, since SQLite has to undo the unfinished transaction
-            before the file can be read.
+    With `read_only` neither the file nor files next to it are written, unless it has the journal of
+    a killed program: SQLite has to undo the unfinished transaction before it can be read.
     """
     _refuse_write_ahead_log(path)
     unfinished = _journal(path)
@@ -137,9 +134,9 @@ def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
     )
     try:
         connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limits.DOCUMENT)
-        for pragma in ("synchronous = EXTRA", "foreign_keys = ON", "trusted_schema = OFF"):
+        pragmas = "synchronous = EXTRA", "foreign_keys = ON", "trusted_schema = OFF"
+        for pragma in (*pragmas, "cell_size_check = ON"):
             connection.execute(f"PRAGMA {pragma}")
-        connection.execute("PRAGMA cell_size_check = ON")
         connection.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
         if sys.version_info >= (3, 12):
             connection.setconfig(sqlite3.SQLITE_DBCONFIG_DEFENSIVE, True)

@@ -1,25 +1,56 @@
-"""Two campaigns of one arm: the current error of the earlier calibration, and what has changed."""
+"""What has changed on an arm: between two campaigns, or since its factory measured it.
+
+`compare` finds changes between campaigns and the current error of the earlier calibration;
+`validate` predicts another campaign's readings, without those that were fitted.
+
+`check_factory` tests a few readings: all effects of the catalogue are fitted together, starting
+from the factory's kinematics, each with its own variance (see `identification.mixed_fit`), so that
+sag under the arm's weight, backlash and scatter do not count as changes. The test statistic T is
+twice the gain of the restricted log likelihood by encoder offsets and link geometry; without these,
+all other variances are estimated again. With f variances at zero, T is a mixture of χ² with 0 to f
+degrees of freedom; its p-value is at most that of f (Self and Liang, J. Am. Stat. Assoc. 82 (1987)
+605). A displacement of the whole arm, such as an offset of the first joint, cannot be separated
+from an unknown pose of the tracker.
+"""
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import chi2
 
 from hilcal.campaign.campaign import Campaign, opened
 from hilcal.campaign.revisions import mode_of
+from hilcal.cell import Cell
 from hilcal.diagnosis.change import changing, find_changes
 from hilcal.diagnosis.comparison import Comparison, completed, error_today
+from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identification import validation
+from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit
 from hilcal.identification.later_readings import earlier_fit, setting
 from hilcal.identification.misdescription import refuse_misdescribed
+from hilcal.identification.mixed_fit import MixedFit, mixed_fit
 from hilcal.identification.posterior import Differences, Posterior, parameter_differences
 from hilcal.identification.registration import register
+from hilcal.identification.validation import CampaignValidation, Judged, acceptance, extrapolation
+from hilcal.mixed.variances import estimate_variances
 from hilcal.names import quoted
 from hilcal.readings.readings import Readings
 from hilcal.readings.same_readings import never_fitted
+from hilcal.robot.arm import Arm, as_counted
+from hilcal.robot.factory import FactoryKinematics, with_factory
+from hilcal.shown import Shown
 from hilcal.store.revision import CARRIED, RevisionRecord
+from hilcal.types import Bools
+
+LEVEL = 1e-3
+"""p-value below which the geometry counts as changed; a choice."""
+LEAST = 8
+"""Least number of readings, in view of the nine unknowns of the frames; a choice."""
 
 
 def compare(
@@ -140,3 +171,150 @@ def _nominal_rms(later: Campaign, readings: Readings) -> float | None:
     except InputError as error:
         raise InputError(f"{later.path}: {error}") from None
     return registered.rms
+
+
+def validate(
+    run: Campaign | str | Path,
+    other: Campaign | str | Path,
+    revision: int | RevisionRecord | None = None,
+    limit_m: float | None = None,
+    *,
+    register: bool = False,
+    say: Callable[[str], None] = lambda text: None,
+) -> CampaignValidation:
+    """Predict readings of another campaign with a revision of this one.
+
+    Readings that the revision was fitted to are recognised in any file (see
+    `hilcal.readings.same_readings`) and left out. Where all were fitted, all are predicted, and
+    `judged.unseen` is False.
+
+    >>> with hc.Campaign.open(RUN) as run:
+    ...     result = hc.validate(run, run)
+    >>> result.judged.fitted, result.judged.unseen
+    (50, False)
+
+    Args:
+        run: the campaign of the revision, or its path; without a revision the baseline is fitted,
+            but not stored.
+        other: the campaign of the readings, or its path.
+        revision: number or record of the revision; None: the one in use.
+        limit_m: the largest 3-D position error allowed, m; None: [limits] accuracy_m of the
+            configuration of `run`.
+        register: the tracker was moved: estimate its registration first.
+        say: takes progress, one line each.
+
+    Raises:
+        InputError: another robot, no such revision, or an effect that needs a column that the
+            other readings lack.
+        CannotAnswerError: a limit, and all readings were fitted; or the registration does not
+            converge.
+    """
+    if not isinstance(run, Campaign) or not isinstance(other, Campaign):
+        with opened(run) as first, opened(other) as second:
+            return validate(first, second, revision, limit_m, register=register, say=say)
+    if run.cell.arm.name != other.cell.arm.name:
+        raise InputError(
+            f"{other.path}: robot {other.cell.arm.name}; the model of {run.path} is of "
+            f"{run.cell.arm.name}"
+        )
+    record = revision if isinstance(revision, RevisionRecord) else run.in_use(revision)
+    if record is None:
+        record = run.record(run.fit_in_use(say)[1])
+    mode, fitted, readings = mode_of(record), run.fitted_readings(record), other.readings
+    model, theta = run.restore_model(record)
+    refitted, fresh = never_fitted(readings, fitted, mode == "deflection")
+    mixed = bool(refitted.any() and fresh.any())
+    judged = Judged(
+        number=record.number or None,
+        mode=mode,
+        readings=len(readings),
+        fitted=int(refitted.sum()),
+        spoilt=int(np.sum(~refitted & ~fresh)) if mixed else 0,
+        unseen=mixed or not refitted.any(),
+        scalar=bool(readings.scalar.any()),
+    )
+    if limit_m is None and judged.unseen:
+        limit_m = run.config.limits.accuracy_m
+    if limit_m is not None and not judged.unseen:
+        count = "all" if refitted.all() else f"{judged.fitted} of"
+        raise CannotAnswerError(
+            f"{other.path}: {count} its {len(readings)} readings were fitted by {judged.model} of "
+            f"{run.path}; a limit is tested with readings that were not"
+        )
+    chosen = readings[fresh] if mixed else readings
+    say(f"predicting {len(chosen)} readings")
+    prediction = validation.validate(model, theta, fitted, chosen, mode, registered=register)
+    say("comparing with what was measured")
+    beyond = extrapolation(run.predictive(record, model, theta), fitted, prediction)
+    shares = acceptance(prediction, beyond, limit_m)
+    return CampaignValidation(model, judged, prediction, beyond, shares)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FactoryCheck(Shown):
+    """Result of the test."""
+
+    changed: bool  # whether the geometry differs from the factory's
+    p_value: float  # of the geometric change, under the hypothesis of none
+    moved_m: float  # rms displacement of the target by the geometric change, m
+    moved_std_m: float  # its standard deviation
+    factory_m: float  # rms misfit of the positions with the factory's kinematics alone, m
+    nominal_m: float  # the same with the maker's nominal kinematics
+    noise_m: float  # rms of the stated noise of the readings, m
+    readings: int
+
+
+def check_factory(
+    cell: Cell,
+    nominal: Arm,
+    factory: FactoryKinematics,
+    readings: Readings,
+    catalogue: Catalogue | None = None,
+) -> FactoryCheck:
+    """Test readings of a few poses against the kinematics that the factory measured.
+
+    `nominal` is the maker's design, with joints in the maker's convention, not the cell's.
+
+    Raises:
+        CannotAnswerError: too few readings, or readings that do not determine the frames.
+    """
+    if len(readings) < LEAST:
+        raise CannotAnswerError(f"{len(readings)} readings; {LEAST} or more can answer")
+    robot = cell.configured().robot
+    factory_cell = replace(cell, arm=as_counted(with_factory(nominal, factory), robot))
+    nominal_cell = replace(cell, arm=as_counted(nominal, robot))
+    fit = mixed_fit(baseline(factory_cell, readings, "absolute", catalogue), readings, "absolute")
+    problem = fit.problem
+    effects = fit.model.catalogue
+    kinematic = [k for k, f in enumerate(problem.families.random) if effects[f.effect].kinematic]
+    without = estimate_variances(
+        problem.without(kinematic), np.delete(fit.variances.log_std, kinematic), search=True
+    )
+    gain = fit.variances.equations.log_likelihood - without.equations.log_likelihood
+    p = float(chi2.sf(max(2.0 * gain, 0.0), len(kinematic)))
+    moved, std = _displacement(fit, readings, np.isin(problem.family, kinematic))
+    covariance = readings.covariance[:, :3, :3]
+    return FactoryCheck(
+        changed=p < LEVEL,
+        p_value=p,
+        moved_m=moved,
+        moved_std_m=std,
+        factory_m=register(factory_cell, readings).rms,
+        nominal_m=register(nominal_cell, readings).rms,
+        noise_m=float(np.sqrt(np.mean(np.trace(covariance, axis1=1, axis2=2)))),
+        readings=len(readings),
+    )
+
+
+def _displacement(fit: MixedFit, readings: Readings, columns: Bools) -> tuple[float, float]:
+    """Return rms displacement by some columns beyond the span of the frames, and its std, m."""
+    prediction = fit.model.predict(readings.states, fit.theta)
+    x = fit.problem.coordinates(fit.model.jacobian(prediction, fit.theta, 3))
+    rows = x.reshape(-1, x.shape[-1])
+    frames, selected = rows[:, : fit.problem.flat], rows[:, fit.problem.flat :][:, columns]
+    selected = selected - frames @ np.linalg.lstsq(frames, selected, rcond=None)[0]
+    indices = fit.problem.flat + np.flatnonzero(columns)
+    displacement = selected @ fit.variances.equations.coordinates[indices]
+    spread = np.einsum("rk,kl,rl->r", selected, fit.covariance[np.ix_(indices, indices)], selected)
+    n = len(readings)
+    return float(np.sqrt(displacement @ displacement / n)), float(np.sqrt(spread.sum() / n))

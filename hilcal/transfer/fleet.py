@@ -1,33 +1,308 @@
-"""A fleet: campaigns are fitted and diagnosed by the engine, and pooled by type of arm."""
+"""A fleet: campaigns are fitted and diagnosed by the engine, and pooled by type of arm.
 
-from collections.abc import Callable, Mapping
+Effects in at least the share `COMMON` of the campaigns are pooled; parameters with a strength of
+their own (shrunk families) are not. A parameter is pooled if at least two arms determine it. Time
+is in years since the arm's first campaign. See `regression.variance_components.hierarchy`.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import pairwise
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import norm
 
 from hilcal.engine import Advance, Engine
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.carried import SAME_M
+from hilcal.identification.posterior import Posterior, PosteriorEffect, Source
+from hilcal.readings.readings import Range
 from hilcal.readings.same_readings import shared
+from hilcal.regression.schur import schur_complement
+from hilcal.regression.variance_components import (
+    FALSE_ALARM,
+    UNDETERMINED,
+    FleetEstimates,
+    Hierarchy,
+    Unlike,
+    hierarchy,
+    unlike,
+)
+from hilcal.store.revision import seconds_of, utc_now
 from hilcal.transfer.members import (
     Entry,
     Failure,
     Member,
+    TypeSize,
     entries,
     member_of,
     prints_of,
+    type_sizes,
 )
-from hilcal.transfer.pooled import Pooled, effects_seen, pooled
+from hilcal.types import Floats
+
+COMMON = 0.5
+"""Least share of the arms with an effect for it to count as a trait of the type; a choice."""
+RARE = 0.1
+"""Largest share of the arms with an effect for it to count as a defect of single arms; a choice."""
+FEWEST_ARMS = 3
+"""Least number of arms to pool a type; a choice: two have no spread."""
+YEAR_S = 365.25 * 86400.0
+
+
+@dataclass(frozen=True, slots=True)
+class Odd:
+    """A parameter of one arm that differs from the other arms of its type."""
+
+    arm: str
+    campaign: str  # campaign before which the arm changed; empty if the arm itself is unlike
+    parameter: str  # "effect.parameter"
+    off: float  # difference from the expected value, SI
+    unit: str
+    sigma: float  # the same in standard deviations of the prediction from the other arms
+    p_value: float  # among all parameters and arms that were tested
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """One parameter of a type, SI."""
+
+    parameter: str  # "effect.parameter"
+    unit: str
+    mean: float  # μ of the type
+    mean_std: float  # its standard uncertainty
+    between: float  # standard deviation from arm to arm
+    between_std: float  # its standard error
+    within: float | None
+    """Standard deviation between campaigns of an arm; None if no arm was measured twice."""
+    per_year: float | None  # β, common drift; None if no arm was measured at two times
+    per_year_std: float | None  # its standard uncertainty
+
+
+@dataclass(frozen=True, slots=True)
+class DiagnosedEffect:
+    """An effect that diagnoses added."""
+
+    effect: str
+    arms: tuple[str, ...]  # arms with the effect
+    of: int  # number of all arms
+    kind: str  # "trait" of the type, "defect" of single arms, or "some"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pooled:
+    """Pooled parameters of the arms of one type."""
+
+    type: str
+    arms: tuple[str, ...]
+    campaigns: tuple[str, ...]
+    parameters: tuple[Spread, ...]
+    odd: tuple[Odd, ...]  # differences of arms, then changes of arms; most certain first
+    seen: tuple[DiagnosedEffect, ...]  # effects that diagnoses added, most frequent first
+    wear: tuple[str, ...]  # parameters whose common drift is certain
+    prior: Posterior  # prediction for another arm
+    off: Floats  # (A, K) parameters of each arm minus the mean of the type, SI
+    off_std: Floats
+    """(A, K) their standard uncertainties; infinite where the arm did not determine them."""
+    sizes: tuple[TypeSize, ...]  # of the effects of the type, by their names
+
+    @property
+    def distance(self) -> Floats:
+        """(A, K) `off` over the combined spread between arms and uncertainty of the arm, σ.
+
+        NaN where the arm did not determine the parameter.
+        """
+        between = np.array([p.between for p in self.parameters])
+        determined = np.isfinite(self.off_std)
+        std = np.hypot(between, np.where(determined, self.off_std, 1.0))
+        return np.where(determined, self.off / std, np.nan)
+
+
+def effects_seen(members: Sequence[Member]) -> tuple[DiagnosedEffect, ...]:
+    """Return the effects that diagnoses added, with the arms that have them."""
+    arms: dict[str, list[str]] = {}
+    for m in members:
+        for name in m.added:
+            arms.setdefault(name, []).append(m.arm)
+    count = len({m.arm for m in members})
+    out = []
+    for name, names in arms.items():
+        with_effect = tuple(dict.fromkeys(names))
+        share = len(with_effect) / count
+        kind = "trait" if share >= COMMON else "defect" if share <= RARE else "some"
+        out.append(DiagnosedEffect(name, with_effect, count, kind))
+    return tuple(sorted(out, key=lambda s: -len(s.arms)))
+
+
+def pooled(members: Sequence[Member], diagnosed: Sequence[DiagnosedEffect]) -> Pooled:
+    """Pool the campaigns of arms of one type.
+
+    Raises:
+        CannotAnswerError: fewer than three arms, or no parameter that two arms determine.
+    """
+    first = members[0].posterior
+    arms = tuple(dict.fromkeys(m.arm for m in members))
+    if len(arms) < FEWEST_ARMS:
+        raise CannotAnswerError(
+            f"{len(arms)} arms of the type {members[0].type}: two have no spread; give campaigns "
+            f"of at least {FEWEST_ARMS} arms, better 10"
+        )
+    effects, names = _common(members)
+    if not names:
+        raise CannotAnswerError(
+            f"no parameter of an arm of the type {first.arm} is determined by campaigns of two arms"
+        )
+    scales, units = (
+        {k: v for m in members for k, v in zip(m.posterior.names, of(m.posterior), strict=True)}
+        for of in (attrgetter("scale"), attrgetter("units"))
+    )
+    scale = np.array([scales[name] for name in names])
+    estimates = _estimates(members, arms, names, scale)
+    h, unlike_arms = hierarchy(estimates)
+    late, changed = _changes(estimates, h)
+    of_arms = [(o, arms[o.unit], "") for o in unlike_arms]
+    of_campaigns = [(o, members[late[o.unit]].arm, members[late[o.unit]].name) for o in changed]
+    odd = []
+    for o, arm, campaign in (*of_arms, *of_campaigns):
+        name, off = names[o.parameter], float(o.off * scale[o.parameter])
+        odd.append(Odd(arm, campaign, name, off, units[name], o.sigma, o.p_value))
+    years = np.sqrt(np.diag(h.covariance)[len(names) :])
+    certain = 2 * norm.sf(np.abs(h.slope) / np.where(years > 0, years, np.inf)) * len(names)
+    timed = bool(np.any(h.slope != 0))
+    spreads = [
+        Spread(
+            parameter=name,
+            unit=units[name],
+            mean=float(h.mu[k] * scale[k]),
+            mean_std=float(np.sqrt(h.covariance[k, k]) * scale[k]),
+            between=float(np.sqrt(h.between[k]) * scale[k]),
+            between_std=float(h.between_std_error[k] * scale[k]),
+            within=float(np.sqrt(h.within[k]) * scale[k]) if estimates.repeated else None,
+            per_year=float(h.slope[k] * scale[k]) if timed else None,
+            per_year_std=float(years[k] * scale[k]) if timed else None,
+        )
+        for k, name in enumerate(names)
+    ]
+    return Pooled(
+        type=members[0].type,
+        arms=arms,
+        campaigns=tuple(m.name for m in members),
+        parameters=tuple(spreads),
+        odd=tuple(odd),
+        seen=tuple(diagnosed),
+        wear=tuple(n for n, p in zip(names, certain, strict=True) if timed and p < FALSE_ALARM),
+        prior=_prior(members, effects, names, scale, units, h, len(arms)),
+        off=(h.arm_mean - h.mu) * scale,
+        off_std=np.where(h.arm_variance < UNDETERMINED**2, np.sqrt(h.arm_variance) * scale, np.inf),
+        sizes=type_sizes([m.sizes for m in members if m.sizes is not None]),
+    )
+
+
+def _common(members: Sequence[Member]) -> tuple[tuple[PosteriorEffect, ...], tuple[str, ...]]:
+    """Effects that most campaigns have, with the same options, and their parameters to pool."""
+    count = Counter(e.name for m in members for e in m.posterior.effects)
+    effects = []
+    for name, n in count.items():
+        alike = [e for m in members for e in m.posterior.effects if e.name == name]
+        if n >= COMMON * len(members) and all(e.options == alike[0].options for e in alike):
+            effects.append(alike[0])
+    pooled_names = {e.name for e in effects}
+    arms: dict[str, set[str]] = {}
+    for m in members:
+        p = m.posterior
+        for name, std, own_precision in zip(p.names, p.std, p.own_precision, strict=True):
+            if name.split(".", 1)[0] in pooled_names and own_precision == 0 and np.isfinite(std):
+                arms.setdefault(name, set()).add(m.arm)
+    order = dict.fromkeys(name for m in members for name in m.posterior.names)
+    names = tuple(name for name in order if len(arms.get(name, ())) > 1)
+    used = {name.split(".", 1)[0] for name in names}
+    return tuple(e for e in effects if e.name in used), names
+
+
+def _estimates(
+    members: Sequence[Member], arms: Sequence[str], names: Sequence[str], scale: Floats
+) -> FleetEstimates:
+    """The members' parameters in ordinary magnitudes, with all but `names` marginalised out."""
+    k = len(names)
+    mean, information = np.zeros((len(members), k)), np.zeros((len(members), k, k))
+    place = {name: i for i, name in enumerate(names)}
+    for c, m in enumerate(members):
+        p = m.posterior
+        columns = np.array([i for i, name in enumerate(p.names) if name in place], dtype=np.int64)
+        indices = np.array([place[p.names[i]] for i in columns], dtype=np.int64)
+        scaled = p.information * (p.scale[:, None] * p.scale)
+        information[c][np.ix_(indices, indices)] = schur_complement(scaled, columns)
+        mean[c, indices] = p.mean[columns] / scale[indices]
+    seconds = np.array([seconds_of(m.date) for m in members])
+    arm = np.array([arms.index(m.arm) for m in members])
+    first = np.full(len(arms), np.inf)
+    np.minimum.at(first, arm, seconds)
+    return FleetEstimates(mean, information, arm, (seconds - first[arm]) / YEAR_S)
+
+
+def _changes(estimates: FleetEstimates, h: Hierarchy) -> tuple[list[int], Sequence[Unlike]]:
+    """Return the repeated campaigns of arms, and the changes of arms before them."""
+    covariance = np.linalg.inv(estimates.information + 1e-8 * np.eye(estimates.mean.shape[1]))
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    late, change, spread = [], [], []
+    for a in range(int(estimates.arm.max()) + 1):
+        campaigns = np.flatnonzero(estimates.arm == a)
+        campaigns = campaigns[np.argsort(estimates.time[campaigns], kind="stable")]
+        for previous, current in pairwise(campaigns):
+            years = estimates.time[current] - estimates.time[previous]
+            late.append(int(current))
+            change.append(estimates.mean[current] - estimates.mean[previous] - years * h.slope)
+            spread.append(variance[current] + variance[previous])
+    return late, unlike(np.array(change), np.array(spread)) if late else []
+
+
+def _prior(
+    members: Sequence[Member],
+    effects: tuple[PosteriorEffect, ...],
+    names: tuple[str, ...],
+    scale: Floats,
+    units: dict[str, str],
+    h: Hierarchy,
+    arms: int,
+) -> Posterior:
+    """Prediction for another arm: N(μ, Cov μ + τ² + ω²)."""
+    information = np.linalg.inv(h.predictive)
+    information = (information + information.T) / 2
+    ranges: dict[tuple[str, str], tuple[float, float]] = {}
+    for m in members:
+        for r in m.posterior.ranges:
+            a, b = ranges.get((r.variable, r.unit), (np.inf, -np.inf))
+            ranges[r.variable, r.unit] = min(a, r.low), max(b, r.high)
+    first = members[0].posterior
+    modes = Counter(m.posterior.mode for m in members)
+    return Posterior(
+        arm=first.arm,
+        links=first.links,
+        mode=modes.most_common(1)[0][0],
+        effects=effects,
+        names=names,
+        units=tuple(units[name] for name in names),
+        scale=scale,
+        mean=h.mu * scale,
+        information=information / (scale[:, None] * scale),
+        own_precision=np.zeros(len(names)),
+        scatter=None,
+        ranges=tuple(Range(v, u, a, b) for (v, u), (a, b) in ranges.items()),
+        prints=np.concatenate([m.posterior.prints for m in members]),
+        source=Source(
+            campaign=f"{len(members)} campaigns of {arms} arms of the type {first.arm}",
+            created=utc_now(),
+            n_readings=sum(m.posterior.source.n_readings for m in members),
+        ),
+    )
+
 
 Counting = Callable[[str, int], AbstractContextManager[Advance]]
-
-
-def _silent(label: str, total: int) -> AbstractContextManager[Advance]:
-    """Show no progress."""
-    return nullcontext(lambda step: None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,6 +318,10 @@ class Fleet:
         from hilcal.present.html import fragment
 
         return fragment(fleet_report(self))
+
+
+def _silent(label: str, total: int) -> AbstractContextManager[Advance]:
+    return nullcontext(lambda step: None)
 
 
 def fleet(directory: Path, engine: Engine, counting: Counting = _silent) -> Fleet:

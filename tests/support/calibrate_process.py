@@ -78,32 +78,34 @@ class Calibration:
 
     def every_reading_once(self) -> int:
         """Check that each step of each plan was measured once; returns the number of readings."""
-        files, count = Files(self.run), 0
-        for path in (files.run, files.validation, files.corrected):
+        count = 0
+        for path in self._files():
+            count += self._once(path)
             with CampaignFile.open(path, read_only=True) as campaign:
                 log = RunLog(campaign)
-                steps = [tuple(d["step"].values()) for d in log.details()]
-                assert len(steps) == len(set(steps)) == campaign.n_readings
                 assert log.done() == frozenset(log.plan.steps)
                 assert len(log.plan.steps) == campaign.n_readings
-                count += campaign.n_readings
         return count
 
     def stored(self) -> int:
-        if not self.run.exists():
-            return 0
-        with CampaignFile.open(self.run, read_only=True) as campaign:
-            steps = [tuple(d["step"].values()) for d in RunLog(campaign).details()]
-        assert len(steps) == len(set(steps))
-        return len(steps)
+        return self._once(self.run) if self.run.exists() else 0
 
     def sound(self) -> None:
         """Check that what is there can be read."""
-        files = Files(self.run)
-        for path in (files.run, files.validation, files.corrected):
+        for path in self._files():
             if path.exists():
-                with CampaignFile.open(path, read_only=True) as campaign:
-                    assert len(RunLog(campaign).details()) == campaign.n_readings
+                self._once(path)
+
+    def _files(self) -> tuple[Path, ...]:
+        files = Files(self.run)
+        return files.run, files.validation, files.corrected
+
+    def _once(self, path: Path) -> int:
+        """Return how many readings a campaign holds, each with its details once."""
+        with CampaignFile.open(path, read_only=True) as campaign:
+            steps = [tuple(d["step"].values()) for d in RunLog(campaign).details()]
+            assert len(steps) == len(set(steps)) == campaign.n_readings
+        return len(steps)
 
     def look(self, pid: int) -> None:
         try:

@@ -15,7 +15,7 @@ of its joint, after the last joint that of the first step.
 """
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
 from pathlib import Path
@@ -42,10 +42,6 @@ LEFT = 1e-9
 Edits = list[tuple[Span, str]]
 LARGEST, SMALLEST = 1e6, 1e-6
 """Largest number, and least length of a direction; choices."""
-TURNING = ("revolute", "continuous")
-"""Types of a joint that turns."""
-EXPRESSION = re.compile(r"\$\{([^{}]*)\}")
-"""An expression of a xacro."""
 _TAG = re.compile(r"<(?:\"[^\"]*\"|'[^']*'|[^<>\"'])*>")
 
 
@@ -160,64 +156,6 @@ def read_xml(path: Path) -> Document:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LinkTree:
-    """The links of a description, and the joints that lead to them."""
-
-    document: Document
-    leads: Mapping[str, tuple[str, Node]]  # by child link: its parent link, and the joint
-
-    def chain(self, base: str | None, tip: str | None) -> tuple[list[Node], list[Node]]:
-        """Return the joints from a base up to its common ancestor with a tip, and down to the tip.
-
-        By default the base is the root, the tip the last link after the moving joints.
-        """
-        to_tip = self._up(self._last() if tip is None else self._link(tip))
-        to_base = to_tip[-1:] if base is None else self._up(self._link(base))
-        common = next((name for name in to_base if name in to_tip), None)
-        if common is None:
-            raise InputError(f"{self.document.name}: no chain from '{base}' to '{to_tip[0]}'")
-        up, down = (links[: links.index(common)] for links in (to_base, to_tip))
-        return [self.leads[k][1] for k in up], [self.leads[k][1] for k in reversed(down)]
-
-    def _up(self, link: str) -> list[str]:
-        """Return a link and its ancestors, the root last."""
-        out = [link]
-        while out[-1] in self.leads:
-            out.append(self.leads[out[-1]][0])
-            if len(out) > len(self.leads) + 1:
-                raise InputError(f"{self.document.name}: its joints go round in a circle")
-        return out
-
-    def _link(self, name: str) -> str:
-        """Return the link of a name, which may omit the expressions of a xacro."""
-        links = {*self.leads, *(parent for parent, _ in self.leads.values())}
-        matching = [link for link in links if name in (link, EXPRESSION.sub("", link))]
-        if len(matching) != 1:
-            valid = ", ".join(sorted(escaped(EXPRESSION.sub("", link)) for link in links))
-            reason = f"link '{escaped(name)}' is there {len(matching)} times; valid: {valid}"
-            raise InputError(f"{self.document.name}: {reason}")
-        return matching[0]
-
-    def _last(self) -> str:
-        """Return the only link after moving joints that has no children."""
-        parents = {parent for parent, _ in self.leads.values()}
-
-        def moves(link: str) -> bool:
-            kinds = (self.leads[k][1].attributes.get("type") for k in self._up(link)[:-1])
-            return any(kind in TURNING for kind in kinds)
-
-        last = sorted(link for link in self.leads if link not in parents and moves(link))
-        if not last:
-            raise InputError(f"{self.document.name}: no revolute joint; valid: one with the arm")
-        if len(last) > 1:
-            names = ", ".join(escaped(EXPRESSION.sub("", link)) for link in last)
-            raise InputError(
-                f"{self.document.name}: give --tip-link, the flange; its last links: {names}"
-            )
-        return last[0]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class ChainStep:
     """One step of a chain: a transform, and after it a joint or none."""
 
@@ -293,7 +231,11 @@ def _frames(
         for k in range(len(turning)):
             g = se3.inverse(old[k]) @ left[-1] @ drawn[k]
             if k > 0 and not _near(g):
-                left[-1], zeros = _with_zero(old[k], left[-1], drawn[k]), zeros + 1
+                # another zero: H turns about z until the next axis agrees (parallel: its place)
+                column = 3 if np.hypot(*old[k][:2, 2]) <= NEAR_RAD else 2
+                of_arm, of_file = old[k][:2, column], (left[-1] @ drawn[k])[:2, column]
+                turn = np.arctan2(*of_arm[::-1]) - np.arctan2(*of_file[::-1])
+                left[-1], zeros = se3.screw(2, float(turn)) @ left[-1], zeros + 1
                 g = se3.inverse(old[k]) @ left[-1] @ drawn[k]
             if not _near(g):
                 misses.append((k, *_off(g)))
@@ -327,16 +269,6 @@ def _off(g: Floats) -> tuple[float, float]:
     return float(np.hypot(*g[:2, 3])), float(np.arctan2(np.hypot(g[0, 2], g[1, 2]), g[2, 2]))
 
 
-def _with_zero(link: Floats, h: Floats, drawn: Floats) -> Floats:
-    """Return H with the turn about z that aligns the next axis of the file with that of the arm."""
-    of_file = h @ drawn
-    parallel = np.hypot(link[0, 2], link[1, 2]) <= NEAR_RAD
-    column = 3 if parallel else 2  # parallel axes: by their position
-    turn = np.arctan2(link[1, column], link[0, column])
-    turn -= np.arctan2(of_file[1, column], of_file[0, column])
-    return se3.screw(2, float(turn)) @ h
-
-
 def edits_of(steps: Sequence[ChainStep], places: Sequence[Floats]) -> tuple[Edits, list[str]]:
     """Edits of all steps that change, and the names of these steps."""
     pairs = [(s, p) for s, p in zip(steps, places, strict=True) if moved(s.place, p) > LEFT]
@@ -356,12 +288,6 @@ def z_to(axis: Floats) -> Floats:
     if size < 1e-12:
         return np.eye(4) if axis[2] > 0 else np.diag([1.0, -1.0, -1.0, 1.0])
     return se3.matrix(se3.rotation(np.arctan2(size, axis[2]) * about / size), np.zeros(3))
-
-
-def not_between(name: str, kind: str) -> str:
-    """Return why a joint is not allowed between base and tip."""
-    joint = f"joint '{escaped(name)}' is {escaped(kind) or 'nothing'}"
-    return f"{joint}; valid between base and tip: revolute, continuous, fixed"
 
 
 def numbers(values: Floats) -> str:

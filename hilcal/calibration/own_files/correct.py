@@ -10,9 +10,8 @@ from hilcal import limits
 from hilcal.calibration.dh_table import dh_rows
 from hilcal.calibration.handover import Corrected
 from hilcal.calibration.own_files.chain_text import LEFT, SAME, edits_of, moved, read_xml, redrawn
+from hilcal.calibration.own_files.link_trees import sdf_chain, urdf_steps
 from hilcal.calibration.own_files.mjcf_text import mjcf_steps
-from hilcal.calibration.own_files.sdf_text import sdf_chain
-from hilcal.calibration.own_files.urdf_text import urdf_steps
 from hilcal.calibration.programs.program import Span, edited
 from hilcal.errors import InputError
 from hilcal.numbers import length

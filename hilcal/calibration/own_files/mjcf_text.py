@@ -69,7 +69,6 @@ def _named(document: Document, world: Node, name: str, tags: tuple[str, ...]) ->
 
 
 def _step(document: Document, node: Node) -> ChainStep:
-    """Return the step of a body or a site; raises as `mjcf_steps` does."""
     joints = [c for c in node.children if c.tag in ("joint", "freejoint")]
     if node.tag == "frame" or len(joints) > 1:
         reason = f"{_name(node)} is a frame or has several joints; valid: one hinge in a body"
@@ -93,21 +92,17 @@ def _step(document: Document, node: Node) -> ChainStep:
             out.append(document.put(node, "pos", numbers(new[:3, 3])))
         turned = se3.rotation_vector(new[:3, :3] @ place[:3, :3].T)
         if np.linalg.norm(turned) > 1e-12:
-            out += _put_quat(document, node, new[:3, :3])
+            value = numbers(se3.quaternion(new[:3, :3]))
+            key = next((k for k in _TURNS if k in node.attributes), "quat")
+            old = document.attribute(node, key)
+            if key == "quat" or old is None:
+                return [*out, document.put(node, "quat", value)]
+            head = document.text.rfind(key, node.begin, old.begin)
+            between = document.text[head + len(key) : old.begin]
+            out.append((Span(0, head, old.end), f"quat{between}{value}"))
         return out
 
     return ChainStep(_name(node), node.line, place, turn, write)
-
-
-def _put_quat(document: Document, node: Node, r: Floats) -> Edits:
-    """Edits that set the orientation of an element."""
-    value = numbers(se3.quaternion(r))
-    key = next((k for k in _TURNS if k in node.attributes), "quat")
-    old = document.attribute(node, key)
-    if key == "quat" or old is None:
-        return [document.put(node, "quat", value)]
-    head = document.text.rfind(key, node.begin, old.begin)
-    return [(Span(0, head, old.end), f"quat{document.text[head + len(key) : old.begin]}{value}")]
 
 
 def _rotation(document: Document, node: Node) -> Floats:

@@ -16,7 +16,7 @@ Integrators*, chapters 10 to 12; *Expert Programming*, status and turn.
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +39,7 @@ from hilcal.calibration.programs.program import (
 )
 from hilcal.types import Floats, Ints
 
+KINDS = ("TOOL", "BASE")
 POSE, AXES, TURN = ("X", "Y", "Z", "A", "B", "C"), tuple(f"A{k}" for k in range(1, 7)), "T"
 OVERHEAD, ELBOW = 1, 2
 """Bits of S."""
@@ -115,8 +116,7 @@ def read_krl(path: Path, frames_file: Path | None, tool: Floats | None) -> Progr
     if len(set(encodings)) > 1:
         texts = tuple(p.read_bytes().decode(encoding) for p in paths)
     config = frames_file is not None and frames_file.suffix.lower() == ".dat"
-    controller = controller_frames(None if config else frames_file, KRL, tool)
-    reader = _KrlReader(path, controller)
+    reader = _KrlReader(path, controller_frames(None if config else frames_file, KRL, tool))
     reader.text, reader.encoding = texts[0], encoding
     reader.files = [p.name for p in paths]
     for k, text in enumerate(texts):
@@ -177,20 +177,9 @@ class _State:
     base: Floats | str = f"the program does not set $BASE {_BEFORE}"
 
     def same(self, other: "_State") -> bool:
-        """Whether tool and base are the same as in another state, or unknown in both."""
-        return all(
-            a is b
-            or (isinstance(a, np.ndarray) and isinstance(b, np.ndarray) and np.array_equal(a, b))
-            for a, b in ((self.tool, other.tool), (self.base, other.base))
-        )
-
-
-@dataclass(slots=True, eq=False)
-class _Block:
-    """An open block: the state at its beginning, and at the ends of its branches."""
-
-    begin: _State
-    ends: list[_State] = field(default_factory=list)
+        """Whether tool and base are the same as in another state, or unknown for one reason."""
+        pairs = (self.tool, other.tool), (self.base, other.base)
+        return all(np.array_equal(a, b) for a, b in pairs)
 
 
 class _KrlReader(ProgramReader):
@@ -214,22 +203,21 @@ class _KrlReader(ProgramReader):
         """Read the statements of the first text."""
         lines = list(_code(texts[0]))
         self.used = self._used_otherwise(lines)
-        blocks: list[_Block] = []
+        blocks: list[list[_State]] = []  # states at the beginning and after branches of open blocks
         for k, (line, offset, code) in enumerate(lines):
             word = _word(code)
             if word in ("DEF", "DEFFCT", "GLOBAL") and re.search(r"\bDEF(FCT)?\b", code, re.I):
                 self.state, blocks = _State(), []
             elif word in _ELSE and blocks:
-                blocks[-1].ends.append(self.state)
-                self.state = blocks[-1].begin
+                blocks[-1].append(self.state)
+                self.state = blocks[-1][0]
             elif word in _CLOSES and blocks:
-                block = blocks.pop()
-                if not all(s.same(self.state) for s in (*block.ends, block.begin)):
+                if not all(s.same(self.state) for s in blocks.pop()):
                     self._forget(f"the block that ends in line {line} sets them on some ways only")
             elif word in _OPENS:
                 if word in _LOOPS and _sets(lines[k + 1 :]):
                     self._forget(f"the loop of line {line} sets them later")
-                blocks.append(_Block(self.state))
+                blocks.append([self.state])
             elif word and re.fullmatch(r"\s*\w+\s*:\s*", code):
                 self._forget(f"line {line} is a label, which may be reached from elsewhere")
             else:
@@ -241,17 +229,16 @@ class _KrlReader(ProgramReader):
         self.state = _State(reason, reason)
 
     def _statement(self, line: int, offset: int, code: str) -> None:
-        """Process one statement."""
         if m := _MOTION.match(code):
             self._motion(line, offset, code, m)
         elif m := _SET.match(code):
-            self._set(m[1].upper(), m[2].strip(), line, offset + m.start(2))
+            self._set(m[1].upper(), m[2].strip(), line)
         elif m := _FDAT.match(code):
             self.form = m[1]
         elif m := _BAS.match(code):
             topic, number = m[1].upper(), (m[2] or "").strip()
-            if topic in ("TOOL", "BASE"):
-                self._set(topic, f"{topic}_DATA[{number}]", line, offset)
+            if topic in KINDS:
+                self._set(topic, f"{topic}_DATA[{number}]", line)
             elif topic in ("PTP_PARAMS", "CP_PARAMS", "PTP_DAT", "CP_DAT", "FRAMES"):
                 self._of_form(self.form, line)
             elif topic == "INITMOV":
@@ -262,7 +249,7 @@ class _KrlReader(ProgramReader):
         elif (m := _CALL.match(code)) and m[1].upper() not in _NO_CALLS:
             self._forget(f"{m[1][:40]} of line {line} may set them")
 
-    def _of_form(self, name: str | None, line: int, only: str = "") -> None:
+    def _of_form(self, name: str | None, line: int, kinds: Sequence[str] = KINDS) -> None:
         """Set tool and base of an inline form."""
         values = self.data.get(_key(name or ""), [])
         if len(values) != 1 or "TOOL_NO" not in values[0].fields:
@@ -273,27 +260,23 @@ class _KrlReader(ProgramReader):
         if fields.get("IPO_FRAME", ("#BASE",))[0].upper() != "#BASE":
             reason = f"{name} has its tool outside of the arm (IPO_FRAME #TCP)"
             raise self.refused(line, reason, "a tool on the flange")
-        for kind in ("TOOL", "BASE"):
-            if only in ("", kind):
-                number = fields.get(f"{kind}_NO", ("0",))[0]
-                self._set(kind, f"{kind}_DATA[{number}]", line, 0)
+        for kind in kinds:
+            self._set(kind, f"{kind}_DATA[{fields.get(f'{kind}_NO', ('0',))[0]}]", line)
 
-    def _set(self, kind: str, value: str, line: int, offset: int) -> None:
-        """Set `$TOOL` or `$BASE`."""
-        out = self._frame(kind, value, line, offset)
-        self.state = replace(self.state, **{kind.lower(): out})
+    def _set(self, kind: str, value: str, line: int) -> None:
+        self.state = replace(self.state, **{kind.lower(): self._frame(kind, value, line)})
 
     def _numbers(self, name: str) -> Floats | None:
         """Numbers of the pose of a name; None if it has none, or several."""
         values = self.data.get(_key(name), [])
         return values[0].numbers(POSE) if len(values) == 1 else None
 
-    def _frame(self, kind: str, value: str, line: int, offset: int) -> Floats | str:
+    def _frame(self, kind: str, value: str, line: int) -> Floats | str:
         """Pose of a value, or why it is unknown."""
         if value.upper() == "$NULLFRAME":
             return np.eye(4)
         if value.startswith("{"):
-            numbers = _Value.of(value, offset, 0, line).numbers(POSE)
+            numbers = _Value.of(value, 0, 0, line).numbers(POSE)
             return f"${kind} of line {line} is not whole" if numbers is None else of_euler(numbers)
         m = _INDEX.match(value)
         if m is None or m[1].upper() != kind:
@@ -306,33 +289,30 @@ class _KrlReader(ProgramReader):
         return self.controller.pose(group, m[2], name)
 
     def _motion(self, line: int, offset: int, code: str, m: re.Match[str]) -> None:
-        """Record the targets of a motion."""
         word = m[1].upper()
         head, *with_ = re.split(r"\bWITH\b", code[m.end() :], maxsplit=1, flags=re.I)
         previous = self.state
-        for kind in ("TOOL", "BASE"):
+        for kind in KINDS:
             setting = re.search(rf"\${kind}\s*=\s*(.+?)(?=,\s*\$|$)", "".join(with_), re.I)
             if setting:
                 text = setting[1].strip()
                 form = re.match(r"\w+\s*\(.*?\b(\w+)(?:\.\w+)?\s*\)", text)
                 if form and _key(form[1]) in self.data:
-                    self._of_form(form[1], line, kind)
+                    self._of_form(form[1], line, [kind])
                 else:
-                    self._set(kind, text, line, 0)
+                    self._set(kind, text, line)
         left = ""
         if word.endswith("_REL") or word == "ASYPTP":
             left = f"{word} is not corrected"
         elif "CIRC" in word and re.search(r"\bCA\b", head, re.I):
             left = "a circle with CA does not end at the point that is stated"
-        targets = [
-            (b, t) for b, t in arguments_of(head) if not re.match(r"\s*(CA|C_\w+)\b", t, re.I)
-        ]
+        approximation = re.compile(r"\s*(CA|C_\w+)\b", re.IGNORECASE)
+        targets = [(b, t) for b, t in arguments_of(head) if not approximation.match(t)]
         for begin, target in targets[: 2 if "CIRC" in word else 1]:
             self._target(line, offset + m.end() + begin, target, word in ("PTP", "SPTP"), left)
         self.state = previous
 
     def _target(self, line: int, offset: int, text: str, obeyed: bool, left: str) -> None:
-        """Record one target."""
         body = re.sub(r"\s+C_(PTP|DIS|VEL|ORI|SPL)\b.*", "", text, flags=re.I).strip()
         offset += len(text) - len(text.lstrip())
         key, name, value = _key(body), f"line {line}", _Value(0, line, "", {})
@@ -354,8 +334,8 @@ class _KrlReader(ProgramReader):
         self.record(key, bare if left else self._point(bare, value, obeyed), line, obeyed)
 
     def _point(self, bare: ProgramPoint, value: _Value, obeyed: bool) -> ProgramPoint:
-        """Return the point of an aggregate."""
-        moving = [k for k, f in value.fields.items() if re.fullmatch(r"E[1-6]", k) and _moves(f[0])]
+        axes = (k for k in value.fields if re.fullmatch(r"E[1-6]", k))
+        moving = [k for k in axes if value.numbers([k]) is None or value.numbers([k]) != 0]
         if moving:
             return replace(bare, left=f"{moving[0]} moves, and it is not known what that carries")
         keys = AXES if AXES[0] in value.fields else POSE
@@ -370,8 +350,8 @@ class _KrlReader(ProgramReader):
         status = [UNSTATED] * 2 if s is None else [int(s[0]) & OVERHEAD, int(s[0]) // ELBOW & 1]
         turn = [UNSTATED] * JOINTS if t is None else [int(t[0]) >> k & 1 for k in range(JOINTS)]
         config = () if t is None else value.spans([TURN])
-        stated = {"flags": (*status, *turn), "config": config, "obeyed": obeyed}
-        return bare.at_pose(spans, numbers, tool, self.state.base, **stated)
+        bare = replace(bare, flags=(*status, *turn), config=config, obeyed=obeyed)
+        return bare.at_pose(spans, numbers, tool, self.state.base)
 
     def _used_otherwise(self, lines: Sequence[tuple[int, int, str]]) -> dict[str, int]:
         """Names of points that statements other than motions use, with their lines."""
@@ -398,13 +378,6 @@ def _value(text: str) -> float:
     if text.startswith("'"):
         return int(text[2:-1], 2 if text[1] in "Bb" else 16)
     return float(text)
-
-
-def _moves(text: str) -> bool:
-    try:
-        return _value(text) != 0
-    except ValueError:
-        return True
 
 
 def _word(code: str) -> str:

@@ -8,7 +8,7 @@ which intersect. For other arms, where nothing is stated, and where the controll
 (on straight lines), the solution is the one nearest to the previous point.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -16,8 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from hilcal.calibration.points import Points, solutions
-from hilcal.calibration.programs.fanuc import read_ls
-from hilcal.calibration.programs.inform import read_jbi
+from hilcal.calibration.programs.fanuc_inform import read_jbi, read_ls
 from hilcal.calibration.programs.krl import read_krl
 from hilcal.calibration.programs.program import JOINTS, UNSTATED, Language, Program, ProgramPoint
 from hilcal.calibration.programs.rapid import read_rapid
@@ -70,7 +69,11 @@ class UnderstoodProgram:
         stated = np.array([p.flags or unstated for p in points])
         computed = np.array([bool(p.template) for p in points])
         stated[computed] = flags_of(self.arm, language, self.q[computed])
-        flags = flags_after(self.arm, language, self.q, q, stated)
+        agreed, agrees = (_agree(self.arm, language, x, stated) for x in (self.q, q))
+        changed = agreed & ~agrees & (stated != UNSTATED)
+        if unlike(self.arm, language):
+            changed &= ~np.array(language.of_shape)
+        flags = np.where(changed, flags_of(self.arm, language, q), stated)
         return self.program.corrected(self.arm, points, self.q, q, flags)
 
 
@@ -83,10 +86,9 @@ def understood(
     near: Floats | None = None,
     leave: bool = False,
 ) -> UnderstoodProgram:
-    """Read a program.
+    """Read a program; the first pose is near to joint values `near` (6,), rad.
 
-    `tool` (4, 4) T_flange_tool replaces tools that neither the program nor `frames` has; the first
-    pose is near to joint values `near` (6,), rad.
+    `tool` (4, 4) T_flange_tool replaces tools that neither the program nor `frames` has.
     """
     try:
         program = READERS[path.suffix.lower()](path, frames, tool)
@@ -101,8 +103,11 @@ def understood(
     program = replace(program, points=tuple(points))
     _refuse(path, program.points, leave)
     q, doubts, said = resolve(program, arm, near)
-    longest, remarks = longest_tool(program.understood)
-    result = UnderstoodProgram(program, arm, q, longest, said + remarks).without(doubts)
+    poses = [p for p in program.understood if not p.joints] or program.understood
+    longest = max(poses, key=lambda p: float(np.linalg.norm(p.tool[:3, 3])))
+    if any(not np.allclose(p.tool, longest.tool, atol=1e-9) for p in poses):
+        said += (f"several tools; errors are stated for the longest, that of {longest.name}",)
+    result = UnderstoodProgram(program, arm, q, longest.tool, said).without(doubts)
     _refuse(path, result.program.points, leave)
     return result
 
@@ -138,14 +143,13 @@ def unlike(arm: Arm, language: Language) -> str:
     if wrong.any():
         k = int(np.argmax(wrong))
         is_, should = (
-            "[" + ", ".join(f"{v:.2g}" for v in np.round(row, 3) + 0.0) + "]"
+            f"[{', '.join(f'{v:.2g}' for v in np.round(row, 3) + 0.0)}]"
             for row in (axes[k], np.array(language.axes[k], dtype=float))
         )
         return f"axis {k + 1} with all joint values zero is {is_}, not {should}"
     p = chain.position[:JOINTS, 0]
     normals = {k: np.cross(axes[k], axes[4]) for k in (3, 5)}
-    gaps = [abs((p[k] - p[4]) @ n) / np.linalg.norm(n) for k, n in normals.items()]
-    gap = max(gaps)
+    gap = max(abs((p[k] - p[4]) @ n) / np.linalg.norm(n) for k, n in normals.items())
     return f"axes 4 to 6 miss each other by {1e3 * gap:.3g} mm" if gap > MEET else ""
 
 
@@ -178,8 +182,7 @@ def resolve(
 ) -> tuple[Floats, list[str], tuple[str, ...]]:
     """Return joint values (N, 6) that take the nominal arm to the points, doubts, and remarks.
 
-    A doubt is why the values of a point are not certain, "" if they are. The first pose is near to
-    joint values `near` (6,), rad; None if unknown.
+    A doubt is why the values of a point are not certain, "" if they are.
     """
     language = program.language
     if arm.n != JOINTS or arm.mimic is not None:
@@ -201,11 +204,9 @@ def resolve(
         if not p.obeyed and previous is not None:
             required[:] = False
         q, doubt = _solve(arm, language, p, previous, stated, required)
-        unfit += bool(
-            not doubt
-            and not required.any()
-            and not _fits(arm, language, q[None], stated, (stated != UNSTATED) & readable)[0]
-        )
+        all_stated = (stated != UNSTATED) & readable
+        fits = doubt or required.any() or _fits(arm, language, q[None], stated, all_stated)[0]
+        unfit += not fits
         joints.append(q)
         doubts.append(doubt)
     remarks = []
@@ -241,11 +242,10 @@ def _solve(
         )
     if previous is not None:
         q = solutions(arm, p.tool, previous[None], goal)
-        good = len(q) and np.abs(q[0] - previous).max() < np.pi / 2
-        if good and _fits(arm, language, q, stated, required)[0]:
-            close = np.abs(q[0] - previous).max() < 0.5
-            if close or required.all():
-                return q[0], ""
+        near = np.pi / 2 if required.all() else 0.5
+        fits = len(q) > 0 and _fits(arm, language, q, stated, required)[0]
+        if fits and np.abs(q[0] - previous).max() < near:
+            return q[0], ""
     all_solutions = solutions(arm, p.tool, None, goal)
     if not len(all_solutions):
         raise InputError(f"{p.name}: the nominal arm does not reach it from anywhere")
@@ -268,17 +268,6 @@ def _solve(
     return best, ""
 
 
-def flags_after(arm: Arm, language: Language, old_q: Floats, q: Floats, stated: Ints) -> Ints:
-    """(N, F) configuration to state after a correction: new where the correction left the old one.
-
-    `old_q` and `q` are joint values (N, 6) before and after, rad; `stated` (N, F) is the old one.
-    """
-    changed = _agree(arm, language, old_q, stated) & ~_agree(arm, language, q, stated)
-    if unlike(arm, language):
-        changed &= ~np.array(language.of_shape)
-    return np.where(changed & (stated != UNSTATED), flags_of(arm, language, q), stated)
-
-
 def _agree(arm: Arm, language: Language, q: Floats, stated: Ints) -> Bools:
     """(K, F) which flags joint values (K, 6) agree with; at a border, those of both sides."""
     shapes = shape(arm, q)
@@ -298,12 +287,3 @@ def _turned(arm: Arm, q: Floats) -> Floats:
         for v, low, high in zip(q, arm.q_min, arm.q_max, strict=True)
     ]
     return np.array(list(product(*choices))).reshape(-1, JOINTS)
-
-
-def longest_tool(points: Sequence[ProgramPoint]) -> tuple[Floats, tuple[str, ...]]:
-    """(4, 4) T_flange_tool of the points, the longest of several, and remarks."""
-    poses = [p for p in points if not p.joints] or list(points)
-    first = max(poses, key=lambda p: float(np.linalg.norm(p.tool[:3, 3])))
-    if all(np.allclose(p.tool, first.tool, atol=1e-9) for p in poses):
-        return first.tool, ()
-    return first.tool, (f"several tools; errors are stated for the longest, that of {first.name}",)

@@ -15,7 +15,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -82,21 +81,12 @@ class ProgramPoint:
         return replace(self, numbers=tuple(numbers), values=values, joints=True, tool=known_tool)
 
     def at_pose(
-        self,
-        numbers: Sequence[Span],
-        values: Floats,
-        tool: Floats | str,
-        frame: Floats | str,
-        **extra: Any,
+        self, numbers: Sequence[Span], values: Floats, tool: Floats | str, frame: Floats | str
     ) -> "ProgramPoint":
         """Return the point with a pose; it is not corrected if tool or frame is a reason (text)."""
         if isinstance(tool, str) or isinstance(frame, str):
             return replace(self, left=tool if isinstance(tool, str) else str(frame))
-        return replace(self, numbers=tuple(numbers), values=values, tool=tool, frame=frame, **extra)
-
-
-def _as_written(_: Ints, texts: Sequence[str]) -> list[str]:
-    return list(texts)
+        return replace(self, numbers=tuple(numbers), values=values, tool=tool, frame=frame)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +107,7 @@ class Language:
     of_shape: tuple[bool, ...]
     """(F,) which flags depend on the shape of the arm, not on the joint values alone."""
     moves: str  # its motions, for people
-    written: Callable[[Ints, Sequence[str]], list[str]] = _as_written
+    written: Callable[[Ints, Sequence[str]], list[str]] = lambda _, texts: list(texts)
     """New texts at `ProgramPoint.config`, from the flags and the old texts."""
     padded: bool = False  # whether numbers are aligned in columns
     count: int = JOINTS  # numbers of a pose
@@ -146,16 +136,14 @@ class Program:
 
         `old_q`, `q` (N, 6) are joint values before and after, rad; `flags` (N, F) the new flags.
         """
-        edits: list[tuple[Span, str]] = []
-        poses = evaluate(arm, q)
-        for k, p in enumerate(points):
-            flange = se3.matrix(poses.rotation[-1][k], poses.position[-1][k])
-            edits += self._edits(p, flange, old_q[k], q[k], flags[k])
-        out = {}
-        for k, (suffix, text) in enumerate(zip(self.suffixes, self.texts, strict=True)):
-            new = edited(text, [(s, piece) for s, piece in edits if s.file == k])
-            out[suffix] = new.encode(self.encoding)
-        return out
+        chain = evaluate(arm, q)
+        flanges = se3.matrix(chain.rotation[-1], chain.position[-1])
+        rows = zip(points, flanges, old_q, q, flags, strict=True)
+        edits = [edit for row in rows for edit in self._edits(*row)]
+        return {
+            suffix: edited(text, [e for e in edits if e[0].file == k]).encode(self.encoding)
+            for k, (suffix, text) in enumerate(zip(self.suffixes, self.texts, strict=True))
+        }
 
     def _edits(
         self, p: ProgramPoint, flange: Floats, old_q: Floats, q: Floats, flags: Ints
@@ -175,7 +163,7 @@ class Program:
             return []
         new = language.numbers(goal, p.values)
         decimals = [language.decimals[0]] * 3 + [language.decimals[1]] * (len(new) - 3)
-        old = [self._text(s) for s in p.config]
+        old = [self.texts[s.file][s.begin : s.end] for s in p.config]
         config = language.written(flags, old) if p.config or p.template else []
         if not config and np.any(flags != np.array(p.flags)):
             raise InputError(
@@ -188,16 +176,13 @@ class Program:
         changed = [(s, w) for s, w, o in zip(p.config, config, old, strict=True) if w != o]
         return self._numbers(p, new, decimals) + changed
 
-    def _text(self, span: Span) -> str:
-        return self.texts[span.file][span.begin : span.end]
-
     def _numbers(
         self, p: ProgramPoint, new: Floats, decimals: Sequence[int]
     ) -> list[tuple[Span, str]]:
         """Edits that replace the numbers, with at least as many decimals as the old ones."""
         out = []
         for span, value, least in zip(p.numbers, new.tolist(), decimals, strict=True):
-            old = self._text(span)
+            old = self.texts[span.file][span.begin : span.end]
             digits = old.lower().partition("e")[0].partition(".")[2]
             text = f"{value:.{max(least, len(digits.strip())) if least else 0}f}"
             if text.strip("-0.") == "":
@@ -250,7 +235,6 @@ def line_of(text: str, offset: int) -> int:
 
 @lru_cache(maxsize=4)
 def _ends(text: str) -> list[int]:
-    """Offsets of the ends of lines."""
     return [m.start() for m in re.finditer("\n", text)]
 
 
@@ -265,7 +249,7 @@ class _FramesFile(Section):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ControllerFrames:
-    """Tools, frames and settings that the controller stores outside of programs."""
+    """What the controller stores outside of programs."""
 
     language: Language
     poses: Mapping[str, Mapping[str, Floats]]
@@ -303,8 +287,8 @@ def controller_frames(
     if path.suffix.lower() != ".toml":
         raise InputError(f"{path}: frames of {language.name} programs; valid: {language.frames}")
     section, count = load_section(path, _FramesFile), language.count
-    groups = {"tools": section.tools, "bases": section.bases}
-    for key, group in groups.items():
+    poses: dict[str, dict[str, Floats]] = {"tools": {}, "bases": {}}
+    for key, group in (("tools", section.tools), ("bases", section.bases)):
         for name, numbers in group.items():
             if len(numbers) != count:
                 raise InputError(
@@ -312,29 +296,21 @@ def controller_frames(
                     f"{count}, as the controller shows them: mm and degrees"
                     + (", x y z q1 q2 q3 q4" if count > JOINTS else "")
                 )
+            poses[key][name] = language.pose(np.array(numbers))
     pulses = section.pulses_per_degree
     if pulses is not None and (len(pulses) != JOINTS or not all(pulses)):
         raise InputError(f"{path.name}: pulses_per_degree; valid: {JOINTS} numbers other than 0")
     axes = section.turn_axes
     if axes is not None and (len(axes) != 3 or not set(axes) <= set(range(1, JOINTS + 1))):
         raise InputError(f"{path.name}: turn_axes; valid: three axes, such as [1, 4, 6]")
-    return ControllerFrames(
-        language,
-        {
-            key: {name: language.pose(np.array(numbers)) for name, numbers in group.items()}
-            for key, group in groups.items()
-        },
-        None if pulses is None else np.degrees(1.0) * np.array(pulses),
-        axes,
-        tool,
-    )
+    per_rad = None if pulses is None else np.degrees(1.0) * np.array(pulses)
+    return ControllerFrames(language, poses, per_rad, axes, tool)
 
 
 class ProgramReader:
     """Base of the readers of all makers, which collect the points of a program's text."""
 
     def __init__(self, path: Path, controller: ControllerFrames):
-        """Read the text, without its points."""
         self.path, self.controller = path, controller
         self.text, self.encoding = read_text(path)
         self.points: dict[str, ProgramPoint] = {}
@@ -365,16 +341,11 @@ class ProgramReader:
             if name in self.points and not self.points[name].left:
                 left = f"line {line} uses or changes it otherwise"
                 self.points[name] = replace(self.points[name], left=left)
-        language = self.controller.language
-        if not self.points:
+        language, points = self.controller.language, tuple(self.points.values())
+        if not points:
             raise InputError(f"{self.path.name}: no motions; valid: {language.moves}")
-        return Program(
-            language,
-            tuple(suffixes) or (self.path.suffix,),
-            tuple(texts) or (self.text,),
-            tuple(self.points.values()),
-            self.encoding,
-        )
+        suffixes, texts = tuple(suffixes) or (self.path.suffix,), tuple(texts) or (self.text,)
+        return Program(language, suffixes, texts, points, self.encoding)
 
 
 def of_euler(values: Floats) -> Floats:

@@ -195,7 +195,6 @@ class _RapidReader(ProgramReader):
         return arguments[:count], arguments[-1][1] if len(arguments) >= LEAST else "", options
 
     def _motion(self, offset: int, code: str, m: re.Match[str], obeyed: bool) -> None:
-        """Record the targets of a motion."""
         line = line_of(self.text, offset + m.start())
         targets, tool, options = self._targets(code, m)
         if not tool:
@@ -260,7 +259,7 @@ class _RapidReader(ProgramReader):
                 name = f"{text} (line {line_of(self.text, place)})"
                 new = self._value(value, place, name, kind == "jointtarget")
         if not new.left and not joints:
-            new = new.at_pose(new.numbers, new.values, *frames, obeyed=obeyed)
+            new = replace(new, obeyed=obeyed).at_pose(new.numbers, new.values, *frames)
         self.record(key, new, line)
 
     def _value(self, text: str, offset: int, name: str, joints: bool) -> ProgramPoint:

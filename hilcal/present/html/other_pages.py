@@ -25,8 +25,7 @@ from hilcal.present.html import FirstScreen, render
 from hilcal.present.html.report import identity
 
 if TYPE_CHECKING:
-    from hilcal.transfer.fleet import Fleet
-    from hilcal.transfer.pooled import Pooled
+    from hilcal.transfer.fleet import Fleet, Pooled
 
 Named = tuple[str, str]  # name and SHA-256 of a campaign's file
 

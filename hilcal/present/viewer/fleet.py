@@ -20,9 +20,8 @@ from hilcal.store.revision import seconds_of
 from hilcal.types import Bools, Floats
 
 if TYPE_CHECKING:  # above this layer
-    from hilcal.transfer.fleet import Fleet
+    from hilcal.transfer.fleet import Fleet, Pooled
     from hilcal.transfer.members import Member
-    from hilcal.transfer.pooled import Pooled
 
 _JOINT = re.compile(r"\.j(\d+)\b")
 _STANDS = (0.0, -1.4, 1.0, -1.2, -1.57, 0.0)  # joint values of the drawn arms, rad: upright

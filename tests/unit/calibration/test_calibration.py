@@ -9,12 +9,11 @@ import pytest
 
 import hilcal as hc
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.compensation import band
+from hilcal.calibration.compensation import band, tool_poses
 from hilcal.calibration.covariance_source import CovarianceSource
 from hilcal.calibration.measured import Measured
 from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.storage import from_json, to_json
-from hilcal.calibration.tool import tool_poses
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.robot_frames import one_of_each

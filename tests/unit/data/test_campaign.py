@@ -80,8 +80,7 @@ def test_round_trip_is_exact(tmp_path, x):
 
 
 def test_description_is_kept(tmp_path):
-    path = make(tmp_path / "run.hilcal")
-    with CampaignFile.open(path) as campaign:
+    with CampaignFile.open(make(tmp_path / "run.hilcal")) as campaign:
         assert campaign.config_json == '{"robot": "ur10"}'
         assert campaign.base_dir == "base/dir"
         assert campaign.source == "a test"
@@ -289,12 +288,8 @@ def test_a_second_writer_waits_or_is_told(tmp_path):
 )
 def test_a_read_only_file_or_folder_is_said(words):
     """As SQLite words them: for the superuser, who may run the tests, nothing is read-only."""
-    with (
-        pytest.raises(
-            InputError, match=r"run\.hilcal: cannot be written .*read-only; valid: a copy"
-        ),
-        sqlite_errors(Path("run.hilcal")),
-    ):
+    said = r"run\.hilcal: cannot be written .*read-only; valid: a copy"
+    with pytest.raises(InputError, match=said), sqlite_errors(Path("run.hilcal")):
         raise sqlite3.OperationalError(words)
 
 
@@ -304,16 +299,12 @@ def _replace(path):
     other.replace(path)
 
 
-def _rename_folder(path):
-    path.parent.rename(path.parent.with_name("renamed"))
-
-
 LOST = {
     "deleted": Path.unlink,
     "replaced by another campaign": _replace,
     "replaced by a text": lambda p: (p.unlink(), p.write_text("x")),
     "moved": lambda p: p.rename(p.with_name("moved.hilcal")),
-    "its folder moved": _rename_folder,
+    "its folder moved": lambda p: p.parent.rename(p.parent.with_name("renamed")),
     "its folder deleted": lambda p: shutil.rmtree(p.parent),
 }
 
@@ -356,8 +347,7 @@ def test_a_rescued_copy_replaces_no_file(tmp_path):
     path, there = tmp_path / "run.hilcal", tmp_path / "run.rescued.hilcal"
     there.write_text("kept")
     file = _campaign(path)
-    log = RunLog(file)
-    log.record(_reading(STEPS[0]), STEPS[0], {})
+    RunLog(file).record(_reading(STEPS[0]), STEPS[0], {})
     path.unlink()
     with pytest.raises(MovedFileError) as told, file:
         pass
@@ -454,23 +444,21 @@ def _lost(tmp_path, batches, tries, writer=POWER_WRITER, syncs=4):
     return count
 
 
-@pytest.mark.skipif(shutil.which("gcc") is None, reason="the recorder needs gcc")
-def test_power_loss_at_every_write(tmp_path):
-    assert _lost(tmp_path, 3, tries=2) > 50
+needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="the recorder needs gcc")
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(shutil.which("gcc") is None, reason="the recorder needs gcc")
-def test_power_loss_in_many_orders(tmp_path):
-    assert _lost(tmp_path, 6, tries=30) > 1000
+@needs_gcc
+@pytest.mark.parametrize(
+    ("batches", "tries", "least"), [(3, 2, 50), pytest.param(6, 30, 1000, marks=pytest.mark.slow)]
+)
+def test_power_loss_at_every_write_in_many_orders(batches, tries, least, tmp_path):
+    assert _lost(tmp_path, batches, tries=tries) > least
 
 
-@pytest.mark.skipif(shutil.which("gcc") is None, reason="the recorder needs gcc")
+@needs_gcc
 def test_a_program_that_does_not_sync_is_found_out(tmp_path):
-    careless = POWER_WRITER.replace(
-        "    x = simple", "    run.connection.execute(OFF)\n    x = simple"
-    )
-    careless = 'OFF = "PRAGMA synchronous = OFF"\n' + careless
+    off = '    run.connection.execute("PRAGMA synchronous = OFF")\n'
+    careless = POWER_WRITER.replace("    x = simple", f"{off}    x = simple")
     with pytest.raises((AssertionError, InputError)):
         _lost(tmp_path, 3, tries=3, writer=careless, syncs=0)
 

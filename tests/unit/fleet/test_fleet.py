@@ -14,9 +14,8 @@ from hilcal.identification.posterior import Posterior
 from hilcal.present.html.other_pages import arms_chart, fleet_page
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.transfer.fleet import Fleet
+from hilcal.transfer.fleet import Fleet, effects_seen, pooled
 from hilcal.transfer.members import Failure, Member, entries, member_of
-from hilcal.transfer.pooled import effects_seen, pooled
 from tests.support.calibrate_process import CELL
 from tests.support.campaigns import cell_of, configuration, noiseless, plan, with_noise, world_of
 from tests.support.cli_cases import ok, refused
@@ -71,9 +70,14 @@ def members(one, seed, odd=0.0):
     return found
 
 
-def test_the_spread_of_arms_is_recovered_and_the_odd_one_named(one):
+@pytest.fixture(scope="module")
+def with_odd(one):
     fleet = members(one, 3, odd=1.5)
-    found = pooled(fleet, effects_seen(fleet))
+    return fleet, pooled(fleet, effects_seen(fleet))
+
+
+def test_the_spread_of_arms_is_recovered_and_the_odd_one_named(one, with_odd):
+    found = with_odd[1]
     assert found.parameters
     for p in found.parameters:
         mean = one.mean[one.names.index(p.parameter)]
@@ -93,9 +97,8 @@ def test_in_an_ordinary_fleet_nobody_is_named(one):
         assert pooled(members(one, seed), ()).odd == ()
 
 
-def test_the_page_shows_who_is_unlike(one):
-    fleet = members(one, 3, odd=1.5)
-    of = pooled(fleet, effects_seen(fleet))
+def test_the_page_shows_who_is_unlike(with_odd):
+    fleet, of = with_odd
     drawn = arms_chart(of)
     assert [(len(trace.y), trace.name) for trace in drawn.data] == [
         (ARMS * len(of.parameters) - 1, "like its type"),
@@ -245,12 +248,12 @@ def test_campaigns_of_the_same_readings_are_refused(how, capsys, tmp_path):
 
     def extended(path):
         moved = (again.value + rng.normal(0, 1e-5, x.value.shape) for _ in range(4))
-        store(
-            path, x, *(replace(again, value=v, cycle=again.cycle + k) for k, v in enumerate(moved))
-        )
+        more = (replace(again, value=v, cycle=again.cycle + k) for k, v in enumerate(moved))
+        store(path, x, *more)
 
+    content = (folder / "b.hilcal").read_bytes()
     if how == "a copy":
-        other.write_bytes((folder / "b.hilcal").read_bytes())
+        other.write_bytes(content)
     elif how == "a link":
         other.symlink_to("b.hilcal")
     elif how == "imported again":  # other names, another order, six decimals
@@ -265,7 +268,7 @@ def test_campaigns_of_the_same_readings_are_refused(how, capsys, tmp_path):
         extended(folder / "e.hilcal")
     else:
         for k in range(25):
-            (folder / f"d{k:02d}.hilcal").write_bytes((folder / "b.hilcal").read_bytes())
+            (folder / f"d{k:02d}.hilcal").write_bytes(content)
     told = refused(capsys, 2, "fleet", folder, "-o", tmp_path / "p.json", "--workers", "1")
     assert "have readings in common" in told
     first = "d.hilcal" if how == "two extensions" else "b.hilcal"

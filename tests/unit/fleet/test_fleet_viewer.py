@@ -7,8 +7,7 @@ import rerun as rr
 from hilcal.present.viewer import style
 from hilcal.present.viewer.fleet import DrawnType, places, record_fleet
 from hilcal.robot.scene import capsules
-from hilcal.transfer.fleet import Fleet
-from hilcal.transfer.pooled import pooled
+from hilcal.transfer.fleet import Fleet, pooled
 from tests.support.picture import Shot, needs_vulkan, pictures
 from tests.support.recordings import chunks, entities, rows
 from tests.support.viewer_plan import rgb

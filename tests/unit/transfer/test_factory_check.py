@@ -1,7 +1,5 @@
 """Whether an arm is still what its factory measured, on readings of a simulated world."""
 
-from dataclasses import replace
-
 import pytest
 
 from hilcal.cell import cell_from_config
@@ -11,7 +9,7 @@ from hilcal.drivers.simulated.rehearsal import case_of_plan, read_plan
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError
 from hilcal.robot.catalogue import load_arm
-from hilcal.transfer.factory import check_factory
+from hilcal.transfer.compare import check_factory
 from tests.support.factory_cases import factory_of, write
 
 CELL = {
@@ -60,6 +58,5 @@ def test_a_change_since_the_factory_is_found_and_none_is_invented(tmp_path, hide
 def test_too_few_readings_cannot_answer(tmp_path):
     config, measured = readings(tmp_path, "nothing", 3)
     cell = cell_from_config(config, tmp_path)
-    few = measured[:7]
     with pytest.raises(CannotAnswerError, match="7 readings; 8"):
-        check_factory(replace(cell), load_arm("ur15"), cell.factory, few)
+        check_factory(cell, load_arm("ur15"), cell.factory, measured[:7])

@@ -50,14 +50,19 @@ def at_nominal(cell, of):
     return replace(of, value=Model(cell, ()).predict(of.states, np.zeros(0)).observation.position)
 
 
-@pytest.fixture(scope="module")
-def sizes():
-    cell, told = cell_of({}), []
+def sizes_told(ordinary):
+    """Sizes by five arms of a type, whose cell states `ordinary`."""
+    cell, told = cell_of(ordinary), []
     for arm in range(5):
         readings = measured(cell, 30, np.random.default_rng([arm, 7]))
         found = mixed_fit(baseline(cell, readings, "absolute"), readings, "absolute")
-        told.append(evidence_of(found.variances, {}))
-    return {s.effect: s for s in type_sizes(told)}
+        told.append(evidence_of(found.variances, ordinary))
+    return type_sizes(told)
+
+
+@pytest.fixture(scope="module")
+def sizes():
+    return {s.effect: s for s in sizes_told({})}
 
 
 def test_the_sizes_of_a_type_are_in_their_intervals(sizes):
@@ -70,13 +75,7 @@ def test_the_sizes_of_a_type_are_in_their_intervals(sizes):
 
 
 def test_what_a_cell_says_already_does_not_count_twice(sizes):
-    told = []
-    cell = cell_of(TRUTH)
-    for arm in range(5):
-        readings = measured(cell, 30, np.random.default_rng([arm, 7]))
-        found = mixed_fit(baseline(cell, readings, "absolute"), readings, "absolute")
-        told.append(evidence_of(found.variances, TRUTH))
-    for s in type_sizes(told):
+    for s in sizes_told(TRUTH):
         assert s.factor == pytest.approx(sizes[s.effect].factor, rel=0.5)
 
 

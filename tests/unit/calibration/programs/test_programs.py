@@ -14,15 +14,9 @@ import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilcal.calibration.programs.fanuc import LS
-from hilcal.calibration.programs.inform import INFORM
+from hilcal.calibration.programs.fanuc_inform import INFORM, LS
 from hilcal.calibration.programs.krl import KRL
-from hilcal.calibration.programs.languages import (
-    flags_of,
-    resolve,
-    understood,
-    unlike,
-)
+from hilcal.calibration.programs.languages import flags_of, resolve, understood, unlike
 from hilcal.calibration.programs.program import UNSTATED, Language, Program, ProgramPoint
 from hilcal.calibration.programs.rapid import RAPID
 from hilcal.errors import InputError
