@@ -25,14 +25,7 @@ from hilcal.identification.folds import folds_of, random_folds
 from hilcal.identification.gauss_newton import columns_of
 from hilcal.identification.priors import scales_of
 from hilcal.regression.evidence import FamilyScore, Spectrum, score_family
-from hilcal.regression.leave_out import (
-    FamilyProducts,
-    Fold,
-    family_products,
-    improves,
-    left_out_of_families,
-    left_out_residual,
-)
+from hilcal.regression.leave_out import FamilyFolds, Fold, improves
 from hilcal.regression.normal_equations import Basis, find_basis, normal_equations
 from hilcal.regression.projection import Projection
 from hilcal.types import Bools, Floats, Ints
@@ -118,8 +111,8 @@ class Linearisation:
         The strengths are those of the fit, as in `held_out`; `Fit.left_out` has strengths chosen
         without the pose.
         """
-        white = left_out_residual(self.folds, self.projection, self.fit.white)
-        return by_pose(self.fit, white)
+        model = FamilyFolds(self.folds, self.projection)
+        return by_pose(self.fit, model.left_out(self.fit.white, of_fit=True))
 
     @cached_property
     def folds(self) -> tuple[Fold, ...]:
@@ -131,15 +124,15 @@ class Linearisation:
         """Return M X of whitened columns X (R, P)."""
         return self.projection.project_out(x)
 
-    def information(self, x: Floats | FamilyProducts) -> Floats:
+    def information(self, x: Floats | FamilyFolds) -> Floats:
         """Return S = Xᵀ M X (P, P) of whitened columns X (R, P), or of their products."""
-        if isinstance(x, FamilyProducts):
-            return self.projection.schur(x.whole.gram, x.whole.cross)
+        if isinstance(x, FamilyFolds):
+            return self.projection.schur(x.gram, x.cross)
         return self.projection.information(x)
 
-    def products(self, families: Iterable[Floats]) -> list[FamilyProducts]:
+    def products(self, families: Iterable[Floats]) -> list[FamilyFolds]:
         """Return the products of families of whitened columns, for `held_out`."""
-        return family_products(self.folds, self.projection, self.fit.white, families)
+        return [FamilyFolds(self.folds, self.projection, x) for x in families]
 
     def score(
         self, x: Floats, s: Floats | Spectrum | None = None, most: float = np.inf
@@ -180,26 +173,20 @@ class Linearisation:
         """Return a reduction of ‖r‖² as a share of the misfit, within [0, 1]."""
         return float(np.clip(gain / self.misfit(), 0.0, 1.0))
 
-    def held_out(self, families: Sequence[tuple[FamilyProducts, FamilyScore]]) -> list[HeldOut]:
-        """Return the reduction of the held-out error by each family alone.
-
-        A family is given by its products, and its score, which has its ridge; see
-        `regression.leave_out`.
-        """
-        visible = [(products, score.ridge) for products, score in families if score.rank]
-        residuals = iter(left_out_of_families(self.folds, self.projection, self.fit.white, visible))
-        return [
-            self._held_out(next(residuals)) if score.rank else HeldOut(0.0, False)
-            for _, score in families
-        ]
-
-    def _held_out(self, residual: Floats) -> HeldOut:
-        """Compare a residual (R,) predicted without each pose with that of the model alone."""
-        noise = self.fit.whitening.rank
-        before, after = self.left_out, by_pose(self.fit, residual)
+    def held_out(self, families: Sequence[tuple[FamilyFolds, FamilyScore]]) -> list[HeldOut]:
+        """Return the reduction of the held-out error by each family, with its score's ridge."""
+        noise, before = self.fit.whitening.rank, self.left_out
         misfit = max(float(before.sum()) - noise, LEAST_MISFIT * np.sqrt(2 * noise))
-        gain = float(before.sum() - after.sum())
-        return HeldOut(float(np.clip(gain / misfit, -1.0, 1.0)), improves(before, after))
+        out = []
+        for family, score in families:
+            if not score.rank:
+                out.append(HeldOut(0.0, False))
+                continue
+            after = by_pose(self.fit, family.left_out(self.fit.white, score.ridge, of_fit=True))
+            gain = float(before.sum() - after.sum())
+            share = float(np.clip(gain / misfit, -1.0, 1.0))
+            out.append(HeldOut(share, improves(before, after)))
+        return out
 
 
 def linearise(fit: Fit) -> Linearisation:

@@ -4,22 +4,20 @@ After registration the nominal arm misses readings by its geometric errors, some
 larger misfit is no effect but a wrong description. Single hypotheses (`KINDS`) are tried on some of
 the readings, then the best of them in combination (beam search), until one explains the readings.
 
-Arms of one size differ by millimetres from one generation to the next, and registration hides part
-of that: readings of a UR10 leave some 4 mm with the description of a UR10e, which is not too much
-for an arm before calibration. So every arm of the catalogue with as many joints is registered to
-the readings as the described one was (`other_arm`). With e the displacements by the errors of the
-true arm and d those from one description to the other, the frames projected off, the wrong
-description leaves |e + d| and the right one |e|. One that leaves less than half of what the
-described one leaves is named. Were the described arm the right one then, |e − d| ≤ |e|/2: its
-errors would be larger than 2/3 |d|, and lie along d.
+Arms of one size differ by millimetres from one generation to the next, which is not too much for an
+arm before calibration. So every arm of the catalogue with as many joints is registered to the
+readings, too (`other_arm`). With e the displacements by the errors of the true arm and d those from
+one description to the other, the frames projected off, the wrong description leaves |e + d| and the
+right one |e|. One that leaves less than half of what the described one leaves is named. Were the
+described arm the right one then, |e − d| ≤ |e|/2: its errors would be larger than 2/3 |d|, and lie
+along d.
 """
 
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
-from itertools import combinations
-from typing import Any
+from functools import lru_cache, reduce
+from itertools import combinations, product
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -128,12 +126,6 @@ class Hypothesis:
         """The subject; two hypotheses on one subject are not combined."""
         return self.kind, self.joint, self.follows
 
-    @property
-    def order_of_trial(self) -> tuple[object, ...]:
-        """Hypotheses about the arm come first, then those about joints, then couplings."""
-        rank = {"arm": 0, "joint": 1, "coupling": 2}.get(self.kind, 3)
-        return (rank, *self.subject, self.sign, self.offset)
-
     def applied(self, d: Described) -> Described:
         """Return arm and readings under this hypothesis."""
         return KINDS[self.kind].applied(d, self)
@@ -146,8 +138,7 @@ class Hypothesis:
 
 
 Applied = Callable[[Described, Hypothesis], Described]
-Way = tuple[Hypothesis, ...]
-"""Hypotheses that are tried together."""
+Way = tuple[Hypothesis, ...]  # tried together
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +164,7 @@ def _another_arm(d: Described, h: Hypothesis) -> Described:
     return replace(d, arm=arm if d.conventions is None else as_counted(arm, d.conventions))
 
 
-def _mapped(name: str, change: Callable[[Any], Any]) -> Applied:
+def _mapped(name: str, change: Callable[[Floats], Floats]) -> Applied:
     """Return a change of one attribute of the description, unless that is None."""
 
     def applied(d: Described, _: Hypothesis) -> Described:
@@ -233,12 +224,12 @@ KINDS: dict[str, Kind] = {
     "joint": Kind(_recounted, _joint_words, ""),
     "coupling": Kind(_recounted, _coupling_words, ""),
     "base_unknown": Kind(
-        _mapped("base_unknown", lambda _: True),
+        lambda d, _: replace(d, base_unknown=True),
         "the base stands elsewhere than [tracker] says",
         "leave out [tracker] base_xyz_m and base_rotvec_rad",
     ),
     "target_unknown": Kind(
-        _mapped("target_unknown", lambda _: True),
+        lambda d, _: replace(d, target_unknown=True),
         "the target sits elsewhere than [tool] says",
         "leave out [tool] target_m",
     ),
@@ -284,10 +275,8 @@ OF_ATTITUDES = ("mirrored_positions", "turn_degrees", "turn_radians", "inverse",
 def hypotheses(d: Described) -> Iterator[Hypothesis]:
     """Yield the single hypotheses."""
     n, slides = d.arm.n, d.arm.slides
-    if not d.base_unknown:
-        yield Hypothesis("base_unknown")
-    if not d.target_unknown:
-        yield Hypothesis("target_unknown")
+    frames = {"base_unknown": d.base_unknown, "target_unknown": d.target_unknown}
+    yield from (Hypothesis(kind) for kind, unknown in frames.items() if not unknown)
     for j in range(1, n + 1):
         for sign in (-1, 1):
             for quarter in (0, 2, 1, -1):
@@ -300,32 +289,28 @@ def hypotheses(d: Described) -> Iterator[Hypothesis]:
     simple += ["travel_millimetres"] * bool(slides.any())
     yield from map(Hypothesis, simple if d.turn is None else [*simple, *OF_ATTITUDES])
     yield from (Hypothesis("arm", arm=arm.name) for arm in other_arms(d.arm))
-    yield from (Hypothesis("shift", shift=k) for k in shifts(len(d.q)))
+    yield from shifts(len(d.q))
     # Columns: two exchanged, all rotated, or reversed.
-    straight, orders = tuple(range(1, n + 1)), []
-    for i, j in combinations(range(n), 2):
-        order = list(straight)
-        order[i], order[j] = order[j], order[i]
-        orders.append(tuple(order))
+    straight = tuple(range(1, n + 1))
+    swaps = ({i: j, j: i} for i, j in combinations(straight, 2))
+    orders = [tuple(swap.get(k, k) for k in straight) for swap in swaps]
     orders += [(*straight[k:], *straight[:k]) for k in range(1, n)]
     orders.append(straight[::-1])
     yield from (Hypothesis("columns", order=order) for order in dict.fromkeys(orders))
 
 
-def shifts(count: int) -> Iterator[int]:
+def shifts(count: int) -> Iterator[Hypothesis]:
     """Yield the shifts of rows that leave at least half of so many readings to judge by."""
-    yield from (k for k in SHIFTS if 2 * abs(k) <= count)
+    yield from (Hypothesis("shift", shift=k) for k in SHIFTS if 2 * abs(k) <= count)
 
 
 def pairs(n: int) -> Iterator[Way]:
     """Yield pairs that hide each other: two signs, and the zeros of two neighbours."""
     for i, j in combinations(range(1, n + 1), 2):
         yield Hypothesis("joint", i, -1), Hypothesis("joint", j, -1)
-    for j in range(1, n):
-        for a in (1, -1, 2):
-            for b in (1, -1, 2):
-                zeros = (a * np.pi / 2, b * np.pi / 2)
-                yield Hypothesis("joint", j, 1, zeros[0]), Hypothesis("joint", j + 1, 1, zeros[1])
+    for j, a, b in product(range(1, n), (1, -1, 2), (1, -1, 2)):
+        first = Hypothesis("joint", j, 1, a * np.pi / 2)
+        yield first, Hypothesis("joint", j + 1, 1, b * np.pi / 2)
 
 
 def mended(way: Way, cell: Cell) -> str:
@@ -362,11 +347,8 @@ def keys(way: Way, cell: Cell) -> dict[str, str]:
         (any(h.offset for h in way), json.dumps([round(float(z), 4) + 0.0 for z in zero])),
         (any(h.follows for h in way), f"[{', '.join(f'{{ {entry} }}' for entry in entries)}]"),
     )
-    return {
-        key: value
-        for key, (changed, value) in zip(Conventions.model_fields, values, strict=True)
-        if changed
-    }
+    pairs = zip(Conventions.model_fields, values, strict=True)
+    return {key: value for key, (changed, value) in pairs if changed}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -538,12 +520,9 @@ class _DescriptionSearch:
                 for h in additions
                 if h.subject not in [g.subject for g in partial]
             ]
-            if depth == 1:
-                ways += [
-                    way
-                    for way in pairs(self._cell.arm.n)
-                    if not any(h.offset and slides[h.joint - 1] for h in way)
-                ]
+            for way in pairs(self._cell.arm.n) if depth == 1 else ():
+                if not any(h.offset and slides[h.joint - 1] for h in way):
+                    ways.append(way)
             rough = {w: self.score(w, True) for w in dict.fromkeys(map(_sorted, ways))}
             best = sorted(rough, key=lambda w: (rough[w], _cost(w)))[:CAREFUL]
             scores = {**rough, **{w: self.score(w) for w in best}}
@@ -561,9 +540,7 @@ class _DescriptionSearch:
 
         Where a pose has many readings, only its last one is wrong, and looks like a gross error.
         """
-        count = len(self._readings)
-        ways: list[Way] = [(Hypothesis("shift", shift=k),) for k in shifts(count)]
-        tried = {way: self.score(way) for way in ways}
+        tried = {(h,): self.score((h,)) for h in shifts(len(self._readings))}
         return _explained(tried, min(self.enough, self.score(()) / FACTOR)) if tried else ()
 
     def _enough(self, tried: dict[Way, float], base: float) -> tuple[Explanation, ...]:
@@ -645,10 +622,7 @@ class _DescriptionSearch:
         return data, frames, free_parameters(d.base_unknown, ~fixed, axes)
 
     def _described(self, way: Way) -> Described:
-        d = self._stated
-        for h in way:
-            d = h.applied(d)
-        return d
+        return reduce(lambda d, h: h.applied(d), way, self._stated)
 
     def _robust(self, way: Way) -> tuple[float, Bools, Placement]:
         """Register with weights by which rows that do not fit lose their influence.
@@ -693,7 +667,9 @@ def _cost(way: Way) -> int:
 
 
 def _sorted(way: Way) -> Way:
-    return tuple(sorted(way, key=lambda h: h.order_of_trial))
+    """Hypotheses about the arm come first, then those about joints, then couplings."""
+    rank = {"arm": 0, "joint": 1, "coupling": 2}
+    return tuple(sorted(way, key=lambda h: (rank.get(h.kind, 3), *h.subject, h.sign, h.offset)))
 
 
 def _levers(m: int) -> Floats:

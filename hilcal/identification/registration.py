@@ -2,14 +2,15 @@
 
 With the nominal flange poses (R_i, p_i), readings y_i obey
 
-    y_i = R (p_i + R_i τ) + t,      M_i = R R_i R_τ  (attitude, where read)
+    y_i = h(R (p_i + R_i τ) + t),      M_i = R R_i R_τ  (attitude, where read)
 
-R, t: the base in the sensor's frame; τ, R_τ: the target k(i) on the flange. The 6 + 6 T parameters
-are a shift of the base at the centroid of the flange's positions and a turn, base axes; per target
-a shift and a turn, flange axes; all in ordinary sizes. Starts are closed forms (Kabsch; linear
-equations of a point, |p|² − d² being linear in it, and of a plane) and rotations of a cube.
-Readings that are centimetres off are detected from a robust start, and left out. Directions that
-the poses do not determine stay near the cell's targets and are listed.
+R, t: the base in the sensor's frame; τ, R_τ: the target k(i) on the flange; h: what the observer
+o(i) reads, for one tracker the position itself. The 6 + 6 T + 6 O parameters are a shift of the
+base at the centroid of the flange's positions and a turn, base axes; per target a shift and a turn,
+flange axes; per observer the twist of its frame; all in ordinary sizes. Starts are closed forms
+(Kabsch; linear equations of a point, |p|² − d² being linear in it, and of a plane) and rotations of
+a cube. Readings that are centimetres off are detected from a robust start, and left out. Directions
+that the poses do not determine stay near the cell's targets and are listed.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,7 +18,6 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from hilcal.cell import Cell, Observer, plane_frame
 from hilcal.effects.target_offset import TargetOffset
@@ -32,7 +32,7 @@ from hilcal.identification.least_trimmed_squares import (
 )
 from hilcal.identification.solver import echelon, minimise
 from hilcal.model.model import Model
-from hilcal.model.observe import read_by
+from hilcal.model.observe import Observation, by_observer_frame, sighted
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import inverse_root
 from hilcal.robot import se3
@@ -46,12 +46,12 @@ TARGET_M, BASE_M = 0.3, 3.0  # ordinary distances of target and flange, of track
 TELL = 0.1  # share of an ordinary size to which readings must determine a direction
 ALTERNATIONS = 10  # between rotation and translations; least squares follow
 HOLD = 1e-6  # weight of an ordinary size in the linear starts, against an error of 1 m
-HOLD_SEVERAL = 1e-3  # the same in whitened rows of several observers
 MIN_POSES = 4
 NARROW = 1e-3  # m rms from a line, below which positions are collinear
 FEW, FEW_EACH = 100, 50  # readings that starts are tried on: of all, and of each observer
 GOOD = 10.0  # rms misfit with roughness at which no other start is tried: 1 mm and 1 mrad
-STEPS, TRIED, FOLLOWED = 15, 5, 6  # steps of a start; rotations of a cube tried; starts followed
+STEPS, TRIED = 15, 5  # steps of a start; rotations of a cube that are tried
+STEPS_SEVERAL, FOLLOWED = 50, 6  # with several observers: steps of a start; starts followed
 DISTURBED = 3e-3  # m rms from which far readings are looked for: nominal arms are off by less
 BEYOND = 10.0  # times the median misfit from which on a reading of several observers is far off
 LEAST_FAR = 1e-4  # m, misfit that is never far off
@@ -121,42 +121,73 @@ def _pose(t: Floats) -> dict[str, Sequence[float]]:
 
 
 def register(cell: Cell, readings: Readings) -> Registration:
-    """Estimate the registration and the target's offset where they are unknown.
+    """Estimate the places of base, targets and observers where they are unknown.
 
     Raises:
-        CannotAnswerError: the poses do not determine it: fewer than four distinct positions, all on
-            one line, or fewer readings of an observer than unknowns of its place.
+        CannotAnswerError: the poses do not determine them: fewer than four distinct positions, all
+            on one line, or fewer readings of an observer than unknowns of its place.
     """
-    if readings.states.observer is not None:
-        return _of_several(cell.observed_by(readings.observers), readings)
-    angle, data = angles(readings), FrameData.of(cell.arm, readings)
-    frames, free = given_and_free(cell, data.m == 6)
-    fixed = cell.registration_known and cell.target_known
-    if fixed:
-        placement, null = Placement(data, frames, np.zeros_like(free)), np.zeros((len(free), 0))
-        far = _far(readings, placement)
-    else:
-        distinct = len(np.unique(np.round(angle, 9), axis=0))
-        if distinct < MIN_POSES:
-            raise CannotAnswerError(
-                f"registration: {distinct} distinct poses; measure at least {MIN_POSES}, better "
-                "10, that turn the flange and do not lie on a line"
-            )
+    cell = cell.observed_by(readings.observers)
+    data, m = FrameData.of(cell.arm, readings), readings.m
+    frames, free = given_and_free(cell, m == 6)
+    estimated = not (cell.registration_known and cell.target_known) or any(
+        o.free for o in cell.observers
+    )
+    if estimated:
+        _refuse_few(cell, readings)
         placement, null = _fitted(data, frames, free)
-        far = _far(readings, placement)
-        if far.any():
-            placement, null = _fitted(data[~far], frames, free)
-        x = data.points(placement.frames)
-        spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
-        if data.m == 3 and not cell.registration_known and spread[1] < NARROW * np.sqrt(len(x)):
+    else:
+        placement, null = Placement(data, frames, np.zeros_like(free)), np.zeros((len(free), 0))
+    far = _far(readings, placement)
+    if estimated and 0 < far.mean() <= MOST:
+        placement, null = _fitted(data[~far], frames, free)
+        if cell.observers:
+            far = _far_by_median(data.misfit(placement.frames))
+    off, found = data.misfit(placement.frames), placement.frames
+    if estimated:
+        x = data.points(found)
+        spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)[1]
+        in_space = m == 6 or cell.registration_known or bool(cell.observers)
+        if not in_space and spread < NARROW * np.sqrt(len(x)):
             raise CannotAnswerError(
                 "registration: all positions lie in one point or on one line; measure poses "
                 "spread in space"
             )
-        frames = placement.frames
-        cell = replace(cell.with_targets(frames.targets), registration=frames.base)
-    off = data.misfit(placement.frames)
-    return _registration(cell, readings, off, far, far, _undetermined(null), not fixed)
+        cell = replace(cell.with_targets(found.targets), observers=found.observers)
+        cell = replace(cell, registration=found.base)
+    rms, turn_rms = (
+        float(np.sqrt(np.mean(np.sum(off[~far, part] ** 2, axis=1))))
+        for part in (slice(0, 3), slice(3, 6))
+    )
+    return Registration(
+        cell=cell,
+        off=off,
+        rms=rms,
+        turn_rms=turn_rms if m == 6 else None,
+        far=far & (far.mean() <= MOST),
+        undetermined=_undetermined(null, found),
+        still=np.ptp(angles(readings), axis=0) < TURNED,
+        estimated=estimated,
+    )
+
+
+def _refuse_few(cell: Cell, readings: Readings) -> None:
+    """Refuse fewer readings than determine the places."""
+    angle = angles(readings)
+    for k, o in enumerate(cell.observers):
+        rows = readings.observer == k
+        count = len(np.unique(angle[rows], axis=0)) * (3 if o.name.kind == "station" else 1)
+        if 0 < count < len(o.free):
+            raise CannotAnswerError(
+                f"registration: {o.name} has readings of {rows.sum()} poses, too few for the "
+                f"{len(o.free)} unknowns of its place; measure more, or state its place"
+            )
+    distinct = len(np.unique(np.round(angle, 9), axis=0))
+    if distinct < MIN_POSES and not cell.observers:
+        raise CannotAnswerError(
+            f"registration: {distinct} distinct poses; measure at least {MIN_POSES}, better "
+            "10, that turn the flange and do not lie on a line"
+        )
 
 
 def targets_as_fitted(model: Model, theta: Floats) -> Floats:
@@ -167,37 +198,29 @@ def targets_as_fitted(model: Model, theta: Floats) -> Floats:
     return model.cell.all_targets
 
 
-def _registration(
-    cell: Cell,
-    readings: Readings,
-    off: Floats,
-    beyond: Bools,
-    far: Bools,
-    undetermined: tuple[Undetermined, ...],
-    estimated: bool,
-) -> Registration:
-    """Return a registration with the errors of the readings that are not `beyond` (N,)."""
-    rms, turn = (
-        float(np.sqrt(np.mean(np.sum(off[~beyond, part] ** 2, axis=1))))
-        for part in (slice(0, 3), slice(3, 6))
-    )
-    still = np.ptp(angles(readings), axis=0) < TURNED
-    turn_rms = turn if readings.m == 6 else None
-    return Registration(cell, off, rms, turn_rms, far, undetermined, still, estimated)
-
-
 def _fitted(data: "FrameData", frames: "Frames", free: Bools) -> tuple["Placement", Floats]:
     """Return the best frames, by a part of the readings, then by all; and undetermined directions.
 
-    The directions (6 + 6 T, U) are of unit length, in ordinary sizes.
+    The directions (P, U) are of unit length, in ordinary sizes.
     """
-    part = data[np.unique(np.linspace(0, len(data) - 1, FEW).astype(int))]
-    best = best_placement(part, frames, free, GOOD * np.sqrt(part.m), STEPS, TRIED)
+    if data.observer is None:
+        part = data[np.unique(np.linspace(0, len(data) - 1, FEW).astype(int))]
+        best = best_placement(part, frames, free, GOOD * np.sqrt(part.m), STEPS, TRIED)
+    else:
+        rows = (np.flatnonzero(data.observer == k) for k in np.unique(data.observer))
+        few = [r[np.linspace(0, len(r) - 1, FEW_EACH).astype(int)] for r in rows]
+        part = data[np.unique(np.concatenate(few))]
+        starts = [Placement(part, start, free) for start in _starts(data, part, frames, free)]
+        starts.sort(key=lambda p: p.square)
+        tried = [minimise(start, STEPS_SEVERAL) for start in starts[:FOLLOWED]]
+        best = min(tried, key=lambda p: p.square)
     return settled(minimise(Placement(data, best.frames, free)), frames)
 
 
 def _far(readings: Readings, placement: "Placement") -> Bools:
     """(N,) readings far off while the others fit to within `DISTURBED`; none in other cases."""
+    if placement.frames.observers:
+        return _far_by_median(placement.off)
     data, none = placement.data, np.zeros(len(readings), dtype=np.bool_)
 
     def fits(off: Floats) -> bool:
@@ -222,23 +245,33 @@ def _far(readings: Readings, placement: "Placement") -> Bools:
     return far if fits(placement.off[~far]) and not len(alike) else none
 
 
-def _undetermined(null: Floats) -> tuple[Undetermined, ...]:
+def _far_by_median(off: Floats) -> Bools:
+    """(N,) readings that are off (N, m) by far more than most."""
+    size = np.linalg.norm(off[:, :3], axis=1)
+    return np.asarray(size > max(LEAST_FAR, BEYOND * float(np.median(size))))
+
+
+def _undetermined(null: Floats, frames: "Frames") -> tuple[Undetermined, ...]:
     """Return the undetermined directions, each with as few parameters of a target as possible."""
-    size = len(null) // 6 - 1
-    shifts = [6 + 6 * k + i for k in range(size) for i in range(3)]
-    turns_and_base = [3, 4, 5, *(9 + 6 * k + i for k in range(size) for i in range(3)), 0, 1, 2]
-    rows = echelon(null.T, (shifts, turns_and_base), TOLD)
-    return tuple(_direction(row / np.abs(row).max()) for row in rows)
+    size = len(frames.targets)
+    targets = np.arange(6, 6 + 6 * size).reshape(-1, 2, 3)
+    turns_and_base = [3, 4, 5, *targets[:, 1].reshape(-1).tolist(), 0, 1, 2]
+    of_observers = range(6 + 6 * size, len(null))
+    blocks = (targets[:, 0].reshape(-1).tolist(), turns_and_base, of_observers)
+    return tuple(_direction(row, frames) for row in echelon(null.T, blocks, TOLD))
 
 
-def _direction(row: Floats, observers: tuple[str, ...] = ()) -> Undetermined:
+def _direction(row: Floats, frames: "Frames") -> Undetermined:
     """Return one direction, in ordinary sizes, in m and rad."""
-    moved = row * (np.abs(row) >= TOLD) * sizes(len(row) // 6 - 1)
-    of_targets = moved[6:].reshape(-1, 6)
-    active = np.flatnonzero(np.abs(of_targets).any(axis=1))
+    row = row / np.abs(row).max()
+    moved = (row * (np.abs(row) >= TOLD) * frames.sizes).reshape(-1, 2, 3)
+    count = 1 + len(frames.targets)
+    active = np.flatnonzero(np.abs(moved[1:count]).any(axis=(1, 2)))
     target = int(active[0]) if len(active) else None
-    six = of_targets[target] if target is not None else np.zeros(6)
-    return Undetermined(target, six[:3], six[3:], moved[:3], moved[3:6], observers)
+    shift, turn = np.zeros((2, 3)) if target is None else moved[1 + target]
+    pairs = zip(frames.observers, moved[count:], strict=True)
+    observers = tuple(str(o.name) for o, m in pairs if m.any())
+    return Undetermined(target, shift, turn, *moved[0], observers)
 
 
 def angles(readings: Readings) -> Floats:
@@ -259,11 +292,6 @@ def inverse_roots(covariance: Floats, partial: bool = False) -> Floats:
     return inverse_root(covariance + rough)
 
 
-def sizes(targets: int) -> Floats:
-    """(6 + 6 T,) ordinary sizes of the parameters, m and rad."""
-    return np.array([BASE_M] * 3 + [1.0] * 3 + ([TARGET_M] * 3 + [1.0] * 3) * targets)
-
-
 def free_parameters(base: bool, targets: Bools, attitudes: bool) -> Bools:
     """(6 + 6 T,) which parameters are estimated; of base and targets (T,), which are unknown.
 
@@ -275,17 +303,26 @@ def free_parameters(base: bool, targets: Bools, attitudes: bool) -> Bools:
 
 
 def given_and_free(cell: Cell, attitudes: bool) -> tuple["Frames", Bools]:
-    """Return the frames of a cell, and (6 + 6 T,) which of their parameters are estimated."""
+    """Return the frames of a cell, and (P,) which of their parameters are estimated."""
     free = free_parameters(not cell.registration_known, ~np.array(cell.known_targets), attitudes)
-    return Frames(cell.registration, cell.all_targets), free
+    observers = (np.isin(np.arange(6), o.free) for o in cell.observers)
+    frames = Frames(cell.registration, cell.all_targets, cell.observers)
+    return frames, np.concatenate([free, *observers])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frames:
-    """Base T_sensor_base (4, 4), and targets T_flange_target (T, 4, 4)."""
+    """Base, targets and observers, with P = 6 + 6 T + 6 O parameters."""
 
-    base: Floats
-    targets: Floats
+    base: Floats  # (4, 4) T_sensor_base
+    targets: Floats  # (T, 4, 4) T_flange_target
+    observers: tuple[Observer, ...] = ()  # those that read; none for one tracker
+
+    @property
+    def sizes(self) -> Floats:
+        """(P,) ordinary sizes of the parameters, m and rad."""
+        parts = [BASE_M, *[TARGET_M] * len(self.targets), *[BASE_M] * len(self.observers)]
+        return np.array([size for part in parts for size in [part] * 3 + [1.0] * 3])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -298,13 +335,16 @@ class FrameData:
     attitude: Floats | None  # (N, 3, 3) attitudes read
     root: Floats  # (N, m, m) inverse root of the covariance, roughness included
     target: Ints  # (N,) index of the target that was read
+    observer: Ints | None = None  # (N,) index of the observer that read it
 
     @classmethod
     def of(cls, arm: Arm, readings: Readings) -> "FrameData":
         """Return the readings with the flange poses of a nominal arm."""
         value, turn = readings.value, readings.value[:, 3:] if readings.m == 6 else None
-        root = inverse_roots(readings.covariance)
-        return cls.at(arm, angles(readings), value[:, :3], turn, root, readings.target)
+        observer = readings.states.observer
+        root = inverse_roots(readings.covariance, partial=observer is not None)
+        data = cls.at(arm, angles(readings), value[:, :3], turn, root, readings.target)
+        return replace(data, observer=observer)
 
     @classmethod
     def at(
@@ -334,14 +374,22 @@ class FrameData:
         """(N, 3) predicted positions of the targets, base axes, m."""
         return self.position + se3.apply(self.rotation, frames.targets[self.target, :3, 3])
 
+    def seen(self, frames: Frames) -> Observation:
+        """Return the predicted readings."""
+        r, points = frames.base[:3, :3], self.points(frames)
+        turn = r @ self.rotation @ frames.targets[self.target, :3, :3]
+        position = points @ r.T + frames.base[:3, 3]
+        if self.observer is None:
+            return Observation(position, turn, points, r)
+        return sighted(frames.observers, self.observer, position, turn)
+
     def misfit(self, frames: Frames) -> Floats:
-        """(N, m) measured minus predicted, sensor axes, m and rad."""
-        r, t = frames.base[:3, :3], frames.base[:3, 3]
-        off = self.value - self.points(frames) @ r.T - t
+        """(N, m) measured minus predicted, m and rad, in the axes of what reads."""
+        o = self.seen(frames)
+        off = self.value - o.position
         if self.attitude is None:
             return np.asarray(off)
-        predicted = r @ self.rotation @ frames.targets[self.target, :3, :3]
-        turn = se3.rotation_vector(self.attitude @ np.swapaxes(predicted, 1, 2))
+        turn = se3.rotation_vector(self.attitude @ np.swapaxes(o.rotation, 1, 2))
         return np.concatenate([off, turn], axis=1)
 
 
@@ -351,7 +399,7 @@ class Placement:
 
     data: FrameData
     frames: Frames
-    free: Bools  # (6 + 6 T,) the parameters that are estimated, K of them
+    free: Bools  # (P,) the parameters that are estimated, K of them
     held: Floats | None = None  # (T, 4, 4) targets with a prior of the ordinary sizes
     weight: float = 1.0  # of a target an ordinary size off, in units of whitened misfit
 
@@ -375,10 +423,10 @@ class Placement:
         """(R,) whitened misfit, and that of the prior."""
         if self.held is None:
             return self.white.reshape(-1)
-        t = self.frames.targets
+        t, away = self.frames.targets, np.zeros(len(self.free))
         shift = (t[:, :3, 3] - self.held[:, :3, 3]) / TARGET_M
         turn = se3.rotation_vector(t[:, :3, :3] @ np.swapaxes(self.held[:, :3, :3], 1, 2)) / np.pi
-        away = np.concatenate([np.zeros(6), np.concatenate([shift, turn], axis=1).reshape(-1)])
+        away[6 : 6 + 6 * len(t)] = np.concatenate([shift, turn], axis=1).reshape(-1)
         return np.concatenate([self.white.reshape(-1), -self.weight * away[self.free]])
 
     def jacobian(self) -> Floats:
@@ -386,24 +434,33 @@ class Placement:
         rows = self.columns().reshape(self.white.size, int(np.count_nonzero(self.free)))
         if self.held is None:
             return rows
-        slopes = np.tile(np.repeat([1.0, 1.0 / np.pi], 3), len(self.held))
-        away = np.concatenate([np.zeros(6), slopes])[self.free]
-        return np.concatenate([rows, self.weight * np.diag(away)])
+        slopes, count = np.zeros(len(self.free)), len(self.held)
+        slopes[6 : 6 + 6 * count] = np.tile(np.repeat([1.0, 1.0 / np.pi], 3), count)
+        return np.concatenate([rows, self.weight * np.diag(slopes[self.free])])
 
     def columns(self) -> Floats:
         """(N, m, K) whitened derivative of the predicted readings."""
-        data, r = self.data, self.frames.base[:3, :3]
-        turned = r @ data.rotation
-        out = np.zeros((len(data), data.m, len(self.free)))
+        data, frames, r = self.data, self.frames, self.frames.base[:3, :3]
+        turned, m = r @ data.rotation, data.m
+        out = np.zeros((len(data), m, len(self.free)))
         out[:, :3, :3] = r
-        out[:, :3, 3:6] = -r @ se3.skew(data.points(self.frames) - self._centre)
-        out[:, 3:, 3:6] = r[: data.m - 3]
-        for k in range(len(self.frames.targets)):
+        out[:, :3, 3:6] = -r @ se3.skew(data.points(frames) - self._centre)
+        out[:, 3:, 3:6] = r[: m - 3]
+        for k in range(len(frames.targets)):
             rows, first = data.target == k, 6 + 6 * k
             out[rows, :3, first : first + 3] = turned[rows]
-            out[rows, 3:, first + 3 : first + 6] = turned[rows, : data.m - 3]
-        size = sizes(len(self.frames.targets))[self.free]
-        return np.asarray(data.root @ out[:, :, self.free] * size)
+            out[rows, 3:, first + 3 : first + 6] = turned[rows, : m - 3]
+        if data.observer is not None:
+            o = data.seen(frames)
+            out[:, :3] = o.axes @ out[:, :3]
+            if m == 6:
+                turns = np.stack([x.frame[:3, :3] for x in frames.observers])
+                out[:, 3:] = turns[data.observer] @ out[:, 3:]
+            moved = by_observer_frame(o, m)
+            for k in range(len(frames.observers)):
+                rows, first = data.observer == k, 6 + 6 * (len(frames.targets) + k)
+                out[rows, :, first : first + 6] = moved[rows]
+        return np.asarray(data.root @ out[:, :, self.free] * frames.sizes[self.free])
 
     @property
     def linear(self) -> ReadingModel:
@@ -414,15 +471,19 @@ class Placement:
     def moved(self, step: Floats) -> "Placement":
         """Return the placement after a step (K,)."""
         full = np.zeros(len(self.free))
-        full[self.free] = sizes(len(self.frames.targets))[self.free] * step
-        targets, of_targets = self.frames.targets.copy(), full[6:].reshape(-1, 6)
+        full[self.free] = self.frames.sizes[self.free] * step
+        targets, parts = self.frames.targets.copy(), full.reshape(-1, 6)
+        of_targets, of_observers = np.split(parts[1:], [len(targets)])
         targets[:, :3, 3] += of_targets[:, :3]
         targets[:, :3, :3] = se3.rotation(of_targets[:, 3:]) @ targets[:, :3, :3]
-        base = self.frames.base @ _moved_about(self._centre, full[:6])
-        return replace(self, frames=Frames(base, targets))
+        about, back = np.eye(4), np.eye(4)
+        about[:3, 3], back[:3, 3] = self._centre, -self._centre
+        base = self.frames.base @ about @ se3.matrix(se3.rotation(full[3:6]), full[:3]) @ back
+        pairs = zip(self.frames.observers, of_observers, strict=True)
+        return replace(self, frames=Frames(base, targets, tuple(_shifted(o, x) for o, x in pairs)))
 
     def determined(self, spread: float) -> tuple[Floats, Floats]:
-        """Undetermined directions (6 + 6 T, U) by the misfit; the step (K,) along the others."""
+        """Undetermined directions (P, U) by the misfit; the step (K,) along the others."""
         a = self.jacobian()
         # Squared singular values up to 1e12 leave rounding of 1e-2 in those that decide, about 10.
         squares, vectors = np.linalg.eigh(a.T @ a)
@@ -438,11 +499,11 @@ class Placement:
         return np.asarray(self.data.position.mean(axis=0))
 
 
-def _moved_about(centre: Floats, six: Floats) -> Floats:
-    """(4, 4) a shift and a turn (6,) about a point (3,)."""
-    about, back = np.eye(4), np.eye(4)
-    about[:3, 3], back[:3, 3] = centre, -centre
-    return about @ se3.matrix(se3.rotation(six[3:]), six[:3]) @ back
+def _shifted(o: Observer, six: Floats) -> Observer:
+    """Return an observer whose frame moved by a twist (6,), a point by its offset at 3."""
+    if o.name.kind == "point":
+        o, six = replace(o, offset=o.offset + float(six[3])), np.append(six[:3], np.zeros(3))
+    return replace(o, frame=se3.matrix(*se3.exp(six)) @ o.frame)
 
 
 def best_placement(
@@ -469,9 +530,10 @@ def settled(placement: Placement, frames: Frames) -> tuple[Placement, Floats]:
     """Return the minimum, its undetermined part held near the targets of `frames`; and that part.
 
     The prior has the ordinary sizes as standard deviations. It acts along the undetermined
-    directions (6 + 6 T, U) alone: along the others, the last steps go to the minimum without it.
+    directions (P, U) alone: along the others, the last steps go to the minimum without it.
     """
-    dof = max(placement.data.m * len(placement.data) - int(np.count_nonzero(placement.free)), 1)
+    read = np.count_nonzero(np.any(placement.data.root != 0, axis=2))
+    dof = max(int(read) - int(np.count_nonzero(placement.free)), 1)
     spread = max(float(np.sqrt(placement.square / dof)), 1.0)
     null, _ = placement.determined(spread)
     if null.size:
@@ -550,174 +612,34 @@ def _with_translations(data: FrameData, frames: Frames, rotation: Floats, free: 
     if data.attitude is not None:
         means = [np.einsum("nji,njk->ik", turned[rows], data.attitude[rows]) for rows in rows_of]
         targets[:, :3, :3] = nearest_rotation(np.array(means))
-    return Frames(se3.matrix(rotation, x[:3]), targets)
+    return replace(frames, base=se3.matrix(rotation, x[:3]), targets=targets)
 
 
-def _of_several(cell: Cell, readings: Readings) -> Registration:
-    """Register readings of several observers."""
-    angle = angles(readings)
-    for k, o in enumerate(cell.observers):
-        rows = readings.observer == k
-        count = len(np.unique(angle[rows], axis=0)) * (3 if o.name.kind == "station" else 1)
-        if 0 < count < len(o.free):
-            raise CannotAnswerError(
-                f"registration: {o.name} has readings of {rows.sum()} poses, too few for the "
-                f"{len(o.free)} unknowns of its place; measure more, or state its place"
-            )
-    placed, off, null = _placed(cell, readings)
-    far = _far_of_several(off)
-    if 0 < far.mean() <= MOST:
-        placed, _, null = _placed(cell, readings[~far])
-        off = Sightings.of(cell, readings).off(placed)
-        far = _far_of_several(off)
-    targets, base = ~np.array(cell.known_targets), not cell.registration_known
-    place = [*range(6 * base), *(6 + 6 * k + i for k in np.flatnonzero(targets) for i in range(3))]
-    ends = np.cumsum([len(place), *(len(o.free) for o in cell.observers)]).tolist()
-    undetermined = []
-    for v in null.T:
-        full = np.zeros(6 + 6 * len(targets))
-        full[place] = v[: len(place)]
-        parts = zip(cell.observers, ends[:-1], ends[1:], strict=True)
-        moved = tuple(str(o.name) for o, a, b in parts if np.any(np.abs(v[a:b]) > TOLD))
-        undetermined.append(_direction(full / np.abs(full).max(initial=TOLD), moved))
-    reported = far if far.mean() <= MOST else np.zeros_like(far)
-    estimated = base or bool(targets.any()) or any(o.free for o in cell.observers)
-    return _registration(placed, readings, off, far, reported, tuple(undetermined), estimated)
+def _starts(data: FrameData, part: FrameData, frames: Frames, free: Bools) -> Iterator[Frames]:
+    """Yield starts for several observers, which are placed by a part of the readings.
 
-
-def _far_of_several(off: Floats) -> Bools:
-    """(N,) readings that are off (N, m) by far more than most."""
-    size = np.linalg.norm(off[:, :3], axis=1)
-    return np.asarray(size > max(LEAST_FAR, BEYOND * float(np.median(size))))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Sightings:
-    """Readings of several observers with the flange poses of the nominal arm."""
-
-    cell: Cell  # with the observers of the readings
-    readings: Readings
-    data: FrameData  # whose root is zero in rows that are not read
-
-    @classmethod
-    def of(cls, cell: Cell, readings: Readings) -> "Sightings":
-        """Return the readings with the flange poses of the nominal arm."""
-        root = inverse_roots(readings.covariance, True)
-        return cls(cell, readings, replace(FrameData.of(cell.arm, readings), root=root))
-
-    @property
-    def targets(self) -> Bools:
-        """(T,) which of the targets are unknown."""
-        return ~np.array(self.cell.known_targets)
-
-    @property
-    def sizes(self) -> Floats:
-        """(K,) ordinary sizes of the unknowns: base, targets, observers."""
-        base = [] if self.cell.registration_known else [BASE_M] * 3 + [1.0] * 3
-        observers = [BASE_M if e < 3 else 1.0 for o in self.cell.observers for e in o.free]
-        return np.array([*base, *[TARGET_M] * 3 * int(self.targets.sum()), *observers])
-
-    def points(self, cell: Cell) -> Floats:
-        """(N, 3) predicted positions of the targets, sensor axes, m."""
-        base = self.data.points(Frames(cell.registration, cell.all_targets))
-        return np.asarray(base @ cell.registration[:3, :3].T + cell.registration[:3, 3])
-
-    def off(self, cell: Cell) -> Floats:
-        """(N, m) measured minus predicted, m and rad; zero in elements that are not read."""
-        r, attitude = self.readings, self.data.attitude
-        turn = cell.registration[:3, :3] @ self.data.rotation @ cell.all_targets[r.target, :3, :3]
-        position, turned = read_by(cell.observers, r.observer, self.points(cell), turn)
-        off = r.value[:, :3] - position
-        if attitude is None:
-            return np.asarray(off)
-        apart = se3.rotation_vector(attitude @ np.swapaxes(turned, 1, 2))
-        return np.concatenate([off, apart], axis=1)
-
-    def white(self, cell: Cell) -> Floats:
-        """(N·m,) whitened misfit."""
-        return se3.apply(self.data.root, self.off(cell)).reshape(-1)
-
-    def moved(self, cell: Cell, step: Floats) -> Cell:
-        """Return a cell moved by (K,), in ordinary sizes."""
-        x, start = step * self.sizes, 0
-        if not cell.registration_known:
-            motion = _moved_about(self.data.position.mean(axis=0), x[:6])
-            cell, start = replace(cell, registration=cell.registration @ motion), 6
-        poses = cell.all_targets.copy()
-        for k in np.flatnonzero(self.targets):
-            poses[k, :3, 3] += x[start : start + 3]
-            start += 3
-        observers = []
-        for o in cell.observers:
-            six = np.zeros(6)
-            six[list(o.free)] = x[start : start + len(o.free)]
-            start += len(o.free)
-            offset, six[3] = (six[3], 0.0) if o.name.kind == "point" else (0.0, six[3])
-            frame = se3.matrix(*se3.exp(six)) @ o.frame
-            observers.append(replace(o, frame=frame, offset=o.offset + offset))
-        return replace(cell.with_targets(poses), observers=tuple(observers))
-
-    def settled(self, start: Cell, steps: int | None = None) -> tuple[Cell, float, Floats]:
-        """Return the minimum near a start, its sum of squares, and the Jacobian (R, K) there."""
-        count = len(self.sizes)
-        if not count:
-            return start, float(np.sum(self.white(start) ** 2)), np.zeros((0, 0))
-
-        def residual(x: Floats) -> Floats:
-            return np.concatenate([self.white(self.moved(start, x)), HOLD_SEVERAL * x])
-
-        minimum = least_squares(residual, np.zeros(count), max_nfev=steps)
-        jacobian = np.asarray(minimum.jac, dtype=float)[: len(minimum.fun) - count]
-        return self.moved(start, minimum.x), 2.0 * float(minimum.cost), jacobian
-
-    def with_observers(self, cell: Cell) -> Cell:
-        """Return a cell with its observers placed by their readings, in closed form."""
-        p, r = self.points(cell), self.readings
-        rows = [r.observer == k for k in range(len(cell.observers))]
-        observers = (
-            _observer_placed(o, p[k], r.value[k, :3]) if o.free and k.any() else o
-            for o, k in zip(cell.observers, rows, strict=True)
-        )
-        return replace(cell, observers=tuple(observers))
-
-
-def _placed(cell: Cell, readings: Readings) -> tuple[Cell, Floats, Floats]:
-    """Place base, targets and the observers of the readings as far as they are unknown.
-
-    Returns the cell with all in place; (N, m) measured minus predicted; directions (K, U) of unit
-    length, in ordinary sizes, that the readings do not determine.
+    Base and targets are by stations of known place, else by rotations of a cube.
     """
-    data, part = Sightings.of(cell, readings), np.zeros(len(readings), dtype=bool)
-    for k in range(len(cell.observers)):
-        rows = np.flatnonzero(readings.observer == k)
-        if len(rows):
-            part[rows[np.linspace(0, len(rows) - 1, FEW_EACH).astype(int)]] = True
-    few = Sightings.of(cell, readings[part])
-    starts = [few.with_observers(start) for start in _starts(cell, readings)]
-    starts.sort(key=lambda c: float(np.sum(few.white(c) ** 2)))
-    tried = [few.settled(c, 50) for c in starts[:FOLLOWED]]
-    placed, square, jacobian = data.settled(min(tried, key=lambda t: t[1])[0])
-    rank = int(np.count_nonzero(np.any(data.data.root != 0, axis=2)))
-    spread = max(np.sqrt(square / max(rank - jacobian.shape[1], 1)), 1.0)
-    squares, vectors = np.linalg.eigh(jacobian.T @ jacobian)
-    return placed, data.off(placed), vectors[:, squares <= (spread / TELL) ** 2]
-
-
-def _starts(cell: Cell, readings: Readings) -> Iterator[Cell]:
-    """Yield starts of base and targets: by stations of known place, else by rotations of a cube."""
-    main = [k for k, o in enumerate(cell.observers) if o.name.kind == "station" and not o.free]
-    rows = np.isin(readings.observer, main)
-    if rows.any() and len(np.unique(readings.pose[rows])) >= MIN_POSES:
-        frames, free = given_and_free(cell, readings.m == 6)
-        data = FrameData.of(cell.arm, readings[rows])
-        placed = best_placement(data, frames, free, GOOD * np.sqrt(data.m), STEPS, TRIED).frames
-        yield replace(cell.with_targets(placed.targets), registration=placed.base)
-    elif cell.registration_known:
-        yield cell
-    else:
-        tied = [o.frame for o in cell.observers if o.tied]
+    known = [k for k, o in enumerate(frames.observers) if o.name.kind == "station" and not o.free]
+    rows, bases = np.isin(data.observer, known), [frames]
+    if len(np.unique(np.round(data.position[rows], 9), axis=0)) >= MIN_POSES:
+        by_stations = replace(data[rows], observer=None)
+        of_both = free[: 6 + 6 * len(frames.targets)]
+        good = GOOD * np.sqrt(data.m)
+        alone = replace(frames, observers=())
+        best = best_placement(by_stations, alone, of_both, good, STEPS, TRIED).frames
+        bases = [replace(best, observers=frames.observers)]
+    elif free[:6].any():
+        tied = [o.frame for o in frames.observers if o.tied]
         centre = np.mean([-f[:3, :3].T @ f[:3, 3] for f in tied], axis=0)
-        yield from (replace(cell, registration=se3.matrix(turn, centre)) for turn in cube())
+        bases = [replace(frames, base=se3.matrix(turn, centre)) for turn in cube()]
+    for f in bases:
+        p, observers = part.points(f) @ f.base[:3, :3].T + f.base[:3, 3], []
+        for k, o in enumerate(frames.observers):
+            mine = part.observer == k
+            placed = bool(o.free) and bool(np.any(mine))
+            observers.append(_observer_placed(o, p[mine], part.value[mine]) if placed else o)
+        yield replace(f, observers=tuple(observers))
 
 
 def _observer_placed(o: Observer, p: Floats, value: Floats) -> Observer:
