@@ -46,14 +46,17 @@ from hilcal.diagnosis.minimum_detectable_effect import (
 from hilcal.diagnosis.stepwise import trial
 from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.effect_columns import (
+from hilcal.identification.fit import Fit
+from hilcal.identification.linearisation import (
     EffectColumns,
+    HeldOut,
+    Linearisation,
+    by_pose,
     columns_in_parts,
     columns_of_each,
     effect_columns,
+    linearise,
 )
-from hilcal.identification.fit import Fit
-from hilcal.identification.linearisation import HeldOut, Linearisation, by_pose, linearise
 from hilcal.identification.residual import residual
 from hilcal.regression.evidence import FamilyScore, Spectrum, score_family, spectrum
 from hilcal.regression.leave_out import FamilyFolds, improves

@@ -40,6 +40,7 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.same_readings import among
 from hilcal.regression.schur import schur_complement
 from hilcal.robot.arm import Arm
+from hilcal.store.codec import decode, encode
 from hilcal.types import Bools, Floats, Ints
 
 Relation = Literal["arm", "type"]
@@ -107,24 +108,21 @@ class CarriedPrior:
 
     def to_json(self) -> dict[str, object]:
         """Return the prior as JSON, the posterior included."""
+        rest = ("relation", "least", "expected", "drift")
         return {
             "posterior": self.posterior.to_json(),
-            "relation": self.relation,
-            "least": dict(self.least),
-            "expected": dict(self.expected),
-            "drift": None if self.drift is None else self.drift.tolist(),
+            **{k: encode(getattr(self, k)) for k in rest},
         }
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "CarriedPrior":
         """Return what `to_json` wrote."""
-        drift = content["drift"]
         return cls(
             Posterior.from_json(content["posterior"]),
-            RELATIONS[RELATIONS.index(content["relation"])],
+            decode(Relation, content["relation"]),
             dict(content["least"]),
             dict(content["expected"]),
-            None if drift is None else np.array(drift, dtype=float),
+            decode(Floats | None, content["drift"]),
         )
 
 

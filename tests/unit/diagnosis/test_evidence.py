@@ -21,10 +21,9 @@ from hilcal.identification import effect_columns as columns_module
 from hilcal.identification.baseline import baseline
 from hilcal.identification.carried import carried_prior
 from hilcal.identification.drift import carried_effects, evidence_of_carried
-from hilcal.identification.effect_columns import columns_of_each, effect_columns
 from hilcal.identification.fit import fit
 from hilcal.identification.gauss_newton import whitened_jacobian
-from hilcal.identification.linearisation import linearise
+from hilcal.identification.linearisation import columns_of_each, effect_columns, linearise
 from hilcal.identification.posterior import Posterior
 from hilcal.identification.priors import names_of
 from hilcal.present.verdict import message

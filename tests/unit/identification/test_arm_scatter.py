@@ -14,10 +14,9 @@ from hilcal.diagnosis.evidence import Evidence
 from hilcal.diagnosis.misfit_breakdown import MisfitShare
 from hilcal.diagnosis.verdict import diagnose, judge
 from hilcal.identification.arm_scatter import estimate_arm_scatter, factors, with_arm_scatter
-from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import fit
 from hilcal.identification.full_covariance import with_common_scatter, with_joint_scatter
-from hilcal.identification.linearisation import linearise
+from hilcal.identification.linearisation import effect_columns, linearise
 from hilcal.identification.registration import register
 from hilcal.present.verdict import message
 from hilcal.readings.covariance import COVERS, INSTRUMENT

@@ -19,10 +19,15 @@ from hilcal.identification.carried import carried_prior
 from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import to_json
 from hilcal.identification.parameters_document import covariance_of
-from hilcal.identification.posterior import Posterior, Source, parameter_differences
-from hilcal.identification.posterior_document import read, write
+from hilcal.identification.posterior import (
+    Posterior,
+    Source,
+    parameter_differences,
+    read_posterior,
+)
 from hilcal.identification.predictive import predictive
 from hilcal.robot.catalogue import load_arm
+from hilcal.store.codec import write_document
 from hilcal.store.revision import from_text, to_text
 from hilcal.store.rows import content_hash
 from studies.change import measured as measured_again
@@ -81,8 +86,8 @@ def test_it_comes_back_exactly(tmp_path):
         np.testing.assert_array_equal(getattr(again, name), getattr(p, name))
     for name in ("arm", "mode", "effects", "names", "units", "scatter", "ranges", "source"):
         assert getattr(again, name) == getattr(p, name)
-    write(p, tmp_path / "a.json")
-    np.testing.assert_array_equal(read(tmp_path / "a.json").information, p.information)
+    write_document(tmp_path / "a.json", p.to_json())
+    np.testing.assert_array_equal(read_posterior(tmp_path / "a.json").information, p.information)
 
 
 def test_what_was_not_determined_has_no_information():
