@@ -25,11 +25,7 @@ from hilcal.model.model import Model
 from hilcal.readings.covariance import scatter_alone, with_scatter
 from hilcal.readings.readings import ArmScatter, Readings, ScatterKind
 from hilcal.readings.whitening import Whitening, whitening
-from hilcal.regression.variance_components import (
-    BlockRows,
-    VarianceComponents,
-    variance_components,
-)
+from hilcal.regression.variance_components import BlockRows, VarianceComponents, variance_components
 from hilcal.types import Floats, Ints
 
 MOST_ROWS = 4000

@@ -24,7 +24,8 @@ from hilcal.effects.spec import EffectSpec
 from hilcal.identification.carried import CarriedPrior, check_prior
 from hilcal.identification.fit import Fit
 from hilcal.identification.misdescription import refuse_misdescribed
-from hilcal.identification.registration import TARGET_M, TELL, register
+from hilcal.identification.placement import TARGET_M, TELL
+from hilcal.identification.registration import register
 from hilcal.identification.torques import require_torques
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings

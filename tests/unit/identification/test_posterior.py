@@ -19,12 +19,7 @@ from hilcal.identification.carried import carried_prior
 from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import to_json
 from hilcal.identification.parameters_document import covariance_of
-from hilcal.identification.posterior import (
-    Posterior,
-    Source,
-    parameter_differences,
-    read_posterior,
-)
+from hilcal.identification.posterior import Posterior, Source, parameter_differences, read_posterior
 from hilcal.identification.predictive import predictive
 from hilcal.robot.catalogue import load_arm
 from hilcal.store.codec import write_document
