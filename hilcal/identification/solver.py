@@ -74,10 +74,9 @@ def shortened(
     cost: Callable[[T], float] | None = None,
     limit: float = np.inf,
 ) -> T | None:
-    """Return the first acceptable result of the full step, half of it, a quarter, …; else None.
+    """Return the first result of the full step, half of it, … whose cost is at most the limit.
 
-    A result is acceptable if its cost is at most the limit. `moved` and `cost` may raise
-    CannotAnswerError.
+    None without one; `moved` and `cost` may raise CannotAnswerError.
     """
     for halving in range(most):
         try:
