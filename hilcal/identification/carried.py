@@ -95,6 +95,11 @@ class CarriedPrior:
         strength = 1.0 / np.sqrt(np.where(precision > 0, precision, 1.0))
         return np.where(precision > 0, strength, self.posterior.scale)
 
+    @cached_property
+    def lowest(self) -> Floats:
+        """(1 + G,) no doubt, and the least drift of each group."""
+        return np.array([0.0, *(self.least.get(g.effect, 0.0) for g in self.groups)])
+
     def index_in(self, names: tuple[str, ...]) -> tuple[Ints, Ints]:
         """Parameters (K,) of a model, by their names, and their places in the posterior."""
         place = {name: k for k, name in enumerate(self.posterior.names)}

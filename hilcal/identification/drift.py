@@ -114,7 +114,7 @@ class _Columns:
 
 def chosen_drift(model: Model, solution: Solution, w: Whitening) -> Floats:
     """Return δ (1 + G,) at a fit: the doubt of its carried prior, and the drift of its groups."""
-    prior, lowest, rows = _linear(model, solution, w)
+    prior, rows = _linear(model, solution, w)
     scale2 = np.array([1.0, *(prior.expected.get(g.effect, 1.0) ** 2 for g in prior.groups)])
     forms = [g @ g.T for g in rows.drift]
 
@@ -145,7 +145,7 @@ def chosen_drift(model: Model, solution: Solution, w: Whitening) -> Floats:
         change, v = np.abs(new - v) * traces, new
         if change.max() < TOLERANCE:
             break
-    return np.asarray(np.sqrt(np.where(v > NEGLIGIBLE, v, 0.0) + lowest**2))
+    return np.asarray(np.sqrt(np.where(v > NEGLIGIBLE, v, 0.0) + prior.lowest**2))
 
 
 def conflicts(model: Model, solution: Solution, w: Whitening) -> tuple[Conflict, ...]:
@@ -156,9 +156,9 @@ def conflicts(model: Model, solution: Solution, w: Whitening) -> tuple[Conflict,
     """
     if model.prior is None:
         return ()
-    prior, lowest, rows = _linear(model, solution, w)
-    used = lowest if model.prior.drift is None else model.prior.drift
-    v = used**2 - lowest**2
+    prior, rows = _linear(model, solution, w)
+    used = prior.lowest if model.prior.drift is None else model.prior.drift
+    v = used**2 - prior.lowest**2
     total = rows.random @ rows.random.T + solution.beta * np.eye(len(rows.y))
     for moved in np.flatnonzero(v > NEGLIGIBLE):
         total += v[moved] * rows.drift[moved] @ rows.drift[moved].T
@@ -176,15 +176,10 @@ def conflicts(model: Model, solution: Solution, w: Whitening) -> tuple[Conflict,
     return tuple(sorted(out, key=lambda c: c.p_value))
 
 
-def least(prior: CarriedPrior) -> Floats:
-    """(1 + G,) no doubt, and the least drift of each group."""
-    return np.array([0.0, *(prior.least.get(g.effect, 0.0) for g in prior.groups)])
-
-
-def _linear(model: Model, solution: Solution, w: Whitening) -> tuple[CarriedPrior, Floats, _Linear]:
-    """The carried prior with its least drift (1 + G,), that drift, and the linear problem."""
+def _linear(model: Model, solution: Solution, w: Whitening) -> tuple[CarriedPrior, _Linear]:
+    """The carried prior with its least drift, and the linear problem."""
     assert model.prior is not None  # noqa: S101 - the callers' condition
-    prior = model.prior.with_drift(least(model.prior))
+    prior = model.prior.with_drift(model.prior.lowest)
     space = coordinates_of(replace(model, prior=prior))
     index, place = prior.index_in(names_of(model))
     c, held = _Columns.at_fit(model, solution, w), space.std == 1.0
@@ -195,7 +190,7 @@ def _linear(model: Model, solution: Solution, w: Whitening) -> tuple[CarriedPrio
     drift += [a[:, group == g] * unit[group == g] for g in range(len(prior.groups))]
     y = c.y - a @ space.mean
     if len(y) <= a.shape[1] + c.flat.shape[1] + c.random.shape[1]:
-        return prior, least(prior), _Linear(y, flat, random, tuple(drift), 0, 0.0)
+        return prior, _Linear(y, flat, random, tuple(drift), 0, 0.0)
     # All columns are combinations of these; the rows beyond their span are noise.
     columns = np.hstack([a * prior.posterior.scale[place], c.flat, c.random])
     span = sl.qr(columns, mode="economic", check_finite=False)[0]
@@ -203,7 +198,7 @@ def _linear(model: Model, solution: Solution, w: Whitening) -> tuple[CarriedPrio
     noise_rows, square = max(w.rank - len(inside), 0), max(float(y @ y - inside @ inside), 0.0)
     turned = tuple(span.T @ g for g in drift)
     flat, random = np.asarray(span.T @ flat), np.asarray(span.T @ random)
-    return prior, least(prior), _Linear(inside, flat, random, turned, noise_rows, square)
+    return prior, _Linear(inside, flat, random, turned, noise_rows, square)
 
 
 def carried_effects(model: Model) -> tuple[str, ...]:

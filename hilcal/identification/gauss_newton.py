@@ -12,16 +12,16 @@ A `NewtonProblem` states the objective at a point and the linear problem there, 
 replaced by any rows with the same products.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
+from hilcal.errors import CannotAnswerError
 from hilcal.identification.carried import Coordinates, coordinates_of
 from hilcal.identification.priors import prior_of, scales_of
 from hilcal.identification.residual import residual
-from hilcal.identification.solver import shortened
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening
@@ -202,6 +202,7 @@ class NewtonPoint:
 
 
 P = TypeVar("P", bound=NewtonPoint)
+T = TypeVar("T")
 
 
 class Minimum(NamedTuple, Generic[P]):
@@ -311,6 +312,27 @@ def accelerated(path: Sequence[tuple[Floats, Floats]]) -> Floats:
     (aim, moved), parts = path[-1], zip(*path, strict=True)
     aims, moves = (np.diff(part, axis=0) for part in parts)
     return np.asarray(aim - np.linalg.lstsq(moves.T, moved, rcond=None)[0] @ aims)
+
+
+def shortened(
+    moved: Callable[[Floats], T],
+    step: Floats,
+    most: int,
+    cost: Callable[[T], float] | None = None,
+    limit: float = np.inf,
+) -> T | None:
+    """Return the first result of the full step, half of it, … whose cost is at most the limit.
+
+    None without one; `moved` and `cost` may raise CannotAnswerError.
+    """
+    for halving in range(most):
+        try:
+            reached = moved(0.5**halving * step)
+            if cost is None or cost(reached) <= limit:
+                return reached
+        except CannotAnswerError:
+            continue
+    return None
 
 
 def _line_search(

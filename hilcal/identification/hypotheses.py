@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations, product
+from typing import Any
 
 import numpy as np
 
@@ -107,7 +108,7 @@ def _another_arm(d: Described, h: Hypothesis) -> Described:
     return replace(d, arm=arm if d.conventions is None else as_counted(arm, d.conventions))
 
 
-def _mapped(name: str, change: Callable[[Floats], Floats]) -> Applied:
+def _mapped(name: str, change: Callable[[Any], Any]) -> Applied:
     """Return a change of one attribute of the description, unless that is None."""
 
     def applied(d: Described, _: Hypothesis) -> Described:

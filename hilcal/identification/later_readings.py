@@ -31,11 +31,11 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.arm_scatter import with_arm_scatter
 from hilcal.identification.baseline import ARM
 from hilcal.identification.fit import Fit
+from hilcal.identification.gauss_newton import shortened
 from hilcal.identification.predictive import Predictive, predictive_of
 from hilcal.identification.priors import scales_of
 from hilcal.identification.registration import register, targets_as_fitted
 from hilcal.identification.residual import residual
-from hilcal.identification.solver import shortened
 from hilcal.identification.validation import require_columns
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import Readings

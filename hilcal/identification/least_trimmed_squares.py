@@ -26,7 +26,7 @@ from typing import Protocol, Self, TypeVar
 import numpy as np
 from scipy.stats import chi2
 
-from hilcal.identification.solver import shortened
+from hilcal.identification.gauss_newton import shortened
 from hilcal.readings.whitening import inverse_root
 from hilcal.types import Bools, Floats, Ints
 

@@ -32,19 +32,18 @@ from hilcal.identification.hypotheses import (
     pairs,
     shifts,
 )
-from hilcal.identification.registration import (
+from hilcal.identification.placement import (
     FrameData,
     Frames,
     Placement,
-    Registration,
     angles,
     best_placement,
     free_parameters,
     given_and_free,
-    register,
+    minimise,
 )
+from hilcal.identification.registration import Registration, register
 from hilcal.identification.residual import noise_floor
-from hilcal.identification.solver import minimise
 from hilcal.numbers import length
 from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
@@ -269,7 +268,8 @@ class _DescriptionSearch:
 
         Where a pose has many readings, only its last one is wrong, and looks like a gross error.
         """
-        tried = {(h,): self.score((h,)) for h in shifts(len(self._readings))}
+        ways: list[Way] = [(h,) for h in shifts(len(self._readings))]
+        tried = {way: self.score(way) for way in ways}
         return _explained(tried, min(self.enough, self.score(()) / FACTOR)) if tried else ()
 
     def _enough(self, tried: dict[Way, float], base: float) -> tuple[Explanation, ...]:

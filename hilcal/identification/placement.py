@@ -8,7 +8,6 @@ import numpy as np
 
 from hilcal.cell import Cell, Observer, plane_frame
 from hilcal.identification.least_trimmed_squares import ReadingModel
-from hilcal.identification.solver import minimise
 from hilcal.model.observe import Observation, by_observer_frame, sighted
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import inverse_root
@@ -27,6 +26,9 @@ MIN_POSES = 4
 FEW, FEW_EACH = 100, 50  # readings that starts are tried on: of all, and of each observer
 GOOD = 10.0  # rms misfit with roughness at which no other start is tried: 1 mm and 1 mrad
 STEPS, TRIED = 15, 5  # steps of a start; rotations of a cube that are tried
+MOST_STEPS, DAMPING = 40, 1e-3  # of `minimise`: most steps; λ of the first one
+SETTLED = 1e-9  # relative decrease of the sum of squares below which it ends
+SMALL = 1e-12  # largest element of a step below which it ends: rounding
 STEPS_SEVERAL, FOLLOWED = 50, 6  # with several observers: steps of a start; starts followed
 
 
@@ -151,7 +153,7 @@ class FrameData:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Frames and the data that they are fitted to: a point of `solver.minimise`."""
+    """Frames and the data that they are fitted to: a point of `minimise`."""
 
     data: FrameData
     frames: Frames
@@ -260,6 +262,40 @@ def _shifted(o: Observer, six: Floats) -> Observer:
     if o.name.kind == "point":
         o, six = replace(o, offset=o.offset + float(six[3])), np.append(six[:3], np.zeros(3))
     return replace(o, frame=se3.matrix(*se3.exp(six)) @ o.frame)
+
+
+def minimise(at: Placement, steps: int = MOST_STEPS) -> Placement:
+    """Return the point of least squares that is reached from a start (Levenberg, Marquardt).
+
+        minimise ‖r(p)‖²,    r(p ⊕ δ) = r(p) − J δ + …,    (JᵀJ + λ diag JᵀJ) δ = Jᵀr
+
+    p ⊕ δ need not be a sum, as frames rotate. A prior about zero is a further row of r.
+    """
+    square, normal, damping = float(at.residual @ at.residual), None, DAMPING
+    for _ in range(steps):
+        if normal is None:
+            a = at.jacobian()
+            normal = a.T @ a, a.T @ at.residual
+        h, gradient = normal
+        if not len(h):
+            break
+        # Damped in units of each column, too, so that no coordinate diverges.
+        largest = h.diagonal().max()
+        guard = damping * (h.diagonal() + 1e-6 * largest) + 1e-12 * largest + 1e-300
+        step: Floats = np.asarray(np.linalg.solve(h + np.diag(guard), gradient), dtype=float)
+        trial = at.moved(step)
+        reduced = float(trial.residual @ trial.residual)
+        if reduced > square:
+            damping *= 8.0
+            if damping > 1e8:
+                break
+            continue
+        done = square - reduced <= SETTLED * square + 1e-12 * len(a) and damping <= DAMPING
+        at, square, normal = trial, reduced, None
+        damping = max(0.1 * damping, 1e-9)
+        if done or np.abs(step).max() < SMALL:
+            break
+    return at
 
 
 def best_placement(
@@ -396,7 +432,7 @@ def _starts(data: FrameData, part: FrameData, frames: Frames, free: Bools) -> It
     Base and targets are by stations of known place, else by rotations of a cube.
     """
     known = [k for k, o in enumerate(frames.observers) if o.name.kind == "station" and not o.free]
-    rows, bases = np.isin(data.observer, known), [frames]
+    rows, bases = np.isin(np.asarray(data.observer), known), [frames]
     if len(np.unique(np.round(data.position[rows], 9), axis=0)) >= MIN_POSES:
         by_stations = replace(data[rows], observer=None)
         of_both = free[: 6 + 6 * len(frames.targets)]

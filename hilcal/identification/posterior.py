@@ -197,7 +197,7 @@ def _read(content: Mapping[str, Any]) -> Posterior:
         "scatter": content["arm_scatter"],
         "prints": unpack(content["prints"]["values"]).reshape(-1, columns),
     }
-    p = decode(Posterior, {**content, **named})
+    p: Posterior = decode(Posterior, {**content, **named})
     if len(p.units) != count or len(set(p.names)) != count or columns < 5:
         raise ValueError("its arrays do not fit its parameters")
     shapes = {a.shape for a in (p.mean, p.scale, p.own_precision)}

@@ -36,10 +36,11 @@ from hilcal.identification.placement import (
     angles,
     fitted_placement,
     given_and_free,
+    minimise,
 )
-from hilcal.identification.solver import echelon, minimise
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
+from hilcal.regression.normal_equations import echelon
 from hilcal.robot import se3
 from hilcal.types import Bools, Floats
 
@@ -183,7 +184,7 @@ def _refuse_few(cell: Cell, readings: Readings) -> None:
         )
 
 
-def targets_asfitted_placement(model: Model, theta: Floats) -> Floats:
+def targets_as_fitted(model: Model, theta: Floats) -> Floats:
     """(T, 4, 4) all targets of a model with parameters (P,)."""
     for e, rows in zip(model.effects, model.slices(), strict=True):
         if isinstance(e, TargetOffset):
@@ -245,4 +246,4 @@ def _direction(row: Floats, frames: Frames) -> Undetermined:
     shift, turn = np.zeros((2, 3)) if target is None else moved[1 + target]
     pairs = zip(frames.observers, moved[count:], strict=True)
     observers = tuple(str(o.name) for o, m in pairs if m.any())
-    return Undetermined(target, shift, turn, *moved[0], observers)
+    return Undetermined(target, shift, turn, moved[0, 0], moved[0, 1], observers)

@@ -33,11 +33,10 @@ from hilcal.identification.carried import Coordinates
 from hilcal.identification.folds import block_folds, changes, region_folds
 from hilcal.identification.gauss_newton import Solution, whitened_jacobian
 from hilcal.identification.priors import names_of, prior_of, scales_of
-from hilcal.identification.solver import echelon
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening
-from hilcal.regression.normal_equations import NULL_SHARE, Basis
+from hilcal.regression.normal_equations import NULL_SHARE, Basis, echelon
 from hilcal.regression.projection import Projection
 from hilcal.regression.schur import inverse_root
 from hilcal.types import Bools, Floats, Ints

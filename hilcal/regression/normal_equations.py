@@ -22,7 +22,7 @@ in the same way (TSQR). Source: Demmel, Grigori, Hoemmen and Langou,
 (2012) A206-A239.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -175,6 +175,28 @@ def find_basis(
     conditions = _conditions(r, scale[columns], rank)
     structural = int(np.count_nonzero(s > floor))
     return Basis(transform, precision, null, flat, held, s[keep], structural, *conditions)
+
+
+def echelon(rows: Floats, blocks: Sequence[Sequence[int]], least: float = 0.0) -> Floats:
+    """Bring directions (U, P) to reduced echelon form, so that each involves few parameters.
+
+    Columns of a block become pivots before those of the next one; elements up to `least` are no
+    pivots.
+    """
+    rows, done = rows.copy(), 0
+    for block in blocks:
+        while done < len(rows) and len(block):
+            sub = np.abs(rows[done:][:, block])
+            i, j = np.unravel_index(int(np.argmax(sub)), sub.shape)
+            if sub[i, j] <= least:
+                break
+            pivot = block[int(j)]
+            rows[[done, done + int(i)]] = rows[[done + int(i), done]]
+            rows[done] /= rows[done, pivot]
+            remaining = np.arange(len(rows)) != done
+            rows[remaining] -= rows[remaining, pivot][:, None] * rows[done]
+            done += 1
+    return rows
 
 
 def flat_triangle(a: Floats, columns: Ints, scale: Floats) -> Floats:

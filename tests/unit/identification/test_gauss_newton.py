@@ -10,10 +10,16 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.fit import fit
-from hilcal.identification.gauss_newton import NewtonPoint, accelerated, linear_problem, regularise
+from hilcal.identification.gauss_newton import (
+    NewtonPoint,
+    accelerated,
+    linear_problem,
+    regularise,
+    shortened,
+)
+from hilcal.identification.placement import minimise
 from hilcal.identification.priors import scales_of
 from hilcal.identification.residual import residual
-from hilcal.identification.solver import minimise, shortened
 from hilcal.model.model import Model
 from hilcal.readings.readings import States
 from hilcal.readings.whitening import whitening
