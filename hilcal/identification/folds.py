@@ -1,14 +1,12 @@
 """Prediction of poses that are left out, and changes of the parameters by leaving them out.
 
 Whole poses are left out, never single readings, as readings of one pose share its errors. Commanded
-poses that agree in every joint within `SAME_POSE` count as one pose, whatever their names, so that
-no repeated pose is predicted from its repetition. A fold is left out by one Gauss-Newton step from
-the full fit, with its rows subtracted exactly from the normal equations. The strengths of shrunk
-families are chosen anew for each fold (`regression.empirical_bayes`).
-
-Without a fold the flat parameters have a prior about zero (see `regression.leave_out`), whose
-standard deviation is their ordinary magnitude, or the rms of the effect's parameters in the full
-fit if that is larger.
+poses that agree in every joint within `SAME_POSE` count as one pose, whatever their names. A fold
+is left out by one Gauss-Newton step from the full fit, with its rows subtracted exactly from the
+normal equations. The strengths of shrunk families are chosen anew for each fold
+(`regression.empirical_bayes`). Without a fold the flat parameters have a prior about zero (see
+`regression.leave_out`), whose standard deviation is their ordinary magnitude, or the rms of the
+effect's parameters in the full fit if that is larger.
 """
 
 import numpy as np

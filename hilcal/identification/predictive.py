@@ -122,20 +122,17 @@ NONE = Excess()
 
 
 def excess(
-    raw: Floats,
-    stated: Whitening,
-    used: Whitening,
-    rows: Floats,
-    root: Floats,
+    raw: Floats, stated: Whitening, used: Whitening, rows: Floats, root: Floats,
     previous: Excess = NONE,
-) -> Excess:
+) -> Excess:  # fmt: skip
     """Return the excess of a residual (D, m) over the stated noise.
 
     V is that of `stated`. C, with the root (P, K) over its noise factor, belongs to the scaling
     `used` of the same measurements, which whitens the rows (R, P) and has the excess `previous`; a
     part with such an excess is not tested against chance again.
     """
-    spread, chosen = _spread(used, rows, root), _spaced(len(raw))
+    chosen = np.linspace(0, len(raw) - 1, min(len(raw), SOME)).astype(int)
+    spread = _spread(used, rows, root, chosen)
     position, attitude = 0.0, 1.0
     for part in (slice(0, 3), slice(3, 6))[: raw.shape[1] // 3]:
         values, vectors = np.linalg.eigh(stated.covariance[:, part, part])
@@ -161,13 +158,8 @@ def excess(
     return Excess(position, attitude)
 
 
-def _spaced(count: int) -> Ints:
-    return np.linspace(0, count - 1, min(count, SOME)).astype(int)
-
-
-def _spread(w: Whitening, rows: Floats, root: Floats) -> Floats:
-    """J C Jᵀ (S, m, m) of some measurements, evenly spaced."""
-    measurements = _spaced(len(w.reading))
+def _spread(w: Whitening, rows: Floats, root: Floats, measurements: Ints) -> Floats:
+    """J C Jᵀ (S, m, m) of some measurements."""
     out, row, first = np.zeros((len(measurements), w.m, w.m)), 0, 0
     for b in w.buckets:
         groups, size = len(b.loaded), b.factor.shape[-1]
@@ -317,10 +309,9 @@ def _spectrum(
 def left_out_variances(
     a: Floats, fold: Ints, predicted: Sequence[tuple[Floats, Ints]], root: Floats, noise: float
 ) -> list[float]:
-    """Mean variance of `predicted` rows, each predicted without its fold.
+    """Mean variance of `predicted` rows (R', P) with folds (R',), each without its fold.
 
-    `a` are the fitted rows (R, P) in units of W, with their folds (R,); `predicted` are rows
-    (R', P) in other units, with folds (R',); `root` (P, K) is that of C, `noise` σ².
+    `a` are the fitted rows (R, P) in units of W, `root` (P, K) is that of C, `noise` σ².
     """
     total = np.zeros(len(predicted))
     for f in range(int(fold.max(initial=-1)) + 1):
@@ -357,8 +348,7 @@ def family_prior(model: Model, prior: Floats) -> Floats:
 def parameter_factor(p: Predictive, left_out_sigma: float) -> float:
     """Factor, at least 1, by which C is too small where the noise alone is right.
 
-    With it the mean variance on poses left out is the mean square of the whitened residual there,
-    `left_out_sigma`².
+    The mean variance on poses left out is then the mean square of the whitened residual there.
     """
     return max(p.least, (left_out_sigma**2 - max(p.scatter, 1.0)) / max(p.left_out, 1e-12))
 
@@ -366,9 +356,8 @@ def parameter_factor(p: Predictive, left_out_sigma: float) -> float:
 def position_factor(p: Predictive, left_out_m: float) -> float:
     """Factor, at least 1, by which C is too small for positions.
 
-    With it the stated mean square error of positions left out is the observed one, in m², as a band
-    about a position is stated. In units of V the directions that an instrument measures
-    best would decide, in which misfits count most.
+    The stated mean square error of positions left out is then the observed one, in m². In units of
+    V the directions that an instrument measures best would decide, in which misfits count most.
     """
     return max(p.least, (left_out_m**2 - p.scatter_m2) / max(p.left_out_m2, 1e-300))
 

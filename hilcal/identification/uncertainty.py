@@ -131,8 +131,8 @@ def identifiable_parameters(
 def name_directions(model: Model, null: Floats, most: int = 3) -> tuple[str, ...]:
     """Name unidentifiable directions by the parameters that move together in them.
 
-    The directions are brought to echelon form first, each pivoting on its largest element,
-    so that every one involves few parameters. Factors are in ordinary magnitudes.
+    Each is pivoted on its largest element, so that it involves few parameters. Factors are in
+    ordinary magnitudes.
     """
     names, out = names_of(model), []
     for row in echelon(null.T, (range(len(null)),)):
