@@ -32,18 +32,18 @@ from scipy.linalg.lapack import dtpqrt
 from hilcal.regression.schur import inverse_root, positive_solve
 from hilcal.types import Bools, Floats, Ints
 
-INFORMATION = 0.2
-"""Least singular value s of an identifiable direction, in units of the residual's spread."""
-NULL_SHARE = 0.1
-"""Share of its standard uncertainty by which an identifiable parameter may move for an ordinary
-magnitude along an unidentifiable direction; a choice, no study set it."""
+INFORMATION = 0.2  # least singular value s of an identifiable direction, in residuals' spreads
+NULL_SHARE = (
+    0.1  # share of its standard uncertainty by which an identifiable parameter may move for
+)
+# an ordinary magnitude along an unidentifiable direction; a choice, no study set it
 ROUNDING = 1e-10
-TALL = 10_000
-"""Number of rows from which the QR is done in parts that fit into the processor's cache: a third of
-the time for 300,000 rows of 30; a choice by timing."""
+TALL = (
+    10_000  # rows from which the QR is done in parts that fit into the processor's cache: a third
+)
+# of the time for 300,000 rows of 30; a choice by timing
 _ROWS = 4096  # rows multiplied at a time; a choice by memory
-ROWS = 3072
-"""Rows reduced at a time, which fit into the processor's cache; a choice by timing."""
+ROWS = 3072  # rows reduced at a time, which fit into the processor's cache; a choice by timing
 BLOCK = 8  # columns whose reflections are applied together; a choice by timing
 
 
@@ -76,8 +76,7 @@ class Triangle:
 def triangle_of(a: Floats, right: Floats) -> Floats:
     """Return the triangle T (P + 1, P + 1) of [A, b], A (R, P) and b (R,).
 
-    TᵀT = [A, b]ᵀ [A, b], so that the rows of T can replace those of [A, b] in a least-squares
-    problem.
+    Its rows can replace those of [A, b] in a least-squares problem, as TᵀT = [A, b]ᵀ [A, b].
     """
     triangle = Triangle(a.shape[1] + 1)
     triangle.add(a, right)

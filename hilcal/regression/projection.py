@@ -34,14 +34,9 @@ class Projection:
         """Return M X = X − B H⁻¹ Bᵀ X of whitened columns (R,) or (R, P)."""
         return np.asarray(x - self.rows @ self.solve(self.rows.T @ x))
 
-    def information(self, x: Floats, gram: Floats | None = None) -> Floats:
-        """Return Xᵀ M X (P, P), the Schur complement of the model in the information on X.
-
-        Args:
-            x: (R, P) whitened columns.
-            gram: (P, P) XᵀX, if it was computed before.
-        """
-        return self.schur(x.T @ x if gram is None else gram, self.rows.T @ x)
+    def information(self, x: Floats) -> Floats:
+        """Return Xᵀ M X (P, P) of X (R, P), the Schur complement of the model."""
+        return self.schur(x.T @ x, self.rows.T @ x)
 
     def schur(self, gram: Floats, cross: Floats) -> Floats:
         """Return Xᵀ M X (P, P) from XᵀX (P, P) and BᵀX (K, P)."""
@@ -53,25 +48,10 @@ class Projection:
 
             y − B H⁻¹ (Bᵀ y − Λ z)
 
-        Else this step would be ascribed to a column that the model nearly explains, divided by the
-        small part of the column that the model does not explain.
-
-        Args:
-            y: (R,) residual of the model.
-            z: (K,) its coordinates; used only where they have a prior.
+        y is its residual, z (K,) its coordinates, used only where they have a prior. Else this step
+        would be ascribed to a column that the model nearly explains, divided by its small rest.
         """
         return np.asarray(y - self.rows @ self.solve(self.rows.T @ y - self.ridge * z))
-
-    def effective(self) -> float:
-        """Effective number of parameters of the model, tr(H⁻¹ BᵀB)."""
-        held = self.ridge > 0
-        determined = np.count_nonzero(np.any(self.inverse_root, axis=1))
-        variance = np.sum(self.inverse_root[:, held] ** 2, axis=0)
-        return float(determined - np.sum(self.ridge[held] * variance))
-
-    def root(self) -> Floats:
-        """Return Q (R, K) with M = 1 − Q Qᵀ."""
-        return np.asarray(self.rows @ self.inverse_root.T)
 
 
 def projection(rows: Floats, ridge: Floats, gram: Floats | None = None) -> Projection:

@@ -27,8 +27,7 @@ from hilcal.types import Bools, Floats, Ints
 # double precision turns a zero into about 1e-16 times the number of rows; at 1e-12 a parameter's
 # standard uncertainty is a million times that with all other parameters known.
 DETERMINED = 1e-12
-_SOUND = 1e-2
-"""Share of the largest inverse allowed, 1/`DETERMINED`, up to which Cholesky's factor is used."""
+_SOUND = 1e-2  # share of the largest inverse, 1/`DETERMINED`, up to which Cholesky's factor is used
 
 
 def inverse_root(block: Floats) -> Floats:
@@ -98,12 +97,9 @@ def nuisance_inverse(m: Floats, nuisance: Ints) -> Floats:
 
 
 def schur_complement(m: Floats, interest: Ints, nuisance: Ints | None = None) -> Floats:
-    """Return S (..., I, I) of information matrices M (..., P, P).
+    """Return S (..., I, I) of positive semidefinite information matrices M (..., P, P).
 
-    Args:
-        m: symmetric, positive semidefinite.
-        interest: (I,) indices of the parameters of interest.
-        nuisance: (N,) indices of the parameters estimated as well; all others by default.
+    `interest` (I,) and `nuisance` (N,) are indices of parameters, by default all others.
     """
     if nuisance is None:
         nuisance = np.setdiff1d(np.arange(m.shape[-1]), interest)
@@ -120,10 +116,6 @@ class SchurComplement:
     matrix: Floats  # (I, I) S
     lift: Floats  # (P, I) U
     inverse: Floats | None  # (P, P) Y; None without nuisance parameters
-
-    def embed(self, inner: Floats) -> Floats:
-        """Return U G Uᵀ (P, P) of G (I, I): the gradient by M of tr(G S)."""
-        return np.asarray(self.lift @ inner @ self.lift.T)
 
 
 def differentiable_schur_complement(m: Floats, interest: Ints | None) -> SchurComplement:
@@ -144,23 +136,14 @@ def eliminate(
 ) -> tuple[Floats, Floats, float]:
     """Eliminate parameters from normal equations, or add them to a model: the same operation.
 
-    With G = XᵀX, b = Xᵀy and ‖y‖² of all columns X, o the columns to eliminate and λ their ridge,
+    With G = XᵀX (P, P), b = Xᵀy (P,) and ‖y‖² of all columns X, o the columns to eliminate and λ
+    their ridge, the inverse of their prior variance in units of the noise,
 
         G ← G − G_o (G_oo + λ 1)⁻ G_oᵀ,   b ← b − G_o (G_oo + λ 1)⁻ b_o,
         ‖y‖² ← ‖y‖² − b_oᵀ (G_oo + λ 1)⁻ b_o
 
     are the normal equations of the other columns after elimination of o, and the penalised sum of
-    squares that remains.
-
-    Args:
-        gram: (P, P) G.
-        rhs: (P,) b.
-        square: ‖y‖².
-        out: o.
-        ridge: λ, inverse of the prior variance of o in units of the noise.
-
-    Returns:
-        (P, P), (P,) and the sum of squares; the rows at o are meaningless.
+    squares that remains. The rows at o are meaningless.
     """
     inner = gram[out, out] + ridge * np.eye(len(rhs[out]))
     solved = inverse_root(inner) @ np.column_stack([gram[out], rhs[out]])
