@@ -102,7 +102,11 @@ class Snooping:
     def begin(self, rng: np.random.Generator) -> Screened:
         """Test all readings from a robust start; `solution` may be fitted to gross errors, too."""
         every = np.ones(len(self.readings), dtype=np.bool_)
-        if self._all_noise():
+        point = linearised(self, self.solution.y)
+        residual = point.linear.residuals(point.linear.tested)
+        linear = point.with_nuisance(float(np.mean(residual**2)))
+        t2 = linear.distances(linear.tested)[linear.tested]
+        if t2.max() <= limit(linear.m, len(t2)):  # model and smooth functions explain all
             return Screened(every, every, 1.0)
         point, used = robust_start(linearised(self, self.y), rng)
         linear = point.linear
@@ -117,14 +121,6 @@ class Snooping:
             used = updated
         core = float(chi2.ppf(CORE, linear.m)) * variance(linear, t2, centre)
         return self._screened(point, (t2 <= core) | centre, misfit)
-
-    def _all_noise(self) -> bool:
-        """Whether model and smooth functions explain all readings to the noise."""
-        point = linearised(self, self.solution.y)
-        residual = point.linear.residuals(point.linear.tested)
-        linear = point.with_nuisance(float(np.mean(residual**2)))
-        t2 = linear.distances(linear.tested)[linear.tested]
-        return bool(t2.max() <= limit(linear.m, len(t2)))
 
     def again(self, screened: Screened) -> Screened:
         """Repeat the test, from the readings that agreed in `screened` and their solution."""
@@ -153,7 +149,10 @@ class Snooping:
             alike = off_alike(readings, linear.tested, off, shift[:, :3], axes.rotation)
             single = ~np.isin(off, alike) & ~readings.scalar[off]  # a distance has no direction
             rows = off[single]
-            unit = _units(readings.covariance[rows])
+            # The rms over directions, of lengths and angles apart.
+            std2 = np.diagonal(readings.covariance[rows], axis1=1, axis2=2)
+            std2 = std2.reshape(len(rows), -1, 3).mean(axis=2)
+            unit = np.repeat(np.sqrt(std2), 3, axis=1)
             sites = point.sites[rows] / unit[:, :, None]
             law = rows[along_one_site(shift[single] / unit, sites, readings.pose[rows])]
             if not len(law):
@@ -169,7 +168,7 @@ class Snooping:
     ) -> tuple[Bools, Floats, float]:
         """Return the good readings (N,), t² (N,) from the fit to them, and the scale of its bulk.
 
-        The iteration starts with the `used` readings (N,); those `of_law` (N,) always stay.
+        It starts with the `used` readings (N,); those `of_law` (N,) always stay.
         """
         count = int(np.count_nonzero(linear.tested))
         for _ in range(ROUNDS):
@@ -295,13 +294,6 @@ def _covariance(readings: Readings, members: Ints) -> Floats:
     return out
 
 
-def _units(covariance: Floats) -> Floats:
-    """(F, m) standard deviations of readings: the rms over directions, lengths and angles apart."""
-    m = covariance.shape[1]
-    variance = np.diagonal(covariance, axis1=1, axis2=2).reshape(len(covariance), m // 3, 3)
-    return np.asarray(np.repeat(np.sqrt(variance.mean(axis=2)), 3, axis=1))
-
-
 def _residual(readings: Readings, prediction: Prediction, members: Ints) -> Floats:
     """(N, m) measured minus predicted; rotations of groups relative to an unloaded reading."""
     o = prediction.observation
@@ -351,13 +343,10 @@ def smooth_nuisance_columns(
 
 
 def off_alike(readings: Readings, tested: Bools, off: Ints, shift: Floats, axes: Floats) -> Ints:
-    """Return the rows in runs with the same shift; none up to `ACCIDENTAL` of the tested ones.
+    """Return the rows in runs with the same shift; none up to `ACCIDENTAL` of the tested ones (N,).
 
-    Args:
-        tested: (N,) readings that were tested.
-        off: (F,) rows of readings that deviate, ascending.
-        shift: (F, 3) their shifts, sensor axes.
-        axes: (F, 3, 3) rotations of the target, sensor axes.
+    Of readings that deviate: `off` (F,) ascending rows, `shift` (F, 3) in sensor axes, and `axes`
+    (F, 3, 3), the rotations of the target.
     """
     order = np.zeros(len(readings), dtype=np.int64)
     alike = np.zeros(len(off), dtype=np.bool_)
@@ -409,13 +398,10 @@ def site_columns(model: Model, theta: Floats, prediction: Prediction, readings: 
 
 
 def along_one_site(shift: Floats, columns: Floats, pose: Ints) -> Bools:
-    """(F,) which deviating readings are ascribed to a law.
+    """(F,) which deviating readings, at poses of numbers (F,), are ascribed to a law.
 
-    Args:
-        shift: (F, m) in units of the noise, equal for all directions, so that random shifts have no
-            preferred direction.
-        columns: (F, m, P) changes by each site, in the same units.
-        pose: (F,) number of the pose.
+    The shifts (F, m), and the columns (F, m, P) of changes by each site, are in units of the noise,
+    equal for all directions, so that random shifts have no preferred one.
     """
     count, m, sites = columns.shape
     if not count:

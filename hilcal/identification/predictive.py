@@ -99,12 +99,6 @@ class Excess:
         a, b = self.position, other.position
         return abs(a - b) <= SAME * max(a, b) and abs(self.attitude / other.attitude - 1) <= SAME
 
-    def halfway(self, other: "Excess") -> "Excess":
-        """Return the geometric mean of this and another one; half of s² where one has none."""
-        both = self.position, other.position
-        middle = float(np.sqrt(both[0] * both[1])) if min(both) > 0 else sum(both) / 2
-        return Excess(middle, float(np.sqrt(self.attitude * other.attitude)))
-
     def widened(self, covariance: Floats, share: float = 1.0) -> Floats:
         """Return covariances (N, m, m) with the excess, of s² a share."""
         place = np.arange(covariance.shape[-1]) < 3
@@ -262,7 +256,11 @@ def predictive(
         new = excess(residual(fitted, refitted, stated), stated, w, a, root / np.sqrt(noise), extra)
         if new.near(extra):
             break
-        extra = new if step == 0 else new.halfway(extra)
+        # The geometric mean of both; half of s² where one has none.
+        s2, old = new.position, extra.position
+        middle = float(np.sqrt(s2 * old)) if min(s2, old) > 0 else (s2 + old) / 2
+        half = Excess(middle, float(np.sqrt(new.attitude * extra.attitude)))
+        extra = new if step == 0 else half
         w = whitening(extra.of_readings(fitted, mode), mode, "gc")
     shares = []
     for k in range(0, len(a), CHUNK * w.m):
@@ -343,14 +341,6 @@ def family_prior(model: Model, prior: Floats) -> Floats:
             mean = np.bincount(pool, weights=prior[rows] ** 2) / np.maximum(np.bincount(pool), 1)
             std[rows] = np.maximum(std[rows], np.sqrt(mean)[pool])
     return std
-
-
-def parameter_factor(p: Predictive, left_out_sigma: float) -> float:
-    """Factor, at least 1, by which C is too small where the noise alone is right.
-
-    The mean variance on poses left out is then the mean square of the whitened residual there.
-    """
-    return max(p.least, (left_out_sigma**2 - max(p.scatter, 1.0)) / max(p.left_out, 1e-12))
 
 
 def position_factor(p: Predictive, left_out_m: float) -> float:
@@ -443,5 +433,7 @@ def _information(fit: Fit, scale: Floats) -> tuple[Floats, Floats]:
         precision = np.where(std > 0, 1.0 / std**2, np.inf)
     # A family that was dropped entirely has its ordinary magnitude.
     precision[np.isinf(precision)] = 1.0
-    kappa = parameter_factor(p, fit.holdout.rms_sigma)
+    # With κ the mean variance on poses left out is the mean square of the whitened residual there.
+    square = fit.holdout.rms_sigma**2
+    kappa = max(p.least, (square - max(p.scatter, 1.0)) / max(p.left_out, 1e-12))
     return (a.T @ a / p.noise + np.diag(precision)) / kappa, precision / kappa

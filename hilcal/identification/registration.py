@@ -233,17 +233,15 @@ def _undetermined(null: Floats, frames: Frames) -> tuple[Undetermined, ...]:
     turns_and_base = [3, 4, 5, *targets[:, 1].reshape(-1).tolist(), 0, 1, 2]
     of_observers = range(6 + 6 * size, len(null))
     blocks = (targets[:, 0].reshape(-1).tolist(), turns_and_base, of_observers)
-    return tuple(_direction(row, frames) for row in echelon(null.T, blocks, TOLD))
-
-
-def _direction(row: Floats, frames: Frames) -> Undetermined:
-    """Return one direction, in ordinary sizes, in m and rad."""
-    row = row / np.abs(row).max()
-    moved = (row * (np.abs(row) >= TOLD) * frames.sizes).reshape(-1, 2, 3)
-    count = 1 + len(frames.targets)
-    active = np.flatnonzero(np.abs(moved[1:count]).any(axis=(1, 2)))
-    target = int(active[0]) if len(active) else None
-    shift, turn = np.zeros((2, 3)) if target is None else moved[1 + target]
-    pairs = zip(frames.observers, moved[count:], strict=True)
-    observers = tuple(str(o.name) for o, m in pairs if m.any())
-    return Undetermined(target, shift, turn, moved[0, 0], moved[0, 1], observers)
+    out = []
+    for row in echelon(null.T, blocks, TOLD):
+        row = row / np.abs(row).max()
+        moved = (row * (np.abs(row) >= TOLD) * frames.sizes).reshape(-1, 2, 3)
+        base, of_targets, of_others = moved[0], moved[1 : 1 + size], moved[1 + size :]
+        active = np.flatnonzero(np.abs(of_targets).any(axis=(1, 2)))
+        target = int(active[0]) if len(active) else None
+        shift, turn = np.zeros((2, 3)) if target is None else of_targets[target]
+        pairs = zip(frames.observers, of_others, strict=True)
+        observers = tuple(str(o.name) for o, m in pairs if m.any())
+        out.append(Undetermined(target, shift, turn, base[0], base[1], observers))
+    return tuple(out)

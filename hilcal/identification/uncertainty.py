@@ -89,22 +89,16 @@ def uncertainty(
     null = in_ordinary_magnitudes(space, basis.null, scale)
     carried = space.carried(len(scale))
     identifiable = identifiable_parameters(basis, solution.prior, carried, scale, std, null)
-    std = np.where(identifiable, std * _widening_factors(model, w, solution, covariance), np.inf)
+    # The unknown prior variances of shrunk families widen both their own `std` and all others.
+    groups, beta, prior = prior_of(model)[1], solution.beta, solution.prior
+    factor = hyperparameter_factors(beta * covariance, solution.theta, prior, groups)
+    dropped = np.flatnonzero((groups >= 0) & (prior == 0))
+    if w.scaling != "none" and len(dropped) and solution.rows.shape[1]:
+        columns = whitened_jacobian(model, solution.prediction, solution.theta, w, dropped)
+        of_model = solution.transform, solution.projection()
+        factor = factor * dropped_group_factors(*of_model, columns, groups[dropped], beta)
+    std = np.where(identifiable, std * factor, np.inf)
     return Uncertainty(std, formal, identifiable, misfit, name_directions(model, null))
-
-
-def _widening_factors(model: Model, w: Whitening, solution: Solution, covariance: Floats) -> Floats:
-    """Factors (P,) by which the unknown prior variances of shrunk families widen `std`."""
-    groups, beta = prior_of(model)[1], solution.beta
-    factor = hyperparameter_factors(beta * covariance, solution.theta, solution.prior, groups)
-    dropped = np.flatnonzero((groups >= 0) & (solution.prior == 0))
-    if w.scaling == "none" or not len(dropped) or not solution.rows.shape[1]:
-        return factor
-    columns = whitened_jacobian(model, solution.prediction, solution.theta, w, dropped)
-    transform = solution.transform
-    return factor * dropped_group_factors(
-        transform, solution.projection(), columns, groups[dropped], beta
-    )
 
 
 def in_ordinary_magnitudes(space: Coordinates, null: Floats, scale: Floats) -> Floats:

@@ -126,15 +126,6 @@ def wrench_form(
     return by_wrenches(blocks, lambda j: moves.dq[:, :, j], moves.by_slot)
 
 
-def by_wrench_changes(form: Mapping[tuple[int, bool], Floats], change: Floats, m: int) -> Floats:
-    """Motion (N, m, P) of a reading by changes (N, P, n + 1, 6) of the wrenches; `wrench_form`."""
-    out = zeros(len(change), m, change.shape[1])
-    for (slot, moment), rows in form.items():
-        half = change[:, :, slot, MOMENT if moment else FORCE]
-        out += rows_times(rows, half, transposed=True)
-    return out
-
-
 def by_load(form: Mapping[tuple[int, bool], Floats], chain: Chain, load: Load, m: int) -> Floats:
     """Derivative (N, m, 6) of a reading by the load's wrench at the load point, base axes.
 
@@ -272,7 +263,9 @@ class ReadingColumns:
     def add_wrench_changes(self, change: Floats, place: Ints) -> None:
         """Add changes (N, P, n + 1, 6) of the slot wrenches by the P parameters of an effect."""
         used = place >= 0
-        self._add(by_wrench_changes(self._form, change[:, used], self._moves.m), place[used])
+        for (slot, moment), rows in self._form.items():
+            half = change[:, used, slot, MOMENT if moment else FORCE]
+            self._add(rows_times(rows, half, transposed=True), place[used])
 
     def add_load_changes(self, change: Floats, place: Ints) -> None:
         """Add changes (N, P, 6) of the load's wrench at the load point, base axes."""

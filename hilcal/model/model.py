@@ -19,7 +19,7 @@ from hilcal.readings.readings import Readings, States
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
 from hilcal.robot.batch import along_states, by_field, chunks, take, zeros
-from hilcal.robot.chain import Chain, Deviation
+from hilcal.robot.chain import Deviation
 from hilcal.robot.statics import Load, geometric_stiffness, slot_wrenches
 from hilcal.shown import Brief
 from hilcal.types import Floats, Ints
@@ -185,7 +185,9 @@ class Model(Brief):
             s = replace(s, chain=chain, wrench=wrench, load=load)
             deviation = _deviation(elastic, s, rigid, checked=previous is None)
             chain = chains.evaluate(cell.arm, angle, deviation, turns)
-            moved = _flange_motion(s.chain, chain, cell.arm.reach)
+            shift = np.abs(chain.position[-1] - s.chain.position[-1]).max(initial=0.0)
+            turn = np.abs(chain.rotation[-1] - s.chain.rotation[-1]).max(initial=0.0)
+            moved = float(max(shift, cell.arm.reach * turn))  # of the flange, m
             # The steps shrink geometrically: the error is about the next one.
             missing = moved if previous is None else moved * (moved / previous)
             if not elastic or missing <= EQUILIBRIUM_TOLERANCE:
@@ -349,10 +351,3 @@ def _no_equilibrium(elastic: list[tuple[Effect, Floats]]) -> CannotAnswerError:
         f"{', '.join(e.name for e, _ in elastic)} grow instead of settling; measure "
         "poses and loads that determine them, or leave an effect out"
     )
-
-
-def _flange_motion(a: Chain, b: Chain, reach: float) -> float:
-    """Largest displacement, or rotation times reach, of the flange from one chain to another."""
-    shift = np.abs(b.position[-1] - a.position[-1]).max(initial=0.0)
-    turn = np.abs(b.rotation[-1] - a.rotation[-1]).max(initial=0.0)
-    return float(max(shift, reach * turn))

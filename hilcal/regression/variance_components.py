@@ -147,7 +147,9 @@ def _evaluated(blocks: Sequence[BlockRows], ridge: Floats, variance: Floats) -> 
         white = _flat(root @ b.rows)
         h += white.T @ white
     t = inverse_root(h)
-    log_det += _log_det(t)
+    triangular = not np.triu(t, 1).any()  # log det H on its range, from TᵀT = H⁻
+    values = np.abs(np.diag(t)) if triangular else np.linalg.svd(t, compute_uv=False)
+    log_det -= 2 * float(np.log(values[values > 0]).sum())
     weighted = [_flat(inverse @ b.rows) for inverse, b in zip(inverses, blocks, strict=True)]
 
     def project(x: list[Floats]) -> list[Floats]:
@@ -181,13 +183,6 @@ def _evaluated(blocks: Sequence[BlockRows], ridge: Floats, variance: Floats) -> 
 def _flat(x: Floats) -> Floats:
     """(G·S, Q) rows of blocks (G, S, Q)."""
     return x.reshape(-1, x.shape[2])
-
-
-def _log_det(t: Floats) -> float:
-    """Return log det H on its range, from T with Tᵀ T = H⁻."""
-    triangular = not np.triu(t, 1).any()
-    values = np.abs(np.diag(t)) if triangular else np.linalg.svd(t, compute_uv=False)
-    return float(-2 * np.log(values[values > 0]).sum())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
