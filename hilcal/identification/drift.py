@@ -88,28 +88,24 @@ class _Linear:
         return p, p @ self.y
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Columns:
-    """Whitened columns of a fit, by whether they have a prior."""
+def _columns(
+    model: Model, solution: Solution, w: Whitening
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Whitened columns at a fit, by whether they have a prior, and the residual.
 
-    a: Floats  # (R, P) of all parameters, zero for those that are not estimated
-    flat: Floats  # (R, F) of parameters without a prior
-    random: Floats  # (R, C) with a prior that is not carried, in units of its standard deviation
-    y: Floats  # (R,) residual with every parameter with a prior at zero
-
-    @classmethod
-    def at_fit(cls, model: Model, solution: Solution, w: Whitening) -> "_Columns":
-        """Return the columns at the fit."""
-        s, carried = solution, solution.space.carried(model.size)
-        index = np.flatnonzero(s.estimated & ~carried)
-        used, std = np.flatnonzero(s.estimated | carried), s.prior[index]
-        free = np.isinf(std)
-        a = np.zeros((len(s.white), model.size))
-        a[:, used] = whitened_jacobian(model, s.prediction, s.theta, w, used)
-        theta = np.where(s.estimated | carried, s.theta, 0.0)
-        theta[index[free]] = 0.0  # flat ones may stay where they are
-        random = a[:, index[~free]] * std[~free]
-        return cls(a, a[:, index[free]], random, s.white + a @ theta)
+    (R, P) of all parameters, zero for those that are not estimated; (R, F) of those without a
+    prior; (R, C) with a prior that is not carried, in its standard deviations; (R,) residual with
+    every parameter with a prior at zero.
+    """
+    s, carried = solution, solution.space.carried(model.size)
+    index = np.flatnonzero(s.estimated & ~carried)
+    used, std = np.flatnonzero(s.estimated | carried), s.prior[index]
+    free = np.isinf(std)
+    a = np.zeros((len(s.white), model.size))
+    a[:, used] = whitened_jacobian(model, s.prediction, s.theta, w, used)
+    theta = np.where(s.estimated | carried, s.theta, 0.0)
+    theta[index[free]] = 0.0  # flat ones may stay where they are
+    return a, a[:, index[free]], a[:, index[~free]] * std[~free], s.white + a @ theta
 
 
 def chosen_drift(model: Model, solution: Solution, w: Whitening) -> Floats:
@@ -182,17 +178,17 @@ def _linear(model: Model, solution: Solution, w: Whitening) -> tuple[CarriedPrio
     prior = model.prior.with_drift(model.prior.lowest)
     space = coordinates_of(replace(model, prior=prior))
     index, place = prior.index_in(names_of(model))
-    c, held = _Columns.at_fit(model, solution, w), space.std == 1.0
-    a = c.a[:, index]
+    (of_all, without, others, y), held = _columns(model, solution, w), space.std == 1.0
+    a = of_all[:, index]
     group, unit = prior.group[place], prior.unit[place]
     drift = [a @ space.matrix[:, held]]
-    flat, random = np.hstack([c.flat, a @ space.matrix[:, ~held]]), np.hstack([*drift, c.random])
+    flat, random = np.hstack([without, a @ space.matrix[:, ~held]]), np.hstack([*drift, others])
     drift += [a[:, group == g] * unit[group == g] for g in range(len(prior.groups))]
-    y = c.y - a @ space.mean
-    if len(y) <= a.shape[1] + c.flat.shape[1] + c.random.shape[1]:
+    y = y - a @ space.mean
+    if len(y) <= a.shape[1] + without.shape[1] + others.shape[1]:
         return prior, _Linear(y, flat, random, tuple(drift), 0, 0.0)
     # All columns are combinations of these; the rows beyond their span are noise.
-    columns = np.hstack([a * prior.posterior.scale[place], c.flat, c.random])
+    columns = np.hstack([a * prior.posterior.scale[place], without, others])
     span = sl.qr(columns, mode="economic", check_finite=False)[0]
     inside = span.T @ y
     noise_rows, square = max(w.rank - len(inside), 0), max(float(y @ y - inside @ inside), 0.0)
@@ -213,8 +209,7 @@ def evidence_of_carried(
     model: Model, solution: Solution, w: Whitening, effects: Sequence[str]
 ) -> dict[str, float]:
     """Return the log evidence of the readings for each effect, given the others of the model."""
-    c = _Columns.at_fit(model, solution, w)
-    y, a, flat, random = c.y, c.a, c.flat, c.random
+    a, flat, random, y = _columns(model, solution, w)
     full = coordinates_of(model)
     columns = np.hstack([flat, random, a[:, full.index] @ full.matrix])
     if columns.shape[1] < len(y):

@@ -111,11 +111,7 @@ class Estimates(Sequence[Estimate]):
         return [asdict(row) for row in self.rows]
 
     def to_frame(self) -> "pd.DataFrame":
-        """Return a pandas data frame, indexed by name.
-
-        Raises:
-            InputError: pandas is not installed.
-        """
+        """Return a pandas data frame, indexed by name; an InputError without pandas."""
         with needed_by("to_frame (to_dicts returns the same without pandas)"):
             import pandas as pd
         return pd.DataFrame(self.to_dicts()).set_index("name")

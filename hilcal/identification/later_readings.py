@@ -156,10 +156,7 @@ class Setting:
 
 @dataclass(frozen=True, eq=False)
 class Remeasured:
-    """Later readings explained by an earlier fit and changes of the arm, at some coordinates.
-
-    R whitened rows, K coordinates u, b and δ, L coordinates p, P parameters.
-    """
+    """Later readings explained by an earlier fit and changes: rows R, coordinates K and L."""
 
     setting: Setting  # the readings and the earlier fit
     changes: tuple[Moving, ...]
@@ -375,8 +372,7 @@ def remeasure(
 ) -> Remeasured:
     """Find the minimum by Gauss-Newton on the exact chain, with flat changes of the arm.
 
-    `start` may be a minimum with the first of the changes. Raises CannotAnswerError where there is
-    no static equilibrium.
+    `start` may be a minimum with the first changes. CannotAnswerError: no static equilibrium.
     """
     k, sizes = later.lift.shape[1], [c.directions.shape[1] for c in changes]
     effects = tuple({id(c.effect): c.effect for c in changes}.values())

@@ -117,11 +117,7 @@ class Posterior(Brief):
 
     @classmethod
     def of(cls, fit: "Fit", source: Source | None = None) -> "Posterior":
-        """Return the posterior of the arm's parameters after a fit.
-
-        Args:
-            fit: gc-scaled.
-            source: where the fit is from; hash and number of its readings are filled in.
+        """Return the posterior of the arm's parameters after a fit, with a hash of its readings.
 
         Raises:
             InputError: a fit of another scaling than gc.
@@ -152,11 +148,7 @@ class Posterior(Brief):
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "Posterior":
-        """Return what `to_json` wrote.
-
-        Raises:
-            InputError: another kind of document, or a newer version, or a damaged one.
-        """
+        """Return what `to_json` wrote; an InputError for another, newer or damaged document."""
         return read_document(content, "prior", FORMAT, (VERSION,), _read)
 
     def index(self, effect: str) -> Ints:
@@ -221,8 +213,7 @@ def spectrum(information: Floats, least: float = LEAST) -> tuple[Floats, Floats]
 def determined(information: Floats) -> Floats:
     """Information (K, K), in ordinary magnitudes, without directions that are hardly determined.
 
-    A fit holds directions whose information is below `INFORMATION`² where they are, see
-    `regression.normal_equations`: their values were not estimated.
+    A fit holds those below `INFORMATION`² where they are: their values were not estimated.
     """
     values, vectors = spectrum(information, INFORMATION**2)
     root = vectors * np.sqrt(values)

@@ -246,12 +246,17 @@ def predictive(
     parameters, extra, w = np.arange(model.size), Excess(), stated
     for step in range(ROUNDS + 1):
         a = rows_in(w)
-        values, vectors, noise = _spectrum(a, raw, w, noise_factor)
+        values, vectors = np.linalg.eigh(a.T @ a)
+        values, white = np.maximum(values, 0.0), w.whiten(raw).reshape(-1)
+        noise = 1.0 if noise_factor is None else noise_factor
+        for _ in range(ITERATIONS if noise_factor is None else 0):
+            free = max(w.rank - float(np.sum(values / (values + noise))), 1.0)
+            noise = max(1.0, float(white @ white) / free)
         root = vectors * np.sqrt(noise / (values + noise))
         if noise_factor is not None or step == ROUNDS:  # with a background, which holds any misfit
             break
         # The residual of the parameters with this noise and this prior, and its leverage.
-        moved = root @ (root.T @ (a.T @ w.whiten(raw).reshape(-1) / noise - pull))
+        moved = root @ (root.T @ (a.T @ white / noise - pull))
         refitted = model.predict(fitted.states, theta + space.transform(std * moved))
         new = excess(residual(fitted, refitted, stated), stated, w, a, root / np.sqrt(noise), extra)
         if new.near(extra):
@@ -286,22 +291,6 @@ def predictive(
         factor, least,
         leverage, scatter, left_out, scatter_m2, 3 * left_out_m2,
     )  # fmt: skip
-
-
-def _spectrum(
-    a: Floats, raw: Floats, w: Whitening, noise_factor: float | None
-) -> tuple[Floats, Floats, float]:
-    """Eigenvalues and eigenvectors of AᵀA, and σ², which may be given."""
-    values, vectors = np.linalg.eigh(a.T @ a)
-    values = np.maximum(values, 0.0)
-    if noise_factor is not None:
-        return values, vectors, noise_factor
-    white = w.whiten(raw).reshape(-1)
-    rss, noise = float(white @ white), 1.0
-    for _ in range(ITERATIONS):
-        free = max(w.rank - float(np.sum(values / (values + noise))), 1.0)
-        noise = max(1.0, rss / free)
-    return values, vectors, noise
 
 
 def left_out_variances(

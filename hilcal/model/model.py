@@ -129,13 +129,9 @@ class Model(Brief):
 
     def __add__(self, effect: Effect | EffectSpec | str | type[Effect]) -> "Model":
         """Return the model with one more effect; one that is only named is built for it."""
-        if isinstance(effect, str | type):
-            effect = EffectSpec(effect)
-        if isinstance(effect, EffectSpec):
-            return self._with(effect)
-        return replace(self, effects=(*self.effects, effect))
-
-    def _with(self, spec: EffectSpec) -> "Model":
+        spec = EffectSpec(effect) if isinstance(effect, str | type) else effect
+        if not isinstance(spec, EffectSpec):
+            return replace(self, effects=(*self.effects, spec))
         if self.readings is None:
             raise InputError(
                 f"effect {spec.name}: this model was made without readings; add an effect that is "
@@ -144,8 +140,8 @@ class Model(Brief):
         catalogue, states, m = self.catalogue, self.readings.states, self.readings.m
         if not isinstance(spec.kind, str) and spec.kind not in catalogue.effects:
             catalogue = catalogue.with_effects(spec.kind)
-        effect = catalogue.make(spec.name, self.cell, states, spec.options, m)
-        return replace(self, effects=(*self.effects, effect), catalogue=catalogue)
+        made = catalogue.make(spec.name, self.cell, states, spec.options, m)
+        return replace(self, effects=(*self.effects, made), catalogue=catalogue)
 
     def predict(self, states: States, theta: Floats, near: Prediction | None = None) -> Prediction:
         """Equilibrium of N states: elastic deviations at the deflected configuration.

@@ -39,7 +39,9 @@ def _near(points: Floats, distance: float) -> tuple[Ints, Ints]:
         joined.append(first[cKDTree(points[first]).query_pairs(distance, np.inf, 0, "ndarray")])
         pairs = np.concatenate(joined)
         return pairs[:, 0], pairs[:, 1]
-    members = [first[rows] for rows in _split(cell[first])]
+    group_of = cell[first]
+    order = np.argsort(group_of, kind="stable")
+    members = np.split(first[order], np.flatnonzero(np.diff(group_of[order])) + 1)
     tree, up = cKDTree(cells), np.arange(len(cells))
 
     def group(k: Ints) -> Ints:
@@ -64,12 +66,6 @@ def _near(points: Floats, distance: float) -> tuple[Ints, Ints]:
                 up[high] = low
     pairs = np.concatenate(joined)
     return pairs[:, 0], pairs[:, 1]
-
-
-def _split(group: Ints) -> list[Ints]:
-    """Return the members of each group."""
-    order = np.argsort(group, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(group[order])) + 1)
 
 
 def groups_within(points: Floats, distance: float) -> Ints:

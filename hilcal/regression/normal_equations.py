@@ -257,8 +257,6 @@ def normal_equations(a: Floats, target: Floats, basis: Basis, gram: Floats) -> N
     size = basis.transform.shape[1]
     full = np.empty((size, size))
     full[:flat, :flat] = rows.T @ rows
-    if not len(held):
-        return NormalEquations(basis, full, rows.T @ target)
     full[:flat, flat:] = (rows.T @ a)[:, held] * sigma
     full[flat:, :flat] = full[:flat, flat:].T
     inner = gram[np.ix_(held, held)]
