@@ -213,7 +213,6 @@ class _LinearModel:
     linear: ReadingModel
 
     def moved(self, delta: Floats) -> "_LinearModel":
-        """Return the linear model after a step δ (K,)."""
         y = self.y.copy()
         y[self.live] += self.scale * delta
         return linearised(self.snooping, y)

@@ -289,7 +289,6 @@ class Residuals(Sequence[Floats]):
         return len(self._fit.raw)
 
     def __getitem__(self, key: int | slice) -> Any:
-        """Return the residual of one measurement (m,), or of several."""
         return self._fit.raw[key]
 
     def __repr__(self) -> str:

@@ -394,8 +394,6 @@ class Solution:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Iterate(NewtonPoint):
-    """A point with its prediction, residual (D, m), and whitened residual (R,)."""
-
     prediction: Prediction
     raw: Floats
     white: Floats
@@ -403,8 +401,6 @@ class _Iterate(NewtonPoint):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem(NewtonProblem[_Iterate]):
-    """A fit of readings in memory, with their scaling."""
-
     readings: Readings
     w: Whitening
 

@@ -58,7 +58,6 @@ class ReadingModel:
     """(G, S) rows of the readings of each group, unloaded ones first, −1 beyond the last."""
 
     def __len__(self) -> int:
-        """Return the number of readings N."""
         return len(self.residual)
 
     @property

@@ -131,7 +131,6 @@ class DescriptionFinding:
         )
 
     def _rows_named(self, readings: Readings) -> str:
-        """Name the rows that do not fit while most do."""
         which = np.flatnonzero(self.rows).tolist()
 
         def name(k: int) -> str:
@@ -214,8 +213,6 @@ def examine(registered: Registration, readings: Readings) -> DescriptionFinding 
 
 
 class _DescriptionSearch:
-    """Descriptions that are tried on the same readings."""
-
     def __init__(self, cell: Cell, readings: Readings, enough: float) -> None:
         self._cell, self._readings = cell, readings
         self.enough, self.tried = enough, 0

@@ -164,14 +164,11 @@ def _sizes(readings: Readings, station: Sequence[float] | None) -> dict[str, flo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Components:
-    """Estimated components of the noise of readings."""
-
     model: Model  # frames, at which the arm's scatter is evaluated
     factors: Mapping[str, float]  # standard deviations, in those of the default and `SCATTER_RAD`
     log_errors: Mapping[str, float]  # standard errors of their logs
 
     def estimate(self, readings: Readings, station: Sequence[float] | None) -> NoiseEstimate:
-        """Return the noise in figures."""
         size = {k: self.factors[k] * s for k, s in _sizes(readings, station).items()}
         turn = size.get(ORIENTATION)
         scatter = self.factors.get(SCATTER)
@@ -185,7 +182,6 @@ class _Components:
 
 
 def _components(readings: Readings, cell: Cell, config: CellConfig) -> _Components | None:
-    """Estimate the components of the noise; None as of `with_estimated_noise`."""
     if len(np.unique(readings.pose)) < FEWEST_POSES or readings.scalar.any():
         return None
     mode, share = usual_mode(readings), MOST_ROWS / readings.value.size

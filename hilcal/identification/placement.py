@@ -120,11 +120,9 @@ class FrameData:
         return 3 if self.attitude is None else 6
 
     def __len__(self) -> int:
-        """Return the number of readings."""
         return len(self.value)
 
     def __getitem__(self, rows: Ints | Bools | slice) -> "FrameData":
-        """Return the chosen readings."""
         arrays = {f.name: a for f in fields(self) if (a := getattr(self, f.name)) is not None}
         return replace(self, **{name: a[rows] for name, a in arrays.items()})
 

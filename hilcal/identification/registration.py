@@ -166,7 +166,6 @@ def register(cell: Cell, readings: Readings) -> Registration:
 
 
 def _refuse_few(cell: Cell, readings: Readings) -> None:
-    """Refuse fewer readings than determine the places."""
     angle = angles(readings)
     for k, o in enumerate(cell.observers):
         rows = readings.observer == k

@@ -257,7 +257,6 @@ def _misfit_with(
 
 
 def _try_import(table: Path, proposal: Proposal, settings: CellConfig, cell: Cell) -> list[str]:
-    """Import with the proposed mapping; return the outcome in sentences."""
     if proposal.lacking:
         return []
     try:

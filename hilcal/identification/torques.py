@@ -129,7 +129,6 @@ def check_torques(cell: Cell, readings: Readings) -> TorqueCheck | None:
 
 
 def _means(x: Floats, group: Ints) -> Floats:
-    """(G, n) means of the groups (N,)."""
     out = np.zeros((int(group.max()) + 1, x.shape[1]))
     np.add.at(out, group, x)
     return np.asarray(out / np.bincount(group)[:, None])
@@ -178,7 +177,6 @@ def _fitted(
 def _factor(
     cell: Cell, r: Readings, name: str, value: float, low: float, high: float, p: float
 ) -> TorqueFactor:
-    """Return a factor with its mass."""
     stated: float | None = None
     g = float(np.linalg.norm(cell.gravity))
     if name == ARM:

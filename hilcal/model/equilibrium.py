@@ -235,7 +235,6 @@ class ReadingColumns:
         out: Floats,  # (N, m, L), to be written
         scale: Floats | None = None,  # (L,) units of the parameters, SI by default
     ) -> None:
-        """Begin with zeros."""
         self._moves, self._blocks, self._load, self._out = moves, blocks, load, out
         self._scale = np.ones(out.shape[2]) if scale is None else scale
         self._sums = zeros(*out.shape)

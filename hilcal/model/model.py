@@ -44,7 +44,6 @@ class Prediction(Brief):
     observation: Observation  # what the sensor would read
 
     def __getitem__(self, rows: slice) -> "Prediction":
-        """Return the prediction of the chosen states."""
         s = self.situation
         chosen = replace(
             s, states=s.states[rows], angle=s.angle[rows], chain=take(s.chain, rows, axis=1),
@@ -89,7 +88,6 @@ class Model(Brief):
     _slices: tuple[slice, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Refuse an effect that is there twice."""
         ends = accumulate((len(e.magnitudes) for e in self.effects), initial=0)
         # Needed at every step; an effect with a thousand parameters takes long to name them.
         object.__setattr__(self, "_slices", tuple(slice(a, b) for a, b in pairwise(ends)))

@@ -102,7 +102,6 @@ class FamilyFolds:
     """A model without each fold, and a family X (R, F); products of columns are formed once."""
 
     def __init__(self, folds: tuple[Fold, ...], p: Projection, x: Floats | None = None) -> None:
-        """Form the products of a family, or of the model alone."""
         self._x = x = np.zeros((len(p.rows), 0)) if x is None else x
         self._folds, self._p = folds, p
         self.gram, self.cross = x.T @ x, p.rows.T @ x  # XᵀX, BᵀX of all rows

@@ -51,7 +51,6 @@ class Triangle:
     """The triangle R (K, K) of the QR of all rows added so far."""
 
     def __init__(self, size: int) -> None:
-        """Start with K columns and no rows."""
         self._r = np.zeros((size, size), order="F")
 
     @property

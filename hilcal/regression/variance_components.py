@@ -135,7 +135,6 @@ def _step(blocks: Sequence[BlockRows], ridge: Floats, point: _RemlPoint) -> _Rem
 
 
 def _evaluated(blocks: Sequence[BlockRows], ridge: Floats, variance: Floats) -> _RemlPoint:
-    """Evaluate ℓ, its slope and AI."""
     inverses, log_det = [], 0.0
     h = np.diag(ridge).astype(float)
     for b in blocks:
@@ -181,7 +180,6 @@ def _evaluated(blocks: Sequence[BlockRows], ridge: Floats, variance: Floats) -> 
 
 
 def _flat(x: Floats) -> Floats:
-    """(G·S, Q) rows of blocks (G, S, Q)."""
     return x.reshape(-1, x.shape[2])
 
 
@@ -337,7 +335,6 @@ def _expectation(
     nx, ny = n @ design, np.einsum("cij,cj->ci", n, fleet.mean)
 
     def of_arms(x: Floats) -> Floats:
-        """Sums (A, ...) over the campaigns of each arm."""
         out = np.zeros((fleet.arms, *x.shape[1:]))
         np.add.at(out, fleet.arm, x)
         return out
