@@ -11,9 +11,14 @@ from hilcal.effects.options import Options
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.effects.written import read_effects_text
 from hilcal.errors import InputError
-from hilcal.identification.carried import CarriedPrior, check_arm, coordinates_of
+from hilcal.identification.carried import (
+    CarriedPrior,
+    check_arm,
+    coordinates_of,
+    prior_of,
+    scales_of,
+)
 from hilcal.identification.fit import Fit
-from hilcal.identification.priors import prior_of, scales_of
 from hilcal.mixed.families import families_of
 from hilcal.model.model import Model
 from hilcal.readings.readings import ObserverKind, ObserverName, States

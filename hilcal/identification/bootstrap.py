@@ -25,10 +25,10 @@ import numpy as np
 
 from hilcal.engine.engine import Engine
 from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identification.carried import names_of, prior_of
 from hilcal.identification.fit import Fit
 from hilcal.identification.folds import distinct_poses
 from hilcal.identification.gauss_newton import solve
-from hilcal.identification.priors import names_of, prior_of
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode, Scaling, whitening

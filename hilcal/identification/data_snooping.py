@@ -29,6 +29,7 @@ import numpy as np
 from scipy.stats import beta, binom, chi2
 
 from hilcal.errors import CannotAnswerError
+from hilcal.identification.carried import scales_of
 from hilcal.identification.gauss_newton import Solution
 from hilcal.identification.least_trimmed_squares import (
     MISFIT,
@@ -40,7 +41,6 @@ from hilcal.identification.least_trimmed_squares import (
     robust_start,
     variance,
 )
-from hilcal.identification.priors import scales_of
 from hilcal.model.model import Model, Prediction
 from hilcal.model.observe import motion
 from hilcal.readings.readings import Readings

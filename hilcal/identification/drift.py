@@ -37,9 +37,8 @@ import numpy as np
 import scipy.linalg as sl
 from scipy.stats import norm
 
-from hilcal.identification.carried import CarriedPrior, DriftGroup, coordinates_of
+from hilcal.identification.carried import CarriedPrior, DriftGroup, coordinates_of, names_of
 from hilcal.identification.gauss_newton import Solution, whitened_jacobian
-from hilcal.identification.priors import names_of
 from hilcal.model.model import Model
 from hilcal.readings.whitening import Whitening
 from hilcal.regression.evidence import ratio_tail

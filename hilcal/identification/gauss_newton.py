@@ -19,8 +19,7 @@ from typing import ClassVar, Generic, NamedTuple, TypeVar
 import numpy as np
 
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.carried import Coordinates, coordinates_of
-from hilcal.identification.priors import prior_of, scales_of
+from hilcal.identification.carried import Coordinates, coordinates_of, prior_of, scales_of
 from hilcal.identification.residual import residual
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import Readings
@@ -34,7 +33,7 @@ from hilcal.regression.normal_equations import (
     normal_equations,
     triangle_of,
 )
-from hilcal.regression.projection import Projection, projection
+from hilcal.regression.schur import Projection, projection
 from hilcal.types import Bools, Floats, Ints
 
 # All of these are choices.

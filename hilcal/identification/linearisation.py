@@ -20,15 +20,15 @@ from itertools import chain
 import numpy as np
 
 from hilcal.effects.protocol import Effect
+from hilcal.identification.carried import scales_of
 from hilcal.identification.fit import Fit
 from hilcal.identification.folds import folds_of, random_folds
 from hilcal.identification.gauss_newton import columns_of
-from hilcal.identification.priors import scales_of
 from hilcal.readings.whitening import Whitening
 from hilcal.regression.evidence import FamilyScore, Spectrum, score_family
 from hilcal.regression.leave_out import FamilyFolds, Fold, improves
 from hilcal.regression.normal_equations import Basis, find_basis, normal_equations
-from hilcal.regression.projection import Projection
+from hilcal.regression.schur import Projection
 from hilcal.types import Bools, Floats, Ints
 
 LEAST_MISFIT = 3.0  # least value of a misfit, in standard deviations of χ²; a choice

@@ -29,16 +29,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from hilcal.identification.carried import Coordinates
+from hilcal.identification.carried import Coordinates, names_of, prior_of, scales_of
 from hilcal.identification.folds import block_folds, changes, region_folds
 from hilcal.identification.gauss_newton import Solution, whitened_jacobian
-from hilcal.identification.priors import names_of, prior_of, scales_of
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening
 from hilcal.regression.normal_equations import NULL_SHARE, Basis, echelon
-from hilcal.regression.projection import Projection
-from hilcal.regression.schur import inverse_root
+from hilcal.regression.schur import Projection, inverse_root
 from hilcal.types import Bools, Floats, Ints
 
 LEARNT = 0.7  # posterior over prior standard deviation below which one is identifiable; a choice

@@ -14,7 +14,7 @@ from hilcal.calibration.measured import WORDS, Outside
 from hilcal.calibration.programs.program import ProgramPoint
 from hilcal.calibration.urscript import Waypoint
 from hilcal.identification.bootstrap import Bootstrap
-from hilcal.identification.priors import names_of
+from hilcal.identification.carried import names_of
 from hilcal.identification.validation import BAND as REGION
 from hilcal.identification.validation import (
     Acceptance,

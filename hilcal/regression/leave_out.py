@@ -16,8 +16,7 @@ import numpy as np
 from scipy.stats import norm, wilcoxon
 
 from hilcal.regression.normal_equations import NormalEquations
-from hilcal.regression.projection import Projection
-from hilcal.regression.schur import inverse_root, positive_solve
+from hilcal.regression.schur import Projection, inverse_root, positive_solve
 from hilcal.types import Bools, Floats, Ints
 
 LEAST_GAIN = 0.002

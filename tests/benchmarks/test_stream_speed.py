@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from hilcal.effects.protocol import Effect
-from hilcal.identification.priors import scales_of
+from hilcal.identification.carried import scales_of
 from hilcal.model.model import Model
 from hilcal.regression.normal_equations import Triangle
 from hilcal.stream import fit as passes

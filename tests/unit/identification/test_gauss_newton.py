@@ -9,6 +9,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from hilcal.errors import CannotAnswerError
+from hilcal.identification.carried import scales_of
 from hilcal.identification.fit import fit
 from hilcal.identification.gauss_newton import (
     NewtonPoint,
@@ -18,7 +19,6 @@ from hilcal.identification.gauss_newton import (
     shortened,
 )
 from hilcal.identification.placement import minimise
-from hilcal.identification.priors import scales_of
 from hilcal.identification.residual import residual
 from hilcal.model.model import Model
 from hilcal.readings.readings import States

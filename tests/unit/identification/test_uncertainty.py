@@ -9,9 +9,9 @@ from scipy.stats import chi2
 from hilcal.engine.engine import open_engine
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.bootstrap import again, bootstrap
+from hilcal.identification.carried import prior_of
 from hilcal.identification.fit import fit
 from hilcal.identification.folds import distinct_poses
-from hilcal.identification.priors import prior_of
 from hilcal.model.model import Model
 from hilcal.present.calibration import bootstrap_remarks
 from hilcal.readings.readings import Readings

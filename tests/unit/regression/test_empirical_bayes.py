@@ -14,8 +14,7 @@ from hilcal.regression.empirical_bayes import (
     solutions,
     spent_by_groups,
 )
-from hilcal.regression.projection import projection
-from hilcal.regression.schur import eliminate
+from hilcal.regression.schur import eliminate, projection
 from tests.support.campaigns import campaign, measured, plan
 from tests.support.effect_cases import make
 from tests.support.fit_cases import based

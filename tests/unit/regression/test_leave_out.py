@@ -6,7 +6,7 @@ import pytest
 from hilcal.identification.linearisation import eliminate_columns
 from hilcal.regression.leave_out import FamilyFolds, folds
 from hilcal.regression.normal_equations import find_basis, normal_equations
-from hilcal.regression.projection import projection
+from hilcal.regression.schur import projection
 
 PRIOR = np.array([np.inf, np.inf, 0.5, 2.0, np.inf, 1.0])
 MAGNITUDE = np.array([1.0, 2.0, 1.0, 1.0, 0.5, 1.0])

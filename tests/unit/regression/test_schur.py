@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
 
-from hilcal.regression.connected import connected, groups_within
-from hilcal.regression.projection import projection
+from hilcal.identification.folds import connected, groups_within
 from hilcal.regression.schur import (
     differentiable_schur_complement,
     eliminate,
     inverse_root,
     nuisance_inverse,
     positive_solve,
+    projection,
     schur_complement,
 )
 from tests.support.regression_cases import KINDS, problem
