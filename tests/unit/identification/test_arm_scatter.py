@@ -125,9 +125,6 @@ def test_a_hidden_reflector_is_a_missing_reading():
     assert len(f.whitening) == np.count_nonzero(~kept.unloaded) - orphans
 
 
-# --- where nothing states it ------------------------------------------------------------------
-
-
 def scattering(std=2e-5, m=3, seed=0, noise=1.0, poses=16, loads=3, law=0.0):
     """Each reading is an arrival with joints off by `std` (n,), by the world's own kinematics.
 

@@ -125,9 +125,6 @@ def test_every_effect_says_whose_it_is():
     assert not {"joint_compliance", "link_geometry", "transmission_error"} & setup
 
 
-# --- two campaigns side by side: the gauge of the frames, scatter, and a real change ----------
-
-
 @pytest.fixture(scope="module")
 def arm():
     """An arm without errors of its links, so that two small models hold all there is."""
@@ -188,8 +185,6 @@ def test_effects_that_one_fit_lacks_are_named(arm):
     assert d.apart == ("encoder_offset",)
     assert {r.name.split(".")[0] for r in d.rows} == {"joint_compliance"}
 
-
-# --- as prior of another campaign: the same as both together, drift, refusals -----------------
 
 NAMES = ("joint_compliance", "encoder_offset", "joint_tilt_compliance")
 

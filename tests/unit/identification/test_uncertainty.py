@@ -135,8 +135,6 @@ def test_halves_agree_within_what_is_stated_over_many_seeds(effect):
     assert np.mean(np.abs(stated) > 1.96) < 0.1
 
 
-# --- the bootstrap of whole poses -------------------------------------------------------------
-
 POSES = 40
 COMPLIANCE = slice(6, 12)  # behind the base's frame
 

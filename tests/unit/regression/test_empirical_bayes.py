@@ -270,16 +270,11 @@ def covered(truth, campaigns=4000):
     return inside / count, wide / count
 
 
+FURTHER = ((1, 0), (1, 1), (2, 0), (2, 2), (3, 0), (8, 2))
+
+
 @pytest.mark.parametrize(
-    "truth",
-    [
-        (0, 0),
-        (3, 3),
-        *(
-            pytest.param(further, marks=pytest.mark.long)
-            for further in ((1, 0), (1, 1), (2, 0), (2, 2), (3, 0), (8, 2))
-        ),
-    ],
+    "truth", [(0, 0), (3, 3), *(pytest.param(t, marks=pytest.mark.long) for t in FURTHER)]
 )
 def test_intervals_hold_the_truth_about_as_often_as_stated(truth):
     as_chosen, wide = covered(np.array(truth, dtype=float))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
 
-from hilcal.identification.folds import connected, groups_within
+from hilcal.identification.folds import groups_within
 from hilcal.regression.schur import (
     differentiable_schur_complement,
     eliminate,
@@ -160,19 +160,6 @@ def test_columns_that_depend_on_each_other_count_once(scale):
     p, q = projection(double, np.zeros(6)), np.linalg.qr(own)[0]
     np.testing.assert_allclose(p.project_out(y), y - q @ (q.T @ y), atol=1e-10)
     assert np.count_nonzero(np.any(p.inverse_root, axis=1)) == 3
-
-
-def test_things_are_joined_also_through_others():
-    group = connected(np.array([0, 3, 4]), np.array([3, 4, 0]), 6)
-    assert len(set(group)) == 4
-    assert group[0] == group[3] == group[4]
-
-
-def test_points_are_joined_where_no_coordinate_differs_by_more():
-    points = np.array([[0.0, 0.0], [0.9, -0.9], [1.8, -0.9], [4.0, 0.0], [4.0, 1.1]])
-    group = groups_within(points, 1.0)
-    assert group[0] == group[1] == group[2]
-    assert len(set(group)) == 3
 
 
 def test_groups_and_their_numbers_are_those_of_a_graph():
