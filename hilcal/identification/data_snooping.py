@@ -8,17 +8,16 @@ The residual of the robust start gives their variance. Then readings enter or le
 distance t² from the fit to the others, which is χ²_m distributed for a good reading, until the set
 does not change (Baarda, *A testing procedure for use in geodetic networks*, 1968).
 
-Readings that deviate by one common cause are no gross errors. Such are readings in a row with the
-same shift in the axes of the sensor or of the target, as by another reflector, a target that was
-moved on the tool, or a bumped tracker (`off_alike`); and readings with shifts along the directions
-of one site of the arm (`along_one_site`). A law of a joint, of a link that bends, or of the force
-sensor moves each reading along one direction, whatever the law depends on; a gross error has any
-direction. For a random error in m dimensions the share of its square normal to a direction is
-sin² ~ Beta((m − 1)/2, 1/2), so that its distribution function p is uniform. With p_(n) ascending, n
-of F gross errors are as near to the directions of a site as p_(n) with the probability
-P(B(F, p_(n)) ≥ n). Its minimum over n and the sites is multiplied by F and the number of sites.
-Where the product is too small, the readings near these directions, if of at least two poses, are
-ascribed to a law.
+Readings that deviate by one common cause are no gross errors: readings in a row with the same shift
+in the axes of the sensor or of the target, as by another reflector, a target that was moved on the
+tool, or a bumped tracker (`off_alike`); and readings with shifts along the directions of one site
+of the arm (`along_one_site`), as a law of a joint, of a link that bends, or of the force sensor
+moves each reading along one direction, whatever it depends on. For a random error in m dimensions
+the share of its square normal to a direction is sin² ~ Beta((m − 1)/2, 1/2), so that its
+distribution function p is uniform. With p_(n) ascending, n of F gross errors are as near to the
+directions of a site as p_(n) with the probability P(B(F, p_(n)) ≥ n). Its minimum over n and the
+sites is multiplied by F and the number of sites; where the product is too small, the readings near
+these directions, if of at least two poses, are ascribed to a law.
 """
 
 from dataclasses import dataclass, replace

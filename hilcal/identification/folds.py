@@ -169,31 +169,29 @@ def connected(a: Ints, b: Ints, count: int) -> Ints:
     return np.asarray(connected_components(joined, directed=False)[1], dtype=np.int64)
 
 
-def _near(points: Floats, distance: float) -> tuple[Ints, Ints]:
-    """Return pairs (K,) and (K,) of points that form the groups which all near pairs would form.
+def groups_within(points: Floats, distance: float) -> Ints:
+    """Return the group number (N,) of each point (N, D).
 
-    Points in one cell of half the distance are joined in a chain. Two cells that are not yet joined
-    are joined by one near pair, if there is any.
+    Two points are joined where they differ by at most `distance` in every coordinate. Points in one
+    cell of half the distance are joined in a chain; two cells that are not yet joined, by one near
+    pair, if there is any: near pairs may be too many to be listed.
     """
     from scipy.spatial import cKDTree  # slow to import
 
     if not points.size:
-        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+        return np.arange(len(points))
     place = np.floor(points / (distance / 2)) if distance else points
     cells, cell = np.unique(place, axis=0, return_inverse=True)
     cell = cell.reshape(-1)
     order = np.argsort(cell, kind="stable")
-    same = np.diff(cell[order]) == 0
-    joined = [np.stack([order[:-1], order[1:]], axis=1)[same]]
+    joined = [np.stack([order[:-1], order[1:]], axis=1)[np.diff(cell[order]) == 0]]
     # Of equal points one is used: a tree does not divide them.
     first = np.sort(np.unique(points, axis=0, return_index=True)[1])
     if 2 * len(cells) > len(first):  # hardly any cell holds several
         joined.append(first[cKDTree(points[first]).query_pairs(distance, np.inf, 0, "ndarray")])
-        pairs = np.concatenate(joined)
-        return pairs[:, 0], pairs[:, 1]
-    group_of = cell[first]
-    order = np.argsort(group_of, kind="stable")
-    members = np.split(first[order], np.flatnonzero(np.diff(group_of[order])) + 1)
+        return connected(*np.concatenate(joined).T, len(points))
+    order = np.argsort(cell[first], kind="stable")
+    members = np.split(first[order], np.flatnonzero(np.diff(cell[first][order])) + 1)
     tree, up = cKDTree(cells), np.arange(len(cells))
 
     def group(k: Ints) -> Ints:
@@ -216,13 +214,4 @@ def _near(points: Floats, distance: float) -> tuple[Ints, Ints]:
             if separation[k] <= distance:
                 joined.append(np.array([[few[k], many[index[k]]]]))
                 up[high] = low
-    pairs = np.concatenate(joined)
-    return pairs[:, 0], pairs[:, 1]
-
-
-def groups_within(points: Floats, distance: float) -> Ints:
-    """Return the group number (N,) of each point (N, D).
-
-    Two points are joined where they differ by at most `distance` in every coordinate.
-    """
-    return connected(*_near(points, distance), len(points))
+    return connected(*np.concatenate(joined).T, len(points))

@@ -372,6 +372,11 @@ class Solution:
     converged: bool  # whether the last step was negligible
 
     @property
+    def live(self) -> Ints:
+        """(L,) indices of the y that are not held at zero."""
+        return np.flatnonzero(self.prior > 0)
+
+    @property
     def transform(self) -> Floats:
         """(P, K) change of the parameters by z."""
         return self.space.transform(self.equations.basis.transform)

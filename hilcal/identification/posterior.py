@@ -7,23 +7,21 @@ included,
 
 is the information: Λ the precision of the effects' own priors, σ² the noise factor, κ ≥ 1 by how
 much errors at poses left out exceed what the parameters explain. The strengths of shrunk families
-are those of `predictive.family_prior`: a harmonic that the readings did not need is not known to be
-zero where nothing was measured. Parameters of the setup (frames, tool, instruments;
+are those of `predictive.family_prior`. Parameters of the setup (frames, tool, instruments;
 `Effect.of_setup`) are marginalised out, by the Schur complement of M. What the readings did not
 determine has no information: not a large variance, and not a zero one.
 
 Two campaigns of one arm are compared in the same gauge (`parameter_differences`). Their likelihoods
-of the parameters that both have, without the effects' own priors and all others marginalised out,
-have the information I_A and I_B; that on d = θ_B − θ_A is the parallel sum (Anderson and Duffin,
-J. Math. Anal. Appl. 26 (1969) 576-594)
+of the parameters that both have, all others marginalised out, have the information I_A and I_B;
+that on d = θ_B − θ_A is the parallel sum (Anderson and Duffin, J. Math. Anal. Appl. 26 (1969) 576)
 
     P = I_A (I_A + I_B)⁻ I_B
 
 singular along every direction that one of the campaigns did not determine: what a frame absorbs, or
-a joint that did not turn. Along these the two fits may differ by anything. So each parameter, and
-each effect as a whole, is compared with all others free within f = `FREE` of their ordinary
-magnitudes: in these, S = ((P + 1/f²)⁻¹_mm)⁻¹ − 1/f² is the information on its difference. What is
-known less well than to one magnitude is not compared.
+a joint that did not turn. So each parameter, and each effect as a whole, is compared with all
+others free within f = `FREE` of their ordinary magnitudes: in these,
+S = ((P + 1/f²)⁻¹_mm)⁻¹ − 1/f² is the information on its difference. What is known less well than
+to one magnitude is not compared.
 """
 
 from collections.abc import Mapping

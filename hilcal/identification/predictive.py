@@ -1,38 +1,33 @@
 """Covariance of predictions, also where nothing was measured, and the posterior of an arm.
 
 The posterior of a fit holds the strengths of shrunk families at what the evidence chose, zero for
-the groups that the readings do not need. That says nothing of joint angles that were never
-visited. So a group of a shrunk family has at least the mean variance of its pool as its prior
-(`Effect.pools`), and a parameter without a prior one about zero of its ordinary magnitude, or the
-rms of its effect's parameters if more, as where poses are left out (`folds`). With the Jacobian
+groups that the readings do not need, which says nothing of joint angles never visited. So a group
+of a shrunk family has at least the mean variance of its pool as its prior (`Effect.pools`), and a
+parameter without a prior one about zero, as where poses are left out (`folds`). With the Jacobian
 A (R, P) of the fitted readings, whitened by W, σ² their noise factor, Λ the prior precision,
 
     C = (AᵀA/σ² + Λ)⁻¹,    Cov(measured − predicted) = κ (σ² W + J C Jᵀ)
 
 W is the stated covariance V, with more for positions or attitudes where their residual asks for it:
 a misfit has not the shape of an instrument's noise, which is small along the beam. W, C and the
-residual of parameters with this W and Λ depend on each other; they are computed in turns. Where the
-model has a background its standard deviations are in units of the instrument's noise, and σ is the
-factor of that as the mixed model estimates it; otherwise σ² is from the residual, at least 1.
+residual of parameters with this W and Λ are computed in turns. Where the model has a background, σ
+is the factor of the instrument's noise in the mixed model; otherwise σ² is from the residual, at
+least 1.
 
 κ, at least 1, makes the mean variance on poses left out, in units of V, equal to the mean square
-error there. The variance is that of the folds as they are left out, F of rows Y, with X
-the same whitened by W and multiplied by the root of C: the mean of Y (1 − XᵀX/σ²)⁻¹ Yᵀ. With few
-poses one fold alone may determine a direction; its variance is that of the prior then.
+error there. Of the folds as they are left out, F of rows Y, with X the same whitened by W and
+multiplied by the root of C, it is the mean of Y (1 − XᵀX/σ²)⁻¹ Yᵀ.
 
 The uncertainty of the variances of a background makes C larger by how far it moves the parameters
-(`mixed.prediction`), and κ is at least its mean effect on predictions (Kackar and
-Harville, JASA 79 (1984) 853). At given variances rows that are predicted without their fold are off
-by e with the variance v (`mixed.prediction.left_out`). With x = (log s, η) drawn from its
-posterior, by weights from the normal approximation at its maximum x̂, the mean square is
-E[Σ v] + E|e − E e|²; its ratio to Σ v at x̂ is that least κ. Both hold that motion, once where it
-acts and once as a mean: with 20, 30 and 60 poses of 30 simulated arms that have all effects, 95, 92
-and 95 % of other poses are then in their 95 % band, and 93, 89 and 93 % with κ alone.
+(`mixed.prediction`), and κ is at least its mean effect on predictions (Kackar and Harville, JASA 79
+(1984) 853). At given variances rows predicted without their fold are off by e with the variance v.
+With x = (log s, η) drawn from its posterior, by weights from the normal approximation at its
+maximum x̂, the mean square is E[Σ v] + E|e − E e|²; its ratio to Σ v at x̂ is that least κ. With
+both, 92 to 95 % of the other poses of simulated arms are in their 95 % band.
 
 The excess of a residual over the stated noise (`excess`): with r (3,) the residuals of the D
-positions, V their covariance, W = V + s² 1, and J C Jᵀ the covariance of their predictions, C that
-of parameters estimated with σ² W, s² solves (Mandel and Paule, Anal. Chem. 42 (1970) 1194, for the
-scatter between laboratories beyond what each states)
+positions, W = V + s² 1, and J C Jᵀ the covariance of their predictions, C that of parameters
+estimated with σ² W, s² solves (Mandel and Paule, Anal. Chem. 42 (1970) 1194)
 
     Σ rᵀ W⁻¹ r = 3 D − Σ tr (σ² W)⁻¹ J C Jᵀ
 

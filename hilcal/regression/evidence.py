@@ -1,6 +1,6 @@
 """Test, power and evidence of a family of columns that a fitted model lacks, without a refit.
 
-With r the whitened residual of the model, M the projection off its columns (`projection`) and
+With r the whitened residual of the model, M the projection off its columns (`schur`) and
 X (R, P) the family's columns in ordinary magnitudes, everything follows from
 
     S = Xᵀ M X,    g = Xᵀ r,    ‖r‖²
@@ -22,11 +22,10 @@ The family is judged as a whole:
 
   and β | r is Student's with ν degrees of freedom, mean (S + t⁻²)⁻¹ g and scale matrix
   (‖r‖²_t / ν) (S + t⁻²)⁻¹. This is exact for a model without priors; for one with priors, ‖r‖²
-  stands for rᵀ M⁻¹ r, which is larger by the penalty. t maximises the evidence. Of two families
-  that explain the same, the smaller one has more evidence.
+  stands for rᵀ M⁻¹ r, which is larger by the penalty. t maximises the evidence.
 
-Diagnosis and planning use the same formula. If σ² = 1 were assumed, a misfit of variance factor φ
-would overstate the evidence of each direction by about φ.
+If σ² = 1 were assumed, a misfit of variance factor φ would overstate the evidence of each direction
+by about φ.
 
 Sources: O'Hagan and Forster, *Bayesian Inference* (2004), chapter 11; Goeman, van de Geer and van
 Houwelingen, *Testing against a high dimensional alternative*, J. R. Stat. Soc. B 68 (2006) 477-493;
