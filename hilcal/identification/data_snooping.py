@@ -150,7 +150,7 @@ class Snooping:
             rows = off[single]
             # The rms over directions, of lengths and angles apart.
             std2 = np.diagonal(readings.covariance[rows], axis1=1, axis2=2)
-            std2 = std2.reshape(len(rows), -1, 3).mean(axis=2)
+            std2 = std2.reshape(len(rows), readings.m // 3, 3).mean(axis=2)
             unit = np.repeat(np.sqrt(std2), 3, axis=1)
             sites = point.sites[rows] / unit[:, :, None]
             law = rows[along_one_site(shift[single] / unit, sites, readings.pose[rows])]

@@ -293,5 +293,5 @@ def keys(way: Way, cell: Cell) -> dict[str, str]:
         (any(h.offset for h in way), json.dumps([round(float(z), 4) + 0.0 for z in zero])),
         (any(h.follows for h in way), f"[{', '.join(f'{{ {entry} }}' for entry in entries)}]"),
     )
-    pairs = zip(Conventions.model_fields, values, strict=True)
-    return {key: value for key, (changed, value) in pairs if changed}
+    by_key = zip(Conventions.model_fields, values, strict=True)
+    return {key: value for key, (changed, value) in by_key if changed}

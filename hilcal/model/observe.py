@@ -240,19 +240,12 @@ class SlotFrames:
     def by_twist(self, slot: int, v: Floats | None, w: Floats, elements: slice = ALL) -> Floats:
         """Rows (N, m, E) by elements of the twist, from rows by v (None for zero) and ω."""
         turned, shift = self._blocks(slot)
-        start, stop = elements.start, elements.stop
-        out = empty(*w.shape[:2], stop - start)
-        split = max(min(3, stop) - start, 0)
-        if split and v is not None:
-            np.einsum("nmi,nij->nmj", v, turned[..., start : start + split], out=out[..., :split])
-        elif split:
-            out[..., :split] = 0.0
-        if stop > 3:
-            turns = slice(max(start - 3, 0), stop - 3)
-            np.einsum("nmi,nij->nmj", w, turned[..., turns], out=out[..., split:])
-            if v is not None and shift is not None:
-                out[..., split:] += rows_times(v, shift[..., turns])
-        return out
+        out = empty(*w.shape[:2], 6)
+        out[..., :3] = 0.0 if v is None or elements.start > 2 else rows_times(v, turned)
+        out[..., 3:] = rows_times(w, turned)
+        if v is not None and shift is not None:
+            out[..., 3:] += rows_times(v, shift)
+        return out[..., elements]
 
     def need_displacement(self, slot: int, elements: slice) -> bool:
         """Whether these elements of the twist of a slot displace the arm beyond it."""
