@@ -379,7 +379,7 @@ def site_columns(model: Model, theta: Floats, prediction: Prediction, readings: 
     """(N, m, P) changes of readings by each site, at last by 1 N and 1 N·m on the force sensor."""
     p, states, observation, m = prediction, readings.states, prediction.observation, readings.m
     moves = motion(model.cell, observation, p.situation.chain, p.deviation, m)
-    turns = [moves.by_slot(k, slice(3, 6)) for k in range(p.situation.wrench.shape[1])]
+    turns = [moves.by_slot(k)[:, :, 3:] for k in range(p.situation.wrench.shape[1])]
     sensor = []
     for part in (slice(0, 3), slice(3, 6)):
         for axis in np.moveaxis(p.situation.chain.rotation[-1], 2, 0):

@@ -18,14 +18,13 @@ from functools import cached_property, partial
 import numpy as np
 
 from hilcal.effects.protocol import Columns, Effect, Situation
-from hilcal.model.observe import ReadingDerivative, SlotFrames
+from hilcal.model.observe import ReadingDerivative
 from hilcal.robot import se3
 from hilcal.robot.batch import along_states, zeros
 from hilcal.robot.chain import Chain
 from hilcal.robot.statics import (
     GeometricStiffness,
     Load,
-    MotionGradient,
     rows_times,
     rows_times_constant,
 )
@@ -103,7 +102,11 @@ def at_equilibrium(
     previous = total
     for _ in range(MAX_TERMS):
         gradient = stiffness.gradient(term)
-        term = by_wrenches(blocks, gradient.joint, partial(_by_twist, gradient, moves.frames))
+        term = by_wrenches(
+            blocks,
+            gradient.joint,
+            lambda k, g=gradient: moves.frames.by_twist(k, g.displacement(k), g.turn(k)),
+        )
         for place, b in term.items():
             form[place] = form[place] + b
         size = _norm(term)
@@ -145,23 +148,13 @@ def by_load(form: Mapping[tuple[int, bool], Floats], chain: Chain, load: Load, m
 def by_wrenches(
     blocks: list[SlotResponse],
     by_joint: Callable[[int], Floats],  # (N, m) by the displacement of a joint
-    by_slot: Callable[[int, slice], Floats],  # (N, m, E) by elements of a slot's twist
+    by_slot: Callable[[int], Floats],  # (N, m, 6) by a slot's twist
 ) -> dict[tuple[int, bool], Floats]:
     """Derivatives (N, m, 3) by the force (False) and moment (True) of each slot, without zeros."""
-    used: dict[int, slice] = {}
-    for b in blocks:
-        if not b.joint:
-            old = used.get(b.deviating, b.elements)
-            start, stop = min(old.start, b.elements.start), max(old.stop, b.elements.stop)
-            used[b.deviating] = slice(start, stop)
-    twists = {slot: by_slot(slot, elements) for slot, elements in used.items()}
+    twists = {slot: by_slot(slot) for slot in {b.deviating for b in blocks if not b.joint}}
     out: dict[tuple[int, bool], Floats] = {}
     for b in blocks:
-        if b.joint:
-            rows = by_joint(b.deviating)[..., None]
-        else:
-            e = used[b.deviating].start
-            rows = twists[b.deviating][..., b.elements.start - e : b.elements.stop - e]
+        rows = by_joint(b.deviating)[..., None] if b.joint else twists[b.deviating][..., b.elements]
         moment = b.components.start >= MOMENT.start
         first = MOMENT.start if moment else FORCE.start
         if (b.slot, moment) not in out:
@@ -173,12 +166,6 @@ def by_wrenches(
         for i, element in zip(*np.nonzero(b.values[0]), strict=True):
             part[..., i] += rows[..., element] * b.values[0, i, element]
     return out
-
-
-def _by_twist(gradient: MotionGradient, frames: SlotFrames, slot: int, elements: slice) -> Floats:
-    """Derivative (N, m, E) by elements of the twist of a slot, from that by its motion."""
-    v = gradient.displacement(slot) if frames.need_displacement(slot, elements) else None
-    return frames.by_twist(slot, v, gradient.turn(slot), elements)
 
 
 def _norm(form: Mapping[tuple[int, bool], Floats]) -> float:

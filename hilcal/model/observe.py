@@ -21,8 +21,6 @@ from hilcal.robot.statics import MotionGradient, rows_times
 from hilcal.shown import Brief
 from hilcal.types import Bools, Floats, Ints
 
-ALL = slice(0, 6)  # All elements of a twist
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation(Brief):
@@ -150,15 +148,13 @@ class ReadingDerivative:
         drive = self.cell.arm.drive
         return self.dq if drive is None else np.asarray(self.dq @ drive)
 
-    def by_slot(self, slot: int, elements: slice = ALL) -> Floats:
-        """Motion (N, m, E) by some elements of the twist of a slot."""
+    def by_slot(self, slot: int) -> Floats:
+        """Motion (N, m, 6) by the twist of a slot."""
         v, w = self._rigid(slot)
         if self.yielding is not None:
-            w = w + self.yielding.turn(slot)
-            if self.frames.need_displacement(slot, elements):
-                shift = self.yielding.displacement(slot)
-                v = v if shift is None else v + shift
-        return self.frames.by_twist(slot, v, w, elements)
+            shift, w = self.yielding.displacement(slot), w + self.yielding.turn(slot)
+            v = v if shift is None else v + shift
+        return self.frames.by_twist(slot, v, w)
 
     def _rigid(self, slot: int) -> tuple[Floats, Floats]:
         """Rows (N, m, 3) by displacement and turn of all beyond a slot, as of a rigid body."""
@@ -237,19 +233,15 @@ class SlotFrames:
     # R J and R Q (None for zero) of the slots that were needed
     cache: dict[int, tuple[Floats, Floats | None]] = field(default_factory=dict)
 
-    def by_twist(self, slot: int, v: Floats | None, w: Floats, elements: slice = ALL) -> Floats:
-        """Rows (N, m, E) by elements of the twist, from rows by v (None for zero) and ω."""
+    def by_twist(self, slot: int, v: Floats | None, w: Floats) -> Floats:
+        """Rows (N, m, 6) by the twist of a slot, from rows by v (None for zero) and ω."""
         turned, shift = self._blocks(slot)
         out = empty(*w.shape[:2], 6)
-        out[..., :3] = 0.0 if v is None or elements.start > 2 else rows_times(v, turned)
+        out[..., :3] = 0.0 if v is None else rows_times(v, turned)
         out[..., 3:] = rows_times(w, turned)
         if v is not None and shift is not None:
             out[..., 3:] += rows_times(v, shift)
-        return out[..., elements]
-
-    def need_displacement(self, slot: int, elements: slice) -> bool:
-        """Whether these elements of the twist of a slot displace the arm beyond it."""
-        return elements.start < 3 or self._blocks(slot)[1] is not None
+        return out
 
     def _blocks(self, slot: int) -> tuple[Floats, Floats | None]:
         if slot not in self.cache:
