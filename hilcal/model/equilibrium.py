@@ -105,7 +105,7 @@ def at_equilibrium(
         term = by_wrenches(
             blocks,
             gradient.joint,
-            lambda k, g=gradient: moves.frames.by_twist(k, g.displacement(k), g.turn(k)),
+            lambda k, g=gradient: moves.by_twist(k, g.displacement(k), g.turn(k)),
         )
         for place, b in term.items():
             form[place] = form[place] + b

@@ -137,10 +137,11 @@ class ReadingDerivative:
     chain: Chain
     deviation: Deviation
     m: int
-    frames: "SlotFrames"
     dq: Floats  # (N, m, n) derivative by displacements of the chain's joints
     yielding: MotionGradient | None = None  # of the yielding of the arm
     _cache: dict[int, tuple[Floats, Floats]] = field(default_factory=dict, repr=False)
+    # R J and R Q (None for zero) of the slots that were needed, see `by_twist`
+    _turned: dict[int, tuple[Floats, Floats | None]] = field(default_factory=dict, repr=False)
 
     @property
     def drives(self) -> Floats:
@@ -154,7 +155,29 @@ class ReadingDerivative:
         if self.yielding is not None:
             shift, w = self.yielding.displacement(slot), w + self.yielding.turn(slot)
             v = v if shift is None else v + shift
-        return self.frames.by_twist(slot, v, w)
+        return self.by_twist(slot, v, w)
+
+    def by_twist(self, slot: int, v: Floats | None, w: Floats) -> Floats:
+        """Rows (N, m, 6) by the twist ξ of a slot, from rows by v (None for zero) and ω.
+
+        v = R J dξ_v + R Q dξ_ω and ω = R J dξ_ω are motions of its frame, R the orientation after
+        ξ, J and Q the blocks of the right Jacobian (`se3`).
+        """
+        if slot not in self._turned:
+            r, shift = self.chain.rotation[slot], None
+            twist = None if self.chain.twist is None else self.chain.twist[slot]
+            if twist is not None and twist.any():
+                j, q = se3.right_jacobian_blocks(twist)
+                shift = se3.product(r, q) if twist[:, :3].any() else None
+                r = se3.product(r, j)
+            self._turned[slot] = r, shift
+        turned, shift = self._turned[slot]
+        out = empty(*w.shape[:2], 6)
+        out[..., :3] = 0.0 if v is None else rows_times(v, turned)
+        out[..., 3:] = rows_times(w, turned)
+        if v is not None and shift is not None:
+            out[..., 3:] += rows_times(v, shift)
+        return out
 
     def _rigid(self, slot: int) -> tuple[Floats, Floats]:
         """Rows (N, m, 3) by displacement and turn of all beyond a slot, as of a rigid body."""
@@ -222,46 +245,13 @@ class ReadingDerivative:
         return position if scale is None else position / (1 + scale[:, None])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SlotFrames:
-    """From motions of a frame to its twist ξ: v = R J dξ_v + R Q dξ_ω, ω = R J dξ_ω.
-
-    J and Q are the blocks of the right Jacobian (`se3`), R the frame's orientation after ξ.
-    """
-
-    chain: Chain
-    # R J and R Q (None for zero) of the slots that were needed
-    cache: dict[int, tuple[Floats, Floats | None]] = field(default_factory=dict)
-
-    def by_twist(self, slot: int, v: Floats | None, w: Floats) -> Floats:
-        """Rows (N, m, 6) by the twist of a slot, from rows by v (None for zero) and ω."""
-        turned, shift = self._blocks(slot)
-        out = empty(*w.shape[:2], 6)
-        out[..., :3] = 0.0 if v is None else rows_times(v, turned)
-        out[..., 3:] = rows_times(w, turned)
-        if v is not None and shift is not None:
-            out[..., 3:] += rows_times(v, shift)
-        return out
-
-    def _blocks(self, slot: int) -> tuple[Floats, Floats | None]:
-        if slot not in self.cache:
-            r, shift = self.chain.rotation[slot], None
-            twist = None if self.chain.twist is None else self.chain.twist[slot]
-            if twist is not None and twist.any():
-                j, q = se3.right_jacobian_blocks(twist)
-                shift = se3.product(r, q) if twist[:, :3].any() else None
-                r = se3.product(r, j)
-            self.cache[slot] = r, shift
-        return self.cache[slot]
-
-
 def motion(
     cell: Cell, observation: Observation, chain: Chain, deviation: Deviation, m: int
 ) -> ReadingDerivative:
     """Prepare the motions of a reading with m elements at fixed wrenches."""
     moved = joint_jacobian(chain, observation.base_position)
     dq = _to_sensor(observation, deviation, moved, m)
-    return ReadingDerivative(cell, observation, chain, deviation, m, SlotFrames(chain), dq)
+    return ReadingDerivative(cell, observation, chain, deviation, m, dq)
 
 
 def _once(x: Floats) -> Floats:
