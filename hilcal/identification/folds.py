@@ -189,7 +189,8 @@ def groups_within(points: Floats, distance: float) -> Ints:
     first = np.sort(np.unique(points, axis=0, return_index=True)[1])
     if 2 * len(cells) > len(first):  # hardly any cell holds several
         joined.append(first[cKDTree(points[first]).query_pairs(distance, np.inf, 0, "ndarray")])
-        return connected(*np.concatenate(joined).T, len(points))
+        a, b = np.concatenate(joined).T
+        return connected(a, b, len(points))
     order = np.argsort(cell[first], kind="stable")
     members = np.split(first[order], np.flatnonzero(np.diff(cell[first][order])) + 1)
     tree, up = cKDTree(cells), np.arange(len(cells))
@@ -214,4 +215,5 @@ def groups_within(points: Floats, distance: float) -> Ints:
             if separation[k] <= distance:
                 joined.append(np.array([[few[k], many[index[k]]]]))
                 up[high] = low
-    return connected(*np.concatenate(joined).T, len(points))
+    a, b = np.concatenate(joined).T
+    return connected(a, b, len(points))

@@ -25,6 +25,7 @@ from hilcal.robot.chain import Chain
 from hilcal.robot.statics import (
     GeometricStiffness,
     Load,
+    MotionGradient,
     rows_times,
     rows_times_constant,
 )
@@ -102,11 +103,11 @@ def at_equilibrium(
     previous = total
     for _ in range(MAX_TERMS):
         gradient = stiffness.gradient(term)
-        term = by_wrenches(
-            blocks,
-            gradient.joint,
-            lambda k, g=gradient: moves.by_twist(k, g.displacement(k), g.turn(k)),
-        )
+
+        def by_slot(k: int, g: MotionGradient = gradient) -> Floats:
+            return moves.by_twist(k, g.displacement(k), g.turn(k))
+
+        term = by_wrenches(blocks, gradient.joint, by_slot)
         for place, b in term.items():
             form[place] = form[place] + b
         size = _norm(term)

@@ -75,22 +75,16 @@ class Model(Brief):
     cell: Cell
     effects: tuple[Effect, ...]  # with distinct names
     catalogue: Catalogue = field(default_factory=installed)  # the effects that it could have
-    readings: Readings | None = None
-    """for which effects are set up when they are added by name; None for no readings"""
-    prior: "CarriedPrior | None" = None
-    """what another campaign has determined of parameters of the same names; None for nothing"""
+    readings: Readings | None = None  # for which effects are set up when they are added by name
+    prior: "CarriedPrior | None" = None  # of parameters of the same names, by another campaign
+    # by effect, the standard deviations (q,) of its parameters where they are random with a mean
+    # of zero, SI (see `hilcal.mixed`)
     random: Mapping[str, Floats] = field(default_factory=dict)
-    """by effect, the standard deviations (q,) of its parameters where they are random with a mean
-    of zero, SI (see `hilcal.mixed`)"""
+    # names of effects among `random` that take part in predictions although the readings do not
+    # prove any of them by itself
     background: frozenset[str] = frozenset()
-    """names of effects among `random` that take part in predictions although the readings do not
-    prove any of them by itself"""
-    _slices: tuple[slice, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        ends = accumulate((len(e.magnitudes) for e in self.effects), initial=0)
-        # Needed at every step; an effect with a thousand parameters takes long to name them.
-        object.__setattr__(self, "_slices", tuple(slice(a, b) for a, b in pairwise(ends)))
         names = self.names
         for name in names:
             if names.count(name) > 1:
@@ -119,11 +113,12 @@ class Model(Brief):
     @property
     def size(self) -> int:
         """Number of parameters."""
-        return self._slices[-1].stop if self._slices else 0
+        return sum(len(e.magnitudes) for e in self.effects)
 
     def slices(self) -> tuple[slice, ...]:
         """The slice of each effect's parameters in the vector of all."""
-        return self._slices
+        ends = accumulate((len(e.magnitudes) for e in self.effects), initial=0)
+        return tuple(slice(a, b) for a, b in pairwise(ends))
 
     def __add__(self, effect: Effect | EffectSpec | str | type[Effect]) -> "Model":
         """Return the model with one more effect; one that is only named is built for it."""
@@ -217,10 +212,7 @@ class Model(Brief):
         (P,), by the parameters in these units.
         """
         count = len(prediction.situation.angle)
-        if effects is self.effects:  # naming a thousand parameters takes long
-            sizes = [s.stop - s.start for s in self.slices()]
-        else:
-            sizes = [len(e.magnitudes) for e in effects]
+        sizes = [len(e.magnitudes) for e in effects]
         place = np.full(sum(sizes), -1)
         live = np.arange(len(place)) if live is None else live
         place[live] = np.arange(len(live))
