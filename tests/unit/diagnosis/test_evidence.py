@@ -17,7 +17,7 @@ from hilcal.diagnosis.evidence import (
 from hilcal.diagnosis.noise import MISFIT_ALARM
 from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.identification import effect_columns as columns_module
+from hilcal.identification import linearisation as columns_module
 from hilcal.identification.baseline import baseline
 from hilcal.identification.carried import carried_prior, names_of
 from hilcal.identification.drift import carried_effects, evidence_of_carried
