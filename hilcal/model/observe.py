@@ -164,13 +164,13 @@ class ReadingDerivative:
         ξ, J and Q the blocks of the right Jacobian (`se3`).
         """
         if slot not in self._turned:
-            r, shift = self.chain.rotation[slot], None
             twist = None if self.chain.twist is None else self.chain.twist[slot]
+            r, beyond = self.chain.rotation[slot], None
             if twist is not None and twist.any():
                 j, q = se3.right_jacobian_blocks(twist)
-                shift = se3.product(r, q) if twist[:, :3].any() else None
+                beyond = se3.product(r, q) if twist[:, :3].any() else None
                 r = se3.product(r, j)
-            self._turned[slot] = r, shift
+            self._turned[slot] = r, beyond
         turned, shift = self._turned[slot]
         out = empty(*w.shape[:2], 6)
         out[..., :3] = 0.0 if v is None else rows_times(v, turned)
