@@ -23,13 +23,12 @@ from hilcal.errors import InputError
 from hilcal.identification import baseline as starting_models
 from hilcal.identification import bootstrap as bootstraps
 from hilcal.identification import fit as fits
-from hilcal.identification import posterior_document
 from hilcal.identification.arm_scatter import with_prior_scatter
 from hilcal.identification.carried import CarriedPrior, carried_prior, check_prior
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_covariance import CovarianceParts, covariance_parts, full_readings
 from hilcal.identification.noise_estimate import NOISE, NoiseEstimate, with_estimated_noise
-from hilcal.identification.posterior import Posterior
+from hilcal.identification.posterior import Posterior, read_posterior
 from hilcal.model.model import Model
 from hilcal.optional import needed_by
 from hilcal.present.story import build_story
@@ -330,7 +329,7 @@ def load_posterior(path: str | Path, catalogue: Catalogue | None = None) -> Post
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     if not is_campaign:
-        return posterior_document.read(path)
+        return read_posterior(path)
     with Campaign.open(path, catalogue, read_only=True) as run:
         return run.posterior()
 

@@ -27,7 +27,7 @@ from hilcal.effects.options import Options
 from hilcal.engine import Advance, Engine
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline, with_effects
-from hilcal.identification.carried import CarriedPrior, coordinates_of
+from hilcal.identification.carried import CarriedPrior, coordinates_of, prior_of, scales_of
 from hilcal.identification.fit import Estimates, Fit, fit
 from hilcal.identification.fit_document import finite
 from hilcal.identification.folds import FOLDS
@@ -45,7 +45,6 @@ from hilcal.identification.gauss_newton import (
     whitened_jacobian,
 )
 from hilcal.identification.least_trimmed_squares import bulk, limit
-from hilcal.identification.priors import prior_of, scales_of
 from hilcal.identification.residual import ErrorBlock, WithVarianceFactor, residual
 from hilcal.identification.uncertainty import (
     MISFIT_CHANCE,

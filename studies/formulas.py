@@ -34,7 +34,7 @@ from hilcal.discovery.sites import Site
 from hilcal.identification.linearisation import Linearisation
 from hilcal.present.document import table
 from hilcal.present.progress import counting
-from hilcal.regression.projection import projection
+from hilcal.regression.schur import projection
 from hilcal.types import Floats
 from hilcal.whole_file import replace_file
 from studies.records import Cases, Figure, Keep, keep, resumed

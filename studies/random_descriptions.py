@@ -11,7 +11,8 @@ import numpy as np
 
 from hilcal.cell import STANDARD_GRAVITY, Cell
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.misdescription import Described, DescriptionFinding, Hypothesis, examine
+from hilcal.identification.hypotheses import Described, Hypothesis
+from hilcal.identification.misdescription import DescriptionFinding, examine
 from hilcal.identification.registration import register
 from hilcal.readings.readings import Readings, States
 from hilcal.robot import se3

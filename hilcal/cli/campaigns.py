@@ -253,8 +253,8 @@ def fleet(
     from hilcal.cli.fitting import check_record
     from hilcal.cli.showing import opening
     from hilcal.engine import open_engine
-    from hilcal.identification.posterior_document import write
     from hilcal.present.comparison import fleet_report
+    from hilcal.store.codec import write_document
     from hilcal.transfer.fleet import fleet as pool_fleet
     from hilcal.transfer.fleet import to_json
     from hilcal.transfer.members import entries
@@ -269,7 +269,7 @@ def fleet(
     written = {}
     for arm_type in pooled.types:
         path = out if len(pooled.types) == 1 else out.with_stem(f"{out.stem}-{arm_type.type}")
-        write(arm_type.prior, path)
+        write_document(path, arm_type.prior.to_json())
         written[arm_type.type] = str(path)
         t.show(f"\n{path}: what to expect of another {arm_type.type}, for --prior {quoted(path)}")
     document = to_json(pooled, written)

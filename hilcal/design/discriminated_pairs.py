@@ -25,8 +25,7 @@ from hilcal.design.criterion import DiscriminatedPairs, Objective, Pair
 from hilcal.design.information import DesignProblem
 from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.effect_columns import computable, effect_columns
-from hilcal.identification.linearisation import Linearisation, linearise
+from hilcal.identification.linearisation import Linearisation, computable, effect_columns, linearise
 from hilcal.regression.evidence import family_power
 from hilcal.regression.schur import schur_complement
 from hilcal.store.plan import UNLOADED

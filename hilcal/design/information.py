@@ -25,9 +25,9 @@ from hilcal.design.nominal_model import (
 )
 from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.effect_columns import computable, effect_columns
+from hilcal.identification.carried import scales_of
 from hilcal.identification.gauss_newton import whitened_jacobian
-from hilcal.identification.priors import scales_of
+from hilcal.identification.linearisation import computable, effect_columns
 from hilcal.model.model import Prediction
 from hilcal.readings.covariance import (
     expected_share_of_mean,

@@ -11,10 +11,14 @@ from hilcal.effects.options import Options
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.effects.written import read_effects_text
 from hilcal.errors import InputError
-from hilcal.identification.carried import CarriedPrior, check_arm, coordinates_of
-from hilcal.identification.drift import least
+from hilcal.identification.carried import (
+    CarriedPrior,
+    check_arm,
+    coordinates_of,
+    prior_of,
+    scales_of,
+)
 from hilcal.identification.fit import Fit
-from hilcal.identification.priors import prior_of, scales_of
 from hilcal.mixed.families import families_of
 from hilcal.model.model import Model
 from hilcal.readings.readings import ObserverKind, ObserverName, States
@@ -138,7 +142,7 @@ def carried_information(model: Model, live: Ints) -> Floats | None:
     if model.prior is None:
         return None
     if model.prior.drift is None:
-        model = replace(model, prior=model.prior.with_drift(least(model.prior)))
+        model = replace(model, prior=model.prior.with_drift(model.prior.lowest))
     coordinates = coordinates_of(model)
     rows = coordinates.inverse[coordinates.std == 1.0]
     information = np.zeros((model.size, model.size))

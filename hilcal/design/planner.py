@@ -28,7 +28,7 @@ from hilcal.effects.per_joint import PerJoint
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.carried import CarriedPrior
 from hilcal.identification.fit import Fit
-from hilcal.identification.registration import MIN_POSES
+from hilcal.identification.placement import MIN_POSES
 from hilcal.measuring.route import seconds_at_rest
 from hilcal.regression.normal_equations import INFORMATION
 from hilcal.regression.schur import DETERMINED

@@ -386,7 +386,7 @@ def _exact(before: Remeasured, after: Remeasured, count: int) -> tuple[float, fl
         return 0.0, 1.0
     explained = values[shown] * (vectors[:, shown].T @ after.sizes[-count:]) ** 2
     explained *= gain / max(float(explained.sum()), 1e-300)
-    evidence = float(log_evidence(values[shown], explained, rss, dof).max())
+    evidence = float(log_evidence(values[shown], explained, rss, dof)[0].max())
     variance = max((rss - gain) / (dof - rank), 1e-300)
     return evidence, float(f_distribution.sf(gain / rank / variance, rank, dof - rank))
 

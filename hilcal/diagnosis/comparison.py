@@ -18,11 +18,10 @@ from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE
 from hilcal.diagnosis.stepwise import add
 from hilcal.errors import HilcalError
 from hilcal.identification.arm_scatter import estimate_arm_scatter, with_arm_scatter
-from hilcal.identification.effect_columns import columns_of_each
 from hilcal.identification.fit import Fit
 from hilcal.identification.fit import fit as solve
 from hilcal.identification.later_readings import Setting, beside_frames, frames_alone, remeasure
-from hilcal.identification.linearisation import linearise
+from hilcal.identification.linearisation import columns_of_each, linearise
 from hilcal.identification.posterior import Differences
 from hilcal.identification.residual import error_block
 from hilcal.identification.validation import Extrapolation, Validation, extrapolation

@@ -39,17 +39,20 @@ from hilcal.diagnosis.minimum_detectable_effect import Strength, least_of_family
 from hilcal.diagnosis.stepwise import trial
 from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.effect_columns import (
+from hilcal.identification.fit import Fit
+from hilcal.identification.linearisation import (
     EffectColumns,
+    HeldOut,
+    Linearisation,
+    by_pose,
     columns_in_parts,
     columns_of_each,
     effect_columns,
+    linearise,
 )
-from hilcal.identification.fit import Fit
-from hilcal.identification.linearisation import HeldOut, Linearisation, by_pose, linearise
 from hilcal.identification.residual import residual
 from hilcal.regression.evidence import FamilyScore, Spectrum, score_family, spectrum
-from hilcal.regression.leave_out import improves, left_out_residual
+from hilcal.regression.leave_out import FamilyFolds, improves
 from hilcal.regression.schur import eliminate
 from hilcal.shown import Brief
 from hilcal.types import Floats
@@ -409,8 +412,8 @@ def beyond_geometry(p: Linearisation, family: EffectColumns, geometry: Floats) -
     # One ridge for both: columns in units of their strength.
     both = np.hstack([geometry / np.sqrt(first.ridge), family.white / np.sqrt(second.ridge)])
     without, with_family = (
-        by_pose(fit, left_out_residual(p.folds, p.projection, fit.white, columns, 1.0))
-        for columns in (both[:, :q], both)
+        by_pose(fit, FamilyFolds(p.folds, p.projection, x).left_out(fit.white, 1.0, of_fit=True))
+        for x in (both[:, :q], both)
     )
     return improves(without, with_family, SURE)
 

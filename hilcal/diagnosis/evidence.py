@@ -58,10 +58,10 @@ from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
 from hilcal.identification.arm_scatter import estimate_arm_scatter, with_arm_scatter
 from hilcal.identification.drift import carried_effects, evidence_of_carried
-from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import (
     Linearisation,
+    effect_columns,
     eliminate_effect,
     linearise,
     model_columns,

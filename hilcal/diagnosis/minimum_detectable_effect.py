@@ -18,8 +18,12 @@ from functools import cached_property
 
 import numpy as np
 
-from hilcal.identification.effect_columns import EffectColumns, effect_columns
-from hilcal.identification.linearisation import Linearisation, by_pose
+from hilcal.identification.linearisation import (
+    EffectColumns,
+    Linearisation,
+    by_pose,
+    effect_columns,
+)
 from hilcal.regression.evidence import (
     LARGE_FAMILY,
     FamilyScore,

@@ -8,7 +8,7 @@ it predicts on poses left out. It names no cause.
 
 Constants of each pose, three displacements of the target, are columns C, whitened and orthonormal;
 each has rows in one pose alone. Beside the model they are M C, with M = 1 − Q Qᵀ (see
-`regression.projection`). With W = CᵀQ their Gram matrix is the identity less a matrix of at most
+`regression.schur`). With W = CᵀQ their Gram matrix is the identity less a matrix of at most
 the model's rank,
 
     CᵀM²C = 1 − W (2 − QᵀQ) Wᵀ = 1 − V Vᵀ,    VᵀV = diag(t)
@@ -32,7 +32,7 @@ from scipy.stats import f as f_distribution
 from hilcal.diagnosis.recorded import state_variables
 from hilcal.identification.linearisation import Linearisation
 from hilcal.model.observe import motion
-from hilcal.regression.projection import Projection
+from hilcal.regression.schur import Projection
 from hilcal.types import Floats, Ints
 
 if TYPE_CHECKING:

@@ -35,11 +35,11 @@ from scipy.stats import f as f_distribution
 
 from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE
 from hilcal.identification.fit import Fit
+from hilcal.identification.folds import connected, groups_within
 from hilcal.identification.residual import variance_interval
 from hilcal.model.observe import motion
 from hilcal.readings.readings import ArmScatter, Readings
 from hilcal.readings.whitening import Bucket, Whitening, whitening
-from hilcal.regression.connected import connected, groups_within
 from hilcal.robot.arm import Arm
 from hilcal.store.codec import encode
 from hilcal.types import Floats, Ints

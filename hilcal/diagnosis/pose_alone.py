@@ -26,9 +26,8 @@ from hilcal.diagnosis.noise import MISFIT_ALARM
 from hilcal.diagnosis.stepwise import add
 from hilcal.effects.protocol import Effect
 from hilcal.errors import HilcalError
-from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import Fit, fit
-from hilcal.identification.linearisation import Linearisation, linearise
+from hilcal.identification.linearisation import Linearisation, effect_columns, linearise
 from hilcal.readings.readings import Readings
 from hilcal.regression.evidence import spectrum
 from hilcal.robot import se3

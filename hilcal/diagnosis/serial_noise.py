@@ -38,8 +38,8 @@ import numpy as np
 from scipy.linalg import block_diag, lapack, solve_triangular
 
 from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE, candidates
-from hilcal.identification.effect_columns import columns_of_each
 from hilcal.identification.fit import Fit, fit
+from hilcal.identification.linearisation import columns_of_each
 from hilcal.model.observe import motion
 from hilcal.readings.covariance import instrument_root
 from hilcal.readings.readings import Clock, SerialNoise

@@ -19,7 +19,7 @@ from hilcal.discovery.search import LEAST, SAME, Selection
 from hilcal.errors import HilcalError
 from hilcal.identification.fit import Fit
 from hilcal.regression.forward_selection import families_beside
-from hilcal.regression.leave_out import left_out_residuals
+from hilcal.regression.leave_out import FamilyFolds
 from hilcal.types import Floats
 
 
@@ -124,11 +124,11 @@ def resembling(
     law = np.hstack([problem.columns(t) for t in s.terms])
     free = problem.model.project_out(law)
     y = (law @ np.linalg.lstsq(free, problem.residual, rcond=1e-8)[0])[:, None]
-    folds = linear.folds
-    total = float(np.sum(left_out_residuals(folds, linear.projection, y) ** 2))
+    folds, model = linear.folds, linear.projection
+    total = float(np.sum(FamilyFolds(folds, model).left_out(y) ** 2))
     out = []
     for effect, part in columns.items():
-        residual = left_out_residuals(folds, linear.projection, y, x[:, part])
+        residual = FamilyFolds(folds, model, x[:, part]).left_out(y)
         share = 1.0 - float(np.sum(residual**2)) / max(total, 1e-300)
         out.append(Resemblance(effect, float(np.sqrt(max(share, 0.0)))))
     return tuple(sorted(out, key=lambda r: -r.cosine))

@@ -15,7 +15,7 @@ from hilcal.discovery.compose import composed_terms, grown
 from hilcal.discovery.screen import LawTerm, Scored, Screen, ScreenedTerm
 from hilcal.identification.linearisation import Linearisation
 from hilcal.regression.evidence import FamilyScore, score_family
-from hilcal.regression.projection import Projection, projection
+from hilcal.regression.schur import Projection, projection
 from hilcal.types import Bools, Floats, Ints
 
 EXTENDED = 40  # Candidates that are extended to other axes and joints; a choice

@@ -27,7 +27,7 @@ from hilcal.discovery.sites import Site, site_motions
 from hilcal.identification.fit import Fit
 from hilcal.identification.linearisation import Linearisation
 from hilcal.regression.evidence import FamilyScore
-from hilcal.regression.projection import projection
+from hilcal.regression.schur import projection
 from hilcal.types import Bools, Floats, Ints
 
 

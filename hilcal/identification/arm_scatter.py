@@ -14,7 +14,7 @@ components (Schwarz), is chosen. The alternative is V = f V_0, an instrument noi
 the difference of the evidences says whether the readings distinguish the two.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,16 +25,11 @@ from hilcal.model.model import Model
 from hilcal.readings.covariance import scatter_alone, with_scatter
 from hilcal.readings.readings import ArmScatter, Readings, ScatterKind
 from hilcal.readings.whitening import Whitening, whitening
-from hilcal.regression.variance_components import (
-    BlockRows,
-    VarianceComponents,
-    variance_components,
-)
+from hilcal.regression.variance_components import BlockRows, VarianceComponents, variance_components
 from hilcal.types import Floats, Ints
 
-MOST_ROWS = 4000
-"""Most whitened rows used, of randomly chosen poses, for speed; a choice: hundreds of arrivals
-determine σ to a few per cent."""
+MOST_ROWS = 4000  # whitened rows used, of randomly chosen poses, for speed; a choice: hundreds of
+# arrivals determine σ to a few per cent
 SEED = 20250304  # of the choice of poses
 KINDS: tuple[ScatterKind, ...] = ("joints", "each joint", "isotropic")
 
@@ -60,8 +55,7 @@ def with_arm_scatter(cell: Cell, readings: Readings, scatter: ArmScatter) -> Rea
 def with_prior_scatter(model: Model, readings: Readings) -> Readings:
     """Return the readings with the arm's scatter of the model's carried prior.
 
-    Without such a scatter, or where the covariance contains the arm's scatter already, the readings
-    are returned unchanged.
+    Unchanged without such a scatter, or where the covariance contains the arm's scatter already.
     """
     scatter = None if model.prior is None else model.prior.posterior.scatter
     if scatter is None or readings.scatter_stated or readings.arm_scatter is not None:
@@ -69,51 +63,35 @@ def with_prior_scatter(model: Model, readings: Readings) -> Readings:
     return with_arm_scatter(model.cell, readings, scatter)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Whitened:
-    """Data for the components: readings, scaling, whitened residual (R,) and columns (R, K)."""
-
-    readings: Readings
-    w: Whitening
-    y: Floats
-    rows: Floats
-
-    def blocks(self, components: list[list[Floats]]) -> list[BlockRows]:
-        """Rows in blocks, with the whitened blocks of each component."""
-        out, start = [], 0
-        for k, b in enumerate(self.w.buckets):
-            groups, size = len(b.loaded), b.factor.shape[-1]
-            stop = start + groups * size
-            y = self.y[start:stop].reshape(groups, size)
-            rows = self.rows[start:stop].reshape(groups, size, -1)
-            out.append(BlockRows(y, rows, np.stack([c[k] for c in components])))
-            start = stop
-        return out
-
-    def instrument(self) -> list[Floats]:
-        """Whitened blocks of the stated covariance."""
-        measured = [np.any(b.factor != 0, axis=2) for b in self.w.buckets]
-        return [m[:, :, None] * np.eye(m.shape[1]) for m in measured]
-
-
 def estimate_arm_scatter(fit: Fit) -> ArmScatter | None:
     """Estimate the arm's scatter; None where the residual shows none.
 
     The fit must be gc-scaled, and the covariance of its readings the stated one.
     """
-    data, ridge = _whitened(fit), fit.solution.equations.basis.prior_precision
-    cell, price = fit.model.cell, 0.5 * float(np.log(fit.dof))
+    readings, w, white, columns = _whitened(fit)
+    ridge, price = fit.solution.equations.basis.prior_precision, 0.5 * float(np.log(fit.dof))
+    cell = fit.model.cell
 
-    def maximised(kind: ScatterKind | None) -> VarianceComponents:
-        if kind is None:  # a noisier instrument
-            return variance_components(data.blocks([data.instrument()]), ridge)
-        parts = [
-            whitened_blocks(scatter_alone(data.readings, f), data.w)
-            for f in factors(cell, data.readings, kind)
-        ]
-        return variance_components(data.blocks(parts), ridge)
+    def maximised(parts: list[list[Floats]]) -> VarianceComponents:
+        """Components with the whitened blocks of each."""
+        blocks, start = [], 0
+        for k, b in enumerate(w.buckets):
+            shape = groups, size = len(b.loaded), b.factor.shape[-1]
+            rows = slice(start, start + groups * size)
+            components = np.stack([part[k] for part in parts])
+            y, x = white[rows].reshape(shape), columns[rows].reshape(*shape, columns.shape[1])
+            blocks.append(BlockRows(y, x, components))
+            start = rows.stop
+        return variance_components(blocks, ridge)
 
-    components, noisier = {kind: maximised(kind) for kind in KINDS}, maximised(None)
+    measured = [np.any(b.factor != 0, axis=2) for b in w.buckets]
+    noisier = maximised([[m[:, :, None] * np.eye(m.shape[1]) for m in measured]])
+    components = {
+        kind: maximised(
+            [whitened_blocks(scatter_alone(readings, f), w) for f in factors(cell, readings, kind)]
+        )
+        for kind in KINDS
+    }
     evidence = {kind: v.log_likelihood - len(v.variance) * price for kind, v in components.items()}
     best = max(KINDS, key=lambda kind: evidence[kind])
     variance = components[best].variance
@@ -124,7 +102,7 @@ def estimate_arm_scatter(fit: Fit) -> ArmScatter | None:
     error = np.where(std > 0, spread / (2 * np.where(std > 0, std, 1.0)), 0.0)
     moved = sum(
         v * np.mean(np.sum(f[:, :3] ** 2, axis=(1, 2)))
-        for v, f in zip(variance, factors(cell, data.readings, best), strict=True)
+        for v, f in zip(variance, factors(cell, readings, best), strict=True)
     )
     return ArmScatter(
         kind=best,
@@ -136,8 +114,8 @@ def estimate_arm_scatter(fit: Fit) -> ArmScatter | None:
     )
 
 
-def _whitened(fit: Fit) -> _Whitened:
-    """Whiten the residual and the columns of a fit in blocks of whole arrivals."""
+def _whitened(fit: Fit) -> tuple[Readings, Whitening, Floats, Floats]:
+    """Some readings of whole arrivals, their scaling, whitened residual (R,) and columns (R, K)."""
     inliers, s = fit.readings[~fit.outlier], fit.solution
     live = np.flatnonzero(s.estimated)
     if inliers.states.target is not None and inliers.common is None:
@@ -151,7 +129,7 @@ def _whitened(fit: Fit) -> _Whitened:
     white = w.whiten(fit.raw[place[chosen[w.reading]]]).reshape(-1)
     jacobian = fit.model.jacobian(s.prediction, s.theta, w.m, live)[chosen]
     rows = w.whiten(w.raw(jacobian)).reshape(w.m * len(w), len(live)) @ s.transform[live]
-    return _Whitened(some, w, white + rows @ s.coordinates(), rows)
+    return some, w, white + rows @ s.coordinates(), rows
 
 
 def some_poses(readings: Readings, share: float, seed: int, fewest: int = 1) -> Ints:

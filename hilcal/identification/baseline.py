@@ -24,7 +24,8 @@ from hilcal.effects.protocol import EffectSpec
 from hilcal.identification.carried import CarriedPrior, check_prior
 from hilcal.identification.fit import Fit
 from hilcal.identification.misdescription import refuse_misdescribed
-from hilcal.identification.registration import TARGET_M, TELL, register
+from hilcal.identification.placement import TARGET_M, TELL
+from hilcal.identification.registration import register
 from hilcal.identification.torques import require_torques
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
@@ -43,12 +44,8 @@ def baseline(
     """Return the starting model: unknown frames, and joint compliance where a load acts.
 
     The `role` of the catalogue's effects selects them. For absolute readings of an arm without
-    masses under several loads, the effects of its weight are added. The effects of a prior are
-    added, too, except those that need data which the readings lack.
-
-    Raises:
-        InputError: a prior of another arm, or of these very readings.
-        CannotAnswerError: the readings do not determine an unknown frame.
+    masses under several loads, the effects of its weight are added; so are those of a prior, except
+    where they need data which the readings lack. Raises as `with_effects`.
     """
     catalogue = catalogue or installed()
     names: list[str] = []
@@ -119,9 +116,9 @@ def loads_differ(readings: Readings) -> bool:
 
 
 def masses_note(fit: Fit) -> str | None:
-    """Return how missing masses affect the compliances of a fit; None where they do not.
+    """Return in a sentence how missing masses affect the compliances of a fit; None if they do not.
 
-    One sentence, without the initial capital and the full stop.
+    Without the initial capital and the full stop.
     """
     model, readings = fit.model, fit.readings[~fit.outlier]
     if not masses_missing(model.cell, fit.mode) or not any(e.elastic for e in model.effects):

@@ -8,12 +8,10 @@ readings, and fits the model to them:
 
 It assumes that errors of different poses are independent, and nothing else of the noise. The
 standard uncertainties of a fit without a misfit also assume the size of the noise and independent
-readings of a pose, so that the bootstrap tests them. With
-a misfit, neighbouring poses share errors; then the stated ones are those of a jackknife over
-regions of joint space, and the larger and better ones. With few poses for many parameters the
-bootstrap is too wide: a draw has 63 % of the poses. Strengths of shrunk families are chosen anew in
-each draw; their spread is about a mean that shrinkage has pulled towards zero, which the stated one
-counts as well, and they are not compared.
+readings of a pose, so that the bootstrap tests them. With a misfit, neighbouring poses share
+errors; then the stated ones, of a jackknife over regions of joint space, are larger and better.
+With few poses for many parameters the bootstrap is too wide: a draw has 63 % of the poses.
+Strengths of shrunk families, which each draw chooses anew, are not compared.
 
 Source: Efron and Tibshirani, *An Introduction to the Bootstrap*, chapters 6, 9 and 13; Cameron and
 Miller, *A Practitioner's Guide to Cluster-Robust Inference*, on drawing whole groups.
@@ -27,10 +25,10 @@ import numpy as np
 
 from hilcal.engine import Engine
 from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identification.carried import names_of, prior_of
 from hilcal.identification.fit import Fit
 from hilcal.identification.folds import distinct_poses
 from hilcal.identification.gauss_newton import solve
-from hilcal.identification.priors import names_of, prior_of
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode, Scaling, whitening

@@ -20,6 +20,7 @@ eigenvalues λ > 0, N the others, D the variances of the drift,
     U = [E L, N],    L Lᵀ = (1 + δ_0²) diag(1/λ) + Eᵀ D E
 
 so that the prior has the information ((1 + δ_0²) Λ⁻¹ + D)⁻¹ where Λ has some, and none elsewhere.
+Also the priors and ordinary magnitudes that the effects of a model declare.
 """
 
 import re
@@ -34,17 +35,18 @@ import scipy.linalg as sl
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
 from hilcal.identification.posterior import Posterior, spectrum
-from hilcal.identification.priors import names_of
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.same_readings import among
 from hilcal.regression.schur import schur_complement
 from hilcal.robot.arm import Arm
+from hilcal.store.codec import decode, encode
 from hilcal.types import Bools, Floats, Ints
 
 Relation = Literal["arm", "type"]
 RELATIONS: tuple[Relation, ...] = get_args(Relation)
 _JOINT = re.compile(r"j([1-9][0-9]*)$")
+FIRST_GUESS = 0.3  # first prior std of a shrunk family, in ordinary magnitudes; a choice
 SAME_M = 1e-6  # difference of two nominal link lengths that are the same: rounding of a table
 
 
@@ -94,6 +96,11 @@ class CarriedPrior:
         strength = 1.0 / np.sqrt(np.where(precision > 0, precision, 1.0))
         return np.where(precision > 0, strength, self.posterior.scale)
 
+    @cached_property
+    def lowest(self) -> Floats:
+        """(1 + G,) no doubt, and the least drift of each group."""
+        return np.array([0.0, *(self.least.get(g.effect, 0.0) for g in self.groups)])
+
     def index_in(self, names: tuple[str, ...]) -> tuple[Ints, Ints]:
         """Parameters (K,) of a model, by their names, and their places in the posterior."""
         place = {name: k for k, name in enumerate(self.posterior.names)}
@@ -107,24 +114,21 @@ class CarriedPrior:
 
     def to_json(self) -> dict[str, object]:
         """Return the prior as JSON, the posterior included."""
+        rest = ("relation", "least", "expected", "drift")
         return {
             "posterior": self.posterior.to_json(),
-            "relation": self.relation,
-            "least": dict(self.least),
-            "expected": dict(self.expected),
-            "drift": None if self.drift is None else self.drift.tolist(),
+            **{k: encode(getattr(self, k)) for k in rest},
         }
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "CarriedPrior":
         """Return what `to_json` wrote."""
-        drift = content["drift"]
         return cls(
             Posterior.from_json(content["posterior"]),
-            RELATIONS[RELATIONS.index(content["relation"])],
+            decode(Relation, content["relation"]),
             dict(content["least"]),
             dict(content["expected"]),
-            None if drift is None else np.array(drift, dtype=float),
+            decode(Floats | None, content["drift"]),
         )
 
 
@@ -315,3 +319,39 @@ def _spectrum(p: Posterior, place: tuple[int, ...]) -> tuple[Floats, Floats]:
     some = scaled if len(place) == len(scaled) else schur_complement(scaled, rows)
     values, vectors = spectrum(some)
     return values, vectors if values.any() else np.eye(len(values))
+
+
+def prior_of(model: Model) -> tuple[Floats, Ints]:
+    """Starting prior (P,) of a model, and the shrinkage group (P,) of each parameter or −1.
+
+    Random effects have the standard deviations stated in the model. Parameters with a carried prior
+    are flat here, see `carried.Coordinates`.
+    """
+    prior, groups, used = [np.zeros(0)], [np.zeros(0, dtype=np.int64)], 0
+    for e in model.effects:
+        size = len(e.magnitudes)
+        group, fixed = e.groups(), e.prior_std()
+        if e.name in model.random:
+            group, fixed = None, model.random[e.name]
+        if group is not None:
+            prior.append(FIRST_GUESS * e.magnitudes)
+            groups.append(group + used)
+            used += int(group.max()) + 1
+        else:
+            prior.append(np.full(size, np.inf) if fixed is None else fixed)
+            groups.append(np.full(size, -1))
+    std, number = np.concatenate(prior), np.concatenate(groups)
+    if model.prior is not None:
+        carried = model.prior.index_in(names_of(model))[0]
+        std[carried], number[carried] = np.inf, -1
+    return std, number
+
+
+def names_of(model: Model) -> tuple[str, ...]:
+    """Names of the parameters, "effect.parameter"."""
+    return tuple(f"{e.name}.{p.name}" for e in model.effects for p in e.parameters)
+
+
+def scales_of(model: Model) -> Floats:
+    """(P,) ordinary magnitudes of the parameters."""
+    return np.concatenate([np.zeros(0), *(e.magnitudes for e in model.effects)])

@@ -8,17 +8,16 @@ The residual of the robust start gives their variance. Then readings enter or le
 distance t² from the fit to the others, which is χ²_m distributed for a good reading, until the set
 does not change (Baarda, *A testing procedure for use in geodetic networks*, 1968).
 
-Readings that deviate by one common cause are no gross errors. Such are readings in a row with the
-same shift in the axes of the sensor or of the target, as by another reflector, a target that was
-moved on the tool, or a bumped tracker (`off_alike`); and readings with shifts along the directions
-of one site of the arm (`along_one_site`). A law of a joint, of a link that bends, or of the force
-sensor moves each reading along one direction, whatever the law depends on; a gross error has any
-direction. For a random error in m dimensions the share of its square normal to a direction is
-sin² ~ Beta((m − 1)/2, 1/2), so that its distribution function p is uniform. With p_(n) ascending, n
-of F gross errors are as near to the directions of a site as p_(n) with the probability
-P(B(F, p_(n)) ≥ n). Its minimum over n and the sites is multiplied by F and the number of sites.
-Where the product is too small, the readings near these directions, if of at least two poses, are
-ascribed to a law.
+Readings that deviate by one common cause are no gross errors: readings in a row with the same shift
+in the axes of the sensor or of the target, as by another reflector, a target that was moved on the
+tool, or a bumped tracker (`off_alike`); and readings with shifts along the directions of one site
+of the arm (`along_one_site`), as a law of a joint, of a link that bends, or of the force sensor
+moves each reading along one direction, whatever it depends on. For a random error in m dimensions
+the share of its square normal to a direction is sin² ~ Beta((m − 1)/2, 1/2), so that its
+distribution function p is uniform. With p_(n) ascending, n of F gross errors are as near to the
+directions of a site as p_(n) with the probability P(B(F, p_(n)) ≥ n). Its minimum over n and the
+sites is multiplied by F and the number of sites; where the product is too small, the readings near
+these directions, if of at least two poses, are ascribed to a law.
 """
 
 from dataclasses import dataclass, replace
@@ -29,6 +28,7 @@ import numpy as np
 from scipy.stats import beta, binom, chi2
 
 from hilcal.errors import CannotAnswerError
+from hilcal.identification.carried import scales_of
 from hilcal.identification.gauss_newton import Solution
 from hilcal.identification.least_trimmed_squares import (
     MISFIT,
@@ -40,7 +40,6 @@ from hilcal.identification.least_trimmed_squares import (
     robust_start,
     variance,
 )
-from hilcal.identification.priors import scales_of
 from hilcal.model.model import Model, Prediction
 from hilcal.model.observe import motion
 from hilcal.readings.readings import Readings
@@ -102,7 +101,11 @@ class Snooping:
     def begin(self, rng: np.random.Generator) -> Screened:
         """Test all readings from a robust start; `solution` may be fitted to gross errors, too."""
         every = np.ones(len(self.readings), dtype=np.bool_)
-        if self._all_noise():
+        point = linearised(self, self.solution.y)
+        residual = point.linear.residuals(point.linear.tested)
+        linear = point.with_nuisance(float(np.mean(residual**2)))
+        t2 = linear.distances(linear.tested)[linear.tested]
+        if t2.max() <= limit(linear.m, len(t2)):  # model and smooth functions explain all
             return Screened(every, every, 1.0)
         point, used = robust_start(linearised(self, self.y), rng)
         linear = point.linear
@@ -117,14 +120,6 @@ class Snooping:
             used = updated
         core = float(chi2.ppf(CORE, linear.m)) * variance(linear, t2, centre)
         return self._screened(point, (t2 <= core) | centre, misfit)
-
-    def _all_noise(self) -> bool:
-        """Whether model and smooth functions explain all readings to the noise."""
-        point = linearised(self, self.solution.y)
-        residual = point.linear.residuals(point.linear.tested)
-        linear = point.with_nuisance(float(np.mean(residual**2)))
-        t2 = linear.distances(linear.tested)[linear.tested]
-        return bool(t2.max() <= limit(linear.m, len(t2)))
 
     def again(self, screened: Screened) -> Screened:
         """Repeat the test, from the readings that agreed in `screened` and their solution."""
@@ -153,7 +148,10 @@ class Snooping:
             alike = off_alike(readings, linear.tested, off, shift[:, :3], axes.rotation)
             single = ~np.isin(off, alike) & ~readings.scalar[off]  # a distance has no direction
             rows = off[single]
-            unit = _units(readings.covariance[rows])
+            # The rms over directions, of lengths and angles apart.
+            std2 = np.diagonal(readings.covariance[rows], axis1=1, axis2=2)
+            std2 = std2.reshape(len(rows), readings.m // 3, 3).mean(axis=2)
+            unit = np.repeat(np.sqrt(std2), 3, axis=1)
             sites = point.sites[rows] / unit[:, :, None]
             law = rows[along_one_site(shift[single] / unit, sites, readings.pose[rows])]
             if not len(law):
@@ -169,7 +167,7 @@ class Snooping:
     ) -> tuple[Bools, Floats, float]:
         """Return the good readings (N,), t² (N,) from the fit to them, and the scale of its bulk.
 
-        The iteration starts with the `used` readings (N,); those `of_law` (N,) always stay.
+        It starts with the `used` readings (N,); those `of_law` (N,) always stay.
         """
         count = int(np.count_nonzero(linear.tested))
         for _ in range(ROUNDS):
@@ -214,7 +212,6 @@ class _LinearModel:
     linear: ReadingModel
 
     def moved(self, delta: Floats) -> "_LinearModel":
-        """Return the linear model after a step δ (K,)."""
         y = self.y.copy()
         y[self.live] += self.scale * delta
         return linearised(self.snooping, y)
@@ -295,13 +292,6 @@ def _covariance(readings: Readings, members: Ints) -> Floats:
     return out
 
 
-def _units(covariance: Floats) -> Floats:
-    """(F, m) standard deviations of readings: the rms over directions, lengths and angles apart."""
-    m = covariance.shape[1]
-    variance = np.diagonal(covariance, axis1=1, axis2=2).reshape(len(covariance), m // 3, 3)
-    return np.asarray(np.repeat(np.sqrt(variance.mean(axis=2)), 3, axis=1))
-
-
 def _residual(readings: Readings, prediction: Prediction, members: Ints) -> Floats:
     """(N, m) measured minus predicted; rotations of groups relative to an unloaded reading."""
     o = prediction.observation
@@ -351,13 +341,10 @@ def smooth_nuisance_columns(
 
 
 def off_alike(readings: Readings, tested: Bools, off: Ints, shift: Floats, axes: Floats) -> Ints:
-    """Return the rows in runs with the same shift; none up to `ACCIDENTAL` of the tested ones.
+    """Return the rows in runs with the same shift; none up to `ACCIDENTAL` of the tested ones (N,).
 
-    Args:
-        tested: (N,) readings that were tested.
-        off: (F,) rows of readings that deviate, ascending.
-        shift: (F, 3) their shifts, sensor axes.
-        axes: (F, 3, 3) rotations of the target, sensor axes.
+    Of readings that deviate: `off` (F,) ascending rows, `shift` (F, 3) in sensor axes, and `axes`
+    (F, 3, 3), the rotations of the target.
     """
     order = np.zeros(len(readings), dtype=np.int64)
     alike = np.zeros(len(off), dtype=np.bool_)
@@ -392,7 +379,7 @@ def site_columns(model: Model, theta: Floats, prediction: Prediction, readings: 
     """(N, m, P) changes of readings by each site, at last by 1 N and 1 N·m on the force sensor."""
     p, states, observation, m = prediction, readings.states, prediction.observation, readings.m
     moves = motion(model.cell, observation, p.situation.chain, p.deviation, m)
-    turns = [moves.by_slot(k, slice(3, 6)) for k in range(p.situation.wrench.shape[1])]
+    turns = [moves.by_slot(k)[:, :, 3:] for k in range(p.situation.wrench.shape[1])]
     sensor = []
     for part in (slice(0, 3), slice(3, 6)):
         for axis in np.moveaxis(p.situation.chain.rotation[-1], 2, 0):
@@ -409,13 +396,10 @@ def site_columns(model: Model, theta: Floats, prediction: Prediction, readings: 
 
 
 def along_one_site(shift: Floats, columns: Floats, pose: Ints) -> Bools:
-    """(F,) which deviating readings are ascribed to a law.
+    """(F,) which deviating readings, at poses of numbers (F,), are ascribed to a law.
 
-    Args:
-        shift: (F, m) in units of the noise, equal for all directions, so that random shifts have no
-            preferred direction.
-        columns: (F, m, P) changes by each site, in the same units.
-        pose: (F,) number of the pose.
+    The shifts (F, m), and the columns (F, m, P) of changes by each site, are in units of the noise,
+    equal for all directions, so that random shifts have no preferred one.
     """
     count, m, sites = columns.shape
     if not count:

@@ -37,9 +37,8 @@ import numpy as np
 import scipy.linalg as sl
 from scipy.stats import norm
 
-from hilcal.identification.carried import CarriedPrior, DriftGroup, coordinates_of
+from hilcal.identification.carried import CarriedPrior, DriftGroup, coordinates_of, names_of
 from hilcal.identification.gauss_newton import Solution, whitened_jacobian
-from hilcal.identification.priors import names_of
 from hilcal.model.model import Model
 from hilcal.readings.whitening import Whitening
 from hilcal.regression.evidence import ratio_tail
@@ -88,33 +87,29 @@ class _Linear:
         return p, p @ self.y
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Columns:
-    """Whitened columns of a fit, by whether they have a prior."""
+def _columns(
+    model: Model, solution: Solution, w: Whitening
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Whitened columns at a fit, by whether they have a prior, and the residual.
 
-    a: Floats  # (R, P) of all parameters, zero for those that are not estimated
-    flat: Floats  # (R, F) of parameters without a prior
-    random: Floats  # (R, C) with a prior that is not carried, in units of its standard deviation
-    y: Floats  # (R,) residual with every parameter with a prior at zero
-
-    @classmethod
-    def at_fit(cls, model: Model, solution: Solution, w: Whitening) -> "_Columns":
-        """Return the columns at the fit."""
-        s, carried = solution, solution.space.carried(model.size)
-        index = np.flatnonzero(s.estimated & ~carried)
-        used, std = np.flatnonzero(s.estimated | carried), s.prior[index]
-        free = np.isinf(std)
-        a = np.zeros((len(s.white), model.size))
-        a[:, used] = whitened_jacobian(model, s.prediction, s.theta, w, used)
-        theta = np.where(s.estimated | carried, s.theta, 0.0)
-        theta[index[free]] = 0.0  # flat ones may stay where they are
-        random = a[:, index[~free]] * std[~free]
-        return cls(a, a[:, index[free]], random, s.white + a @ theta)
+    (R, P) of all parameters, zero for those that are not estimated; (R, F) of those without a
+    prior; (R, C) with a prior that is not carried, in its standard deviations; (R,) residual with
+    every parameter with a prior at zero.
+    """
+    s, carried = solution, solution.space.carried(model.size)
+    index = np.flatnonzero(s.estimated & ~carried)
+    used, std = np.flatnonzero(s.estimated | carried), s.prior[index]
+    free = np.isinf(std)
+    a = np.zeros((len(s.white), model.size))
+    a[:, used] = whitened_jacobian(model, s.prediction, s.theta, w, used)
+    theta = np.where(s.estimated | carried, s.theta, 0.0)
+    theta[index[free]] = 0.0  # flat ones may stay where they are
+    return a, a[:, index[free]], a[:, index[~free]] * std[~free], s.white + a @ theta
 
 
 def chosen_drift(model: Model, solution: Solution, w: Whitening) -> Floats:
     """Return δ (1 + G,) at a fit: the doubt of its carried prior, and the drift of its groups."""
-    prior, lowest, rows = _linear(model, solution, w)
+    prior, rows = _linear(model, solution, w)
     scale2 = np.array([1.0, *(prior.expected.get(g.effect, 1.0) ** 2 for g in prior.groups)])
     forms = [g @ g.T for g in rows.drift]
 
@@ -145,7 +140,7 @@ def chosen_drift(model: Model, solution: Solution, w: Whitening) -> Floats:
         change, v = np.abs(new - v) * traces, new
         if change.max() < TOLERANCE:
             break
-    return np.asarray(np.sqrt(np.where(v > NEGLIGIBLE, v, 0.0) + lowest**2))
+    return np.asarray(np.sqrt(np.where(v > NEGLIGIBLE, v, 0.0) + prior.lowest**2))
 
 
 def conflicts(model: Model, solution: Solution, w: Whitening) -> tuple[Conflict, ...]:
@@ -156,9 +151,9 @@ def conflicts(model: Model, solution: Solution, w: Whitening) -> tuple[Conflict,
     """
     if model.prior is None:
         return ()
-    prior, lowest, rows = _linear(model, solution, w)
-    used = lowest if model.prior.drift is None else model.prior.drift
-    v = used**2 - lowest**2
+    prior, rows = _linear(model, solution, w)
+    used = prior.lowest if model.prior.drift is None else model.prior.drift
+    v = used**2 - prior.lowest**2
     total = rows.random @ rows.random.T + solution.beta * np.eye(len(rows.y))
     for moved in np.flatnonzero(v > NEGLIGIBLE):
         total += v[moved] * rows.drift[moved] @ rows.drift[moved].T
@@ -176,34 +171,29 @@ def conflicts(model: Model, solution: Solution, w: Whitening) -> tuple[Conflict,
     return tuple(sorted(out, key=lambda c: c.p_value))
 
 
-def least(prior: CarriedPrior) -> Floats:
-    """(1 + G,) no doubt, and the least drift of each group."""
-    return np.array([0.0, *(prior.least.get(g.effect, 0.0) for g in prior.groups)])
-
-
-def _linear(model: Model, solution: Solution, w: Whitening) -> tuple[CarriedPrior, Floats, _Linear]:
-    """The carried prior with its least drift (1 + G,), that drift, and the linear problem."""
+def _linear(model: Model, solution: Solution, w: Whitening) -> tuple[CarriedPrior, _Linear]:
+    """The carried prior with its least drift, and the linear problem."""
     assert model.prior is not None  # noqa: S101 - the callers' condition
-    prior = model.prior.with_drift(least(model.prior))
+    prior = model.prior.with_drift(model.prior.lowest)
     space = coordinates_of(replace(model, prior=prior))
     index, place = prior.index_in(names_of(model))
-    c, held = _Columns.at_fit(model, solution, w), space.std == 1.0
-    a = c.a[:, index]
+    (of_all, without, others, y), held = _columns(model, solution, w), space.std == 1.0
+    a = of_all[:, index]
     group, unit = prior.group[place], prior.unit[place]
     drift = [a @ space.matrix[:, held]]
-    flat, random = np.hstack([c.flat, a @ space.matrix[:, ~held]]), np.hstack([*drift, c.random])
+    flat, random = np.hstack([without, a @ space.matrix[:, ~held]]), np.hstack([*drift, others])
     drift += [a[:, group == g] * unit[group == g] for g in range(len(prior.groups))]
-    y = c.y - a @ space.mean
-    if len(y) <= a.shape[1] + c.flat.shape[1] + c.random.shape[1]:
-        return prior, least(prior), _Linear(y, flat, random, tuple(drift), 0, 0.0)
+    y = y - a @ space.mean
+    if len(y) <= a.shape[1] + without.shape[1] + others.shape[1]:
+        return prior, _Linear(y, flat, random, tuple(drift), 0, 0.0)
     # All columns are combinations of these; the rows beyond their span are noise.
-    columns = np.hstack([a * prior.posterior.scale[place], c.flat, c.random])
+    columns = np.hstack([a * prior.posterior.scale[place], without, others])
     span = sl.qr(columns, mode="economic", check_finite=False)[0]
     inside = span.T @ y
     noise_rows, square = max(w.rank - len(inside), 0), max(float(y @ y - inside @ inside), 0.0)
     turned = tuple(span.T @ g for g in drift)
     flat, random = np.asarray(span.T @ flat), np.asarray(span.T @ random)
-    return prior, least(prior), _Linear(inside, flat, random, turned, noise_rows, square)
+    return prior, _Linear(inside, flat, random, turned, noise_rows, square)
 
 
 def carried_effects(model: Model) -> tuple[str, ...]:
@@ -218,8 +208,7 @@ def evidence_of_carried(
     model: Model, solution: Solution, w: Whitening, effects: Sequence[str]
 ) -> dict[str, float]:
     """Return the log evidence of the readings for each effect, given the others of the model."""
-    c = _Columns.at_fit(model, solution, w)
-    y, a, flat, random = c.y, c.a, c.flat, c.random
+    a, flat, random, y = _columns(model, solution, w)
     full = coordinates_of(model)
     columns = np.hstack([flat, random, a[:, full.index] @ full.matrix])
     if columns.shape[1] < len(y):

@@ -68,20 +68,12 @@ class Estimates(Sequence[Estimate]):
     ) -> "Estimates":
         """Return the `shown` parameters (P,) of a model; an infinite `std` (P,) means unknown."""
         names = [(f"{e.name}.{p.name}", p.unit) for e in model.effects for p in e.parameters]
-        stated = identifiable & np.isfinite(std)
-        return cls(
-            tuple(
-                Estimate(
-                    name,
-                    float(theta[k]) if identifiable[k] else None,
-                    float(std[k]) if stated[k] else None,
-                    unit,
-                    bool(identifiable[k]),
-                )
-                for k, (name, unit) in enumerate(names)
-                if shown[k]
-            )
-        )
+        rows = []
+        for k in np.flatnonzero(shown).tolist():
+            (name, unit), known = names[k], bool(identifiable[k])
+            size = float(std[k]) if known and np.isfinite(std[k]) else None
+            rows.append(Estimate(name, float(theta[k]) if known else None, size, unit, known))
+        return cls(tuple(rows))
 
     def lines(self, most: int | None = None) -> list[str]:
         """Return a line for each parameter, or for the first `most`."""
@@ -89,18 +81,15 @@ class Estimates(Sequence[Estimate]):
         return [row.line(width) for row in self.rows[:most]]
 
     def __repr__(self) -> str:
-        """Return lines of the first parameters."""
         lines = self.lines(12)
         hidden = len(self.rows) - len(lines)
         tail = [f"  ... and {hidden} more"] * bool(hidden)
         return "\n".join(["Estimates(", *lines, *tail, ")"])
 
     def __len__(self) -> int:
-        """Return the number of parameters."""
         return len(self.rows)
 
     def __iter__(self) -> Iterator[Estimate]:
-        """Yield the parameters in order."""
         return iter(self.rows)
 
     @overload
@@ -122,11 +111,7 @@ class Estimates(Sequence[Estimate]):
         return [asdict(row) for row in self.rows]
 
     def to_frame(self) -> "pd.DataFrame":
-        """Return a pandas data frame, indexed by name.
-
-        Raises:
-            InputError: pandas is not installed.
-        """
+        """Return a pandas data frame, indexed by name; an InputError without pandas."""
         with needed_by("to_frame (to_dicts returns the same without pandas)"):
             import pandas as pd
         return pd.DataFrame(self.to_dicts()).set_index("name")
@@ -281,18 +266,10 @@ class Residuals(Sequence[Floats]):
     """
 
     def __init__(self, fit: Fit) -> None:
-        """Take the residuals of a fit."""
         self._fit = fit
 
     def __call__(self, frame: Frame = "sensor") -> Floats:
-        """Return an array (D, m).
-
-        Args:
-            frame: axes of the residuals: of the "sensor", or of the arm's "base".
-
-        Raises:
-            InputError: another frame.
-        """
+        """Return an array (D, m) in axes of the "sensor", or of the arm's "base"."""
         raw = self._fit.raw
         if frame == "sensor":
             return raw
@@ -306,23 +283,15 @@ class Residuals(Sequence[Floats]):
         return self._fit.to_frame()
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Floats:
-        """Return the array in sensor axes."""
         return np.array(self._fit.raw, dtype=dtype, copy=copy)
 
     def __len__(self) -> int:
-        """Return the number of measurements D."""
         return len(self._fit.raw)
 
-    @overload
-    def __getitem__(self, key: int) -> Floats: ...
-    @overload
-    def __getitem__(self, key: slice) -> Sequence[Floats]: ...
     def __getitem__(self, key: int | slice) -> Any:
-        """Return the residual of one measurement (m,), or of several."""
         return self._fit.raw[key]
 
     def __repr__(self) -> str:
-        """Return their number and size."""
         rms = 1e6 * self._fit.error.rms_m
         return f"Residuals({len(self)} of {self._fit.mode} readings: {rms:.1f} µm rms)"
 

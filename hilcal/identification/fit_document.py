@@ -72,18 +72,11 @@ def prior_to_json(fit: Fit) -> dict[str, object]:
 
     `drift` is a standard deviation in ordinary magnitudes, in shrunk families in their strengths.
     """
-    prior = fit.model.prior
+    prior, numbers = fit.model.prior, ("moved_sigma", "p_value", "drift")
     if prior is None:
         return {}
     conflicts = [
-        {
-            "effect": c.group.effect,
-            "part": c.group.part,
-            "joint": c.group.joint,
-            "moved_sigma": c.moved_sigma,
-            "p_value": c.p_value,
-            "drift": c.drift,
-        }
+        {**asdict(c.group), "joint": c.group.joint, **{k: getattr(c, k) for k in numbers}}
         for c in fit.conflicts
     ]
     source = asdict(prior.posterior.source)
@@ -92,10 +85,7 @@ def prior_to_json(fit: Fit) -> dict[str, object]:
 
 def outliers(fit: Fit) -> list[dict[str, object]]:
     """Readings that were set aside, with their Mahalanobis distance and likely cause."""
-    return [
-        {"pose": g.pose, "load": g.load, "sigma": g.sigma, "reason": g.reason}
-        for g in gross_errors(fit)
-    ]
+    return [{k: v for k, v in asdict(g).items() if k != "row"} for g in gross_errors(fit)]
 
 
 def notes(fit: Fit) -> tuple[str, ...]:

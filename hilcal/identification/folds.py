@@ -1,24 +1,21 @@
 """Prediction of poses that are left out, and changes of the parameters by leaving them out.
 
 Whole poses are left out, never single readings, as readings of one pose share its errors. Commanded
-poses that agree in every joint within `SAME_POSE` count as one pose, whatever their names, so that
-no repeated pose is predicted from its repetition. A fold is left out by one Gauss-Newton step from
-the full fit, with its rows subtracted exactly from the normal equations. The strengths of shrunk
-families are chosen anew for each fold (`regression.empirical_bayes`).
-
-Without a fold the flat parameters have a prior about zero (see `regression.leave_out`), whose
-standard deviation is their ordinary magnitude, or the rms of the effect's parameters in the full
-fit if that is larger.
+poses that agree in every joint within `SAME_POSE` count as one pose, whatever their names. A fold
+is left out by one Gauss-Newton step from the full fit, with its rows subtracted exactly from the
+normal equations. The strengths of shrunk families are chosen anew for each fold
+(`regression.empirical_bayes`). Without a fold the flat parameters have a prior about zero (see
+`regression.leave_out`), whose standard deviation is their ordinary magnitude, or the rms of the
+effect's parameters in the full fit if that is larger.
 """
 
 import numpy as np
 
+from hilcal.identification.carried import FIRST_GUESS, prior_of, scales_of
 from hilcal.identification.gauss_newton import Solution, whitened_jacobian
-from hilcal.identification.priors import FIRST_GUESS, prior_of, scales_of
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening
-from hilcal.regression.connected import groups_within
 from hilcal.regression.empirical_bayes import FamilyProblem, solutions
 from hilcal.regression.leave_out import Fold, folds
 from hilcal.types import Floats, Ints
@@ -158,3 +155,65 @@ def _with_families(
     change = (z - coordinates) @ s.transform.T
     change[:, dropped] = u[:, count:] * guess
     return np.asarray(change)
+
+
+def connected(a: Ints, b: Ints, count: int) -> Ints:
+    """Return the group number (count,) of each of `count` items; items a[k] and b[k] are joined.
+
+    Groups are numbered in the order of their first items.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    joined = coo_array((np.ones(len(a)), (a, b)), shape=(count, count))
+    return np.asarray(connected_components(joined, directed=False)[1], dtype=np.int64)
+
+
+def groups_within(points: Floats, distance: float) -> Ints:
+    """Return the group number (N,) of each point (N, D).
+
+    Two points are joined where they differ by at most `distance` in every coordinate. Points in one
+    cell of half the distance are joined in a chain; two cells that are not yet joined, by one near
+    pair, if there is any: near pairs may be too many to be listed.
+    """
+    from scipy.spatial import cKDTree  # slow to import
+
+    if not points.size:
+        return np.arange(len(points))
+    place = np.floor(points / (distance / 2)) if distance else points
+    cells, cell = np.unique(place, axis=0, return_inverse=True)
+    cell = cell.reshape(-1)
+    order = np.argsort(cell, kind="stable")
+    joined = [np.stack([order[:-1], order[1:]], axis=1)[np.diff(cell[order]) == 0]]
+    # Of equal points one is used: a tree does not divide them.
+    first = np.sort(np.unique(points, axis=0, return_index=True)[1])
+    if 2 * len(cells) > len(first):  # hardly any cell holds several
+        joined.append(first[cKDTree(points[first]).query_pairs(distance, np.inf, 0, "ndarray")])
+        a, b = np.concatenate(joined).T
+        return connected(a, b, len(points))
+    order = np.argsort(cell[first], kind="stable")
+    members = np.split(first[order], np.flatnonzero(np.diff(cell[first][order])) + 1)
+    tree, up = cKDTree(cells), np.arange(len(cells))
+
+    def group(k: Ints) -> Ints:
+        while np.any(up[k] != k):
+            up[k] = k = up[up[k]]
+        return k
+
+    for i in range(len(cells)):
+        near = np.array(tree.query_ball_point(cells[i], 3.0 if distance else 0.0, p=np.inf))
+        for j in near[group(near) != group(np.array([i]))].tolist():
+            low, high = sorted(group(np.array([i, j])).tolist())
+            if low == high:
+                continue
+            few, many = sorted((members[i], members[j]), key=len)
+            nearest = cKDTree(points[many]).query(
+                points[few], p=np.inf, distance_upper_bound=float(np.nextafter(distance, np.inf))
+            )
+            separation, index = (np.atleast_1d(x) for x in nearest)
+            k = int(np.argmin(separation))
+            if separation[k] <= distance:
+                joined.append(np.array([[few[k], many[index[k]]]]))
+                up[high] = low
+    a, b = np.concatenate(joined).T
+    return connected(a, b, len(points))

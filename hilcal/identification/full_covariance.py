@@ -79,11 +79,10 @@ def covariance_parts(covers: str | None, config: CellConfig) -> CovarianceParts:
 def with_joint_scatter(cell: Cell, readings: Readings, joint_std: Floats) -> Readings:
     """Return the readings with the scatter of the joints added to the instrument's covariance.
 
-    V = V_instrument + R J Σ_q Jᵀ Rᵀ with the Jacobian of the nominal arm and R the orientation of
-    the base in the sensor's frame, estimated from the readings where it is unknown, and standard
-    deviations (n,) from one arrival to the next, rad. With too few poses to estimate it, the
-    readings are returned as they are; nothing can be fitted to them either. Targets that were read
-    in one arrival have the scatter in common (`Readings.common`).
+    V = V_instrument + R J Σ_q Jᵀ Rᵀ with the Jacobian of the nominal arm, R the orientation of the
+    base in the sensor's frame, estimated where it is unknown, and standard deviations (n,) from one
+    arrival to the next, rad. Readings with too few poses for that are returned as they are. Targets
+    read in one arrival have the scatter in common (`Readings.common`).
     """
     factor = _scatter(cell, readings, joint_std)
     return readings if factor is None else with_scatter(readings, factor)

@@ -3,7 +3,6 @@
 Also the error before any fit, and the residuals as columns of a table.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -81,10 +80,9 @@ def full_prediction(fit: Fit) -> FullPrediction:
 def error_before(fit: Fit) -> ErrorBlock:
     """Return the error of the rigid nominal arm at the readings of a fit, m.
 
-    Of deflections it is the deflection itself, which a rigid arm does not have. Of absolute
-    readings it is what remains where the unknown frames (registration, target) are fitted to the
-    nominal arm alone: those of a fitted model belong to its other parameters, and are wrong for the
-    nominal arm.
+    Of deflections it is the deflection itself. Of absolute readings it is what remains where the
+    unknown frames (registration, target) are fitted to the nominal arm alone: those of a fitted
+    model belong to its other parameters.
     """
     used, w = fit.readings[~fit.outlier], fit.whitening
     frames = tuple(x for x in fit.model.effects if x.role in FRAME_ROLES)
@@ -106,11 +104,10 @@ def residual_table(fit: Fit) -> dict[str, Column]:
     """
     r, (raw, w) = fit.readings, with_outliers(fit)
 
-    def spread(values: Floats) -> Sequence[list[float | None]]:
-        """Columns of values (D, k) at their readings, None elsewhere."""
+    def spread(values: Floats) -> list[float | None]:
+        """A column of values (D,) at their readings, None elsewhere."""
         by_reading = dict(zip(w.reading.tolist(), values.tolist(), strict=True))
-        return [[by_reading[k][c] if k in by_reading else None for k in range(len(r))]
-                for c in range(values.shape[1])]  # fmt: skip
+        return [by_reading.get(k) for k in range(len(r))]
 
     table: dict[str, Column] = {
         "reading": np.arange(1, len(r) + 1),
@@ -121,12 +118,12 @@ def residual_table(fit: Fit) -> dict[str, Column]:
     if r.states.target is not None:
         table["target"] = [r.target_names[k] for k in r.target.tolist()]
     table["set_aside"] = fit.outlier.astype(int)
-    table["sigma"] = spread(np.sqrt(mahalanobis2(raw, w.covariance))[:, None])[0]
+    table["sigma"] = spread(np.sqrt(mahalanobis2(raw, w.covariance)))
     for kind, values in (("residual", raw), ("left_out", all_left_out(fit)[0])):
         base = (values.reshape(len(values), -1, 3) @ fit.frames.base[:3, :3]).reshape(values.shape)
         for frame, components in (("", values), ("base_", base)):
-            for element, column in zip(ELEMENTS, spread(components), strict=False):
-                table[f"{kind}_{frame}{element}"] = column
+            for element, column in zip(ELEMENTS, components.T, strict=False):
+                table[f"{kind}_{frame}{element}"] = spread(column)
     return table
 
 

@@ -12,15 +12,15 @@ A `NewtonProblem` states the objective at a point and the linear problem there, 
 replaced by any rows with the same products.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from hilcal.identification.carried import Coordinates, coordinates_of
-from hilcal.identification.priors import prior_of, scales_of
+from hilcal.errors import CannotAnswerError
+from hilcal.identification.carried import Coordinates, coordinates_of, prior_of, scales_of
 from hilcal.identification.residual import residual
-from hilcal.identification.solver import shortened
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening
@@ -33,7 +33,7 @@ from hilcal.regression.normal_equations import (
     normal_equations,
     triangle_of,
 )
-from hilcal.regression.projection import Projection, projection
+from hilcal.regression.schur import Projection, projection
 from hilcal.types import Bools, Floats, Ints
 
 # All of these are choices.
@@ -72,10 +72,7 @@ class LinearProblem:
         )
 
     def basis(self, scale: Floats, prior: Floats, spread: float) -> Basis:
-        """Return identifiable coordinates for magnitudes (P,), priors (P,) and the residual's σ.
-
-        Unless rows are whitened, only rounding decides the rank.
-        """
+        """Return identifiable coordinates; rounding alone decides the rank of unwhitened rows."""
         threshold = spread if self.whitened else None
         return find_basis(self.a, scale[self.live], prior[self.live], threshold)
 
@@ -99,17 +96,13 @@ class Regularisation:
 
 
 def regularise(
-    p: LinearProblem, scale: Floats, prior: Floats, groups: Ints, choose: bool
+    p: LinearProblem,
+    scale: Floats,  # (P,) ordinary magnitudes
+    prior: Floats,  # (P,) current prior standard deviations
+    groups: Ints,  # (P,) shrinkage groups, or −1
+    choose: bool,  # whether the evidence chooses the priors of shrunk families
 ) -> Regularisation:
-    """Choose priors, noise factor and rank for a linear problem.
-
-    Args:
-        p: the problem.
-        scale: (P,) ordinary magnitudes.
-        prior: (P,) current prior standard deviations.
-        groups: (P,) shrinkage groups, or −1.
-        choose: whether the evidence chooses the priors of shrunk families.
-    """
+    """Choose priors, noise factor and rank for a linear problem."""
     # The rms residual at the solution does not depend on the point of linearisation.
     basis = p.basis(scale, prior, 1.0)
     equations = p.equations(basis)
@@ -161,8 +154,7 @@ def noise_factor(p: LinearProblem, equations: NormalEquations, beta: float = 1.0
 def effective_parameters(equations: NormalEquations, beta: float, root: Floats) -> float:
     """Number of flat directions plus Σ (1 − β Λ_kk H⁻¹_kk) over parameters with a prior.
 
-    Args:
-        root: (K, K) T with Tᵀ T = H⁻¹.
+    T (K, K) is the `root` with Tᵀ T = H⁻¹.
     """
     return len(equations.basis.singular) + float(np.sum(_determined(equations, beta, root)))
 
@@ -170,9 +162,7 @@ def effective_parameters(equations: NormalEquations, beta: float, root: Floats) 
 def spent_parameters(equations: NormalEquations, beta: float, groups: Ints) -> float:
     """Degrees of freedom that a fit uses: `effective_parameters` and the choice of strengths.
 
-    Args:
-        equations: over all parameters.
-        groups: (P,) shrinkage groups, or −1.
+    The equations are over all parameters, `groups` (P,) their shrinkage groups, or −1.
     """
     group = groups[equations.basis.held]
     determined = _determined(equations, beta, equations.inverse_root(beta))
@@ -211,6 +201,7 @@ class NewtonPoint:
 
 
 P = TypeVar("P", bound=NewtonPoint)
+T = TypeVar("T")
 
 
 class Minimum(NamedTuple, Generic[P]):
@@ -255,10 +246,8 @@ def linear_problem(
     """Return the linear problem of whitened rows (R, L) and residual (R,) at a point.
 
     The unknowns are steps of flat parameters, so that unidentifiable directions do not move, and
-    values of parameters with a prior, as the prior is about zero.
-
-    Many rows are reduced to a triangle once, which replaces them in rank analysis, choice of priors
-    and solution; unless most columns have a prior, as their products cost less.
+    values of parameters with a prior. Many rows are reduced to a triangle, unless most columns have
+    a prior, as their products cost less.
     """
     live, rows = np.flatnonzero(prior > 0), a
     origin = np.where(np.isinf(prior), point.y, 0.0)
@@ -279,7 +268,8 @@ def minimum(problem: NewtonProblem[P], start: Floats | None, prior: Floats | Non
     y = np.zeros(model.size) if start is None else start
     point = problem.at(np.where(sigma > 0, y, 0.0))
     by: Regularisation  # set in the first step
-    square, settled, path = np.inf, False, Acceleration()
+    square, settled = np.inf, False
+    path: list[tuple[Floats, Floats]] = []
     for iterations in range(1, MAX_ITERATIONS + 1):
         linear = problem.linearise(point, sigma)
         if not settled:
@@ -292,7 +282,10 @@ def minimum(problem: NewtonProblem[P], start: Floats | None, prior: Floats | Non
         aim = linear.origin.copy()
         aim[linear.live] += by.basis.transform @ equations.solve(by.beta)
         moved = linear.rows @ (aim - point.y)[linear.live]
-        shortcut = path.accelerated(aim, moved) if settled and problem.same_rows else None
+        shortcut = None
+        if settled and problem.same_rows:
+            path = [*path[-DEPTH:], (aim, moved)]
+            shortcut = accelerated(path) if len(path) > 1 else None
         start_point, point = point, _line_search(problem, point, aim, by, shortcut)
         previous, square = square, point.mean_square(len(by.basis.singular))
         noise = max(square, by.beta) * linear.rank
@@ -305,34 +298,40 @@ def minimum(problem: NewtonProblem[P], start: Floats | None, prior: Floats | Non
     return Minimum(point, by, iterations, False, None)
 
 
-class Acceleration:
-    """Anderson's acceleration of the steps after priors and rank have settled.
+def accelerated(path: Sequence[tuple[Floats, Floats]]) -> Floats:
+    """Anderson's acceleration of the steps after priors and rank have settled: the aim (P,).
 
     Where a residual remains, steps in a weakly determined direction shrink only by a constant
-    factor. Step i leads to g_i and moves the whitened readings by f_i. With α_i, Σ α_i = 1, that
-    minimise ‖Σ α_i f_i‖ over the last steps, the accelerated step leads to Σ α_i g_i.
+    factor. Step i of the `path` leads to g_i (P,) and moves the whitened readings by f_i (R,). With
+    α_i, Σ α_i = 1, that minimise ‖Σ α_i f_i‖, the accelerated step leads to Σ α_i g_i.
 
     Source: Walker and Ni, *Anderson acceleration for fixed-point iterations*, SIAM J. Numer. Anal.
     49 (2011) 1715-1735.
     """
+    (aim, moved), parts = path[-1], zip(*path, strict=True)
+    aims, moves = (np.diff(part, axis=0) for part in parts)
+    return np.asarray(aim - np.linalg.lstsq(moves.T, moved, rcond=None)[0] @ aims)
 
-    def __init__(self) -> None:
-        """Start without steps."""
-        self._steps: list[tuple[Floats, Floats]] = []
 
-    def accelerated(self, aim: Floats, moved: Floats) -> Floats | None:
-        """Add a step and return the accelerated aim (P,); None after the first step.
+def shortened(
+    moved: Callable[[Floats], T],
+    step: Floats,
+    most: int,
+    cost: Callable[[T], float] | None = None,
+    limit: float = np.inf,
+) -> T | None:
+    """Return the first result of the full step, half of it, … whose cost is at most the limit.
 
-        Args:
-            aim: (P,) where the step alone leads to.
-            moved: (R,) motion of the whitened readings by the step.
-        """
-        self._steps = [*self._steps[-DEPTH:], (aim, moved)]
-        if len(self._steps) == 1:
-            return None
-        aims, moves = (np.diff(part, axis=0) for part in zip(*self._steps, strict=True))
-        gamma = np.linalg.lstsq(moves.T, moved, rcond=None)[0]
-        return np.asarray(aim - gamma @ aims)
+    None without one; `moved` and `cost` may raise CannotAnswerError.
+    """
+    for halving in range(most):
+        try:
+            reached = moved(0.5**halving * step)
+            if cost is None or cost(reached) <= limit:
+                return reached
+        except CannotAnswerError:
+            continue
+    return None
 
 
 def _line_search(
@@ -340,8 +339,7 @@ def _line_search(
 ) -> P:
     """Go to the `shortcut` (P,) if the objective does not grow; else towards `aim` (P,).
 
-    The step towards `aim` is halved while the objective grows, as the chain may be strongly
-    nonlinear along a weakly determined direction.
+    That step is halved while the objective grows, as the chain may be strongly nonlinear.
     """
 
     def cost(trial: P) -> float:
@@ -400,8 +398,6 @@ class Solution:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Iterate(NewtonPoint):
-    """A point with its prediction, residual (D, m), and whitened residual (R,)."""
-
     prediction: Prediction
     raw: Floats
     white: Floats
@@ -409,8 +405,6 @@ class _Iterate(NewtonPoint):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem(NewtonProblem[_Iterate]):
-    """A fit of readings in memory, with their scaling."""
-
     readings: Readings
     w: Whitening
 
@@ -433,21 +427,13 @@ class _Problem(NewtonProblem[_Iterate]):
 
 def solve(
     model: Model,
-    readings: Readings,
-    w: Whitening,
-    start: Floats | None = None,
-    prior: Floats | None = None,
+    readings: Readings,  # without gross errors
+    w: Whitening,  # their scaling
+    start: Floats | None = None,  # (P,) first parameters; else zero, or a carried prior's mean
+    prior: Floats | None = None,  # (P,) fixed prior standard deviations; else the evidence chooses
+    # those of shrunk families
 ) -> Solution:
-    """Fit all parameters of the model to the readings.
-
-    Args:
-        model: the model.
-        readings: without gross errors.
-        w: scaling of the readings.
-        start: (P,) first parameters; else zero, or the mean of a carried prior.
-        prior: (P,) fixed prior standard deviations; else the evidence chooses those of shrunk
-            families.
-    """
+    """Fit all parameters of the model to the readings."""
     space = coordinates_of(model)
     if len(space.index):
         theta = space.theta(np.zeros(model.size)) if start is None else start

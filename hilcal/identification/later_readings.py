@@ -13,7 +13,7 @@ c by the residual (`earlier_fit`). The minimum over u, p, b and δ of
 
     ‖y − f‖² / (a V) + ‖u‖² + ‖p‖² / (c V̄)
 
-is rᵀ M r of the linearised problem (`regression.projection`): what the earlier fit does not
+is rᵀ M r of the linearised problem (`regression.schur`): what the earlier fit does not
 explain. Without any change it follows χ² with as many degrees of freedom as
 there are elements beyond the flat parameters.
 """
@@ -30,17 +30,17 @@ from hilcal.effects.protocol import Effect, Role
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.arm_scatter import with_arm_scatter
 from hilcal.identification.baseline import ARM
+from hilcal.identification.carried import scales_of
 from hilcal.identification.fit import Fit
+from hilcal.identification.gauss_newton import shortened
 from hilcal.identification.predictive import Predictive, predictive_of
-from hilcal.identification.priors import scales_of
 from hilcal.identification.registration import register, targets_as_fitted
 from hilcal.identification.residual import residual
-from hilcal.identification.solver import shortened
 from hilcal.identification.validation import require_columns
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening, covariance_blocks, whitening
-from hilcal.regression.projection import Projection, projection
+from hilcal.regression.schur import Projection, projection
 from hilcal.types import Floats
 
 # All of these are choices.
@@ -156,10 +156,7 @@ class Setting:
 
 @dataclass(frozen=True, eq=False)
 class Remeasured:
-    """Later readings explained by an earlier fit and changes of the arm, at some coordinates.
-
-    R whitened rows, K coordinates u, b and δ, L coordinates p, P parameters.
-    """
+    """Later readings explained by an earlier fit and changes: rows R, coordinates K and L."""
 
     setting: Setting  # the readings and the earlier fit
     changes: tuple[Moving, ...]
@@ -375,8 +372,7 @@ def remeasure(
 ) -> Remeasured:
     """Find the minimum by Gauss-Newton on the exact chain, with flat changes of the arm.
 
-    `start` may be a minimum with the first of the changes. Raises CannotAnswerError where there is
-    no static equilibrium.
+    `start` may be a minimum with the first changes. CannotAnswerError: no static equilibrium.
     """
     k, sizes = later.lift.shape[1], [c.directions.shape[1] for c in changes]
     effects = tuple({id(c.effect): c.effect for c in changes}.values())

@@ -26,7 +26,7 @@ from typing import Protocol, Self, TypeVar
 import numpy as np
 from scipy.stats import chi2
 
-from hilcal.identification.solver import shortened
+from hilcal.identification.gauss_newton import shortened
 from hilcal.readings.whitening import inverse_root
 from hilcal.types import Bools, Floats, Ints
 
@@ -58,7 +58,6 @@ class ReadingModel:
     """(G, S) rows of the readings of each group, unloaded ones first, −1 beyond the last."""
 
     def __len__(self) -> int:
-        """Return the number of readings N."""
         return len(self.residual)
 
     @property
@@ -140,8 +139,8 @@ class ReadingModel:
     def near(self, delta: Floats) -> tuple[Floats, Bools]:
         """Squared distances (N,) from the model with δ (K,), and which readings are centres (N,).
 
-        Readings of a group are compared with one of them, its centre, at the distance zero: that
-        with the least Σ log(1 + d²), which is near most others wherever the rest are.
+        Readings of a group are compared with one of them, its centre: that with the least
+        Σ log(1 + d²), which is near most others wherever the rest are.
         """
         r = self.residual - self.columns @ delta
         d2, centre = np.asarray(np.sum(r**2, axis=1)), np.zeros(len(self), dtype=np.bool_)
@@ -265,8 +264,8 @@ def bulk(distance2: Floats, m: int) -> float:
 def limit(m: int, count: int, scale: float = 1.0) -> float:
     """Squared distance from which on one of `count` measurements is a gross error.
 
-    It is the χ²_m quantile that a good reading exceeds in one of a thousand campaigns, times the
-    scale of the bulk where that is wider than the stated noise.
+    The χ²_m quantile that a good reading exceeds in one of a thousand campaigns, times the scale of
+    the bulk where that is wider than the stated noise.
     """
     far = float(chi2.isf(FALSE_ALARMS / count, m)) * max(1.0, scale)
     chance, sure = MISFIT

@@ -1,4 +1,4 @@
-"""The linearisation of a fit: evidence and predictions of effects that are not in the model.
+"""The linearisation of a fit: columns, evidence and predictions of effects that it lacks.
 
 The ranking of effects that could be missing and the planning of measurements that separate them
 both use it, so that the power of the plan and the test of the diagnosis have the same information.
@@ -9,35 +9,98 @@ columns,
 
     r₀ = y − A H⁻¹ Aᵀ y
 
-is the residual against which the eliminated columns, and columns that could replace them, are
-scored.
+is the residual against which these, and columns that could replace them, are scored.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 
 import numpy as np
 
-from hilcal.identification.effect_columns import EffectColumns
+from hilcal.effects.protocol import Effect
+from hilcal.identification.carried import scales_of
 from hilcal.identification.fit import Fit
 from hilcal.identification.folds import folds_of, random_folds
 from hilcal.identification.gauss_newton import columns_of
-from hilcal.identification.priors import scales_of
+from hilcal.readings.whitening import Whitening
 from hilcal.regression.evidence import FamilyScore, Spectrum, score_family
-from hilcal.regression.leave_out import (
-    FamilyProducts,
-    Fold,
-    family_products,
-    improves,
-    left_out_of_families,
-    left_out_residual,
-)
+from hilcal.regression.leave_out import FamilyFolds, Fold, improves
 from hilcal.regression.normal_equations import Basis, find_basis, normal_equations
-from hilcal.regression.projection import Projection
+from hilcal.regression.schur import Projection
 from hilcal.types import Bools, Floats, Ints
 
 LEAST_MISFIT = 3.0  # least value of a misfit, in standard deviations of χ²; a choice
+TOGETHER = 4_000_000  # most numbers computed together, 32 MB; freed with the last effect of them
+
+
+@dataclass(frozen=True, eq=False)
+class EffectColumns:
+    """The columns of an effect in ordinary magnitudes of its parameters."""
+
+    effect: Effect
+    scale: Floats  # (P,) ordinary magnitudes, SI
+    together: Floats  # (R, Q) columns of all effects whitened together
+    within: slice  # the P columns of this effect
+    of_readings: Floats  # (N, m, P) motion of the fitted readings, sensor axes, m and rad
+    whitening: Whitening  # of the readings
+    bare: Bools  # (N,) unloaded readings
+
+    @property
+    def white(self) -> Floats:
+        """(R, P) whitened columns."""
+        return self.together[:, self.within]
+
+    @cached_property
+    def motion(self) -> Floats:
+        """(D, 3, P) displacement of each measured position, m."""
+        return self.whitening.raw(self.of_readings[:, :3])
+
+    @cached_property
+    def unloaded(self) -> Floats:
+        """(U, 3, P) displacement of the target in each unloaded reading, sensor axes, m."""
+        return np.asarray(self.of_readings[self.bare, :3])
+
+
+def computable(fit: Fit, effect: Effect) -> bool:
+    """Whether the fitted readings have the columns that an effect needs."""
+    return type(effect).computable(fit.solution.prediction.situation.states)
+
+
+def effect_columns(fit: Fit, effect: Effect) -> EffectColumns:
+    """Return the columns of an effect outside of the model, at the parameters of the fit."""
+    return next(columns_of_each(fit, (effect,)))
+
+
+def columns_of_each(fit: Fit, effects: Sequence[Effect]) -> Iterator[EffectColumns]:
+    """Yield `effect_columns` of several effects."""
+    return chain.from_iterable(columns_in_parts(fit, effects))
+
+
+def columns_in_parts(fit: Fit, effects: Sequence[Effect]) -> Iterator[tuple[EffectColumns, ...]]:
+    """Yield `effect_columns` of several effects in order, in parts that are computed together.
+
+    A part has up to `TOGETHER` numbers; the equilibrium is differentiated once for each part.
+    """
+    w, s = fit.whitening, fit.solution
+    count, bare = len(s.prediction.situation.angle) * w.m, fit.readings[~fit.outlier].unloaded
+    ends = np.cumsum([0, *(count * len(e.magnitudes) for e in effects)])
+    start = 0
+    while start < len(effects):
+        fitting = int(np.searchsorted(ends, ends[start] + TOGETHER, side="right")) - 1
+        stop = max(fitting, start + 1)
+        part, start = tuple(effects[start:stop]), stop
+        scale = np.concatenate([e.magnitudes for e in part])
+        columns = fit.model.jacobian_of(part, s.prediction, s.theta, w.m, scale=scale)
+        white, edges = (
+            w.whiten_readings(columns),
+            np.cumsum([0, *(len(e.magnitudes) for e in part)]),
+        )
+        yield tuple(
+            EffectColumns(e, e.magnitudes, white, within, columns[:, :, within], w, bare)
+            for e, within in zip(part, map(slice, edges[:-1], edges[1:]), strict=True)
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,28 +124,18 @@ class ReducedModel:
     def information(self, x: Floats, gram: Floats, products: Floats) -> Floats:
         """Return Xᵀ M X (Q, Q), M the projection off the columns that stay.
 
-        Args:
-            x: (R, Q) whitened columns X.
-            gram: (Q, Q) XᵀX.
-            products: (P, Q) of the model's columns with X.
+        Of whitened columns X (R, Q), with XᵀX, and products (P, Q) of the model's columns with X.
         """
-        return self._information(self.flat.T @ x, gram, products)
-
-    def _information(self, flat: Floats, gram: Floats, products: Floats) -> Floats:
-        """Return `information` of X from the products (F, Q) of the flat directions with X."""
-        held, count = self.basis.held, self.flat.shape[1]
-        sigma = self.basis.transform[held, count + np.arange(len(held))]
+        held, flat = self.basis.held, self.flat.T @ x
+        sigma = self.basis.transform[held, len(flat) + np.arange(len(held))]
         lifted = self.inverse_root @ np.vstack([flat, sigma[:, None] * products[held]])
         return np.asarray(gram - lifted.T @ lifted)
 
     def score(self) -> FamilyScore:
         """Score the eliminated columns against the model without them."""
-        products = self.gram[:, self.out]
-        # Products with all columns, as selecting columns would copy them.
-        flat = (self.flat.T @ self.columns)[:, self.out]
-        s = self._information(flat, products[self.out], products)
-        slope = (self.columns.T @ self.residual)[self.out]
-        return score_family(s, slope, self.rss, self.dof)
+        x, products = self.columns[:, self.out], self.gram[:, self.out]
+        s = self.information(x, products[self.out], products)
+        return score_family(s, x.T @ self.residual, self.rss, self.dof)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,8 +171,8 @@ class Linearisation:
         The strengths are those of the fit, as in `held_out`; `Fit.left_out` has strengths chosen
         without the pose.
         """
-        white = left_out_residual(self.folds, self.projection, self.fit.white)
-        return by_pose(self.fit, white)
+        model = FamilyFolds(self.folds, self.projection)
+        return by_pose(self.fit, model.left_out(self.fit.white, of_fit=True))
 
     @cached_property
     def folds(self) -> tuple[Fold, ...]:
@@ -131,31 +184,24 @@ class Linearisation:
         """Return M X of whitened columns X (R, P)."""
         return self.projection.project_out(x)
 
-    def information(self, x: Floats | FamilyProducts) -> Floats:
+    def information(self, x: Floats | FamilyFolds) -> Floats:
         """Return S = Xᵀ M X (P, P) of whitened columns X (R, P), or of their products."""
-        if isinstance(x, FamilyProducts):
-            return self.projection.schur(x.whole.gram, x.whole.cross)
+        if isinstance(x, FamilyFolds):
+            return self.projection.schur(x.gram, x.cross)
         return self.projection.information(x)
 
-    def products(self, families: Iterable[Floats]) -> list[FamilyProducts]:
+    def products(self, families: Iterable[Floats]) -> list[FamilyFolds]:
         """Return the products of families of whitened columns, for `held_out`."""
-        return family_products(self.folds, self.projection, self.fit.white, families)
+        return [FamilyFolds(self.folds, self.projection, x) for x in families]
 
     def score(
         self, x: Floats, s: Floats | Spectrum | None = None, most: float = np.inf
     ) -> FamilyScore:
-        """Score whitened columns X (R, P) as an addition to the model.
-
-        Args:
-            x: X.
-            s: (P, P) S or its spectrum, if computed before.
-            most: largest plausible strength.
-        """
-        s = self.information(x) if s is None else s
-        return self.score_of(s, x.T @ self.residual, most)
+        """Score whitened columns X (R, P) as an addition; with S if known; see `score_of`."""
+        return self.score_of(self.information(x) if s is None else s, x.T @ self.residual, most)
 
     def score_of(self, s: Floats | Spectrum, g: Floats, most: float = np.inf) -> FamilyScore:
-        """Score a family by S, or its spectrum, and g = Xᵀ r (P,); see `families`."""
+        """Score a family by S, or its spectrum, g = Xᵀ r (P,), and the largest plausible size."""
         return score_family(s, g, self.rss, self.fit.dof, most=most)
 
     def families(self, columns: Sequence[EffectColumns]) -> list[tuple[Floats, Floats]]:
@@ -180,26 +226,20 @@ class Linearisation:
         """Return a reduction of ‖r‖² as a share of the misfit, within [0, 1]."""
         return float(np.clip(gain / self.misfit(), 0.0, 1.0))
 
-    def held_out(self, families: Sequence[tuple[FamilyProducts, FamilyScore]]) -> list[HeldOut]:
-        """Return the reduction of the held-out error by each family alone.
-
-        A family is given by its products, and its score, which has its ridge; see
-        `regression.leave_out`.
-        """
-        visible = [(products, score.ridge) for products, score in families if score.rank]
-        residuals = iter(left_out_of_families(self.folds, self.projection, self.fit.white, visible))
-        return [
-            self._held_out(next(residuals)) if score.rank else HeldOut(0.0, False)
-            for _, score in families
-        ]
-
-    def _held_out(self, residual: Floats) -> HeldOut:
-        """Compare a residual (R,) predicted without each pose with that of the model alone."""
-        noise = self.fit.whitening.rank
-        before, after = self.left_out, by_pose(self.fit, residual)
+    def held_out(self, families: Sequence[tuple[FamilyFolds, FamilyScore]]) -> list[HeldOut]:
+        """Return the reduction of the held-out error by each family, with its score's ridge."""
+        noise, before = self.fit.whitening.rank, self.left_out
         misfit = max(float(before.sum()) - noise, LEAST_MISFIT * np.sqrt(2 * noise))
-        gain = float(before.sum() - after.sum())
-        return HeldOut(float(np.clip(gain / misfit, -1.0, 1.0)), improves(before, after))
+        out = []
+        for family, score in families:
+            if not score.rank:
+                out.append(HeldOut(0.0, False))
+                continue
+            after = by_pose(self.fit, family.left_out(self.fit.white, score.ridge, of_fit=True))
+            gain = float(before.sum() - after.sum())
+            share = float(np.clip(gain / misfit, -1.0, 1.0))
+            out.append(HeldOut(share, improves(before, after)))
+        return out
 
 
 def linearise(fit: Fit) -> Linearisation:
@@ -262,27 +302,16 @@ def left_out_by_pose(fit: Fit) -> Floats:
 
 
 def eliminate_columns(
-    columns: Floats,
-    gram: Floats,
-    white: Floats,
-    theta: Floats,
-    prior: Floats,
-    out: Bools,
-    beta: float,
-    rank: int,
+    columns: Floats,  # (R, P) whitened columns A
+    gram: Floats,  # (P, P) AᵀA
+    white: Floats,  # (R,) whitened residual of the fit
+    theta: Floats,  # (P,) parameters of the fit
+    prior: Floats,  # (P,) prior standard deviations, infinite for flat, zero for held parameters
+    out: Bools,  # (P,) columns to eliminate
+    beta: float,  # noise factor of the fit
+    rank: int,  # number of rows with information
 ) -> ReducedModel:
-    """Eliminate columns from a fitted linear model.
-
-    Args:
-        columns: (R, P) whitened columns A.
-        gram: (P, P) AᵀA.
-        white: (R,) whitened residual of the fit.
-        theta: (P,) parameters of the fit.
-        prior: (P,) prior standard deviations, infinite for flat parameters, zero for held ones.
-        out: (P,) columns to eliminate.
-        beta: noise factor of the fit.
-        rank: number of rows with information.
-    """
+    """Eliminate columns from a fitted linear model."""
     stay = ~out & (prior > 0)
     basis = find_basis(columns, np.ones(columns.shape[1]), np.where(stay, prior, 0.0))
     y = white + columns @ np.where(out, theta, 0.0)
@@ -294,14 +323,6 @@ def eliminate_columns(
     root = equations.inverse_root(beta)
     step = basis.transform @ (root.T @ (root @ (equations.rhs - ridge * z)))
     shrunk = float(np.sum(ridge * np.sum(root**2, axis=0)))
-    determined = float(np.count_nonzero(np.any(root, axis=1)))
-    return ReducedModel(
-        columns=columns,
-        out=out,
-        basis=basis,
-        flat=basis.flat_rows(columns),
-        inverse_root=root,
-        gram=gram,
-        residual=y - columns @ step,
-        dof=rank - (determined - shrunk),
-    )
+    dof = rank - (float(np.count_nonzero(np.any(root, axis=1))) - shrunk)
+    rows = basis.flat_rows(columns)
+    return ReducedModel(columns, out, basis, rows, root, gram, y - columns @ step, dof)

@@ -4,47 +4,50 @@ After registration the nominal arm misses readings by its geometric errors, some
 larger misfit is no effect but a wrong description. Single hypotheses (`KINDS`) are tried on some of
 the readings, then the best of them in combination (beam search), until one explains the readings.
 
-Arms of one size differ by millimetres from one generation to the next, and registration hides part
-of that: readings of a UR10 leave some 4 mm with the description of a UR10e, which is not too much
-for an arm before calibration. So every arm of the catalogue with as many joints is registered to
-the readings as the described one was (`other_arm`). With e the displacements by the errors of the
-true arm and d those from one description to the other, the frames projected off, the wrong
-description leaves |e + d| and the right one |e|. One that leaves less than half of what the
-described one leaves is named. Were the described arm the right one then, |e − d| ≤ |e|/2: its
-errors would be larger than 2/3 |d|, and lie along d.
+Arms of one size differ by millimetres from one generation to the next, which is not too much for an
+arm before calibration. So every arm of the catalogue with as many joints is registered to the
+readings, too (`other_arm`). With e the displacements by the errors of the true arm and d those from
+one description to the other, the frames projected off, the wrong description leaves |e + d| and the
+right one |e|. One that leaves less than half of what the described one leaves is named. Were the
+described arm the right one then, |e − d| ≤ |e|/2: its errors would be larger than 2/3 |d|, and lie
+along d.
 """
 
-import json
-from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, reduce
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
 from hilcal.cell import Cell
-from hilcal.config.sections import Conventions
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.registration import (
+from hilcal.identification.hypotheses import (
+    Described,
+    Hypothesis,
+    Way,
+    hypotheses,
+    keys,
+    mended,
+    pairs,
+    shifts,
+)
+from hilcal.identification.placement import (
     FrameData,
     Frames,
     Placement,
-    Registration,
     angles,
     best_placement,
     free_parameters,
     given_and_free,
-    register,
+    minimise,
 )
+from hilcal.identification.registration import Registration, register
 from hilcal.identification.residual import noise_floor
-from hilcal.identification.solver import minimise
 from hilcal.numbers import length
 from hilcal.readings.readings import Readings
-from hilcal.robot import se3
-from hilcal.robot.arm import Arm, as_counted, may_follow, with_conventions
-from hilcal.robot.catalogue import load_arm, other_arms
+from hilcal.robot.arm import Arm, as_counted
+from hilcal.robot.catalogue import other_arms
 from hilcal.robot.chain import evaluate
 from hilcal.types import Bools, Floats, Ints
 
@@ -69,303 +72,10 @@ HALF = 0.5  # share of the described arm's misfit that another may leave to be n
 # simulated arms off by 1 and 3 mm and mrad none was named another one (test_other_arm keeps some)
 BEYOND_NOISE = 3.0  # misfit in standard deviations from which on other arms are tried
 ARM_ROWS, ARM_STEPS = 100, 10  # readings that every arm is tried on; steps of its registration
-SHIFTS = (1, -1, 2, -2)  # rows by which joints and positions are tried against each other
 TRIED = (
     "signs, zeros, couplings and columns of the joints, units, shifted rows, mirrored axes, "
     "inverse poses, other arms, alone and in combination"
 )
-MIRROR = np.array([1.0, -1.0, 1.0])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Described:
-    """Arm and readings as they are described."""
-
-    arm: Arm
-    q: Floats  # (N, n) joint values, rad
-    value: Floats  # (N, 3) positions, m
-    turn: Floats | None  # (N, 3) rotation vectors of the attitudes, rad
-    base_unknown: bool
-    target_unknown: bool
-    shift: int = 0  # by how many rows the joint values come after their positions
-    conventions: Conventions | None = None  # how the controller counts any arm's joints
-
-    @property
-    def paired(self) -> Bools:
-        """(N,) rows that have joint values and a position under the shift."""
-        k = np.arange(len(self.q)) + self.shift
-        return (k >= 0) & (k < len(self.q))
-
-
-@dataclass(frozen=True, slots=True)
-class Hypothesis:
-    """One possible error of the description."""
-
-    kind: str  # key of `KINDS`
-    joint: int = 0  # number from 1, where it is about one
-    sign: int = 1  # −1 where the joint turns the other way
-    offset: float = 0.0  # of its zero, rad: the chain turns by sign q + offset
-    follows: int = 0  # number of the joint that it follows, from 1; with `factor`
-    factor: float = 0.0  # of the coupling
-    arm: str = ""  # another arm of the catalogue
-    shift: int = 0  # as of `Described`
-    order: tuple[int, ...] = ()  # column, from 1, that holds the values of each joint
-
-    @property
-    def is_zero(self) -> bool:
-        """Whether it is only the zero of a joint, off by other than quarter turns."""
-        quarters = self.offset / (np.pi / 2)
-        return self.kind == "joint" and self.sign > 0 and abs(quarters - round(quarters)) > 0.02
-
-    @property
-    def cost(self) -> int:
-        """Number of changes: another zero together with the other sign counts two."""
-        return 1 + (self.kind == "joint" and self.sign < 0 and self.offset != 0.0)
-
-    @property
-    def subject(self) -> tuple[str, int, int]:
-        """The subject; two hypotheses on one subject are not combined."""
-        return self.kind, self.joint, self.follows
-
-    @property
-    def order_of_trial(self) -> tuple[object, ...]:
-        """Hypotheses about the arm come first, then those about joints, then couplings."""
-        rank = {"arm": 0, "joint": 1, "coupling": 2}.get(self.kind, 3)
-        return (rank, *self.subject, self.sign, self.offset)
-
-    def applied(self, d: Described) -> Described:
-        """Return arm and readings under this hypothesis."""
-        return KINDS[self.kind].applied(d, self)
-
-    @property
-    def words(self) -> str:
-        """What is wrong, in a phrase."""
-        phrase = KINDS[self.kind].words
-        return phrase if isinstance(phrase, str) else phrase(self)
-
-
-Applied = Callable[[Described, Hypothesis], Described]
-Way = tuple[Hypothesis, ...]
-"""Hypotheses that are tried together."""
-
-
-@dataclass(frozen=True, slots=True)
-class Kind:
-    """A row of the table."""
-
-    applied: Applied  # arm and readings under a hypothesis
-    words: str | Callable[[Hypothesis], str]  # what is wrong, in a phrase
-    mended: str | None = None  # a line of CELL.toml; '' where `keys` says it; None: in the table
-
-
-def _recounted(d: Described, h: Hypothesis) -> Described:
-    n, j = d.arm.n, h.joint - 1
-    sign, offset, coupling = np.ones(n), np.zeros(n), np.zeros((n, n))
-    sign[j], offset[j] = h.sign, h.offset
-    if h.follows:
-        coupling[j, h.follows - 1] = h.factor
-    return replace(d, arm=with_conventions(d.arm, sign, offset, coupling))
-
-
-def _another_arm(d: Described, h: Hypothesis) -> Described:
-    arm = load_arm(h.arm)
-    return replace(d, arm=arm if d.conventions is None else as_counted(arm, d.conventions))
-
-
-def _mapped(name: str, change: Callable[[Any], Any]) -> Applied:
-    """Return a change of one attribute of the description, unless that is None."""
-
-    def applied(d: Described, _: Hypothesis) -> Described:
-        value = getattr(d, name)
-        return d if value is None else replace(d, **{name: change(value)})
-
-    return applied
-
-
-def _angles_by(turning: Callable[[Floats], Floats], sliding: float = 1.0) -> Applied:
-    """Return a change of the joint values: a function of those that turn, a factor of slides."""
-    return lambda d, _: replace(d, q=np.where(d.arm.slides, sliding * d.q, turning(d.q)))
-
-
-def _mirrored(d: Described, _: Hypothesis) -> Described:
-    # D exp(w) D = exp(−D w) for a reflection D
-    turn = None if d.turn is None else -d.turn * MIRROR
-    return replace(d, value=d.value * MIRROR, turn=turn)
-
-
-def _inverse(d: Described, _: Hypothesis) -> Described:
-    if d.turn is None:
-        return d
-    back = np.asarray(-np.einsum("nji,nj->ni", se3.rotation(d.turn), d.value))
-    return replace(d, value=back, turn=-d.turn)
-
-
-def _joint_words(h: Hypothesis) -> str:
-    degrees = np.degrees(h.offset)
-    if h.sign > 0:
-        return f"joint {h.joint}'s zero is {degrees:.4g}° elsewhere in these data"
-    turned = f"joint {h.joint} turns the other way in these data"
-    return turned if not h.offset else f"{turned} and counts from {degrees:.4g}°"
-
-
-def _coupling_words(h: Hypothesis) -> str:
-    way = "with" if h.factor > 0 else "against"
-    return f"joint {h.joint} turns {way} joint {h.follows} (a coupling of {h.factor:+g})"
-
-
-def _shift_words(h: Hypothesis) -> str:
-    rows = "row" if abs(h.shift) == 1 else "rows"
-    way = "before" if h.shift > 0 else "after"
-    return f"each position stands {abs(h.shift)} {rows} {way} the joint values it belongs to"
-
-
-def _columns_words(h: Hypothesis) -> str:
-    moved = [(j, k) for j, k in enumerate(h.order, 1) if j != k]
-    if len(moved) == 2:
-        return f"the columns of joints {moved[0][0]} and {moved[1][0]} are exchanged"
-    listed = ", ".join(f"joint {j}'s values are in the column of joint {k}" for j, k in moved)
-    return f"the columns of the joints are in another order: {listed}"
-
-
-KINDS: dict[str, Kind] = {
-    "arm": Kind(_another_arm, lambda h: f"the arm is another one, {h.arm}", ""),
-    "joint": Kind(_recounted, _joint_words, ""),
-    "coupling": Kind(_recounted, _coupling_words, ""),
-    "base_unknown": Kind(
-        _mapped("base_unknown", lambda _: True),
-        "the base stands elsewhere than [tracker] says",
-        "leave out [tracker] base_xyz_m and base_rotvec_rad",
-    ),
-    "target_unknown": Kind(
-        _mapped("target_unknown", lambda _: True),
-        "the target sits elsewhere than [tool] says",
-        "leave out [tool] target_m",
-    ),
-    "millimetres": Kind(
-        _mapped("value", lambda p: 1e-3 * p), "the positions are millimetres, not metres"
-    ),
-    "metres": Kind(
-        _mapped("value", lambda p: 1e3 * p),
-        "the positions are metres, and were taken for millimetres",
-    ),
-    "joint_degrees": Kind(_angles_by(np.radians), "the joint values are degrees, not radians"),
-    "joint_radians": Kind(
-        _angles_by(np.degrees), "the joint values are radians, and were taken for degrees"
-    ),
-    "travel_millimetres": Kind(
-        _angles_by(np.positive, 1e-3),
-        "the travels of the joints that slide are millimetres, not metres",
-    ),
-    "turn_degrees": Kind(_mapped("turn", np.radians), "the attitudes are degrees, not radians"),
-    "turn_radians": Kind(
-        _mapped("turn", np.degrees), "the attitudes are radians, and were taken for degrees"
-    ),
-    "mirrored": Kind(
-        _mirrored, "the axes of the readings are left-handed: one coordinate has the other sign"
-    ),
-    "mirrored_positions": Kind(
-        _mapped("value", lambda p: p * MIRROR), "one coordinate of the positions has the other sign"
-    ),
-    "inverse": Kind(
-        _inverse, "the poses are the inverse ones, of the tracker in the target's axes"
-    ),
-    "inverse_attitude": Kind(_mapped("turn", np.negative), "the attitudes are the inverse ones"),
-    "shift": Kind(
-        lambda d, h: replace(d, q=np.roll(d.q, -h.shift, axis=0), shift=d.shift + h.shift),
-        _shift_words,
-    ),
-    "columns": Kind(lambda d, h: replace(d, q=d.q[:, np.array(h.order) - 1]), _columns_words),
-}
-"""All kinds of hypotheses."""
-OF_ATTITUDES = ("mirrored_positions", "turn_degrees", "turn_radians", "inverse", "inverse_attitude")
-
-
-def hypotheses(d: Described) -> Iterator[Hypothesis]:
-    """Yield the single hypotheses."""
-    n, slides = d.arm.n, d.arm.slides
-    if not d.base_unknown:
-        yield Hypothesis("base_unknown")
-    if not d.target_unknown:
-        yield Hypothesis("target_unknown")
-    for j in range(1, n + 1):
-        for sign in (-1, 1):
-            for quarter in (0, 2, 1, -1):
-                if (sign < 0 or quarter) and not (quarter and slides[j - 1]):
-                    yield Hypothesis("joint", j, sign, quarter * np.pi / 2)
-    for joint, follows in may_follow(n):
-        for factor in (1.0, -1.0) if slides[joint - 1] == slides[follows - 1] else ():
-            yield Hypothesis("coupling", joint, follows=follows, factor=factor)
-    simple = ["millimetres", "metres", "joint_degrees", "joint_radians", "mirrored"]
-    simple += ["travel_millimetres"] * bool(slides.any())
-    yield from map(Hypothesis, simple if d.turn is None else [*simple, *OF_ATTITUDES])
-    yield from (Hypothesis("arm", arm=arm.name) for arm in other_arms(d.arm))
-    yield from (Hypothesis("shift", shift=k) for k in shifts(len(d.q)))
-    # Columns: two exchanged, all rotated, or reversed.
-    straight, orders = tuple(range(1, n + 1)), []
-    for i, j in combinations(range(n), 2):
-        order = list(straight)
-        order[i], order[j] = order[j], order[i]
-        orders.append(tuple(order))
-    orders += [(*straight[k:], *straight[:k]) for k in range(1, n)]
-    orders.append(straight[::-1])
-    yield from (Hypothesis("columns", order=order) for order in dict.fromkeys(orders))
-
-
-def shifts(count: int) -> Iterator[int]:
-    """Yield the shifts of rows that leave at least half of so many readings to judge by."""
-    yield from (k for k in SHIFTS if 2 * abs(k) <= count)
-
-
-def pairs(n: int) -> Iterator[Way]:
-    """Yield pairs that hide each other: two signs, and the zeros of two neighbours."""
-    for i, j in combinations(range(1, n + 1), 2):
-        yield Hypothesis("joint", i, -1), Hypothesis("joint", j, -1)
-    for j in range(1, n):
-        for a in (1, -1, 2):
-            for b in (1, -1, 2):
-                zeros = (a * np.pi / 2, b * np.pi / 2)
-                yield Hypothesis("joint", j, 1, zeros[0]), Hypothesis("joint", j + 1, 1, zeros[1])
-
-
-def mended(way: Way, cell: Cell) -> str:
-    """Return what to write into CELL.toml, or to change in the table; begins with '; '."""
-    lines = [f'[robot] model = "{h.arm}"' for h in way if h.arm][:1]
-    lines += [f"[robot] {key} = {value}" for key, value in keys(way, cell).items()]
-    where = [KINDS[h.kind].mended for h in way]
-    lines += [line for line in where if line]
-    advice = f"; in CELL.toml: {', '.join(lines)}" if lines else ""
-    return f"{advice}; correct it in the table" if None in where else advice
-
-
-def keys(way: Way, cell: Cell) -> dict[str, str]:
-    """Return the keys of [robot] that describe the joints under some hypotheses, as TOML."""
-    n, robot = cell.arm.n, None if cell.config is None else cell.config.robot
-    sign = np.array((robot and robot.joint_sign) or (1,) * n)
-    zero = np.array((robot and robot.joint_offset_deg) or (0.0,) * n)
-    coupled = [
-        c.model_dump(exclude_defaults=True) | {"factor": c.factor}
-        for c in (robot.joint_coupling if robot else ())
-    ]
-    for h in way:
-        j = h.joint - 1
-        if h.offset:
-            zero[j] += sign[j] * np.degrees(h.offset)
-        if h.sign < 0:
-            sign[j] *= -1
-        if h.follows:
-            factor = float(sign[j] * h.factor)
-            coupled.append({"joint": h.joint, "follows": h.follows, "factor": factor})
-    entries = [", ".join(f"{k} = {json.dumps(v)}" for k, v in c.items()) for c in coupled]
-    values = (
-        (any(h.sign < 0 for h in way), json.dumps([int(s) for s in sign])),
-        (any(h.offset for h in way), json.dumps([round(float(z), 4) + 0.0 for z in zero])),
-        (any(h.follows for h in way), f"[{', '.join(f'{{ {entry} }}' for entry in entries)}]"),
-    )
-    return {
-        key: value
-        for key, (changed, value) in zip(Conventions.model_fields, values, strict=True)
-        if changed
-    }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -420,7 +130,6 @@ class DescriptionFinding:
         )
 
     def _rows_named(self, readings: Readings) -> str:
-        """Name the rows that do not fit while most do."""
         which = np.flatnonzero(self.rows).tolist()
 
         def name(k: int) -> str:
@@ -503,8 +212,6 @@ def examine(registered: Registration, readings: Readings) -> DescriptionFinding 
 
 
 class _DescriptionSearch:
-    """Descriptions that are tried on the same readings."""
-
     def __init__(self, cell: Cell, readings: Readings, enough: float) -> None:
         self._cell, self._readings = cell, readings
         self.enough, self.tried = enough, 0
@@ -537,12 +244,9 @@ class _DescriptionSearch:
                 for h in additions
                 if h.subject not in [g.subject for g in partial]
             ]
-            if depth == 1:
-                ways += [
-                    way
-                    for way in pairs(self._cell.arm.n)
-                    if not any(h.offset and slides[h.joint - 1] for h in way)
-                ]
+            for way in pairs(self._cell.arm.n) if depth == 1 else ():
+                if not any(h.offset and slides[h.joint - 1] for h in way):
+                    ways.append(way)
             rough = {w: self.score(w, True) for w in dict.fromkeys(map(_sorted, ways))}
             best = sorted(rough, key=lambda w: (rough[w], _cost(w)))[:CAREFUL]
             scores = {**rough, **{w: self.score(w) for w in best}}
@@ -560,8 +264,7 @@ class _DescriptionSearch:
 
         Where a pose has many readings, only its last one is wrong, and looks like a gross error.
         """
-        count = len(self._readings)
-        ways: list[Way] = [(Hypothesis("shift", shift=k),) for k in shifts(count)]
+        ways: list[Way] = [(h,) for h in shifts(len(self._readings))]
         tried = {way: self.score(way) for way in ways}
         return _explained(tried, min(self.enough, self.score(()) / FACTOR)) if tried else ()
 
@@ -644,10 +347,7 @@ class _DescriptionSearch:
         return data, frames, free_parameters(d.base_unknown, ~fixed, axes)
 
     def _described(self, way: Way) -> Described:
-        d = self._stated
-        for h in way:
-            d = h.applied(d)
-        return d
+        return reduce(lambda d, h: h.applied(d), way, self._stated)
 
     def _robust(self, way: Way) -> tuple[float, Bools, Placement]:
         """Register with weights by which rows that do not fit lose their influence.
@@ -692,7 +392,9 @@ def _cost(way: Way) -> int:
 
 
 def _sorted(way: Way) -> Way:
-    return tuple(sorted(way, key=lambda h: h.order_of_trial))
+    """Hypotheses about the arm come first, then those about joints, then couplings."""
+    rank = {"arm": 0, "joint": 1, "coupling": 2}
+    return tuple(sorted(way, key=lambda h: (rank.get(h.kind, 3), *h.subject, h.sign, h.offset)))
 
 
 def _levers(m: int) -> Floats:

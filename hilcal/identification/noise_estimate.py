@@ -8,18 +8,14 @@ estimated where [repeatability] does not state it:
     V = f_a² V_along + f_c² V_across + f_o² V_orientation + σ_q² R J Jᵀ Rᵀ
 
 They are variance components, estimated by restricted maximum likelihood together with the frames
-and with every effect of the catalogue as random effects (see `hilcal.mixed`), so that no effect
-counts as noise, nor noise as an effect. Gross errors are left out.
-
-Where the readings show several effects at once, as those of most real arms do, few of them cannot
-separate noise from effects: the default stays then, and a fit of all effects estimates the noise
-with them (see `identification.background`).
+and with every effect of the catalogue as random effects (see `hilcal.mixed`), without gross errors.
+Where the readings show several effects at once, few of them cannot separate noise from effects: the
+default stays then, and a fit of all effects estimates the noise (`identification.background`).
 
 The covariance of a measured reading is that of the mean of its samples, of which the default is the
-prior. Errors of the instrument that change from pose to pose do not show in them, and of another
-instrument few samples tell little. Where the readings of a campaign contradict them,
-f_a, f_c and f_o are stored with it (`measured_noise`), and the default's covariance times these
-takes their place when it is opened (`with_noise_factors`); the arm's scatter is left to diagnosis.
+prior. Errors of the instrument that change from pose to pose do not show in them. Where the
+readings of a campaign contradict them, f_a, f_c and f_o are stored with it (`measured_noise`), and
+the default's covariance times these takes their place when it is opened (`with_noise_factors`).
 """
 
 import json
@@ -164,14 +160,11 @@ def _sizes(readings: Readings, station: Sequence[float] | None) -> dict[str, flo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Components:
-    """Estimated components of the noise of readings."""
-
     model: Model  # frames, at which the arm's scatter is evaluated
     factors: Mapping[str, float]  # standard deviations, in those of the default and `SCATTER_RAD`
     log_errors: Mapping[str, float]  # standard errors of their logs
 
     def estimate(self, readings: Readings, station: Sequence[float] | None) -> NoiseEstimate:
-        """Return the noise in figures."""
         size = {k: self.factors[k] * s for k, s in _sizes(readings, station).items()}
         turn = size.get(ORIENTATION)
         scatter = self.factors.get(SCATTER)
@@ -185,7 +178,6 @@ class _Components:
 
 
 def _components(readings: Readings, cell: Cell, config: CellConfig) -> _Components | None:
-    """Estimate the components of the noise; None as of `with_estimated_noise`."""
     if len(np.unique(readings.pose)) < FEWEST_POSES or readings.scalar.any():
         return None
     mode, share = usual_mode(readings), MOST_ROWS / readings.value.size

@@ -7,43 +7,45 @@ included,
 
 is the information: Λ the precision of the effects' own priors, σ² the noise factor, κ ≥ 1 by how
 much errors at poses left out exceed what the parameters explain. The strengths of shrunk families
-are those of `predictive.family_prior`: a harmonic that the readings did not need is not known to be
-zero where nothing was measured. Parameters of the setup (frames, tool, instruments;
+are those of `predictive.family_prior`. Parameters of the setup (frames, tool, instruments;
 `Effect.of_setup`) are marginalised out, by the Schur complement of M. What the readings did not
 determine has no information: not a large variance, and not a zero one.
 
 Two campaigns of one arm are compared in the same gauge (`parameter_differences`). Their likelihoods
-of the parameters that both have, without the effects' own priors and all others marginalised out,
-have the information I_A and I_B; that on d = θ_B − θ_A is the parallel sum (Anderson and Duffin,
-J. Math. Anal. Appl. 26 (1969) 576-594)
+of the parameters that both have, all others marginalised out, have the information I_A and I_B;
+that on d = θ_B − θ_A is the parallel sum (Anderson and Duffin, J. Math. Anal. Appl. 26 (1969) 576)
 
     P = I_A (I_A + I_B)⁻ I_B
 
 singular along every direction that one of the campaigns did not determine: what a frame absorbs, or
-a joint that did not turn. Along these the two fits may differ by anything. So each parameter, and
-each effect as a whole, is compared with all others free within f = `FREE` of their ordinary
-magnitudes: in these, S = ((P + 1/f²)⁻¹_mm)⁻¹ − 1/f² is the information on its difference. What is
-known less well than to one magnitude is not compared.
+a joint that did not turn. So each parameter, and each effect as a whole, is compared with all
+others free within f = `FREE` of their ordinary magnitudes: in these,
+S = ((P + 1/f²)⁻¹_mm)⁻¹ − 1/f² is the information on its difference. What is known less well than
+to one magnitude is not compared.
 """
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.stats import chi2
 
+from hilcal import __version__, limits
 from hilcal.readings.readings import ArmScatter, Range
 from hilcal.readings.whitening import Mode
 from hilcal.regression.normal_equations import INFORMATION, NULL_SHARE
 from hilcal.regression.schur import schur_complement
 from hilcal.shown import Brief
+from hilcal.store.codec import decode, encode, pack, read_document, read_file, unpack
 from hilcal.types import Floats, Ints
 
 if TYPE_CHECKING:
     from hilcal.identification.fit import Fit
 
 
+FORMAT, VERSION = "hilcal-posterior", 1
 FREE = 10.0  # how far the others may differ when one is compared, in ordinary magnitudes; a choice
 LEAST = INFORMATION**2 / 2  # from which a direction is determined, in ordinary magnitudes
 LISTED = 60  # parameters of an effect from which it is compared as a whole only; a choice
@@ -113,11 +115,7 @@ class Posterior(Brief):
 
     @classmethod
     def of(cls, fit: "Fit", source: Source | None = None) -> "Posterior":
-        """Return the posterior of the arm's parameters after a fit.
-
-        Args:
-            fit: gc-scaled.
-            source: where the fit is from; hash and number of its readings are filled in.
+        """Return the posterior of the arm's parameters after a fit, with a hash of its readings.
 
         Raises:
             InputError: a fit of another scaling than gc.
@@ -128,21 +126,28 @@ class Posterior(Brief):
         return posterior_of(fit, source)
 
     def to_json(self) -> dict[str, object]:
-        """Return the posterior as JSON, SI, exactly; see `posterior_document`."""
-        from hilcal.identification.posterior_document import to_json
-
-        return to_json(self)
+        """Return the posterior as JSON, SI; large arrays as base64 of doubles, none rounded."""
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "hilcal": __version__,
+            "arm": self.arm,
+            "readings": self.mode,
+            "parameters": list(self.names),
+            "information": pack(self.information[np.tril_indices(len(self.mean))]),
+            "arm_scatter": encode(self.scatter),
+            "prints": {"columns": self.prints.shape[1], "values": pack(self.prints)},
+            **{
+                k: encode(getattr(self, k))
+                for k in ("links", "source", "effects", "units", "ranges")
+            },
+            **{k: encode(getattr(self, k)) for k in ("scale", "mean", "own_precision")},
+        }
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "Posterior":
-        """Return what `to_json` wrote.
-
-        Raises:
-            InputError: another kind of document, or a newer version.
-        """
-        from hilcal.identification.posterior_document import from_json
-
-        return from_json(content)
+        """Return what `to_json` wrote; an InputError for another, newer or damaged document."""
+        return read_document(content, "prior", FORMAT, (VERSION,), _read)
 
     def index(self, effect: str) -> Ints:
         """Indices of the parameters of an effect; none where it is not among them."""
@@ -165,6 +170,37 @@ class Posterior(Brief):
         return np.where(moved <= NULL_SHARE * std, std * self.scale, np.inf)
 
 
+def read_posterior(path: Path) -> Posterior:
+    """Read a posterior from a JSON file."""
+    return read_file(path, "prior", Posterior.from_json)
+
+
+def _read(content: Mapping[str, Any]) -> Posterior:
+    count, columns = len(content["parameters"]), int(content["prints"]["columns"])
+    limits.check_parameters(count)
+    lower = np.zeros((count, count))
+    lower[np.tril_indices(count)] = unpack(content["information"])
+    named = {
+        "mode": content["readings"],
+        "names": content["parameters"],
+        "information": lower + np.tril(lower, -1).T,
+        "scatter": content["arm_scatter"],
+        "prints": unpack(content["prints"]["values"]).reshape(-1, columns),
+    }
+    p: Posterior = decode(Posterior, {**content, **named})
+    if len(p.units) != count or len(set(p.names)) != count or columns < 5:
+        raise ValueError("its arrays do not fit its parameters")
+    shapes = {a.shape for a in (p.mean, p.scale, p.own_precision)}
+    if shapes != {(count,)} or p.links.shape != (columns - 3, 4, 4):
+        raise ValueError("its arrays do not fit its arm and parameters")
+    numbers = (p.information, p.links, p.prints, p.mean, p.scale, p.own_precision)
+    if not all(np.isfinite(a).all() for a in numbers):
+        raise ValueError("numbers that are not finite")
+    if np.any(p.scale <= 0) or np.any(p.own_precision < 0):
+        raise ValueError("a magnitude or precision that cannot be")
+    return p
+
+
 def spectrum(information: Floats, least: float = LEAST) -> tuple[Floats, Floats]:
     """Eigenvalues (K,), zero where hardly anything is determined, and vectors of information."""
     values, vectors = np.linalg.eigh((information + information.T) / 2)
@@ -175,8 +211,7 @@ def spectrum(information: Floats, least: float = LEAST) -> tuple[Floats, Floats]
 def determined(information: Floats) -> Floats:
     """Information (K, K), in ordinary magnitudes, without directions that are hardly determined.
 
-    A fit holds directions whose information is below `INFORMATION`² where they are, see
-    `regression.normal_equations`: their values were not estimated.
+    A fit holds those below `INFORMATION`² where they are: their values were not estimated.
     """
     values, vectors = spectrum(information, INFORMATION**2)
     root = vectors * np.sqrt(values)

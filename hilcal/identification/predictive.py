@@ -1,38 +1,33 @@
 """Covariance of predictions, also where nothing was measured, and the posterior of an arm.
 
 The posterior of a fit holds the strengths of shrunk families at what the evidence chose, zero for
-the groups that the readings do not need. That says nothing of joint angles that were never
-visited. So a group of a shrunk family has at least the mean variance of its pool as its prior
-(`Effect.pools`), and a parameter without a prior one about zero of its ordinary magnitude, or the
-rms of its effect's parameters if more, as where poses are left out (`folds`). With the Jacobian
+groups that the readings do not need, which says nothing of joint angles never visited. So a group
+of a shrunk family has at least the mean variance of its pool as its prior (`Effect.pools`), and a
+parameter without a prior one about zero, as where poses are left out (`folds`). With the Jacobian
 A (R, P) of the fitted readings, whitened by W, σ² their noise factor, Λ the prior precision,
 
     C = (AᵀA/σ² + Λ)⁻¹,    Cov(measured − predicted) = κ (σ² W + J C Jᵀ)
 
 W is the stated covariance V, with more for positions or attitudes where their residual asks for it:
 a misfit has not the shape of an instrument's noise, which is small along the beam. W, C and the
-residual of parameters with this W and Λ depend on each other; they are computed in turns. Where the
-model has a background its standard deviations are in units of the instrument's noise, and σ is the
-factor of that as the mixed model estimates it; otherwise σ² is from the residual, at least 1.
+residual of parameters with this W and Λ are computed in turns. Where the model has a background, σ
+is the factor of the instrument's noise in the mixed model; otherwise σ² is from the residual, at
+least 1.
 
 κ, at least 1, makes the mean variance on poses left out, in units of V, equal to the mean square
-error there. The variance is that of the folds as they are left out, F of rows Y, with X
-the same whitened by W and multiplied by the root of C: the mean of Y (1 − XᵀX/σ²)⁻¹ Yᵀ. With few
-poses one fold alone may determine a direction; its variance is that of the prior then.
+error there. Of the folds as they are left out, F of rows Y, with X the same whitened by W and
+multiplied by the root of C, it is the mean of Y (1 − XᵀX/σ²)⁻¹ Yᵀ.
 
 The uncertainty of the variances of a background makes C larger by how far it moves the parameters
-(`mixed.prediction`), and κ is at least its mean effect on predictions (Kackar and
-Harville, JASA 79 (1984) 853). At given variances rows that are predicted without their fold are off
-by e with the variance v (`mixed.prediction.left_out`). With x = (log s, η) drawn from its
-posterior, by weights from the normal approximation at its maximum x̂, the mean square is
-E[Σ v] + E|e − E e|²; its ratio to Σ v at x̂ is that least κ. Both hold that motion, once where it
-acts and once as a mean: with 20, 30 and 60 poses of 30 simulated arms that have all effects, 95, 92
-and 95 % of other poses are then in their 95 % band, and 93, 89 and 93 % with κ alone.
+(`mixed.prediction`), and κ is at least its mean effect on predictions (Kackar and Harville, JASA 79
+(1984) 853). At given variances rows predicted without their fold are off by e with the variance v.
+With x = (log s, η) drawn from its posterior, by weights from the normal approximation at its
+maximum x̂, the mean square is E[Σ v] + E|e − E e|²; its ratio to Σ v at x̂ is that least κ. With
+both, 92 to 95 % of the other poses of simulated arms are in their 95 % band.
 
 The excess of a residual over the stated noise (`excess`): with r (3,) the residuals of the D
-positions, V their covariance, W = V + s² 1, and J C Jᵀ the covariance of their predictions, C that
-of parameters estimated with σ² W, s² solves (Mandel and Paule, Anal. Chem. 42 (1970) 1194, for the
-scatter between laboratories beyond what each states)
+positions, W = V + s² 1, and J C Jᵀ the covariance of their predictions, C that of parameters
+estimated with σ² W, s² solves (Mandel and Paule, Anal. Chem. 42 (1970) 1194)
 
     Σ rᵀ W⁻¹ r = 3 D − Σ tr (σ² W)⁻¹ J C Jᵀ
 
@@ -48,13 +43,12 @@ from scipy.stats import chi2
 
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.carried import coordinates_of
+from hilcal.identification.carried import coordinates_of, scales_of
 from hilcal.identification.fit import Fit
 from hilcal.identification.folds import distinct_poses, ordinary, random_folds
 from hilcal.identification.gauss_newton import whitened_jacobian
 from hilcal.identification.mixed_fit import INSTRUMENT, mixed_fit_at
 from hilcal.identification.posterior import Posterior, PosteriorEffect, Source, determined
-from hilcal.identification.priors import scales_of
 from hilcal.identification.residual import residual
 from hilcal.mixed.equations import equations, left_out
 from hilcal.mixed.variances import Variances, log_posterior
@@ -99,12 +93,6 @@ class Excess:
         a, b = self.position, other.position
         return abs(a - b) <= SAME * max(a, b) and abs(self.attitude / other.attitude - 1) <= SAME
 
-    def halfway(self, other: "Excess") -> "Excess":
-        """Return the geometric mean of this and another one; half of s² where one has none."""
-        both = self.position, other.position
-        middle = float(np.sqrt(both[0] * both[1])) if min(both) > 0 else sum(both) / 2
-        return Excess(middle, float(np.sqrt(self.attitude * other.attitude)))
-
     def widened(self, covariance: Floats, share: float = 1.0) -> Floats:
         """Return covariances (N, m, m) with the excess, of s² a share."""
         place = np.arange(covariance.shape[-1]) < 3
@@ -122,20 +110,17 @@ NONE = Excess()
 
 
 def excess(
-    raw: Floats,
-    stated: Whitening,
-    used: Whitening,
-    rows: Floats,
-    root: Floats,
+    raw: Floats, stated: Whitening, used: Whitening, rows: Floats, root: Floats,
     previous: Excess = NONE,
-) -> Excess:
+) -> Excess:  # fmt: skip
     """Return the excess of a residual (D, m) over the stated noise.
 
     V is that of `stated`. C, with the root (P, K) over its noise factor, belongs to the scaling
     `used` of the same measurements, which whitens the rows (R, P) and has the excess `previous`; a
     part with such an excess is not tested against chance again.
     """
-    spread, chosen = _spread(used, rows, root), _spaced(len(raw))
+    chosen = np.linspace(0, len(raw) - 1, min(len(raw), SOME)).astype(int)
+    spread = _spread(used, rows, root, chosen)
     position, attitude = 0.0, 1.0
     for part in (slice(0, 3), slice(3, 6))[: raw.shape[1] // 3]:
         values, vectors = np.linalg.eigh(stated.covariance[:, part, part])
@@ -161,13 +146,8 @@ def excess(
     return Excess(position, attitude)
 
 
-def _spaced(count: int) -> Ints:
-    return np.linspace(0, count - 1, min(count, SOME)).astype(int)
-
-
-def _spread(w: Whitening, rows: Floats, root: Floats) -> Floats:
-    """J C Jᵀ (S, m, m) of some measurements, evenly spaced."""
-    measurements = _spaced(len(w.reading))
+def _spread(w: Whitening, rows: Floats, root: Floats, measurements: Ints) -> Floats:
+    """J C Jᵀ (S, m, m) of some measurements."""
     out, row, first = np.zeros((len(measurements), w.m, w.m)), 0, 0
     for b in w.buckets:
         groups, size = len(b.loaded), b.factor.shape[-1]
@@ -260,17 +240,26 @@ def predictive(
     parameters, extra, w = np.arange(model.size), Excess(), stated
     for step in range(ROUNDS + 1):
         a = rows_in(w)
-        values, vectors, noise = _spectrum(a, raw, w, noise_factor)
+        values, vectors = np.linalg.eigh(a.T @ a)
+        values, white = np.maximum(values, 0.0), w.whiten(raw).reshape(-1)
+        noise = 1.0 if noise_factor is None else noise_factor
+        for _ in range(ITERATIONS if noise_factor is None else 0):
+            free = max(w.rank - float(np.sum(values / (values + noise))), 1.0)
+            noise = max(1.0, float(white @ white) / free)
         root = vectors * np.sqrt(noise / (values + noise))
         if noise_factor is not None or step == ROUNDS:  # with a background, which holds any misfit
             break
         # The residual of the parameters with this noise and this prior, and its leverage.
-        moved = root @ (root.T @ (a.T @ w.whiten(raw).reshape(-1) / noise - pull))
+        moved = root @ (root.T @ (a.T @ white / noise - pull))
         refitted = model.predict(fitted.states, theta + space.transform(std * moved))
         new = excess(residual(fitted, refitted, stated), stated, w, a, root / np.sqrt(noise), extra)
         if new.near(extra):
             break
-        extra = new if step == 0 else new.halfway(extra)
+        # The geometric mean of both; half of s² where one has none.
+        s2, old = new.position, extra.position
+        middle = float(np.sqrt(s2 * old)) if min(s2, old) > 0 else (s2 + old) / 2
+        half = Excess(middle, float(np.sqrt(new.attitude * extra.attitude)))
+        extra = new if step == 0 else half
         w = whitening(extra.of_readings(fitted, mode), mode, "gc")
     shares = []
     for k in range(0, len(a), CHUNK * w.m):
@@ -298,29 +287,12 @@ def predictive(
     )  # fmt: skip
 
 
-def _spectrum(
-    a: Floats, raw: Floats, w: Whitening, noise_factor: float | None
-) -> tuple[Floats, Floats, float]:
-    """Eigenvalues and eigenvectors of AᵀA, and σ², which may be given."""
-    values, vectors = np.linalg.eigh(a.T @ a)
-    values = np.maximum(values, 0.0)
-    if noise_factor is not None:
-        return values, vectors, noise_factor
-    white = w.whiten(raw).reshape(-1)
-    rss, noise = float(white @ white), 1.0
-    for _ in range(ITERATIONS):
-        free = max(w.rank - float(np.sum(values / (values + noise))), 1.0)
-        noise = max(1.0, rss / free)
-    return values, vectors, noise
-
-
 def left_out_variances(
     a: Floats, fold: Ints, predicted: Sequence[tuple[Floats, Ints]], root: Floats, noise: float
 ) -> list[float]:
-    """Mean variance of `predicted` rows, each predicted without its fold.
+    """Mean variance of `predicted` rows (R', P) with folds (R',), each without its fold.
 
-    `a` are the fitted rows (R, P) in units of W, with their folds (R,); `predicted` are rows
-    (R', P) in other units, with folds (R',); `root` (P, K) is that of C, `noise` σ².
+    `a` are the fitted rows (R, P) in units of W, `root` (P, K) is that of C, `noise` σ².
     """
     total = np.zeros(len(predicted))
     for f in range(int(fold.max(initial=-1)) + 1):
@@ -354,21 +326,11 @@ def family_prior(model: Model, prior: Floats) -> Floats:
     return std
 
 
-def parameter_factor(p: Predictive, left_out_sigma: float) -> float:
-    """Factor, at least 1, by which C is too small where the noise alone is right.
-
-    With it the mean variance on poses left out is the mean square of the whitened residual there,
-    `left_out_sigma`².
-    """
-    return max(p.least, (left_out_sigma**2 - max(p.scatter, 1.0)) / max(p.left_out, 1e-12))
-
-
 def position_factor(p: Predictive, left_out_m: float) -> float:
     """Factor, at least 1, by which C is too small for positions.
 
-    With it the stated mean square error of positions left out is the observed one, in m², as a band
-    about a position is stated. In units of V the directions that an instrument measures
-    best would decide, in which misfits count most.
+    The stated mean square error of positions left out is then the observed one, in m². In units of
+    V the directions that an instrument measures best would decide, in which misfits count most.
     """
     return max(p.least, (left_out_m**2 - p.scatter_m2) / max(p.left_out_m2, 1e-300))
 
@@ -454,5 +416,7 @@ def _information(fit: Fit, scale: Floats) -> tuple[Floats, Floats]:
         precision = np.where(std > 0, 1.0 / std**2, np.inf)
     # A family that was dropped entirely has its ordinary magnitude.
     precision[np.isinf(precision)] = 1.0
-    kappa = parameter_factor(p, fit.holdout.rms_sigma)
+    # With κ the mean variance on poses left out is the mean square of the whitened residual there.
+    square = fit.holdout.rms_sigma**2
+    kappa = max(p.least, (square - max(p.scatter, 1.0)) / max(p.left_out, 1e-12))
     return (a.T @ a / p.noise + np.diag(precision)) / kappa, precision / kappa

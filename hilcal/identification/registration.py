@@ -2,56 +2,50 @@
 
 With the nominal flange poses (R_i, p_i), readings y_i obey
 
-    y_i = R (p_i + R_i τ) + t,      M_i = R R_i R_τ  (attitude, where read)
+    y_i = h(R (p_i + R_i τ) + t),      M_i = R R_i R_τ  (attitude, where read)
 
-R, t: the base in the sensor's frame; τ, R_τ: the target k(i) on the flange. The 6 + 6 T parameters
-are a shift of the base at the centroid of the flange's positions and a turn, base axes; per target
-a shift and a turn, flange axes; all in ordinary sizes. Starts are closed forms (Kabsch; linear
-equations of a point, |p|² − d² being linear in it, and of a plane) and rotations of a cube.
-Readings that are centimetres off are detected from a robust start, and left out. Directions that
-the poses do not determine stay near the cell's targets and are listed.
+R, t: the base in the sensor's frame; τ, R_τ: the target k(i) on the flange; h: what the observer
+o(i) reads, for one tracker the position itself. The 6 + 6 T + 6 O parameters are a shift of the
+base at the centroid of the flange's positions and a turn, base axes; per target a shift and a turn,
+flange axes; per observer the twist of its frame; all in ordinary sizes. Starts are closed forms
+(Kabsch; linear equations of a point, |p|² − d² being linear in it, and of a plane) and rotations of
+a cube. Readings that are centimetres off are detected from a robust start, and left out. Directions
+that the poses do not determine stay near the cell's targets and are listed.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
 
-from hilcal.cell import Cell, Observer, plane_frame
+from hilcal.cell import Cell
 from hilcal.effects.target_offset import TargetOffset
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.data_snooping import off_alike
 from hilcal.identification.least_trimmed_squares import (
     MOST,
-    ReadingModel,
     limit,
     robust_start,
     variance,
 )
-from hilcal.identification.solver import echelon, minimise
+from hilcal.identification.placement import (
+    MIN_POSES,
+    FrameData,
+    Frames,
+    Placement,
+    angles,
+    fitted_placement,
+    given_and_free,
+    minimise,
+)
 from hilcal.model.model import Model
-from hilcal.model.observe import read_by
 from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import inverse_root
+from hilcal.regression.normal_equations import echelon
 from hilcal.robot import se3
-from hilcal.robot.arm import Arm
-from hilcal.robot.chain import evaluate
-from hilcal.types import Bools, Floats, Ints
+from hilcal.types import Bools, Floats
 
 # All of these are choices.
-ROUGH = (1e-4, 1e-4)  # m and rad, added to the stated noise: nominal arms are 0.1 to 3 mm off
-TARGET_M, BASE_M = 0.3, 3.0  # ordinary distances of target and flange, of tracker and base
-TELL = 0.1  # share of an ordinary size to which readings must determine a direction
-ALTERNATIONS = 10  # between rotation and translations; least squares follow
-HOLD = 1e-6  # weight of an ordinary size in the linear starts, against an error of 1 m
-HOLD_SEVERAL = 1e-3  # the same in whitened rows of several observers
-MIN_POSES = 4
 NARROW = 1e-3  # m rms from a line, below which positions are collinear
-FEW, FEW_EACH = 100, 50  # readings that starts are tried on: of all, and of each observer
-GOOD = 10.0  # rms misfit with roughness at which no other start is tried: 1 mm and 1 mrad
-STEPS, TRIED, FOLLOWED = 15, 5, 6  # steps of a start; rotations of a cube tried; starts followed
 DISTURBED = 3e-3  # m rms from which far readings are looked for: nominal arms are off by less
 BEYOND = 10.0  # times the median misfit from which on a reading of several observers is far off
 LEAST_FAR = 1e-4  # m, misfit that is never far off
@@ -121,42 +115,72 @@ def _pose(t: Floats) -> dict[str, Sequence[float]]:
 
 
 def register(cell: Cell, readings: Readings) -> Registration:
-    """Estimate the registration and the target's offset where they are unknown.
+    """Estimate the places of base, targets and observers where they are unknown.
 
     Raises:
-        CannotAnswerError: the poses do not determine it: fewer than four distinct positions, all on
-            one line, or fewer readings of an observer than unknowns of its place.
+        CannotAnswerError: the poses do not determine them: fewer than four distinct positions, all
+            on one line, or fewer readings of an observer than unknowns of its place.
     """
-    if readings.states.observer is not None:
-        return _of_several(cell.observed_by(readings.observers), readings)
-    angle, data = angles(readings), FrameData.of(cell.arm, readings)
-    frames, free = given_and_free(cell, data.m == 6)
-    fixed = cell.registration_known and cell.target_known
-    if fixed:
-        placement, null = Placement(data, frames, np.zeros_like(free)), np.zeros((len(free), 0))
-        far = _far(readings, placement)
+    cell = cell.observed_by(readings.observers)
+    data, m = FrameData.of(cell.arm, readings), readings.m
+    frames, free = given_and_free(cell, m == 6)
+    estimated = not (cell.registration_known and cell.target_known) or any(
+        o.free for o in cell.observers
+    )
+    if estimated:
+        _refuse_few(cell, readings)
+        placement, null = fitted_placement(data, frames, free)
     else:
-        distinct = len(np.unique(np.round(angle, 9), axis=0))
-        if distinct < MIN_POSES:
-            raise CannotAnswerError(
-                f"registration: {distinct} distinct poses; measure at least {MIN_POSES}, better "
-                "10, that turn the flange and do not lie on a line"
-            )
-        placement, null = _fitted(data, frames, free)
-        far = _far(readings, placement)
-        if far.any():
-            placement, null = _fitted(data[~far], frames, free)
-        x = data.points(placement.frames)
-        spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
-        if data.m == 3 and not cell.registration_known and spread[1] < NARROW * np.sqrt(len(x)):
+        placement, null = Placement(data, frames, np.zeros_like(free)), np.zeros((len(free), 0))
+    far = _far(readings, placement)
+    if estimated and 0 < far.mean() <= MOST:
+        placement, null = fitted_placement(data[~far], frames, free)
+        if cell.observers:
+            far = _far_by_median(data.misfit(placement.frames))
+    off, found = data.misfit(placement.frames), placement.frames
+    if estimated:
+        x = data.points(found)
+        spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)[1]
+        in_space = m == 6 or cell.registration_known or bool(cell.observers)
+        if not in_space and spread < NARROW * np.sqrt(len(x)):
             raise CannotAnswerError(
                 "registration: all positions lie in one point or on one line; measure poses "
                 "spread in space"
             )
-        frames = placement.frames
-        cell = replace(cell.with_targets(frames.targets), registration=frames.base)
-    off = data.misfit(placement.frames)
-    return _registration(cell, readings, off, far, far, _undetermined(null), not fixed)
+        cell = replace(cell.with_targets(found.targets), observers=found.observers)
+        cell = replace(cell, registration=found.base)
+    rms, turn_rms = (
+        float(np.sqrt(np.mean(np.sum(off[~far, part] ** 2, axis=1))))
+        for part in (slice(0, 3), slice(3, 6))
+    )
+    return Registration(
+        cell=cell,
+        off=off,
+        rms=rms,
+        turn_rms=turn_rms if m == 6 else None,
+        far=far & (far.mean() <= MOST),
+        undetermined=_undetermined(null, found),
+        still=np.ptp(angles(readings), axis=0) < TURNED,
+        estimated=estimated,
+    )
+
+
+def _refuse_few(cell: Cell, readings: Readings) -> None:
+    angle = angles(readings)
+    for k, o in enumerate(cell.observers):
+        rows = readings.observer == k
+        count = len(np.unique(angle[rows], axis=0)) * (3 if o.name.kind == "station" else 1)
+        if 0 < count < len(o.free):
+            raise CannotAnswerError(
+                f"registration: {o.name} has readings of {rows.sum()} poses, too few for the "
+                f"{len(o.free)} unknowns of its place; measure more, or state its place"
+            )
+    distinct = len(np.unique(np.round(angle, 9), axis=0))
+    if distinct < MIN_POSES and not cell.observers:
+        raise CannotAnswerError(
+            f"registration: {distinct} distinct poses; measure at least {MIN_POSES}, better "
+            "10, that turn the flange and do not lie on a line"
+        )
 
 
 def targets_as_fitted(model: Model, theta: Floats) -> Floats:
@@ -167,37 +191,10 @@ def targets_as_fitted(model: Model, theta: Floats) -> Floats:
     return model.cell.all_targets
 
 
-def _registration(
-    cell: Cell,
-    readings: Readings,
-    off: Floats,
-    beyond: Bools,
-    far: Bools,
-    undetermined: tuple[Undetermined, ...],
-    estimated: bool,
-) -> Registration:
-    """Return a registration with the errors of the readings that are not `beyond` (N,)."""
-    rms, turn = (
-        float(np.sqrt(np.mean(np.sum(off[~beyond, part] ** 2, axis=1))))
-        for part in (slice(0, 3), slice(3, 6))
-    )
-    still = np.ptp(angles(readings), axis=0) < TURNED
-    turn_rms = turn if readings.m == 6 else None
-    return Registration(cell, off, rms, turn_rms, far, undetermined, still, estimated)
-
-
-def _fitted(data: "FrameData", frames: "Frames", free: Bools) -> tuple["Placement", Floats]:
-    """Return the best frames, by a part of the readings, then by all; and undetermined directions.
-
-    The directions (6 + 6 T, U) are of unit length, in ordinary sizes.
-    """
-    part = data[np.unique(np.linspace(0, len(data) - 1, FEW).astype(int))]
-    best = best_placement(part, frames, free, GOOD * np.sqrt(part.m), STEPS, TRIED)
-    return settled(minimise(Placement(data, best.frames, free)), frames)
-
-
-def _far(readings: Readings, placement: "Placement") -> Bools:
+def _far(readings: Readings, placement: Placement) -> Bools:
     """(N,) readings far off while the others fit to within `DISTURBED`; none in other cases."""
+    if placement.frames.observers:
+        return _far_by_median(placement.off)
     data, none = placement.data, np.zeros(len(readings), dtype=np.bool_)
 
     def fits(off: Floats) -> bool:
@@ -222,528 +219,28 @@ def _far(readings: Readings, placement: "Placement") -> Bools:
     return far if fits(placement.off[~far]) and not len(alike) else none
 
 
-def _undetermined(null: Floats) -> tuple[Undetermined, ...]:
-    """Return the undetermined directions, each with as few parameters of a target as possible."""
-    size = len(null) // 6 - 1
-    shifts = [6 + 6 * k + i for k in range(size) for i in range(3)]
-    turns_and_base = [3, 4, 5, *(9 + 6 * k + i for k in range(size) for i in range(3)), 0, 1, 2]
-    rows = echelon(null.T, (shifts, turns_and_base), TOLD)
-    return tuple(_direction(row / np.abs(row).max()) for row in rows)
-
-
-def _direction(row: Floats, observers: tuple[str, ...] = ()) -> Undetermined:
-    """Return one direction, in ordinary sizes, in m and rad."""
-    moved = row * (np.abs(row) >= TOLD) * sizes(len(row) // 6 - 1)
-    of_targets = moved[6:].reshape(-1, 6)
-    active = np.flatnonzero(np.abs(of_targets).any(axis=1))
-    target = int(active[0]) if len(active) else None
-    six = of_targets[target] if target is not None else np.zeros(6)
-    return Undetermined(target, six[:3], six[3:], moved[:3], moved[3:6], observers)
-
-
-def angles(readings: Readings) -> Floats:
-    """(N, n) joint values of the readings: as the encoders reported them, else as commanded."""
-    states = readings.states
-    return states.q if states.q_actual is None else states.q_actual
-
-
-def inverse_roots(covariance: Floats, partial: bool = False) -> Floats:
-    """(N, m, m) W with W V Wᵀ = I, V the covariance with the roughness added.
-
-    With `partial` elements without a variance were not read: they get no roughness either.
-    """
-    m = covariance.shape[-1]
-    rough = np.repeat(np.square(ROUGH), 3)[:m] * np.eye(m)
-    if partial:
-        rough = rough * (np.diagonal(covariance, axis1=1, axis2=2) > 0)[:, None, :]
-    return inverse_root(covariance + rough)
-
-
-def sizes(targets: int) -> Floats:
-    """(6 + 6 T,) ordinary sizes of the parameters, m and rad."""
-    return np.array([BASE_M] * 3 + [1.0] * 3 + ([TARGET_M] * 3 + [1.0] * 3) * targets)
-
-
-def free_parameters(base: bool, targets: Bools, attitudes: bool) -> Bools:
-    """(6 + 6 T,) which parameters are estimated; of base and targets (T,), which are unknown.
-
-    A target's axes show in attitudes alone, and are estimated from them even at a known offset.
-    """
-    return np.concatenate(
-        [np.full(6, base), *(np.repeat([bool(t), attitudes], 3) for t in targets)]
-    )
-
-
-def given_and_free(cell: Cell, attitudes: bool) -> tuple["Frames", Bools]:
-    """Return the frames of a cell, and (6 + 6 T,) which of their parameters are estimated."""
-    free = free_parameters(not cell.registration_known, ~np.array(cell.known_targets), attitudes)
-    return Frames(cell.registration, cell.all_targets), free
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Frames:
-    """Base T_sensor_base (4, 4), and targets T_flange_target (T, 4, 4)."""
-
-    base: Floats
-    targets: Floats
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FrameData:
-    """The data that determine the frames."""
-
-    rotation: Floats  # (N, 3, 3) nominal orientation of the flange, base axes
-    position: Floats  # (N, 3) nominal position of the flange, m
-    value: Floats  # (N, 3) positions read, sensor axes, m
-    attitude: Floats | None  # (N, 3, 3) attitudes read
-    root: Floats  # (N, m, m) inverse root of the covariance, roughness included
-    target: Ints  # (N,) index of the target that was read
-
-    @classmethod
-    def of(cls, arm: Arm, readings: Readings) -> "FrameData":
-        """Return the readings with the flange poses of a nominal arm."""
-        value, turn = readings.value, readings.value[:, 3:] if readings.m == 6 else None
-        root = inverse_roots(readings.covariance)
-        return cls.at(arm, angles(readings), value[:, :3], turn, root, readings.target)
-
-    @classmethod
-    def at(
-        cls, arm: Arm, q: Floats, value: Floats, turn: Floats | None, root: Floats, target: Ints
-    ) -> "FrameData":
-        """Return readings at joint values (N, n); `turn` (N, 3) are the attitudes, rad."""
-        chain = evaluate(arm, q)
-        rotation, position = (np.ascontiguousarray(x[-1]) for x in (chain.rotation, chain.position))
-        attitude = None if turn is None else se3.rotation(turn)
-        return cls(rotation, position, value, attitude, root, target)
-
-    @property
-    def m(self) -> int:
-        """Elements per reading: 3 or 6."""
-        return 3 if self.attitude is None else 6
-
-    def __len__(self) -> int:
-        """Return the number of readings."""
-        return len(self.value)
-
-    def __getitem__(self, rows: Ints | Bools | slice) -> "FrameData":
-        """Return the chosen readings."""
-        arrays = {f.name: a for f in fields(self) if (a := getattr(self, f.name)) is not None}
-        return replace(self, **{name: a[rows] for name, a in arrays.items()})
-
-    def points(self, frames: Frames) -> Floats:
-        """(N, 3) predicted positions of the targets, base axes, m."""
-        return self.position + se3.apply(self.rotation, frames.targets[self.target, :3, 3])
-
-    def misfit(self, frames: Frames) -> Floats:
-        """(N, m) measured minus predicted, sensor axes, m and rad."""
-        r, t = frames.base[:3, :3], frames.base[:3, 3]
-        off = self.value - self.points(frames) @ r.T - t
-        if self.attitude is None:
-            return np.asarray(off)
-        predicted = r @ self.rotation @ frames.targets[self.target, :3, :3]
-        turn = se3.rotation_vector(self.attitude @ np.swapaxes(predicted, 1, 2))
-        return np.concatenate([off, turn], axis=1)
-
-
-@dataclass(frozen=True, eq=False)
-class Placement:
-    """Frames and the data that they are fitted to: a point of `solver.minimise`."""
-
-    data: FrameData
-    frames: Frames
-    free: Bools  # (6 + 6 T,) the parameters that are estimated, K of them
-    held: Floats | None = None  # (T, 4, 4) targets with a prior of the ordinary sizes
-    weight: float = 1.0  # of a target an ordinary size off, in units of whitened misfit
-
-    @cached_property
-    def off(self) -> Floats:
-        """(N, m) misfit, m and rad."""
-        return self.data.misfit(self.frames)
-
-    @cached_property
-    def white(self) -> Floats:
-        """(N, m) whitened misfit."""
-        return np.asarray(np.einsum("nij,nj->ni", self.data.root, self.off))
-
-    @property
-    def square(self) -> float:
-        """Whitened sum of squares."""
-        return float(np.sum(self.white**2))
-
-    @property
-    def residual(self) -> Floats:
-        """(R,) whitened misfit, and that of the prior."""
-        if self.held is None:
-            return self.white.reshape(-1)
-        t = self.frames.targets
-        shift = (t[:, :3, 3] - self.held[:, :3, 3]) / TARGET_M
-        turn = se3.rotation_vector(t[:, :3, :3] @ np.swapaxes(self.held[:, :3, :3], 1, 2)) / np.pi
-        away = np.concatenate([np.zeros(6), np.concatenate([shift, turn], axis=1).reshape(-1)])
-        return np.concatenate([self.white.reshape(-1), -self.weight * away[self.free]])
-
-    def jacobian(self) -> Floats:
-        """(R, K) derivative of the prediction."""
-        rows = self.columns().reshape(self.white.size, int(np.count_nonzero(self.free)))
-        if self.held is None:
-            return rows
-        slopes = np.tile(np.repeat([1.0, 1.0 / np.pi], 3), len(self.held))
-        away = np.concatenate([np.zeros(6), slopes])[self.free]
-        return np.concatenate([rows, self.weight * np.diag(away)])
-
-    def columns(self) -> Floats:
-        """(N, m, K) whitened derivative of the predicted readings."""
-        data, r = self.data, self.frames.base[:3, :3]
-        turned = r @ data.rotation
-        out = np.zeros((len(data), data.m, len(self.free)))
-        out[:, :3, :3] = r
-        out[:, :3, 3:6] = -r @ se3.skew(data.points(self.frames) - self._centre)
-        out[:, 3:, 3:6] = r[: data.m - 3]
-        for k in range(len(self.frames.targets)):
-            rows, first = data.target == k, 6 + 6 * k
-            out[rows, :3, first : first + 3] = turned[rows]
-            out[rows, 3:, first + 3 : first + 6] = turned[rows, : data.m - 3]
-        size = sizes(len(self.frames.targets))[self.free]
-        return np.asarray(data.root @ out[:, :, self.free] * size)
-
-    @property
-    def linear(self) -> ReadingModel:
-        """The linear model of the readings."""
-        none, columns = np.zeros(np.count_nonzero(self.free)), self.columns()
-        return ReadingModel(self.white, columns, none, none, self.data.root)
-
-    def moved(self, step: Floats) -> "Placement":
-        """Return the placement after a step (K,)."""
-        full = np.zeros(len(self.free))
-        full[self.free] = sizes(len(self.frames.targets))[self.free] * step
-        targets, of_targets = self.frames.targets.copy(), full[6:].reshape(-1, 6)
-        targets[:, :3, 3] += of_targets[:, :3]
-        targets[:, :3, :3] = se3.rotation(of_targets[:, 3:]) @ targets[:, :3, :3]
-        base = self.frames.base @ _moved_about(self._centre, full[:6])
-        return replace(self, frames=Frames(base, targets))
-
-    def determined(self, spread: float) -> tuple[Floats, Floats]:
-        """Undetermined directions (6 + 6 T, U) by the misfit; the step (K,) along the others."""
-        a = self.jacobian()
-        # Squared singular values up to 1e12 leave rounding of 1e-2 in those that decide, about 10.
-        squares, vectors = np.linalg.eigh(a.T @ a)
-        visible = squares > (spread / TELL) ** 2
-        null = np.zeros((len(self.free), np.count_nonzero(~visible)))
-        null[self.free] = vectors[:, ~visible]
-        part = vectors[:, visible]
-        return null, part @ ((part.T @ (a.T @ self.residual)) / squares[visible])
-
-    @cached_property
-    def _centre(self) -> Floats:
-        """(3,) the point of the base axes that the base turns about, m."""
-        return np.asarray(self.data.position.mean(axis=0))
-
-
-def _moved_about(centre: Floats, six: Floats) -> Floats:
-    """(4, 4) a shift and a turn (6,) about a point (3,)."""
-    about, back = np.eye(4), np.eye(4)
-    about[:3, 3], back[:3, 3] = centre, -centre
-    return about @ se3.matrix(se3.rotation(six[3:]), six[:3]) @ back
-
-
-def best_placement(
-    data: FrameData, frames: Frames, free: Bools, good: float, steps: int, rotated: int
-) -> Placement:
-    """Return the best placement from several starts: closed forms, then rotations of a cube.
-
-    Of these the best `rotated` are tried. The search ends at a whitened rms misfit per reading of
-    `good`; each start takes at most `steps`.
-    """
-    placements: list[Placement] = []
-    for start in _closed_forms(data, frames, free):
-        placements.append(minimise(Placement(data, start, free), steps))
-        if placements[-1].square <= good**2 * len(data):
-            return min(placements, key=lambda p: p.square)
-    if rotated and free[:6].any():
-        turns = (_with_translations(data, frames, turn, free) for turn in cube())
-        ranked = sorted((Placement(data, f, free) for f in turns), key=lambda p: p.square)
-        placements += [minimise(placement, steps) for placement in ranked[:rotated]]
-    return min(placements, key=lambda p: p.square)
-
-
-def settled(placement: Placement, frames: Frames) -> tuple[Placement, Floats]:
-    """Return the minimum, its undetermined part held near the targets of `frames`; and that part.
-
-    The prior has the ordinary sizes as standard deviations. It acts along the undetermined
-    directions (6 + 6 T, U) alone: along the others, the last steps go to the minimum without it.
-    """
-    dof = max(placement.data.m * len(placement.data) - int(np.count_nonzero(placement.free)), 1)
-    spread = max(float(np.sqrt(placement.square / dof)), 1.0)
-    null, _ = placement.determined(spread)
-    if null.size:
-        held = replace(placement, held=frames.targets, weight=spread)
-        placement = replace(minimise(held), held=None)
-    for _ in range(3):
-        null, step = placement.determined(spread)
-        placement = placement.moved(step)
-    return placement, null
-
-
-def nearest_rotation(m: Floats) -> Floats:
-    """Return the rotation (..., 3, 3) nearest to a matrix (Kabsch 1976)."""
-    u, _, vt = np.linalg.svd(m)
-    flip = np.ones(m.shape[:-1])
-    flip[..., 2] = np.sign(np.linalg.det(u @ vt))
-    return np.asarray((u * flip[..., None, :]) @ vt)
-
-
-def rotation_of_attitudes(attitude: Floats, flange: Floats) -> Floats:
-    """(3, 3) A of M_i Bᵀ = A R_i, attitudes M and flange orientations R (N, 3, 3)."""
-    # A linear system, vec by rows: (M_i ⊗ I) vec(Bᵀ) = (I ⊗ R_iᵀ) vec(A)
-    eye = np.eye(3)
-    left = np.einsum("nij,kl->nikjl", attitude, eye).reshape(-1, 9)
-    right = np.einsum("ij,nlk->nikjl", eye, flange).reshape(-1, 9)
-    gram = np.concatenate([left, -right], axis=1)
-    a = np.linalg.eigh(gram.T @ gram)[1][9:, 0].reshape(3, 3)
-    return nearest_rotation(a * (np.sign(np.linalg.det(a)) or 1.0))
-
-
-def cube() -> Floats:
-    """(24, 3, 3) the rotations that take a cube to itself."""
-    from scipy.spatial.transform import Rotation  # slow to import
-
-    return np.asarray(np.round(Rotation.create_group("O").as_matrix()))
-
-
-def _closed_forms(data: FrameData, frames: Frames, free: Bools) -> Iterator[Frames]:
-    """Yield base and targets from attitudes and from positions."""
-    if not free[:6].any():
-        yield _with_translations(data, frames, frames.base[:3, :3], free)
-        return
-    if data.attitude is not None:
-        first = data.target == data.target[0]
-        base = rotation_of_attitudes(data.attitude[first], data.rotation[first])
-        yield _with_translations(data, frames, base, free)
-    # Positions alone: Procrustes for R, then linear for τ and t, a few times.
-    out, y = frames, data.value - data.value.mean(axis=0)
-    for _ in range(ALTERNATIONS):
-        x, previous = data.points(out), out.targets
-        turn = nearest_rotation(y.T @ (x - x.mean(axis=0)))
-        out = _with_translations(data, frames, turn, free)
-        if np.abs(out.targets - previous).max() < 1e-6:
-            break
-    yield out
-
-
-def _with_translations(data: FrameData, frames: Frames, rotation: Floats, free: Bools) -> Frames:
-    """Complete a rotation of the base by the best translations and the targets' axes."""
-    count, size = len(data), len(frames.targets)
-    turned, rows_of = rotation @ data.rotation, [data.target == k for k in range(size)]
-    a = np.zeros((count, 3, 3 + 3 * size))
-    a[:, :, :3] = np.eye(3)
-    for k, rows in enumerate(rows_of):
-        a[rows, :, 3 + 3 * k : 6 + 3 * k] = turned[rows]
-    live = np.repeat(free[::6], 3)
-    x = np.concatenate([frames.base[:3, 3], *frames.targets[:, :3, 3]])
-    hold = np.repeat([HOLD / BASE_M] + [HOLD / TARGET_M] * size, 3)
-    flat = a.reshape(-1, len(x))
-    remainder = (data.value - data.position @ rotation.T).reshape(-1) - flat @ x
-    if live.any():
-        system = np.concatenate([flat, np.diag(hold * np.sqrt(count))])[:, live]
-        x[live] += np.linalg.lstsq(system, np.append(remainder, np.zeros(len(x))), rcond=None)[0]
-    targets = frames.targets.copy()
-    targets[:, :3, 3] = x[3:].reshape(size, 3)
-    if data.attitude is not None:
-        means = [np.einsum("nji,njk->ik", turned[rows], data.attitude[rows]) for rows in rows_of]
-        targets[:, :3, :3] = nearest_rotation(np.array(means))
-    return Frames(se3.matrix(rotation, x[:3]), targets)
-
-
-def _of_several(cell: Cell, readings: Readings) -> Registration:
-    """Register readings of several observers."""
-    angle = angles(readings)
-    for k, o in enumerate(cell.observers):
-        rows = readings.observer == k
-        count = len(np.unique(angle[rows], axis=0)) * (3 if o.name.kind == "station" else 1)
-        if 0 < count < len(o.free):
-            raise CannotAnswerError(
-                f"registration: {o.name} has readings of {rows.sum()} poses, too few for the "
-                f"{len(o.free)} unknowns of its place; measure more, or state its place"
-            )
-    placed, off, null = _placed(cell, readings)
-    far = _far_of_several(off)
-    if 0 < far.mean() <= MOST:
-        placed, _, null = _placed(cell, readings[~far])
-        off = Sightings.of(cell, readings).off(placed)
-        far = _far_of_several(off)
-    targets, base = ~np.array(cell.known_targets), not cell.registration_known
-    place = [*range(6 * base), *(6 + 6 * k + i for k in np.flatnonzero(targets) for i in range(3))]
-    ends = np.cumsum([len(place), *(len(o.free) for o in cell.observers)]).tolist()
-    undetermined = []
-    for v in null.T:
-        full = np.zeros(6 + 6 * len(targets))
-        full[place] = v[: len(place)]
-        parts = zip(cell.observers, ends[:-1], ends[1:], strict=True)
-        moved = tuple(str(o.name) for o, a, b in parts if np.any(np.abs(v[a:b]) > TOLD))
-        undetermined.append(_direction(full / np.abs(full).max(initial=TOLD), moved))
-    reported = far if far.mean() <= MOST else np.zeros_like(far)
-    estimated = base or bool(targets.any()) or any(o.free for o in cell.observers)
-    return _registration(placed, readings, off, far, reported, tuple(undetermined), estimated)
-
-
-def _far_of_several(off: Floats) -> Bools:
+def _far_by_median(off: Floats) -> Bools:
     """(N,) readings that are off (N, m) by far more than most."""
     size = np.linalg.norm(off[:, :3], axis=1)
     return np.asarray(size > max(LEAST_FAR, BEYOND * float(np.median(size))))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Sightings:
-    """Readings of several observers with the flange poses of the nominal arm."""
-
-    cell: Cell  # with the observers of the readings
-    readings: Readings
-    data: FrameData  # whose root is zero in rows that are not read
-
-    @classmethod
-    def of(cls, cell: Cell, readings: Readings) -> "Sightings":
-        """Return the readings with the flange poses of the nominal arm."""
-        root = inverse_roots(readings.covariance, True)
-        return cls(cell, readings, replace(FrameData.of(cell.arm, readings), root=root))
-
-    @property
-    def targets(self) -> Bools:
-        """(T,) which of the targets are unknown."""
-        return ~np.array(self.cell.known_targets)
-
-    @property
-    def sizes(self) -> Floats:
-        """(K,) ordinary sizes of the unknowns: base, targets, observers."""
-        base = [] if self.cell.registration_known else [BASE_M] * 3 + [1.0] * 3
-        observers = [BASE_M if e < 3 else 1.0 for o in self.cell.observers for e in o.free]
-        return np.array([*base, *[TARGET_M] * 3 * int(self.targets.sum()), *observers])
-
-    def points(self, cell: Cell) -> Floats:
-        """(N, 3) predicted positions of the targets, sensor axes, m."""
-        base = self.data.points(Frames(cell.registration, cell.all_targets))
-        return np.asarray(base @ cell.registration[:3, :3].T + cell.registration[:3, 3])
-
-    def off(self, cell: Cell) -> Floats:
-        """(N, m) measured minus predicted, m and rad; zero in elements that are not read."""
-        r, attitude = self.readings, self.data.attitude
-        turn = cell.registration[:3, :3] @ self.data.rotation @ cell.all_targets[r.target, :3, :3]
-        position, turned = read_by(cell.observers, r.observer, self.points(cell), turn)
-        off = r.value[:, :3] - position
-        if attitude is None:
-            return np.asarray(off)
-        apart = se3.rotation_vector(attitude @ np.swapaxes(turned, 1, 2))
-        return np.concatenate([off, apart], axis=1)
-
-    def white(self, cell: Cell) -> Floats:
-        """(N·m,) whitened misfit."""
-        return se3.apply(self.data.root, self.off(cell)).reshape(-1)
-
-    def moved(self, cell: Cell, step: Floats) -> Cell:
-        """Return a cell moved by (K,), in ordinary sizes."""
-        x, start = step * self.sizes, 0
-        if not cell.registration_known:
-            motion = _moved_about(self.data.position.mean(axis=0), x[:6])
-            cell, start = replace(cell, registration=cell.registration @ motion), 6
-        poses = cell.all_targets.copy()
-        for k in np.flatnonzero(self.targets):
-            poses[k, :3, 3] += x[start : start + 3]
-            start += 3
-        observers = []
-        for o in cell.observers:
-            six = np.zeros(6)
-            six[list(o.free)] = x[start : start + len(o.free)]
-            start += len(o.free)
-            offset, six[3] = (six[3], 0.0) if o.name.kind == "point" else (0.0, six[3])
-            frame = se3.matrix(*se3.exp(six)) @ o.frame
-            observers.append(replace(o, frame=frame, offset=o.offset + offset))
-        return replace(cell.with_targets(poses), observers=tuple(observers))
-
-    def settled(self, start: Cell, steps: int | None = None) -> tuple[Cell, float, Floats]:
-        """Return the minimum near a start, its sum of squares, and the Jacobian (R, K) there."""
-        count = len(self.sizes)
-        if not count:
-            return start, float(np.sum(self.white(start) ** 2)), np.zeros((0, 0))
-
-        def residual(x: Floats) -> Floats:
-            return np.concatenate([self.white(self.moved(start, x)), HOLD_SEVERAL * x])
-
-        minimum = least_squares(residual, np.zeros(count), max_nfev=steps)
-        jacobian = np.asarray(minimum.jac, dtype=float)[: len(minimum.fun) - count]
-        return self.moved(start, minimum.x), 2.0 * float(minimum.cost), jacobian
-
-    def with_observers(self, cell: Cell) -> Cell:
-        """Return a cell with its observers placed by their readings, in closed form."""
-        p, r = self.points(cell), self.readings
-        rows = [r.observer == k for k in range(len(cell.observers))]
-        observers = (
-            _observer_placed(o, p[k], r.value[k, :3]) if o.free and k.any() else o
-            for o, k in zip(cell.observers, rows, strict=True)
-        )
-        return replace(cell, observers=tuple(observers))
-
-
-def _placed(cell: Cell, readings: Readings) -> tuple[Cell, Floats, Floats]:
-    """Place base, targets and the observers of the readings as far as they are unknown.
-
-    Returns the cell with all in place; (N, m) measured minus predicted; directions (K, U) of unit
-    length, in ordinary sizes, that the readings do not determine.
-    """
-    data, part = Sightings.of(cell, readings), np.zeros(len(readings), dtype=bool)
-    for k in range(len(cell.observers)):
-        rows = np.flatnonzero(readings.observer == k)
-        if len(rows):
-            part[rows[np.linspace(0, len(rows) - 1, FEW_EACH).astype(int)]] = True
-    few = Sightings.of(cell, readings[part])
-    starts = [few.with_observers(start) for start in _starts(cell, readings)]
-    starts.sort(key=lambda c: float(np.sum(few.white(c) ** 2)))
-    tried = [few.settled(c, 50) for c in starts[:FOLLOWED]]
-    placed, square, jacobian = data.settled(min(tried, key=lambda t: t[1])[0])
-    rank = int(np.count_nonzero(np.any(data.data.root != 0, axis=2)))
-    spread = max(np.sqrt(square / max(rank - jacobian.shape[1], 1)), 1.0)
-    squares, vectors = np.linalg.eigh(jacobian.T @ jacobian)
-    return placed, data.off(placed), vectors[:, squares <= (spread / TELL) ** 2]
-
-
-def _starts(cell: Cell, readings: Readings) -> Iterator[Cell]:
-    """Yield starts of base and targets: by stations of known place, else by rotations of a cube."""
-    main = [k for k, o in enumerate(cell.observers) if o.name.kind == "station" and not o.free]
-    rows = np.isin(readings.observer, main)
-    if rows.any() and len(np.unique(readings.pose[rows])) >= MIN_POSES:
-        frames, free = given_and_free(cell, readings.m == 6)
-        data = FrameData.of(cell.arm, readings[rows])
-        placed = best_placement(data, frames, free, GOOD * np.sqrt(data.m), STEPS, TRIED).frames
-        yield replace(cell.with_targets(placed.targets), registration=placed.base)
-    elif cell.registration_known:
-        yield cell
-    else:
-        tied = [o.frame for o in cell.observers if o.tied]
-        centre = np.mean([-f[:3, :3].T @ f[:3, 3] for f in tied], axis=0)
-        yield from (replace(cell, registration=se3.matrix(turn, centre)) for turn in cube())
-
-
-def _observer_placed(o: Observer, p: Floats, value: Floats) -> Observer:
-    """Place an observer by its readings (N, 3) of positions (N, 3), sensor axes."""
-    middle, read = p.mean(axis=0), value.mean(axis=0)
-    x = p - middle
-    if o.name.kind == "station":
-        turn = nearest_rotation((value - read).T @ x)
-        return replace(o, frame=se3.matrix(turn, read - turn @ middle))
-    if o.name.kind == "point":
-        # |p|² − d² = 2 p·c − |c|², d the reading less its offset, which is linear in it, too.
-        if not set(o.free) & {0, 1, 2}:
-            return o
-        open_offset = 3 in o.free
-        d = value[:, 0] - (0.0 if open_offset else o.offset)
-        columns = [2 * x, np.ones((len(p), 1))] + ([-2 * d[:, None]] if open_offset else [])
-        solution = np.linalg.lstsq(np.hstack(columns), np.sum(x**2, axis=1) - d**2, rcond=1e-6)[0]
-        frame = se3.matrix(np.eye(3), -(solution[:3] + middle))
-        return replace(o, frame=frame, offset=-float(solution[4]) if open_offset else o.offset)
-    if 4 not in o.free:  # the direction of the gauge is known
-        frame = o.frame.copy()
-        frame[0, 3] = read[0] - frame[0, :3] @ middle
-        return replace(o, frame=frame)
-    # G = n·p − h: linear in n and h; where nearly all points lie in a plane, its normal.
-    g = value[:, 0] - read[0]
-    axes, linear = np.linalg.svd(x, full_matrices=True)[2], np.linalg.lstsq(x, g, rcond=1e-6)[0]
-    tried = [n / np.linalg.norm(n) for n in (linear, axes[2], -axes[2]) if np.linalg.norm(n) > 1e-9]
-    best = min(tried, key=lambda n: float(np.sum((x @ n - g) ** 2)))
-    return replace(o, frame=plane_frame(best, middle - read[0] * best))
+def _undetermined(null: Floats, frames: Frames) -> tuple[Undetermined, ...]:
+    """Return the undetermined directions, each with as few parameters of a target as possible."""
+    size = len(frames.targets)
+    targets = np.arange(6, 6 + 6 * size).reshape(-1, 2, 3)
+    turns_and_base = [3, 4, 5, *targets[:, 1].reshape(-1).tolist(), 0, 1, 2]
+    of_observers = range(6 + 6 * size, len(null))
+    blocks = (targets[:, 0].reshape(-1).tolist(), turns_and_base, of_observers)
+    out = []
+    for row in echelon(null.T, blocks, TOLD):
+        row = row / np.abs(row).max()
+        moved = (row * (np.abs(row) >= TOLD) * frames.sizes).reshape(-1, 2, 3)
+        base, of_targets, of_others = moved[0], moved[1 : 1 + size], moved[1 + size :]
+        active = np.flatnonzero(np.abs(of_targets).any(axis=(1, 2)))
+        target = int(active[0]) if len(active) else None
+        shift, turn = np.zeros((2, 3)) if target is None else of_targets[target]
+        pairs = zip(frames.observers, of_others, strict=True)
+        observers = tuple(str(o.name) for o, m in pairs if m.any())
+        out.append(Undetermined(target, shift, turn, base[0], base[1], observers))
+    return tuple(out)

@@ -97,8 +97,7 @@ def robot_frames(model: Model, theta: Floats) -> RobotFrames:
 def whole_turns(model: Model, theta: Floats) -> Bools:
     """Return for each of the n joints whether a whole turn leaves predictions unchanged.
 
-    Kinematics and periodic laws repeat after a whole turn. A law in the angle itself, such as a
-    coupling of joints, does not; nor do cables, which no effect of the catalogue describes.
+    Kinematics and periodic laws repeat; a law in the angle itself, such as a coupling, does not.
     """
     states, n = random_states(model.cell), model.cell.arm.n
     reference = model.predict(states, theta).observation
@@ -161,7 +160,8 @@ def _constant(model: Model, theta: Floats) -> tuple[Floats, tuple[str, ...], tup
         d = e.deviation(theta[rows], situation)
         frames = (d.base, d.station, d.target, d.scale, d.observer)
         moves_frames = any(f is not None for f in frames)
-        constant = not e.elastic and _is_constant(d.dq) and _is_constant(d.twist)
+        parts = [part for part in (d.dq, d.twist) if part is not None]
+        constant = not e.elastic and all(np.abs(x - x[:1]).max() <= SAME for x in parts)
         if not constant or moves_frames or d.dq is d.twist:
             beyond.append(e.name)
             continue
@@ -173,10 +173,6 @@ def _constant(model: Model, theta: Floats) -> tuple[Floats, tuple[str, ...], tup
     turns[: arm.n, 2], shifts[: arm.n, 2] = moved * ~arm.slides, moved * arm.slides
     links = arm.links @ se3.matrix(*se3.exp(twist)) @ se3.matrix(se3.rotation(turns), shifts)
     return links, tuple(within), tuple(beyond)
-
-
-def _is_constant(values: Floats | None) -> bool:
-    return values is None or bool(np.abs(values - values[:1]).max() <= SAME)
 
 
 def random_states(cell: Cell) -> States:

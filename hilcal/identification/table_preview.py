@@ -23,21 +23,15 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.misdescription import examine
-from hilcal.identification.registration import nearest_rotation, register, rotation_of_attitudes
+from hilcal.identification.placement import nearest_rotation, rotation_of_attitudes
+from hilcal.identification.registration import register
 from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
 from hilcal.tables.guess_values import BY_VALUES, RIVALS
 from hilcal.tables.mapped import import_readings
 from hilcal.tables.mapping import Mapping
-from hilcal.tables.proposal import (
-    FAR,
-    GUESSED,
-    SIDE_BY_SIDE,
-    TURN,
-    Proposal,
-    UnderstoodColumn,
-)
+from hilcal.tables.proposal import FAR, GUESSED, SIDE_BY_SIDE, TURN, Proposal, UnderstoodColumn
 from hilcal.tables.propose import Proposed, propose
 from hilcal.tables.units import ANGLES, CONVENTIONS, LENGTHS, NUMBERS, rotations
 from hilcal.toml import check_section
@@ -263,7 +257,6 @@ def _misfit_with(
 
 
 def _try_import(table: Path, proposal: Proposal, settings: CellConfig, cell: Cell) -> list[str]:
-    """Import with the proposed mapping; return the outcome in sentences."""
     if proposal.lacking:
         return []
     try:

@@ -114,10 +114,8 @@ def check_torques(cell: Cell, readings: Readings) -> TorqueCheck | None:
     def means(parts: Mapping[str, Floats]) -> dict[str, Floats]:
         return {k: _means(x, group) for k, x in parts.items()}
 
-    determined = [
-        np.abs(x).max() > TOLD * max(np.abs(loads[k]).max(), 1e-12)
-        for k, x in centred(loads).items()
-    ]
+    pairs = zip(centred(loads).values(), loads.values(), strict=True)
+    determined = [np.abs(x).max() > TOLD * max(np.abs(y).max(), 1e-12) for x, y in pairs]
     if loads and all(determined):  # every load by differences between the readings of one pose
         lost = len(np.unique(group))
         y = centred({"y": torque})["y"]
@@ -131,7 +129,6 @@ def check_torques(cell: Cell, readings: Readings) -> TorqueCheck | None:
 
 
 def _means(x: Floats, group: Ints) -> Floats:
-    """(G, n) means of the groups (N,)."""
     out = np.zeros((int(group.max()) + 1, x.shape[1]))
     np.add.at(out, group, x)
     return np.asarray(out / np.bincount(group)[:, None])
@@ -180,7 +177,6 @@ def _fitted(
 def _factor(
     cell: Cell, r: Readings, name: str, value: float, low: float, high: float, p: float
 ) -> TorqueFactor:
-    """Return a factor with its mass."""
     stated: float | None = None
     g = float(np.linalg.norm(cell.gravity))
     if name == ARM:

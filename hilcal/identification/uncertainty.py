@@ -29,17 +29,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from hilcal.identification.carried import Coordinates
+from hilcal.identification.carried import Coordinates, names_of, prior_of, scales_of
 from hilcal.identification.folds import block_folds, changes, region_folds
 from hilcal.identification.gauss_newton import Solution, whitened_jacobian
-from hilcal.identification.priors import names_of, prior_of, scales_of
-from hilcal.identification.solver import echelon
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening
-from hilcal.regression.normal_equations import NULL_SHARE, Basis
-from hilcal.regression.projection import Projection
-from hilcal.regression.schur import inverse_root
+from hilcal.regression.normal_equations import NULL_SHARE, Basis, echelon
+from hilcal.regression.schur import Projection, inverse_root
 from hilcal.types import Bools, Floats, Ints
 
 LEARNT = 0.7  # posterior over prior standard deviation below which one is identifiable; a choice
@@ -90,22 +87,16 @@ def uncertainty(
     null = in_ordinary_magnitudes(space, basis.null, scale)
     carried = space.carried(len(scale))
     identifiable = identifiable_parameters(basis, solution.prior, carried, scale, std, null)
-    std = np.where(identifiable, std * _widening_factors(model, w, solution, covariance), np.inf)
+    # The unknown prior variances of shrunk families widen both their own `std` and all others.
+    groups, beta, prior = prior_of(model)[1], solution.beta, solution.prior
+    factor = hyperparameter_factors(beta * covariance, solution.theta, prior, groups)
+    dropped = np.flatnonzero((groups >= 0) & (prior == 0))
+    if w.scaling != "none" and len(dropped) and solution.rows.shape[1]:
+        columns = whitened_jacobian(model, solution.prediction, solution.theta, w, dropped)
+        of_model = solution.transform, solution.projection()
+        factor = factor * dropped_group_factors(*of_model, columns, groups[dropped], beta)
+    std = np.where(identifiable, std * factor, np.inf)
     return Uncertainty(std, formal, identifiable, misfit, name_directions(model, null))
-
-
-def _widening_factors(model: Model, w: Whitening, solution: Solution, covariance: Floats) -> Floats:
-    """Factors (P,) by which the unknown prior variances of shrunk families widen `std`."""
-    groups, beta = prior_of(model)[1], solution.beta
-    factor = hyperparameter_factors(beta * covariance, solution.theta, solution.prior, groups)
-    dropped = np.flatnonzero((groups >= 0) & (solution.prior == 0))
-    if w.scaling == "none" or not len(dropped) or not solution.rows.shape[1]:
-        return factor
-    columns = whitened_jacobian(model, solution.prediction, solution.theta, w, dropped)
-    transform = solution.transform
-    return factor * dropped_group_factors(
-        transform, solution.projection(), columns, groups[dropped], beta
-    )
 
 
 def in_ordinary_magnitudes(space: Coordinates, null: Floats, scale: Floats) -> Floats:
@@ -132,8 +123,8 @@ def identifiable_parameters(
 def name_directions(model: Model, null: Floats, most: int = 3) -> tuple[str, ...]:
     """Name unidentifiable directions by the parameters that move together in them.
 
-    The directions are brought to echelon form first, each pivoting on its largest element,
-    so that every one involves few parameters. Factors are in ordinary magnitudes.
+    Each is pivoted on its largest element, so that it involves few parameters. Factors are in
+    ordinary magnitudes.
     """
     names, out = names_of(model), []
     for row in echelon(null.T, (range(len(null)),)):

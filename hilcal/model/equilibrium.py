@@ -18,7 +18,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from hilcal.effects.protocol import Columns, Effect, Situation
-from hilcal.model.observe import ReadingDerivative, SlotFrames
+from hilcal.model.observe import ReadingDerivative
 from hilcal.robot import se3
 from hilcal.robot.chain import Chain
 from hilcal.robot.se3 import along_states, zeros
@@ -103,7 +103,11 @@ def at_equilibrium(
     previous = total
     for _ in range(MAX_TERMS):
         gradient = stiffness.gradient(term)
-        term = by_wrenches(blocks, gradient.joint, partial(_by_twist, gradient, moves.frames))
+
+        def by_slot(k: int, g: MotionGradient = gradient) -> Floats:
+            return moves.by_twist(k, g.displacement(k), g.turn(k))
+
+        term = by_wrenches(blocks, gradient.joint, by_slot)
         for place, b in term.items():
             form[place] = form[place] + b
         size = _norm(term)
@@ -126,15 +130,6 @@ def wrench_form(
     return by_wrenches(blocks, lambda j: moves.dq[:, :, j], moves.by_slot)
 
 
-def by_wrench_changes(form: Mapping[tuple[int, bool], Floats], change: Floats, m: int) -> Floats:
-    """Motion (N, m, P) of a reading by changes (N, P, n + 1, 6) of the wrenches; `wrench_form`."""
-    out = zeros(len(change), m, change.shape[1])
-    for (slot, moment), rows in form.items():
-        half = change[:, :, slot, MOMENT if moment else FORCE]
-        out += rows_times(rows, half, transposed=True)
-    return out
-
-
 def by_load(form: Mapping[tuple[int, bool], Floats], chain: Chain, load: Load, m: int) -> Floats:
     """Derivative (N, m, 6) of a reading by the load's wrench at the load point, base axes.
 
@@ -154,23 +149,13 @@ def by_load(form: Mapping[tuple[int, bool], Floats], chain: Chain, load: Load, m
 def by_wrenches(
     blocks: list[SlotResponse],
     by_joint: Callable[[int], Floats],  # (N, m) by the displacement of a joint
-    by_slot: Callable[[int, slice], Floats],  # (N, m, E) by elements of a slot's twist
+    by_slot: Callable[[int], Floats],  # (N, m, 6) by a slot's twist
 ) -> dict[tuple[int, bool], Floats]:
     """Derivatives (N, m, 3) by the force (False) and moment (True) of each slot, without zeros."""
-    used: dict[int, slice] = {}
-    for b in blocks:
-        if not b.joint:
-            old = used.get(b.deviating, b.elements)
-            start, stop = min(old.start, b.elements.start), max(old.stop, b.elements.stop)
-            used[b.deviating] = slice(start, stop)
-    twists = {slot: by_slot(slot, elements) for slot, elements in used.items()}
+    twists = {slot: by_slot(slot) for slot in {b.deviating for b in blocks if not b.joint}}
     out: dict[tuple[int, bool], Floats] = {}
     for b in blocks:
-        if b.joint:
-            rows = by_joint(b.deviating)[..., None]
-        else:
-            e = used[b.deviating].start
-            rows = twists[b.deviating][..., b.elements.start - e : b.elements.stop - e]
+        rows = by_joint(b.deviating)[..., None] if b.joint else twists[b.deviating][..., b.elements]
         moment = b.components.start >= MOMENT.start
         first = MOMENT.start if moment else FORCE.start
         if (b.slot, moment) not in out:
@@ -182,12 +167,6 @@ def by_wrenches(
         for i, element in zip(*np.nonzero(b.values[0]), strict=True):
             part[..., i] += rows[..., element] * b.values[0, i, element]
     return out
-
-
-def _by_twist(gradient: MotionGradient, frames: SlotFrames, slot: int, elements: slice) -> Floats:
-    """Derivative (N, m, E) by elements of the twist of a slot, from that by its motion."""
-    v = gradient.displacement(slot) if frames.need_displacement(slot, elements) else None
-    return frames.by_twist(slot, v, gradient.turn(slot), elements)
 
 
 def _norm(form: Mapping[tuple[int, bool], Floats]) -> float:
@@ -244,7 +223,6 @@ class ReadingColumns:
         out: Floats,  # (N, m, L), to be written
         scale: Floats | None = None,  # (L,) units of the parameters, SI by default
     ) -> None:
-        """Begin with zeros."""
         self._moves, self._blocks, self._load, self._out = moves, blocks, load, out
         self._scale = np.ones(out.shape[2]) if scale is None else scale
         self._sums = zeros(*out.shape)
@@ -272,7 +250,9 @@ class ReadingColumns:
     def add_wrench_changes(self, change: Floats, place: Ints) -> None:
         """Add changes (N, P, n + 1, 6) of the slot wrenches by the P parameters of an effect."""
         used = place >= 0
-        self._add(by_wrench_changes(self._form, change[:, used], self._moves.m), place[used])
+        for (slot, moment), rows in self._form.items():
+            half = change[:, used, slot, MOMENT if moment else FORCE]
+            self._add(rows_times(rows, half, transposed=True), place[used])
 
     def add_load_changes(self, change: Floats, place: Ints) -> None:
         """Add changes (N, P, 6) of the load's wrench at the load point, base axes."""

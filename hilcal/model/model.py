@@ -17,7 +17,7 @@ from hilcal.model.observe import Observation, ReadingDerivative, motion, observe
 from hilcal.readings.readings import Readings, States
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
-from hilcal.robot.chain import Chain, Deviation
+from hilcal.robot.chain import Deviation
 from hilcal.robot.se3 import along_states, by_field, chunks, take, zeros
 from hilcal.robot.statics import Load, geometric_stiffness, slot_wrenches
 from hilcal.shown import Brief
@@ -43,7 +43,6 @@ class Prediction(Brief):
     observation: Observation  # what the sensor would read
 
     def __getitem__(self, rows: slice) -> "Prediction":
-        """Return the prediction of the chosen states."""
         s = self.situation
         chosen = replace(
             s, states=s.states[rows], angle=s.angle[rows], chain=take(s.chain, rows, axis=1),
@@ -75,23 +74,16 @@ class Model(Brief):
     cell: Cell
     effects: tuple[Effect, ...]  # with distinct names
     catalogue: Catalogue = field(default_factory=installed)  # the effects that it could have
-    readings: Readings | None = None
-    """for which effects are set up when they are added by name; None for no readings"""
-    prior: "CarriedPrior | None" = None
-    """what another campaign has determined of parameters of the same names; None for nothing"""
+    readings: Readings | None = None  # for which effects are set up when they are added by name
+    prior: "CarriedPrior | None" = None  # of parameters of the same names, by another campaign
+    # by effect, the standard deviations (q,) of its parameters where they are random with a mean
+    # of zero, SI (see `hilcal.mixed`)
     random: Mapping[str, Floats] = field(default_factory=dict)
-    """by effect, the standard deviations (q,) of its parameters where they are random with a mean
-    of zero, SI (see `hilcal.mixed`)"""
+    # names of effects among `random` that take part in predictions although the readings do not
+    # prove any of them by itself
     background: frozenset[str] = frozenset()
-    """names of effects among `random` that take part in predictions although the readings do not
-    prove any of them by itself"""
-    _slices: tuple[slice, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Refuse an effect that is there twice."""
-        ends = accumulate((len(e.magnitudes) for e in self.effects), initial=0)
-        # Needed at every step; an effect with a thousand parameters takes long to name them.
-        object.__setattr__(self, "_slices", tuple(slice(a, b) for a, b in pairwise(ends)))
         names = self.names
         for name in names:
             if names.count(name) > 1:
@@ -120,21 +112,18 @@ class Model(Brief):
     @property
     def size(self) -> int:
         """Number of parameters."""
-        return self._slices[-1].stop if self._slices else 0
+        return sum(len(e.magnitudes) for e in self.effects)
 
     def slices(self) -> tuple[slice, ...]:
         """The slice of each effect's parameters in the vector of all."""
-        return self._slices
+        ends = accumulate((len(e.magnitudes) for e in self.effects), initial=0)
+        return tuple(slice(a, b) for a, b in pairwise(ends))
 
     def __add__(self, effect: Effect | EffectSpec | str | type[Effect]) -> "Model":
         """Return the model with one more effect; one that is only named is built for it."""
-        if isinstance(effect, str | type):
-            effect = EffectSpec(effect)
-        if isinstance(effect, EffectSpec):
-            return self._with(effect)
-        return replace(self, effects=(*self.effects, effect))
-
-    def _with(self, spec: EffectSpec) -> "Model":
+        spec = EffectSpec(effect) if isinstance(effect, str | type) else effect
+        if not isinstance(spec, EffectSpec):
+            return replace(self, effects=(*self.effects, spec))
         if self.readings is None:
             raise InputError(
                 f"effect {spec.name}: this model was made without readings; add an effect that is "
@@ -143,8 +132,8 @@ class Model(Brief):
         catalogue, states, m = self.catalogue, self.readings.states, self.readings.m
         if not isinstance(spec.kind, str) and spec.kind not in catalogue.effects:
             catalogue = catalogue.with_effects(spec.kind)
-        effect = catalogue.make(spec.name, self.cell, states, spec.options, m)
-        return replace(self, effects=(*self.effects, effect), catalogue=catalogue)
+        made = catalogue.make(spec.name, self.cell, states, spec.options, m)
+        return replace(self, effects=(*self.effects, made), catalogue=catalogue)
 
     def predict(self, states: States, theta: Floats, near: Prediction | None = None) -> Prediction:
         """Equilibrium of N states: elastic deviations at the deflected configuration.
@@ -184,7 +173,9 @@ class Model(Brief):
             s = replace(s, chain=chain, wrench=wrench, load=load)
             deviation = _deviation(elastic, s, rigid, checked=previous is None)
             chain = chains.evaluate(cell.arm, angle, deviation, turns)
-            moved = _flange_motion(s.chain, chain, cell.arm.reach)
+            shift = np.abs(chain.position[-1] - s.chain.position[-1]).max(initial=0.0)
+            turn = np.abs(chain.rotation[-1] - s.chain.rotation[-1]).max(initial=0.0)
+            moved = float(max(shift, cell.arm.reach * turn))  # of the flange, m
             # The steps shrink geometrically: the error is about the next one.
             missing = moved if previous is None else moved * (moved / previous)
             if not elastic or missing <= EQUILIBRIUM_TOLERANCE:
@@ -220,10 +211,7 @@ class Model(Brief):
         (P,), by the parameters in these units.
         """
         count = len(prediction.situation.angle)
-        if effects is self.effects:  # naming a thousand parameters takes long
-            sizes = [s.stop - s.start for s in self.slices()]
-        else:
-            sizes = [len(e.magnitudes) for e in effects]
+        sizes = [len(e.magnitudes) for e in effects]
         place = np.full(sum(sizes), -1)
         live = np.arange(len(place)) if live is None else live
         place[live] = np.arange(len(live))
@@ -348,10 +336,3 @@ def _no_equilibrium(elastic: list[tuple[Effect, Floats]]) -> CannotAnswerError:
         f"{', '.join(e.name for e, _ in elastic)} grow instead of settling; measure "
         "poses and loads that determine them, or leave an effect out"
     )
-
-
-def _flange_motion(a: Chain, b: Chain, reach: float) -> float:
-    """Largest displacement, or rotation times reach, of the flange from one chain to another."""
-    shift = np.abs(b.position[-1] - a.position[-1]).max(initial=0.0)
-    turn = np.abs(b.rotation[-1] - a.rotation[-1]).max(initial=0.0)
-    return float(max(shift, reach * turn))

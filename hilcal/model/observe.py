@@ -9,7 +9,7 @@ elements, the others zero; see `Readings`).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,8 +20,6 @@ from hilcal.robot.se3 import empty, zeros
 from hilcal.robot.statics import MotionGradient, rows_times
 from hilcal.shown import Brief
 from hilcal.types import Bools, Floats, Ints
-
-ALL = slice(0, 6)  # All elements of a twist
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,7 +36,7 @@ class Observation(Brief):
     local: Floats | None = None  # (N, 3) the same in the axes of the observer
     read: Floats | None = None  # (N, 3, 3) derivative of `position` by `local`
     by_sensor: Floats | None = None  # (N, 3, 3) derivative of `position` by `sensor`
-    distance: Floats | None = None  # (N,) 1 where a distance is read, which has an offset; else 0
+    far: Bools | None = None  # (N,) where a distance is read, which has an offset
 
 
 def observe(
@@ -71,71 +69,60 @@ def observe(
     if deviation.scale is not None:
         position = position * (1 + deviation.scale[:, None])
     axes = np.broadcast_to(axes, rotation.shape)
-    if observer is not None and cell.observers:
-        return _observed(cell, deviation, observer, position, rotation, base_position, axes)
-    return Observation(position, rotation, base_position, axes)
+    if observer is None or not cell.observers:
+        return Observation(position, rotation, base_position, axes)
+    o = sighted(cell.observers, observer, position, rotation, deviation.observer)
+    return replace(o, base_position=base_position, axes=se3.product(o.axes, axes))
 
 
-def _observed(
-    cell: Cell, deviation: Deviation, observer: Ints, sensor: Floats, rotation: Floats,
-    base_position: Floats, axes: Floats,
-) -> Observation:  # fmt: skip
-    """Convert positions and attitudes in sensor axes into the readings of the observers (N,)."""
-    turn, local, offset = _in_observer_axes(cell.observers, observer, sensor)
-    if deviation.observer is not None:
-        twist, extra = _twist_and_offset(deviation.observer, _distances(cell.observers, observer))
-        observer_r, observer_p = se3.exp(twist)
-        local, turn = observer_p + se3.apply(observer_r, local), se3.product(observer_r, turn)
-        offset = offset + extra
-    value, read, distance = _sensed(cell.observers, observer, local, offset)
-    by_sensor = se3.product(read, turn)
-    rotation, axes = se3.product(turn, rotation), se3.product(by_sensor, axes)
-    return Observation(
-        value, rotation, base_position, axes, sensor, local, read, by_sensor, distance
-    )
+def sighted(
+    observers: Sequence[Observer],
+    number: Ints,
+    sensor: Floats,
+    rotation: Floats,
+    moved: Floats | None = None,
+) -> Observation:
+    """Return what observers (N,) read of positions (N, 3) and attitudes in sensor axes.
 
-
-def read_by(
-    observers: Sequence[Observer], number: Ints, sensor: Floats, rotation: Floats
-) -> tuple[Floats, Floats]:
-    """Return what observers (N,) read of positions (N, 3) and attitudes, sensor axes."""
-    turn, local, offset = _in_observer_axes(observers, number, sensor)
-    return _sensed(observers, number, local, offset)[0], turn @ rotation
-
-
-def _in_observer_axes(
-    observers: Sequence[Observer], number: Ints, sensor: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """Orientation (N, 3, 3) of the observers, positions (N, 3) in their axes, offsets (N,)."""
+    `moved` (N, 6) are the twists of their frames, see `Deviation.observer`. The base of the
+    observation is the sensor.
+    """
     frame = np.stack([o.frame for o in observers])[number]
-    local = frame[:, :3, 3] + se3.apply(frame[:, :3, :3], sensor)
-    return frame[:, :3, :3], local, np.array([o.offset for o in observers])[number]
-
-
-def _distances(observers: Sequence[Observer], number: Ints) -> Bools:
-    return np.array([o.name.kind == "point" for o in observers])[number]
-
-
-def _twist_and_offset(moved: Floats, far: Bools) -> tuple[Floats, Floats]:
-    """Twists (N, 6) and offsets (N,) of the observers, see `Deviation.observer`."""
-    twist = moved.copy()
-    twist[far, 3:] = 0.0
-    return twist, np.where(far, moved[:, 3], 0.0)
-
-
-def _sensed(
-    observers: Sequence[Observer], number: Ints, local: Floats, offset: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """What observers read (N, 3) of local positions, the derivative, and where it is a distance."""
     kind = np.array([o.name.kind for o in observers])[number]
-    far, flat = _distances(observers, number), kind == "gauge"
+    far, flat = kind == "point", kind == "gauge"
+    offset, turn = np.array([o.offset for o in observers])[number], frame[:, :3, :3]
+    local = frame[:, :3, 3] + se3.apply(turn, sensor)
+    if moved is not None:
+        observer_r, observer_p = se3.exp(_turning(moved, far))
+        local, turn = observer_p + se3.apply(observer_r, local), se3.product(observer_r, turn)
+        offset = offset + np.where(far, moved[:, 3], 0.0)
     length = np.linalg.norm(local, axis=1)
     read, value = np.tile(np.eye(3), (len(local), 1, 1)), local.copy()
     read[far | flat], value[far | flat, 1:] = 0.0, 0.0
     read[far, 0] = local[far] / np.maximum(length[far], 1e-12)[:, None]
     read[flat, 0, 0] = 1.0
     value[far, 0] = length[far] + offset[far]
-    return value, read, far.astype(float)
+    by_sensor = se3.product(read, turn)
+    return Observation(
+        value, se3.product(turn, rotation), sensor, by_sensor, sensor, local, read, by_sensor, far
+    )
+
+
+def _turning(moved: Floats, far: Bools) -> Floats:
+    """Twists (N, 6) of the observers without the offsets of distances."""
+    return np.where(far[:, None] & (np.arange(6) > 2), 0.0, moved)
+
+
+def by_observer_frame(o: Observation, m: int, moved: Floats | None = None) -> Floats:
+    """Motion (N, m, 6) of a reading by the twist of the observer's frame, as of `sighted`."""
+    out = zeros(len(o.position), m, 6)
+    if o.local is not None and o.read is not None and o.far is not None:
+        back = None if moved is None else -_turning(moved, o.far)
+        jacobian = twist_jacobian(np.eye(3)[None], o.local, back)
+        out[:, :3] = o.read @ jacobian[:, :3]
+        out[:, 3:] = jacobian[:, 3:m]
+        out[o.far, 0, 3:] = [1.0, 0.0, 0.0]
+    return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,10 +137,11 @@ class ReadingDerivative:
     chain: Chain
     deviation: Deviation
     m: int
-    frames: "SlotFrames"
     dq: Floats  # (N, m, n) derivative by displacements of the chain's joints
     yielding: MotionGradient | None = None  # of the yielding of the arm
     _cache: dict[int, tuple[Floats, Floats]] = field(default_factory=dict, repr=False)
+    # R J and R Q (None for zero) of the slots that were needed, see `by_twist`
+    _turned: dict[int, tuple[Floats, Floats | None]] = field(default_factory=dict, repr=False)
 
     @property
     def drives(self) -> Floats:
@@ -161,15 +149,35 @@ class ReadingDerivative:
         drive = self.cell.arm.drive
         return self.dq if drive is None else np.asarray(self.dq @ drive)
 
-    def by_slot(self, slot: int, elements: slice = ALL) -> Floats:
-        """Motion (N, m, E) by some elements of the twist of a slot."""
+    def by_slot(self, slot: int) -> Floats:
+        """Motion (N, m, 6) by the twist of a slot."""
         v, w = self._rigid(slot)
         if self.yielding is not None:
-            w = w + self.yielding.turn(slot)
-            if self.frames.need_displacement(slot, elements):
-                shift = self.yielding.displacement(slot)
-                v = v if shift is None else v + shift
-        return self.frames.by_twist(slot, v, w, elements)
+            shift, w = self.yielding.displacement(slot), w + self.yielding.turn(slot)
+            v = v if shift is None else v + shift
+        return self.by_twist(slot, v, w)
+
+    def by_twist(self, slot: int, v: Floats | None, w: Floats) -> Floats:
+        """Rows (N, m, 6) by the twist ξ of a slot, from rows by v (None for zero) and ω.
+
+        v = R J dξ_v + R Q dξ_ω and ω = R J dξ_ω are motions of its frame, R the orientation after
+        ξ, J and Q the blocks of the right Jacobian (`se3`).
+        """
+        if slot not in self._turned:
+            twist = None if self.chain.twist is None else self.chain.twist[slot]
+            r, beyond = self.chain.rotation[slot], None
+            if twist is not None and twist.any():
+                j, q = se3.right_jacobian_blocks(twist)
+                beyond = se3.product(r, q) if twist[:, :3].any() else None
+                r = se3.product(r, j)
+            self._turned[slot] = r, beyond
+        turned, shift = self._turned[slot]
+        out = empty(*w.shape[:2], 6)
+        out[..., :3] = 0.0 if v is None else rows_times(v, turned)
+        out[..., 3:] = rows_times(w, turned)
+        if v is not None and shift is not None:
+            out[..., 3:] += rows_times(v, shift)
+        return out
 
     def _rigid(self, slot: int) -> tuple[Floats, Floats]:
         """Rows (N, m, 3) by displacement and turn of all beyond a slot, as of a rigid body."""
@@ -220,16 +228,7 @@ class ReadingDerivative:
 
     def by_observer(self) -> Floats:
         """Motion (N, m, 6) by the twist of the observer's frame, see `Deviation.observer`."""
-        moved = zeros(len(self.dq), self.m, 6)
-        o, twist = self.observation, self.deviation.observer
-        if o.local is not None and o.read is not None:
-            far = np.asarray(o.distance, dtype=float)
-            back = None if twist is None else -_twist_and_offset(twist, far > 0)[0]
-            jacobian = twist_jacobian(np.eye(3)[None], o.local, back)
-            moved[:, :3] = o.read @ jacobian[:, :3]
-            moved[:, 3:] = jacobian[:, 3 : self.m]
-            moved[far > 0, 0, 3:] = [1.0, 0.0, 0.0]
-        return moved
+        return by_observer_frame(self.observation, self.m, self.deviation.observer)
 
     def _as_read(self, moved: Floats) -> Floats:
         """Motion (N, m, E) of the reading by that of the target in sensor axes."""
@@ -246,57 +245,13 @@ class ReadingDerivative:
         return position if scale is None else position / (1 + scale[:, None])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SlotFrames:
-    """From motions of a frame to its twist ξ: v = R J dξ_v + R Q dξ_ω, ω = R J dξ_ω.
-
-    J and Q are the blocks of the right Jacobian (`se3`), R the frame's orientation after ξ.
-    """
-
-    chain: Chain
-    # R J and R Q (None for zero) of the slots that were needed
-    cache: dict[int, tuple[Floats, Floats | None]] = field(default_factory=dict)
-
-    def by_twist(self, slot: int, v: Floats | None, w: Floats, elements: slice = ALL) -> Floats:
-        """Rows (N, m, E) by elements of the twist, from rows by v (None for zero) and ω."""
-        turned, shift = self._blocks(slot)
-        start, stop = elements.start, elements.stop
-        out = empty(*w.shape[:2], stop - start)
-        split = max(min(3, stop) - start, 0)
-        if split and v is not None:
-            np.einsum("nmi,nij->nmj", v, turned[..., start : start + split], out=out[..., :split])
-        elif split:
-            out[..., :split] = 0.0
-        if stop > 3:
-            turns = slice(max(start - 3, 0), stop - 3)
-            np.einsum("nmi,nij->nmj", w, turned[..., turns], out=out[..., split:])
-            if v is not None and shift is not None:
-                out[..., split:] += rows_times(v, shift[..., turns])
-        return out
-
-    def need_displacement(self, slot: int, elements: slice) -> bool:
-        """Whether these elements of the twist of a slot displace the arm beyond it."""
-        return elements.start < 3 or self._blocks(slot)[1] is not None
-
-    def _blocks(self, slot: int) -> tuple[Floats, Floats | None]:
-        if slot not in self.cache:
-            r, shift = self.chain.rotation[slot], None
-            twist = None if self.chain.twist is None else self.chain.twist[slot]
-            if twist is not None and twist.any():
-                j, q = se3.right_jacobian_blocks(twist)
-                shift = se3.product(r, q) if twist[:, :3].any() else None
-                r = se3.product(r, j)
-            self.cache[slot] = r, shift
-        return self.cache[slot]
-
-
 def motion(
     cell: Cell, observation: Observation, chain: Chain, deviation: Deviation, m: int
 ) -> ReadingDerivative:
     """Prepare the motions of a reading with m elements at fixed wrenches."""
     moved = joint_jacobian(chain, observation.base_position)
     dq = _to_sensor(observation, deviation, moved, m)
-    return ReadingDerivative(cell, observation, chain, deviation, m, SlotFrames(chain), dq)
+    return ReadingDerivative(cell, observation, chain, deviation, m, dq)
 
 
 def _once(x: Floats) -> Floats:

@@ -18,8 +18,8 @@ from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE
 from hilcal.identification.background import FamilySize
+from hilcal.identification.carried import names_of
 from hilcal.identification.fit import Fit
-from hilcal.identification.priors import names_of
 from hilcal.names import escaped
 from hilcal.present.document import load_name
 from hilcal.present.fit import CERTAIN, follows

@@ -24,22 +24,20 @@ Sources: MacKay, *Bayesian interpolation*, Neural Computation 4 (1992) 415-447; 
 Faul, *Fast marginal likelihood maximisation for sparse Bayesian models*, AISTATS 2003.
 """
 
-from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import scipy.linalg as sl
 from scipy.special import exp1
 from scipy.stats import chi2
 
-from hilcal.regression.schur import eliminate, inverse_root
+from hilcal.regression.schur import eliminate
 from hilcal.types import Floats, Ints
 
-ITERATIONS = 25
-"""Most fixed-point iterations; a choice: strengths are needed to `TOLERANCE` only."""
+ITERATIONS = 25  # most of the fixed point; a choice: strengths are needed to `TOLERANCE` only
 NEGLIGIBLE = 1e-3  # share of the noise per parameter below which a group is dropped; a guess
-TOLERANCE = 0.2
-"""Change of the logarithm of a variance at which it counts as converged: 10 % of σ; a choice."""
+TOLERANCE = 0.2  # change of a variance's logarithm that ends the iteration, 10 % of σ; a choice
 PATIENCE = 3  # iterations before groups are judged by quality and sparsity; a choice
 
 
@@ -112,7 +110,7 @@ def maximise_evidence(
 
 
 def spent_by_groups(share: Floats, size: Ints) -> Floats:
-    """Degrees of freedom (G,) that retained groups use.
+    """Degrees of freedom (G,) that retained groups use; t = γ/k is the `share` that data determine.
 
     γ = Σ (1 − Σ_pp/σ²) counts the parameters at fixed strengths. But the same data select a group
     and set its strength. With x = |z|² of k orthonormal parameters z, a group is retained where
@@ -123,9 +121,6 @@ def spent_by_groups(share: Floats, size: Ints) -> Floats:
 
     degrees of freedom: k where it is far above the noise, and right on average for groups of noise
     (a dropped group uses none).
-
-    Args:
-        share: t, the share γ/k of each group that the data determine.
     """
     k = np.asarray(size, dtype=float)
     retained, mean = chi2.sf(k, k), k * chi2.sf(k, k + 2.0)
@@ -183,84 +178,39 @@ def solutions(p: FamilyProblem, fold: Ints) -> Floats:
     square = np.bincount(fold, weights=p.target**2)
 
     def without(f: int) -> Floats:
-        others = _OtherRows(gram, grams[f], rhs - sides[f], flat, float(square.sum() - square[f]))
-        count = len(fold) - int(count_of[f]) - flat
-        first = others.maximised(p.std, p.groups, p.beta, count)
-        start = others.with_dropped(p.groups, first.std, first.beta)
-        last = others.maximised(start, p.groups, first.beta, count)
-        return others.solution(last.std, last.beta)
+        g, b, yy = gram - grams[f], rhs - sides[f], float(square.sum() - square[f])
+        inner, slope, yy = eliminate(g, b, yy, slice(0, flat))
+        inner, slope = inner[flat:, flat:], slope[flat:]
+        of_others = (inner, slope, yy, len(fold) - int(count_of[f]) - flat, 0, p.groups)
+        first = maximise_evidence(*of_others, p.std, p.beta)
+        start = _with_dropped(inner, slope, p.groups, first.std, first.beta)
+        last = maximise_evidence(*of_others, start, first.beta)
+        live = np.concatenate([np.arange(flat), flat + np.flatnonzero(last.std)])
+        ridge = np.concatenate([np.zeros(flat), last.beta / last.std[last.std > 0] ** 2])
+        u = np.zeros(len(b))
+        u[live] = sl.cho_solve(sl.cho_factor(g[np.ix_(live, live)] + np.diag(ridge)), b[live])
+        return u
 
     return np.array([without(f) for f in range(len(grams))])
 
 
-@dataclass(frozen=True, eq=False)
-class _OtherRows:
-    """The problem of all rows outside of a fold; only the needed part of its products is formed."""
-
-    gram_all: Floats  # (F + P, F + P) AᵀA of all rows
-    gram_fold: Floats  # the same of the fold
-    rhs: Floats  # (F + P,) Aᵀy of the other rows
-    flat: int  # number F of unshrunk columns
-    square: float  # ‖y‖² of the other rows
-
-    @cached_property
-    def _cross(self) -> Floats:
-        """C (F, P + 1): eliminating unshrunk columns subtracts CᵀC from the rest of [AᵀA, Aᵀy]."""
-        flat = self.flat
-        rows = self.gram_all[:flat] - self.gram_fold[:flat]
-        right = np.column_stack([rows[:, flat:], self.rhs[:flat]])
-        return np.asarray(inverse_root(rows[:, :flat]) @ right)
-
-    @cached_property
-    def _slope(self) -> Floats:
-        """(P,) Aᵀy of the shrunk columns after elimination of the unshrunk ones."""
-        return np.asarray(self.rhs[self.flat :] - self._cross[:, :-1].T @ self._cross[:, -1])
-
-    def gram(self, rows: Ints, columns: Ints) -> Floats:
-        """AᵀA between shrunk columns after elimination of the unshrunk ones."""
-        part = np.ix_(self.flat + rows, self.flat + columns)
-        explained = self._cross[:, rows].T @ self._cross[:, columns]
-        return np.asarray(self.gram_all[part] - self.gram_fold[part] - explained)
-
-    def maximised(self, std: Floats, groups: Ints, beta: float, count: int) -> EmpiricalPrior:
-        """Maximise the evidence over the strengths that are not zero."""
-        live, out = np.flatnonzero(std), np.zeros(len(groups))
-        square = self.square - float(self._cross[:, -1] @ self._cross[:, -1])
-        gram, slope = self.gram(live, live), self._slope[live]
-        prior = maximise_evidence(gram, slope, square, count, 0, groups[live], std[live], beta)
-        out[live] = prior.std
-        return replace(prior, std=out)
-
-    def with_dropped(self, groups: Ints, std: Floats, beta: float) -> Floats:
-        """Return strengths (P,), with those of dropped groups that the rows support."""
-        out, live = np.flatnonzero(std == 0), np.flatnonzero(std > 0)
-        if not len(out):
-            return std
-        h = self.gram(live, live) + np.diag(beta / std[live] ** 2)
-        x = np.column_stack([self.gram(live, out), self._slope[live]])
-        x = sl.solve_triangular(sl.cholesky(h, lower=True), x, lower=True)
-        k = self.flat + out
-        size = self.gram_all[k, k] - self.gram_fold[k, k] - np.sum(self._cross[:, out] ** 2, axis=0)
-        free = np.maximum(size - np.sum(x[:, :-1] ** 2, axis=0), 1e-300)
-        slope = self._slope[out] - x[:, :-1].T @ x[:, -1]
-        group, count = groups[out], int(groups.max()) + 1
-        members = np.bincount(group, minlength=count)
-        quality = np.bincount(group, weights=slope**2 / (beta * free), minlength=count)
-        excess = np.bincount(group, weights=slope**2 - beta * free, minlength=count)
-        spread = np.bincount(group, weights=free**2, minlength=count)
-        enters = (quality > members) & (excess > 0)
-        variance = np.where(enters, excess / np.maximum(spread, 1e-300), 0.0)
-        start = std.copy()
-        start[out] = np.sqrt(variance[group])
-        return start
-
-    def solution(self, std: Floats, beta: float) -> Floats:
-        """Return u (F + P) for strengths (P,)."""
-        retained = std > 0
-        live = np.concatenate([np.arange(self.flat), self.flat + np.flatnonzero(retained)])
-        part = np.ix_(live, live)
-        ridge = np.concatenate([np.zeros(self.flat), beta / std[retained] ** 2])
-        h = self.gram_all[part] - self.gram_fold[part] + np.diag(ridge)
-        u = np.zeros(len(self.rhs))
-        u[live] = sl.cho_solve(sl.cho_factor(h), self.rhs[live])
-        return u
+def _with_dropped(g: Floats, b: Floats, groups: Ints, std: Floats, beta: float) -> Floats:
+    """Return strengths (P,), with those of dropped groups that the rows with AᵀA, Aᵀy support."""
+    out, live = np.flatnonzero(std == 0), np.flatnonzero(std > 0)
+    if not len(out):
+        return std
+    h = g[np.ix_(live, live)] + np.diag(beta / std[live] ** 2)
+    x = np.column_stack([g[np.ix_(live, out)], b[live]])
+    x = sl.solve_triangular(sl.cholesky(h, lower=True), x, lower=True)
+    free = np.maximum(np.diag(g)[out] - np.sum(x[:, :-1] ** 2, axis=0), 1e-300)
+    slope = b[out] - x[:, :-1].T @ x[:, -1]
+    group, count = groups[out], int(groups.max()) + 1
+    members = np.bincount(group, minlength=count)
+    quality = np.bincount(group, weights=slope**2 / (beta * free), minlength=count)
+    excess = np.bincount(group, weights=slope**2 - beta * free, minlength=count)
+    spread = np.bincount(group, weights=free**2, minlength=count)
+    enters = (quality > members) & (excess > 0)
+    variance = np.where(enters, excess / np.maximum(spread, 1e-300), 0.0)
+    start = std.copy()
+    start[out] = np.sqrt(variance[group])
+    return start

@@ -1,6 +1,6 @@
 """Test, power and evidence of a family of columns that a fitted model lacks, without a refit.
 
-With r the whitened residual of the model, M the projection off its columns (`projection`) and
+With r the whitened residual of the model, M the projection off its columns (`schur`) and
 X (R, P) the family's columns in ordinary magnitudes, everything follows from
 
     S = Xᵀ M X,    g = Xᵀ r,    ‖r‖²
@@ -22,11 +22,10 @@ The family is judged as a whole:
 
   and β | r is Student's with ν degrees of freedom, mean (S + t⁻²)⁻¹ g and scale matrix
   (‖r‖²_t / ν) (S + t⁻²)⁻¹. This is exact for a model without priors; for one with priors, ‖r‖²
-  stands for rᵀ M⁻¹ r, which is larger by the penalty. t maximises the evidence. Of two families
-  that explain the same, the smaller one has more evidence.
+  stands for rᵀ M⁻¹ r, which is larger by the penalty. t maximises the evidence.
 
-Diagnosis and planning use the same formula. If σ² = 1 were assumed, a misfit of variance factor φ
-would overstate the evidence of each direction by about φ.
+If σ² = 1 were assumed, a misfit of variance factor φ would overstate the evidence of each direction
+by about φ.
 
 Sources: O'Hagan and Forster, *Bayesian Inference* (2004), chapter 11; Goeman, van de Geer and van
 Houwelingen, *Testing against a high dimensional alternative*, J. R. Stat. Soc. B 68 (2006) 477-493;
@@ -43,16 +42,13 @@ from scipy.stats import f as f_distribution
 
 from hilcal.types import Bools, Floats
 
-VISIBLE = 1e-4
-"""Eigenvalues of S below this are not tested: an ordinary magnitude along such a direction moves
-all data together by less than 0.01 σ; a guess."""
+VISIBLE = 1e-4  # eigenvalues of S below this are not tested: an ordinary magnitude along such a
+# direction moves all data together by less than 0.01 σ; a guess
 RELATIVE = 1e-10  # eigenvalues of S below this share of the largest are rounding
-NEAR_MEAN = 2e-3
-"""Distance from the mean, in standard deviations, within which Lugannani's formula loses digits."""
+NEAR_MEAN = 2e-3  # standard deviations about the mean in which Lugannani's formula loses digits
 LARGE_FAMILY = 0.1  # share of the degrees of freedom from which a family is large; a guess
 ROUNDING = 1e-12
-STRENGTHS = np.logspace(-3, 3, 61)
-"""Tried prior standard deviations τ, in ordinary magnitudes; t² = τ² ν / ‖r‖²."""
+STRENGTHS = np.logspace(-3, 3, 61)  # tried τ, in ordinary magnitudes; t² = τ² ν / ‖r‖²
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,15 +127,8 @@ def log_evidence(
     rss: float,  # ‖r‖²
     dof: float,  # ν
     strengths: Floats = STRENGTHS,  # (T,) τ
-) -> Floats:
-    """Return the log evidence (T, ...) of families at each strength τ."""
-    return _evidence(lam, explained, rss, dof, strengths)[0]
-
-
-def _evidence(
-    lam: Floats, explained: Floats, rss: float, dof: float, strengths: Floats
 ) -> tuple[Floats, Floats]:
-    """`log_evidence`, and ‖r‖²_t / ‖r‖² (T, ...)."""
+    """Return the log evidence (T, ...) of families at each strength τ, and ‖r‖²_t / ‖r‖²."""
     grown = 1.0 + np.multiply.outer(strengths**2 * (dof / rss), lam)
     remaining = rss - explained.sum(axis=-1) + (explained / grown).sum(axis=-1)
     remaining = np.maximum(remaining / rss, ROUNDING)
@@ -174,7 +163,7 @@ def score_family(
         p_value = float(f_distribution.sf(gain / rank / variance, rank, free - rank))
     else:
         p_value = ratio_tail(lam, free, float(c @ c) / rss)
-    evidence, remaining = _evidence(lam, explained, rss, dof, STRENGTHS)
+    evidence, remaining = log_evidence(lam, explained, rss, dof)
     unbounded = int(np.argmax(evidence))
     if np.isfinite(most):
         # τ = t σ with σ² = ‖r‖²/ν, which contains what the family explains: use ‖r‖²_t instead.
@@ -207,11 +196,8 @@ def score_family(
 def ratio_tail(eigenvalues: Floats, dimension: float, c: float) -> float:
     """Probability that a ratio of quadratic forms zᵀ L z / zᵀ z of z ~ N(0, I_R) exceeds c.
 
-    This is P(Σ (λ_i − c) χ²_1 > 0), by the saddlepoint approximation of Lugannani and Rice.
-
-    Args:
-        eigenvalues: (K,) non-zero eigenvalues λ of L.
-        dimension: R, at least K; the other R − K eigenvalues are zero.
+    This is P(Σ (λ_i − c) χ²_1 > 0), by the saddlepoint approximation of Lugannani and Rice; λ (K,)
+    are the non-zero eigenvalues of L, R ≥ K is the `dimension`.
     """
     top = float(eigenvalues.max(initial=0.0))
     if c <= 0 or top <= 0:
@@ -254,13 +240,10 @@ def ratio_tail(eigenvalues: Floats, dimension: float, c: float) -> float:
 
 
 def family_power(s: Floats, beta: Floats, level: float, dof: float = np.inf) -> float:
-    """Return the power of the test at `level` against the parameters β of a family.
+    """Return the power of the test at `level` against the parameters β (P,) of a family with S.
 
-    Args:
-        s: (P, P) S.
-        beta: (P,) β.
-        level: of the test; returned where no direction of the family is visible.
-        dof: degrees of freedom of the residual without the family; infinite for known noise.
+    `dof` is that of the residual without the family, infinite for known noise. Where no direction
+    of the family is visible, the power is the level.
     """
     eigen = spectrum(s)
     if eigen.rank == 0 or dof - eigen.rank < 1:

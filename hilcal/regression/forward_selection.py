@@ -27,9 +27,8 @@ from hilcal.regression.evidence import FamilyScore, log_evidence, score_family, 
 from hilcal.regression.schur import eliminate, positive_solve
 from hilcal.types import Bools, Floats, Ints
 
-SPANNED = 1e-6
-"""Eigenvalues of a chosen block's gram below this share of the largest are ignored: directions that
-the model and earlier blocks nearly explain; a choice."""
+SPANNED = 1e-6  # eigenvalues of a chosen block's gram below this share of the largest are ignored:
+# directions that the model and earlier blocks nearly explain; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,15 +110,13 @@ def forward_selection(families: CandidateFamilies, most: int) -> Iterator[Additi
 def block_evidence(gram: Floats, g: Floats, rss: float, dof: float, strengths: Floats) -> Floats:
     """Gain in log evidence (L,) of each of L blocks, at its best of the prior strengths (T,).
 
-    Args:
-        gram: (L, W, W) of the blocks projected off the model.
-        g: (L, W) products of the blocks with the residual.
+    Of blocks projected off the model, with their gram (L, W, W) and products with r, g (L, W).
     """
     lam, u = np.linalg.eigh(gram)
     testable = visible(lam)
     c2 = np.einsum("lij,li->lj", u, g) ** 2
     explained = np.where(testable, c2 / np.where(testable, lam, 1.0), 0.0)
-    evidence = log_evidence(np.where(testable, lam, 0.0), explained, rss, dof, strengths)
+    evidence = log_evidence(np.where(testable, lam, 0.0), explained, rss, dof, strengths)[0]
     return np.asarray(evidence.max(axis=0))
 
 

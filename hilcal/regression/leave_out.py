@@ -1,27 +1,22 @@
 """Prediction of rows that are left out, with the model and a family of columns refitted.
 
 Each fold is left out by one Gauss-Newton step from the fit to all rows, with the fold's rows
-subtracted exactly from the normal equations. The residual of the fit to all rows would be too
-small, as it was fitted to the fold, too.
+subtracted exactly from the normal equations.
 
 A single pose may be the only one that determines a direction. A flat estimate along this direction
 from the other poses would be noise, magnified without limit, and one such pose would dominate the
 error. So without a fold the flat parameters have a prior about zero (empirical Bayes), whose
-standard deviation is their magnitude in the full fit. A direction that the other rows determine to
-1/s of this magnitude shrinks by the share 1/(1 + s²): not at all where s is large, to zero where s
-is small.
+standard deviation is their magnitude in the full fit: a direction that the other rows determine to
+1/s of this magnitude shrinks by the share 1/(1 + s²).
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
-from functools import reduce
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import norm, wilcoxon
 
 from hilcal.regression.normal_equations import NormalEquations
-from hilcal.regression.projection import Projection
-from hilcal.regression.schur import inverse_root, positive_solve
+from hilcal.regression.schur import Projection, inverse_root, positive_solve
 from hilcal.types import Bools, Floats, Ints
 
 LEAST_GAIN = 0.002
@@ -34,16 +29,11 @@ FAMILY_ROUNDING = 1e-10  # least ridge of a family, as a share of the largest sq
 
 
 def improves(before: Floats, after: Floats, sure: float = SURE) -> bool:
-    """Return whether squared whitened residuals of poses left out became smaller.
+    """Return whether squared whitened residuals (P,) of poses left out became smaller.
 
-    The gain over the poses must be significant: by its mean, or by Wilcoxon's signed ranks at the
-    same level, as the mean scatters where few poses gain very much. Source: Wilcoxon, *Individual
-    comparisons by ranking methods*, Biometrics Bulletin 1 (1945) 80-83.
-
-    Args:
-        before: (P,) of the model before the change.
-        after: (P,) of the changed model.
-        sure: least gain in standard errors.
+    The gain must exceed `sure` standard errors from pose to pose, or the same level by Wilcoxon's
+    signed ranks (Biometrics Bulletin 1 (1945) 80-83), as the mean scatters where few poses gain
+    very much.
     """
     if float(np.sum(after)) >= (1 - LEAST_GAIN) ** 2 * float(np.sum(before)):
         return False
@@ -69,7 +59,7 @@ class Fold:
         return np.asarray(p.rows[self.out])
 
     def solve(self, rhs: Floats) -> Floats:
-        """Return H⁻¹ times (K,) or (K, P)."""
+        """Return H⁻¹ times (K, ...)."""
         return np.asarray(self.inverse_root.T @ (self.inverse_root @ rhs))
 
     def step(self) -> Floats:
@@ -107,111 +97,32 @@ def folds(
     return tuple(without(f) for f in range(int(fold.max()) + 1))
 
 
-def left_out_residual(
-    folds: tuple[Fold, ...],
-    p: Projection,
-    white: Floats,  # (R,) residual of the model fitted to all rows
-    x: Floats | None = None,  # (R, F) whitened columns of the family; None for the model alone
-    ridge: float = 0.0,
-) -> Floats:
-    """Return the residual (R,) of each row, predicted without its fold by model and family."""
-    if x is None:
-        residual = np.zeros(len(white))
-        for fold in folds:
-            residual[fold.out] = white[fold.out] - fold.rows(p) @ fold.step()
-        return residual
-    products = family_products(folds, p, white, [x])[0]
-    return left_out_of_families(folds, p, white, [(products, ridge)])[0]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Products:
-    """BᵀX, XᵀX and Xᵀr of some rows."""
-
-    cross: Floats
-    gram: Floats
-    rhs: Floats
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FamilyProducts:
-    """Products of a family's columns with themselves and with the model's."""
-
-    x: Floats  # (R, F) whitened columns
-    parts: tuple[Products, ...]  # of each fold
-    whole: Products  # of all rows
-
-
-def family_products(
-    folds: tuple[Fold, ...], p: Projection, white: Floats, families: Iterable[Floats]
-) -> list[FamilyProducts]:
-    """Form the products of families of whitened columns (R, F) with residuals (R,)."""
-    columns = list(families)
-    parts: list[list[Products]] = [[] for _ in columns]
-    for fold in folds:
-        model, y = fold.rows(p), white[fold.out]
-        for x, of_folds in zip(columns, parts, strict=True):
-            family = x[fold.out]
-            of_folds.append(Products(model.T @ family, family.T @ family, family.T @ y))
-
-    def total(products: list[Products]) -> Products:
-        by_field = ([getattr(part, f.name) for part in products] for f in fields(Products))
-        return Products(*(reduce(np.add, values) for values in by_field))
-
-    return [
-        FamilyProducts(x, tuple(of_folds), total(of_folds))
-        for x, of_folds in zip(columns, parts, strict=True)
-    ]
-
-
-def left_out_of_families(
-    folds: tuple[Fold, ...],
-    p: Projection,
-    white: Floats,
-    families: Sequence[tuple[FamilyProducts, float]],
-) -> list[Floats]:
-    """Return `left_out_residual` (R,) of the model with each family alone, with its ridge."""
-    residuals = [np.zeros(len(white)) for _ in families]
-    for f, fold in enumerate(folds):
-        out, model = fold.out, fold.rows(p)
-        size = fold.inverse_root @ fold.rhs
-        for (family, ridge), residual in zip(families, residuals, strict=True):
-            total, part = family.whole, family.parts[f]
-            # Eliminate the model's coordinates, then solve for the family.
-            along = fold.inverse_root @ (total.cross - part.cross)
-            h = total.gram - along.T @ along - part.gram
-            largest = float(np.diagonal(total.gram).max(initial=0.0))
-            h[np.diag_indices_from(h)] += max(ridge, FAMILY_ROUNDING * largest)
-            step = positive_solve(h, total.rhs - part.rhs - along.T @ size)
-            back = fold.inverse_root.T @ (size - along @ step)
-            residual[out] = white[out] - model @ back - family.x[out] @ step
-    return residuals
-
-
 class FamilyFolds:
-    """Model and family without each fold: products formed once, for any residuals and ridges."""
+    """A model without each fold, and a family X (R, F); products of columns are formed once."""
 
     def __init__(self, folds: tuple[Fold, ...], p: Projection, x: Floats | None = None) -> None:
-        """Form the products of a family X (R, F), or of the model alone."""
         self._x = x = np.zeros((len(p.rows), 0)) if x is None else x
         self._folds, self._p = folds, p
-        gram, cross = x.T @ x, p.rows.T @ x
-        self._rounding = FAMILY_ROUNDING * float(gram.max(initial=0.0))
+        self.gram, self.cross = x.T @ x, p.rows.T @ x  # XᵀX, BᵀX of all rows
+        self._rounding = FAMILY_ROUNDING * float(self.gram.max(initial=0.0))
         self._products = []
         for fold in folds:
             out = x[fold.out]
-            c = cross - fold.rows(p).T @ out
+            c = self.cross - fold.rows(p).T @ out
             solved = fold.solve(c)
-            self._products.append((c, solved, gram - out.T @ out - c.T @ solved))
+            self._products.append((c, solved, self.gram - out.T @ out - c.T @ solved))
 
-    def left_out(self, y: Floats, ridge: float = 0.0) -> Floats:
-        """Return `left_out_residual` (R, K) of K simulated residuals y (R, K), for θ = 0."""
+    def left_out(self, y: Floats, ridge: float = 0.0, of_fit: bool = False) -> Floats:
+        """Return the residual (R, ...) of each row, predicted without its fold.
+
+        y (R, ...) are residuals of a model with the parameters zero, or the residual `of_fit`.
+        """
         x, p = self._x, self._p
         total, rhs = p.rows.T @ y, x.T @ y
         left = np.zeros(y.shape)
         for fold, (c, solved, gram) in zip(self._folds, self._products, strict=True):
             out, model, r = x[fold.out], fold.rows(p), y[fold.out]
-            steps = fold.solve(total - model.T @ r)
+            steps = fold.step() if of_fit else fold.solve(total - model.T @ r)
             left[fold.out] = r - model @ steps
             if x.shape[1]:
                 h, b = gram.copy(), rhs - out.T @ r - c.T @ steps
@@ -219,14 +130,3 @@ class FamilyFolds:
                 family = positive_solve(h, b)
                 left[fold.out] += model @ (solved @ family) - out @ family
         return left
-
-
-def left_out_residuals(
-    folds: tuple[Fold, ...],
-    p: Projection,
-    y: Floats,
-    x: Floats | None = None,
-    ridge: float = 0.0,
-) -> Floats:
-    """Return `FamilyFolds.left_out` (R, K) of residuals y (R, K)."""
-    return FamilyFolds(folds, p, x).left_out(y, ridge)

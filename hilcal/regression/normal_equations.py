@@ -22,7 +22,7 @@ in the same way (TSQR). Source: Demmel, Grigori, Hoemmen and Langou,
 (2012) A206-A239.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,18 +32,18 @@ from scipy.linalg.lapack import dtpqrt
 from hilcal.regression.schur import inverse_root, positive_solve
 from hilcal.types import Bools, Floats, Ints
 
-INFORMATION = 0.2
-"""Least singular value s of an identifiable direction, in units of the residual's spread."""
-NULL_SHARE = 0.1
-"""Share of its standard uncertainty by which an identifiable parameter may move for an ordinary
-magnitude along an unidentifiable direction; a choice, no study set it."""
+INFORMATION = 0.2  # least singular value s of an identifiable direction, in residuals' spreads
+NULL_SHARE = (
+    0.1  # share of its standard uncertainty by which an identifiable parameter may move for
+)
+# an ordinary magnitude along an unidentifiable direction; a choice, no study set it
 ROUNDING = 1e-10
-TALL = 10_000
-"""Number of rows from which the QR is done in parts that fit into the processor's cache: a third of
-the time for 300,000 rows of 30; a choice by timing."""
+TALL = (
+    10_000  # rows from which the QR is done in parts that fit into the processor's cache: a third
+)
+# of the time for 300,000 rows of 30; a choice by timing
 _ROWS = 4096  # rows multiplied at a time; a choice by memory
-ROWS = 3072
-"""Rows reduced at a time, which fit into the processor's cache; a choice by timing."""
+ROWS = 3072  # rows reduced at a time, which fit into the processor's cache; a choice by timing
 BLOCK = 8  # columns whose reflections are applied together; a choice by timing
 
 
@@ -51,7 +51,6 @@ class Triangle:
     """The triangle R (K, K) of the QR of all rows added so far."""
 
     def __init__(self, size: int) -> None:
-        """Start with K columns and no rows."""
         self._r = np.zeros((size, size), order="F")
 
     @property
@@ -76,8 +75,7 @@ class Triangle:
 def triangle_of(a: Floats, right: Floats) -> Floats:
     """Return the triangle T (P + 1, P + 1) of [A, b], A (R, P) and b (R,).
 
-    TᵀT = [A, b]ᵀ [A, b], so that the rows of T can replace those of [A, b] in a least-squares
-    problem.
+    Its rows can replace those of [A, b] in a least-squares problem, as TᵀT = [A, b]ᵀ [A, b].
     """
     triangle = Triangle(a.shape[1] + 1)
     triangle.add(a, right)
@@ -177,6 +175,28 @@ def find_basis(
     return Basis(transform, precision, null, flat, held, s[keep], structural, *conditions)
 
 
+def echelon(rows: Floats, blocks: Sequence[Sequence[int]], least: float = 0.0) -> Floats:
+    """Bring directions (U, P) to reduced echelon form, so that each involves few parameters.
+
+    Columns of a block become pivots before those of the next one; elements up to `least` are no
+    pivots.
+    """
+    rows, done = rows.copy(), 0
+    for block in blocks:
+        while done < len(rows) and len(block):
+            sub = np.abs(rows[done:][:, block])
+            i, j = np.unravel_index(int(np.argmax(sub)), sub.shape)
+            if sub[i, j] <= least:
+                break
+            pivot = block[int(j)]
+            rows[[done, done + int(i)]] = rows[[done + int(i), done]]
+            rows[done] /= rows[done, pivot]
+            remaining = np.arange(len(rows)) != done
+            rows[remaining] -= rows[remaining, pivot][:, None] * rows[done]
+            done += 1
+    return rows
+
+
 def flat_triangle(a: Floats, columns: Ints, scale: Floats) -> Floats:
     """Return R of the QR of some columns of A (R, P), multiplied by their magnitudes (P,)."""
     if len(a) > TALL and len(columns):
@@ -236,8 +256,6 @@ def normal_equations(a: Floats, target: Floats, basis: Basis, gram: Floats) -> N
     size = basis.transform.shape[1]
     full = np.empty((size, size))
     full[:flat, :flat] = rows.T @ rows
-    if not len(held):
-        return NormalEquations(basis, full, rows.T @ target)
     full[:flat, flat:] = (rows.T @ a)[:, held] * sigma
     full[flat:, :flat] = full[:flat, flat:].T
     inner = gram[np.ix_(held, held)]

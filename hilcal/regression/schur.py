@@ -1,4 +1,4 @@
-"""The Schur complement of nuisance parameters, with a rule for singular information matrices.
+"""The Schur complement of nuisance parameters, and the projection off a model's columns.
 
 For parameters of interest i and nuisance parameters n
 
@@ -12,6 +12,15 @@ Y = M_nn⁻ at n and zero elsewhere, S is a concave function of M = Σ w_k H_k w
 Rule for singular blocks: M_nn is scaled to unit diagonal, and M_nn⁻ is the inverse on its
 eigenvectors whose eigenvalue exceeds `DETERMINED`. Directions without information explain
 nothing. The scaling makes the rule independent of the units of the parameters.
+
+With B (R, K) the whitened columns of a fitted model and Λ (K,) the ridge of their priors, zero for
+a column without one,
+
+    M = 1 − B H⁻¹ Bᵀ,    H = BᵀB + diag(Λ)
+
+is the marginal precision of the data when the model's parameters are integrated out (`Projection`):
+without priors the orthogonal projection off the columns of B; with priors M M ≠ M. Columns may be
+linearly dependent, by the rule above.
 
 Source: Pukelsheim, *Optimal Design of Experiments* (1993), chapter 3.
 """
@@ -27,8 +36,7 @@ from hilcal.types import Bools, Floats, Ints
 # double precision turns a zero into about 1e-16 times the number of rows; at 1e-12 a parameter's
 # standard uncertainty is a million times that with all other parameters known.
 DETERMINED = 1e-12
-_SOUND = 1e-2
-"""Share of the largest inverse allowed, 1/`DETERMINED`, up to which Cholesky's factor is used."""
+_SOUND = 1e-2  # share of the largest inverse, 1/`DETERMINED`, up to which Cholesky's factor is used
 
 
 def inverse_root(block: Floats) -> Floats:
@@ -98,12 +106,9 @@ def nuisance_inverse(m: Floats, nuisance: Ints) -> Floats:
 
 
 def schur_complement(m: Floats, interest: Ints, nuisance: Ints | None = None) -> Floats:
-    """Return S (..., I, I) of information matrices M (..., P, P).
+    """Return S (..., I, I) of positive semidefinite information matrices M (..., P, P).
 
-    Args:
-        m: symmetric, positive semidefinite.
-        interest: (I,) indices of the parameters of interest.
-        nuisance: (N,) indices of the parameters estimated as well; all others by default.
+    `interest` (I,) and `nuisance` (N,) are indices of parameters, by default all others.
     """
     if nuisance is None:
         nuisance = np.setdiff1d(np.arange(m.shape[-1]), interest)
@@ -120,10 +125,6 @@ class SchurComplement:
     matrix: Floats  # (I, I) S
     lift: Floats  # (P, I) U
     inverse: Floats | None  # (P, P) Y; None without nuisance parameters
-
-    def embed(self, inner: Floats) -> Floats:
-        """Return U G Uᵀ (P, P) of G (I, I): the gradient by M of tr(G S)."""
-        return np.asarray(self.lift @ inner @ self.lift.T)
 
 
 def differentiable_schur_complement(m: Floats, interest: Ints | None) -> SchurComplement:
@@ -144,25 +145,58 @@ def eliminate(
 ) -> tuple[Floats, Floats, float]:
     """Eliminate parameters from normal equations, or add them to a model: the same operation.
 
-    With G = XᵀX, b = Xᵀy and ‖y‖² of all columns X, o the columns to eliminate and λ their ridge,
+    With G = XᵀX (P, P), b = Xᵀy (P,) and ‖y‖² of all columns X, o the columns to eliminate and λ
+    their ridge, the inverse of their prior variance in units of the noise,
 
         G ← G − G_o (G_oo + λ 1)⁻ G_oᵀ,   b ← b − G_o (G_oo + λ 1)⁻ b_o,
         ‖y‖² ← ‖y‖² − b_oᵀ (G_oo + λ 1)⁻ b_o
 
     are the normal equations of the other columns after elimination of o, and the penalised sum of
-    squares that remains.
-
-    Args:
-        gram: (P, P) G.
-        rhs: (P,) b.
-        square: ‖y‖².
-        out: o.
-        ridge: λ, inverse of the prior variance of o in units of the noise.
-
-    Returns:
-        (P, P), (P,) and the sum of squares; the rows at o are meaningless.
+    squares that remains. The rows at o are meaningless.
     """
     inner = gram[out, out] + ridge * np.eye(len(rhs[out]))
     solved = inverse_root(inner) @ np.column_stack([gram[out], rhs[out]])
     cross, side = solved[:, :-1], solved[:, -1]
     return gram - cross.T @ cross, rhs - cross.T @ side, square - float(side @ side)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Projection:
+    """M of one linear model."""
+
+    rows: Floats  # (R, K) B
+    ridge: Floats  # (K,) Λ
+    inverse_root: Floats  # (K, K) T with Tᵀ T = H⁻¹
+
+    def solve(self, rhs: Floats) -> Floats:
+        """Return H⁻¹ times (K,) or (K, P)."""
+        return np.asarray(self.inverse_root.T @ (self.inverse_root @ rhs))
+
+    def project_out(self, x: Floats) -> Floats:
+        """Return M X = X − B H⁻¹ Bᵀ X of whitened columns (R,) or (R, P)."""
+        return np.asarray(x - self.rows @ self.solve(self.rows.T @ x))
+
+    def information(self, x: Floats) -> Floats:
+        """Return Xᵀ M X (P, P) of X (R, P), the Schur complement of the model."""
+        return self.schur(x.T @ x, self.rows.T @ x)
+
+    def schur(self, gram: Floats, cross: Floats) -> Floats:
+        """Return Xᵀ M X (P, P) from XᵀX (P, P) and BᵀX (K, P)."""
+        lifted = self.inverse_root @ cross
+        return np.asarray(gram - lifted.T @ lifted)
+
+    def residual(self, y: Floats, z: Floats) -> Floats:
+        """Return the residual (R,) after the remaining Gauss-Newton step of the model.
+
+            y − B H⁻¹ (Bᵀ y − Λ z)
+
+        y is its residual, z (K,) its coordinates, used only where they have a prior. Else this step
+        would be ascribed to a column that the model nearly explains, divided by its small rest.
+        """
+        return np.asarray(y - self.rows @ self.solve(self.rows.T @ y - self.ridge * z))
+
+
+def projection(rows: Floats, ridge: Floats, gram: Floats | None = None) -> Projection:
+    """Return M of the columns B (R, K) with the ridge Λ (K,); `gram` is BᵀB (K, K) if computed."""
+    h = (rows.T @ rows if gram is None else gram) + np.diag(ridge)
+    return Projection(rows, ridge, inverse_root(h))

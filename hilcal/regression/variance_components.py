@@ -43,24 +43,18 @@ from scipy.stats import t as student
 from hilcal.regression.schur import inverse_root, positive_solve
 from hilcal.types import Bools, Floats, Ints
 
-STEPS = 50  # most Newton steps; a choice, fewer than ten are usual
-HALVINGS = 12  # most halvings of a step; a choice
-CONVERGED = 1e-6
-"""Gain of ℓ below which the iteration ends: the s_i are then within 0.002 σ; a choice."""
-EM_STEPS = 400  # most EM steps; a choice: fleets of 30 arms take about 100
-EM_CONVERGED = 1e-4
-"""Relative change of all variances that ends EM; a choice, far below their sampling error."""
-LEAST = 1e-8
-"""Least variance, and least information on a parameter of an arm, for parameters in ordinary
-magnitudes; far below what measurements determine: a choice."""
-START = (1.0, 0.05)  # variances τ², ω² at the start of EM; a choice
-UNDETERMINED = 5.0
-"""Standard uncertainty of an arm's parameter, in ordinary magnitudes, above which it is not tested;
-a choice."""
-FALSE_ALARM = 0.01
-"""Probability that an element is named in a fleet without outliers; a choice."""
-FEWEST = 5
-"""Least number of arms for the test for outliers; a choice: three hardly have a spread."""
+# All of these are choices.
+STEPS = 50  # most Newton steps; fewer than ten are usual
+HALVINGS = 12  # most halvings of a step
+CONVERGED = 1e-6  # gain of ℓ below which the iteration ends: the s_i are then within 0.002 σ
+EM_STEPS = 400  # most EM steps; fleets of 30 arms take about 100
+EM_CONVERGED = 1e-4  # relative change of all variances that ends EM, far below sampling errors
+LEAST = 1e-8  # least variance, and least information on a parameter of an arm, in ordinary
+# magnitudes; far below what measurements determine
+START = (1.0, 0.05)  # variances τ², ω² at the start of EM
+UNDETERMINED = 5.0  # standard uncertainty, ordinary magnitudes, from which nothing is tested
+FALSE_ALARM = 0.01  # probability that an element is named in a fleet without outliers
+FEWEST = 5  # least number of arms for the test for outliers: three hardly have a spread
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,7 +135,6 @@ def _step(blocks: Sequence[BlockRows], ridge: Floats, point: _RemlPoint) -> _Rem
 
 
 def _evaluated(blocks: Sequence[BlockRows], ridge: Floats, variance: Floats) -> _RemlPoint:
-    """Evaluate ℓ, its slope and AI."""
     inverses, log_det = [], 0.0
     h = np.diag(ridge).astype(float)
     for b in blocks:
@@ -153,7 +146,9 @@ def _evaluated(blocks: Sequence[BlockRows], ridge: Floats, variance: Floats) -> 
         white = _flat(root @ b.rows)
         h += white.T @ white
     t = inverse_root(h)
-    log_det += _log_det(t)
+    triangular = not np.triu(t, 1).any()  # log det H on its range, from TᵀT = H⁻
+    values = np.abs(np.diag(t)) if triangular else np.linalg.svd(t, compute_uv=False)
+    log_det -= 2 * float(np.log(values[values > 0]).sum())
     weighted = [_flat(inverse @ b.rows) for inverse, b in zip(inverses, blocks, strict=True)]
 
     def project(x: list[Floats]) -> list[Floats]:
@@ -185,15 +180,7 @@ def _evaluated(blocks: Sequence[BlockRows], ridge: Floats, variance: Floats) -> 
 
 
 def _flat(x: Floats) -> Floats:
-    """(G·S, Q) rows of blocks (G, S, Q)."""
     return x.reshape(-1, x.shape[2])
-
-
-def _log_det(t: Floats) -> float:
-    """Return log det H on its range, from T with Tᵀ T = H⁻."""
-    triangular = not np.triu(t, 1).any()
-    values = np.abs(np.diag(t)) if triangular else np.linalg.svd(t, compute_uv=False)
-    return float(-2 * np.log(values[values > 0]).sum())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -319,38 +306,25 @@ def _em(fleet: FleetEstimates, apart: Bools) -> Hierarchy:
     normal = np.maximum((~apart).sum(axis=0), 1)
     many = np.bincount(fleet.arm, minlength=fleet.arms)[fleet.arm] > 1
     for _ in range(EM_STEPS):
-        e = _expectation(fleet, tau2, omega2, apart, timed)
+        _, _, u2, e2, _, _ = _expectation(fleet, tau2, omega2, apart, timed)
         previous = np.concatenate([tau2, omega2])
-        tau2 = np.maximum(np.where(apart, 0.0, e.u2).sum(axis=0) / normal, LEAST)
+        tau2 = np.maximum(np.where(apart, 0.0, u2).sum(axis=0) / normal, LEAST)
         if repeated:
-            omega2 = np.maximum(e.e2[many].mean(axis=0), LEAST)
+            omega2 = np.maximum(e2[many].mean(axis=0), LEAST)
         change = np.concatenate([tau2, omega2]) - previous
         if np.abs(change / np.maximum(previous, LEAST)).max() < EM_CONVERGED:
             break
-    e = _expectation(fleet, tau2, omega2, apart, timed)
+    b, b_cov, _, _, mean, variance = _expectation(fleet, tau2, omega2, apart, timed)
     covariance = np.zeros((2 * k, 2 * k))
-    size = len(e.b)
-    covariance[:size, :size] = e.covariance
-    slope = e.b[k:] if timed else np.zeros(k)
-    return Hierarchy(
-        e.b[:k], slope, covariance, tau2, omega2, e.arm_mean, e.arm_variance, apart.copy()
-    )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Expected:
-    b: Floats
-    covariance: Floats
-    u2: Floats
-    e2: Floats
-    arm_mean: Floats
-    arm_variance: Floats
+    covariance[: len(b), : len(b)] = b_cov
+    slope = b[k:] if timed else np.zeros(k)
+    return Hierarchy(b[:k], slope, covariance, tau2, omega2, mean, variance, apart.copy())
 
 
 def _expectation(
     fleet: FleetEstimates, tau2: Floats, omega2: Floats, apart: Bools, timed: bool
-) -> _Expected:
-    """E-step: the joint normal distribution of b = (μ, β), u and e, given the variances."""
+) -> tuple[Floats, ...]:
+    """E-step: b = (μ, β) and its covariance; E[u²], E[e²]; means of arms alone, and variances."""
     k, m, eye = fleet.mean.shape[1], fleet.information, np.eye(fleet.mean.shape[1])
     # e_c integrated out: N = (M⁻¹ + Ω)⁻¹ = (1 + M Ω)⁻¹ M
     n = np.linalg.solve(eye + m * omega2, m)
@@ -361,7 +335,6 @@ def _expectation(
     nx, ny = n @ design, np.einsum("cij,cj->ci", n, fleet.mean)
 
     def of_arms(x: Floats) -> Floats:
-        """Sums (A, ...) over the campaigns of each arm."""
         out = np.zeros((fleet.arms, *x.shape[1:]))
         np.add.at(out, fleet.arm, x)
         return out
@@ -390,4 +363,4 @@ def _expectation(
     drift = fleet.time[:, None] * b[k:] if timed else np.zeros_like(fleet.mean)
     without_drift = of_arms(np.einsum("cij,cj->ci", n, fleet.mean - drift))
     arm_mean = np.einsum("akl,al->ak", alone, without_drift)
-    return _Expected(b, b_cov, u2, e2, arm_mean, np.diagonal(alone, axis1=1, axis2=2).copy())
+    return b, b_cov, u2, e2, arm_mean, np.diagonal(alone, axis1=1, axis2=2).copy()

@@ -19,13 +19,13 @@ from hilcal.effects.encoder_offset import EncoderOffset
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.effects.joint_tilt_compliance import JointTiltCompliance
 from hilcal.effects.target_offset import TargetOffset
+from hilcal.identification.carried import prior_of, scales_of
 from hilcal.identification.gauss_newton import (
     NewtonPoint,
     linear_problem,
     regularise,
     whitened_jacobian,
 )
-from hilcal.identification.priors import prior_of, scales_of
 from hilcal.identification.residual import residual
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import Readings

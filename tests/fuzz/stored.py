@@ -17,8 +17,8 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.urscript import program_points, with_joints
 from hilcal.effects import template
 from hilcal.effects.catalogue import installed
-from hilcal.identification import posterior_document
 from hilcal.identification.carried import carried_prior, check_arm
+from hilcal.identification.posterior import read_posterior
 from hilcal.present.campaign import info_report, two_revisions
 from hilcal.procedure.state import next_step, settings_of
 from hilcal.robot.catalogue import load_arm
@@ -213,7 +213,7 @@ def _compensated(path: Path) -> None:
 
 
 def _carried(path: Path) -> None:
-    prior = carried_prior(posterior_document.read(path))
+    prior = carried_prior(read_posterior(path))
     check_arm(prior, load_arm("ur10e"))
     found = prior.posterior
     prior.index_in(found.names)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.regression.projection import Projection, projection
+from hilcal.regression.schur import Projection, projection
 from hilcal.types import Floats
 
 

@@ -29,13 +29,11 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.rehearsal import planned_states, simulate
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import baseline
-from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import fit
-from hilcal.identification.linearisation import linearise
+from hilcal.identification.linearisation import effect_columns, linearise
 from hilcal.refinement import add
 from hilcal.regression.evidence import family_power
-from hilcal.regression.projection import projection
-from hilcal.regression.schur import schur_complement
+from hilcal.regression.schur import projection, schur_complement
 from hilcal.store.plan import REFERENCE, UNLOADED
 from studies.study_more import joined
 from tests.support.campaigns import (

@@ -23,9 +23,8 @@ from hilcal.effects.catalogue import BUILT_IN
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.errors import InputError
 from hilcal.identification.baseline import with_effects
-from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import fit
-from hilcal.identification.linearisation import linearise
+from hilcal.identification.linearisation import effect_columns, linearise
 from hilcal.present.diagnosis import finer
 from hilcal.present.verdict import message
 from hilcal.refinement import refine

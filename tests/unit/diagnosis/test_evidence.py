@@ -12,16 +12,14 @@ from hilcal.diagnosis.evidence import spoken_against, whole_catalogue
 from hilcal.diagnosis.noise import MISFIT_ALARM
 from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.identification import effect_columns as columns_module
+from hilcal.identification import linearisation as columns_module
 from hilcal.identification.baseline import baseline
-from hilcal.identification.carried import carried_prior
+from hilcal.identification.carried import carried_prior, names_of
 from hilcal.identification.drift import carried_effects, evidence_of_carried
-from hilcal.identification.effect_columns import columns_of_each, effect_columns
 from hilcal.identification.fit import fit
 from hilcal.identification.gauss_newton import whitened_jacobian
-from hilcal.identification.linearisation import linearise
+from hilcal.identification.linearisation import columns_of_each, effect_columns, linearise
 from hilcal.identification.posterior import Posterior
-from hilcal.identification.priors import names_of
 from hilcal.present.verdict import message
 from hilcal.refinement import refine
 from tests.support.campaigns import campaign, measured, plan

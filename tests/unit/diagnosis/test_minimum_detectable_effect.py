@@ -5,8 +5,7 @@ import numpy as np
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.minimum_detectable_effect import least_strength
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.identification.effect_columns import effect_columns
-from hilcal.identification.linearisation import linearise
+from hilcal.identification.linearisation import effect_columns, linearise
 from hilcal.present.diagnosis import could_have_been_seen
 from hilcal.regression.evidence import spectrum
 from tests.support.campaigns import campaign

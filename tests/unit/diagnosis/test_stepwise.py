@@ -12,8 +12,7 @@ from hilcal.diagnosis.minimum_detectable_effect import least_strength
 from hilcal.diagnosis.stepwise import add, exchange, remove, trial
 from hilcal.drivers.simulated.injected_effects import hide
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.effect_columns import effect_columns
-from hilcal.identification.linearisation import linearise
+from hilcal.identification.linearisation import effect_columns, linearise
 from hilcal.refinement import Path, refine
 from hilcal.regression.evidence import spectrum
 from tests.support.campaigns import NOTHING, campaign, measured, plan, world_of

@@ -20,9 +20,8 @@ from hilcal.discovery.sites import ORDINARY
 from hilcal.effects.catalogue import installed
 from hilcal.effects.check import check_effect
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import fit
-from hilcal.identification.linearisation import linearise
+from hilcal.identification.linearisation import effect_columns, linearise
 from hilcal.present.diagnosis import discovery_report, refined_laws, silence
 from hilcal.refinement import refine
 from studies.unmodelled_laws import law_named, shift

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from hilcal.errors import CannotAnswerError
-from hilcal.identification import posterior_document
 from hilcal.identification.baseline import baseline
 from hilcal.identification.carried import carried_prior
 from hilcal.identification.fit import fit
@@ -14,6 +13,7 @@ from hilcal.identification.posterior import Posterior
 from hilcal.present.html.other_pages import arms_chart, fleet_page
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.codec import write_document
 from hilcal.transfer.fleet import Fleet, effects_seen, pooled
 from hilcal.transfer.members import Failure, Member, entries, member_of
 from tests.support.calibrate_process import CELL
@@ -139,7 +139,7 @@ def test_with_the_prior_a_new_arm_needs_fewer_poses(one):
 
 def prior_file(one, path):
     """What a fleet of 30 arms lets expect, as `fleet -o` writes it; and a small cell beside it."""
-    posterior_document.write(pooled(members(one, 3), ()).prior, path)
+    write_document(path, pooled(members(one, 3), ()).prior.to_json())
     path.with_name("cell.toml").write_text(CELL, encoding="utf-8")
     return path
 

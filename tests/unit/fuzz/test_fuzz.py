@@ -9,8 +9,9 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.urscript import program_points
 from hilcal.config import CellConfig
 from hilcal.errors import HilcalError
-from hilcal.identification import parameters_document, posterior_document
-from hilcal.identification.registration import inverse_roots
+from hilcal.identification import parameters_document
+from hilcal.identification.placement import inverse_roots
+from hilcal.identification.posterior import read_posterior
 from hilcal.readings.covariance import is_covariance
 from hilcal.store.plan import load_plan, read_plan
 from hilcal.tables.mapping import Mapping, load_mapping
@@ -72,7 +73,7 @@ DEEP = "[" * 100_000 + "]" * 100_000
     [
         (DEEP, load_plan),
         (DEEP, lambda path: CellConfig.from_json(path.read_text())),
-        (DEEP, posterior_document.read),
+        (DEEP, read_posterior),
         (DEEP, parameters_document.read),
         (DEEP, Calibration.load),
         ("a = " + "[" * 5000, lambda path: load_mapping(path, Mapping)),
@@ -90,7 +91,7 @@ def test_a_prior_whose_number_of_columns_is_infinite(tmp_path):
     path, content = tmp_path / "prior.json", json.loads(Bench(tmp_path).documents["posterior"])
     content["prints"]["columns"] = float("inf")
     path.write_text(json.dumps(content).replace("Infinity", "1e999"))
-    refusal("a damaged prior", posterior_document.read, path)
+    refusal("a damaged prior", read_posterior, path)
 
 
 def test_correlations_that_have_no_eigenvalues():

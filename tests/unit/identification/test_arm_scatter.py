@@ -14,10 +14,9 @@ from hilcal.diagnosis.evidence import Evidence
 from hilcal.diagnosis.misfit_breakdown import MisfitShare
 from hilcal.diagnosis.verdict import diagnose, judge
 from hilcal.identification.arm_scatter import estimate_arm_scatter, factors, with_arm_scatter
-from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import fit
 from hilcal.identification.full_covariance import with_common_scatter, with_joint_scatter
-from hilcal.identification.linearisation import linearise
+from hilcal.identification.linearisation import effect_columns, linearise
 from hilcal.identification.registration import register
 from hilcal.present.verdict import message
 from hilcal.readings.covariance import COVERS, INSTRUMENT
@@ -124,9 +123,6 @@ def test_a_hidden_reflector_is_a_missing_reading():
     assert chi2.sf(f.chi2, f.dof) > 1e-3
     orphans = np.count_nonzero(third & ~r.unloaded)
     assert len(f.whitening) == np.count_nonzero(~kept.unloaded) - orphans
-
-
-# --- where nothing states it ------------------------------------------------------------------
 
 
 def scattering(std=2e-5, m=3, seed=0, noise=1.0, poses=16, loads=3, law=0.0):

@@ -25,9 +25,6 @@ WAVES = ("joint_compliance", "transmission_error")
 GEOMETRY = ("joint_compliance", "link_geometry")
 
 
-# --- recovery -------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("m", [3, 6])
 @pytest.mark.parametrize("mode", MODES)
 def test_parameters_are_recovered_exactly_without_noise(mode, m):
@@ -117,9 +114,6 @@ def test_the_order_of_readings_and_of_effects_does_not_matter():
         assert other[name][1] == pytest.approx(std, rel=1e-6), name
 
 
-# --- identifiability ------------------------------------------------------------------------
-
-
 def seen_directions(model, readings, m):
     """Numeric rank of the scaled Jacobian, by differences of the prediction."""
     scale = np.array([p.scale for e in model.effects for p in e.parameters])
@@ -193,9 +187,6 @@ def test_no_more_elements_than_parameters_cannot_answer(mode, count):
     assert 3 * int(re.search(told, line)[1]) > 6
 
 
-# --- as a value for scripts -----------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def found():
     c = campaign(poses=8, mode="absolute")
@@ -232,9 +223,6 @@ def test_residuals_in_base_axes_are_those_of_the_sensor_turned_back(found):
     rows, r = found.whitening.reading, found.readings
     added = found.predict(r.states).position[rows] + found.residuals()[:, :3]
     np.testing.assert_allclose(added, r.value[rows, :3], atol=1e-12)
-
-
-# --- units and scaling ----------------------------------------------------------------------
 
 
 def in_other_lengths(cell, readings, k):
@@ -370,8 +358,6 @@ def test_scaling_parameters_of_different_units_lowers_the_condition():
     assert again.condition_scaled == pytest.approx(basis.condition_scaled, rel=1e-3)
     assert again.condition_unscaled == pytest.approx(basis.condition_unscaled, rel=1e-3)
 
-
-# --- an arm that is described without masses, under its weight and loads ----------------------
 
 C = campaign("none", "absolute", 0, poses=12)
 BARE = replace(C.cell, arm=replace(C.cell.arm, masses=np.zeros(6), coms=np.zeros((6, 3))))

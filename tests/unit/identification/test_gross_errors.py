@@ -51,9 +51,6 @@ def shifted(readings, rows, shift):
     return replace(readings, value=value)
 
 
-# --- set aside and listed -------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("size", [3e-4, 2e-3, 0.5])
 @pytest.mark.parametrize("mode", MODES)
 def test_three_gross_errors_are_set_aside_and_listed(mode, size):
@@ -106,9 +103,6 @@ def test_gross_errors_say_what_they_look_like(mode):
     assert "was the load hung" in reasons[2]
 
 
-# --- the limit, and false alarms ------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("m", "factor", "tried"), [(3, 1, 5000), (6, 1, 5000), (3, 4, 2000)])
 def test_good_readings_are_called_gross_once_in_a_thousand_campaigns(m, factor, tried):
     """Also beside a misfit twice as wide as the noise, where it is rarer."""
@@ -150,9 +144,6 @@ def test_a_true_effect_is_not_mistaken_for_gross_errors():
         of = study_case(CONFIG, robot, "deflection", ("wrench_bias",), 3.0, seed)
         cases.append((of.cell, of.readings, "deflection"))
     assert not any(based(*case).outlier.any() for case in cases)
-
-
-# --- as campaigns spoil their readings ------------------------------------------------------
 
 
 def gross(r, rng, share=0.05):
@@ -313,8 +304,6 @@ def test_a_block_off_by_centimetres_is_refused():
         baseline(twelve().cell, readings, "absolute")
 
 
-# --- laws of one site -----------------------------------------------------------------------
-
 APART = np.arange(400)
 
 
@@ -375,9 +364,6 @@ def test_gross_errors_beside_such_a_law_are_found():
     assert found.outlier[wrong].mean() >= 0.95
     lost = np.isin(r.pose, r.pose[wrong[r.unloaded[wrong]]])  # with their unloaded reading
     assert not found.outlier[~lost & ~np.isin(np.arange(len(r)), wrong)].any()
-
-
-# --- the linear model of single readings ----------------------------------------------------
 
 
 def random_model(mode, rng):

@@ -9,14 +9,8 @@ from scipy.spatial.transform import Rotation
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
 from hilcal.identification.baseline import baseline
-from hilcal.identification.misdescription import (
-    BEYOND_NOISE,
-    Described,
-    Hypothesis,
-    examine,
-    other_arm,
-    other_arm_of,
-)
+from hilcal.identification.hypotheses import Described, Hypothesis
+from hilcal.identification.misdescription import BEYOND_NOISE, examine, other_arm, other_arm_of
 from hilcal.identification.registration import register
 from hilcal.identification.table_preview import clearly_best, rank_conventions
 from hilcal.robot.arm import as_counted

@@ -20,8 +20,7 @@ from tests.support.cli_cases import ok
 from tests.support.rows import first
 from tests.unit.identification.test_misdescription import measured
 
-OFF = 0.3
-"""mm and mrad of each link: an ordinary arm."""
+OFF = 0.3  # mm and mrad of each link: an ordinary arm
 
 
 def tabled(readings, path, noise=""):
@@ -106,10 +105,8 @@ STATED = "range_std_m = 5e-6\ntransverse_std_m = 7.5e-6\n"
 def sampled(seed, sigma, between):
     """Readings of an ordinary arm, each the mean of samples with the default's covariance.
 
-    Args:
-        seed: of arm, poses and noise.
-        sigma: of a sample, each axis; the default's noise where None.
-        between: of what the instrument errs by from pose to pose.
+    `sigma` is of each axis of a sample, None for the default's noise; `between` of what the
+    instrument errs by from pose to pose.
     """
     r, rng = measured("ur5", seed, OFF, 60, 1e-9), np.random.default_rng(seed)
     means = []
@@ -144,18 +141,12 @@ def run_of(readings, path, tracker="", arm=""):
     return path / "r.hilcal"
 
 
+STATED_ARM = "[repeatability]\njoint_std_rad = 1e-7\n"
+INSTRUMENTS = [(2e-5, 0.0, ""), (5e-6, 1e-4, ""), (2e-4, 0.0, ""), (5e-6, 2e-5, "")]
+
+
 @pytest.mark.parametrize(
-    ("sigma", "between", "arm"),
-    first(
-        2,
-        [
-            (2e-5, 0.0, ""),
-            (5e-6, 1e-4, ""),
-            (2e-4, 0.0, ""),
-            (5e-6, 2e-5, ""),
-            (5e-6, 1e-4, "[repeatability]\njoint_std_rad = 1e-7\n"),
-        ],
-    ),
+    ("sigma", "between", "arm"), first(2, [*INSTRUMENTS, (5e-6, 1e-4, STATED_ARM)])
 )
 def test_another_instrument_is_noise(tmp_path, capsys, sigma, between, arm):
     readings = sampled(3, sigma, between)

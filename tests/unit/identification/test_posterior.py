@@ -19,10 +19,10 @@ from hilcal.identification.carried import carried_prior
 from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import to_json
 from hilcal.identification.parameters_document import covariance_of
-from hilcal.identification.posterior import Posterior, Source, parameter_differences
-from hilcal.identification.posterior_document import read, write
+from hilcal.identification.posterior import Posterior, Source, parameter_differences, read_posterior
 from hilcal.identification.predictive import predictive
 from hilcal.robot.catalogue import load_arm
+from hilcal.store.codec import write_document
 from hilcal.store.revision import from_text, to_text
 from hilcal.store.rows import content_hash
 from studies.change import measured as measured_again
@@ -81,8 +81,8 @@ def test_it_comes_back_exactly(tmp_path):
         np.testing.assert_array_equal(getattr(again, name), getattr(p, name))
     for name in ("arm", "mode", "effects", "names", "units", "scatter", "ranges", "source"):
         assert getattr(again, name) == getattr(p, name)
-    write(p, tmp_path / "a.json")
-    np.testing.assert_array_equal(read(tmp_path / "a.json").information, p.information)
+    write_document(tmp_path / "a.json", p.to_json())
+    np.testing.assert_array_equal(read_posterior(tmp_path / "a.json").information, p.information)
 
 
 def test_what_was_not_determined_has_no_information():
@@ -123,9 +123,6 @@ def test_every_effect_says_whose_it_is():
     setup = {kind.name for kind in installed().effects if kind.of_setup}
     assert {"base_frame", "target_offset", "tracker_drift", "wrench_bias", "load_point"} <= setup
     assert not {"joint_compliance", "link_geometry", "transmission_error"} & setup
-
-
-# --- two campaigns side by side: the gauge of the frames, scatter, and a real change ----------
 
 
 @pytest.fixture(scope="module")
@@ -188,8 +185,6 @@ def test_effects_that_one_fit_lacks_are_named(arm):
     assert d.apart == ("encoder_offset",)
     assert {r.name.split(".")[0] for r in d.rows} == {"joint_compliance"}
 
-
-# --- as prior of another campaign: the same as both together, drift, refusals -----------------
 
 NAMES = ("joint_compliance", "encoder_offset", "joint_tilt_compliance")
 

@@ -7,12 +7,7 @@ import pytest
 
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import fit
-from hilcal.identification.predictive import (
-    Excess,
-    excess,
-    left_out_variances,
-    predictive_of,
-)
+from hilcal.identification.predictive import Excess, excess, left_out_variances, predictive_of
 from hilcal.identification.robot_frames import whole_turns
 from hilcal.identification.validation import extrapolation, validate
 from hilcal.readings.whitening import whitening

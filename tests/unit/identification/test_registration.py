@@ -221,8 +221,6 @@ def test_a_known_frame_is_left_alone():
     assert register(replace(cell, registration=np.eye(4)), readings).rms > 1.0
 
 
-# --- several targets ------------------------------------------------------------------------
-
 OF_THREE = [(True, True, True), (False, True, False), (False, False, False)]
 
 

@@ -98,8 +98,7 @@ def test_commands_say_what_the_load_weighs(tmp_path, capsys):
     run = tmp_path / "r.hilcal"
     ok(capsys, "import", tmp_path / "t.csv", "--config", config, "-o", run)
     for command in ("info", "identify", "diagnose"):
-        told = ok(capsys, command, run).out
-        words = " ".join(told.split())
+        words = " ".join(ok(capsys, command, run).out.split())
         assert re.search(r"load 10kg is 4\.[89]\d? kg, not 10 \(95 %", words), words
     document = json.loads(ok(capsys, "info", run, "--json").out)
     assert document["torques"]["factors"][0]["differs"]

@@ -9,9 +9,9 @@ from scipy.stats import chi2
 from hilcal.engine import open_engine
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.bootstrap import again, bootstrap
+from hilcal.identification.carried import prior_of
 from hilcal.identification.fit import fit
 from hilcal.identification.folds import distinct_poses
-from hilcal.identification.priors import prior_of
 from hilcal.model.model import Model
 from hilcal.present.calibration import bootstrap_remarks
 from hilcal.readings.readings import Readings
@@ -134,8 +134,6 @@ def test_halves_agree_within_what_is_stated_over_many_seeds(effect):
     assert 0.3 < rms(stated) < 1.3
     assert np.mean(np.abs(stated) > 1.96) < 0.1
 
-
-# --- the bootstrap of whole poses -------------------------------------------------------------
 
 POSES = 40
 COMPLIANCE = slice(6, 12)  # behind the base's frame

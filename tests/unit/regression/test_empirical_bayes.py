@@ -6,11 +6,7 @@ import pytest
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.gauss_newton import effective_parameters
-from hilcal.identification.uncertainty import (
-    HIDDEN,
-    dropped_group_factors,
-    hyperparameter_factors,
-)
+from hilcal.identification.uncertainty import HIDDEN, dropped_group_factors, hyperparameter_factors
 from hilcal.identification.validation import validate
 from hilcal.regression.empirical_bayes import (
     FamilyProblem,
@@ -18,8 +14,7 @@ from hilcal.regression.empirical_bayes import (
     solutions,
     spent_by_groups,
 )
-from hilcal.regression.projection import projection
-from hilcal.regression.schur import eliminate
+from hilcal.regression.schur import eliminate, projection
 from tests.support.campaigns import campaign, measured, plan
 from tests.support.effect_cases import make
 from tests.support.fit_cases import based
@@ -275,16 +270,11 @@ def covered(truth, campaigns=4000):
     return inside / count, wide / count
 
 
+FURTHER = ((1, 0), (1, 1), (2, 0), (2, 2), (3, 0), (8, 2))
+
+
 @pytest.mark.parametrize(
-    "truth",
-    [
-        (0, 0),
-        (3, 3),
-        *(
-            pytest.param(further, marks=pytest.mark.long)
-            for further in ((1, 0), (1, 1), (2, 0), (2, 2), (3, 0), (8, 2))
-        ),
-    ],
+    "truth", [(0, 0), (3, 3), *(pytest.param(t, marks=pytest.mark.long) for t in FURTHER)]
 )
 def test_intervals_hold_the_truth_about_as_often_as_stated(truth):
     as_chosen, wide = covered(np.array(truth, dtype=float))

@@ -4,15 +4,9 @@ import numpy as np
 import pytest
 
 from hilcal.identification.linearisation import eliminate_columns
-from hilcal.regression.leave_out import (
-    FamilyFolds,
-    family_products,
-    folds,
-    left_out_of_families,
-    left_out_residual,
-)
+from hilcal.regression.leave_out import FamilyFolds, folds
 from hilcal.regression.normal_equations import find_basis, normal_equations
-from hilcal.regression.projection import projection
+from hilcal.regression.schur import projection
 
 PRIOR = np.array([np.inf, np.inf, 0.5, 2.0, np.inf, 1.0])
 MAGNITUDE = np.array([1.0, 2.0, 1.0, 1.0, 0.5, 1.0])
@@ -33,17 +27,26 @@ def case(beta):
     return a, x, y, refit(a, y, PRIOR, beta)
 
 
-@pytest.mark.parametrize("beta", [1.0, 2.5])
-def test_rows_left_out_are_predicted_as_by_a_refit_without_them(beta):
+def model(beta):
+    """Folds and columns of the fit of `case`, its basis and residual, and a family."""
     a, x, y, theta = case(beta)
     basis = find_basis(a, np.ones(6), PRIOR)
     equations = normal_equations(a, y, basis, a.T @ a)
     p = projection(a @ basis.transform, beta * basis.prior_precision)
     fold = np.arange(60) % 5
     each = folds(p, y - a @ theta, equations, theta, PRIOR, MAGNITUDE, beta, fold)
-    ridge = 0.8
-    found = left_out_residual(each, p, y - a @ theta, x, ridge)
-    alone = left_out_residual(each, p, y - a @ theta, np.zeros((60, 0)), ridge)
+    return each, p, basis, y - a @ theta, x
+
+
+@pytest.mark.parametrize("beta", [1.0, 2.5])
+def test_rows_left_out_are_predicted_as_by_a_refit_without_them(beta):
+    a, x, y, theta = case(beta)
+    each, p, basis, white, _ = model(beta)
+    fold, ridge, family = np.arange(60) % 5, 0.8, FamilyFolds(each, p, x)
+    found = family.left_out(white, ridge, of_fit=True)
+    alone = FamilyFolds(each, p).left_out(white, of_fit=True)
+    information = p.schur(family.gram, family.cross)
+    np.testing.assert_allclose(information, p.information(x), rtol=1e-11, atol=1e-12)
     # Without a fold the flat parameters have a prior, too.
     std = np.where(np.isinf(PRIOR), MAGNITUDE, PRIOR)
     for f in range(5):
@@ -51,41 +54,15 @@ def test_rows_left_out_are_predicted_as_by_a_refit_without_them(beta):
         whole = np.hstack([a, x])
         both = refit(whole[~out], y[~out], np.append(std, np.full(2, np.sqrt(beta / ridge))), beta)
         np.testing.assert_allclose(found[out], y[out] - whole[out] @ both, atol=1e-4)
-        model = refit(a[~out], y[~out], std, beta)
-        np.testing.assert_allclose(alone[out], y[out] - a[out] @ model, atol=1e-4)
+        bare = refit(a[~out], y[~out], std, beta)
+        np.testing.assert_allclose(alone[out], y[out] - a[out] @ bare, atol=1e-4)
         step = basis.transform @ each[f].step()
-        np.testing.assert_allclose(theta + step, model, atol=1e-4)
-
-
-def model(beta):
-    """Folds and columns of the fit of `case`, its residual, and a family."""
-    a, x, y, theta = case(beta)
-    basis = find_basis(a, np.ones(6), PRIOR)
-    equations = normal_equations(a, y, basis, a.T @ a)
-    p = projection(a @ basis.transform, beta * basis.prior_precision)
-    fold = np.arange(60) % 5
-    each = folds(p, y - a @ theta, equations, theta, PRIOR, MAGNITUDE, beta, fold)
-    return each, p, y - a @ theta, x
-
-
-def test_families_together_are_predicted_as_each_by_itself():
-    each, p, white, x = model(1.0)
-    other = np.random.default_rng(5).standard_normal((60, 4))
-    families = [(x, 0.8), (other, 3.0), (other[:, :1], 0.1)]
-    products = family_products(each, p, white, [columns for columns, _ in families])
-    ridges = [ridge for _, ridge in families]
-    together = left_out_of_families(each, p, white, list(zip(products, ridges, strict=True)))
-    for (columns, ridge), left in zip(families, together, strict=True):
-        alone = left_out_residual(each, p, white, columns, ridge)
-        np.testing.assert_allclose(left, alone, rtol=1e-11, atol=1e-13)
-    for of in products:
-        whole = p.schur(of.whole.gram, of.whole.cross)
-        np.testing.assert_allclose(whole, p.information(of.x), rtol=1e-11, atol=1e-12)
+        np.testing.assert_allclose(theta + step, bare, atol=1e-4)
 
 
 @pytest.mark.parametrize("ridge", [0.0, 0.8, 40.0])
 def test_simulated_residuals_are_predicted_as_by_refits_without_their_fold(ridge):
-    each, p, _, x = model(1.0)
+    each, p, _, _, x = model(1.0)
     y = np.random.default_rng(6).standard_normal((60, 3))
     found = FamilyFolds(each, p, x)
     for again in (ridge, 2.0, ridge):  # another ridge in between changes nothing

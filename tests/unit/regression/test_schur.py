@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
 
-from hilcal.regression.connected import connected, groups_within
-from hilcal.regression.projection import projection
+from hilcal.identification.folds import groups_within
 from hilcal.regression.schur import (
     differentiable_schur_complement,
     eliminate,
     inverse_root,
     nuisance_inverse,
     positive_solve,
+    projection,
     schur_complement,
 )
 from tests.support.regression_cases import KINDS, problem
@@ -89,7 +89,7 @@ def test_its_derivatives_by_the_information():
 
     at = differentiable_schur_complement(m, INTEREST)
     step = 1e-4
-    gradient = at.embed(g)
+    gradient = at.lift @ g @ at.lift.T
     slope = (value(step) - value(-step)) / (2 * step)
     assert float(np.sum(gradient * h)) == pytest.approx(slope, rel=1e-7)
     bend = (
@@ -141,15 +141,6 @@ def test_products_are_those_of_the_dense_matrix(kind):
     np.testing.assert_allclose(p.project_out(of.x), m @ of.x, atol=1e-12)
     np.testing.assert_allclose(p.project_out(of.y), m @ of.y, atol=1e-12)
     np.testing.assert_allclose(p.information(of.x), of.x.T @ m @ of.x, rtol=1e-12, atol=1e-11)
-    q = p.root()
-    np.testing.assert_allclose(np.eye(len(m)) - q @ q.T, m, atol=1e-12)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_effective_number_of_parameters_is_the_trace_of_the_hat_matrix(kind):
-    of = problem(kind)
-    hat = np.eye(len(of.y)) - of.dense
-    assert of.projection.effective() == pytest.approx(np.trace(hat), rel=1e-12, abs=1e-12)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -168,20 +159,7 @@ def test_columns_that_depend_on_each_other_count_once(scale):
     double = scale * np.hstack([own, own @ rng.standard_normal((3, 2)), np.zeros((30, 1))])
     p, q = projection(double, np.zeros(6)), np.linalg.qr(own)[0]
     np.testing.assert_allclose(p.project_out(y), y - q @ (q.T @ y), atol=1e-10)
-    assert p.effective() == pytest.approx(3.0)
-
-
-def test_things_are_joined_also_through_others():
-    group = connected(np.array([0, 3, 4]), np.array([3, 4, 0]), 6)
-    assert len(set(group)) == 4
-    assert group[0] == group[3] == group[4]
-
-
-def test_points_are_joined_where_no_coordinate_differs_by_more():
-    points = np.array([[0.0, 0.0], [0.9, -0.9], [1.8, -0.9], [4.0, 0.0], [4.0, 1.1]])
-    group = groups_within(points, 1.0)
-    assert group[0] == group[1] == group[2]
-    assert len(set(group)) == 3
+    assert np.count_nonzero(np.any(p.inverse_root, axis=1)) == 3
 
 
 def test_groups_and_their_numbers_are_those_of_a_graph():

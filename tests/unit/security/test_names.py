@@ -48,7 +48,7 @@ from hilcal.config.reference import cell_text
 from hilcal.discovery.law import source_of_form
 from hilcal.drivers.terminal_operator import TerminalOperator
 from hilcal.errors import InputError
-from hilcal.identification import posterior_document
+from hilcal.identification import posterior
 from hilcal.names import check_name, check_names, csv_text, escaped, from_csv, quoted
 from hilcal.present import charts as chart_style
 from hilcal.present import html as page
@@ -459,8 +459,8 @@ def test_cells_and_documents_refuse_a_name_or_keep_it(name):
     content = {**CALIBRATION[0], "loads": {name: [0.0] * 6}}
     refused_or(lambda: next(iter(storage.from_json(content).loads)).strip(), name, "calibration")
     if escaped(name) != name:
-        prior = {"format": posterior_document.FORMAT, "version": 1, "arm": name}
-        refusal("holds the character", posterior_document.from_json, prior)
+        prior = {"format": posterior.FORMAT, "version": 1, "arm": name}
+        refusal("holds the character", posterior.Posterior.from_json, prior)
 
 
 @pytest.mark.parametrize("table_", ["poses", "loads", "revisions"])
