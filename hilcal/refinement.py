@@ -30,6 +30,7 @@ from hilcal.identification.background import (
 )
 from hilcal.identification.drift import carried_effects
 from hilcal.identification.fit import Fit, fit
+from hilcal.identification.mixed_fit import MOST_NOISE_ROWS
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
@@ -42,6 +43,9 @@ MOST_REVISIONS = 15
 MOST_SCATTERS = 2
 """Estimates of the arm's scatter at most: the first, and another after further effects."""
 BACKGROUND = "background"  # `RefinementStep.added` of a step that adds a background
+UNEXPLAINED = ("unknown_effect", "noise_misjudged")
+"""Verdicts with which all effects are tried together where readings are many: single effects are
+then proved down to a size below the noise, and all together take minutes. A choice."""
 FAR = 0.1
 """Share of an effect's evidence by which the evidence of its replacements must exceed it while the
 model is not adequate; a guess."""
@@ -323,7 +327,8 @@ class Path:
         """Fit all other effects of the catalogue together; whether the model has them now.
 
         They are not tried if the stated noise explains the residual and the readings do not prove
-        them together. They stay as the model's background if the error on poses left out falls by
+        them together; nor where many readings and the named effects leave nothing to explain. They
+        stay as the model's background if the error on poses left out falls by
         a share (`background_is_better`); also by more than it scatters from pose to pose, if the
         readings do not prove them, or the verdict `unknown_effect` says that they may imitate an
         effect that the catalogue lacks. Those proved beside all others are then named.
@@ -332,6 +337,9 @@ class Path:
         tried = self._background_tried or bool(last.fit.model.background)
         d = last.diagnosis
         if tried or not self._room or d.wrong_figures:
+            return False
+        many = last.fit.readings.value.size > MOST_NOISE_ROWS
+        if many and d.verdict not in UNEXPLAINED:
             return False
         self._background_tried = True
         if not allows_background(last.fit):

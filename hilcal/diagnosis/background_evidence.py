@@ -12,10 +12,12 @@ import numpy as np
 
 from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE, Suspect
 from hilcal.diagnosis.minimum_detectable_effect import Strength
+from hilcal.identification.arm_scatter import some_poses
 from hilcal.identification.background import UNSURE
 from hilcal.identification.fit import Fit, all_left_out
 from hilcal.identification.linearisation import HeldOut
 from hilcal.identification.mixed_fit import (
+    MOST_NOISE_ROWS,
     linearised_problem,
     mixed_fit_at,
     sizes_at,
@@ -56,9 +58,11 @@ class BackgroundEffect:
 def p_value_of_others(fit: Fit) -> float:
     """Joint p-value of all effects that the model does not name, beside noise of any size.
 
-    They are tested at the fit, by one common multiple of their ordinary sizes.
+    They are tested at the fit, by one common multiple of their ordinary sizes, with more than
+    `MOST_NOISE_ROWS` elements by poses chosen at random.
     """
     readings = fit.readings[~fit.outlier].as_stated()
+    readings = readings[some_poses(readings, MOST_NOISE_ROWS / readings.value.size, SEED)]
     model = with_all_effects(fit.model, readings.states)
     fitted = {
         (e.name, p.name): value
@@ -91,7 +95,7 @@ def background_evidence(fit: Fit) -> tuple[BackgroundEffect, ...]:
     model, theta = fit.model, fit.theta
     if not model.background:
         return ()
-    mixed = mixed_fit_at(model, fit.readings[~fit.outlier].as_stated(), fit.mode, theta)
+    mixed = mixed_fit_at(model, fit.readings[~fit.outlier], fit.mode, theta)
     problem, log_std = mixed.equations.problem, mixed.log_std
     rng, random = np.random.default_rng(SEED), problem.families.random
     moves = fit.whitening.raw(model.jacobian(fit.solution.prediction, theta, 3))  # (D, 3, P)

@@ -16,25 +16,26 @@ import numpy as np
 
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.arm_scatter import with_arm_scatter
+from hilcal.identification.arm_scatter import some_poses, with_arm_scatter
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.full_covariance import joint_factors
 from hilcal.identification.mixed_fit import (
     INSTRUMENT,
+    MOST_NOISE_ROWS,
     SCATTER,
     SCATTER_RAD,
+    SEED,
     MixedFit,
-    mixed_fit,
     mixed_fit_at,
     mixed_fit_of,
+    with_all_effects,
 )
 from hilcal.model.model import Model
 from hilcal.readings.readings import ArmScatter
 from hilcal.types import Floats
 
-MOST_ROWS = 1500
-"""Most elements of readings for which a background is fitted: with more, single effects are added
-until the model is adequate, and the cost grows as the cube of the columns. A choice."""
+MOST_ROWS = 10_000
+"""Most elements of readings for which a background is fitted; a choice: it takes minutes."""
 MOST_ROWS_OF_LINES = 2000
 """Most elements of readings for which lines are pooled; a choice: it takes some seconds."""
 UNSURE = 2.0
@@ -133,8 +134,7 @@ def family_sizes(fit: Fit) -> tuple[FamilySize, ...]:
     model = fit.model
     if not model.background:
         return ()
-    inliers = fit.readings[~fit.outlier].as_stated()
-    variances = mixed_fit_at(model, inliers, fit.mode, fit.theta)
+    variances = mixed_fit_at(model, fit.readings[~fit.outlier], fit.mode, fit.theta)
     problem, log_std = variances.equations.problem, variances.log_std
     error = np.sqrt(np.diag(variances.covariance))
     jacobian = model.jacobian(fit.solution.prediction, fit.theta, 3)
@@ -190,12 +190,19 @@ def with_background(fitted: Fit, named: Collection[str]) -> Fit | None:
     `named` effects do not belong to the background.
     """
     readings = fitted.readings.as_stated()
+    model = with_all_effects(fitted.model, readings[~fitted.outlier].states)
+    sample = readings[~fitted.outlier]
+    sample = sample[some_poses(sample, MOST_NOISE_ROWS / sample.value.size, SEED)]
     try:
-        mixed = mixed_fit(fitted.model, readings[~fitted.outlier], fitted.mode)
+        mixed = mixed_fit_of(model, sample, fitted.mode)
+        if not readings.scatter_stated:
+            readings = with_arm_scatter(model.cell, readings, _scatter(mixed))
+        inliers = readings[~fitted.outlier]
+        if len(sample) < len(inliers):
+            inliers = replace(inliers, scatter_stated=True)
+            mixed = mixed_fit_of(model, inliers, fitted.mode, start=mixed)
         if _implausible(mixed) - set(fitted.model.names):
             return None
-        if not readings.scatter_stated:
-            readings = with_arm_scatter(mixed.model.cell, readings, _scatter(mixed))
         return fit(background_model(mixed, named), readings, fitted.mode, start=mixed.theta)
     except CannotAnswerError:
         return None

@@ -44,6 +44,11 @@ UNSEEN = -0.5
 LITTLE = 1e-3
 """Weight of the arm's scatter in the matrix whose eigenvectors turn the rows: it decides where the
 instrument's parts are isotropic."""
+MOST_NOISE_ROWS = 1500
+"""Most elements of readings whose noise is estimated with the variances of the effects. The noise
+of more is estimated from poses chosen at random: equations of white noise are many times faster
+(`MixedProblem.compressed`). A choice."""
+SEED = 0  # of these poses
 NOISE_SPREAD = 1.5
 """Spread of the log standard deviation of the noise: a factor of 4.5 either way; a choice."""
 
@@ -128,6 +133,7 @@ def mixed_fit_of(
     mode: Mode,
     flat: Collection[str] = (),  # effects whose parameters have no prior
     lines: Collection[str] = (),  # effects of which each group is a family
+    start: MixedFit | None = None,  # of the same model
 ) -> MixedFit:
     """Fit the effects of a model together to readings without gross errors.
 
@@ -136,23 +142,32 @@ def mixed_fit_of(
         InputError: a deflection without its unloaded reading.
     """
     w = whitening(readings, mode, "gc")
-    variances, theta = _iterated(model, readings, w, families_of(model, flat, lines))
+    variances, theta = _iterated(model, readings, w, families_of(model, flat, lines), start=start)
     return MixedFit(model, readings, theta, variances, coordinates_covariance(variances))
 
 
 def mixed_fit_at(model: Model, readings: Readings, mode: Mode, theta: Floats) -> Variances:
     """Estimate the variances of a model's effects, linearised at fixed parameters theta (P,).
 
-    The readings have no gross errors, and their stated covariance.
+    The readings have no gross errors; see `linearised_problem`.
     """
     problem = linearised_problem(model, readings, mode, theta)
     return estimate_variances(problem, sizes_at(problem, model, theta))
 
 
 def linearised_problem(model: Model, readings: Readings, mode: Mode, theta: Floats) -> MixedProblem:
-    """Return the linear problem of a model at theta (P,), for readings as in `mixed_fit_at`."""
-    w = whitening(readings, mode, "gc")
-    return _linearise(model, readings, w, theta).problem
+    """Return the linear problem of a model at theta (P,), for readings without gross errors.
+
+    The arm's scatter is a part of the noise, unless stated. If it was estimated and the readings
+    are more than `MOST_NOISE_ROWS` elements, it counts as known.
+    """
+    many = readings.value.size > MOST_NOISE_ROWS
+    if many and readings.arm_scatter is not None:
+        readings = replace(readings, scatter_stated=True)
+    else:
+        readings = readings.as_stated()
+    problem = _linearise(model, readings, whitening(readings, mode, "gc"), theta).problem
+    return problem.compressed() if many else problem
 
 
 def sizes_at(problem: MixedProblem, model: Model, theta: Floats) -> Floats:
@@ -189,17 +204,19 @@ def _iterated(
     w: Whitening,
     families: Families | None = None,
     parts: Sequence[NoisePart] = (),
+    start: MixedFit | None = None,
 ) -> tuple[Variances, Floats]:
     """Return the variances and the parameters (P,) predicted with them, linearised there.
 
     A step that increases the penalised squares is halved, as large parameters that cancel in the
     linear model do not cancel exactly.
     """
-    theta, start = np.zeros(model.size), None
+    theta = np.zeros(model.size) if start is None else start.theta
     point, rounds = _linearise(model, readings, w, theta, families, parts), 0
+    log_std = None if start is None else start.variances.log_std[: len(point.problem.priors)]
     while True:
-        variances = estimate_variances(point.problem, start, search=True)
-        start, rounds = variances.log_std, rounds + 1
+        variances = estimate_variances(point.problem.compressed(), log_std, search=True)
+        log_std, rounds = variances.log_std, rounds + 1
         square = point.penalised(theta, variances.equations)
         step = point.problem.parameters(variances.equations.coordinates, model.size) - theta
         for k in range(HALVINGS):
@@ -231,7 +248,9 @@ class _Linearised:
             float(np.sum((theta[f.parameters] / (s * f.magnitude)) ** 2))
             for f, s in zip(self.problem.families.random, np.exp(equations.log_std), strict=False)
         )
-        return float(np.sum((self.white / equations.noise_std) ** 2)) + penalty
+        problem, families = self.problem, len(self.problem.families.random)
+        noise_std = problem.noise_std(equations.log_std[families:])
+        return float(np.sum((self.white / noise_std) ** 2)) + penalty
 
 
 def _linearise(

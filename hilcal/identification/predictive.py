@@ -217,7 +217,7 @@ def predictive(
     fold = random_folds(distinct_poses(fitted)[stated.reading])
     noise_factor, least, from_variances = None, 1.0, np.zeros((model.size, model.size))
     if model.background:
-        variances = mixed_fit_at(model, fitted.as_stated(), mode, theta)
+        variances = mixed_fit_at(model, fitted, mode, theta)
         arm = fitted.arm_scatter  # the standard deviations are in units of its factor
         noise_factor = (variances.std(INSTRUMENT) if arm is None else arm.instrument_factor) ** 2
         prior = prior * np.sqrt(noise_factor)

@@ -160,7 +160,9 @@ class Equations:
     def log_likelihood(self) -> float:
         """ℓ, the restricted log likelihood, without its constant."""
         square = float(self.target @ self.residual)
-        return -float(np.log(self.noise_std).sum()) - 0.5 * (self.projection.log_det + square)
+        log_std = float(np.log(self.noise_std).sum())
+        log_std += self.problem.zeros * float(self.log_std[self._count])
+        return -log_std - 0.5 * (self.projection.log_det + square)
 
     @cached_property
     def spent(self) -> Floats:
@@ -175,6 +177,7 @@ class Equations:
         p = self.problem
         square = np.bincount(p.family, self.c[p.flat :] ** 2, minlength=self._count)
         noise = (self.residual**2 - self.projection.diagonal) @ self._white_noise
+        noise[0] -= p.zeros
         return np.concatenate([square - self.spent, noise])
 
     @cached_property
@@ -250,10 +253,7 @@ def equations(problem: MixedProblem, log_std: Floats) -> Equations:
         numpy.linalg.LinAlgError: Cholesky's factorisation fails, as the standard deviations differ
             too much.
     """
-    eta = log_std[len(problem.families.random) :]
-    variance = sum(np.exp(2 * e) * n.variance for n, e in zip(problem.noise, eta, strict=True))
-    # Rows without variance carry no information.
-    noise_std = np.sqrt(np.where(variance == 0.0, 1.0, variance))
+    noise_std = problem.noise_std(log_std[len(problem.families.random) :])
     rows, target = problem.x / noise_std[:, None], problem.y / noise_std
     rows[:, problem.flat :] *= np.exp(log_std)[problem.family]
     form = _ByRows if rows.shape[0] < rows.shape[1] else _ByColumns

@@ -9,7 +9,7 @@ orthonormal basis of the frames' columns.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -41,6 +41,7 @@ class MixedProblem:
     families: Families  # of the other columns
     family: Ints  # (K − k,) family of each other column
     noise: tuple[Noise, ...]  # components, that of the instrument first
+    zeros: int = 0  # further rows, zero in y and x, with the variance exp(2 η) of the instrument
 
     @property
     def flat(self) -> int:
@@ -80,6 +81,11 @@ class MixedProblem:
             start = stop
         return theta
 
+    def noise_std(self, eta: Floats) -> Floats:
+        """(R,) R^½ at η (N,); 1 for rows without variance, which carry no information."""
+        variance = sum(np.exp(2 * e) * n.variance for n, e in zip(self.noise, eta, strict=True))
+        return np.sqrt(np.where(variance == 0.0, 1.0, variance))
+
     def without(self, numbers: Sequence[int]) -> "MixedProblem":
         """Return the problem without the columns of some families."""
         random = tuple(f for k, f in enumerate(self.families.random) if k not in numbers)
@@ -88,8 +94,24 @@ class MixedProblem:
         renumbered = np.cumsum(~np.isin(np.arange(len(self.families.random)), numbers)) - 1
         return MixedProblem(
             self.y, x, self.frames, Families(self.families.frames, random),
-            renumbered[self.family[retained]], self.noise,
+            renumbered[self.family[retained]], self.noise, self.zeros,
         )  # fmt: skip
+
+    def compressed(self) -> "MixedProblem":
+        """Return the same problem in K + 1 rows, where it has more, and white noise alone.
+
+        [X | y] = Q R with orthonormal Q: the rows R have the same noise as [X | y], and the others
+        of Qᵀ [X | y] are zero.
+        """
+        noise = self.noise[0]
+        measured = noise.variance > 0.0
+        count, columns = int(measured.sum()), self.x.shape[1]
+        if len(self.noise) > 1 or np.any(noise.variance[measured] != 1.0) or count <= columns + 1:
+            return self
+        rows = np.linalg.qr(np.column_stack([self.x, self.y])[measured], mode="r")
+        white = replace(noise, variance=np.ones(len(rows)))
+        zeros = self.zeros + count - len(rows)
+        return replace(self, y=rows[:, -1], x=rows[:, :-1], noise=(white,), zeros=zeros)
 
 
 def mixed_problem(

@@ -239,3 +239,28 @@ def test_rows_are_turned_so_that_blocks_of_noise_are_diagonal():
         apart = np.abs(u[g][:, variance[g] < -0.5])
         np.testing.assert_allclose(np.sort(apart.max(axis=0, initial=0.0)), 1.0)
         assert apart[seen[g]].max(initial=0.0) < 1e-12
+
+
+def test_compressed_rows_of_white_noise_say_the_same():
+    p = problem(np.random.default_rng(3), scatter=False)
+    unmeasured = Noise("instrument", np.append(p.noise[0].variance, 0.0), p.noise[0].prior)
+    p = replace(p, y=np.append(p.y, 0.0), x=np.vstack([p.x, np.zeros(p.x.shape[1])]))
+    p = replace(p, noise=(unmeasured,))
+    small = p.compressed()
+    assert small.x.shape == (p.x.shape[1] + 1, p.x.shape[1])
+    x = np.array([0.3, -0.8, 0.4])
+    a, b = equations(p, x), equations(small, x)
+    for quantity in ("log_likelihood", "slope", "information", "coordinates", "sensitivity"):
+        np.testing.assert_allclose(getattr(b, quantity), getattr(a, quantity), rtol=1e-7)
+    whole, compressed = estimate_variances(p), estimate_variances(small)
+    np.testing.assert_allclose(compressed.log_std, whole.log_std, atol=1e-6)
+    np.testing.assert_allclose(
+        evidence(small, 0, np.random.default_rng(0)).ratio,
+        evidence(p, 0, np.random.default_rng(0)).ratio,
+        rtol=1e-5,
+    )
+
+
+def test_rows_with_two_kinds_of_noise_are_not_compressed():
+    p = problem(np.random.default_rng(3))
+    assert p.compressed() is p
