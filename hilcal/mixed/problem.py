@@ -108,7 +108,7 @@ class MixedProblem:
         count, columns = int(measured.sum()), self.x.shape[1]
         if len(self.noise) > 1 or np.any(noise.variance[measured] != 1.0) or count <= columns + 1:
             return self
-        rows = np.linalg.qr(np.column_stack([self.x, self.y])[measured], mode="r")
+        rows = np.asarray(np.linalg.qr(np.column_stack([self.x, self.y])[measured], mode="r"))
         white = replace(noise, variance=np.ones(len(rows)))
         zeros = self.zeros + count - len(rows)
         return replace(self, y=rows[:, -1], x=rows[:, :-1], noise=(white,), zeros=zeros)
