@@ -205,7 +205,7 @@ class Calibration(Brief):
             pose = np.broadcast_to(np.asarray(wanted, dtype=float), (len(states), 4, 4))
             goal = np.array(pose[:, :3, :3]), np.array(pose[:, :3, 3])
         kernel = self._kernel(tool_pose)
-        if isinstance(kernel, Compiled):
+        if isinstance(kernel, Compiled) and kernel.covers(states.q):
             solution, residual = kernel.compensate(states, goal)
             inverse = Inverse(solution, residual[:, 0], residual[:, 1])
         else:

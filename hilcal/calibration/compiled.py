@@ -261,6 +261,11 @@ class Compiled:
     """Effects that need times, temperatures or sides of approach, with their parameters."""
     one: Situation  # a state to evaluate these effects at
 
+    def covers(self, q: Floats) -> bool:
+        """Whether the tables hold at joint values (N, n); some wrists turn without a stop."""
+        _, (by_angle, _, soft) = self.tables
+        return not (len(by_angle) or len(soft)) or bool(np.all(np.abs(q) <= TURN))
+
     def compensate(
         self, states: States, goal: tuple[Floats, Floats] | None
     ) -> tuple[Floats, Floats]:
