@@ -33,7 +33,7 @@ from hilcal.drivers.ur_link.reading import (
     survey,
 )
 from hilcal.drivers.ur_link.states import CHECK_LINK, CONTROL, HOLD_ON, failure
-from hilcal.drivers.ur_link.supervision import Controller, UrOptions
+from hilcal.drivers.ur_link.supervision import UrController, UrOptions
 from hilcal.drivers.ur_link.worker import WorkerError
 from hilcal.errors import InputError
 from hilcal.measuring.devices import ArmSample, Report
@@ -59,7 +59,7 @@ class UrArm:
     def __init__(
         self,
         config: CellConfig,
-        controller: Controller,
+        controller: UrController,
         silent: str,
         receiver: Receiver,
         torques: TorqueReader | None = None,
@@ -343,7 +343,7 @@ def open_arm(config: CellConfig) -> UrArm:
         if missing:
             word = states.version_word(version)
             raise failure(host, f"its version {word} lacks {', '.join(sorted(missing))}")
-        controller = Controller.of(host, version, options.robot_api_port)
+        controller = UrController.of(host, version, options.robot_api_port)
         silent = controller.why_silent(_ASK_S)
         receiver = Receiver(host, options.receive_hz, outputs, _RECEIVE_S)
     except LinkError as error:

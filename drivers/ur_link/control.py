@@ -16,7 +16,7 @@ from hilcal.drivers.ur_link.children import WATCHDOG_HZ
 from hilcal.drivers.ur_link.probe import Connection, LinkError
 from hilcal.drivers.ur_link.reading import STALE_S, Reading, Receiver
 from hilcal.drivers.ur_link.states import CHECK_LINK, RESUME, failure
-from hilcal.drivers.ur_link.supervision import PRIMARY_PORT, Controller
+from hilcal.drivers.ur_link.supervision import PRIMARY_PORT, UrController
 from hilcal.drivers.ur_link.worker import Worker, WorkerError
 from hilcal.measuring.route import duration
 from hilcal.types import Floats
@@ -114,7 +114,7 @@ class Control(Worker):
     If the process is killed, the robot's watchdog stops the arm.
     """
 
-    def __init__(self, controller: Controller, seconds: float) -> None:
+    def __init__(self, controller: UrController, seconds: float) -> None:
         """Take control of the arm within a deadline."""
         flags = controller.script_port == PRIMARY_PORT, controller.upper
         arguments = repr(_HZ), repr(LEASE_S), *(str(int(flag)) for flag in flags)
@@ -154,7 +154,7 @@ class Control(Worker):
         self.kill()
 
 
-def take(controller: Controller, receiver: Receiver) -> Control:
+def take(controller: UrController, receiver: Receiver) -> Control:
     """Take control of an arm that is ready for it."""
     host, end = controller.host, time.monotonic() + CONNECT_S
     try:
@@ -178,7 +178,7 @@ def take(controller: Controller, receiver: Receiver) -> Control:
     return control
 
 
-def _start(controller: Controller, end: float) -> Control:
+def _start(controller: UrController, end: float) -> Control:
     """Start the worker; try twice: our query of the registers may still hold them."""
     try:
         return Control(controller, end - time.monotonic())
@@ -189,7 +189,7 @@ def _start(controller: Controller, end: float) -> Control:
     return Control(controller, end - time.monotonic())
 
 
-def _check_ready(controller: Controller, receiver: Receiver) -> None:
+def _check_ready(controller: UrController, receiver: Receiver) -> None:
     """Refuse a robot that cannot be controlled; end a paused program, which a stop may leave."""
     host, reading = controller.host, receiver.read()
     if reading.sample.safety != states.NORMAL:
@@ -244,7 +244,7 @@ class Halt:
 class Brakes:
     """The ways to stop one arm."""
 
-    controller: Controller
+    controller: UrController
     receiver: Receiver
 
     def ease(self, control: Control, brake: float) -> bool:
@@ -318,7 +318,7 @@ class Brakes:
         return None
 
 
-def cause_of(controller: Controller, halt: Halt, symptom: str) -> tuple[str, str]:
+def cause_of(controller: UrController, halt: Halt, symptom: str) -> tuple[str, str]:
     """Return cause and advice, after the arm has been stopped.
 
     A safety stop also ends the program, and a lost link the process that commands the arm. So the

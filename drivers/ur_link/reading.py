@@ -23,7 +23,7 @@ from hilcal.drivers.ur_link import probe, states
 from hilcal.drivers.ur_link.children import OUTPUTS as OUTPUTS
 from hilcal.drivers.ur_link.children import TORQUE as TORQUE
 from hilcal.drivers.ur_link.probe import Connection, LinkError
-from hilcal.drivers.ur_link.supervision import PRIMARY_PORT, Controller
+from hilcal.drivers.ur_link.supervision import PRIMARY_PORT, UrController
 from hilcal.drivers.ur_link.worker import Worker, WorkerError
 from hilcal.errors import InputError
 from hilcal.measuring.devices import ArmSample, Report, Row, report_of
@@ -242,7 +242,7 @@ _SHARE = 0.5
 _ASK_S = 1.5
 
 
-def survey(controller: Controller, receiver: Receiver, model: str, silent: str) -> Report:
+def survey(controller: UrController, receiver: Receiver, model: str, silent: str) -> Report:
     """Ask all that needs no motion; `silent`: why the supervision does not answer, else empty."""
     supervision, hz = controller.supervision, receiver.hz
     version = states.version_word(controller.version)

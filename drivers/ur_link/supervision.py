@@ -215,7 +215,7 @@ REALTIME_PORT, PRIMARY_PORT = 30003, 30001
 
 
 @dataclass(frozen=True, slots=True)
-class Controller:
+class UrController:
     """A controller, and how one of its version is supervised and commanded."""
 
     host: str

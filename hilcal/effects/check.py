@@ -79,8 +79,9 @@ def example_situation(cell: Cell, states: States) -> Situation:
     chain = chains.evaluate(cell.arm, angle)
     load = Load(states.wrench, cell.load_point, cell.tool_mass, cell.tool_com, cell.gravity)
     wrench = slot_wrenches(cell.arm, chain, load)
-    wrench.flags.writeable = False
     turned = cell.arm.phases(angle)
+    for array in (wrench, turned):
+        array.flags.writeable = False
     return Situation(cell, states, turned, chain, wrench, load, typical_compliances(cell))
 
 

@@ -139,10 +139,9 @@ def doubt_to_settle(o: Campaign, d: Diagnosis, say: Say) -> Doubt:
 
 def _settled(o: Campaign, d: Diagnosis) -> str:
     """Return the message that there are no suspects to separate, with the next step."""
-    path = quoted(o.path)
     see, further = (
-        f"see hilcal diagnose {path}",
-        f"hilcal plan CELL.toml -o PLAN.json --after {path}",
+        f"see hilcal diagnose {quoted(o.path)}",
+        f"hilcal plan CELL.toml -o PLAN.json --after {quoted(o.path)}",
     )
     if d.verdict == "adequate":
         why = (
@@ -161,7 +160,8 @@ def _settled(o: Campaign, d: Diagnosis) -> str:
     elif d.verdict == "missing_effect":
         lead = d.suspects[0]
         add = (
-            f"{lead.effect} alone is missing; add it with: hilcal add {path} {quoted(lead.effect)}"
+            f"{lead.effect} alone is missing; add it with: "
+            f"hilcal add {quoted(o.path)} {quoted(lead.effect)}"
         )
         why = _differ(o, lead) if lead.coarse else add
     else:

@@ -276,10 +276,8 @@ def _emscon() -> Parser:
         tracker._options = emscon.EmsconOptions(target=target)  # type: ignore[arg-type]
         tracker._config, tracker._remarks, tracker._line = Tracker(), [], line
         tracker._ready = lambda seconds=0.0: np.inf  # type: ignore[method-assign]
-        tracker._clock = None  # type: ignore[assignment]
-        tracker._soon = tracker._ready  # type: ignore[method-assign]
-        kind, status, body = line.result(until=np.inf)
-        tracker._measure = lambda: tracker._checked(kind, status, body)  # type: ignore[method-assign]
+        tracker._clock = Clock()
+        tracker._do = lambda *words, until: b""  # type: ignore[assignment]
         sample = tracker.measure()
         if not (np.isfinite(sample.value).all() and np.linalg.eigvalsh(sample.covariance)[0] > 0.0):
             raise Accepted("emscon: a reading that cannot be")

@@ -242,7 +242,7 @@ def test_levels_hold_the_share_of_noise_they_name():
 
 def test_arm_of_another_shape_is_drawn(tmp_path):
     six, told, path = ur10e(), story(poses=3), tmp_path / "four.rrd"
-    cut = {k: getattr(six, k)[:4] for k in ("masses", "coms", "joint_names")}
+    cut = {k: getattr(six, k)[:4] for k in ("masses", "coms", "joint_names", "q_min", "q_max")}
     save(replace(told, arm=replace(six, links=six.links[:5], **cut), q=told.q[:, :4]), path)
     assert len(rows(path, "/world/arm/body5", "Transform3D:translation", "pose")) == 3
 
