@@ -94,7 +94,8 @@ class Calibration:
         """Check that what is there can be read."""
         for path in self._files():
             if path.exists():
-                self._once(path)
+                with CampaignFile.open(path, read_only=True) as campaign:
+                    assert self._once(path) == campaign.n_readings
 
     def _files(self) -> tuple[Path, ...]:
         files = Files(self.run)
