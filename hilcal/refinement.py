@@ -44,8 +44,11 @@ MOST_SCATTERS = 2
 """Estimates of the arm's scatter at most: the first, and another after further effects."""
 BACKGROUND = "background"  # `RefinementStep.added` of a step that adds a background
 UNEXPLAINED = ("unknown_effect", "noise_misjudged")
-"""Verdicts with which all effects are tried together where readings are many: single effects are
-then proved down to a size below the noise, and all together take minutes. A choice."""
+"""Verdicts with which all effects are tried together where readings are many; a choice: they prove
+single effects far below the noise, and all together take minutes."""
+MANY = 6
+"""Added effects with which all are tried together in any case where readings are many; a choice: an
+arm that shows so many has the others, too, and each further one takes as long."""
 FAR = 0.1
 """Share of an effect's evidence by which the evidence of its replacements must exceed it while the
 model is not adequate; a guess."""
@@ -187,12 +190,12 @@ def refine_from(
     background: bool = True,
 ) -> Refinement:
     """Refine a fit without estimating the correlation of its noise anew; see `refine`."""
-    path = Path(first, say, history, laws, on_step)
+    path = Path(first, say, history, laws, on_step, background)
     changed = True
     while changed:
         path.extend()
         changed = path.reconsider()
-        changed = changed or (background and path.take_background()) or path.take_scatter()
+        changed = changed or path.take_background() or path.take_scatter()
     path.pool_lines()
     return Refinement(tuple(path.steps))
 
@@ -207,8 +210,10 @@ class Path:
         history: History = NOTHING,
         laws: LawSearch | None = None,
         on_step: Callable[[RefinementStep], None] = lambda step: None,
+        background: bool = True,
     ) -> None:
         """Start with a fit whose effects stay; `history` tells how its model was reached."""
+        self._background = background
         self.steps: list[RefinementStep] = []
         self._start, self._start_history, self._say = first.model.named, history, say
         self._laws, self._on_step = laws, on_step
@@ -254,8 +259,19 @@ class Path:
     def extend(self) -> None:
         """Add suspects while any lowers the error on poses left out."""
         # Where suspects are rejected, the step is judged anew: a law may be searched after all.
-        while self._room and (self._add_law() or self._add_suspect() or self._add_law()):
+        while self._room and (
+            self._add_law()
+            or (self._shows_many() and self.take_background())
+            or self._add_suspect()
+            or self._add_law()
+        ):
             pass
+
+    def _shows_many(self) -> bool:
+        """Whether many readings show many effects; see `MANY`."""
+        last = self.steps[-1].fit
+        added = sum(name not in self._start for name in last.model.named)
+        return last.readings.value.size > MOST_NOISE_ROWS and added >= MANY
 
     def _add_law(self) -> bool:
         """Add a law if no effect of the catalogue explains the misfit; whether a law was added.
@@ -327,19 +343,20 @@ class Path:
         """Fit all other effects of the catalogue together; whether the model has them now.
 
         They are not tried if the stated noise explains the residual and the readings do not prove
-        them together; nor where many readings and the named effects leave nothing to explain. They
-        stay as the model's background if the error on poses left out falls by
-        a share (`background_is_better`); also by more than it scatters from pose to pose, if the
-        readings do not prove them, or the verdict `unknown_effect` says that they may imitate an
-        effect that the catalogue lacks. Those proved beside all others are then named.
+        them together; nor where readings are many, a few effects are named and the verdict blames
+        neither the noise nor an unknown effect. They stay as the model's background if the error on
+        poses left out falls by a share (`background_is_better`); also by more than it scatters from
+        pose to pose, if the readings do not prove them, or the verdict `unknown_effect` says that
+        they may imitate an effect that the catalogue lacks. Those proved beside all others are then
+        named.
         """
         last = self.steps[-1]
         tried = self._background_tried or bool(last.fit.model.background)
         d = last.diagnosis
-        if tried or not self._room or d.wrong_figures:
+        if not self._background or tried or not self._room or d.wrong_figures:
             return False
         many = last.fit.readings.value.size > MOST_NOISE_ROWS
-        if many and d.verdict not in UNEXPLAINED:
+        if many and not (d.verdict in UNEXPLAINED or self._shows_many()):
             return False
         self._background_tried = True
         if not allows_background(last.fit):

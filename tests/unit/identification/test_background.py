@@ -23,6 +23,8 @@ from hilcal.refinement import BACKGROUND, refine
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.revision import from_text, to_text
 from hilcal.store.rows import content_hash
+from studies.all_effects_command import Case
+from studies.all_effects_command import refined as all_effects
 from studies.diagnosis import Asked
 from studies.diagnosis_command import simulate
 from studies.random_campaigns import rehearsal_states
@@ -222,6 +224,15 @@ def test_without_shrunk_effects_there_are_no_lines():
     case = study_case(configuration(), "ur10e", "absolute", (), 0.0, 1, n_poses=12)
     plain = based(case.cell, case.readings, "absolute")
     assert with_pooled_lines(plain) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("poses", "seed"), [(600, 0), (600, 1), (1000, 2)])
+def test_many_poses_of_an_arm_with_every_effect_blame_no_noise_and_no_unknown_law(poses, seed):
+    found = all_effects(Case(poses, seed, factor=1.0, without=False))
+    assert found.verdict in ("ambiguous", "adequate")
+    assert found.rms_m < 1.03 * found.best_m
+    assert found.inside > 0.92
 
 
 CONFIG = configuration()
