@@ -352,9 +352,10 @@ def refine(
     >>> [step.added for step in path.steps]
     [None, 'joint_tilt_compliance']
 
+    `readings`, `prior` and `mode` are as for `fit`.
+
     Args:
         model: the starting model; or a campaign alone, for its baseline.
-        readings, prior, mode: as for `fit`.
         discover: a folder. Where no effect explains the misfit, a law is searched, as by
             `hilcal refine --discover`; the files of laws in the final model are written there.
         background: whether all effects of the catalogue are fitted together, as a background, where
