@@ -46,9 +46,9 @@ BACKGROUND = "background"  # `RefinementStep.added` of a step that adds a backgr
 UNEXPLAINED = ("unknown_effect", "noise_misjudged")
 """Verdicts with which all effects are tried together where readings are many; a choice: they prove
 single effects far below the noise, and all together take minutes."""
-MANY = 6
-"""Added effects with which all are tried together in any case where readings are many; a choice: an
-arm that shows so many has the others, too, and each further one takes as long."""
+MANY_EFFECTS = 6
+"""Number of added effects from which on all are tried together where readings are many, whatever the
+verdict; a choice: such an arm has the others, too, and each single trial takes long."""
 FAR = 0.1
 """Share of an effect's evidence by which the evidence of its replacements must exceed it while the
 model is not adequate; a guess."""
@@ -261,17 +261,17 @@ class Path:
         # Where suspects are rejected, the step is judged anew: a law may be searched after all.
         while self._room and (
             self._add_law()
-            or (self._shows_many() and self.take_background())
+            or (self._has_many_effects() and self.take_background())
             or self._add_suspect()
             or self._add_law()
         ):
             pass
 
-    def _shows_many(self) -> bool:
-        """Whether many readings show many effects; see `MANY`."""
+    def _has_many_effects(self) -> bool:
+        """Whether many readings show many effects; see `MANY_EFFECTS`."""
         last = self.steps[-1].fit
         added = sum(name not in self._start for name in last.model.named)
-        return last.readings.value.size > MOST_NOISE_ROWS and added >= MANY
+        return last.readings.value.size > MOST_NOISE_ROWS and added >= MANY_EFFECTS
 
     def _add_law(self) -> bool:
         """Add a law if no effect of the catalogue explains the misfit; whether a law was added.
@@ -356,7 +356,7 @@ class Path:
         if not self._background or tried or not self._room or d.wrong_figures:
             return False
         many = last.fit.readings.value.size > MOST_NOISE_ROWS
-        if many and not (d.verdict in UNEXPLAINED or self._shows_many()):
+        if many and not (d.verdict in UNEXPLAINED or self._has_many_effects()):
             return False
         self._background_tried = True
         if not allows_background(last.fit):

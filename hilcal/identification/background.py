@@ -188,6 +188,10 @@ def with_background(fitted: Fit, named: Collection[str]) -> Fit | None:
     multiplying the instrument's noise by its estimated factor, the standard deviations of the
     effects are divided by this factor, which gives the same fit. Gross errors stay set aside. The
     `named` effects do not belong to the background.
+
+    With more than `MOST_NOISE_ROWS` elements of readings, the ratio of the arm's scatter to the
+    instrument's noise is estimated from poses chosen at random; all readings then determine the
+    effects and the size of the noise.
     """
     readings = fitted.readings.as_stated()
     model = with_all_effects(fitted.model, readings[~fitted.outlier].states)

@@ -62,12 +62,21 @@ def config_flags(q: Floats, shape: Ints) -> Ints:
     return np.column_stack([q[:, 4] > 0, shape[:, 1], shape[:, 0], turns])
 
 
+AXES = (
+    (0, 0, 1),
+    (0, 1, 0),
+    (0, -1, 0),
+    (-1, 0, 0),
+    (0, -1, 0),
+    (-1, 0, 0),
+)  # of both makers' joints
+
 LS = Language(
     name="FANUC",
     pose=of_wpr,
     numbers=to_wpr,
     decimals=(3, 3, 3),
-    axes=((0, 0, 1), (0, 1, 0), (0, -1, 0), (-1, 0, 0), (0, -1, 0), (-1, 0, 0)),
+    axes=AXES,
     flags=config_flags,
     of_shape=(True, True, True, *(False,) * JOINTS),
     moves="J, L, C or A with P[…]",
@@ -192,7 +201,7 @@ INFORM = Language(
     pose=of_wpr,
     numbers=to_wpr,
     decimals=(3, 4, 4),
-    axes=((0, 0, 1), (0, 1, 0), (0, -1, 0), (-1, 0, 0), (0, -1, 0), (-1, 0, 0)),
+    axes=AXES,
     flags=rconf,
     of_shape=(False, True, True, False, False, False),
     moves="MOVJ, MOVL, MOVC, MOVS",
