@@ -47,7 +47,7 @@ UNEXPLAINED = ("unknown_effect", "noise_misjudged")
 """Verdicts with which all effects are tried together where readings are many; a choice: they prove
 single effects far below the noise, and all together take minutes."""
 MANY_EFFECTS = 6
-"""Number of added effects from which on all are tried together where readings are many, whatever the
+"""Number of added effects from which on all are tried together where readings are many, with any
 verdict; a choice: such an arm has the others, too, and each single trial takes long."""
 FAR = 0.1
 """Share of an effect's evidence by which the evidence of its replacements must exceed it while the

@@ -62,7 +62,7 @@ SETS = {
 _QUERIES = (es.GET_SYSTEM_STATUS, es.GET_REFLECTORS, es.GET_TRACKER_INFO, es.GET_ENVIRONMENT,
             es.GET_STATUS_INFO)  # fmt: skip
 INFO = struct.pack("<iiiidddiiddIii", 1, 1, 1, 1, 0.0, 160.0, 0.8, 10, 2, 3.14, 3.14, 1, 1, 0)
-"""Of the tracker, after its type, name and number: what it has, and its limits."""
+"""Equipment and limits of the tracker: the end of the answer to GetTrackerInfo."""
 
 
 @dataclass(slots=True, eq=False)

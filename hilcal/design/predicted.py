@@ -39,14 +39,14 @@ def prediction_poses(
     nominal: NominalModel,
     config: CellConfig,  # `[planning] work_*`, loads
     feasible: Floats,  # (N, n) feasible states to draw from, rad
-    may: Clear | None = None,  # for a box
+    is_clear: Clear | None = None,  # tests poses drawn in a box
 ) -> PredictionPoses:
     """Return the prediction poses of `[planning]`: named, within a box, or of the candidates.
 
     With deflections, the deflection under `work_load` is predicted; with `work_load = "none"`, the
     deflection under each load in turn.
     """
-    q, where = _poses(nominal, config, feasible, may)
+    q, where = _poses(nominal, config, feasible, is_clear)
     cell, planning = nominal.cell, config.planning
     of_loads = {load.name: load.wrench(cell.gravity) for load in config.loads}
     deflection = planning.readings == "deflection"
@@ -84,7 +84,7 @@ def position_derivative(
 
 
 def _poses(
-    nominal: NominalModel, config: CellConfig, feasible: Floats, may: Clear | None
+    nominal: NominalModel, config: CellConfig, feasible: Floats, is_clear: Clear | None
 ) -> tuple[Floats, str]:
     """Return prediction poses (T, n), and in words where they are."""
     planning, cell = config.planning, nominal.cell
@@ -108,13 +108,13 @@ def _poses(
     low, high = cell.arm.usual_range
     margin = config.limits.joint_margin_rad
     low, high = low + margin, high - margin
-    for _ in range(_ROUNDS if may is not None else 0):
+    for _ in range(_ROUNDS if is_clear is not None else 0):
         if len(inside) >= COUNT:
             break
         drawn = cell.arm.complete(rng.uniform(low, high, (_DRAWN, n)))
         drawn = _inside(nominal, drawn, *box)
-        if may is not None and len(drawn):
-            inside = np.concatenate([inside, drawn[may(drawn)]])
+        if is_clear is not None and len(drawn):
+            inside = np.concatenate([inside, drawn[is_clear(drawn)]])
     if not len(inside):
         raise CannotAnswerError(
             f"no feasible pose holds the target between work_min_m = {box[0].tolist()} and "

@@ -211,7 +211,7 @@ KINDS: dict[str, Kind] = {
     ),
     "columns": Kind(lambda d, h: replace(d, q=d.q[:, np.array(h.order) - 1]), _columns_words),
 }
-"""All kinds of hypotheses."""
+"""What may be wrong with the description of arm and readings, by name."""
 
 
 OF_ATTITUDES = ("mirrored_positions", "turn_degrees", "turn_radians", "inverse", "inverse_attitude")
