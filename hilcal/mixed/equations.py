@@ -26,8 +26,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
-from scipy.linalg.lapack import dpotri
+from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dpotri, dtrtri
 
 from hilcal.mixed.problem import MixedProblem
 from hilcal.types import Floats, Ints
@@ -38,9 +38,9 @@ EIGENVALUE = 1e-12  # share of the largest below which an eigenvalue is zero
 class _ByColumns:
     """P by Cholesky's factor of C (K, K)."""
 
-    def __init__(self, rows: Floats, flat: int) -> None:
+    def __init__(self, rows: Floats, c: Floats, flat: int) -> None:
+        """`c` is Tᵀ T (K, K) of the rows T, and is overwritten."""
         self.rows = rows
-        c = rows.T @ rows
         random = np.arange(flat, len(c))
         c[random, random] += 1.0
         self.factor = cho_factor(c, lower=True, overwrite_a=True)
@@ -51,10 +51,14 @@ class _ByColumns:
         return np.asarray(v - self.rows @ cho_solve(self.factor, self.rows.T @ v))
 
     @cached_property
+    def _root(self) -> Floats:
+        """(K, K) L⁻¹, C = L Lᵀ."""
+        return np.tril(dtrtri(self.factor[0], lower=True)[0])
+
+    @cached_property
     def spent(self) -> Floats:
         """(K,) T_iᵀ P T_i = 1 − (C⁻¹)_ii; holds for random columns only."""
-        root = solve_triangular(self.factor[0], np.eye(len(self.factor[0])), lower=True)
-        return np.asarray(1.0 - np.einsum("ij,ij->j", root, root))
+        return np.asarray(1.0 - np.sum(self._root**2, axis=0))
 
     @cached_property
     def inverse(self) -> Floats:
@@ -62,13 +66,9 @@ class _ByColumns:
         return np.asarray(cho_solve(self.factor, np.eye(len(self.factor[0]))))
 
     @cached_property
-    def _lifted(self) -> Floats:
-        return np.asarray(solve_triangular(self.factor[0], self.rows.T, lower=True)).T
-
-    @cached_property
     def diagonal(self) -> Floats:
         """(R,) diagonal of P."""
-        return 1.0 - np.asarray(np.sum(self._lifted**2, axis=1))
+        return np.asarray(1.0 - np.sum((self.rows @ self._root.T) ** 2, axis=1))
 
 
 class _ByRows:
@@ -127,6 +127,7 @@ class Equations:
 
     problem: MixedProblem  # rows, columns and noise
     log_std: Floats  # (F + N,) log s of the families, η of the noise
+    scale: Floats  # (K,) S
     rows: Floats  # (R, K) T
     target: Floats  # (R,) t
     noise_std: Floats  # (R,) R^½
@@ -136,12 +137,6 @@ class Equations:
     def _count(self) -> int:
         """Number of families."""
         return len(self.problem.families.random)
-
-    @cached_property
-    def scale(self) -> Floats:
-        """(K,) S."""
-        p = self.problem
-        return np.concatenate([np.ones(p.flat), np.exp(self.log_std)[p.family]])
 
     @cached_property
     def residual(self) -> Floats:
@@ -176,9 +171,19 @@ class Equations:
         """(F + N,) derivatives of ℓ by log s and η."""
         p = self.problem
         square = np.bincount(p.family, self.c[p.flat :] ** 2, minlength=self._count)
-        noise = (self.residual**2 - self.projection.diagonal) @ self._white_noise
+        noise = self.residual**2 @ self._white_noise - self._freedom
         noise[0] -= p.zeros
         return np.concatenate([square - self.spent, noise])
+
+    @property
+    def _freedom(self) -> Floats:
+        """(N,) tr(P W_k), degrees of freedom of each component of the noise.
+
+        Together they are the measured rows less the parameters.
+        """
+        if self._white_noise.shape[1] > 1:
+            return np.asarray(self.projection.diagonal @ self._white_noise)
+        return np.asarray(self._white_noise.sum(axis=0) - self.problem.flat - self.spent.sum())
 
     @cached_property
     def _white_noise(self) -> Floats:
@@ -253,11 +258,19 @@ def equations(problem: MixedProblem, log_std: Floats) -> Equations:
         numpy.linalg.LinAlgError: Cholesky's factorisation fails, as the standard deviations differ
             too much.
     """
-    noise_std = problem.noise_std(log_std[len(problem.families.random) :])
-    rows, target = problem.x / noise_std[:, None], problem.y / noise_std
-    rows[:, problem.flat :] *= np.exp(log_std)[problem.family]
-    form = _ByRows if rows.shape[0] < rows.shape[1] else _ByColumns
-    return Equations(problem, log_std, rows, target, noise_std, form(rows, problem.flat))
+    eta, flat = log_std[len(problem.families.random) :], problem.flat
+    noise_std = problem.noise_std(eta)
+    scale = np.concatenate([np.ones(flat), np.exp(log_std)[problem.family]])
+    rows, target = problem.x / noise_std[:, None] * scale, problem.y / noise_std
+    projection: _ByColumns | _ByRows
+    if rows.shape[0] < rows.shape[1]:
+        projection = _ByRows(rows, flat)
+    elif problem.white:
+        weight = np.exp(-eta[0]) * scale
+        projection = _ByColumns(rows, problem.gram * weight * weight[:, None], flat)
+    else:
+        projection = _ByColumns(rows, rows.T @ rows, flat)
+    return Equations(problem, log_std, scale, rows, target, noise_std, projection)
 
 
 def left_out(e: Equations, fold: Ints) -> tuple[Floats, Floats]:

@@ -63,6 +63,17 @@ class MixedProblem:
         """Names of families and components of the noise."""
         return (*self.families.names, *(n.name for n in self.noise))
 
+    @cached_property
+    def white(self) -> bool:
+        """Whether all measured rows have the noise of one component, of equal variance."""
+        variance = self.noise[0].variance
+        return len(self.noise) == 1 and bool(np.all((variance == 0.0) | (variance == 1.0)))
+
+    @cached_property
+    def gram(self) -> Floats:
+        """(K, K) Xᵀ X."""
+        return np.asarray(self.x.T @ self.x)
+
     def coordinates(self, jacobian: Floats) -> Floats:
         """Return columns (..., K) from derivatives (..., P) by the model's parameters."""
         random = self.families.random
@@ -106,7 +117,7 @@ class MixedProblem:
         noise = self.noise[0]
         measured = noise.variance > 0.0
         count, columns = int(measured.sum()), self.x.shape[1]
-        if len(self.noise) > 1 or np.any(noise.variance[measured] != 1.0) or count <= columns + 1:
+        if not self.white or count <= columns + 1:
             return self
         rows = np.asarray(np.linalg.qr(np.column_stack([self.x, self.y])[measured], mode="r"))
         white = replace(noise, variance=np.ones(len(rows)))
