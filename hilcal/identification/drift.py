@@ -48,7 +48,7 @@ from hilcal.types import Floats, Ints
 ITERATIONS = 40  # of the fixed point, at most; a choice
 TOLERANCE = 0.1  # change of the degrees of freedom v tr P K of a group that ends them; a choice
 NEGLIGIBLE = 1e-6  # variance in units of S² that counts as none
-MANY = 1e6  # dimension at which a ratio of quadratic forms is one of them
+LARGE_DIMENSION = 1e6  # dimension at which a ratio of quadratic forms is one of them
 LEAST_P = 1e-300
 
 
@@ -166,7 +166,9 @@ def conflicts(model: Model, solution: Solution, w: Whitening) -> tuple[Conflict,
             continue
         values = np.maximum(np.linalg.eigvalsh(inner), 0.0)
         square = float(np.sum((x.T @ residual) ** 2))
-        chance = ratio_tail(values[values > 0] / MANY, MANY, square / MANY**2)
+        chance = ratio_tail(
+            values[values > 0] / LARGE_DIMENSION, LARGE_DIMENSION, square / LARGE_DIMENSION**2
+        )
         out.append(Conflict(group, chance, float(used[k])))
     return tuple(sorted(out, key=lambda c: c.p_value))
 

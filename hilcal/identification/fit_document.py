@@ -36,8 +36,8 @@ def to_json(fit: Fit) -> dict[str, object]:
         "converged": fit.solution.converged,
         "iterations": fit.solution.iterations,
         "condition": {
-            "unscaled": finite(basis.condition_unscaled),
-            "scaled": finite(basis.condition_scaled),
+            "unscaled": finite_or_null(basis.condition_unscaled),
+            "scaled": finite_or_null(basis.condition_scaled),
         },
         "parameters": fit.parameters.to_dicts(),
         "background": background_of(fit).to_json(),
@@ -114,17 +114,17 @@ def notes(fit: Fit) -> tuple[str, ...]:
     return tuple(out)
 
 
-def finite(value: float) -> float | None:
+def finite_or_null(value: float) -> float | None:
     """Return a JSON number, null where there is none."""
     return float(value) if np.isfinite(value) else None
 
 
-def plain(content: object) -> object:
+def with_nulls(content: object) -> object:
     """Return JSON content in which every number that is not finite is null."""
     if isinstance(content, float | np.floating):
-        return finite(float(content))
+        return finite_or_null(float(content))
     if isinstance(content, Mapping):
-        return {str(k): plain(v) for k, v in content.items()}
+        return {str(k): with_nulls(v) for k, v in content.items()}
     if isinstance(content, list | tuple):
-        return [plain(v) for v in content]
+        return [with_nulls(v) for v in content]
     return content

@@ -48,8 +48,8 @@ LARGEST_STEP = 2.0  # of log s or η at a time: a factor of 7; a choice
 CONVERGED = 1e-4
 """Gain of the log posterior below which the iteration ends; a choice: estimates are then within 1 %
 of their standard error."""
-JUMPS = 8  # most restarts of Newton's method from another size of one family; a choice
-WORTH = 0.01  # least gain of the log posterior for another restart; a choice
+MOST_JUMPS = 8  # most restarts of Newton's method from another size of one family; a choice
+LEAST_GAIN = 0.01  # least gain of the log posterior for another restart; a choice
 SIZES = np.linspace(-7.0, 7.0, 57)
 """Searched values of log s: a factor of 1000 either way in steps of a quarter; a choice."""
 DAMPINGS = 12  # most increases of the damping in one step, tenfold each; a choice
@@ -96,12 +96,12 @@ def estimate_variances(
     except np.linalg.LinAlgError as error:
         raise CannotAnswerError("the mixed model's equations have no solution") from error
     maximum, best = _newton(at_start)
-    for _ in range(JUMPS if search else 0):
+    for _ in range(MOST_JUMPS if search else 0):
         try:
             trial, value = _newton(equations(problem, _better_size(maximum)))
         except np.linalg.LinAlgError:
             break
-        if value < best + WORTH:
+        if value < best + LEAST_GAIN:
             break
         maximum, best = trial, value
     return Variances(maximum, np.asarray(np.linalg.inv(maximum.information + precision)), best)

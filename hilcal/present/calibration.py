@@ -370,7 +370,7 @@ def validation_report(
         yield f"These readings are {z_all:.2g} times as far off as the fit states.\n"
 
 
-def _beyond(v: validation.Beyond) -> str:
+def _beyond(v: validation.ExceededRange) -> str:
     if v.variable == "leverage":
         return f"leverage: {v.count}, far from all fitted poses in several joints together"
     if v.unit == "rad":

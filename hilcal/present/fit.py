@@ -19,7 +19,7 @@ from hilcal.identification.full_prediction import (
     full_prediction,
     gross_errors,
 )
-from hilcal.identification.predictive import of_arm
+from hilcal.identification.predictive import belongs_to_arm
 from hilcal.identification.residual import ErrorBlock
 from hilcal.numbers import length, percent
 from hilcal.present.document import Block, Table, heading, note, table
@@ -412,7 +412,7 @@ def prior_lines(fit: Fit) -> list[str]:
     if len(moved) > MOST_TOLD:
         lines.append(f"  … and {len(moved) - MOST_TOLD} more (--json lists them)")
     in_prior = {e.name for e in prior.posterior.effects}
-    new = [e.name for e in fit.model.effects if of_arm(e) and e.name not in in_prior]
+    new = [e.name for e in fit.model.effects if belongs_to_arm(e) and e.name not in in_prior]
     ask = "hilcal compare EARLIER LATER says what has changed"
     if new:
         lines.append(f"  Its model did not have {numbers.names(new)}; {ask}.")

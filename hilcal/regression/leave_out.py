@@ -21,29 +21,29 @@ from hilcal.types import Bools, Floats, Ints
 
 LEAST_GAIN = 0.002
 """Share by which the rms error on poses left out must fall for an effect to stay ..."""
-SURE = 2.0
+STANDARD_ERRORS = 2.0
 """... and the number of standard errors, from pose to pose, or the same level by signed ranks."""
-FEWEST = 8  # least number of poses for the test by ranks
+FEWEST_POSES = 8  # least number of poses for the test by ranks
 ROUNDING = 1e-6  # ridge of flat directions, whose gram is the identity
 FAMILY_ROUNDING = 1e-10  # least ridge of a family, as a share of the largest square of a column
 
 
-def improves(before: Floats, after: Floats, sure: float = SURE) -> bool:
+def improves(before: Floats, after: Floats, standard_errors: float = STANDARD_ERRORS) -> bool:
     """Return whether squared whitened residuals (P,) of poses left out became smaller.
 
-    The gain must exceed `sure` standard errors from pose to pose, or the same level by Wilcoxon's
-    signed ranks (Biometrics Bulletin 1 (1945) 80-83), as the mean scatters where few poses gain
-    very much.
+    The gain must exceed `standard_errors` standard errors from pose to pose, or the same level by
+    Wilcoxon's signed ranks (Biometrics Bulletin 1 (1945) 80-83), as the mean scatters where few
+    poses gain very much.
     """
     if float(np.sum(after)) >= (1 - LEAST_GAIN) ** 2 * float(np.sum(before)):
         return False
     gain = before - after
     error = float(np.std(gain)) / np.sqrt(max(len(gain) - 1, 1))
-    if float(np.mean(gain)) > sure * error:
+    if float(np.mean(gain)) > standard_errors * error:
         return True
-    if np.count_nonzero(gain) < FEWEST:
+    if np.count_nonzero(gain) < FEWEST_POSES:
         return False
-    return float(wilcoxon(gain, alternative="greater").pvalue) < float(norm.sf(sure))
+    return float(wilcoxon(gain, alternative="greater").pvalue) < float(norm.sf(standard_errors))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
