@@ -262,7 +262,7 @@ _Trial = tuple[float, float, LaterFit, tuple[Candidate, ...]]
 
 
 def find_changes(
-    setting: LaterReadings,  # later readings, none of which was fitted, beside the earlier fit
+    later: LaterReadings,  # later readings, none of which was fitted, beside the earlier fit
     say: Callable[[str], None] = lambda text: None,  # takes progress, one line each
 ) -> Changes:
     """Find the changes between an earlier fit and later readings of the same arm.
@@ -270,15 +270,15 @@ def find_changes(
     Raises:
         CannotAnswerError: too few readings, or no static equilibrium.
     """
-    earlier, w, cell = setting.earlier, setting.w, setting.model.cell
-    before = fit_later(setting)
+    earlier, w, cell = later.earlier, later.w, later.model.cell
+    before = fit_later(later)
     if before.dof < 3:
         raise CannotAnswerError(
             f"{len(w)} later readings leave nothing to judge a change by; measure at least "
             f"{-(-(before.free + 3) // w.m)}, better 15"
         )
     catalogue = earlier.fit.model.catalogue
-    possible = candidates(cell, setting.readings.states, catalogue, w.m, anew=setting.anew)
+    possible = candidates(cell, later.readings.states, catalogue, w.m, anew=later.anew)
     current, tested = before, 0
     steps: list[_Step] = []
     hidden: tuple[Candidate, ...] = ()

@@ -175,24 +175,24 @@ def _most_evident(fit: Fit, names: Collection[str]) -> str | None:
     return max(sure, key=lambda name: sure[name], default=None)
 
 
-def error_today(setting: LaterReadings, changes: Changes, drawing: float | None) -> ErrorToday:
+def error_today(later: LaterReadings, changes: Changes, drawing: float | None) -> ErrorToday:
     """Return the earlier calibration's error; `drawing`: rms error with the arm as drawn, m."""
-    minimum, w = fit_later(with_frames_only(setting)), setting.w
+    minimum, w = fit_later(with_frames_only(later)), later.w
     white = w.whiten(minimum.raw).reshape(-1)
     prediction = Validation(
-        readings=setting.readings,
+        readings=later.readings,
         whitening=w,
         raw=minimum.raw,
         error=error_block(minimum.raw, w),
         variance_factor=float(white @ white) / max(w.rank - minimum.free, 1),
-        registered=setting.anew,
+        registered=later.anew,
     )
-    predictive, lift = setting.earlier.predictive, directions_beside_frames(setting)
+    predictive, lift = later.earlier.predictive, directions_beside_frames(later)
     covariance = lift @ lift.T / predictive.factor
     predictive = replace(
         predictive, model=minimum.model, theta=minimum.theta, covariance=covariance
     )
-    fit, before = setting.earlier.fit, changes.before
+    fit, before = later.earlier.fit, changes.before
     ratio = before.rss / before.dof
     return ErrorToday(
         prediction=prediction,

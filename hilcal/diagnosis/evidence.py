@@ -350,9 +350,9 @@ class Evidence:
             noise=noise,
         )
 
-    def tree_share(self, beyond: float) -> float:
+    def tree_share(self, other_share: float) -> float:
         """Return the share of the misfit that trees predict; see `residual_regression`."""
-        return self._regressions.tree_share(self.linearisation, beyond)
+        return self._regressions.tree_share(self.linearisation, other_share)
 
     def alternatives(
         self, effects: Collection[str], excluded: Collection[str]

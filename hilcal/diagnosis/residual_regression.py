@@ -131,12 +131,12 @@ class Regressions:
             self._of[p.fit] = smooth
         return self._of[p.fit]
 
-    def tree_share(self, p: Linearisation, beyond: float) -> float:
+    def tree_share(self, p: Linearisation, other_share: float) -> float:
         """Cached `tree_share`."""
         shares = self._trees.setdefault(p.fit, {})
-        if beyond not in shares:
-            shares[beyond] = tree_share(p, beyond)
-        return shares[beyond]
+        if other_share not in shares:
+            shares[other_share] = tree_share(p, other_share)
+        return shares[other_share]
 
 
 def residual_regression(p: Linearisation) -> ResidualRegression:
@@ -313,13 +313,13 @@ def _least_squares(p: Linearisation, x: Floats) -> tuple[Floats, Floats]:
     return y, np.asarray(inverse * max(variance, 1e-300))
 
 
-def tree_share(p: Linearisation, beyond: float = 0.0) -> float:
+def tree_share(p: Linearisation, other_share: float = 0.0) -> float:
     """Return the share of the misfit that trees predict on poses left out, within [0, 1].
 
-    A share below `beyond`, which is predicted without trees, is less precise; it is 0 where no more
-    than `PREDICTABLE` remains beyond it.
+    A share below `other_share`, which is predicted without trees, is less precise; it is 0 where no
+    more than `PREDICTABLE` remains beyond it.
     """
-    if beyond >= 1.0 - PREDICTABLE:
+    if other_share >= 1.0 - PREDICTABLE:
         return 0.0
     fit, w = p.fit, p.fit.whitening
     std = np.sqrt(np.trace(w.covariance[:, :3, :3], axis1=1, axis2=2) / 3)
@@ -343,7 +343,7 @@ def tree_share(p: Linearisation, beyond: float = 0.0) -> float:
         axis=1,
     )
     fold, scale = random_folds(fit.pose, FOLDS)[chosen], p.rss / p.misfit()
-    share = predict_by_trees(features[chosen], target[chosen], fold, scale, beyond).share
+    share = predict_by_trees(features[chosen], target[chosen], fold, scale, other_share).share
     return float(np.clip(share, 0.0, 1.0))
 
 
@@ -361,7 +361,7 @@ def predict_by_trees(
     target: Floats,  # (D, K)
     fold: Ints,  # (D,) fold of each row, from 0; with one fold nothing is predicted
     scale: float = 1.0,  # factor of the share; `PRECISION` holds for the product
-    beyond: float = 0.0,  # share below which the precision does not matter
+    other_share: float = 0.0,  # share below which the precision does not matter
 ) -> TreePrediction:
     """Return the share of ‖target‖² that trees predict in rows left out."""
     total = float(np.sum(target**2))
@@ -390,7 +390,7 @@ def predict_by_trees(
         of_trees = np.concatenate([of_trees, [errors(len(of_trees) + k) for k in range(TREES)]])
         square, std = _mean_of_pairs(of_trees @ of_trees.T)
         share, std, count = scale * (1.0 - square / total), scale * std / total, len(of_trees)
-        no_more = share + std * float(stdtrit(count - 1, STOP_CONFIDENCE)) < beyond
+        no_more = share + std * float(stdtrit(count - 1, STOP_CONFIDENCE)) < other_share
         if std <= PRECISION or no_more or count >= MOST_TREES:
             return TreePrediction(share, std, count)
 

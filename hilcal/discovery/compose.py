@@ -406,7 +406,7 @@ def _best_terms(
         if k is None:
             continue
         out.append(candidates.term(((s, k),), price))
-        partner = screen.grammar.turned(k)
+        partner = screen.grammar.with_sine(k)
         if partner is not None:
             out.append(candidates.term(((s, k), (s, partner)), price + LOG2))
     return out

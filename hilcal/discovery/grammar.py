@@ -170,7 +170,7 @@ class Grammar:
             self._read[v.symbol] = v.read(self.situation)
         return self._read[v.symbol]
 
-    def turned(self, k: int) -> int | None:
+    def with_sine(self, k: int) -> int | None:
         """Return the amplitude with sine for cosine in its first periodic factor."""
         if k < len(self.amplitudes):
             return int(self.partner[k]) if self.partner[k] >= 0 else None

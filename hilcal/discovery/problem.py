@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from hilcal.discovery.compose import composed_terms, grown
-from hilcal.discovery.screen import LawTerm, Scored, Screen, ScreenedTerm
+from hilcal.discovery.screen import LawTerm, ScoredTerm, Screen, ScreenedTerm
 from hilcal.identification.linearisation import Linearisation
 from hilcal.regression.evidence import FamilyScore, score_family
 from hilcal.regression.schur import Projection, projection
@@ -56,7 +56,9 @@ class SearchProblem:
         self._thin, self._thin_residual = self.model, self.residual
         if self.screened_share < 1.0:
             self._thin, self._thin_residual = _refitted(linear, self.screened)
-        self._scored: dict[tuple[tuple[tuple[tuple[int, int], ...], bool], ...], list[Scored]] = {}
+        self._scored: dict[
+            tuple[tuple[tuple[tuple[int, int], ...], bool], ...], list[ScoredTerm]
+        ] = {}
 
     @cached_property
     def screening_residual(self) -> Floats:
@@ -84,7 +86,7 @@ class SearchProblem:
         """(R', P) whitened columns of a term in the rows that are used."""
         return self.screen.columns_of(term)[self.rows]
 
-    def scored(self, chosen: tuple[LawTerm, ...] = ()) -> list[Scored]:
+    def scored(self, chosen: tuple[LawTerm, ...] = ()) -> list[ScoredTerm]:
         """Return the short list beside chosen terms, the best odds first; cached."""
         key = tuple((t.parts, t.common) for t in chosen)
         if key not in self._scored:
@@ -242,7 +244,7 @@ class CandidateTerms:
             - np.float32(0.5 * count) * (np.log(ratio) + np.float32(1.0))
         )
 
-    def score(self, terms: Sequence[LawTerm]) -> list[Scored]:
+    def score(self, terms: Sequence[LawTerm]) -> list[ScoredTerm]:
         """Score terms exactly beside the chosen ones."""
         p = self.problem
         out = []
@@ -252,7 +254,7 @@ class CandidateTerms:
             ends = np.cumsum([0] + [len(t.parts) for t in batch])
             for t, a, b in zip(batch, ends[:-1], ends[1:], strict=True):
                 columns = x[:, a:b].sum(axis=1, keepdims=True) if t.common else x[:, a:b]
-                out.append(Scored(t, self._score(columns)))
+                out.append(ScoredTerm(t, self._score(columns)))
         return out
 
     def _score(self, x: Floats) -> FamilyScore:

@@ -47,7 +47,7 @@ class LawTerm:
 
 
 @dataclass(frozen=True, eq=False)
-class Scored:
+class ScoredTerm:
     """A term with its score beside chosen terms."""
 
     term: LawTerm

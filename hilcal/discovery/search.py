@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from hilcal.discovery.problem import SHORT_LIST, CandidateTerms, SearchProblem
-from hilcal.discovery.screen import LawTerm, Scored, Screen
+from hilcal.discovery.screen import LawTerm, ScoredTerm, Screen
 from hilcal.regression.evidence import FamilyScore
 from hilcal.regression.forward_selection import families_beside
 from hilcal.types import Floats
@@ -86,13 +86,13 @@ def worth_their_length(selections: Iterable[Selection]) -> list[Selection]:
     return out
 
 
-def _ordered(problem: SearchProblem, chosen: tuple[LawTerm, ...] = ()) -> list[Scored]:
+def _ordered(problem: SearchProblem, chosen: tuple[LawTerm, ...] = ()) -> list[ScoredTerm]:
     """Return the short list, best first; the first is the simplest within odds of 20 : 1."""
     scored = problem.scored(chosen)
     if not scored:
         return []
 
-    def preference(c: Scored) -> tuple[float, ...]:
+    def preference(c: ScoredTerm) -> tuple[float, ...]:
         """Sort key of terms that are as good: the simplest, then the likeliest first."""
         *simple, functions = _simplicity(problem.screen, c.term)
         return (*simple, -round(c.odds), functions, -c.odds)
@@ -141,8 +141,8 @@ def _better(problem: SearchProblem, s: Selection, other: Selection) -> bool:
     return _extent(problem, s.terms) < _extent(problem, other.terms)
 
 
-def _distinct(problem: SearchProblem, scored: list[Scored], count: int) -> list[Scored]:
-    out: list[Scored] = []
+def _distinct(problem: SearchProblem, scored: list[ScoredTerm], count: int) -> list[ScoredTerm]:
+    out: list[ScoredTerm] = []
     units: list[Floats] = []
     for c in scored[:SHORT_LIST]:
         if c.odds < LEAST_LOG_ODDS:

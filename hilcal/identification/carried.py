@@ -97,7 +97,7 @@ class CarriedPrior:
         return np.where(precision > 0, strength, self.posterior.scale)
 
     @cached_property
-    def lowest(self) -> Floats:
+    def least_drift(self) -> Floats:
         """(1 + G,) no doubt, and the least drift of each group."""
         return np.array([0.0, *(self.least.get(g.effect, 0.0) for g in self.groups)])
 

@@ -140,7 +140,7 @@ def chosen_drift(model: Model, solution: Solution, w: Whitening) -> Floats:
         change, v = np.abs(new - v) * traces, new
         if change.max() < TOLERANCE:
             break
-    return np.asarray(np.sqrt(np.where(v > NEGLIGIBLE, v, 0.0) + prior.lowest**2))
+    return np.asarray(np.sqrt(np.where(v > NEGLIGIBLE, v, 0.0) + prior.least_drift**2))
 
 
 def conflicts(model: Model, solution: Solution, w: Whitening) -> tuple[Conflict, ...]:
@@ -152,8 +152,8 @@ def conflicts(model: Model, solution: Solution, w: Whitening) -> tuple[Conflict,
     if model.prior is None:
         return ()
     prior, rows = _linear(model, solution, w)
-    used = prior.lowest if model.prior.drift is None else model.prior.drift
-    v = used**2 - prior.lowest**2
+    used = prior.least_drift if model.prior.drift is None else model.prior.drift
+    v = used**2 - prior.least_drift**2
     total = rows.random @ rows.random.T + solution.beta * np.eye(len(rows.y))
     for moved in np.flatnonzero(v > NEGLIGIBLE):
         total += v[moved] * rows.drift[moved] @ rows.drift[moved].T
@@ -176,7 +176,7 @@ def conflicts(model: Model, solution: Solution, w: Whitening) -> tuple[Conflict,
 def _linear(model: Model, solution: Solution, w: Whitening) -> tuple[CarriedPrior, _Linear]:
     """The carried prior with its least drift, and the linear problem."""
     assert model.prior is not None  # noqa: S101 - the callers' condition
-    prior = model.prior.with_drift(model.prior.lowest)
+    prior = model.prior.with_drift(model.prior.least_drift)
     space = coordinates_of(replace(model, prior=prior))
     index, place = prior.index_in(names_of(model))
     (of_all, without, others, y), held = _columns(model, solution, w), space.std == 1.0

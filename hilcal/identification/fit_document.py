@@ -10,9 +10,9 @@ from hilcal.identification.baseline import masses_note
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_prediction import (
     disagreement_words,
-    error_before,
     full_prediction,
     gross_errors,
+    nominal_error,
 )
 from hilcal.identification.registration import register
 
@@ -46,7 +46,7 @@ def to_json(fit: Fit) -> dict[str, object]:
         "variance_factor": fit.variance_factor,
         "variance_factor_interval": list(fit.variance_factor_interval),
         "error": {
-            "before": error_before(fit).to_json(),
+            "before": nominal_error(fit).to_json(),
             "fit": fit.error.to_json(),
             "holdout": fit.holdout.to_json(),
         },

@@ -122,10 +122,10 @@ def _with_families(
         dropped = dropped[:0]
     guess = START_STD * scales_of(model)[dropped]
     dropped_columns = whitened_jacobian(model, s.prediction, s.theta, w, dropped)
-    in_family = groups[basis.held] >= 0
+    in_family = groups[basis.with_prior] >= 0
     shrunk = flat + np.flatnonzero(in_family)
     unshrunk = np.concatenate([np.arange(flat), flat + np.flatnonzero(~in_family)])
-    family = np.concatenate([groups[basis.held[in_family]], groups[dropped]])
+    family = np.concatenate([groups[basis.with_prior[in_family]], groups[dropped]])
     coordinates, order = s.coordinates(), np.concatenate([unshrunk, shrunk])
     # Flat parameters have the prior about zero of `folds_of`; other unshrunk ones have their prior.
     magnitude = ordinary_magnitudes_of_y(model, s)

@@ -78,7 +78,7 @@ def full_prediction(fit: Fit) -> FullPrediction:
 
 
 @lru_cache(maxsize=1)
-def error_before(fit: Fit) -> ErrorBlock:
+def nominal_error(fit: Fit) -> ErrorBlock:
     """Return the error of the rigid nominal arm at the readings of a fit, m.
 
     Of deflections it is the deflection itself. Of absolute readings it is what remains where the

@@ -126,7 +126,9 @@ def _family_priors(
     # The families' columns are unscaled, all others in well-conditioned coordinates.
     basis = p.basis(scale, np.where(family, 1.0, prior), spread)
     equations = p.equations(basis)
-    of_family = np.append(np.zeros(len(basis.singular), dtype=bool), family[p.live[basis.held]])
+    of_family = np.append(
+        np.zeros(len(basis.singular), dtype=bool), family[p.live[basis.with_prior]]
+    )
     order, unshrunk = np.argsort(of_family, kind="stable"), int(np.sum(~of_family))
     gram = equations.gram[np.ix_(order, order)]
     gram[np.arange(unshrunk), np.arange(unshrunk)] += beta * basis.prior_precision[order[:unshrunk]]
@@ -164,7 +166,7 @@ def spent_parameters(equations: NormalEquations, beta: float, groups: Ints) -> f
 
     The equations are over all parameters, `groups` (P,) their shrinkage groups, or −1.
     """
-    group = groups[equations.basis.held]
+    group = groups[equations.basis.with_prior]
     determined = _determined(equations, beta, equations.inverse_root(beta))
     chosen = group >= 0
     unshrunk = float(np.sum(determined[~chosen])) + len(equations.basis.singular)
@@ -497,7 +499,7 @@ def columns_of(
 def prior_coordinates(basis: Basis, y: Floats, prior: Floats) -> Floats:
     """Return z (K,) of the y with a prior; zero for flat directions."""
     flat = np.zeros(len(basis.singular))
-    return np.concatenate([flat, y[basis.held] / prior[basis.held]])
+    return np.concatenate([flat, y[basis.with_prior] / prior[basis.with_prior]])
 
 
 def over_all_parameters(basis: Basis, live: Ints, size: int) -> Basis:
@@ -505,4 +507,6 @@ def over_all_parameters(basis: Basis, live: Ints, size: int) -> Basis:
     transform = np.zeros((size, basis.transform.shape[1]))
     null, flat = np.zeros((size, basis.null.shape[1])), np.zeros(size, dtype=bool)
     transform[live], null[live], flat[live] = basis.transform, basis.null, basis.flat
-    return replace(basis, transform=transform, null=null, flat=flat, held=live[basis.held])
+    return replace(
+        basis, transform=transform, null=null, flat=flat, with_prior=live[basis.with_prior]
+    )

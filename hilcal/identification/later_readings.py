@@ -62,7 +62,7 @@ class EarlierFit:
     predictive: Predictive
     root: Floats  # (P, K) R, root of κC
     noise: float  # a, variance of the noise in units of the stated one
-    by_pose: float  # c, variance of the misfit that all readings of a pose share, likewise
+    pose_variance: float  # c, variance of the misfit that all readings of a pose share, likewise
 
 
 def earlier_fit(fit: Fit) -> EarlierFit:
@@ -152,7 +152,7 @@ class LaterReadings:
     def scaled(self, white: Floats) -> Floats:
         """Whitened rows (R, ...) in units of the noise."""
         alone = len(np.unique(self.w.group)) == len(self.w)
-        a = self.earlier.noise + (self.earlier.by_pose if alone else 0.0)
+        a = self.earlier.noise + (self.earlier.pose_variance if alone else 0.0)
         return np.asarray(white / np.sqrt(a))
 
 
@@ -161,8 +161,7 @@ class LaterFit:
     """Later readings explained by an earlier fit and changes: rows R, coordinates K and L."""
 
     later: LaterReadings  # the readings and the earlier fit
-    changes: tuple[EffectDirections, ...]
-    model: Model  # that of the setting, and the changes
+    model: Model  # that of `later`, and the changes
     mean: Floats  # (P,) prior mean of its parameters
     lift: Floats  # (P, K) directions of u, b and δ
     ridge: Floats  # (K + L,) of these and of p: 1 for those with a prior, 0 for flat ones
@@ -362,7 +361,7 @@ def _rows(model: Model, mean: Floats, lift: Floats, readings: Readings, w: White
 
 def _pose_rows(earlier: EarlierFit, w: Whitening) -> Floats:
     """Rows (R, L) of a misfit that is common to the measurements of a pose, with its spread."""
-    shared = earlier.by_pose / earlier.noise
+    shared = earlier.pose_variance / earlier.noise
     poses, pose = np.unique(w.group, return_inverse=True)
     if shared < LEAST_POSE_SHARE or len(poses) == len(w):
         return np.zeros((len(w) * w.m, 0))
@@ -395,7 +394,7 @@ def fit_later(
         count = k + len(start.sizes)
         x[:count] = start.coordinates[:count]
         x[lift.shape[1] :] = start.coordinates[count:]
-    point = LaterFit(later, tuple(changes), model, mean, lift, ridge, x)
+    point = LaterFit(later, model, mean, lift, ridge, x)
     for _ in range(STEPS):
         m = point.projection
         step = m.solve(m.rows.T @ point.target) - point.coordinates

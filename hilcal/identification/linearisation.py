@@ -127,7 +127,7 @@ class ReducedModel:
 
         Of whitened columns X (R, Q), with XᵀX, and products (P, Q) of the model's columns with X.
         """
-        held, flat = self.basis.held, self.flat.T @ x
+        held, flat = self.basis.with_prior, self.flat.T @ x
         sigma = self.basis.transform[held, len(flat) + np.arange(len(held))]
         lifted = self.inverse_root @ np.vstack([flat, sigma[:, None] * products[held]])
         return np.asarray(gram - lifted.T @ lifted)
@@ -320,7 +320,7 @@ def eliminate_columns(
     # Priors are about zero, not about the parameters of the fit.
     count, ridge = len(basis.singular), beta * basis.prior_precision
     z = np.zeros(len(ridge))
-    z[count:] = (theta / np.where(stay, prior, 1.0))[basis.held]
+    z[count:] = (theta / np.where(stay, prior, 1.0))[basis.with_prior]
     root = equations.inverse_root(beta)
     step = basis.transform @ (root.T @ (root @ (equations.rhs - ridge * z)))
     shrunk = float(np.sum(ridge * np.sum(root**2, axis=0)))

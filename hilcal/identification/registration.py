@@ -87,7 +87,7 @@ class Registration:
     turn_rms: float | None  # of the attitude's error, rad; None for positions alone
     far: Bools  # (N,) far off while the others fit: the frames are not fitted to these
     undetermined: tuple[Undetermined, ...]
-    still: Bools  # (n,) joints that never turned
+    never_turned: Bools  # (n,) joints that never turned
     estimated: bool  # whether anything was unknown
 
     def to_json(
@@ -106,7 +106,7 @@ class Registration:
             "rms_m": self.rms,
             "rms_rad": self.turn_rms,
             "undetermined": [u.to_json() for u in self.undetermined],
-            "joints_never_turned": (np.flatnonzero(self.still) + 1).tolist(),
+            "joints_never_turned": (np.flatnonzero(self.never_turned) + 1).tolist(),
         }
 
 
@@ -160,7 +160,7 @@ def register(cell: Cell, readings: Readings) -> Registration:
         turn_rms=turn_rms if m == 6 else None,
         far=far & (far.mean() <= MOST_WRONG),
         undetermined=_undetermined(null, found),
-        still=np.ptp(angles(readings), axis=0) < LEAST_TURN,
+        never_turned=np.ptp(angles(readings), axis=0) < LEAST_TURN,
         estimated=estimated,
     )
 

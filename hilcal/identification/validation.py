@@ -237,7 +237,7 @@ class Judged:
     mode: Mode
     readings: int  # number of readings in the other campaign
     fitted: int  # number of these that the revision was fitted to
-    spoilt: int  # further ones whose unloaded reading was fitted
+    sharing_unloaded: int  # further ones whose unloaded reading was fitted
     unseen: bool  # whether those that are judged were never fitted; False where all were
     scalar: bool = False  # whether some readings are one number, a distance or a height
 

@@ -65,7 +65,6 @@ class Variances:
 
     equations: Equations  # at the estimate
     covariance: Floats  # (F + N, F + N) of log s and η
-    log_posterior: float  # ℓ plus the log prior, without constants
 
     @property
     def log_std(self) -> Floats:
@@ -104,7 +103,7 @@ def estimate_variances(
         if value < best + LEAST_GAIN:
             break
         maximum, best = trial, value
-    return Variances(maximum, np.asarray(np.linalg.inv(maximum.information + precision)), best)
+    return Variances(maximum, np.asarray(np.linalg.inv(maximum.information + precision)))
 
 
 def log_posterior(e: Equations) -> float:
@@ -167,21 +166,6 @@ def coordinates_covariance(variances: Variances) -> Floats:
     return np.asarray(variances.equations.covariance + j @ variances.covariance @ j.T)
 
 
-def predict(variances: Variances, jacobian: Floats) -> tuple[Floats, Floats]:
-    """Predict rows that were not measured.
-
-    Args:
-        jacobian: (N, m, P) derivative of the predicted quantities by the model's parameters.
-
-    Returns:
-        (N, m) change from the prediction of the model with all parameters zero, and (N, m, m) its
-        covariance.
-    """
-    x = variances.equations.problem.coordinates(jacobian)
-    covariance = coordinates_covariance(variances)
-    return x @ variances.equations.coordinates, x @ covariance @ np.swapaxes(x, -1, -2)
-
-
 @dataclass(frozen=True, slots=True)
 class FamilyEvidence:
     """Evidence for a family or an effect."""
@@ -196,7 +180,7 @@ def evidence(
     families: int | Sequence[int],
     rng: np.random.Generator,  # for the simulated ratios
     start: Floats | None = None,  # (F + N,) log s and η of all families; else priors' means
-    most: float = np.inf,  # largest plausible s, in ordinary magnitudes
+    largest: float = np.inf,  # largest plausible s, in ordinary magnitudes
 ) -> FamilyEvidence:
     """Return the evidence for a family, or for several families of one effect.
 
@@ -216,7 +200,7 @@ def evidence(
         return FamilyEvidence(0.0, 1.0, 0)
     mu = mu[visible]
     w2 = (u[:, visible].T @ score) ** 2 / mu
-    bound = (most / ordinary[numbers].max()) ** 2
+    bound = (largest / ordinary[numbers].max()) ** 2
     ratio = float(_ratios(mu, w2[None], bound)[0])
     drawn = _ratios(mu, rng.standard_normal((DRAWS, len(mu))) ** 2, bound)
     p = (1 + int(np.count_nonzero(drawn >= ratio))) / (1 + DRAWS) if ratio > 0 else 1.0

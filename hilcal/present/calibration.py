@@ -329,7 +329,11 @@ def opening(judged: validation.Judged, test: validation.Validation) -> Iterator[
         )
         return
     if judged.fitted:
-        sharing = f", and {judged.spoilt} more share an unloaded reading" if judged.spoilt else ""
+        sharing = (
+            f", and {judged.sharing_unloaded} more share an unloaded reading"
+            if judged.sharing_unloaded
+            else ""
+        )
         yield (
             f"{judged.fitted} of the {judged.readings} readings were fitted by {judged.model}"
             f"{sharing}; they are left out."

@@ -15,9 +15,9 @@ from hilcal.identification.fit import Fit
 from hilcal.identification.fit_document import notes
 from hilcal.identification.full_prediction import (
     FullPrediction,
-    error_before,
     full_prediction,
     gross_errors,
+    nominal_error,
 )
 from hilcal.identification.predictive import belongs_to_arm
 from hilcal.identification.residual import ErrorBlock
@@ -156,7 +156,7 @@ def _family(fit: Fit, effect: Effect, index: Ints) -> str:
 
 def errors(fit: Fit) -> Table:
     """Return the table of errors: nominal arm, fitted poses, poses left out, noise alone."""
-    rows = {"before: rigid nominal arm": error_before(fit)}
+    rows = {"before: rigid nominal arm": nominal_error(fit)}
     rows |= {"poses fitted": fit.error, "poses left out": fit.holdout}
     return _errors(rows, full_prediction(fit).noise_floor, error_words(fit.readings))
 
@@ -178,7 +178,7 @@ def _errors(
 
 def before_and_after(fit: Fit) -> str:
     """Return a sentence on the errors without and with the fitted model."""
-    nominal, floor = length(error_before(fit).rms_m), length(full_prediction(fit).noise_floor)
+    nominal, floor = length(nominal_error(fit).rms_m), length(full_prediction(fit).noise_floor)
     without = f"The rigid nominal arm, its frames fitted alone, is off by {nominal} rms"
     if fit.mode == "deflection":
         without = f"Deflections of {nominal} rms were measured"

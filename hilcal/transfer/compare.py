@@ -229,7 +229,7 @@ def validate(
         mode=mode,
         readings=len(readings),
         fitted=int(refitted.sum()),
-        spoilt=int(np.sum(~refitted & ~fresh)) if mixed else 0,
+        sharing_unloaded=int(np.sum(~refitted & ~fresh)) if mixed else 0,
         unseen=mixed or not refitted.any(),
         scalar=bool(readings.scalar.any()),
     )

@@ -15,7 +15,7 @@ from hilcal.diagnosis.noise import repeat_classes
 from hilcal.identification.background import family_sizes
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_covariance import CovarianceParts
-from hilcal.identification.full_prediction import error_before, reading_name
+from hilcal.identification.full_prediction import nominal_error, reading_name
 from hilcal.identification.residual import CONFIDENCE, ErrorBlock
 from hilcal.identification.validation import CampaignValidation
 from hilcal.numbers import length, percent
@@ -172,7 +172,7 @@ def _cards(m: ReportContent) -> Iterator[tuple[str, str, str]]:
     model = "nominal arm, only its frames fitted"
     if m.fit.mode == "deflection":
         model = "deflection under load; a rigid arm has none"
-    yield card("Before", error_before(m.fit), f"; {model}")
+    yield card("Before", nominal_error(m.fit), f"; {model}")
     if m.tested is not None:
         kind = "never fitted" if m.tested.validation.judged.unseen else "fitted, so no test"
         yield card("After, validation", m.tested.validation.prediction.error, f"; {kind}")

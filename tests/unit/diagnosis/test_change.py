@@ -149,6 +149,8 @@ def test_a_misfit_that_is_of_poses_is_told_from_one_of_readings(arm):
     ]
     w = found[0].fit.whitening
     drawn = float(np.mean(w.whiten(of_pose[w.reading]) ** 2))
-    assert found[0].by_pose == pytest.approx(drawn, rel=0.3)  # some of the 90 values are fitted
-    assert found[0].by_pose > 5 * found[0].noise
-    assert found[1].by_pose < 0.5 * found[1].noise  # parameters are shared by a pose, too
+    assert found[0].pose_variance == pytest.approx(
+        drawn, rel=0.3
+    )  # some of the 90 values are fitted
+    assert found[0].pose_variance > 5 * found[0].noise
+    assert found[1].pose_variance < 0.5 * found[1].noise  # parameters are shared by a pose, too

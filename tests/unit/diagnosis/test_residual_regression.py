@@ -204,7 +204,10 @@ def test_noise_is_not_predicted():
 
 def test_trees_are_grown_no_further_than_they_matter():
     x, y, fold = table(2, 0.5)
-    exact, less = predict_by_trees(x, y, fold, 3.0), predict_by_trees(x, y, fold, 3.0, beyond=0.95)
+    exact, less = (
+        predict_by_trees(x, y, fold, 3.0),
+        predict_by_trees(x, y, fold, 3.0, other_share=0.95),
+    )
     assert less.trees == module.TREES < exact.trees
     assert less.share < 0.95
     assert predict_by_trees(x, y, fold, 3.0) == exact
