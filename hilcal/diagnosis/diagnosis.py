@@ -208,7 +208,7 @@ class Diagnosis(Shown, Tabular):
             "pose_alone": self.pose_alone and asdict(self.pose_alone),
             "rejected": list(self.history.rejected),
             "alternatives": [
-                _attributes(a, "effect", "same_as", "others")
+                _attributes(a, "effect", "same_as") | {"others": list(a.replacements)}
                 for a in self.alternatives
                 if a.inseparable
             ],
