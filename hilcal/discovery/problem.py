@@ -269,7 +269,7 @@ class CandidateTerms:
     def shortlist(self) -> list[LawTerm]:
         """Return the candidates with the best odds, extended to phases, axes and joints."""
         best_of, one = self.best(), self.problem.screen.constant
-        turned = self.problem.screen.grammar.turned
+        turned = self.problem.screen.grammar.with_sine
         out: dict[tuple[tuple[tuple[int, int], ...], bool], LawTerm] = {}
 
         def add(t: LawTerm) -> None:
