@@ -83,7 +83,7 @@ def test_no_refit_fails_in_silence(monkeypatch):
     law = Selection((term(p, 0.5),), (known.total + 20.0,))
     module = sys.modules[effects_replacing_law.__module__]
     with monkeypatch.context() as m:
-        m.setattr(module, "exact", fails)
+        m.setattr(module, "refit_exactly", fails)
         assert (
             effects_replacing_law(fitted, p, law, known).names == ()
         )  # far less likely by algebra

@@ -71,7 +71,7 @@ def test_what_is_written_is_an_effect_that_lowers_the_error():
     model = before.model + kind(before.model.cell, before.readings.states)
     after = fit(model, before.readings, before.mode)
     assert after.holdout.rms_m < 0.6 * before.holdout.rms_m
-    assert after.variance_factor == pytest.approx(d.laws[0].left, rel=1e-3)
+    assert after.variance_factor == pytest.approx(d.laws[0].variance_factor, rel=1e-3)
     assert after.parameters["bent.a"].value == pytest.approx(
         d.laws[0].parameters[0].value, rel=1e-4
     )
@@ -267,7 +267,7 @@ def test_a_number_that_the_model_absorbs_is_dropped():
     assert kept.text() == "dq_3 = a·cos(q_4)·τ_3"
     assert [c.name for c in values] == ["a"]
     assert abs(values[0].value) > 10 * values[0].std
-    assert after.variance_factor == pytest.approx(found().laws[0].left, rel=1e-3)
+    assert after.variance_factor == pytest.approx(found().laws[0].variance_factor, rel=1e-3)
     check_effect(kind)
 
 
@@ -278,7 +278,7 @@ def test_a_law_whose_refit_fails_is_named_with_the_reason(monkeypatch):
 
     module = sys.modules[discover.__module__]
     monkeypatch.setattr(module, "search", lambda *_, **__: searched())
-    monkeypatch.setattr(module, "exact", fails)
+    monkeypatch.setattr(module, "refit_exactly", fails)
     d = discover(campaign(LAW), name="bent")
     assert d.reason == "no_law"
     said = silence(d)
