@@ -54,7 +54,8 @@ Result = TypeVar("Result")
 Advance = Callable[[int], None]
 Versions = tuple[tuple[str, str], ...]
 
-DEATHS = 3  # most workers that may die with one item before it is given up; Dask's own, a choice
+MOST_DEATHS = 3
+"""Most workers that may die with one item before it is given up; Dask's own, a choice."""
 
 
 class ClusterError(HilcalError):
@@ -63,11 +64,11 @@ class ClusterError(HilcalError):
     exit_code = 3
 
 
-def deadly(where: str) -> ClusterError:
+def worker_deaths(where: str) -> ClusterError:
     """Return the error for an item whose workers all died."""
     return ClusterError(
-        f"{where}: one computation ended {DEATHS + 1} workers, each time without a message (out of "
-        "memory?); start fewer workers, or larger ones"
+        f"{where}: one computation ended {MOST_DEATHS + 1} workers, each time without a message "
+        "(out of memory?); start fewer workers, or larger ones"
     )
 
 
@@ -115,7 +116,7 @@ def compute(
         return function(item) if seed is None else function(item, np.random.default_rng(seed))
 
 
-SIGNALLED = 128
+SIGNAL_EXIT = 128
 """Exit code of a program that a signal ended, minus the number of the signal, as in shells."""
 _SPAWN = multiprocessing.get_context("spawn")  # a fork would copy locks that threads of BLAS hold
 
@@ -165,8 +166,8 @@ class Processes:
                     except (EOFError, ConnectionError) as error:
                         self.end([worker])
                         deaths[k] += 1
-                        if deaths[k] > DEATHS:
-                            raise deadly(f"{self._count} workers of this machine") from error
+                        if deaths[k] > MOST_DEATHS:
+                            raise worker_deaths(f"{self._count} workers of this machine") from error
                         todo.appendleft(k)
                         continue
                     self._idle.append(worker)
@@ -258,7 +259,7 @@ def _signals_as_exit() -> Iterator[None]:
     """
 
     def end(number: int, frame: FrameType | None) -> None:
-        raise SystemExit(SIGNALLED + number)
+        raise SystemExit(SIGNAL_EXIT + number)
 
     main = threading.current_thread() is threading.main_thread()
     endings = (signal.SIGTERM, signal.SIGHUP) if main else ()
@@ -272,8 +273,8 @@ def _signals_as_exit() -> Iterator[None]:
             signal.signal(kind, signal.SIG_DFL)
 
 
-ANSWER_S = 10.0  # most time for the scheduler's answer, s; a choice
-WORKERS_S = 10.0  # most time until a cluster has a worker, s; a choice
+ANSWER_TIMEOUT_S = 10.0  # most time for the scheduler's answer, s; a choice
+WORKERS_TIMEOUT_S = 10.0  # most time until a cluster has a worker, s; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -300,7 +301,7 @@ class Cluster:
             for future, result in waiting:
                 yield number[future.key], result
         except KilledWorker as error:
-            raise deadly(f"cluster {self.address}") from error
+            raise worker_deaths(f"cluster {self.address}") from error
         except (FutureCancelledError, OSError) as error:
             raise ClusterError(
                 f"cluster {self.address}: lost in the middle; start it again"
@@ -318,7 +319,7 @@ def cluster(address: str) -> Iterator[Cluster]:
         if address.startswith("tls://"):
             _check_certificates(address)
         try:
-            client = Client(address, timeout=ANSWER_S, set_as_default=False)
+            client = Client(address, timeout=ANSWER_TIMEOUT_S, set_as_default=False)
         except ValueError as error:
             raise InputError(
                 f"--scheduler {address}: not an address; valid: as `dask scheduler` prints it, "
@@ -326,12 +327,13 @@ def cluster(address: str) -> Iterator[Cluster]:
             ) from error
         except OSError as error:
             raise ClusterError(
-                f"--scheduler {address}: no scheduler answers within {ANSWER_S:g} s, or none that "
-                "takes tcp:// or our certificate; start one with `dask scheduler --host ADDRESS`"
+                f"--scheduler {address}: no scheduler answers within {ANSWER_TIMEOUT_S:g} s, "
+                "or none that takes tcp:// or our certificate; start one with "
+                "`dask scheduler --host ADDRESS`"
             ) from error
         with client:
             try:
-                client.wait_for_workers(1, timeout=WORKERS_S)
+                client.wait_for_workers(1, timeout=WORKERS_TIMEOUT_S)
             except TimeoutError as error:
                 raise ClusterError(
                     f"--scheduler {address}: the scheduler has no workers; start some with "
@@ -409,7 +411,7 @@ class Engine:
         yield from self.workers.results(Task(function, versions()), items, seeds)
 
 
-ALONE = Engine(None)  # computes in this process, with the present number of BLAS threads
+IN_PROCESS = Engine(None)  # computes in this process, with the present number of BLAS threads
 
 
 @contextmanager
@@ -432,7 +434,7 @@ def open_engine(workers: int | None = None, scheduler: str | None = None) -> Ite
         raise InputError(f"--workers {count}; valid: a whole number from 1")
     if count == 1:
         with threadpool_limits(limits=1, user_api="blas"):
-            yield ALONE
+            yield IN_PROCESS
         return
     with processes(count) as local:
         yield Engine(local)

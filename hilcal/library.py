@@ -13,7 +13,7 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config
 from hilcal.diagnosis.diagnosis import Diagnosis, History
 from hilcal.diagnosis.serial_noise import with_serial_noise
-from hilcal.diagnosis.verdict import NOTHING
+from hilcal.diagnosis.verdict import NO_HISTORY
 from hilcal.diagnosis.verdict import diagnose as judge_fit
 from hilcal.discovery.discovery import LawSearch
 from hilcal.effects.catalogue import Catalogue, installed
@@ -27,12 +27,12 @@ from hilcal.identification.arm_scatter import with_prior_scatter
 from hilcal.identification.carried import CarriedPrior, carried_prior, check_prior
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_covariance import CovarianceParts, covariance_parts, full_readings
-from hilcal.identification.noise_estimate import NOISE, NoiseEstimate, with_estimated_noise
+from hilcal.identification.noise_estimate import NOISE_KEY, NoiseEstimate, with_estimated_noise
 from hilcal.identification.posterior import Posterior, read_posterior
 from hilcal.model.model import Model
 from hilcal.optional import needed_by
 from hilcal.present.story import build_story
-from hilcal.readings.covariance import COVERS, FROM, TRACKER, tracker_noise
+from hilcal.readings.covariance import COVERS_KEY, FROM_KEY, TRACKER, tracker_noise
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES, SCALINGS, Mode, usual_mode
 from hilcal.refinement import Refinement
@@ -108,9 +108,9 @@ def import_campaign(
     if not imported.noise_stated:
         say("estimating the noise, which nothing states")
     imported, noise = with_estimated_noise(imported, cell, settings)
-    texts = {COVERS: imported.covers}
-    texts |= {FROM: TRACKER} if imported.from_tracker else {}
-    texts |= {} if noise is None else {NOISE: noise.to_json()}
+    texts = {COVERS_KEY: imported.covers}
+    texts |= {FROM_KEY: TRACKER} if imported.from_tracker else {}
+    texts |= {} if noise is None else {NOISE_KEY: noise.to_json()}
     say(f"writing {output}")
     about = settings.to_json(), str(base_dir), f"{table.name} ({Path(kind).name})"
     readings = imported.readings
@@ -283,7 +283,9 @@ def fit(
 
 
 def diagnose(
-    fit: Fit | Campaign, history: History = NOTHING, say: Callable[[str], None] = lambda text: None
+    fit: Fit | Campaign,
+    history: History = NO_HISTORY,
+    say: Callable[[str], None] = lambda text: None,
 ) -> Diagnosis:
     """Diagnose a fit, or the revision in use of a campaign: what is missing, with a verdict.
 

@@ -17,13 +17,13 @@ from typing import Concatenate, ParamSpec, Self, TextIO, TypeVar
 from hilcal.errors import InputError
 
 SETTINGS = 1 << 19  # Bytes of a TOML file
-DOTS = 100  # Dots in a line of TOML: the parser's time grows with the square of a key's parts
+TOML_DOTS = 100  # Dots in a line of TOML: the parser's time grows with the square of a key's parts
 PROGRAM = 1 << 22  # Bytes of a robot's description, a file of effects
 SCRIPT = 1 << 21  # Bytes of a robot program
 STATEMENTS = 100_000  # Statements of a robot program
 STATEMENT = 10_000  # Characters of a statement
-BLOCKS = 100  # Nested blocks around a statement
-NESTED = 100  # Nested expressions in a statement
+NESTED_BLOCKS = 100  # Nested blocks around a statement
+NESTED_EXPRESSIONS = 100  # Nested expressions in a statement
 DOCUMENT = 1 << 25  # Bytes of a JSON document: plan, calibration, prior
 VALUES = 2_000_000  # Values of a JSON document: Python takes some 100 bytes for an empty list
 TABLE = 1 << 27  # Bytes of a table, as text or compressed
@@ -34,22 +34,24 @@ COLUMNS = 2000  # Columns of a table
 CELLS = 5_000_000  # Cells of a table
 SHEETS = 100  # Sheets of a workbook
 ELEMENTS = 1_000_000  # XML elements of a workbook's part other than a sheet, such as its styles
-DEEP = 50  # Nested XML elements
-DESCRIBED = 500  # Joints of a robot's description, including fixed ones and those of grippers
-MOVING = 100  # Joints of a robot's description that are not fixed
+XML_DEPTH = 50  # Nested XML elements
+DESCRIBED_JOINTS = 500
+"""Joints of a robot's description, including fixed ones and those of grippers."""
+MOVING_JOINTS = 100  # Joints of a robot's description that are not fixed
 JOINTS = 32  # Joints of an arm
 PARAMETERS = 4000  # Parameters of a model in a file
 NUMBERS = 1 << 26  # Numbers of an array from a file
-SHARED = 1 << 24  # Numbers of joint covariances of readings with a common error: (L m)² of L
-FITTED = 150_000  # Readings times elements that are fitted together
-PLANNED = 20_000  # Poses of a plan, and steps of a plan: a week of measuring
+SHARED_COVARIANCE = 1 << 24
+"""Numbers of joint covariances of readings with a common error: (L m)² of L."""
+FITTED_ELEMENTS = 150_000  # Readings times elements that are fitted together
+PLANNED_POSES = 20_000  # Poses of a plan, and steps of a plan: a week of measuring
 MEMORY = 3 << 28  # Bytes that reading a file may take in addition to those of the process
 _RESERVE_BYTES = 1 << 23  # Bytes that are freed first when memory runs out
 _LOCK = threading.RLock()  # The memory limit is the process's: one thread at a time may set it
 P = ParamSpec("P")
 Q = TypeVar("Q", bound=str | Path)
 T = TypeVar("T")
-STREAM = "a longer series is fitted as a stream (docs/how-to/fit-a-stream.md)"
+STREAM_HINT = "a longer series is fitted as a stream (docs/how-to/fit-a-stream.md)"
 
 
 def check_size(name: str, size: int, most: int) -> None:
@@ -61,7 +63,7 @@ def check_size(name: str, size: int, most: int) -> None:
 def check_rows(name: str, rows: int) -> None:
     """Refuse too many rows; raises as `check_size` does."""
     if rows > ROWS:
-        raise InputError(f"{name}: more than {ROWS} rows; {STREAM}")
+        raise InputError(f"{name}: more than {ROWS} rows; {STREAM_HINT}")
 
 
 def check_cells(name: str, rows: int, columns: int = 1) -> None:
@@ -69,13 +71,13 @@ def check_cells(name: str, rows: int, columns: int = 1) -> None:
     if columns > COLUMNS:
         raise InputError(f"{name}: {columns} columns; valid: at most {COLUMNS}")
     if rows * columns > CELLS:
-        raise InputError(f"{name}: more than {CELLS / 1e6:.0f} million cells; {STREAM}")
+        raise InputError(f"{name}: more than {CELLS / 1e6:.0f} million cells; {STREAM_HINT}")
 
 
 def check_planned(name: str, items: str, count: int) -> None:
     """Refuse a plan of too many poses or steps; raises as `check_size` does."""
-    if count > PLANNED:
-        raise InputError(f"{name}: {count} {items}; valid: at most {PLANNED} in a plan")
+    if count > PLANNED_POSES:
+        raise InputError(f"{name}: {count} {items}; valid: at most {PLANNED_POSES} in a plan")
 
 
 class Lines:
@@ -124,21 +126,23 @@ def check_numbers(name: str, count: int) -> None:
 
 def check_fitted(readings: int, elements: int, where: str = "") -> None:
     """Refuse to fit too many readings together; raises as `check_size` does."""
-    if readings * elements > FITTED:
+    if readings * elements > FITTED_ELEMENTS:
         raise InputError(
             f"{where}{readings} readings of {elements} elements; valid: at most "
-            f"{FITTED // elements} in a campaign: fewer, or means of repeats; {STREAM}"
+            f"{FITTED_ELEMENTS // elements} in a campaign: fewer, or means of repeats; "
+            f"{STREAM_HINT}"
         )
 
 
 def check_shared(shared: int, elements: int, groups: int) -> None:
     """Refuse too many readings with a common error, per group; raises as `check_size` does."""
-    if groups * (shared * elements) ** 2 > SHARED:
+    if groups * (shared * elements) ** 2 > SHARED_COVARIANCE:
         raise InputError(
             f"{shared} loaded readings share one unloaded reading or arrival"
             f"{f', {groups} times' if groups > 1 else ''}; valid: at most "
-            f"{int((SHARED / groups) ** 0.5) // elements} of {elements} elements: measure unloaded "
-            "again between them (another cycle), or fit absolute readings (--readings absolute)"
+            f"{int((SHARED_COVARIANCE / groups) ** 0.5) // elements} of {elements} elements: "
+            "measure unloaded again between them (another cycle), or fit absolute readings "
+            "(--readings absolute)"
         )
 
 

@@ -34,19 +34,19 @@ def unit_for(unit: str, values: Sequence[float]) -> tuple[str, float]:
     return unit, 1.0
 
 
-def angle_or(unit: str) -> tuple[str, float]:
+def variable_unit(unit: str) -> tuple[str, float]:
     """Return unit and factor of a recorded variable: angles in degrees, others in SI."""
     return ("°", 180.0 / math.pi) if unit == "rad" else (unit, 1.0)
 
 
-def of_joint(unit: str) -> tuple[str, float]:
+def joint_unit(unit: str) -> tuple[str, float]:
     """Return the unit for people, and its factor, of a joint value in rad, or m of a slide."""
-    return ("mm", 1e3) if unit == "m" else angle_or(unit)
+    return ("mm", 1e3) if unit == "m" else variable_unit(unit)
 
 
 def joint_value(value: float, unit: str, places: int = 1) -> str:
     """Write a joint value in rad, or m of a slide, for people."""
-    name, factor = of_joint(unit)
+    name, factor = joint_unit(unit)
     return f"{factor * value:.{places}f}{name if name == '°' else ' ' + name}"
 
 

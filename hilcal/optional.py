@@ -38,10 +38,10 @@ def needed_by(user: str) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        raise MissingPackageError(f"{user}: {lacking(error) or error}") from error
+        raise MissingPackageError(f"{user}: {missing_package(error) or error}") from error
 
 
-def lacking(error: BaseException) -> str:
+def missing_package(error: BaseException) -> str:
     """Return which package an import lacks, and how to install it; "" for other errors."""
     name = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
     package = name.split(".")[0]

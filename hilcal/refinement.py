@@ -6,7 +6,7 @@ from functools import cache
 
 from hilcal import limits
 from hilcal.diagnosis.background_evidence import (
-    TOGETHER,
+    JOINT_LEVEL,
     BackgroundEffect,
     background_evidence,
     background_is_better,
@@ -19,7 +19,7 @@ from hilcal.diagnosis.evidence import Alternative, Evidence
 from hilcal.diagnosis.residual_regression import Regressions
 from hilcal.diagnosis.serial_noise import serial_noise, with_serial_noise
 from hilcal.diagnosis.stepwise import add, exchange, predicts_better, remove, trial
-from hilcal.diagnosis.verdict import NOTHING, judge, judge_naming
+from hilcal.diagnosis.verdict import NO_HISTORY, judge, judge_naming
 from hilcal.discovery.discovery import LawSearch
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.arm_scatter import with_arm_scatter, with_prior_scatter
@@ -43,13 +43,13 @@ MOST_REVISIONS = 15
 MOST_SCATTERS = 2
 """Estimates of the arm's scatter at most: the first, and another after further effects."""
 BACKGROUND = "background"  # `RefinementStep.added` of a step that adds a background
-UNEXPLAINED = ("unknown_effect", "noise_misjudged")
+UNEXPLAINED_VERDICTS = ("unknown_effect", "noise_misjudged")
 """Verdicts with which all effects are tried together where readings are many; a choice: they prove
 single effects far below the noise, and all together take minutes."""
 MANY_EFFECTS = 6
 """Number of added effects from which on all are tried together where readings are many, with any
 verdict; a choice: such an arm has the others, too, and each single trial takes long."""
-FAR = 0.1
+EXCHANGE_MARGIN = 0.1
 """Share of an effect's evidence by which the evidence of its replacements must exceed it while the
 model is not adequate; a guess."""
 
@@ -125,9 +125,9 @@ def refine(
     readings: Readings,
     mode: Mode,
     say: Say = lambda text: None,
-    history: History = NOTHING,
+    history: History = NO_HISTORY,
     laws: LawSearch | None = None,
-    seen: Callable[[RefinementStep], None] = lambda step: None,
+    on_step: Callable[[RefinementStep], None] = lambda step: None,
     background: bool = True,
 ) -> Refinement:
     """Fit, diagnose, add the first suspect, and repeat.
@@ -137,7 +137,7 @@ def refine(
     suspect from others, the first is added: any of them lowers the error. When no suspect remains,
     every addition is reconsidered: a redundant effect is removed, and an effect that others replace
     better is exchanged for them. If the residual is then more than noise, all effects of the
-    catalogue are fitted together (`Path.take_background`). If the rest of the misfit is the arm's
+    catalogue are fitted together (`Path.add_background`). If the rest of the misfit is the arm's
     scatter, the last step is a fit with the scatter in the covariance, so weights, uncertainties
     and p-values include it. In the last fit the lines of a transmission error are shrunk to the
     size of their pool, which predicts better than separate lines (`with_pooled_lines`). All fits
@@ -155,7 +155,7 @@ def refine(
         laws: searches a law where the verdict is `unknown_effect`, before effects that only
             resemble the missing one are added, and where the misfit is taken for the arm's scatter;
             the law is then added and judged like any effect.
-        seen: takes each step as soon as it is judged; the last verdict can still change.
+        on_step: takes each step as soon as it is judged; the last verdict can still change.
         background: whether a background of all effects is allowed.
 
     Raises:
@@ -165,7 +165,7 @@ def refine(
     say(f"fitting {' + '.join(model.names) or 'the bare arm'}")
     readings = with_prior_scatter(model, readings.with_serial(None))
     first = with_serial_noise(fit(model, readings, mode))
-    refinement = refine_from(first, say, history, laws, seen, background)
+    refinement = refine_from(first, say, history, laws, on_step, background)
     last = refinement.fit
     if last.model.names == first.model.names:
         return refinement
@@ -178,13 +178,13 @@ def refine(
         return refinement
     say("the noise is correlated along the order" if noise else "the noise is white after all")
     first = fit(model, first.readings.with_serial(noise), mode)
-    return refine_from(first, say, history, laws, seen, background)
+    return refine_from(first, say, history, laws, on_step, background)
 
 
 def refine_from(
     first: Fit,
     say: Say = lambda text: None,
-    history: History = NOTHING,
+    history: History = NO_HISTORY,
     laws: LawSearch | None = None,
     on_step: Callable[[RefinementStep], None] = lambda step: None,
     background: bool = True,
@@ -195,7 +195,7 @@ def refine_from(
     while changed:
         path.extend()
         changed = path.reconsider()
-        changed = changed or path.take_background() or path.take_scatter()
+        changed = changed or path.add_background() or path.add_scatter()
     path.pool_lines()
     return Refinement(tuple(path.steps))
 
@@ -207,7 +207,7 @@ class Path:
         self,
         first: Fit,
         say: Say = lambda text: None,
-        history: History = NOTHING,
+        history: History = NO_HISTORY,
         laws: LawSearch | None = None,
         on_step: Callable[[RefinementStep], None] = lambda step: None,
         background: bool = True,
@@ -261,7 +261,7 @@ class Path:
         # Where suspects are rejected, the step is judged anew: a law may be searched after all.
         while self._room and (
             self._add_law()
-            or (self._has_many_effects() and self.take_background())
+            or (self._has_many_effects() and self.add_background())
             or self._add_suspect()
             or self._add_law()
         ):
@@ -339,7 +339,7 @@ class Path:
                 return True
         return False
 
-    def take_background(self) -> bool:
+    def add_background(self) -> bool:
         """Fit all other effects of the catalogue together; whether the model has them now.
 
         They are not tried if the stated noise explains the residual and the readings do not prove
@@ -356,12 +356,12 @@ class Path:
         if not self._background or tried or not self._room or d.wrong_figures:
             return False
         many = last.fit.readings.value.size > MOST_NOISE_ROWS
-        if many and not (d.verdict in UNEXPLAINED or self._has_many_effects()):
+        if many and not (d.verdict in UNEXPLAINED_VERDICTS or self._has_many_effects()):
             return False
         self._background_tried = True
         if not allows_background(last.fit):
             return False
-        proved_together = p_value_of_others(last.fit) <= TOGETHER
+        proved_together = p_value_of_others(last.fit) <= JOINT_LEVEL
         as_stated = d.residual_is_noise and last.fit.readings.arm_scatter is None
         # The residual of serially correlated noise resembles effects.
         if as_stated and (not proved_together or last.fit.readings.serial is not None):
@@ -388,7 +388,7 @@ class Path:
             self._append(step)
         return True
 
-    def take_scatter(self) -> bool:
+    def add_scatter(self) -> bool:
         """Fit with the arm's scatter in the covariance; returns whether the covariance changed.
 
         The scatter is estimated once more if effects were added after its first estimate.
@@ -434,14 +434,14 @@ class Path:
     def _better(self, last: RefinementStep, alternative: Alternative) -> bool:
         """Whether an alternative is worth a trial.
 
-        While the residual is not noise, its evidence must be larger by the share `FAR`. When it is
-        noise, several effects in the place of one must lower the rms by `LEAST_SHARE`: the log
-        evidence grows by n δ where the rms of n residuals falls by a small share δ.
+        While the residual is not noise, its evidence must be larger by the share `EXCHANGE_MARGIN`.
+        When it is noise, several effects in the place of one must lower the rms by `LEAST_SHARE`:
+        the log evidence grows by n δ where the rms of n residuals falls by a small share δ.
         """
-        least = alternative.own
+        least = alternative.effect_log_evidence
         if not last.diagnosis.residual_is_noise:
-            least *= 1.0 + FAR
-        elif len(alternative.others) > 1:
+            least *= 1.0 + EXCHANGE_MARGIN
+        elif len(alternative.replacements) > 1:
             least += LEAST_SHARE * last.fit.dof
         return alternative.better and alternative.log_evidence > least
 
@@ -452,8 +452,8 @@ class Path:
         no better need not be larger; and while the residual is not noise, since the evidence
         assumes noise.
         """
-        effect, (first, *further) = alternative.effect, alternative.others
-        self._say(f"trying {' + '.join(alternative.others)} in place of {effect}")
+        effect, (first, *further) = alternative.effect, alternative.replacements
+        self._say(f"trying {' + '.join(alternative.replacements)} in place of {effect}")
         try:
             trials = [exchange(last.fit, effect, first)]
             for name in further:

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 MOST_LINES = 15  # lines of a `repr`
 WIDTH = 70  # characters of a value in a `repr`; longer values are named by type and size
-FEW = 7  # numbers of an array that are written out
+MOST_WRITTEN = 7  # numbers of an array that are written out
 
 
 def brief(value: Any) -> str:
@@ -31,7 +31,7 @@ def shortened(value: object) -> str:
 
     kind = type(value).__name__
     if isinstance(value, np.ndarray):
-        few = value.ndim <= 1 and value.size <= FEW
+        few = value.ndim <= 1 and value.size <= MOST_WRITTEN
         return f"array({np.array2string(value, precision=4)})" if few else f"array {value.shape}"
     if isinstance(value, Mapping):
         return f"{kind} of {len(value)}: {_cut(', '.join(map(str, value)))}" if value else "{}"

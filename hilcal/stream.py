@@ -29,7 +29,7 @@ from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.carried import CarriedPrior, coordinates_of, prior_of, scales_of
 from hilcal.identification.fit import Estimates, Fit, fit
-from hilcal.identification.fit_document import finite
+from hilcal.identification.fit_document import finite_or_null
 from hilcal.identification.folds import FOLDS
 from hilcal.identification.full_covariance import joint_factors, with_joint_scatter
 from hilcal.identification.gauss_newton import (
@@ -44,16 +44,16 @@ from hilcal.identification.gauss_newton import (
     spent_parameters,
     whitened_jacobian,
 )
-from hilcal.identification.least_trimmed_squares import bulk, limit
+from hilcal.identification.least_trimmed_squares import bulk_scale, rejection_limit
 from hilcal.identification.residual import ErrorBlock, WithVarianceFactor, residual
 from hilcal.identification.uncertainty import (
-    MISFIT_CHANCE,
+    MISFIT_LEVEL,
     identifiable_parameters,
     in_ordinary_magnitudes,
     name_directions,
 )
 from hilcal.model.model import Model, Prediction
-from hilcal.readings.covariance import WHOLE, with_scatter
+from hilcal.readings.covariance import INSTRUMENT_AND_ARM, with_scatter
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening, whitening
 from hilcal.regression.normal_equations import NormalEquations, Triangle, combined
@@ -310,7 +310,7 @@ def fit_stream(
     work = replace(work, model=replace(first.model, readings=None))
     problem = _Stream(work.model, coordinates_of(work.model), True, work, engine, counting)
     theta = first.theta
-    far = limit(readings.m, len(stream), bulk(first.mahalanobis2, readings.m))
+    far = rejection_limit(readings.m, len(stream), bulk_scale(first.mahalanobis2, readings.m))
     for search in range(OUTLIER_ROUNDS + 1):
         solved = _solved(problem, theta)
         theta = solved.point.theta
@@ -328,7 +328,7 @@ def _scatter(stream: ReadingStream, cell: Cell) -> Floats:
     """Return the arm's scatter (n,) to add to the covariances, rad; zero if they include it."""
     config = cell.configured()
     stated = columns.covariance_columns(3)[0] in stream.columns
-    included = stream.covers == WHOLE or (stated and config.repeatability.in_tables)
+    included = stream.covers == INSTRUMENT_AND_ARM or (stated and config.repeatability.in_tables)
     return np.zeros(cell.arm.n) if included else config.repeatability.per_joint(cell.arm.n)
 
 
@@ -365,11 +365,11 @@ class _StreamMinimum:
         basis, space, groups = self.equations.basis, problem.coordinates, prior_of(model)[1]
         transform, scale = space.transform(basis.transform), scales_of(model)
         covariance = transform @ self.equations.inverse(beta) @ transform.T
-        covariance[space.index, space.index] += space.rest / beta
+        covariance[space.index, space.index] += space.omitted_variance / beta
         formal = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         spent = spent_parameters(self.equations, beta, groups)
         dof = max(point.elements - spent, 1.0)
-        inflated = bool(chi2.sf(point.rss, dof) < MISFIT_CHANCE)
+        inflated = bool(chi2.sf(point.rss, dof) < MISFIT_LEVEL)
         std = formal
         if inflated:
             change = self.change[list(point.folds)]
@@ -427,7 +427,7 @@ def _solved(problem: _Stream, theta: Floats) -> _StreamMinimum:
     """Return the minimum, starting from parameters (P,)."""
     space = problem.coordinates
     solution = minimum(problem, space.of_theta(theta), None)
-    point, regularisation = solution.point, solution.by
+    point, regularisation = solution.point, solution.regularisation
     live_basis, beta, prior = regularisation.basis, regularisation.beta, regularisation.prior
     if point.elements <= live_basis.structural:
         raise CannotAnswerError(
@@ -465,7 +465,10 @@ def to_json(fit: StreamFit) -> dict[str, object]:
         "rank": fit.rank,
         "converged": fit.converged,
         "passes": fit.passes,
-        "condition": {"unscaled": finite(fit.condition[0]), "scaled": finite(fit.condition[1])},
+        "condition": {
+            "unscaled": finite_or_null(fit.condition[0]),
+            "scaled": finite_or_null(fit.condition[1]),
+        },
         "parameters": fit.parameters.to_dicts(),
         "unidentifiable": list(fit.null),
         "inflated": fit.inflated,

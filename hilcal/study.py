@@ -22,7 +22,7 @@ from rich.text import Text
 from scipy import stats
 from scipy.linalg import solve_triangular
 
-from hilcal.engine import ALONE, Advance, Engine
+from hilcal.engine import IN_PROCESS, Advance, Engine
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.readings.covariance import TrackerNoise, joint_scatter, tracker_covariance
 from hilcal.readings.readings import Readings, States
@@ -250,7 +250,7 @@ def scaling_study(
     *,
     arm: Arm | None = None,
     poses: int = 30,
-    engine: Engine = ALONE,
+    engine: Engine = IN_PROCESS,
     advance: Advance | None = None,
 ) -> ScalingStudy:
     """Simulate the identification of joint compliances with every scaling.

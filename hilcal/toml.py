@@ -73,10 +73,10 @@ def read_toml(path: Path) -> dict[str, Any]:
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not UTF-8 text (byte {error.start}); expected TOML") from None
     for number, line in enumerate(text.split("\n"), start=1):
-        if line.count(".") > limits.DOTS:
+        if line.count(".") > limits.TOML_DOTS:
             raise InputError(
-                f"{path.name}: line {number} has more than {limits.DOTS} dots; valid: TOML with "
-                "sections"
+                f"{path.name}: line {number} has more than {limits.TOML_DOTS} dots; "
+                "valid: TOML with sections"
             )
     try:
         data = tomllib.loads(text)

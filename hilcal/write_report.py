@@ -26,7 +26,7 @@ from hilcal.whole_file import replace_file
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class ReportOptions:
     """The options of `report`."""
 
     later: Campaign | None = None
@@ -74,7 +74,7 @@ def report(
         InputError: no such revision, the page cannot be written, or see `validate` and `compare`.
         CannotAnswerError: the readings do not determine the baseline, or see `validate`.
     """
-    options = Asked(later, validation, limit_m, operator, revision, appendix)
+    options = ReportOptions(later, validation, limit_m, operator, revision, appendix)
     with opened(run) as campaign:
         page = campaign.path.with_suffix(".html") if path is None else Path(path)
         write_report(campaign, page, options, say)
@@ -82,7 +82,7 @@ def report(
 
 
 def write_report(
-    run: Campaign, path: Path, options: Asked, say: Say = lambda text: None
+    run: Campaign, path: Path, options: ReportOptions, say: Say = lambda text: None
 ) -> FirstScreen:
     """Write a page as `report` does, and return its first screen."""
     later, validation = options.later, options.validation
@@ -117,10 +117,10 @@ def write_report(
 
 
 def content_of(
-    run: Campaign, options: Asked | None = None, say: Say = lambda text: None
+    run: Campaign, options: ReportOptions | None = None, say: Say = lambda text: None
 ) -> ReportContent:
     """Collect the content of a report of one campaign; raises as `report` does."""
-    options = options or Asked()
+    options = options or ReportOptions()
     validation, limit_m, revision = options.validation, options.limit_m, options.revision
     record, chapters = run.in_use(revision), run.chapters(say, revision)
     say("preparing the story")

@@ -16,7 +16,7 @@ import numpy as np
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.diagnosis.change import LEVEL, POWER, STATED_DOF, Changes, changing, find_changes
-from hilcal.diagnosis.comparison import completed
+from hilcal.diagnosis.comparison import with_missing_effects
 from hilcal.drivers.simulated.injected_effects import (
     Draw,
     joint_compliance,
@@ -28,7 +28,7 @@ from hilcal.drivers.simulated.world import World, stand
 from hilcal.errors import HilcalError
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import fit
-from hilcal.identification.later_readings import EarlierFit, earlier_fit, setting
+from hilcal.identification.later_readings import EarlierFit, earlier_fit, later_readings
 from hilcal.readings.readings import Readings
 from hilcal.regression.evidence import noncentrality_of_power
 from hilcal.types import Floats
@@ -152,7 +152,7 @@ def studied_arm(
     world = replace(world, physics=physics)
     readings = measured(world, chosen, poses, rng)
     model = with_effects(cell, readings, "absolute", GEOMETRY)
-    fitted, _ = completed(fit(model, readings, "absolute"), changing(model.catalogue))
+    fitted, _ = with_missing_effects(fit(model, readings, "absolute"), changing(model.catalogue))
     return StudiedArm(robot, cell, world, chosen, loads[2:4], earlier_fit(fitted))
 
 
@@ -244,7 +244,7 @@ def case(
     rms = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
     repaired = Case(arm.robot, repair, joint, anew, seed, size, factor, other, rms)
     try:
-        changes = find_changes(setting(arm.earlier, readings, anew=anew))
+        changes = find_changes(later_readings(arm.earlier, readings, anew=anew))
     except HilcalError as error:
         return replace(repaired, failure=str(error))
     return judged(repaired, changes, moved, change)
@@ -260,8 +260,8 @@ def judged(repaired: Case, changes: Changes, moved: Floats, change: float) -> Ca
         change: of the joint's compliance, rad/(N·m).
     """
     test, first = changes.before, changes.found[0] if changes.found else None
-    w = test.setting.w
-    x = w.whiten(w.raw(moved)[:, :, None])[:, 0] / np.sqrt(test.setting.earlier.noise)
+    w = test.later.w
+    x = w.whiten(w.raw(moved)[:, :, None])[:, 0] / np.sqrt(test.later.earlier.noise)
     level = LEVEL / changes.tested
     noncentrality = noncentrality_of_power(1, test.dof + STATED_DOF - 1, level, POWER)
     truth = {"encoder_offset": repaired.size_rad, "joint_compliance": change}

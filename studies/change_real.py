@@ -12,10 +12,10 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.diagnosis.change import find_changes
-from hilcal.diagnosis.comparison import completed
+from hilcal.diagnosis.comparison import with_missing_effects
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import fit
-from hilcal.identification.later_readings import EarlierFit, earlier_fit, setting
+from hilcal.identification.later_readings import EarlierFit, earlier_fit, later_readings
 from hilcal.library import read_table
 from hilcal.readings.readings import Readings
 from hilcal.robot import se3
@@ -70,7 +70,7 @@ def real_case(k: int, study: RealStudy) -> RealCase:
     anew = bool(k % 2)
     if joint:
         later = _moved(earlier, later, joint - 1)
-    changes = find_changes(setting(earlier, later, anew=anew))
+    changes = find_changes(later_readings(earlier, later, anew=anew))
     z = [
         (c.sizes[0].value - ZERO_RAD) / c.sizes[0].std
         for c in changes.found
@@ -91,7 +91,7 @@ def _halves(study: RealStudy) -> tuple[EarlierFit, list[tuple[Readings, int]]]:
     poses = rng.permutation(np.unique(readings.pose))
     half = np.isin(readings.pose, poses[: len(poses) // 2])
     model = with_effects(cell, readings[half], "absolute", EFFECTS)
-    fitted, _ = completed(fit(model, readings[half], "absolute"), (), lambda _: None)
+    fitted, _ = with_missing_effects(fit(model, readings[half], "absolute"), (), lambda _: None)
     earlier, other_half = earlier_fit(fitted), np.flatnonzero(~half)
     out = []
     for k in range(2 * study.count):

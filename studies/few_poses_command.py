@@ -178,7 +178,7 @@ def share_in_band(fitted: Fit, test: Readings, error: Floats) -> float:
     prediction = fitted.model.predict(test.states, fitted.theta)
     if fitted.readings.arm_scatter is not None:
         test = with_arm_scatter(fitted.model.cell, test, fitted.readings.arm_scatter)
-    total = band.of_reading(prediction, whitening(test, "absolute", "gc"))[:, :3, :3]
+    total = band.reading_covariance(prediction, whitening(test, "absolute", "gc"))[:, :3, :3]
     square = np.einsum("ni,nij,nj->n", error, np.linalg.inv(total), error)
     return float(np.mean(square < chi2.ppf(0.95, 3)))
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.engine import ALONE, Engine
+from hilcal.engine import IN_PROCESS, Engine
 from studies.plans_errors import Arm, Errors, Prepared, Subject, prepared, run_campaign, subject
 from studies.plans_kinds import Chosen, Scene, at_random, grid, matching, optimal, scene
 from studies.plans_statistics import Measured, Summary, summary
@@ -143,7 +143,7 @@ def plans_study(
     campaigns: int = 50,
     candidates: int | None = None,
     seed: int = 0,
-    engine: Engine = ALONE,
+    engine: Engine = IN_PROCESS,
     advance: Callable[[int], None] = lambda step: None,
 ) -> PlansStudy:
     """Compare plans on one robot.

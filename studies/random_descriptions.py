@@ -11,7 +11,7 @@ import numpy as np
 
 from hilcal.cell import STANDARD_GRAVITY, Cell
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.hypotheses import Described, Hypothesis
+from hilcal.identification.hypotheses import Description, Hypothesis
 from hilcal.identification.misdescription import DescriptionFinding, examine
 from hilcal.identification.registration import register
 from hilcal.readings.readings import Readings, States
@@ -178,7 +178,7 @@ def _draw(rng: np.random.Generator) -> Case | None:
     for change in truth:
         if change.kind in ("joint", "coupling", "arm"):
             nothing = np.zeros((1, 6))
-            described = Described(true_arm, nothing, nothing[:, :3], None, True, True)
+            described = Description(true_arm, nothing, nothing[:, :3], None, True, True)
             true_arm = change.applied(described).arm
     q = random_poses(kind, true_arm, int(rng.integers(25, 90)), rng)
     if len(q) < 12:

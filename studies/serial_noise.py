@@ -146,5 +146,5 @@ def _predicted(f: Fit, clean: Readings) -> tuple[int, int]:
     w = whitening(clean, f.mode)
     prediction = f.model.predict(clean.states, f.theta)
     error = residual(clean, prediction, w)
-    std = np.sqrt(np.diagonal(p.of_prediction(prediction, w), axis1=1, axis2=2))
+    std = np.sqrt(np.diagonal(p.prediction_covariance(prediction, w), axis1=1, axis2=2))
     return int(np.sum(np.abs(error) <= NORMAL_95 * std)), error.size

@@ -18,7 +18,7 @@ from hilcal.drivers.simulated.world import SimulatedNoise, World
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
 from hilcal.measuring.route import approach_sides, home, route
-from hilcal.readings.covariance import COVERS, WHOLE
+from hilcal.readings.covariance import COVERS_KEY, INSTRUMENT_AND_ARM
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import Mode
 from hilcal.store.campaign_file import CampaignFile
@@ -88,7 +88,7 @@ class Rehearsal(SimulationCase):
             self.config.to_json(),
             str(self.cell.base_dir),
             "simulated campaign",
-            more={COVERS: WHOLE},
+            more={COVERS_KEY: INSTRUMENT_AND_ARM},
             readings=self.readings,
         ).close()
 

@@ -43,7 +43,12 @@ from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import InputError
 from hilcal.identification.fit import Fit
 from hilcal.identification.predictive import position_factor, predictive
-from hilcal.identification.robot_frames import RobotFrames, one_of_each, robot_frames, whole_turns
+from hilcal.identification.robot_frames import (
+    RobotFrames,
+    robot_frames,
+    state_with_every_column,
+    whole_turns,
+)
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import States
 from hilcal.readings.whitening import Mode
@@ -101,7 +106,7 @@ class Calibration(Brief):
             used = replace(used, states=replace(used.states, torque=None))
         p = predictive(model, fit.theta, fit.solution.prior, used, fit.mode, fit.holdout.rms_sigma)
         values, vectors = np.linalg.eigh(p.covariance)
-        noise = np.trace(p.of_noise(fit.whitening)[:, :3, :3], axis1=1, axis2=2)
+        noise = np.trace(p.noise_covariance(fit.whitening)[:, :3, :3], axis1=1, axis2=2)
         kappa = position_factor(p, fit.holdout.rms_m)
         # A deflection is the difference of two readings.
         readings = 2 if fit.mode == "deflection" else 1
@@ -294,7 +299,7 @@ class Calibration(Brief):
         self, q: Floats, wrench: Floats | None, recorded: Mapping[str, Floats] | None
     ) -> tuple[States, tuple[str, ...]]:
         """Return points as states, and the columns that means fill; raises as `predict` does."""
-        n, example = self.model.cell.arm.n, one_of_each(self.model.cell)
+        n, example = self.model.cell.arm.n, state_with_every_column(self.model.cell)
         q = np.array(q, dtype=float, order="C", ndmin=2)
         if q.shape[1:] != (n,) or not len(q):
             raise InputError(f"q has shape {q.shape}; valid: ({n},) or (N, {n})")

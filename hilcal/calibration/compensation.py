@@ -25,7 +25,7 @@ from scipy.stats import chi2
 from hilcal.calibration.measured import Outside
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.errors import InputError
-from hilcal.identification.robot_frames import one_of_each, robot_frames
+from hilcal.identification.robot_frames import robot_frames, state_with_every_column
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import States
 from hilcal.robot import se3
@@ -81,7 +81,7 @@ def tool_of(model: Model, theta: Floats, pose: Floats | None) -> ToolPose:
         cell = replace(model.cell, targets=None, target_names=(), targets_known=())
         cell = replace(cell, target=robot.flange @ pose, target_known=True)
         tool_model = replace(model, cell=cell, effects=tuple(used))
-    state = one_of_each(tool_model.cell)
+    state = state_with_every_column(tool_model.cell)
     if tool_model.cell.targets is not None:
         state = replace(state, target=np.zeros(1, dtype=np.int64))
     situation = tool_model.predict(state, theta[columns]).situation

@@ -60,7 +60,7 @@ def corrected(calibration: Calibration) -> Corrected:
     if arm.coupling is not None or arm.drive is not None:
         raise InputError(f"{arm.name}: joints are coupled, which constant transforms cannot hold")
     robot = calibration.frames
-    return Corrected(replace(arm, links=robot.links), robot.within, robot.beyond)
+    return Corrected(replace(arm, links=robot.links), robot.constant_effects, robot.other_effects)
 
 
 def urdf(arm: Arm, note: str = "") -> str:

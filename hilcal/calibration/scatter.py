@@ -28,7 +28,7 @@ from typing import Literal
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.diagnosis.noise import FEWEST, RP_PER_RMS, classes, stated_repeatability
+from hilcal.diagnosis.noise import FEWEST_DOF, RP_PER_RMS, repeat_classes, stated_repeatability
 from hilcal.errors import InputError
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_covariance import joint_factors
@@ -89,9 +89,9 @@ def scatter_of(fit: Fit) -> Scatter:
 def _shown_by_repeats(fit: Fit) -> float | None:
     """Standard deviation of each joint, rad; None where there are too few repeats."""
     inliers = fit.readings[~fit.outlier]
-    _, kind, count = np.unique(classes(inliers), return_inverse=True, return_counts=True)
+    _, kind, count = np.unique(repeat_classes(inliers), return_inverse=True, return_counts=True)
     dof = 3 * (len(inliers) - len(count))
-    if dof < FEWEST:
+    if dof < FEWEST_DOF:
         return None
     residual = inliers.value[:, :3] - fit.solution.prediction.observation.position
     mean = np.zeros((len(count), 3))

@@ -23,7 +23,7 @@ from hilcal.calibration.scatter import Scatter
 from hilcal.cell import Cell, Observer
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
-from hilcal.identification.robot_frames import one_of_each
+from hilcal.identification.robot_frames import state_with_every_column
 from hilcal.model.model import Model
 from hilcal.readings.readings import ObserverName
 from hilcal.readings.whitening import MODES
@@ -94,7 +94,7 @@ def _read(content: Mapping[str, Any], catalogue: Catalogue) -> Calibration:
                 f"it has the effect {e['name']}, which is not in the catalogue; give the file "
                 "that defines it: --effects-from FILE.py"
             )
-        effects.append(catalogue.make(e["name"], cell, one_of_each(cell), e["options"]))
+        effects.append(catalogue.make(e["name"], cell, state_with_every_column(cell), e["options"]))
     model = Model(cell, tuple(effects), catalogue)
     names = [f"{e.name}.{p.name}" for e in effects for p in e.parameters]
     limits.check_parameters(len(names))

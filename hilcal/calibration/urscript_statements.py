@@ -79,8 +79,8 @@ def statements(program: str) -> tuple[Statement, ...]:
             raise _refused(number, f"{len(body)} characters, at most {limits.STATEMENT} are read")
         if len(out) == limits.STATEMENTS:
             raise _refused(number, f"more than {limits.STATEMENTS} statements before it")
-        if len(open_blocks) > limits.BLOCKS:
-            raise _refused(number, f"it stands in more than {limits.BLOCKS} blocks")
+        if len(open_blocks) > limits.NESTED_BLOCKS:
+            raise _refused(number, f"it stands in more than {limits.NESTED_BLOCKS} blocks")
         match = _WORD.match(body)
         word = match[0] if match else ""
         plain = _STRING_OR_COMMENT.sub("", body).strip()
@@ -130,7 +130,7 @@ def _parsed(text: str, number: int, word: str) -> ast.stmt:
     try:
         (node,) = ast.parse(text + "\n pass" * header).body
         level: list[ast.AST] = [node]  # the depth that Python itself reads varies
-        for _ in range(limits.NESTED):
+        for _ in range(limits.NESTED_EXPRESSIONS):
             level = [part for parent in level for part in ast.iter_child_nodes(parent)]
         supported = not level and all(_means_the_same(n, text) for n in _parts(node))
     except (SyntaxError, ValueError, RecursionError, MemoryError):

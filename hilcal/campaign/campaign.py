@@ -29,13 +29,13 @@ from hilcal.identification.full_covariance import (
     full_readings,
     with_noise_of,
 )
-from hilcal.identification.noise_estimate import NOISE, NoiseEstimate, with_noise_factors
+from hilcal.identification.noise_estimate import NOISE_KEY, NoiseEstimate, with_noise_factors
 from hilcal.identification.posterior import Posterior, Source
 from hilcal.identification.predictive import Predictive
 from hilcal.model.model import Model
 from hilcal.names import quoted
 from hilcal.present.story import Chapter
-from hilcal.readings.covariance import COVERS, FROM, INSTRUMENT, TRACKER, WHOLE
+from hilcal.readings.covariance import COVERS_KEY, FROM_KEY, INSTRUMENT, INSTRUMENT_AND_ARM, TRACKER
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode, usual_mode
 from hilcal.refinement import Refinement
@@ -183,8 +183,8 @@ class Campaign(Brief):
         `changes` are all changes of the cell; those of the campaign where None.
         """
         reasons: dict[tuple[str, str], str] = {}
-        noise, changes = self.file.about(NOISE), self.changes if changes is None else changes
-        if noise is None and self.file.about(FROM) != TRACKER:
+        noise, changes = self.file.about(NOISE_KEY), self.changes if changes is None else changes
+        if noise is None and self.file.about(FROM_KEY) != TRACKER:
             why = "the covariances of these readings are those that were measured, or of the table"
             reasons |= {("tracker", key): why for key in INSTRUMENT_NOISE}
         covers = _covers(self.file, changes)
@@ -192,7 +192,7 @@ class Campaign(Brief):
             hint = "; state the noise in [tracker], too" if noise is not None else ""
             why = f"the covariances of these readings include the arm's scatter already{hint}"
             old = "an older version of hilcal imported these readings; import the table again"
-            reasons["repeatability", "joint_std_rad"] = why if covers == WHOLE else old
+            reasons["repeatability", "joint_std_rad"] = why if covers == INSTRUMENT_AND_ARM else old
         if self.file.about(PLAN) is not None and self.config.force_sensor is not None:
             reasons["tool", "load_point_m"] = "the force sensor's moments are stored about it"
         return reasons
@@ -210,7 +210,11 @@ class Campaign(Brief):
     @property
     def covers(self) -> str:
         """What the covariance of `readings` covers, in the words of an exchange table."""
-        return INSTRUMENT if self.covariance_parts in ("instrument", "as imported") else WHOLE
+        return (
+            INSTRUMENT
+            if self.covariance_parts in ("instrument", "as imported")
+            else INSTRUMENT_AND_ARM
+        )
 
     @property
     def stored_covers(self) -> str:
@@ -220,7 +224,7 @@ class Campaign(Brief):
         a scatter of the arm.
         """
         added = covariance_parts(INSTRUMENT, self.config) != "instrument"
-        return _covers(self.file, self.changes) or (WHOLE if added else INSTRUMENT)
+        return _covers(self.file, self.changes) or (INSTRUMENT_AND_ARM if added else INSTRUMENT)
 
     @property
     def data_hash(self) -> str:
@@ -527,8 +531,8 @@ def _named_from(fits: Sequence[Fit]) -> Sequence[Fit]:
 def estimated_noise(file: CampaignFile) -> NoiseEstimate | None:
     """Return the noise estimated at import or after measuring; None where it is stated."""
     if file.about(PLAN) is None:
-        return NoiseEstimate.from_json(file.about(NOISE))
-    event = RunLog(file).last(NOISE)
+        return NoiseEstimate.from_json(file.about(NOISE_KEY))
+    event = RunLog(file).last(NOISE_KEY)
     return None if event is None or event["factors"] is None else NoiseEstimate.of(event)
 
 
@@ -546,14 +550,14 @@ def _with_instrument(
 def _restates(file: CampaignFile, changes: Changes) -> bool:
     """Whether changes in [tracker] replace the covariances of the readings."""
     keys = changes.get("tracker", {}).keys()
-    if file.about(NOISE) is not None:
+    if file.about(NOISE_KEY) is not None:
         return not keys.isdisjoint(INSTRUMENT_NOISE)
-    return file.about(FROM) == TRACKER and not keys.isdisjoint((*INSTRUMENT_NOISE, "station_m"))
+    return file.about(FROM_KEY) == TRACKER and not keys.isdisjoint((*INSTRUMENT_NOISE, "station_m"))
 
 
 def _covers(file: CampaignFile, changes: Changes) -> str | None:
     """Return what the covariance of the readings covers before the arm's scatter is added."""
-    return INSTRUMENT if _restates(file, changes) else file.about(COVERS)
+    return INSTRUMENT if _restates(file, changes) else file.about(COVERS_KEY)
 
 
 @contextmanager

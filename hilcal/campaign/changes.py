@@ -7,9 +7,9 @@ from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.revisions import carried_of, has_background, mode_of
 from hilcal.config.cell import Changes
 from hilcal.diagnosis.diagnosis import Diagnosis, History
-from hilcal.diagnosis.effect_ranking import Suspect, addition
+from hilcal.diagnosis.effect_ranking import Suspect, added_suspect
 from hilcal.diagnosis.serial_noise import with_serial_noise
-from hilcal.diagnosis.verdict import NOTHING, diagnose
+from hilcal.diagnosis.verdict import NO_HISTORY, diagnose
 from hilcal.effects.options import Options
 from hilcal.effects.written import write_effect
 from hilcal.identification.arm_scatter import with_arm_scatter, with_prior_scatter
@@ -102,11 +102,13 @@ def _stored(
     number = o.store(before, judged) if number is None else number
     new_number = o.store(after, d, added, removed, number)
     promised = added is not None and before.scaling == "gc"
-    expected = addition(before, after) if promised else None
+    expected = added_suspect(before, after) if promised else None
     return Changed(number, before, new_number, after, d, added, removed, expected)
 
 
-def refit(o: Campaign, record: RevisionRecord, say: Say, history: History = NOTHING) -> Diagnosis:
+def refit(
+    o: Campaign, record: RevisionRecord, say: Say, history: History = NO_HISTORY
+) -> Diagnosis:
     """Fit the model of a revision to all readings of a campaign, in its cell, and diagnose the fit.
 
     Frames that the cell does not know are estimated. The prior of another campaign, a background

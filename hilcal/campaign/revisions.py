@@ -73,7 +73,7 @@ def to_record(
     }
     result: dict[str, object] = {"identify": fit_document.to_json(fitted)}
     if diagnosis is not None:
-        result["diagnose"] = fit_document.plain(diagnosis)
+        result["diagnose"] = fit_document.with_nulls(diagnosis)
     return RevisionRecord(
         effects=model.named,
         added=added,
@@ -85,8 +85,8 @@ def to_record(
         parameters_json={
             "names": _names(model),
             "theta": fitted.theta.tolist(),
-            "std": [fit_document.finite(s) for s in fitted.uncertainty.std],
-            "prior": [fit_document.finite(s) for s in fitted.solution.prior],
+            "std": [fit_document.finite_or_null(s) for s in fitted.uncertainty.std],
+            "prior": [fit_document.finite_or_null(s) for s in fitted.solution.prior],
             "registration": cell.registration.tolist(),
             "target": cell.target.tolist(),
             "outliers": np.flatnonzero(fitted.outlier).tolist(),

@@ -20,7 +20,7 @@ import typer
 from hilcal import __version__, errors
 from hilcal.cli import commands
 from hilcal.names import escaped
-from hilcal.optional import lacking
+from hilcal.optional import missing_package
 from hilcal.store.kept_texts import typed
 
 DEBUG = "HILCAL_DEBUG"
@@ -273,7 +273,7 @@ def _explained(error: Exception, name: str) -> tuple[str, int]:
     if isinstance(error, ImportError) and (library := _LIBRARY.match(str(error))):
         package = " (libgomp1 on Debian)" if library[1] == "libgomp.so.1" else ""
         return f"the system library {library[1]} is missing: install its package{package}", _USAGE
-    if message := lacking(error):
+    if message := missing_package(error):
         return message, _USAGE
     from hilcal.effects.protocol import failure_of
 

@@ -24,7 +24,7 @@ from hilcal.present.campaign import import_preview, info_report
 from hilcal.present.document import Words, heading
 from hilcal.present.fit import model_name, target_words
 from hilcal.present.progress import counting, working
-from hilcal.readings.covariance import COVERS
+from hilcal.readings.covariance import COVERS_KEY
 from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.kept_texts import CALIBRATION_FILE, ROBOT_FILE, check_robot
@@ -164,7 +164,7 @@ def info(run: Path, as_json: bool = False) -> None:
     t = terminal(as_json)
     with CampaignFile.open(run, read_only=True) as file:
         content = overview(file)
-        parts = covariance_parts(file.about(COVERS), content.config)
+        parts = covariance_parts(file.about(COVERS_KEY), content.config)
         noise = estimated_noise(file)
         robot_texts = file.about(ROBOT_FILE), file.about(CALIBRATION_FILE)
         check_robot(run, file.config_json, *robot_texts)

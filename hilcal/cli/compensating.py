@@ -19,7 +19,7 @@ from hilcal.cli.options import catalogue_with, check_new, command
 from hilcal.cli.terminal import terminal
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.fit_document import plain
+from hilcal.identification.fit_document import with_nulls
 from hilcal.names import csv_text
 from hilcal.present.calibration import compensation_report, fates, refusals, waypoints_table
 from hilcal.present.progress import working
@@ -281,7 +281,7 @@ def _write(
         return list(files)
     content: str
     if path.suffix == ".json":
-        content = json.dumps(plain(document), allow_nan=False, indent=2) + "\n"
+        content = json.dumps(with_nulls(document), allow_nan=False, indent=2) + "\n"
     elif path.suffix == ".csv":
         content = _csv(names, result, units)
     elif n != urscript.JOINTS:

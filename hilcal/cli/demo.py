@@ -29,7 +29,7 @@ from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.evidence import Evidence
 from hilcal.diagnosis.verdict import diagnose, judge
 from hilcal.discovery.discovery import LawSearch, agreement, laws_json
-from hilcal.discovery.search import SAME
+from hilcal.discovery.search import SAME_CORRELATION
 from hilcal.drivers.simulated.injected_effects import HARD_TO_SEPARATE, RESEMBLING
 from hilcal.drivers.simulated.rehearsal import (
     INVENTED,
@@ -376,11 +376,11 @@ def _judge_law(r: Rehearsal, refinement: Refinement, laws: LawSearch) -> tuple[b
     soft = r.world.physics.joint_compliance
     moved, _ = hidden_law.moved(r.cell, r.world.registration, soft, r.readings.states)
     for previous, step in pairwise(refinement.steps):
-        d = next((d for d in laws.found if d.laws and d.laws[0].name == step.added), None)
+        d = next((d for d in laws.discoveries if d.laws and d.laws[0].name == step.added), None)
         if d is not None:
             law, same = d.laws[0], agreement(previous.fit, step.fit, moved)
             statement = f"Found was {law.formula}, which agrees with it over these readings by a"
-            return same >= SAME, f"{hidden}. {statement} correlation of {same:.3f}."
+            return same >= SAME_CORRELATION, f"{hidden}. {statement} correlation of {same:.3f}."
     return False, f"{hidden}. It was not found."
 
 

@@ -20,9 +20,9 @@ from hilcal.effects import template
 from hilcal.effects.catalogue import BUILT_IN, Catalogue, installed
 from hilcal.effects.check import NAME, ROBOT, example_cell, example_states
 from hilcal.effects.protocol import Effect
-from hilcal.effects.written import option_defaults, written
+from hilcal.effects.written import option_defaults, option_text
 from hilcal.errors import InputError
-from hilcal.identification.fit_document import plain
+from hilcal.identification.fit_document import with_nulls
 from hilcal.mixed.families import expected_sizes
 from hilcal.names import quoted
 from hilcal.present.campaign import section_report, sections_overview
@@ -84,7 +84,7 @@ def _options_table(instances: list[Effect], defaults: dict[str, dict[str, object
         for name, meaning in e.option_help.items():
             first = explained.setdefault((name, meaning), e.name)
             text = meaning if first == e.name else f"as for {first}"
-            default = written(defaults[e.name][name])
+            default = option_text(defaults[e.name][name])
             out.add(e.name, name, f"{text}\ndefault: {default}" if default else text)
     return out
 
@@ -99,7 +99,7 @@ def _document(e: Effect, defaults: dict[str, object], catalogue: Catalogue) -> d
         "elastic": e.elastic,
         "needs": list(e.needs),
         "options": list(e.option_help),
-        "defaults": plain(defaults),
+        "defaults": with_nulls(defaults),
         "option_help": dict(e.option_help),
         "parameters": parameters,
         "plausible": plausible if np.isfinite(e.most()) else None,

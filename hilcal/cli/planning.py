@@ -18,12 +18,12 @@ from hilcal.design.next import Next, PairPower
 from hilcal.design.nominal_model import check_effects
 from hilcal.design.planner import Request, make
 from hilcal.design.summary import CheckedPlan, about, checked, refusal, summarise
-from hilcal.diagnosis.diagnosis import MOST
+from hilcal.diagnosis.diagnosis import MOST_IN_DOUBT
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import DeviceError, HilcalError, InputError
 from hilcal.identification.carried import CarriedPrior
-from hilcal.identification.fit_document import plain
+from hilcal.identification.fit_document import with_nulls
 from hilcal.measuring.connect import ConnectionResult, connect, told_by, with_kinematics
 from hilcal.measuring.route import DryRun, dry_run
 from hilcal.names import quoted
@@ -212,7 +212,7 @@ def answer_json(answer: ConnectionResult) -> dict[str, object]:
         "answers": report is not None,
         "name": "" if report is None else report.name,
         "facts": {} if report is None else dict(report.facts),
-        "fields": {} if report is None else plain(dict(report.fields)),
+        "fields": {} if report is None else with_nulls(dict(report.fields)),
         "problems": list(answer.problems),
     }
 
@@ -302,6 +302,6 @@ def _named(text: str | None, catalogue: Catalogue) -> tuple[str, ...] | None:
         return None
     for name in (name for name, options in effects.items() if options):
         raise InputError(f"--suspects: {name} takes no options here; valid: {name}")
-    if not 2 <= len(effects) <= MOST:
-        raise InputError(f"--suspects has {len(effects)} names; valid: 2 to {MOST}")
+    if not 2 <= len(effects) <= MOST_IN_DOUBT:
+        raise InputError(f"--suspects has {len(effects)} names; valid: 2 to {MOST_IN_DOUBT}")
     return tuple(effects)

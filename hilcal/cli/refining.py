@@ -15,7 +15,7 @@ from hilcal.cli.showing import followed
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.diagnosis.serial_noise import with_serial_noise
-from hilcal.diagnosis.verdict import NOTHING
+from hilcal.diagnosis.verdict import NO_HISTORY
 from hilcal.diagnosis.verdict import diagnose as judge
 from hilcal.discovery.discovery import LawSearch, discovery_json, laws_json, rival_sources
 from hilcal.discovery.discovery import discover as search
@@ -211,7 +211,7 @@ def refine(
             else:
                 say("registering")
                 model, fitted = fitting.starting_model(o, mode, named, carried), o.readings
-            history = NOTHING if latest is None else o.history(latest.number)
+            history = NO_HISTORY if latest is None else o.history(latest.number)
             origin = () if latest is None else (latest.number,)
             numbers_to_be = itertools.chain(origin, itertools.count(len(o.file.revisions()) + 1))
 

@@ -44,7 +44,7 @@ from hilcal.errors import (
     StoppedError,
 )
 from hilcal.identification.full_covariance import full_readings
-from hilcal.identification.noise_estimate import NOISE, measured_noise
+from hilcal.identification.noise_estimate import NOISE_KEY, measured_noise
 from hilcal.measuring import connect
 from hilcal.measuring.devices import Clock
 from hilcal.measuring.route import dry_run
@@ -60,7 +60,7 @@ from hilcal.present.progress import Say, counting, full_words, missed_words, wat
 from hilcal.present.registration import covariance_words
 from hilcal.procedure.procedure import Measure, Procedure, checked_plan
 from hilcal.procedure.state import WORLD
-from hilcal.readings.covariance import COVERS, WHOLE
+from hilcal.readings.covariance import COVERS_KEY, INSTRUMENT_AND_ARM
 from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, load_plan, with_new_names
@@ -240,10 +240,10 @@ def estimate_noise(t: Terminal, config: CellConfig, cell: Cell, campaign: Campai
     log = RunLog(campaign)
     noise = measured_noise(campaign.readings(), cell, config)
     if noise is not None:
-        log.event(NOISE, asdict(noise))
+        log.event(NOISE_KEY, asdict(noise))
         t.notice(sentence(covariance_words("instrument", noise)))
-    elif log.last(NOISE) is not None:  # withdraws an estimate from fewer readings
-        log.event(NOISE, {"factors": None})
+    elif log.last(NOISE_KEY) is not None:  # withdraws an estimate from fewer readings
+        log.event(NOISE_KEY, {"factors": None})
 
 
 def _sighted(
@@ -341,7 +341,7 @@ def on_devices(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator
 
         def measured() -> Rehearsal:
             missing(campaign)
-            stored = campaign.readings(), campaign.about(COVERS)
+            stored = campaign.readings(), campaign.about(COVERS_KEY)
             readings = full_readings(*stored, secret.cell, world.config)
             return secret.measured(readings, world.config)
 
@@ -361,7 +361,12 @@ def in_process(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator
     source = "rehearsal in a simulated cell, without devices"
     text = secret.config.to_json()
     with CampaignFile.create(
-        settings.output, text, str(settings.base_dir), source, overwrite=True, more={COVERS: WHOLE}
+        settings.output,
+        text,
+        str(settings.base_dir),
+        source,
+        overwrite=True,
+        more={COVERS_KEY: INSTRUMENT_AND_ARM},
     ) as campaign:
 
         def last_time() -> float:

@@ -42,7 +42,7 @@ def report(
     appendix: bool = False, effects_from: list[Path] | None = None, as_json: bool = False,
 ) -> None:  # fmt: skip
     """Write the whole story as one HTML page, a certificate first; it prints on six pages."""
-    from hilcal.write_report import Asked, write_report
+    from hilcal.write_report import ReportOptions, write_report
 
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     limit_m = None if limit is None else parse_length(limit, "--limit")
@@ -55,7 +55,9 @@ def report(
             return stack.enter_context(Campaign.open(path, catalogue, read_only=True))
 
         first = stack.enter_context(Campaign.open(run, catalogue, read_only=True))
-        options = Asked(opened(later), opened(validation), limit_m, operator, revision, appendix)
+        options = ReportOptions(
+            opened(later), opened(validation), limit_m, operator, revision, appendix
+        )
         result = write_report(first, output, options, say)
     t.show(f"{result.headline}.")
     if result.limit:

@@ -16,7 +16,7 @@ from rich.console import Console, RenderableType
 
 from hilcal.cli import error_document
 from hilcal.errors import HilcalError
-from hilcal.identification.fit_document import plain
+from hilcal.identification.fit_document import with_nulls
 from hilcal.present.progress import SafeConsole
 
 WIDTH = 100
@@ -60,7 +60,7 @@ class Terminal:
         if failed is not None:
             document |= error_document(failed, failed.exit_code)
         if self.json:
-            text = json.dumps(plain(document), allow_nan=False, indent=2)
+            text = json.dumps(with_nulls(document), allow_nan=False, indent=2)
             print(text, file=self.out, flush=True)
         if failed is not None:
             raise failed

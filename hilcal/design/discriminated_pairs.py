@@ -106,7 +106,7 @@ def posterior_draws(linear: Linearisation, effect: Effect, count: int) -> Floats
     if not computable(linear.fit, effect):
         return None
     columns = effect_columns(linear.fit, effect)
-    score = linear.score(columns.white, most=effect.most())
+    score = linear.score(columns.white, largest=effect.most())
     if not score.rank or score.log_evidence <= SUPPORTED:
         return None
     mean, root = columns.scale * score.step, columns.scale[:, None] * score.root

@@ -142,7 +142,7 @@ def carried_information(model: Model, live: Ints) -> Floats | None:
     if model.prior is None:
         return None
     if model.prior.drift is None:
-        model = replace(model, prior=model.prior.with_drift(model.prior.lowest))
+        model = replace(model, prior=model.prior.with_drift(model.prior.least_drift))
     coordinates = coordinates_of(model)
     rows = coordinates.inverse[coordinates.std == 1.0]
     information = np.zeros((model.size, model.size))

@@ -10,7 +10,7 @@ from hilcal.design.information import DesignProblem, DesignTerm
 from hilcal.design.nominal_model import NominalModel, nominal_states
 from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.uncertainty import LEARNT, MEANINGLESS
+from hilcal.identification.uncertainty import IDENTIFIABLE_RATIO, LARGEST_STD
 from hilcal.regression.normal_equations import INFORMATION, NULL_SHARE, ROUNDING
 from hilcal.regression.schur import inverse_root
 from hilcal.robot.chain import evaluate
@@ -214,7 +214,9 @@ def _stated(covariance: Floats, null: Floats, prior: Floats) -> Floats:
     """Return standard uncertainties over the scales; infinite where identification refuses."""
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     flat, unseen = np.isinf(prior), np.linalg.norm(null, axis=1)
-    good = np.where(flat, (unseen <= NULL_SHARE * std) & (std < MEANINGLESS), std < LEARNT * prior)
+    good = np.where(
+        flat, (unseen <= NULL_SHARE * std) & (std < LARGEST_STD), std < IDENTIFIABLE_RATIO * prior
+    )
     return np.where(good, std, np.inf)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE, Suspect
 from hilcal.diagnosis.minimum_detectable_effect import Strength
 from hilcal.identification.arm_scatter import some_poses
-from hilcal.identification.background import UNSURE
+from hilcal.identification.background import IMPLAUSIBLE_FACTOR
 from hilcal.identification.fit import Fit, all_left_out
 from hilcal.identification.linearisation import HeldOut
 from hilcal.identification.mixed_fit import (
@@ -27,16 +27,16 @@ from hilcal.mixed.variances import evidence
 from hilcal.regression.evidence import FamilyScore
 from hilcal.types import Floats
 
-PROVED = 0.01
+FALSE_ALARM = 0.01
 """Chance of naming any absent effect of the background, over all tested effects; a choice: poses
 left out have shown already that something is missing."""
-WORTH = 0.05
+LEAST_GAIN = 0.05
 """Share by which the rms error on poses left out must fall for a background; a choice: a background
 has hundreds of parameters, and a model of named effects alone is easier to understand."""
-TOGETHER = 0.05
+JOINT_LEVEL = 0.05
 """Chance of trying a background where the residual is only noise of another size, or the arm's
 scatter; a choice: the error on poses left out has to fall, too."""
-LIKELY = 0.1
+POSSIBLE_LEVEL = 0.1
 """p-value below which an effect of the background is named as possibly present; a choice."""
 SEED = 0  # of the simulated ratios, so that equal fits give equal p-values
 
@@ -82,12 +82,12 @@ def p_value_of_others(fit: Fit) -> float:
 def background_is_better(named: Fit, background: Fit) -> bool:
     """Whether a fit with a background is better than one with the named effects alone.
 
-    The rms error on poses left out must fall by the share `WORTH`; both errors are whitened by the
-    noise of the fit with the background.
+    The rms error on poses left out must fall by the share `LEAST_GAIN`; both errors are whitened by
+    the noise of the fit with the background.
     """
     raw, w = all_left_out(background)
     square = float(np.sum(w.whiten(all_left_out(named)[0]) ** 2))
-    return float(np.sum(w.whiten(raw) ** 2)) <= (1 - WORTH) ** 2 * square
+    return float(np.sum(w.whiten(raw) ** 2)) <= (1 - LEAST_GAIN) ** 2 * square
 
 
 def background_evidence(fit: Fit) -> tuple[BackgroundEffect, ...]:
@@ -104,7 +104,7 @@ def background_evidence(fit: Fit) -> tuple[BackgroundEffect, ...]:
     numbered = [(k, f) for k, f in enumerate(random) if f.effect in model.background]
     for name, group in groupby(numbered, lambda kf: kf[1].effect):
         numbers, families = zip(*group, strict=True)
-        test = evidence(problem, numbers, rng, log_std, UNSURE * most[name])
+        test = evidence(problem, numbers, rng, log_std, IMPLAUSIBLE_FACTOR * most[name])
         if not test.rank:
             continue
         index = np.concatenate([f.parameters for f in families])
@@ -136,12 +136,12 @@ def proved(tested: tuple[BackgroundEffect, ...]) -> tuple[str, ...]:
     an implausibly large effect.
     """
     sure = [b for b in tested if b.ratio > 2 * SAME_EVIDENCE]
-    return tuple(b.effect for b in sure if b.p_value * len(tested) < PROVED)
+    return tuple(b.effect for b in sure if b.p_value * len(tested) < FALSE_ALARM)
 
 
 def as_suspects(tested: tuple[BackgroundEffect, ...]) -> Iterator[Suspect]:
     """Yield the effects of a background as suspects: none is proved, each may be present."""
-    likely = [b.effect for b in tested if b.p_value < LIKELY]
+    likely = [b.effect for b in tested if b.p_value < POSSIBLE_LEVEL]
     for b in tested:
         score = FamilyScore(
             p_value=b.p_value,

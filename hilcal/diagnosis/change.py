@@ -30,7 +30,13 @@ from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.protocol import Changeable, Directions, Effect, Kind
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.later_readings import EarlierFit, Moving, Remeasured, Setting, remeasure
+from hilcal.identification.later_readings import (
+    EarlierFit,
+    EffectDirections,
+    LaterFit,
+    LaterReadings,
+    fit_later,
+)
 from hilcal.readings.readings import States
 from hilcal.regression.evidence import (
     FamilyScore,
@@ -41,7 +47,7 @@ from hilcal.regression.evidence import (
 )
 from hilcal.types import Floats
 
-PLACE = Changeable("setup", "tracker's place", "the place of the tracker, or of the base")
+TRACKER_PLACE = Changeable("setup", "tracker's place", "the place of the tracker, or of the base")
 SUFFIX = " changed"  # ends the name of an effect that stands for a change
 LEVEL = 0.01
 """Probability of a false claim where nothing has changed, over all candidates; a choice."""
@@ -50,11 +56,12 @@ STATED_DOF = 20.0
 """ν_0, degrees of freedom of the scatter that the earlier fit states: good to a sixth, since it
 differs with day and place. A choice."""
 UNEXPLAINED = 1e-3  # p-value below which the residual after all changes is unexplained; a choice
-TRIED = 5  # candidates with most evidence in the linearisation that are fitted exactly; a choice
-TAKEN_APART = 2
+MOST_EXACT_FITS = 5
+"""Candidates with most evidence in the linearisation that are fitted exactly; a choice."""
+MOST_REPAIRED_JOINTS = 2
 """Joints for which zero and compliance are tried together: those of the first candidates."""
-MOST = 4  # most changes that are searched: an arm with more is another arm; a choice
-ABSORBED = 1e-4
+MOST_CHANGES = 4  # most changes that are searched: an arm with more is another arm; a choice
+LEAST_INFORMATION_SHARE = 1e-4
 """Least share of a candidate's information that frames and prior must leave, a hundredth of its
 motion, for the readings to show it. A choice."""
 
@@ -71,7 +78,7 @@ class Candidate:
     parameters: tuple[str, ...]  # (k,) names of the directions
     units: tuple[str, ...]
     scale: Floats  # (k,) their ordinary magnitudes, SI
-    moving: Moving  # the directions, in ordinary magnitudes
+    effect_directions: EffectDirections  # the directions, in ordinary magnitudes
 
     @property
     def kind(self) -> Kind:
@@ -163,8 +170,8 @@ class Limit:
 class Changes:
     """The changes since an earlier campaign."""
 
-    before: Remeasured  # the earlier fit at the later readings, without any change
-    after: Remeasured  # with the changes
+    before: LaterFit  # the earlier fit at the later readings, without any change
+    after: LaterFit  # with the changes
     found: tuple[Change, ...]  # strongest first
     limits: tuple[Limit, ...]  # of candidates with one parameter
     tested: int  # number of candidates that the readings can show, plus the number of joints
@@ -203,7 +210,7 @@ def candidates(
         return effect
 
     def put(name: str, effect: Effect, change: Changeable, d: Directions, joint: int = 0) -> None:
-        units, moving = (d.parameters, d.units, d.scale), Moving(effect, d.matrix)
+        units, moving = (d.parameters, d.units, d.scale), EffectDirections(effect, d.matrix)
         out.append(Candidate(d.name, name, change.part, joint, change, *units, moving))
 
     for name in changing(catalogue):
@@ -222,7 +229,7 @@ def candidates(
                 put(name, effect, part, _single(f"{name}.{label}", effect, label), joint)
     for kind in () if anew else catalogue.with_role("registration"):
         if (effect := make(kind.name)) is not None:
-            put(kind.name, effect, PLACE, _single(kind.name, effect))
+            put(kind.name, effect, TRACKER_PLACE, _single(kind.name, effect))
     return tuple(out)
 
 
@@ -250,12 +257,12 @@ class _ScoredChange:
 
 _Step = tuple[Candidate, float, float, tuple[Candidate, ...]]
 """A change: candidate, p-value, log evidence, and the candidates not separated from it."""
-_Trial = tuple[float, float, Remeasured, tuple[Candidate, ...]]
+_Trial = tuple[float, float, LaterFit, tuple[Candidate, ...]]
 """Log evidence, p-value and minimum with some candidates added."""
 
 
 def find_changes(
-    setting: Setting,  # later readings, none of which was fitted, beside the earlier fit
+    later: LaterReadings,  # later readings, none of which was fitted, beside the earlier fit
     say: Callable[[str], None] = lambda text: None,  # takes progress, one line each
 ) -> Changes:
     """Find the changes between an earlier fit and later readings of the same arm.
@@ -263,19 +270,19 @@ def find_changes(
     Raises:
         CannotAnswerError: too few readings, or no static equilibrium.
     """
-    earlier, w, cell = setting.earlier, setting.w, setting.model.cell
-    before = remeasure(setting)
+    earlier, w, cell = later.earlier, later.w, later.model.cell
+    before = fit_later(later)
     if before.dof < 3:
         raise CannotAnswerError(
             f"{len(w)} later readings leave nothing to judge a change by; measure at least "
             f"{-(-(before.free + 3) // w.m)}, better 15"
         )
     catalogue = earlier.fit.model.catalogue
-    possible = candidates(cell, setting.readings.states, catalogue, w.m, anew=setting.anew)
+    possible = candidates(cell, later.readings.states, catalogue, w.m, anew=later.anew)
     current, tested = before, 0
     steps: list[_Step] = []
     hidden: tuple[Candidate, ...] = ()
-    while len(steps) < MOST:
+    while len(steps) < MOST_CHANGES:
         say("testing what may have changed" if not steps else "testing what else may have changed")
         scored = [_score(current, c) for c in possible if all(c is not s[0] for s in steps)]
         shown = [s for s in scored if s.shown]
@@ -302,30 +309,30 @@ def find_changes(
     )
 
 
-def _pooled(minimum: Remeasured) -> tuple[float, float]:
+def _pooled(minimum: LaterFit) -> tuple[float, float]:
     """‖r‖² and ν, including the scatter that the earlier fit states."""
-    stated = min(STATED_DOF, minimum.setting.earlier.fit.dof)
+    stated = min(STATED_DOF, minimum.later.earlier.fit.dof)
     return minimum.rss + stated, minimum.dof + stated
 
 
-def _least_noise(minimum: Remeasured) -> float:
+def _least_noise(minimum: LaterFit) -> float:
     """σ² for the uncertainty of sizes; a few lucky readings do not lower it below that stated."""
     rss, dof = _pooled(minimum)
     return max(rss / dof, 1.0)
 
 
-def _score(minimum: Remeasured, candidate: Candidate) -> _ScoredChange:
-    x, motion = minimum.columns(candidate.moving)
+def _score(minimum: LaterFit, candidate: Candidate) -> _ScoredChange:
+    x, motion = minimum.columns(candidate.effect_directions)
     s = minimum.projection.information(x)
     g = x.T @ minimum.projection.project_out(minimum.target)
     score = score_family(s, g, *_pooled(minimum))
-    informative = float(np.trace(s)) > ABSORBED * float(np.sum(x**2))
+    informative = float(np.trace(s)) > LEAST_INFORMATION_SHARE * float(np.sum(x**2))
     return _ScoredChange(candidate, score, s, motion, score.rank > 0 and informative)
 
 
 def _best(
-    minimum: Remeasured, changed: Sequence[Candidate], shown: Sequence[_ScoredChange], tested: int
-) -> tuple[Remeasured, list[_Step]] | None:
+    minimum: LaterFit, changed: Sequence[Candidate], shown: Sequence[_ScoredChange], tested: int
+) -> tuple[LaterFit, list[_Step]] | None:
     """Return the minimum with one more change, and the change; None where none is sure."""
     order = sorted(shown, key=lambda s: -s.score.log_evidence)
     if not order or min(s.score.p_value for s in order) * tested >= LEVEL:
@@ -333,8 +340,8 @@ def _best(
     tried: list[_Trial] = []
     for added in _trials([s.candidate for s in order]):
         try:
-            moving = [c.moving for c in (*changed, *added)]
-            after = remeasure(minimum.setting, moving, minimum)
+            moving = [c.effect_directions for c in (*changed, *added)]
+            after = fit_later(minimum.later, moving, minimum)
         except CannotAnswerError:
             continue
         evidence, p_value = _exact(minimum, after, sum(len(c.parameters) for c in added))
@@ -347,7 +354,7 @@ def _best(
 
     def size(t: _Trial) -> tuple[int, float]:
         """Number of parameters, and their rms in units of plausible sizes."""
-        plausible = [c.moving.effect.most() for c in t[3] for _ in c.parameters]
+        plausible = [c.effect_directions.effect.most() for c in t[3] for _ in c.parameters]
         relative = t[2].sizes[-len(plausible) :] / plausible
         return len(plausible), float(np.sqrt(np.mean(relative**2)))
 
@@ -355,7 +362,7 @@ def _best(
     evidence, p_value, after, best = min((t for t in sure if most - t[0] < SAME_EVIDENCE), key=size)
     apart = [t for t in tried if all(c is not b for c in t[3] for b in best)]
     rivals = [(c, t[0]) for t in apart for c in t[3]]
-    rivals += [(s.candidate, s.score.log_evidence) for s in order[TRIED:]]
+    rivals += [(s.candidate, s.score.log_evidence) for s in order[MOST_EXACT_FITS:]]
     same = {c.name: c for c, e in rivals if most - e < SAME_EVIDENCE}
     chance = min(p_value * tested, 1.0)
     return after, [(c, chance, evidence, tuple(same.values())) for c in best]
@@ -367,14 +374,16 @@ def _trials(order: Sequence[Candidate]) -> list[tuple[Candidate, ...]]:
     A joint that was taken apart has another zero and another compliance: fitted one after the
     other, either of them, or a family of waves, would first absorb both changes.
     """
-    joints = list(dict.fromkeys(c.joint for c in order[:TRIED] if c.joint))[:TAKEN_APART]
+    joints = list(dict.fromkeys(c.joint for c in order[:MOST_EXACT_FITS] if c.joint))[
+        :MOST_REPAIRED_JOINTS
+    ]
     sets = (
         tuple(c for c in order if c.joint == joint and c.change.with_others) for joint in joints
     )
-    return [*((c,) for c in order[:TRIED]), *(s for s in sets if len(s) > 1)]
+    return [*((c,) for c in order[:MOST_EXACT_FITS]), *(s for s in sets if len(s) > 1)]
 
 
-def _exact(before: Remeasured, after: Remeasured, count: int) -> tuple[float, float]:
+def _exact(before: LaterFit, after: LaterFit, count: int) -> tuple[float, float]:
     """Log evidence and p-value of the last `count` sizes, from the exact minima."""
     rss, dof = _pooled(before)
     gain = max(before.rss - after.rss, 0.0)
@@ -391,14 +400,14 @@ def _exact(before: Remeasured, after: Remeasured, count: int) -> tuple[float, fl
     return evidence, float(f_distribution.sf(gain / rank / variance, rank, dof - rank))
 
 
-def _needed(minimum: Remeasured, steps: list[_Step], tested: int) -> tuple[Remeasured, list[_Step]]:
+def _needed(minimum: LaterFit, steps: list[_Step], tested: int) -> tuple[LaterFit, list[_Step]]:
     """Return the minimum and the changes without those that the others make needless."""
     while len(steps) > 1:
         rss, dof = _pooled(minimum)
         without = []
         for k, step in enumerate(steps):
-            moving = [s[0].moving for s in steps if s is not step]
-            reduced, count = remeasure(minimum.setting, moving), len(step[0].parameters)
+            moving = [s[0].effect_directions for s in steps if s is not step]
+            reduced, count = fit_later(minimum.later, moving), len(step[0].parameters)
             gain = max(reduced.rss - minimum.rss, 0.0)
             p_value = float(f_distribution.sf(gain / count * dof / rss, count, dof))
             without.append((p_value, k, reduced))
@@ -409,7 +418,7 @@ def _needed(minimum: Remeasured, steps: list[_Step], tested: int) -> tuple[Remea
     return minimum, steps
 
 
-def _sized(after: Remeasured, steps: Sequence[_Step], earlier: EarlierFit) -> tuple[Change, ...]:
+def _sized(after: LaterFit, steps: Sequence[_Step], earlier: EarlierFit) -> tuple[Change, ...]:
     noise, fit = _least_noise(after), earlier.fit
     before = {  # values and standard deviations of the earlier fit
         (e.name, p.name): (float(fit.theta[k]), float(np.linalg.norm(earlier.root[k])))
@@ -422,7 +431,7 @@ def _sized(after: Remeasured, steps: Sequence[_Step], earlier: EarlierFit) -> tu
         start = index.stop
         value = c.scale * after.sizes[index]
         std = c.scale * np.sqrt(noise * np.diag(after.inverse)[index])
-        moved = after.columns(c.moving)[1] @ after.sizes[index]
+        moved = after.columns(c.effect_directions)[1] @ after.sizes[index]
         rows = zip(c.parameters, c.units, value.tolist(), std.tolist(), strict=True)
         sizes = tuple(ChangeSize(p, u, v, e, before.get((c.effect, p))) for p, u, v, e in rows)
         moved_m = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
@@ -431,7 +440,7 @@ def _sized(after: Remeasured, steps: Sequence[_Step], earlier: EarlierFit) -> tu
 
 
 def _limits(
-    after: Remeasured, possible: Sequence[Candidate], changed: Sequence[Candidate], tested: int
+    after: LaterFit, possible: Sequence[Candidate], changed: Sequence[Candidate], tested: int
 ) -> tuple[Limit, ...]:
     """Return the smallest detectable change of each unchanged candidate with one parameter."""
     noise, dof = _least_noise(after), _pooled(after)[1]
@@ -444,7 +453,7 @@ def _limits(
         if s.shown:
             noncentrality = noncentrality_of_power(1, dof - 1, LEVEL / max(tested, 1), POWER)
             size = float(np.sqrt(noncentrality * noise / s.information[0, 0]))
-            size = size if size <= c.moving.effect.most() else np.inf
+            size = size if size <= c.effect_directions.effect.most() else np.inf
         moved = float(np.sqrt(np.mean(np.sum(s.motion[:, :, 0] ** 2, axis=1))))
         moved_m = size * moved if np.isfinite(size) else np.inf
         size *= float(c.scale[0])

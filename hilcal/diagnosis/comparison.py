@@ -20,7 +20,12 @@ from hilcal.errors import HilcalError
 from hilcal.identification.arm_scatter import estimate_arm_scatter, with_arm_scatter
 from hilcal.identification.fit import Fit
 from hilcal.identification.fit import fit as solve
-from hilcal.identification.later_readings import Setting, beside_frames, frames_alone, remeasure
+from hilcal.identification.later_readings import (
+    LaterReadings,
+    directions_beside_frames,
+    fit_later,
+    with_frames_only,
+)
 from hilcal.identification.linearisation import columns_of_each, linearise
 from hilcal.identification.posterior import Differences
 from hilcal.identification.residual import error_block
@@ -28,13 +33,13 @@ from hilcal.identification.validation import Extrapolation, Validation, extrapol
 from hilcal.readings.whitening import Mode
 from hilcal.shown import Shown
 
-MOST = 2
+MOST_ADDED = 2
 """Most effects that are added. A choice: an earlier model that lacks more is no calibration."""
-MISFIT = 0.01  # p-value of χ² below which the residual exceeds the stated noise; a choice
+MISFIT_LEVEL = 0.01  # p-value of χ² below which the residual exceeds the stated noise; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Today:
+class ErrorToday:
     """The error of the earlier calibration at the later readings.
 
     z is the rms of the error in units of its covariance as the earlier fit states it: its square
@@ -83,7 +88,7 @@ class Comparison(Shown):
     anew: bool
     told: bool
     tool: tuple[str, ...]
-    today: Today
+    today: ErrorToday
     changes: Changes
     differences: Differences | None = None
 
@@ -129,19 +134,19 @@ class Comparison(Shown):
         }
 
 
-def completed(
+def with_missing_effects(
     fit: Fit, names: Collection[str], say: Callable[[str], None] = lambda text: None
 ) -> tuple[Fit, tuple[str, ...]]:
     """Add effects, and the scatter, that a gc-scaled fit's readings show; the fit, their names."""
     added: list[str] = []
-    while len(added) < MOST and (effect := _most_evident(fit, names)) is not None:
+    while len(added) < MOST_ADDED and (effect := _most_evident(fit, names)) is not None:
         say(f"adding {effect} to the earlier model, as its own readings ask for")
         try:
             fit = add(fit, effect)
         except HilcalError:
             break
         added.append(effect)
-    if fit.readings.arm_scatter is None and chi2.sf(fit.chi2, fit.dof) <= MISFIT:
+    if fit.readings.arm_scatter is None and chi2.sf(fit.chi2, fit.dof) <= MISFIT_LEVEL:
         say("estimating the scatter of the earlier readings")
         scatter = estimate_arm_scatter(fit)
         if scatter is not None:
@@ -170,26 +175,26 @@ def _most_evident(fit: Fit, names: Collection[str]) -> str | None:
     return max(sure, key=lambda name: sure[name], default=None)
 
 
-def error_today(setting: Setting, changes: Changes, drawing: float | None) -> Today:
+def error_today(later: LaterReadings, changes: Changes, drawing: float | None) -> ErrorToday:
     """Return the earlier calibration's error; `drawing`: rms error with the arm as drawn, m."""
-    minimum, w = remeasure(frames_alone(setting)), setting.w
+    minimum, w = fit_later(with_frames_only(later)), later.w
     white = w.whiten(minimum.raw).reshape(-1)
     prediction = Validation(
-        readings=setting.readings,
+        readings=later.readings,
         whitening=w,
         raw=minimum.raw,
         error=error_block(minimum.raw, w),
         variance_factor=float(white @ white) / max(w.rank - minimum.free, 1),
-        registered=setting.anew,
+        registered=later.anew,
     )
-    predictive, lift = setting.earlier.knows, beside_frames(setting)
+    predictive, lift = later.earlier.predictive, directions_beside_frames(later)
     covariance = lift @ lift.T / predictive.factor
     predictive = replace(
         predictive, model=minimum.model, theta=minimum.theta, covariance=covariance
     )
-    fit, before = setting.earlier.fit, changes.before
+    fit, before = later.earlier.fit, changes.before
     ratio = before.rss / before.dof
-    return Today(
+    return ErrorToday(
         prediction=prediction,
         beyond=extrapolation(predictive, fit.readings[~fit.outlier], prediction),
         z=float(np.sqrt(ratio)),

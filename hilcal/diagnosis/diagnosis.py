@@ -22,11 +22,11 @@ from hilcal.readings.readings import ArmScatter
 from hilcal.shown import Shown, Tabular, presenter
 from hilcal.store.codec import encode
 
-MOST = 4
+MOST_IN_DOUBT = 4
 """Most effects to separate at once: each ordered pair is a term of the design; a guess."""
 PRIOR_ODDS = 1.0 / 9.0
 """Of an effect of the catalogue to be on an arm and large enough to be proved; a choice."""
-LARGEST = 30.0
+LARGEST_LOG_EVIDENCE = 30.0
 """Log evidence at which the probability saturates, at 1 - 2e-12."""
 
 Verdict = Literal["adequate", "missing_effect", "ambiguous", "unknown_effect", "noise_misjudged"]
@@ -61,7 +61,7 @@ VERDICTS: dict[Reason, Verdict] = {
     "wrong_figure": "ambiguous",
 }
 """The verdict that each reason leads to."""
-CURVE = (
+CURVE_KEYS = (
     "variable", "unit", "share", "moves", "direction", "labels", "x", "y", "error", "y_unit",
     "determined",
 )  # fmt: skip
@@ -194,7 +194,11 @@ class Diagnosis(Shown, Tabular):
             "not_shown": list(self.not_shown),
             "tests": {**tests, "each": FALSE_ALARM / max(self.tested, 1)},
             "apart": [
-                {"effect": a.effect, "unlike": a.unlike, "times": a.times if a.possible else None}
+                {
+                    "effect": a.effect,
+                    "unlike": a.unexplained_share,
+                    "times": a.readings_factor if a.possible else None,
+                }
                 for a in self.separability
             ],
             "beyond": self.insufficiency
@@ -204,12 +208,12 @@ class Diagnosis(Shown, Tabular):
             "pose_alone": self.pose_alone and asdict(self.pose_alone),
             "rejected": list(self.history.rejected),
             "alternatives": [
-                _attributes(a, "effect", "same_as", "others")
+                _attributes(a, "effect", "same_as") | {"others": list(a.replacements)}
                 for a in self.alternatives
                 if a.inseparable
             ],
             "needless": list(self.redundant),
-            "carriers": [_attributes(v, *CURVE) for v in self.dependences],
+            "carriers": [_attributes(v, *CURVE_KEYS) for v in self.dependences],
             "arm_scatter": self.scatter and self.scatter.to_json(),
             "serial_noise": self.fit.readings.serial and self.fit.readings.serial.to_json(),
             "pure_error": self.pure_error and self.pure_error.to_dict(),
@@ -220,7 +224,7 @@ def _attributes(value: object, *names: str) -> dict[str, object]:
     return {name: encode(getattr(value, name)) for name in names}
 
 
-def in_doubt(d: Diagnosis, most: int = MOST) -> tuple[str, ...]:
+def in_doubt(d: Diagnosis, most: int = MOST_IN_DOUBT) -> tuple[str, ...]:
     """Return effects that the readings do not separate; none unless the verdict is `ambiguous`.
 
     They are missing from the model, the first suspect first; or the first was added to the model
@@ -230,7 +234,7 @@ def in_doubt(d: Diagnosis, most: int = MOST) -> tuple[str, ...]:
         return (d.suspects[0].effect, *(s.effect for s in d.separability))[:most]
     if d.reason == "inseparable_addition":
         a = next(a for a in d.alternatives if a.inseparable)
-        return (a.effect, *(a.same_as or a.others))[:most]
+        return (a.effect, *(a.same_as or a.replacements))[:most]
     return d.pose_alone.effects[:most] if d.pose_alone is not None else ()
 
 
@@ -249,20 +253,24 @@ def effect_probabilities(steps: Sequence[Diagnosis], effects: Iterable[str]) -> 
     has 1 / (1 + exp(L_others - L - (number of others) + 1)), the others have the complement.
     """
     alternatives = steps[-1].alternatives
-    evidence = {a.effect: a.own for a in alternatives}
+    evidence = {a.effect: a.effect_log_evidence for a in alternatives}
     for d in reversed(steps):
         evidence = {b.effect: b.ratio / 2 for b in d.background} | evidence
         evidence = {s.effect: s.score.log_evidence for s in d.suspects} | evidence
     names = tuple(effects)
     p = {name: _probability(evidence.get(name, 0.0)) for name in {*names, *evidence}}
     for a in alternatives:
-        log_odds = np.clip(a.log_evidence - a.own - len(a.others) + 1, -LARGEST, LARGEST)
+        log_odds = np.clip(
+            a.log_evidence - a.effect_log_evidence - len(a.replacements) + 1,
+            -LARGEST_LOG_EVIDENCE,
+            LARGEST_LOG_EVIDENCE,
+        )
         stays = float(1.0 / (1.0 + np.exp(log_odds)))
-        p |= {name: max(p.get(name, 0.0), 1.0 - stays) for name in a.others}
+        p |= {name: max(p.get(name, 0.0), 1.0 - stays) for name in a.replacements}
         p[a.effect] = min(p[a.effect], stays)
     return {name: p[name] for name in names}
 
 
 def _probability(log_evidence: float) -> float:
-    gain = np.clip(log_evidence, -LARGEST, LARGEST) - 1.0
+    gain = np.clip(log_evidence, -LARGEST_LOG_EVIDENCE, LARGEST_LOG_EVIDENCE) - 1.0
     return float(1.0 / (1.0 + np.exp(-gain) / PRIOR_ODDS))

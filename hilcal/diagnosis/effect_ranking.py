@@ -10,12 +10,12 @@ Deflections show errors of geometry and encoders in the second order only, their
 in the first. With the frames estimated, an effect should hardly displace these by more than the
 model misses there,
 
-    t g ≤ `ALLOWED` s,    s² = mean |P y|²,    g² = mean Σ_p |P x_p|²
+    t g ≤ `MOST_UNLOADED_MOTION` s,    s² = mean |P y|²,    g² = mean Σ_p |P x_p|²
 
 y the residual of the unloaded readings, x_p their displacement by an ordinary magnitude of
 parameter p, P the projection off the frames. Elastic effects are exempt: a controller may
-compensate the effect of gravity. If more than a share `LOST` of the evidence needs larger sizes,
-the effect is implausible, and the size that it needs is stated.
+compensate the effect of gravity. If more than a share `MOST_EVIDENCE_LOST` of the evidence needs
+larger sizes, the effect is implausible, and the size that it needs is stated.
 
 Promise. Columns hold for small parameters, so the exact model is evaluated at the step that the
 score promises, with the model's own parameters adapted; if that loses much, a refit decides. The
@@ -57,7 +57,7 @@ from hilcal.regression.schur import eliminate
 from hilcal.shown import Brief
 from hilcal.types import Floats
 
-ALLOWED = 2.0
+MOST_UNLOADED_MOTION = 2.0
 """Most displacement of unloaded readings by an effect, in units of the model's error there: other
 errors may hide as much again. A choice."""
 ROUNDING = 1e-9
@@ -65,10 +65,10 @@ LEAST_KEPT = 0.5  # share of a promise that must be kept; true effects of 3 σ k
 SAME_EVIDENCE = 3.0  # suspects whose evidence differs by less, e³ = 20 : 1, are inseparable
 FALSE_ALARM = 0.001
 """Probability of naming an effect where none is missing, over the whole catalogue."""
-LOST = 0.2
+MOST_EVIDENCE_LOST = 0.2
 """Share of its evidence that an effect may lose at plausible sizes. A choice: a prior that is too
 narrow by half costs a few units however strong the evidence is."""
-SURE = 3.1
+STANDARD_ERRORS = 3.1
 """Standard errors, from pose to pose, by which an effect of the load must lower the error on poses
 left out beside geometry: p = 0.001, since a dozen of them are tested."""
 
@@ -104,7 +104,7 @@ class Suspect(Brief):
     @property
     def sure(self) -> bool:
         """Whether the error on poses left out falls by more than it scatters from pose to pose."""
-        return not self.refuted and self.left_out().sure
+        return not self.refuted and self.left_out().significant
 
     @property
     def least(self) -> Strength:
@@ -185,44 +185,44 @@ def catalogue_columns(fit: Fit) -> tuple[Floats, dict[str, slice], dict[str, flo
     return (
         columns,
         dict(zip(names, map(slice, ends[:-1], ends[1:]), strict=True)),
-        {name: most(f, bare) for name, f in zip(names, families, strict=True)},
+        {name: largest_plausible(f, bare) for name, f in zip(names, families, strict=True)},
     )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Unloaded:
+class UnloadedReadings:
     """The unloaded readings of a campaign of deflections."""
 
     frames: Floats  # (K, F) orthonormal displacements by the frames
-    missed: float  # s, rms of their residual beside the frames, m
+    rms_m: float  # s, rms of their residual beside the frames, m
 
 
-def unloaded_readings(fit: Fit) -> Unloaded | None:
+def unloaded_readings(fit: Fit) -> UnloadedReadings | None:
     """Return the unloaded readings; None for absolute readings, which show all errors."""
     if fit.mode == "absolute":
         return None
     readings, model = fit.readings[~fit.outlier], fit.model
     rows, kinds = readings.unloaded, model.catalogue.with_role("registration", "target")
     frames = columns_of_each(fit, [kind(model.cell, readings.states) for kind in kinds])
-    columns = np.concatenate([frame.unloaded for frame in frames], axis=2)
+    columns = np.concatenate([frame.unloaded_motion for frame in frames], axis=2)
     u, s, _ = np.linalg.svd(columns.reshape(3 * int(rows.sum()), -1), full_matrices=False)
     u = u[:, s > ROUNDING * s.max(initial=0.0)]
     error = readings.value[:, :3] - fit.solution.prediction.observation.position
     y = error[rows].reshape(-1)
     missed = y - u @ (u.T @ y)
-    return Unloaded(u, float(np.sqrt(missed @ missed / max(len(y) - u.shape[1], 1))))
+    return UnloadedReadings(u, float(np.sqrt(missed @ missed / max(len(y) - u.shape[1], 1))))
 
 
-def most(family: EffectColumns, bare: Unloaded | None) -> float:
+def largest_plausible(family: EffectColumns, unloaded: UnloadedReadings | None) -> float:
     """Return the largest plausible strength of an effect, in ordinary magnitudes."""
     largest = family.effect.most()
-    if bare is None or family.effect.elastic:
+    if unloaded is None or family.effect.elastic:
         return largest
-    x = family.unloaded.reshape(-1, len(family.scale))
-    free = (x - bare.frames @ (bare.frames.T @ x)).ravel()
+    x = family.unloaded_motion.reshape(-1, len(family.scale))
+    free = (x - unloaded.frames @ (unloaded.frames.T @ x)).ravel()
     moved = float(np.sqrt(free @ free / len(x)))
-    limited = moved > ROUNDING * bare.missed
-    return min(largest, ALLOWED * bare.missed / moved) if limited else largest
+    limited = moved > ROUNDING * unloaded.rms_m
+    return min(largest, MOST_UNLOADED_MOTION * unloaded.rms_m / moved) if limited else largest
 
 
 def rank_suspects(
@@ -241,7 +241,7 @@ def rank_suspects(
         s = replace(s, explains=explains and s.holdout_share >= LEAST_SHARE)
         if s.passes:
             family = effect_columns(p.fit, effect)
-            if no_load and through_load(effect):
+            if no_load and acts_through_load(effect):
                 s = replace(s, refuted=not beyond_geometry(p, family, geometry()))
             if s.passes:
                 kept = kept_by_step(p, family, s.score)
@@ -252,7 +252,7 @@ def rank_suspects(
     return ranked(out)
 
 
-def addition(before: Fit, after: Fit) -> Suspect:
+def added_suspect(before: Fit, after: Fit) -> Suspect:
     """Return the last effect of a refit as a suspect of the gc-scaled fit before it."""
     p, effect = linearise(before), after.model.effects[-1]
     if effect.name in before.model.names:  # a finer form of it
@@ -295,7 +295,7 @@ def _scored(p: Linearisation, effects: Sequence[Effect]) -> Iterator[_Scored]:
     for families in columns_in_parts(p.fit, effects):
         scored = []
         for family, (s, g) in zip(families, p.families(families), strict=True):
-            of_s, largest = spectrum(s), most(family, bare)
+            of_s, largest = spectrum(s), largest_plausible(family, bare)
             scored.append(_Scored(family, s, of_s, g, largest, p.score_of(of_s, g, largest)))
         able = [c for c in scored if c.score.p_value < FALSE_ALARM and c.score.log_evidence > 0]
         held_out = iter(_left_out(p, [(c.family.white, c.score) for c in able]))
@@ -338,7 +338,9 @@ def _implausible(p: Linearisation, scored: _Scored) -> tuple[tuple[str, float, f
     if not bounded.bounded:
         return ()
     free = p.score_of(scored.spectrum, scored.gradient)
-    if free.log_evidence - bounded.log_evidence <= max(SAME_EVIDENCE, LOST * free.log_evidence):
+    if free.log_evidence - bounded.log_evidence <= max(
+        SAME_EVIDENCE, MOST_EVIDENCE_LOST * free.log_evidence
+    ):
         return ()
     units = np.array([q.unit for q in scored.family.effect.parameters])
 
@@ -376,7 +378,7 @@ def kept_by_step(p: Linearisation, family: EffectColumns, score: FamilyScore) ->
     return (fit.chi2 - exact) / max(fit.chi2 - linear, 1e-300)
 
 
-def through_load(effect: Effect) -> bool:
+def acts_through_load(effect: Effect) -> bool:
     """Whether an effect acts through loads or weights."""
     return effect.elastic or effect.load_change(np.zeros(len(effect.parameters))) is not None
 
@@ -415,7 +417,7 @@ def beyond_geometry(p: Linearisation, family: EffectColumns, geometry: Floats) -
         by_pose(fit, FamilyFolds(p.folds, p.projection, x).left_out(fit.white, 1.0, of_fit=True))
         for x in (both[:, :q], both)
     )
-    return improves(without, with_family, SURE)
+    return improves(without, with_family, STANDARD_ERRORS)
 
 
 def added_variable(fit: Fit, suspect: Suspect) -> tuple[Floats, Floats] | None:

@@ -13,7 +13,7 @@ fitted instead, the share
 
 remains, S_A|B the Schur complement of B: λ = βᵀ S_A|B β is the non-centrality of the test of A
 beyond B, as in planning. k times as many readings like these give k λ, and separate A from B when
-k λ reaches `NEEDED`.
+k λ reaches `SEPARATING_SQUARES`.
 
 Sufficiency. An effect outside the catalogue resembles effects of the catalogue: a base that sways
 with the air temperature looks like a drifting tracker. The best suspect then passes every test, and
@@ -46,8 +46,8 @@ from hilcal.diagnosis.noise import (
     PREDICTABLE,
     NoiseVerdict,
     PureError,
-    instrument_instead,
     judge_noise,
+    prefers_instrument,
     pure_error,
 )
 from hilcal.diagnosis.pose_alone import PoseAlone, pose_alone
@@ -77,20 +77,20 @@ from hilcal.regression.forward_selection import (
 from hilcal.regression.schur import schur_complement
 from hilcal.types import Floats
 
-MOST_INSTEAD = 3  # effects that are tried together in place of one; a choice
-PRICE = 1.0
+MOST_REPLACEMENTS = 3  # effects that are tried together in place of one; a choice
+PRICE_OF_EFFECT = 1.0
 """Evidence that each further effect costs: the data chose its strength, too; a guess."""
-NEEDED = 12.0
+SEPARATING_SQUARES = 12.0
 """Sum of squares, in σ², by which the right one of two suspects must fit better to be identified in
 nine cases of ten at odds of 20 : 1: the difference scatters by twice its square root."""
-ALIKE = 1e-3
+INSEPARABLE_SHARE = 1e-3
 """Share below which no number of readings like these separates two effects; a guess."""
 LEAST_REMAINDER = 0.02
 """Share of the misfit that must remain for the first suspect to be in doubt; set by the study of
 the diagnosis: effects outside the catalogue against hidden effects of the catalogue."""
 MOST_REFITS = 2
-MOST_TOGETHER = 6
-CHANCE = 0.01  # p-value above which an effect is redundant
+MOST_BY_ALGEBRA = 6
+REDUNDANCY_LEVEL = 0.01  # p-value above which an effect is redundant
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,25 +98,25 @@ class Alternative:
     """Other effects that could replace an effect of the model."""
 
     effect: str
-    own: float  # log evidence of the effect, against the model without it
+    effect_log_evidence: float  # log evidence of the effect, against the model without it
     same_as: tuple[str, ...]  # single effects that the readings do not separate from the effect
-    others: tuple[str, ...]  # effects that replace it together, in the order of their addition
+    replacements: tuple[str, ...]  # effects that replace it together, in the order of adding
     log_evidence: float  # of the others together
 
     @property
     def better(self) -> bool:
         """Whether the readings prefer the others, beyond doubt."""
-        return self.log_evidence > self.own + SAME_EVIDENCE
+        return self.log_evidence > self.effect_log_evidence + SAME_EVIDENCE
 
     @property
     def as_good(self) -> bool:
         """Whether the others explain as much as the effect."""
-        return self.log_evidence > self.own - SAME_EVIDENCE
+        return self.log_evidence > self.effect_log_evidence - SAME_EVIDENCE
 
     @property
     def inseparable(self) -> bool:
         """Whether the readings do not separate the effect from another, or from several."""
-        return bool(self.same_as) or (self.as_good and len(self.others) > 1)
+        return bool(self.same_as) or (self.as_good and len(self.replacements) > 1)
 
 
 class StepwiseAlternatives:
@@ -141,13 +141,13 @@ class StepwiseAlternatives:
         same: tuple[str, ...] = ()
         names: list[str] = []
         total = 0.0
-        for step in forward_selection(families.without(barred), MOST_INSTEAD):
+        for step in forward_selection(families.without(barred), MOST_REPLACEMENTS):
             if not names and evidence > SAME_EVIDENCE:
                 single = [(n, s.log_evidence) for n, s in step.scores.items()]
                 same = tuple(n for n, e in single if abs(e - evidence) < SAME_EVIDENCE < e)
             if step.score.log_evidence <= SAME_EVIDENCE:
                 break
-            total += step.score.log_evidence - (PRICE if names else 0.0)
+            total += step.score.log_evidence - (PRICE_OF_EFFECT if names else 0.0)
             names.append(step.name)
             if total > evidence + SAME_EVIDENCE:
                 break
@@ -159,13 +159,13 @@ class Separability:
     """How a rival differs from a suspect."""
 
     effect: str  # the rival
-    unlike: float  # u, the share of the suspect's sum of squares that the rival cannot explain
-    times: float  # k, factor of the number of readings that separates them; infinite for none
+    unexplained_share: float  # u, of the suspect's sum of squares, by the rival
+    readings_factor: float  # k, number of readings that separates them by that of the present
 
     @property
     def possible(self) -> bool:
         """Whether more readings like these would separate them."""
-        return bool(np.isfinite(self.times))
+        return bool(np.isfinite(self.readings_factor))
 
 
 def separability(
@@ -179,9 +179,10 @@ def separability(
     for name in lead.same_as:
         s = p.information(np.hstack([x, effect_columns(p.fit, by_name[name]).white]))
         total = float(beta @ s[np.ix_(of_lead, of_lead)] @ beta)
-        unlike = float(beta @ schur_complement(s, of_lead) @ beta) / max(total, 1e-300)
-        times = np.inf if unlike < ALIKE else NEEDED / max(unlike * total, 1e-300)
-        out.append(Separability(name, unlike, times))
+        share = float(beta @ schur_complement(s, of_lead) @ beta) / max(total, 1e-300)
+        squares = max(share * total, 1e-300)
+        factor = np.inf if share < INSEPARABLE_SHARE else SEPARATING_SQUARES / squares
+        out.append(Separability(name, share, factor))
     return tuple(out)
 
 
@@ -199,24 +200,24 @@ class Insufficiency:
 
 def whole_catalogue(fit: Fit) -> tuple[tuple[str, ...], float, float]:
     """Add all significant effects by algebra; return their names, best first, ‖r‖² and dof."""
-    families = beside_catalogue(fit, *catalogue_columns(fit))
+    families = catalogue_families(fit, *catalogue_columns(fit))
     steps = significant(families)
     last = steps[-1].after if steps else families
     return tuple(s.name for s in steps), last.rss, max(last.dof - last.spent, 1.0)
 
 
-def beside_catalogue(
-    fit: Fit, x: Floats, columns: dict[str, slice], most: dict[str, float]
+def catalogue_families(
+    fit: Fit, x: Floats, columns: dict[str, slice], largest: dict[str, float]
 ) -> CandidateFamilies:
     """Return the effects of `catalogue_columns` beside a fit."""
     p = linearise(fit)
-    return families_beside(p.information(x), p.residual, fit.dof, x, columns, most)
+    return families_beside(p.information(x), p.residual, fit.dof, x, columns, largest)
 
 
 def significant(families: CandidateFamilies) -> list[Addition]:
     """Return the additions that are significant, each beside the previous ones."""
     level = FALSE_ALARM / max(len(families.columns), 1)
-    steps = forward_selection(families, MOST_TOGETHER)
+    steps = forward_selection(families, MOST_BY_ALGEBRA)
     return list(takewhile(lambda s: s.score.log_evidence > 0 and s.score.p_value < level, steps))
 
 
@@ -298,7 +299,7 @@ class Evidence:
         return pose_alone(self.linearisation, self.effects, level)
 
     @cached_property
-    def by_arrivals(self) -> "Evidence | None":
+    def with_arm_scatter(self) -> "Evidence | None":
         """The evidence with the arm's estimated scatter in the covariance; None if not needed.
 
         The arm's scatter displaces all targets of one arrival together. Tests that treat these
@@ -308,7 +309,7 @@ class Evidence:
         in_covariance = readings.scatter_stated or readings.arm_scatter is not None
         if readings.states.target is None or in_covariance or not self.misfit:
             return None
-        if self.arm_scatter is None or instrument_instead(self.arm_scatter):
+        if self.arm_scatter is None or prefers_instrument(self.arm_scatter):
             return None
         scattered = with_arm_scatter(model.cell, readings, self.arm_scatter)
         fitted = fit(model, scattered, self.fit.mode, start=self.fit.theta)
@@ -317,7 +318,7 @@ class Evidence:
     @cached_property
     def redundant(self) -> tuple[str, ...]:
         """Effects of the model without which the readings are explained as well."""
-        return (*spoken_against(self.fit), *backward_elimination(self.fit))
+        return (*contradicted_effects(self.fit), *backward_elimination(self.fit))
 
     @cached_property
     def insufficiency(self) -> Insufficiency | None:
@@ -338,7 +339,7 @@ class Evidence:
             names.append(effects[0])
         regression = self._regressions.of(linearise(current))
         noise = judge_noise(current, pure_error(current), regression.share > PREDICTABLE)
-        if noise.misjudged or not noise.off:
+        if noise.misjudged or not noise.contradicted:
             return None
         return Insufficiency(
             effects=(*names, *effects),
@@ -349,9 +350,9 @@ class Evidence:
             noise=noise,
         )
 
-    def tree_share(self, beyond: float) -> float:
+    def tree_share(self, other_share: float) -> float:
         """Return the share of the misfit that trees predict; see `residual_regression`."""
-        return self._regressions.tree_share(self.linearisation, beyond)
+        return self._regressions.tree_share(self.linearisation, other_share)
 
     def alternatives(
         self, effects: Collection[str], excluded: Collection[str]
@@ -368,7 +369,7 @@ class Evidence:
 def backward_elimination(fit: Fit) -> dict[str, FamilyScore]:
     """Return the redundant effects, each scored against the model without it; weakest first.
 
-    Effects with a carried prior are left to `spoken_against`, those of a background to
+    Effects with a carried prior are left to `contradicted_effects`, those of a background to
     `background_evidence`.
     """
     carried = fit.solution.space.carried(fit.model.size)
@@ -382,11 +383,11 @@ def backward_elimination(fit: Fit) -> dict[str, FamilyScore]:
         return {}
     x = model_columns(fit)
     scores = {n: eliminate_effect(fit, x, n).score() for n in judged}
-    redundant = [n for n in judged if scores[n].p_value > CHANCE]
+    redundant = [n for n in judged if scores[n].p_value > REDUNDANCY_LEVEL]
     return {n: scores[n] for n in sorted(redundant, key=lambda n: -scores[n].p_value)}
 
 
-def spoken_against(fit: Fit) -> tuple[str, ...]:
+def contradicted_effects(fit: Fit) -> tuple[str, ...]:
     """Return effects whose carried prior the new readings contradict at 20 : 1, strongest first."""
     names = carried_effects(fit.model) if fit.scaling == "gc" else ()
     evidence = evidence_of_carried(fit.model, fit.solution, fit.whitening, names) if names else {}

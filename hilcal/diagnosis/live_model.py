@@ -22,9 +22,9 @@ from hilcal.readings.whitening import whitening
 from hilcal.regression.schur import inverse_root
 from hilcal.types import Floats
 
-LEAST = 8  # distinct poses from which a registration is estimated; a guess
+FEWEST_POSES = 8  # distinct poses from which a registration is estimated; a guess
 GROWTH = 1.15  # factor of the number of readings after which the model is fitted again; a guess
-ORDINARY = 3.0
+PRIOR_STD = 3.0
 """Prior standard deviation of every parameter, in units of its ordinary magnitude; a guess."""
 
 
@@ -98,14 +98,14 @@ class LiveModel:
         fitted, count = self._fitted, len(readings)
         loaded = bool(np.any(readings.states.wrench))
         stale = fitted is None or loaded != fitted.loaded or count > GROWTH * fitted.count
-        if stale and len(np.unique(distinct_poses(readings))) >= LEAST:
+        if stale and len(np.unique(distinct_poses(readings))) >= FEWEST_POSES:
             # Unloaded readings need compliant joints, too: the arm bends under its own weight.
             names = [kind.name for kind in installed().with_role("baseline")]
             model = with_effects(self._cell, readings, "absolute", names)
             w = whitening(readings, "absolute", "gc")
             solution = solve(model, readings, w)
             rms = float(np.sqrt(np.mean(np.sum(solution.raw[:, :3] ** 2, axis=1))))
-            scale, live = ORDINARY * scales_of(model), solution.live
+            scale, live = PRIOR_STD * scales_of(model), solution.live
             a = np.zeros((w.m * len(w), model.size))
             rows = whitened_jacobian(model, solution.prediction, solution.theta, w, live)
             a[:, live] = rows * scale[live]

@@ -171,7 +171,7 @@ class SuspectTests:
         scores: list[FamilyScore] = []
         able = [False] * y.shape[1]
         for k in range(len(able)):
-            c = score_family(self.s, g[:, k], float(rss[k]), p.fit.dof, most=self.largest)
+            c = score_family(self.s, g[:, k], float(rss[k]), p.fit.dof, largest=self.largest)
             scores.append(c)
             able[k] = c.p_value < self.level and c.log_evidence > 0
             failed = len(scores) - sum(able)

@@ -39,9 +39,9 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 DETERMINED = 1e-6  # least singular value of a direction, over the largest; below: rounding
-HELD = 1.0 - DETERMINED**2  # t from which the model has a direction already
+SPANNED = 1.0 - DETERMINED**2  # t from which the model has a direction already
 POLYNOMIAL = 3
-MANY = 4000  # degrees of freedom from which the families of joint angles are finer
+FINE_DOF = 4000  # degrees of freedom from which the families of joint angles are finer
 MOST_AT_ONCE = 8_000_000
 """Elements of the columns that are scored together, 64 MB; a choice."""
 
@@ -132,7 +132,7 @@ def _times(motions: Floats, basis: Floats) -> Floats:
 def _variables(p: Linearisation) -> Iterator[tuple[str, Floats, bool]]:
     """Yield name, functions (N, F), and whether both readings of a deflection contribute."""
     fit, situation = p.fit, p.fit.solution.prediction.situation
-    harmonics = np.arange(1, 3 if fit.dof < MANY else 7)
+    harmonics = np.arange(1, 3 if fit.dof < FINE_DOF else 7)
     for v in state_variables(p):
         if v.kind in ("angle", "travel"):
             phase = situation.angle[:, v.joint, None] * harmonics
@@ -218,7 +218,7 @@ def pose_constants(p: Linearisation) -> PoseConstants | None:
     shared = np.asarray(columns.T @ b) @ inverse_root.T @ (vectors * np.sqrt(np.abs(values)))
     t, turn = np.linalg.eigh(shared.T @ shared)
     shared = shared @ turn
-    rank = determined - int(np.count_nonzero(t >= HELD))
+    rank = determined - int(np.count_nonzero(t >= SPANNED))
     if rank <= 0 or fit.dof - rank <= 0:
         return None
     gain = _square(np.asarray(columns.T @ p.project_out(p.residual[:, None])), shared, t)
@@ -250,5 +250,5 @@ def _orthonormal(columns: Floats, pose: Ints) -> "tuple[csr_array, int]":
 def _square(z: Floats, shared: Floats, t: Floats) -> float:
     """Return zᵀ (1 − V Vᵀ)⁺ z, summed over the columns of z."""
     along = np.sum((shared.T @ z) ** 2, axis=1)
-    held = t >= HELD
+    held = t >= SPANNED
     return float(np.sum(z**2) + np.sum(along[~held] / (1.0 - t[~held])) - np.sum(along[held]))

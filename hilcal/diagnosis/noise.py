@@ -35,7 +35,7 @@ from scipy.stats import f as f_distribution
 
 from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE
 from hilcal.identification.fit import Fit
-from hilcal.identification.folds import connected, groups_within
+from hilcal.identification.folds import connected_groups, groups_within
 from hilcal.identification.residual import variance_interval
 from hilcal.model.observe import motion
 from hilcal.readings.readings import ArmScatter, Readings
@@ -48,10 +48,10 @@ SAME_ANGLE = 1e-6  # commanded joints of repeats agree within this, rad
 SAME_LOAD = 0.05  # wrenches of repeats agree within this share of the campaign's largest
 ROUNDING = 1e-9
 DRAWS = 600
-AT_ONCE = 1 << 22  # numbers that are drawn at a time, 32 MB; a choice
-CERTAIN = 0.003  # probability of naming a direction where all have the same factor
-FEWEST_ALONG = 8.0  # least degrees of freedom of a direction that is judged
-FEWEST = 10  # degrees of freedom below which pure error is not used; a guess
+DRAWN_AT_ONCE = 1 << 22  # numbers that are drawn at a time, 32 MB; a choice
+FALSE_ALARM = 0.003  # probability of naming a direction where all have the same factor
+FEWEST_DOF_OF_DIRECTION = 8.0  # least degrees of freedom of a direction that is judged
+FEWEST_DOF = 10  # degrees of freedom below which pure error is not used; a guess
 MISFIT_ALARM = 0.0005
 """Probability of calling a right variance factor wrong, on each side."""
 PREDICTABLE = 0.1
@@ -62,9 +62,9 @@ Guide CG 4, *Quantifying uncertainty in analytical measurement*, 3rd ed. 2012)."
 RP_PER_RMS = 2.09
 """Pose repeatability RP = mean + 3 S of the distances from their centre (ISO 9283, 7.2.2), in units
 of their rms, for an isotropic normal scatter."""
-INDUSTRIAL = 1e-4
+USUAL_REPEATABILITY_M = 1e-4
 """RP of an arm whose data sheet is not known, m: data sheets state 0.02 to 0.1 mm."""
-ELSEWHERE = 3.0
+MOST_SCATTER = 3.0
 """Most scatter of an arm in a campaign, in units of RP; a choice. RP is measured warm, at five
 poses in one cube, each approached from one side; a campaign uses all poses and sides."""
 
@@ -127,7 +127,7 @@ class NoiseVerdict:
         return self.reason in ("repeats", "too_large", "unknown")
 
     @property
-    def off(self) -> bool:
+    def contradicted(self) -> bool:
         """Whether χ² contradicts the stated noise."""
         return self.reason != "as_stated"
 
@@ -150,21 +150,21 @@ def judge_noise(fit: Fit, repeats: PureError | None, predictable: bool) -> Noise
 
 
 def stated_repeatability(arm: Arm) -> float:
-    """Return RP as the arm's maker states it, m, or else `INDUSTRIAL`."""
-    return INDUSTRIAL if arm.repeatability is None else arm.repeatability
+    """Return RP as the arm's maker states it, m, or else `USUAL_REPEATABILITY_M`."""
+    return USUAL_REPEATABILITY_M if arm.repeatability is None else arm.repeatability
 
 
-def of_repeatability_size(scatter: ArmScatter, arm: Arm) -> bool:
+def within_repeatability(scatter: ArmScatter, arm: Arm) -> bool:
     """Whether the repeatability of the arm allows the scatter."""
-    return RP_PER_RMS * scatter.size_m <= ELSEWHERE * stated_repeatability(arm)
+    return RP_PER_RMS * scatter.size_m <= MOST_SCATTER * stated_repeatability(arm)
 
 
-def instrument_instead(scatter: ArmScatter) -> bool:
+def prefers_instrument(scatter: ArmScatter) -> bool:
     """Whether the readings prefer, beyond doubt, an instrument that is noisier than stated."""
     return scatter.log_evidence < -SAME_EVIDENCE
 
 
-def separated(scatter: ArmScatter) -> bool:
+def separates_instrument(scatter: ArmScatter) -> bool:
     """Whether the readings distinguish the arm's scatter from a noisier instrument."""
     return abs(scatter.log_evidence) > SAME_EVIDENCE
 
@@ -172,7 +172,7 @@ def separated(scatter: ArmScatter) -> bool:
 def pure_error(fit: Fit) -> PureError | None:
     """Compare repeats; None where there are too few."""
     c = contrasts(fit)
-    if c is None or c.dof < FEWEST:
+    if c is None or c.dof < FEWEST_DOF:
         return None
     pure = float(c.y @ c.y) / c.bias
     lack = max(float(np.sum(c.whitening.whiten(fit.raw) ** 2)) / c.bias - pure, 0.0)
@@ -183,8 +183,8 @@ def pure_error(fit: Fit) -> PureError | None:
     overall = max(pure / c.dof, 1e-300)
     off = [
         v
-        for v in every_direction(fit, c)
-        if v.p_value < CERTAIN
+        for v in judge_directions(fit, c)
+        if v.p_value < FALSE_ALARM
         and (v.factor > overall) == (v.factor > 1)
         and abs(np.log(max(v.factor, 1e-300))) > abs(np.log(overall))
     ]
@@ -210,7 +210,7 @@ class Contrasts:
     y: Floats  # (r,) the part of the residual in the contrasts, free of nuisance
     nuisance: Floats  # (r, k) orthonormal columns of the differences between repeats
     bias: float  # factor by which estimated covariances make ‖y‖² too large
-    moves: Floats  # (N, m, n) motion of each reading by each joint, sensor axes
+    joint_motion: Floats  # (N, m, n) motion of each reading by each joint, sensor axes
 
     @property
     def dof(self) -> int:
@@ -218,7 +218,7 @@ class Contrasts:
         explained = sum(b.explained.shape[1] for b in self.blocks)
         return int(len(self.y) - explained - self.nuisance.shape[1])
 
-    def free(self, x: Floats) -> Floats:
+    def project_out(self, x: Floats) -> Floats:
         """Return the part of rows (r, ...) in the contrasts, free of nuisance."""
         x = _unexplained(self.blocks, x)
         return np.asarray(x - self.nuisance @ (self.nuisance.T @ x))
@@ -241,7 +241,7 @@ class Contrasts:
         return out
 
 
-def classes(readings: Readings) -> Ints:
+def repeat_classes(readings: Readings) -> Ints:
     """(N,) class of each reading: same joints, same load by name and wrench, same target."""
     s = readings.states
     parts = s.wrench[:, :3], s.wrench[:, 3:]
@@ -255,7 +255,7 @@ def classes(readings: Readings) -> Ints:
 def contrasts(fit: Fit) -> Contrasts | None:
     """Contrasts of the repeats of a fit; None where nothing was repeated."""
     readings = fit.readings[~fit.outlier]
-    kind = classes(readings)
+    kind = repeat_classes(readings)
     if len(np.unique(kind)) == len(kind):
         return None
     readings, bias = _pooled(readings, kind)
@@ -322,7 +322,7 @@ def _blocks(w: Whitening, kind: Ints) -> tuple[RepeatGroup, ...]:
     # Groups are joined if they share a class of measurements. They share no unloaded reading,
     # which would correlate them (see `whitening`).
     total = len(groups) + int(number.max()) + 1
-    joined = connected(owner, len(groups) + number, total)[: len(groups)]
+    joined = connected_groups(owner, len(groups) + number, total)[: len(groups)]
     ends = np.flatnonzero(np.diff(np.sort(joined))) + 1
     parts = np.split(np.argsort(joined, kind="stable"), ends)
     blocks = (_block([groups[k] for k in rows], number, w.m) for rows in parts)
@@ -389,16 +389,16 @@ def _differences(fit: Fit, readings: Readings, kind: Ints, moves: Floats) -> Flo
     return columns[:, :, np.any(columns, axis=(0, 1))]
 
 
-def every_direction(fit: Fit, c: Contrasts) -> list[NoiseWhere]:
+def judge_directions(fit: Fit, c: Contrasts) -> list[NoiseWhere]:
     """Judge all directions; p-values are corrected for their number."""
     directions = _directions(fit, c)
     rng = np.random.default_rng(20250301)
     rows = [np.flatnonzero(np.any(d != 0, axis=(1, 2))) for _, _, d in directions]
     square, size = np.zeros(1 + DRAWS), np.zeros((len(directions), 1 + DRAWS))
-    at_once = max(AT_ONCE // len(c.y), 1)
+    at_once = max(DRAWN_AT_ONCE // len(c.y), 1)
     for start in range(0, 1 + DRAWS, at_once):
         batch = slice(start, min(start + at_once, 1 + DRAWS))
-        drawn = c.free(rng.standard_normal((len(c.y), batch.stop - batch.start)))
+        drawn = c.project_out(rng.standard_normal((len(c.y), batch.stop - batch.start)))
         if start == 0:
             drawn[:, 0] = c.y
         square[batch], slopes = np.sum(drawn**2, axis=0), c.slopes(drawn)
@@ -411,7 +411,7 @@ def every_direction(fit: Fit, c: Contrasts) -> list[NoiseWhere]:
     for (kind, name, _), t in zip(directions, size, strict=True):
         mean, spread = float(t[1:].mean()), float(t[1:].std())
         dof = 2 * (mean / spread) ** 2 if mean > 0 else 0.0
-        if dof >= FEWEST_ALONG:
+        if dof >= FEWEST_DOF_OF_DIRECTION:
             factor = float(t[0]) / mean / c.bias
             low, high = (factor * dof / float(chi2.isf(q, dof)) for q in (0.025, 0.975))
             out.append(NoiseWhere(kind, name, factor, (low, high), _p(t / square)))
@@ -450,7 +450,10 @@ def _directions(fit: Fit, c: Contrasts) -> list[tuple[Kind, str, Floats]]:
         turned = np.zeros_like(root)
         turned[:, 3:] = root[:, 3:]
         out.append(("axis", "orientation", turned))
-    out += [("joint", f"joint {j + 1}", c.moves[:, :, [j]]) for j in range(c.moves.shape[2])]
+    out += [
+        ("joint", f"joint {j + 1}", c.joint_motion[:, :, [j]])
+        for j in range(c.joint_motion.shape[2])
+    ]
     loads = np.unique(readings.load)
     if len(loads) > 1:
         for load in loads:

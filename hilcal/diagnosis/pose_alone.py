@@ -7,9 +7,9 @@ The residual is split by constants of each pose, three displacements of the targ
 nearly all of the misfit and leave noise, those effects are listed whose columns are such constants
 to nearly all of their square. The parameters of a family can be separated once the poses measure
 about as many elements as the family has parameters. The proposed number of further poses is the
-smallest of `SHARES` at which the first of these effects, as large as the misfit, would pass every
-test of a suspect with the probability `SURE`, in campaigns simulated by algebra at the
-linearisation of the fit: with further unloaded readings within the range of the joints so far.
+smallest of `TRIED_SHARES` at which the first of these effects, as large as the misfit, would pass
+every test of a suspect with the probability `ENOUGH_POWER`, in campaigns simulated by algebra at
+the linearisation of the fit: with further unloaded readings within the range of the joints so far.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from hilcal.diagnosis.effect_ranking import FALSE_ALARM, most, unloaded_readings
+from hilcal.diagnosis.effect_ranking import FALSE_ALARM, largest_plausible, unloaded_readings
 from hilcal.diagnosis.minimum_detectable_effect import SuspectTests
 from hilcal.diagnosis.misfit_breakdown import pose_constants
 from hilcal.diagnosis.noise import MISFIT_ALARM
@@ -32,15 +32,15 @@ from hilcal.readings.readings import Readings
 from hilcal.regression.evidence import spectrum
 from hilcal.robot import se3
 
-LEAST = 0.9
+LEAST_SHARE = 0.9
 """Share of the misfit that pose constants must explain; a choice: they explain 0.99 of a
 transmission error of 2 σ."""
-ALIKE = 0.98
+SPANNED_SHARE = 0.98
 """Share of the square of an effect's columns that pose constants must explain for the effect to
 depend on the pose alone; a choice."""
 DRAWS = 24  # simulated campaigns per number of poses; a choice: 0.9 is known to 0.06
-SURE = 0.9  # probability at which poses are enough; a choice
-SHARES = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
+ENOUGH_POWER = 0.9  # probability at which poses are enough; a choice
+TRIED_SHARES = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
 """Tried numbers of further poses, in units of the number that would measure as many elements as the
 family has parameters. A choice."""
 _SEED = 20240613
@@ -63,8 +63,8 @@ class PosePower(NamedTuple):
 
     effect: str  # present with the size that explains the misfit
     rival: str  # in the model
-    now: float  # chance with the readings so far
-    then: float  # chance with further poses as well
+    power_now: float  # chance with the readings so far
+    power_then: float  # chance with further poses as well
 
 
 def pose_alone(
@@ -79,14 +79,14 @@ def pose_alone(
     fit, rank = p.fit, constants.rank
     remainder = p.rss - constants.gain
     share = p.share(constants.gain - rank * remainder / (fit.dof - rank))
-    if share < LEAST or float(chi2.sf(remainder, fit.dof - rank)) < MISFIT_ALARM:
+    if share < LEAST_SHARE or float(chi2.sf(remainder, fit.dof - rank)) < MISFIT_ALARM:
         return None
     able, states = [], fit.readings[~fit.outlier].states
     for e in (*(e for e in fit.model.effects if e.fine(states)), *effects):
         full = e.fine(states) or e
         x = p.project_out(effect_columns(fit, full).white)
         square = float(np.sum(x**2))
-        if square > 0 and constants.square(x) >= ALIKE * square:
+        if square > 0 and constants.square(x) >= SPANNED_SHARE * square:
             able.append((len(full.parameters), e))
     able.sort(key=lambda pair: -pair[0])
     poses = int(fit.pose.max()) + 1
@@ -97,10 +97,10 @@ def pose_alone(
     if first.name in fit.model.names:
         return PoseAlone(share, names, poses, missing, None)
     further, power = missing, 0.0
-    for part in SHARES:
+    for part in TRIED_SHARES:
         further = max(int(np.ceil(part * missing)), 1)
-        power = chance(p, first, further, level)
-        if power >= SURE:
+        power = detection_power(p, first, further, level)
+        if power >= ENOUGH_POWER:
             break
     return PoseAlone(share, names, poses, further, power)
 
@@ -122,7 +122,7 @@ def pose_powers(
             p = linearise(add(fit, rival))
         except HilcalError:
             continue
-        now, then = (chance(p, effect, n, level, strength) for n in (0, further))
+        now, then = (detection_power(p, effect, n, level, strength) for n in (0, further))
         yield PosePower(first, rival, now, then)
 
 
@@ -133,7 +133,7 @@ def strength_of(p: Linearisation, effect: Effect) -> float:
     return min(float(np.sqrt(p.misfit() / square)), full.most()) if square > 0.0 else 0.0
 
 
-def chance(
+def detection_power(
     p: Linearisation,  # of the fit so far
     effect: Effect,
     further: int,  # poses, read unloaded
@@ -154,7 +154,7 @@ def chance(
     signal = t * x @ rng.standard_normal((x.shape[1], DRAWS))
     y = signal + rng.standard_normal(signal.shape)
     s = spectrum(q.information(scored.white))
-    largest = most(scored, unloaded_readings(extended))
+    largest = largest_plausible(scored, unloaded_readings(extended))
     return float(np.mean(SuspectTests(q, scored, s, level, largest).passed(y)))
 
 

@@ -21,10 +21,10 @@ ROW_ORDER = "row order"
 ROUNDING = 1e-9  # least variation of a variable, as a share of its largest value
 HARMONICS = 4
 POWERS = 4
-WIDTH = 9
+LAW_COLUMNS = 9
 """Most columns of a law: functions of one joint, or three functions along three axes."""
 BINS = 8
-PER_MOTION = 1e-3
+ORDINARY_MOTION = 1e-3
 """An ordinary motion: 1 mrad of a joint, 1 mm of the target."""
 
 
@@ -143,7 +143,7 @@ def law_variables(p: Linearisation) -> list[RecordedVariable]:
             smooth(v, 0.0 if v.kind == "torque" else float(np.median(v.values)))
     loads = np.unique(readings.load)
     if len(loads) > 1:
-        member = (readings.load[:, None] == loads[:WIDTH]).astype(float)
+        member = (readings.load[:, None] == loads[:LAW_COLUMNS]).astype(float)
         names = tuple(readings.load_names[k] for k in loads)
         index = np.searchsorted(loads, readings.load).astype(float)
         out.append(RecordedVariable("load", "", index, member, None, names))
@@ -156,15 +156,17 @@ def motions(p: Linearisation) -> list[Floats]:
     drives = motion(fit.model.cell, s.observation, s.situation.chain, s.deviation, m).drives
     axes = np.zeros((len(drives), m, 3))
     axes[:, :3] = s.observation.axes
-    return [PER_MOTION * drives[:, :, [j]] for j in range(drives.shape[2])] + [PER_MOTION * axes]
+    return [ORDINARY_MOTION * drives[:, :, [j]] for j in range(drives.shape[2])] + [
+        ORDINARY_MOTION * axes
+    ]
 
 
 def law_columns(p: Linearisation, v: RecordedVariable, moves: Floats) -> Floats:
     """(R, WIDTH) whitened columns of a law with one of the `motions`, padded with zeros."""
     w = p.fit.whitening
-    functions = v.product()[:, : WIDTH // moves.shape[2]]
+    functions = v.product()[:, : LAW_COLUMNS // moves.shape[2]]
     raw = (moves[:, :, :, None] * functions[:, None, None, :]).reshape(*moves.shape[:2], -1)
-    out = np.zeros((w.m * len(w), WIDTH))
+    out = np.zeros((w.m * len(w), LAW_COLUMNS))
     out[:, : raw.shape[2]] = w.whiten(w.raw(raw)).reshape(len(out), -1)
     return out
 
@@ -181,7 +183,7 @@ def bins_of(v: RecordedVariable) -> tuple[Floats, Floats]:
     return bins.astype(float), np.array([v.values[bins == k].mean() for k in range(len(filled))])
 
 
-CLEAR = 0.85
+CLEAR_PROBABILITY = 0.85
 """Probability from which a difference is clear: that a random picked reading has a larger (or a
 smaller) value than a random one of the others. A choice."""
 
@@ -198,8 +200,8 @@ class Difference:
 
     @property
     def clear(self) -> bool:
-        """Whether the difference is worth naming, see `CLEAR`."""
-        return max(self.larger, 1 - self.larger) >= CLEAR
+        """Whether the difference is worth naming, see `CLEAR_PROBABILITY`."""
+        return max(self.larger, 1 - self.larger) >= CLEAR_PROBABILITY
 
 
 def recorded_values(fit: Fit) -> tuple[StateVariable, ...]:

@@ -20,7 +20,8 @@ left out of its training, the mean over all pairs of trees
 
 estimates the squared error of the infinitely large ensemble without bias, so few trees suffice.
 Trees are added until the standard error of the share by the choice of trees (jackknife) is
-`PRECISE`, or until they surely predict no more than without them (Student's t, `NO_MORE`).
+`PRECISION`, or until they surely predict no more than without them (Student's t,
+`STOP_CONFIDENCE`).
 
 Sources: Geurts, Ernst and Wehenkel, *Extremely randomized trees*, Machine Learning 63 (2006) 3-42,
 implementation of scikit-learn; Hoeffding, *A class of statistics with asymptotically normal
@@ -36,8 +37,8 @@ from scipy.special import stdtrit
 
 from hilcal.diagnosis.noise import PREDICTABLE
 from hilcal.diagnosis.recorded import (
-    PER_MOTION,
-    WIDTH,
+    LAW_COLUMNS,
+    ORDINARY_MOTION,
     RecordedVariable,
     bins_of,
     law_columns,
@@ -55,12 +56,12 @@ from hilcal.types import Bools, Floats, Ints
 FOLDS = 5
 TREES = 4  # trees added to a fold at a time; a choice
 MOST_TREES = 60
-PRECISE = 0.03
+PRECISION = 0.03
 """Standard error of the share by the choice of trees. A choice: a third of `PREDICTABLE`. With 60
 trees per fold it is 0.01 to 0.06 on campaigns of 50 poses."""
-NO_MORE = 0.99
+STOP_CONFIDENCE = 0.99
 """Confidence that trees predict no more than another predictor, at which no trees are added."""
-LEAF = 3
+LEAF_SIZE = 3
 MOST_MEASUREMENTS = 4000  # used by trees, for speed; a guess
 MOST_ROWS = 3000
 MOST_LAWS = 3
@@ -69,12 +70,13 @@ LEAST_EVIDENCE = 8.0
 """Gain in log evidence that a law needs, since many are tried; a guess."""
 STRENGTHS = np.logspace(-2, 3, 21)
 """Prior standard deviations that are tried: fewer than for effects, since laws are many."""
-SURE = 3.0
+STANDARD_ERRORS = 3.0
 """Standard errors, from pose to pose, by which laws must lower the error on poses left out; a
 choice: chance then finds a law in one campaign of a thousand."""
-LITTLE = 0.1  # share predicted by smooth laws below which trees are fitted as well; a guess
-AT_ONCE = 16  # laws whose columns are computed together; a choice by memory
-DETERMINED = 2.0
+SMALL_LAW_SHARE = 0.1
+"""Share predicted by smooth laws below which trees are fitted as well; a guess."""
+LAWS_AT_ONCE = 16  # laws whose columns are computed together; a choice by memory
+LEAST_SIGNAL_TO_NOISE = 2.0
 """Least ratio of a curve to its rms standard error; a choice: a smaller curve is largely error."""
 LEAST_RIDGE, LAW_RIDGE = 1e-6, 1e-3
 """Least ridge of the model's directions, since a part of the rows may not determine all; ridge of
@@ -98,8 +100,8 @@ class Dependence:
 
     @property
     def determined(self) -> bool:
-        """Whether the curve exceeds its standard error by the factor `DETERMINED`."""
-        return bool(np.sum(self.y**2) > DETERMINED**2 * np.sum(self.error**2))
+        """Whether the curve exceeds its standard error by the factor `LEAST_SIGNAL_TO_NOISE`."""
+        return bool(np.sum(self.y**2) > LEAST_SIGNAL_TO_NOISE**2 * np.sum(self.error**2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,7 +111,7 @@ class ResidualRegression:
     share: float  # of the misfit on poses left out, within [0, 1]
     dependences: tuple[Dependence, ...]  # variables that carry the share, largest first
     # whether laws lower the error by more than it scatters from pose to pose, whatever the noise
-    sure: bool = False
+    significant: bool = False
 
 
 class Regressions:
@@ -124,17 +126,17 @@ class Regressions:
         """Return the predictable share of the misfit, by laws or trees, and what carries it."""
         if p.fit not in self._of:
             smooth = smooth_laws(p)
-            if smooth.share < LITTLE:
+            if smooth.share < SMALL_LAW_SHARE:
                 smooth = replace(smooth, share=max(smooth.share, self.tree_share(p, smooth.share)))
             self._of[p.fit] = smooth
         return self._of[p.fit]
 
-    def tree_share(self, p: Linearisation, beyond: float) -> float:
+    def tree_share(self, p: Linearisation, other_share: float) -> float:
         """Cached `tree_share`."""
         shares = self._trees.setdefault(p.fit, {})
-        if beyond not in shares:
-            shares[beyond] = tree_share(p, beyond)
-        return shares[beyond]
+        if other_share not in shares:
+            shares[other_share] = tree_share(p, other_share)
+        return shares[other_share]
 
 
 def residual_regression(p: Linearisation) -> ResidualRegression:
@@ -169,7 +171,7 @@ class _Laws:
 
     def at(self, rows: Bools) -> Floats:
         """(R', L, WIDTH) columns of all laws in some of the rows."""
-        out = np.empty((int(rows.sum()), len(self.variable), WIDTH))
+        out = np.empty((int(rows.sum()), len(self.variable), LAW_COLUMNS))
         for law in range(len(self.variable)):
             out[:, law] = self.columns(law)[rows]
         return out
@@ -181,7 +183,7 @@ class _Laws:
 
     def without(self, f: int, chosen: list[int]) -> tuple[Floats, list[Floats]]:
         """Model step (K,) and coefficients of the chosen laws, refitted without a fold."""
-        rows, size, width = self._fold != f, len(self.ridge), WIDTH * len(chosen)
+        rows, size, width = self._fold != f, len(self.ridge), LAW_COLUMNS * len(chosen)
         h = np.empty((size + width, size + width))
         h[:size, :size] = sum(self._grams) - self._grams[f] + np.diag(self.ridge)
         b = np.concatenate([sum(self._sides) - self._sides[f], np.zeros(width)])
@@ -192,7 +194,7 @@ class _Laws:
             h[size:, size:] = x.T @ x + LAW_RIDGE * np.eye(width)
             b[size:] = x.T @ self._p.fit.white[rows]
         step = positive_solve(h, b)
-        return step[:size], list(step[size:].reshape(-1, WIDTH))
+        return step[:size], list(step[size:].reshape(-1, LAW_COLUMNS))
 
 
 def smooth_laws(p: Linearisation) -> ResidualRegression:
@@ -231,7 +233,7 @@ def smooth_laws(p: Linearisation) -> ResidualRegression:
     square = float(without @ without)
     misfit = max(square - w.rank, 3 * np.sqrt(2 * w.rank))
     share = float(np.clip((square - float(with_laws @ with_laws)) / misfit, 0.0, 1.0))
-    sure = improves(by_pose(p.fit, without), by_pose(p.fit, with_laws), SURE)
+    sure = improves(by_pose(p.fit, without), by_pose(p.fit, with_laws), STANDARD_ERRORS)
     return ResidualRegression(share, _dependences(p, laws, lost, share), sure)
 
 
@@ -257,14 +259,14 @@ def _best(p: Linearisation, laws: _Laws, numbers: list[int]) -> int:
     """Number of the law with the largest evidence on all rows."""
     grams, slopes = [], []
     solved = p.projection.solve(p.rows.T @ p.residual)
-    for start in range(0, len(numbers), AT_ONCE):
-        x = np.stack([laws.columns(law) for law in numbers[start : start + AT_ONCE]], axis=1)
+    for start in range(0, len(numbers), LAWS_AT_ONCE):
+        x = np.stack([laws.columns(law) for law in numbers[start : start + LAWS_AT_ONCE]], axis=1)
         flat = x.reshape(len(x), -1)
         product = p.rows.T @ flat
         lifted = (p.projection.inverse_root @ product).reshape(-1, *x.shape[1:])
         blocks, explained = x.transpose(1, 2, 0), lifted.transpose(1, 2, 0)
         grams.append(blocks @ blocks.transpose(0, 2, 1) - explained @ explained.transpose(0, 2, 1))
-        slopes.append((flat.T @ p.residual - product.T @ solved).reshape(-1, WIDTH))
+        slopes.append((flat.T @ p.residual - product.T @ solved).reshape(-1, LAW_COLUMNS))
     gram, slope = np.concatenate(grams), np.concatenate(slopes)
     return numbers[int(np.argmax(block_evidence(gram, slope, p.rss, p.fit.dof, STRENGTHS)))]
 
@@ -294,8 +296,8 @@ def _curve(
         moves=f"joint {number + 1}" if joint else "target",
         direction=direction,
         x=x,
-        y=PER_MOTION * (y - y.mean()),
-        error=PER_MOTION * error,
+        y=ORDINARY_MOTION * (y - y.mean()),
+        error=ORDINARY_MOTION * error,
         y_unit=p.fit.model.cell.arm.unit(number) if joint else "m",
         labels=v.labels,
     )
@@ -311,13 +313,13 @@ def _least_squares(p: Linearisation, x: Floats) -> tuple[Floats, Floats]:
     return y, np.asarray(inverse * max(variance, 1e-300))
 
 
-def tree_share(p: Linearisation, beyond: float = 0.0) -> float:
+def tree_share(p: Linearisation, other_share: float = 0.0) -> float:
     """Return the share of the misfit that trees predict on poses left out, within [0, 1].
 
-    A share below `beyond`, which is predicted without trees, is less precise; it is 0 where no more
-    than `PREDICTABLE` remains beyond it.
+    A share below `other_share`, which is predicted without trees, is less precise; it is 0 where no
+    more than `PREDICTABLE` remains beyond it.
     """
-    if beyond >= 1.0 - PREDICTABLE:
+    if other_share >= 1.0 - PREDICTABLE:
         return 0.0
     fit, w = p.fit, p.fit.whitening
     std = np.sqrt(np.trace(w.covariance[:, :3, :3], axis1=1, axis2=2) / 3)
@@ -341,7 +343,7 @@ def tree_share(p: Linearisation, beyond: float = 0.0) -> float:
         axis=1,
     )
     fold, scale = random_folds(fit.pose, FOLDS)[chosen], p.rss / p.misfit()
-    share = predicted(features[chosen], target[chosen], fold, scale, beyond).share
+    share = predict_by_trees(features[chosen], target[chosen], fold, scale, other_share).share
     return float(np.clip(share, 0.0, 1.0))
 
 
@@ -354,12 +356,12 @@ class TreePrediction:
     trees: int  # per fold
 
 
-def predicted(
+def predict_by_trees(
     features: Floats,  # (D, F)
     target: Floats,  # (D, K)
     fold: Ints,  # (D,) fold of each row, from 0; with one fold nothing is predicted
-    scale: float = 1.0,  # factor of the share; `PRECISE` holds for the product
-    beyond: float = 0.0,  # share below which the precision does not matter
+    scale: float = 1.0,  # factor of the share; `PRECISION` holds for the product
+    other_share: float = 0.0,  # share below which the precision does not matter
 ) -> TreePrediction:
     """Return the share of ‖target‖² that trees predict in rows left out."""
     total = float(np.sum(target**2))
@@ -378,7 +380,7 @@ def predicted(
         with sklearn.config_context(skip_parameter_validation=True):
             for f, (rows, x_train, y_train) in enumerate(folds):
                 seed = MOST_TREES * f + number
-                tree = ExtraTreeRegressor(min_samples_leaf=LEAF, random_state=seed)
+                tree = ExtraTreeRegressor(min_samples_leaf=LEAF_SIZE, random_state=seed)
                 tree.fit(x_train, y_train, check_input=False)
                 error[rows] -= tree.predict(x[rows], check_input=False).reshape(error[rows].shape)
         return np.asarray(error.reshape(-1))
@@ -388,8 +390,8 @@ def predicted(
         of_trees = np.concatenate([of_trees, [errors(len(of_trees) + k) for k in range(TREES)]])
         square, std = _mean_of_pairs(of_trees @ of_trees.T)
         share, std, count = scale * (1.0 - square / total), scale * std / total, len(of_trees)
-        no_more = share + std * float(stdtrit(count - 1, NO_MORE)) < beyond
-        if std <= PRECISE or no_more or count >= MOST_TREES:
+        no_more = share + std * float(stdtrit(count - 1, STOP_CONFIDENCE)) < other_share
+        if std <= PRECISION or no_more or count >= MOST_TREES:
             return TreePrediction(share, std, count)
 
 

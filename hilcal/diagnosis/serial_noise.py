@@ -47,31 +47,35 @@ from hilcal.readings.whitening import arrival_groups, deflection_groups, runs
 from hilcal.regression.schur import inverse_root
 from hilcal.types import Floats, Ints
 
-CHANCE = 8.0
+LEAST_GAIN = 8.0
 """Gain of the restricted log likelihood that is more than chance, p = 0.0002 by the mixture of χ²
 with one and two degrees of freedom (Self and Liang, JASA 82 (1987) 605), on two clocks."""
-AGAINST = 6.0
+CONTRADICTING_GAIN = 6.0
 """Gain of the restricted log likelihood by a free σ² that contradicts σ² = 1: that of
 `noise.MISFIT_ALARM`."""
-SUSPECT = 0.5 * CHANCE
+LEAST_PROMISE = 0.5 * LEAST_GAIN
 """Gain that slope and curvature at white noise must promise for the full computation; a choice: the
 promise is good to a third."""
-SIZES = (1.0, 10.0, 100.0)  # tried variances of a rival, in units of the noise's; a choice
-LEAD = 2.0
-"""Factor by which the gain of a rival at one of `SIZES` must exceed that of serial noise at
-`STARTS` to explain the readings far better; a choice, rough but fast to test."""
-FEWEST = 12  # readings below which nothing is estimated; a choice
+RIVAL_VARIANCES = (1.0, 10.0, 100.0)
+"""Tried variances of a rival, in units of the noise's; a choice."""
+RIVAL_FACTOR = 2.0
+"""Factor by which the gain of a rival at one of `RIVAL_VARIANCES` must exceed that of serial noise
+at `STARTS` to explain the readings far better; a choice, rough but fast to test."""
+FEWEST_READINGS = 12  # readings below which nothing is estimated; a choice
 MOST_READINGS = 600  # measurements above which nothing is estimated; a choice by timing
-POSITION = 3  # elements of a reading that are used: the noise of orientation follows the position's
+POSITION_ELEMENTS = 3
+"""Elements of a reading that are used: the noise of orientation follows the position's."""
 MOST_ROWS = 450
 """Rows used at most, for speed; a choice: 150 readings determine ρ to 0.05."""
-PIECE = 50  # measurements in each run that is used of a large campaign; a choice
-LEAST, MOST = np.exp(-12.0), np.exp(12.0)  # bounds of v_f: none, and far more than noise
+RUN_LENGTH = 50  # measurements in each run that is used of a large campaign; a choice
+LEAST_VARIANCE, MOST_VARIANCE = np.exp(-12.0), np.exp(12.0)
+"""Bounds of v_f: none, and far more than noise."""
 MOST_SHARE = 0.999  # bound of φ; with it every covariance has an inverse
 ROUNDING = 1e-9
 """Least variance, in units of the noise, and least information, as a share of the mean."""
 MOST_NAMED = 2  # rivals that are named
-SOME = 0.01  # mean variance from which a rival is named, in units of the noise's; a choice
+NAMED_VARIANCE = 0.01
+"""Mean variance from which a rival is named, in units of the noise's; a choice."""
 SHARE_STEP, LENGTH_STEP = 0.02, 0.05  # steps of φ and log τ for the curvature
 STARTS = (0.3, 0.8, 0.97)  # values of ρ from which the likelihood is maximised
 
@@ -92,10 +96,10 @@ def with_serial_noise(white: Fit, prior: Floats | None = None) -> Fit:
 
 def serial_noise(white: Fit) -> SerialNoise | None:
     """Estimate the serial noise of a gc-scaled fit with white noise; None where there is none."""
-    if white.scaling != "gc" or not FEWEST <= len(white.raw) <= MOST_READINGS:
+    if white.scaling != "gc" or not FEWEST_READINGS <= len(white.raw) <= MOST_READINGS:
         return None
     by_order = _problem(white, "order")
-    if by_order is None or by_order.promise() < SUSPECT:
+    if by_order is None or by_order.promise() < LEAST_PROMISE:
         return None
     names, rivals = by_order.rivals()
     if by_order.outdone(rivals):
@@ -107,19 +111,19 @@ def serial_noise(white: Fit) -> SerialNoise | None:
         if timed.value >= alone.value:
             problem, alone = by_time, timed
             names, rivals = problem.rivals()
-    if alone.value - problem.maximised(problem.none, serial=False).value < CHANCE:
+    if alone.value - problem.maximised(problem.none, serial=False).value < LEAST_GAIN:
         return None
     effects = problem.maximised(rivals, serial=False)
     both = problem.maximised(rivals, serial=True, start=effects)
     gain = both.value - effects.value
-    if gain >= CHANCE or alone.value - effects.value >= SAME_EVIDENCE:
+    if gain >= LEAST_GAIN or alone.value - effects.value >= SAME_EVIDENCE:
         # Needless variances of rivals would absorb a part of the noise.
         needed = both.value - alone.value >= SAME_EVIDENCE
         return problem.noise(*((both, rivals) if needed else (alone, problem.none)), gain)
     if effects.value - alone.value >= SAME_EVIDENCE:
         return None
     largest = np.argsort(-effects.v)[:MOST_NAMED]
-    instead = tuple(names[k] for k in largest if effects.v[k] > SOME)
+    instead = tuple(names[k] for k in largest if effects.v[k] > NAMED_VARIANCE)
     return replace(problem.noise(alone, problem.none, gain), proved=False, instead=instead)
 
 
@@ -189,24 +193,26 @@ class _SerialProblem:
         readings, p = self.fit.readings[~self.fit.outlier], self.fit.solution.prediction
 
         def of_columns(x: Floats) -> Floats:
-            white = self.difference @ x[:, :POSITION].reshape(-1, x.shape[2])
+            white = self.difference @ x[:, :POSITION_ELEMENTS].reshape(-1, x.shape[2])
             return np.asarray(white @ white.T)
 
         for columns in columns_of_each(self.fit, candidates(self.fit)):
-            yield columns.effect.name, of_columns(columns.of_readings[self.rows])
+            yield columns.effect.name, of_columns(columns.motion_of_readings[self.rows])
         time = readings.states.time
         t = np.arange(len(readings), dtype=float) if time is None else time
         scaled = 2 * (t - t.min()) / max(float(np.ptp(t)), 1e-300) - 1
         chain = p.situation.chain
-        moves = motion(self.fit.model.cell, p.observation, chain, p.deviation, POSITION)
+        moves = motion(self.fit.model.cell, p.observation, chain, p.deviation, POSITION_ELEMENTS)
         for motions in (moves.drives, p.observation.axes):
             powers = [motions * scaled[:, None, None] ** k for k in (1, 2, 3)]
             yield "the time", of_columns(np.concatenate(powers, axis=2)[self.rows])
         arrival = readings.arrivals[self.rows]
         together = arrival[:, None] == arrival
         if not readings.scatter_stated and together.sum() > len(arrival):
-            flat = moves.drives[self.rows].reshape(len(arrival) * POSITION, -1)
-            scatter = (flat @ flat.T) * np.kron(together, np.ones((POSITION, POSITION)))
+            flat = moves.drives[self.rows].reshape(len(arrival) * POSITION_ELEMENTS, -1)
+            scatter = (flat @ flat.T) * np.kron(
+                together, np.ones((POSITION_ELEMENTS, POSITION_ELEMENTS))
+            )
             yield "the arm's scatter", self.difference @ scatter @ self.difference.T
         pose = readings.pose[self.rows]
         yield "the pose", self.correlated((pose[:, None] == pose).astype(float))
@@ -246,7 +252,7 @@ class _SerialProblem:
         bounds = [
             (0.0, MOST_SHARE if serial else 0.0),
             (np.log(0.2 * step), np.log(2.0 * span)),
-            *[(np.log(LEAST), np.log(MOST))] * count,
+            *[(np.log(LEAST_VARIANCE), np.log(MOST_VARIANCE))] * count,
         ]
         best = minimize(objective, x, jac=True, bounds=bounds, method="L-BFGS-B")
         share, length = float(best.x[0]), float(np.exp(best.x[1]))
@@ -320,13 +326,13 @@ class _SerialProblem:
 
         white = value()
         serial = max(value(0.5, rho) for rho in STARTS)
-        rival = max(value(size=size) for size in SIZES)
-        return rival - white >= LEAD * max(serial - white, 0.0) + CHANCE + SAME_EVIDENCE
+        rival = max(value(size=size) for size in RIVAL_VARIANCES)
+        return rival - white >= RIVAL_FACTOR * max(serial - white, 0.0) + LEAST_GAIN + SAME_EVIDENCE
 
     def noise(self, free: _SerialPoint, rivals: Floats, gain: float) -> SerialNoise:
         """Return the estimate from the maximum with free σ²; uncertainties by curvature of ℓ."""
         point = self.maximised(rivals, serial=True, start=free, stated=True)
-        stated = free.value - point.value < AGAINST
+        stated = free.value - point.value < CONTRADICTING_GAIN
         point = point if stated else free
         share = min(point.share, MOST_SHARE - SHARE_STEP)
 
@@ -353,14 +359,14 @@ class _SerialProblem:
 
 def _problem(white: Fit, clock: Clock) -> _SerialProblem | None:
     """Form the rows of the likelihood; None where t, covariance or their number forbid it."""
-    readings, m = white.readings, POSITION
+    readings, m = white.readings, POSITION_ELEMENTS
     t = readings.states.time if clock == "time" else np.arange(len(readings), dtype=float)
     assert t is not None  # noqa: S101 - the caller's condition
     along, t = replace(readings, along=t)[~white.outlier], t[~white.outlier]
     if np.ptp(t) == 0:
         return None
     groups = (deflection_groups if white.mode == "deflection" else arrival_groups)(along)
-    pieces = runs(along, groups, PIECE)  # of which evenly spaced ones, with `MOST_ROWS`, are used
+    pieces = runs(along, groups, RUN_LENGTH)  # of these `MOST_ROWS`, evenly spaced, are used
     share = min(MOST_ROWS / (m * sum(p[0].size for p in pieces)), 1.0)
     spaced = np.linspace(0, len(pieces) - 1, max(int(len(pieces) * share), 1))
     chosen = [pieces[k] for k in spaced.astype(int)]

@@ -33,7 +33,7 @@ surely predict the residual on poses left out.
 
 If several targets are read in one arrival, the arm's scatter is not stated and χ² is too large, the
 rules are applied to the fit with the estimated scatter in its covariance (see
-`Evidence.by_arrivals`), and 3 becomes 5b or 5c.
+`Evidence.with_arm_scatter`), and 3 becomes 5b or 5c.
 
 The covariance of a judged fit includes a correlation of the noise along the order of the readings
 (see `serial_noise`). If it is not proved, since effects explain the readings as well, 3 and 5c
@@ -55,7 +55,7 @@ import numpy as np
 
 from hilcal import limits
 from hilcal.diagnosis.background_evidence import (
-    TOGETHER,
+    JOINT_LEVEL,
     BackgroundEffect,
     as_suspects,
     p_value_of_others,
@@ -66,25 +66,25 @@ from hilcal.diagnosis.evidence import Evidence, Separability, separability
 from hilcal.diagnosis.misfit_breakdown import MisfitShare
 from hilcal.diagnosis.noise import (
     PREDICTABLE,
-    instrument_instead,
     judge_noise,
-    of_repeatability_size,
+    prefers_instrument,
+    within_repeatability,
 )
 from hilcal.diagnosis.residual_regression import ResidualRegression
 from hilcal.identification.fit import Fit
 
-NOTHING = History()
+NO_HISTORY = History()
 IN_SAMPLE = ("pose", "direction")  # first words of variables whose share is of the fitted poses
 MOST_NAMED = 2  # variables that a sentence names
-BESIDE_A_BACKGROUND = ("residual_is_noise", "inseparable_addition", "arm_scatter")
+BACKGROUND_OVERRIDES = ("residual_is_noise", "inseparable_addition", "arm_scatter")
 """Reasons that "background" overrides where effects are proved together, not one by one."""
-SAME_IN_POSE = 0.5
+MOST_POSE_SHARE = 0.5
 """Share of the misfit that all readings of a pose have in common, above which it is not the scatter
 of single arrivals; a choice."""
 
 
 def diagnose(
-    fit: Fit, history: History = NOTHING, say: Callable[[str], None] = lambda text: None
+    fit: Fit, history: History = NO_HISTORY, say: Callable[[str], None] = lambda text: None
 ) -> Diagnosis:
     """Judge a fit, reached by the changes of `history`; `say` takes progress, one line each.
 
@@ -145,14 +145,14 @@ def judge(e: Evidence, history: History) -> Diagnosis:
 
 def _with_arrivals(e: Evidence, history: History) -> Diagnosis:
     """Judge; with the arm's scatter in the covariance where readings of one arrival share it."""
-    if e.by_arrivals is None or e.arm_scatter is None:
+    if e.with_arm_scatter is None or e.arm_scatter is None:
         return _judged(e, history)
-    d = _judged(e.by_arrivals, history)
+    d = _judged(e.with_arm_scatter, history)
     scatter = replace(e.arm_scatter, predicted_share=d.predictable_share, predicted_by=d.follows)
     d = replace(d, fit=e.fit, scatter=scatter)
     if d.reason != "residual_is_noise":
         return d
-    plausible = of_repeatability_size(scatter, e.fit.model.cell.arm)
+    plausible = within_repeatability(scatter, e.fit.model.cell.arm)
     noise = judge_noise(e.fit, e.pure_error, False)
     return replace(d, reason="arm_scatter" if plausible else "misjudged_noise", noise=noise)
 
@@ -180,7 +180,7 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
         follows = _carrying(regression)
     else:
         # Noise that was estimated while an effect is missing is too large to show the effect.
-        hidden = not readings.noise_stated and e.regression.sure
+        hidden = not readings.noise_stated and e.regression.significant
         regression = e.regression if e.misfit or hidden else ResidualRegression(0.0, ())
         significant = _significant(e.misfit_breakdown)
         follows = _carrying(regression) or tuple(v.variable for v in significant)
@@ -198,15 +198,15 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
         in_fit = readings.arm_scatter is not None
         little = noise.reason == "predictable" and max(predicted, *patterns, 0.0) <= PREDICTABLE
         same_in_pose = any(
-            v.variable == "pose" and v.share > SAME_IN_POSE and v.p_value < FALSE_ALARM
+            v.variable == "pose" and v.share > MOST_POSE_SHARE and v.p_value < FALSE_ALARM
             for v in e.misfit_breakdown
         )
         may = e.misfit and (noise.misjudged or little) and not in_fit and not same_in_pose
         estimate = e.arm_scatter if may and not readings.scatter_stated else None
         by_arm = (
             estimate is not None
-            and not instrument_instead(estimate)
-            and of_repeatability_size(estimate, arm)
+            and not prefers_instrument(estimate)
+            and within_repeatability(estimate, arm)
         )
         if estimate is not None and (by_arm or noise.misjudged):
             names = follows[:MOST_NAMED]
@@ -217,7 +217,7 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
             reason = "arm_scatter"
         elif noise.misjudged and not (in_fit and noise.reason == "too_large"):
             reason = "misjudged_noise"
-        elif noise.off and not noise.misjudged:
+        elif noise.contradicted and not noise.misjudged:
             reason = "no_suspect"
         else:
             in_doubt = any(a.inseparable for a in e.alternatives(added, history.removed))
@@ -227,7 +227,7 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
             reason = "serial_or_effect"
         if e.background and (
             reason == "misjudged_noise"
-            or (reason in BESIDE_A_BACKGROUND and p_value_of_others(e.fit) <= TOGETHER)
+            or (reason in BACKGROUND_OVERRIDES and p_value_of_others(e.fit) <= JOINT_LEVEL)
         ):
             reason, suspects = "background", (*as_suspects(e.background), *suspects)
     alone = None

@@ -26,21 +26,21 @@ FigureKind = Literal["load", "tool_mass", "tool_com"]
 LEAST_SHARE = 0.8
 """Share of the misfit that a wrong figure must explain; a choice: ordinary effects may explain the
 remainder."""
-MOST_LEFT = 0.7
+MOST_REMAINING = 0.7
 """Share of χ² that may remain where the noise was estimated, so that χ² shows no misfit."""
-MARGIN = 10.0
+BIC_MARGIN = 10.0
 """Difference of the criterion within which other figures are named beside the best one; very strong
 evidence (Kass and Raftery, *Bayes factors*, J. Am. Stat. Assoc. 90 (1995) 773)."""
-PROMISING = 0.2  # share of χ² that the first step must promise for a refit; a choice
-AS_PROMISING = 0.5  # the same, as a share of the largest promise
-STEPS = 5  # most refits of a figure; a choice, two or three are usual
-SMALL = 1.0  # largest step that needs no further refit, in units of `STEP`
-OFF = {"load": 1.2, "tool_mass": 1.3}
+LEAST_PROMISE = 0.2  # share of χ² that the first step must promise for a refit; a choice
+LEAST_RELATIVE_PROMISE = 0.5  # the same, as a share of the largest promise
+MOST_STEPS = 5  # most refits of a figure; a choice, two or three are usual
+SMALL_STEP = 1.0  # largest step that needs no further refit, in units of `DERIVATIVE_STEP`
+MISTAKE_FACTOR = {"load": 1.2, "tool_mass": 1.3}
 """Factor from which a mass is a mistake; choices: scales are more accurate, guesses are not."""
-LARGEST = 0.5  # most of a mass that one step removes, as a share; a step trebles it at most
-HANGS = 0.999  # cosine to gravity from which a force is a weight
-OFF_M = 0.02  # shift from which a centre of mass is a mistake, m; a choice
-STEP: dict[FigureKind, float] = {"load": 1e-2, "tool_mass": 1e-1, "tool_com": 1e-2}
+LARGEST_STEP = 0.5  # most of a mass that one step removes, as a share; a step trebles it at most
+WEIGHT_COSINE = 0.999  # cosine to gravity from which a force is a weight
+MISTAKE_M = 0.02  # shift from which a centre of mass is a mistake, m; a choice
+DERIVATIVE_STEP: dict[FigureKind, float] = {"load": 1e-2, "tool_mass": 1e-1, "tool_com": 1e-2}
 """Steps of the derivatives: relative for wrench and mass, m for the centre of mass."""
 
 
@@ -81,7 +81,7 @@ class _Figure:
 
     def columns(self, stated: Fit, near: Prediction) -> Floats:
         """(R, k) whitened derivatives of the measurements by the figure, near a prediction."""
-        fitted, w, h = ~stated.outlier, stated.whitening, STEP[self.kind]
+        fitted, w, h = ~stated.outlier, stated.whitening, DERIVATIVE_STEP[self.kind]
         readings = stated.readings[fitted]
         out = []
         for change in h * np.eye(self.size):
@@ -119,24 +119,24 @@ class _Figure:
             CannotAnswerError: no equilibrium with the changed figure.
         """
         change, refit = np.zeros(self.size), stated
-        for _ in range(STEPS):
+        for _ in range(MOST_STEPS):
             if self.kind == "tool_com":
                 change = change + step
             else:  # no mass changes its sign
-                change = (1.0 + change) * (1.0 + np.clip(step, -LARGEST, 2.0)) - 1.0
+                change = (1.0 + change) * (1.0 + np.clip(step, -LARGEST_STEP, 2.0)) - 1.0
             changed = self.applied(stated, change)
             refit = fit(changed.model, changed.readings, stated.mode, start=refit.theta)
             step, _ = self.step(refit)
-            if np.abs(step).max() < SMALL * STEP[self.kind]:
+            if np.abs(step).max() < SMALL_STEP * DERIVATIVE_STEP[self.kind]:
                 break
         return change, refit
 
     def mistaken(self, change: Floats) -> bool:
         """Whether a change (k,) is too large for rounding."""
         if self.kind == "tool_com":
-            return float(np.linalg.norm(change)) > OFF_M
+            return float(np.linalg.norm(change)) > MISTAKE_M
         factor = 1.0 + float(change[0])
-        return max(factor, 1.0 / factor) > OFF[self.kind]
+        return max(factor, 1.0 / factor) > MISTAKE_FACTOR[self.kind]
 
     def named(self, stated: Fit, change: Floats, refit: Fit) -> WrongFigure:
         """Return the figure as stated and as changed by (k,), with the errors of both fits."""
@@ -149,7 +149,7 @@ class _Figure:
                 load = readings.load_names[self.load]
                 force = readings.states.wrench[readings.load == self.load, :3].mean(axis=0)
                 size, g = float(np.linalg.norm(force)), float(np.linalg.norm(cell.gravity))
-                hangs = g > 0.0 and float(force @ cell.gravity) > HANGS * size * g
+                hangs = g > 0.0 and float(force @ cell.gravity) > WEIGHT_COSINE * size * g
                 figure, unit = np.array([size / g if hangs else size]), "kg" if hangs else "N"
             estimate = figure * (1.0 + change)
         values = tuple(figure.tolist()), tuple(estimate.tolist())
@@ -169,17 +169,17 @@ def wrong_figures(fit: Fit, suspects: Sequence[Suspect]) -> tuple[WrongFigure, .
     most = max((share for _, _, share in tried), default=0.0)
     named: list[tuple[float, WrongFigure]] = []
     for figure, step, share in tried:
-        if share < max(PROMISING, AS_PROMISING * most):
+        if share < max(LEAST_PROMISE, LEAST_RELATIVE_PROMISE * most):
             continue
         try:
             change, refit = figure.refitted(fit, step)
         except CannotAnswerError:  # a figure without an equilibrium explains nothing
             continue
         bic = _criterion(fit, refit, figure.size)
-        if bic is not None and figure.mistaken(change) and bic < min(best, -MARGIN):
+        if bic is not None and figure.mistaken(change) and bic < min(best, -BIC_MARGIN):
             named.append((bic, figure.named(fit, change, refit)))
     named.sort(key=lambda pair: pair[0])
-    return tuple(figure for bic, figure in named if bic <= named[0][0] + MARGIN)
+    return tuple(figure for bic, figure in named if bic <= named[0][0] + BIC_MARGIN)
 
 
 def _figures(fit: Fit) -> Iterator[_Figure]:
@@ -202,7 +202,7 @@ def _criterion(stated: Fit, refit: Fit, size: int) -> float | None:
     chi2, dof = float(np.sum(w.whiten(residual(readings, prediction, w)) ** 2)), refit.dof
     most = chi2 - LEAST_SHARE * max(chi2 - dof, LEAST_MISFIT * np.sqrt(2 * dof))
     if not stated.readings.noise_stated:
-        most = min(most, MOST_LEFT * chi2)
+        most = min(most, MOST_REMAINING * chi2)
     if refit.chi2 > most:
         return None
     return float(w.rank * np.log(max(refit.chi2, 1e-300) / chi2) + size * np.log(w.rank))

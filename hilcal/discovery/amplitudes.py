@@ -24,7 +24,8 @@ Kind = Literal[
     "angle", "sum", "torque", "force", "load", "gravity", "temperature", "time", "hanging", "side",
     "place", "sight", "sensor", "composed",
 ]  # fmt: skip
-VARIES = 1e-6  # Least spread, as a share of the largest value, of a quantity that counts as varying
+LEAST_SPREAD = 1e-6
+"""Least spread, as a share of the largest value, of a quantity that counts as varying."""
 _AXES = "xyz"
 _COMPONENTS = tuple(
     (c, *(("force", "f") if c < 3 else ("moment", "m")), _AXES[c % 3], "N" if c < 3 else "N·m")
@@ -84,7 +85,7 @@ def variables(s: Situation) -> list[Variable]:
     n = s.angle.shape[1]
     quantities = chain(_angles(s), _wrenches(n), _attitude(n), _recorded(s, n), _places())
     values = ((v, v.read(s)) for v in quantities)
-    return [v for v, x in values if np.ptp(x) > VARIES * max(float(np.abs(x).max()), 1e-300)]
+    return [v for v, x in values if np.ptp(x) > LEAST_SPREAD * max(float(np.abs(x).max()), 1e-300)]
 
 
 def _angles(s: Situation) -> Iterator[Variable]:

@@ -38,11 +38,12 @@ LARGEST_SUM = 3  # Products of a sum at most; a choice
 QUANTITIES = 2  # Recorded quantities of an argument at most; a choice: more are too many sums
 REFINED = 2  # Functions of single products, and of sums, that are refined; a choice, by time
 QUANTILES = tuple(k / 20 for k in range(1, 20))  # Levels that are tried, as quantiles
-TIMES = (0.4, 0.7, 1.0, 1.5, 2.2)  # Weights that are tried, over the linearised one; a choice
+WEIGHT_FACTORS = (0.4, 0.7, 1.0, 1.5, 2.2)
+"""Weights that are tried, over the linearised one; a choice."""
 EVALUATIONS = 60  # Evaluations of the sum of squares per refined number; a choice
 DIGITS = 3
 INDEPENDENT = 1e-3  # Least share of a column's square beside other columns; a choice
-WORST = 1e12
+REJECTED = 1e12
 POWERS = {"above": shapes.ABOVE_POWER, "below": shapes.BELOW_POWER}
 LEAST_POWER, MOST_POWER = 0.5, 4.0  # of a bend; at least 1 under wrenches; a choice
 LOG2 = float(np.log(2.0))
@@ -73,7 +74,7 @@ class SiteSums:
         screen = candidates.problem.screen
         form = screen.form[s]
         self.evidence = candidates.evidence
-        self.slope: Floats = form.T @ candidates.problem.thin
+        self.slope: Floats = form.T @ candidates.problem.screening_residual
         self.free: Floats = np.float32(candidates.problem.share) * screen.free[s]
         for along, unit in candidates.directions():
             products = form.T @ unit
@@ -145,11 +146,11 @@ def _screened(candidates: CandidateTerms) -> list[_Bent]:
     def by_site(v: Floats) -> Floats:
         return np.asarray(np.einsum("srk,r->sk", screen.form, v))
 
-    one = screen.one
+    one = screen.constant
     share = np.float32(p.share)
-    moved = by_site(p.thin)
+    moved = by_site(p.screening_residual)
     slope, slope_one = moved @ bends.values.T, moved.sum(axis=1)
-    square, across = share * bends.square, share * bends.across_one
+    square, across = share * bends.square, share * bends.across_constant
     square_one = share * screen.square[:, one]
     for along, unit in candidates.directions():
         by_unit = by_site(unit)
@@ -245,7 +246,7 @@ def _leveled(
     which = (*b.which, further)
     a = _values(candidates, which)
     tried: list[tuple[float, tuple[float, ...], tuple[float, ...]]] = []
-    for times in TIMES:
+    for times in WEIGHT_FACTORS:
         weights = (*b.weights, times * weight)
         u = np.asarray(weights) @ a
         levels = np.quantile(u, QUANTILES)
@@ -279,8 +280,8 @@ def _terms(candidates: CandidateTerms, site: SiteSums, b: _Bent) -> list[LawTerm
         if k is None:
             continue
         out.append(candidates.term(((b.s, k),), price))
-        if screen.visible(b.s, screen.one):
-            out.append(candidates.term(((b.s, k), (b.s, screen.one)), price + LOG2))
+        if screen.visible(b.s, screen.constant):
+            out.append(candidates.term(((b.s, k), (b.s, screen.constant)), price + LOG2))
     return out
 
 
@@ -297,7 +298,7 @@ def _refined(candidates: CandidateTerms, site: SiteSums, b: _Bent) -> Amplitude:
     grammar = candidates.problem.screen.grammar
     low, high = float(np.finfo(float).tiny), np.inf
     if b.shape in POWERS.values():
-        elastic = any(grammar.at(k).elastic for k in b.which)
+        elastic = any(grammar.amplitude(k).elastic for k in b.which)
         low, high = 1.0 if elastic else LEAST_POWER, MOST_POWER
 
     def parts(x: Floats) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -307,9 +308,9 @@ def _refined(candidates: CandidateTerms, site: SiteSums, b: _Bent) -> Amplitude:
     def objective(x: Floats) -> float:
         weights, numbers = parts(x)
         if not all(low <= n <= high for k, n in enumerate(numbers) if k not in b.shape.places):
-            return WORST
+            return REJECTED
         values = b.shape.value(np.asarray(weights) @ a, numbers)
-        return min(-float(site.odds(unit_rows(values[None]))[0]), WORST)
+        return min(-float(site.odds(unit_rows(values[None]))[0]), REJECTED)
 
     start = np.zeros(len(begin))
     result = minimize(
@@ -318,18 +319,18 @@ def _refined(candidates: CandidateTerms, site: SiteSums, b: _Bent) -> Amplitude:
                  "initial_simplex": np.vstack([start, 0.15 * np.eye(len(begin))])},
     )  # fmt: skip
     weights, numbers = parts(result.x if result.fun < objective(start) else start)
-    terms = tuple((w, grammar.at(k)) for w, k in zip(weights, b.which, strict=True))
+    terms = tuple((w, grammar.amplitude(k)) for w, k in zip(weights, b.which, strict=True))
     factors = terms[0][1].factors
     recorded = len(terms) == 1 and len(factors) == 1 and factors[0].shape is shapes.LINEAR
     quantity = factors[0].variable if recorded else composed(terms)
     return Amplitude((Factor(quantity, b.shape, numbers),))
 
 
-MOST = 4  # Complexity of a product; a choice
+MOST_COMPLEXITY = 4  # Complexity of a product; a choice
 MOST_FACTORS = 3  # Factors of a product; a choice
 GROWN, VARIED = 12, 24  # Candidates that are multiplied, and varied; a choice, by time
 RETAINED = 24  # Best of either that are scored in full; a choice
-FACTORS = (0.35, 0.5, 0.7, 0.85, 1.2, 1.4, 2.0, 2.8)  # by which numbers are varied; a choice
+NUMBER_FACTORS = (0.35, 0.5, 0.7, 0.85, 1.2, 1.4, 2.0, 2.8)  # by which numbers are varied; a choice
 
 
 def grown(candidates: CandidateTerms, best: list[ScreenedTerm]) -> list[LawTerm]:
@@ -342,12 +343,14 @@ def grown(candidates: CandidateTerms, best: list[ScreenedTerm]) -> list[LawTerm]
 
 def _products(candidates: CandidateTerms, s: int, f: int) -> list[Amplitude]:
     screen = candidates.problem.screen
-    a = screen.grammar.at(f)
+    a = screen.grammar.amplitude(f)
     if not a.factors or len(a.factors) >= MOST_FACTORS:
         return []
     out = []
-    for further in screen.grammar.singles:
-        if a.cost + further.cost > MOST or not all(different(further, x) for x in a.factors):
+    for further in screen.grammar.single_factors:
+        if a.cost + further.cost > MOST_COMPLEXITY or not all(
+            different(further, x) for x in a.factors
+        ):
             continue
         product = Amplitude((*a.factors, further))
         index = screen.grammar.place(product)
@@ -360,7 +363,7 @@ def _products(candidates: CandidateTerms, s: int, f: int) -> list[Amplitude]:
 
 def _numbers(candidates: CandidateTerms, f: int) -> list[tuple[Amplitude, float]]:
     grammar = candidates.problem.screen.grammar
-    a = grammar.at(f)
+    a = grammar.amplitude(f)
     out = []
     for i, factor in enumerate(a.factors):
         for n in factor.shape.free:
@@ -368,7 +371,7 @@ def _numbers(candidates: CandidateTerms, f: int) -> list[tuple[Amplitude, float]
             if n in factor.shape.places:
                 tried = np.quantile(grammar.read(factor.variable), QUANTILES).tolist()
             else:
-                tried = [old * k for k in FACTORS]
+                tried = [old * k for k in NUMBER_FACTORS]
             values = sorted({float(f"{v:.2g}") for v in tried} - {old})
             price = float(np.log(len(values) + 1))
             for value in values:
@@ -403,7 +406,7 @@ def _best_terms(
         if k is None:
             continue
         out.append(candidates.term(((s, k),), price))
-        partner = screen.grammar.turned(k)
+        partner = screen.grammar.with_sine(k)
         if partner is not None:
             out.append(candidates.term(((s, k), (s, partner)), price + LOG2))
     return out

@@ -28,9 +28,9 @@ from hilcal.types import Floats, Ints
 
 MOST_CURVES = 3
 BINS = 12
-LINE = 101  # Points of the drawn law; a choice, as are the two above
+LINE_POINTS = 101  # Points of the drawn law; a choice, as are the two above
 MOST_POINTS = 2000  # Most readings that are drawn; a choice, by memory
-LEAST = 0.02  # Least size of g, as share of its largest, for a reading to count; a choice
+LEAST_DIVISOR = 0.02  # Least size of g, as share of its largest, for a reading to count; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +93,7 @@ def _curve(
     drawn = _points(_usable(std, divisor))
     x, divisor = x[drawn], divisor[drawn]
     y, std = law(x) + deviation[drawn] / divisor, std[drawn] / np.abs(divisor)
-    ends = np.linspace(float(x.min()), float(x.max()), LINE)
+    ends = np.linspace(float(x.min()), float(x.max()), LINE_POINTS)
     ordinate, unit = site.symbol, site.unit
     if others.factors:
         inner, divided = others.text(), others.unit()
@@ -105,7 +105,7 @@ def _curve(
 def _usable(std: Floats, divisor: Floats) -> Ints:
     """Indices of the readings that determine a motion that is divided by the other factors."""
     size = np.abs(divisor)
-    return np.flatnonzero(np.isfinite(std) & (size > LEAST * float(size.max())))
+    return np.flatnonzero(np.isfinite(std) & (size > LEAST_DIVISOR * float(size.max())))
 
 
 def _points(usable: Ints) -> Ints:
@@ -152,7 +152,8 @@ def binned(x: Floats, y: Floats, std: Floats) -> Floats:
 
 
 MOST_SITES = 2  # Sites of a law that are drawn, those with the largest motion; a choice
-SMOOTH = 0.05  # von Neumann's ratio below which a law is drawn as line, not binned; a choice
+MOST_ROUGHNESS = 0.05
+"""Von Neumann's ratio below which a law is drawn as line, not binned; a choice."""
 
 Axes = tuple[Variable, Variable | None]  # Quantity of the abscissa, and divisor of the ordinate
 
@@ -238,11 +239,13 @@ def _drawn_curve(
         x = _folded(v.read(s), _order(v, effect.summary))
         roughness = _roughness(x[usable], law[usable] / divisor[usable])
         candidates.append((roughness, len(candidates), v, g, divisor, usable, x))
-    roughness, _, v, g, divisor, usable, x = min(candidates, key=lambda t: (t[0] > SMOOTH, t[:2]))
+    roughness, _, v, g, divisor, usable, x = min(
+        candidates, key=lambda t: (t[0] > MOST_ROUGHNESS, t[:2])
+    )
     drawn = _points(usable)
     x, law_values = x[drawn], law[drawn] / divisor[drawn]
     y, error = law_values + partial[drawn] / divisor[drawn], std[drawn] / np.abs(divisor[drawn])
-    line = _line(x, law_values) if roughness <= SMOOTH else binned(x, law_values, error)[:2]
+    line = _line(x, law_values) if roughness <= MOST_ROUGHNESS else binned(x, law_values, error)[:2]
     ordinate, unit = site.symbol, site.unit
     if g is not None:
         ordinate, unit = f"{ordinate}/{g.symbol}", unit if g.unit == "1" else f"{unit}/({g.unit})"
@@ -257,7 +260,7 @@ def _line(x: Floats, y: Floats) -> Floats:
     if len(points) < 2:
         return np.vstack([x[:1], y[:1]])
     mean = np.bincount(index, y) / np.bincount(index)
-    ends = np.linspace(points[0], points[-1], LINE)
+    ends = np.linspace(points[0], points[-1], LINE_POINTS)
     return np.vstack([ends, PchipInterpolator(points, mean)(ends)])
 
 

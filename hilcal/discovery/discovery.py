@@ -22,12 +22,17 @@ from scipy.stats import chi2
 from hilcal.diagnosis.noise import MISFIT_ALARM, PREDICTABLE
 from hilcal.diagnosis.residual_regression import Dependence, residual_regression
 from hilcal.discovery.curve import Curve, curves
-from hilcal.discovery.known_effects import KnownEffects, instead_of_law, known_effects, resembling
-from hilcal.discovery.law import Again, Coefficient, Form, Law, form_of, source_of_form
+from hilcal.discovery.known_effects import (
+    KnownEffects,
+    effects_replacing_law,
+    known_effects,
+    resembling,
+)
+from hilcal.discovery.law import Coefficient, Form, Law, SelectionFrequency, form_of, source_of_form
 from hilcal.discovery.problem import SearchProblem
-from hilcal.discovery.refit import exact, refine
+from hilcal.discovery.refit import refine, refit_exactly
 from hilcal.discovery.screen import LawTerm, Screen, screen
-from hilcal.discovery.search import LEAST, Selection, search
+from hilcal.discovery.search import LEAST_LOG_ODDS, Selection, search
 from hilcal.discovery.structures import Structure, averaged, pareto, structure_of, structures
 from hilcal.effects.catalogue import effects_of
 from hilcal.errors import CannotAnswerError, HilcalError, InputError
@@ -52,7 +57,7 @@ Reason = Literal["law", "adequate", "catalogue", "no_law", "unpredictable"]
 - unpredictable: nothing recorded predicts the residual.
 """
 LEAST_SHARE = 0.1  # of the misfit on poses left out that a law must explain
-NEAR = 0.7  # Least cosine of an effect of the catalogue that resembles a law; a choice
+LEAST_COSINE = 0.7  # Least cosine of an effect of the catalogue that resembles a law; a choice
 MOST_RIVALS = 2  # Alternatives that can be written as effects; a choice: `next` separates few
 
 
@@ -61,8 +66,8 @@ class FoldSearch:
     """Result of the searches without each fold."""
 
     share: float  # of the misfit of the poses left out that the laws explain
-    sure: bool  # whether the reduction of error exceeds its scatter from pose to pose
-    found: tuple[Selection | None, ...]  # law of each fold; None for none
+    significant: bool  # whether the reduction of error exceeds its scatter from pose to pose
+    selections: tuple[Selection | None, ...]  # law of each fold; None for none
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +109,7 @@ class Discovery(Shown):
 
 def alternatives(d: Discovery, law: Law) -> tuple[Structure, ...]:
     """Return structures within odds of 20 : 1 of a law, the likeliest first."""
-    least = law.probability * float(np.exp(-LEAST))
+    least = law.probability * float(np.exp(-LEAST_LOG_ODDS))
     return tuple(x for x in d.structures if x.probability > least and x.law != law.name)
 
 
@@ -137,14 +142,14 @@ def discover(
     best = max(selections, key=lambda s: s.total)
     say("comparing with the catalogue")
     effects = known_effects(fit)
-    explained = instead_of_law(fit, problem, best, effects)
+    explained = effects_replacing_law(fit, problem, best, effects)
     if explained.names:
         names, tried = explained.names, screening.candidates
         answer = Discovery(fit, "catalogue", catalogue=names, candidates=tried)
     else:
         say("repeating the search without each fold of poses")
         folds = search_by_folds(screening)
-        if not folds.sure or folds.share < LEAST_SHARE:
+        if not folds.significant or folds.share < LEAST_SHARE:
             answer = _silent(fit, screening, say, folds.share)
         else:
             answer = _laws(fit, problem, selections, folds, effects, say, name)
@@ -196,7 +201,7 @@ def _laws(
             continue
         say(f"refitting with {form.text()}")
         try:
-            after, form, coefficients, _ = exact(screen, form, name)
+            after, form, coefficients, _ = refit_exactly(screen, form, name)
         except HilcalError as error:
             refused.append((form.text(), str(error)))
             continue
@@ -250,16 +255,16 @@ def _law(
     score = score_family(linear.information(x), x.T @ linear.residual, linear.rss, linear.fit.dof)
     price = sum(t.price for t in s.terms)
     p_value = float(np.exp(min(np.log(max(score.p_value, 1e-300)) + price, 0.0)))
-    near = tuple(r for r in resembling(problem, s, effects) if r.cosine >= NEAR)
+    near = tuple(r for r in resembling(problem, s, effects) if r.cosine >= LEAST_COSINE)
     situation = linear.fit.solution.prediction.situation
     factors = (f for p in form.parts for f in p.amplitude.factors)
     read = {v.symbol: (v.read(situation), v.unit) for f in factors for v in f.variable.recorded}
     ranges = [(k, float(x.min()), float(x.max()), unit) for k, (x, unit) in read.items()]
     return Law(
         name=name, form=form, parameters=coefficients, p_value=p_value, odds=s.total,
-        holdout_share=share, left=after.variance_factor, probability=probability,
+        holdout_share=share, variance_factor=after.variance_factor, probability=probability,
         resembles=near[:3], ranges=tuple(ranges),
-        again=found_again(problem.screen, folds, s.terms),
+        selection_frequencies=selection_frequencies(problem.screen, folds, s.terms),
     )  # fmt: skip
 
 
@@ -280,8 +285,10 @@ def search_by_folds(screen: Screen) -> FoldSearch:
         selections = search(problem, beam=1)
         chosen = max(selections, key=lambda s: s.total, default=None)
         of_fold.append(chosen)
-        residual[out] = predicted(problem, None, out)
-        residual_after[out] = residual[out] if chosen is None else predicted(problem, chosen, out)
+        residual[out] = left_out_residual(problem, None, out)
+        residual_after[out] = (
+            residual[out] if chosen is None else left_out_residual(problem, chosen, out)
+        )
     of_pose = by_pose(fit, residual), by_pose(fit, residual_after)
     rank = fit.whitening.rank
     misfit = max(float(of_pose[0].sum()) - rank, 3.0 * np.sqrt(2.0 * rank))
@@ -289,7 +296,7 @@ def search_by_folds(screen: Screen) -> FoldSearch:
     return FoldSearch(share, improves(*of_pose), tuple(of_fold))
 
 
-def predicted(problem: SearchProblem, selection: Selection | None, out: Bools) -> Floats:
+def left_out_residual(problem: SearchProblem, selection: Selection | None, out: Bools) -> Floats:
     """Residual of rows that are left out, by model and law refitted to the other rows."""
     screen = problem.screen
     linear = screen.linear
@@ -304,12 +311,16 @@ def predicted(problem: SearchProblem, selection: Selection | None, out: Bools) -
     return np.asarray(white[out] - x[out] @ step)
 
 
-def found_again(screen: Screen, folds: FoldSearch, terms: tuple[LawTerm, ...]) -> tuple[Again, ...]:
+def selection_frequencies(
+    screen: Screen, folds: FoldSearch, terms: tuple[LawTerm, ...]
+) -> tuple[SelectionFrequency, ...]:
     """Return, for each site and its quantities, the share of searches by folds that find them."""
-    searches = [_causes(screen, s.terms) for s in folds.found if s is not None]
-    count = max(len(folds.found), 1)
+    searches = [_causes(screen, s.terms) for s in folds.selections if s is not None]
+    count = max(len(folds.selections), 1)
     return tuple(
-        Again(place, names, sum((place, frozenset(names)) in s for s in searches) / count)
+        SelectionFrequency(
+            place, names, sum((place, frozenset(names)) in s for s in searches) / count
+        )
         for (place, _), names in _causes(screen, terms).items()
     )
 
@@ -318,7 +329,11 @@ def _causes(
     screen: Screen, terms: tuple[LawTerm, ...]
 ) -> dict[tuple[str, frozenset[str]], tuple[str, ...]]:
     """Sites with the quantities that move them; a constant counts only where it is alone."""
-    pairs = [(screen.sites[s].words, screen.grammar.at(f).names) for t in terms for s, f in t.parts]
+    pairs = [
+        (screen.sites[s].words, screen.grammar.amplitude(f).names)
+        for t in terms
+        for s, f in t.parts
+    ]
     moved = {place for place, names in pairs if names}
     return {
         (place, frozenset(names)): names for place, names in pairs if names or place not in moved
@@ -382,9 +397,11 @@ def law_json(law: Law, d: Discovery) -> dict[str, object]:
         "parameters": [asdict(c) for c in law.parameters],
         "holdout_share": law.holdout_share,
         "p_value": law.p_value,
-        "variance_factor": law.left,
+        "variance_factor": law.variance_factor,
         "probability": law.probability,
-        "found_again": [{**asdict(a), "variables": list(a.variables)} for a in law.again],
+        "found_again": [
+            {**asdict(a), "variables": list(a.variables)} for a in law.selection_frequencies
+        ],
         "alternatives": [x.form.text() for x in alternatives(d, law)],
         "resembles": [asdict(r) for r in law.resembles],
         "ranges": [
@@ -411,29 +428,29 @@ def curve_json(c: Curve) -> dict[str, object]:
 
 
 MOST_SEARCHES = 3  # Most searches of one refinement; a choice, by time
-NAME = "found"
+LAW_NAME = "found"
 
 
 class LawSearch:
     """Searches for laws of one refinement, with their results."""
 
-    def __init__(self, folder: Path, name: str = NAME, replacing: bool = False) -> None:
+    def __init__(self, folder: Path, name: str = LAW_NAME, replacing: bool = False) -> None:
         """Laws are named after their future files; `replacing` deletes old files."""
         if replacing:
             for k in range(1, MOST_SEARCHES + 1):
                 (folder / f"{_numbered(name, k)}.py").unlink(missing_ok=True)
-        self.found: list[Discovery] = []  # the searches, in order
+        self.discoveries: list[Discovery] = []  # the searches, in order
         self.files: dict[str, Path] = {}  # of laws that were written, by name; see `write`
         self._folder, self._name = folder, name
         self._sources: dict[str, str] = {}
 
     def propose(self, fitted: Fit, say: Callable[[str], None]) -> tuple[Fit, str] | None:
         """Return the fit with a law, and the law's name; None if no law is proposed."""
-        if any(d.fit is fitted for d in self.found) or len(self.found) == MOST_SEARCHES:
+        if any(d.fit is fitted for d in self.discoveries) or len(self.discoveries) == MOST_SEARCHES:
             return None
         name = self._free_name(fitted)
         d = discover(fitted, say, name)
-        self.found.append(d)
+        self.discoveries.append(d)
         if d.after is None:
             return None
         model, after = fitted.model, d.after
@@ -473,10 +490,10 @@ def _numbered(name: str, k: int) -> str:
 
 def laws_json(s: LawSearch) -> dict[str, object]:
     """Return the searches of a refinement as JSON."""
-    written = [s.files.get(d.laws[0].name) if d.laws else None for d in s.found]
+    written = [s.files.get(d.laws[0].name) if d.laws else None for d in s.discoveries]
     return {
         "discover": [
             {**discovery_json(d), "written": file and str(file)}
-            for d, file in zip(s.found, written, strict=True)
+            for d, file in zip(s.discoveries, written, strict=True)
         ]
     }

@@ -1,8 +1,8 @@
 """All amplitudes that are tried: products of functions of different quantities.
 
-A product has at most `MOST_FACTORS` factors and the complexity `MOST`. Its price, for the size of
-the search, is the logarithm of the number of candidates of its complexity, plus log 2 for each unit
-of complexity: simple laws are few, and cheap.
+A product has at most `MOST_FACTORS` factors and the complexity `MOST_COMPLEXITY`. Its price, for
+the size of the search, is the logarithm of the number of candidates of its complexity, plus log 2
+for each unit of complexity: simple laws are few, and cheap.
 """
 
 from dataclasses import dataclass, field, replace
@@ -18,7 +18,8 @@ from hilcal.effects.protocol import Situation
 from hilcal.types import Floats, Ints
 
 HARMONICS = 4  # Multiples of an angle; as in the diagnosis
-FINEST = 512  # Highest multiple of an angle, at most one per pose; a choice, as for encoders
+HIGHEST_MULTIPLE = 512
+"""Highest multiple of an angle, at most one per pose; a choice, as for encoders."""
 
 
 def functions(v: Variable, x: Floats, most: int) -> list[Factor]:
@@ -102,17 +103,18 @@ def _round(x: float) -> float:
     return float(f"{x:.2g}")
 
 
-MOST = 3  # Complexity of a product; a choice: about 10⁶ candidates with all sites
+MOST_COMPLEXITY = 3  # Complexity of a product; a choice: about 10⁶ candidates with all sites
 MOST_FACTORS = 2  # Factors of a product; a choice, for the same reason
-SOME = 2000  # Products that are formed at a time; a choice, by memory
-ARGUMENT = 2  # Complexity of a product in a composed quantity; a choice, by their number
+PRODUCTS_AT_ONCE = 2000  # Products that are formed at a time; a choice, by memory
+ARGUMENT_COMPLEXITY = 2  # Complexity of a product in a composed quantity; a choice, by their number
 COMPOSED_OF = {
     "angle", "torque", "load", "gravity", "temperature", "time", "hanging", "place",
 }  # fmt: skip
 """Kinds of quantities in composed ones; a choice: components in joint axes are too many."""
 WAVES_OF_ARGUMENT = 2  # Multiples of an angle in a composed quantity; a choice
-SHAPES = 5  # of a composed quantity: bends to both sides, also with an exponent, steps
-FLAT = 0.1  # Spread over size of nearly constant factors, which enter no product; a choice
+SHAPES_OF_ARGUMENT = 5  # of a composed quantity: bends to both sides, also with an exponent, steps
+NEARLY_CONSTANT = 0.1
+"""Spread over size of nearly constant factors, which enter no product; a choice."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,13 +127,13 @@ class Grammar:
     size: Floats  # (F,) root mean squares before scaling
     cost: Ints  # (F,) complexities
     partner: Ints  # (F,) index with sine for cosine in the first periodic factor; −1 for none
-    less: Ints  # (2, F) index of a product of two without first, and second factor; else −1
+    without_factor: Ints  # (2, F) index of a product of two without either factor; else −1
     situation: Situation
-    singles: tuple[Factor, ...]  # functions of one quantity from which products are formed
+    single_factors: tuple[Factor, ...]  # functions of one quantity from which products are formed
     _more: list[tuple[Amplitude, Floats, float]] = field(default_factory=list)
     _read: dict[str, Floats] = field(default_factory=dict)
 
-    def at(self, k: int) -> Amplitude:
+    def amplitude(self, k: int) -> Amplitude:
         """Return an amplitude by its index."""
         count = len(self.amplitudes)
         return self.amplitudes[k] if k < count else self._more[k - count][0]
@@ -168,11 +170,11 @@ class Grammar:
             self._read[v.symbol] = v.read(self.situation)
         return self._read[v.symbol]
 
-    def turned(self, k: int) -> int | None:
+    def with_sine(self, k: int) -> int | None:
         """Return the amplitude with sine for cosine in its first periodic factor."""
         if k < len(self.amplitudes):
             return int(self.partner[k]) if self.partner[k] >= 0 else None
-        partner = _turned(self.at(k))
+        partner = _turned(self.amplitude(k))
         return None if partner is None else self.index(partner)
 
     def place(self, amplitude: Amplitude) -> int | None:
@@ -193,7 +195,7 @@ class Grammar:
 
     def inner(self, k: int) -> list[int]:
         """Return the indices of the amplitudes with one factor less."""
-        factors = self.at(k).factors
+        factors = self.amplitude(k).factors
         less = (Amplitude((*factors[:i], *factors[i + 1 :])) for i in range(len(factors)))
         return [index for a in less if (index := self.place(a)) is not None]
 
@@ -207,7 +209,7 @@ class Grammar:
         if len(a.factors) == 1 and isinstance(u := a.factors[0].variable, Composed):
             # Further products of a sum are priced where they are added.
             argument = float(self.price_of_argument[u.terms[0][1].cost])
-            return argument + log(SHAPES * sites) + log(2.0) * a.factors[0].shape.cost
+            return argument + log(SHAPES_OF_ARGUMENT * sites) + log(2.0) * a.factors[0].shape.cost
         kind = a.cost, len(a.factors)
         count = self._counts.get(kind, self._counts.get((a.cost, 0), 1))
         return log(max(count, 1) * sites) + log(2.0) * a.cost
@@ -215,7 +217,7 @@ class Grammar:
     @cached_property
     def _counts(self) -> dict[tuple[int, int], int]:
         """Number of products by complexity and factors; with 0 factors, of `amplitudes`."""
-        n = np.bincount([f.cost for f in self.singles], minlength=4).tolist()
+        n = np.bincount([f.cost for f in self.single_factors], minlength=4).tolist()
         by_cost = np.bincount(self.cost).tolist()
         return {
             (4, 2): comb(n[2], 2) + n[1] * n[3],
@@ -227,7 +229,7 @@ class Grammar:
     @cached_property
     def price_of_argument(self) -> Floats:
         """(C,) log of the number of products in arguments, plus log 2 per unit, by complexity."""
-        count = np.bincount(self.cost[self.smooth], minlength=ARGUMENT + 1)
+        count = np.bincount(self.cost[self.smooth], minlength=ARGUMENT_COMPLEXITY + 1)
         return np.asarray(np.log(np.maximum(count, 1)) + log(2.0) * np.arange(len(count)))
 
     @cached_property
@@ -239,7 +241,7 @@ class Grammar:
     @cached_property
     def unit_of_smooth(self) -> dict[int, str]:
         """Units of `smooth`, by index."""
-        return {k: self.at(k).unit() for k in self.smooth.tolist()}
+        return {k: self.amplitude(k).unit() for k in self.smooth.tolist()}
 
     @cached_property
     def depends(self) -> tuple[frozenset[str], ...]:
@@ -249,7 +251,7 @@ class Grammar:
 
 def _smooth(a: Amplitude) -> bool:
     kinds = {f.variable.kind for f in a.factors}
-    if not 0 < a.cost <= ARGUMENT or not kinds <= COMPOSED_OF | {"sum"}:
+    if not 0 < a.cost <= ARGUMENT_COMPLEXITY or not kinds <= COMPOSED_OF | {"sum"}:
         return False
     if len(a.factors) > 1 and "sum" in kinds:
         return False
@@ -267,24 +269,24 @@ def _key(a: Amplitude) -> frozenset[tuple[str, str, Numbers]]:
 
 def grammar(quantities: list[Variable], s: Situation, poses: int = 0) -> Grammar:
     """Return all products of functions of quantities; `poses` limits multiples of an angle."""
-    singles = [f for v in quantities for f in functions(v, v.read(s), MOST)]
+    singles = [f for v in quantities for f in functions(v, v.read(s), MOST_COMPLEXITY)]
     singles += [  # fine waves, as complex as a product: in no product
         Factor(v, f, (float(k),))
         for v in quantities
         if v.kind == "angle"
-        for k in range(HARMONICS + 1, min(poses, FINEST) + 1)
+        for k in range(HARMONICS + 1, min(poses, HIGHEST_MULTIPLE) + 1)
         for f in (shapes.FINE_COS, shapes.FINE_SIN)
     ]
     value = np.array([f.values(s) for f in singles]).reshape(len(singles), -1)
     cost = np.array([f.cost for f in singles])
-    flat = np.std(value, axis=1) < FLAT * np.sqrt(np.mean(value**2, axis=1))
+    flat = np.std(value, axis=1) < NEARLY_CONSTANT * np.sqrt(np.mean(value**2, axis=1))
     pairs: list[tuple[int, int]] = [(-1, -1)] + [
-        (i, -1) for i in range(len(singles)) if cost[i] <= MOST
+        (i, -1) for i in range(len(singles)) if cost[i] <= MOST_COMPLEXITY
     ]
-    curved = np.flatnonzero((cost < MOST) & ~flat).tolist()
+    curved = np.flatnonzero((cost < MOST_COMPLEXITY) & ~flat).tolist()
     for start, i in enumerate(curved, start=1):
         for k in curved[start:]:
-            if cost[i] + cost[k] <= MOST and different(singles[i], singles[k]):
+            if cost[i] + cost[k] <= MOST_COMPLEXITY and different(singles[i], singles[k]):
                 pairs.append((i, k))
     value = np.vstack([value, np.ones(value.shape[1])])
     values, size, nonzero = _products(value, np.array(pairs))
@@ -321,12 +323,12 @@ def _products(value: Floats, pairs: Ints) -> tuple[Floats, Floats, Ints]:
     Also (F',) root mean squares before scaling, and indices of the pairs: those that are not zero.
     """
     size = np.empty(len(pairs))
-    for part in (slice(a, a + SOME) for a in range(0, len(pairs), SOME)):
+    for part in (slice(a, a + PRODUCTS_AT_ONCE) for a in range(0, len(pairs), PRODUCTS_AT_ONCE)):
         first, second = pairs[part].T
         size[part] = np.sqrt(np.mean((value[first] * value[second]) ** 2, axis=1))
     nonzero = np.flatnonzero(size > 0)
     out: Floats = np.empty((len(nonzero), value.shape[1]), dtype=np.float32)
-    for part in (slice(a, a + SOME) for a in range(0, len(nonzero), SOME)):
+    for part in (slice(a, a + PRODUCTS_AT_ONCE) for a in range(0, len(nonzero), PRODUCTS_AT_ONCE)):
         first, second = pairs[nonzero[part]].T
         out[part] = value[first] * value[second] / size[nonzero[part], None]
     return out, size[nonzero], nonzero

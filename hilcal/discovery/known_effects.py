@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.diagnosis.effect_ranking import catalogue_columns
-from hilcal.diagnosis.evidence import beside_catalogue, significant
+from hilcal.diagnosis.evidence import catalogue_families, significant
 from hilcal.diagnosis.stepwise import add
 from hilcal.discovery.law import Resemblance, form_of
 from hilcal.discovery.problem import SearchProblem
-from hilcal.discovery.refit import exact, left_by, refine
-from hilcal.discovery.search import LEAST, SAME, Selection
+from hilcal.discovery.refit import refine, refit_exactly, rss_with_law
+from hilcal.discovery.search import LEAST_LOG_ODDS, SAME_CORRELATION, Selection
 from hilcal.errors import HilcalError
 from hilcal.identification.fit import Fit
 from hilcal.regression.forward_selection import families_beside
@@ -29,7 +29,7 @@ class KnownEffects:
 
     names: tuple[str, ...]  # effects that explain the misfit together, in the order of adding
     odds: tuple[float, ...]  # that each adds: log evidence minus the log of the choice
-    left: tuple[float, ...]  # variance factor of the linearisation after each
+    variance_factors: tuple[float, ...]  # variance factor of the linearisation after each
     white: Floats  # (R, P) whitened columns of all effects that could be added
     columns: dict[str, slice]  # of each effect
 
@@ -42,7 +42,7 @@ class KnownEffects:
 def known_effects(fit: Fit) -> KnownEffects:
     """Add effects of the catalogue to a fit by algebra, as long as they are significant."""
     x, columns, most = catalogue_columns(fit)
-    steps = significant(beside_catalogue(fit, x, columns, most))
+    steps = significant(catalogue_families(fit, x, columns, most))
     choice = float(np.log(max(len(columns), 1)))
     return KnownEffects(
         tuple(s.name for s in steps),
@@ -54,32 +54,39 @@ def known_effects(fit: Fit) -> KnownEffects:
 
 
 @dataclass(frozen=True, slots=True)
-class Instead:
+class Replacement:
     """Effects of the catalogue in place of a law."""
 
     names: tuple[str, ...] = ()  # effects that explain as well; none if the law is preferred
     unfitted: tuple[tuple[str, str], ...] = ()  # effects that could not be refitted, and why
 
 
-def instead_of_law(
+def effects_replacing_law(
     fit: Fit, problem: SearchProblem, law: Selection, effects: KnownEffects
-) -> Instead:
+) -> Replacement:
     """Return the effects that explain the misfit as well as a law, at odds of 20 : 1; or none."""
     # A law whose exact refit fails is not preferred to effects whose refit does not.
-    if effects.total > law.total - LEAST:
-        return Instead(effects.names)
+    if effects.total > law.total - LEAST_LOG_ODDS:
+        return Replacement(effects.names)
     alike = resembling(problem, law, effects)
-    if alike and alike[0].cosine >= SAME and not tells_more(problem, law, effects, alike[0].effect):
-        return Instead(effects.names or (alike[0].effect,))
+    if (
+        alike
+        and alike[0].cosine >= SAME_CORRELATION
+        and not needed_beside_effect(problem, law, effects, alike[0].effect)
+    ):
+        return Replacement(effects.names or (alike[0].effect,))
     total, explained = _exact_effects(fit, effects)
-    if total > law.total - LEAST and total > _exact_law(fit, problem, law) - LEAST:
+    if (
+        total > law.total - LEAST_LOG_ODDS
+        and total > _exact_law(fit, problem, law) - LEAST_LOG_ODDS
+    ):
         return explained
     return replace(explained, names=())
 
 
-def _exact_effects(fit: Fit, effects: KnownEffects) -> tuple[float, Instead]:
+def _exact_effects(fit: Fit, effects: KnownEffects) -> tuple[float, Replacement]:
     """Return the best odds of the first effects in exact refits without more gross errors."""
-    after, odds, best, explained = fit, 0.0, -np.inf, Instead()
+    after, odds, best, explained = fit, 0.0, -np.inf, Replacement()
     for k, name in enumerate(effects.names):
         try:
             after = add(after, name)
@@ -88,9 +95,9 @@ def _exact_effects(fit: Fit, effects: KnownEffects) -> tuple[float, Instead]:
         odds += effects.odds[k]
         if np.any(after.outlier & ~fit.outlier):
             continue
-        total = odds + _beyond(fit, effects.left[k], after)
+        total = odds + _beyond(fit, effects.variance_factors[k], after)
         if total > best:
-            best, explained = total, Instead(effects.names[: k + 1])
+            best, explained = total, Replacement(effects.names[: k + 1])
     return best, explained
 
 
@@ -99,10 +106,10 @@ def _exact_law(fit: Fit, problem: SearchProblem, law: Selection) -> float:
     screen = problem.screen
     form = refine(screen, form_of(screen, law.terms))
     try:
-        after, form, *_ = exact(screen, form, "law")
+        after, form, *_ = refit_exactly(screen, form, "law")
     except HilcalError:
         return -np.inf
-    squares = left_by(screen, form, fit.solution.prediction.situation)
+    squares = rss_with_law(screen, form, fit.solution.prediction.situation)
     return law.total + _beyond(fit, squares / max(fit.dof - form.count, 1.0), after)
 
 
@@ -134,7 +141,9 @@ def resembling(
     return tuple(sorted(out, key=lambda r: -r.cosine))
 
 
-def tells_more(problem: SearchProblem, s: Selection, effects: KnownEffects, effect: str) -> bool:
+def needed_beside_effect(
+    problem: SearchProblem, s: Selection, effects: KnownEffects, effect: str
+) -> bool:
     """Whether odds of 20 : 1, corrected for the search, require a law beside a similar effect."""
     x, columns = effects.white, effects.columns
     law = np.hstack([problem.columns(t) for t in s.terms])
@@ -148,4 +157,4 @@ def tells_more(problem: SearchProblem, s: Selection, effects: KnownEffects, effe
     if not score.rank:
         return True
     law_score = families.with_family("effect", score).scores()["law"]
-    return bool(law_score.log_evidence - sum(t.price for t in s.terms) > LEAST)
+    return bool(law_score.log_evidence - sum(t.price for t in s.terms) > LEAST_LOG_ODDS)

@@ -134,7 +134,9 @@ def form_of(screen: Screen, terms: tuple[LawTerm, ...]) -> Form:
     for t in terms:
         for k, (site, amplitude) in enumerate(t.parts):
             coefficient = count if t.common else count + k
-            parts.append(LawPart(screen.sites[site], screen.grammar.at(amplitude), coefficient))
+            parts.append(
+                LawPart(screen.sites[site], screen.grammar.amplitude(amplitude), coefficient)
+            )
         count += 1 if t.common else len(t.parts)
     return Form(tuple(parts))
 
@@ -177,7 +179,7 @@ def coefficients(form: Form, step: Floats, std: Floats) -> tuple[Coefficient, ..
 
 
 @dataclass(frozen=True, slots=True)
-class Again:
+class SelectionFrequency:
     """How often the searches without a fold found a cause again."""
 
     acts_on: str
@@ -203,11 +205,11 @@ class Law:
     p_value: float  # of the joint test of its columns, times the number of candidates
     odds: float  # logarithm of the odds against no law, corrected for the size of the search
     holdout_share: float  # share of the misfit that it explains on poses left out
-    left: float  # variance factor of the fit with the law
+    variance_factor: float  # variance factor of the fit with the law
     probability: float  # posterior, of its structure
     resembles: tuple[Resemblance, ...]  # effects of the catalogue that are near, the nearest first
     ranges: tuple[tuple[str, float, float, str], ...]  # of each quantity in the readings
-    again: tuple[Again, ...] = ()  # how often each site and its quantities were found
+    selection_frequencies: tuple[SelectionFrequency, ...] = ()  # of each site, its quantities
 
     @property
     def formula(self) -> str:
@@ -245,7 +247,7 @@ class Law:
         return self.form.variables
 
 
-USUAL = 1e-4  # Ordinary magnitude of an unknown coefficient, SI; a choice
+ORDINARY_COEFFICIENT = 1e-4  # Ordinary magnitude of an unknown coefficient, SI; a choice
 _HEAD = '''"""`{name}`: {formula}
 
 Proposed by `hilcal discover`; change it as you like. Every command takes it:
@@ -361,7 +363,7 @@ def _parameters(form: Form, values: tuple[Coefficient, ...]) -> Iterator[str]:
     scales = {k: float(f"{x:.0e}") for k, x in size.items() if x > 0 and np.isfinite(x)}
     for k, letter in enumerate(LETTERS[: form.count]):
         sites = ", ".join(dict.fromkeys(p.site.words for p in form.parts if p.coefficient == k))
-        scale = scales.get(letter, USUAL)
+        scale = scales.get(letter, ORDINARY_COEFFICIENT)
         yield f'            Parameter("{letter}", "{form.unit(k)}", {scale!r}, "{sites}"),'
 
 

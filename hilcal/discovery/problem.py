@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from hilcal.discovery.compose import composed_terms, grown
-from hilcal.discovery.screen import LawTerm, Scored, Screen, ScreenedTerm
+from hilcal.discovery.screen import LawTerm, ScoredTerm, Screen, ScreenedTerm
 from hilcal.identification.linearisation import Linearisation
 from hilcal.regression.evidence import FamilyScore, score_family
 from hilcal.regression.schur import Projection, projection
@@ -49,24 +49,26 @@ class SearchProblem:
         self.dof = max(linear.fit.dof - (1.0 - self.share) * len(self.rows), 1.0)
         self.square = self.share * screen.square
         self.across = self.share * screen.across
-        self.across_one = self.share * screen.across_one
+        self.across_one = self.share * screen.across_constant
         # With many readings, the screening uses some of these rows only.
         self.screened = self.rows & screen.rows
         self.screened_share = float(self.screened.sum() / self.rows.sum())
         self._thin, self._thin_residual = self.model, self.residual
         if self.screened_share < 1.0:
             self._thin, self._thin_residual = _refitted(linear, self.screened)
-        self._scored: dict[tuple[tuple[tuple[tuple[int, int], ...], bool], ...], list[Scored]] = {}
+        self._scored: dict[
+            tuple[tuple[tuple[tuple[int, int], ...], bool], ...], list[ScoredTerm]
+        ] = {}
 
     @cached_property
-    def thin(self) -> Floats:
+    def screening_residual(self) -> Floats:
         """The residual in the rows of the screening (R',)."""
         return self._in_screening(self._thin_residual)
 
     @cached_property
     def slope(self) -> Floats:
         """(S, F) xᵀ r in the rows that are screened."""
-        return self.screen.inner(self.thin)
+        return self.screen.inner(self.screening_residual)
 
     def _in_screening(self, v: Floats) -> Floats:
         """Expand values of this problem's screened rows to all rows of the screening (R',)."""
@@ -84,7 +86,7 @@ class SearchProblem:
         """(R', P) whitened columns of a term in the rows that are used."""
         return self.screen.columns_of(term)[self.rows]
 
-    def scored(self, chosen: tuple[LawTerm, ...] = ()) -> list[Scored]:
+    def scored(self, chosen: tuple[LawTerm, ...] = ()) -> list[ScoredTerm]:
         """Return the short list beside chosen terms, the best odds first; cached."""
         key = tuple((t.parts, t.common) for t in chosen)
         if key not in self._scored:
@@ -127,7 +129,7 @@ class CandidateTerms:
         """
         p = self.problem
         slope, square, across, across_one = p.slope, p.square, p.across, p.across_one
-        partner, one = p.screen.grammar.partner, p.screen.one
+        partner, one = p.screen.grammar.partner, p.screen.constant
         for products, along in zip(*self._directions[:2], strict=True):
             slope = slope - np.float32(along) * products
             square = square - products**2
@@ -141,7 +143,7 @@ class CandidateTerms:
     def _chosen_causes(self) -> tuple[frozenset[int], frozenset[str]]:
         screen = self.problem.screen
         parts = [part for t in self.chosen for part in t.parts]
-        names = (n for _, f in parts for n in screen.grammar.at(f).names)
+        names = (n for _, f in parts for n in screen.grammar.amplitude(f).names)
         return frozenset(s for s, _ in parts), frozenset(names)
 
     @cached_property
@@ -158,7 +160,7 @@ class CandidateTerms:
         full = self.problem.screen.price_of(f)
         if not self.chosen:
             return full
-        a = self.problem.screen.grammar.at(f)
+        a = self.problem.screen.grammar.amplitude(f)
         (places, names), (_, prices) = self._chosen_causes, self._same_causes
         if s in places and a.cost < len(prices) and {*a.names} <= names:
             return float(prices[a.cost])
@@ -191,10 +193,10 @@ class CandidateTerms:
         """
         p = self.problem
         slopes, squares, across, across_one = self._screened()
-        amplitudes, one = p.screen.grammar, p.screen.one
+        amplitudes, one = p.screen.grammar, p.screen.constant
         partner = amplitudes.partner
         paired = np.flatnonzero(partner >= 0)
-        products = np.flatnonzero((amplitudes.less >= 0).all(axis=0))
+        products = np.flatnonzero((amplitudes.without_factor >= 0).all(axis=0))
         best: dict[str, list[ScreenedTerm]] = {k: [] for k in ("", "p", "c", "pc", "1", "2")}
         for s in range(len(p.screen.sites)):
             price = self._prices(s).astype(np.float32)
@@ -216,16 +218,18 @@ class CandidateTerms:
                 gain = np.where(visible, g * g / safe, 0.0)
                 odds = self.evidence(gain + gain0, 1 + constant) - price - LOG2 * constant
                 keep_largest(best[suffix], np.where(visible, odds, -np.inf), s)
-                both = together(safe, g, h, visible, paired, partner)
+                both = pair_gain(safe, g, h, visible, paired, partner)
                 odds = self.evidence(both + gain0, 2 + constant)
                 odds = odds - price[paired] - LOG2 * (1 + constant)
                 keep_largest(best["p" + suffix], np.where(both > 0, odds, -np.inf), s, paired)
             a, g = squares[s], slopes[s]
-            for key, less, h in zip("12", amplitudes.less, p.screen.across_less[:, s], strict=True):
+            for key, less, h in zip(
+                "12", amplitudes.without_factor, p.screen.across_without_factor[:, s], strict=True
+            ):
                 h = np.float32(p.share) * h
                 for along in (product[s] for product in self._directions[0]):
                     h = h - along * along[less]
-                both = together(np.where(a > 0, a, 1.0), g, h, a > 0, products, less)
+                both = pair_gain(np.where(a > 0, a, 1.0), g, h, a > 0, products, less)
                 odds = self.evidence(both, 2) - price[products] - LOG_ZERO
                 keep_largest(best[key], np.where(both > 0, odds, -np.inf), s, products)
         return best
@@ -240,7 +244,7 @@ class CandidateTerms:
             - np.float32(0.5 * count) * (np.log(ratio) + np.float32(1.0))
         )
 
-    def score(self, terms: Sequence[LawTerm]) -> list[Scored]:
+    def score(self, terms: Sequence[LawTerm]) -> list[ScoredTerm]:
         """Score terms exactly beside the chosen ones."""
         p = self.problem
         out = []
@@ -250,7 +254,7 @@ class CandidateTerms:
             ends = np.cumsum([0] + [len(t.parts) for t in batch])
             for t, a, b in zip(batch, ends[:-1], ends[1:], strict=True):
                 columns = x[:, a:b].sum(axis=1, keepdims=True) if t.common else x[:, a:b]
-                out.append(Scored(t, self._score(columns)))
+                out.append(ScoredTerm(t, self._score(columns)))
         return out
 
     def _score(self, x: Floats) -> FamilyScore:
@@ -264,8 +268,8 @@ class CandidateTerms:
 
     def shortlist(self) -> list[LawTerm]:
         """Return the candidates with the best odds, extended to phases, axes and joints."""
-        best_of, one = self.best(), self.problem.screen.one
-        turned = self.problem.screen.grammar.turned
+        best_of, one = self.best(), self.problem.screen.constant
+        turned = self.problem.screen.grammar.with_sine
         out: dict[tuple[tuple[tuple[int, int], ...], bool], LawTerm] = {}
 
         def add(t: LawTerm) -> None:
@@ -283,7 +287,7 @@ class CandidateTerms:
                     add(self.term(parts, LOG2 * (1 + len(extra))))
         for key, factor in (("1", 0), ("2", 1)):
             for x in best_of[key][:EXTENDED]:
-                less = self.problem.screen.grammar.less[:, x.f].tolist()
+                less = self.problem.screen.grammar.without_factor[:, x.f].tolist()
                 add(self.term(((x.s, x.f), (x.s, less[factor])), LOG_ZERO))
                 parts = tuple((x.s, k) for k in (x.f, *less) if self.problem.screen.visible(x.s, k))
                 add(self.term(parts, LOG_ZERO + LOG2))
@@ -299,7 +303,7 @@ class CandidateTerms:
     def _extended(self, s: int, f: int) -> Iterator[LawTerm]:
         screen = self.problem.screen
         site, grammar = screen.sites[s], screen.grammar
-        amplitude, place = grammar.at(f), grammar.place
+        amplitude, place = grammar.amplitude(f), grammar.place
 
         def visible(parts: list[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
             return tuple(p for p in parts if screen.visible(*p))
@@ -340,7 +344,7 @@ class CandidateTerms:
 
 
 SHORT_LIST = 200  # Candidates that are scored in full at each step; a choice
-OF_SITE = 60  # Most of these of one site; a choice
+MOST_OF_SITE = 60  # Most of these of one site; a choice
 SPANNED = 1e-9  # Directions of chosen columns below this share of the largest are rounding
 
 
@@ -353,7 +357,7 @@ def orthonormal(model: Projection, x: Floats) -> Floats:
     return np.asarray(free @ (vectors[:, spanned] / np.sqrt(values[spanned])))
 
 
-def together(
+def pair_gain(
     square: Floats, slope: Floats, across: Floats, visible: Bools, which: Ints, partner: Ints
 ) -> Floats:
     """(H,) gain of candidates `which` (H,), each with a partner; zero where the two are dependent.
@@ -373,8 +377,8 @@ def keep_largest(best: list[ScreenedTerm], odds: Floats, s: int, which: Ints | N
     """Add the best candidates of a site to `best`, best first."""
     least = best[-1].odds if len(best) == SHORT_LIST else -np.inf
     top = np.flatnonzero(odds > least)
-    if len(top) > OF_SITE:
-        top = top[np.argpartition(-odds[top], OF_SITE - 1)[:OF_SITE]]
+    if len(top) > MOST_OF_SITE:
+        top = top[np.argpartition(-odds[top], MOST_OF_SITE - 1)[:MOST_OF_SITE]]
     best += [
         ScreenedTerm(s, int(f if which is None else which[f]), float(x))
         for f, x in zip(top.tolist(), odds[top].tolist(), strict=True)

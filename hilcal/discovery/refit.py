@@ -29,11 +29,11 @@ from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import Linearisation
 from hilcal.types import Floats
 
-WORTH = 3.0  # Gain in log likelihood that refined numbers need, beyond ½ ln ν each; 20 : 1
+LEAST_GAIN = 3.0  # Gain in log likelihood that refined numbers need, beyond ½ ln ν each; 20 : 1
 DIGITS = 3
 SPANNED = 1e-10  # Directions of a law's columns below this share of the largest are rounding
-FACTOR = 30.0  # Factor by which a positive number may change at most; a choice
-SPREADS = 3.0  # Largest change of a level, in standard deviations of its quantity; a choice
+LARGEST_FACTOR = 30.0  # Factor by which a positive number may change at most; a choice
+LARGEST_SHIFT = 3.0  # Largest change of a level, in standard deviations of its quantity; a choice
 
 
 def refine(screen: Screen, form: Form) -> Form:
@@ -45,7 +45,7 @@ def refine(screen: Screen, form: Form) -> Form:
     free = free_numbers(form, s)
     if not free:
         return form
-    best = left_by(screen, form, s)
+    best = rss_with_law(screen, form, s)
 
     def numbers_at(x: Floats) -> list[float]:
         return [number.at(v) for number, v in zip(free, x.tolist(), strict=True)]
@@ -54,7 +54,7 @@ def refine(screen: Screen, form: Form) -> Form:
         values = numbers_at(x)
         if not np.isfinite(values).all():
             return np.inf
-        return left_by(screen, with_values(form, free, values), s)
+        return rss_with_law(screen, with_values(form, free, values), s)
 
     result = minimize(
         objective, np.zeros(len(free)), method="Nelder-Mead",
@@ -63,13 +63,13 @@ def refine(screen: Screen, form: Form) -> Form:
     )  # fmt: skip
     values = [float(f"{v:.{DIGITS}g}") for v in numbers_at(result.x)]
     refined = with_values(form, free, values)
-    after = left_by(screen, refined, s)
+    after = rss_with_law(screen, refined, s)
     dof = linear.fit.dof
     gain = 0.5 * dof * np.log(best / max(after, 1e-300))
-    return refined if gain > len(free) * (0.5 * np.log(dof)) + WORTH else form
+    return refined if gain > len(free) * (0.5 * np.log(dof)) + LEAST_GAIN else form
 
 
-def left_by(screen: Screen, form: Form, s: Situation) -> float:
+def rss_with_law(screen: Screen, form: Form, s: Situation) -> float:
     """Sum of squares with a law, by algebra; infinite if the law is not finite."""
     linear = screen.linear
     x = form.columns(screen, s)
@@ -84,7 +84,7 @@ def _step(linear: Linearisation, x: Floats) -> Floats:
     return np.asarray(step, dtype=float)
 
 
-def exact(
+def refit_exactly(
     screen: Screen, form: Form, name: str
 ) -> tuple[Fit, Form, tuple[Coefficient, ...], type[Effect]]:
     """Refit the exact model with the law as an effect, after checking the effect.
@@ -127,15 +127,15 @@ class FreeNumber:
     places: tuple[tuple[int, int], ...]  # (part, factor) of each function with this number
     index: int  # among the function's numbers, or among the weights of its quantity
     weight: bool  # whether it is a weight
-    begin: float
+    start: float
     scale: float  # unit of its change; 0 if it changes by factors eˣ instead
     least: float = -np.inf  # lower bound
 
     def at(self, x: float) -> float:
         """Return the value after a change x; infinite for too large a change."""
-        if abs(x) > (SPREADS if self.scale else np.log(FACTOR)):
+        if abs(x) > (LARGEST_SHIFT if self.scale else np.log(LARGEST_FACTOR)):
             return float("inf")
-        value = self.begin + self.scale * x if self.scale else self.begin * float(np.exp(x))
+        value = self.start + self.scale * x if self.scale else self.start * float(np.exp(x))
         return value if value >= self.least else float("inf")
 
     def put(self, factor: Factor, value: float) -> Factor:

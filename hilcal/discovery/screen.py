@@ -38,7 +38,7 @@ class LawTerm:
     parts: tuple[tuple[int, int], ...]  # (site, amplitude) of each column, by index
     price: float  # for the size of the search
     common: bool = False  # whether all columns have one coefficient
-    alone: float = 0.0  # price as the first term
+    price_alone: float = 0.0  # price as the first term
 
     @property
     def count(self) -> int:
@@ -47,7 +47,7 @@ class LawTerm:
 
 
 @dataclass(frozen=True, eq=False)
-class Scored:
+class ScoredTerm:
     """A term with its score beside chosen terms."""
 
     term: LawTerm
@@ -70,7 +70,7 @@ class ScreenedTerm:
 
 MOST_READINGS = 400  # Most readings of the screening; a choice: time grows with their square
 VISIBLE = 1e-4  # Least share of a column's square beside the model, for single precision
-ALIKE = 1 - 1e-9  # Least cosine of the motions of equivalent sites; rounding
+ALIAS_COSINE = 1 - 1e-9  # Least cosine of the motions of equivalent sites; rounding
 LEAST_MOTION = 1e-4  # Square of a whitened column that counts as zero
 
 
@@ -83,7 +83,7 @@ class Bends:
     numbers: tuple[tuple[float, ...], ...]
     values: Floats  # (C, K) at the readings of the screening, scaled to root mean square 1
     square: Floats  # (S, C) xᵀ M x; zero where a site does not allow the function
-    across_one: Floats  # (S, C) xᵀ M x' with a constant at the site
+    across_constant: Floats  # (S, C) xᵀ M x' with a constant at the site
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,8 +100,8 @@ class Screen:
     free: Floats  # (S, K, K) Q_s of these
     square: Floats  # (S, F) xᵀ M x; zero where the model explains a column
     across: Floats  # (S, F) xᵀ M x' with the partner of each amplitude
-    across_one: Floats  # (S, F) xᵀ M x' with a constant at the site
-    across_less: Floats  # (2, S, F) xᵀ M x' of a product with that without first, and second factor
+    across_constant: Floats  # (S, F) xᵀ M x' with a constant at the site
+    across_without_factor: Floats  # (2, S, F) xᵀ M x' of a product with that without either factor
 
     @cached_property
     def price(self) -> Floats:
@@ -114,7 +114,7 @@ class Screen:
         flat = self.motion.reshape(-1, len(self.sites))
         size = np.linalg.norm(flat, axis=0)
         unit = flat / np.where(size > 0, size, 1.0)
-        alike = np.abs(unit.T @ unit) > ALIKE
+        alike = np.abs(unit.T @ unit) > ALIAS_COSINE
         takes = [(s.takes(False), s.takes(True), s.takes(False, True)) for s in self.sites]
         out = []
         for k in range(len(self.sites)):
@@ -123,7 +123,7 @@ class Screen:
         return tuple(out)
 
     @cached_property
-    def one(self) -> int:
+    def constant(self) -> int:
         """Index of the constant amplitude."""
         return self.grammar.amplitudes.index(Amplitude(()))
 
@@ -135,7 +135,7 @@ class Screen:
         """Return the price of a candidate, also of a grown one."""
         if amplitude < len(self.price):
             return float(self.price[amplitude])
-        return self.grammar.price_of(self.grammar.at(amplitude), len(self.sites))
+        return self.grammar.price_of(self.grammar.amplitude(amplitude), len(self.sites))
 
     @cached_property
     def bends(self) -> Bends:
@@ -152,7 +152,7 @@ class Screen:
                 numbers += list(zip(*(n.tolist() for n in starts), strict=True))
                 rows.append(unit_rows(shape.value(u, tuple(parameters))))
         values: Floats = np.vstack([np.zeros((0, len(self.readings)), dtype=np.float32), *rows])
-        elastic = np.array([grammar.at(k).elastic for k in arguments], dtype=np.bool_)
+        elastic = np.array([grammar.amplitude(k).elastic for k in arguments], dtype=np.bool_)
         bent = np.repeat(elastic, len(values) // max(len(arguments), 1))
         square: Floats = np.empty((len(self.sites), len(values)), dtype=np.float32)
         across: Floats = np.empty_like(square)
@@ -252,11 +252,11 @@ def _across_factors(amplitudes: Grammar, values: Floats, lifted: Floats) -> Floa
     """(2, F) xᵀ Q x' of products with the amplitude without first, and second factor."""
     # With a product f g and Q symmetric, (f g)ᵀ Q g = fᵀ (g ∘ Q g): no product is formed.
     out: Floats = np.zeros((2, len(amplitudes.size)), dtype=np.float32)
-    products = np.flatnonzero((amplitudes.less >= 0).all(axis=0))
+    products = np.flatnonzero((amplitudes.without_factor >= 0).all(axis=0))
     if not len(products):
         return out
-    second, first = amplitudes.less[:, products]
-    singles, place = np.unique(amplitudes.less[:, products], return_inverse=True)
+    second, first = amplitudes.without_factor[:, products]
+    singles, place = np.unique(amplitudes.without_factor[:, products], return_inverse=True)
     g, f = place.reshape(2, -1)
     v = values[singles]
     both = v @ (v * lifted[singles]).T

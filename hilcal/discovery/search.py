@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from hilcal.discovery.problem import SHORT_LIST, CandidateTerms, SearchProblem
-from hilcal.discovery.screen import LawTerm, Scored, Screen
+from hilcal.discovery.screen import LawTerm, ScoredTerm, Screen
 from hilcal.regression.evidence import FamilyScore
 from hilcal.regression.forward_selection import families_beside
 from hilcal.types import Floats
@@ -19,9 +19,9 @@ from hilcal.types import Floats
 BEAM = 3  # First terms that start a selection each; a choice
 MOST_TERMS = 3  # Most terms of a law; a choice
 MOST_COEFFICIENTS = 8  # Most coefficients of a law; a choice: more are not readable
-LEAST = 3.0  # Log odds, corrected for the search, that a further term needs: 20 : 1
+LEAST_LOG_ODDS = 3.0  # Log odds, corrected for the search, that a further term needs: 20 : 1
 FALSE_ALARM = 1e-3  # Chance of a first term if nothing is hidden, over the whole search
-SAME = 0.98  # Correlation of projected columns above which they count as the same law
+SAME_CORRELATION = 0.98  # Correlation of projected columns above which they count as the same law
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Selection:
 def search(problem: SearchProblem, most: int = MOST_TERMS, beam: int = BEAM) -> list[Selection]:
     """Return the best selection of each number of terms that is worth it; none for chance."""
     ordered = _ordered(problem)
-    if not ordered or ordered[0].odds <= LEAST:
+    if not ordered or ordered[0].odds <= LEAST_LOG_ODDS:
         return []
     first = ordered[0]
     if np.log(max(first.score.p_value, 1e-300)) + first.term.price >= np.log(FALSE_ALARM):
@@ -58,19 +58,21 @@ def search(problem: SearchProblem, most: int = MOST_TERMS, beam: int = BEAM) -> 
         keep(s)
         while len(s.terms) < most:
             further = _ordered(problem, s.terms)
-            if not further or further[0].odds < LEAST:
+            if not further or further[0].odds < LEAST_LOG_ODDS:
                 break
             terms = (*s.terms, further[0].term)
             if sum(t.count for t in terms) > MOST_COEFFICIENTS:
                 break
-            grown = _pruned(problem, replace(s, terms=terms, odds=chain(problem, terms)))
-            if grown.total < s.total + LEAST:
+            grown = _pruned(
+                problem, replace(s, terms=terms, odds=stepwise_log_odds(problem, terms))
+            )
+            if grown.total < s.total + LEAST_LOG_ODDS:
                 break
             # The last term is already the best beside the others.
             s = _exchanged(problem, grown, last=len(grown.terms) - 1)
             keep(s)
     return [
-        replace(s, terms=tuple(plain(problem.screen, t) for t in s.terms))
+        replace(s, terms=tuple(with_simplest_site(problem.screen, t) for t in s.terms))
         for s in worth_their_length(best[k] for k in sorted(best))
     ]
 
@@ -79,23 +81,23 @@ def worth_their_length(selections: Iterable[Selection]) -> list[Selection]:
     """Return the selections that have odds of 20 : 1 over every shorter one."""
     out: list[Selection] = []
     for s in selections:
-        if all(s.total >= shorter.total + LEAST for shorter in out):
+        if all(s.total >= shorter.total + LEAST_LOG_ODDS for shorter in out):
             out.append(s)
     return out
 
 
-def _ordered(problem: SearchProblem, chosen: tuple[LawTerm, ...] = ()) -> list[Scored]:
+def _ordered(problem: SearchProblem, chosen: tuple[LawTerm, ...] = ()) -> list[ScoredTerm]:
     """Return the short list, best first; the first is the simplest within odds of 20 : 1."""
     scored = problem.scored(chosen)
     if not scored:
         return []
 
-    def preference(c: Scored) -> tuple[float, ...]:
+    def preference(c: ScoredTerm) -> tuple[float, ...]:
         """Sort key of terms that are as good: the simplest, then the likeliest first."""
         *simple, functions = _simplicity(problem.screen, c.term)
         return (*simple, -round(c.odds), functions, -c.odds)
 
-    first = min((c for c in scored if c.odds > scored[0].odds - LEAST), key=preference)
+    first = min((c for c in scored if c.odds > scored[0].odds - LEAST_LOG_ODDS), key=preference)
     return [first, *(c for c in scored if c is not first)]
 
 
@@ -106,7 +108,7 @@ def _simplicity(screen: Screen, t: LawTerm) -> tuple[float, ...]:
     quantity of the site's own joint is simpler than one of another joint. A joint's temperature
     correlates with everything that changes with time: at another joint it counts a unit more.
     """
-    amplitudes = [screen.grammar.at(a) for _, a in t.parts]
+    amplitudes = [screen.grammar.amplitude(a) for _, a in t.parts]
     cost = max(a.cost + screen.grammar.tuned(a) for a in amplitudes)
     sites = max(screen.sites[s].rank for s, _ in t.parts)
     functions = max(sum(f.shape.rank for f in a.factors) for a in amplitudes)
@@ -124,7 +126,7 @@ def _simplicity(screen: Screen, t: LawTerm) -> tuple[float, ...]:
     return t.count + cost, sites, apart, functions
 
 
-def plain(screen: Screen, t: LawTerm) -> LawTerm:
+def with_simplest_site(screen: Screen, t: LawTerm) -> LawTerm:
     """Replace the site of a term by its simplest alias; terms of several sites keep theirs."""
     places = {place for place, _ in t.parts}
     if len(places) > 1:
@@ -134,16 +136,16 @@ def plain(screen: Screen, t: LawTerm) -> LawTerm:
 
 def _better(problem: SearchProblem, s: Selection, other: Selection) -> bool:
     """Whether a law is likelier than another one, or simpler if within odds of 20 : 1."""
-    if abs(s.total - other.total) > LEAST:
+    if abs(s.total - other.total) > LEAST_LOG_ODDS:
         return s.total > other.total
     return _extent(problem, s.terms) < _extent(problem, other.terms)
 
 
-def _distinct(problem: SearchProblem, scored: list[Scored], count: int) -> list[Scored]:
-    out: list[Scored] = []
+def _distinct(problem: SearchProblem, scored: list[ScoredTerm], count: int) -> list[ScoredTerm]:
+    out: list[ScoredTerm] = []
     units: list[Floats] = []
     for c in scored[:SHORT_LIST]:
-        if c.odds < LEAST:
+        if c.odds < LEAST_LOG_ODDS:
             break
         x = problem.columns(c.term)
         fit = problem.model.project_out(x) @ c.score.step
@@ -151,7 +153,7 @@ def _distinct(problem: SearchProblem, scored: list[Scored], count: int) -> list[
         if size == 0:
             continue
         fit = fit / size
-        if all(abs(float(fit @ u)) < SAME for u in units):
+        if all(abs(float(fit @ u)) < SAME_CORRELATION for u in units):
             out.append(c)
             units.append(fit)
         if len(out) == count:
@@ -167,11 +169,11 @@ def _pruned(problem: SearchProblem, s: Selection) -> Selection:
             remaining = (*s.terms[:k], *s.terms[k + 1 :])
             worth.append(CandidateTerms(problem, remaining).score([term])[0].odds)
         weakest = int(np.argmin(worth))
-        if worth[weakest] >= LEAST:
-            return replace(s, odds=chain(problem, s.terms))
+        if worth[weakest] >= LEAST_LOG_ODDS:
+            return replace(s, odds=stepwise_log_odds(problem, s.terms))
         terms = (*s.terms[:weakest], *s.terms[weakest + 1 :])
-        terms = led(terms)
-        s = replace(s, terms=terms, odds=chain(problem, terms))
+        terms = with_first_price(terms)
+        s = replace(s, terms=terms, odds=stepwise_log_odds(problem, terms))
     return s
 
 
@@ -182,36 +184,36 @@ def _exchanged(problem: SearchProblem, s: Selection, last: int) -> Selection:
         ordered = _ordered(problem, remaining)
         if not ordered or ordered[0].term.parts == s.terms[k].parts:
             continue
-        terms = led((*remaining, ordered[0].term))
+        terms = with_first_price((*remaining, ordered[0].term))
         if sum(t.count for t in terms) > MOST_COEFFICIENTS:
             continue
-        exchanged = replace(s, terms=terms, odds=chain(problem, terms))
+        exchanged = replace(s, terms=terms, odds=stepwise_log_odds(problem, terms))
         if _better(problem, exchanged, s):
             s = exchanged
     return s
 
 
-def led(terms: tuple[LawTerm, ...]) -> tuple[LawTerm, ...]:
+def with_first_price(terms: tuple[LawTerm, ...]) -> tuple[LawTerm, ...]:
     """Return terms with the first at its price as first term."""
-    return (replace(terms[0], price=terms[0].alone), *terms[1:])
+    return (replace(terms[0], price=terms[0].price_alone), *terms[1:])
 
 
 def _extent(problem: SearchProblem, terms: tuple[LawTerm, ...]) -> tuple[float, ...]:
     """Sort key: number of quantities, of sites, and the summed simplicity of the terms."""
     screen = problem.screen
     parts = [part for t in terms for part in t.parts]
-    names = {n for _, f in parts for n in screen.grammar.at(f).names}
+    names = {n for _, f in parts for n in screen.grammar.amplitude(f).names}
     simplicity = np.sum([_simplicity(screen, t) for t in terms], axis=0)
     return len(names), len({s for s, _ in parts}), *simplicity.tolist()
 
 
-def chain(problem: SearchProblem, terms: tuple[LawTerm, ...]) -> tuple[float, ...]:
+def stepwise_log_odds(problem: SearchProblem, terms: tuple[LawTerm, ...]) -> tuple[float, ...]:
     """Log odds of each term beside the previous ones; their sum is that of the whole law."""
-    scores = chained(problem, terms)
+    scores = scored_stepwise(problem, terms)
     return tuple(s.log_evidence - t.price for s, t in zip(scores, terms, strict=True))
 
 
-def chained(problem: SearchProblem, terms: tuple[LawTerm, ...]) -> list[FamilyScore]:
+def scored_stepwise(problem: SearchProblem, terms: tuple[LawTerm, ...]) -> list[FamilyScore]:
     """Score each term beside the previous ones."""
     x = [problem.columns(t) for t in terms]
     ends = np.cumsum([0, *(c.shape[1] for c in x)])

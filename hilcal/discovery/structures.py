@@ -29,13 +29,13 @@ from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.refit import refine
 from hilcal.discovery.screen import LawTerm, Screen
 from hilcal.discovery.search import (
-    LEAST,
+    LEAST_LOG_ODDS,
     MOST_COEFFICIENTS,
     MOST_TERMS,
     Selection,
-    chained,
-    led,
-    plain,
+    scored_stepwise,
+    with_first_price,
+    with_simplest_site,
 )
 from hilcal.discovery.sites import motions_of
 from hilcal.identification.fit import Fit
@@ -45,7 +45,7 @@ from hilcal.types import Floats
 
 Terms = tuple[LawTerm, ...]
 MOST_LIKELY = 8  # Most structures within Occam's window; a choice
-CLOSE = 12.0  # Log odds from the best within which a structure counts; a choice
+OCCAM_WINDOW = 12.0  # Log odds from the best within which a structure counts; a choice
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,7 @@ def structures(problem: SearchProblem, selections: Sequence[Selection]) -> tuple
         kind: chosen.get(kind, max(laws, key=lambda m: m[0])[1]) for kind, laws in groups.items()
     }
     order = sorted(chance, key=lambda kind: -chance[kind])
-    likely = [kind for kind in order if chance[kind] > np.exp(-LEAST) * chance[order[0]]]
+    likely = [kind for kind in order if chance[kind] > np.exp(-LEAST_LOG_ODDS) * chance[order[0]]]
     likely = [*likely[:MOST_LIKELY], *chosen]
     simplest = {form_of(screen, best[kind]).complexity: kind for kind in reversed(order)}
     out = [
@@ -105,7 +105,7 @@ def structures(problem: SearchProblem, selections: Sequence[Selection]) -> tuple
 def structure_of(screen: Screen, terms: Terms) -> Hashable:
     """Sites and functions of a law, without their free numbers, and its number of coefficients."""
     return sum(t.count for t in terms), frozenset(
-        (screen.alias[s], frozenset(map(_function, screen.grammar.at(a).factors)))
+        (screen.alias[s], frozenset(map(_function, screen.grammar.amplitude(a).factors)))
         for t in terms
         for s, a in t.parts
     )
@@ -129,14 +129,14 @@ def _met(problem: SearchProblem, selections: Iterable[Selection]) -> list[tuple[
     for base in bases:
         base_odds = log_odds(problem, base)
         for c in problem.scored(base):
-            terms = led((*base, plain(problem.screen, c.term)))
+            terms = with_first_price((*base, with_simplest_site(problem.screen, c.term)))
             if not c.score.rank or sum(t.count for t in terms) > MOST_COEFFICIENTS:
                 continue
-            odds = base_odds + c.score.marginal - c.term.price - LEAST * bool(base)
+            odds = base_odds + c.score.marginal - c.term.price - LEAST_LOG_ODDS * bool(base)
             key = frozenset((t.parts, t.common) for t in (*base, c.term))
             if key not in out or out[key][0] < odds:
                 out[key] = odds, terms
-    least = max((odds for odds, _ in out.values()), default=0.0) - CLOSE
+    least = max((odds for odds, _ in out.values()), default=0.0) - OCCAM_WINDOW
     # Scores beside chosen terms, whose coefficients are free, differ slightly from the exact odds.
     return [
         (odds if len(terms) == 1 else log_odds(problem, terms), terms)
@@ -149,9 +149,9 @@ def log_odds(problem: SearchProblem, terms: Terms) -> float:
     """Return the log posterior odds of a law with its present numbers, against none."""
     if not terms:
         return 0.0
-    terms = led(terms)
-    evidence = sum(s.marginal for s in chained(problem, terms))
-    return evidence - sum(t.price for t in terms) - LEAST * (len(terms) - 1)
+    terms = with_first_price(terms)
+    evidence = sum(s.marginal for s in scored_stepwise(problem, terms))
+    return evidence - sum(t.price for t in terms) - LEAST_LOG_ODDS * (len(terms) - 1)
 
 
 def _structure(screen: Screen, kind: Hashable, terms: Terms, chance: float) -> Structure:

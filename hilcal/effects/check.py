@@ -88,7 +88,7 @@ def example_situation(cell: Cell, states: States) -> Situation:
 NAME = re.compile(r"[a-z][a-z0-9_]*")
 JOINTS = (6, 7)  # of arms to try an effect on; it has to pass on one
 NEEDS = ("time", "load_time", "air_temperature", "joint_temperature", "approach", "q_actual")
-AGREES = 1e-3
+AGREEMENT = 1e-3
 """A derivative lies between the difference quotients of both sides, also at a kink such as that of
 max(τ, 0). Share of the largest value by which it may lie outside; a guess, far above rounding."""
 ROUNDING = 1e-9  # Share of the largest value that rounding may change; a guess, far above 1e-16
@@ -377,4 +377,4 @@ def _agree(method: str, phrase: str, derivative: Floats, above: Floats, below: F
     size = float(max(np.abs(x).max() for x in (derivative, above, below)))
     off = float(np.abs(outside).max()) / size if size > 0 else 0.0
     wrong = f"{method} is not the derivative {phrase} is off by {100 * off:.1f} %"
-    _need(off <= AGREES, f"{wrong} of its largest value")
+    _need(off <= AGREEMENT, f"{wrong} of its largest value")

@@ -12,7 +12,7 @@ from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Floats
 
-SECOND = 1.0  # Unit of time of the law, s
+TIME_UNIT_S = 1.0  # Unit of time of the law, s
 
 
 class Creep(TorqueLaw):
@@ -55,7 +55,7 @@ class Creep(TorqueLaw):
 
     def _decades(self, s: Situation) -> Floats:
         assert s.states.load_time is not None  # noqa: S101 - checked at construction
-        return np.asarray(np.log10(1 + s.states.load_time / SECOND))[:, None]
+        return np.asarray(np.log10(1 + s.states.load_time / TIME_UNIT_S))[:, None]
 
     def of_torque(self, s: Situation) -> tuple[Floats, Floats]:
         """Return c_j τ_j log10(1 + t/1 s), and c_j log10(1 + t/1 s)."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilcal.effects.options import ordinary_give
+from hilcal.effects.options import ordinary_joint_motions
 from hilcal.effects.per_joint import TorqueLaw
 from hilcal.effects.protocol import Changeable, Situation
 from hilcal.types import Floats
@@ -23,7 +23,7 @@ class JointCompliance(TorqueLaw):
 
     def ordinary(self) -> Floats:
         """3 mrad (0.1 mm) at the rated torque (force)."""
-        return ordinary_give(self.cell) / self.cell.arm.ratings
+        return ordinary_joint_motions(self.cell) / self.cell.arm.ratings
 
     def of_torque(self, s: Situation) -> tuple[Floats, Floats]:
         """Return τ_j, and 1."""

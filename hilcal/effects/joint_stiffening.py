@@ -1,6 +1,6 @@
 """`joint_stiffening`: a gear stiffens under load."""
 
-from hilcal.effects.options import ordinary_give
+from hilcal.effects.options import ordinary_joint_motions
 from hilcal.effects.per_joint import TorqueLaw
 from hilcal.effects.protocol import Situation
 from hilcal.types import Floats
@@ -16,7 +16,7 @@ class JointStiffening(TorqueLaw):
 
     def ordinary(self) -> Floats:
         """As much as the compliance at the joint's rated torque."""
-        return ordinary_give(self.cell) / self.cell.arm.ratings**3
+        return ordinary_joint_motions(self.cell) / self.cell.arm.ratings**3
 
     def of_torque(self, s: Situation) -> tuple[Floats, Floats]:
         """Return τ_j³, and 3 τ_j²."""

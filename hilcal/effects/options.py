@@ -61,7 +61,7 @@ def rated_moments(cell: Cell) -> Floats:
     return np.asarray(cell.arm.ratings * np.where(cell.arm.slides, LEVER, 1.0))
 
 
-def ordinary_give(cell: Cell) -> Floats:
+def ordinary_joint_motions(cell: Cell) -> Floats:
     """(n,) how far a joint ordinarily gives at its rated torque or force, rad or m."""
     return np.where(cell.arm.slides, ORDINARY_SHIFT, ORDINARY_TWIST)
 

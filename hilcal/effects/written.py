@@ -45,11 +45,11 @@ def read_effects_text(text: str, where: str, catalogue: Catalogue) -> dict[str, 
 
 def write_effect(name: str, options: Options) -> str:
     """Write an effect with options so that `read_effects_text` reads the same."""
-    inside = ", ".join(f"{key}={written(value)}" for key, value in options.items())
+    inside = ", ".join(f"{key}={option_text(value)}" for key, value in options.items())
     return f"{name}({inside})" if inside else name
 
 
-def written(value: object) -> str:
+def option_text(value: object) -> str:
     """Write the value of an option; nothing for None."""
     if value is None:
         return ""
@@ -63,7 +63,7 @@ def written(value: object) -> str:
         quote = "'" if '"' in value else '"'
         return value if plain else f"{quote}{value}{quote}"
     if isinstance(value, list | tuple):
-        return f"[{', '.join(written(v) for v in value)}]"
+        return f"[{', '.join(option_text(v) for v in value)}]"
     return repr(value)
 
 
@@ -74,7 +74,7 @@ def chosen_options(effect: Effect, states: States, m: int) -> dict[str, object]:
         key: value
         for key, value in effect.options.items()
         if not key.startswith("prior_")
-        and (key not in usual or written(usual[key]) != written(value))
+        and (key not in usual or option_text(usual[key]) != option_text(value))
     }
 
 
@@ -87,7 +87,7 @@ def option_defaults(kind: type[Effect], cell: Cell, states: States) -> dict[str,
         part = kind(cell, states[len(states) // 3 :]).options
     except InputError:  # fewer readings will not do
         part = {}
-    same = {name: written(full.get(name)) == written(part.get(name)) for name in full}
+    same = {name: option_text(full.get(name)) == option_text(part.get(name)) for name in full}
     return {name: full[name] if same.get(name) else None for name in kind.option_help}
 
 

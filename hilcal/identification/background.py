@@ -38,11 +38,11 @@ MOST_ROWS = 10_000
 """Most elements of readings for which a background is fitted; a choice: it takes minutes."""
 MOST_ROWS_OF_LINES = 2000
 """Most elements of readings for which lines are pooled; a choice: it takes some seconds."""
-UNSURE = 2.0
+IMPLAUSIBLE_FACTOR = 2.0
 """Factor by which an estimated standard deviation may exceed the plausible one, as few readings
 determine it to such a factor only; a choice."""
 
-WIDTH = 1.96
+HALF_WIDTH_95 = 1.96
 """Half width of a 95 % interval, in standard errors of log s."""
 
 
@@ -146,7 +146,9 @@ def family_sizes(fit: Fit) -> tuple[FamilySize, ...]:
         if roles[f.effect] in FRAME_ROLES:
             continue
         magnitude = float(np.sqrt(np.mean(f.magnitude**2)))
-        low, middle, high = np.exp(log_std[k] + WIDTH * error[k] * np.array([-1.0, 0.0, 1.0]))
+        low, middle, high = np.exp(
+            log_std[k] + HALF_WIDTH_95 * error[k] * np.array([-1.0, 0.0, 1.0])
+        )
         out.append(
             FamilySize(
                 name=f.name,
@@ -246,7 +248,7 @@ def _implausible(mixed: MixedFit) -> set[str]:
         effect.name
         for effect, rows in zip(mixed.model.effects, mixed.model.slices(), strict=True)
         if effect.role not in FRAME_ROLES
-        and np.any(std[rows] > UNSURE * effect.most() * effect.magnitudes)
+        and np.any(std[rows] > IMPLAUSIBLE_FACTOR * effect.most() * effect.magnitudes)
     }
 
 

@@ -24,14 +24,14 @@ from hilcal.effects.protocol import EffectSpec
 from hilcal.identification.carried import CarriedPrior, check_prior
 from hilcal.identification.fit import Fit
 from hilcal.identification.misdescription import refuse_misdescribed
-from hilcal.identification.placement import TARGET_M, TELL
+from hilcal.identification.placement import DETERMINED_SHARE, TARGET_M
 from hilcal.identification.registration import register
 from hilcal.identification.torques import require_torques
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
 
-ARM = 0.5  # m, length over angle of a registration's prior: half of a reach; a guess
+LEVER_M = 0.5  # m, length over angle of a registration's prior: half of a reach; a guess
 
 
 def baseline(
@@ -96,9 +96,9 @@ def with_effects(
         defaults: Options = {}
         if name in frames and mode == "deflection":
             length = max(registered.rms, 1e-6)
-            defaults = {"prior_m": length, "prior_rad": length / ARM}
+            defaults = {"prior_m": length, "prior_rad": length / LEVER_M}
         elif name in held and registered.undetermined:
-            defaults = {"prior_m": TARGET_M, "prior_rad": TELL}
+            defaults = {"prior_m": TARGET_M, "prior_rad": DETERMINED_SHARE}
         chosen = options.get(name) or carried.get(name, {})
         model = model + EffectSpec(name, {**defaults, **chosen})
     return model

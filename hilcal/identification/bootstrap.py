@@ -39,7 +39,7 @@ LEVEL = 0.95  # of the percentile interval, unless another is asked for
 DRAWS = 200  # usual: the standard deviation is known to 5 % (Efron and Tibshirani, 6.4)
 LEAST_DRAWS = 20  # a choice: the standard deviation is known to 16 %
 LEAST_POSES = 10  # distinct ones; a choice: of fewer, draws are too often the same few
-TOGETHER = 5  # draws that a worker makes at a time, on any number of workers; a choice
+DRAWS_PER_TASK = 5  # draws that a worker makes at a time, on any number of workers; a choice
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +146,7 @@ def bootstrap(
         null=fit.solution.equations.basis.null.shape[1],
         seed=seed,
     )
-    parts = [range(a, min(a + TOGETHER, draws)) for a in range(0, draws, TOGETHER)]
+    parts = [range(a, min(a + DRAWS_PER_TASK, draws)) for a in range(0, draws, DRAWS_PER_TASK)]
     results: dict[int, Floats] = {}
     for k, theta in engine.results(drawn, parts):
         results[k] = theta
@@ -183,7 +183,7 @@ def _drawn(
     """(K, P) parameters of some draws; NaN where a draw does not determine as many as all poses."""
     out = np.full((len(draws), model.size), np.nan)
     for row, draw in enumerate(draws):
-        some = again(readings, group, np.random.default_rng([seed, draw]))
+        some = resample(readings, group, np.random.default_rng([seed, draw]))
         try:
             solution = solve(model, some, whitening(some, *like), start=start)
         except CannotAnswerError:
@@ -193,7 +193,7 @@ def _drawn(
     return out
 
 
-def again(readings: Readings, group: Ints, rng: np.random.Generator) -> Readings:
+def resample(readings: Readings, group: Ints, rng: np.random.Generator) -> Readings:
     """Return the readings of as many groups as there are, drawn with replacement.
 
     A group that is drawn twice gives two poses, so that each loaded reading keeps its own unloaded

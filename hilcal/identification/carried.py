@@ -37,7 +37,7 @@ from hilcal.errors import InputError
 from hilcal.identification.posterior import Posterior, spectrum
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
-from hilcal.readings.same_readings import among
+from hilcal.readings.same_readings import found_among_prints
 from hilcal.regression.schur import schur_complement
 from hilcal.robot.arm import Arm
 from hilcal.store.codec import decode, encode
@@ -46,7 +46,7 @@ from hilcal.types import Bools, Floats, Ints
 Relation = Literal["arm", "type"]
 RELATIONS: tuple[Relation, ...] = get_args(Relation)
 _JOINT = re.compile(r"j([1-9][0-9]*)$")
-FIRST_GUESS = 0.3  # first prior std of a shrunk family, in ordinary magnitudes; a choice
+START_STD = 0.3  # first prior std of a shrunk family, in ordinary magnitudes; a choice
 SAME_M = 1e-6  # difference of two nominal link lengths that are the same: rounding of a table
 
 
@@ -97,7 +97,7 @@ class CarriedPrior:
         return np.where(precision > 0, strength, self.posterior.scale)
 
     @cached_property
-    def lowest(self) -> Floats:
+    def least_drift(self) -> Floats:
         """(1 + G,) no doubt, and the least drift of each group."""
         return np.array([0.0, *(self.least.get(g.effect, 0.0) for g in self.groups)])
 
@@ -182,7 +182,7 @@ def carried_prior(
 def check_prior(prior: CarriedPrior, arm: Arm, readings: Readings) -> None:
     """Refuse a prior of another arm, or one estimated from readings that are to be fitted."""
     check_arm(prior, arm)
-    repeated = int(among(readings, prior.posterior.prints).sum())
+    repeated = int(found_among_prints(readings, prior.posterior.prints).sum())
     if repeated:
         raise InputError(
             f"{_label(prior.posterior)} was learnt from {repeated} of the {len(readings)} "
@@ -219,7 +219,7 @@ class Coordinates:
     matrix: Floats  # (K, K) U, SI
     inverse: Floats  # (K, K) y = inverse (θ − m)
     std: Floats  # (K,) standard deviations of y: 1, infinite for flat ones, 0 for those left out
-    rest: Floats  # (K,) variance of θ by the coordinates that were left out, SI
+    omitted_variance: Floats  # (K,) variance of θ by the coordinates that were left out, SI
 
     def _replaced(self, x: Floats, values: Floats | float | bool) -> Floats:
         """Return x (P, ...) with values of the parameters that have a carried prior."""
@@ -259,7 +259,7 @@ class Coordinates:
         """(P,) which parameters have a carried prior."""
         return np.isin(np.arange(size), self.index)
 
-    def felt(self, a: Floats) -> "Coordinates":
+    def restricted(self, a: Floats) -> "Coordinates":
         """Return the coordinates reduced to those that derivatives A (R, P) by θ depend on.
 
         The rest stays at the prior's mean. Unchanged where there are as many rows as coordinates.
@@ -275,7 +275,7 @@ class Coordinates:
         matrix[:, used], inverse[used], std[used] = u @ turn, turn.T @ self.inverse[held], 1.0
         variance = np.sum(u**2, axis=1) - np.sum(matrix[:, used] ** 2, axis=1)
         rest = np.maximum(variance, 0.0)
-        return replace(self, matrix=matrix, inverse=inverse, std=std, rest=rest)
+        return replace(self, matrix=matrix, inverse=inverse, std=std, omitted_variance=rest)
 
 
 def coordinates_of(model: Model) -> Coordinates:
@@ -334,7 +334,7 @@ def prior_of(model: Model) -> tuple[Floats, Ints]:
         if e.name in model.random:
             group, fixed = None, model.random[e.name]
         if group is not None:
-            prior.append(FIRST_GUESS * e.magnitudes)
+            prior.append(START_STD * e.magnitudes)
             groups.append(group + used)
             used += int(group.max()) + 1
         else:

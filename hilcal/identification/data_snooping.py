@@ -10,10 +10,10 @@ does not change (Baarda, *A testing procedure for use in geodetic networks*, 196
 
 Readings that deviate by one common cause are no gross errors: readings in a row with the same shift
 in the axes of the sensor or of the target, as by another reflector, a target that was moved on the
-tool, or a bumped tracker (`off_alike`); and readings with shifts along the directions of one site
-of the arm (`along_one_site`), as a law of a joint, of a link that bends, or of the force sensor
-moves each reading along one direction, whatever it depends on. For a random error in m dimensions
-the share of its square normal to a direction is sin² ~ Beta((m − 1)/2, 1/2), so that its
+tool, or a bumped tracker (`runs_of_equal_shifts`); and readings with shifts along the directions of
+one site of the arm (`along_one_site`), as a law of a joint, of a link that bends, or of the force
+sensor moves each reading along one direction, whatever it depends on. For a random error in m
+dimensions the share of its square normal to a direction is sin² ~ Beta((m − 1)/2, 1/2), so that its
 distribution function p is uniform. With p_(n) ascending, n of F gross errors are as near to the
 directions of a site as p_(n) with the probability P(B(F, p_(n)) ≥ n). Its minimum over n and the
 sites is multiplied by F and the number of sites; where the product is too small, the readings near
@@ -31,14 +31,14 @@ from hilcal.errors import CannotAnswerError
 from hilcal.identification.carried import scales_of
 from hilcal.identification.gauss_newton import Solution
 from hilcal.identification.least_trimmed_squares import (
-    MISFIT,
-    MOST,
+    MISFIT_SCALES,
+    MOST_WRONG,
     ReadingModel,
-    bulk,
-    limit,
+    bulk_scale,
     nearest,
+    rejection_limit,
     robust_start,
-    variance,
+    trimmed_variance,
 )
 from hilcal.model.model import Model, Prediction
 from hilcal.model.observe import motion
@@ -48,22 +48,26 @@ from hilcal.robot import se3
 from hilcal.types import Bools, Floats, Ints
 
 # All of these are choices.
-SMALLEST = 3e-3  # share of the largest t² in the fit below which no reading leaves in one round
-ACCIDENT = 1e-3  # probability of so many shared unloaded readings among gross errors: a misfit
-CORE = 0.99  # probability of the χ² quantile up to which readings enter the robust start
+LEAST_T2_SHARE = 3e-3
+"""Share of the largest t² in the fit below which no reading leaves in one round."""
+SHARED_LEVEL = 1e-3  # probability of so many shared unloaded readings among gross errors: a misfit
+START_QUANTILE = 0.99  # probability of the χ² quantile up to which readings enter the robust start
 MOST_COLUMNS = 200  # parameters fitted anew with each set; of more, only those without a prior
-ROUGH_M = 1e-3  # scatter of most readings, m, that no arm reaches: the readings disagree
-ROUNDS = 20  # most rounds in which readings enter and leave
-WHITENED = 4096  # readings whitened at a time
-EXACT = 1e-6  # share of a group's mean covariance added to each reading, as exact ones have none
+DISAGREEMENT_M = 1e-3  # scatter of most readings, m, that no arm reaches: the readings disagree
+MOST_ROUNDS = 20  # most rounds in which readings enter and leave
+WHITENED_AT_ONCE = 4096  # readings whitened at a time
+COVARIANCE_RIDGE = 1e-6
+"""Share of a group's mean covariance added to each reading, as exact ones have none."""
 MOST_SHARE = 0.35  # most nuisance columns, as a share of the whitened rows
-SAME = 0.25  # largest difference of two equal shifts, as a share of the larger one
-BETWEEN = 1  # most readings with another shift between two with equal shifts
-RUN = 4  # fewest readings with an equal shift: two in a row agree by chance
-ACCIDENTAL = 0.05  # share of readings up to which those with equal shifts count as gross errors
-CHANCE = 1e-2  # of so many near one site by chance, and of noise so far from a law's direction
-FEWEST = 2  # poses that a law must move: at one pose directions of sites may coincide
-ROUGH = 0.05  # share of a law's shift normal to its direction that the linearisation may cause
+SAME_SHIFT = 0.25  # largest difference of two equal shifts, as a share of the larger one
+MOST_BETWEEN = 1  # most readings with another shift between two with equal shifts
+FEWEST_IN_RUN = 4  # fewest readings with an equal shift: two in a row agree by chance
+MOST_ALIKE_SHARE = 0.05
+"""Share of readings up to which those with equal shifts count as gross errors."""
+SITE_LEVEL = 1e-2  # of so many near one site by chance, and of noise so far from a law's direction
+FEWEST_POSES = 2  # poses that a law must move: at one pose directions of sites may coincide
+LINEARISATION_SHARE = 0.05
+"""Share of a law's shift normal to its direction that the linearisation may cause."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +82,7 @@ class Disagreement:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Screened:
+class SnoopingResult:
     """Result of the test for gross errors."""
 
     agree: Bools  # (N,) readings that agree with the model
@@ -89,7 +93,7 @@ class Screened:
 
 
 @dataclass(frozen=True, eq=False)
-class Snooping:
+class DataSnooping:
     """Test of the readings of a fit for gross errors."""
 
     model: Model
@@ -98,34 +102,34 @@ class Snooping:
     solution: Solution  # of a part of the readings
     y: Floats  # (P,) coordinates at which the model is linearised
 
-    def begin(self, rng: np.random.Generator) -> Screened:
+    def test(self, rng: np.random.Generator) -> SnoopingResult:
         """Test all readings from a robust start; `solution` may be fitted to gross errors, too."""
         every = np.ones(len(self.readings), dtype=np.bool_)
         point = linearised(self, self.solution.y)
         residual = point.linear.residuals(point.linear.tested)
         linear = point.with_nuisance(float(np.mean(residual**2)))
         t2 = linear.distances(linear.tested)[linear.tested]
-        if t2.max() <= limit(linear.m, len(t2)):  # model and smooth functions explain all
-            return Screened(every, every, 1.0)
+        if t2.max() <= rejection_limit(linear.m, len(t2)):  # model and smooth functions explain all
+            return SnoopingResult(every, every, 1.0)
         point, used = robust_start(linearised(self, self.y), rng)
         linear = point.linear
-        d2, centre = linear.near(linear.fitted(used)[0])
-        misfit = variance(linear, d2, centre)
+        d2, centre = linear.distances_from(linear.fitted(used)[0])
+        misfit = trimmed_variance(linear, d2, centre)
         linear = point.with_nuisance(misfit)
-        for _ in range(ROUNDS):
+        for _ in range(MOST_ROUNDS):
             t2, centre = _tested(linear, used)
             updated, _ = nearest(linear, t2, centre)
             if np.array_equal(updated, used):
                 break
             used = updated
-        core = float(chi2.ppf(CORE, linear.m)) * variance(linear, t2, centre)
+        core = float(chi2.ppf(START_QUANTILE, linear.m)) * trimmed_variance(linear, t2, centre)
         return self._screened(point, (t2 <= core) | centre, misfit)
 
-    def again(self, screened: Screened) -> Screened:
+    def retest(self, screened: SnoopingResult) -> SnoopingResult:
         """Repeat the test, from the readings that agreed in `screened` and their solution."""
         return self._screened(linearised(self, self.y), screened.agree, screened.misfit)
 
-    def _screened(self, point: "_LinearModel", used: Bools, misfit: float) -> Screened:
+    def _screened(self, point: "_LinearModel", used: Bools, misfit: float) -> SnoopingResult:
         readings = self.readings
         every, of_law = np.ones_like(used), np.zeros_like(used)
         count = int(np.count_nonzero(point.linear.tested))
@@ -135,17 +139,19 @@ class Snooping:
             agree = used | ~linear.tested
             off = np.flatnonzero(~agree)
             if self._accident(linear, off):
-                return Screened(every, every, misfit)
+                return SnoopingResult(every, every, misfit)
             size = np.sqrt(scale * np.mean(np.trace(readings.covariance[:, :3, :3], 0, 1, 2)))
-            if len(off) > MOST * count or (scale > MISFIT[1] and size > ROUGH_M):
-                off = np.flatnonzero((t2 > limit(linear.m, count)) & linear.tested)
-                return Screened(every, every, misfit, Disagreement("many", off))
+            if len(off) > MOST_WRONG * count or (
+                scale > MISFIT_SCALES[1] and size > DISAGREEMENT_M
+            ):
+                off = np.flatnonzero((t2 > rejection_limit(linear.m, count)) & linear.tested)
+                return SnoopingResult(every, every, misfit, Disagreement("many", off))
             if not len(off):
-                return Screened(agree, every, misfit)
+                return SnoopingResult(agree, every, misfit)
             white = linear.residuals(used)[off, :, None]
             shift = (np.linalg.pinv(linear.root[off]) @ white)[:, :, 0]
             axes = self.model.predict(readings.states[off], self.solution.theta).observation
-            alike = off_alike(readings, linear.tested, off, shift[:, :3], axes.rotation)
+            alike = runs_of_equal_shifts(readings, linear.tested, off, shift[:, :3], axes.rotation)
             single = ~np.isin(off, alike) & ~readings.scalar[off]  # a distance has no direction
             rows = off[single]
             # The rms over directions, of lengths and angles apart.
@@ -157,7 +163,7 @@ class Snooping:
             if not len(law):
                 fitted = agree | np.isin(np.arange(len(agree)), alike)
                 disagreement = Disagreement("alike", alike) if len(alike) else None
-                return Screened(agree, self._fittable(linear, fitted), misfit, disagreement)
+                return SnoopingResult(agree, self._fittable(linear, fitted), misfit, disagreement)
             of_law[law] = True
             residual = point.linear.residuals(used | of_law)[used | of_law]
             misfit = max(misfit, float(np.mean(residual**2)))
@@ -170,11 +176,13 @@ class Snooping:
         It starts with the `used` readings (N,); those `of_law` (N,) always stay.
         """
         count = int(np.count_nonzero(linear.tested))
-        for _ in range(ROUNDS):
+        for _ in range(MOST_ROUNDS):
             t2, centre = _tested(linear, used)
             judged = t2[used & (t2 > 0)]
-            scale = bulk(judged, linear.m) if len(judged) else 1.0
-            far = max(limit(linear.m, count, scale), SMALLEST * float(t2[used].max()))
+            scale = bulk_scale(judged, linear.m) if len(judged) else 1.0
+            far = max(
+                rejection_limit(linear.m, count, scale), LEAST_T2_SHARE * float(t2[used].max())
+            )
             updated = linear.with_lone_centres(((t2 <= far) & linear.tested) | of_law, centre)
             if np.array_equal(updated, used):
                 break
@@ -186,7 +194,7 @@ class Snooping:
         shared = self.readings.unloaded & linear.tested & (linear.group >= 0)
         unloaded = int(np.count_nonzero(shared[off]))
         share = float(np.mean(shared[linear.tested]))
-        return unloaded > 0 and float(binom.sf(unloaded - 1, len(off), share)) < ACCIDENT
+        return unloaded > 0 and float(binom.sf(unloaded - 1, len(off), share)) < SHARED_LEVEL
 
     def _fittable(self, linear: ReadingModel, agree: Bools) -> Bools:
         """Return `agree` (N,) without groups that lack a good loaded or a good unloaded reading."""
@@ -204,7 +212,7 @@ class Snooping:
 class _LinearModel:
     """The linear model of all readings at coordinates y (P,)."""
 
-    snooping: Snooping
+    snooping: DataSnooping
     y: Floats
     live: Ints  # (K,) indices of the estimated coordinates, which are the columns of `linear`
     scale: Floats  # (K,) their ordinary magnitudes, the units of the columns
@@ -224,10 +232,10 @@ class _LinearModel:
 
     def with_nuisance(self, misfit: float) -> ReadingModel:
         """Return the linear model with smooth nuisance columns of variance `misfit` − 1."""
-        s, rank = self.snooping, int(self.linear.read[self.linear.tested].sum())
+        s, rank = self.snooping, int(self.linear.elements_read[self.linear.tested].sum())
         columns = smooth_nuisance_columns(s.model, self.prediction, s.readings, rank)
-        for k in range(0, len(columns), WHITENED):  # in place: the largest array of a fit
-            rows = slice(k, k + WHITENED)
+        for k in range(0, len(columns), WHITENED_AT_ONCE):  # in place: the largest array of a fit
+            rows = slice(k, k + WHITENED_AT_ONCE)
             columns[rows] = self.linear.root[rows] @ columns[rows]
         count = max(columns.shape[0] * columns.shape[1], 1)
         length = np.sqrt(np.einsum("nip,nip->p", columns, columns) / count)
@@ -237,7 +245,7 @@ class _LinearModel:
         return self.linear.with_columns(columns if nonzero.all() else columns[:, :, nonzero])
 
 
-def linearised(snooping: Snooping, y: Floats) -> _LinearModel:
+def linearised(snooping: DataSnooping, y: Floats) -> _LinearModel:
     """Return the linear model of all readings at the coordinates y (P,)."""
     model, readings, s = snooping.model, snooping.readings, snooping.solution
     theta = s.space.theta(y)
@@ -288,7 +296,7 @@ def _covariance(readings: Readings, members: Ints) -> Floats:
     mean = np.sum(v[members] * present, axis=1) / present.sum(axis=1)
     out = v.copy()
     g, s = np.nonzero(members >= 0)
-    out[members[g, s]] += EXACT * mean[g]
+    out[members[g, s]] += COVARIANCE_RIDGE * mean[g]
     return out
 
 
@@ -315,7 +323,7 @@ def _tested(linear: ReadingModel, used: Bools) -> tuple[Floats, Bools]:
     """t² (N,) of all readings, and the centres of groups (N,)."""
     if not len(linear.members):
         return linear.distances(used), np.zeros_like(used)
-    _, centre = linear.near(linear.fitted(used)[0])
+    _, centre = linear.distances_from(linear.fitted(used)[0])
     return linear.distances(linear.with_lone_centres(used, centre)), centre
 
 
@@ -340,8 +348,10 @@ def smooth_nuisance_columns(
     return np.concatenate([*joints, *drift, *loads, *harmonics, *links], axis=2)[:, :, :most]
 
 
-def off_alike(readings: Readings, tested: Bools, off: Ints, shift: Floats, axes: Floats) -> Ints:
-    """Return the rows in runs with the same shift; none up to `ACCIDENTAL` of the tested ones (N,).
+def runs_of_equal_shifts(
+    readings: Readings, tested: Bools, off: Ints, shift: Floats, axes: Floats
+) -> Ints:
+    """Return the rows in runs with the same shift; none up to `MOST_ALIKE_SHARE` of the tested.
 
     Of readings that deviate: `off` (F,) ascending rows, `shift` (F, 3) in sensor axes, and `axes`
     (F, 3, 3), the rotations of the target.
@@ -355,24 +365,24 @@ def off_alike(readings: Readings, tested: Bools, off: Ints, shift: Floats, axes:
         i = np.flatnonzero(target[off] == k)
         turned = (shift[i, None] @ axes[i])[:, 0]
         alike[i] = _in_a_row(order[off[i]], shift[i]) | _in_a_row(order[off[i]], turned)
-    few = np.count_nonzero(alike) <= ACCIDENTAL * np.count_nonzero(tested)
+    few = np.count_nonzero(alike) <= MOST_ALIKE_SHARE * np.count_nonzero(tested)
     return off[:0] if few else off[alike]
 
 
 def _in_a_row(order: Ints, shift: Floats) -> Bools:
-    """(F,) which shifts (F, 3) belong to a run of at least `RUN` equal ones.
+    """(F,) which shifts (F, 3) belong to a run of at least `FEWEST_IN_RUN` equal ones.
 
-    The readings between two of them, at most `BETWEEN`, deviate as well.
+    The readings between two of them, at most `MOST_BETWEEN`, deviate as well.
     """
     count = len(shift)
     run, size = np.arange(count), np.linalg.norm(shift, axis=1)
-    for ahead in range(1, BETWEEN + 2):
+    for ahead in range(1, MOST_BETWEEN + 2):
         for k in range(count - ahead):
             j = k + ahead
             distance = np.linalg.norm(shift[j] - shift[k])
-            if order[j] - order[k] == ahead and distance <= SAME * max(size[k], size[j]):
+            if order[j] - order[k] == ahead and distance <= SAME_SHIFT * max(size[k], size[j]):
                 run[run == run[j]] = run[k]
-    return np.asarray(np.bincount(run, minlength=count)[run] >= RUN)
+    return np.asarray(np.bincount(run, minlength=count)[run] >= FEWEST_IN_RUN)
 
 
 def site_columns(model: Model, theta: Floats, prediction: Prediction, readings: Readings) -> Floats:
@@ -407,7 +417,7 @@ def along_one_site(shift: Floats, columns: Floats, pose: Ints) -> Bools:
     square, length = np.sum(shift**2, axis=1), np.linalg.norm(columns, axis=1)
     along = np.einsum("fi,fip->fp", shift, columns) / np.where(length > 0, length, np.inf)
     normal = np.maximum(square[:, None] - along**2, 0.0)
-    near = normal <= (chi2.isf(CHANCE, m - 1) + ROUGH**2 * square)[:, None]
+    near = normal <= (chi2.isf(SITE_LEVEL, m - 1) + LINEARISATION_SHARE**2 * square)[:, None]
     p = np.where(near, beta.cdf(normal / square[:, None], (m - 1) / 2, 0.5), 1.0)
     ascending: Floats = np.sort(p[_different(shift, pose)], axis=0)
     count = len(ascending)
@@ -415,8 +425,8 @@ def along_one_site(shift: Floats, columns: Floats, pose: Ints) -> Bools:
     law = [
         k
         for k, least in enumerate(np.argmin(so_many, axis=0))
-        if so_many[least, k] * count * sites < CHANCE
-        and len(np.unique(pose[p[:, k] <= ascending[least, k]])) >= FEWEST
+        if so_many[least, k] * count * sites < SITE_LEVEL
+        and len(np.unique(pose[p[:, k] <= ascending[least, k]])) >= FEWEST_POSES
     ]
     return np.asarray(near[:, law].any(axis=1))
 
@@ -427,6 +437,6 @@ def _different(shift: Floats, pose: Ints) -> Bools:
     for rows in (np.flatnonzero(pose == p) for p in np.unique(pose)):
         size = np.linalg.norm(shift[rows], axis=1)
         distance = np.linalg.norm(shift[rows, None] - shift[rows], axis=2)
-        same = distance <= SAME * np.maximum(size[:, None], size)
+        same = distance <= SAME_SHIFT * np.maximum(size[:, None], size)
         out[rows] = ~np.tril(same, -1).any(axis=1)
     return out

@@ -48,7 +48,7 @@ from hilcal.types import Floats, Ints
 ITERATIONS = 40  # of the fixed point, at most; a choice
 TOLERANCE = 0.1  # change of the degrees of freedom v tr P K of a group that ends them; a choice
 NEGLIGIBLE = 1e-6  # variance in units of S² that counts as none
-MANY = 1e6  # dimension at which a ratio of quadratic forms is one of them
+LARGE_DIMENSION = 1e6  # dimension at which a ratio of quadratic forms is one of them
 LEAST_P = 1e-300
 
 
@@ -140,7 +140,7 @@ def chosen_drift(model: Model, solution: Solution, w: Whitening) -> Floats:
         change, v = np.abs(new - v) * traces, new
         if change.max() < TOLERANCE:
             break
-    return np.asarray(np.sqrt(np.where(v > NEGLIGIBLE, v, 0.0) + prior.lowest**2))
+    return np.asarray(np.sqrt(np.where(v > NEGLIGIBLE, v, 0.0) + prior.least_drift**2))
 
 
 def conflicts(model: Model, solution: Solution, w: Whitening) -> tuple[Conflict, ...]:
@@ -152,8 +152,8 @@ def conflicts(model: Model, solution: Solution, w: Whitening) -> tuple[Conflict,
     if model.prior is None:
         return ()
     prior, rows = _linear(model, solution, w)
-    used = prior.lowest if model.prior.drift is None else model.prior.drift
-    v = used**2 - prior.lowest**2
+    used = prior.least_drift if model.prior.drift is None else model.prior.drift
+    v = used**2 - prior.least_drift**2
     total = rows.random @ rows.random.T + solution.beta * np.eye(len(rows.y))
     for moved in np.flatnonzero(v > NEGLIGIBLE):
         total += v[moved] * rows.drift[moved] @ rows.drift[moved].T
@@ -166,7 +166,9 @@ def conflicts(model: Model, solution: Solution, w: Whitening) -> tuple[Conflict,
             continue
         values = np.maximum(np.linalg.eigvalsh(inner), 0.0)
         square = float(np.sum((x.T @ residual) ** 2))
-        chance = ratio_tail(values[values > 0] / MANY, MANY, square / MANY**2)
+        chance = ratio_tail(
+            values[values > 0] / LARGE_DIMENSION, LARGE_DIMENSION, square / LARGE_DIMENSION**2
+        )
         out.append(Conflict(group, chance, float(used[k])))
     return tuple(sorted(out, key=lambda c: c.p_value))
 
@@ -174,7 +176,7 @@ def conflicts(model: Model, solution: Solution, w: Whitening) -> tuple[Conflict,
 def _linear(model: Model, solution: Solution, w: Whitening) -> tuple[CarriedPrior, _Linear]:
     """The carried prior with its least drift, and the linear problem."""
     assert model.prior is not None  # noqa: S101 - the callers' condition
-    prior = model.prior.with_drift(model.prior.lowest)
+    prior = model.prior.with_drift(model.prior.least_drift)
     space = coordinates_of(replace(model, prior=prior))
     index, place = prior.index_in(names_of(model))
     (of_all, without, others, y), held = _columns(model, solution, w), space.std == 1.0

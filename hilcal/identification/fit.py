@@ -9,11 +9,11 @@ import numpy as np
 
 from hilcal import limits
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.data_snooping import Disagreement, Snooping
+from hilcal.identification.data_snooping import DataSnooping, Disagreement
 from hilcal.identification.drift import Conflict, chosen_drift, conflicts
 from hilcal.identification.folds import distinct_poses, leave_out, random_folds
 from hilcal.identification.gauss_newton import Solution, solve
-from hilcal.identification.least_trimmed_squares import limit
+from hilcal.identification.least_trimmed_squares import rejection_limit
 from hilcal.identification.residual import ErrorBlock, WithVarianceFactor, error_block, residual
 from hilcal.identification.robot_frames import RobotFrames, robot_frames
 from hilcal.identification.uncertainty import Uncertainty, uncertainty
@@ -365,16 +365,16 @@ def _set_aside(
     used = np.ones(len(readings), dtype=bool)
     w, solution = _solve(model, readings, mode, "gc", start, prior)
     distance2 = mahalanobis2(solution.raw, w.covariance)
-    if distance2.max() <= limit(w.m, len(distance2)):
+    if distance2.max() <= rejection_limit(w.m, len(distance2)):
         return used, None, (w, solution)
     y = np.zeros(model.size) if start is None else solution.space.of_theta(start)
-    screened = Snooping(model, readings, mode, solution, y).begin(np.random.default_rng(SEED))
+    screened = DataSnooping(model, readings, mode, solution, y).test(np.random.default_rng(SEED))
     for _ in range(OUTLIER_ROUNDS):
         if np.array_equal(screened.used, used):
             break
         used = screened.used
         w, solution = _solve(model, readings[used], mode, "gc", solution.theta, prior)
-        screened = Snooping(model, readings, mode, solution, solution.y).again(screened)
+        screened = DataSnooping(model, readings, mode, solution, solution.y).retest(screened)
     return used, screened.disagreement, (w, solution)
 
 

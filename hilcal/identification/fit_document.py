@@ -10,9 +10,9 @@ from hilcal.identification.baseline import masses_note
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_prediction import (
     disagreement_words,
-    error_before,
     full_prediction,
     gross_errors,
+    nominal_error,
 )
 from hilcal.identification.registration import register
 
@@ -36,8 +36,8 @@ def to_json(fit: Fit) -> dict[str, object]:
         "converged": fit.solution.converged,
         "iterations": fit.solution.iterations,
         "condition": {
-            "unscaled": finite(basis.condition_unscaled),
-            "scaled": finite(basis.condition_scaled),
+            "unscaled": finite_or_null(basis.condition_unscaled),
+            "scaled": finite_or_null(basis.condition_scaled),
         },
         "parameters": fit.parameters.to_dicts(),
         "background": background_of(fit).to_json(),
@@ -46,7 +46,7 @@ def to_json(fit: Fit) -> dict[str, object]:
         "variance_factor": fit.variance_factor,
         "variance_factor_interval": list(fit.variance_factor_interval),
         "error": {
-            "before": error_before(fit).to_json(),
+            "before": nominal_error(fit).to_json(),
             "fit": fit.error.to_json(),
             "holdout": fit.holdout.to_json(),
         },
@@ -114,17 +114,17 @@ def notes(fit: Fit) -> tuple[str, ...]:
     return tuple(out)
 
 
-def finite(value: float) -> float | None:
+def finite_or_null(value: float) -> float | None:
     """Return a JSON number, null where there is none."""
     return float(value) if np.isfinite(value) else None
 
 
-def plain(content: object) -> object:
+def with_nulls(content: object) -> object:
     """Return JSON content in which every number that is not finite is null."""
     if isinstance(content, float | np.floating):
-        return finite(float(content))
+        return finite_or_null(float(content))
     if isinstance(content, Mapping):
-        return {str(k): plain(v) for k, v in content.items()}
+        return {str(k): with_nulls(v) for k, v in content.items()}
     if isinstance(content, list | tuple):
-        return [plain(v) for v in content]
+        return [with_nulls(v) for v in content]
     return content

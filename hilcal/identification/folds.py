@@ -11,7 +11,7 @@ effect's parameters in the full fit if that is larger.
 
 import numpy as np
 
-from hilcal.identification.carried import FIRST_GUESS, prior_of, scales_of
+from hilcal.identification.carried import START_STD, prior_of, scales_of
 from hilcal.identification.gauss_newton import Solution, whitened_jacobian
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
@@ -73,11 +73,11 @@ def region_folds(angle: Floats, pose: Ints, count: int = FOLDS) -> Ints:
 
 def folds_of(model: Model, solution: Solution, fold: Ints) -> tuple[Fold, ...]:
     """Return the normal equations of a fit without each fold; `fold` (R,) numbers them by row."""
-    s, magnitude = solution, ordinary_y(model, solution)
+    s, magnitude = solution, ordinary_magnitudes_of_y(model, solution)
     return folds(s.projection(), s.white, s.equations, s.y, s.prior, magnitude, s.beta, fold)
 
 
-def ordinary(model: Model, theta: Floats) -> Floats:
+def ordinary_magnitudes(model: Model, theta: Floats) -> Floats:
     """Magnitude (P,) of each parameter: the ordinary one, or the rms over its effect if larger."""
     out = scales_of(model)
     for rows in model.slices():
@@ -85,12 +85,12 @@ def ordinary(model: Model, theta: Floats) -> Floats:
     return out
 
 
-def ordinary_y(model: Model, solution: Solution) -> Floats:
-    """`ordinary` (P,) of the coordinates y of a solution."""
-    return solution.space.scales(ordinary(model, solution.theta))
+def ordinary_magnitudes_of_y(model: Model, solution: Solution) -> Floats:
+    """`ordinary_magnitudes` (P,) of the coordinates y of a solution."""
+    return solution.space.scales(ordinary_magnitudes(model, solution.theta))
 
 
-def changes(model: Model, solution: Solution, fold: Ints, w: Whitening) -> Floats:
+def parameter_changes(model: Model, solution: Solution, fold: Ints, w: Whitening) -> Floats:
     """Return the parameters without each fold (D,) minus those with it (F, P)."""
     steps = [f.step() for f in folds_of(model, solution, w.rows_of(fold))]
     return np.asarray(np.array(steps) @ solution.transform.T)
@@ -102,7 +102,7 @@ def leave_out(model: Model, solution: Solution, fold: Ints, w: Whitening) -> Flo
     if w.scaling != "none" and bool((groups >= 0).any()):
         change = _with_families(model, solution, fold, w, groups)
     else:
-        change = changes(model, solution, fold, w)
+        change = parameter_changes(model, solution, fold, w)
     moved = np.flatnonzero(np.any(change != 0, axis=0))
     columns = w.raw(model.jacobian(solution.prediction, solution.theta, w.m, moved))
     predicted = solution.raw.copy()
@@ -114,21 +114,21 @@ def leave_out(model: Model, solution: Solution, fold: Ints, w: Whitening) -> Flo
 def _with_families(
     model: Model, solution: Solution, fold: Ints, w: Whitening, groups: Ints
 ) -> Floats:
-    """`changes` for a model with shrunk families, with strengths chosen for each fold."""
+    """`parameter_changes` for a model with shrunk families, with strengths chosen for each fold."""
     s, basis = solution, solution.equations.basis
     flat, count = len(basis.singular), len(basis.prior_precision)
     dropped = np.flatnonzero((groups >= 0) & (s.prior == 0))
     if len(dropped) * s.raw.size > MOST_ELEMENTS:
         dropped = dropped[:0]
-    guess = FIRST_GUESS * scales_of(model)[dropped]
+    guess = START_STD * scales_of(model)[dropped]
     dropped_columns = whitened_jacobian(model, s.prediction, s.theta, w, dropped)
-    in_family = groups[basis.held] >= 0
+    in_family = groups[basis.with_prior] >= 0
     shrunk = flat + np.flatnonzero(in_family)
     unshrunk = np.concatenate([np.arange(flat), flat + np.flatnonzero(~in_family)])
-    family = np.concatenate([groups[basis.held[in_family]], groups[dropped]])
+    family = np.concatenate([groups[basis.with_prior[in_family]], groups[dropped]])
     coordinates, order = s.coordinates(), np.concatenate([unshrunk, shrunk])
     # Flat parameters have the prior about zero of `folds_of`; other unshrunk ones have their prior.
-    magnitude = ordinary_y(model, s)
+    magnitude = ordinary_magnitudes_of_y(model, s)
     per_magnitude = basis.transform[:, :flat] / magnitude[:, None]
     fitted = np.where(basis.flat, s.y / magnitude, 0.0)
     ridge = s.beta * np.eye(len(unshrunk))
@@ -157,7 +157,7 @@ def _with_families(
     return np.asarray(change)
 
 
-def connected(a: Ints, b: Ints, count: int) -> Ints:
+def connected_groups(a: Ints, b: Ints, count: int) -> Ints:
     """Return the group number (count,) of each of `count` items; items a[k] and b[k] are joined.
 
     Groups are numbered in the order of their first items.
@@ -190,7 +190,7 @@ def groups_within(points: Floats, distance: float) -> Ints:
     if 2 * len(cells) > len(first):  # hardly any cell holds several
         joined.append(first[cKDTree(points[first]).query_pairs(distance, np.inf, 0, "ndarray")])
         a, b = np.concatenate(joined).T
-        return connected(a, b, len(points))
+        return connected_groups(a, b, len(points))
     order = np.argsort(cell[first], kind="stable")
     members = np.split(first[order], np.flatnonzero(np.diff(cell[first][order])) + 1)
     tree, up = cKDTree(cells), np.arange(len(cells))
@@ -216,4 +216,4 @@ def groups_within(points: Floats, distance: float) -> Ints:
                 joined.append(np.array([[few[k], many[index[k]]]]))
                 up[high] = low
     a, b = np.concatenate(joined).T
-    return connected(a, b, len(points))
+    return connected_groups(a, b, len(points))

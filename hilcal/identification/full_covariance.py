@@ -12,7 +12,7 @@ from hilcal.identification.registration import register
 from hilcal.model.model import Model
 from hilcal.readings.covariance import (
     INSTRUMENT,
-    WHOLE,
+    INSTRUMENT_AND_ARM,
     arrival_factors,
     tracker_covariance,
     tracker_noise,
@@ -68,7 +68,7 @@ def with_noise_of(tracker: Tracker, readings: Readings) -> Readings:
 
 def covariance_parts(covers: str | None, config: CellConfig) -> CovarianceParts:
     """Return the parts of the full covariance, for stored covariances that cover `covers`."""
-    if covers == WHOLE:
+    if covers == INSTRUMENT_AND_ARM:
         return "instrument and arm as stated"
     if covers != INSTRUMENT:
         return "as imported"

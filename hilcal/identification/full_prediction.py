@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.identification.fit import Fit, all_left_out, mahalanobis2, with_outliers
 from hilcal.identification.gauss_newton import solve
-from hilcal.identification.least_trimmed_squares import MOST
+from hilcal.identification.least_trimmed_squares import MOST_WRONG
 from hilcal.identification.residual import ErrorBlock, error_block, noise_floor, residual
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import Readings
@@ -20,10 +20,11 @@ from hilcal.readings.whitening import Whitening, whitening
 from hilcal.tables.write import Column
 from hilcal.types import Floats, Ints
 
-ALIKE = 1e-3  # χ² quantile of the distance below which two readings are alike; a choice
-SAME = 1e-3  # a reading that repeats another to this share of σ is stale; a choice
-MOSTLY = 0.8  # share of the whitened error that an axis must have to be named; a choice
-SWAPPED = 0.1  # share of an error that another target's place may leave: centimetres; a choice
+ALIKE_QUANTILE = 1e-3  # χ² quantile of the distance below which two readings are alike; a choice
+STALE_SHARE = 1e-3  # a reading that repeats another to this share of σ is stale; a choice
+NAMED_AXIS_SHARE = 0.8  # share of the whitened error that an axis must have to be named; a choice
+SWAPPED_SHARE = 0.1
+"""Share of an error that another target's place may leave: centimetres; a choice."""
 AXES = ("x", "y", "z", "rotation about x", "rotation about y", "rotation about z")
 ELEMENTS = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
 
@@ -55,7 +56,7 @@ class FullPrediction:
 
     def name(self, measurement: int) -> tuple[str, str]:
         """Pose and load of a measurement."""
-        return names(self.readings, int(self.whitening.reading[measurement]))
+        return reading_name(self.readings, int(self.whitening.reading[measurement]))
 
     def target_name(self, measurement: int) -> str:
         """Target of a measurement; '' where there is one."""
@@ -65,7 +66,7 @@ class FullPrediction:
         return str(r.target_names[int(r.target[self.whitening.reading[measurement]])])
 
 
-def names(readings: Readings, row: int) -> tuple[str, str]:
+def reading_name(readings: Readings, row: int) -> tuple[str, str]:
     """Pose and load of a reading."""
     return readings.pose_names[readings.pose[row]], readings.load_names[readings.load[row]]
 
@@ -77,7 +78,7 @@ def full_prediction(fit: Fit) -> FullPrediction:
 
 
 @lru_cache(maxsize=1)
-def error_before(fit: Fit) -> ErrorBlock:
+def nominal_error(fit: Fit) -> ErrorBlock:
     """Return the error of the rigid nominal arm at the readings of a fit, m.
 
     Of deflections it is the deflection itself. Of absolute readings it is what remains where the
@@ -187,7 +188,7 @@ def _gross_error(e: FullPrediction, row: int, off: Floats, covariance: Floats) -
     )
     if r.states.target is not None:
         reason = f"target {r.target_names[r.target[row]]}: {reason}"
-    return GrossError(row, *names(r, row), _distance(off, covariance), reason)
+    return GrossError(row, *reading_name(r, row), _distance(off, covariance), reason)
 
 
 def _another_target(e: FullPrediction, row: int, off: Floats) -> str:
@@ -203,14 +204,14 @@ def _another_target(e: FullPrediction, row: int, off: Floats) -> str:
     away = [float(np.linalg.norm(off[:3] - (x - places[r.target[row]]))) for x in places]
     candidates = [k for k in range(count) if k != r.target[row]]
     closest = min(candidates, key=lambda k: away[k], default=-1)
-    if closest < 0 or away[closest] >= SWAPPED * float(np.linalg.norm(off[:3])):
+    if closest < 0 or away[closest] >= SWAPPED_SHARE * float(np.linalg.norm(off[:3])):
         return ""
     return f"lies where {r.target_names[closest]} is: were they swapped?"
 
 
 def _stale(r: Readings, row: int) -> str:
     std = np.sqrt(np.maximum(np.diagonal(r.covariance[row]), 1e-300))
-    if row and np.all(np.abs(r.value[row] - r.value[row - 1]) <= SAME * std):
+    if row and np.all(np.abs(r.value[row] - r.value[row - 1]) <= STALE_SHARE * std):
         return "equal to the reading before: not taken anew (stale)?"
     return ""
 
@@ -223,7 +224,7 @@ def _like_another(r: Readings, row: int) -> str:
         for k in np.flatnonzero(candidates).tolist()
     }
     closest = min(away, key=lambda k: away[k], default=-1)
-    if closest < 0 or away[closest] ** 2 >= float(chi2.isf(ALIKE, r.m)):
+    if closest < 0 or away[closest] ** 2 >= float(chi2.isf(ALIKE_QUANTILE, r.m)):
         return ""
     load = r.load_names[r.load[closest]]
     if load == "none":
@@ -236,7 +237,7 @@ def _like_another(r: Readings, row: int) -> str:
 def _by_axis(off: Floats, covariance: Floats) -> str:
     white = np.abs(off) / np.sqrt(np.maximum(np.diagonal(covariance), 1e-300))
     axis, sigma = int(np.argmax(white)), _distance(off, covariance)
-    mostly = white[axis] >= MOSTLY * float(np.linalg.norm(white))
+    mostly = white[axis] >= NAMED_AXIS_SHARE * float(np.linalg.norm(white))
     return f"{sigma:.0f} σ off in {AXES[axis]}" if mostly else f"{sigma:.0f} σ off"
 
 
@@ -254,12 +255,12 @@ def disagreement_words(fit: Fit) -> str:
     count = f"{len(disagreement.rows)} of {len(readings)}"
     if disagreement.kind == "many":
         return (
-            f"more than {100 * MOST:.0f} % of the readings disagree with what the others agree on, "
-            f"too many to tell wrong ones from right ones ({count} are beyond the noise): none was "
-            "set aside, and nothing that is fitted to them holds; find out what went wrong in "
-            "measuring"
+            f"more than {100 * MOST_WRONG:.0f} % of the readings disagree with what the others "
+            f"agree on, too many to tell wrong ones from right ones ({count} are beyond "
+            "the noise): none was set aside, and nothing that is fitted to them holds; find out "
+            "what went wrong in measuring"
         )
-    first, last = ("/".join(names(readings, int(disagreement.rows[k]))) for k in (0, -1))
+    first, last = ("/".join(reading_name(readings, int(disagreement.rows[k]))) for k in (0, -1))
     return (
         f"{count} readings, between {first} and {last}, are off by the same shift, so that they "
         "have one cause: another reflector, a target moved on the tool, a tracker that was bumped. "

@@ -41,7 +41,7 @@ MAX_ITERATIONS = 20  # steps; the tests of convergence allow 8
 CONVERGED = 1e-5  # motion of the whitened readings by the last step, in units of the noise
 SETTLED = 0.02  # priors and rank are chosen anew until the residual changes by less than this share
 # in a step, or is within the noise
-DEPTH = 3  # previous steps that a step is combined with: weak directions are as few
+ACCELERATION_DEPTH = 3  # previous steps that a step is combined with: weak directions are as few
 HALVINGS = 8  # most step lengths of a line search
 NOISE_STEPS, NOISE_TOLERANCE = 50, 1e-9  # iterations of the noise factor, and relative change
 
@@ -126,7 +126,9 @@ def _family_priors(
     # The families' columns are unscaled, all others in well-conditioned coordinates.
     basis = p.basis(scale, np.where(family, 1.0, prior), spread)
     equations = p.equations(basis)
-    of_family = np.append(np.zeros(len(basis.singular), dtype=bool), family[p.live[basis.held]])
+    of_family = np.append(
+        np.zeros(len(basis.singular), dtype=bool), family[p.live[basis.with_prior]]
+    )
     order, unshrunk = np.argsort(of_family, kind="stable"), int(np.sum(~of_family))
     gram = equations.gram[np.ix_(order, order)]
     gram[np.arange(unshrunk), np.arange(unshrunk)] += beta * basis.prior_precision[order[:unshrunk]]
@@ -164,7 +166,7 @@ def spent_parameters(equations: NormalEquations, beta: float, groups: Ints) -> f
 
     The equations are over all parameters, `groups` (P,) their shrinkage groups, or −1.
     """
-    group = groups[equations.basis.held]
+    group = groups[equations.basis.with_prior]
     determined = _determined(equations, beta, equations.inverse_root(beta))
     chosen = group >= 0
     unshrunk = float(np.sum(determined[~chosen])) + len(equations.basis.singular)
@@ -190,10 +192,12 @@ class NewtonPoint:
     rss: float  # sum of squares of the whitened residual
     elements: int  # number of elements of the residual
 
-    def objective(self, by: Regularisation) -> float:
+    def objective(self, regularisation: Regularisation) -> float:
         """Return ‖w‖² + β ‖y/σ‖² over the y with a prior."""
-        held = np.isfinite(by.prior) & (by.prior > 0)
-        return self.rss + by.beta * float(np.sum((self.y[held] / by.prior[held]) ** 2))
+        held = np.isfinite(regularisation.prior) & (regularisation.prior > 0)
+        return self.rss + regularisation.beta * float(
+            np.sum((self.y[held] / regularisation.prior[held]) ** 2)
+        )
 
     def mean_square(self, parameters: int = 0) -> float:
         """Return ‖w‖² over the degrees of freedom, with a number of estimated parameters."""
@@ -208,7 +212,7 @@ class Minimum(NamedTuple, Generic[P]):
     """End of the iteration."""
 
     point: P
-    by: Regularisation  # of the last linear problem
+    regularisation: Regularisation  # of the last linear problem
     iterations: int
     converged: bool  # whether the last step was negligible
     rows: Floats | None  # (R, L) of the last linearisation if it is valid at the point
@@ -284,7 +288,7 @@ def minimum(problem: NewtonProblem[P], start: Floats | None, prior: Floats | Non
         moved = linear.rows @ (aim - point.y)[linear.live]
         shortcut = None
         if settled and problem.same_rows:
-            path = [*path[-DEPTH:], (aim, moved)]
+            path = [*path[-ACCELERATION_DEPTH:], (aim, moved)]
             shortcut = accelerated(path) if len(path) > 1 else None
         start_point, point = point, _line_search(problem, point, aim, by, shortcut)
         previous, square = square, point.mean_square(len(by.basis.singular))
@@ -439,10 +443,10 @@ def solve(
         theta = space.theta(np.zeros(model.size)) if start is None else start
         prediction = model.predict(readings.states, theta)
         a = whitened_jacobian(model, prediction, theta, w, np.arange(model.size))
-        space = space.felt(a)
+        space = space.restricted(a)
     problem = _Problem(model, space, w.scaling != "none", readings, w)
     end = minimum(problem, None if start is None else space.of_theta(start), prior)
-    point, by = end.point, end.by
+    point, by = end.point, end.regularisation
     live = np.flatnonzero(by.prior > 0)
     rows = by.basis.rows(problem.columns(point, live) if end.rows is None else end.rows)
     beta = point.mean_square(len(by.basis.singular)) if w.scaling == "none" else by.beta
@@ -495,7 +499,7 @@ def columns_of(
 def prior_coordinates(basis: Basis, y: Floats, prior: Floats) -> Floats:
     """Return z (K,) of the y with a prior; zero for flat directions."""
     flat = np.zeros(len(basis.singular))
-    return np.concatenate([flat, y[basis.held] / prior[basis.held]])
+    return np.concatenate([flat, y[basis.with_prior] / prior[basis.with_prior]])
 
 
 def over_all_parameters(basis: Basis, live: Ints, size: int) -> Basis:
@@ -503,4 +507,6 @@ def over_all_parameters(basis: Basis, live: Ints, size: int) -> Basis:
     transform = np.zeros((size, basis.transform.shape[1]))
     null, flat = np.zeros((size, basis.null.shape[1])), np.zeros(size, dtype=bool)
     transform[live], null[live], flat[live] = basis.transform, basis.null, basis.flat
-    return replace(basis, transform=transform, null=null, flat=flat, held=live[basis.held])
+    return replace(
+        basis, transform=transform, null=null, flat=flat, with_prior=live[basis.with_prior]
+    )

@@ -20,7 +20,7 @@ MIRROR = np.array([1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Described:
+class Description:
     """Arm and readings as they are described."""
 
     arm: Arm
@@ -50,7 +50,7 @@ class Hypothesis:
     follows: int = 0  # number of the joint that it follows, from 1; with `factor`
     factor: float = 0.0  # of the coupling
     arm: str = ""  # another arm of the catalogue
-    shift: int = 0  # as of `Described`
+    shift: int = 0  # as of `Description`
     order: tuple[int, ...] = ()  # column, from 1, that holds the values of each joint
 
     @property
@@ -69,7 +69,7 @@ class Hypothesis:
         """The subject; two hypotheses on one subject are not combined."""
         return self.kind, self.joint, self.follows
 
-    def applied(self, d: Described) -> Described:
+    def applied(self, d: Description) -> Description:
         """Return arm and readings under this hypothesis."""
         return KINDS[self.kind].applied(d, self)
 
@@ -80,20 +80,20 @@ class Hypothesis:
         return phrase if isinstance(phrase, str) else phrase(self)
 
 
-Applied = Callable[[Described, Hypothesis], Described]
-Way = tuple[Hypothesis, ...]  # tried together
+Applied = Callable[[Description, Hypothesis], Description]
+Combination = tuple[Hypothesis, ...]  # tried together
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class HypothesisKind:
     """A row of the table."""
 
     applied: Applied  # arm and readings under a hypothesis
     words: str | Callable[[Hypothesis], str]  # what is wrong, in a phrase
-    mended: str | None = None  # a line of CELL.toml; '' where `keys` says it; None: in the table
+    correction: str | None = None  # line of CELL.toml; '': `robot_keys` says it; None: in the table
 
 
-def _recounted(d: Described, h: Hypothesis) -> Described:
+def _recounted(d: Description, h: Hypothesis) -> Description:
     n, j = d.arm.n, h.joint - 1
     sign, offset, coupling = np.ones(n), np.zeros(n), np.zeros((n, n))
     sign[j], offset[j] = h.sign, h.offset
@@ -102,7 +102,7 @@ def _recounted(d: Described, h: Hypothesis) -> Described:
     return replace(d, arm=with_conventions(d.arm, sign, offset, coupling))
 
 
-def _another_arm(d: Described, h: Hypothesis) -> Described:
+def _another_arm(d: Description, h: Hypothesis) -> Description:
     arm = load_arm(h.arm)
     return replace(d, arm=arm if d.conventions is None else as_counted(arm, d.conventions))
 
@@ -110,7 +110,7 @@ def _another_arm(d: Described, h: Hypothesis) -> Described:
 def _mapped(name: str, change: Callable[[Any], Any]) -> Applied:
     """Return a change of one attribute of the description, unless that is None."""
 
-    def applied(d: Described, _: Hypothesis) -> Described:
+    def applied(d: Description, _: Hypothesis) -> Description:
         value = getattr(d, name)
         return d if value is None else replace(d, **{name: change(value)})
 
@@ -122,13 +122,13 @@ def _angles_by(turning: Callable[[Floats], Floats], sliding: float = 1.0) -> App
     return lambda d, _: replace(d, q=np.where(d.arm.slides, sliding * d.q, turning(d.q)))
 
 
-def _mirrored(d: Described, _: Hypothesis) -> Described:
+def _mirrored(d: Description, _: Hypothesis) -> Description:
     # D exp(w) D = exp(−D w) for a reflection D
     turn = None if d.turn is None else -d.turn * MIRROR
     return replace(d, value=d.value * MIRROR, turn=turn)
 
 
-def _inverse(d: Described, _: Hypothesis) -> Described:
+def _inverse(d: Description, _: Hypothesis) -> Description:
     if d.turn is None:
         return d
     back = np.asarray(-np.einsum("nji,nj->ni", se3.rotation(d.turn), d.value))
@@ -162,54 +162,62 @@ def _columns_words(h: Hypothesis) -> str:
     return f"the columns of the joints are in another order: {listed}"
 
 
-KINDS: dict[str, Kind] = {
-    "arm": Kind(_another_arm, lambda h: f"the arm is another one, {h.arm}", ""),
-    "joint": Kind(_recounted, _joint_words, ""),
-    "coupling": Kind(_recounted, _coupling_words, ""),
-    "base_unknown": Kind(
+KINDS: dict[str, HypothesisKind] = {
+    "arm": HypothesisKind(_another_arm, lambda h: f"the arm is another one, {h.arm}", ""),
+    "joint": HypothesisKind(_recounted, _joint_words, ""),
+    "coupling": HypothesisKind(_recounted, _coupling_words, ""),
+    "base_unknown": HypothesisKind(
         lambda d, _: replace(d, base_unknown=True),
         "the base stands elsewhere than [tracker] says",
         "leave out [tracker] base_xyz_m and base_rotvec_rad",
     ),
-    "target_unknown": Kind(
+    "target_unknown": HypothesisKind(
         lambda d, _: replace(d, target_unknown=True),
         "the target sits elsewhere than [tool] says",
         "leave out [tool] target_m",
     ),
-    "millimetres": Kind(
+    "millimetres": HypothesisKind(
         _mapped("value", lambda p: 1e-3 * p), "the positions are millimetres, not metres"
     ),
-    "metres": Kind(
+    "metres": HypothesisKind(
         _mapped("value", lambda p: 1e3 * p),
         "the positions are metres, and were taken for millimetres",
     ),
-    "joint_degrees": Kind(_angles_by(np.radians), "the joint values are degrees, not radians"),
-    "joint_radians": Kind(
+    "joint_degrees": HypothesisKind(
+        _angles_by(np.radians), "the joint values are degrees, not radians"
+    ),
+    "joint_radians": HypothesisKind(
         _angles_by(np.degrees), "the joint values are radians, and were taken for degrees"
     ),
-    "travel_millimetres": Kind(
+    "travel_millimetres": HypothesisKind(
         _angles_by(np.positive, 1e-3),
         "the travels of the joints that slide are millimetres, not metres",
     ),
-    "turn_degrees": Kind(_mapped("turn", np.radians), "the attitudes are degrees, not radians"),
-    "turn_radians": Kind(
+    "turn_degrees": HypothesisKind(
+        _mapped("turn", np.radians), "the attitudes are degrees, not radians"
+    ),
+    "turn_radians": HypothesisKind(
         _mapped("turn", np.degrees), "the attitudes are radians, and were taken for degrees"
     ),
-    "mirrored": Kind(
+    "mirrored": HypothesisKind(
         _mirrored, "the axes of the readings are left-handed: one coordinate has the other sign"
     ),
-    "mirrored_positions": Kind(
+    "mirrored_positions": HypothesisKind(
         _mapped("value", lambda p: p * MIRROR), "one coordinate of the positions has the other sign"
     ),
-    "inverse": Kind(
+    "inverse": HypothesisKind(
         _inverse, "the poses are the inverse ones, of the tracker in the target's axes"
     ),
-    "inverse_attitude": Kind(_mapped("turn", np.negative), "the attitudes are the inverse ones"),
-    "shift": Kind(
+    "inverse_attitude": HypothesisKind(
+        _mapped("turn", np.negative), "the attitudes are the inverse ones"
+    ),
+    "shift": HypothesisKind(
         lambda d, h: replace(d, q=np.roll(d.q, -h.shift, axis=0), shift=d.shift + h.shift),
         _shift_words,
     ),
-    "columns": Kind(lambda d, h: replace(d, q=d.q[:, np.array(h.order) - 1]), _columns_words),
+    "columns": HypothesisKind(
+        lambda d, h: replace(d, q=d.q[:, np.array(h.order) - 1]), _columns_words
+    ),
 }
 """What may be wrong with the description of arm and readings, by name."""
 
@@ -217,7 +225,7 @@ KINDS: dict[str, Kind] = {
 OF_ATTITUDES = ("mirrored_positions", "turn_degrees", "turn_radians", "inverse", "inverse_attitude")
 
 
-def hypotheses(d: Described) -> Iterator[Hypothesis]:
+def hypotheses(d: Description) -> Iterator[Hypothesis]:
     """Yield the single hypotheses."""
     n, slides = d.arm.n, d.arm.slides
     frames = {"base_unknown": d.base_unknown, "target_unknown": d.target_unknown}
@@ -249,7 +257,7 @@ def shifts(count: int) -> Iterator[Hypothesis]:
     yield from (Hypothesis("shift", shift=k) for k in SHIFTS if 2 * abs(k) <= count)
 
 
-def pairs(n: int) -> Iterator[Way]:
+def pairs(n: int) -> Iterator[Combination]:
     """Yield pairs that hide each other: two signs, and the zeros of two neighbours."""
     for i, j in combinations(range(1, n + 1), 2):
         yield Hypothesis("joint", i, -1), Hypothesis("joint", j, -1)
@@ -258,17 +266,17 @@ def pairs(n: int) -> Iterator[Way]:
         yield first, Hypothesis("joint", j + 1, 1, b * np.pi / 2)
 
 
-def mended(way: Way, cell: Cell) -> str:
+def correction(combination: Combination, cell: Cell) -> str:
     """Return what to write into CELL.toml, or to change in the table; begins with '; '."""
-    lines = [f'[robot] model = "{h.arm}"' for h in way if h.arm][:1]
-    lines += [f"[robot] {key} = {value}" for key, value in keys(way, cell).items()]
-    where = [KINDS[h.kind].mended for h in way]
+    lines = [f'[robot] model = "{h.arm}"' for h in combination if h.arm][:1]
+    lines += [f"[robot] {key} = {value}" for key, value in robot_keys(combination, cell).items()]
+    where = [KINDS[h.kind].correction for h in combination]
     lines += [line for line in where if line]
     advice = f"; in CELL.toml: {', '.join(lines)}" if lines else ""
     return f"{advice}; correct it in the table" if None in where else advice
 
 
-def keys(way: Way, cell: Cell) -> dict[str, str]:
+def robot_keys(combination: Combination, cell: Cell) -> dict[str, str]:
     """Return the keys of [robot] that describe the joints under some hypotheses, as TOML."""
     n, robot = cell.arm.n, None if cell.config is None else cell.config.robot
     sign = np.array((robot and robot.joint_sign) or (1,) * n)
@@ -277,7 +285,7 @@ def keys(way: Way, cell: Cell) -> dict[str, str]:
         c.model_dump(exclude_defaults=True) | {"factor": c.factor}
         for c in (robot.joint_coupling if robot else ())
     ]
-    for h in way:
+    for h in combination:
         j = h.joint - 1
         if h.offset:
             zero[j] += sign[j] * np.degrees(h.offset)
@@ -288,9 +296,12 @@ def keys(way: Way, cell: Cell) -> dict[str, str]:
             coupled.append({"joint": h.joint, "follows": h.follows, "factor": factor})
     entries = [", ".join(f"{k} = {json.dumps(v)}" for k, v in c.items()) for c in coupled]
     values = (
-        (any(h.sign < 0 for h in way), json.dumps([int(s) for s in sign])),
-        (any(h.offset for h in way), json.dumps([round(float(z), 4) + 0.0 for z in zero])),
-        (any(h.follows for h in way), f"[{', '.join(f'{{ {entry} }}' for entry in entries)}]"),
+        (any(h.sign < 0 for h in combination), json.dumps([int(s) for s in sign])),
+        (any(h.offset for h in combination), json.dumps([round(float(z), 4) + 0.0 for z in zero])),
+        (
+            any(h.follows for h in combination),
+            f"[{', '.join(f'{{ {entry} }}' for entry in entries)}]",
+        ),
     )
     by_key = zip(Conventions.model_fields, values, strict=True)
     return {key: value for key, (changed, value) in by_key if changed}

@@ -29,7 +29,7 @@ from hilcal.config.cell import Tool
 from hilcal.effects.protocol import Effect, Role
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.arm_scatter import with_arm_scatter
-from hilcal.identification.baseline import ARM
+from hilcal.identification.baseline import LEVER_M
 from hilcal.identification.carried import scales_of
 from hilcal.identification.fit import Fit
 from hilcal.identification.gauss_newton import shortened
@@ -46,9 +46,11 @@ from hilcal.types import Floats
 # All of these are choices.
 STEPS = 20  # most Gauss-Newton steps; they converge within four
 CONVERGED = 1e-4  # step that ends them, rms of the whitened rows
-ABSURD = 1e4  # change of a parameter, in ordinary magnitudes, that is not tried; 10 m of a link
-LEAST = 1e-6  # directions of the prior that move readings by less, in σ, are left at its mean
-LEAST_SHARED = 1e-3  # share of a pose in the misfit that is neglected
+LARGEST_CHANGE = 1e4
+"""Change of a parameter, in ordinary magnitudes, that is not tried; 10 m of a link."""
+LEAST_MOTION = 1e-6
+"""Directions of the prior that move readings by less, in σ, are left at its mean."""
+LEAST_POSE_SHARE = 1e-3  # share of a pose in the misfit that is neglected
 HALVINGS = 6  # of a step that makes the sum of squares grow
 
 
@@ -57,10 +59,10 @@ class EarlierFit:
     """A gc-scaled fit, and its predictive distribution for readings that were not fitted."""
 
     fit: Fit
-    knows: Predictive
+    predictive: Predictive
     root: Floats  # (P, K) R, root of κC
     noise: float  # a, variance of the noise in units of the stated one
-    by_pose: float  # c, variance of the misfit that all readings of a pose share, likewise
+    pose_variance: float  # c, variance of the misfit that all readings of a pose share, likewise
 
 
 def earlier_fit(fit: Fit) -> EarlierFit:
@@ -125,7 +127,7 @@ def _share_by_pose(fit: Fit, knows: Predictive, inliers: Readings) -> float:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Moving:
+class EffectDirections:
     """A change of the arm: an effect that is added, with some directions of its parameters."""
 
     effect: Effect  # with a name that the model lacks; several changes may share one
@@ -133,7 +135,7 @@ class Moving:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Setting:
+class LaterReadings:
     """Later readings, and the parameters that may explain them without a change of the arm."""
 
     earlier: EarlierFit
@@ -150,17 +152,16 @@ class Setting:
     def scaled(self, white: Floats) -> Floats:
         """Whitened rows (R, ...) in units of the noise."""
         alone = len(np.unique(self.w.group)) == len(self.w)
-        a = self.earlier.noise + (self.earlier.by_pose if alone else 0.0)
+        a = self.earlier.noise + (self.earlier.pose_variance if alone else 0.0)
         return np.asarray(white / np.sqrt(a))
 
 
 @dataclass(frozen=True, eq=False)
-class Remeasured:
+class LaterFit:
     """Later readings explained by an earlier fit and changes: rows R, coordinates K and L."""
 
-    setting: Setting  # the readings and the earlier fit
-    changes: tuple[Moving, ...]
-    model: Model  # that of the setting, and the changes
+    later: LaterReadings  # the readings and the earlier fit
+    model: Model  # that of `later`, and the changes
     mean: Floats  # (P,) prior mean of its parameters
     lift: Floats  # (P, K) directions of u, b and δ
     ridge: Floats  # (K + L,) of these and of p: 1 for those with a prior, 0 for flat ones
@@ -170,32 +171,32 @@ class Remeasured:
     def theta(self) -> Floats:
         """(P,) parameters; raises CannotAnswerError where they have no static equilibrium."""
         step = self.lift @ self.coordinates[: self.lift.shape[1]]
-        if np.any(np.abs(step) > ABSURD * scales_of(self.model)):
+        if np.any(np.abs(step) > LARGEST_CHANGE * scales_of(self.model)):
             raise CannotAnswerError("a change of such a size has no static equilibrium")
         return np.asarray(self.mean + step)
 
     @cached_property
     def prediction(self) -> Prediction:
         """Prediction of the readings."""
-        return self.model.predict(self.setting.readings.states, self.theta)
+        return self.model.predict(self.later.readings.states, self.theta)
 
     @cached_property
     def raw(self) -> Floats:
         """(D, m) residual, sensor axes."""
-        return residual(self.setting.readings, self.prediction, self.setting.w)
+        return residual(self.later.readings, self.prediction, self.later.w)
 
     @cached_property
     def white(self) -> Floats:
         """(R,) residual in units of the noise √a."""
-        return self.setting.scaled(self.setting.w.whiten(self.raw).reshape(-1))
+        return self.later.scaled(self.later.w.whiten(self.raw).reshape(-1))
 
     @cached_property
     def projection(self) -> Projection:
         """M, of rows in units of the noise √a."""
-        w = self.setting.w
+        w = self.later.w
         jacobian = self.model.jacobian(self.prediction, self.theta, w.m)
-        moved = self.setting.scaled(w.whiten(w.raw(jacobian @ self.lift)))
-        return projection(np.hstack([moved, self.setting.poses]), self.ridge)
+        moved = self.later.scaled(w.whiten(w.raw(jacobian @ self.lift)))
+        return projection(np.hstack([moved, self.later.poses]), self.ridge)
 
     @cached_property
     def target(self) -> Floats:
@@ -207,7 +208,7 @@ class Remeasured:
     @property
     def square(self) -> float:
         """The minimised sum of squares."""
-        remaining = self.white - self.setting.poses @ self.coordinates[self.lift.shape[1] :]
+        remaining = self.white - self.later.poses @ self.coordinates[self.lift.shape[1] :]
         return float(remaining @ remaining + self.ridge @ self.coordinates**2)
 
     @property
@@ -224,34 +225,34 @@ class Remeasured:
     @property
     def dof(self) -> float:
         """Degrees of freedom of rᵀ M r."""
-        return float(self.setting.w.rank - self.free)
+        return float(self.later.w.rank - self.free)
 
     @property
     def sizes(self) -> Floats:
         """(k,) δ of all changes, in order."""
-        return self.coordinates[self.setting.lift.shape[1] : self.lift.shape[1]]
+        return self.coordinates[self.later.lift.shape[1] : self.lift.shape[1]]
 
     @property
     def inverse(self) -> Floats:
         """(k, k) covariance of δ in units of the noise a."""
-        root = self.projection.inverse_root[:, self.setting.lift.shape[1] : self.lift.shape[1]]
+        root = self.projection.inverse_root[:, self.later.lift.shape[1] : self.lift.shape[1]]
         return np.asarray(root.T @ root)
 
-    def columns(self, moving: Moving) -> tuple[Floats, Floats]:
+    def columns(self, moving: EffectDirections) -> tuple[Floats, Floats]:
         """Return rows (R, k) of a change, and the motion (D, 3, k) of the target it makes, m."""
-        w = self.setting.w
+        w = self.later.w
         jacobian = self.model.jacobian_of((moving.effect,), self.prediction, self.theta, w.m)
         raw = w.raw(jacobian @ moving.directions)
-        return self.setting.scaled(w.whiten(raw)), raw[:, :3]
+        return self.later.scaled(w.whiten(raw)), raw[:, :3]
 
-    def moved(self, step: Floats) -> "Remeasured":
+    def moved(self, step: Floats) -> "LaterFit":
         """Return the same after a step (K + L,) of the coordinates."""
         return replace(self, coordinates=self.coordinates + step)
 
 
-def setting(
+def later_readings(
     earlier: EarlierFit, readings: Readings, *, anew: bool, cell: Cell | None = None
-) -> Setting:
+) -> LaterReadings:
     """Prepare the comparison of later readings with an earlier fit.
 
     With `anew` the place of the tracker is estimated. Of the later campaign's `cell` the tool is
@@ -296,25 +297,29 @@ def setting(
         lift[:count] = np.concatenate([earlier.root[s] for _, s in parts])
     # Directions of the prior that do not move the readings stay at its mean.
     _, values, vectors = np.linalg.svd(_rows(model, mean, lift, readings, w), full_matrices=False)
-    lift = lift @ vectors[values > LEAST * max(float(values.max(initial=0.0)), 1.0)].T
+    lift = lift @ vectors[values > LEAST_MOTION * max(float(values.max(initial=0.0)), 1.0)].T
     size = scales_of(model)[count:]
     if fit.mode == "deflection":  # deflections determine only the turns of frames
-        size = np.array([rms if p.unit == "m" else rms / ARM for f in frames for p in f.parameters])
+        size = np.array(
+            [rms if p.unit == "m" else rms / LEVER_M for f in frames for p in f.parameters]
+        )
     free = np.full(len(size), 1.0 if fit.mode == "deflection" else 0.0)
     ridge = np.concatenate([np.ones(lift.shape[1]), free])
     lift = np.hstack([lift, np.eye(model.size)[:, count:] * size])
     poses = _pose_rows(earlier, w)
-    return Setting(earlier, readings, w, model, mean, lift, ridge, poses, anew, len(mean) - count)
+    return LaterReadings(
+        earlier, readings, w, model, mean, lift, ridge, poses, anew, len(mean) - count
+    )
 
 
-def frames_alone(later: Setting) -> Setting:
+def with_frames_only(later: LaterReadings) -> LaterReadings:
     """Return the setting with the earlier parameters fixed; frames are free."""
     moves = np.any(later.lift[len(later.mean) - later.frames :] != 0.0, axis=0)
     none = later.poses[:, :0]
     return replace(later, lift=later.lift[:, moves], ridge=later.ridge[moves], poses=none)
 
 
-def beside_frames(later: Setting) -> Floats:
+def directions_beside_frames(later: LaterReadings) -> Floats:
     """(P, K) directions of the prior, each with the motion of frames that absorbs most of it."""
     frames = np.any(later.lift[len(later.mean) - later.frames :] != 0.0, axis=0)
     prior = later.lift[:, ~frames]
@@ -356,9 +361,9 @@ def _rows(model: Model, mean: Floats, lift: Floats, readings: Readings, w: White
 
 def _pose_rows(earlier: EarlierFit, w: Whitening) -> Floats:
     """Rows (R, L) of a misfit that is common to the measurements of a pose, with its spread."""
-    shared = earlier.by_pose / earlier.noise
+    shared = earlier.pose_variance / earlier.noise
     poses, pose = np.unique(w.group, return_inverse=True)
-    if shared < LEAST_SHARED or len(poses) == len(w):
+    if shared < LEAST_POSE_SHARE or len(poses) == len(w):
         return np.zeros((len(w) * w.m, 0))
     out = np.zeros((len(w), w.m, len(poses), w.m))
     std = np.sqrt(shared * np.diagonal(w.covariance, axis1=1, axis2=2))
@@ -367,9 +372,9 @@ def _pose_rows(earlier: EarlierFit, w: Whitening) -> Floats:
     return w.whiten(out.reshape(len(w), w.m, -1))
 
 
-def remeasure(
-    later: Setting, changes: Sequence[Moving] = (), start: Remeasured | None = None
-) -> Remeasured:
+def fit_later(
+    later: LaterReadings, changes: Sequence[EffectDirections] = (), start: LaterFit | None = None
+) -> LaterFit:
     """Find the minimum by Gauss-Newton on the exact chain, with flat changes of the arm.
 
     `start` may be a minimum with the first changes. CannotAnswerError: no static equilibrium.
@@ -389,7 +394,7 @@ def remeasure(
         count = k + len(start.sizes)
         x[:count] = start.coordinates[:count]
         x[lift.shape[1] :] = start.coordinates[count:]
-    point = Remeasured(later, tuple(changes), model, mean, lift, ridge, x)
+    point = LaterFit(later, model, mean, lift, ridge, x)
     for _ in range(STEPS):
         m = point.projection
         step = m.solve(m.rows.T @ point.target) - point.coordinates

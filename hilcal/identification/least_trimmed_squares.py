@@ -16,7 +16,7 @@ d²_(k) ascending squared distances of the readings from the linear model with �
 than half of them, so that nearly half may be wrong, by any amount. A fit to the h readings that are
 nearest to a model has a lower sum (concentration); it starts from many random subsets that just
 determine the model, and the lowest sum is kept. The bulk of the distances gives the limit of a
-gross error (`limit`).
+gross error (`rejection_limit`).
 """
 
 from dataclasses import dataclass, field
@@ -31,18 +31,23 @@ from hilcal.readings.whitening import inverse_root
 from hilcal.types import Bools, Floats, Ints
 
 # All of these are choices.
-MOST = 0.45  # share of the readings that may be wrong: half of few agree on some model by chance
-MISSED, STARTS = 1e-3, 300  # probability that every subset has a wrong reading; most subsets
-FEW, BEST, LAST = 300, 20, 20  # readings that subsets are of (source); best ones; steps at most
+MOST_WRONG = 0.45
+"""Share of the readings that may be wrong: half of few agree on some model by chance."""
+MISS_PROBABILITY, MOST_SUBSETS = 1e-3, 300
+"""Probability that every subset has a wrong reading; most subsets."""
+SUBSET_READINGS, BEST_SUBSETS, MOST_FINAL_STEPS = 300, 20, 20
+"""Readings that subsets are of (source); best subsets that are continued; steps of these at
+most."""
 HALVINGS = 6  # shorter steps that are tried
-ANEW = 6  # most linearisations: gross errors may have led the first one far off
+MOST_LINEARISATIONS = 6  # gross errors may have led the first one far off
 FALSE_ALARMS = 1e-3  # expected good readings set aside per campaign under the right model
-MISFIT_FACTOR = 6.25  # of the limit with a misfit, 2.5 in distance: its tails are heavier; reached
-MISFIT = (1.25, 1.5)  # gradually between these scales of the bulk, noise alone and a sure misfit
-SINGULAR = 1e-9  # ridge, as a share of a column's square: few readings determine few columns
-AT_A_TIME = 4096  # readings whose covariance is formed at a time
-FAR = 100.0  # χ² beyond which its probability is not evaluated
-LEVERAGE = 1e-6  # share of a reading's information that must remain for a test
+MISFIT_FACTOR = 6.25  # of the limit with a misfit, 2.5 in distance: its tails are heavier
+MISFIT_SCALES = (1.25, 1.5)
+"""Scales of the bulk between which `MISFIT_FACTOR` is reached: noise alone, and a sure misfit."""
+SINGULAR_RIDGE = 1e-9  # ridge, as a share of a column's square: few readings determine few columns
+READINGS_AT_ONCE = 4096  # readings whose covariance is formed at a time
+LARGEST_CHI2 = 100.0  # χ² beyond which its probability is not evaluated
+LEAST_INFORMATION_SHARE = 1e-6  # share of a reading's information that must remain for a test
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,13 +71,13 @@ class ReadingModel:
         return int(self.residual.shape[1])
 
     @cached_property
-    def enough(self) -> int:
+    def fewest_readings(self) -> int:
         """Number of readings whose elements are as many as the coordinates without a prior."""
-        elements = max(int(np.median(self.read)), 1)
+        elements = max(int(np.median(self.elements_read)), 1)
         return -(-int(np.count_nonzero(self.precision == 0)) // elements)
 
     @cached_property
-    def read(self) -> Ints:
+    def elements_read(self) -> Ints:
         """(N,) elements of each reading that were read."""
         return np.asarray(np.count_nonzero(np.any(self.root != 0, axis=2), axis=1))
 
@@ -122,9 +127,9 @@ class ReadingModel:
         """
         _, covariance, r, b = self._fitted(used)
         spread = np.empty((len(b), self.m, self.m))
-        for k in range(0, len(b), AT_A_TIME):
-            some = b[k : k + AT_A_TIME]
-            spread[k : k + AT_A_TIME] = (some @ covariance) @ some.swapaxes(1, 2)
+        for k in range(0, len(b), READINGS_AT_ONCE):
+            some = b[k : k + READINGS_AT_ONCE]
+            spread[k : k + READINGS_AT_ONCE] = (some @ covariance) @ some.swapaxes(1, 2)
         if len(self.members):
             grouped = self.group >= 0
             root, offset = self.root[grouped], self._offset_covariance(used)[self.group[grouped]]
@@ -132,11 +137,11 @@ class ReadingModel:
         a = np.eye(self.m) + np.where(used, -1.0, 1.0)[:, None, None] * spread
         values, vectors = np.linalg.eigh(a)
         c = np.einsum("nij,ni->nj", vectors, r)
-        regular = values > LEVERAGE
+        regular = values > LEAST_INFORMATION_SHARE
         t2 = np.sum(np.where(regular, c**2 / np.where(regular, values, 1.0), 0.0), axis=1)
         return self._comparable(np.asarray(t2))
 
-    def near(self, delta: Floats) -> tuple[Floats, Bools]:
+    def distances_from(self, delta: Floats) -> tuple[Floats, Bools]:
         """Squared distances (N,) from the model with δ (K,), and which readings are centres (N,).
 
         Readings of a group are compared with one of them, its centre: that with the least
@@ -168,13 +173,13 @@ class ReadingModel:
         """(N,) squared distances t², converted to those of readings of m elements.
 
         For a reading of fewer elements, such as a distance, χ² of the same probability; what
-        exceeds `FAR`, where that is rounding, is added.
+        exceeds `LARGEST_CHI2`, where that is rounding, is added.
         """
-        less = (self.read > 0) & (self.read < self.m)
+        less = (self.elements_read > 0) & (self.elements_read < self.m)
         if not less.any():
             return t2
-        near, out = np.minimum(t2[less], FAR), t2.copy()
-        out[less] = chi2.isf(chi2.sf(near, self.read[less]), self.m) + t2[less] - near
+        near, out = np.minimum(t2[less], LARGEST_CHI2), t2.copy()
+        out[less] = chi2.isf(chi2.sf(near, self.elements_read[less]), self.m) + t2[less] - near
         return out
 
     def _fitted(self, used: Bools) -> tuple[Floats, Floats, Floats, Floats]:
@@ -204,7 +209,7 @@ class ReadingModel:
     def _guard(self) -> Floats:
         """(K,) ridge against singular equations."""
         squares = np.einsum("nik,nik->k", self.columns, self.columns)
-        return np.asarray(SINGULAR * squares + 1e-300)
+        return np.asarray(SINGULAR_RIDGE * squares + 1e-300)
 
     def _offset_covariance(self, used: Bools) -> Floats:
         """(G, m, m) covariance of the offset of each group; zero without a used reading."""
@@ -247,7 +252,7 @@ L = TypeVar("L", bound=Linearised)
 def robust_start(model: L, rng: np.random.Generator) -> tuple[L, Bools]:
     """Return the linearisation that most readings agree on, and which readings do (N,)."""
     used, delta = _trimmed(model.linear, rng)
-    for _ in range(ANEW):
+    for _ in range(MOST_LINEARISATIONS):
         model = shortened(model.moved, delta, HALVINGS) or model
         _, chosen, delta = _concentrated(model.linear, used)
         if np.array_equal(chosen, used):
@@ -256,23 +261,23 @@ def robust_start(model: L, rng: np.random.Generator) -> tuple[L, Bools]:
     return model, used
 
 
-def bulk(distance2: Floats, m: int) -> float:
+def bulk_scale(distance2: Floats, m: int) -> float:
     """Scale of most squared distances: their median over that of χ²_m."""
     return float(np.median(distance2) / chi2.median(m))
 
 
-def limit(m: int, count: int, scale: float = 1.0) -> float:
+def rejection_limit(m: int, count: int, scale: float = 1.0) -> float:
     """Squared distance from which on one of `count` measurements is a gross error.
 
     The χ²_m quantile that a good reading exceeds in one of a thousand campaigns, times the scale of
     the bulk where that is wider than the stated noise.
     """
     far = float(chi2.isf(FALSE_ALARMS / count, m)) * max(1.0, scale)
-    chance, sure = MISFIT
+    chance, sure = MISFIT_SCALES
     return far * float(MISFIT_FACTOR ** np.clip((scale - chance) / (sure - chance), 0.0, 1.0))
 
 
-def variance(model: ReadingModel, d2: Floats, centre: Bools) -> float:
+def trimmed_variance(model: ReadingModel, d2: Floats, centre: Bools) -> float:
     """Variance of good readings by the median of the h least squared distances (N,)."""
     candidates = np.sort(d2[model.tested & ~centre])
     half = (_trusted(model, len(candidates)) + 1) // 2
@@ -291,32 +296,32 @@ def nearest(model: ReadingModel, d2: Floats, centre: Bools) -> tuple[Bools, floa
 
 def _trusted(model: ReadingModel, n: int) -> int:
     """Return h, how many of n readings that are no centres."""
-    wrong = int(MOST * np.count_nonzero(model.tested))
-    return min(max(n - wrong, -(-n // 3), model.enough + 2), n)
+    wrong = int(MOST_WRONG * np.count_nonzero(model.tested))
+    return min(max(n - wrong, -(-n // 3), model.fewest_readings + 2), n)
 
 
 def _trimmed(model: ReadingModel, rng: np.random.Generator) -> tuple[Bools, Floats]:
     """Least trimmed squares: the readings (N,), and δ (K,) from them."""
     rows = _subset_rows(model, rng)
     part = model[rows] if len(rows) < len(model) else model
-    size = (part.enough + 1) * (2 if len(part.members) else 1)
-    starts = np.log(MISSED) / np.log1p(-((1.0 - MOST) ** size))
-    count = int(min(np.ceil(starts), STARTS))
-    tried = [nearest(part, *part.near(_from_subset(part, rng))) for _ in range(count)]
+    size = (part.fewest_readings + 1) * (2 if len(part.members) else 1)
+    starts = np.log(MISS_PROBABILITY) / np.log1p(-((1.0 - MOST_WRONG) ** size))
+    count = int(min(np.ceil(starts), MOST_SUBSETS))
+    tried = [nearest(part, *part.distances_from(_from_subset(part, rng))) for _ in range(count)]
     tried.sort(key=lambda t: t[1])
-    best = [_concentrated(part, used) for used, _ in tried[:BEST]]
+    best = [_concentrated(part, used) for used, _ in tried[:BEST_SUBSETS]]
     _, used, delta = min(best, key=lambda t: t[0])
     if part is not model:
-        _, used, delta = _concentrated(model, nearest(model, *model.near(delta))[0])
+        _, used, delta = _concentrated(model, nearest(model, *model.distances_from(delta))[0])
     return used, delta
 
 
 def _concentrated(model: ReadingModel, used: Bools) -> tuple[float, Bools, Floats]:
     """Sum, readings (N,), and δ (K,) that led to them."""
     total = np.inf
-    for _ in range(LAST):
+    for _ in range(MOST_FINAL_STEPS):
         delta = model.fitted(used)[0]
-        used, lowest = nearest(model, *model.near(delta))
+        used, lowest = nearest(model, *model.distances_from(delta))
         if lowest >= total * (1 - 1e-9):
             break
         total = lowest
@@ -324,17 +329,17 @@ def _concentrated(model: ReadingModel, used: Bools) -> tuple[float, Bools, Float
 
 
 def _subset_rows(model: ReadingModel, rng: np.random.Generator) -> Ints:
-    """Rows of at most about `FEW` readings, whole groups."""
+    """Rows of at most about `SUBSET_READINGS` readings, whole groups."""
     if not len(model.members):
-        return np.sort(rng.permutation(len(model))[:FEW])
-    count = max(FEW // model.members.shape[1], model.enough + 2)
+        return np.sort(rng.permutation(len(model))[:SUBSET_READINGS])
+    count = max(SUBSET_READINGS // model.members.shape[1], model.fewest_readings + 2)
     rows = model.members[rng.permutation(len(model.members))[:count]]
     return np.sort(rows[rows >= 0])
 
 
 def _from_subset(model: ReadingModel, rng: np.random.Generator) -> Floats:
     """δ (K,) from random readings that just determine it and one more; of groups two of each."""
-    count = model.enough + 1
+    count = model.fewest_readings + 1
     if not len(model.members):
         rows = rng.permutation(len(model))[:count]
     else:

@@ -32,7 +32,8 @@ from hilcal.regression.schur import Projection
 from hilcal.types import Bools, Floats, Ints
 
 LEAST_MISFIT = 3.0  # least value of a misfit, in standard deviations of χ²; a choice
-TOGETHER = 4_000_000  # most numbers computed together, 32 MB; freed with the last effect of them
+MOST_AT_ONCE = 4_000_000
+"""Most numbers computed together, 32 MB; freed with the last effect of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,26 +42,26 @@ class EffectColumns:
 
     effect: Effect
     scale: Floats  # (P,) ordinary magnitudes, SI
-    together: Floats  # (R, Q) columns of all effects whitened together
-    within: slice  # the P columns of this effect
-    of_readings: Floats  # (N, m, P) motion of the fitted readings, sensor axes, m and rad
+    white_of_all: Floats  # (R, Q) columns of all effects whitened together
+    columns: slice  # the P columns of this effect
+    motion_of_readings: Floats  # (N, m, P) motion of the fitted readings, sensor axes, m and rad
     whitening: Whitening  # of the readings
-    bare: Bools  # (N,) unloaded readings
+    unloaded: Bools  # (N,) unloaded readings
 
     @property
     def white(self) -> Floats:
         """(R, P) whitened columns."""
-        return self.together[:, self.within]
+        return self.white_of_all[:, self.columns]
 
     @cached_property
     def motion(self) -> Floats:
         """(D, 3, P) displacement of each measured position, m."""
-        return self.whitening.raw(self.of_readings[:, :3])
+        return self.whitening.raw(self.motion_of_readings[:, :3])
 
     @cached_property
-    def unloaded(self) -> Floats:
+    def unloaded_motion(self) -> Floats:
         """(U, 3, P) displacement of the target in each unloaded reading, sensor axes, m."""
-        return np.asarray(self.of_readings[self.bare, :3])
+        return np.asarray(self.motion_of_readings[self.unloaded, :3])
 
 
 def computable(fit: Fit, effect: Effect) -> bool:
@@ -81,14 +82,14 @@ def columns_of_each(fit: Fit, effects: Sequence[Effect]) -> Iterator[EffectColum
 def columns_in_parts(fit: Fit, effects: Sequence[Effect]) -> Iterator[tuple[EffectColumns, ...]]:
     """Yield `effect_columns` of several effects in order, in parts that are computed together.
 
-    A part has up to `TOGETHER` numbers; the equilibrium is differentiated once for each part.
+    A part has up to `MOST_AT_ONCE` numbers; the equilibrium is differentiated once for each part.
     """
     w, s = fit.whitening, fit.solution
     count, bare = len(s.prediction.situation.angle) * w.m, fit.readings[~fit.outlier].unloaded
     ends = np.cumsum([0, *(count * len(e.magnitudes) for e in effects)])
     start = 0
     while start < len(effects):
-        fitting = int(np.searchsorted(ends, ends[start] + TOGETHER, side="right")) - 1
+        fitting = int(np.searchsorted(ends, ends[start] + MOST_AT_ONCE, side="right")) - 1
         stop = max(fitting, start + 1)
         part, start = tuple(effects[start:stop]), stop
         scale = np.concatenate([e.magnitudes for e in part])
@@ -108,7 +109,7 @@ class ReducedModel:
     """A fitted linear model with some of its columns eliminated; columns are not copied."""
 
     columns: Floats  # (R, P) all columns of the model
-    out: Bools  # (P,) eliminated columns
+    eliminated: Bools  # (P,) eliminated columns
     basis: Basis  # coordinates of the columns that stay, flat ones first
     flat: Floats  # (R, F) rows by the flat coordinates
     inverse_root: Floats  # (K, K) T with Tᵀ T = H⁻¹
@@ -126,15 +127,15 @@ class ReducedModel:
 
         Of whitened columns X (R, Q), with XᵀX, and products (P, Q) of the model's columns with X.
         """
-        held, flat = self.basis.held, self.flat.T @ x
+        held, flat = self.basis.with_prior, self.flat.T @ x
         sigma = self.basis.transform[held, len(flat) + np.arange(len(held))]
         lifted = self.inverse_root @ np.vstack([flat, sigma[:, None] * products[held]])
         return np.asarray(gram - lifted.T @ lifted)
 
     def score(self) -> FamilyScore:
         """Score the eliminated columns against the model without them."""
-        x, products = self.columns[:, self.out], self.gram[:, self.out]
-        s = self.information(x, products[self.out], products)
+        x, products = self.columns[:, self.eliminated], self.gram[:, self.eliminated]
+        s = self.information(x, products[self.eliminated], products)
         return score_family(s, x.T @ self.residual, self.rss, self.dof)
 
 
@@ -143,7 +144,7 @@ class HeldOut:
     """Reduction of the held-out error by a family."""
 
     share: float  # of the misfit; negative where predictions become worse
-    sure: bool  # whether the reduction is significant against the scatter from pose to pose
+    significant: bool  # whether the reduction is significant against the scatter from pose to pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,24 +196,24 @@ class Linearisation:
         return [FamilyFolds(self.folds, self.projection, x) for x in families]
 
     def score(
-        self, x: Floats, s: Floats | Spectrum | None = None, most: float = np.inf
+        self, x: Floats, s: Floats | Spectrum | None = None, largest: float = np.inf
     ) -> FamilyScore:
         """Score whitened columns X (R, P) as an addition; with S if known; see `score_of`."""
-        return self.score_of(self.information(x) if s is None else s, x.T @ self.residual, most)
+        return self.score_of(self.information(x) if s is None else s, x.T @ self.residual, largest)
 
-    def score_of(self, s: Floats | Spectrum, g: Floats, most: float = np.inf) -> FamilyScore:
+    def score_of(self, s: Floats | Spectrum, g: Floats, largest: float = np.inf) -> FamilyScore:
         """Score a family by S, or its spectrum, g = Xᵀ r (P,), and the largest plausible size."""
-        return score_family(s, g, self.rss, self.fit.dof, most=most)
+        return score_family(s, g, self.rss, self.fit.dof, largest=largest)
 
     def families(self, columns: Sequence[EffectColumns]) -> list[tuple[Floats, Floats]]:
         """Return S (P, P) and g = Xᵀ r (P,) of effects whose columns were whitened together."""
         if not columns:
             return []
         model_rows = np.column_stack([self.rows, self.residual])
-        products = model_rows.T @ columns[0].together
+        products = model_rows.T @ columns[0].white_of_all
         out = []
         for c in columns:
-            of_effect = products[:, c.within]
+            of_effect = products[:, c.columns]
             lifted = self.projection.inverse_root @ of_effect[:-1]
             out.append((c.white.T @ c.white - lifted.T @ lifted, of_effect[-1]))
         return out
@@ -319,7 +320,7 @@ def eliminate_columns(
     # Priors are about zero, not about the parameters of the fit.
     count, ridge = len(basis.singular), beta * basis.prior_precision
     z = np.zeros(len(ridge))
-    z[count:] = (theta / np.where(stay, prior, 1.0))[basis.held]
+    z[count:] = (theta / np.where(stay, prior, 1.0))[basis.with_prior]
     root = equations.inverse_root(beta)
     step = basis.transform @ (root.T @ (root @ (equations.rhs - ridge * z)))
     shrunk = float(np.sum(ridge * np.sum(root**2, axis=0)))

@@ -23,13 +23,13 @@ from scipy.optimize import minimize_scalar
 from hilcal.cell import Cell
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.hypotheses import (
-    Described,
+    Combination,
+    Description,
     Hypothesis,
-    Way,
+    correction,
     hypotheses,
-    keys,
-    mended,
     pairs,
+    robot_keys,
     shifts,
 )
 from hilcal.identification.placement import (
@@ -54,25 +54,27 @@ from hilcal.types import Bools, Floats, Ints
 # All of these are choices.
 GATE_M, GATE_REACH = 0.010, 0.01  # the gate: rms misfit, m, or as a share of the reach if more;
 # arms before calibration are 0.1 to 3 mm off, old or large ones up to 1 % of their reach
-LOOK = 0.3  # share of the gate above which hypotheses are tried: frames may hide a part
+SEARCH_SHARE = 0.3  # share of the gate above which hypotheses are tried: frames may hide a part
 GATE_EXTENT = 0.03  # share of the positions' extent that counts as a misfit where they are close
 LEVER = 0.3  # m, by which attitude errors count as position errors: an ordinary tool
 ROWS = 40  # readings that hypotheses are tried on, spread over all: seven times the unknowns
 DEPTH, BEAM = 3, (6, 3)  # most hypotheses together; best ones that a 2nd and a 3rd are tried on
-FACTOR = 4.0  # how many times smaller a hypothesis must make the misfit
-CAREFUL = 10  # best ones by a rough search that are searched with care
-ALIKE = 2.0  # hypotheses that leave less than so many times the least misfit do equally well
-WRONG_ROWS = 0.2  # largest share of rows that may be wrong by themselves
-FIRST = ("shift", "columns")  # combined with others only where they help by themselves; for speed
-OFF_DEG = 0.2  # zero of a single joint, degrees, that is worth mentioning
+LEAST_IMPROVEMENT = 4.0  # how many times smaller a hypothesis must make the misfit
+MOST_CAREFUL = 10  # best ones by a rough search that are searched with care
+EQUALLY_GOOD = 2.0  # hypotheses that leave less than so many times the least misfit do equally well
+MOST_WRONG_ROWS = 0.2  # largest share of rows that may be wrong by themselves
+SEPARATE_FIRST = ("shift", "columns")
+"""Hypotheses that are combined with others only where they help by themselves; for speed."""
+LEAST_ZERO_DEG = 0.2  # zero of a single joint, degrees, that is worth mentioning
 MOST_NAMED = 8  # rows, or explanations, that are named
-ZEROS = tuple(np.radians([0.0, 45.0, -45.0, 135.0, -135.0]).tolist())  # where searches begin
+ZERO_STARTS = tuple(np.radians([0.0, 45.0, -45.0, 135.0, -135.0]).tolist())  # where searches begin
 ZERO_WIDTH, ZERO_EXACT = np.pi / 4, 1e-7  # range of a search to both sides, and its tolerance, rad
-HALF = 0.5  # share of the described arm's misfit that another may leave to be named; of 900
-# simulated arms off by 1 and 3 mm and mrad none was named another one (test_other_arm keeps some)
+OTHER_ARM_SHARE = 0.5
+"""Share of the described arm's misfit that another may leave to be named; of 900 simulated arms off
+by 1 and 3 mm and mrad none was named another one (test_other_arm keeps some)."""
 BEYOND_NOISE = 3.0  # misfit in standard deviations from which on other arms are tried
 ARM_ROWS, ARM_STEPS = 100, 10  # readings that every arm is tried on; steps of its registration
-TRIED = (
+HYPOTHESES_IN_WORDS = (
     "signs, zeros, couplings and columns of the joints, units, shifted rows, mirrored axes, "
     "inverse poses, other arms, alone and in combination"
 )
@@ -82,7 +84,7 @@ TRIED = (
 class Explanation:
     """Hypotheses that together explain the readings."""
 
-    changes: Way
+    changes: Combination
     rms: float  # misfit with them, m; attitudes count with `LEVER`
 
 
@@ -114,7 +116,7 @@ class DescriptionFinding:
         if self.explanations:
             causes = [
                 f"{' and '.join(h.words for h in e.changes)}: {size} → {length(e.rms)} with it"
-                f"{mended(e.changes, cell)}"
+                f"{correction(e.changes, cell)}"
                 for e in self.explanations[:MOST_NAMED]
             ]
             line = f"{begin}: {'; or, as well: '.join(causes)}"
@@ -125,8 +127,8 @@ class DescriptionFinding:
             return f"{begin}: {rows}; the others fit. Correct or remove them"
         return (
             f"{begin}; at most {length(self.gate)} is fitted. Nothing that was tried explains it "
-            f"({self.tried} descriptions: {TRIED}). Check the robot's model, and that joints and "
-            "positions in one row belong together"
+            f"({self.tried} descriptions: {HYPOTHESES_IN_WORDS}). Check the robot's "
+            "model, and that joints and positions in one row belong together"
         )
 
     def _rows_named(self, readings: Readings) -> str:
@@ -157,7 +159,7 @@ class DescriptionFinding:
                 {
                     "rms_m": e.rms,
                     "changes": [asdict(h) for h in e.changes],
-                    "robot": keys(e.changes, cell),
+                    "robot": robot_keys(e.changes, cell),
                 }
                 for e in self.explanations
             ],
@@ -179,8 +181,8 @@ def examine(registered: Registration, readings: Readings) -> DescriptionFinding 
     cell, gate = registered.cell, max(GATE_M, GATE_REACH * registered.cell.arm.reach)
     # A known base shows the whole geometric error, however close the positions lie.
     extent = np.inf if cell.registration_known else _extent(readings.value[:, :3])
-    far, rms, noise = registered.far, _size(registered.off), noise_floor(readings.covariance)
-    none, fitting_rms = np.zeros_like(far), _size(registered.off[~far])
+    far, rms, noise = registered.far, _size(registered.residual), noise_floor(readings.covariance)
+    none, fitting_rms = np.zeros_like(far), _size(registered.residual[~far])
     if cell.observers:  # hypotheses are tried on positions in one frame only
         fits = not (far.any() or fitting_rms > gate)
         return None if fits else DescriptionFinding(fitting_rms, gate, (), far)
@@ -191,14 +193,14 @@ def examine(registered: Registration, readings: Readings) -> DescriptionFinding 
             return DescriptionFinding(rms, gate, shifted, none, (), search.tried)
         swapped = search.swapped(far)
         return DescriptionFinding(rms if swapped else fitting_rms, gate, (), far, swapped, 1)
-    if rms <= min(LOOK * gate, max(GATE_EXTENT * extent, 5.0 * noise)):
+    if rms <= min(SEARCH_SHARE * gate, max(GATE_EXTENT * extent, 5.0 * noise)):
         return None
     close = max(0.02 * min(extent, cell.arm.reach), rms / 50.0)
     search = _DescriptionSearch(cell, readings, max(3.0 * noise, min(0.25 * gate, close)))
     near, bad, _ = search.robust(())
     if bad.any() and (shifted := search.shifted()):
         return DescriptionFinding(rms, gate, shifted, none, (), search.tried)
-    few = bool(bad.any() and bad.mean() <= WRONG_ROWS)
+    few = bool(bad.any() and bad.mean() <= MOST_WRONG_ROWS)
     if few and near <= search.enough:
         return DescriptionFinding(rms, gate, (), bad, search.swapped(bad), 1)
     explanations = search.explain(gate, DEPTH if rms > gate else 1)
@@ -207,7 +209,7 @@ def examine(registered: Registration, readings: Readings) -> DescriptionFinding 
     if not explanations and few and near <= gate:
         return DescriptionFinding(rms, gate, (), bad, (), search.tried)
     rows = search.robust(explanations[0].changes)[1] if explanations else none
-    rows = rows if rows.mean() <= WRONG_ROWS else none
+    rows = rows if rows.mean() <= MOST_WRONG_ROWS else none
     return DescriptionFinding(rms, gate, explanations, rows, (), search.tried)
 
 
@@ -215,7 +217,7 @@ class _DescriptionSearch:
     def __init__(self, cell: Cell, readings: Readings, enough: float) -> None:
         self._cell, self._readings = cell, readings
         self.enough, self.tried = enough, 0
-        self._stated = Described(
+        self._stated = Description(
             cell.arm,
             angles(readings),
             readings.value[:, :3],
@@ -234,10 +236,10 @@ class _DescriptionSearch:
         """Return the shortest combination that explains the readings, and those that do as well."""
         base, slides = self.score(()), self._cell.arm.slides
         singles = tuple(hypotheses(self._stated))
-        beam: list[Way] = [()]
-        tried: dict[Way, float] = {}
+        beam: list[Combination] = [()]
+        tried: dict[Combination, float] = {}
         for depth in range(most):
-            additions = [h for h in singles if depth == 0 or h.kind not in FIRST]
+            additions = [h for h in singles if depth == 0 or h.kind not in SEPARATE_FIRST]
             ways = [
                 (*partial, h)
                 for partial in beam
@@ -248,7 +250,7 @@ class _DescriptionSearch:
                 if not any(h.offset and slides[h.joint - 1] for h in way):
                     ways.append(way)
             rough = {w: self.score(w, True) for w in dict.fromkeys(map(_sorted, ways))}
-            best = sorted(rough, key=lambda w: (rough[w], _cost(w)))[:CAREFUL]
+            best = sorted(rough, key=lambda w: (rough[w], _cost(w)))[:MOST_CAREFUL]
             scores = {**rough, **{w: self.score(w) for w in best}}
             if depth < 2 and min(scores.values()) > self.enough:
                 scores.update(self._zeros(beam[:2]))
@@ -257,23 +259,25 @@ class _DescriptionSearch:
             if explanations:
                 return explanations
             beam = sorted(scores, key=lambda w: (scores[w], _cost(w)))[: BEAM[min(depth, 1)]]
-        return _explained(tried, min(gate, base / FACTOR))
+        return _explained(tried, min(gate, base / LEAST_IMPROVEMENT))
 
     def shifted(self) -> tuple[Explanation, ...]:
         """Return the shift of rows that explains the readings, where one does.
 
         Where a pose has many readings, only its last one is wrong, and looks like a gross error.
         """
-        ways: list[Way] = [(h,) for h in shifts(len(self._readings))]
+        ways: list[Combination] = [(h,) for h in shifts(len(self._readings))]
         tried = {way: self.score(way) for way in ways}
-        return _explained(tried, min(self.enough, self.score(()) / FACTOR)) if tried else ()
+        return (
+            _explained(tried, min(self.enough, self.score(()) / LEAST_IMPROVEMENT)) if tried else ()
+        )
 
-    def _enough(self, tried: dict[Way, float], base: float) -> tuple[Explanation, ...]:
+    def _enough(self, tried: dict[Combination, float], base: float) -> tuple[Explanation, ...]:
         """Those that explain the readings: the simplest of each kind, best first."""
         least = min(tried.values())
-        if least > min(self.enough, base / FACTOR):
+        if least > min(self.enough, base / LEAST_IMPROVEMENT):
             return ()
-        alike = ALIKE * least + 1e-6
+        alike = EQUALLY_GOOD * least + 1e-6
         # A hypothesis that can be left out without loss is undetermined, or was a wrong step.
         for way in [w for w in tried if tried[w] <= alike]:
             for h in way:
@@ -281,13 +285,13 @@ class _DescriptionSearch:
                 if shorter and shorter not in tried and self.score(shorter) <= alike:
                     tried = {**tried, shorter: self.score(shorter)}
         good = sorted((w for w in tried if tried[w] <= alike), key=lambda w: (_cost(w), tried[w]))
-        out: dict[tuple[object, ...], Way] = {}
+        out: dict[tuple[object, ...], Combination] = {}
         for way in good:  # of those that differ by their zeros alone, one
             if _cost(way) <= _cost(good[0]):
                 out.setdefault(tuple((*h.subject, h.arm, h.sign) for h in way), way)
         return tuple(Explanation(w, tried[w]) for w in out.values())
 
-    def _zeros(self, ways: list[Way]) -> dict[Way, float]:
+    def _zeros(self, ways: list[Combination]) -> dict[Combination, float]:
         """Try any constant as the zero of each joint, in addition to each of `ways`."""
         out = {}
         for way in ways:
@@ -296,20 +300,20 @@ class _DescriptionSearch:
                 if j in counted or self._cell.arm.slides[j - 1]:
                     continue
                 zero, rms = self._zero_of(way, j)
-                if abs(np.degrees(zero)) > OFF_DEG:
+                if abs(np.degrees(zero)) > LEAST_ZERO_DEG:
                     out[_sorted((*way, Hypothesis("joint", j, 1, zero)))] = rms
         return out
 
-    def _zero_of(self, way: Way, joint: int) -> tuple[float, float]:
+    def _zero_of(self, way: Combination, joint: int) -> tuple[float, float]:
         """Return the best zero of one joint, rad, and the misfit with it, m."""
 
-        def zeroed(zero: float) -> Way:
+        def zeroed(zero: float) -> Combination:
             return (*way, Hypothesis("joint", joint, 1, zero))
 
         def square(zero: float) -> float:
             return self._best(*self._problem(zeroed(zero), self._rows), rough=True).square
 
-        begin = min(ZEROS, key=lambda zero: self.score(zeroed(zero), True))
+        begin = min(ZERO_STARTS, key=lambda zero: self.score(zeroed(zero), True))
         bounds = (begin - ZERO_WIDTH, begin + ZERO_WIDTH)
         minimum = minimize_scalar(
             square, bounds=bounds, method="bounded", options={"xatol": ZERO_EXACT}
@@ -318,7 +322,7 @@ class _DescriptionSearch:
         rms = float(np.sqrt(minimum.fun / count))
         return float(np.arctan2(np.sin(minimum.x), np.cos(minimum.x))), rms
 
-    def _score(self, way: Way, rough: bool = False) -> float:
+    def _score(self, way: Combination, rough: bool = False) -> float:
         """Misfit of the nominal arm under hypotheses, m, scaled to the extent as stated."""
         self.tried += 1
         placement = self._best(*self._problem(way, self._rows), rough)
@@ -329,7 +333,7 @@ class _DescriptionSearch:
         steps, rotated = (6, 0) if rough else (15, 2)
         return best_placement(data, frames, free, self.enough, steps, rotated)
 
-    def _problem(self, way: Way, rows: Ints) -> tuple[FrameData, Frames, Bools]:
+    def _problem(self, way: Combination, rows: Ints) -> tuple[FrameData, Frames, Bools]:
         """Flange poses and readings of some rows under some hypotheses, and what is estimated."""
         d = self._described(way)
         rows = rows[d.paired[rows]]
@@ -346,10 +350,10 @@ class _DescriptionSearch:
         axes = m == 6 and (d.base_unknown or not fixed.all())
         return data, frames, free_parameters(d.base_unknown, ~fixed, axes)
 
-    def _described(self, way: Way) -> Described:
+    def _described(self, way: Combination) -> Description:
         return reduce(lambda d, h: h.applied(d), way, self._stated)
 
-    def _robust(self, way: Way) -> tuple[float, Bools, Placement]:
+    def _robust(self, way: Combination) -> tuple[float, Bools, Placement]:
         """Register with weights by which rows that do not fit lose their influence.
 
         Rms of the rows that fit, m; (N,) those that do not; and the placement.
@@ -381,17 +385,17 @@ class _DescriptionSearch:
         return tuple(out)
 
 
-def _explained(tried: dict[Way, float], most: float) -> tuple[Explanation, ...]:
+def _explained(tried: dict[Combination, float], most: float) -> tuple[Explanation, ...]:
     """Return the best of some trials where it leaves no more than `most`, m."""
     way = min(tried, key=lambda w: tried[w])
     return (Explanation(way, tried[way]),) if tried[way] <= most else ()
 
 
-def _cost(way: Way) -> int:
+def _cost(way: Combination) -> int:
     return sum(h.cost for h in way)
 
 
-def _sorted(way: Way) -> Way:
+def _sorted(way: Combination) -> Combination:
     """Hypotheses about the arm come first, then those about joints, then couplings."""
     rank = {"arm": 0, "joint": 1, "coupling": 2}
     return tuple(sorted(way, key=lambda h: (rank.get(h.kind, 3), *h.subject, h.sign, h.offset)))
@@ -434,10 +438,10 @@ def other_arm(registered: Registration, readings: Readings) -> OtherArm | None:
     some = readings[np.unique(np.linspace(0, len(readings) - 1, ARM_ROWS).astype(int))]
     tried = [(_misfit_with(cell, arm, some), arm) for arm in arms]
     least, arm = min(tried, key=lambda pair: pair[0], default=(np.inf, cell.arm))
-    if least > HALF * registered.rms:
+    if least > OTHER_ARM_SHARE * registered.rms:
         return None
     remaining = _misfit_with(cell, arm, readings)
-    better = remaining <= HALF * registered.rms
+    better = remaining <= OTHER_ARM_SHARE * registered.rms
     return OtherArm(arm.name, registered.rms, remaining) if better else None
 
 
@@ -452,5 +456,5 @@ def other_arm_of(cell: Cell, readings: Readings) -> OtherArm | None:
 def _misfit_with(cell: Cell, arm: Arm, readings: Readings) -> float:
     """Rms misfit of the positions with another arm, from the frames of the described one, m."""
     data = FrameData.of(arm, readings)
-    off = minimise(Placement(data, *given_and_free(cell, data.m == 6)), ARM_STEPS).off
+    off = minimise(Placement(data, *given_and_free(cell, data.m == 6)), ARM_STEPS).misfit
     return _size(off[:, :3])

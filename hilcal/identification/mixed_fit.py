@@ -29,7 +29,7 @@ HARMONICS = 64
 poses cannot resolve, where they act as scatter. A choice: errors of the teeth of strain wave gears
 have the period of a turn of the motor, 100 and more in a turn of the joint, and are too small for
 any tracker."""
-ROUNDS = 5
+MOST_LINEARISATIONS = 5
 """Most linearisations; a choice, three are usual."""
 CONVERGED = 0.02
 """Change of the predicted readings, in units of their noise, that ends the linearisations."""
@@ -39,9 +39,9 @@ SCATTER_RAD = 3e-5
 """Ordinary scatter of a joint, rad: 30 µm at 1 m, as makers state it; the prior mean of η is 0."""
 INSTRUMENT, SCATTER = "instrument", "arm's scatter"
 """Names of the components of the noise."""
-UNSEEN = -0.5
+UNMEASURED_THRESHOLD = -0.5
 """Threshold for rows that are not measured, to which `independent_rows` gives the variance -1."""
-LITTLE = 1e-3
+SCATTER_WEIGHT = 1e-3
 """Weight of the arm's scatter in the matrix whose eigenvectors turn the rows: it decides where the
 instrument's parts are isotropic."""
 MOST_NOISE_ROWS = 1500
@@ -231,7 +231,7 @@ def _iterated(
             return variances, theta
         moved = float(np.sqrt(np.mean((trial.white - point.white) ** 2)))
         theta, point = reached, trial
-        if rounds == ROUNDS or moved < CONVERGED:
+        if rounds == MOST_LINEARISATIONS or moved < CONVERGED:
             return variances, theta
 
 
@@ -293,7 +293,7 @@ def _noise(
     blocks = zip(whitened_blocks(scatter, w), measured, strict=True)
     bases, variances = zip(*(independent_rows(c, m) for c, m in blocks), strict=True)
     variance = np.concatenate([v.reshape(-1) for v in variances])
-    instrument = Noise(INSTRUMENT, (variance > UNSEEN).astype(np.float64), prior)
+    instrument = Noise(INSTRUMENT, (variance > UNMEASURED_THRESHOLD).astype(np.float64), prior)
     return _turned(rows, bases), [instrument, Noise(SCATTER, np.maximum(variance, 0.0), prior)]
 
 
@@ -314,7 +314,7 @@ def _noise_of(
     for blocks in zip(*part_blocks, strict=True):
         *instrument, arm = blocks
         size = max(float(np.abs(arm).max(initial=0.0)), 1e-300)
-        weighted = sum((j * x for j, x in enumerate(instrument, 1)), LITTLE * arm / size)
+        weighted = sum((j * x for j, x in enumerate(instrument, 1)), SCATTER_WEIGHT * arm / size)
         u = np.linalg.eigh(weighted)[1]
         bases.append(u)
         for variance, x in zip(variances, blocks, strict=True):

@@ -41,10 +41,10 @@ from hilcal.identification.mixed_fit import (
     variances_with_noise,
     with_all_effects,
 )
-from hilcal.mixed.families import KNOWN, LogStdPrior
+from hilcal.mixed.families import KNOWN_SPREAD, LogStdPrior
 from hilcal.mixed.variances import Variances, evidence
 from hilcal.model.model import Model
-from hilcal.readings.covariance import INSTRUMENT, WHOLE
+from hilcal.readings.covariance import INSTRUMENT, INSTRUMENT_AND_ARM
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import usual_mode
 from hilcal.tables.table import FROM_TRACKER, ImportResult
@@ -55,14 +55,15 @@ SPREAD = 3.0  # of the log of a factor: 20 either way; cameras see by a hundred 
 HARMONICS = 6  # waves of a gear that take part, for speed; finer ones act as the arm's scatter
 MOST_ROWS = 900  # elements of readings, of poses chosen at random: a σ is known to some per cent
 FEWEST_POSES = 10  # below which frames and effects leave nothing to estimate a noise from
-ROUNDS = 3  # most estimates, each after a new test for gross errors
-SEVERAL = 0.05  # chance of finding several effects where there is one at most
+MOST_ROUNDS = 3  # most estimates, each after a new test for gross errors
+SEVERAL_LEVEL = 0.05  # chance of finding several effects where there is one at most
 SEED = 20251125  # of the poses that are chosen, and of simulated likelihood ratios
-NOISE = "noise"  # key among the texts about an imported campaign, and kind of event of a measured
-# one: the estimate; absent where the noise is stated, or as the samples show it
-CONTRADICTED = 3.0  # standard errors of a factor's log by which readings contradict covariances
+NOISE_KEY = "noise"
+"""Key among the texts about an imported campaign, and kind of event of a measured one: the
+estimate; absent where the noise is stated, or as the samples show it."""
+STANDARD_ERRORS = 3.0  # standard errors of a factor's log by which readings contradict covariances
 LEAST_FACTOR = 1.3  # from which on the noise of readings differs from that of their samples
-ALONG, ACROSS, ORIENTATION, STATED = "along", "across", "orientation", "arm as stated"
+ALONG, ACROSS, ORIENTATION, ARM_AS_STATED = "along", "across", "orientation", "arm as stated"
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +112,7 @@ def with_estimated_noise(
     together = SCATTER in factors and readings.states.target is None
     used = factors if together else {k: f for k, f in factors.items() if k != SCATTER}
     estimated = _with_factors(readings, station, used, components.model)
-    covers = WHOLE if together else INSTRUMENT
+    covers = INSTRUMENT_AND_ARM if together else INSTRUMENT
     notes = tuple(n for n in imported.notes if not n.startswith(FROM_TRACKER))
     return replace(imported, readings=estimated, covers=covers, notes=notes), estimate
 
@@ -131,11 +132,11 @@ def measured_noise(readings: Readings, cell: Cell, config: CellConfig) -> NoiseE
     components = _components(default, cell, config)
     if components is None:
         return None
-    factors = {k: f for k, f in components.factors.items() if k not in (SCATTER, STATED)}
+    factors = {k: f for k, f in components.factors.items() if k not in (SCATTER, ARM_AS_STATED)}
     sampled, default_sizes = _sizes(readings, station), _sizes(default, station)
     off = (
         abs(np.log(f * default_sizes[k] / sampled[k]))
-        > max(np.log(LEAST_FACTOR), CONTRADICTED * components.log_errors[k])
+        > max(np.log(LEAST_FACTOR), STANDARD_ERRORS * components.log_errors[k])
         for k, f in factors.items()
     )
     if not any(off):
@@ -194,12 +195,12 @@ def _estimated(model: Model, readings: Readings, config: CellConfig) -> _Compone
     joint_std = config.repeatability.per_joint(model.cell.arm.n)
     full = with_all_effects(model, readings.states, HARMONICS)
     used = ~fit(model, readings, mode).outlier
-    for _ in range(ROUNDS):
+    for _ in range(MOST_ROUNDS):
         inliers = readings[used]
         if joint_std.any():
             stated = with_joint_scatter(model.cell, inliers, joint_std)
             extra = stated.covariance - inliers.covariance
-            arm = NoisePart(STATED, extra, LogStdPrior(0.0, KNOWN), stated.common)
+            arm = NoisePart(ARM_AS_STATED, extra, LogStdPrior(0.0, KNOWN_SPREAD), stated.common)
         else:
             arm = scatter_part(model, inliers)
         parts = [*_instrument(inliers, station), arm]
@@ -227,7 +228,7 @@ def _estimated(model: Model, readings: Readings, config: CellConfig) -> _Compone
 def _shows_several(variances: Variances) -> bool:
     """Whether the readings show effects in addition to the one that moves them most."""
     e = variances.equations
-    problem, moved = e.problem, e.rows[:, e.problem.flat :] * e.c[e.problem.flat :]
+    problem, moved = e.problem, e.rows[:, e.problem.flat :] * e.solution[e.problem.flat :]
     families = problem.families.random
     columns_of = {f.effect: np.isin(problem.family, [k for k, g in enumerate(families)
           if g.effect == f.effect]) for f in families}  # fmt: skip
@@ -237,7 +238,7 @@ def _shows_several(variances: Variances) -> bool:
     largest = max(motion, key=lambda name: float(np.sum(motion[name] ** 2)))
     smaller = [k for k, f in enumerate(families) if f.effect != largest]
     rng = np.random.default_rng(SEED)
-    return evidence(problem, smaller, rng, variances.log_std).p_value < SEVERAL
+    return evidence(problem, smaller, rng, variances.log_std).p_value < SEVERAL_LEVEL
 
 
 def _with_factors(

@@ -9,7 +9,7 @@ import numpy as np
 
 from hilcal import __version__, limits
 from hilcal.identification.fit import Fit
-from hilcal.identification.fit_document import finite
+from hilcal.identification.fit_document import finite_or_null
 from hilcal.store.codec import encode, pack, read_document, read_file, unpack
 from hilcal.types import Bools, Floats
 
@@ -41,7 +41,7 @@ def covariance_of(fit: Fit) -> Floats:
     solution, u = fit.solution, fit.uncertainty
     transform, space = solution.transform, solution.space
     formal = transform @ solution.equations.inverse(solution.beta) @ transform.T
-    formal[space.index, space.index] += space.rest / solution.beta
+    formal[space.index, space.index] += space.omitted_variance / solution.beta
     size = np.sqrt(np.maximum(np.diag(formal), 1e-300))
     std = np.where(np.isfinite(u.std) & u.identifiable, u.std, np.nan)
     covariance = std[:, None] * (formal / np.outer(size, size)) * std
@@ -60,10 +60,10 @@ def to_json(fit: Fit, source: Mapping[str, object]) -> dict[str, object]:
         {
             "name": f"{e.name}.{p.name}",
             "value": float(fit.theta[k]),
-            "std": finite(u.std[k]) if u.identifiable[k] else None,
+            "std": finite_or_null(u.std[k]) if u.identifiable[k] else None,
             "unit": p.unit,
             "identifiable": bool(u.identifiable[k]),
-            "prior_std": finite(fit.solution.prior[k]),
+            "prior_std": finite_or_null(fit.solution.prior[k]),
         }
         for k, (e, p) in enumerate(every)
     ]

@@ -8,7 +8,7 @@ import numpy as np
 
 from hilcal.cell import Cell, Observer, plane_frame
 from hilcal.identification.least_trimmed_squares import ReadingModel
-from hilcal.model.observe import Observation, by_observer_frame, sighted
+from hilcal.model.observe import Observation, by_observer_frame, observed
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import inverse_root
 from hilcal.robot import se3
@@ -17,19 +17,21 @@ from hilcal.robot.chain import evaluate
 from hilcal.types import Bools, Floats, Ints
 
 # All of these are choices.
-ROUGH = (1e-4, 1e-4)  # m and rad, added to the stated noise: nominal arms are 0.1 to 3 mm off
+ROUGHNESS = (1e-4, 1e-4)  # m and rad, added to the stated noise: nominal arms are 0.1 to 3 mm off
 TARGET_M, BASE_M = 0.3, 3.0  # ordinary distances of target and flange, of tracker and base
-TELL = 0.1  # share of an ordinary size to which readings must determine a direction
+DETERMINED_SHARE = 0.1  # share of an ordinary size to which readings must determine a direction
 ALTERNATIONS = 10  # between rotation and translations; least squares follow
-HOLD = 1e-6  # weight of an ordinary size in the linear starts, against an error of 1 m
+START_WEIGHT = 1e-6  # weight of an ordinary size in the linear starts, against an error of 1 m
 MIN_POSES = 4
-FEW, FEW_EACH = 100, 50  # readings that starts are tried on: of all, and of each observer
-GOOD = 10.0  # rms misfit with roughness at which no other start is tried: 1 mm and 1 mrad
-STEPS, TRIED = 15, 5  # steps of a start; rotations of a cube that are tried
+START_READINGS, START_READINGS_EACH = 100, 50
+"""Readings that starts are tried on: of all, and of each observer."""
+GOOD_RMS = 10.0  # rms misfit with roughness at which no other start is tried: 1 mm and 1 mrad
+START_STEPS, MOST_ROTATIONS = 15, 5  # steps of a start; rotations of a cube that are tried
 MOST_STEPS, DAMPING = 40, 1e-3  # of `minimise`: most steps; λ of the first one
 SETTLED = 1e-9  # relative decrease of the sum of squares below which it ends
-SMALL = 1e-12  # largest element of a step below which it ends: rounding
-STEPS_SEVERAL, FOLLOWED = 50, 6  # with several observers: steps of a start; starts followed
+LEAST_STEP = 1e-12  # largest element of a step below which it ends: rounding
+START_STEPS_SEVERAL, MOST_FOLLOWED = 50, 6
+"""With several observers: steps of a start; starts followed."""
 
 
 def angles(readings: Readings) -> Floats:
@@ -44,7 +46,7 @@ def inverse_roots(covariance: Floats, partial: bool = False) -> Floats:
     With `partial` elements without a variance were not read: they get no roughness either.
     """
     m = covariance.shape[-1]
-    rough = np.repeat(np.square(ROUGH), 3)[:m] * np.eye(m)
+    rough = np.repeat(np.square(ROUGHNESS), 3)[:m] * np.eye(m)
     if partial:
         rough = rough * (np.diagonal(covariance, axis1=1, axis2=2) > 0)[:, None, :]
     return inverse_root(covariance + rough)
@@ -130,18 +132,18 @@ class FrameData:
         """(N, 3) predicted positions of the targets, base axes, m."""
         return self.position + se3.apply(self.rotation, frames.targets[self.target, :3, 3])
 
-    def seen(self, frames: Frames) -> Observation:
+    def predicted_readings(self, frames: Frames) -> Observation:
         """Return the predicted readings."""
         r, points = frames.base[:3, :3], self.points(frames)
         turn = r @ self.rotation @ frames.targets[self.target, :3, :3]
         position = points @ r.T + frames.base[:3, 3]
         if self.observer is None:
             return Observation(position, turn, points, r)
-        return sighted(frames.observers, self.observer, position, turn)
+        return observed(frames.observers, self.observer, position, turn)
 
     def misfit(self, frames: Frames) -> Floats:
         """(N, m) measured minus predicted, m and rad, in the axes of what reads."""
-        o = self.seen(frames)
+        o = self.predicted_readings(frames)
         off = self.value - o.position
         if self.attitude is None:
             return np.asarray(off)
@@ -156,18 +158,18 @@ class Placement:
     data: FrameData
     frames: Frames
     free: Bools  # (P,) the parameters that are estimated, K of them
-    held: Floats | None = None  # (T, 4, 4) targets with a prior of the ordinary sizes
-    weight: float = 1.0  # of a target an ordinary size off, in units of whitened misfit
+    prior_targets: Floats | None = None  # (T, 4, 4) targets with a prior of the ordinary sizes
+    prior_weight: float = 1.0  # of a target an ordinary size off, in units of whitened misfit
 
     @cached_property
-    def off(self) -> Floats:
+    def misfit(self) -> Floats:
         """(N, m) misfit, m and rad."""
         return self.data.misfit(self.frames)
 
     @cached_property
     def white(self) -> Floats:
         """(N, m) whitened misfit."""
-        return np.asarray(np.einsum("nij,nj->ni", self.data.root, self.off))
+        return np.asarray(np.einsum("nij,nj->ni", self.data.root, self.misfit))
 
     @property
     def square(self) -> float:
@@ -177,22 +179,23 @@ class Placement:
     @property
     def residual(self) -> Floats:
         """(R,) whitened misfit, and that of the prior."""
-        if self.held is None:
+        if self.prior_targets is None:
             return self.white.reshape(-1)
         t, away = self.frames.targets, np.zeros(len(self.free))
-        shift = (t[:, :3, 3] - self.held[:, :3, 3]) / TARGET_M
-        turn = se3.rotation_vector(t[:, :3, :3] @ np.swapaxes(self.held[:, :3, :3], 1, 2)) / np.pi
+        shift = (t[:, :3, 3] - self.prior_targets[:, :3, 3]) / TARGET_M
+        back = np.swapaxes(self.prior_targets[:, :3, :3], 1, 2)
+        turn = se3.rotation_vector(t[:, :3, :3] @ back) / np.pi
         away[6 : 6 + 6 * len(t)] = np.concatenate([shift, turn], axis=1).reshape(-1)
-        return np.concatenate([self.white.reshape(-1), -self.weight * away[self.free]])
+        return np.concatenate([self.white.reshape(-1), -self.prior_weight * away[self.free]])
 
     def jacobian(self) -> Floats:
         """(R, K) derivative of the prediction."""
         rows = self.columns().reshape(self.white.size, int(np.count_nonzero(self.free)))
-        if self.held is None:
+        if self.prior_targets is None:
             return rows
-        slopes, count = np.zeros(len(self.free)), len(self.held)
+        slopes, count = np.zeros(len(self.free)), len(self.prior_targets)
         slopes[6 : 6 + 6 * count] = np.tile(np.repeat([1.0, 1.0 / np.pi], 3), count)
-        return np.concatenate([rows, self.weight * np.diag(slopes[self.free])])
+        return np.concatenate([rows, self.prior_weight * np.diag(slopes[self.free])])
 
     def columns(self) -> Floats:
         """(N, m, K) whitened derivative of the predicted readings."""
@@ -207,7 +210,7 @@ class Placement:
             out[rows, :3, first : first + 3] = turned[rows]
             out[rows, 3:, first + 3 : first + 6] = turned[rows, : m - 3]
         if data.observer is not None:
-            o = data.seen(frames)
+            o = data.predicted_readings(frames)
             out[:, :3] = o.axes @ out[:, :3]
             if m == 6:
                 turns = np.stack([x.frame[:3, :3] for x in frames.observers])
@@ -243,7 +246,7 @@ class Placement:
         a = self.jacobian()
         # Squared singular values up to 1e12 leave rounding of 1e-2 in those that decide, about 10.
         squares, vectors = np.linalg.eigh(a.T @ a)
-        visible = squares > (spread / TELL) ** 2
+        visible = squares > (spread / DETERMINED_SHARE) ** 2
         null = np.zeros((len(self.free), np.count_nonzero(~visible)))
         null[self.free] = vectors[:, ~visible]
         part = vectors[:, visible]
@@ -291,7 +294,7 @@ def minimise(at: Placement, steps: int = MOST_STEPS) -> Placement:
         done = square - reduced <= SETTLED * square + 1e-12 * len(a) and damping <= DAMPING
         at, square, normal = trial, reduced, None
         damping = max(0.1 * damping, 1e-9)
-        if done or np.abs(step).max() < SMALL:
+        if done or np.abs(step).max() < LEAST_STEP:
             break
     return at
 
@@ -310,7 +313,7 @@ def best_placement(
         if placements[-1].square <= good**2 * len(data):
             return min(placements, key=lambda p: p.square)
     if rotated and free[:6].any():
-        turns = (_with_translations(data, frames, turn, free) for turn in cube())
+        turns = (_with_translations(data, frames, turn, free) for turn in cube_rotations())
         ranked = sorted((Placement(data, f, free) for f in turns), key=lambda p: p.square)
         placements += [minimise(placement, steps) for placement in ranked[:rotated]]
     return min(placements, key=lambda p: p.square)
@@ -327,8 +330,8 @@ def settled(placement: Placement, frames: Frames) -> tuple[Placement, Floats]:
     spread = max(float(np.sqrt(placement.square / dof)), 1.0)
     null, _ = placement.determined(spread)
     if null.size:
-        held = replace(placement, held=frames.targets, weight=spread)
-        placement = replace(minimise(held), held=None)
+        held = replace(placement, prior_targets=frames.targets, prior_weight=spread)
+        placement = replace(minimise(held), prior_targets=None)
     for _ in range(3):
         null, step = placement.determined(spread)
         placement = placement.moved(step)
@@ -341,15 +344,17 @@ def fitted_placement(data: FrameData, frames: Frames, free: Bools) -> tuple[Plac
     The directions (P, U) are of unit length, in ordinary sizes.
     """
     if data.observer is None:
-        part = data[np.unique(np.linspace(0, len(data) - 1, FEW).astype(int))]
-        best = best_placement(part, frames, free, GOOD * np.sqrt(part.m), STEPS, TRIED)
+        part = data[np.unique(np.linspace(0, len(data) - 1, START_READINGS).astype(int))]
+        best = best_placement(
+            part, frames, free, GOOD_RMS * np.sqrt(part.m), START_STEPS, MOST_ROTATIONS
+        )
     else:
         rows = (np.flatnonzero(data.observer == k) for k in np.unique(data.observer))
-        few = [r[np.linspace(0, len(r) - 1, FEW_EACH).astype(int)] for r in rows]
+        few = [r[np.linspace(0, len(r) - 1, START_READINGS_EACH).astype(int)] for r in rows]
         part = data[np.unique(np.concatenate(few))]
         starts = [Placement(part, start, free) for start in _starts(data, part, frames, free)]
         starts.sort(key=lambda p: p.square)
-        tried = [minimise(start, STEPS_SEVERAL) for start in starts[:FOLLOWED]]
+        tried = [minimise(start, START_STEPS_SEVERAL) for start in starts[:MOST_FOLLOWED]]
         best = min(tried, key=lambda p: p.square)
     return settled(minimise(Placement(data, best.frames, free)), frames)
 
@@ -373,7 +378,7 @@ def rotation_of_attitudes(attitude: Floats, flange: Floats) -> Floats:
     return nearest_rotation(a * (np.sign(np.linalg.det(a)) or 1.0))
 
 
-def cube() -> Floats:
+def cube_rotations() -> Floats:
     """(24, 3, 3) the rotations that take a cube to itself."""
     from scipy.spatial.transform import Rotation  # slow to import
 
@@ -410,7 +415,7 @@ def _with_translations(data: FrameData, frames: Frames, rotation: Floats, free: 
         a[rows, :, 3 + 3 * k : 6 + 3 * k] = turned[rows]
     live = np.repeat(free[::6], 3)
     x = np.concatenate([frames.base[:3, 3], *frames.targets[:, :3, 3]])
-    hold = np.repeat([HOLD / BASE_M] + [HOLD / TARGET_M] * size, 3)
+    hold = np.repeat([START_WEIGHT / BASE_M] + [START_WEIGHT / TARGET_M] * size, 3)
     flat = a.reshape(-1, len(x))
     remainder = (data.value - data.position @ rotation.T).reshape(-1) - flat @ x
     if live.any():
@@ -434,14 +439,14 @@ def _starts(data: FrameData, part: FrameData, frames: Frames, free: Bools) -> It
     if len(np.unique(np.round(data.position[rows], 9), axis=0)) >= MIN_POSES:
         by_stations = replace(data[rows], observer=None)
         of_both = free[: 6 + 6 * len(frames.targets)]
-        good = GOOD * np.sqrt(data.m)
+        good = GOOD_RMS * np.sqrt(data.m)
         alone = replace(frames, observers=())
-        best = best_placement(by_stations, alone, of_both, good, STEPS, TRIED).frames
+        best = best_placement(by_stations, alone, of_both, good, START_STEPS, MOST_ROTATIONS).frames
         bases = [replace(best, observers=frames.observers)]
     elif free[:6].any():
         tied = [o.frame for o in frames.observers if o.tied]
         centre = np.mean([-f[:3, :3].T @ f[:3, 3] for f in tied], axis=0)
-        bases = [replace(frames, base=se3.matrix(turn, centre)) for turn in cube()]
+        bases = [replace(frames, base=se3.matrix(turn, centre)) for turn in cube_rotations()]
     for f in bases:
         p, observers = part.points(f) @ f.base[:3, :3].T + f.base[:3, 3], []
         for k, o in enumerate(frames.observers):

@@ -19,7 +19,7 @@ that on d = θ_B − θ_A is the parallel sum (Anderson and Duffin, J. Math. Ana
 
 singular along every direction that one of the campaigns did not determine: what a frame absorbs, or
 a joint that did not turn. So each parameter, and each effect as a whole, is compared with all
-others free within f = `FREE` of their ordinary magnitudes: in these,
+others free within f = `OTHERS_STD` of their ordinary magnitudes: in these,
 S = ((P + 1/f²)⁻¹_mm)⁻¹ − 1/f² is the information on its difference. What is known less well than
 to one magnitude is not compared.
 """
@@ -46,9 +46,11 @@ if TYPE_CHECKING:
 
 
 FORMAT, VERSION = "hilcal-posterior", 1
-FREE = 10.0  # how far the others may differ when one is compared, in ordinary magnitudes; a choice
-LEAST = INFORMATION**2 / 2  # from which a direction is determined, in ordinary magnitudes
-LISTED = 60  # parameters of an effect from which it is compared as a whole only; a choice
+OTHERS_STD = 10.0
+"""How far the others may differ when one is compared, in ordinary magnitudes; a choice."""
+LEAST_INFORMATION = INFORMATION**2 / 2
+"""From which a direction is determined, in ordinary magnitudes."""
+MOST_LISTED = 60  # parameters of an effect from which it is compared as a whole only; a choice
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +203,7 @@ def _read(content: Mapping[str, Any]) -> Posterior:
     return p
 
 
-def spectrum(information: Floats, least: float = LEAST) -> tuple[Floats, Floats]:
+def spectrum(information: Floats, least: float = LEAST_INFORMATION) -> tuple[Floats, Floats]:
     """Eigenvalues (K,), zero where hardly anything is determined, and vectors of information."""
     values, vectors = np.linalg.eigh((information + information.T) / 2)
     values[values < least] = 0.0
@@ -279,9 +281,9 @@ def parameter_differences(earlier: Posterior, later: Posterior) -> Differences:
     values, vectors = spectrum(first + second)
     half = vectors[:, values > 0] / np.sqrt(values[values > 0])
     parallel = (first @ half) @ (half.T @ second)
-    some = (parallel + parallel.T) / 2 + np.eye(len(common)) / FREE**2
+    some = (parallel + parallel.T) / 2 + np.eye(len(common)) / OTHERS_STD**2
     covariance = np.asarray(np.linalg.inv(some), dtype=float)
-    information = 1.0 / np.diag(covariance) - 1.0 / FREE**2
+    information = 1.0 / np.diag(covariance) - 1.0 / OTHERS_STD**2
     d, names = np.asarray(mean_later - mean_earlier, dtype=float), np.array(owner)
     effects = [_effect(e, covariance, d, np.flatnonzero(names == e)) for e in dict.fromkeys(owner)]
     rows = tuple(
@@ -294,7 +296,7 @@ def parameter_differences(earlier: Posterior, later: Posterior) -> Differences:
             std=float(scale[k] / np.sqrt(information[k])) if information[k] > 1.0 else None,
         )
         for k, name in enumerate(common)
-        if owner.count(owner[k]) < LISTED
+        if owner.count(owner[k]) < MOST_LISTED
     )
     return Differences(rows, tuple(effects), apart)
 
@@ -315,7 +317,7 @@ def _effect(effect: str, covariance: Floats, d: Floats, rows: Ints) -> EffectDif
     d (K,) are the differences of all parameters, with their covariance (K, K) by both campaigns and
     the prior.
     """
-    some = np.linalg.inv(covariance[np.ix_(rows, rows)]) - np.eye(len(rows)) / FREE**2
+    some = np.linalg.inv(covariance[np.ix_(rows, rows)]) - np.eye(len(rows)) / OTHERS_STD**2
     values, vectors = np.linalg.eigh((some + some.T) / 2)
     compared = values > 1.0
     total = float(np.sum(values[compared] * (vectors[:, compared].T @ d[rows]) ** 2))

@@ -45,7 +45,7 @@ from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.carried import coordinates_of, scales_of
 from hilcal.identification.fit import Fit
-from hilcal.identification.folds import distinct_poses, ordinary, random_folds
+from hilcal.identification.folds import distinct_poses, ordinary_magnitudes, random_folds
 from hilcal.identification.gauss_newton import whitened_jacobian
 from hilcal.identification.mixed_fit import INSTRUMENT, mixed_fit_at
 from hilcal.identification.posterior import Posterior, PosteriorEffect, Source, determined
@@ -62,7 +62,7 @@ from hilcal.store.rows import content_hash
 from hilcal.types import Floats, Ints
 
 ITERATIONS = 20  # of the noise factor; it converges within a few
-ROUNDS = 6  # most times that the covariance is computed anew as W changes; a choice
+MOST_ROUNDS = 6  # most times that the covariance is computed anew as W changes; a choice
 MOST_LEVERAGE = 0.99  # of a row; that of a row which alone determines something is 1
 ROUNDING = 1e-9  # least share of a direction's information that is not of one fold
 CHUNK = 4096  # measurements that are processed at once, for memory
@@ -70,10 +70,11 @@ MOST_ROWS = 600  # elements beyond which variances count as known: of 200 poses 
 # the factor is 1.00 to 1.06, and a draw costs the cube of the rows; a choice
 DRAWS, SEED = 30, 0  # of the posterior; a choice: 20 poses of that UR10 give 1.19 to 1.43 by seed
 # log of the largest weight of a draw over the median: tails are not normal; a choice
-HEAVIEST = 2.0
-CHANCE = 0.0005  # p-value of χ² below which there is an excess: that of `diagnosis.noise_verdict`
-SOME = 400  # measurements, evenly spaced, for a mean leverage, for speed; a choice
-SAME = 0.05  # relative change of s² and of the factor that is negligible; a choice
+LARGEST_LOG_WEIGHT = 2.0
+EXCESS_LEVEL = 0.0005
+"""P-value of χ² below which there is an excess: that of `diagnosis.noise_verdict`."""
+LEVERAGE_SAMPLE = 400  # measurements, evenly spaced, for a mean leverage, for speed; a choice
+NEGLIGIBLE_CHANGE = 0.05  # relative change of s² and of the factor that is negligible; a choice
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,14 +85,17 @@ class Excess:
     attitude: float = 1.0  # factor of the variances of the attitude
 
     @property
-    def none(self) -> bool:
+    def is_zero(self) -> bool:
         """Whether there is none."""
         return self.position == 0.0 and self.attitude == 1.0
 
-    def near(self, other: "Excess") -> bool:
+    def is_close(self, other: "Excess") -> bool:
         """Whether the difference to another one is negligible."""
         a, b = self.position, other.position
-        return abs(a - b) <= SAME * max(a, b) and abs(self.attitude / other.attitude - 1) <= SAME
+        return (
+            abs(a - b) <= NEGLIGIBLE_CHANGE * max(a, b)
+            and abs(self.attitude / other.attitude - 1) <= NEGLIGIBLE_CHANGE
+        )
 
     def widened(self, covariance: Floats, share: float = 1.0) -> Floats:
         """Return covariances (N, m, m) with the excess, of s² a share."""
@@ -106,12 +110,12 @@ class Excess:
         return replace(readings, covariance=self.widened(readings.covariance, share))
 
 
-NONE = Excess()
+NO_EXCESS = Excess()
 
 
 def excess(
     raw: Floats, stated: Whitening, used: Whitening, rows: Floats, root: Floats,
-    previous: Excess = NONE,
+    previous: Excess = NO_EXCESS,
 ) -> Excess:  # fmt: skip
     """Return the excess of a residual (D, m) over the stated noise.
 
@@ -119,7 +123,7 @@ def excess(
     `used` of the same measurements, which whitens the rows (R, P) and has the excess `previous`; a
     part with such an excess is not tested against chance again.
     """
-    chosen = np.linspace(0, len(raw) - 1, min(len(raw), SOME)).astype(int)
+    chosen = np.linspace(0, len(raw) - 1, min(len(raw), LEVERAGE_SAMPLE)).astype(int)
     spread = _spread(used, rows, root, chosen)
     position, attitude = 0.0, 1.0
     for part in (slice(0, 3), slice(3, 6))[: raw.shape[1] // 3]:
@@ -132,7 +136,11 @@ def excess(
         square = np.einsum("dij,di->dj", vectors, r) ** 2
         total = float(np.sum(square / values))
         sure = previous.attitude > 1.0 if part.start else previous.position > 0.0
-        if free < 1.0 or total <= free or (not sure and float(chi2.sf(total, free)) >= CHANCE):
+        if (
+            free < 1.0
+            or total <= free
+            or (not sure and float(chi2.sf(total, free)) >= EXCESS_LEVEL)
+        ):
             continue
         if part.start:
             attitude = total / free
@@ -173,7 +181,7 @@ class Predictive:
     excess: Excess  # of W over V
     noise: float  # σ², noise factor of the fitted readings in units of W
     factor: float  # κ
-    least: float  # lower bound of κ, by the uncertainty of the variances
+    least_factor: float  # lower bound of κ, by the uncertainty of the variances
     leverage: Floats  # (D,) largest eigenvalue of the variance of a fitted measurement's prediction
     # over that of the noise
     scatter: float  # mean variance of the fitted readings by σ² W, in units of V
@@ -181,17 +189,17 @@ class Predictive:
     scatter_m2: float  # the first of both of a 3-D position, m²
     left_out_m2: float  # the second
 
-    def of_prediction(self, prediction: Prediction, w: Whitening) -> Floats:
+    def prediction_covariance(self, prediction: Prediction, w: Whitening) -> Floats:
         """Return κ J C Jᵀ (D, m, m) of predicted measurements."""
         jacobian = w.raw(self.model.jacobian(prediction, self.theta, w.m))
         spread = np.einsum("dip,pq,djq->dij", jacobian, self.covariance, jacobian, optimize=True)
         return np.asarray(self.factor * spread)
 
-    def of_reading(self, prediction: Prediction, w: Whitening) -> Floats:
+    def reading_covariance(self, prediction: Prediction, w: Whitening) -> Floats:
         """Return κ (σ² W + J C Jᵀ) (D, m, m), of measured minus predicted."""
-        return self.of_prediction(prediction, w) + self.of_noise(w)
+        return self.prediction_covariance(prediction, w) + self.noise_covariance(w)
 
-    def of_noise(self, w: Whitening) -> Floats:
+    def noise_covariance(self, w: Whitening) -> Floats:
         """Return κ σ² W (D, m, m)."""
         return self.factor * self.noise * self.excess.widened(w.covariance)
 
@@ -238,7 +246,7 @@ def predictive(
         return space.columns(whitened_jacobian(model, prediction, theta, w, parameters)) * std
 
     parameters, extra, w = np.arange(model.size), Excess(), stated
-    for step in range(ROUNDS + 1):
+    for step in range(MOST_ROUNDS + 1):
         a = rows_in(w)
         values, vectors = np.linalg.eigh(a.T @ a)
         values, white = np.maximum(values, 0.0), w.whiten(raw).reshape(-1)
@@ -247,13 +255,15 @@ def predictive(
             free = max(w.rank - float(np.sum(values / (values + noise))), 1.0)
             noise = max(1.0, float(white @ white) / free)
         root = vectors * np.sqrt(noise / (values + noise))
-        if noise_factor is not None or step == ROUNDS:  # with a background, which holds any misfit
+        if (
+            noise_factor is not None or step == MOST_ROUNDS
+        ):  # with a background, which holds any misfit
             break
         # The residual of the parameters with this noise and this prior, and its leverage.
         moved = root @ (root.T @ (a.T @ white / noise - pull))
         refitted = model.predict(fitted.states, theta + space.transform(std * moved))
         new = excess(residual(fitted, refitted, stated), stated, w, a, root / np.sqrt(noise), extra)
-        if new.near(extra):
+        if new.is_close(extra):
             break
         # The geometric mean of both; half of s² where one has none.
         s2, old = new.position, extra.position
@@ -267,7 +277,7 @@ def predictive(
         shares.append(np.linalg.eigvalsh(part @ np.swapaxes(part, 1, 2)) / noise)
     leverage = np.clip(np.concatenate(shares), 0.0, MOST_LEVERAGE).max(axis=1)
     scatter, b, wider = noise, a, extra.widened(stated.covariance)
-    if not extra.none:
+    if not extra.is_zero:
         share = np.trace(np.linalg.solve(stated.covariance, wider), axis1=1, axis2=2)
         scatter = noise * float(share.mean()) / w.m
         b = rows_in(stated)
@@ -312,7 +322,7 @@ def left_out_variances(
 
 def open_prior(model: Model, theta: Floats, prior: Floats) -> Floats:
     """Prior standard deviations (P,) where the readings leave parameters open."""
-    return family_prior(model, np.where(np.isinf(prior), ordinary(model, theta), prior))
+    return family_prior(model, np.where(np.isinf(prior), ordinary_magnitudes(model, theta), prior))
 
 
 def family_prior(model: Model, prior: Floats) -> Floats:
@@ -332,7 +342,7 @@ def position_factor(p: Predictive, left_out_m: float) -> float:
     The stated mean square error of positions left out is then the observed one, in m². In units of
     V the directions that an instrument measures best would decide, in which misfits count most.
     """
-    return max(p.least, (left_out_m**2 - p.scatter_m2) / max(p.left_out_m2, 1e-300))
+    return max(p.least_factor, (left_out_m**2 - p.scatter_m2) / max(p.left_out_m2, 1e-300))
 
 
 def variance_spread(variances: Variances, fold: Ints) -> float:
@@ -354,7 +364,7 @@ def variance_spread(variances: Variances, fold: Ints) -> float:
         weight.append(log_posterior(e) + 0.5 * float(z @ z))
     if not weight:
         return 1.0
-    share = np.exp(np.minimum(np.array(weight) - np.median(weight), HEAVIEST))
+    share = np.exp(np.minimum(np.array(weight) - np.median(weight), LARGEST_LOG_WEIGHT))
     share /= share.sum()
     away = np.array(off) - share @ np.array(off)
     mean = share @ (np.array(variance) + np.sum(away**2, axis=1))
@@ -366,13 +376,13 @@ def posterior_of(fit: Fit, source: Source | None = None) -> Posterior:
     if fit.scaling != "gc":
         raise InputError(f"a prior needs a fit with scaling gc, this one has {fit.scaling}")
     model, cell = fit.model, fit.model.cell
-    effects = [e for e in model.effects if of_arm(e)]
+    effects = [e for e in model.effects if belongs_to_arm(e)]
     if not effects:
         raise CannotAnswerError(
             f"the model {' + '.join(model.names) or 'of the nominal arm'} has no effect of the "
             "arm, only of the setup: there is nothing to carry over; run hilcal refine first"
         )
-    of_arms = np.concatenate([np.full(len(e.parameters), of_arm(e)) for e in model.effects])
+    of_arms = np.concatenate([np.full(len(e.parameters), belongs_to_arm(e)) for e in model.effects])
     interest, scale = np.flatnonzero(of_arms), scales_of(model)
     information, precision = _information(fit, scale)
     marginal = determined(schur_complement(information, interest))
@@ -398,7 +408,7 @@ def posterior_of(fit: Fit, source: Source | None = None) -> Posterior:
     )
 
 
-def of_arm(effect: Effect) -> bool:
+def belongs_to_arm(effect: Effect) -> bool:
     """Whether an effect is of the arm, so that another campaign of it has it, too."""
     return not (type(effect).of_setup or effect.role in FRAME_ROLES)
 
@@ -407,7 +417,7 @@ def _information(fit: Fit, scale: Floats) -> tuple[Floats, Floats]:
     """M (P, P) and the part of its diagonal by the effects' own priors, in ordinary magnitudes."""
     model, s = fit.model, fit.solution
     p, w = predictive_of(fit), fit.whitening
-    if not p.excess.none:
+    if not p.excess.is_zero:
         w = whitening(p.excess.of_readings(fit.readings[~fit.outlier], fit.mode), fit.mode, "gc")
     a = whitened_jacobian(model, s.prediction, s.theta, w, np.arange(model.size))
     a *= scale
@@ -418,5 +428,5 @@ def _information(fit: Fit, scale: Floats) -> tuple[Floats, Floats]:
     precision[np.isinf(precision)] = 1.0
     # With κ the mean variance on poses left out is the mean square of the whitened residual there.
     square = fit.holdout.rms_sigma**2
-    kappa = max(p.least, (square - max(p.scatter, 1.0)) / max(p.left_out, 1e-12))
+    kappa = max(p.least_factor, (square - max(p.scatter, 1.0)) / max(p.left_out, 1e-12))
     return (a.T @ a / p.noise + np.diag(precision)) / kappa, precision / kappa

@@ -21,12 +21,12 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.effects.target_offset import TargetOffset
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.data_snooping import off_alike
+from hilcal.identification.data_snooping import runs_of_equal_shifts
 from hilcal.identification.least_trimmed_squares import (
-    MOST,
-    limit,
+    MOST_WRONG,
+    rejection_limit,
     robust_start,
-    variance,
+    trimmed_variance,
 )
 from hilcal.identification.placement import (
     MIN_POSES,
@@ -45,13 +45,13 @@ from hilcal.robot import se3
 from hilcal.types import Bools, Floats
 
 # All of these are choices.
-NARROW = 1e-3  # m rms from a line, below which positions are collinear
-DISTURBED = 3e-3  # m rms from which far readings are looked for: nominal arms are off by less
-BEYOND = 10.0  # times the median misfit from which on a reading of several observers is far off
-LEAST_FAR = 1e-4  # m, misfit that is never far off
+COLLINEAR_M = 1e-3  # m rms from a line, below which positions are collinear
+DISTURBED_M = 3e-3  # m rms from which far readings are looked for: nominal arms are off by less
+FAR_FACTOR = 10.0  # times the median misfit from which on a reading of several observers is far off
+LEAST_FAR_M = 1e-4  # m, misfit that is never far off
 SEED, ROUNDS = 0, 5  # of random subsets; most rounds in which readings join and leave
-TURNED = 1e-3  # range of a joint's angle, rad, below which it counts as never turned
-TOLD = 0.05  # component of an undetermined direction that is worth mentioning
+LEAST_TURN = 1e-3  # range of a joint's angle, rad, below which it counts as never turned
+LEAST_COMPONENT = 0.05  # component of an undetermined direction that is worth mentioning
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,12 +82,12 @@ class Registration:
     """The place of base and targets, and what the poses do not determine."""
 
     cell: Cell  # with base and target in place
-    off: Floats  # (N, m) measured minus predicted by the nominal arm, sensor axes, m and rad
+    residual: Floats  # (N, m) measured minus predicted by the nominal arm, sensor axes, m and rad
     rms: float  # of the 3-D position error, m, of the readings that are not far off
     turn_rms: float | None  # of the attitude's error, rad; None for positions alone
     far: Bools  # (N,) far off while the others fit: the frames are not fitted to these
     undetermined: tuple[Undetermined, ...]
-    still: Bools  # (n,) joints that never turned
+    never_turned: Bools  # (n,) joints that never turned
     estimated: bool  # whether anything was unknown
 
     def to_json(
@@ -106,7 +106,7 @@ class Registration:
             "rms_m": self.rms,
             "rms_rad": self.turn_rms,
             "undetermined": [u.to_json() for u in self.undetermined],
-            "joints_never_turned": (np.flatnonzero(self.still) + 1).tolist(),
+            "joints_never_turned": (np.flatnonzero(self.never_turned) + 1).tolist(),
         }
 
 
@@ -133,7 +133,7 @@ def register(cell: Cell, readings: Readings) -> Registration:
     else:
         placement, null = Placement(data, frames, np.zeros_like(free)), np.zeros((len(free), 0))
     far = _far(readings, placement)
-    if estimated and 0 < far.mean() <= MOST:
+    if estimated and 0 < far.mean() <= MOST_WRONG:
         placement, null = fitted_placement(data[~far], frames, free)
         if cell.observers:
             far = _far_by_median(data.misfit(placement.frames))
@@ -142,7 +142,7 @@ def register(cell: Cell, readings: Readings) -> Registration:
         x = data.points(found)
         spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)[1]
         in_space = m == 6 or cell.registration_known or bool(cell.observers)
-        if not in_space and spread < NARROW * np.sqrt(len(x)):
+        if not in_space and spread < COLLINEAR_M * np.sqrt(len(x)):
             raise CannotAnswerError(
                 "registration: all positions lie in one point or on one line; measure poses "
                 "spread in space"
@@ -155,12 +155,12 @@ def register(cell: Cell, readings: Readings) -> Registration:
     )
     return Registration(
         cell=cell,
-        off=off,
+        residual=off,
         rms=rms,
         turn_rms=turn_rms if m == 6 else None,
-        far=far & (far.mean() <= MOST),
+        far=far & (far.mean() <= MOST_WRONG),
         undetermined=_undetermined(null, found),
-        still=np.ptp(angles(readings), axis=0) < TURNED,
+        never_turned=np.ptp(angles(readings), axis=0) < LEAST_TURN,
         estimated=estimated,
     )
 
@@ -192,22 +192,22 @@ def targets_as_fitted(model: Model, theta: Floats) -> Floats:
 
 
 def _far(readings: Readings, placement: Placement) -> Bools:
-    """(N,) readings far off while the others fit to within `DISTURBED`; none in other cases."""
+    """(N,) readings far off while the others fit to within `DISTURBED_M`; none in other cases."""
     if placement.frames.observers:
-        return _far_by_median(placement.off)
+        return _far_by_median(placement.misfit)
     data, none = placement.data, np.zeros(len(readings), dtype=np.bool_)
 
     def fits(off: Floats) -> bool:
-        return bool(np.mean(np.sum(off[:, :3] ** 2, axis=1)) <= DISTURBED**2)
+        return bool(np.mean(np.sum(off[:, :3] ** 2, axis=1)) <= DISTURBED_M**2)
 
-    if fits(placement.off):
+    if fits(placement.misfit):
         return none
     placement, used = robust_start(placement, np.random.default_rng(SEED))
     for _ in range(ROUNDS):
         linear = placement.linear
-        d2, _ = linear.near(np.zeros(linear.columns.shape[2]))
-        far = d2 > limit(data.m, len(data), variance(linear, d2, none))
-        if far.mean() > MOST:
+        d2, _ = linear.distances_from(np.zeros(linear.columns.shape[2]))
+        far = d2 > rejection_limit(data.m, len(data), trimmed_variance(linear, d2, none))
+        if far.mean() > MOST_WRONG:
             return none
         placement = replace(placement, frames=minimise(replace(placement, data=data[~far])).frames)
         if np.array_equal(far, ~used):
@@ -215,14 +215,14 @@ def _far(readings: Readings, placement: Placement) -> Bools:
         used = ~far
     rows, base = np.flatnonzero(far), placement.frames.base[:3, :3]
     axes = base @ data.rotation[rows] @ placement.frames.targets[data.target[rows], :3, :3]
-    alike = off_alike(readings, ~none, rows, placement.off[rows, :3], axes)
-    return far if fits(placement.off[~far]) and not len(alike) else none
+    alike = runs_of_equal_shifts(readings, ~none, rows, placement.misfit[rows, :3], axes)
+    return far if fits(placement.misfit[~far]) and not len(alike) else none
 
 
 def _far_by_median(off: Floats) -> Bools:
     """(N,) readings that are off (N, m) by far more than most."""
     size = np.linalg.norm(off[:, :3], axis=1)
-    return np.asarray(size > max(LEAST_FAR, BEYOND * float(np.median(size))))
+    return np.asarray(size > max(LEAST_FAR_M, FAR_FACTOR * float(np.median(size))))
 
 
 def _undetermined(null: Floats, frames: Frames) -> tuple[Undetermined, ...]:
@@ -233,9 +233,9 @@ def _undetermined(null: Floats, frames: Frames) -> tuple[Undetermined, ...]:
     of_observers = range(6 + 6 * size, len(null))
     blocks = (targets[:, 0].reshape(-1).tolist(), turns_and_base, of_observers)
     out = []
-    for row in echelon(null.T, blocks, TOLD):
+    for row in echelon(null.T, blocks, LEAST_COMPONENT):
         row = row / np.abs(row).max()
-        moved = (row * (np.abs(row) >= TOLD) * frames.sizes).reshape(-1, 2, 3)
+        moved = (row * (np.abs(row) >= LEAST_COMPONENT) * frames.sizes).reshape(-1, 2, 3)
         base, of_targets, of_others = moved[0], moved[1 : 1 + size], moved[1 + size :]
         active = np.flatnonzero(np.abs(of_targets).any(axis=(1, 2)))
         target = int(active[0]) if len(active) else None

@@ -7,7 +7,7 @@ from scipy.stats import chi2
 
 from hilcal.model.model import Prediction
 from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import Whitening, measured, relative_rotation
+from hilcal.readings.whitening import Whitening, measured_values, relative_rotation
 from hilcal.robot import se3
 from hilcal.shown import Shown
 from hilcal.types import Floats
@@ -26,7 +26,7 @@ def residual(readings: Readings, prediction: Prediction, w: Whitening) -> Floats
     if w.m == 3:
         return position
     if w.mode == "deflection":
-        turn = measured(readings, w)[:, 3:] - relative_rotation(o.rotation, w)
+        turn = measured_values(readings, w)[:, 3:] - relative_rotation(o.rotation, w)
     else:
         read = se3.rotation(readings.value[:, 3:])
         turn = w.raw(se3.rotation_vector(read @ np.swapaxes(o.rotation, 1, 2)))

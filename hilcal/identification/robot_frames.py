@@ -30,9 +30,11 @@ from hilcal.robot import se3
 from hilcal.types import Bools, Floats
 
 TRIALS = 8  # random states at which deviations are tested for being constant; a choice
-SAME = 1e-15  # largest difference of a constant deviation between states, m and rad: rounding
-SAME_ON = 1e-5  # m, and of a rotation's elements; largest change of a prediction by a whole turn; a
-# choice, which a tracker hardly measures: couplings of joints in a background are smaller
+CONSTANT_TOLERANCE = 1e-15
+"""Largest difference of a constant deviation between states, m and rad: rounding."""
+WHOLE_TURN_TOLERANCE = 1e-5
+"""Largest change of a prediction by a whole turn, m, and of a rotation's elements; a choice, which
+a tracker hardly measures: couplings of joints in a background are smaller."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,8 +49,8 @@ class RobotFrames:
     targets: Floats  # (T, 4, 4) T_flange_target as fitted
     declared: Floats  # (T, 4, 4) the same as stated where all of them are, else as fitted
     links: Floats  # (n + 1, 4, 4) the arm with its constant effects, from base to flange
-    within: tuple[str, ...]  # effects that are constant, and so in `links`
-    beyond: tuple[str, ...]  # effects that are not
+    constant_effects: tuple[str, ...]  # effects that are constant, and so in `links`
+    other_effects: tuple[str, ...]  # effects that are not
 
     @property
     def base_is(self) -> str:
@@ -89,8 +91,8 @@ def robot_frames(model: Model, theta: Floats) -> RobotFrames:
         targets=targets,
         declared=cell.all_targets if stated else targets,
         links=links,
-        within=within,
-        beyond=beyond,
+        constant_effects=within,
+        other_effects=beyond,
     )
 
 
@@ -106,11 +108,13 @@ def whole_turns(model: Model, theta: Floats) -> Bools:
         q = states.q + FULL_TURN * np.eye(n)[j]
         turned = model.predict(replace(states, q=q), theta).observation
         moved = np.abs(turned.position - reference.position).max()
-        out[j] = max(moved, np.abs(turned.rotation - reference.rotation).max()) <= SAME_ON
+        out[j] = (
+            max(moved, np.abs(turned.rotation - reference.rotation).max()) <= WHOLE_TURN_TOLERANCE
+        )
     return out
 
 
-def one_of_each(cell: Cell) -> States:
+def state_with_every_column(cell: Cell) -> States:
     """Return one state that has every column, for effects that are built without readings."""
     scalar, joints = np.zeros(1), np.zeros((1, cell.arm.n))
     return States(
@@ -127,7 +131,7 @@ def one_of_each(cell: Cell) -> States:
 def _fitted(model: Model, theta: Floats) -> tuple[Floats, Floats]:
     """Return the fitted base in its registration (4, 4), and all targets (T, 4, 4)."""
     cell, targets = model.cell, model.cell.all_targets.copy()
-    states = one_of_each(cell)[np.zeros(len(targets), dtype=np.int64)]
+    states = state_with_every_column(cell)[np.zeros(len(targets), dtype=np.int64)]
     if cell.targets is not None:
         states = replace(states, target=np.arange(len(targets)))
     situation, base = model.predict(states, 0 * theta).situation, np.zeros(6)
@@ -161,7 +165,9 @@ def _constant(model: Model, theta: Floats) -> tuple[Floats, tuple[str, ...], tup
         frames = (d.base, d.station, d.target, d.scale, d.observer)
         moves_frames = any(f is not None for f in frames)
         parts = [part for part in (d.dq, d.twist) if part is not None]
-        constant = not e.elastic and all(np.abs(x - x[:1]).max() <= SAME for x in parts)
+        constant = not e.elastic and all(
+            np.abs(x - x[:1]).max() <= CONSTANT_TOLERANCE for x in parts
+        )
         if not constant or moves_frames or d.dq is d.twist:
             beyond.append(e.name)
             continue

@@ -38,12 +38,14 @@ from hilcal.toml import check_section
 from hilcal.types import Floats
 
 # All of these are choices.
-CLOSE = 0.02  # share of the reach that a nominal arm may be off; arms are ten times better
+CLOSE_SHARE = 0.02  # share of the reach that a nominal arm may be off; arms are ten times better
 MOST_TRIED = 8  # choices of columns that are tried; each takes a registration
-AGREES = 0.05  # rad; nominal arms are better by far (1 mrad), other conventions worse (1 rad)
-CLEARER = 5.0  # how much worse the next choice must fit for the first to be certain
-FEWEST, MOST = 6, 300  # readings below which two rotations fit too easily; readings that are tried
-ROUNDS = 20  # steps between A and B
+AGREEMENT_RAD = 0.05
+"""Rad; nominal arms are better by far (1 mrad), other conventions worse (1 rad)."""
+LEAST_RATIO = 5.0  # how much worse the next choice must fit for the first to be certain
+FEWEST_READINGS, MOST_READINGS = 6, 300
+"""Readings below which two rotations fit too easily; readings that are tried."""
+ALTERNATIONS = 20  # steps between A and B
 _EXTERNAL = re.compile(r"e(xt)?_?[1-6]\b", re.IGNORECASE)
 _GENERIC = ("intrinsic-", "fixed-", "rotation-", "quaternion-")
 """Beginnings of the names of conventions that belong to no maker."""
@@ -225,8 +227,8 @@ def _decide_columns(table: Path, proposed: Proposed, settings: CellConfig, cell:
         if rms is not None:
             fits.append((rms, changed))
     fits.sort(key=lambda fit: fit[0])
-    clear = len(fits) > 1 and fits[1][0] > CLEARER * fits[0][0]
-    if not fits or fits[0][0] > CLOSE * cell.arm.reach or not (clear or len(fits) == 1):
+    clear = len(fits) > 1 and fits[1][0] > LEAST_RATIO * fits[0][0]
+    if not fits or fits[0][0] > CLOSE_SHARE * cell.arm.reach or not (clear or len(fits) == 1):
         return []
     proposal.sections = fits[0][1]
     for k, u in enumerate(proposal.understood):
@@ -291,9 +293,9 @@ def rank_conventions(
     Of the numbers (N, k), in a unit of angles, at joint angles (N, n) and positions (N, 3), sensor
     axes; none where there are too few readings.
     """
-    step = max(1, len(q) // MOST)
+    step = max(1, len(q) // MOST_READINGS)
     q, y, values = q[::step], position[::step], values[::step]
-    if len(q) < FEWEST:
+    if len(q) < FEWEST_READINGS:
         return ()
     chain = evaluate(arm, q)
     flange, p = chain.rotation[-1], chain.position[-1]
@@ -314,14 +316,14 @@ def rank_conventions(
 def clearly_best(ranked: Sequence[Agreement]) -> str | None:
     """Return the best convention, where the data leave no doubt; None otherwise."""
     best, second = ranked[:2]
-    clear = best.rms < AGREES and second.rms > CLEARER * best.rms
+    clear = best.rms < AGREEMENT_RAD and second.rms > LEAST_RATIO * best.rms
     return best.convention if clear else None
 
 
 def _fit_attitudes(measured: Floats, flange: Floats) -> tuple[Floats, float]:
     """A and the rms angle, rad, of the best M_i = A R_i B."""
     a = rotation_of_attitudes(measured, flange)
-    for _ in range(ROUNDS):
+    for _ in range(ALTERNATIONS):
         b = nearest_rotation(np.einsum("nji,kj,nkl->il", flange, a, measured))
         a = nearest_rotation(np.einsum("nij,kj,nlk->il", measured, b, flange))
     trace = np.einsum("nij,nij->n", measured, a @ flange @ b)

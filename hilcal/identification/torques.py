@@ -27,11 +27,12 @@ from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats, Ints
 
 ARM, TOOL = "the arm's masses", "the tool's mass"
-LEVEL = 0.95
-SURE = 1e-3  # two-sided p-value below which a factor differs from 1; a choice
-LEAST = 0.02  # share by which it has to differ: torque constants are known to some %; a choice
-ROUNDS = 4  # times that the noise of the drives is estimated anew; a choice
-TOLD = 1e-6  # torques below this share of the largest are rounding
+CONFIDENCE = 0.95
+TEST_LEVEL = 1e-3  # two-sided p-value below which a factor differs from 1; a choice
+LEAST_DIFFERENCE = 0.02
+"""Share by which it has to differ: torque constants are known to some %; a choice."""
+MOST_ROUNDS = 4  # times that the noise of the drives is estimated anew; a choice
+ROUNDING = 1e-6  # torques below this share of the largest are rounding
 
 _Factor = tuple[float, float, float, float]
 """Estimate, lower and upper end of its interval, p-value of 1."""
@@ -115,7 +116,7 @@ def check_torques(cell: Cell, readings: Readings) -> TorqueCheck | None:
         return {k: _means(x, group) for k, x in parts.items()}
 
     pairs = zip(centred(loads).values(), loads.values(), strict=True)
-    determined = [np.abs(x).max() > TOLD * max(np.abs(y).max(), 1e-12) for x, y in pairs]
+    determined = [np.abs(x).max() > ROUNDING * max(np.abs(y).max(), 1e-12) for x, y in pairs]
     if loads and all(determined):  # every load by differences between the readings of one pose
         lost = len(np.unique(group))
         y = centred({"y": torque})["y"]
@@ -144,7 +145,7 @@ def _fitted(
     """
     count, n = y.shape
     largest = max([float(np.abs(x).max()) for x in causes.values()], default=0.0)
-    names = [k for k, x in causes.items() if np.abs(x).max() > TOLD * largest]
+    names = [k for k, x in causes.items() if np.abs(x).max() > ROUNDING * largest]
     columns = [causes[k].T.reshape(-1) for k in names]
     unit = np.eye(n)
     if not lost:
@@ -155,7 +156,7 @@ def _fitted(
     a = np.stack(columns, axis=1) if columns else np.zeros((n * count, 0))
     b, std = y.T.reshape(-1), np.ones(n)
     dof_of_each = max(count - lost - a.shape[1] / n, 1.0)
-    for _ in range(ROUNDS):
+    for _ in range(MOST_ROUNDS):
         w = np.repeat(1.0 / std, count)
         u, s, vt = np.linalg.svd(a * w[:, None], full_matrices=False)
         regular = s > 1e-9 * max(float(s.max(initial=0.0)), 1e-300)
@@ -165,7 +166,7 @@ def _fitted(
         std = np.maximum(np.sqrt(square / dof_of_each), 1e-9 * (1 + np.abs(b).max()))
     null = np.abs(vt[~regular]).max(axis=0, initial=0.0)
     dof = max(n * (count - lost) - a.shape[1], 1)
-    half, out = float(student.ppf(0.5 + LEVEL / 2, dof)), {}
+    half, out = float(student.ppf(0.5 + CONFIDENCE / 2, dof)), {}
     for k, name in enumerate(names):
         if null[k] <= 1e-6:
             value, size = float(x[k]), float(np.sqrt(cov[k, k]))
@@ -187,5 +188,5 @@ def _factor(
         force = r.states.wrench[r.load == r.load_names.index(name), :3]
         if np.all(np.linalg.norm(np.cross(force, cell.gravity), axis=1) < 1e-3 * g):
             stated = float(np.mean(force @ cell.gravity)) / g**2
-    differs = p < SURE and abs(value - 1) > LEAST
+    differs = p < TEST_LEVEL and abs(value - 1) > LEAST_DIFFERENCE
     return TorqueFactor(name, value, low, high, stated, differs)

@@ -30,7 +30,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from hilcal.identification.carried import Coordinates, names_of, prior_of, scales_of
-from hilcal.identification.folds import block_folds, changes, region_folds
+from hilcal.identification.folds import block_folds, parameter_changes, region_folds
 from hilcal.identification.gauss_newton import Solution, whitened_jacobian
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
@@ -39,12 +39,13 @@ from hilcal.regression.normal_equations import NULL_SHARE, Basis, echelon
 from hilcal.regression.schur import Projection, inverse_root
 from hilcal.types import Bools, Floats, Ints
 
-LEARNT = 0.7  # posterior over prior standard deviation below which one is identifiable; a choice
-MEANINGLESS = 10.0  # standard uncertainty, in ordinary magnitudes, from which none is; a choice
-MISFIT_CHANCE = 0.01  # p-value of χ² below which the residual is a misfit; a choice
+IDENTIFIABLE_RATIO = 0.7
+"""Posterior over prior standard deviation below which one is identifiable; a choice."""
+LARGEST_STD = 10.0  # standard uncertainty, in ordinary magnitudes, from which none is; a choice
+MISFIT_LEVEL = 0.01  # p-value of χ² below which the residual is a misfit; a choice
 GRID = np.logspace(-2.0, 3.0, 101)  # values of τ in units of the half-Cauchy's scale
 ROUNDING = 1e-9
-HIDDEN = 2.0  # variance that a dropped group may have, in units of that by noise alone:
+DROPPED_VARIANCE = 2.0  # variance that a dropped group may have, in units of that by noise alone:
 # the mean over τ of a group at the limit of being dropped
 
 
@@ -73,15 +74,15 @@ def uncertainty(
     spread = solution.equations.inverse(solution.beta)
     covariance = solution.transform @ spread @ solution.transform.T
     variance = np.diag(covariance).copy()
-    variance[space.index] += space.rest / solution.beta
+    variance[space.index] += space.omitted_variance / solution.beta
     noise = solution.beta if w.scaling == "none" else 1.0
     formal = np.sqrt(np.maximum(variance, 0.0) * noise)
-    misfit, std = w.scaling != "none" and bool(chi2.sf(total, dof) < MISFIT_CHANCE), formal
+    misfit, std = w.scaling != "none" and bool(chi2.sf(total, dof) < MISFIT_LEVEL), formal
     if misfit:
         std = formal * np.sqrt(total / dof)
         angle = readings.states.q[w.reading]
         for fold in (block_folds(pose), region_folds(angle, pose)):
-            change = changes(model, solution, fold, w)
+            change = parameter_changes(model, solution, fold, w)
             count, off = len(change), change - change.mean(axis=0)
             std = np.maximum(std, np.sqrt((count - 1) / count * np.sum(off**2, axis=0)))
     null = in_ordinary_magnitudes(space, basis.null, scale)
@@ -115,8 +116,8 @@ def identifiable_parameters(
     `scale`, `std` (P,) and directions `null` (P, U) are as in `uncertainty`.
     """
     moved = scale * np.linalg.norm(null, axis=1)
-    flat = (moved <= NULL_SHARE * std) & (std < MEANINGLESS * scale)
-    narrowed = std < LEARNT * np.where(np.isinf(prior), np.inf, prior)
+    flat = (moved <= NULL_SHARE * std) & (std < LARGEST_STD * scale)
+    narrowed = std < IDENTIFIABLE_RATIO * np.where(np.isinf(prior), np.inf, prior)
     return np.where(basis.flat | carried, flat, narrowed & (prior > 0))
 
 
@@ -196,7 +197,9 @@ def dropped_group_factors(
     informed = reach[groups] > ROUNDING * np.maximum(norm2, 1e-300)
     if not informed.any():
         return np.ones(len(transform))
-    hidden = gram[np.ix_(informed, informed)] + np.diag(beta * reach[groups][informed] / HIDDEN)
+    hidden = gram[np.ix_(informed, informed)] + np.diag(
+        beta * reach[groups][informed] / DROPPED_VARIANCE
+    )
     precision = p.rows.T @ p.rows + np.diag(p.ridge)
     explained = inverse_root(hidden) @ cross[:, informed].T
     wide = inverse_root(precision - explained.T @ explained)

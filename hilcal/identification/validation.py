@@ -125,7 +125,7 @@ def _register(
 
 
 @dataclass(frozen=True, slots=True)
-class Beyond:
+class ExceededRange:
     """Readings beyond the fitted range of one variable."""
 
     variable: str  # e.g. "joint 2 angle", "force", "leverage"
@@ -141,7 +141,7 @@ class Extrapolation:
     """The stated errors of predictions of new readings, and which of these lie outside."""
 
     outside: Bools  # (D,) measurements that lie outside in any variable
-    variables: tuple[Beyond, ...]  # those that are exceeded, most measurements first
+    variables: tuple[ExceededRange, ...]  # those that are exceeded, most measurements first
     stated_m: Floats  # (D,) stated standard deviation of the 3-D position error, m
     z: Floats  # (D,) error over the stated standard deviation, rms of the elements
     inside_error: ErrorBlock | None  # of the measurements inside; None where there are none
@@ -181,7 +181,7 @@ def extrapolation(p: Predictive, fitted: Readings, validation: Validation) -> Ex
     w, readings, raw = validation.whitening, validation.readings, validation.raw
     units = p.model.cell.arm.units
     prediction = p.model.predict(readings.states, p.theta)
-    spread, noise = p.of_prediction(prediction, w), p.of_noise(w)
+    spread, noise = p.prediction_covariance(prediction, w), p.noise_covariance(w)
     root = inverse_root(noise)
     leverage = np.linalg.eigvalsh(root @ spread @ np.swapaxes(root, 1, 2))[:, -1]
     beyond, outside = [], np.zeros(len(w.reading), dtype=np.bool_)
@@ -194,13 +194,13 @@ def extrapolation(p: Predictive, fitted: Readings, validation: Validation) -> Ex
         far = r.beyond(x, turning=turns)
         if far.any():
             most = float(r.over(x[far], turning=turns).max())
-            beyond.append(Beyond(name, unit, r.low, r.high, int(far.sum()), most))
+            beyond.append(ExceededRange(name, unit, r.low, r.high, int(far.sum()), most))
         outside |= far
     limit = FAR * float(np.quantile(p.leverage / (1 - p.leverage), 0.99))
     far = leverage > max(limit, 1e-12)
     if far.any():
         most = float(leverage.max() - limit)
-        beyond.append(Beyond("leverage", "1", 0.0, limit, int(far.sum()), most))
+        beyond.append(ExceededRange("leverage", "1", 0.0, limit, int(far.sum()), most))
     outside |= far
     total = spread + noise
     square, read = _squares(total, raw)
@@ -237,7 +237,7 @@ class Judged:
     mode: Mode
     readings: int  # number of readings in the other campaign
     fitted: int  # number of these that the revision was fitted to
-    spoilt: int  # further ones whose unloaded reading was fitted
+    sharing_unloaded: int  # further ones whose unloaded reading was fitted
     unseen: bool  # whether those that are judged were never fitted; False where all were
     scalar: bool = False  # whether some readings are one number, a distance or a height
 

@@ -144,7 +144,7 @@ class Equations:
         return self.projection.project(self.target)
 
     @cached_property
-    def c(self) -> Floats:
+    def solution(self) -> Floats:
         """(K,) solution c, in units of the standard deviations S."""
         q, z = self.rows[:, : self.problem.flat], self.rows[:, self.problem.flat :]
         random = z.T @ self.residual
@@ -170,7 +170,7 @@ class Equations:
     def slope(self) -> Floats:
         """(F + N,) derivatives of ℓ by log s and η."""
         p = self.problem
-        square = np.bincount(p.family, self.c[p.flat :] ** 2, minlength=self._count)
+        square = np.bincount(p.family, self.solution[p.flat :] ** 2, minlength=self._count)
         noise = self.residual**2 @ self._white_noise - self._freedom
         noise[0] -= p.zeros
         return np.concatenate([square - self.spent, noise])
@@ -194,25 +194,27 @@ class Equations:
         return np.asarray(parts / self.noise_std[:, None] ** 2)
 
     @cached_property
-    def working(self) -> Floats:
+    def working_variates(self) -> Floats:
         """(R, F + N) working variates v."""
         p, first = self.problem, self._count
         out = np.zeros((len(self.target), len(self.log_std)))
         for f in range(first):
             columns = np.flatnonzero(p.family == f) + p.flat
-            out[:, f] = 2.0 * (self.rows[:, columns] @ self.c[columns])
+            out[:, f] = 2.0 * (self.rows[:, columns] @ self.solution[columns])
         out[:, first:] = 2.0 * self._white_noise * self.residual[:, None]
         return out
 
     @cached_property
     def information(self) -> Floats:
         """(F + N, F + N) AI, the average information on log s and η."""
-        return np.asarray(0.5 * self.working.T @ self.projection.project(self.working))
+        return np.asarray(
+            0.5 * self.working_variates.T @ self.projection.project(self.working_variates)
+        )
 
     @property
     def coordinates(self) -> Floats:
         """(K,) S c: coordinates of the frames, and u in ordinary magnitudes."""
-        return self.scale * self.c
+        return self.scale * self.solution
 
     @cached_property
     def covariance(self) -> Floats:
@@ -223,9 +225,9 @@ class Equations:
     def sensitivity(self) -> Floats:
         """(K, F + N) derivative of the coordinates by log s and η."""
         p, first = self.problem, self._count
-        rhs = np.zeros((len(self.c), len(self.log_std)))
-        rhs[p.flat + np.arange(len(p.family)), p.family] = 2.0 * self.c[p.flat :]
-        rhs[:, first:] = -self.rows.T @ self.working[:, first:]
+        rhs = np.zeros((len(self.solution), len(self.log_std)))
+        rhs[p.flat + np.arange(len(p.family)), p.family] = 2.0 * self.solution[p.flat :]
+        rhs[:, first:] = -self.rows.T @ self.working_variates[:, first:]
         return np.asarray(self.scale[:, None] * (self.projection.inverse @ rhs))
 
     def profile(self, family: int, log_std: Floats) -> Floats:

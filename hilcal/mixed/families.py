@@ -22,12 +22,12 @@ from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.model.model import Model
 from hilcal.types import Floats, Ints
 
-KNOWN = 1e-3  # spread of the logarithm of a standard deviation that is known
-ARM = 1.5
+KNOWN_SPREAD = 1e-3  # spread of the logarithm of a standard deviation that is known
+ARM_SPREAD = 1.5
 """Spread between arms: a factor of 4.5 either way, so that errors of a tenth or of ten times the
 ordinary ones are plausible; a choice."""
-EFFECT = 1.0  # spread between the effects of an arm: a factor of 2.7; a choice
-LINE = 0.7
+EFFECT_SPREAD = 1.0  # spread between the effects of an arm: a factor of 2.7; a choice
+LINE_SPREAD = 0.7
 """Spread between the lines of a pool, as the waves of one gear: a factor of 2; a choice. Any value
 of 0.5 to 1 predicted simulated transmission errors equally well."""
 
@@ -84,7 +84,7 @@ def families_of(model: Model, flat: Collection[str] = (), lines: Collection[str]
         index = np.arange(columns.start, columns.stop)
         std = effect.prior_std() if effect.role in FRAME_ROLES else None
         if std is not None:
-            known = LogStdPrior(0.0, KNOWN)
+            known = LogStdPrior(0.0, KNOWN_SPREAD)
             random.append(Family(effect.name, effect.name, index, std, known, known=True))
         elif effect.role in FRAME_ROLES or effect.name in flat:
             frames.append(index)
@@ -132,7 +132,7 @@ def _lines(effect: Effect, index: Ints) -> list[Family]:
         group = np.zeros(len(index), dtype=np.int64) if groups is None else groups
         for k in np.unique(group[in_pool]):
             in_line = in_pool & (group == k)
-            prior = LogStdPrior(pool.prior.mean, LINE)
+            prior = LogStdPrior(pool.prior.mean, LINE_SPREAD)
             name = f"{pool.name}, line {k}"
             out.append(
                 Family(
@@ -150,7 +150,9 @@ def log_std_prior(
     covariance = np.diag([p.spread**2 for p in priors])
     effect = np.array([f.effect for f in families])
     unknown = np.array([not f.known for f in families], dtype=float)
-    shared = (ARM**2 + EFFECT**2 * (effect[:, None] == effect)) * np.outer(unknown, unknown)
+    shared = (ARM_SPREAD**2 + EFFECT_SPREAD**2 * (effect[:, None] == effect)) * np.outer(
+        unknown, unknown
+    )
     pool, spread = np.array([f.pool for f in families]), [f.pool_spread for f in families]
     shared += (pool[:, None] == pool) * np.outer(spread, spread)
     covariance[: len(effect), : len(effect)] += shared

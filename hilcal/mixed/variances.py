@@ -48,8 +48,8 @@ LARGEST_STEP = 2.0  # of log s or η at a time: a factor of 7; a choice
 CONVERGED = 1e-4
 """Gain of the log posterior below which the iteration ends; a choice: estimates are then within 1 %
 of their standard error."""
-JUMPS = 8  # most restarts of Newton's method from another size of one family; a choice
-WORTH = 0.01  # least gain of the log posterior for another restart; a choice
+MOST_JUMPS = 8  # most restarts of Newton's method from another size of one family; a choice
+LEAST_GAIN = 0.01  # least gain of the log posterior for another restart; a choice
 SIZES = np.linspace(-7.0, 7.0, 57)
 """Searched values of log s: a factor of 1000 either way in steps of a quarter; a choice."""
 DAMPINGS = 12  # most increases of the damping in one step, tenfold each; a choice
@@ -65,7 +65,6 @@ class Variances:
 
     equations: Equations  # at the estimate
     covariance: Floats  # (F + N, F + N) of log s and η
-    log_posterior: float  # ℓ plus the log prior, without constants
 
     @property
     def log_std(self) -> Floats:
@@ -96,15 +95,15 @@ def estimate_variances(
     except np.linalg.LinAlgError as error:
         raise CannotAnswerError("the mixed model's equations have no solution") from error
     maximum, best = _newton(at_start)
-    for _ in range(JUMPS if search else 0):
+    for _ in range(MOST_JUMPS if search else 0):
         try:
             trial, value = _newton(equations(problem, _better_size(maximum)))
         except np.linalg.LinAlgError:
             break
-        if value < best + WORTH:
+        if value < best + LEAST_GAIN:
             break
         maximum, best = trial, value
-    return Variances(maximum, np.asarray(np.linalg.inv(maximum.information + precision)), best)
+    return Variances(maximum, np.asarray(np.linalg.inv(maximum.information + precision)))
 
 
 def log_posterior(e: Equations) -> float:
@@ -167,21 +166,6 @@ def coordinates_covariance(variances: Variances) -> Floats:
     return np.asarray(variances.equations.covariance + j @ variances.covariance @ j.T)
 
 
-def predict(variances: Variances, jacobian: Floats) -> tuple[Floats, Floats]:
-    """Predict rows that were not measured.
-
-    Args:
-        jacobian: (N, m, P) derivative of the predicted quantities by the model's parameters.
-
-    Returns:
-        (N, m) change from the prediction of the model with all parameters zero, and (N, m, m) its
-        covariance.
-    """
-    x = variances.equations.problem.coordinates(jacobian)
-    covariance = coordinates_covariance(variances)
-    return x @ variances.equations.coordinates, x @ covariance @ np.swapaxes(x, -1, -2)
-
-
 @dataclass(frozen=True, slots=True)
 class FamilyEvidence:
     """Evidence for a family or an effect."""
@@ -196,7 +180,7 @@ def evidence(
     families: int | Sequence[int],
     rng: np.random.Generator,  # for the simulated ratios
     start: Floats | None = None,  # (F + N,) log s and η of all families; else priors' means
-    most: float = np.inf,  # largest plausible s, in ordinary magnitudes
+    largest: float = np.inf,  # largest plausible s, in ordinary magnitudes
 ) -> FamilyEvidence:
     """Return the evidence for a family, or for several families of one effect.
 
@@ -216,7 +200,7 @@ def evidence(
         return FamilyEvidence(0.0, 1.0, 0)
     mu = mu[visible]
     w2 = (u[:, visible].T @ score) ** 2 / mu
-    bound = (most / ordinary[numbers].max()) ** 2
+    bound = (largest / ordinary[numbers].max()) ** 2
     ratio = float(_ratios(mu, w2[None], bound)[0])
     drawn = _ratios(mu, rng.standard_normal((DRAWS, len(mu))) ** 2, bound)
     p = (1 + int(np.count_nonzero(drawn >= ratio))) / (1 + DRAWS) if ratio > 0 else 1.0

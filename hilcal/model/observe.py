@@ -34,9 +34,9 @@ class Observation(Brief):
     axes: Floats
     sensor: Floats | None = None  # (N, 3) target, sensor axes, m; None without several observers
     local: Floats | None = None  # (N, 3) the same in the axes of the observer
-    read: Floats | None = None  # (N, 3, 3) derivative of `position` by `local`
+    by_local: Floats | None = None  # (N, 3, 3) derivative of `position` by `local`
     by_sensor: Floats | None = None  # (N, 3, 3) derivative of `position` by `sensor`
-    far: Bools | None = None  # (N,) where a distance is read, which has an offset
+    is_distance: Bools | None = None  # (N,) where a distance is read, which has an offset
 
 
 def observe(
@@ -71,11 +71,11 @@ def observe(
     axes = np.broadcast_to(axes, rotation.shape)
     if observer is None or not cell.observers:
         return Observation(position, rotation, base_position, axes)
-    o = sighted(cell.observers, observer, position, rotation, deviation.observer)
+    o = observed(cell.observers, observer, position, rotation, deviation.observer)
     return replace(o, base_position=base_position, axes=se3.product(o.axes, axes))
 
 
-def sighted(
+def observed(
     observers: Sequence[Observer],
     number: Ints,
     sensor: Floats,
@@ -114,14 +114,14 @@ def _turning(moved: Floats, far: Bools) -> Floats:
 
 
 def by_observer_frame(o: Observation, m: int, moved: Floats | None = None) -> Floats:
-    """Motion (N, m, 6) of a reading by the twist of the observer's frame, as of `sighted`."""
+    """Motion (N, m, 6) of a reading by the twist of the observer's frame, as of `observed`."""
     out = zeros(len(o.position), m, 6)
-    if o.local is not None and o.read is not None and o.far is not None:
-        back = None if moved is None else -_turning(moved, o.far)
+    if o.local is not None and o.by_local is not None and o.is_distance is not None:
+        back = None if moved is None else -_turning(moved, o.is_distance)
         jacobian = twist_jacobian(np.eye(3)[None], o.local, back)
-        out[:, :3] = o.read @ jacobian[:, :3]
+        out[:, :3] = o.by_local @ jacobian[:, :3]
         out[:, 3:] = jacobian[:, 3:m]
-        out[o.far, 0, 3:] = [1.0, 0.0, 0.0]
+        out[o.is_distance, 0, 3:] = [1.0, 0.0, 0.0]
     return out
 
 

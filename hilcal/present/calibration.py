@@ -329,7 +329,11 @@ def opening(judged: validation.Judged, test: validation.Validation) -> Iterator[
         )
         return
     if judged.fitted:
-        sharing = f", and {judged.spoilt} more share an unloaded reading" if judged.spoilt else ""
+        sharing = (
+            f", and {judged.sharing_unloaded} more share an unloaded reading"
+            if judged.sharing_unloaded
+            else ""
+        )
         yield (
             f"{judged.fitted} of the {judged.readings} readings were fitted by {judged.model}"
             f"{sharing}; they are left out."
@@ -370,7 +374,7 @@ def validation_report(
         yield f"These readings are {z_all:.2g} times as far off as the fit states.\n"
 
 
-def _beyond(v: validation.Beyond) -> str:
+def _beyond(v: validation.ExceededRange) -> str:
     if v.variable == "leverage":
         return f"leverage: {v.count}, far from all fitted poses in several joints together"
     if v.unit == "rad":

@@ -257,7 +257,7 @@ def residual_over(
 
 def residual_by_joint(story: Story, revision: StoryRevision, joint: int) -> go.Figure:
     """Draw the residual of each reading in σ over the angle, or travel, of a joint (from 0)."""
-    unit, factor = numbers.of_joint(story.arm.unit(joint))
+    unit, factor = numbers.joint_unit(story.arm.unit(joint))
     name = f"joint {joint + 1} {story.arm.kind(joint)}"
     return residual_over(story, revision, factor * story.q[:, joint], name, unit)
 

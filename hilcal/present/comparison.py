@@ -134,7 +134,7 @@ def sentence(change: Change) -> str:
         )
     value, std, unit = numbers.measured(s.unit, s.value, s.std)
     share = ""
-    if c.moving.effect.elastic and s.before is not None and s.before[0] > 0:
+    if c.effect_directions.effect.elastic and s.before is not None and s.before[0] > 0:
         share = f", to {numbers.digits((s.before[0] + s.value) / s.before[0], 2)} times what it was"
     signed = value if value.startswith("-") else f"+{value}"
     statement = f"{head} has moved by {signed} ± {std} {unit}{share} ({abs(s.z):.0f} σ)"

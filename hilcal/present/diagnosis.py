@@ -8,7 +8,7 @@ import numpy as np
 from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE, Suspect
-from hilcal.diagnosis.live_model import LEAST
+from hilcal.diagnosis.live_model import FEWEST_POSES
 from hilcal.diagnosis.recorded import ROW_ORDER
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.stepwise import predicts_better
@@ -40,8 +40,9 @@ NOT_TRIED = "could not be tried in the exact model"
 NEWCOMER = f"""\
 The lines that follow are those of a real run: what the arm does, and each reading with its pose,
 load and cycle. It begins beside the reference pose, so that every joint arrives there from a known
-side. From {LEAST} poses on, a first model predicts each reading before it counts: the residual is
-how far it misses. While it is fitted to few poses, and lacks what is hidden, that is a lot."""
+side. From {FEWEST_POSES} poses on, a first model predicts each reading before it counts: the
+residual is how far it misses. While it is fitted to few poses, and lacks what is hidden, that is a
+lot."""
 
 
 def verdict_line(d: Diagnosis) -> Words:
@@ -386,10 +387,11 @@ def _law(law: Law, d: Discovery, first: bool) -> Iterator[Block]:
     if d.attainable > 0:
         share += f", {percent(min(law.holdout_share / d.attainable, 1.0))} of what can be"
     yield f"  explains     {share}"
-    yield f"  left         variance factor {law.left:.2f}, before {d.fit.variance_factor:.2f}"
+    before = d.fit.variance_factor
+    yield f"  left         variance factor {law.variance_factor:.2f}, before {before:.2f}"
     yield f"  chance       {numbers.p_equals(law.p_value)}, corrected for the size of the search"
     yield "  found again  in the searches without some poses:"
-    for a in law.again:
+    for a in law.selection_frequencies:
         causes = f" by {', '.join(a.variables)}" if a.variables else ""
         yield f"    {a.acts_on}{causes}: {percent(a.share)}"
     if near := [f"{r.effect} (cosine {r.cosine:.2f})" for r in law.resembles[:FEW]]:
@@ -410,7 +412,7 @@ def coefficient(c: Coefficient) -> str:
 
 def refined_laws(s: LawSearch) -> Iterator[Block]:
     """Yield the laws that a refinement retained, or the reason for none, of each search."""
-    for d in s.found:
+    for d in s.discoveries:
         if not d.laws:
             yield numbers.sentence(silence(d))
         elif (law := d.laws[0]).name not in s.files:

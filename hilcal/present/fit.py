@@ -15,11 +15,11 @@ from hilcal.identification.fit import Fit
 from hilcal.identification.fit_document import notes
 from hilcal.identification.full_prediction import (
     FullPrediction,
-    error_before,
     full_prediction,
     gross_errors,
+    nominal_error,
 )
-from hilcal.identification.predictive import of_arm
+from hilcal.identification.predictive import belongs_to_arm
 from hilcal.identification.residual import ErrorBlock
 from hilcal.numbers import length, percent
 from hilcal.present.document import Block, Table, heading, note, table
@@ -156,7 +156,7 @@ def _family(fit: Fit, effect: Effect, index: Ints) -> str:
 
 def errors(fit: Fit) -> Table:
     """Return the table of errors: nominal arm, fitted poses, poses left out, noise alone."""
-    rows = {"before: rigid nominal arm": error_before(fit)}
+    rows = {"before: rigid nominal arm": nominal_error(fit)}
     rows |= {"poses fitted": fit.error, "poses left out": fit.holdout}
     return _errors(rows, full_prediction(fit).noise_floor, error_words(fit.readings))
 
@@ -178,7 +178,7 @@ def _errors(
 
 def before_and_after(fit: Fit) -> str:
     """Return a sentence on the errors without and with the fitted model."""
-    nominal, floor = length(error_before(fit).rms_m), length(full_prediction(fit).noise_floor)
+    nominal, floor = length(nominal_error(fit).rms_m), length(full_prediction(fit).noise_floor)
     without = f"The rigid nominal arm, its frames fitted alone, is off by {nominal} rms"
     if fit.mode == "deflection":
         without = f"Deflections of {nominal} rms were measured"
@@ -412,7 +412,7 @@ def prior_lines(fit: Fit) -> list[str]:
     if len(moved) > MOST_TOLD:
         lines.append(f"  … and {len(moved) - MOST_TOLD} more (--json lists them)")
     in_prior = {e.name for e in prior.posterior.effects}
-    new = [e.name for e in fit.model.effects if of_arm(e) and e.name not in in_prior]
+    new = [e.name for e in fit.model.effects if belongs_to_arm(e) and e.name not in in_prior]
     ask = "hilcal compare EARLIER LATER says what has changed"
     if new:
         lines.append(f"  Its model did not have {numbers.names(new)}; {ask}.")

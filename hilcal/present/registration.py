@@ -103,7 +103,7 @@ def base_line(cell: Cell, frames: RobotFrames, mode: Mode = "absolute") -> str:
 def undetermined_lines(registration: Registration) -> Iterator[str]:
     """Yield a sentence for each undetermined direction of the frames."""
     names = registration.cell.target_names if registration.cell.targets is not None else ()
-    still = [int(k) + 1 for k in np.flatnonzero(registration.still)]
+    still = [int(k) + 1 for k in np.flatnonzero(registration.never_turned)]
     why = "the tool hardly changed its orientation, or turned about one axis only"
     if len(still) == 1:
         why = f"joint {still[0]} never turned"

@@ -324,7 +324,7 @@ def laws(fit: Fit) -> tuple[DependenceCurve, ...]:
         says = f"{law.formula}: where it is right, the readings lie on it."
         for c in law.curves:
             x, y, error, _ = c.binned
-            x_unit, x_factor = numbers.angle_or(c.quantity_unit)
+            x_unit, x_factor = numbers.variable_unit(c.quantity_unit)
             y_unit, factor = numbers.unit_for(c.unit, list(c.line[1]))
             over = c.quantity if x_unit in ("", "1") else f"{c.quantity} [{x_unit}]"
             moved, line = f"{c.of} of {c.site} [{y_unit}]", c.line * [[x_factor], [factor]]
@@ -335,7 +335,7 @@ def laws(fit: Fit) -> tuple[DependenceCurve, ...]:
 
 def curve(d: Dependence) -> DependenceCurve:
     """Return a dependence in display units."""
-    x_unit, x_factor = numbers.of_joint(d.unit) if d.unit in ("rad", "m") else (d.unit, 1.0)
+    x_unit, x_factor = numbers.joint_unit(d.unit) if d.unit in ("rad", "m") else (d.unit, 1.0)
     if d.unit == "s" and (span := float(np.ptp(d.x))) > 120:
         x_unit, x_factor = ("h", 1 / 3600) if span > 7200 else ("min", 1 / 60)
     y_unit, y_factor = numbers.unit_for(d.y_unit, list(d.y))

@@ -4,17 +4,17 @@ from collections.abc import Mapping
 
 from hilcal import numbers
 from hilcal.calibration.scatter import ScatterSource
-from hilcal.diagnosis.background_evidence import LIKELY
+from hilcal.diagnosis.background_evidence import POSSIBLE_LEVEL
 from hilcal.diagnosis.diagnosis import Diagnosis, Verdict
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE, Suspect
 from hilcal.diagnosis.evidence import Separability
 from hilcal.diagnosis.noise import (
-    INDUSTRIAL,
     RP_PER_RMS,
+    USUAL_REPEATABILITY_M,
     NoiseVerdict,
     PureError,
-    instrument_instead,
-    separated,
+    prefers_instrument,
+    separates_instrument,
 )
 from hilcal.diagnosis.wrong_figures import WrongFigure
 from hilcal.identification.full_prediction import disagreement_words
@@ -79,8 +79,8 @@ def _verdict(d: Diagnosis) -> list[str]:
     doubts = []
     for a in d.alternatives:
         if a.inseparable:
-            several = len(a.others) > 1 and a.as_good
-            names = [*a.same_as, *[f"{numbers.names(a.others)} together"] * several]
+            several = len(a.replacements) > 1 and a.as_good
+            names = [*a.same_as, *[f"{numbers.names(a.replacements)} together"] * several]
             doubts.append(f"{a.effect} could as well be {', or '.join(names)}")
     return [*adequate, f"But {'; '.join(doubts)}. Measure what separates them."]
 
@@ -120,7 +120,7 @@ def _nothing_missing(d: Diagnosis) -> list[str]:
 
 
 def _background(d: Diagnosis) -> list[str]:
-    likely = [b for b in d.background if b.p_value < LIKELY][:MOST_LIKELY]
+    likely = [b for b in d.background if b.p_value < POSSIBLE_LEVEL][:MOST_LIKELY]
     names = ", ".join(f"{b.effect} ({p_equals(b.p_value)})" for b in likely)
     noise = []
     if d.noise is not None and d.noise.misjudged:
@@ -179,9 +179,9 @@ def _separable(r: Separability) -> str:
     """Return the name of a rival, with the number of readings that would separate it."""
     if not r.possible:
         return f"{r.effect} (no readings of this kind can)"
-    if r.times <= 1.0:
+    if r.readings_factor <= 1.0:
         return r.effect
-    return f"{r.effect} ({r.times:.2g} times as many readings like these would)"
+    return f"{r.effect} ({r.readings_factor:.2g} times as many readings like these would)"
 
 
 def _insufficient(d: Diagnosis) -> list[str]:
@@ -258,7 +258,7 @@ def _misjudged(d: Diagnosis) -> list[str]:
             f"{_rp_comparison(s, d.fit.model.cell.arm)}, more than an arm's repeatability: the "
             "instrument is noisier than stated, or the arm or the target was loose."
         )
-        if instrument_instead(s):
+        if prefers_instrument(s):
             why = (
                 f"They are as if the instrument were {s.instrument_factor:.2g} times as noisy as "
                 "stated, and not as if the arm scattered: mend the stated noise, or repeat some "
@@ -318,7 +318,7 @@ def _arm_scatter(d: Diagnosis) -> list[str]:
             "which is negligible beside the rest."
         )
     doubt = []
-    if not separated(s):
+    if not separates_instrument(s):
         noisy = f"an instrument {s.instrument_factor:.2g} times as noisy as stated"
         doubt = [f"These readings cannot separate it from {noisy}."]
     too_large = d.noise is not None and d.noise.reason == "too_large"
@@ -365,7 +365,8 @@ def repeatability_source(source: ScatterSource, arm: Arm) -> str:
         "estimated": "type A: estimated with the model",
         "stated": "type B: as [repeatability] states it",
         "repeats": "type A: scatter of the repeated readings",
-        "industry": f"type B: not known; RP of arms of industry is up to {length(INDUSTRIAL)}",
+        "industry": "type B: not known; RP of arms of industry is up to "
+        f"{length(USUAL_REPEATABILITY_M)}",
     }.get(source, "not known")
 
 

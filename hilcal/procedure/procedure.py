@@ -41,9 +41,9 @@ from hilcal.present.progress import Say
 from hilcal.procedure import state
 from hilcal.procedure.next_plan import Decision, FurtherMeasuring, PredictedError, predicted_error
 from hilcal.procedure.validation_plan import corrected_plan, left_out_of, paired, validation_plan
-from hilcal.readings.covariance import COVERS, INSTRUMENT
+from hilcal.readings.covariance import COVERS_KEY, INSTRUMENT
 from hilcal.readings.readings import ArmScatter, Readings
-from hilcal.readings.same_readings import already
+from hilcal.readings.same_readings import found_among
 from hilcal.readings.whitening import usual_mode
 from hilcal.refinement import Refinement, refine
 from hilcal.refinement import RefinementStep as RefinementStep
@@ -133,7 +133,7 @@ class Procedure:
         """
         self.check_files()
         first = entry(state.BEGUN, {"settings": self.settings.to_json()})
-        texts = {COVERS: covers, ENTRY.format(1): first}
+        texts = {COVERS_KEY: covers, ENTRY.format(1): first}
         create_run(self.run, config, self.base_dir, plan, source=self._source(), more=texts).close()
 
     def check_files(self) -> None:
@@ -184,7 +184,7 @@ class Procedure:
             model = baseline(o.cell, o.readings, mode, o.catalogue, self.known)
             numbers = itertools.count(len(o.file.revisions()) + 1)
             refinement = refine(
-                model, o.readings, mode, say, seen=lambda step: seen(next(numbers), step)
+                model, o.readings, mode, say, on_step=lambda step: seen(next(numbers), step)
             )
             say("computing standard uncertainties")
             self.keep(o, refinement)
@@ -252,7 +252,7 @@ class Procedure:
             record = self._record(o)
             fitted = o.fitted_readings(record)
             readings = self._readings(o, record, unseen)
-            if already(readings, fitted).any():
+            if found_among(readings, fitted).any():
                 raise InputError(
                     f"{unseen.path}: some of its readings were fitted by revision "
                     f"{record.number} of {self.run}; they test nothing"
@@ -343,15 +343,15 @@ class Procedure:
         all_known = (True,) * len(model.cell.known_targets)
         cell = replace(model.cell, registration_known=True)
         cell = cell.with_targets(cell.all_targets, all_known)
-        readings = full_readings(file.readings(), file.about(COVERS), cell, o.config)
+        readings = full_readings(file.readings(), file.about(COVERS_KEY), cell, o.config)
         scatter = record.parameters_json.get("arm_scatter")
         if scatter is None:
             return readings
         return with_arm_scatter(cell, readings, ArmScatter.from_json(scatter))
 
     def _create(self, path: Path, purpose: str, plan: Plan, o: Campaign) -> None:
-        covers = o.file.about(COVERS) or INSTRUMENT
-        texts = {PURPOSE: purpose, CALIBRATION: state.identity(self.run), COVERS: covers}
+        covers = o.file.about(COVERS_KEY) or INSTRUMENT
+        texts = {PURPOSE: purpose, CALIBRATION: state.identity(self.run), COVERS_KEY: covers}
         config = CellConfig.from_json(o.file.config_json)
         source = self._source(f"{purpose} campaign of {self.run.name}, ")
         create_run(path, config, self.base_dir, plan, source=source, more=texts).close()

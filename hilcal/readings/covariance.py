@@ -9,14 +9,14 @@ the scatter of the joints from one arrival to the next, J the Jacobian of the ta
 
 The third term needs the registration; it is added when the readings are opened
 (`identification.full_covariance`), with σ_q from [repeatability]. The file states what the stored
-covariances cover (`COVERS`):
+covariances cover (`COVERS_KEY`):
 
 - a measured campaign stores the first two terms: `INSTRUMENT`, the third is added;
 - an imported campaign stores what its table states, or `tracker_covariance` where the table states
   none. Both are taken as the instrument's: `INSTRUMENT`, the third is added. Where the table's
   covariances include the arm's scatter, its column `covers` says so ("instrument+arm", which
-  `hilcal export` writes), or the cell does ([repeatability] in_tables = true): `WHOLE`, and nothing
-  is added;
+  `hilcal export` writes), or the cell does ([repeatability] in_tables = true):
+  `INSTRUMENT_AND_ARM`, and nothing is added;
 - to a campaign whose file does not state it, of an older version, nothing is added.
 
 Two readings share the scatter of an arrival, and noise that is correlated along their order; two
@@ -35,11 +35,11 @@ from hilcal.robot.arm import Arm
 from hilcal.robot.chain import drive_jacobian, evaluate
 from hilcal.types import Bools, Floats, Ints
 
-COVERS = "covariance"  # Key among the texts about a campaign: what the stored covariances cover
-FROM = "covariance from"  # key of `TRACKER` where they were made from [tracker]
+COVERS_KEY = "covariance"  # Key among the texts about a campaign: what the stored covariances cover
+FROM_KEY = "covariance from"  # key of `TRACKER` where they were made from [tracker]
 TRACKER = "tracker"
 INSTRUMENT = "instrument"  # They cover the instrument alone, not the arm's repeatability
-WHOLE = "instrument+arm"  # They include the arm's repeatability
+INSTRUMENT_AND_ARM = "instrument+arm"  # They include the arm's repeatability
 ROUNDING = "+rounding"  # end of either word in a table, where rounding is included
 PRIOR_REPEATS = 20.0  # ν0, the repeats that the stated covariance is worth; a guess
 

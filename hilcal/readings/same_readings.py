@@ -25,7 +25,7 @@ SHARED = 0.1  # share of the readings that makes two campaigns of one measuremen
 _APART = 10.0  # Distance of loaded from unloaded readings, in units of the tolerance
 
 
-def already(readings: Readings, reference: Readings) -> Bools:
+def found_among(readings: Readings, reference: Readings) -> Bools:
     """(N,) which readings are among `reference`; attitudes count where both have them."""
     attitude = readings.m == reference.m == 6
     return _near(_coordinates(readings, attitude), _coordinates(reference, attitude))
@@ -36,7 +36,7 @@ def prints(readings: Readings) -> Floats:
     return _coordinates(readings, attitude=False)
 
 
-def among(readings: Readings, stored: Floats) -> Bools:
+def found_among_prints(readings: Readings, stored: Floats) -> Bools:
     """(N,) which readings are among those whose `prints` (M, n + 4) were stored."""
     return _near(prints(readings), stored)
 
@@ -82,7 +82,7 @@ def never_fitted(readings: Readings, fitted: Readings, deflections: bool) -> tup
 
     A deflection is unseen if neither its loaded nor an unloaded reading of it was fitted.
     """
-    repeated = already(readings, fitted)
+    repeated = found_among(readings, fitted)
     if not deflections:
         return repeated, ~repeated
     keys = np.stack([readings.pose, readings.cycle, readings.target], axis=1)

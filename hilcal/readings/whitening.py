@@ -285,7 +285,7 @@ def _innovations(covariance: Floats) -> Floats:
     return np.asarray(inverse[None])
 
 
-def measured(readings: Readings, w: Whitening) -> Floats:
+def measured_values(readings: Readings, w: Whitening) -> Floats:
     """Measurements (D, m): values, or deflections (rotation part: Log(R_l R_uᵀ))."""
     raw = w.raw(readings.value).copy()
     if w.m == 6 and w.mode == "deflection":

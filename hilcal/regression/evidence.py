@@ -44,7 +44,7 @@ from hilcal.types import Bools, Floats
 
 VISIBLE = 1e-4  # eigenvalues of S below this are not tested: an ordinary magnitude along such a
 # direction moves all data together by less than 0.01 σ; a guess
-RELATIVE = 1e-10  # eigenvalues of S below this share of the largest are rounding
+ROUNDING_SHARE = 1e-10  # eigenvalues of S below this share of the largest are rounding
 NEAR_MEAN = 2e-3  # standard deviations about the mean in which Lugannani's formula loses digits
 LARGE_FAMILY = 0.1  # share of the degrees of freedom from which a family is large; a guess
 ROUNDING = 1e-12
@@ -68,7 +68,7 @@ class Spectrum:
 def visible(values: Floats) -> Bools:
     """Return which eigenvalues (..., P) of S are large enough for a test of their directions."""
     largest = values.max(axis=-1, keepdims=True, initial=0.0)
-    return np.asarray(values > np.maximum(VISIBLE, RELATIVE * largest))
+    return np.asarray(values > np.maximum(VISIBLE, ROUNDING_SHARE * largest))
 
 
 def spectrum(s: Floats) -> Spectrum:
@@ -118,7 +118,7 @@ class FamilyScore:
         return s.vectors * np.sqrt(self.noise / (np.where(s.testable, s.values, 0.0) + self.ridge))
 
 
-NOTHING = FamilyScore(1.0, 0.0, 0.0, np.inf, 0, 0.0, 0.0, 0.0, np.zeros(0), None, 0.0)
+NO_EVIDENCE = FamilyScore(1.0, 0.0, 0.0, np.inf, 0, 0.0, 0.0, 0.0, np.zeros(0), None, 0.0)
 
 
 def log_evidence(
@@ -141,7 +141,7 @@ def score_family(
     rss: float,  # ‖r‖²
     dof: float,  # degrees of freedom ν of r
     spent: float = 0.0,
-    most: float = np.inf,
+    largest: float = np.inf,
 ) -> FamilyScore:
     """Score a family.
 
@@ -149,12 +149,12 @@ def score_family(
         spent: effective number of parameters of the model's families with a prior that `dof` does
             not count. They lower the degrees of freedom of the test; the evidence of their addition
             already contains their determinant.
-        most: largest plausible standard deviation of the parameters, for the evidence only.
+        largest: largest plausible standard deviation of the parameters, for the evidence only.
     """
     eigen = s if isinstance(s, Spectrum) else spectrum(s)
     testable, rank, free = eigen.testable, eigen.rank, dof - spent
     if rank == 0 or rss <= 0 or free <= 1:
-        return NOTHING
+        return NO_EVIDENCE
     lam, c = eigen.values[testable], (eigen.vectors.T @ g)[testable]
     explained, small = c**2 / lam, rank <= LARGE_FAMILY * free
     if small:
@@ -165,9 +165,9 @@ def score_family(
         p_value = ratio_tail(lam, free, float(c @ c) / rss)
     evidence, remaining = log_evidence(lam, explained, rss, dof)
     unbounded = int(np.argmax(evidence))
-    if np.isfinite(most):
+    if np.isfinite(largest):
         # τ = t σ with σ² = ‖r‖²/ν, which contains what the family explains: use ‖r‖²_t instead.
-        evidence = np.where(STRENGTHS * np.sqrt(remaining) <= most, evidence, -np.inf)
+        evidence = np.where(STRENGTHS * np.sqrt(remaining) <= largest, evidence, -np.inf)
         evidence[0] = max(evidence[0], -1e300)
     best = int(np.argmax(evidence))
     ridge = rss / (dof * float(STRENGTHS[best]) ** 2)

@@ -41,13 +41,13 @@ class CandidateFamilies:
     dof: float  # degrees of freedom ν of the residual without any of the families
     columns: Mapping[str, slice]  # of each family outside of the model
     spent: float = 0.0  # effective number of parameters of the families in the model
-    most: Mapping[str, float] = field(default_factory=dict)  # largest plausible strengths
+    largest: Mapping[str, float] = field(default_factory=dict)  # largest plausible strengths
 
     def scores(self) -> dict[str, FamilyScore]:
         """Score each family alone."""
         s, g, model = self.information, self.gradient, (self.rss, self.dof, self.spent)
         return {
-            name: score_family(s[k, k], g[k], *model, self.most.get(name, np.inf))
+            name: score_family(s[k, k], g[k], *model, self.largest.get(name, np.inf))
             for name, k in self.columns.items()
         }
 
@@ -69,11 +69,11 @@ def families_beside(
     dof: float,
     x: Floats,  # (R, P) whitened columns of all families, in ordinary magnitudes
     columns: Mapping[str, slice],
-    most: Mapping[str, float],  # largest plausible strength of each family that has one
+    largest: Mapping[str, float],  # largest plausible strength of each family that has one
 ) -> CandidateFamilies:
     """Return the families that can be added to a model."""
     rss = float(residual @ residual)
-    return CandidateFamilies(information, x.T @ residual, rss, dof, columns, most=most)
+    return CandidateFamilies(information, x.T @ residual, rss, dof, columns, largest=largest)
 
 
 @dataclass(frozen=True, eq=False)

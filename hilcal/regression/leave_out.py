@@ -21,42 +21,42 @@ from hilcal.types import Bools, Floats, Ints
 
 LEAST_GAIN = 0.002
 """Share by which the rms error on poses left out must fall for an effect to stay ..."""
-SURE = 2.0
+STANDARD_ERRORS = 2.0
 """... and the number of standard errors, from pose to pose, or the same level by signed ranks."""
-FEWEST = 8  # least number of poses for the test by ranks
+FEWEST_POSES = 8  # least number of poses for the test by ranks
 ROUNDING = 1e-6  # ridge of flat directions, whose gram is the identity
 FAMILY_ROUNDING = 1e-10  # least ridge of a family, as a share of the largest square of a column
 
 
-def improves(before: Floats, after: Floats, sure: float = SURE) -> bool:
+def improves(before: Floats, after: Floats, standard_errors: float = STANDARD_ERRORS) -> bool:
     """Return whether squared whitened residuals (P,) of poses left out became smaller.
 
-    The gain must exceed `sure` standard errors from pose to pose, or the same level by Wilcoxon's
-    signed ranks (Biometrics Bulletin 1 (1945) 80-83), as the mean scatters where few poses gain
-    very much.
+    The gain must exceed `standard_errors` standard errors from pose to pose, or the same level by
+    Wilcoxon's signed ranks (Biometrics Bulletin 1 (1945) 80-83), as the mean scatters where few
+    poses gain very much.
     """
     if float(np.sum(after)) >= (1 - LEAST_GAIN) ** 2 * float(np.sum(before)):
         return False
     gain = before - after
     error = float(np.std(gain)) / np.sqrt(max(len(gain) - 1, 1))
-    if float(np.mean(gain)) > sure * error:
+    if float(np.mean(gain)) > standard_errors * error:
         return True
-    if np.count_nonzero(gain) < FEWEST:
+    if np.count_nonzero(gain) < FEWEST_POSES:
         return False
-    return float(wilcoxon(gain, alternative="greater").pvalue) < float(norm.sf(sure))
+    return float(wilcoxon(gain, alternative="greater").pvalue) < float(norm.sf(standard_errors))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fold:
     """The model's normal equations without one fold."""
 
-    out: Bools  # (R,) rows of the fold
+    left_out_rows: Bools  # (R,) rows of the fold
     inverse_root: Floats  # (K, K) T with Tᵀ T = H⁻¹ of the other rows
     rhs: Floats  # (K,) right-hand side of the other rows, for a step from the fit
 
     def rows(self, p: Projection) -> Floats:
         """Return the model's columns in the rows of the fold."""
-        return np.asarray(p.rows[self.out])
+        return np.asarray(p.rows[self.left_out_rows])
 
     def solve(self, rhs: Floats) -> Floats:
         """Return H⁻¹ times (K, ...)."""
@@ -79,7 +79,7 @@ def folds(
 ) -> tuple[Fold, ...]:
     """Return for each fold the normal equations of a step from the fit without it."""
     basis = equations.basis
-    flat, held = slice(0, len(basis.singular)), basis.held
+    flat, held = slice(0, len(basis.singular)), basis.with_prior
     h = equations.gram + np.diag(p.ridge + np.where(p.ridge > 0, 0.0, ROUNDING))
     per_magnitude = basis.transform[:, flat] / magnitude[:, None]
     h[flat, flat] += beta * per_magnitude.T @ per_magnitude
@@ -107,7 +107,7 @@ class FamilyFolds:
         self._rounding = FAMILY_ROUNDING * float(self.gram.max(initial=0.0))
         self._products = []
         for fold in folds:
-            out = x[fold.out]
+            out = x[fold.left_out_rows]
             c = self.cross - fold.rows(p).T @ out
             solved = fold.solve(c)
             self._products.append((c, solved, self.gram - out.T @ out - c.T @ solved))
@@ -121,12 +121,12 @@ class FamilyFolds:
         total, rhs = p.rows.T @ y, x.T @ y
         left = np.zeros(y.shape)
         for fold, (c, solved, gram) in zip(self._folds, self._products, strict=True):
-            out, model, r = x[fold.out], fold.rows(p), y[fold.out]
+            out, model, r = x[fold.left_out_rows], fold.rows(p), y[fold.left_out_rows]
             steps = fold.step() if of_fit else fold.solve(total - model.T @ r)
-            left[fold.out] = r - model @ steps
+            left[fold.left_out_rows] = r - model @ steps
             if x.shape[1]:
                 h, b = gram.copy(), rhs - out.T @ r - c.T @ steps
                 h[np.diag_indices_from(h)] += max(ridge, self._rounding)
                 family = positive_solve(h, b)
-                left[fold.out] += model @ (solved @ family) - out @ family
+                left[fold.left_out_rows] += model @ (solved @ family) - out @ family
         return left

@@ -98,7 +98,7 @@ class Basis:
     prior_precision: Floats  # (K,) 1/σ² in z coordinates (zero for flat ones)
     null: Floats  # (P, U) unidentifiable unit directions, in ordinary magnitudes
     flat: Bools  # (P,) parameters without a prior
-    held: Ints  # indices of the parameters with a prior, in the order of their z
+    with_prior: Ints  # indices of the parameters with a prior, in the order of their z
     singular: Floats  # (K_flat,) singular values of the identifiable directions
     structural: int  # rank of the flat parameters' columns up to rounding, whatever the noise
     condition_unscaled: float  # condition number of A in physical units, identifiable part
@@ -114,7 +114,7 @@ class Basis:
             transform=self.transform[free],
             null=self.null[free],
             flat=self.flat[free],
-            held=place[self.held],
+            with_prior=place[self.with_prior],
         )
 
     def flat_rows(self, a: Floats) -> Floats:
@@ -130,12 +130,12 @@ class Basis:
         """
         count, flat = len(self.singular), np.flatnonzero(self.flat)
         out = np.empty((len(a), self.transform.shape[1]))
-        sigma = self.transform[self.held, count + np.arange(len(self.held))]
+        sigma = self.transform[self.with_prior, count + np.arange(len(self.with_prior))]
         turned = self.transform[flat, :count]
         for start in range(0, len(a), _ROWS):
             part = slice(start, start + _ROWS)
             out[part, :count] = a[part][:, flat] @ turned
-            out[part, count:] = a[part][:, self.held] * sigma
+            out[part, count:] = a[part][:, self.with_prior] * sigma
         return out
 
 
@@ -251,7 +251,7 @@ def normal_equations(a: Floats, target: Floats, basis: Basis, gram: Floats) -> N
     Flat directions are formed from their rows, whose columns are orthonormal, so that squaring
     costs no accuracy; parameters with a prior from AᵀA, for speed.
     """
-    flat, held, rows = len(basis.singular), basis.held, basis.flat_rows(a)
+    flat, held, rows = len(basis.singular), basis.with_prior, basis.flat_rows(a)
     sigma = basis.transform[held, flat + np.arange(len(held))]
     size = basis.transform.shape[1]
     full = np.empty((size, size))

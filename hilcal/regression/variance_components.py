@@ -26,7 +26,7 @@ of the s_i. Since only the diagonal blocks of P are needed, a step costs two pro
 μ and the common drift β are flat. The variances τ² between arms and ω² from campaign to campaign
 maximise the restricted likelihood, by EM: with everything else integrated out, τ_k² is the mean of
 E[u_ak²], and ω_k² the mean of E[e_ck²]. Elements of u_a that differ from those of the other arms
-(`apart`) have no prior and are excluded from the means.
+(`outlier`) have no prior and are excluded from the means.
 
 Sources: Patterson and Thompson, *Recovery of inter-block information when block sizes are unequal*,
 Biometrika 58 (1971) 545-554; Gilmour, Thompson and Cullis, *Average information REML*, Biometrics
@@ -214,7 +214,7 @@ class Hierarchy:
     within: Floats  # (K,) ω²; zero where no arm was measured twice
     arm_mean: Floats  # (A, K) μ + u_a of each arm alone, without the prior of u_a
     arm_variance: Floats  # (A, K) its variance by the fits and ω²
-    apart: Bools  # (A, K) elements that differ from those of the other arms
+    outlier: Bools  # (A, K) elements that differ from those of the other arms
 
     @property
     def predictive(self) -> Floats:
@@ -227,33 +227,33 @@ class Hierarchy:
         """(K,) standard error of τ, by the expected information of τ² over the arms."""
         weight = 1.0 / (self.between + self.arm_variance) ** 2
         variance_error = np.sqrt(
-            2.0 / np.maximum(np.sum(np.where(self.apart, 0.0, weight), axis=0), LEAST)
+            2.0 / np.maximum(np.sum(np.where(self.outlier, 0.0, weight), axis=0), LEAST)
         )
         return np.asarray(variance_error / (2 * np.sqrt(np.maximum(self.between, LEAST))))
 
 
 @dataclass(frozen=True, slots=True)
-class Unlike:
+class Outlier:
     """An element that differs from those of the other units."""
 
     unit: int  # number of the arm, or of the campaign
     parameter: int  # index
-    off: float  # deviation from the mean of the others, ordinary magnitudes
+    deviation: float  # deviation from the mean of the others, ordinary magnitudes
     sigma: float  # its size in standard deviations predicted from the others
     p_value: float  # corrected for the number of tested elements
 
 
-def hierarchy(estimates: FleetEstimates) -> tuple[Hierarchy, tuple[Unlike, ...]]:
+def hierarchy(estimates: FleetEstimates) -> tuple[Hierarchy, tuple[Outlier, ...]]:
     """Fit the model, name the elements that differ, and fit again with these apart."""
     apart = np.zeros((estimates.arms, estimates.mean.shape[1]), dtype=bool)
     fitted = _em(estimates, apart)
-    named = unlike(fitted.arm_mean, fitted.arm_variance)
+    named = find_outliers(fitted.arm_mean, fitted.arm_variance)
     for element in named:
         apart[element.unit, element.parameter] = True
     return (_em(estimates, apart) if named else fitted), named
 
 
-def unlike(values: Floats, variance: Floats) -> tuple[Unlike, ...]:
+def find_outliers(values: Floats, variance: Floats) -> tuple[Outlier, ...]:
     """Name elements of values (U, K), of variance (U, K), that differ from those of other units.
 
     Each element is compared with the distribution of the same parameter over the other units, with
@@ -263,7 +263,7 @@ def unlike(values: Floats, variance: Floats) -> tuple[Unlike, ...]:
     """
     determined = variance < UNDETERMINED**2
     tests = max(int(determined.sum()), 1)
-    named: list[Unlike] = []
+    named: list[Outlier] = []
     for k in range(values.shape[1]):
         units = np.flatnonzero(determined[:, k])
         while len(units) >= FEWEST and len(units) > 0.8 * determined[:, k].sum():
@@ -278,7 +278,7 @@ def unlike(values: Floats, variance: Floats) -> tuple[Unlike, ...]:
             p = min(1.0, 2 * tests * float(student.sf(sigma, len(units) - 2)))
             if p >= FALSE_ALARM:
                 break
-            named.append(Unlike(int(units[worst]), k, float(off[worst]), sigma, p))
+            named.append(Outlier(int(units[worst]), k, float(off[worst]), sigma, p))
             units = np.delete(units, worst)
     return tuple(sorted(named, key=lambda element: element.p_value))
 

@@ -191,10 +191,10 @@ def _read(path: Path) -> tuple[pin.Model, dict[str, Mimic]]:
             leader, factor, offset = (attributes.get(key, usual) for key, usual in keys.items())
             mimics[within[-1]] = leader, factor, offset
         # Pinocchio recurses for each joint; its memory grows with the cube of the moving joints
-        if joints > limits.DESCRIBED or moving > limits.MOVING:
+        if joints > limits.DESCRIBED_JOINTS or moving > limits.MOVING_JOINTS:
             raise InputError(
-                f"{path.name}: too many joints; valid: at most {limits.DESCRIBED}, "
-                f"{limits.MOVING} of them not fixed"
+                f"{path.name}: too many joints; valid: at most {limits.DESCRIBED_JOINTS}, "
+                f"{limits.MOVING_JOINTS} of them not fixed"
             )
 
     def end(tag: str) -> None:

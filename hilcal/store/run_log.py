@@ -13,7 +13,7 @@ import numpy as np
 from hilcal import limits
 from hilcal.config import CellConfig
 from hilcal.errors import InputError
-from hilcal.readings.covariance import COVERS, INSTRUMENT
+from hilcal.readings.covariance import COVERS_KEY, INSTRUMENT
 from hilcal.readings.readings import Readings
 from hilcal.store import rows, schema
 from hilcal.store.campaign_file import CampaignFile
@@ -43,7 +43,7 @@ def create_run(
     more: Mapping[str, str] | None = None,
 ) -> CampaignFile:
     """Make the campaign file of a run, with its plan and further texts, without readings."""
-    texts = {PLAN: plan.to_json(), COVERS: INSTRUMENT, **(more or {})}
+    texts = {PLAN: plan.to_json(), COVERS_KEY: INSTRUMENT, **(more or {})}
     return CampaignFile.create(
         path, config.to_json(), str(base_dir), source, overwrite=overwrite, more=texts
     )

@@ -182,9 +182,11 @@ def _check_xml(path: str, name: str, stream: IO[bytes]) -> None:
             rows, elements = rows + 1, 0
             limits.check_rows(where, rows)
         cells += sheet and tag == "c"
-        if depth > limits.DEEP or elements > most:
+        if depth > limits.XML_DEPTH or elements > most:
             excess = (
-                f"{depth} elements in each other" if depth > limits.DEEP else f"{elements} elements"
+                f"{depth} elements in each other"
+                if depth > limits.XML_DEPTH
+                else f"{elements} elements"
             )
             raise InputError(
                 f"{where}: {excess}{' in a row' if sheet else ''}; valid: a workbook of readings"

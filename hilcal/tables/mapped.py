@@ -13,7 +13,12 @@ import numpy as np
 from hilcal import limits
 from hilcal.config import CellConfig
 from hilcal.errors import InputError
-from hilcal.readings.covariance import WHOLE, TrackerNoise, tracker_covariance, tracker_noise
+from hilcal.readings.covariance import (
+    INSTRUMENT_AND_ARM,
+    TrackerNoise,
+    tracker_covariance,
+    tracker_noise,
+)
 from hilcal.readings.readings import SAME_POSE, ObserverName, Readings
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
@@ -521,7 +526,7 @@ def import_readings(
     where = "" if tracker.frame == "tracker" or station else ", as if it stood at the arm's base"
     notes = tuple(note + where * (note == exchange.FROM_TRACKER) for note in result.notes)
     stated = exchange.FROM_TRACKER not in result.notes
-    covers = WHOLE if stated and config.repeatability.in_tables else result.covers
+    covers = INSTRUMENT_AND_ARM if stated and config.repeatability.in_tables else result.covers
     readings, copies = exchange.without_copies(result.readings)
     readings, named = exchange.named_loads(readings, config)
     return exchange.ImportResult(

@@ -38,7 +38,7 @@ class ReadingStream:
     station: tuple[float, ...] | None  # (3,) where the tracker's beam starts, m; None: the origin
     columns: tuple[str, ...]
     rows: tuple[int, ...]  # number of rows of each row group
-    covers: str = INSTRUMENT  # what its covariances cover, `INSTRUMENT` or `WHOLE`
+    covers: str = INSTRUMENT  # what its covariances cover, `INSTRUMENT` or `INSTRUMENT_AND_ARM`
     rounding: Floats = field(default_factory=lambda: np.zeros(3))  # (3,) variance that it adds, m²
 
     def __len__(self) -> int:

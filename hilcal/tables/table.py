@@ -9,7 +9,13 @@ import numpy as np
 from hilcal.config import CellConfig
 from hilcal.errors import InputError
 from hilcal.names import check_name, check_names
-from hilcal.readings.covariance import INSTRUMENT, ROUNDING, WHOLE, TrackerNoise, tracker_covariance
+from hilcal.readings.covariance import (
+    INSTRUMENT,
+    INSTRUMENT_AND_ARM,
+    ROUNDING,
+    TrackerNoise,
+    tracker_covariance,
+)
 from hilcal.readings.readings import ObserverName, Readings, States
 from hilcal.robot.arm import Arm
 from hilcal.store.plan import UNLOADED
@@ -205,11 +211,11 @@ def _covers(table: ColumnTable) -> tuple[str, bool]:
 
 def check_covers(word: str, where: str) -> None:
     """Refuse an invalid word for what covariances cover."""
-    if word.removesuffix(ROUNDING) not in (INSTRUMENT, WHOLE):
+    if word.removesuffix(ROUNDING) not in (INSTRUMENT, INSTRUMENT_AND_ARM):
         raise InputError(
             f"{where}: {word!r} is unknown; valid: {INSTRUMENT} (the covariance of the tracker), "
-            f"{WHOLE} (the arm's repeatability is in it), each with {ROUNDING} where the rounding "
-            "of the positions is in it"
+            f"{INSTRUMENT_AND_ARM} (the arm's repeatability is in it), each with {ROUNDING} "
+            "where the rounding of the positions is in it"
         )
 
 

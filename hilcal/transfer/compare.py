@@ -25,13 +25,13 @@ from hilcal.campaign.campaign import Campaign, opened
 from hilcal.campaign.revisions import mode_of
 from hilcal.cell import Cell
 from hilcal.diagnosis.change import changing, find_changes
-from hilcal.diagnosis.comparison import Comparison, completed, error_today
+from hilcal.diagnosis.comparison import Comparison, error_today, with_missing_effects
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification import validation
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit
-from hilcal.identification.later_readings import earlier_fit, setting
+from hilcal.identification.later_readings import earlier_fit, later_readings
 from hilcal.identification.misdescription import refuse_misdescribed
 from hilcal.identification.mixed_fit import MixedFit, mixed_fit
 from hilcal.identification.posterior import Differences, Posterior, parameter_differences
@@ -106,8 +106,8 @@ def compare(
     judged: Mapping[str, Any] = {} if in_use is None else in_use.result_json.get("diagnose", {})
     # A model is not extended if its diagnosis named no missing effect.
     lacks = judged.get("verdict", "missing_effect") == "missing_effect"
-    extended, lacked = completed(fit, changing(run.catalogue) if lacks else (), say)
-    later_setting = setting(earlier_fit(extended), chosen, anew=anew, cell=later.cell)
+    extended, lacked = with_missing_effects(fit, changing(run.catalogue) if lacks else (), say)
+    later_setting = later_readings(earlier_fit(extended), chosen, anew=anew, cell=later.cell)
     changes = find_changes(later_setting, say)
     record, tool = later.in_use(), run.config.tool
     keys = type(tool).model_fields
@@ -229,7 +229,7 @@ def validate(
         mode=mode,
         readings=len(readings),
         fitted=int(refitted.sum()),
-        spoilt=int(np.sum(~refitted & ~fresh)) if mixed else 0,
+        sharing_unloaded=int(np.sum(~refitted & ~fresh)) if mixed else 0,
         unseen=mixed or not refitted.any(),
         scalar=bool(readings.scalar.any()),
     )

@@ -29,9 +29,9 @@ from hilcal.regression.variance_components import (
     UNDETERMINED,
     FleetEstimates,
     Hierarchy,
-    Unlike,
+    Outlier,
+    find_outliers,
     hierarchy,
-    unlike,
 )
 from hilcal.store.revision import seconds_of, utc_now
 from hilcal.transfer.members import (
@@ -169,7 +169,7 @@ def pooled(members: Sequence[Member], diagnosed: Sequence[DiagnosedEffect]) -> P
     of_campaigns = [(o, members[late[o.unit]].arm, members[late[o.unit]].name) for o in changed]
     odd = []
     for o, arm, campaign in (*of_arms, *of_campaigns):
-        name, off = names[o.parameter], float(o.off * scale[o.parameter])
+        name, off = names[o.parameter], float(o.deviation * scale[o.parameter])
         odd.append(Odd(arm, campaign, name, off, units[name], o.sigma, o.p_value))
     years = np.sqrt(np.diag(h.covariance)[len(names) :])
     certain = 2 * norm.sf(np.abs(h.slope) / np.where(years > 0, years, np.inf)) * len(names)
@@ -245,7 +245,7 @@ def _estimates(
     return FleetEstimates(mean, information, arm, (seconds - first[arm]) / YEAR_S)
 
 
-def _changes(estimates: FleetEstimates, h: Hierarchy) -> tuple[list[int], Sequence[Unlike]]:
+def _changes(estimates: FleetEstimates, h: Hierarchy) -> tuple[list[int], Sequence[Outlier]]:
     """Return the repeated campaigns of arms, and the changes of arms before them."""
     covariance = np.linalg.inv(estimates.information + 1e-8 * np.eye(estimates.mean.shape[1]))
     variance = np.diagonal(covariance, axis1=1, axis2=2)
@@ -258,7 +258,7 @@ def _changes(estimates: FleetEstimates, h: Hierarchy) -> tuple[list[int], Sequen
             late.append(int(current))
             change.append(estimates.mean[current] - estimates.mean[previous] - years * h.slope)
             spread.append(variance[current] + variance[previous])
-    return late, unlike(np.array(change), np.array(spread)) if late else []
+    return late, find_outliers(np.array(change), np.array(spread)) if late else []
 
 
 def _prior(

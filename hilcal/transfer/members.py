@@ -33,8 +33,8 @@ from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.mixed_fit import mixed_fit
 from hilcal.identification.posterior import Posterior, Source
-from hilcal.identification.predictive import of_arm
-from hilcal.mixed.families import ARM, EFFECT
+from hilcal.identification.predictive import belongs_to_arm
+from hilcal.mixed.families import ARM_SPREAD, EFFECT_SPREAD
 from hilcal.mixed.variances import Variances
 from hilcal.model.model import Model
 from hilcal.names import check_names
@@ -114,7 +114,9 @@ def type_sizes(evidence: Sequence[SizeEvidence]) -> tuple[TypeSize, ...]:
     if not effects:
         return ()
     count = len(effects)
-    precision = np.linalg.inv(np.full((count, count), ARM**2) + EFFECT**2 * np.eye(count))
+    precision = np.linalg.inv(
+        np.full((count, count), ARM_SPREAD**2) + EFFECT_SPREAD**2 * np.eye(count)
+    )
     vector = np.zeros(count)
     for x in evidence:
         indices = np.array([effects.index(e) for e in x.effects])
@@ -262,7 +264,7 @@ def _member(entry: Entry, run: Campaign, effects: tuple[str, ...]) -> Member:
         date=entry.date or about.created,
         posterior=replace(posterior, scatter=None),
         added=tuple(
-            e.name for e in fitted.model.effects if of_arm(e) and e.name not in start.names
+            e.name for e in fitted.model.effects if belongs_to_arm(e) and e.name not in start.names
         ),
         verdict=verdict,
         rms_m=fitted.holdout.rms_m,

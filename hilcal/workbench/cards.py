@@ -211,7 +211,7 @@ def readings(view: View, d: Snapshot) -> None:
     title("The readings" if variable is None else f"The readings over {variable}")
     recorded = view.session.recorded(d) if variable not in (None, "load") else {}
     if (r := recorded.get(variable or "")) is not None:
-        unit, factor = numbers.angle_or(r.unit)
+        unit, factor = numbers.variable_unit(r.unit)
         figure = charts.residual_over(d.story, d.revision, factor * r.values, r.name, unit)
     else:
         kind = charts.residual_by_load if variable == "load" else charts.residual_by_pose
@@ -243,7 +243,7 @@ def difference(x: Difference) -> str:
         name = "unloaded" if x.variable == f"load {UNLOADED}" else x.variable
         a, b = numbers.percent(x.picked), numbers.percent(x.others)
         return f"{name}: {a} of them, {b} of the others"
-    unit, factor = numbers.angle_or(x.unit)
+    unit, factor = numbers.variable_unit(x.unit)
     a, b = (numbers.digits(factor * value) for value in (x.picked, x.others))
     return f"{x.variable} {a} {unit}, the others {b} {unit}".replace(" ,", ",").rstrip()
 

@@ -50,7 +50,7 @@ from hilcal.store.procedure_log import refuse_fitting
 from hilcal.store.revision import RevisionRecord
 from hilcal.types import Ints
 from hilcal.workbench.viewer import WebViewer
-from hilcal.write_report import Asked, write_report
+from hilcal.write_report import ReportOptions, write_report
 
 Stamp = tuple[int, int, int]
 """Size (bytes), time of the last change (ns) and inode of a file, to detect changes."""
@@ -236,7 +236,7 @@ class WorkbenchSession:
         with tempfile.TemporaryDirectory() as folder, self._open(read_only=True) as opened:
             o, path = opened.at(snapshot.changes), Path(folder) / f"{self.path.stem}{ends[kind]}"
             if kind == "report":
-                write_report(o, path, Asked(revision=number), say)
+                write_report(o, path, ReportOptions(revision=number), say)
             elif kind == "calibration":
                 o.calibration(number).save(path)
             else:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hilcal as hc
-from hilcal.readings.covariance import WHOLE
+from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.tables.table import write_table
 from studies.gross_errors import spoil
 from tests.support.cli_cases import CELL, ok, refused, rehearsal, table
@@ -98,7 +98,7 @@ def test_priors_that_cannot_be_are_refused(tmp_path, capsys):
 
 
 def imported(readings, folder, capsys):
-    write_table(readings, folder / "t.csv", WHOLE)
+    write_table(readings, folder / "t.csv", INSTRUMENT_AND_ARM)
     run = folder / "run.hilcal"
     said = ok(capsys, "import", folder / "t.csv", "--config", CELL, "-o", run).out
     return run, " ".join(said.split())

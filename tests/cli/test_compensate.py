@@ -8,7 +8,7 @@ import pytest
 
 import hilcal as hc
 from hilcal.calibration.urscript import waypoints
-from hilcal.readings.covariance import WHOLE
+from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.readings.readings import States
 from hilcal.robot.chain import evaluate
 from hilcal.robot.factory import with_factory
@@ -21,7 +21,7 @@ JOINTS = "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg"
 
 def made(path):
     """Write a campaign without any revision."""
-    return stored_readings(path, rehearsal("nothing").readings, covers=WHOLE)
+    return stored_readings(path, rehearsal("nothing").readings, covers=INSTRUMENT_AND_ARM)
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from hilcal.drivers.simulated.injected_effects import nothing_hidden
 from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.effects.catalogue import read_effects
 from hilcal.effects.check import check_effect, example_cell, example_situation, example_states
-from hilcal.readings.covariance import WHOLE
+from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.table import write_table
 from studies.random_campaigns import rehearsal_states
@@ -186,7 +186,9 @@ def test_a_law_is_found_written_added_and_the_model_is_adequate(motion, formula,
     readings = simulate(world, states, pose, load, cycle, names, rng)
     law = UnmodelledLaw("hidden", "", (), ("deflection",), motion)
     moved = shift(law, world, states, 3.0, "deflection", pose, cycle)
-    write_table(replace(readings, value=readings.value + moved), tmp_path / "t.csv", WHOLE)
+    write_table(
+        replace(readings, value=readings.value + moved), tmp_path / "t.csv", INSTRUMENT_AND_ARM
+    )
     toml, campaign, found = (tmp_path / name for name in ("c.toml", "run.hilcal", "found.py"))
     toml.write_text(to_toml(config), encoding="utf-8")
     ok(capsys, "import", tmp_path / "t.csv", "--config", toml, "-o", campaign)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import hilcal as hc
 from hilcal.identification.parameters_document import covariance_of, read
-from hilcal.readings.covariance import INSTRUMENT, WHOLE
+from hilcal.readings.covariance import INSTRUMENT, INSTRUMENT_AND_ARM
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
 from hilcal.store.rows import content_hash
@@ -33,7 +33,7 @@ def fitted(tmp_path_factory):
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
-@pytest.mark.parametrize("covers", [INSTRUMENT, WHOLE])
+@pytest.mark.parametrize("covers", [INSTRUMENT, INSTRUMENT_AND_ARM])
 def test_a_campaign_imports_what_another_exported(capsys, tmp_path, kind, covers):
     readings = rehearsal("nothing").readings
     rounded = np.round(readings.value, 4)  # a reader adds the rounding's variance to others
@@ -79,9 +79,9 @@ def test_tables_of_readings_keep_every_bit(tmp_path_factory, seed, m, parquet_fi
     )
     x = replace(x, covariance=0.5 * (x.covariance + np.swapaxes(x.covariance, 1, 2)))
     path = tmp_path_factory.mktemp("bits") / ("t.parquet" if parquet_file else "t.csv")
-    write_table(x, path, with_what_rounding_does(WHOLE, x))
+    write_table(x, path, with_what_rounding_does(INSTRUMENT_AND_ARM, x))
     again = import_table(path, make_arm(), None)
-    assert again.covers == WHOLE
+    assert again.covers == INSTRUMENT_AND_ARM
     assert content_hash(again.readings) == content_hash(x)
     for name in ("time", "load_time", "air_temperature", "joint_temperature", "q_actual"):
         given_, read_ = (np.asarray(getattr(s, name)) for s in (states, again.readings.states))
@@ -116,7 +116,9 @@ def test_other_programs_find_units_and_origin(capsys, fitted, tmp_path):
 
 
 def test_deflections_leave_unloaded_readings_without_residual(capsys, tmp_path):
-    run = stored_readings(tmp_path / "d.hilcal", rehearsal("nothing").readings, covers=WHOLE)
+    run = stored_readings(
+        tmp_path / "d.hilcal", rehearsal("nothing").readings, covers=INSTRUMENT_AND_ARM
+    )
     ok(capsys, "identify", run)
     ok(capsys, "export", run, "--residuals", tmp_path / "e.csv")
     with (tmp_path / "e.csv").open() as stream:

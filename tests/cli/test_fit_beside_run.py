@@ -11,7 +11,7 @@ import pytest
 
 import hilcal as hc
 from hilcal.errors import InputError
-from hilcal.readings.covariance import WHOLE
+from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.store import rows, schema
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.revision import STORED, fitted_to, from_text, to_text
@@ -26,7 +26,7 @@ def fresh(tmp_path_factory):
     """A campaign without revisions."""
     path = tmp_path_factory.mktemp("fresh") / "run.hilcal"
     readings = rehearsal("nothing", poses=8).readings
-    return stored_readings(path, readings, covers=WHOLE).read_bytes()
+    return stored_readings(path, readings, covers=INSTRUMENT_AND_ARM).read_bytes()
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import hilcal as hc
-from hilcal.readings.covariance import WHOLE
+from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.tables.table import write_table
 from tests.support.cli_cases import CELL, ok, rehearsal, run, stored_readings
 from tests.support.paths import ROOT
@@ -27,13 +27,13 @@ def fitted(tmp_path_factory):
     """A folder with a campaign of one revision, points and a table."""
     folder = tmp_path_factory.mktemp("full")
     readings = rehearsal("nothing").readings
-    path = stored_readings(folder / "run.hilcal", readings, covers=WHOLE)
+    path = stored_readings(folder / "run.hilcal", readings, covers=INSTRUMENT_AND_ARM)
     with hc.Campaign.open(path) as opened:
         model = hc.baseline(opened.cell, opened.readings, "absolute")
         opened.append(hc.fit(model, opened.readings, "absolute"))
         opened.calibration().compensate(readings.states.q[:1])  # keeps machine code on the disk
     (folder / "points.csv").write_text(POINTS)
-    write_table(readings, folder / "table.csv", WHOLE)
+    write_table(readings, folder / "table.csv", INSTRUMENT_AND_ARM)
     return folder
 
 

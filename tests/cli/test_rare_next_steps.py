@@ -19,7 +19,7 @@ from hilcal.present.story import build_story
 from hilcal.present.viewer import live
 from hilcal.present.viewer.live import GUIDE
 from hilcal.procedure.next_plan import doubt_to_settle
-from hilcal.readings.covariance import WHOLE
+from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.parquet_stream import open_stream
@@ -208,7 +208,7 @@ def test_a_stream_of_several_targets(run, tmp_path, capsys):
 def test_deflections_are_compared_after_a_fit_of_absolute_readings(run, tmp_path, capsys):
     ok(capsys, "identify", run, "--readings", "deflection")
     readings = rehearsal("hysteresis", 2, 8).readings
-    write_table(readings[readings.unloaded], csv := tmp_path / "bare.csv", WHOLE)
+    write_table(readings[readings.unloaded], csv := tmp_path / "bare.csv", INSTRUMENT_AND_ARM)
     ok(capsys, "import", csv, "--config", CELL, "-o", bare := tmp_path / "bare.hilcal")
     said = refused(capsys, 2, "compare", run, bare)
     follow(capsys, said, f"hilcal identify '{run}' --readings absolute")

@@ -21,7 +21,7 @@ from hilcal.cli.commands import COMMANDS
 from hilcal.config import load_config
 from hilcal.design.planner import Request, make
 from hilcal.drivers.simulated.rehearsal import case_of_plan, read_plan
-from hilcal.readings.covariance import WHOLE
+from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import load_plan, with_new_names
 from hilcal.store.run_log import RunLog, create_run
@@ -168,7 +168,7 @@ def others(config, directory):
 
     plan = make(cell_from_config(config), config, Request(8), np.random.default_rng(2)).ordered.plan
     r = readings(config, plan, 5)
-    write_table(r, directory / "readings.csv", WHOLE)
+    write_table(r, directory / "readings.csv", INSTRUMENT_AND_ARM)
     book = openpyxl.Workbook()
     sheet = book.active
     joints = [f"A{k} [deg]" for k in range(1, 7)]

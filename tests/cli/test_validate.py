@@ -4,7 +4,7 @@ import csv
 
 import pytest
 
-from hilcal.readings.covariance import WHOLE
+from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.tables.table import write_table
 from tests.support.cli_cases import CELL, ok, refused, rehearsal, run
 
@@ -17,7 +17,7 @@ def tables(tmp_path_factory):
     folder, r = tmp_path_factory.mktemp("tables"), rehearsal("hysteresis", poses=POSES).readings
     first = r.pose < FITTED
     for name, rows in (("fit", first), ("rest", ~first), ("all", first | ~first)):
-        write_table(r[rows], folder / f"{name}.csv", WHOLE)
+        write_table(r[rows], folder / f"{name}.csv", INSTRUMENT_AND_ARM)
     return folder
 
 

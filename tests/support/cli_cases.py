@@ -13,7 +13,7 @@ import pytest
 from hilcal.cli import main
 from hilcal.config import CellConfig, load_config
 from hilcal.drivers.simulated.rehearsal import Rehearsal
-from hilcal.readings.covariance import COVERS, WHOLE
+from hilcal.readings.covariance import COVERS_KEY, INSTRUMENT_AND_ARM
 from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
@@ -96,7 +96,7 @@ def stored_readings(
 ) -> Path:
     """Write a campaign file that holds readings alone; in the cell of the demo unless given."""
     content, base_dir = (config or load_config(CELL)).to_json(), str(CELL.parent)
-    more = {} if covers is None else {COVERS: covers}
+    more = {} if covers is None else {COVERS_KEY: covers}
     CampaignFile.create(
         path, content, base_dir, "a test", overwrite=True, more=more, readings=readings
     ).close()
@@ -104,5 +104,5 @@ def stored_readings(
 
 
 def table(path: Path, hidden: str, seed: int = 1, poses: int = POSES) -> Path:
-    write_table(rehearsal(hidden, seed, poses).readings, path, WHOLE)
+    write_table(rehearsal(hidden, seed, poses).readings, path, INSTRUMENT_AND_ARM)
     return path

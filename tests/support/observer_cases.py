@@ -10,7 +10,7 @@ from hilcal.config import CellConfig
 from hilcal.config.sections import Gauge, Point
 from hilcal.drivers.simulated.injected_effects import hide
 from hilcal.drivers.simulated.world import World
-from hilcal.readings.covariance import WHOLE  # noqa: F401 - for the tests
+from hilcal.readings.covariance import INSTRUMENT_AND_ARM  # noqa: F401 - for the tests
 from hilcal.readings.readings import ObserverName, Readings
 from hilcal.robot import se3
 from hilcal.types import Floats

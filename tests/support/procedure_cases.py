@@ -9,7 +9,7 @@ from hilcal.drivers.simulated.rehearsal import SimulationCase, case_of_plan, rea
 from hilcal.effects.catalogue import installed
 from hilcal.procedure.procedure import Procedure
 from hilcal.procedure.state import ProcedureStep, Settings
-from hilcal.readings.covariance import WHOLE
+from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.readings.whitening import Mode
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
@@ -69,7 +69,7 @@ class Drawn:
         self.kinds.append(step.kind)
         p = self.procedure
         if step.kind == "plan":
-            p.begin(p.plan().plan, p.config, covers=WHOLE)
+            p.begin(p.plan().plan, p.config, covers=INSTRUMENT_AND_ARM)
             return None
         if step.moves:
             return p.measure(step, self.measure)

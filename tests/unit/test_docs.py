@@ -14,7 +14,7 @@ from hilcal.config import CellConfig
 from hilcal.config.reference import to_toml
 from hilcal.effects.catalogue import ENTRY_POINT_GROUP
 from hilcal.measuring.devices import TRACKERS
-from hilcal.readings.covariance import WHOLE
+from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.mapping import Mapping
@@ -79,7 +79,7 @@ def test_the_guide_to_the_library_runs_as_it_stands(campaign_of, monkeypatch):
     campaign_of("creep", 10, config)
     Path("CELL.toml").write_text(to_toml(config), encoding="utf-8")
     with CampaignFile.open("run.hilcal") as file:
-        write_table(file.readings(), Path("readings.csv"), WHOLE)
+        write_table(file.readings(), Path("readings.csv"), INSTRUMENT_AND_ARM)
     pyplot = ModuleType("matplotlib.pyplot")
     drawn = []
     monkeypatch.setattr(pyplot, "plot", lambda *given: drawn.append(given), raising=False)

@@ -17,7 +17,7 @@ import pytest
 import hilcal as hc
 from hilcal.config import load_config
 from hilcal.config.reference import to_toml
-from hilcal.readings.covariance import WHOLE
+from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.robot.catalogue import configs_dir
 from hilcal.tables.table import write_table
 from studies.change import measured
@@ -42,8 +42,8 @@ def site(tmp_path_factory):
     case = rehearse(config, "joint_tilt_compliance", 3, 10)
     readings = case.readings
     table, run, later = folder / "t.csv", folder / "run.hilcal", folder / "later.hilcal"
-    write_table(readings, table, WHOLE)
-    write_table(readings, folder / "t.parquet", WHOLE)
+    write_table(readings, table, INSTRUMENT_AND_ARM)
+    write_table(readings, folder / "t.parquet", INSTRUMENT_AND_ARM)
     compliance = case.world.physics.joint_compliance * [1, 2, 1, 1, 1, 1]
     worn = replace(
         case.world, physics=case.world.physics.with_effect("joint_compliance", compliance)

@@ -11,8 +11,8 @@ from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.revisions import chain, restore, restore_model, to_record
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
-from hilcal.identification.fit_document import plain, to_json
-from hilcal.readings.covariance import WHOLE
+from hilcal.identification.fit_document import to_json, with_nulls
+from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.readings.whitening import usual_mode
 from hilcal.refinement import add
 from hilcal.store.campaign_file import CampaignFile
@@ -99,7 +99,7 @@ def with_readings(run, readings):
 def test_a_revision_is_found_again_on_a_machine_that_rounds_otherwise(tmp_path):
     """The arm's scatter in the covariances is computed, and its last bits differ."""
     readings = rehearsal("nothing").readings
-    path = stored_readings(tmp_path / "run.hilcal", readings, covers=WHOLE)
+    path = stored_readings(tmp_path / "run.hilcal", readings, covers=INSTRUMENT_AND_ARM)
     with Campaign.open(path) as run:
         run.append(based(run.cell, run.readings, run.mode()))
         other = replace(run.readings, covariance=run.readings.covariance * (1 + 1e-15))
@@ -165,5 +165,5 @@ def test_deflections_are_usual_where_every_load_has_its_unloaded_reading():
 
 def test_what_json_cannot_hold_becomes_null():
     content = {"a": [1.0, float("nan")], "b": (np.float64("inf"), 2, "x", None, True)}
-    assert plain(content) == {"a": [1.0, None], "b": [None, 2, "x", None, True]}
-    json.dumps(plain(content), allow_nan=False)
+    assert with_nulls(content) == {"a": [1.0, None], "b": [None, 2, "x", None, True]}
+    json.dumps(with_nulls(content), allow_nan=False)

@@ -134,7 +134,7 @@ def read_xml(path: Path) -> Document:
         node.parent = None if parent is top else parent
         parent.children.append(node)
         open_.append(node)
-        if len(open_) > limits.NESTED + 1:
+        if len(open_) > limits.NESTED_EXPRESSIONS + 1:
             raise InputError(f"{path}: nested too deeply; valid: a robot's description")
 
     def end(tag: str) -> None:

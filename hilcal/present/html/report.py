@@ -11,11 +11,11 @@ from hilcal import numbers
 from hilcal.calibration.scatter import COVERAGE, budget
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE, Suspect
-from hilcal.diagnosis.noise import classes
+from hilcal.diagnosis.noise import repeat_classes
 from hilcal.identification.background import family_sizes
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_covariance import CovarianceParts
-from hilcal.identification.full_prediction import error_before, names
+from hilcal.identification.full_prediction import nominal_error, reading_name
 from hilcal.identification.residual import CONFIDENCE, ErrorBlock
 from hilcal.identification.validation import CampaignValidation
 from hilcal.numbers import length, percent
@@ -147,7 +147,7 @@ def where_wrong(m: ReportContent) -> str:
     """Return sentences on the worst pose and on the variables that the misfit follows."""
     d, fit, error = m.diagnosis, m.fit, left_out_errors(m.fit)
     furthest = int(fit.whitening.reading[np.argmax(error)])
-    pose, load = names(fit.readings[~fit.outlier], furthest)
+    pose, load = reading_name(fit.readings[~fit.outlier], furthest)
     place = f"{pose} {load_name(load, 'under ')}"
     worst = f"Of the poses left out, {place} is furthest off: {length(error.max())}."
     if d is None:
@@ -172,7 +172,7 @@ def _cards(m: ReportContent) -> Iterator[tuple[str, str, str]]:
     model = "nominal arm, only its frames fitted"
     if m.fit.mode == "deflection":
         model = "deflection under load; a rigid arm has none"
-    yield card("Before", error_before(m.fit), f"; {model}")
+    yield card("Before", nominal_error(m.fit), f"; {model}")
     if m.tested is not None:
         kind = "never fitted" if m.tested.validation.judged.unseen else "fitted, so no test"
         yield card("After, validation", m.tested.validation.prediction.error, f"; {kind}")
@@ -429,7 +429,7 @@ def _noise(m: ReportContent) -> str:
             "freedom)."
         )
     fitted = m.fit.readings[~m.fit.outlier]
-    repeats = len(fitted) - len(np.unique(classes(fitted)))
+    repeats = len(fitted) - len(np.unique(repeat_classes(fitted)))
     if not repeats:
         return "No reading was repeated: the noise is judged by the model alone."
     quantity = "deflection" if m.fit.mode == "deflection" else "reading"

@@ -16,7 +16,7 @@ from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.storage import from_json, to_json
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
-from hilcal.identification.robot_frames import one_of_each
+from hilcal.identification.robot_frames import state_with_every_column
 from hilcal.model.model import Model
 from hilcal.robot import se3
 from hilcal.robot.arm import with_conventions
@@ -242,7 +242,7 @@ def test_coupled_joints_are_compensated_by_the_controllers_values():
     arm = with_conventions(load_arm("ur10e"), sign, np.zeros(6), follows)
     cell, known = replace(cell_of(registration_known=True), arm=arm), hc.installed()
     names = ("encoder_offset", "joint_compliance")
-    effects = tuple(known.make(name, cell, one_of_each(cell)) for name in names)
+    effects = tuple(known.make(name, cell, state_with_every_column(cell)) for name in names)
     c = Calibration(
         model=Model(cell, effects, known),
         theta=np.repeat([1e-3, 1e-5], 6),

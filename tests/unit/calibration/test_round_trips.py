@@ -20,7 +20,7 @@ from hilcal.calibration.measured import Measured
 from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.storage import from_json, to_json
 from hilcal.effects.protocol import Columns, Parameter
-from hilcal.identification.robot_frames import one_of_each
+from hilcal.identification.robot_frames import state_with_every_column
 from hilcal.model.model import Model
 from hilcal.robot import se3
 from hilcal.robot.catalogue import load_arm, robot_names
@@ -100,7 +100,9 @@ def test_a_dh_table_is_the_arm_to_what_it_states(tmp_path_factory, name, seed, s
 @cache
 def model_of(names, target_known):
     cell, known = cell_of(target_known=target_known), hc.installed()
-    return Model(cell, tuple(known.make(name, cell, one_of_each(cell)) for name in names), known)
+    return Model(
+        cell, tuple(known.make(name, cell, state_with_every_column(cell)) for name in names), known
+    )
 
 
 def random_calibration(names, seed):
@@ -212,7 +214,8 @@ class Sagging(hc.Effect):
 def test_an_effect_without_a_compiled_form_is_named_and_inverted_all_the_same():
     c = random_calibration(("base_frame", "joint_compliance"), 3)
     model = replace(
-        c.model, effects=(*c.model.effects, Sagging(c.model.cell, one_of_each(c.model.cell)))
+        c.model,
+        effects=(*c.model.effects, Sagging(c.model.cell, state_with_every_column(c.model.cell))),
     )
     mine = replace(c, model=model, theta=np.append(c.theta, 2e-3), root=np.zeros((model.size, 1)))
     assert c.without_kernel() == ()

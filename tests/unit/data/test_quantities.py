@@ -13,7 +13,7 @@ from hilcal.cell import Cell
 from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise
 from hilcal.readings.readings import Range
-from hilcal.readings.same_readings import already, never_fitted
+from hilcal.readings.same_readings import found_among, never_fitted
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.rows import content_hash
 from hilcal.tables.table import write_table
@@ -225,27 +225,27 @@ def test_a_copy_is_known_whatever_it_went_through(m):
         load_names=("none", "five", "ten"),
         pose_names=tuple(f"P {k}" for k in range(len(r.pose_names))),
     )
-    assert already(copy, r).all()
-    assert already(r, copy).all()
+    assert found_among(copy, r).all()
+    assert found_among(r, copy).all()
     positions = replace(r, value=r.value[:, :3], covariance=r.covariance[:, :3, :3])
-    assert already(positions, r).all()
+    assert found_among(positions, r).all()
 
 
 def test_what_was_measured_again_is_another_reading():
     r = campaign(poses=300)
     again = replace(r, value=r.value + np.random.default_rng(2).normal(0, NOISE_M, r.value.shape))
-    assert already(again, r).mean() < 0.002  # (0.2 µm)³ in (5 µm √2π)³: none is expected
+    assert found_among(again, r).mean() < 0.002  # (0.2 µm)³ in (5 µm √2π)³: none is expected
     turned = replace(r, states=replace(r.states, q=r.states.q + 1e-3))
-    assert not already(turned, r).any()
+    assert not found_among(turned, r).any()
 
 
 def test_loaded_and_unloaded_readings_differ_and_arms_with_other_joints():
     r = campaign()
     swapped = replace(r, load=np.where(r.load == 0, 1, 0))
-    assert not already(swapped, r)[r.load < 2].any()
-    assert not already(replace(r, states=replace(r.states, q=r.states.q[:, :5])), r).any()
-    assert not already(r, r[:0]).any()
-    assert len(already(r[:0], r)) == 0
+    assert not found_among(swapped, r)[r.load < 2].any()
+    assert not found_among(replace(r, states=replace(r.states, q=r.states.q[:, :5])), r).any()
+    assert not found_among(r, r[:0]).any()
+    assert len(found_among(r[:0], r)) == 0
 
 
 def test_a_deflection_is_unseen_only_if_neither_reading_of_it_was_fitted():

@@ -8,7 +8,12 @@ import pytest
 import hilcal as hc
 from hilcal.errors import InputError
 from hilcal.identification.full_covariance import with_joint_scatter
-from hilcal.readings.covariance import COVERS, WHOLE, TrackerNoise, tracker_covariance
+from hilcal.readings.covariance import (
+    COVERS_KEY,
+    INSTRUMENT_AND_ARM,
+    TrackerNoise,
+    tracker_covariance,
+)
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.table import import_table, write_table
 from hilcal.tables.uncertainty import rounding_variance, step
@@ -139,16 +144,20 @@ def test_nothing_is_added_where_the_cell_or_an_older_import_says_so(table, tmp_p
     config, run = hc.Cell.load(CELL).configured(), tmp_path / "old.hilcal"
     with CampaignFile.create(run, config.to_json(), str(CELL.parent), "t.csv (table)") as file:
         file.append_readings(rehearsal("nothing").readings)
-        assert file.about(COVERS) is None
+        assert file.about(COVERS_KEY) is None
     np.testing.assert_array_equal(*covariances(run))
 
 
 def test_a_table_says_the_same_in_all_rows(tmp_path):
     path = tmp_path / "t.csv"
-    write_table(rehearsal("nothing").readings, path, WHOLE)
+    write_table(rehearsal("nothing").readings, path, INSTRUMENT_AND_ARM)
     lines = path.read_text(encoding="utf-8").splitlines()
-    path.write_text("\n".join([*lines[:2], lines[2].replace(WHOLE, "arm"), *lines[3:]]))
+    path.write_text(
+        "\n".join([*lines[:2], lines[2].replace(INSTRUMENT_AND_ARM, "arm"), *lines[3:]])
+    )
     with pytest.raises(InputError, match=r"row 3, column 'covers': 'arm' is unknown; valid"):
         hc.read_table(path, hc.Cell.load(CELL))
-    path.write_text("\n".join([*lines[:2], lines[2].replace(WHOLE, "instrument"), *lines[3:]]))
+    path.write_text(
+        "\n".join([*lines[:2], lines[2].replace(INSTRUMENT_AND_ARM, "instrument"), *lines[3:]])
+    )
     refusal("all rows must say the same", hc.read_table, path, hc.Cell.load(CELL))

@@ -14,7 +14,7 @@ from hilcal.readings.covariance import (
     joint_scatter,
     tracker_covariance,
 )
-from hilcal.readings.whitening import MODES, inverse_root, measured, whitening
+from hilcal.readings.whitening import MODES, inverse_root, measured_values, whitening
 from hilcal.robot import se3
 from tests.support.readings_cases import made
 from tests.support.refusals import refusal
@@ -237,7 +237,7 @@ def test_absolute_readings_stand_for_themselves(seed, m):
     w = whitening(r, "absolute")
     np.testing.assert_array_equal(w.reading, np.arange(len(r)))
     np.testing.assert_array_equal(w.raw(r.value), r.value)
-    np.testing.assert_array_equal(measured(r, w), r.value)
+    np.testing.assert_array_equal(measured_values(r, w), r.value)
     np.testing.assert_array_equal(w.covariance, r.covariance)
 
 
@@ -258,7 +258,9 @@ def test_measured_rotation_is_that_from_unloaded_to_loaded(seed):
     r = make_readings(
         np.zeros(2, np.int64), np.zeros(2, np.int64), np.array([0, 1]), value, spd(rng, 2, 6)
     )
-    np.testing.assert_allclose(measured(r, whitening(r, "deflection"))[0, 3:], turn, atol=1e-9)
+    np.testing.assert_allclose(
+        measured_values(r, whitening(r, "deflection"))[0, 3:], turn, atol=1e-9
+    )
 
 
 def rotation_variance(unloaded, count=4000):
@@ -278,7 +280,7 @@ def rotation_variance(unloaded, count=4000):
         np.tile(std**2 * np.eye(6), (count * per, 1, 1)),
     )
     w = whitening(r, "deflection", "gu")
-    return np.asarray(w.whiten(measured(r, w)).reshape(-1, 6)[:, 3:].var(axis=0))
+    return np.asarray(w.whiten(measured_values(r, w)).reshape(-1, 6)[:, 3:].var(axis=0))
 
 
 def test_rotations_have_the_stated_noise():

@@ -154,7 +154,7 @@ def test_an_estimate_holds_the_true_parameters():
     off, spread = drawn[0] - true, np.cov(drawn[1:].T)
     assert off @ np.linalg.solve(spread, off) < stats.chi2.isf(1e-4, len(true))
     columns = effect_columns(found, effect)
-    score = linear.score(columns.white, most=effect.most())
+    score = linear.score(columns.white, largest=effect.most())
     np.testing.assert_allclose(drawn[0], columns.scale * score.step, rtol=1e-12)
     stated = columns.scale * np.linalg.norm(score.root, axis=1)
     np.testing.assert_allclose(np.sqrt(np.diag(spread)), stated, rtol=0.06)
@@ -273,7 +273,7 @@ def test_the_chance_of_telling_it_from_a_rival_grows():
     first = based(c.cell, c.readings, "absolute")
     (told,) = pose_powers(first, ("transmission_error", "encoder_offset"), 140)
     assert (told.effect, told.rival) == ("transmission_error", "encoder_offset")
-    assert told.now < 0.3 < 0.8 < told.then
+    assert told.power_now < 0.3 < 0.8 < told.power_then
 
 
 MODES = ("deflection", "absolute")

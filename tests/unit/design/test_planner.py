@@ -20,7 +20,7 @@ from hilcal.design.summary import remarks, summarise
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError
 from hilcal.measuring.route import dry_run
-from hilcal.readings.covariance import WHOLE
+from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import REFERENCE, UNLOADED, load_plan, read_plan, with_new_names
 from hilcal.store.run_log import PLAN
@@ -233,7 +233,7 @@ def test_a_run_without_a_plan_keeps_the_same_rule(tmp_path, capsys):
 def test_planning_on_from_what_is_known(tmp_path, capsys):
     r = rehearsal("nothing")
     table, run = tmp_path / "readings.csv", tmp_path / "run.hilcal"
-    write_table(r.readings, table, WHOLE)
+    write_table(r.readings, table, INSTRUMENT_AND_ARM)
     cell = cell_file(tmp_path, small())
     ok(capsys, "import", table, "--config", cell, "-o", run)
     ok(capsys, "identify", run)

@@ -13,7 +13,7 @@ from hilcal.drivers.simulated.world import stand
 from hilcal.effects.protocol import effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import with_effects
-from hilcal.identification.later_readings import earlier_fit, setting
+from hilcal.identification.later_readings import earlier_fit, later_readings
 from studies.change import measured, remeasured, studied_arm
 from tests.support.campaigns import configuration
 from tests.support.refusals import refusal_of
@@ -35,7 +35,7 @@ def later(arm, change, seed, *, anew=True, count=15):
         registration, station = stand(arm.cell, rng)
         world = replace(world, registration=registration, station=station)
     readings = remeasured(world, arm.loads, count, rng)
-    return find_changes(setting(arm.earlier, readings, anew=anew))
+    return find_changes(later_readings(arm.earlier, readings, anew=anew))
 
 
 def zero(joint, size):
@@ -94,7 +94,7 @@ def test_a_tool_that_is_heavier_is_what_its_columns_say(arm):
     known = candidates(fit.model.cell, states, fit.model.catalogue, 3, anew=True)
     (weight,) = [c for c in known if c.name == "tool_weight"]
     before = fit.model.predict(states, fit.theta)
-    columns = fit.model.jacobian_of((weight.moving.effect,), before, fit.theta, 3)
+    columns = fit.model.jacobian_of((weight.effect_directions.effect,), before, fit.theta, 3)
     mass = weight.scale[0]
     cell = fit.model.cell
     com = cell.tool_mass * cell.tool_com / (cell.tool_mass + mass)  # the mass is at the flange
@@ -106,7 +106,7 @@ def test_a_tool_that_is_heavier_is_what_its_columns_say(arm):
 
     heavier = with_cell(replace(cell, tool_mass=cell.tool_mass + mass, tool_com=com))
     moved = heavier - with_cell(cell)
-    predicted = (columns @ weight.moving.directions)[:, :, 0]
+    predicted = (columns @ weight.effect_directions.directions)[:, :, 0]
     assert np.abs(moved).max() > 1e-6
     np.testing.assert_allclose(predicted, moved, atol=2e-3 * np.abs(moved).max())
 
@@ -120,7 +120,9 @@ def test_what_could_not_have_been_seen_is_larger_with_fewer_readings(arm):
 
 def test_too_few_readings_are_refused(arm):
     readings = remeasured(arm.world, arm.loads, 15, np.random.default_rng(1))
-    refusal_of(CannotAnswerError, "measure at least", setting, arm.earlier, readings[:3], anew=True)
+    refusal_of(
+        CannotAnswerError, "measure at least", later_readings, arm.earlier, readings[:3], anew=True
+    )
 
 
 def test_columns_that_the_later_readings_lack_are_named(arm):
@@ -130,7 +132,7 @@ def test_columns_that_the_later_readings_lack_are_named(arm):
     readings = remeasured(arm.world, arm.loads, 15, np.random.default_rng(1))
     bare = replace(readings.states, air_temperature=None, joint_temperature=None)
     with pytest.raises(InputError, match="thermal_growth needs air_temperature"):
-        setting(warm, replace(readings, states=bare), anew=True)
+        later_readings(warm, replace(readings, states=bare), anew=True)
 
 
 def test_a_misfit_that_is_of_poses_is_told_from_one_of_readings(arm):
@@ -147,6 +149,8 @@ def test_a_misfit_that_is_of_poses_is_told_from_one_of_readings(arm):
     ]
     w = found[0].fit.whitening
     drawn = float(np.mean(w.whiten(of_pose[w.reading]) ** 2))
-    assert found[0].by_pose == pytest.approx(drawn, rel=0.3)  # some of the 90 values are fitted
-    assert found[0].by_pose > 5 * found[0].noise
-    assert found[1].by_pose < 0.5 * found[1].noise  # parameters are shared by a pose, too
+    assert found[0].pose_variance == pytest.approx(
+        drawn, rel=0.3
+    )  # some of the 90 values are fitted
+    assert found[0].pose_variance > 5 * found[0].noise
+    assert found[1].pose_variance < 0.5 * found[1].noise  # parameters are shared by a pose, too

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from hilcal.diagnosis.noise import classes, contrasts, judge_noise, pure_error
+from hilcal.diagnosis.noise import contrasts, judge_noise, pure_error, repeat_classes
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.model.observe import motion
@@ -64,7 +64,7 @@ def test_the_factor_is_chi_square_and_so_is_what_is_left(mode, m, seeds):
 def test_degrees_of_freedom_are_those_of_the_repeats(mode):
     r = Repeated(mode, 6)
     c = contrasts(r.fit(with_noise(r.clean, np.random.default_rng(0))))
-    kind = classes(r.clean)
+    kind = repeat_classes(r.clean)
     # An unloaded reading that deflections share is no measurement by itself.
     counted = np.ones(len(kind), dtype=bool) if mode == "absolute" else ~r.clean.unloaded
     again = np.sum(counted) - len(np.unique(kind[counted]))
@@ -136,6 +136,6 @@ def test_repeats_that_scatter_less_blame_the_model():
     r = Repeated("absolute", 10, effect="encoder_offset")
     f = r.fit(with_noise(r.clean, np.random.default_rng(0), 2.0))
     verdict = judge_noise(f, pure_error(f), False)
-    assert verdict.off
+    assert verdict.contradicted
     assert not verdict.misjudged
     assert verdict.reason == "lack_of_fit"

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from hilcal.diagnosis.effect_ranking import (
+    acts_through_load,
     beyond_geometry,
     candidates,
     geometry_columns,
     kept_by_refit,
     kept_by_step,
-    most,
+    largest_plausible,
     rank_suspects,
-    through_load,
     unloaded_readings,
 )
 from hilcal.diagnosis.evidence import StepwiseAlternatives
@@ -75,10 +75,10 @@ def test_unloaded_readings_bound_what_geometry_may_do_to_deflections():
     found = fitted(replace(c, mode="deflection"))
     (e,) = (e for e in candidates(found) if e.name == "link_geometry")
     off = c.world.physics.link_geometry
-    allowed = most(effect_columns(found, e), unloaded_readings(found))
+    allowed = largest_plausible(effect_columns(found, e), unloaded_readings(found))
     true = float(np.sqrt(np.mean((1e3 * off) ** 2)))
     assert true < allowed < 10 * true
-    assert most(effect_columns(found, e), None) == pytest.approx(e.most())
+    assert largest_plausible(effect_columns(found, e), None) == pytest.approx(e.most())
 
 
 @pytest.mark.parametrize("effect", ["link_geometry", "joint_tilt_compliance"])
@@ -115,7 +115,7 @@ def test_a_stiff_arm_with_a_wrong_geometry_is_not_compliant():
         found = without_loads(seed, stiff=True)
         p = linearise(found)
         effects = candidates(found)
-        elastic = {e.name for e in effects if through_load(e)}
+        elastic = {e.name for e in effects if acts_through_load(e)}
         assert {"joint_compliance", "link_mass", "load_point"} <= elastic
         assert not {"link_geometry", "transmission_error", "hysteresis"} & elastic
         assert not elastic & {s.effect for s in rank_suspects(p, effects) if s.passes}
@@ -195,7 +195,7 @@ def test_a_finer_form_is_no_alternative_to_the_effect(arm):
     found = add(with_joints(c, "each"), "creep")
     assert "creep(joints=each)" in [e.name for e in candidates(found)]
     alternative = StepwiseAlternatives(found).of("creep")
-    assert not any("creep" in name for name in (*alternative.same_as, *alternative.others))
+    assert not any("creep" in name for name in (*alternative.same_as, *alternative.replacements))
 
 
 def test_only_what_is_finer_takes_the_place_of_an_effect(arm):

@@ -7,8 +7,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, multivariate_normal
 
-from hilcal.diagnosis.effect_ranking import candidates, most, rank_suspects, unloaded_readings
-from hilcal.diagnosis.evidence import spoken_against, whole_catalogue
+from hilcal.diagnosis.effect_ranking import (
+    candidates,
+    largest_plausible,
+    rank_suspects,
+    unloaded_readings,
+)
+from hilcal.diagnosis.evidence import contradicted_effects, whole_catalogue
 from hilcal.diagnosis.noise import MISFIT_ALARM
 from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
@@ -115,14 +120,14 @@ def shared():
 
 @pytest.mark.parametrize("together", [0, 20_000, 8_000_000])
 def test_columns_of_several_effects_are_those_of_each(shared, together, monkeypatch):
-    monkeypatch.setattr(columns_module, "TOGETHER", together)
+    monkeypatch.setattr(columns_module, "MOST_AT_ONCE", together)
     effects = candidates(shared)
     s, w = shared.solution, shared.whitening
     for effect, of in zip(effects, columns_of_each(shared, effects), strict=True):
         assert of.effect is effect
         jacobian = shared.model.jacobian_of((effect,), s.prediction, s.theta, w.m) * of.scale
         unloaded = jacobian[shared.readings.unloaded, :3]
-        np.testing.assert_allclose(of.unloaded, unloaded, rtol=1e-11, atol=1e-15)
+        np.testing.assert_allclose(of.unloaded_motion, unloaded, rtol=1e-11, atol=1e-15)
         motion = w.raw(jacobian)[:, :3]
         np.testing.assert_allclose(of.motion, motion, rtol=1e-11, atol=1e-15)
         white = w.whiten_readings(jacobian)
@@ -139,7 +144,7 @@ def test_scores_of_a_catalogue_are_those_of_each_effect_by_itself(shared):
             (of.effect,), shared.solution.prediction, shared.theta, 3
         )
         x = w.whiten(w.raw(jacobian)) * of.scale
-        score = p.score(x, x.T @ p.project_out(x), most(of, bare))
+        score = p.score(x, x.T @ p.project_out(x), largest_plausible(of, bare))
         together = ranked[of.effect.name]
         assert (together.rank, together.strength) == (score.rank, score.strength)
         assert together.log_evidence == pytest.approx(score.log_evidence, rel=1e-9, abs=1e-9)
@@ -177,8 +182,8 @@ def with_prior(*, repaired, poses=10):
 
 
 def test_what_was_repaired_is_spoken_against_and_what_is_there_is_not():
-    assert spoken_against(with_prior(repaired=True)) == (HIDDEN,)
-    assert spoken_against(with_prior(repaired=False)) == ()
+    assert contradicted_effects(with_prior(repaired=True)) == (HIDDEN,)
+    assert contradicted_effects(with_prior(repaired=False)) == ()
 
 
 def test_the_evidence_is_the_ratio_of_normal_densities_of_the_readings():

@@ -8,7 +8,7 @@ import pytest
 from hilcal.diagnosis.diagnosis import in_doubt
 from hilcal.diagnosis.effect_ranking import candidates
 from hilcal.diagnosis.misfit_breakdown import pose_constants
-from hilcal.diagnosis.pose_alone import chance
+from hilcal.diagnosis.pose_alone import detection_power
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import fit
@@ -82,6 +82,6 @@ def test_the_chance_grows_with_the_poses():
     c = campaign("transmission_error", "absolute", 0, **options)
     p = linearise(fitted(c))
     effect = next(e for e in candidates(p.fit) if e.name == "transmission_error")
-    few, many = (chance(p, effect, n, 1e-4) for n in (0, 160))
+    few, many = (detection_power(p, effect, n, 1e-4) for n in (0, 160))
     assert few < 0.2
     assert many > 0.9

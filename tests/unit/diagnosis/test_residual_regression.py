@@ -8,10 +8,10 @@ from sklearn.ensemble import ExtraTreesRegressor
 
 from hilcal.diagnosis import residual_regression as module
 from hilcal.diagnosis.residual_regression import (
-    LEAF,
-    PRECISE,
+    LEAF_SIZE,
+    PRECISION,
     TreePrediction,
-    predicted,
+    predict_by_trees,
     residual_regression,
 )
 from hilcal.identification.linearisation import linearise
@@ -168,7 +168,7 @@ def of_large_forest(x, y, fold, trees=300):
     left = y.copy()
     for f in range(FOLDS):
         mine = fold == f
-        forest = ExtraTreesRegressor(trees, min_samples_leaf=LEAF, random_state=7)
+        forest = ExtraTreesRegressor(trees, min_samples_leaf=LEAF_SIZE, random_state=7)
         left[mine] -= forest.fit(x[~mine], y[~mine]).predict(x[mine])
     return float(1 - np.sum(left**2) / np.sum(y**2))
 
@@ -176,38 +176,41 @@ def of_large_forest(x, y, fold, trees=300):
 def test_few_trees_estimate_what_many_predict():
     x, y, fold = table(0, 1.0)
     many = of_large_forest(x, y, fold)
-    few = predicted(x, y, fold)
+    few = predict_by_trees(x, y, fold)
     assert few.trees < 60
     assert many > 0.2
     assert abs(few.share - many) < 3 * few.std + 0.01  # of 300 trees, their own
-    assert few.std <= PRECISE
+    assert few.std <= PRECISION
 
 
 def test_the_stated_error_is_that_of_other_trees(monkeypatch):
     x, y, fold = table(1, 1.0)
-    monkeypatch.setattr(module, "PRECISE", 0.0)
+    monkeypatch.setattr(module, "PRECISION", 0.0)
     monkeypatch.setattr(module, "MOST_TREES", 8)
     found = []
     for number in range(12):
         # The number of a feature decides what a seed draws.
         order = np.random.default_rng(number).permutation(FEATURES)
-        found.append(predicted(x[:, order], y, fold))
+        found.append(predict_by_trees(x[:, order], y, fold))
     spread = np.std([f.share for f in found], ddof=1)
     assert spread == pytest.approx(np.mean([f.std for f in found]), rel=0.6)
 
 
 def test_noise_is_not_predicted():
-    shares = [predicted(*table(100 + seed, 0.0)).share for seed in range(20)]
+    shares = [predict_by_trees(*table(100 + seed, 0.0)).share for seed in range(20)]
     assert max(shares) < 0.05
     assert np.mean(shares) < 0
 
 
 def test_trees_are_grown_no_further_than_they_matter():
     x, y, fold = table(2, 0.5)
-    exact, less = predicted(x, y, fold, 3.0), predicted(x, y, fold, 3.0, beyond=0.95)
+    exact, less = (
+        predict_by_trees(x, y, fold, 3.0),
+        predict_by_trees(x, y, fold, 3.0, other_share=0.95),
+    )
     assert less.trees == module.TREES < exact.trees
     assert less.share < 0.95
-    assert predicted(x, y, fold, 3.0) == exact
+    assert predict_by_trees(x, y, fold, 3.0) == exact
 
 
 @pytest.mark.parametrize("how", ["one fold", "no residual", "no rows"])
@@ -219,4 +222,4 @@ def test_nothing_to_learn_from(how):
         y = np.zeros_like(y)
     else:
         x, y, fold = x[:0], y[:0], fold[:0]
-    assert predicted(x, y, fold) == TreePrediction(0.0, 0.0, 0)
+    assert predict_by_trees(x, y, fold) == TreePrediction(0.0, 0.0, 0)

@@ -7,7 +7,12 @@ import pytest
 from scipy.stats import f as f_distribution
 
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
-from hilcal.diagnosis.evidence import CHANCE, PRICE, StepwiseAlternatives, backward_elimination
+from hilcal.diagnosis.evidence import (
+    PRICE_OF_EFFECT,
+    REDUNDANCY_LEVEL,
+    StepwiseAlternatives,
+    backward_elimination,
+)
 from hilcal.diagnosis.minimum_detectable_effect import least_strength
 from hilcal.diagnosis.stepwise import add, exchange, remove, trial
 from hilcal.drivers.simulated.injected_effects import hide
@@ -56,7 +61,7 @@ def test_what_is_not_there_is_needless_but_for_chance(mode, effects):
         judged = {n: score.p_value for n, score in backward_elimination(found).items()}
         p_values += [judged.get(name, 0.0) for name in effects]
     assert set(effects) >= set(judged)
-    kept = sum(p < CHANCE for p in p_values)
+    kept = sum(p < REDUNDANCY_LEVEL for p in p_values)
     assert kept <= 4  # a chance of 0.001 for more, at one in a hundred
     for share in (0.25, 0.5, 0.75):
         below = np.mean(np.array(p_values) < share)
@@ -121,7 +126,7 @@ def test_algebra_tells_what_a_refit_would_of_an_effect_and_of_others_in_its_plac
     other = StepwiseAlternatives(full).of("hysteresis")
     own = scores.pop("hysteresis").log_evidence
     assert own > 30.0
-    assert other.own == pytest.approx(own, rel=0.03)
+    assert other.effect_log_evidence == pytest.approx(own, rel=0.03)
     assert own > max(found.log_evidence for found in scores.values()) + 30.0
     assert not other.better
     assert not other.as_good
@@ -131,15 +136,15 @@ def test_effects_added_by_algebra_explain_what_they_do_in_a_fit():
     """Evidence of a chain against that of adding its effects one by one, each refitted."""
     full = _two_in_the_guise_of_one().steps[-1].fit
     other = StepwiseAlternatives(full).of("link_geometry")
-    assert {*other.others} == {"encoder_offset", "tracker_drift"}
+    assert {*other.replacements} == {"encoder_offset", "tracker_drift"}
     assert other.better
     current, total = remove(full, "link_geometry"), 0.0
-    for name in other.others:
+    for name in other.replacements:
         p = linearise(current)
         (found,) = (s for s in rank_suspects(p, candidates(current)) if s.effect == name)
         total += found.score.log_evidence
         current = add(current, name)
-    total -= PRICE * (len(other.others) - 1)
+    total -= PRICE_OF_EFFECT * (len(other.replacements) - 1)
     assert other.log_evidence == pytest.approx(total, rel=0.05)
 
 

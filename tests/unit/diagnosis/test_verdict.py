@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from hilcal.diagnosis.background_evidence import background_evidence, p_value_of_others, proved
-from hilcal.diagnosis.diagnosis import LARGEST, PRIOR_ODDS, History, effect_probabilities, in_doubt
+from hilcal.diagnosis.diagnosis import (
+    LARGEST_LOG_EVIDENCE,
+    PRIOR_ODDS,
+    History,
+    effect_probabilities,
+    in_doubt,
+)
 from hilcal.diagnosis.evidence import Alternative, Evidence
 from hilcal.diagnosis.verdict import diagnose, judge
 from hilcal.identification.background import with_background
@@ -165,7 +171,7 @@ def test_others_share_the_probability_of_what_they_may_stand_for():
 
 def test_no_evidence_is_a_certainty():
     p = effect_probabilities([step({"a": 1e6, "b": -1e6})], "ab")
-    assert odds(p["a"]) == pytest.approx(PRIOR_ODDS * np.exp(LARGEST - 1.0), rel=1e-2)
+    assert odds(p["a"]) == pytest.approx(PRIOR_ODDS * np.exp(LARGEST_LOG_EVIDENCE - 1.0), rel=1e-2)
     assert 0.0 < p["b"] < 1e-12
 
 

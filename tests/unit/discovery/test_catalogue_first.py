@@ -8,10 +8,15 @@ import numpy as np
 import pytest
 
 from hilcal.discovery.discovery import Discovery, discovery_json
-from hilcal.discovery.known_effects import Instead, instead_of_law, known_effects, tells_more
+from hilcal.discovery.known_effects import (
+    Replacement,
+    effects_replacing_law,
+    known_effects,
+    needed_beside_effect,
+)
 from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.screen import LawTerm, screen
-from hilcal.discovery.search import LEAST, Selection
+from hilcal.discovery.search import LEAST_LOG_ODDS, Selection
 from hilcal.effects.protocol import EffectSpec
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.fit import fit
@@ -48,7 +53,7 @@ def test_a_law_is_told_beside_an_effect_only_where_it_is_another(power, size, mo
     known = known_effects(campaign())
     chosen = Selection((own,), (size**2 / 2,))
     try:
-        assert tells_more(p, chosen, known, "joint_stiffening") is more
+        assert needed_beside_effect(p, chosen, known, "joint_stiffening") is more
     finally:
         p.residual = noise
 
@@ -64,7 +69,7 @@ def test_a_large_effect_is_named_by_its_exact_refit(shift, named):
     known = known_effects(fitted)
     assert known.names[0] == "load_point"
     law = Selection((term(p, 0.5),), (known.total + 20.0,))
-    assert instead_of_law(fitted, p, law, known) == Instead(named)
+    assert effects_replacing_law(fitted, p, law, known) == Replacement(named)
 
 
 def test_no_refit_fails_in_silence(monkeypatch):
@@ -76,16 +81,20 @@ def test_no_refit_fails_in_silence(monkeypatch):
     fitted = _with_load_off(0.2)
     p, known = SearchProblem(screen(linearise(fitted))), known_effects(fitted)
     law = Selection((term(p, 0.5),), (known.total + 20.0,))
-    module = sys.modules[instead_of_law.__module__]
+    module = sys.modules[effects_replacing_law.__module__]
     with monkeypatch.context() as m:
-        m.setattr(module, "exact", fails)
-        assert instead_of_law(fitted, p, law, known).names == ()  # far less likely by algebra
-        near = Selection((term(p, 0.5),), (known.total + LEAST,))
-        m.setattr(module, "_exact_effects", lambda *_: (known.total + 1.0, Instead(known.names)))
-        assert instead_of_law(fitted, p, near, known).names == known.names
+        m.setattr(module, "refit_exactly", fails)
+        assert (
+            effects_replacing_law(fitted, p, law, known).names == ()
+        )  # far less likely by algebra
+        near = Selection((term(p, 0.5),), (known.total + LEAST_LOG_ODDS,))
+        m.setattr(
+            module, "_exact_effects", lambda *_: (known.total + 1.0, Replacement(known.names))
+        )
+        assert effects_replacing_law(fitted, p, near, known).names == known.names
     monkeypatch.setattr(module, "add", fails)
-    found = instead_of_law(fitted, p, law, known)
-    assert found == Instead((), ((known.names[0], "it finds no equilibrium"),))
+    found = effects_replacing_law(fitted, p, law, known)
+    assert found == Replacement((), ((known.names[0], "it finds no equilibrium"),))
     answer = Discovery(fitted, "no_law", unfitted=found.unfitted)
     assert "load_point could not be tried in the exact model (it finds no eq" in silence(answer)
     assert discovery_json(answer)["unfitted"] == [

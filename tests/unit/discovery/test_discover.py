@@ -13,7 +13,7 @@ from hilcal.discovery.amplitudes import Amplitude, Factor, variables
 from hilcal.discovery.discovery import Discovery, LawSearch, discover, discovery_json, laws_json
 from hilcal.discovery.law import Form, LawPart, effect_class, source_of_form
 from hilcal.discovery.problem import SearchProblem
-from hilcal.discovery.refit import exact
+from hilcal.discovery.refit import refit_exactly
 from hilcal.discovery.screen import LawTerm, Screen, screen
 from hilcal.discovery.search import Selection, search, worth_their_length
 from hilcal.discovery.sites import ORDINARY
@@ -71,7 +71,7 @@ def test_what_is_written_is_an_effect_that_lowers_the_error():
     model = before.model + kind(before.model.cell, before.readings.states)
     after = fit(model, before.readings, before.mode)
     assert after.holdout.rms_m < 0.6 * before.holdout.rms_m
-    assert after.variance_factor == pytest.approx(d.laws[0].left, rel=1e-3)
+    assert after.variance_factor == pytest.approx(d.laws[0].variance_factor, rel=1e-3)
     assert after.parameters["bent.a"].value == pytest.approx(
         d.laws[0].parameters[0].value, rel=1e-4
     )
@@ -104,7 +104,7 @@ def test_a_refinement_adds_the_law_and_its_file_gives_it_back(tmp_path, monkeypa
 def test_nothing_is_searched_where_the_model_is_adequate(tmp_path):
     before, laws = campaign(), LawSearch(tmp_path)
     assert refine(before.model, before.readings, before.mode, laws=laws).verdict == "adequate"
-    assert laws.found == []
+    assert laws.discoveries == []
     assert hc.refine(before.model, before.readings, discover=tmp_path).verdict == "adequate"
     assert [*tmp_path.iterdir()] == []
     with pytest.raises(InputError, match="no such folder"):
@@ -263,11 +263,11 @@ def test_a_number_that_the_model_absorbs_is_dropped():
     """The zero of a compliance that is no constant: the model has one already."""
     form = with_zero("τ_3")
     assert form.text() == "dq_3 = a·τ_3 + b·cos(q_4)·τ_3"
-    after, kept, values, kind = exact(screened(), form, "kept")
+    after, kept, values, kind = refit_exactly(screened(), form, "kept")
     assert kept.text() == "dq_3 = a·cos(q_4)·τ_3"
     assert [c.name for c in values] == ["a"]
     assert abs(values[0].value) > 10 * values[0].std
-    assert after.variance_factor == pytest.approx(found().laws[0].left, rel=1e-3)
+    assert after.variance_factor == pytest.approx(found().laws[0].variance_factor, rel=1e-3)
     check_effect(kind)
 
 
@@ -278,7 +278,7 @@ def test_a_law_whose_refit_fails_is_named_with_the_reason(monkeypatch):
 
     module = sys.modules[discover.__module__]
     monkeypatch.setattr(module, "search", lambda *_, **__: searched())
-    monkeypatch.setattr(module, "exact", fails)
+    monkeypatch.setattr(module, "refit_exactly", fails)
     d = discover(campaign(LAW), name="bent")
     assert d.reason == "no_law"
     said = silence(d)

@@ -13,7 +13,7 @@ from hilcal.discovery.curve import curves
 from hilcal.discovery.discovery import agreement, discover
 from hilcal.discovery.grammar import grammar
 from hilcal.discovery.law import Form, LawPart, effect_class, source_of_form
-from hilcal.discovery.refit import exact, left_by, refine
+from hilcal.discovery.refit import refine, refit_exactly, rss_with_law
 from hilcal.discovery.screen import screen
 from hilcal.discovery.sites import sites
 from hilcal.effects.check import check_effect, example_cell, example_situation, example_states
@@ -80,7 +80,7 @@ def test_a_one_sided_law_is_an_effect_also_where_nothing_hangs(shape, numbers, j
 
 
 def test_fine_waves_are_tried_up_to_the_number_of_poses_and_in_no_product(monkeypatch):
-    monkeypatch.setattr(products, "MOST", 3)
+    monkeypatch.setattr(products, "MOST_COMPLEXITY", 3)
     s = example()
     words = grammar([v for v in variables(s) if v.kind == "angle"][:2], s, 14)
     fine = [a for a in words.amplitudes if any(f.shape.cost == 3 for f in a.factors)]
@@ -188,11 +188,11 @@ def test_levels_weights_and_exponents_are_refined_together():
     level = float(np.quantile(u.read(s), 0.5))
     begin = Form((LawPart(sites(6)[2], product(Factor(u, shapes.ABOVE, (level,))), 0),))
     after = refine(at, begin)
-    assert left_by(at, after, s) < 0.5 * left_by(at, begin, s)
+    assert rss_with_law(at, after, s) < 0.5 * rss_with_law(at, begin, s)
     (bent,) = after.parts[0].amplitude.factors
     assert isinstance(bent.variable, Composed)
     ((_, one), (weight, two)) = bent.variable.terms
     assert (one, two) == (lever, other)
     assert abs(weight) < 0.1
     assert bent.numbers != (level,)
-    exact(at, after, "refined")
+    refit_exactly(at, after, "refined")

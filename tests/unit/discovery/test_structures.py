@@ -165,8 +165,8 @@ def products(s, count):
     seen = s.square > 0
     out = []
     rng = np.random.default_rng(3)
-    for f in rng.permutation(np.flatnonzero((words.less >= 0).all(axis=0))).tolist():
-        one, two = words.less[:, f].tolist()
+    for f in rng.permutation(np.flatnonzero((words.without_factor >= 0).all(axis=0))).tolist():
+        one, two = words.without_factor[:, f].tolist()
         places = np.flatnonzero(seen[:, f] & seen[:, one] & seen[:, two])
         if len(places):
             out.append((int(rng.choice(places)), f))
@@ -196,7 +196,7 @@ def test_a_pair_is_found_of_which_neither_part_explains_anything_alone():
 def _nearly_alike(s):
     """A product of a site, a factor of it alone, and the unit direction between their columns."""
     for place, f in products(s, 1000):
-        for less in s.grammar.less[:, f].tolist():
+        for less in s.grammar.without_factor[:, f].tolist():
             free = s.linear.project_out(s.columns([(place, f), (place, less)]))
             unit = free / np.linalg.norm(free, axis=0)
             cosine = float(unit[:, 0] @ unit[:, 1])

@@ -12,7 +12,7 @@ import pytest
 
 from hilcal.effects.catalogue import installed
 from hilcal.model.model import Model
-from hilcal.readings.covariance import WHOLE
+from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.table import write_table
 from hilcal.types import Floats
@@ -52,7 +52,7 @@ def case(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tables")
     truth = 2e-6 * np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
     for k, name in enumerate(("fitted", "unseen")):
-        write_table(with_the_law(truth, k, 0), folder / f"{name}.csv", WHOLE)
+        write_table(with_the_law(truth, k, 0), folder / f"{name}.csv", INSTRUMENT_AND_ARM)
     return Case(folder / "fitted.csv", folder / "unseen.csv", truth)
 
 

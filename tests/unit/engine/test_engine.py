@@ -189,7 +189,7 @@ def test_what_is_no_cluster_is_said_in_one_line(workers, address, message):
 
 
 def test_a_scheduler_without_workers_is_refused(monkeypatch):
-    monkeypatch.setattr("hilcal.engine.WORKERS_S", 0.2)
+    monkeypatch.setattr("hilcal.engine.WORKERS_TIMEOUT_S", 0.2)
     with (
         scheduler() as address,
         pytest.raises(ClusterError, match="dask worker"),

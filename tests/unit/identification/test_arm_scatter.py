@@ -19,7 +19,7 @@ from hilcal.identification.full_covariance import with_common_scatter, with_join
 from hilcal.identification.linearisation import effect_columns, linearise
 from hilcal.identification.registration import register
 from hilcal.present.verdict import message
-from hilcal.readings.covariance import COVERS, INSTRUMENT
+from hilcal.readings.covariance import COVERS_KEY, INSTRUMENT
 from hilcal.readings.readings import ArmScatter
 from hilcal.readings.whitening import whitening
 from hilcal.robot import se3
@@ -227,7 +227,7 @@ def test_refine_ends_with_the_scatter_in_the_fit_and_the_file_keeps_it(tmp_path)
     }
     tracker, none = config.tracker.model_copy(update=base), type(config.repeatability)()
     config = config.model_copy(update={"repeatability": none, "tracker": tracker})
-    path, about = tmp_path / "run.hilcal", {COVERS: INSTRUMENT}
+    path, about = tmp_path / "run.hilcal", {COVERS_KEY: INSTRUMENT}
     with CampaignFile.create(path, config.to_json(), str(tmp_path), "made", more=about) as file:
         file.append_readings(readings)
     with hc.Campaign.open(path) as run:

@@ -137,7 +137,7 @@ def test_bands_do_not_depend_on_how_large_the_noise_is_stated(series):
         known = predictive_of(fit)
         prediction = fit.model.predict(test.states, fit.theta)
         of = replace(test, covariance=by * test.covariance, scatter_stated=True)
-        total = known.of_reading(prediction, whitening(of, "absolute", "gc"))
+        total = known.reading_covariance(prediction, whitening(of, "absolute", "gc"))
         off = test.value - prediction.observation.position
         inside = np.einsum("ni,nij,nj->n", off, np.linalg.inv(total), off) < chi2.ppf(0.95, 3)
         assert 0.85 < inside.mean() <= 1.0

@@ -10,15 +10,20 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.data_snooping import (
-    CHANCE,
-    Snooping,
+    SITE_LEVEL,
+    DataSnooping,
     along_one_site,
     linearised,
     site_columns,
 )
 from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import notes, outliers
-from hilcal.identification.least_trimmed_squares import FALSE_ALARMS, ReadingModel, bulk, limit
+from hilcal.identification.least_trimmed_squares import (
+    FALSE_ALARMS,
+    ReadingModel,
+    bulk_scale,
+    rejection_limit,
+)
 from hilcal.identification.misdescription import examine
 from hilcal.identification.registration import register
 from hilcal.present.verdict import message
@@ -109,7 +114,7 @@ def test_good_readings_are_called_gross_once_in_a_thousand_campaigns(m, factor, 
     rng, alarms = np.random.default_rng(m), 0
     for _ in range(tried):
         distance2 = factor * rng.chisquare(m, 150)
-        alarms += bool((distance2 > limit(m, 150, bulk(distance2, m))).any())
+        alarms += bool((distance2 > rejection_limit(m, 150, bulk_scale(distance2, m))).any())
     expected = FALSE_ALARMS * tried
     assert alarms <= poisson.isf(1e-4, expected)
     assert factor > 1 or alarms >= poisson.ppf(1e-4, expected)
@@ -127,7 +132,7 @@ def test_clean_campaigns_keep_all_their_readings(tried):
 
 
 def test_the_limit_moves_away_gradually_as_the_bulk_grows_beyond_chance():
-    far = [limit(3, 150, scale) for scale in (1.0, 1.2, 1.31, 1.4, 1.5, 2.0)]
+    far = [rejection_limit(3, 150, scale) for scale in (1.0, 1.2, 1.31, 1.4, 1.5, 2.0)]
     assert far == sorted(far)
     assert far[2] < 2.1 * far[0]
     for k, factor in ((1, 1.2), (4, 1.5 * 2.5**2), (5, 2.0 * 2.5**2)):
@@ -324,7 +329,7 @@ def test_random_errors_are_along_no_site():
         for number in (1, 5, 40, 80)
         for size in np.geomspace(6, 600, tried // 4)
     )
-    assert binom.sf(wrong - 1, tried, CHANCE) > 1e-3
+    assert binom.sf(wrong - 1, tried, SITE_LEVEL) > 1e-3
 
 
 @pytest.mark.parametrize("sizes", [[100.0] * 6, [100, 50, -100, 60, 30, -80]])
@@ -412,7 +417,7 @@ def test_a_step_of_the_linear_model_is_that_of_the_fit(mode, m):
     c = campaign("none", mode, poses=12, m=m)
     found = based(c.cell, c.readings, mode)
     y = found.solution.y
-    of = linearised(Snooping(found.model, c.readings, mode, found.solution, y), y).linear
+    of = linearised(DataSnooping(found.model, c.readings, mode, found.solution, y), y).linear
     delta, covariance = of.fitted(of.tested)
     assert np.abs(delta / np.sqrt(np.diagonal(covariance))).max() < 1e-2
     left = of.residuals(of.tested)

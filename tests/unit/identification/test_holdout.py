@@ -10,10 +10,10 @@ from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import fit
 from hilcal.identification.folds import (
     block_folds,
-    changes,
     distinct_poses,
     leave_out,
-    ordinary,
+    ordinary_magnitudes,
+    parameter_changes,
     random_folds,
     region_folds,
 )
@@ -45,10 +45,10 @@ def test_leaving_out_is_refitting_without(mode, m):
     solution = solve(model, readings, w, found.theta)
     left_out = leave_out(model, solution, fold, w)
     np.testing.assert_allclose(left_out, found.left_out, rtol=0, atol=1e-9)
-    changed = changes(model, solution, fold, w)
+    changed = parameter_changes(model, solution, fold, w)
     assert len(changed) == 10
     noise, sigma = found.uncertainty.formal, np.sqrt(np.einsum("dii->di", w.covariance))
-    known = ordinary(model, found.theta)
+    known = ordinary_magnitudes(model, found.theta)
     prior = np.where(np.isinf(solution.prior), known, solution.prior)
     moved = []
     for f, change in enumerate(changed):

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
 from hilcal.identification.baseline import baseline
-from hilcal.identification.hypotheses import Described, Hypothesis
+from hilcal.identification.hypotheses import Description, Hypothesis
 from hilcal.identification.misdescription import BEYOND_NOISE, examine, other_arm, other_arm_of
 from hilcal.identification.registration import register
 from hilcal.identification.table_preview import clearly_best, rank_conventions
@@ -29,7 +29,7 @@ PLAIN = told(BASE, np.eye(4), False, False)
 def readings_of(change=None, m=3):
     """Readings by an arm that is otherwise than the catalogue's, at the same joint values."""
     q = np.random.default_rng(2).uniform(-2, 2, (40, 6))
-    nothing = Described(CELL.arm, q, q[:, :3], None, True, True)
+    nothing = Description(CELL.arm, q, q[:, :3], None, True, True)
     return by_arm(CELL.arm if change is None else change.applied(nothing).arm, q, m)
 
 

@@ -112,8 +112,8 @@ def test_a_deflection_has_it_once():
         np.trace(wide.covariance[:, :3, :3] - r.covariance[:, :3, :3], axis1=1, axis2=2), 1.5e-10
     )
     np.testing.assert_allclose(wide.covariance[:, 3:, 3:], 4 * r.covariance[:, 3:, 3:])
-    assert replace(more, position=1.01e-10).near(more)
-    assert not Excess().near(more)
+    assert replace(more, position=1.01e-10).is_close(more)
+    assert not Excess().is_close(more)
 
 
 def split(seed, joint):

@@ -11,7 +11,7 @@ from hilcal.config import load_config
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.torques import check_torques
-from hilcal.readings.covariance import WHOLE
+from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.rows import content_hash
 from hilcal.tables.table import write_table
@@ -79,7 +79,7 @@ def test_compliances_by_measured_torques_do_not_need_the_loads():
 
 def test_tables_and_files_keep_the_torques(tmp_path):
     readings, arm = campaign(0), cell_of().arm
-    write_table(readings, tmp_path / "t.csv", WHOLE)
+    write_table(readings, tmp_path / "t.csv", INSTRUMENT_AND_ARM)
     back = read_table(tmp_path / "t.csv", arm, None)
     np.testing.assert_array_equal(back.states.torque, readings.states.torque)
     with CampaignFile.create(tmp_path / "r.hilcal", "{}", ".", "test") as file:
@@ -92,7 +92,7 @@ def test_tables_and_files_keep_the_torques(tmp_path):
 
 
 def test_commands_say_what_the_load_weighs(tmp_path, capsys):
-    write_table(campaign(1, hung=0.49, friction=0.3), tmp_path / "t.csv", WHOLE)
+    write_table(campaign(1, hung=0.49, friction=0.3), tmp_path / "t.csv", INSTRUMENT_AND_ARM)
     config = tmp_path / "cell.toml"
     config.write_text(CELL.read_text())
     run = tmp_path / "r.hilcal"

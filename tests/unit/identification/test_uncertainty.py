@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from hilcal.engine import open_engine
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.bootstrap import again, bootstrap
+from hilcal.identification.bootstrap import bootstrap, resample
 from hilcal.identification.carried import prior_of
 from hilcal.identification.fit import fit
 from hilcal.identification.folds import distinct_poses
@@ -197,7 +197,7 @@ def test_the_bits_depend_on_the_seed_and_not_on_the_workers():
 
 def test_a_draw_has_whole_poses_each_copy_with_its_own_unloaded_reading():
     readings = campaign("none", "deflection", poses=12).readings
-    found = again(readings, distinct_poses(readings), np.random.default_rng(4))
+    found = resample(readings, distinct_poses(readings), np.random.default_rng(4))
     size, count = len(readings) // 12, np.bincount(found.pose)
     assert count.tolist() == [size] * 12
     assert len(found.pose_names) == 12
@@ -212,7 +212,7 @@ def test_two_names_of_one_pose_are_drawn_together():
     readings = campaign("none", "deflection", poses=12).readings
     twice = Readings.joined([readings, replace(readings, pose=readings.pose + 12)])
     twice = replace(twice, pose_names=tuple(f"p{k}" for k in range(24)))
-    names = set(again(twice, distinct_poses(twice), np.random.default_rng(4)).pose_names)
+    names = set(resample(twice, distinct_poses(twice), np.random.default_rng(4)).pose_names)
     assert {f"p{(int(n[1:]) + 12) % 24}" for n in names} == names
 
 

@@ -9,7 +9,7 @@ from scipy.stats import kstest
 from hilcal.mixed.equations import _ByColumns, _ByRows, equations, left_out
 from hilcal.mixed.families import Families, Family, LogStdPrior
 from hilcal.mixed.problem import Noise, independent_rows, mixed_problem
-from hilcal.mixed.variances import estimate_variances, evidence, predict
+from hilcal.mixed.variances import coordinates_covariance, estimate_variances, evidence
 
 FLAT = LogStdPrior(0.0, 3.0)
 
@@ -137,6 +137,13 @@ def test_standard_deviations_are_found_where_the_rows_tell_them():
     spread = found.std(axis=0) / np.sqrt(len(found))
     assert np.all(np.abs(found.mean(axis=0) - true) < 4 * spread + 0.1 * np.array([3, 1, 0]))
     # the family of three is skewed downwards: half a third of a χ² with three degrees of freedom
+
+
+def predict(variances, jacobian):
+    """The best linear unbiased prediction of rows that were not measured, and its covariance."""
+    x = variances.equations.problem.coordinates(jacobian)
+    covariance = coordinates_covariance(variances)
+    return x @ variances.equations.coordinates, x @ covariance @ np.swapaxes(x, -1, -2)
 
 
 @pytest.mark.parametrize("groups", [8, 12])

@@ -25,7 +25,7 @@ from hilcal.present.html.report import page as page_of
 from hilcal.present.story import Chapter
 from hilcal.refinement import Refinement, RefinementStep
 from hilcal.store.overview import MeasuringDevice
-from hilcal.write_report import Asked, content_of
+from hilcal.write_report import ReportOptions, content_of
 from tests.support.browser import DESKTOP, PHONE, needs_chromium, open_browser
 from tests.support.outline import Outline
 from tests.support.picture import pixels
@@ -146,7 +146,7 @@ def test_a_limit_of_the_cell_is_not_judged_by_a_campaign_that_was_fitted(tmp_pat
     write_campaign(path)
     shutil.copy(path, same)
     with Campaign.open(path) as run, Campaign.open(same) as other:
-        m = content_of(run, Asked(validation=other))
+        m = content_of(run, ReportOptions(validation=other))
     words, passed = limit_words(replace(m, limit_m=1e-3))
     assert passed
     assert words.startswith("PASSED")

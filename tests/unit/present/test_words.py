@@ -18,7 +18,7 @@ from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.options import typical_compliances
 from hilcal.identification.fit_document import to_json
-from hilcal.identification.full_prediction import error_before, full_prediction
+from hilcal.identification.full_prediction import full_prediction, nominal_error
 from hilcal.identification.linearisation import linearise
 from hilcal.present.diagnosis import curves, diagnosis_report, suspects_table
 from hilcal.present.fit import before_and_after, errors, fit_report, where_table, worst_poses
@@ -135,7 +135,7 @@ def shown(printed):
 def test_before_a_deflection_is_what_was_measured():
     f = fitted("deflection", "base_compliance")
     measured = np.linalg.norm(f.whitening.raw(f.readings.value[:, :3]), axis=1)
-    before = error_before(f)
+    before = nominal_error(f)
     assert before.rms_m == pytest.approx(float(np.sqrt(np.mean(measured**2))), rel=1e-9)
     assert before.max_m == pytest.approx(float(measured.max()), rel=1e-9)
     said = before_and_after(f)
@@ -145,7 +145,7 @@ def test_before_a_deflection_is_what_was_measured():
 
 def test_before_of_positions_is_the_rigid_arm_in_frames_of_its_own(absolute, shown):
     """Compliances alone are put to zero; they sag by about torque times compliance."""
-    before, torque = error_before(absolute), absolute.solution.prediction.situation.torque
+    before, torque = nominal_error(absolute), absolute.solution.prediction.situation.torque
     turned = torque * typical_compliances(absolute.model.cell)
     assert absolute.error.rms_m < 0.2 * before.rms_m
     assert 0.1 * np.abs(turned).max() < before.rms_m < 3.0 * np.abs(turned).sum(axis=1).max()

@@ -12,7 +12,7 @@ from hilcal.config.reference import to_toml
 from hilcal.identification.carried import carried_prior
 from hilcal.library import load_posterior
 from hilcal.procedure.state import DECIDED, FROZEN
-from hilcal.readings.same_readings import already
+from hilcal.readings.same_readings import found_among
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import REFERENCE
 from hilcal.store.procedure_log import ProcedureLog, purpose_of, release
@@ -89,7 +89,7 @@ def test_validation_poses_lie_within_what_was_measured_and_are_new(done):
     own = np.array([unseen.pose_names[k] != REFERENCE for k in unseen.pose])
     apart = np.abs(new[own][:, None] - q[None]).max(axis=2)
     assert apart.min() > 0.01
-    assert not already(unseen, fitted).any()
+    assert not found_among(unseen, fitted).any()
 
 
 def test_the_corrected_run_is_at_other_joint_values(done):

@@ -6,7 +6,11 @@ import pytest
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.gauss_newton import effective_parameters
-from hilcal.identification.uncertainty import HIDDEN, dropped_group_factors, hyperparameter_factors
+from hilcal.identification.uncertainty import (
+    DROPPED_VARIANCE,
+    dropped_group_factors,
+    hyperparameter_factors,
+)
 from hilcal.identification.validation import validate
 from hilcal.regression.empirical_bayes import (
     FamilyProblem,
@@ -306,7 +310,7 @@ def test_what_a_dropped_group_could_do_widens_what_it_is_confused_with():
     # As if the dropped ones were in the model, with a prior of their size.
     inverse = np.linalg.inv(h)
     free = dropped - kept @ inverse @ kept.T @ dropped
-    prior = np.sum(free**2, axis=0) / HIDDEN
+    prior = np.sum(free**2, axis=0) / DROPPED_VARIANCE
     full = np.hstack([kept, dropped])
     joint = np.linalg.inv(full.T @ full + np.diag([0.0, 0.0, 0.0, *prior]))
     np.testing.assert_allclose(factor, np.sqrt(np.diag(joint)[:3] / np.diag(inverse)), rtol=1e-6)

@@ -8,7 +8,7 @@ from scipy import stats
 from scipy.stats import beta
 
 from hilcal.regression.evidence import (
-    NOTHING,
+    NO_EVIDENCE,
     STRENGTHS,
     family_power,
     noncentrality_of_power,
@@ -90,7 +90,7 @@ def test_directions_that_cannot_be_seen_count_for_nothing():
     of = problem("rank deficient")
     assert of.x.shape[1] == 6
     assert score(of).rank == 4
-    assert score(of, 1e-4 * of.x) is NOTHING
+    assert score(of, 1e-4 * of.x) is NO_EVIDENCE
     assert list(visible(np.array([-1e-3, 1e-5, 1.0]))) == [False, False, True]
 
 

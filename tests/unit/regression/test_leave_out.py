@@ -69,16 +69,16 @@ def test_simulated_residuals_are_predicted_as_by_refits_without_their_fold(ridge
         left = found.left_out(y, again)
     alone = FamilyFolds(each, p).left_out(y)
     for fold in each:
-        rows, stay = p.rows[fold.out], ~fold.out
+        rows, stay = p.rows[fold.left_out_rows], ~fold.left_out_rows
         h = np.linalg.inv(fold.inverse_root.T @ fold.inverse_root)
         cross = p.rows[stay].T @ x[stay]
         own = x[stay].T @ x[stay] + ridge * np.eye(2)
         rhs = np.vstack([p.rows[stay].T @ y[stay], x[stay].T @ y[stay]])
         step = np.linalg.solve(np.block([[h, cross], [cross.T, own]]), rhs)
-        expected = y[fold.out] - np.hstack([rows, x[fold.out]]) @ step
-        np.testing.assert_allclose(left[fold.out], expected, atol=1e-8)
-        plain = y[fold.out] - rows @ np.linalg.solve(h, p.rows[stay].T @ y[stay])
-        np.testing.assert_allclose(alone[fold.out], plain, atol=1e-8)
+        expected = y[fold.left_out_rows] - np.hstack([rows, x[fold.left_out_rows]]) @ step
+        np.testing.assert_allclose(left[fold.left_out_rows], expected, atol=1e-8)
+        plain = y[fold.left_out_rows] - rows @ np.linalg.solve(h, p.rows[stay].T @ y[stay])
+        np.testing.assert_allclose(alone[fold.left_out_rows], plain, atol=1e-8)
 
 
 @pytest.mark.parametrize("out", [[0], [2, 3], [4, 5], [0, 1, 4]])

@@ -142,7 +142,7 @@ def test_an_arm_that_is_unlike_the_others_is_named_and_leaves_the_spread_alone()
     of, _ = fleet(3, odd=(7, 4, 8.0))
     h, named = hierarchy(of)
     assert [(o.unit, o.parameter) for o in named] == [(7, 4)]
-    assert named[0].off == pytest.approx(8.0, abs=4 * BETWEEN[4])
+    assert named[0].deviation == pytest.approx(8.0, abs=4 * BETWEEN[4])
     ordinary, _ = hierarchy(fleet(3)[0])
     assert np.sqrt(h.between[4]) == pytest.approx(np.sqrt(ordinary.between[4]), rel=0.1)
 

@@ -202,7 +202,7 @@ def plan(poses):
 
 
 def test_a_plan_of_too_many_poses_and_a_list_without_end(tmp_path, monkeypatch):
-    monkeypatch.setattr(limits, "PLANNED", 50)
+    monkeypatch.setattr(limits, "PLANNED_POSES", 50)
     path = tmp_path / "plan.json"
     path.write_text(plan(50).to_json())
     assert len(load_plan(path).steps) == 50
@@ -226,10 +226,10 @@ def test_readings_beyond_what_is_fitted_are_neither_stored_nor_read(tmp_path, mo
     readings, path = made.readings, tmp_path / "run.hilcal"
     with CampaignFile.create(path, configuration().to_json(), str(tmp_path), "test") as file:
         file.append_readings(readings)
-        monkeypatch.setattr(limits, "FITTED", readings.m * len(readings))
+        monkeypatch.setattr(limits, "FITTED_ELEMENTS", readings.m * len(readings))
         assert len(file.readings()) == len(readings)
         refusal(f"at most {len(readings)} in a campaign", file.append_readings, readings[:1])
-        monkeypatch.setattr(limits, "FITTED", readings.m * len(readings) - 1)
+        monkeypatch.setattr(limits, "FITTED_ELEMENTS", readings.m * len(readings) - 1)
         refusal(rf"run\.hilcal: {len(readings)} readings", file.readings)
     refusal(f"{len(readings)} readings of 3 elements", hc.baseline, made.cell, readings)
     write_table(readings, tmp_path / "t.csv", INSTRUMENT)
@@ -242,7 +242,7 @@ def test_many_repeats_of_one_unloaded_reading_make_no_matrix(monkeypatch):
     many = readings[np.tile(one, 40)]
     groups = deflection_groups(replace(many, common=None))
     shared = groups[0][0].shape[1]
-    monkeypatch.setattr(limits, "SHARED", (shared * readings.m) ** 2 - 1)
+    monkeypatch.setattr(limits, "SHARED_COVARIANCE", (shared * readings.m) ** 2 - 1)
     refusal(f"{shared} loaded readings share one unloaded", deflection_groups, many)
 
 

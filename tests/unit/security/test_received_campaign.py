@@ -11,7 +11,7 @@ import pytest
 
 from hilcal.calibration.handover import urdf
 from hilcal.errors import InputError
-from hilcal.readings.covariance import COVERS, WHOLE
+from hilcal.readings.covariance import COVERS_KEY, INSTRUMENT_AND_ARM
 from hilcal.robot.catalogue import load_arm
 from hilcal.store import rows
 from hilcal.store.campaign_file import CampaignFile
@@ -53,7 +53,9 @@ FOREIGN = {
 
 
 def make(path, config, base=""):
-    with CampaignFile.create(path, config, base, "made", more={COVERS: WHOLE}) as file:
+    with CampaignFile.create(
+        path, config, base, "made", more={COVERS_KEY: INSTRUMENT_AND_ARM}
+    ) as file:
         file.append_readings(rehearsal("nothing", poses=8).readings)
     return path
 
