@@ -180,7 +180,7 @@ def _rigid(cell: Cell, q: Floats, pull: Floats) -> tuple[Floats, Floats]:
     """
     origin, none = np.eye(4), np.zeros(cell.arm.n)
     rigid = World(cell, Truth.rigid(cell.arm), origin, origin, SimulatedNoise(), none)
-    rest = rigid.rest(States(q=q, wrench=np.broadcast_to(pull, (len(q), 6))))
+    rest = rigid.equilibrium(States(q=q, wrench=np.broadcast_to(pull, (len(q), 6))))
     return rest.flange, rest.torque[:, rigid.drives]
 
 

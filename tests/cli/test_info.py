@@ -20,11 +20,17 @@ from hilcal.present.html.report import page
 from hilcal.readings.covariance import COVERS, INSTRUMENT
 from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.kept_texts import CALIBRATION_FILE, COMMAND, ROBOT_FILE, typed, typed_now
+from hilcal.store.kept_texts import (
+    CALIBRATION_FILE,
+    COMMAND,
+    ROBOT_FILE,
+    recording_command,
+    running_command,
+)
 from hilcal.store.overview import overview
 from hilcal.store.plan import Plan, Step
 from hilcal.store.run_log import RunLog, check_same_cell, create_run
-from hilcal.write_report import Asked, content_of
+from hilcal.write_report import ReportOptions, content_of
 from tests.support.campaigns import campaign, configuration
 from tests.support.cli_cases import CELL, ok, refused, rehearsal, stored_readings, table
 from tests.unit.discovery.test_discover import campaign as simulated
@@ -165,7 +171,9 @@ def test_a_measured_campaign_says_by_what_and_how_it_was_measured(measured, caps
 def test_a_campaign_that_holds_nothing_yet(tmp_path, capsys):
     path = tmp_path / "empty.hilcal"
     config = load_config(CELL).to_json()
-    CampaignFile.create(path, config, str(CELL.parent), "test", more={COVERS: INSTRUMENT}).close()
+    CampaignFile.create(
+        path, config, str(CELL.parent), "test", more_texts={COVERS: INSTRUMENT}
+    ).close()
     assert ok(capsys, "info", path, "--json").document["n_readings"] == 0
     assert "none yet" in ok(capsys, "info", path).out
     assert "no such campaign" in refused(capsys, 2, "info", tmp_path / "none.hilcal")
@@ -189,7 +197,7 @@ def test_a_revision_keeps_its_command_and_the_page_shows_it(run, capsys):
         o.append(o.fit())  # by the library: nobody has typed anything
         assert COMMAND not in o.file.revision(2).options
         assert overview(o.file).command == ""
-        m = content_of(o, Asked(appendix=True))
+        m = content_of(o, ReportOptions(appendix=True))
     html = page(m)
     assert "Commands as they were typed" in html
     assert "base_frame,joint_compliance" in html
@@ -199,11 +207,11 @@ def test_a_revision_keeps_its_command_and_the_page_shows_it(run, capsys):
 
 
 def test_a_campaign_keeps_the_command_that_made_it(tmp_path):
-    with typed(["hilcal", "import", "a table.csv"]):
+    with recording_command(["hilcal", "import", "a table.csv"]):
         content = configuration().to_json()
         with CampaignFile.create(tmp_path / "x.hilcal", content, "", "x") as file:
             assert file.about(COMMAND) == "hilcal import 'a table.csv'"
-    assert typed_now() == {}
+    assert running_command() == {}
 
 
 @pytest.fixture

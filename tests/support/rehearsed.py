@@ -6,7 +6,7 @@ import numpy as np
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import load_config
-from hilcal.drivers.simulated.injected_effects import nothing_hidden
+from hilcal.drivers.simulated.injected_effects import world_without_effect
 from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.drivers.simulated.world import World
 from hilcal.readings.readings import Readings
@@ -35,7 +35,7 @@ def rehearsed(poses: int, seed: int) -> Rehearsed:
     )
     states = replace(states, load_time=None)
     std = config.repeatability.per_joint(cell.arm.n)
-    world = nothing_hidden(cell, rng, noise=measurement_noise(config), joint_std=std)
+    world = world_without_effect(cell, rng, noise=measurement_noise(config), joint_std=std)
     names = ("none", *(name for name, _ in loads))
     readings = simulate(world, states, pose, load, cycle, names, rng)
     return Rehearsed(cell, world, readings, pose, cycle)

@@ -12,7 +12,7 @@ from hilcal.campaign.campaign import Campaign
 from hilcal.present.html.report import ReportContent
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.write_report import Asked, content_of
+from hilcal.write_report import ReportOptions, content_of
 from tests.support.campaigns import campaign, configuration
 
 EVIL = "<script>window.harmed = 1</script>"
@@ -35,7 +35,7 @@ def small_content(folder: Path) -> ReportContent:
     path = folder / "a&<b>.hilcal"
     write_campaign(path)
     with Campaign.open(path) as run:
-        return content_of(run, Asked(limit_m=1e-3, operator=EVIL, appendix=True))
+        return content_of(run, ReportOptions(limit_m=1e-3, operator=EVIL, appendix=True))
 
 
 @contextmanager

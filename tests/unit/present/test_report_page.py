@@ -18,14 +18,14 @@ from hilcal.present.html.report import (
     first_screen,
     left_out_errors,
     limit_words,
+    misfit_sentence,
     sections,
-    where_wrong,
 )
 from hilcal.present.html.report import page as page_of
 from hilcal.present.story import Chapter
 from hilcal.refinement import Refinement, RefinementStep
 from hilcal.store.overview import MeasuringDevice
-from hilcal.write_report import Asked, content_of
+from hilcal.write_report import ReportOptions, content_of
 from tests.support.browser import DESKTOP, PHONE, needs_chromium, open_browser
 from tests.support.outline import Outline
 from tests.support.picture import pixels
@@ -146,7 +146,7 @@ def test_a_limit_of_the_cell_is_not_judged_by_a_campaign_that_was_fitted(tmp_pat
     write_campaign(path)
     shutil.copy(path, same)
     with Campaign.open(path) as run, Campaign.open(same) as other:
-        m = content_of(run, Asked(validation=other))
+        m = content_of(run, ReportOptions(validation=other))
     words, passed = limit_words(replace(m, limit_m=1e-3))
     assert passed
     assert words.startswith("PASSED")
@@ -168,7 +168,7 @@ def test_poses_left_out_beyond_the_noise_are_not_said_to_be_within_it(made, sigm
     m, fit = made[0], replace(made[0].fit)
     calm = replace(m.diagnosis, reason="residual_is_noise")
     fit.__dict__["holdout"] = replace(m.fit.holdout, rms_sigma=sigma)
-    said = where_wrong(replace(m, chapters=(Chapter(1, None, fit, calm),)))
+    said = misfit_sentence(replace(m, chapters=(Chapter(1, None, fit, calm),)))
     assert ("all poses and loads are predicted within it" in said) == within
     assert (f"by {sigma:.2f} times the noise" in said) != within
 

@@ -53,7 +53,7 @@ FOREIGN = {
 
 
 def make(path, config, base=""):
-    with CampaignFile.create(path, config, base, "made", more={COVERS: WHOLE}) as file:
+    with CampaignFile.create(path, config, base, "made", more_texts={COVERS: WHOLE}) as file:
         file.append_readings(rehearsal("nothing", poses=8).readings)
     return path
 
