@@ -33,7 +33,6 @@ from hilcal.toml import Section, check_section
 from hilcal.types import Floats
 
 PORT, DATA_PORT = 1510, 1511
-GROUP = "239.255.42.99"
 CONNECT, SERVER_INFO, REQUEST, RESPONSE = 0, 1, 2, 3
 REQUEST_DESCRIPTIONS, DESCRIPTIONS, FRAME, KEEP_ALIVE = 4, 5, 7, 10
 Version = tuple[int, int]

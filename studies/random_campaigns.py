@@ -101,14 +101,6 @@ def rehearsal_states(
     return states, pose, load, cycle
 
 
-def dead_weights(masses: Sequence[float], gravity: Floats) -> list[tuple[str, Floats]]:
-    """Return the wrenches of masses that hang at the load point, kg and m/s², by name."""
-    return [
-        (f"{mass:g}kg", np.concatenate([mass * np.asarray(gravity), np.zeros(3)]))
-        for mass in masses
-    ]
-
-
 def spread_poses(cell: Cell, count: int, pulls: Floats, rng: np.random.Generator) -> Floats:
     """Return (count, n) feasible joint angles, each far from the others, rad.
 

@@ -13,7 +13,7 @@ from hilcal.measuring.devices import ArmSample, LoadChangedError
 from hilcal.measuring.feasibility import Feasibility, Margins
 from hilcal.measuring.force import ForceMeter, TaredWrench, judged_part
 from hilcal.measuring.progress import ArmPosition
-from hilcal.measuring.route import Stop, duration, on_route
+from hilcal.measuring.route import Stop, duration, route_problems
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
@@ -300,7 +300,7 @@ class Mover:
         """Check the straight line in joint space between two states (n,), rad."""
         for load in self.hanging:
             stops = Stop("where the arm stands", start, load), Stop(name, goal, load)
-            problems = on_route(self._limits, stops)
+            problems = route_problems(self._limits, stops)
             if problems:
                 raise DeviceError(
                     f"arm: it cannot go to {name} from where it stands: {problems[0]}; {HOW_ON}"

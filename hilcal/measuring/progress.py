@@ -96,8 +96,7 @@ class ReadingStored:
     step: Step
     stored: int  # stored readings of the whole campaign
     total: int  # readings of the plan
-    remaining_real_s: float  # estimated remaining time, real s
-    remaining_cell_s: float  # the same, cell s; differs in a simulated cell only
+    remaining_s: float  # estimated remaining time, real s
     deflection: float | None = None
     """Distance from the unloaded reading of the same pose and cycle, m; None for an unloaded
     reading, and where there is none yet."""

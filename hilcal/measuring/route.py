@@ -126,7 +126,7 @@ def dry_run(cell: Cell, config: CellConfig, plan: Plan) -> DryRun:
         wrong = f"the plan has {width} joint angles per pose; {cell.arm.name} has {n} joints"
         return DryRun((wrong, *problems), (), 0.0, 0, 0)
     stops = route(plan, cell.arm, config.limits.joint_margin_rad)
-    problems += on_route(limits, stops)
+    problems += route_problems(limits, stops)
     moves = [(a, b) for a, b in pairwise(stops) if not np.array_equal(a.q, b.q)]
     pace = config.motion.speed_rad_s, config.motion.acceleration_rad_s2
     changes = sum(stop.change_to is not None for stop in stops)
@@ -166,12 +166,7 @@ def _load_problems(limits: Feasibility, plan: Plan) -> list[str]:
     return out
 
 
-def route_problems(cell: Cell, config: CellConfig, stops: tuple[Stop, ...]) -> list[str]:
-    """Return the problems of stops and of the paths between them, one line each."""
-    return on_route(Feasibility(cell, config), stops)
-
-
-def on_route(limits: Feasibility, stops: tuple[Stop, ...]) -> list[str]:
+def route_problems(limits: Feasibility, stops: tuple[Stop, ...]) -> list[str]:
     """Return the problems of stops and of the paths between them, one line each."""
     lines, at_stops = [], []
     for stop in stops:
@@ -238,7 +233,8 @@ def way_home(
     for stop in reversed(visited):
         candidate = Stop(stop.name, stop.q, hanging)
         way.append(candidate)
-        if np.array_equal(candidate.q, q_home) or not on_route(limits, (candidate, destination)):
+        at_home = np.array_equal(candidate.q, q_home)
+        if at_home or not route_problems(limits, (candidate, destination)):
             break
     way = [*way[1:], destination]
     returned = last.step is not None and (last.step.pose, last.step.load) == (base, UNLOADED)

@@ -449,7 +449,6 @@ class Session:
             self._done,
             len(self._plan.steps),
             self._clock.real(remaining),
-            remaining,
             self._state.deflection(step, reading.value[0, :3], number),
             live,
             settling,

@@ -190,11 +190,7 @@ class _Watcher:
         elif isinstance(event, events.Phase):
             self._update(event.text, phase=event.text)
         elif isinstance(event, events.ReadingStored):
-            left = (
-                f"{duration_text(event.remaining_real_s)} left"
-                if event.remaining_real_s > 0
-                else ""
-            )
+            left = f"{duration_text(event.remaining_s)} left" if event.remaining_s > 0 else ""
             last = f"{event.step}{reading_text(event)}"
             text = f"{event.stored}/{event.total} {last}{', ' * bool(left)}{left}"
             self._update(text, left=left, last=last, done=event.stored, total=event.total)

@@ -237,7 +237,8 @@ def site(tmp_path, monkeypatch):
     answers = tuple(ConnectionResult(d.report().device, "fake", d.report()) for d in devices)
     monkeypatch.setattr(running.connect, "connect", lambda config: (rig, answers))
     monkeypatch.setattr(running, "Clock", lambda scale: made.bench.clock)
-    monkeypatch.setattr(goal_rule, "FIT_TIME_SHARE", 1e9)  # judge after every reading, however slow that is
+    # judge after every reading, however slow that is
+    monkeypatch.setattr(goal_rule, "FIT_TIME_SHARE", 1e9)
     return made
 
 

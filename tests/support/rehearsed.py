@@ -1,5 +1,6 @@
 """Deflections of a simulated UR10e that hides nothing, under two weights, from seeded draws."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,8 +12,8 @@ from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.drivers.simulated.world import World
 from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import configs_dir
-from hilcal.types import Ints
-from studies.random_campaigns import dead_weights, rehearsal_states
+from hilcal.types import Floats, Ints
+from studies.random_campaigns import rehearsal_states
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,6 +23,14 @@ class Rehearsed:
     readings: Readings  # (D,) deflections with their noise
     pose: Ints  # (D,) number of each reading's pose
     cycle: Ints  # (D,) number of its load cycle
+
+
+def dead_weights(masses: Sequence[float], gravity: Floats) -> list[tuple[str, Floats]]:
+    """Return the wrenches of masses that hang at the load point, kg and m/s², by name."""
+    return [
+        (f"{mass:g}kg", np.concatenate([mass * np.asarray(gravity), np.zeros(3)]))
+        for mass in masses
+    ]
 
 
 def rehearsed(poses: int, seed: int) -> Rehearsed:

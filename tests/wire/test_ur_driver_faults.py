@@ -239,7 +239,7 @@ from tests.support import ur_driver_cases as cases
 from hilcal.drivers.ur import open_arm
 arm = open_arm(cases.config(sys.argv[1]))
 arm.take_control(1.0, np.array([0.0, 0.0, 0.1]))
-arm.start_move(cases.away(arm, 2.0), cases.SPEED, cases.ACCELERATION)
+arm.start_move(cases.displaced_joints(arm, 2.0), cases.SPEED, cases.ACCELERATION)
 while arm.moving():
     print("moves", flush=True)
     time.sleep(0.02)

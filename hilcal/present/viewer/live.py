@@ -140,7 +140,7 @@ class LiveTally:
 
     def add(self, event: ReadingStored) -> list[tuple[int, LiveResidual, LiveJudgement | None]]:
         """Count a reading; return each target's residual and its judgement, None without model."""
-        self.last, self.done, self.left = event, event.stored, event.remaining_real_s
+        self.last, self.done, self.left = event, event.stored, event.remaining_s
         residuals = ((event.target, event.live), *event.other_targets)
         return [(k, live, self._judge(event.step, k, live)) for k, live in residuals]
 

@@ -76,7 +76,7 @@ class ArmRows:
 
 
 @dataclass(frozen=True)
-class EntrantInput:
+class TaskInput:
     """A task: its description, rows to train on and to predict, the nominal arm."""
 
     task: Task
@@ -85,7 +85,7 @@ class EntrantInput:
     arm: "NominalArm"
 
     @classmethod
-    def read(cls, folder: Path) -> "EntrantInput":
+    def read(cls, folder: Path) -> "TaskInput":
         """Read the folder of a task."""
         task = read_task(folder)
         arm = NominalArm.read(folder / "robot.urdf", task.about["arm"])
@@ -274,14 +274,14 @@ def left_out(rows: ArmRows, predict: Fitter, folds: int = 5) -> Floats:
     return out
 
 
-def spread(residual: Floats, data: EntrantInput) -> Floats:
+def spread(residual: Floats, data: TaskInput) -> Floats:
     """(M, 3) standard deviation of predictions: rms on poses left out, without the noise."""
     variance = max(float(np.mean(residual**2)) - data.sigma**2, (0.1 * data.sigma) ** 2)
     return np.full((len(data.test.q), 3), np.sqrt(variance))
 
 
 def chosen(
-    data: EntrantInput,
+    data: TaskInput,
     settings: Sequence[float],
     predict: Callable[[float, ArmRows, ArmRows], Floats],
 ) -> tuple[float, Floats]:
@@ -291,7 +291,7 @@ def chosen(
     return settings[best], tried[best]
 
 
-def ridge(data: EntrantInput) -> tuple[Callable[[ArmRows], Floats], Floats]:
+def ridge(data: TaskInput) -> tuple[Callable[[ArmRows], Floats], Floats]:
     """Choose the multiple of the prior of geometry and compliance on poses left out.
 
     Returns:
@@ -309,7 +309,7 @@ def ridge(data: EntrantInput) -> tuple[Callable[[ArmRows], Floats], Floats]:
 
 
 def families(
-    data: EntrantInput, theta: Floats, rows: ArmRows, waves: int
+    data: TaskInput, theta: Floats, rows: ArmRows, waves: int
 ) -> tuple[Floats, dict[str, Floats]]:
     """Columns of frames and of families of effects, at a fit.
 
@@ -342,7 +342,7 @@ def wave(name: str, k: int) -> tuple[Callable[[Floats], Floats], Callable[[str],
 
 
 def with_residual_regression(
-    data: EntrantInput, fit: Callable[[ArmRows], Floats], make: Callable[[], Any]
+    data: TaskInput, fit: Callable[[ArmRows], Floats], make: Callable[[], Any]
 ) -> dict[str, Any]:
     """Add a regression of the residual, in the tracker's axes, to a fit.
 
@@ -397,7 +397,7 @@ class FormulaSearch:
     fitted_position: Floats
 
     @classmethod
-    def of(cls, data: EntrantInput, theta: Floats, rows: ArmRows) -> "FormulaSearch":
+    def of(cls, data: TaskInput, theta: Floats, rows: ArmRows) -> "FormulaSearch":
         """Prepare rows; values are NaN in rows to be predicted."""
         named = data.task.about.get("quantities")
         named = named or {f"{n}{j}": f"{n}{j}{u}" for n, u in UNITS for j in range(1, 7)}
@@ -432,14 +432,14 @@ class FormulaSearch:
         )
 
 
-def enter(entrant: Callable[[EntrantInput], dict[str, Any]]) -> None:
+def enter(entrant: Callable[[TaskInput], dict[str, Any]]) -> None:
     """Run an entrant as the command `python entrant.py TASK_DIR OUT.json`.
 
     Its seconds are processor time, which does not depend on other load of the machine.
     """
     began = time.process_time()
     result: dict[str, Any] = {"std_m": None, "effects": None, "law": None, "note": ""}
-    result |= entrant(EntrantInput.read(Path(sys.argv[1])))
+    result |= entrant(TaskInput.read(Path(sys.argv[1])))
     result["seconds"] = time.process_time() - began
     plain = {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in result.items()}
     Path(sys.argv[2]).write_text(json.dumps(plain), encoding="utf-8")

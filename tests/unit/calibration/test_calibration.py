@@ -269,7 +269,7 @@ def test_coupled_joints_are_compensated_by_the_controllers_values():
 def test_the_covariance_follows_from_the_fitted_states(effect, mode):
     c = calibrated(effect, mode)
     small = json.loads(json.dumps(c.covariance_source.to_json()))
-    again = replace(c, root=None, learnt=CovarianceSource.from_json(small))
+    again = replace(c, root=None, covariance_source=CovarianceSource.from_json(small))
     states = fresh(3)
     a, b = (x.predict(states.q, states.wrench) for x in (c, again))
     np.testing.assert_allclose(a.std_m, b.std_m, rtol=1e-5)

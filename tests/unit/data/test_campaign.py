@@ -393,12 +393,12 @@ POWER_WRITER = """
 import os, sys
 from pathlib import Path
 from hilcal.store.campaign_file import CampaignFile
-from tests.support.readings_cases import simple
+from tests.support.readings_cases import simple_readings
 from tests.unit.data.test_campaign import REVISION
 folder = Path(sys.argv[1])
 ack = os.open(str(folder / "ack"), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
 with CampaignFile.create(folder / "run.hilcal", "{}", "", "a test") as run:
-    x = simple(BATCHES)
+    x = simple_readings(BATCHES)
     for k in range(BATCHES):
         if k == 2:
             run.append_revision(REVISION)

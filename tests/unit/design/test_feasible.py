@@ -243,7 +243,7 @@ def test_what_leaves_nothing_is_named(sections, message):
 def test_too_few_is_told_by_what_takes_most():
     sight = {"tracker_m": [3, 0, 0.5], "target_normal": [0, 0, 1], "incidence_max_rad": 0.05}
     with pytest.raises(CannotAnswerError, match=r"only \d+ poses, 5,000 are needed: .* turn the t"):
-        drawn_of(cell(sight=sight), 5000, least=5000, most=1 << 16)
+        drawn_of(cell(sight=sight), 5000, min_poses=5000, max_states=1 << 16)
 
 
 def test_one_load_that_cannot_be_hung_is_a_remark():
@@ -434,7 +434,7 @@ def test_a_state_is_refused_by_all_or_by_none(made, seed, load):
     c, config = made
     space, guard = FeasibleSpace(c, config, Margins()), Guard(c, config)
     for q in states(c, seed, 4):
-        lines = route_problems(c, config, (Stop("p", q, load),))
+        lines = route_problems(Feasibility(c, config), (Stop("p", q, load),))
         told = [line for line in lines if "N·m" not in line]
         assert told == [x.line("pose p") for x in space.findings(q[None], load, GEOMETRY)]
         assert bool(told) is not space.allowed(q[None], load, GEOMETRY).all()
@@ -475,10 +475,10 @@ def test_a_motion_that_is_planned_passes_and_touches_nothing(made, seed, load):
     planned = q[space.allowed(q, load, STATE_CHECKS)][:3]
     if len(planned):
         for end in planned[space.passable(planned[0], planned, load)]:
-            assert route_problems(c, config, _way(planned[0], end, load)) == []
+            assert route_problems(Feasibility(c, config), _way(planned[0], end, load)) == []
     loose = q[FeasibleSpace(c, config, Margins()).allowed(q, load, STATE_CHECKS)][:3]
     for end in loose[1:]:
-        if route_problems(c, config, _way(loose[0], end, load)):
+        if route_problems(Feasibility(c, config), _way(loose[0], end, load)):
             continue
         for share in np.random.default_rng(seed).random(8):
             between = loose[0] + share * (end - loose[0])
@@ -506,11 +506,11 @@ def test_nothing_small_is_passed_between_two_samples(name, seed, share, load):
             cube = {"name": "cube", "center_m": point.tolist(), "size_m": [0.004] * 3}
             found = cell(limits=free.limits.model_dump(), obstacles=[cube])
             assert not FeasibleSpace(c, found).passable(start, end[None], load).any()
-            problems = route_problems(c, found, _way(start, end, load))
+            problems = route_problems(Feasibility(c, found), _way(start, end, load))
             assert any("cube collide" in x for x in problems)
         low, _ = extent([p for p in parts if p.body > 2], c, between[None])
         box = free.limits.model_dump() | {"workspace_min_m": [-9.0, -9.0, low[2] + 0.002]}
-        assert route_problems(c, cell(limits=box), _way(start, end, load))
+        assert route_problems(Feasibility(c, cell(limits=box)), _way(start, end, load))
 
 
 def _way(start, end, load):

@@ -54,7 +54,7 @@ def mean_variance_of_all(of, work, mode, counts):
     prior = np.concatenate([~np.isinf(live), np.ones(len(std), dtype=bool)]).astype(float)
     m = information_of(nominal, more, scale) + np.diag(prior)
     (part,) = reading_derivatives(nominal, known, of.candidates, more, scale)
-    for (pose, loads), count in zip(of.what, counts, strict=True):
+    for (pose, loads), count in zip(of.contents, counts, strict=True):
         index = tuple(of.candidates.loads.index(name) for name in loads)
         if mode == "absolute":
             rows = absolute_rows(part)[pose, index[0]]

@@ -58,7 +58,7 @@ def test_the_plan_is_what_the_design_chose(usual):
     plan = usual.ordered.plan
     wanted = Counter()
     for k in np.flatnonzero(usual.counts):
-        wanted.update({load: int(usual.counts[k]) for load in usual.problem.what[k][1]})
+        wanted.update({load: int(usual.counts[k]) for load in usual.problem.contents[k][1]})
     loaded = [s for s in plan.steps if s.pose != REFERENCE and s.load != UNLOADED]
     assert Counter(s.load for s in loaded) == wanted
     unloaded = {(s.pose, s.cycle) for s in plan.steps if s.load == UNLOADED}
@@ -95,7 +95,7 @@ def test_the_last_round_takes_poses_that_are_reached(monkeypatch):
     reached, rounds = module._unreachable, []
 
     def lost(space, of, home, units):
-        chosen = {of.what[k][0] for k in units}
+        chosen = {of.contents[k][0] for k in units}
         odd = {pose for pose in chosen if pose % 2} if rounds else set()
         rounds.append(chosen)
         return np.array(sorted(odd | {*reached(space, of, home, units).tolist()}), dtype=np.int64)
@@ -157,7 +157,7 @@ def test_each_criterion_is_best_at_its_own(usual):
 
 def test_absolute_readings_are_planned_one_by_one():
     made = planned(small(readings="absolute"), readings=25)
-    assert all(len(loads) == 1 for _, loads in made.problem.what)
+    assert all(len(loads) == 1 for _, loads in made.problem.contents)
     assert made.counts.sum() == made.budget
     config = small(readings="absolute")
     assert dry_run(cell_from_config(config), config, made.ordered.plan).problems == ()

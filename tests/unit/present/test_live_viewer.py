@@ -107,9 +107,8 @@ def test_a_viewer_that_comes_late_gets_all_and_the_recording_has_it_too(home, sa
         assert listening == ["127.0.0.1"]
         assert process.nice() > 0
         assert tell(live, 24) < SOON
-        wait_until(
-            lambda: readings(live.record) >= 0.9 * (48 - READINGS_BEFORE_MODEL), "recorded"
-        )  # in batches
+        in_batches = 0.9 * (48 - READINGS_BEFORE_MODEL)
+        wait_until(lambda: readings(live.record) >= in_batches, "recorded")
         with client(live.url, late := home / "late.rrd"):
             wait_until(
                 lambda: readings(late) == 48 - READINGS_BEFORE_MODEL, "all with the late viewer"

@@ -91,7 +91,7 @@ def large(m):
     pose, time_s = np.arange(count), 60.0 * np.arange(count)
     story = replace(told, revisions=many, pose_names=named, pose=pose, time_s=time_s)
     name, facts = "Leica AT960-MR", {"firmware": "3.1"}
-    device = MeasuringDevice("tracker", "leica", name, "750123", facts, m.made)
+    device = MeasuringDevice("tracker", "leica", name, "750123", facts, m.created)
     overview = replace(m.overview, instruments=(device,) * 5)
     return replace(plain(m), story=story, overview=overview)
 

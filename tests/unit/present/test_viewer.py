@@ -104,7 +104,7 @@ def test_readings_over_a_suspect_are_drawn_by_their_mean(told, recording):
     left, _, height = bars(recording, "/follows/mean", 0)
     assert 4 <= len(left) <= 12
     assert np.all(np.diff(left) > 0)
-    follows = told.revisions[0].follows
+    follows = told.revisions[0].dependence
     assert follows.y.min() <= height.min() <= height.max() <= follows.y.max()
 
 

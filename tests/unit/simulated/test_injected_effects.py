@@ -19,9 +19,10 @@ from hilcal.drivers.simulated.injected_effects import (
 from hilcal.drivers.simulated.truth import Truth
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
-from studies.random_campaigns import dead_weights, rehearsal_states
+from studies.random_campaigns import rehearsal_states
 from tests.support.example_cell import ur10e_cell
 from tests.support.refusals import refusals, refuses
+from tests.support.rehearsed import dead_weights
 
 CELL = ur10e_cell()
 WEIGHTS = dead_weights([4.0, 8.0, 12.0], CELL.gravity)

@@ -11,9 +11,10 @@ from hilcal.drivers.simulated.injected_effects import hide_effect, world_without
 from hilcal.drivers.simulated.rehearsal import simulate
 from hilcal.drivers.simulated.world import SimulatedNoise
 from hilcal.readings.readings import States
-from studies.random_campaigns import dead_weights, rehearsal_states
+from studies.random_campaigns import rehearsal_states
 from tests.support.example_cell import ur10e_cell
 from tests.support.refusals import refusal
+from tests.support.rehearsed import dead_weights
 
 CELL = ur10e_cell()
 WEIGHTS = dead_weights([5.0, 10.0], CELL.gravity)

@@ -8,8 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.drivers.simulated.injected_effects import world_without_effect
 from hilcal.drivers.simulated.truth import Truth
-from studies.random_campaigns import dead_weights, rehearsal_states
+from studies.random_campaigns import rehearsal_states
 from tests.support.example_cell import ur10e_cell
+from tests.support.rehearsed import dead_weights
 from tests.support.running_world import frames, moment_beyond
 
 CELL = ur10e_cell()

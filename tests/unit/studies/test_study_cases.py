@@ -9,7 +9,6 @@ from hilcal.drivers.simulated.injected_effects import EFFECTS
 from hilcal.errors import InputError
 from hilcal.readings.whitening import whitening
 from studies.diagnosis import intervals
-from studies.random_campaigns import dead_weights
 from studies.study_cases import effects_shown, study_case, with_study_loads
 from studies.study_more import measure_more, suspects
 from studies.unmodelled_laws import LAWS, law_named, shift
@@ -17,6 +16,7 @@ from tests.support.campaigns import configuration
 from tests.support.effect_cases import make
 from tests.support.fit_cases import fitted_model
 from tests.support.refusals import refusal
+from tests.support.rehearsed import dead_weights
 
 
 def case(*hidden, mode="absolute", strength=2.0, **given):

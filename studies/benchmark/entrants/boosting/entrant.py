@@ -9,10 +9,10 @@ from sklearn.ensemble import HistGradientBoostingRegressor
 from sklearn.multioutput import MultiOutputRegressor
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import EntrantInput, enter, with_residual_regression  # type: ignore[import-not-found]
+from benchmark.entrants.common import TaskInput, enter, with_residual_regression  # type: ignore[import-not-found]
 
 
-def boosting(data: EntrantInput) -> dict[str, Any]:
+def boosting(data: TaskInput) -> dict[str, Any]:
     """Learn the residual, an axis at a time."""
 
     def fit(rows: Any) -> Any:

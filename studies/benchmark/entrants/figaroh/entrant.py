@@ -16,7 +16,7 @@ from figaroh.calibration.calibration_tools import calc_updated_fkm  # type: igno
 from figaroh.tools.robot import Robot  # type: ignore[import-not-found]
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import EntrantInput, enter, spread  # type: ignore[import-not-found]
+from benchmark.entrants.common import TaskInput, enter, spread  # type: ignore[import-not-found]
 
 CONFIG = """tasks: {{calibration: {{kinematics: {{base_frame: universe, tool_frame: tool0}},
   measurements: {{markers: [{{measurable_dof: [true, true, true, false, false, false]}}]}},
@@ -37,7 +37,7 @@ class PlacedArm(BaseCalibration):  # type: ignore[misc]
         return calc_updated_fkm(self.model, self.data, var, q, config)
 
 
-def geometry(data: EntrantInput) -> dict[str, Any]:
+def geometry(data: TaskInput) -> dict[str, Any]:
     """Fit all placements at once."""
     robot = Robot(str(data.task.folder / "robot.urdf"), package_dirs=None)
     rows, joints = data.train, [n for n in robot.model.names if n != "universe"]

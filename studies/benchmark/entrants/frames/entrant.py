@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import EntrantInput, enter, left_out, spread  # type: ignore[import-not-found]
+from benchmark.entrants.common import TaskInput, enter, left_out, spread  # type: ignore[import-not-found]
 
 
-def frames(data: EntrantInput) -> dict[str, Any]:
+def frames(data: TaskInput) -> dict[str, Any]:
     """Fit the nine parameters of the frames."""
     arm, rigid = data.arm, np.zeros(42)
 

@@ -9,10 +9,10 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import EntrantInput, enter, ridge, with_residual_regression  # type: ignore[import-not-found]
+from benchmark.entrants.common import TaskInput, enter, ridge, with_residual_regression  # type: ignore[import-not-found]
 
 
-def gaussian_process(data: EntrantInput) -> dict[str, Any]:
+def gaussian_process(data: TaskInput) -> dict[str, Any]:
     """Learn the residual with one length for all features."""
     fit, _ = ridge(data)
     kernel = ConstantKernel(0.5, (1e-4, 10.0)) * RBF(5.0, (1.0, 100.0)) + WhiteKernel(

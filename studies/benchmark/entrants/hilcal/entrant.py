@@ -14,7 +14,7 @@ import numpy as np
 import hilcal as hc
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import JOINTS, WRENCH, EntrantInput, enter  # type: ignore[import-not-found]
+from benchmark.entrants.common import JOINTS, WRENCH, TaskInput, enter  # type: ignore[import-not-found]
 
 CELL = """robot = {{model = "{urdf}", gravity_m_s2 = {gravity_m_s2}}}
 tool = {{mass_kg = {tool[mass_kg]}, com_m = {tool[com_m]}, load_point_m = {load_point_m}}}
@@ -23,7 +23,7 @@ repeatability.joint_std_rad = {r}
 """
 
 
-def calibrated(data: EntrantInput) -> dict[str, Any]:
+def calibrated(data: TaskInput) -> dict[str, Any]:
     """Refine from the baseline, or from the baseline with a discovered law."""
     about, law, note = data.task.about, None, ""
     r = 0.0 if about["track"] in ("ur10", "ur5") else 1e-9  # no arm scatters in a simulated task

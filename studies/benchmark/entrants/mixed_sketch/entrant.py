@@ -15,13 +15,13 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import EntrantInput, enter, families, ridge  # type: ignore[import-not-found]
+from benchmark.entrants.common import TaskInput, enter, families, ridge  # type: ignore[import-not-found]
 
 WAVES, SPREAD = 32, 3.0
 OFTEN: Any = {"maxiter": 4, "xtol": 0.05, "ftol": 1e-4}
 
 
-def mixed(data: EntrantInput) -> dict[str, Any]:
+def mixed(data: TaskInput) -> dict[str, Any]:
     """Estimate the variances, predict by the BLUP, and state its standard deviation."""
     theta = ridge(data)[0](data.train)
     theta[9:] = 0.0

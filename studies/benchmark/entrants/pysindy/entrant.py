@@ -14,15 +14,7 @@ import numpy as np
 import pysindy as ps  # type: ignore[import-not-found]
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import (  # type: ignore[import-not-found]
-    EntrantInput,
-    FormulaSearch,
-    chosen,
-    enter,
-    ridge,
-    spread,
-    wave,
-)
+from benchmark.entrants.common import FormulaSearch, TaskInput, chosen, enter, ridge, spread, wave  # type: ignore[import-not-found]
 
 THRESHOLDS = (0.1, 0.2, 0.3, 0.5, 10.0)  # least share of a term in what is explained; 10: no term
 
@@ -44,7 +36,7 @@ def model(sought: Any, threshold: float) -> Any:
     return sindy.fit(sought.x, t=1.0, x_dot=sought.y, feature_names=sought.names)
 
 
-def sparse(data: EntrantInput) -> dict[str, Any]:
+def sparse(data: TaskInput) -> dict[str, Any]:
     """Choose the threshold on poses left out."""
     fit, _ = ridge(data)
 

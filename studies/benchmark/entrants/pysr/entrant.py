@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import EntrantInput, FormulaSearch, enter, ridge, spread  # type: ignore[import-not-found]
+from benchmark.entrants.common import FormulaSearch, TaskInput, enter, ridge, spread  # type: ignore[import-not-found]
 
 
 def regression() -> Any:
@@ -28,7 +28,7 @@ def regression() -> Any:
     )  # fmt: skip
 
 
-def symbolic(data: EntrantInput) -> dict[str, Any]:
+def symbolic(data: TaskInput) -> dict[str, Any]:
     """Search a formula of each column of the values."""
     search = regression()
     fit, residual = ridge(data)

@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Any
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import EntrantInput, enter, ridge, spread  # type: ignore[import-not-found]
+from benchmark.entrants.common import TaskInput, enter, ridge, spread  # type: ignore[import-not-found]
 
 
-def geometry(data: EntrantInput) -> dict[str, Any]:
+def geometry(data: TaskInput) -> dict[str, Any]:
     """Fit 51 parameters."""
     fit, residual = ridge(data)
     position = data.arm.predict(fit(data.train), data.test)
