@@ -83,29 +83,29 @@ class EmsconConnection:
         self.open = False
         self._socket.close()
 
-    def ask(self, command: int, parameters: bytes = b"", *, until: float) -> tuple[int, bytes]:
+    def ask(self, command: int, parameters: bytes = b"", *, deadline: float) -> tuple[int, bytes]:
         """Send a command, again while the server is busy; return its status and content."""
         while True:
             body = struct.pack("<I", command) + parameters
             self._send(es.HEADER.pack(es.HEADER.size + len(body), es.COMMAND) + body)
-            status, returned = self.answer(command, until=until)
-            if status != es.BUSY or time.monotonic() + _PAUSE_S > until:
+            status, returned = self.answer(command, deadline=deadline)
+            if status != es.BUSY or time.monotonic() + _PAUSE_S > deadline:
                 return status, returned
             time.sleep(_PAUSE_S)
 
-    def answer(self, command: int, *, until: float) -> tuple[int, bytes]:
+    def answer(self, command: int, *, deadline: float) -> tuple[int, bytes]:
         """Return the next answer to a command; late answers to other commands are dropped."""
         while True:
-            kind, body = self._packet(until)
+            kind, body = self._packet(deadline)
             if kind in (es.COMMAND, es.ERROR):
                 number, status = self._two(body)
                 if number == command or (kind == es.ERROR and number == es.UNKNOWN):
                     return status, body[8:]
 
-    def result(self, *, until: float) -> tuple[int, int, bytes]:
+    def result(self, *, deadline: float) -> tuple[int, int, bytes]:
         """Return type, status and content of the result of the running measurement."""
         while True:
-            kind, body = self._packet(until)
+            kind, body = self._packet(deadline)
             if kind in (es.SINGLE, es.SINGLE2, es.PROBE):
                 if len(body) < 4:
                     self._strange("a packet that is cut short")
@@ -251,7 +251,7 @@ class EmsconTracker:
     def report(self) -> Report:
         """Report identity and state of the tracker, and measure once; nothing turns."""
         until = self._ready()
-        status, body = self._line.ask(es.GET_TRACKER_INFO, until=until)
+        status, body = self._line.ask(es.GET_TRACKER_INFO, deadline=until)
         name, serial = "emScon tracker", 0
         if status == es.OK:
             _, field, number = self._line.unpack("<I64si", body)
@@ -304,7 +304,7 @@ class EmsconTracker:
         """Return a plausible result; raise DeviceError for a failed or impossible one."""
         until = self._ready(self._clock.real(self._options.measuring_s))
         self._do("measuring", es.START_MEASUREMENT, until=until)
-        kind, status, body = self._line.result(until=until)
+        kind, status, body = self._line.result(deadline=until)
         if status != es.OK or kind == es.ERROR:
             raise es.failure("measuring", status)
         try:
@@ -422,7 +422,7 @@ class EmsconTracker:
             out[number] = es.text(name)
             if k + 1 >= total:
                 break
-            status, body = self._line.answer(es.GET_REFLECTORS, until=until)
+            status, body = self._line.answer(es.GET_REFLECTORS, deadline=until)
             if status != es.OK:
                 raise es.failure("reading its reflectors", status)
         return out
@@ -437,7 +437,7 @@ class EmsconTracker:
         self._do("setting the search", es.SET_SEARCH, packed, until=until)
 
     def _find(self, doing: str, command: int, parameters: bytes, until: float) -> None:
-        status, _ = self._line.ask(command, parameters, until=until)
+        status, _ = self._line.ask(command, parameters, deadline=until)
         if status == es.NOT_IMPLEMENTED or status in (1, 35, 38):
             raise es.failure(doing, status)
         if status != es.OK:
@@ -445,8 +445,8 @@ class EmsconTracker:
 
     def _do(self, doing: str, command: int, parameters: bytes = b"", *, until: float) -> bytes:
         """Carry out a command and return its content; raises DeviceError if it fails."""
-        status, body = self._line.ask(command, parameters, until=until)
-        if status not in es.GOOD:
+        status, body = self._line.ask(command, parameters, deadline=until)
+        if status not in es.SUCCESS:
             raise es.failure(doing, status)
         return body
 

@@ -49,10 +49,12 @@ WEATHER = ("none: temperature, pressure, humidity as set", "read, but not used",
 """States of the weather station in GET_SYSTEM_STATUS."""
 
 OK, BUSY, NOT_IMPLEMENTED, NOT_INITIALIZED = 0, 1, 2, 39
-GOOD = frozenset({OK, *range(11, 22, 2)})  # odd 11 to 21: done, though a parameter is out of range
+SUCCESS = frozenset(
+    {OK, *range(11, 22, 2)}
+)  # odd 11 to 21: done, though a parameter is out of range
 NO_DISTANCE, NO_RESULT = 37, 10009
 
-LOST = {
+NO_READING = {
     NO_DISTANCE: "no distance (the beam was broken; the reflector has to be found again)",
     NOT_INITIALIZED: "the tracker is no longer initialised; it has to find its zeros again",
     93: "the probe's orientation could not be measured",
@@ -85,15 +87,15 @@ _MEANING = {
 }
 
 
-def failure(doing: str, status: int) -> DeviceError:
-    """Return the exception for a status that is not `OK`; `doing`: e.g. "measuring"."""
-    if status in LOST:
-        return TargetLostError(f"tracker: {doing}: {LOST[status]} (status {status})")
+def failure(action: str, status: int) -> DeviceError:
+    """Return the exception for a status that is not `OK`; `action`: e.g. "measuring"."""
+    if status in NO_READING:
+        return TargetLostError(f"tracker: {action}: {NO_READING[status]} (status {status})")
     meaning = _MEANING.get(status)
     if meaning is None and (3 <= status <= 22 or 47 <= status <= 55):
         meaning = "a parameter is refused"
     cause = f"{meaning} (status {status})" if meaning else f"status {status}"
-    return DeviceError(f"tracker: {doing}: the tracker reports: {cause}")
+    return DeviceError(f"tracker: {action}: the tracker reports: {cause}")
 
 
 def text(field: bytes) -> str:

@@ -31,7 +31,7 @@ class FrameFormat:
     size: int  # of the frame, with header and checksum, bytes
     checksum: Callable[[bytes], bytes]
     """From all bytes but the last two: what these two must be."""
-    weak: bool = False
+    weak_checksum: bool = False
     """Whether the checksum is a mere sum; then a frame counts only if the next header follows it
     directly."""
 
@@ -71,7 +71,7 @@ class Deframer:
             if len(buffer) - at < size:
                 break
             good = self._good(at)
-            if good and (not self._in_step or self._format.weak):
+            if good and (not self._in_step or self._format.weak_checksum):
                 needed = len(header) if self._in_step else size
                 if len(buffer) - at < size + needed:
                     break  # decided when the next frame has come

@@ -54,7 +54,7 @@ WARNINGS = {
 }
 """Codes of a full measurement that is usable, with a remark."""
 
-LOST = {
+NO_READING = {
     1285: "only angles were measured, no distance (beam broken?)",
     1288: "only angles were measured, without full correction",
     1289: "only angles were measured, without guarantee",
@@ -94,7 +94,7 @@ _MEANING = {
 """Meaning of the commonest codes, to stand alone or after a colon."""
 
 
-def words(code: int) -> str:
+def code_text(code: int) -> str:
     """Return meaning and number of a return code, for people."""
     try:
         name = GeoComCode(code).name.replace("_", " ").lower()
@@ -104,12 +104,12 @@ def words(code: int) -> str:
         return f"code {code}"
 
 
-def failure(doing: str, code: int) -> DeviceError:
-    """Return the exception for a return code without a reading; `doing`: e.g. "measuring"."""
-    if code in LOST:
-        return TargetLostError(f"tracker: {doing}: {LOST[code]} (code {code})")
+def failure(action: str, code: int) -> DeviceError:
+    """Return the exception for a return code without a reading; `action`: e.g. "measuring"."""
+    if code in NO_READING:
+        return TargetLostError(f"tracker: {action}: {NO_READING[code]} (code {code})")
     advice = f"; {_ADVICE[code]}" if code in _ADVICE else ""
-    return DeviceError(f"tracker: {doing}: the instrument reports: {words(code)}{advice}")
+    return DeviceError(f"tracker: {action}: the instrument reports: {code_text(code)}{advice}")
 
 
 DEVICE = "tracker"
@@ -191,26 +191,26 @@ class Link:
         values: Values = (),
         parsers: Parsers = (),
         *,
-        until: float,
+        deadline: float,
         seconds: float = ANSWER_S,
     ) -> Reply:
-        """Repeat a request until an undamaged reply comes, by `until`, `time.monotonic` s.
+        """Repeat a request until an undamaged reply comes, by `deadline`, `time.monotonic` s.
 
         `parsers`: one per value of the reply; `seconds`: longest wait for one reply.
         """
         complaint, silent, damaged = "", 0, 0
-        while damaged < _TRIES and time.monotonic() < until:
-            answer, complaint = self._once(request, values, parsers, seconds, until)
+        while damaged < _TRIES and time.monotonic() < deadline:
+            answer, complaint = self._once(request, values, parsers, seconds, deadline)
             if answer is not None and answer.code not in BUSY:
                 return answer
             if answer is not None:
-                time.sleep(max(0.0, min(_PAUSE_S, until - time.monotonic())))
+                time.sleep(max(0.0, min(_PAUSE_S, deadline - time.monotonic())))
                 continue
             damaged += 1
             if isinstance(self._connection.failure, TimeoutError):
                 silent += 1
                 if silent == 1:  # does even the simplest request get no reply?
-                    self._once(NULL, (), (), ANSWER_S, until)
+                    self._once(NULL, (), (), ANSWER_S, deadline)
                 if isinstance(self._connection.failure, TimeoutError):
                     break
         raise DeviceError(f"{DEVICE} at {self._path}: {complaint or 'no answer in time'}")
@@ -247,12 +247,15 @@ class Link:
             ):
                 params = response.params
                 several = params if isinstance(params, tuple) else (params,)
-                return Reply(code, () if params is None else several, host_ns), words(code)
+                return Reply(code, () if params is None else several, host_ns), code_text(code)
             drain(self._port, _QUIET_S, min(_DRAIN_S, max(0.0, until - time.monotonic())))
             self._connection.reset()
         if self._connection.failure is not None or reply is None:
             return None, self._silence()
-        return None, f"answers stay damaged or out of step ({words(code or local)}); {self._hint()}"
+        return (
+            None,
+            f"answers stay damaged or out of step ({code_text(code or local)}); {self._hint()}",
+        )
 
     def _silence(self) -> str:
         received = self._connection.received
@@ -345,7 +348,7 @@ class GeoComTracker:
         hz, v = np.arctan2(x, y) % (2 * np.pi), np.arctan2(np.hypot(x, y), z)
         until = time.monotonic() + DEADLINE_S + self._moving_s
         answer = self._link.ask(
-            TURN, (float(hz), float(v), 0, 0, 0), until=until, seconds=ANSWER_S + self._moving_s
+            TURN, (float(hz), float(v), 0, 0, 0), deadline=until, seconds=ANSWER_S + self._moving_s
         )
         if answer.code != OK:
             raise failure("turning to the target", answer.code)
@@ -361,10 +364,10 @@ class GeoComTracker:
         seconds = ANSWER_S + self._moving_s
 
         def do(request: int, *values: float) -> int:
-            return self._link.ask(request, values, until=until, seconds=seconds).code
+            return self._link.ask(request, values, deadline=until, seconds=seconds).code
 
         code = do(FINE_ADJUST, window, window, 0)
-        if code in LOST and search:
+        if code in NO_READING and search:
             code = do(SEARCH, 0)
             if code != OK:
                 raise failure("searching for the target", code)
@@ -415,7 +418,7 @@ class GeoComTracker:
         except DeviceError as error:
             if not isinstance(error, TargetLostError):
                 try:  # does it answer at all?
-                    self._link.ask(NULL, until=until)
+                    self._link.ask(NULL, deadline=until)
                 except DeviceError:
                     raise error from None
             problems.append(str(error).removeprefix(f"{DEVICE}: "))
@@ -451,7 +454,7 @@ class GeoComTracker:
 
     def _full(self, until: float, measuring: float) -> PolarReading | None:
         """Measure, with the standard deviation of the angles; None if the request is unknown."""
-        started = self._link.ask(DO_MEASURE, (_DISTANCE, _CORRECTED), until=until)
+        started = self._link.ask(DO_MEASURE, (_DISTANCE, _CORRECTED), deadline=until)
         if started.code in UNKNOWN:
             self._has_full = False
             return None
@@ -461,7 +464,7 @@ class GeoComTracker:
             FULL_MEASUREMENT,
             (round(1000 * MEASURING_S), _CORRECTED),
             (float,) * 8,
-            until=until,
+            deadline=until,
             seconds=ANSWER_S + measuring,
         )
         if answer.code in UNKNOWN:
@@ -483,7 +486,7 @@ class GeoComTracker:
             MEASURE_DISTANCE_ANGLE,
             (_DISTANCE_PROGRAM,),
             (float,) * 4,
-            until=until,
+            deadline=until,
             seconds=ANSWER_S + measuring,
         )
         warning = usable(answer)
@@ -518,7 +521,7 @@ class GeoComTracker:
 
     def _values(self, until: float, request: int, *parsers: Any) -> tuple[Any, ...] | None:
         """Return the values of a reply; None where the instrument gives none."""
-        answer = self._link.ask(request, (), parsers, until=until)
+        answer = self._link.ask(request, (), parsers, deadline=until)
         return answer.values if answer.code == OK and answer.values else None
 
 

@@ -33,13 +33,12 @@ from hilcal.toml import Section, check_section
 from hilcal.types import Floats
 
 PORT, DATA_PORT = 1510, 1511
-GROUP = "239.255.42.99"
 CONNECT, SERVER_INFO, REQUEST, RESPONSE = 0, 1, 2, 3
 REQUEST_DESCRIPTIONS, DESCRIPTIONS, FRAME, KEEP_ALIVE = 4, 5, 7, 10
 Version = tuple[int, int]
 OLDEST: Version = (3, 0)
 NEWEST: Version = (4, 2)
-SIZED: Version = (4, 1)  # first version whose lists state their length in bytes
+FIRST_SIZED: Version = (4, 1)  # first version whose lists state their length in bytes
 LARGEST = 1 << 16
 MARKER_SET, RIGID_BODY = 0, 1
 _HEAD = struct.Struct("<HH")
@@ -54,7 +53,7 @@ def message(number: int, content: bytes = b"") -> bytes:
     return _HEAD.pack(number, len(content)) + content
 
 
-def opened(data: bytes) -> tuple[int, bytes]:
+def unpacked(data: bytes) -> tuple[int, bytes]:
     """Return number and content of a message; raises struct.error if cut short."""
     number, size = _HEAD.unpack_from(data)
     if len(data) < _HEAD.size + size:
@@ -122,7 +121,7 @@ class Reader:
     def listed(self) -> tuple[int, int]:
         """Return the number of elements of a list, and where it ends (0: not stated)."""
         count = self.count()
-        size = self.count() if self.version >= SIZED else 0
+        size = self.count() if self.version >= FIRST_SIZED else 0
         return count, self.at + size if size else 0
 
     def text(self) -> str:
@@ -168,7 +167,7 @@ def names(content: bytes, version: Version) -> dict[int, str]:
     out: dict[int, str] = {}
     for _ in range(r.count()):
         kind = r.count()
-        end = r.count() + r.at if version >= SIZED else 0
+        end = r.count() + r.at if version >= FIRST_SIZED else 0
         if kind == RIGID_BODY:
             name = r.text()
             out[r.count()] = name
@@ -427,7 +426,7 @@ class NatNetTracker:
         """Return the content of the next message if it is of the kind, else None."""
         line.settimeout(max(seconds, 1e-3))
         try:
-            number, content = opened(line.recv(LARGEST))
+            number, content = unpacked(line.recv(LARGEST))
         except (TimeoutError, struct.error):
             return None
         return content if number == kind else None

@@ -32,7 +32,7 @@ from hilcal.types import Floats
 PORT = 49152
 RECORD = 36
 START, STOP = 2, 0
-AGAIN_S = 0.3
+RENEW_S = 0.3
 """Silence, s, after which the request to send is repeated: it may be lost, the sensor restarted."""
 _PAGE_S = 2.0
 _LARGEST = 1 << 16
@@ -101,7 +101,7 @@ class Datagrams:
                 self._received += data
             else:
                 self.corrupt += 1
-        if time.monotonic() - self._heard > AGAIN_S:
+        if time.monotonic() - self._heard > RENEW_S:
             self._heard = time.monotonic()
             with contextlib.suppress(ConnectionRefusedError):
                 self._ask(START)

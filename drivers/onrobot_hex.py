@@ -40,7 +40,7 @@ def _sensor(counts_per_N: float, counts_per_Nm: float, rate: float) -> fs.Sensor
             return f"the {NAME} is loaded over its range; take the load off"
         return ""
 
-    frame = fs.FrameFormat(b"\xaa\x07\x08\x10", 22, _checksum, weak=True)
+    frame = fs.FrameFormat(b"\xaa\x07\x08\x10", 22, _checksum, weak_checksum=True)
     return fs.SensorFormat(
         NAME, frame, _BODY, unit, lambda: fs.ByDeviceClock(1.0 / rate, 16), overload
     )

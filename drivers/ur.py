@@ -120,7 +120,7 @@ class UrArm:
         if self._silent:
             raise failure(self._host, f"cannot take control: {self._silent}")
         self._end_program()
-        self._control = command.take(self._controller, self._receiver)
+        self._control = command.take_control(self._controller, self._receiver)
         self._was_ours = True
         self._fault = ""
         try:
@@ -208,7 +208,7 @@ class UrArm:
         if reading.runtime != states.PLAYING:
             self._fail(_why_ended(reading, control))
         try:
-            expired, _ = control.alive()
+            expired, _ = control.renew_lease()
         except WorkerError as error:
             self._fail(command.not_commanded(error))
         if expired:
@@ -216,7 +216,7 @@ class UrArm:
         if motion.arrived(reading):
             self._motion = None
             with contextlib.suppress(WorkerError):  # at rest; the next command shows a failure
-                control.rest()
+                control.end_lease()
             return False
         late = motion.overdue(reading)
         if late is not None:
@@ -233,8 +233,8 @@ class UrArm:
         halt = self._brakes.halt(self._control, self._brake)
         self._control = self._motion = None
         self._fault = "its program was ended to stop it"
-        if not halt.stands:
-            why = f" ({halt.lost})" if halt.lost else ""
+        if not halt.at_rest:
+            why = f" ({halt.link_failure})" if halt.link_failure else ""
             raise failure(self._host, f"it was told to stop{why}", HOLD_ON)
 
     def close(self) -> None:
@@ -260,7 +260,7 @@ class UrArm:
     def _give_back(self) -> None:
         control, self._control, self._motion = self._control, None, None
         if control is not None:
-            control.give_back()
+            control.release()
 
     def _end_program(self) -> None:
         """End our program, which ur_rtde may have uploaded again after a lost link."""
@@ -273,7 +273,7 @@ class UrArm:
         """Whether an arm not under control stands."""
         with contextlib.suppress(LinkError):
             first, second = self._receiver.read(), self._receiver.read()
-            return command.stands(first) and command.stands(second)
+            return command.at_rest(first) and command.at_rest(second)
         return False
 
     def _read(self) -> Reading:
@@ -303,7 +303,7 @@ class UrArm:
         halt = self._brakes.halt(self._control, self._brake, lost)
         self._control = self._motion = None
         self._fault, advice = command.cause_of(self._controller, halt, symptom)
-        if not halt.stands:
+        if not halt.at_rest:
             advice = f"{HOLD_ON}; {advice}"
         raise failure(self._host, self._fault, advice)
 
@@ -311,7 +311,7 @@ class UrArm:
 def _why_ended(reading: Reading, control: command.Control) -> str:
     """Return why the robot's program ended, from the controller and the control process."""
     try:
-        expired, late = control.alive(_PULSE_S)
+        expired, late = control.renew_lease(_PULSE_S)
     except WorkerError:
         return command.program_ended(reading, 0.0)
     return command.UNWATCHED if expired else command.program_ended(reading, late)

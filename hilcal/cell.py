@@ -11,7 +11,7 @@ from hilcal.config.sections import Gauge, Point
 from hilcal.errors import InputError
 from hilcal.readings.readings import ObserverName
 from hilcal.robot import se3
-from hilcal.robot.arm import Arm, as_counted
+from hilcal.robot.arm import Arm, with_controller_conventions
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.factory import FactoryKinematics, read_factory, with_factory
 from hilcal.shown import Brief
@@ -177,7 +177,7 @@ def cell_from_config(
         factory = read_factory(path, arm, calibration_file)
         arm = with_factory(arm, factory) if robot.kinematics == "factory" else arm
     try:
-        arm = as_counted(arm, robot)
+        arm = with_controller_conventions(arm, robot)
     except InputError as error:
         raise InputError(f"[robot] {error}") from None
     if robot.repeatability_m is not None:

@@ -49,7 +49,7 @@ FIRST_DAY = datetime(2026, 1, 1).astimezone()  # a clock before this day has nev
 ON_NETWORK = ("nfs", "nfs4", "cifs", "smb3", "9p", "fuse.sshfs")
 """File systems on which SQLite's locks are unreliable (SQLite FAQ, question 5)."""
 _TIME_ERROR, _WRITES = 5, 9
-LOWEST = (3, 11)
+MIN_PYTHON = (3, 11)
 DISTRIBUTION = "hilcal"
 NATIVE = {"pin": "pinocchio", "ur-rtde": "rtde_control", "rerun-sdk": "rerun", "numba": "numba"}
 """Modules of packages with compiled parts, which fail on other processors."""
@@ -60,14 +60,16 @@ GROUPS = {
     "hilcal.operators": "operators",
 }
 NOT_FOR_USERS = ("all", "dev", "docs", "release")  # Extras that no command needs
-LATE_MS = 1  # Largest latency timer: how long the driver holds bytes; default 16 (FTDI, AN232B-04)
-MEDDLERS = {
+MAX_LATENCY_MS = (
+    1  # Largest latency timer: how long the driver holds bytes; default 16 (FTDI, AN232B-04)
+)
+INTERFERING_SERVICES = {
     "ModemManager": "it talks to serial adapters that are plugged in",
     "brltty": "it takes adapters for Braille displays",
 }
 """Services that open adapters of other programs."""
 SECONDS = 1.0  # Most time for an answer. A choice: on a cell's own network it takes a millisecond
-SLOW = 0.02  # longer than any connection to a controller in the same room takes, s. A choice
+SLOW_S = 0.02  # longer than any connection to a controller in the same room takes, s. A choice
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _BELOW = re.compile(r"""python_version\s*<\s*["'](\d+)\.(\d+)["']""")
 _EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
@@ -185,7 +187,7 @@ def load(measured: Callable[[], tuple[float, float, float]] = os.getloadavg) -> 
 
 def program(version: str) -> tuple[Finding, ...]:
     """Return the findings on the installed hilcal of this version, Python, packages and drivers."""
-    old = sys.version_info < LOWEST
+    old = sys.version_info < MIN_PYTHON
     python = f"{platform.python_version()} at {sys.executable}, {platform.platform()}"
     mend = "install Python 3.11 or later" if old else ""
     return (
@@ -287,7 +289,7 @@ def serial_ports(
         out.append(PORT("adapters", "ok", "none is plugged in"))
     if connected:
         running = {_program(proc, number) for number in _numbers(proc)}
-        for name, why in MEDDLERS.items():
+        for name, why in INTERFERING_SERVICES.items():
             if name in running:
                 mend = f"sudo systemctl stop {name}"
                 out.append(PORT(name, "warning", f"it runs: {why}", mend))
@@ -315,9 +317,9 @@ def _port(name: str, path: str, about: str, needed: bool, root: Path) -> Iterato
     timer, late = root / "sys/bus/usb-serial/devices" / Path(path).name / "latency_timer", 0
     with suppress(OSError, ValueError):
         late = int(timer.read_text(encoding="ascii"))
-    if late > LATE_MS:
+    if late > MAX_LATENCY_MS:
         slow = f"{text}; holds answers back for up to {late} ms (latency timer)"
-        yield PORT(name, "warning", slow, f"echo {LATE_MS} | sudo tee {timer}")
+        yield PORT(name, "warning", slow, f"echo {MAX_LATENCY_MS} | sudo tee {timer}")
     elif not holder:
         yield PORT(name, "ok", f"{text}; free, and you may use it")
 
@@ -380,7 +382,7 @@ def reachable(host: str, services: Mapping[int, str]) -> list[Finding]:
             mend = "check the address, and that the service is enabled on the controller"
             out.append(NETWORK(name, "problem", f"{error.strerror or error}", mend))
         else:
-            mend = "connect by cable, without other networks between" if took > SLOW else ""
+            mend = "connect by cable, without other networks between" if took > SLOW_S else ""
             state: State = "warning" if mend else "ok"
             out.append(NETWORK(name, state, f"answers in {1e3 * took:.1f} ms", mend))
     return out

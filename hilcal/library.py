@@ -114,7 +114,9 @@ def import_campaign(
     say(f"writing {output}")
     about = settings.to_json(), str(base_dir), f"{table.name} ({Path(kind).name})"
     readings = imported.readings
-    CampaignFile.create(output, *about, overwrite=overwrite, more=texts, readings=readings).close()
+    CampaignFile.create(
+        output, *about, overwrite=overwrite, more_texts=texts, readings=readings
+    ).close()
     parts = covariance_parts(imported.covers, settings)
     return Imported(settings, cell, readings, noise, parts, imported.notes)
 
@@ -414,14 +416,14 @@ def plan(
         CannotAnswerError: the cell leaves too few poses, or the readings are too few.
     """
     with needed_by("a plan"):
-        from hilcal.design.planner import Request, make
+        from hilcal.design.planner import PlanRequest, plan_readings
         from hilcal.design.summary import about, checked, summarise
 
     config, rng = cell.configured(), np.random.default_rng(seed)
     if given is not None and prior is not None:
         raise InputError("a plan after a fit has the prior of that fit; leave out one of both")
-    request = Request(poses, criterion=criterion)
-    planned = make(cell, config, request, rng, given, prior=_carried(prior, None))
+    request = PlanRequest(poses, criterion=criterion)
+    planned = plan_readings(cell, config, request, rng, given, prior=_carried(prior, None))
     file = replace(planned.ordered.plan, about=about(planned))
     return checked(cell, config, file, summarise(planned, config, rng, compare=False))
 
@@ -465,12 +467,12 @@ def simulate(
 
     bare_plan = plan if isinstance(plan, Plan) else plan.plan
     if not isinstance(cell, Cell):
-        return rehearsal.read_plan(cell, bare_plan, [seed])
+        return rehearsal.simulate_plan(cell, bare_plan, [seed])
     if hide == rehearsal.INVENTED:
         catalogue = rehearsal.invented_law(catalogue or installed())
     config = cell.configured()
     case = rehearsal.case_of_plan(config, bare_plan, hide, seed, catalogue, cell.base_dir)
-    return rehearsal.read_plan(case, bare_plan, [seed, 1])
+    return rehearsal.simulate_plan(case, bare_plan, [seed, 1])
 
 
 @contextmanager

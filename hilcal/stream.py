@@ -87,10 +87,10 @@ class Errors:
     """The contribution of a row group to the errors of the fit (0) and without its fold (1)."""
 
     sums: Floats  # (2, 3) sums of the distance, of its square, of the whitened squares
-    most: Floats  # (2,) largest distance, m
+    max_m: Floats  # (2,) largest distance, m
     floor: float  # sum of the traces of the covariances, m²
     rank: int  # number of whitened rows that carry information
-    far: Ints  # rows beyond the limit, counted from 0 in the stream, ascending
+    far_rows: Ints  # rows beyond the limit, counted from 0 in the stream, ascending
     distance2: Floats  # their squared Mahalanobis distances
 
 
@@ -123,11 +123,11 @@ def reduce_group(group: int, work: PassTask, theta: Floats) -> Reduced:
 
 
 def errors_of_group(
-    group: int, work: PassTask, theta: Floats, change: Floats, far: float
+    group: int, work: PassTask, theta: Floats, change: Floats, limit: float
 ) -> Errors:
     """Return the errors of a row group at parameters (P,).
 
-    `change` (F, P) is the change of the parameters by leaving out each fold; `far` is the squared
+    `change` (F, P) is the change of the parameters by leaving out each fold; `limit` is the squared
     Mahalanobis distance beyond which rows are listed.
     """
     moved = np.flatnonzero(np.any(change != 0, axis=0))
@@ -144,7 +144,7 @@ def errors_of_group(
         floor += float(np.trace(c.readings.covariance[:, :3, :3], axis1=1, axis2=2).sum())
         rank += c.w.rank
         distance2 = np.sum(c.w.whiten(c.raw).reshape(c.raw.shape) ** 2, axis=1)
-        beyond = distance2 > far
+        beyond = distance2 > limit
         rows.append(c.rows[beyond])
         distances.append(distance2[beyond])
     return Errors(sums, most, floor, rank, np.concatenate(rows), np.concatenate(distances))
@@ -186,7 +186,7 @@ Result = TypeVar("Result")
 SAMPLE = 2000
 """Most readings for registration, starting model and starting values; a choice: enough for every
 effect of the catalogue, and a fit of a second."""
-NAMED = 10  # most gross errors that are named; a choice
+MAX_NAMED = 10  # most gross errors that are named; a choice
 OUTLIER_ROUNDS = 2  # most searches for gross errors that are followed by a new fit; a choice
 MAX_OUTLIER_SHARE = 0.05  # largest share of gross errors; a choice: more are a misfit of the model
 
@@ -315,7 +315,7 @@ def fit_stream(
         solved = _solved(problem, theta)
         theta = solved.point.theta
         errors = solved.errors(far)
-        aside = {k: e.far for k, e in enumerate(errors) if len(e.far)}
+        aside = {k: e.far_rows for k, e in enumerate(errors) if len(e.far_rows)}
         count, previous = (sum(map(len, x.values())) for x in (aside, problem.work.outliers))
         if count in (0, previous) or count > MAX_OUTLIER_SHARE * len(stream):
             break
@@ -355,7 +355,7 @@ class _StreamMinimum:
     def errors(self, far: float) -> tuple[Errors, ...]:
         """Return the errors of each row group; see `errors_of_group`."""
         work, theta = self.problem.work, self.point.theta
-        run = partial(errors_of_group, work=work, theta=theta, change=self.change, far=far)
+        run = partial(errors_of_group, work=work, theta=theta, change=self.change, limit=far)
         return self.problem.over(run)
 
     def result(self, first: Fit, errors: tuple[Errors, ...]) -> StreamFit:
@@ -381,7 +381,7 @@ class _StreamMinimum:
         identifiable = identifiable_parameters(basis, prior, carried, scale, std, null)
         wider = std / np.where(formal > 0, formal, 1.0)
         sums, count = sum(e.sums for e in errors), len(problem.work.stream)
-        rank, most = sum(e.rank for e in errors), np.max([e.most for e in errors], axis=0)
+        rank, most = sum(e.rank for e in errors), np.max([e.max_m for e in errors], axis=0)
         blocks = [
             ErrorBlock(
                 rms_m=float(np.sqrt(s[1] / count)),
@@ -395,7 +395,7 @@ class _StreamMinimum:
         worst = [
             (int(row) + 1, float(np.sqrt(d2)))
             for k, e in enumerate(errors)
-            for row, d2 in zip(e.far, e.distance2, strict=True)
+            for row, d2 in zip(e.far_rows, e.distance2, strict=True)
             if k in aside and row in aside[k]
         ]
         return StreamFit(
@@ -417,7 +417,7 @@ class _StreamMinimum:
             holdout=blocks[1],
             noise_floor=float(np.sqrt(sum(e.floor for e in errors) / count)),
             outliers=sum(map(len, aside.values())),
-            named=tuple(sorted(worst, key=lambda row: -row[1])[:NAMED]),
+            named=tuple(sorted(worst, key=lambda row: -row[1])[:MAX_NAMED]),
             passes=1 + len(problem.passed),
             converged=self.converged,
         )

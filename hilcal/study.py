@@ -61,8 +61,8 @@ class StudyDesign:
     wrenches: Floats  # (L, 6) at the target, base axes, N and N·m
     observation: Floats  # (P, L, 6, n) blocks of A_M, m and rad per rad/(N·m)
     std: Floats  # (P, 6) standard deviations of one reading: tracker and arm, m, rad
-    specified: Floats  # (P, 6, 6) correlations of one reading by tracker and arm
-    common: Floats  # (P, 6, 6) correlations of the arm's repeatability J Σ_q Jᵀ
+    reading_correlation: Floats  # (P, 6, 6) correlations of one reading by tracker and arm
+    arm_correlation: Floats  # (P, 6, 6) correlations of the arm's repeatability J Σ_q Jᵀ
 
     def covariance(self, correlation: float) -> Floats:
         """Return the covariance (P, 6, 6) of one reading, V = D ((1 - ρ) I + ρ C) D.
@@ -70,7 +70,7 @@ class StudyDesign:
         D: diagonal of the standard deviations, independent of ρ; C: correlation matrix of the
         arm's repeatability; ρ: share of each element's variance that is common to the elements.
         """
-        mixed = (1 - correlation) * np.eye(6) + correlation * self.common
+        mixed = (1 - correlation) * np.eye(6) + correlation * self.arm_correlation
         return self.std[:, :, None] * mixed * self.std[:, None, :]
 
 
@@ -123,7 +123,7 @@ def make_readings(design: StudyDesign, covariance: Floats, shared: bool) -> Read
     )
 
 
-def bound(design: StudyDesign, covariance: Floats, shared: bool) -> Floats:
+def cramer_rao_bound(design: StudyDesign, covariance: Floats, shared: bool) -> Floats:
     """Return the Cramér–Rao bound (n, n) on the covariance of any unbiased estimate of c.
 
         F⁻¹,  F = Σ_p Σ_kl (C⁻¹)_kl A_pkᵀ V_p⁻¹ A_pl,   C = I + 1 1ᵀ (shared) or 2 I
@@ -150,7 +150,7 @@ def _feasible(arm: Arm, q: Floats) -> Bools:
     for wrench in WRENCHES:
         wrenches = np.broadcast_to(wrench, (len(q), 6))
         load = Load(wrenches, TARGET, 0.0, np.zeros(3), np.array([0.0, 0.0, -9.80665]))
-        torques = arm.drive_torques(arm.along(slot_wrenches(arm, chain, load)))
+        torques = arm.drive_torques(arm.joint_components(slot_wrenches(arm, chain, load)))
         ok &= (np.abs(torques) < arm.torque_max).all(axis=1)
     return np.asarray(ok)
 
@@ -257,13 +257,13 @@ def scaling_study(
 
     Each correlation, the share ρ of variance that is common to the six elements, is one experiment
     with shared and one with separate unloaded readings. The engine computes the experiments, see
-    `experiments`, in parallel. All scalings and units have the same noise. `arm` None: the UR10e.
+    `n_experiments`, in parallel. All scalings and units have the same noise. `arm` None: the UR10e.
     """
     check(runs, correlations, poses)
     design = make_design(rng, arm or load_arm("ur10e"), poses)
     tasks = _experiments(rng, design, correlations, runs)
     results = engine.map(partial(_cells, design=design, runs=runs), tasks, advance=advance)
-    typical = _off_diagonal(design.specified) / _off_diagonal(design.common)
+    typical = _off_diagonal(design.reading_correlation) / _off_diagonal(design.arm_correlation)
     cells = tuple(cell for of_one in results for cell in of_one)
     return ScalingStudy(design.arm.name, runs, poses, len(design.wrenches), typical, cells)
 
@@ -281,7 +281,7 @@ def check(runs: int, correlations: Sequence[float] = CORRELATIONS, poses: int = 
             raise InputError(f"correlation {rho:g}: must be in [0, 1)")
 
 
-def experiments(correlations: Sequence[float] = CORRELATIONS) -> int:
+def n_experiments(correlations: Sequence[float] = CORRELATIONS) -> int:
     """Return the number of experiments of a study."""
     return 2 * len(correlations)
 
@@ -306,7 +306,7 @@ def _cells(experiment: _Experiment, design: StudyDesign, runs: int) -> list[Stud
     """Return all scalings and units with the same noise; `_mc` are from the spread of the runs."""
     rho, shared, rng = experiment
     covariance = design.covariance(rho)
-    limit = np.sqrt(np.diagonal(bound(design, covariance, shared)))[:, None]
+    limit = np.sqrt(np.diagonal(cramer_rao_bound(design, covariance, shared)))[:, None]
     readings = make_readings(design, covariance, shared)
     # A copy, so that the experiment can be repeated after a worker's death.
     noise = deepcopy(rng).standard_normal((len(readings), 6, runs))

@@ -11,7 +11,7 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit, fit
 from hilcal.names import quoted
 from hilcal.present.html import FirstScreen
-from hilcal.present.html.report import ReportContent, Tested, first_screen, page
+from hilcal.present.html.report import ReportContent, TestCampaign, first_screen, page
 from hilcal.present.progress import Say
 from hilcal.present.story import build_story, of_left_out
 from hilcal.procedure.state import IMPROVED, Files
@@ -131,7 +131,7 @@ def content_of(
     tested = corrected = None
     if validation is not None:
         prediction = validate(run, validation, record, limit_m, say=say)
-        tested = Tested(validation.path.name, _sha256(validation.path), prediction)
+        tested = TestCampaign(validation.path.name, _sha256(validation.path), prediction)
         commands.append(f"hilcal validate {name} {quoted(validation.path.name)}{number}")
     gain = ProcedureLog(run.file).last(IMPROVED)
     if gain and record and gain["revision"] == record.number:
@@ -139,7 +139,7 @@ def content_of(
     return ReportContent(
         name=run.path.name,
         sha256=_sha256(run.path),
-        made=utc_now(),
+        created=utc_now(),
         version=hilcal.__version__,
         overview=overview(run.file),
         covariance=run.covariance_parts,
@@ -149,7 +149,7 @@ def content_of(
         left_out=of_left_out(story.revisions[-1], fitted),
         scalings=_scalings(fitted, say) if options.appendix else {},
         plan=None if run.file.about(PLAN) is None else RunLog(run.file).plan,
-        tested=tested,
+        test=tested,
         corrected=corrected,
         limit_m=run.config.limits.accuracy_m if limit_m is None else limit_m,
         operator=options.operator,

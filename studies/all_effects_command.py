@@ -52,7 +52,7 @@ BAND = (0.93, 0.97)
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class AllEffectsCase:
     """A campaign on a simulated arm.
 
     Attributes:
@@ -69,7 +69,7 @@ class Case:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class AllEffectsResult:
     """Result of a case.
 
     Attributes:
@@ -114,14 +114,14 @@ def all_effects(
     t = terminal(as_json)
     counts = [int(n) for n in poses.split(",")]
     cases = [
-        Case(n, s, float(sizes ** np.random.default_rng([s, 1]).uniform(-1, 1)), without)
+        AllEffectsCase(n, s, float(sizes ** np.random.default_rng([s, 1]).uniform(-1, 1)), without)
         for n, s in product(counts, range(first_seed, first_seed + seeds))
     ]
     with (
         open_engine(*one_by_default(jobs, scheduler)) as engine,
         counting(t.progress, "arms", len(cases)) as advance,
     ):
-        done: Sequence[Found | None] = engine.map(refined, cases, advance=advance)
+        done: Sequence[AllEffectsResult | None] = engine.map(refined, cases, advance=advance)
     answered = [d for d in done if d is not None]
     figures = [f for n in counts for f in _figures(n, [d for d in answered if d.poses == n])]
     if refused := len(done) - len(answered):
@@ -132,7 +132,7 @@ def all_effects(
     t.document({"cases": [asdict(d) for d in answered]})
 
 
-def refined(case: Case) -> Found | None:
+def refined(case: AllEffectsCase) -> AllEffectsResult | None:
     """Refine the poses of a case, and predict others; None where the program refuses them."""
     rng = np.random.default_rng(case.seed)
     cell = cell_from_config(
@@ -170,7 +170,7 @@ def refined(case: Case) -> Found | None:
         plain = refine(start, some, "absolute", background=False).fit
         position = plain.model.predict(test.states, plain.theta).observation.position
         without = _rms(test.value - position)
-    return Found(
+    return AllEffectsResult(
         case.poses,
         case.factor,
         _rms(error),
@@ -207,7 +207,7 @@ def _rms(error: Floats) -> float:
     return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
 
 
-def _figures(poses: int, results: list[Found]) -> list[Figure]:
+def _figures(poses: int, results: list[AllEffectsResult]) -> list[Figure]:
     """Figures of the arms of one number of poses."""
     ratio = np.array([f.rms_m / f.best_m for f in results])
     inside = float(np.mean([f.inside for f in results]))

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.drivers.simulated.injected_effects import nothing_hidden
+from hilcal.drivers.simulated.injected_effects import world_without_effect
 from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.whole_file import replace_file
 from studies.random_campaigns import rehearsal_states
@@ -32,7 +32,7 @@ def table(cell: Cell) -> str:
     hung = [(load.name, load.wrench(cell.gravity)) for load in config.loads]
     states, pose, load, cycle = rehearsal_states(cell, POSES, hung, rng)
     states = replace(states, q=np.radians(np.round(np.degrees(states.q), 3)))
-    plain = nothing_hidden(
+    plain = world_without_effect(
         cell,
         rng,
         noise=measurement_noise(config),

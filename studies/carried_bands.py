@@ -16,9 +16,9 @@ import numpy as np
 from hilcal.calibration.calibration import Calibration
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
-from hilcal.drivers.simulated.injected_effects import Draw, nothing_hidden, typical_torque
+from hilcal.drivers.simulated.injected_effects import Draw, typical_torque, world_without_effect
 from hilcal.drivers.simulated.rehearsal import measurement_noise
-from hilcal.drivers.simulated.world import World, stand
+from hilcal.drivers.simulated.world import World, place_tracker
 from hilcal.identification.arm_scatter import with_prior_scatter
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.carried import carried_prior
@@ -77,7 +77,7 @@ def band_cases(
         measurement_noise(robot_config),
         robot_config.repeatability.per_joint(cell.arm.n),
     )
-    world = nothing_hidden(cell, rng, noise=noise, joint_std=joints)
+    world = world_without_effect(cell, rng, noise=noise, joint_std=joints)
     draw = Draw(cell.arm, world.physics.joint_compliance, typical_torque(cell.arm))
     lacking = LACKING[seed // 2 % len(LACKING)] if seed % 2 else ""
     physics = world.physics
@@ -88,12 +88,12 @@ def band_cases(
     readings = measured(_within(world, 0), [], first, rng)
     first_fit = fit(with_effects(cell, readings, "absolute", GEOMETRY), readings, "absolute")
     prior = carried_prior(Posterior.of(first_fit))
-    registration, station = stand(cell, rng)
+    registration, station = place_tracker(cell, rng)
     again = _within(replace(world, registration=registration, station=station), 1)
     second = measured(again, [], max(numbers) + TESTED, rng)
     # The band of a calibration contains the arm's scatter; the tested readings add the tracker's.
     tracker = replace(again, joint_std=np.zeros(cell.arm.n))
-    tracker_alone = tracker.covariance(again.sight(second.states), second.m)
+    tracker_alone = tracker.covariance(again.ideal_readings(second.states), second.m)
     out = []
     for n in numbers:
         order = rng.permutation(len(second))

@@ -39,7 +39,7 @@ MOST_TESTED = 400
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class CarryOutcome:
     """One fit to N poses.
 
     Attributes:
@@ -119,7 +119,7 @@ def _readings(which: str, path: Path) -> Readings:
 
 def _drawn(
     case: tuple[str, Path, int], prior: CarriedPrior, draws: int, without: bool
-) -> tuple[list[Outcome], list[Outcome]]:
+) -> tuple[list[CarryOutcome], list[CarryOutcome]]:
     """Fit n poses of a series, drawn several times, with the prior and without any."""
     name, path, n = case
     cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
@@ -157,13 +157,13 @@ def set_up_anew(readings: Readings, rng: np.random.Generator) -> Readings:
     return replace(readings, value=value, covariance=(covariance + covariance.swapaxes(1, 2)) / 2)
 
 
-def outcome(fitted: Fit | None, tested: Readings) -> Outcome:
+def outcome(fitted: Fit | None, tested: Readings) -> CarryOutcome:
     """Predict tested poses by the calibration of a fit; without a fit the error is infinite."""
     if fitted is None:
-        return Outcome(float("inf"), 0.0)
+        return CarryOutcome(float("inf"), 0.0)
     c = Calibration.of(fitted)
     errors, inside = judged(c, c.predict(tested.states.q, tested.states.wrench), tested)
-    return Outcome(float(errors.mean()), float(inside.mean()))
+    return CarryOutcome(float(errors.mean()), float(inside.mean()))
 
 
 def _carried(cell: Cell, some: Readings, prior: CarriedPrior) -> Fit:
@@ -189,8 +189,8 @@ def _without_of(record: Path | None) -> dict[tuple[str, int], list[float]]:
 def _figures(
     name: str,
     n: int,
-    with_it: list[Outcome],
-    alone: list[Outcome],
+    with_it: list[CarryOutcome],
+    alone: list[CarryOutcome],
     recorded: list[float] | None = None,
 ) -> list[Figure]:
     errors = np.array([o.mean_m for o in with_it])

@@ -20,11 +20,11 @@ from hilcal.diagnosis.comparison import with_missing_effects
 from hilcal.drivers.simulated.injected_effects import (
     Draw,
     joint_compliance,
-    nothing_hidden,
     typical_torque,
+    world_without_effect,
 )
 from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
-from hilcal.drivers.simulated.world import World, stand
+from hilcal.drivers.simulated.world import World, place_tracker
 from hilcal.errors import HilcalError
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import fit
@@ -68,7 +68,7 @@ class StudiedArm:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Case:
+class ChangeCase:
     """One comparison.
 
     Attributes:
@@ -144,7 +144,7 @@ def studied_arm(
         measurement_noise(robot_config),
         robot_config.repeatability.per_joint(cell.arm.n),
     )
-    world = nothing_hidden(cell, rng, noise=noise, joint_std=joints)
+    world = world_without_effect(cell, rng, noise=noise, joint_std=joints)
     draw = Draw(cell.arm, world.physics.joint_compliance, typical_torque(cell.arm))
     physics = world.physics
     for name in ("link_geometry", "encoder_offset", "transmission_error", *more):
@@ -203,7 +203,7 @@ def case(
     *,
     other: bool = False,
     count: int = READINGS_B,
-) -> Case:
+) -> ChangeCase:
     """Repair an arm, measure it again, and compare.
 
     Args:
@@ -218,7 +218,7 @@ def case(
     rng = np.random.default_rng([seed, joint, len(repair), anew])
     world, k = arm.world, joint - 1
     if anew:
-        registration, station = stand(arm.cell, rng)
+        registration, station = place_tracker(arm.cell, rng)
         world = replace(world, registration=registration, station=station)
     physics, size, factor = world.physics, 0.0, 1.0
     if repair != "nothing" and repair != "compliance":
@@ -240,9 +240,12 @@ def case(
     changed = replace(world, physics=physics.with_effect("joint_compliance", compliance))
     loads, warmer = (arm.others, WARMER) if other else (arm.loads, 0.0)
     readings = remeasured(changed, loads, count, rng, warmer)
-    moved = changed.sight(readings.states).position - world.sight(readings.states).position
+    moved = (
+        changed.ideal_readings(readings.states).position
+        - world.ideal_readings(readings.states).position
+    )
     rms = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
-    repaired = Case(arm.robot, repair, joint, anew, seed, size, factor, other, rms)
+    repaired = ChangeCase(arm.robot, repair, joint, anew, seed, size, factor, other, rms)
     try:
         changes = find_changes(later_readings(arm.earlier, readings, anew=anew))
     except HilcalError as error:
@@ -250,7 +253,7 @@ def case(
     return judged(repaired, changes, moved, change)
 
 
-def judged(repaired: Case, changes: Changes, moved: Floats, change: float) -> Case:
+def judged(repaired: ChangeCase, changes: Changes, moved: Floats, change: float) -> ChangeCase:
     """Return the case with the answer of the program.
 
     Args:

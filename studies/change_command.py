@@ -18,7 +18,7 @@ from hilcal.numbers import length
 from hilcal.present.document import table
 from hilcal.present.progress import counting
 from hilcal.robot.catalogue import configs_dir
-from studies.change import READINGS_B, REPAIRS, Case, StudiedArm, case, studied_arm
+from studies.change import READINGS_B, REPAIRS, ChangeCase, StudiedArm, case, studied_arm
 from studies.change_real import ZERO_RAD, RealCase, RealStudy, real_case
 from studies.records import Figure, Keep, keep
 
@@ -109,7 +109,7 @@ def _arms() -> tuple[StudiedArm, ...]:
     return tuple(studied_arm(config, robot, k, more=more) for k, (robot, more) in enumerate(ARMS))
 
 
-def _case(comparison: tuple[bool, int], first: int, count: int) -> Case:
+def _case(comparison: tuple[bool, int], first: int, count: int) -> ChangeCase:
     """Return the k-th case with a repair, or the k-th case without."""
     repaired, k = comparison
     arms = _arms()
@@ -120,7 +120,7 @@ def _case(comparison: tuple[bool, int], first: int, count: int) -> Case:
     return case(arm, "nothing", 0, anew, seed, other=other, count=count)
 
 
-def _repaired(arms: Sequence[StudiedArm], k: int, first: int, count: int) -> Case:
+def _repaired(arms: Sequence[StudiedArm], k: int, first: int, count: int) -> ChangeCase:
     """Return the k-th repair: kinds, arms, joints and setups in turn, all combined."""
     arm, repair = arms[k % len(arms)], REPAIRS[k // len(arms) % len(REPAIRS)]
     rng = np.random.default_rng([first + k, 5])
@@ -128,7 +128,7 @@ def _repaired(arms: Sequence[StudiedArm], k: int, first: int, count: int) -> Cas
     return case(arm, repair, joint, anew, first + k, count=count)
 
 
-def figures_of(cases: Sequence[Case]) -> list[Figure]:
+def figures_of(cases: Sequence[ChangeCase]) -> list[Figure]:
     """Return the figures of simulated arms."""
     quiet = [c for c in cases if c.repair == "nothing"]
     repaired = [c for c in cases if c.repair != "nothing"]
@@ -175,7 +175,7 @@ def figures_of(cases: Sequence[Case]) -> list[Figure]:
     return out
 
 
-def _missed(cases: Sequence[Case]) -> list[Figure]:
+def _missed(cases: Sequence[ChangeCase]) -> list[Figure]:
     """Count missed changes that these readings cannot show, and other missed ones."""
     hidden = [c for c in cases if not c.visible]
     turned = [c for c in hidden if c.size_rad and c.joint == 1 and c.anew]

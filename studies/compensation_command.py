@@ -43,7 +43,7 @@ ENVIRONMENT = ("time", "load_time", "air_temperature", "joint_temperature", "app
 
 
 @dataclass(frozen=True, slots=True)
-class Left:
+class SplitErrors:
     """Remaining errors of a calibration at poses that were not fitted.
 
     Attributes:
@@ -121,7 +121,9 @@ def compensation(
     t.document({"series": document})
 
 
-def _split(case: tuple[Path, int], splits: int, share: float, folder: Path | None) -> list[Left]:
+def _split(
+    case: tuple[Path, int], splits: int, share: float, folder: Path | None
+) -> list[SplitErrors]:
     """Fit the k-th part of a series, and correct the other poses."""
     path, k = case
     cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
@@ -170,7 +172,7 @@ def _before(cell: Cell, fitted: Readings, tested: Readings) -> Floats:
     return np.asarray(np.linalg.norm(tested.value[:, :3] - predicted, axis=1))
 
 
-def _left(name: str, which: str, c: Calibration, tested: Readings, before: Floats) -> Left:
+def _left(name: str, which: str, c: Calibration, tested: Readings, before: Floats) -> SplitErrors:
     recorded = {k: v for k in ENVIRONMENT if (v := getattr(tested.states, k)) is not None}
     p = c.predict(tested.states.q, tested.states.wrench, recorded=recorded)
     errors, inside = judged(c, p, tested)
@@ -181,7 +183,7 @@ def _left(name: str, which: str, c: Calibration, tested: Readings, before: Float
         (float(errors[x].mean()), float(inside[x].mean())) if x.any() else (None, None)
         for x in (beyond, ~beyond)
     )
-    return Left(
+    return SplitErrors(
         split=name,
         model=which,
         scatter=c.scatter.source == "estimated",
@@ -220,7 +222,7 @@ def judged(c: Calibration, p: ToolPoses, tested: Readings) -> tuple[Floats, Bool
     return np.asarray(errors), np.asarray(errors <= band(p.covariance + instrument))
 
 
-def _figures(series: str, results: list[Left]) -> Iterator[Figure]:
+def _figures(series: str, results: list[SplitErrors]) -> Iterator[Figure]:
     """Yield mean and worst over the random halves, and the first half alone."""
     low, high = WANTED_BAND
     kinds = dict.fromkeys(x.split.rstrip("0123456789 ") for x in results)
@@ -255,7 +257,7 @@ def _figures(series: str, results: list[Left]) -> Iterator[Figure]:
                 yield Figure(f"{title}: verdicts", ", ".join(x.verdict for x in parts))
 
 
-def _beyond(parts: list[Left]) -> str:
+def _beyond(parts: list[SplitErrors]) -> str:
     """Describe the remaining error at poses that the program refuses, and at all others."""
     share = 100 * np.mean([x.beyond for x in parts])
     clauses = [f"{share:.1f} % of poses"]

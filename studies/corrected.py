@@ -33,7 +33,7 @@ from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.config.sections import CellLoad
-from hilcal.drivers.simulated.rehearsal import as_told
+from hilcal.drivers.simulated.rehearsal import program_config
 from hilcal.effects.catalogue import installed
 from hilcal.engine import open_engine
 from hilcal.errors import DeviceError
@@ -73,13 +73,13 @@ SEED = 11
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Case:
+class CorrectedCase:
     """One cell.
 
     Attributes:
         arm: name of the arm.
         hidden: the hidden effect.
-        found: the errors before and after correction.
+        improvement: the errors before and after correction.
         verdict: of the refinement.
         model: effects of the refined model.
         seconds: duration.
@@ -87,7 +87,7 @@ class Case:
 
     arm: str
     hidden: str
-    found: Improvement
+    improvement: Improvement
     verdict: str
     model: tuple[str, ...]
     seconds: float
@@ -114,8 +114,8 @@ def corrected(
     folder.mkdir(parents=True, exist_ok=True)
     cells = [(arm, hidden) for hidden in effects.split(",") for arm in arms.split(",")]
     run = partial(case, folder=folder.absolute(), points=points, poses=poses)
-    done: dict[int, Case] = {}
-    cases: list[Case] = []
+    done: dict[int, CorrectedCase] = {}
+    cases: list[CorrectedCase] = []
     with open_engine(*one_by_default(jobs, scheduler)) as engine:
         for number, finished in engine.results(run, cells):
             done[number] = finished
@@ -127,14 +127,14 @@ def corrected(
     t.document(
         {
             "cases": [
-                {"arm": c.arm, "hidden": c.hidden, "verdict": c.verdict, **c.found.to_dict()}
+                {"arm": c.arm, "hidden": c.hidden, "verdict": c.verdict, **c.improvement.to_dict()}
                 for c in cases
             ]
         }
     )
 
 
-def case(cell: tuple[str, str], folder: Path, points: int, poses: int = POSES) -> Case:
+def case(cell: tuple[str, str], folder: Path, points: int, poses: int = POSES) -> CorrectedCase:
     """Calibrate one cell, or continue where its files end.
 
     Args:
@@ -153,7 +153,7 @@ def case(cell: tuple[str, str], folder: Path, points: int, poses: int = POSES) -
         poses=poses, validation=points, seed=seed, readings="absolute", hide=hidden,
         under_load=True,
     )  # fmt: skip
-    config = as_told(cell_of(arm, seed), hidden)
+    config = program_config(cell_of(arm, seed), hidden)
     run = folder / f"{arm}-{hidden}.hilcal"
     with _alone(run.with_suffix(".log")) as log:
         quiet = Console(file=log, width=100)
@@ -162,7 +162,9 @@ def case(cell: tuple[str, str], folder: Path, points: int, poses: int = POSES) -
     improvement = p.compare()
     record = p.record()
     verdict = str(record.result_json.get("diagnose", {}).get("verdict", ""))
-    return Case(arm, hidden, improvement, verdict, record.effects, time.monotonic() - start)
+    return CorrectedCase(
+        arm, hidden, improvement, verdict, record.effects, time.monotonic() - start
+    )
 
 
 def _calibrated(t: Terminal, run: Path, config: CellConfig, settings: Settings) -> Procedure:
@@ -218,9 +220,9 @@ def cell_of(arm: str, seed: int) -> CellConfig:
     )
 
 
-def words(c: Case) -> str:
+def words(c: CorrectedCase) -> str:
     """Return a case in a line."""
-    e = c.found.everything
+    e = c.improvement.everything
     removed = "" if e.removed is None else f", {100 * e.removed:.1f} % of the excess removed"
     return (
         f"{c.arm}, {c.hidden}: {length(e.before.rms_m)} → {length(e.after.rms_m)} rms (noise "
@@ -228,12 +230,12 @@ def words(c: Case) -> str:
     )
 
 
-def figures(cases: list[Case]) -> list[Figure]:
+def figures(cases: list[CorrectedCase]) -> list[Figure]:
     """Return the figures of all cases together, and of each case."""
-    results = [c.found.everything for c in cases]
+    results = [c.improvement.everything for c in cases]
     removed = [e.removed for e in results if e.removed is not None]
     inside, points = sum(e.inside for e in results), sum(e.count for e in results)
-    share, left_out = inside / points, sum(len(c.found.left_out) for c in cases)
+    share, left_out = inside / points, sum(len(c.improvement.left_out) for c in cases)
     band = f"{100 * WANTED_BAND[0]:.0f} to {100 * WANTED_BAND[1]:.0f} %"
     out = [
         Figure(

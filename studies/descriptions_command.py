@@ -12,7 +12,7 @@ from hilcal.cli.terminal import terminal
 from hilcal.engine import open_engine
 from hilcal.present.document import table
 from hilcal.present.progress import counting
-from studies.random_descriptions import Outcome, draw, judge
+from studies.random_descriptions import DescriptionOutcome, draw, judge
 from studies.records import Figure, Keep, keep
 
 
@@ -77,7 +77,7 @@ def descriptions(
     keep(keep_file, "Errors of description", figures)
 
 
-def _judged(seed: int) -> tuple[str | None, Outcome]:
+def _judged(seed: int) -> tuple[str | None, DescriptionOutcome]:
     """Draw a case, and return its error and the program's answer."""
     case = draw(np.random.default_rng(seed))
     return case.error, judge(case)[0]

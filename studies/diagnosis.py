@@ -37,7 +37,7 @@ INTERVAL = 1.959964
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class DiagnosisCase:
     """Settings of a case.
 
     Attributes:
@@ -82,10 +82,10 @@ class Sample:
     variables: tuple[str, ...] = ()
 
 
-Simulate = Callable[[Asked], Sample]
+Simulate = Callable[[DiagnosisCase], Sample]
 """Simulate a campaign; equal settings give equal campaigns."""
 
-More = Callable[[Asked, Diagnosis], Readings | None]
+More = Callable[[DiagnosisCase, Diagnosis], Readings | None]
 """Measure readings that separate the suspects of a diagnosis, and return all readings, those of the
 campaign first; None where nothing is in doubt or can be separated."""
 
@@ -127,7 +127,7 @@ class Judgement:
 
 
 @dataclass(frozen=True, slots=True)
-class Added:
+class AddedEffect:
     """An effect that a refinement added, and the effects inseparable from it."""
 
     effect: str
@@ -135,7 +135,7 @@ class Added:
 
 
 @dataclass(frozen=True, slots=True)
-class Inside:
+class IntervalCount:
     """Number of identifiable true parameters of an effect inside their 95 % intervals."""
 
     effect: str
@@ -144,7 +144,7 @@ class Inside:
 
 
 @dataclass(frozen=True, slots=True)
-class Refined:
+class RefinementResult:
     """Result of a refinement.
 
     Attributes:
@@ -157,11 +157,11 @@ class Refined:
     """
 
     judgement: Judgement
-    added: tuple[Added, ...]
+    added: tuple[AddedEffect, ...]
     model: tuple[str, ...]
     holdout: float
     holdout_real: float
-    intervals: tuple[Inside, ...]
+    intervals: tuple[IntervalCount, ...]
 
     def finds(self, effect: str) -> bool:
         """Whether an effect is in the model, or inseparable from an added one."""
@@ -171,11 +171,11 @@ class Refined:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class DiagnosisOutcome:
     """A case.
 
     Attributes:
-        asked: its settings.
+        case: its settings.
         first: judgement of the baseline; None where the case failed.
         refined: result of the refinement; None without one.
         again: judgement of the baseline after a round of further readings.
@@ -184,9 +184,9 @@ class Outcome:
         impossible: reason why there is no such campaign; the case then does not count.
     """
 
-    asked: Asked
+    case: DiagnosisCase
     first: Judgement | None = None
-    refined: Refined | None = None
+    refined: RefinementResult | None = None
     again: Judgement | None = None
     variables: tuple[str, ...] = ()
     failure: str = ""
@@ -194,8 +194,8 @@ class Outcome:
 
 
 def run_case(
-    asked: Asked, simulate: Simulate, more: More | None = None, refined: bool = True
-) -> Outcome:
+    asked: DiagnosisCase, simulate: Simulate, more: More | None = None, refined: bool = True
+) -> DiagnosisOutcome:
     """Simulate, fit the baseline, diagnose as `diagnose` does, and refine as `refine` does.
 
     Args:
@@ -207,20 +207,22 @@ def run_case(
     try:
         sample = simulate(asked)
     except InputError as error:  # e.g. a gear that would have to stiffen to nothing
-        return Outcome(asked, impossible=_line(error))
+        return DiagnosisOutcome(asked, impossible=_line(error))
     except Exception as error:
-        return Outcome(asked, failure=f"{type(error).__name__}: {_line(error)}")
+        return DiagnosisOutcome(asked, failure=f"{type(error).__name__}: {_line(error)}")
     try:
         return _run(asked, sample, more, refined)
     except Exception as error:
-        return Outcome(asked, failure=f"{type(error).__name__}: {_line(error)}")
+        return DiagnosisOutcome(asked, failure=f"{type(error).__name__}: {_line(error)}")
 
 
 def _line(error: Exception) -> str:
     return " ".join(str(error).split())
 
 
-def _run(asked: Asked, sample: Sample, more: More | None, refined: bool) -> Outcome:
+def _run(
+    asked: DiagnosisCase, sample: Sample, more: More | None, refined: bool
+) -> DiagnosisOutcome:
     model = baseline(sample.cell, sample.readings, asked.mode)
     if refined and asked.kind not in ("nothing", "noise"):
         r = refine(model, sample.readings, asked.mode)
@@ -239,7 +241,7 @@ def _run(asked: Asked, sample: Sample, more: More | None, refined: bool) -> Outc
             later_model = baseline(sample.cell, readings, asked.mode)
             later = diagnose(fit(later_model, readings, asked.mode))
         again = judgement(later)
-    return Outcome(asked, judgement(diagnosis), result, again, sample.variables)
+    return DiagnosisOutcome(asked, judgement(diagnosis), result, again, sample.variables)
 
 
 def judgement(d: Diagnosis) -> Judgement:
@@ -259,13 +261,13 @@ def judgement(d: Diagnosis) -> Judgement:
     )
 
 
-def _refined(r: Refinement, sample: Sample) -> Refined:
+def _refined(r: Refinement, sample: Sample) -> RefinementResult:
     last = r.steps[-1]
     floor, real = _floors(last.fit, sample)
-    return Refined(
+    return RefinementResult(
         judgement=judgement(last.diagnosis),
         added=tuple(
-            Added(after.added, _same_as(before.diagnosis, after.added))
+            AddedEffect(after.added, _same_as(before.diagnosis, after.added))
             for before, after in zip(r.steps, r.steps[1:], strict=False)
             if after.added is not None
         ),
@@ -287,7 +289,7 @@ def _floors(f: Fit, sample: Sample) -> tuple[float, float]:
     return e.noise_floor, float(np.sqrt(np.mean(np.sum(noise**2, axis=1))))
 
 
-def intervals(f: Fit, truth: Mapping[str, float]) -> tuple[Inside, ...]:
+def intervals(f: Fit, truth: Mapping[str, float]) -> tuple[IntervalCount, ...]:
     """Count true parameters in their 95 % intervals, of effects in the truth.
 
     Parameters that are not identifiable have no interval. Newly registered frames have no true
@@ -302,5 +304,5 @@ def intervals(f: Fit, truth: Mapping[str, float]) -> tuple[Inside, ...]:
         identifiable = f.uncertainty.identifiable[rows]
         error = np.abs(f.theta[rows] - true)[identifiable]
         inside = error <= INTERVAL * f.uncertainty.std[rows][identifiable]
-        out.append(Inside(effect.name, int(inside.sum()), int(identifiable.sum())))
+        out.append(IntervalCount(effect.name, int(inside.sum()), int(identifiable.sum())))
     return tuple(out)

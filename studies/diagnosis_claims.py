@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from studies.diagnosis import Kind, Outcome
+from studies.diagnosis import DiagnosisOutcome, Kind
 from studies.diagnosis_rates import (
     HELD_OUT,
     Rate,
@@ -48,9 +48,9 @@ class Claim:
         return self.least <= self.rate.share <= self.most
 
 
-def claims(outcomes: Sequence[Outcome]) -> tuple[Claim, ...]:
+def claims(outcomes: Sequence[DiagnosisOutcome]) -> tuple[Claim, ...]:
     """Return all claims about these cases."""
-    makers: dict[Kind, Callable[[Sequence[Outcome]], Iterable[Claim]]] = {
+    makers: dict[Kind, Callable[[Sequence[DiagnosisOutcome]], Iterable[Claim]]] = {
         "hidden": _hidden,
         "nothing": _nothing,
         "noise": _noise,
@@ -59,22 +59,22 @@ def claims(outcomes: Sequence[Outcome]) -> tuple[Claim, ...]:
     }
     out: list[Claim] = []
     for kind, make in makers.items():
-        of_kind = [o for o in outcomes if o.asked.kind == kind]
+        of_kind = [o for o in outcomes if o.case.kind == kind]
         if of_kind:
             out += make(of_kind)
     return tuple(out)
 
 
-def _hidden(cases: Sequence[Outcome]) -> Iterable[Claim]:
-    strengths = list(dict.fromkeys(o.asked.strength for o in cases))
+def _hidden(cases: Sequence[DiagnosisOutcome]) -> Iterable[Claim]:
+    strengths = list(dict.fromkeys(o.case.strength for o in cases))
     for s in strengths:
-        of_strength = [o for o in cases if o.asked.strength == s]
+        of_strength = [o for o in cases if o.case.strength == s]
         yield Claim("hidden", f"found at {s:g} σ", rate(of_strength, found), FOUND.get(s))
         yield Claim("hidden", f"found and named at {s:g} σ", rate(of_strength, named))
-    again = [o for o in cases if o.asked.again]
+    again = [o for o in cases if o.case.again]
     if again:
         hit = rate(
-            again, lambda o: o.again is not None and all(o.again.finds(e) for e in o.asked.hidden)
+            again, lambda o: o.again is not None and all(o.again.finds(e) for e in o.case.hidden)
         )
         yield Claim("hidden", "found after a further round at 0.5 σ", hit, 0.9)
     for a in afterwards(cases):
@@ -86,14 +86,14 @@ def _hidden(cases: Sequence[Outcome]) -> Iterable[Claim]:
         yield Claim("hidden", f"true parameters in 95 % intervals {of}", a.intervals, 0.93, 0.97)
 
 
-def _nothing(cases: Sequence[Outcome]) -> Iterable[Claim]:
+def _nothing(cases: Sequence[DiagnosisOutcome]) -> Iterable[Claim]:
     hit = rate(cases, lambda o: o.first is not None and o.first.verdict == "adequate")
     yield Claim("nothing", "nothing hidden: adequate", hit, 0.99)
 
 
-def _noise(cases: Sequence[Outcome]) -> Iterable[Claim]:
-    for stated in dict.fromkeys(o.asked.stated for o in cases):
-        of_stated = [o for o in cases if o.asked.stated == stated]
+def _noise(cases: Sequence[DiagnosisOutcome]) -> Iterable[Claim]:
+    for stated in dict.fromkeys(o.case.stated for o in cases):
+        of_stated = [o for o in cases if o.case.stated == stated]
         case = f"σ stated {stated:g} × the true one"
         silent = rate(of_stated, lambda o: o.first is not None and not o.first.named)
         yield Claim("noise", f"{case}: no effect named", silent, 0.98)
@@ -103,13 +103,13 @@ def _noise(cases: Sequence[Outcome]) -> Iterable[Claim]:
         yield Claim("noise", f"{case}: noise_misjudged", misjudged)
 
 
-def _pairs(cases: Sequence[Outcome]) -> Iterable[Claim]:
+def _pairs(cases: Sequence[DiagnosisOutcome]) -> Iterable[Claim]:
     claim = "two hidden effects: both in the refined model"
     yield Claim("pairs", f"{claim}, or not told from what is", rate(cases, both_found), 0.9)
     yield Claim("pairs", claim, rate(cases, both_added))
 
 
-def _outside(cases: Sequence[Outcome]) -> Iterable[Claim]:
+def _outside(cases: Sequence[DiagnosisOutcome]) -> Iterable[Claim]:
     law = "an effect outside of the catalogue"
     yield Claim("outside", f"{law}: unknown_effect, in the end", rate(cases, unknown), 0.9)
     yield Claim("outside", f"{law}: unknown_effect, at once", rate(cases, unknown_at_once), 0.9)

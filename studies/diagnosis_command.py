@@ -17,7 +17,7 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES, Mode
 from hilcal.robot.catalogue import configs_dir, robot_names
 from hilcal.toml import suggest
-from studies.diagnosis import KINDS, Asked, Kind, Sample, run_case
+from studies.diagnosis import KINDS, DiagnosisCase, Kind, Sample, run_case
 from studies.diagnosis_claims import claims
 from studies.diagnosis_document import document
 from studies.diagnosis_pool import run_all
@@ -121,18 +121,18 @@ def diagnosis(
         raise typer.Exit(_INTERRUPTED)
 
 
-def simulate(asked: Asked) -> Sample:
+def simulate(asked: DiagnosisCase) -> Sample:
     """Measure the campaign of a case in the simulated world."""
     c = _case(asked)
     return Sample(c.cell, c.readings, c.noise, c.world.truth, c.variables)
 
 
-def more(asked: Asked, diagnosis: Diagnosis) -> Readings | None:
+def more(asked: DiagnosisCase, diagnosis: Diagnosis) -> Readings | None:
     """Measure readings that separate the suspects of a diagnosis, in the same world."""
     return measure_more(_config(), asked.robot, _case(asked), diagnosis, asked.seed)
 
 
-def _case(asked: Asked) -> StudyCase:
+def _case(asked: DiagnosisCase) -> StudyCase:
     return study_case(
         _config(), asked.robot, asked.mode, asked.hidden, asked.strength, asked.seed,
         stated=asked.stated, cycles=asked.cycles,

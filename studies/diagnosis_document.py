@@ -3,19 +3,19 @@
 from collections.abc import Sequence
 from dataclasses import asdict
 
-from studies.diagnosis import Outcome
+from studies.diagnosis import DiagnosisOutcome
 from studies.diagnosis_claims import claims
-from studies.diagnosis_rates import Found, by_effect, coverage_by_effect, found
+from studies.diagnosis_rates import EffectRates, by_effect, coverage_by_effect, found
 
 
-def document(outcomes: Sequence[Outcome], complete: bool) -> dict[str, object]:
+def document(outcomes: Sequence[DiagnosisOutcome], complete: bool) -> dict[str, object]:
     """Return figures and cases.
 
     Args:
         outcomes: the cases that were run.
         complete: whether these are all.
     """
-    hidden = [o for o in outcomes if o.asked.kind == "hidden"]
+    hidden = [o for o in outcomes if o.case.kind == "hidden"]
     return {
         "complete": complete,
         "claims": [
@@ -35,7 +35,7 @@ def document(outcomes: Sequence[Outcome], complete: bool) -> dict[str, object]:
     }
 
 
-def _effect(f: Found) -> dict[str, object]:
+def _effect(f: EffectRates) -> dict[str, object]:
     return {
         "effect": f.effect,
         "readings": f.mode,
@@ -49,5 +49,5 @@ def _effect(f: Found) -> dict[str, object]:
     }
 
 
-def _case(o: Outcome) -> dict[str, object]:
-    return {**asdict(o), "found": found(o) if o.asked.kind == "hidden" else None}
+def _case(o: DiagnosisOutcome) -> dict[str, object]:
+    return {**asdict(o), "found": found(o) if o.case.kind == "hidden" else None}

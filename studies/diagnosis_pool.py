@@ -3,18 +3,18 @@
 from collections.abc import Callable, Sequence
 
 from hilcal.engine import Advance, open_engine
-from studies.diagnosis import Asked, Outcome
+from studies.diagnosis import DiagnosisCase, DiagnosisOutcome
 
-Run = Callable[[Asked], Outcome]
+Run = Callable[[DiagnosisCase], DiagnosisOutcome]
 
 
 def run_all(
-    questions: Sequence[Asked],
+    questions: Sequence[DiagnosisCase],
     run: Run,
     jobs: int | None,
     advance: Advance,
     scheduler: str | None = None,
-) -> tuple[tuple[Outcome, ...], bool]:
+) -> tuple[tuple[DiagnosisOutcome, ...], bool]:
     """Run cases, and return the finished ones in the order of the questions, and whether all are.
 
     Ctrl-C ends the run: running cases are dropped, finished ones are returned.
@@ -26,7 +26,7 @@ def run_all(
         advance: called after each case.
         scheduler: address of a cluster, instead of processes of this machine.
     """
-    finished: dict[int, Outcome] = {}
+    finished: dict[int, DiagnosisOutcome] = {}
     try:
         with open_engine(jobs, scheduler) as engine:
             for number, outcome in engine.results(run, questions):

@@ -7,7 +7,7 @@ from itertools import combinations, product
 import numpy as np
 
 from hilcal.readings.whitening import Mode
-from studies.diagnosis import Asked, Kind
+from studies.diagnosis import DiagnosisCase, Kind
 
 MANY = 3.0
 """Strength of two effects at once, and of one outside of the catalogue, σ."""
@@ -50,7 +50,7 @@ class Extent:
     again: bool = False
 
 
-def questions(extent: Extent) -> tuple[Asked, ...]:
+def questions(extent: Extent) -> tuple[DiagnosisCase, ...]:
     """Return the settings of all cases, kind by kind; arms take turns where numbers are totals."""
     makers = {
         "hidden": _hidden,
@@ -62,36 +62,36 @@ def questions(extent: Extent) -> tuple[Asked, ...]:
     return tuple(q for kind in extent.kinds for q in makers[kind](extent))
 
 
-def _hidden(e: Extent) -> Iterator[Asked]:
+def _hidden(e: Extent) -> Iterator[DiagnosisCase]:
     # Seeds are the outer loop, so that a stopped study has cases of all effects.
     for seed, mode in product(_seeds(e, e.seeds), e.modes):
         for effect, robot, strength in product(e.effects[mode], e.robots, e.strengths):
             again = e.again and strength == AGAIN
-            yield Asked("hidden", robot, mode, (effect,), strength, seed, again=again)
+            yield DiagnosisCase("hidden", robot, mode, (effect,), strength, seed, again=again)
 
 
-def _nothing(e: Extent) -> Iterator[Asked]:
+def _nothing(e: Extent) -> Iterator[DiagnosisCase]:
     for seed, mode in product(_seeds(e, e.nothing), e.modes):
-        yield Asked("nothing", _turn(e.robots, seed), mode, (), 0.0, seed)
+        yield DiagnosisCase("nothing", _turn(e.robots, seed), mode, (), 0.0, seed)
 
 
-def _noise(e: Extent) -> Iterator[Asked]:
+def _noise(e: Extent) -> Iterator[DiagnosisCase]:
     for seed, mode, stated in product(_seeds(e, e.noise), e.modes, MISJUDGED):
-        yield Asked("noise", _turn(e.robots, seed), mode, (), 0.0, seed, stated, cycles=2)
+        yield DiagnosisCase("noise", _turn(e.robots, seed), mode, (), 0.0, seed, stated, cycles=2)
 
 
-def _pairs(e: Extent) -> Iterator[Asked]:
+def _pairs(e: Extent) -> Iterator[DiagnosisCase]:
     for seed, mode in product(_seeds(e, e.pairs), e.modes):
         pairs = list(combinations(e.effects[mode], 2))
         if pairs:
             pick = np.random.default_rng([seed, len(pairs)]).integers(len(pairs))
-            yield Asked("pairs", _turn(e.robots, seed), mode, pairs[pick], MANY, seed)
+            yield DiagnosisCase("pairs", _turn(e.robots, seed), mode, pairs[pick], MANY, seed)
 
 
-def _outside(e: Extent) -> Iterator[Asked]:
+def _outside(e: Extent) -> Iterator[DiagnosisCase]:
     for seed, mode in product(_seeds(e, e.seeds), e.modes):
         for law, robot in product(e.laws[mode], e.robots):
-            yield Asked("outside", robot, mode, (law,), MANY, seed)
+            yield DiagnosisCase("outside", robot, mode, (law,), MANY, seed)
 
 
 def _seeds(e: Extent, count: int) -> range:

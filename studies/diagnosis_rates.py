@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.readings.whitening import Mode
-from studies.diagnosis import Judgement, Outcome, Refined
+from studies.diagnosis import DiagnosisOutcome, Judgement, RefinementResult
 
 HELD_OUT = 1.05
 """Largest ratio of held-out error to noise floor of a right model."""
@@ -30,24 +30,24 @@ class Rate:
         return {"share": self.share, "hits": self.hits, "cases": self.cases}
 
 
-def rate(outcomes: Iterable[Outcome], hit: Callable[[Outcome], bool]) -> Rate:
+def rate(outcomes: Iterable[DiagnosisOutcome], hit: Callable[[DiagnosisOutcome], bool]) -> Rate:
     """Return the rate of hits; a failed case is no hit, an impossible case does not count."""
     possible = tuple(o for o in outcomes if not o.impossible)
     return Rate(sum(not o.failure and hit(o) for o in possible), len(possible))
 
 
-def found(o: Outcome) -> bool:
+def found(o: DiagnosisOutcome) -> bool:
     """Whether each hidden effect is first, or in a first set of at most three."""
-    return o.first is not None and all(o.first.finds(e) for e in o.asked.hidden)
+    return o.first is not None and all(o.first.finds(e) for e in o.case.hidden)
 
 
-def named(o: Outcome) -> bool:
+def named(o: DiagnosisOutcome) -> bool:
     """Whether the hidden effect is found, and the verdict names it."""
     return found(o) and o.first is not None and o.first.named
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class EffectRates:
     """Rates of one effect, hidden in readings of one mode at one strength.
 
     Attributes:
@@ -73,17 +73,19 @@ class Found:
     size_again: float
 
 
-def by_effect(outcomes: Iterable[Outcome]) -> tuple[Found, ...]:
+def by_effect(outcomes: Iterable[DiagnosisOutcome]) -> tuple[EffectRates, ...]:
     """Summarise hidden effects, in order of appearance."""
-    groups: dict[tuple[str, Mode, float], list[Outcome]] = {}
+    groups: dict[tuple[str, Mode, float], list[DiagnosisOutcome]] = {}
     for o in outcomes:
-        groups.setdefault((o.asked.hidden[0], o.asked.mode, o.asked.strength), []).append(o)
+        groups.setdefault((o.case.hidden[0], o.case.mode, o.case.strength), []).append(o)
     return tuple(_found(*key, group) for key, group in groups.items())
 
 
-def _found(effect: str, mode: Mode, strength: float, group: Sequence[Outcome]) -> Found:
-    again = [o for o in group if o.asked.again]
-    return Found(
+def _found(
+    effect: str, mode: Mode, strength: float, group: Sequence[DiagnosisOutcome]
+) -> EffectRates:
+    again = [o for o in group if o.case.again]
+    return EffectRates(
         effect=effect,
         mode=mode,
         strength=strength,
@@ -101,7 +103,7 @@ def _size(judgements: Iterable[Judgement | None]) -> float:
     return float(np.mean(sizes)) if sizes else float("nan")
 
 
-def _instead(group: Iterable[Outcome]) -> tuple[tuple[str, int], ...]:
+def _instead(group: Iterable[DiagnosisOutcome]) -> tuple[tuple[str, int], ...]:
     """Count the first effects where the hidden one is not found, too large sets, and failures."""
     count: Counter[str] = Counter()
     for o in group:
@@ -110,14 +112,14 @@ def _instead(group: Iterable[Outcome]) -> tuple[tuple[str, int], ...]:
         if o.first is None:
             count["failed"] += 1
         elif not found(o):
-            inside = o.asked.hidden[0] in o.first.same_as
+            inside = o.case.hidden[0] in o.first.same_as
             count[f"{o.first.lead} (set of {1 + len(o.first.same_as)})" if inside else o.first.lead
                   or "no suspect"] += 1  # fmt: skip
     return tuple(sorted(count.items(), key=lambda item: (-item[1], item[0])))
 
 
 @dataclass(frozen=True, slots=True)
-class Afterwards:
+class RefinementRates:
     """Refinements of the cases that were found and named, at one strength.
 
     Attributes:
@@ -135,18 +137,18 @@ class Afterwards:
     intervals: Rate
 
 
-def afterwards(outcomes: Iterable[Outcome]) -> tuple[Afterwards, ...]:
+def afterwards(outcomes: Iterable[DiagnosisOutcome]) -> tuple[RefinementRates, ...]:
     """Summarise refinements by strength."""
-    groups: dict[float, list[Refined]] = {}
+    groups: dict[float, list[RefinementResult]] = {}
     right: dict[float, int] = {}
     for o in outcomes:
         if named(o) and o.refined is not None:
-            key = o.asked.strength
+            key = o.case.strength
             groups.setdefault(key, []).append(o.refined)
-            exact = {a.effect for a in o.refined.added} == set(o.asked.hidden)
+            exact = {a.effect for a in o.refined.added} == set(o.case.hidden)
             right[key] = right.get(key, 0) + exact
     return tuple(
-        Afterwards(
+        RefinementRates(
             strength,
             Rate(right[strength], len(group)),
             Rate(sum(r.holdout <= HELD_OUT for r in group), len(group)),
@@ -157,40 +159,40 @@ def afterwards(outcomes: Iterable[Outcome]) -> tuple[Afterwards, ...]:
     )
 
 
-def coverage(refined: Iterable[Refined], effect: str | None = None) -> Rate:
+def coverage(refined: Iterable[RefinementResult], effect: str | None = None) -> Rate:
     """Return the rate of true parameters in their intervals, of one effect or of all."""
     intervals = [i for r in refined for i in r.intervals if effect in (None, i.effect)]
     return Rate(sum(i.inside for i in intervals), sum(i.parameters for i in intervals))
 
 
-def coverage_by_effect(outcomes: Iterable[Outcome]) -> tuple[tuple[str, Rate], ...]:
+def coverage_by_effect(outcomes: Iterable[DiagnosisOutcome]) -> tuple[tuple[str, Rate], ...]:
     """Coverage by effect, of refinements of cases that were found and named."""
     refined = [o.refined for o in outcomes if named(o) and o.refined is not None]
     effects = dict.fromkeys(i.effect for r in refined for i in r.intervals)
     return tuple((e, coverage(refined, e)) for e in effects)
 
 
-def both_found(o: Outcome) -> bool:
+def both_found(o: DiagnosisOutcome) -> bool:
     """Whether a refinement finds both hidden effects, or effects inseparable from them."""
-    return o.refined is not None and all(o.refined.finds(e) for e in o.asked.hidden)
+    return o.refined is not None and all(o.refined.finds(e) for e in o.case.hidden)
 
 
-def both_added(o: Outcome) -> bool:
+def both_added(o: DiagnosisOutcome) -> bool:
     """Whether both are in the refined model."""
-    return o.refined is not None and set(o.asked.hidden) <= set(o.refined.model)
+    return o.refined is not None and set(o.case.hidden) <= set(o.refined.model)
 
 
-def unknown(o: Outcome) -> bool:
+def unknown(o: DiagnosisOutcome) -> bool:
     """Whether the verdict is `unknown_effect`, before or after refining."""
     judged = (o.first, o.refined.judgement if o.refined is not None else None)
     return any(j is not None and j.verdict == "unknown_effect" for j in judged)
 
 
-def unknown_at_once(o: Outcome) -> bool:
+def unknown_at_once(o: DiagnosisOutcome) -> bool:
     """Whether the first verdict is `unknown_effect`."""
     return o.first is not None and o.first.verdict == "unknown_effect"
 
 
-def followed(o: Outcome) -> bool:
+def followed(o: DiagnosisOutcome) -> bool:
     """Whether a true variable is among the first two of the first diagnosis."""
     return o.first is not None and o.first.follows(o.variables)

@@ -6,10 +6,10 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from studies.diagnosis import Outcome
+from studies.diagnosis import DiagnosisOutcome
 from studies.diagnosis_claims import Claim, claims
 from studies.diagnosis_rates import (
-    Found,
+    EffectRates,
     Rate,
     both_added,
     both_found,
@@ -30,9 +30,9 @@ CAPTION = (
 _NAMES = 3  # effects that a row lists
 
 
-def report(outcomes: Sequence[Outcome]) -> Iterator[Table | Text | str]:
+def report(outcomes: Sequence[DiagnosisOutcome]) -> Iterator[Table | Text | str]:
     """Yield the tables of the cases, and their totals."""
-    hidden = [o for o in outcomes if o.asked.kind == "hidden"]
+    hidden = [o for o in outcomes if o.case.kind == "hidden"]
     effects = by_effect(hidden)
     for mode in dict.fromkeys(f.mode for f in effects):
         yield _title(f"effects hidden in {mode} readings: found")
@@ -43,7 +43,7 @@ def report(outcomes: Sequence[Outcome]) -> Iterator[Table | Text | str]:
             yield _title("first instead")
             yield _first_instead(of_mode)
             yield ""
-    if len({o.asked.robot for o in hidden}) > 1:
+    if len({o.case.robot for o in hidden}) > 1:
         yield _title("found, by arm")
         yield _robots(hidden)
         yield ""
@@ -52,12 +52,12 @@ def report(outcomes: Sequence[Outcome]) -> Iterator[Table | Text | str]:
         yield _title("true parameters in 95 % intervals, by effect")
         yield _coverage(covered)
         yield ""
-    pairs = [o for o in outcomes if o.asked.kind == "pairs"]
+    pairs = [o for o in outcomes if o.case.kind == "pairs"]
     if pairs:
         yield _title("two hidden effects, by one of them")
         yield _pairs(pairs)
         yield ""
-    outside = [o for o in outcomes if o.asked.kind == "outside"]
+    outside = [o for o in outcomes if o.case.kind == "outside"]
     if outside:
         yield _title("effects outside of the catalogue")
         yield _outside(outside)
@@ -74,8 +74,8 @@ def report(outcomes: Sequence[Outcome]) -> Iterator[Table | Text | str]:
         yield f"{len(failures)} cases failed and count as misses; the first: {_case(failures[0])}"
 
 
-def _case(o: Outcome) -> str:
-    a = o.asked
+def _case(o: DiagnosisOutcome) -> str:
+    a = o.case
     hidden, reason = " + ".join(a.hidden) or "nothing", o.failure or o.impossible
     return f"{hidden}, {a.robot}, {a.mode}, {a.strength:g} σ, seed {a.seed}: {reason}"
 
@@ -84,7 +84,7 @@ def _title(text: str) -> Text:
     return Text(text, style="bold")
 
 
-def _effects(rows: Sequence[Found]) -> Table:
+def _effects(rows: Sequence[EffectRates]) -> Table:
     strengths = sorted({f.strength for f in rows}, reverse=True)
     again = any(f.again.cases for f in rows)
     names = [name for s in strengths for name in (f"{s:g} σ", "named", "set")]
@@ -101,7 +101,7 @@ def _effects(rows: Sequence[Found]) -> Table:
     return out
 
 
-def _first_instead(rows: Sequence[Found]) -> Table:
+def _first_instead(rows: Sequence[EffectRates]) -> Table:
     out = _table("hidden", "what led, and how often")
     out.columns[-1].justify = "left"
     for effect in dict.fromkeys(f.effect for f in rows):
@@ -111,7 +111,7 @@ def _first_instead(rows: Sequence[Found]) -> Table:
     return out
 
 
-def _instead(rows: Iterable[Found]) -> str:
+def _instead(rows: Iterable[EffectRates]) -> str:
     count: dict[str, int] = {}
     for row in rows:
         for name, number in row.instead:
@@ -122,12 +122,12 @@ def _instead(rows: Iterable[Found]) -> str:
     return ", ".join([*shown, *([f"others {further}"] if further else [])])
 
 
-def _robots(cases: Sequence[Outcome]) -> Table:
-    strengths = sorted({o.asked.strength for o in cases}, reverse=True)
+def _robots(cases: Sequence[DiagnosisOutcome]) -> Table:
+    strengths = sorted({o.case.strength for o in cases}, reverse=True)
     out = _table("arm", "n", *(f"{s:g} σ" for s in strengths))
-    for robot in dict.fromkeys(o.asked.robot for o in cases):
-        of_robot = [o for o in cases if o.asked.robot == robot and not o.impossible]
-        shares = [rate([o for o in of_robot if o.asked.strength == s], found) for s in strengths]
+    for robot in dict.fromkeys(o.case.robot for o in cases):
+        of_robot = [o for o in cases if o.case.robot == robot and not o.impossible]
+        shares = [rate([o for o in of_robot if o.case.strength == s], found) for s in strengths]
         out.add_row(robot, str(len(of_robot)), *(_share(r) for r in shares))
     return out
 
@@ -139,20 +139,20 @@ def _coverage(rows: Iterable[tuple[str, Rate]]) -> Table:
     return out
 
 
-def _pairs(cases: Sequence[Outcome]) -> Table:
+def _pairs(cases: Sequence[DiagnosisOutcome]) -> Table:
     out = _table("one of them", "n", "both found", "both in the model")
-    for effect in sorted({e for o in cases for e in o.asked.hidden}):
-        of_effect = [o for o in cases if effect in o.asked.hidden and not o.impossible]
+    for effect in sorted({e for o in cases for e in o.case.hidden}):
+        of_effect = [o for o in cases if effect in o.case.hidden and not o.impossible]
         shares = (_share(rate(of_effect, both_found)), _share(rate(of_effect, both_added)))
         out.add_row(effect, str(len(of_effect)), *shares)
     return out
 
 
-def _outside(cases: Sequence[Outcome]) -> Table:
+def _outside(cases: Sequence[DiagnosisOutcome]) -> Table:
     out = _table("law", "readings", "n", "unknown_effect", "its variable", "first instead")
     out.columns[1].justify = out.columns[-1].justify = "left"
-    for law, mode in dict.fromkeys((o.asked.hidden[0], o.asked.mode) for o in cases):
-        of_law = [o for o in cases if (o.asked.hidden[0], o.asked.mode) == (law, mode)]
+    for law, mode in dict.fromkeys((o.case.hidden[0], o.case.mode) for o in cases):
+        of_law = [o for o in cases if (o.case.hidden[0], o.case.mode) == (law, mode)]
         count: dict[str, int] = {}
         for o in of_law:
             if o.first is not None and not followed(o):

@@ -10,7 +10,7 @@ from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
 from hilcal.discovery.discovery import agreement, discover
 from hilcal.discovery.law import Law
-from hilcal.drivers.simulated.injected_effects import hide, nothing_hidden
+from hilcal.drivers.simulated.injected_effects import hide_effect, world_without_effect
 from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.drivers.simulated.world import World
 from hilcal.effects.protocol import EffectSpec
@@ -41,7 +41,7 @@ CLEAR = 3.0
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class DiscoveryCase:
     """A case: a hidden law of `KINDS`, a hidden effect of the catalogue, or nothing.
 
     `loads` is the number of the study's loads that are used; None for all.
@@ -59,7 +59,7 @@ class Asked:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class DiscoveryOutcome:
     """Result of a case.
 
     Attributes:
@@ -76,7 +76,7 @@ class Outcome:
         impossible: reason why there is no such campaign.
     """
 
-    asked: Asked
+    asked: DiscoveryCase
     reason: str = ""
     formula: str = ""
     truth: str = ""
@@ -109,15 +109,15 @@ class Simulated:
     fresh: Campaign
 
 
-def run_case(config: CellConfig, asked: Asked) -> Outcome:
+def run_case(config: CellConfig, asked: DiscoveryCase) -> DiscoveryOutcome:
     """Simulate, search, and measure the error at fresh poses."""
     try:
         c = simulated(config, asked)
     except InputError as error:
-        return Outcome(asked, impossible=str(error))
+        return DiscoveryOutcome(asked, impossible=str(error))
     law, before = c.law, c.before
     d = discover(before)
-    out = Outcome(asked, d.reason, truth=asked.effect if law is None else law.words)
+    out = DiscoveryOutcome(asked, d.reason, truth=asked.effect if law is None else law.words)
     if d.laws:
         out = replace(out, formula=d.laws[0].formula, p_value=d.laws[0].p_value)
     if law is None:
@@ -137,7 +137,7 @@ def run_case(config: CellConfig, asked: Asked) -> Outcome:
     )
 
 
-def simulated(config: CellConfig, asked: Asked) -> Simulated:
+def simulated(config: CellConfig, asked: DiscoveryCase) -> Simulated:
     """Simulate two campaigns, and fit the first one.
 
     Raises:
@@ -152,7 +152,7 @@ def simulated(config: CellConfig, asked: Asked) -> Simulated:
     robot_config, loads = with_study_loads(config, asked.robot)
     loads = loads[: asked.loads]
     cell = cell_from_config(robot_config)
-    world = nothing_hidden(
+    world = world_without_effect(
         cell,
         rng,
         noise=measurement_noise(robot_config),
@@ -162,7 +162,7 @@ def simulated(config: CellConfig, asked: Asked) -> Simulated:
     campaign = rehearsal_states(cell, asked.poses, loads, rng)
     if asked.effect:
         states, pose, _, cycle = campaign
-        world = hide(
+        world = hide_effect(
             asked.effect, cell, states, asked.strength, asked.mode, rng,
             world=world, pose=pose, cycle=cycle,
         )  # fmt: skip
@@ -187,12 +187,12 @@ def _same_quantities(names: Iterable[str]) -> frozenset[str]:
 
 
 def with_catalogue(
-    out: Outcome,
+    out: DiscoveryOutcome,
     law: Foreign,
     before: Fit,
     names: Sequence[str],
     c: Simulated,
-) -> Outcome:
+) -> DiscoveryOutcome:
     """Return the outcome after adding the effects of the catalogue that the answer names."""
     model = before.model
     for name in names:

@@ -18,7 +18,7 @@ from hilcal.present.document import table
 from hilcal.present.progress import counting
 from hilcal.readings.whitening import MODES, Mode
 from hilcal.robot.catalogue import configs_dir
-from studies.discover import Asked, Outcome, run_case
+from studies.discover import DiscoveryCase, DiscoveryOutcome, run_case
 from studies.foreign_laws import KINDS
 from studies.records import Figure, Keep, keep
 from studies.study_cases import effects_shown
@@ -99,13 +99,13 @@ def discover(
 
 def _run(
     config: CellConfig,
-    asked: Sequence[Asked],
+    asked: Sequence[DiscoveryCase],
     cases: Path | None,
     t: Terminal,
     workers: tuple[int | None, str | None],
-) -> list[Outcome]:
+) -> list[DiscoveryOutcome]:
     """Run the cases on several workers, and append each to the file of cases when it is done."""
-    outcomes: dict[int, Outcome] = {}
+    outcomes: dict[int, DiscoveryOutcome] = {}
     with (
         open_engine(*workers) as engine,
         counting(t.progress, "campaigns", len(asked)) as advance,
@@ -119,52 +119,54 @@ def _run(
     return [outcomes[k] for k in range(len(asked))]
 
 
-def _brief(o: Outcome) -> dict[str, object]:
+def _brief(o: DiscoveryOutcome) -> dict[str, object]:
     """Return a case for the record."""
     hidden = o.asked.law or o.asked.effect or "nothing"
     return {**asdict(o), "asked": f"{hidden}, {o.asked.robot}, seed {o.asked.seed}"}
 
 
-def _outcome(line: str) -> Outcome:
+def _outcome(line: str) -> DiscoveryOutcome:
     """Return a case that `--cases` wrote."""
     case = json.loads(line)
-    return Outcome(**{**case, "asked": Asked(**case["asked"])})
+    return DiscoveryOutcome(**{**case, "asked": DiscoveryCase(**case["asked"])})
 
 
 def _laws(
     names: Sequence[str], seeds: int, first: int, strength: float, poses: int
-) -> Iterator[Asked]:
+) -> Iterator[DiscoveryCase]:
     for seed in range(first, first + seeds):
         for k, name in enumerate(names):
             robot = ROBOTS[(seed + k) % len(ROBOTS)]
             mode = _mode(KINDS[name][0])
-            yield Asked(robot, mode, name, seed=seed, strength=strength, poses=poses)
+            yield DiscoveryCase(robot, mode, name, seed=seed, strength=strength, poses=poses)
 
 
-def _effects(count: int, first: int, strength: float, poses: int) -> Iterator[Asked]:
+def _effects(count: int, first: int, strength: float, poses: int) -> Iterator[DiscoveryCase]:
     for seed in range(first, first + count):
         for mode in MODES:
             for k, effect in enumerate(e for e in effects_shown(mode) if e != "base_frame"):
                 robot = ROBOTS[(seed + k) % len(ROBOTS)]
-                yield Asked(robot, mode, effect=effect, seed=seed, strength=strength, poses=poses)
+                yield DiscoveryCase(
+                    robot, mode, effect=effect, seed=seed, strength=strength, poses=poses
+                )
 
 
-def _nothing(count: int, noise: int, first: int, poses: int) -> Iterator[Asked]:
+def _nothing(count: int, noise: int, first: int, poses: int) -> Iterator[DiscoveryCase]:
     for stated, several in ((1.0, count), (0.5, noise), (2.0, noise)):
         for seed in range(first, first + several):
             robot, mode = ROBOTS[seed % len(ROBOTS)], MODES[seed % len(MODES)]
-            yield Asked(robot, mode, seed=seed, stated=stated, poses=poses)
+            yield DiscoveryCase(robot, mode, seed=seed, stated=stated, poses=poses)
 
 
 def _mode(name: str) -> Mode:
     return next(m for m in MODES if m == name)
 
 
-def claims(outcomes: Sequence[Outcome]) -> Iterator[Figure]:
+def claims(outcomes: Sequence[DiscoveryOutcome]) -> Iterator[Figure]:
     """Yield the claims about the search, with counts."""
     laws = [o for o in outcomes if o.asked.law]
     plain = bool(laws) and all(map(_plain, laws))
-    of_law: tuple[tuple[str, float, Callable[[Outcome], bool]], ...] = (
+    of_law: tuple[tuple[str, float, Callable[[DiscoveryOutcome], bool]], ...] = (
         ("error at fresh poses at most 1.15 times the noise", 0.75, lambda o: 0 < o.after <= FLOOR),
         ("excess of the error at fresh poses halved", 0.90, _halved),
         ("site right", 0.90, lambda o: o.site),
@@ -188,15 +190,15 @@ def claims(outcomes: Sequence[Outcome]) -> Iterator[Figure]:
             yield _figure(claim, held, least)
 
 
-def _plain(o: Outcome) -> bool:
+def _plain(o: DiscoveryOutcome) -> bool:
     return o.asked.strength >= 10.0 and o.asked.poses >= 100
 
 
-def _bare(o: Outcome) -> bool:
+def _bare(o: DiscoveryOutcome) -> bool:
     return not o.asked.law and not o.asked.effect
 
 
-def _halved(o: Outcome) -> bool:
+def _halved(o: DiscoveryOutcome) -> bool:
     return o.after > 0 and o.after - 1.0 <= 0.5 * max(o.before - 1.0, 0.0)
 
 

@@ -29,7 +29,14 @@ from hilcal.present.progress import counting
 from hilcal.readings.whitening import whitening
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Floats
-from studies.discover import Asked, Outcome, Simulated, error_at, simulated, with_catalogue
+from studies.discover import (
+    DiscoveryCase,
+    DiscoveryOutcome,
+    Simulated,
+    error_at,
+    simulated,
+    with_catalogue,
+)
 from studies.discover_command import FLOOR, ROBOTS, SAME
 from studies.foreign_laws import KINDS
 from studies.formulas import PEERS, Peers, asked
@@ -39,7 +46,7 @@ POSES, LOADS = 16, 2
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class PeerLaw:
     """Answer of a program.
 
     Attributes:
@@ -55,26 +62,26 @@ class Told:
     seconds: float
 
 
-def run_case(config: CellConfig, case: Asked, python: Path | None) -> dict[str, Told]:
+def run_case(config: CellConfig, case: DiscoveryCase, python: Path | None) -> dict[str, PeerLaw]:
     """Hide one law, and let every program search it."""
     c = simulated(config, case)
     start = process_time()
     d = discover(c.before)
     seconds, alone = process_time() - start, error_at(c.before, c.fresh)
-    out = {"without a law": Told("", 0.0, alone, 0.0)}
-    out["hilcal"] = Told(f"({d.reason})", 0.0, alone, seconds)
+    out = {"without a law": PeerLaw("", 0.0, alone, 0.0)}
+    out["hilcal"] = PeerLaw(f"({d.reason})", 0.0, alone, seconds)
     if d.reason == "catalogue" and c.law is not None:
-        o = with_catalogue(Outcome(case), c.law, c.before, d.catalogue, c)
-        out["hilcal"] = Told(o.formula, o.correlation, o.after, seconds)
+        o = with_catalogue(DiscoveryOutcome(case), c.law, c.before, d.catalogue, c)
+        out["hilcal"] = PeerLaw(o.formula, o.correlation, o.after, seconds)
     elif d.after is not None:
         same = agreement(c.before, d.after, c.first.moved)
-        out["hilcal"] = Told(d.laws[0].formula, same, error_at(d.after, c.fresh), seconds)
+        out["hilcal"] = PeerLaw(d.laws[0].formula, same, error_at(d.after, c.fresh), seconds)
     for peer in PEERS if python else ():
         out[peer] = _by_peer(c, Path(python or ""), peer, alone)
     return out
 
 
-def _by_peer(c: Simulated, python: Path, peer: str, alone: float) -> Told:
+def _by_peer(c: Simulated, python: Path, peer: str, alone: float) -> PeerLaw:
     f, fresh = c.before, c.fresh.readings
     linear, w = linearise(f), f.whitening
     truth = w.whiten_readings(c.first.moved[~f.outlier])
@@ -93,7 +100,7 @@ def _by_peer(c: Simulated, python: Path, peer: str, alone: float) -> Told:
     }
     reply: dict[str, Any] = asked(python, peer, problem)
     if "error" in reply:
-        return Told(f"not run: {reply['error']}", 0.0, alone, 0.0)
+        return PeerLaw(f"not run: {reply['error']}", 0.0, alone, 0.0)
     x = w.whiten_readings(motion * np.array(reply["fitted"])[:, None])
     free = linear.project_out(x)
     factor = float(x @ linear.residual) / max(float(x @ free), 1e-300)
@@ -107,7 +114,7 @@ def _by_peer(c: Simulated, python: Path, peer: str, alone: float) -> Told:
     left, noise = residual(fresh, prediction, v) - factor * moved, v.raw(c.fresh.noise)
     error = float(np.sqrt(np.sum(left[:, :3] ** 2) / np.sum(noise[:, :3] ** 2)))
     same = factor * float(free @ hidden) / max(abs(factor) * size, 1e-300)
-    return Told(str(reply["formula"]), same, error, reply["seconds"])
+    return PeerLaw(str(reply["formula"]), same, error, reply["seconds"])
 
 
 def _site(c: Simulated, truth: Floats) -> tuple[int, Floats]:
@@ -148,15 +155,15 @@ def discover_field(
     every, names = list(KINDS), law or list(KINDS)
 
     def run(name: str) -> dict[str, object]:
-        case = Asked(ROBOTS[every.index(name) % len(ROBOTS)], "absolute", name, seed=seed,
+        case = DiscoveryCase(ROBOTS[every.index(name) % len(ROBOTS)], "absolute", name, seed=seed,
                      strength=strength, poses=POSES, loads=LOADS)  # fmt: skip
         return {who: asdict(a) for who, a in run_case(config, case, peers).items()}
 
-    done: list[tuple[str, dict[str, Told]]] = []
+    done: list[tuple[str, dict[str, PeerLaw]]] = []
     with counting(t.progress, "laws", len(names)) as advance:
         for case in resumed(cases, names, run):
             answers: dict[str, Any] = {k: v for k, v in case.items() if k != "case"}
-            done.append((str(case["case"]), {k: Told(**v) for k, v in answers.items()}))
+            done.append((str(case["case"]), {k: PeerLaw(**v) for k, v in answers.items()}))
             advance(1)
     rows = table("hidden", "searcher", "correlation", "fresh error", "found", left=(0, 1, 4))
     for name, answers in done:
@@ -174,7 +181,7 @@ def discover_field(
     t.document({"cases": content, "figures": [asdict(f) for f in figures]})
 
 
-def claims(done: Sequence[tuple[str, dict[str, Told]]]) -> Iterator[Figure]:
+def claims(done: Sequence[tuple[str, dict[str, PeerLaw]]]) -> Iterator[Figure]:
     """Yield how often values and formulas of each program are right."""
     for who in done[0][1]:
         given = [answers[who] for _, answers in done]

@@ -28,20 +28,20 @@ from studies.records import Figure, Keep, keep
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Series:
+class DiscoverySeries:
     """Result of a series.
 
     Attributes:
         name: of its folder.
-        left: the fit after refinement, with the stated noise, without an estimated scatter.
+        fit: the fit after refinement, with the stated noise, without an estimated scatter.
         regression: share of the misfit predicted by a regression on everything recorded.
-        found: the search for a law.
+        discovery: the search for a law.
     """
 
     name: str
-    left: Fit
+    fit: Fit
     regression: float
-    found: Discovery
+    discovery: Discovery
 
 
 def discover_real(
@@ -62,36 +62,38 @@ def discover_real(
     ):
         done = engine.map(_searched, series, advance=advance)
     figures = [f for s in done for f in _of_series(s)]
-    figures += [_carried(a, b) for a, b in permutations(done, 2) if a.found.laws]
+    figures += [_carried(a, b) for a, b in permutations(done, 2) if a.discovery.laws]
     for f in figures:
         t.show(f"{f.what}: {f.measured}")
     keep(keep_file, "What is left of a real UR10", figures)
     t.document({"figures": [{"what": f.what, "measured": f.measured} for f in figures]})
 
 
-def _searched(path: Path) -> Series:
+def _searched(path: Path) -> DiscoverySeries:
     cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
     readings = read_table(path, cell, "ipa-ur10")
     last = refine(baseline(cell, readings, "absolute"), readings, "absolute").fit
     stated = fit(last.model, last.readings.as_stated(), last.mode, start=last.theta)
     law = discover(stated)
-    return Series(path.parent.name, stated, residual_regression(linearise(stated)).share, law)
+    return DiscoverySeries(
+        path.parent.name, stated, residual_regression(linearise(stated)).share, law
+    )
 
 
-def _of_series(s: Series) -> list[Figure]:
-    before = s.left.holdout.mean_m
+def _of_series(s: DiscoverySeries) -> list[Figure]:
+    before = s.fit.holdout.mean_m
     out = [
         Figure(
-            f"{s.name}: left by {' + '.join(s.left.model.names)}",
+            f"{s.name}: left by {' + '.join(s.fit.model.names)}",
             f"{length(before)} mean of poses left out, variance factor "
-            f"{s.left.variance_factor:.2f} of the stated noise",
+            f"{s.fit.variance_factor:.2f} of the stated noise",
         ),
         Figure(
             f"{s.name}: share of the misfit that a regression of everything recorded predicts",
             percent(s.regression),
         ),
     ]
-    d = s.found
+    d = s.discovery
     if not d.laws or d.after is None:
         return [*out, Figure(f"{s.name}: law", f"none ({d.reason})")]
     law = d.laws[0]
@@ -108,15 +110,15 @@ def _of_series(s: Series) -> list[Figure]:
     ]
 
 
-def _carried(a: Series, b: Series) -> Figure:
+def _carried(a: DiscoverySeries, b: DiscoverySeries) -> Figure:
     """Share of the other series' misfit that the law of one series explains, without a refit."""
-    law = a.found.laws[0]
-    linear, w = linearise(b.left), b.left.whitening
-    states = b.left.solution.prediction.situation.states
-    effect = effect_class(a.found.source, law.name)(b.left.model.cell, states)
+    law = a.discovery.laws[0]
+    linear, w = linearise(b.fit), b.fit.whitening
+    states = b.fit.solution.prediction.situation.states
+    effect = effect_class(a.discovery.source, law.name)(b.fit.model.cell, states)
     values = np.array([c.value for c in law.parameters])
-    prediction, theta = b.left.solution.prediction, b.left.theta
-    moved = b.left.model.jacobian_of((effect,), prediction, theta, w.m) @ values
+    prediction, theta = b.fit.solution.prediction, b.fit.theta
+    moved = b.fit.model.jacobian_of((effect,), prediction, theta, w.m) @ values
     predicted = w.whiten(w.raw(moved)).reshape(-1)
     free = linear.project_out(predicted)
     along = float(predicted @ linear.residual)
@@ -124,6 +126,6 @@ def _carried(a: Series, b: Series) -> Figure:
     cosine = along / max(float(np.sqrt((predicted @ free) * linear.rss)), 1e-300)
     return Figure(
         f"law of {a.name}, coefficients as found there, on {b.name}",
-        f"explains {100 * gain / (linear.rss - b.left.dof):.1f} % of the misfit; correlation with "
+        f"explains {100 * gain / (linear.rss - b.fit.dof):.1f} % of the misfit; correlation with "
         f"the residual {cosine:.2f}",
     )

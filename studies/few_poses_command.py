@@ -24,7 +24,7 @@ from hilcal.cli.terminal import terminal
 from hilcal.design.choice import EFFORT, objective_of
 from hilcal.design.information import problem
 from hilcal.design.nominal_model import nominal_model
-from hilcal.design.optimum import best
+from hilcal.design.optimum import best_design
 from hilcal.design.planner import without_undetermined
 from hilcal.design.predicted import prediction_poses
 from hilcal.engine import open_engine
@@ -66,7 +66,7 @@ frame = "tracker"
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class FewPosesCase:
     """Fitted poses of a series.
 
     Attributes:
@@ -85,7 +85,7 @@ class Case:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class FewPosesResult:
     """Result of a case.
 
     Attributes:
@@ -126,12 +126,15 @@ def few_poses(
     """Refine few random poses of real series, and predict 500 others."""
     t = terminal(as_json)
     counts = [int(n) for n in poses.split(",")]
-    cases = [Case(p, n, d, attitudes, planned) for p, n, d in product(series, counts, range(draws))]
+    cases = [
+        FewPosesCase(p, n, d, attitudes, planned)
+        for p, n, d in product(series, counts, range(draws))
+    ]
     with (
         open_engine(*one_by_default(jobs, scheduler)) as engine,
         counting(t.progress, "fits", len(cases)) as advance,
     ):
-        done: Sequence[Found] = engine.map(refined, cases, advance=advance)
+        done: Sequence[FewPosesResult] = engine.map(refined, cases, advance=advance)
     figures = []
     for path, n in product(series, counts):
         results = [f for f in done if (f.series, f.poses) == (path.parent.name, n)]
@@ -143,7 +146,7 @@ def few_poses(
     t.document({"cases": [asdict(f) for f in done]})
 
 
-def refined(case: Case) -> Found:
+def refined(case: FewPosesCase) -> FewPosesResult:
     """Refine the poses of a case, and predict others."""
     cell, readings = series_of(case.path)
     if not case.attitudes:
@@ -157,7 +160,7 @@ def refined(case: Case) -> Found:
     last = refine(baseline(cell, some, "absolute"), some, "absolute")
     f, d = last.fit, last.diagnosis
     error = test.value[:, :3] - f.model.predict(test.states, f.theta).observation.position
-    return Found(
+    return FewPosesResult(
         case.path.parent.name,
         case.poses,
         case.draw,
@@ -183,7 +186,7 @@ def share_in_band(fitted: Fit, test: Readings, error: Floats) -> float:
     return float(np.mean(square < chi2.ppf(0.95, 3)))
 
 
-def _planned(cell: Cell, readings: Readings, case: Case) -> Ints:
+def _planned(cell: Cell, readings: Readings, case: FewPosesCase) -> Ints:
     """Return the readings that a plan for predictions at all of them chooses."""
     config = cell.configured()
     planning = config.planning.model_copy(update={"readings": "absolute"})
@@ -192,7 +195,9 @@ def _planned(cell: Cell, readings: Readings, case: Case) -> Ints:
     design_problem, _ = without_undetermined(problem(nominal_model(cell, config, m), config, q))
     work = prediction_poses(design_problem.nominal, config, q)
     objective = objective_of(design_problem, config, "I", work)
-    design = best(objective, float(case.poses), np.random.default_rng(case.draw), effort=EFFORT)
+    design = best_design(
+        objective, float(case.poses), np.random.default_rng(case.draw), effort=EFFORT
+    )
     return np.flatnonzero(design.counts)
 
 
@@ -219,7 +224,7 @@ def series_of(path: Path) -> tuple[Cell, Readings]:
 
 
 def _figures(
-    series: str, poses: int, results: list[Found], *, attitudes: bool, planned: bool
+    series: str, poses: int, results: list[FewPosesResult], *, attitudes: bool, planned: bool
 ) -> list[Figure]:
     title = f"{series}, {poses} {'planned ' * planned}{'poses' if attitudes else 'positions'}"
     mean = 1e3 * float(np.mean([f.mean_m for f in results]))

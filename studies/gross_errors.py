@@ -40,7 +40,7 @@ HIDDEN: dict[Mode, tuple[str, ...]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Spoilt:
+class GrossErrorCase:
     """Settings of a campaign.
 
     Attributes:
@@ -55,11 +55,11 @@ class Spoilt:
 
 
 @dataclass(frozen=True, slots=True)
-class Counted:
+class GrossErrorCounts:
     """Result of the refinement of a campaign.
 
     Attributes:
-        asked: settings of the campaign.
+        case: settings of the campaign.
         mode: of its readings.
         readings: number of readings.
         wrong: number of gross errors.
@@ -70,7 +70,7 @@ class Counted:
         what: arm, number of poses, hidden effect, and the message of a refusal.
     """
 
-    asked: Spoilt
+    case: GrossErrorCase
     mode: Mode
     readings: int
     wrong: int
@@ -96,7 +96,7 @@ def spoil(
     return replace(readings, value=value), rows
 
 
-def count(config: CellConfig, asked: Spoilt) -> Counted:
+def count(config: CellConfig, asked: GrossErrorCase) -> GrossErrorCounts:
     """Draw a campaign, refine it as a user does, and count the readings set aside."""
     rng = np.random.default_rng([30, asked.seed])
     robot, mode = str(rng.choice(ARMS)), MODES[asked.seed % 2]
@@ -110,9 +110,11 @@ def count(config: CellConfig, asked: Spoilt) -> Counted:
         refined = refine(baseline(case.cell, readings, mode), readings, mode)
     except (InputError, CannotAnswerError) as error:
         text = f"{text}: {error}"
-        return Counted(asked, mode, len(readings), len(wrong), 0, 0, False, "refused", text)
+        return GrossErrorCounts(
+            asked, mode, len(readings), len(wrong), 0, 0, False, "refused", text
+        )
     listed = {g.row for g in gross_errors(refined.fit)}
-    return Counted(
+    return GrossErrorCounts(
         asked,
         mode,
         len(readings),

@@ -13,7 +13,7 @@ from hilcal.engine import open_engine
 from hilcal.present.document import table
 from hilcal.present.progress import counting
 from hilcal.robot.catalogue import configs_dir
-from studies.gross_errors import Counted, Spoilt, count
+from studies.gross_errors import GrossErrorCase, GrossErrorCounts, count
 from studies.records import Figure, Keep, keep
 
 CELL = "demo_ur10e.toml"
@@ -45,7 +45,7 @@ def gross_errors(
     t = terminal(as_json)
     kinds = [(share, size) for share, size, _ in ARMS] + [(0.0, 5e-3), (TOO_MANY, 5e-3)]
     every = [
-        Spoilt(share, size, k * campaigns + seed)
+        GrossErrorCase(share, size, k * campaigns + seed)
         for k, (share, size) in enumerate(kinds)
         for seed in range(campaigns)
     ]
@@ -68,11 +68,11 @@ def gross_errors(
     keep(keep_file, "Gross errors", figures)
 
 
-def _counted(campaign: Spoilt) -> Counted:
+def _counted(campaign: GrossErrorCase) -> GrossErrorCounts:
     return count(load_config(configs_dir() / "cells" / CELL), campaign)
 
 
-def _figures(campaigns: Sequence[Counted], share: float, size: float) -> list[Figure]:
+def _figures(campaigns: Sequence[GrossErrorCounts], share: float, size: float) -> list[Figure]:
     """Figures of the campaigns of one share and size."""
     total = len(campaigns)
     readings, wrong = sum(c.readings for c in campaigns), sum(c.wrong for c in campaigns)
@@ -115,15 +115,15 @@ def _figures(campaigns: Sequence[Counted], share: float, size: float) -> list[Fi
     ]
 
 
-def _verdicts(campaigns: Sequence[Counted]) -> str:
+def _verdicts(campaigns: Sequence[GrossErrorCounts]) -> str:
     return ", ".join(f"{n} {v}" for v, n in Counter(c.outcome for c in campaigns).most_common())
 
 
-def _row(c: Counted) -> dict[str, object]:
+def _row(c: GrossErrorCounts) -> dict[str, object]:
     return {
-        "share": c.asked.share,
-        "size_m": c.asked.size_m,
-        "seed": c.asked.seed,
+        "share": c.case.share,
+        "size_m": c.case.size_m,
+        "seed": c.case.seed,
         "readings": c.readings,
         "mode": c.mode,
         "wrong": c.wrong,

@@ -56,7 +56,7 @@ def scene(world: World, states: States, before: Scene | None = None) -> Scene:
         states: the states.
         before: scene of the first campaign with the same law, if this is another one.
     """
-    rest, sight = world.rest(states), world.sight(states)
+    rest, sight = world.equilibrium(states), world.ideal_readings(states)
     flange = rest.flange
     place = flange[:, :3, 3] + flange[:, :3, :3] @ world.cell.target[:3, 3]
     return Scene(

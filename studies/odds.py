@@ -28,7 +28,7 @@ from hilcal.discovery.screen import LawTerm, Screen, screen
 from hilcal.discovery.search import search
 from hilcal.discovery.sites import motions_of
 from hilcal.discovery.structures import averaged, structure_of, structures
-from hilcal.drivers.simulated.injected_effects import nothing_hidden
+from hilcal.drivers.simulated.injected_effects import world_without_effect
 from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
@@ -52,7 +52,7 @@ BINS = (0.0, 0.05, 0.2, 0.5, 0.8, 0.95, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
+class OddsCase:
     """Result of one drawn law.
 
     Attributes:
@@ -80,7 +80,7 @@ def _campaign(number: int) -> tuple[Screen, Readings]:
     robot_config, loads = with_study_loads(config, ROBOTS[number % len(ROBOTS)])
     mode, loads = MODES[number % len(MODES)], loads[:LOADS]
     cell = cell_from_config(robot_config)
-    world = nothing_hidden(
+    world = world_without_effect(
         cell,
         rng,
         noise=measurement_noise(robot_config),
@@ -93,7 +93,7 @@ def _campaign(number: int) -> tuple[Screen, Readings]:
     return screen(linearise(fit(baseline(cell, readings, mode), readings, mode))), fresh
 
 
-def run_case(seed: int) -> Drawn:
+def run_case(seed: int) -> OddsCase:
     """Draw a law and noise, search, and predict fresh poses."""
     bare, fresh = _campaign(seed // OF_CAMPAIGN)
     rng, linear = np.random.default_rng([20261127, seed]), bare.linear
@@ -111,7 +111,7 @@ def run_case(seed: int) -> Drawn:
     problem = SearchProblem(s)
     selections = search(problem)
     if not selections:
-        return Drawn(form.text())
+        return OddsCase(form.text())
     listed = structures(problem, selections)
     chosen = {structure_of(s, f.terms) for f in selections[-1:]}
     (law,) = (f for f in listed if f.kind in chosen)
@@ -124,7 +124,7 @@ def run_case(seed: int) -> Drawn:
     by_model = w.raw(base.model.jacobian(prediction, base.theta, w.m)) @ base.solution.transform
     absorbed = linear.projection.solve(linear.rows.T @ (x @ coefficients + noise))
     error = w.raw(by_law @ coefficients) - by_model @ absorbed
-    return Drawn(
+    return OddsCase(
         form.text(),
         law.form.text(),
         tuple((f.probability, f.kind == truth) for f in listed),

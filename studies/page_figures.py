@@ -14,15 +14,15 @@ import plotly.graph_objects as go
 
 from hilcal.cell import Cell
 from hilcal.config.cell import Repeatability, Tracker
-from hilcal.design.planner import Planned, Request, make
+from hilcal.design.planner import Planned, PlanRequest, plan_readings
 from hilcal.design.summary import summarise
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.drivers.simulated.rehearsal import NOTHING, case_of_plan, read_plan
+from hilcal.drivers.simulated.rehearsal import NO_EFFECT, case_of_plan, simulate_plan
 from hilcal.identification.background import FamilySize
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.present import charts as style
-from hilcal.present.charts import made_of
+from hilcal.present.charts import family_sizes
 from hilcal.readings.covariance import (
     TrackerNoise,
     measurement_covariance,
@@ -69,7 +69,9 @@ def figures(measured: Path) -> dict[str, go.Figure]:
         InputError: a file that is no record.
     """
     cell = _cell()
-    planned = make(cell, cell.configured(), Request(POSES), np.random.default_rng(SEED))
+    planned = plan_readings(
+        cell, cell.configured(), PlanRequest(POSES), np.random.default_rng(SEED)
+    )
     readings = _readings(cell, planned)
     records = [measured / f"1-few-poses{suffix}.json" for suffix in ("", "-250")]
     return dict(
@@ -113,8 +115,8 @@ def _readings(cell: Cell, planned: Planned, factor: float = 1.0) -> Readings:
         }
     )
     plan = planned.ordered.plan
-    case = case_of_plan(loud, plan, NOTHING, SEED, base_dir=cell.base_dir)
-    return read_plan(case, plan, [SEED, 1]).readings
+    case = case_of_plan(loud, plan, NO_EFFECT, SEED, base_dir=cell.base_dir)
+    return simulate_plan(case, plan, [SEED, 1]).readings
 
 
 def scalings() -> go.Figure:
@@ -265,7 +267,7 @@ def _weights(planned: Planned) -> tuple[Floats, Floats]:
 def certificate(planned: Planned) -> go.Figure:
     """Price of each unit per reading, at the continuous optimum."""
     weight, price = _weights(planned)
-    price = price / planned.asked.units.cost[planned.usable]
+    price = price / planned.objective.units.cost[planned.usable]
     price = price / price.max()
     order = np.argsort(-price)
     rank, price = np.arange(1, len(order) + 1), price[order]
@@ -286,15 +288,15 @@ def certificate(planned: Planned) -> go.Figure:
 
 def random_plans(planned: Planned) -> go.Figure:
     """Efficiency of random plans of the same cost, and of the chosen one, against the bound."""
-    rng, units = np.random.default_rng(SEED), planned.asked.units
+    rng, units = np.random.default_rng(SEED), planned.objective.units
     usable = np.flatnonzero(planned.usable)
     spent = float(planned.design.cost)
     efficiency = []
     for _ in range(RANDOM):
         order = rng.permutation(usable)
         plan = order[np.cumsum(units.cost[order]) <= spent]
-        m = planned.asked.prior + units.information(np.ones(len(plan)), plan)
-        efficiency.append(float(planned.asked.criterion.value(m)) / planned.design.bound)
+        m = planned.objective.prior + units.information(np.ones(len(plan)), plan)
+        efficiency.append(float(planned.objective.criterion.value(m)) / planned.design.bound)
     bins = {"start": 0, "end": 100, "size": 2}
     traces = [
         go.Histogram(
@@ -333,4 +335,4 @@ def sample_sizes(cell: Cell, planned: Planned) -> go.Figure:
 
 def _made_of(record: Path) -> go.Figure:
     sizes: list[Mapping[str, object]] = json.loads(record.read_text(encoding="utf-8"))["sizes"]
-    return made_of([FamilySize(**s) for s in sizes])  # type: ignore[arg-type]
+    return family_sizes([FamilySize(**s) for s in sizes])  # type: ignore[arg-type]

@@ -16,9 +16,9 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.engine import IN_PROCESS, Engine
-from studies.plans_errors import Arm, Errors, Prepared, Subject, prepared, run_campaign, subject
+from studies.plans_errors import Arm, Errors, PreparedPlan, Subject, prepared, run_campaign, subject
 from studies.plans_kinds import Chosen, Scene, at_random, grid, matching, optimal, scene
-from studies.plans_statistics import Measured, Summary, summary
+from studies.plans_statistics import MeanAndStd, Summary, summary
 
 TEST, PARAMETERS = "test", "D"
 RANDOM, GRID = "random", "grid"
@@ -71,22 +71,22 @@ class Shrinkage:
 
     kind: str
     parameter: float
-    parameter_real: Measured
+    parameter_real: MeanAndStd
     position: float
-    position_real: Measured
-    twice: Measured
+    position_real: MeanAndStd
+    twice: MeanAndStd
 
     @property
-    def agreement(self) -> Measured:
+    def agreement(self) -> MeanAndStd:
         """True over predicted shrinkage of the parameter error."""
         real = self.parameter_real
-        return Measured(real.value / self.parameter, real.std / self.parameter)
+        return MeanAndStd(real.value / self.parameter, real.std / self.parameter)
 
     @property
-    def position_agreement(self) -> Measured:
+    def position_agreement(self) -> MeanAndStd:
         """True over predicted shrinkage of the error at the test poses."""
         real = self.position_real
-        return Measured(real.value / self.position, real.std / self.position)
+        return MeanAndStd(real.value / self.position, real.std / self.position)
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,14 +195,16 @@ def plans_study(
         )
         for kind in kinds
     )
-    return PlansStudy(config.robot.model, s.exact.mode, readings, campaigns, s.work.what, lines)
+    return PlansStudy(
+        config.robot.model, s.exact.mode, readings, campaigns, s.work.description, lines
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Campaign:
     """A plan, the arm to measure, and the generator of the noise."""
 
-    plan: Prepared
+    plan: PreparedPlan
     arm: Subject
     noise: np.random.Generator
 
@@ -238,7 +240,7 @@ def _needs(
     return None if position is None else matching(s, position, readings, rng, others=others > 0)
 
 
-def _ratio(a: Measured, b: Measured) -> Measured:
+def _ratio(a: MeanAndStd, b: MeanAndStd) -> MeanAndStd:
     """Divide figures, with the uncertainty of independent figures."""
     value = a.value / b.value
-    return Measured(value, value * float(np.hypot(a.std / a.value, b.std / b.value)))
+    return MeanAndStd(value, value * float(np.hypot(a.std / a.value, b.std / b.value)))

@@ -14,7 +14,7 @@ from hilcal.cli.options import Jobs, Json, Scheduler
 from hilcal.cli.terminal import terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.design.nominal_model import nominal_tracker_place
-from hilcal.drivers.simulated.injected_effects import nothing_hidden
+from hilcal.drivers.simulated.injected_effects import world_without_effect
 from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.drivers.simulated.world import World
 from hilcal.engine import open_engine
@@ -25,7 +25,7 @@ from hilcal.robot import se3
 from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.types import Floats
 from studies.plans import MakeArm, PlansStudy, kinds_of, plans_study
-from studies.plans_errors import Asked
+from studies.plans_errors import PlannedReadings
 from studies.plans_table import CAPTION, as_predicted, halved, report
 from studies.records import Figure, Keep, keep
 
@@ -162,7 +162,7 @@ class SimulatedArm:
         names = (f.name for f in fields(physics) if f.name not in FRAMES)
         return {name: np.asarray(getattr(physics, name)).reshape(-1) for name in names}
 
-    def measure(self, asked: Asked, rng: np.random.Generator) -> Readings:
+    def measure(self, asked: PlannedReadings, rng: np.random.Generator) -> Readings:
         """Return simulated readings of the tracker."""
         return simulate(
             self.world, asked.states, asked.pose, asked.load, asked.cycle, asked.load_names, rng
@@ -170,7 +170,7 @@ class SimulatedArm:
 
     def position(self, states: States) -> Floats:
         """Return (N, 3) true positions of the target, sensor axes, m."""
-        return self.world.sight(states).position
+        return self.world.ideal_readings(states).position
 
 
 def world(cell: Cell, config: CellConfig, rng: np.random.Generator) -> World:
@@ -180,7 +180,7 @@ def world(cell: Cell, config: CellConfig, rng: np.random.Generator) -> World:
     A reading is the mean of the configured number of samples, with the noise that a plan assumes.
     """
     noise = measurement_noise(config, config.acquire.samples)
-    drawn = nothing_hidden(
+    drawn = world_without_effect(
         cell, rng, noise=noise, joint_std=config.repeatability.per_joint(cell.arm.n)
     )
     place, _ = nominal_tracker_place(cell, config)

@@ -23,7 +23,7 @@ from studies.plans_kinds import Chosen, Scene
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Asked:
+class PlannedReadings:
     """The N readings of a plan, in the form of `Readings`.
 
     Attributes:
@@ -48,7 +48,7 @@ class Arm(Protocol):
     def parameters(self) -> Mapping[str, Floats]:
         """True parameters by effect, SI."""
 
-    def measure(self, asked: Asked, rng: np.random.Generator) -> Readings:
+    def measure(self, asked: PlannedReadings, rng: np.random.Generator) -> Readings:
         """Return simulated readings of the tracker."""
 
     def position(self, states: States) -> Floats:
@@ -122,11 +122,11 @@ def _of_interest(position: Floats, unloaded: Ints) -> Floats:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Prepared:
+class PreparedPlan:
     """Data of a plan for its campaigns, which is sent to other processes.
 
     Attributes:
-        asked: the readings.
+        readings_planned: the readings.
         std: predicted standard uncertainties by parameter, SI.
         ordinary: ordinary magnitudes by parameter, SI.
         position: predicted RMS error over the test poses, m.
@@ -134,7 +134,7 @@ class Prepared:
         poses: number of different poses.
     """
 
-    asked: Asked
+    readings_planned: PlannedReadings
     std: Mapping[str, float]
     ordinary: Mapping[str, float]
     position: float
@@ -142,12 +142,12 @@ class Prepared:
     poses: int
 
 
-def prepared(chosen: Chosen) -> Prepared:
+def prepared(chosen: Chosen) -> PreparedPlan:
     """Return the data of a plan for its campaigns."""
     prediction = chosen.predicted
     assert prediction.position is not None  # noqa: S101 - every scene has test poses
-    return Prepared(
-        asked=readings_asked(chosen),
+    return PreparedPlan(
+        readings_planned=planned_readings(chosen),
         std=prediction.by_name(),
         ordinary={t.name: t.scale for t in chosen.problem.terms if not t.potential},
         position=prediction.position,
@@ -157,7 +157,7 @@ def prepared(chosen: Chosen) -> Prepared:
 
 
 def run_campaign(
-    cell: Cell, config: CellConfig, plan: Prepared, subject: Subject, rng: np.random.Generator
+    cell: Cell, config: CellConfig, plan: PreparedPlan, subject: Subject, rng: np.random.Generator
 ) -> Errors:
     """Simulate a campaign of a plan, identify, and compare with the truth.
 
@@ -168,7 +168,7 @@ def run_campaign(
         CannotAnswerError: the readings do not determine the parameters.
     """
     mode, names = config.planning.readings, planned_effects(config, installed())
-    readings = subject.arm.measure(plan.asked, rng)
+    readings = subject.arm.measure(plan.readings_planned, rng)
     f = fit(with_effects(cell, readings, mode, names, names), readings, mode)
     at_test = f.model.predict(subject.test, f.theta).observation.position
     error = _of_interest(at_test, subject.unloaded) - subject.truth
@@ -196,7 +196,7 @@ def run_campaign(
     )
 
 
-def readings_asked(chosen: Chosen) -> Asked:
+def planned_readings(chosen: Chosen) -> PlannedReadings:
     """Return the readings of a plan; each repetition of a unit is a further cycle."""
     source: DesignProblem = chosen.problem
     mode: Mode = "deflection" if source.mode == "deflection" else "absolute"
@@ -206,8 +206,8 @@ def readings_asked(chosen: Chosen) -> Asked:
     cycle: list[int] = []
     last_cycle: dict[object, int] = {}
     for k in np.flatnonzero(chosen.counts):
-        candidate, _ = source.what[k]
-        loads = readings_of(source.what[k], mode)
+        candidate, _ = source.contents[k]
+        loads = readings_of(source.contents[k], mode)
         for _ in range(int(chosen.counts[k])):
             # Absolute readings of one cycle have different loads.
             key = candidate if mode == "deflection" else (candidate, loads)
@@ -218,4 +218,4 @@ def readings_asked(chosen: Chosen) -> Asked:
     used, index = np.unique(pose, return_inverse=True)
     candidates = source.candidates
     states = nominal_states(candidates.q[used][index], candidates.wrench[np.array(load)])
-    return Asked(states, index, np.array(load), np.array(cycle), names)
+    return PlannedReadings(states, index, np.array(load), np.array(cycle), names)

@@ -9,14 +9,14 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.design.choice import EFFORT, compound_objective
-from hilcal.design.feasible import Space, draw
+from hilcal.design.feasible import FeasibleSpace, draw_poses
 from hilcal.design.information import DesignProblem, problem
 from hilcal.design.nominal_model import NominalModel, nominal_model
-from hilcal.design.optimum import best
+from hilcal.design.optimum import best_design
 from hilcal.design.predicted import (
     PredictedUncertainty,
     PredictionPoses,
-    predicted,
+    predicted_uncertainty,
     prediction_poses,
     rms,
 )
@@ -49,7 +49,7 @@ class Scene:
 
     cell: Cell
     config: CellConfig
-    space: Space
+    space: FeasibleSpace
     nominal: NominalModel
     exact: DesignProblem
     robust: DesignProblem | None
@@ -59,9 +59,9 @@ class Scene:
         """Predicted RMS position error, m, with potential terms estimated, too; else None."""
         if self.robust is None or chosen.problem not in (self.exact, self.robust):
             return None
-        if self.robust.what != self.exact.what:
+        if self.robust.contents != self.exact.contents:
             return None
-        return predicted(self.robust, chosen.counts, work=self.work).position_open
+        return predicted_uncertainty(self.robust, chosen.counts, work=self.work).position_open
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,7 +88,7 @@ class Chosen:
     @property
     def poses(self) -> int:
         """Number of different poses."""
-        return len({self.problem.what[k][0] for k in np.flatnonzero(self.counts)})
+        return len({self.problem.contents[k][0] for k in np.flatnonzero(self.counts)})
 
 
 def scene(cell: Cell, config: CellConfig, candidates: int, rng: np.random.Generator) -> Scene:
@@ -98,9 +98,9 @@ def scene(cell: Cell, config: CellConfig, candidates: int, rng: np.random.Genera
         CannotAnswerError: no feasible pose, or no load that any of them bears.
         InputError: from the configuration's `[planning]`.
     """
-    space = Space(cell, config)
-    drawn = draw(space, candidates, rng)
-    apart = draw(space, TEST_POSES, rng).q
+    space = FeasibleSpace(cell, config)
+    drawn = draw_poses(space, candidates, rng)
+    apart = draw_poses(space, TEST_POSES, rng).q
     model = nominal_model(cell, config)
     alone = without_potential(config)
     exact = problem(model, alone, drawn.q, drawn.allowed)
@@ -131,9 +131,11 @@ def optimal(
     if robust and s.robust is not None:
         of_plan, config = s.robust, s.config
     objective = compound_objective(of_plan, config, criterion, s.work, float(budget), rng)
-    design = best(objective, float(budget), rng, effort=EFFORT)
+    design = best_design(objective, float(budget), rng, effort=EFFORT)
     counts = np.asarray(design.counts, dtype=float)
-    return Chosen(of_plan, counts, predicted(of_plan, counts, work=s.work), design.efficiency)
+    return Chosen(
+        of_plan, counts, predicted_uncertainty(of_plan, counts, work=s.work), design.efficiency
+    )
 
 
 def at_random(s: Scene, budget: int, rng: np.random.Generator) -> Chosen:
@@ -199,7 +201,7 @@ def matching(
         positions = []
         for order in orders:
             counts = _of_poses(s.exact, cycle(order), readings, s.work).counts
-            p = predicted(judge, counts, work=s.work)
+            p = predicted_uncertainty(judge, counts, work=s.work)
             positions.append(p.position_open if others else p.position)
         return rms(np.array(positions, dtype=float)) <= position
 
@@ -219,7 +221,7 @@ def _of_poses(
 ) -> Chosen:
     """Add poses in order, each with as many loads as it bears, until the budget is used."""
     counts, remaining = np.zeros(len(design_problem.units)), float(budget)
-    pose = np.array([p for p, _ in design_problem.what])
+    pose = np.array([p for p, _ in design_problem.contents])
     cost, least = design_problem.units.cost, float(design_problem.units.cost.min())
     for p in order:
         if remaining < least:
@@ -233,4 +235,4 @@ def _of_poses(
             if cost[k] <= remaining:
                 counts[k] += 1.0
                 remaining -= float(cost[k])
-    return Chosen(design_problem, counts, predicted(design_problem, counts, work=work))
+    return Chosen(design_problem, counts, predicted_uncertainty(design_problem, counts, work=work))

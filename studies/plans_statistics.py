@@ -11,7 +11,7 @@ from studies.plans_errors import Errors
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class MeanAndStd:
     """A figure from simulated campaigns with the standard uncertainty of the simulation."""
 
     value: float
@@ -39,16 +39,16 @@ class Summary:
     readings: float
     poses: float
     parameter: float
-    parameter_real: Measured
-    spread: Measured
+    parameter_real: MeanAndStd
+    spread: MeanAndStd
     position: float
-    position_real: Measured
+    position_real: MeanAndStd
 
     @property
-    def position_ratio(self) -> Measured:
+    def position_ratio(self) -> MeanAndStd:
         """True over predicted error at the test poses."""
         real = self.position_real
-        return Measured(real.value / self.position, real.std / self.position)
+        return MeanAndStd(real.value / self.position, real.std / self.position)
 
 
 def summary(errors: Sequence[Errors]) -> Summary:
@@ -69,17 +69,17 @@ def summary(errors: Sequence[Errors]) -> Summary:
         readings=float(np.mean([e.readings for e in errors])),
         poses=float(np.mean([e.poses for e in errors])),
         parameter=float(np.exp(np.mean(np.log(predicted)))),
-        parameter_real=Measured(mean, mean * _of_mean(influence)),
+        parameter_real=MeanAndStd(mean, mean * _of_mean(influence)),
         spread=_root((square / std2).mean(axis=1)),
         position=rms(np.array([e.position_std for e in errors])),
         position_real=_root(np.array([e.position**2 for e in errors])),
     )
 
 
-def _root(squares: Floats) -> Measured:
+def _root(squares: Floats) -> MeanAndStd:
     """Root of the mean of squares (n,), with its uncertainty."""
     value = float(np.sqrt(squares.mean()))
-    return Measured(value, _of_mean(squares) / (2.0 * value))
+    return MeanAndStd(value, _of_mean(squares) / (2.0 * value))
 
 
 def _of_mean(values: Floats) -> float:

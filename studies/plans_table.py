@@ -7,7 +7,7 @@ from rich.table import Table
 from rich.text import Text
 
 from studies.plans import TOLERANCE, PlansStudy, Shrinkage
-from studies.plans_statistics import Measured
+from studies.plans_statistics import MeanAndStd
 
 
 def report(study: PlansStudy) -> Iterator[Table | Text | str]:
@@ -106,7 +106,7 @@ def _needed(study: PlansStudy, needs: int | None) -> tuple[str, str]:
     return ("-", "-") if needs is None else (f"{needs}", f"{100 * study.readings / needs:.0f} %")
 
 
-def as_predicted(ratio: Measured) -> str:
+def as_predicted(ratio: MeanAndStd) -> str:
     """Judge a ratio that should be 1 within 10 %: yes, no, or unclear with too few campaigns."""
     return _verdict(TOLERANCE - abs(ratio.value - 1.0), ratio.std)
 
@@ -126,7 +126,7 @@ def _verdict(room: float, std: float) -> str:
     return "unclear" if room + 2.0 * std >= 0.0 else "no"
 
 
-def _ratio(m: Measured) -> str:
+def _ratio(m: MeanAndStd) -> str:
     return f"{m.value:.2f} ± {m.std:.2f}"
 
 

@@ -101,14 +101,6 @@ def rehearsal_states(
     return states, pose, load, cycle
 
 
-def dead_weights(masses: Sequence[float], gravity: Floats) -> list[tuple[str, Floats]]:
-    """Return the wrenches of masses that hang at the load point, kg and m/s², by name."""
-    return [
-        (f"{mass:g}kg", np.concatenate([mass * np.asarray(gravity), np.zeros(3)]))
-        for mass in masses
-    ]
-
-
 def spread_poses(cell: Cell, count: int, pulls: Floats, rng: np.random.Generator) -> Floats:
     """Return (count, n) feasible joint angles, each far from the others, rad.
 
@@ -180,7 +172,7 @@ def _rigid(cell: Cell, q: Floats, pull: Floats) -> tuple[Floats, Floats]:
     """
     origin, none = np.eye(4), np.zeros(cell.arm.n)
     rigid = World(cell, Truth.rigid(cell.arm), origin, origin, SimulatedNoise(), none)
-    rest = rigid.rest(States(q=q, wrench=np.broadcast_to(pull, (len(q), 6))))
+    rest = rigid.equilibrium(States(q=q, wrench=np.broadcast_to(pull, (len(q), 6))))
     return rest.flange, rest.torque[:, rigid.drives]
 
 

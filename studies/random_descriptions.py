@@ -40,7 +40,7 @@ ERRORS = (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Case:
+class DescriptionCase:
     """One draw.
 
     Attributes:
@@ -156,7 +156,7 @@ def random_poses(kind: str, arm: Arm, count: int, rng: np.random.Generator) -> F
     return np.asarray(q[np.abs(off).max(axis=1) < 1e-6])
 
 
-def draw(rng: np.random.Generator) -> Case:
+def draw(rng: np.random.Generator) -> DescriptionCase:
     """Draw a case, anew where the poses do not allow a registration."""
     while True:
         case = _draw(rng)
@@ -164,7 +164,7 @@ def draw(rng: np.random.Generator) -> Case:
             return case
 
 
-def _draw(rng: np.random.Generator) -> Case | None:
+def _draw(rng: np.random.Generator) -> DescriptionCase | None:
     m = int(rng.choice([3, 6]))
     kind = str(rng.choice(POSES))
     error = str(rng.choice(ERRORS)) if rng.random() < 0.5 else None
@@ -210,7 +210,7 @@ def _draw(rng: np.random.Generator) -> Case | None:
         size = _size(cell, wrong)
     except CannotAnswerError:
         return None
-    return Case(cell, wrong, truth, error, kind, best, size < 3.0 * best + 1e-6)
+    return DescriptionCase(cell, wrong, truth, error, kind, best, size < 3.0 * best + 1e-6)
 
 
 def _cell(arm: Arm, rng: np.random.Generator) -> Cell:
@@ -296,7 +296,7 @@ def _size(cell: Cell, readings: Readings) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class DescriptionOutcome:
     """Answer of the program to a case.
 
     Attributes:
@@ -311,21 +311,21 @@ class Outcome:
     exact: bool
 
 
-def judge(case: Case) -> tuple[Outcome, DescriptionFinding | None]:
+def judge(case: DescriptionCase) -> tuple[DescriptionOutcome, DescriptionFinding | None]:
     """Run the program on a case."""
     finding = examine(register(case.cell, case.readings), case.readings)
     refused = finding is not None and finding.refused
     if case.error is None or case.hidden:
-        return Outcome(not refused, None, False), finding
+        return DescriptionOutcome(not refused, None, False), finding
     if case.error == "swapped rows":
         named = finding is not None and bool(finding.rows.any()) and not finding.explanations
-        return Outcome(named, named, named), finding
+        return DescriptionOutcome(named, named, named), finding
     explanations = [] if finding is None else list(finding.explanations)
     exact = any(_keys(e.changes) == _keys(case.truth) for e in explanations)
     fits = bool(explanations) and explanations[0].rms < 3.0 * case.best + 1e-6
     fewer = bool(explanations) and len(explanations[0].changes) <= len(case.truth)
     named = exact or (fits and fewer)
-    return Outcome(named or (refused and fits), named, exact), finding
+    return DescriptionOutcome(named or (refused and fits), named, exact), finding
 
 
 def _keys(changes: tuple[Hypothesis, ...]) -> list[tuple[object, ...]]:

@@ -21,7 +21,7 @@ from studies.records import Figure, Keep, keep
 
 
 @dataclass(frozen=True, slots=True)
-class Refined:
+class RefinedSeries:
     """Result of the refinement of a series.
 
     Attributes:
@@ -78,14 +78,14 @@ def real(
     t.document({"series": [{name: getattr(r, name) for name in names} for r in done]})
 
 
-def refined(path: Path) -> Refined:
+def refined(path: Path) -> RefinedSeries:
     """Read a series and refine its model."""
     start = time.monotonic()
     cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
     readings = read_table(path, cell, "ipa-ur10")
     r = refine(baseline(cell, readings, "absolute"), readings, "absolute")
     first, last = (f.holdout.mean_m for f in (r.steps[0].fit, r.fit))
-    return Refined(
+    return RefinedSeries(
         path.parent.name, len(readings), (first, last), r.fit.model.names, r.verdict,
         time.monotonic() - start,
     )  # fmt: skip

@@ -10,7 +10,7 @@ from hilcal.cli.terminal import terminal
 from hilcal.engine import open_engine
 from hilcal.present.progress import counting
 from hilcal.readings.whitening import SCALINGS
-from hilcal.study import check, experiments, scaling_study, table
+from hilcal.study import check, n_experiments, scaling_study, table
 from studies.records import Figure, Keep, keep
 
 
@@ -26,7 +26,7 @@ def scaling(
     steps = f"experiments of {runs} campaigns, each with every scaling"
     with (
         open_engine(*one_by_default(jobs, scheduler)) as engine,
-        counting(t.progress, steps, experiments()) as advance,
+        counting(t.progress, steps, n_experiments()) as advance,
     ):
         rng = np.random.default_rng(1)
         study = scaling_study(rng, runs, engine=engine, advance=advance)

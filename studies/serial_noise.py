@@ -26,7 +26,7 @@ FRESH = 20
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class SerialNoiseOutcome:
     """Result of a refinement.
 
     Attributes:
@@ -59,8 +59,8 @@ class SerialCase:
     seed: int
     rho: float
     hidden: str
-    before: Outcome
-    after: Outcome
+    before: SerialNoiseOutcome
+    after: SerialNoiseOutcome
     found: float | None
     proved: bool
 
@@ -108,7 +108,7 @@ def serial_case(
     if readings.states.time is None:
         states = replace(states, time=None)
     fresh = simulate(case.world, states, pose, load, cycle, readings.load_names, rng)
-    clean = replace(fresh, value=case.world.sight(states).position)
+    clean = replace(fresh, value=case.world.ideal_readings(states).position)
     return SerialCase(
         seed=seed,
         rho=rho,
@@ -120,8 +120,10 @@ def serial_case(
     )
 
 
-def _outcome(refined: Refinement, start: Model, case: StudyCase, clean: Readings) -> Outcome:
-    return Outcome(
+def _outcome(
+    refined: Refinement, start: Model, case: StudyCase, clean: Readings
+) -> SerialNoiseOutcome:
+    return SerialNoiseOutcome(
         refined.verdict,
         tuple(n for n in refined.fit.model.names if n not in start.names),
         _parameters(refined.fit, case),

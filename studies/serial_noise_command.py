@@ -16,7 +16,7 @@ from hilcal.engine import open_engine
 from hilcal.present.progress import counting
 from hilcal.robot.catalogue import configs_dir
 from studies.records import Figure, Keep, keep
-from studies.serial_noise import Outcome, SerialCase, serial_case
+from studies.serial_noise import SerialCase, SerialNoiseOutcome, serial_case
 
 HELD = 0.93
 """Required share of true values within 95 % intervals for strongly correlated noise."""
@@ -108,6 +108,8 @@ def _of_noise(cases: Sequence[SerialCase], rho: float) -> Iterator[Figure]:
     )
 
 
-def _share(cases: Sequence[SerialCase], holds: Callable[[Outcome], bool], serial: bool) -> str:
+def _share(
+    cases: Sequence[SerialCase], holds: Callable[[SerialNoiseOutcome], bool], serial: bool
+) -> str:
     true = [holds(c.after if serial else c.before) for c in cases]
     return f"{100 * float(np.mean(true)):.0f} %"

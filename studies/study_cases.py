@@ -11,10 +11,10 @@ from hilcal.config import CellConfig
 from hilcal.drivers.simulated.injected_effects import (
     DEFLECTION_EFFECTS,
     EFFECTS,
-    hide,
-    nothing_hidden,
+    hide_effect,
+    world_without_effect,
 )
-from hilcal.drivers.simulated.rehearsal import as_told, measurement_noise, simulate
+from hilcal.drivers.simulated.rehearsal import measurement_noise, program_config, simulate
 from hilcal.drivers.simulated.world import World
 from hilcal.errors import InputError
 from hilcal.readings.readings import Readings
@@ -123,10 +123,10 @@ def study_case(
     rng = np.random.default_rng([seed, cycles, *(crc32(w.encode()) for w in (robot, mode, names))])
     robot_config, loads = with_study_loads(config, robot)
     cell = cell_from_config(
-        as_told(robot_config, "base_frame" if "base_frame" in hidden else "nothing")
+        program_config(robot_config, "base_frame" if "base_frame" in hidden else "nothing")
     )
     states, pose, load, cycle = rehearsal_states(cell, n_poses, loads, rng, cycles=cycles)
-    world = nothing_hidden(
+    world = world_without_effect(
         cell, rng,
         noise=measurement_noise(robot_config),
         joint_std=robot_config.repeatability.per_joint(cell.arm.n),
@@ -137,14 +137,14 @@ def study_case(
     laws: list[UnmodelledLaw] = []
     for name in hidden:
         if name in EFFECTS:
-            world = hide(
+            world = hide_effect(
                 name, cell, states, strength, mode, rng, world=world, pose=pose, cycle=cycle
             )
         else:
             laws.append(law_named(name))
     load_names = ("none", *(name for name, _ in loads))
     readings = simulate(world, states, pose, load, cycle, load_names, rng)
-    clean = world.sight(states).position
+    clean = world.ideal_readings(states).position
     beyond = sum(
         (shift(law, world, states, strength, mode, pose, cycle) for law in laws),
         np.zeros_like(clean),

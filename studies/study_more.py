@@ -7,8 +7,8 @@ import numpy as np
 
 from hilcal.config import CellConfig
 from hilcal.config.sections import CellLoad
-from hilcal.design.next import measure_next
-from hilcal.design.planner import Request
+from hilcal.design.next import plan_separating
+from hilcal.design.planner import PlanRequest
 from hilcal.diagnosis.diagnosis import Diagnosis, in_doubt
 from hilcal.drivers.simulated.rehearsal import planned_states, simulate
 from hilcal.errors import CannotAnswerError
@@ -61,9 +61,9 @@ def measure_more(
     planning = robot_config.planning.model_copy(update={"candidates": CANDIDATES})
     robot_config = robot_config.model_copy(update={"loads": list(loads), "planning": planning})
     # A limit on readings is faster than leaving out loads one by one.
-    request = Request(poses, readings=poses * (1 + len(loads)))
+    request = PlanRequest(poses, readings=poses * (1 + len(loads)))
     try:
-        separating = measure_next(case.cell, robot_config, diagnosis.fit, names, request, rng)
+        separating = plan_separating(case.cell, robot_config, diagnosis.fit, names, request, rng)
     except CannotAnswerError:
         return None
     before, plan = case.readings, separating.planned.ordered.plan

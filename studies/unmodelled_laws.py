@@ -206,8 +206,8 @@ def shift(
 ) -> Floats:
     """Return the displacement (N, 3) of the readings by the law, sensor axes, m.
 
-    Its size is such that sqrt(mean |W d|²) = strength_sigma, as in `injected_effects.hide`: d is
-    the change of a reading, or of a loaded minus its unloaded reading; W whitens it.
+    Its size is such that sqrt(mean |W d|²) = strength_sigma, see `injected_effects.hide_effect`: d
+    is the change of a reading, or of a loaded minus its unloaded reading; W whitens it.
 
     Raises:
         InputError: a mode that does not show the law, or states that lack a variable of the law.
@@ -215,7 +215,7 @@ def shift(
     if mode not in law.readings:
         raise InputError(f"law {law.name!r} needs readings {' or '.join(law.readings)}, not {mode}")
     motion = law.motion(states, world.drive_torque(states))
-    sight = world.sight(states)
+    sight = world.ideal_readings(states)
     n = states.q.shape[1]
     moved = np.einsum("nij,nj->ni", sight.jacobian[:, :3], motion[:, :n]) + motion[:, n:]
     covariance, change = world.covariance(sight), moved

@@ -30,17 +30,17 @@ import numpy as np
 from hilcal.measuring.route import dry_run
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.run_log import RunLog
-from tests.support.calibrate_process import Calibration
+from tests.support.calibrate_process import CalibrationProcess
 from tests.support.campaign_cases import (
-    BEGUN,
+    STARTED,
     STARVED,
     EndedError,
     Fault,
     Run,
     Site,
-    right,
+    check_readings,
+    check_stopped_on_its_way,
     site,
-    stopped_on_its_way,
 )
 from tests.support.spread_plan import spread_plan
 from tests.support.timing import wait_until
@@ -83,7 +83,7 @@ class Soak:
     _stack: ExitStack = field(default_factory=ExitStack)
     _site: Site | None = None
     _path: Path | None = None
-    _calibration: Calibration | None = None
+    _calibration: CalibrationProcess | None = None
     _number: int = 0
     _met: str = ""
 
@@ -179,8 +179,8 @@ class Soak:
         again = self._run()
         try:
             time.sleep(self.rng.uniform(0.0, 3.0))
-            second.do(self.site)
-            first.undo(self.site)
+            second.cause(self.site)
+            first.mend(self.site)
             self._ends(again, (first, second), exact=False)
         finally:
             self._undo((first, second))
@@ -193,12 +193,12 @@ class Soak:
             person.loaded(run)
             if moment == "moving":
                 run.wait_until(lambda: self.site.ask("arm", "state")["moving"], "motion")
-            since = len(run.words)
+            since = len(run.output)
             name = self.site.ask("world", "state")["load"]
             self.site.ask("world", "hang", name=None)
             self.counts["faults"] += 1
             if name is not None:  # else it was being taken off just then
-                run.wait_until(lambda: NOTICED.search(run.words[since:]), "words about the load")
+                run.wait_until(lambda: NOTICED.search(run.output[since:]), "words about the load")
         except EndedError:
             self._ended(run)  # the campaign was done before
         else:
@@ -259,7 +259,7 @@ class Soak:
         code, words = run.end()
         assert code in ((-signal.SIGKILL, 0) if hard else (130, 0)), words
         if goal is not None and code:
-            stopped_on_its_way(self.site, since, goal)
+            check_stopped_on_its_way(self.site, since, goal)
         self._still()
         self._gone(run)
         self._sound()
@@ -273,12 +273,12 @@ class Soak:
         arrivals = self.site.ask("arm", "state")["arrivals"]
         if fault is not None:
             self._count(fault)
-            fault.do(self.site)
+            fault.cause(self.site)
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
         finally:
             if fault is not None:
-                fault.undo(self.site)
+                fault.mend(self.site)
         words = done.stdout + done.stderr
         assert "Traceback" not in words, words
         assert done.returncode in (0, 3), words
@@ -291,15 +291,15 @@ class Soak:
         if self._calibration is None:
             here = self.folder / f"calibrate{self.counts['calibrations']}"
             here.mkdir()
-            self._calibration = Calibration(here)
+            self._calibration = CalibrationProcess(here)
             self.counts["calibrations"] += 1
         c = self._calibration
         try:
             killed = c.killed_after(self.rng.uniform(0.0, 14.0))
             self.counts["kills of calibrate"] += killed
-            c.sound()
+            c.check_readable()
             if not killed:
-                c.every_reading_once()
+                c.check_each_reading_once()
                 self._calibration = None
         except BaseException:
             self._calibration = None
@@ -372,15 +372,15 @@ class Soak:
                 if k:
                     time.sleep(self.rng.uniform(0.0, 1.0))
                 self._count(fault)
-                fault.do(self.site)
+                fault.cause(self.site)
             must = STOP_MEASURING if goal is None else STOP_MOVING
             alone = [f for f in faults if f in must] if exact and len(faults) == 1 else []
-            in_motion = [f for f in alone if goal is not None and f.stops]
+            in_motion = [f for f in alone if goal is not None and f.stops_arm]
             for fault in in_motion:
                 self._stands(fault, since)
             ended = self._ends(run, faults, exact=exact)
             if ended and any(f in MOTION for f in in_motion):
-                stopped_on_its_way(self.site, since, goal)  # type: ignore[arg-type]
+                check_stopped_on_its_way(self.site, since, goal)  # type: ignore[arg-type]
             for fault in alone:
                 assert ended or run.process.returncode == 0, f"{fault.name}: not noticed"
         finally:
@@ -397,7 +397,7 @@ class Soak:
     def _undo(self, faults: tuple[Fault, ...]) -> None:
         """Mend everything; twice, since a protective stop is not unlocked in local mode."""
         for fault in (*faults, *faults):
-            fault.undo(self.site)
+            fault.mend(self.site)
 
     def _stands(self, fault: Fault, since: float) -> None:
         """Wait until an arm that was in motion stands, and keep how long that took."""
@@ -429,14 +429,14 @@ class Soak:
         self.counts[f"exit {code}"] += 1
         if code == 3:
             if STARVED.search(lines[0]) and not all(
-                re.search(says, lines[0]) for fault in faults for says in fault.says
+                re.search(says, lines[0]) for fault in faults for says in fault.patterns
             ):
                 self.starved += 1
             else:
                 for fault in faults:
-                    for says in fault.says:
+                    for says in fault.patterns:
                         assert re.search(says, lines[0]), f"{fault.name}: {lines[0]}"
-            if BEGUN in words:  # before that nothing is there to go on with
+            if STARTED in words:  # before that nothing is there to go on with
                 assert "--resume" in lines[0], lines[0]
             assert len(lines[0]) > 40, f"too short to name cause and mend: {lines[0]}"
         assert not self.site.ask("arm", "state")["moving"], "the arm moves after the program's end"
@@ -450,7 +450,7 @@ class Soak:
             time.sleep(0.02)
 
     def _gone(self, run: Run) -> None:
-        assert run.left_behind() == [], "a process is left"
+        assert run.orphans() == [], "a process is left"
         end = time.monotonic() + 3.0
         while self.site.ask("arm", "state")["rtde_clients"]:
             assert time.monotonic() < end, "a client of the controller is left"
@@ -464,7 +464,7 @@ class Soak:
             count = campaign.n_readings
         assert len(steps) == len(set(steps)) == count, "a reading is lost or doubled"
         if count:
-            right(self.site, self.path)
+            check_readings(self.site, self.path)
 
     def _count_stored(self) -> int:
         if not self.path.exists():

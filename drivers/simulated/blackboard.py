@@ -113,7 +113,7 @@ class Blackboard:
             time.sleep(0)
         raise RuntimeError(f"blackboard: section {section} is never at rest (its writer died?)")
 
-    def written(self, section: str) -> int:
+    def write_count(self, section: str) -> int:
         """Return a number that every write of a section changes."""
         return int(self._sequence[section][0])
 

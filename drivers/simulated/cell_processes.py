@@ -68,10 +68,10 @@ class DeviceProcess:
     @property
     def pid(self) -> int | None:
         """Process number while it runs."""
-        return None if self._process is None or self.ended else self._process.pid
+        return None if self._process is None or self.has_ended else self._process.pid
 
     @property
-    def ended(self) -> bool:
+    def has_ended(self) -> bool:
         """Whether it has ended by itself."""
         return self._process is not None and self._process.poll() is not None
 
@@ -81,7 +81,7 @@ class DeviceProcess:
 
     def check(self) -> None:
         """Raise DeviceError with the last line of its output if it has ended."""
-        if self._process is None or not self.ended:
+        if self._process is None or not self.has_ended:
             return
         output = self.log.read_text(encoding="utf-8", errors="replace").split("\n")
         last = next((line.strip() for line in reversed(output) if line.strip()), "no message")
@@ -168,7 +168,7 @@ class SimulatedCell:
             try:
                 cell._start(devices.values())
             except BaseException as error:
-                in_use = "in use" in str(error) and any(d.ended for d in devices.values())
+                in_use = "in use" in str(error) and any(d.has_ended for d in devices.values())
                 cell.close()
                 if attempt == _HOSTS or not in_use:
                     raise

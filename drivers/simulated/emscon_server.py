@@ -150,7 +150,7 @@ class SimulatedTracker:
         if query == es.GET_SYSTEM_STATUS:
             state = es.INITIALIZED if self.initialized else es.BOOTED
             return [struct.pack("<4I3iI2i", es.OK, state, 3, 2, 3, 8, 900, 2, 0, SERIAL)]
-        held = es.REFLECTOR_FOUND if self.station.held() is not None else 0
+        held = es.REFLECTOR_FOUND if self.station.held_target() is not None else 0
         return [struct.pack("<Ii", es.OK, 15 | 4096 | es.LEVELLED | held)]
 
     def _acquire(self, command: int, body: bytes) -> int:

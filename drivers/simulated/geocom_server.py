@@ -183,13 +183,13 @@ class Station:
         """Return the true present place of its target; None if not visible."""
         return self.stray or self.targets().get(self.number)
 
-    def held(self) -> PolarPoint | None:
+    def held_target(self) -> PolarPoint | None:
         """Return the true place of the held target; None without lock or sight."""
         return self.target() if self.locked else None
 
-    def look(self) -> PolarPoint | None:
+    def measure_target(self) -> PolarPoint | None:
         """Measure the held target once and turn the telescope to it; None without one."""
-        true = self.held()
+        true = self.held_target()
         if true is None:
             return None
         self.pointing = self.newest = self.stuck or self.beam.observe(true, self.rng)
@@ -212,7 +212,7 @@ class Station:
         if angles:
             self.number = min(angles, key=lambda k: angles[k])
         self.locked = bool(angles)
-        self.look()
+        self.measure_target()
         return self.locked
 
     def start_ranging(self) -> None:
@@ -237,7 +237,7 @@ class Station:
         if self.ranging is None or time.monotonic() < self.ranging:
             return
         self.ranging = None
-        polar = self.look()
+        polar = self.measure_target()
         if polar is not None and not self.dist_error:
             self.distance, self.distance_ms = polar.distance, int(self.board.time * 1e3)
 
@@ -321,7 +321,7 @@ def _carried_out(s: Station, rpc: int, p: Parameters) -> Answer:
         case 2029:
             values = _numbers(s, *s.atmosphere)
         case 2107:
-            polar = s.look() or s.pointing
+            polar = s.measure_target() or s.pointing
             return s.warning, _numbers(s, polar.hz, polar.v)
         case 2108 | 2167:
             return _with_distance(s, int(p[0]), full=rpc == 2167)
@@ -396,7 +396,7 @@ def _with_distance(station: Station, patience_ms: int, *, full: bool) -> Answer:
     station.finish_ranging(patience_ms * 1e-3)
     if station.dist_error:
         return DISTANCE_ERROR, []
-    polar, distance = station.look() or station.pointing, station.distance
+    polar, distance = station.measure_target() or station.pointing, station.distance
     code = station.warning if distance > 0.0 else ANGLES_ONLY
     if not full:
         return code, _numbers(station, polar.hz, polar.v, distance)
@@ -424,7 +424,7 @@ def _measure(station: Station, mode: int) -> Answer:
             return DISTANCE_ERROR, []
         polar, distance = station.pointing, station.distance
     else:
-        polar = station.look() or station.pointing
+        polar = station.measure_target() or station.pointing
         distance = station.distance if mode == 0 else 0.0
     code = station.warning if distance > 0.0 or mode == 1 else ANGLES_ONLY
     return code, [*_numbers(station, polar.hz, polar.v, distance), str(mode)]

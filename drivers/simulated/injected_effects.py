@@ -9,7 +9,7 @@ from hilcal.cell import Cell
 from hilcal.drivers.simulated.mechanics import rotation_vector
 from hilcal.drivers.simulated.own_law import OwnLaw
 from hilcal.drivers.simulated.truth import Truth, joint_temperature, long_links, rated_torque
-from hilcal.drivers.simulated.world import IdealReading, SimulatedNoise, World, stand
+from hilcal.drivers.simulated.world import IdealReading, SimulatedNoise, World, place_tracker
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.robot.arm import Arm
@@ -150,7 +150,7 @@ _SOFTER = 1.5  # a stiffening gear is softer at no torque (catalogues: K1 is abo
 _TARGET_SCATTER = 2e-3  # m, scatter of an unknown target about its configured place
 
 
-def nothing_hidden(
+def world_without_effect(
     cell: Cell,
     rng: np.random.Generator,
     *,
@@ -162,7 +162,7 @@ def nothing_hidden(
     An unknown registration or target of the cell is drawn. The default repeatability `joint_std`,
     rad, is 0.02 mm to 0.03 mm at the flange of an arm of 1.3 m.
     """
-    registration, station = stand(cell, rng)
+    registration, station = place_tracker(cell, rng)
     truth = Truth.rigid(cell.arm)
     truth = truth.with_effect("joint_compliance", joint_compliance(cell.arm, rng))
     offsets: Floats | None = None
@@ -190,7 +190,7 @@ def softened(world: World, effect: object) -> World:
     return replace(world, physics=world.physics.with_effect("joint_compliance", softer))
 
 
-def hide(
+def hide_effect(
     effect: str | OwnLaw,
     cell: Cell,
     states: States,
@@ -219,7 +219,7 @@ def hide(
     """
     _check(effect, strength_sigma, readings_mode, m)
     if world is None:
-        world = softened(nothing_hidden(cell, rng), effect)
+        world = softened(world_without_effect(cell, rng), effect)
     if effect == "none" or strength_sigma == 0.0:
         return world
     if isinstance(effect, OwnLaw):
@@ -227,7 +227,7 @@ def hide(
     else:
         name = effect
         hidden, reference = _shipped_effect(effect, world, states, harmonics, rng)
-    baseline = reference.sight(states)
+    baseline = reference.ideal_readings(states)
     pairs = None if readings_mode == "absolute" else _pairs(states, pose, cycle)
     covariance = reference.covariance(baseline, m)
     if pairs is not None:
@@ -235,7 +235,7 @@ def hide(
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))
 
     def strength(factor: float) -> float:
-        change = _change(hidden(factor).sight(states), baseline, m)
+        change = _change(hidden(factor).ideal_readings(states), baseline, m)
         if pairs is not None:
             change = change[pairs[0]] - change[pairs[1]]
         return float(np.sqrt(np.mean((whiten @ change[:, :, None]) ** 2)))
@@ -245,8 +245,8 @@ def hide(
 
 def _user_effect(law: OwnLaw, world: World, rng: np.random.Generator) -> Callable[[float], World]:
     """Return the world with a user's effect as a function of its strength."""
-    direction = law.drawn(rng)
-    return lambda factor: replace(world, own=replace(law, theta=factor * direction))
+    direction = law.draw(rng)
+    return lambda factor: replace(world, own_law=replace(law, theta=factor * direction))
 
 
 def _shipped_effect(

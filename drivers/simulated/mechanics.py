@@ -18,7 +18,7 @@ def displacement(twist: Floats) -> Floats:
     return np.asarray(pin.exp6(pin.Motion(twist[:3], twist[3:])).homogeneous)
 
 
-def turned(rotation: Floats) -> Floats:
+def rotation_matrices(rotation: Floats) -> Floats:
     """Return (N, 3, 3) rotation matrices of (N, 3) rotation vectors, rad."""
     return np.array([pin.exp3(w) for w in rotation]).reshape(-1, 3, 3)
 
@@ -35,7 +35,7 @@ def skew(vector: Floats) -> Floats:
     return out - np.swapaxes(out, -1, -2)
 
 
-def moved_by(jacobian: Floats, arm: Floats) -> Floats:
+def at_point(jacobian: Floats, arm: Floats) -> Floats:
     """Return Jacobians (N, 6, k) at a point displaced by `arm` (N, 3): v' = v + omega × arm."""
     out = jacobian.copy()
     out[:, :3] += np.cross(jacobian[:, 3:], arm[:, :, None], axis=1)
@@ -360,7 +360,7 @@ class _LoadedArm:
         twist = final.jacobian[:, :, self.tree.drive]
         twist = np.concatenate([turn @ twist[:, :3], turn @ twist[:, 3:]], axis=1)
         shift = flange[:, :3, 3] - final.pose[:, :3, 3]
-        return flange, delta, final.torque, moved_by(twist, shift)
+        return flange, delta, final.torque, at_point(twist, shift)
 
     def load(self, q: Floats, wrench: Floats, growth: Floats) -> _LoadTorque:
         """Return the torques at N configurations; `wrench` as the sensor reads it.
@@ -383,7 +383,7 @@ class _LoadedArm:
         acting = local.copy()
         if self.sensor is not None:
             loaded = wrench.any(axis=1)
-            acting[loaded] = self.sensor.acting(local[loaded])
+            acting[loaded] = self.sensor.true_wrench(local[loaded])
             turn = self.sensor.gain @ turn
         acting[:, 3:] += acting[:, :3] @ self.lever.T
         turn[:, 3:] += self.lever @ turn[:, :3]

@@ -89,12 +89,12 @@ class Cameras:
         )
         markers = b"all\0" + struct.pack("<I6f", 2, *range(6))
         lists = [(1, markers), (1, struct.pack("<3f", 9, 9, 9)), (1 + self.extra, bodies)]
-        lists += [(0, b"")] * (2 if version >= nn.SIZED else 1)  # skeletons, assets
+        lists += [(0, b"")] * (2 if version >= nn.FIRST_SIZED else 1)  # skeletons, assets
         lists += [(1, struct.pack("<I3ffHf", 1, 0, 0, 0, 0.01, 2, 1e-4)), (0, b""), (0, b"")]
         out = _COUNT.pack(self.number)
         for count, content in lists:
             out += _COUNT.pack(count)
-            out += (_COUNT.pack(len(content)) if version >= nn.SIZED else b"") + content
+            out += (_COUNT.pack(len(content)) if version >= nn.FIRST_SIZED else b"") + content
         suffix = struct.pack("<IId3Q", 0, 0, self.board.time, 0, 0, 0)
         precise = struct.pack("<II", 0, 0) if version >= (4, 0) else b""
         return out + suffix + precise + struct.pack("<HI", 0, 0)
@@ -109,11 +109,11 @@ class Cameras:
             content += struct.pack("<I6f2I", 2, *range(6), 0, 0)
             content += b"m1\0m2\0" if version >= (4, 0) else b""
             parts.append((1, content))
-        if version < nn.SIZED:  # a description after those of the rigid bodies
+        if version < nn.FIRST_SIZED:  # a description after those of the rigid bodies
             parts.append((5, b"camera\0" + struct.pack("<7f", *range(7))))
         out = _COUNT.pack(len(parts))
         for kind, content in parts:
-            size = _COUNT.pack(len(content)) if version >= nn.SIZED else b""
+            size = _COUNT.pack(len(content)) if version >= nn.FIRST_SIZED else b""
             out += _COUNT.pack(kind) + size + content
         return out
 
@@ -123,7 +123,7 @@ class Cameras:
             return
         data, sender = self.line.recvfrom(1 << 16)
         with contextlib.suppress(struct.error):
-            self._serve(*nn.opened(data), sender)
+            self._serve(*nn.unpacked(data), sender)
 
     def _serve(self, number: int, content: bytes, sender: tuple[str, int]) -> None:
         version, _ = self.clients.get(sender, (self.version, 0.0))

@@ -41,12 +41,12 @@ class OwnLaw:
         pairs = zip(self.effect.parameters, self.theta, strict=True)
         return {f"{self.effect.name}.{p.name}": float(value) for p, value in pairs if value}
 
-    def drawn(self, rng: np.random.Generator) -> Floats:
+    def draw(self, rng: np.random.Generator) -> Floats:
         """Draw (P,) parameters of ordinary magnitude."""
         scale = np.array([p.scale for p in self.effect.parameters])
         return np.asarray(scale * rng.standard_normal(len(scale)))
 
-    def moved(
+    def displacements(
         self, cell: Cell, frame: Floats, compliance: Floats, states: States
     ) -> tuple[Floats, Floats]:
         """Return displacements (N, 3) and rotations (N, 3, 3) of N readings, sensor axes.

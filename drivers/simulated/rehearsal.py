@@ -26,7 +26,7 @@ from hilcal.store.plan import UNLOADED, Plan
 from hilcal.toml import suggest
 from hilcal.types import Floats, Ints
 
-NOTHING = "nothing"
+NO_EFFECT = "nothing"
 RANDOM = "random"
 INVENTED = "invented"  # a law that the catalogue lacks; see `invented_law`
 REGISTRATION_XYZ = (2.4, -1.6, -0.5)
@@ -51,7 +51,7 @@ def invented_law(catalogue: Catalogue) -> Catalogue:
 
 def check_choice(choice: str, catalogue: Catalogue | None = None) -> None:
     """Raise InputError, with the valid choices, for what cannot be hidden."""
-    valid = (*choices(), *own_choices(catalogue), RANDOM, NOTHING)
+    valid = (*choices(), *own_choices(catalogue), RANDOM, NO_EFFECT)
     if choice not in valid:
         raise InputError(f"hide {choice!r}{suggest(choice, valid)}; valid: {', '.join(valid)}")
 
@@ -88,7 +88,7 @@ class Rehearsal(SimulationCase):
             self.config.to_json(),
             str(self.cell.base_dir),
             "simulated campaign",
-            more={COVERS_KEY: INSTRUMENT_AND_ARM},
+            more_texts={COVERS_KEY: INSTRUMENT_AND_ARM},
             readings=self.readings,
         ).close()
 
@@ -115,12 +115,14 @@ def measurement_noise(config: CellConfig, samples: int = 1) -> SimulatedNoise:
     )
 
 
-def as_told(config: CellConfig, choice: str, catalogue: Catalogue | None = None) -> CellConfig:
+def program_config(
+    config: CellConfig, choice: str, catalogue: Catalogue | None = None
+) -> CellConfig:
     """Return the configuration that the program gets when an effect is hidden."""
     check_choice(choice, catalogue)
     if not config.loads and choice in injected.DEFLECTION_EFFECTS:
         valid = ", ".join(
-            (*(e for e in choices() if e not in injected.DEFLECTION_EFFECTS), NOTHING)
+            (*(e for e in choices() if e not in injected.DEFLECTION_EFFECTS), NO_EFFECT)
         )
         raise InputError(
             f"the cell has no [[loads]]; {choice}, which loads show, needs at least one; valid to "
@@ -147,7 +149,7 @@ def simulation_case(
     `choice` is one of `choices()` or `own_choices(catalogue)`, "random" or "nothing"; the strength
     is that at the states which `visit` returns, with the tracker's `noise` of one reading.
     """
-    config = as_told(config, choice, catalogue)
+    config = program_config(config, choice, catalogue)
     cell = cell_from_config(config, base_dir)
     slides, hidden = bool(cell.arm.slides.any()), choice
     if choice in injected.OF_SLIDES and not slides:
@@ -163,13 +165,13 @@ def simulation_case(
     loaded = choice in injected.DEFLECTION_EFFECTS if law is None else law.effect.elastic
     mode: Mode = "deflection" if loaded and _paired(v) else "absolute"
     joint_std = config.repeatability.per_joint(cell.arm.n)
-    world = injected.nothing_hidden(cell, rng, noise=noise, joint_std=joint_std)
+    world = injected.world_without_effect(cell, rng, noise=noise, joint_std=joint_std)
     strength = 0.0
-    if hidden != NOTHING:
+    if hidden != NO_EFFECT:
         strength = config.simulation.strength_sigma
         world = injected.softened(world, hidden)
         effect = law or hidden
-        world = injected.hide(
+        world = injected.hide_effect(
             effect, cell, v.states, strength, mode, rng, world=world, pose=v.pose, cycle=v.cycle
         )
     return SimulationCase(config, cell, mode, world, hidden, strength)
@@ -209,7 +211,7 @@ def simulate(
         pose_names=tuple(f"p{i + 1}" for i in range(int(np.max(pose)) + 1)),
         target_names=world.cell.target_names if states.target is not None else (),
     )
-    arrival, sight = None, world.sight(states)
+    arrival, sight = None, world.ideal_readings(states)
     if states.target is not None:
         arrival = readings.arrivals
         readings = replace(readings, common=sight.jacobian[:, :m] * world.joint_std)
@@ -288,7 +290,9 @@ def case_of_plan(
     return replace(case, world=world, home=plan.joints(home(plan)))
 
 
-def read_plan(s: SimulationCase, plan: Plan, seed: Sequence[int], start: float = 0.0) -> Rehearsal:
+def simulate_plan(
+    s: SimulationCase, plan: Plan, seed: Sequence[int], start: float = 0.0
+) -> Rehearsal:
     """Draw the readings of a plan, each a mean, from the time `start` of the campaign on, s."""
     config = s.config
     world = replace(s.world, noise=measurement_noise(config, config.acquire.samples))
@@ -305,11 +309,11 @@ def simulated_cell(
     seed: int,
     base_dir: Path,
     directory: Path | None = None,
-    begun: float = 0.0,
+    start_s: float = 0.0,
 ) -> Iterator[SimulatedCell]:
     """Run the simulated devices of a cell, their files in `directory`, until the block ends.
 
-    The world's time starts at `begun`, s.
+    The world's time starts at `start_s`, s.
     """
     with (
         tempfile.TemporaryDirectory(prefix="hilcal-") as temporary,
@@ -319,7 +323,7 @@ def simulated_cell(
             directory or Path(temporary),
             seed,
             base_dir=base_dir,
-            start_s=begun,
+            start_s=start_s,
             home=case.home,
         ) as cell,
     ):

@@ -83,7 +83,7 @@ class Truth:
         """Return the truth with one effect's parameters replaced."""
         return replace(self, **{effect: value})
 
-    def named(self, arm: Arm) -> dict[str, float]:
+    def nonzero_parameters(self, arm: Arm) -> dict[str, float]:
         """Return the parameters that are not zero, as "effect.part": value in SI."""
         out: dict[str, float] = {}
         for f in fields(self):
@@ -146,10 +146,10 @@ def warm_up(time: Floats, n: int = 6) -> Floats:
     return np.asarray(AIR + rise + (_WARM_START - rise) * decay)
 
 
-def needed(effect: str, name: str, values: Floats | None, lack: str) -> Floats:
-    """Return a field of the states that a hidden effect needs; `lack`: message if it is missing."""
+def required_column(effect: str, name: str, values: Floats | None, missing_text: str) -> Floats:
+    """Return a column of the states that a hidden effect needs; else raise `missing_text`."""
     if values is None:
-        raise InputError(f"{name}: {effect} is hidden but the states {lack}")
+        raise InputError(f"{name}: {effect} is hidden but the states {missing_text}")
     return values
 
 
@@ -165,7 +165,9 @@ def joint_errors(hidden: Truth, arm: Arm, states: States, reference: float) -> F
     error = np.broadcast_to(hidden.encoder_offset, states.q.shape).copy()
     if np.any(hidden.hysteresis):
         lack = "name no side from which the joints arrived; valid: -1 or +1 per state and joint"
-        error += hidden.hysteresis * needed("hysteresis", "approach", states.approach, lack)
+        error += hidden.hysteresis * required_column(
+            "hysteresis", "approach", states.approach, lack
+        )
     if np.any(hidden.thermal_joint_drift):
         error += hidden.thermal_joint_drift * (joint_temperature(states) - reference)
     order = np.arange(1, hidden.transmission_error.shape[1] + 1)
@@ -197,7 +199,9 @@ def guide_motion(hidden: Truth, arm: Arm, states: States) -> Floats | None:
 def joint_temperature(states: States) -> Floats:
     """Return the (N, n) temperatures of the joints, °C."""
     lack = "carry no temperatures of the joints; valid: °C per state and joint"
-    return needed("thermal_joint_drift", "joint_temperature", states.joint_temperature, lack)
+    return required_column(
+        "thermal_joint_drift", "joint_temperature", states.joint_temperature, lack
+    )
 
 
 def further_compliance(hidden: Truth, arm: Arm, states: States) -> Floats | None:
@@ -212,7 +216,7 @@ def further_compliance(hidden: Truth, arm: Arm, states: States) -> Floats | None
         extra = cos * np.cos(2.0 * angle) + sin * np.sin(2.0 * angle)
     if np.any(hidden.creep):
         lack = "do not tell how long the load has hung; valid: seconds since its last change"
-        time = needed("creep", "load_time", states.load_time, lack)
+        time = required_column("creep", "load_time", states.load_time, lack)
         growth = hidden.creep * np.log10(1.0 + time)
         creep = growth[:, None] * hidden.joint_compliance
         extra = creep if extra is None else extra + creep
@@ -239,7 +243,7 @@ def link_growth(hidden: Truth, states: States) -> Floats | None:
     if temperature is None and states.joint_temperature is not None:
         temperature = states.joint_temperature.mean(axis=1)
     lack = "carry no temperature; valid: °C of the air, or of the joints"
-    temperature = needed("thermal_growth", "air_temperature", temperature, lack)
+    temperature = required_column("thermal_growth", "air_temperature", temperature, lack)
     return np.asarray(1.0 + hidden.thermal_growth * (temperature - LINK_REFERENCE))
 
 
@@ -273,7 +277,7 @@ class Misreading:
         turn = _both(axes)
         return Misreading(turn @ self.gain @ turn.T, turn @ self.bias)
 
-    def acting(self, reading: Floats) -> Floats:
+    def true_wrench(self, reading: Floats) -> Floats:
         """Return the (N, 6) wrenches that act when the sensor reads `reading`, N and N·m."""
         return np.asarray((reading - self.bias) @ self.gain.T)
 

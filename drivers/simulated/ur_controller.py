@@ -118,7 +118,7 @@ class Controller:
     def run(self, text: str) -> None:
         """Replace the running program, if allowed."""
         self.scripts += 1
-        if not self.arm.remote or not self.arm.able:
+        if not self.arm.remote or not self.arm.can_run:
             why = "the robot is not ready" if self.arm.remote else "local mode"
             self.arm.note(f"script ignored: {why}")
         elif text.startswith("sec"):  # a secondary program moves nothing and stops nothing
@@ -151,7 +151,7 @@ class Controller:
     def play(self) -> OrderResult:
         """Resume a paused program and its interrupted motion."""
         arm = self.arm
-        if arm.runtime is not Runtime.PAUSED or self._program is None or not arm.able:
+        if arm.runtime is not Runtime.PAUSED or self._program is None or not arm.can_run:
             return OrderResult.REFUSED
         arm.runtime = Runtime.PLAYING
         arm.note("program resumed")

@@ -318,7 +318,7 @@ class RtdeLinks:
         """Return when the next package is due, `time.monotonic`, s; infinite if none is."""
         return min((link.due for link in self.links if link.started), default=float("inf"))
 
-    def hears(self, register: int) -> bool:
+    def has_writer(self, register: int) -> bool:
         """Return whether a client that writes an integer register is connected."""
         return not self.arm.rtde_mute and f"{_INT}{register}" in self.owners
 

@@ -80,7 +80,7 @@ class UrServer:
         self.controller = control.Controller(state, board)
         sensors = Sensors(state, board, rng)
         self.rtde = RtdeLinks(state, sensors, self.controller.step)
-        self.controller.hears = self.rtde.hears
+        self.controller.hears = self.rtde.has_writer
         arm = state.kinematics.arm
         self.is_x = state.version[0] >= POLYSCOPE_X
         supervision = control.RobotApiServer if self.is_x else control.DashboardServer

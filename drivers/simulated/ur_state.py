@@ -84,9 +84,9 @@ class LinearMotion:
             time -= duration
         return way, 0.0
 
-    def point(self, way: float) -> Floats:
+    def point(self, distance: float) -> Floats:
         """Return the joint angles (n,) at a path of the leading joint, rad."""
-        return self.origin + self.direction * way
+        return self.origin + self.direction * distance
 
     @property
     def length(self) -> float:
@@ -330,7 +330,7 @@ class ArmState:
         return names.get(self.runtime, "STOPPED")
 
     @property
-    def able(self) -> bool:
+    def can_run(self) -> bool:
         """Whether power and safety allow a program to run."""
         return self.robot_mode is RobotMode.RUNNING and self.safety_mode is SafetyMode.NORMAL
 

@@ -57,7 +57,7 @@ class SimulatedNoise:
         # turn about `up` moves the sight to the left (azimuth), about -left moves it upwards
         azimuth = up * (draw[0] * across / distance)[:, None]
         elevation = -left * (draw[1] * across / distance)[:, None]
-        direction = mech.turned(azimuth + elevation) @ sight[:, :, None]
+        direction = mech.rotation_matrices(azimuth + elevation) @ sight[:, :, None]
         return np.asarray(direction[:, :, 0] * (distance + draw[2] * along)[:, None])
 
     def _spread(self, position: Floats) -> tuple[Floats, Floats, Floats]:
@@ -106,7 +106,7 @@ class World:
     offsets: Floats | None = None
     """(T, 3) displacement of each of several targets from its configured place, flange axes, m.
     `physics.target_offset` moves all of them."""
-    own: OwnLaw | None = None
+    own_law: OwnLaw | None = None
     """A user's effect, in addition to the mechanics."""
     _tree: mech.ElasticTree = field(init=False, repr=False)
 
@@ -116,21 +116,21 @@ class World:
     @property
     def truth(self) -> dict[str, float]:
         """The hidden parameters that are not zero, as "effect.part": value in SI."""
-        law = {} if self.own is None else self.own.truth
-        return {**self.physics.named(self.cell.arm), **law}
+        law = {} if self.own_law is None else self.own_law.truth
+        return {**self.physics.nonzero_parameters(self.cell.arm), **law}
 
     @property
     def drives(self) -> Ints:
-        """(n,) indices of the drives among the elastic degrees of freedom of `rest`."""
+        """(n,) indices of the drives among the elastic degrees of freedom of `equilibrium`."""
         return self._tree.drive
 
     @property
-    def ages(self) -> bool:
+    def drifts(self) -> bool:
         """Whether the target moves with time or temperature while arm and load rest."""
         causes = ("tracker_drift", "creep", "thermal_growth", "thermal_joint_drift")
-        return self.own is not None or any(np.any(getattr(self.physics, c)) for c in causes)
+        return self.own_law is not None or any(np.any(getattr(self.physics, c)) for c in causes)
 
-    def rest(self, states: States, slip: Floats | None = None) -> mech.Equilibrium:
+    def equilibrium(self, states: States, slip: Floats | None = None) -> mech.Equilibrium:
         """Return the equilibrium of N states; `slip` (N, n): error of the drives at rest, rad."""
         arm, hidden = self.cell.arm, self.physics
         errors = laws.joint_errors(hidden, arm, states, self.joint_reference)
@@ -150,38 +150,47 @@ class World:
 
     def drive_torque(self, states: States) -> Floats:
         """Return the (N, n) torque that weight and load exert at each drive, N·m."""
-        return self.cell.arm.drive_torques(self.rest(states).torque[:, self.drives])
+        return self.cell.arm.drive_torques(self.equilibrium(states).torque[:, self.drives])
 
-    def sight(
-        self, states: States, slip: Floats | None = None, rest: mech.Equilibrium | None = None
+    def ideal_readings(
+        self,
+        states: States,
+        slip: Floats | None = None,
+        equilibrium: mech.Equilibrium | None = None,
     ) -> IdealReading:
         """Return the readings of N states without the tracker's noise.
 
         T_sensor_target = exp(t [drift]) T_sensor_base exp([base_frame]) T_base_flange
         T_flange_target, with the target shifted by its offset; the position is then multiplied by
         1 + s about the origin of the sensor axes. A user's effect displaces the target before drift
-        and scale. `slip` as for `rest`; `rest`: the equilibrium, if already computed.
+        and scale. `slip` as for `equilibrium`; `equilibrium`: the equilibrium, if already computed.
         """
-        hidden, rest = self.physics, rest or self.rest(states, slip)
+        hidden, equilibrium = self.physics, equilibrium or self.equilibrium(states, slip)
         target = np.array(self.cell.target_of(states.target))
         target[..., :3, 3] += hidden.target_offset
         if self.offsets is not None:
             target[..., :3, 3] += self.offsets[0 if states.target is None else states.target]
         frame = self.registration @ mech.displacement(hidden.base_frame)
         R = frame[:3, :3]
-        pose = frame @ rest.flange @ target
+        pose = frame @ equilibrium.flange @ target
         position, rotation = pose[:, :3, 3], pose[:, :3, :3]
         by_drive = (
-            rest.jacobian if self.cell.arm.drive is None else (rest.jacobian @ self.cell.arm.drive)
+            equilibrium.jacobian
+            if self.cell.arm.drive is None
+            else (equilibrium.jacobian @ self.cell.arm.drive)
         )
-        jac = mech.moved_by(by_drive, (rest.flange[:, :3, :3] @ target[..., :3, 3:])[:, :, 0])
+        jac = mech.at_point(
+            by_drive, (equilibrium.flange[:, :3, :3] @ target[..., :3, 3:])[:, :, 0]
+        )
         jac = np.concatenate([R @ jac[:, :3], R @ jac[:, 3:]], axis=1)
-        if self.own is not None:
-            shift, turn = self.own.moved(self.cell, frame, hidden.joint_compliance, states)
+        if self.own_law is not None:
+            shift, turn = self.own_law.displacements(
+                self.cell, frame, hidden.joint_compliance, states
+            )
             position, rotation = position + shift, turn @ rotation
         if np.any(hidden.tracker_drift):
             lack = "carry no time stamps; valid: seconds since the campaign's start"
-            time = laws.needed("tracker_drift", "time", states.time, lack)
+            time = laws.required_column("tracker_drift", "time", states.time, lack)
             drift = np.array([mech.displacement(hidden.tracker_drift * t) for t in time])
             position = (drift[:, :3, :3] @ position[:, :, None])[:, :, 0] + drift[:, :3, 3]
             rotation = drift[:, :3, :3] @ rotation
@@ -190,12 +199,12 @@ class World:
             jac[:, :3] *= 1.0 + hidden.tracker_scale
         return IdealReading(position, rotation, jac)
 
-    def covariance(self, sight: IdealReading, m: int = 3) -> Floats:
+    def covariance(self, ideal: IdealReading, m: int = 3) -> Floats:
         """Return the (N, m, m) covariance of readings: tracker + J Sigma_q Jᵀ, sensor axes."""
         turn = self.station[:3, :3].T
-        cov = self.noise.covariance(self._from_station(sight.position), m)
+        cov = self.noise.covariance(self._from_station(ideal.position), m)
         cov[:, :3, :3] = turn @ cov[:, :3, :3] @ turn.T
-        jac = sight.jacobian[:, :m] * self.joint_std
+        jac = ideal.jacobian[:, :m] * self.joint_std
         return np.asarray(cov + jac @ np.swapaxes(jac, 1, 2))
 
     def observe(
@@ -209,13 +218,15 @@ class World:
         """
         k = np.arange(len(states)) if arrival is None else arrival
         slip = self.joint_std * rng.standard_normal((int(k.max()) + 1, states.q.shape[1]))[k]
-        sight = self.sight(states, slip)
+        sight = self.ideal_readings(states, slip)
         observed = self.noise.observe(self._from_station(sight.position), rng)
         axes, origin = self.station[:3, :3], self.station[:3, 3:]
         position = observed @ axes - (axes.T @ origin)[:, 0]
         if m == 3:
             return position
-        turn = mech.turned(self.noise.orientation_std * rng.standard_normal((len(states), 3)))
+        turn = mech.rotation_matrices(
+            self.noise.orientation_std * rng.standard_normal((len(states), 3))
+        )
         return np.hstack([position, mech.rotation_vector(turn @ sight.rotation)])
 
     def _from_station(self, position: Floats) -> Floats:
@@ -223,7 +234,7 @@ class World:
         return np.asarray(position @ self.station[:3, :3].T + self.station[:3, 3])
 
 
-def stand(cell: Cell, rng: np.random.Generator) -> tuple[Floats, Floats]:
+def place_tracker(cell: Cell, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """Place the tracker: return the true T_sensor_base and T_station_sensor, (4, 4) each.
 
     An unknown registration is drawn: the station is 3 m away from the base, at a height near the

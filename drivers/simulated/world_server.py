@@ -29,7 +29,7 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.blackboard import MOST_TARGETS, Blackboard
-from hilcal.drivers.simulated.mechanics import turned
+from hilcal.drivers.simulated.mechanics import rotation_matrices
 from hilcal.drivers.simulated.own_law import OwnLaw
 from hilcal.drivers.simulated.truth import AIR, Truth, warm_up
 from hilcal.drivers.simulated.world import SimulatedNoise, World
@@ -68,8 +68,10 @@ class WorldState:
         self._loads = config.loads
         sensor = config.force_sensor  # None: at the flange
         self._sensor_origin = np.array(sensor.origin_m) if sensor else np.zeros(3)
-        self._sensor_turn = turned(np.array([sensor.rotvec_rad]))[0] if sensor else np.eye(3)
-        self._ages = world.ages
+        self._sensor_turn = (
+            rotation_matrices(np.array([sensor.rotvec_rad]))[0] if sensor else np.eye(3)
+        )
+        self._ages = world.drifts
         self._rng = np.random.default_rng([seed, 0])
         self._lock = threading.RLock()
         truth = board.read("truth")
@@ -86,7 +88,7 @@ class WorldState:
     def step(self, now_ns: int) -> None:
         """Publish what has changed; `now_ns` is the real time, `time.monotonic_ns`."""
         with self._lock:
-            number = self._board.written("arm")
+            number = self._board.write_count("arm")
             if number == self._handled and now_ns - self._written_ns < _REFRESH_NS:
                 return
             arm = self._read_arm()
@@ -197,14 +199,14 @@ class WorldState:
             approach=arm["side"][None].copy(),
         )
         slip = self.slip(int(arm["arrivals"]))[None]
-        rest = world.rest(states, slip)
+        rest = world.equilibrium(states, slip)
         targets = np.full((MOST_TARGETS, 3), np.nan)
         if world.cell.targets is None:
-            sight = world.sight(states, slip, rest)
+            sight = world.ideal_readings(states, slip, rest)
         else:
             count = len(world.cell.targets)
             repeated = replace(states[np.zeros(count, dtype=np.int64)], target=np.arange(count))
-            sight = world.sight(repeated, np.repeat(slip, count, axis=0))
+            sight = world.ideal_readings(repeated, np.repeat(slip, count, axis=0))
             targets[:count] = sight.position
         flange = rest.flange[0]
         self._board.write(
@@ -301,7 +303,7 @@ def write_world(path: Path, world: World, config: CellConfig, base_dir: Path | N
         "config": json.loads(config.to_json()),
         "base_dir": None if base_dir is None else str(base_dir.resolve()),
         "physics": {f.name: _listed(getattr(world.physics, f.name)) for f in fields(Truth)},
-        "own": None if world.own is None else world.own.to_json(),
+        "own": None if world.own_law is None else world.own_law.to_json(),
         "noise": asdict(world.noise),
         "joint_reference": world.joint_reference,
         **{name: _listed(getattr(world, name)) for name in _ARRAYS},
@@ -322,7 +324,7 @@ def read_world(path: Path) -> tuple[World, CellConfig]:
             physics=Truth(**{name: _array(value) for name, value in data["physics"].items()}),
             noise=SimulatedNoise(along, across, noise["orientation_std"]),
             joint_reference=data["joint_reference"],
-            own=None if data["own"] is None else OwnLaw.from_json(cell, data["own"]),
+            own_law=None if data["own"] is None else OwnLaw.from_json(cell, data["own"]),
             **{name: _array(data[name]) for name in _ARRAYS},
         )
     except OSError as error:

@@ -270,12 +270,12 @@ class ControlInterface:
             raise RuntimeError("the controller takes no watchdog")
 
 
-def control(host: str, hz: str, lease: str, relayed: str, upper: str) -> Serve:
-    """Take control; `relayed`, `upper`: 1 or 0, see `supervision.Generation`."""
+def control(host: str, hz: str, lease: str, relayed: str, upper_registers: str) -> Serve:
+    """Take control; `relayed`, `upper_registers`: 1 or 0, see `supervision.Generation`."""
     from rtde_control import RTDEControlInterface as Interface
 
     flags = int(Interface.FLAG_UPLOAD_SCRIPT) | int(Interface.FLAG_NO_EXT_FT)
-    if int(upper):
+    if int(upper_registers):
         flags |= int(Interface.FLAG_UPPER_RANGE_REGISTERS)
     process = None
     if int(relayed):

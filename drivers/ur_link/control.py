@@ -21,11 +21,11 @@ from hilcal.drivers.ur_link.worker import Worker, WorkerError
 from hilcal.measuring.route import duration
 from hilcal.types import Floats
 
-STANDS_RAD_S = 0.01  # joints slower than this stand; measured speeds are noisy, rad/s
+REST_RAD_S = 0.01  # joints slower than this stand; measured speeds are noisy, rad/s
 MARGIN_S = 5.0
 """Allowed delay of a motion, and longest pause, real s."""
 SLACK = 1.5  # allowed duration of a motion, as a multiple of the computed one
-SLOWEST = 0.02  # below this share of its speed a motion counts as paused
+PAUSED_SPEED_SHARE = 0.02  # below this share of its speed a motion counts as paused
 _TARGET_RAD = 1e-5
 _BRAKE_S = 0.15
 _BRAKE_MIN, _BRAKE_MAX = 2.0, 10.0
@@ -36,9 +36,9 @@ def deceleration(speed: float) -> float:
     return float(np.clip(speed / _BRAKE_S, _BRAKE_MIN, _BRAKE_MAX))
 
 
-def stands(reading: Reading) -> bool:
+def at_rest(reading: Reading) -> bool:
     """Whether no joint moves."""
-    return float(np.abs(reading.sample.qd).max()) < STANDS_RAD_S
+    return float(np.abs(reading.sample.qd).max()) < REST_RAD_S
 
 
 class MotionInProgress:
@@ -67,7 +67,7 @@ class MotionInProgress:
         return (
             float(np.abs(sample.q_target - self._goal).max()) <= _TARGET_RAD
             and float(np.abs(sample.q - self._goal).max()) <= self._arrival
-            and stands(reading)
+            and at_rest(reading)
         )
 
     def overdue(self, reading: Reading) -> str | None:
@@ -77,8 +77,8 @@ class MotionInProgress:
         """
         sample, now = reading.sample, time.monotonic()
         interval, self._checked = now - self._checked, now
-        self._spent += interval * max(min(sample.speed_scaling, 1.0), SLOWEST)
-        if sample.speed_scaling >= SLOWEST:
+        self._spent += interval * max(min(sample.speed_scaling, 1.0), PAUSED_SPEED_SHARE)
+        if sample.speed_scaling >= PAUSED_SPEED_SHARE:
             self._paused = None
         elif self._paused is None:
             self._paused = now
@@ -116,11 +116,11 @@ class Control(Worker):
 
     def __init__(self, controller: UrController, seconds: float) -> None:
         """Take control of the arm within a deadline."""
-        flags = controller.script_port == PRIMARY_PORT, controller.upper
+        flags = controller.script_port == PRIMARY_PORT, controller.upper_registers
         arguments = repr(_HZ), repr(LEASE_S), *(str(int(flag)) for flag in flags)
         super().__init__("control", (controller.host, *arguments), seconds)
 
-    def alive(self, seconds: float = COMMAND_S) -> tuple[bool, float]:
+    def renew_lease(self, seconds: float = COMMAND_S) -> tuple[bool, float]:
         """Renew the lease of the motion; `seconds`: deadline of the answer, real s.
 
         Return whether the motion was stopped because its lease had expired, and the longest pause
@@ -134,7 +134,7 @@ class Control(Worker):
         how = {"speed": speed, "acceleration": acceleration, "deceleration": brake}
         return bool(self.call("move", COMMAND_S, q=q.tolist(), **how)["done"])
 
-    def rest(self) -> None:
+    def end_lease(self) -> None:
         """End the lease: the motion has ended."""
         self.call("rest", COMMAND_S)
 
@@ -147,14 +147,14 @@ class Control(Worker):
         cog = com.tolist() if com.any() else [0.0, 0.0, _NO_COG]
         return bool(self.call("payload", COMMAND_S, mass=mass, com=cog)["done"])
 
-    def give_back(self) -> None:
+    def release(self) -> None:
         """End the robot's program and the process; never raises."""
         with contextlib.suppress(WorkerError):
             self.call("bye", COMMAND_S)
         self.kill()
 
 
-def take(controller: UrController, receiver: Receiver) -> Control:
+def take_control(controller: UrController, receiver: Receiver) -> Control:
     """Take control of an arm that is ready for it."""
     host, end = controller.host, time.monotonic() + CONNECT_S
     try:
@@ -236,8 +236,8 @@ class Halt:
     """How a stop ended."""
 
     reading: Reading | None  # after the stop; None if the state cannot be read
-    stands: bool
-    lost: str  # why the link was lost before it was renewed; else empty
+    at_rest: bool
+    link_failure: str  # why the link was lost before it was renewed; else empty
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,18 +253,18 @@ class Brakes:
             control.stop(brake, 0.3)
             reading = self._until_still(_GENTLE_S, program=False)
             if reading is not None and reading.runtime == states.PLAYING:
-                control.rest()
+                control.end_lease()
                 return True
         return False
 
-    def halt(self, control: Control | None, brake: float, lost: str = "") -> Halt:
+    def halt(self, control: Control | None, brake: float, link_failure: str = "") -> Halt:
         """Stop in every way, which ends control; never raises.
 
-        `brake`: deceleration of the leading joint, rad/s²; `lost`: why the link is lost.
+        `brake`: deceleration of the leading joint, rad/s²; `link_failure`: why the link is lost.
         """
         if control is not None:
             try:
-                if not lost:
+                if not link_failure:
                     control.stop(brake, 0.1)
             except WorkerError:
                 pass
@@ -275,15 +275,15 @@ class Brakes:
         except LinkError:
             self._by_script(brake)
         try:
-            if not lost:
+            if not link_failure:
                 return self._watch(brake)
         except LinkError as error:
-            lost = str(error)
+            link_failure = str(error)
         try:
             self.receiver.renew(_RENEW_S)
-            return replace(self._watch(brake), lost=lost)
+            return replace(self._watch(brake), link_failure=link_failure)
         except LinkError:
-            return Halt(None, False, lost)
+            return Halt(None, False, link_failure)
 
     def _watch(self, brake: float) -> Halt:
         """Wait until the arm stands; command the stop once more if it does not."""
@@ -312,7 +312,7 @@ class Brakes:
             reading = self.receiver.read(STALE_S)
             ended = reading.runtime not in (states.PLAYING, states.RESUMING)
             safe = not program or ended or reading.sample.safety != states.NORMAL
-            count = count + 1 if stands(reading) and safe else 0
+            count = count + 1 if at_rest(reading) and safe else 0
             if count == 2:
                 return reading
         return None
@@ -333,8 +333,8 @@ def cause_of(controller: UrController, halt: Halt, symptom: str) -> tuple[str, s
     with contextlib.suppress(LinkError):
         if controller.supervision.in_remote_control(ASK_S) is False:
             return "it was switched to local mode", f"switch it to remote control, {RESUME}"
-    if halt.lost:
-        return f"the link is lost: {halt.lost}", CHECK_LINK
+    if halt.link_failure:
+        return f"the link is lost: {halt.link_failure}", CHECK_LINK
     return symptom, f"look at the pendant, {RESUME}"
 
 

@@ -222,7 +222,7 @@ class UrController:
     version: tuple[int, ...]  # major, minor, bugfix, build
     supervision: Dashboard | RobotApi
     script_port: int  # for programs: the real-time port; of PolyScope X the primary port
-    upper: bool
+    upper_registers: bool
     """Whether commands use the upper half of the registers (24 to 47), which no fieldbus uses.
     ur_rtde 1.6.5 supports them up to PolyScope 5.22; on newer versions its program uses the lower
     half, so the flag for the upper half would separate program and client."""
@@ -231,13 +231,15 @@ class UrController:
     def of(cls, host: str, version: tuple[int, ...], api_port: int) -> Self:
         """Return the controller of this version."""
         if version[0] >= POLYSCOPE_X:
-            return cls(host, version, RobotApi(host, api_port), PRIMARY_PORT, upper=False)
-        return cls(host, version, Dashboard(host), REALTIME_PORT, upper=version[:2] < (5, 23))
+            return cls(host, version, RobotApi(host, api_port), PRIMARY_PORT, upper_registers=False)
+        return cls(
+            host, version, Dashboard(host), REALTIME_PORT, upper_registers=version[:2] < (5, 23)
+        )
 
     @property
     def registers(self) -> tuple[str, str]:
         """Two of the registers through which ur_rtde sends commands."""
-        first = 24 if self.upper else 0
+        first = 24 if self.upper_registers else 0
         return f"input_int_register_{first}", f"input_double_register_{first}"
 
     def why_silent(self, seconds: float) -> str:

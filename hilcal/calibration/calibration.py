@@ -36,7 +36,13 @@ from hilcal.calibration.compensation import (
 )
 from hilcal.calibration.compiled import Compiled, compiled
 from hilcal.calibration.covariance_source import CovarianceSource
-from hilcal.calibration.measured import Condition, Measured, SensorMount, conditions_of, needed
+from hilcal.calibration.measured import (
+    Condition,
+    MeasuredRanges,
+    SensorMount,
+    conditions_of,
+    missing_columns,
+)
 from hilcal.calibration.scatter import Scatter, scatter_of
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.protocol import FRAME_ROLES
@@ -55,7 +61,7 @@ from hilcal.readings.whitening import Mode
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
-from hilcal.robot.factory import SAME, flange_difference, of_dict, with_factory
+from hilcal.robot.factory import SAME_FLANGE_M, flange_difference, of_dict, with_factory
 from hilcal.shown import Brief
 from hilcal.store.codec import read_file, write_document
 from hilcal.store.schema import is_campaign
@@ -80,14 +86,14 @@ class Calibration(Brief):
     theta: Floats  # (P,) its parameters
     mode: Mode  # kind of readings that it was fitted to
     root: Floats | None
-    """(P, K) R with κ C = R Rᵀ; None where it is computed from `learnt`, when it is needed."""
+    """(P, K) R with κ C = R Rᵀ; None: computed from `covariance_source` when needed."""
     misfit: float  # s², m²
     scatter: Scatter  # of the arm
-    measured: Measured  # ranges of the fitted readings
+    measured: MeasuredRanges  # ranges of the fitted readings
     loads: Mapping[str, Floats]  # (6,) wrench at the load point, base axes, by load of the cell
     source: Mapping[str, Any]  # origin of the calibration, for people
     sensor: SensorMount | None = None  # pose of the force sensor; None without one
-    learnt: CovarianceSource | None = None  # from which the covariance is computed; else None
+    covariance_source: CovarianceSource | None = None  # None where `root` is stated
     conditions: Mapping[str, Condition] = field(default_factory=dict)
     """Means that replace columns of `States` that points lack, by column."""
 
@@ -122,11 +128,11 @@ class Calibration(Brief):
             root=vectors * np.sqrt(kappa * np.maximum(values, 0.0)),
             misfit=p.excess.position / readings,
             scatter=scatter_of(fit),
-            measured=Measured.of(used.states, p, noise, model.cell.arm.units),
+            measured=MeasuredRanges.of(used.states, p, noise, model.cell.arm.units),
             loads={load.name: load.wrench(model.cell.gravity) for load in loads},
             source=dict(source or {}),
             sensor=SensorMount.of(model.cell),
-            learnt=covariance_source,
+            covariance_source=covariance_source,
         )
         return replace(bare, conditions=conditions_of(model, used.states, bare._moves))
 
@@ -232,7 +238,7 @@ class Calibration(Brief):
         if stated is None or arm.sign is not None or arm.coupling is not None:
             return arm
         with_stated = with_factory(arm, of_dict(stated, "the controller's kinematics"))
-        return with_stated if flange_difference(with_stated, arm)[1] > SAME else arm
+        return with_stated if flange_difference(with_stated, arm)[1] > SAME_FLANGE_M else arm
 
     @cached_property
     def _compiled(self) -> Compiled | tuple[str, ...]:
@@ -316,7 +322,7 @@ class Calibration(Brief):
         for name, column in {"q": q, **columns}.items():
             if not np.isfinite(column).all():
                 raise InputError(f"{name} has values that are not finite")
-        missing = needed(self.model, States(q, **columns))
+        missing = missing_columns(self.model, States(q, **columns))
         untold = tuple(c for c in missing if c in self.conditions)
         for name in untold:
             mean = self.conditions[name].mean
@@ -373,8 +379,8 @@ class Calibration(Brief):
         """(P, K) R with κ C = R Rᵀ."""
         if self.root is not None:
             return self.root
-        assert self.learnt is not None  # noqa: S101  (`root` or `learnt` is there)
-        return self.learnt.root(self.model, self.theta, self.mode)
+        assert self.covariance_source is not None  # noqa: S101  (`root` or `covariance_source` is there)
+        return self.covariance_source.root(self.model, self.theta, self.mode)
 
     def _moves(self, states: States) -> tuple[Floats, Floats]:
         """Position (N, 3) of the tool and J R (N, 3, K); changes by the load for deflections."""
@@ -412,5 +418,5 @@ def calibration_of_stream(fit: StreamFit, source: Mapping[str, Any]) -> Calibrat
         theta=fit.theta,
         root=vectors * np.sqrt(np.maximum(values, 0.0)),
         measured=replace(measured, most_std_m=float(share * measured.most_std_m)),
-        learnt=None,
+        covariance_source=None,
     )

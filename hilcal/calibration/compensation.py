@@ -39,11 +39,11 @@ if TYPE_CHECKING:
 
 TOLERANCE = 1e-10
 """Residual at which a point is solved, m and rad."""
-MOST_STEPS = 30
+MAX_STEPS = 30
 """Newton steps at most; four are usual."""
-MOST_TURN = 0.2
+MAX_JOINT_STEP = 0.2
 """Largest step of a joint, rad; longer ones are shortened, so that the branch stays the same."""
-LEAST_SINGULAR = 1e-3
+MIN_SINGULAR_RATIO = 1e-3
 """Ratio of the smallest to the largest singular value of J, lengths in units of the reach, below
 which a pose is singular: joints may turn a thousand times as far as the tool. A choice."""
 
@@ -153,7 +153,7 @@ def invert(
     residual = np.full((count, 2), np.inf)
     active = np.arange(count)
     scale = np.array([arm.reach] * 3 + [1.0] * 3)
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         r, p, chain = poses(q[active], active)
         rotvec = se3.rotation_vector(se3.product(rotation[active], np.swapaxes(r, 1, 2)))
         e = np.concatenate([position[active] - p, rotvec], axis=1)  # base axes
@@ -164,7 +164,7 @@ def invert(
         if not moving.any():
             break
         longest = np.abs(step).max(axis=1, keepdims=True)
-        step *= np.minimum(1.0, MOST_TURN / np.maximum(longest, 1e-300))
+        step *= np.minimum(1.0, MAX_JOINT_STEP / np.maximum(longest, 1e-300))
         q[active[moving]] += step[moving]
         active = active[moving]
     return Inverse(q, residual[:, 0], residual[:, 1])
@@ -331,15 +331,15 @@ class Compensation(Brief):
         arm = self._tool.model.cell.arm
         jacobian = _jacobian(arm, evaluate(arm, self.q), self.after.position)
         s = np.linalg.svd(jacobian, compute_uv=False)
-        return np.asarray(s[:, -1] < LEAST_SINGULAR * s[:, 0])
+        return np.asarray(s[:, -1] < MIN_SINGULAR_RATIO * s[:, 0])
 
     @property
     def turned_on(self) -> tuple[Outside, ...]:
         """Joint angles that lie within the measured ranges only after whole turns."""
         by_angle = self._calibration.measured.turned_on(replace(self._states, q=self.q))
-        inside: dict[str, Bools | bool] = {o.of.variable: ~o.points for o in self.after.outside}
+        inside: dict[str, Bools | bool] = {o.range.variable: ~o.points for o in self.after.outside}
         remaining = [
-            replace(o, points=o.points & inside.get(o.of.variable, True)) for o in by_angle
+            replace(o, points=o.points & inside.get(o.range.variable, True)) for o in by_angle
         ]
         return tuple(o for o in remaining if o.points.any())
 

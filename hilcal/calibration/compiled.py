@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.calibration.compensation import MOST_TURN, TOLERANCE, ToolPose, in_chain
+from hilcal.calibration.compensation import MAX_JOINT_STEP, TOLERANCE, ToolPose, in_chain
 from hilcal.effects.protocol import FRAME_ROLES, Effect, Situation
 from hilcal.optional import install
 from hilcal.readings.readings import States
@@ -59,7 +59,7 @@ class CompiledForm:
         grids = -TURN, 2 * TURN / (NODES - 1), -self.torque, 2 * self.torque / (TORQUE_NODES - 1)
         return grids, (self.by_angle, self.by_torque, self.soft)
 
-    def take(self, e: Effect, theta: Floats, s: Situation) -> bool:
+    def add(self, e: Effect, theta: Floats, s: Situation) -> bool:
         """Add an effect; return False where it has another form."""
         change = e.wrench_change(theta, s)
         if change is not None:
@@ -157,7 +157,7 @@ class CompiledForm:
         return True
 
 
-def given_the_columns(e: Effect, theta: Floats, s: Situation) -> bool:
+def fixed_columns_suffice(e: Effect, theta: Floats, s: Situation) -> bool:
     """Whether an effect, at fixed columns, is a constant or a compliance of joints."""
     turned = np.roll(s.angle, 1, axis=0)
     permuted = replace(s, states=replace(s.states, q=turned), angle=turned)
@@ -259,7 +259,7 @@ class Compiled:
     mode: Mode  # kind of readings that the model was fitted to
     by_point: tuple[tuple[Effect, Floats], ...]
     """Effects that need times, temperatures or sides of approach, with their parameters."""
-    one: Situation  # a state to evaluate these effects at
+    situation: Situation  # a state to evaluate these effects at
 
     def covers(self, q: Floats) -> bool:
         """Whether the tables hold at joint values (N, n); some wrists turn without a stop."""
@@ -286,15 +286,15 @@ class Compiled:
             tool, unloaded = self.tool.pose if still else self.tool.nominal, np.zeros((count, 6))
             deviations = by_point if still else _zeros(q.shape[1])
             invert_all(
-                self.arm, self.load, laws, tables, deviations, packed(tool), self.reach, MOST_TURN,
-                TOLERANCE, q, unloaded, rotation, position, False, out, residual,
+                self.arm, self.load, laws, tables, deviations, packed(tool), self.reach,
+                MAX_JOINT_STEP, TOLERANCE, q, unloaded, rotation, position, False, out, residual,
             )  # fmt: skip
         if goal is not None or not still:
             rotation, position = in_chain(self.tool, rotation, position)
         invert_all(
             self.arm, self.load, self.laws, self.tables, by_point, packed(self.tool.pose),
-            self.reach, MOST_TURN, TOLERANCE, q, wrench, packed(rotation), packed(position), True,
-            out, residual,
+            self.reach, MAX_JOINT_STEP, TOLERANCE, q, wrench, packed(rotation), packed(position),
+            True, out, residual,
         )  # fmt: skip
         return out, residual
 
@@ -303,7 +303,7 @@ class Compiled:
         zeros = _zeros(states.q.shape[1])
         if not self.by_point:
             return zeros
-        s = self.one if len(states) == 1 else repeated(self.one, len(states))
+        s = self.situation if len(states) == 1 else repeated(self.situation, len(states))
         s = replace(s, states=states, angle=states.q)
         dq, twist, soft = zeros
         for e, theta in self.by_point:
@@ -340,9 +340,9 @@ def compiled(tool: ToolPose, mode: Mode) -> Compiled | tuple[str, ...]:
             point = point if change.point is None else point + change.point
             moments = change.first_moment
             first_moment = first_moment if moments is None else first_moment + moments
-        elif e.needs and given_the_columns(e, theta, s):
+        elif e.needs and fixed_columns_suffice(e, theta, s):
             by_point.append((e, theta))
-        elif not form.take(e, theta, s):
+        elif not form.add(e, theta, s):
             return (e.name,)
     load = (
         packed(point), float(cell.tool_mass), packed(cell.tool_com), packed(cell.gravity),

@@ -52,9 +52,9 @@ class CovarianceSource:
         r, n = self.readings, model.cell.arm.n
         count = len(r.states)
         limits.check_numbers("what its covariance follows from", count * r.m * max(model.size, 1))
-        numbers("prior", self.prior, (model.size,), least=0.0)
-        numbers("noise", self.noise, least=0.0)
-        numbers("factor", self.factor, least=0.0)
+        numbers("prior", self.prior, (model.size,), minimum=0.0)
+        numbers("noise", self.noise, minimum=0.0)
+        numbers("factor", self.factor, minimum=0.0)
         widths = dict.fromkeys(("q", "joint_temperature", "approach", "q_actual", "torque"), n)
         widths |= {"wrench": 6}
         for f in fields(States):

@@ -36,15 +36,15 @@ FULL_TURN = 2 * np.pi
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Corrected:
+class CorrectedArm:
     """An arm with the constant effects of a calibration."""
 
     arm: Arm
-    within: tuple[str, ...]  # effects that it contains
-    beyond: tuple[str, ...]  # effects that it does not contain
+    included: tuple[str, ...]  # effects that it contains
+    not_included: tuple[str, ...]  # effects that it does not contain
 
 
-def corrected(calibration: Calibration) -> Corrected:
+def corrected_arm(calibration: Calibration) -> CorrectedArm:
     """Return the arm with the constant effects of a calibration in its transforms.
 
     Raises:
@@ -60,7 +60,9 @@ def corrected(calibration: Calibration) -> Corrected:
     if arm.coupling is not None or arm.drive is not None:
         raise InputError(f"{arm.name}: joints are coupled, which constant transforms cannot hold")
     robot = calibration.frames
-    return Corrected(replace(arm, links=robot.links), robot.constant_effects, robot.other_effects)
+    return CorrectedArm(
+        replace(arm, links=robot.links), robot.constant_effects, robot.other_effects
+    )
 
 
 def urdf(arm: Arm, note: str = "") -> str:
@@ -177,7 +179,9 @@ def ur_kinematics(
     return "\n".join([*comment, *lines]) + "\n", se3.screw(2, -turn, -shift[-1]) @ arm.links[-1]
 
 
-def frames(calibration: Calibration, corrected_arm: Corrected, beyond_flange: Floats | None) -> str:
+def frames(
+    calibration: Calibration, corrected_arm: CorrectedArm, beyond_flange: Floats | None
+) -> str:
     """Return the frames that a controller asks for, as JSON: x, y, z, rx, ry, rz in m and rad.
 
     `base_in_tracker` is the base of everything that is exported, `base_is` its origin.
@@ -194,8 +198,8 @@ def frames(calibration: Calibration, corrected_arm: Corrected, beyond_flange: Fl
         "tool_on_flange": se3.six(tool),
         "base_in_tracker": se3.six(base),
         "base_is": calibration.frames.base_is,
-        "in_transforms": list(corrected_arm.within),
-        "not_in_transforms": list(corrected_arm.beyond),
+        "in_transforms": list(corrected_arm.included),
+        "not_in_transforms": list(corrected_arm.not_included),
         "controller": {
             "tcp_m_rad": se3.six(tcp),
             "tcp_mm_rad": _millimetres(tcp),
@@ -216,17 +220,17 @@ def _millimetres(pose: Floats) -> list[float]:
     return [round(1e3 * v, 7) for v in values[:3]] + [round(v, 9) for v in values[3:]]
 
 
-def origin_of(place: Floats) -> tuple[Floats, Floats]:
+def origin_of(transform: Floats) -> tuple[Floats, Floats]:
     """Position and fixed-axis roll, pitch, yaw of a pose (4, 4), exact also at pitch ±90°."""
     from scipy.spatial.transform import Rotation  # slow to import
 
-    r = place[:3, :3]
+    r = transform[:3, :3]
     pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
     roll = np.arctan2(r[2, 1], r[2, 2])
     # The remainder is about z, whatever roll rounding chose.
     about_z = r @ Rotation.from_euler("xyz", [roll, pitch, 0.0]).as_matrix().T
     yaw = np.arctan2(about_z[1, 0] - about_z[0, 1], about_z[0, 0] + about_z[1, 1])
-    return place[:3, 3], np.array([roll, pitch, yaw])
+    return transform[:3, 3], np.array([roll, pitch, yaw])
 
 
 def _yaml(value: float) -> str:

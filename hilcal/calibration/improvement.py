@@ -32,7 +32,7 @@ from hilcal.types import Bools, Floats
 
 
 @dataclass(frozen=True, slots=True)
-class Improved:
+class ErrorReduction:
     """Errors of some points before and after the correction.
 
     Attributes:
@@ -74,12 +74,12 @@ class Improvement:
     """Points that could not be corrected or reached, with the reason."""
 
     @property
-    def everything(self) -> Improved:
+    def everything(self) -> ErrorReduction:
         """All points."""
         return self._part("all", np.ones(len(self.poses), dtype=np.bool_))
 
     @property
-    def by_load(self) -> tuple[Improved, ...]:
+    def by_load(self) -> tuple[ErrorReduction, ...]:
         """The points of each load."""
         loads = np.array(self.loads)
         return tuple(self._part(name, loads == name) for name in dict.fromkeys(self.loads))
@@ -88,11 +88,11 @@ class Improvement:
         """Return the number of points whose error exceeds a limit after the correction."""
         return int(np.sum(self.after_m > limit_m))
 
-    def _part(self, name: str, part: Bools) -> Improved:
+    def _part(self, name: str, part: Bools) -> ErrorReduction:
         before, after = ErrorSize.of(self.before_m[part]), ErrorSize.of(self.after_m[part])
         noise = float(np.sqrt(np.mean(self.noise_m[part] ** 2)))
         first, last = (np.sqrt(max(s.rms_m**2 - noise**2, 0.0)) for s in (before, after))
-        return Improved(
+        return ErrorReduction(
             name=name,
             count=int(part.sum()),
             before=before,

@@ -264,7 +264,7 @@ def invert_all(
     by_point: tuple[Floats, Floats, Floats],
     tool: Floats,
     reach: float,
-    most_turn: float,
+    max_joint_step: float,
     tolerance: float,
     q: Floats,
     applied: Floats,
@@ -334,5 +334,5 @@ def invert_all(
                 jacobian[:3, j] = column
             if not _solve(jacobian, e):
                 break
-            joints += min(1.0, most_turn / max(np.abs(e).max(), 1e-300)) * e
+            joints += min(1.0, max_joint_step / max(np.abs(e).max(), 1e-300)) * e
         out_q[point] = joints

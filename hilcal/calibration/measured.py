@@ -43,13 +43,13 @@ from hilcal.types import Bools, Floats
 class Outside:
     """Points outside of a measured range."""
 
-    of: Range  # the range; for the uncertainty, its limit, m
+    range: Range  # the range; for the uncertainty, its limit, m
     points: Bools  # (N,) points outside
     values: Floats  # (N,) values of all points
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class MeasuredRanges:
     """Ranges of the fitted readings."""
 
     ranges: tuple[Range, ...]  # of joint angles, force, moment, temperatures
@@ -58,7 +58,9 @@ class Measured:
     which a point is far from all fitted ones."""
 
     @classmethod
-    def of(cls, states: States, p: Predictive, noise: Floats, units: Sequence[str]) -> "Measured":
+    def of(
+        cls, states: States, p: Predictive, noise: Floats, units: Sequence[str]
+    ) -> "MeasuredRanges":
         """Return the ranges of fitted states.
 
         `noise` (D,) are traces of the measurements' position covariances by noise and misfit, m².
@@ -66,7 +68,7 @@ class Measured:
         spread = noise * p.leverage / (1 - p.leverage)
         return cls(ranges_of(states, units), float(np.sqrt(FAR * np.quantile(spread, 0.99))))
 
-    def middle(self, n: int) -> Floats:
+    def mid_range_q(self, n: int) -> Floats:
         """(n,) joint values in the middle of their ranges, rad or m; zero where unknown."""
         middles = {r.variable: 0.5 * (r.low + r.high) for r in self.ranges}
         names = (travel_name(j) if travel_name(j) in middles else angle_name(j) for j in range(n))
@@ -93,10 +95,10 @@ class Measured:
     def turned_on(self, states: States) -> list[Outside]:
         """Return the joint angles outside of their ranges if whole turns count as different."""
         none = np.zeros(states.q.shape[1], dtype=np.bool_)
-        return [o for o in self.outside(states, None, none) if o.of.unit == "rad"]
+        return [o for o in self.outside(states, None, none) if o.range.unit == "rad"]
 
 
-WORDS = {
+CONDITION_NAMES = {
     "time": "time",
     "load_time": "time under load",
     "air_temperature": "air temperature",
@@ -104,7 +106,7 @@ WORDS = {
     "approach": "sides of approach",
 }
 """Columns of `States` whose mean a calibration may know, with their names for people."""
-MOST = 200
+MAX_STATES = 200
 """Measured states at which variances are computed, evenly spread; a choice."""
 
 
@@ -116,27 +118,27 @@ class Condition:
     variance_m2: float  # v, m²
 
 
-def needed(model: Model, states: States) -> tuple[str, ...]:
-    """Columns that effects of a model need and states lack, in the order of `WORDS`."""
+def missing_columns(model: Model, states: States) -> tuple[str, ...]:
+    """Columns that effects of a model need and states lack, in the order of `CONDITION_NAMES`."""
     needs = {n for e in model.effects if not e.computable(states) for n in e.needs}
     columns = {column for need in needs for column in need.split(" or ")}
-    return tuple(c for c in WORDS if c in columns and getattr(states, c) is None)
+    return tuple(c for c in CONDITION_NAMES if c in columns and getattr(states, c) is None)
 
 
 def conditions_of(
-    model: Model, states: States, moves: Callable[[States], tuple[Floats, Floats]]
+    model: Model, states: States, position_and_spread: Callable[[States], tuple[Floats, Floats]]
 ) -> dict[str, Condition]:
     """Return the conditions that effects of a model need, by column."""
-    names = needed(model, States(states.q, states.wrench))
-    sample = states[:: -(-len(states) // MOST)]
-    reference, out = moves(sample) if names else (np.zeros(0), np.zeros(0)), {}
+    names = missing_columns(model, States(states.q, states.wrench))
+    sample = states[:: -(-len(states) // MAX_STATES)]
+    reference, out = position_and_spread(sample) if names else (np.zeros(0), np.zeros(0)), {}
     for name in names:
         column = getattr(states, name)
         if column is None:
             continue
         mean = column.mean(axis=0)
         constant: dict[str, Any] = {name: np.broadcast_to(mean, getattr(sample, name).shape).copy()}
-        position, spread = moves(replace(sample, **constant))
+        position, spread = position_and_spread(replace(sample, **constant))
         moved = np.sum((reference[0] - position) ** 2) + np.sum((reference[1] - spread) ** 2)
         out[name] = Condition(np.asarray(mean), float(moved) / (3 * len(sample)))
     return out

@@ -31,9 +31,9 @@ from hilcal.names import quoted
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.tables.columns import (
-    OWN_PREFIX,
     POSITION,
     ROTATION,
+    USER_PREFIX,
     WRENCH,
     approach_columns,
     joint_columns,
@@ -46,20 +46,20 @@ from hilcal.tables.grid import ColumnTable
 from hilcal.tables.mapped import mapped_table
 from hilcal.tables.mapping import FileFormat, PointMapping
 from hilcal.tables.proposal import GUESSED
-from hilcal.tables.propose import Proposed, propose, sniff
+from hilcal.tables.propose import GridProposal, propose, sniff
 from hilcal.tables.units import LENGTHS
 from hilcal.types import Floats
 
 NO_LOAD = "none"
-NEAR = 0.5
+NEAREST_RAD = 0.5
 """rad; a solution within this distance of the start counts as the nearest. A choice."""
-STARTS = 300
+N_STARTS = 300
 """Random starts to find all branches from; a choice: an arm of six joints has up to 16."""
-BEYOND = 1e3
+LIMIT_PENALTY = 1e3
 """rad; added to the distance of a solution beyond the joints' limits."""
 LEAST_REACH, LONGEST_TOOL = 0.05, 0.5
 """Least distance of the farthest point over the reach, and largest beyond it, m; choices."""
-LARGEST = 4.0 * np.pi
+LARGEST_RAD = 4.0 * np.pi
 """rad; a choice, twice the range of most joints: larger values in a column of rad are degrees."""
 
 
@@ -69,14 +69,14 @@ class Points:
 
     names: tuple[str, ...]
     q: Floats  # (N, n) joint values, rad; rows of NaN where only a pose is stated
-    wanted: Floats | None = None
+    target_poses: Floats | None = None
     """(N, 4, 4) T_base_tool, NaN where joint values state the target; None if they do for all."""
     wrench: Floats | None = None
     """(N, 6) force and moment at the load point, base axes; None if not stated."""
-    sensed: Floats | None = None
+    sensor_wrench: Floats | None = None
     """(N, 6) change of the force sensor's reading by the load, sensor axes; None if not stated."""
     recorded: Mapping[str, Floats] = field(default_factory=dict)  # other columns of `States`
-    taken: str = ""  # meaning of guessed columns, for people
+    guess: str = ""  # meaning of guessed columns, for people
 
 
 class _OtherNamesError(InputError):
@@ -96,7 +96,7 @@ def read_points(
     present = [group for group in groups if group[1][0] in table.number]
     columns = {quantity: table.matrix(names) * factor for quantity, names, factor in present}
     q = columns.pop("q", None)
-    if q is not None and np.any(large := (np.abs(q) > LARGEST) & ~arm.slides):
+    if q is not None and np.any(large := (np.abs(q) > LARGEST_RAD) & ~arm.slides):
         k = int(np.argmax(np.any(large, axis=1)))
         raise InputError(
             f"{table.at(k)}: a joint at {np.abs(q[k]).max():.4g} rad; columns q1_rad … are in rad, "
@@ -138,10 +138,10 @@ def on_branch(points: Points, arm: Arm, tool: Floats, near: Floats | None) -> Fl
     Of all solutions of a pose, the one nearest to the point's own joint values is returned; without
     these the one nearest to the previous point, for the first point to `near` (n,), rad.
     """
-    if points.wanted is None:
+    if points.target_poses is None:
         return points.q
     out: list[Floats] = []
-    for name, q, goal in zip(points.names, points.q, points.wanted, strict=True):
+    for name, q, goal in zip(points.names, points.q, points.target_poses, strict=True):
         start = q if np.isfinite(q).all() else out[-1] if out else near
         if start is None:
             raise InputError(
@@ -176,7 +176,7 @@ def solutions(arm: Arm, tool: Floats, near: Floats | None, goal: Floats) -> Floa
 def _everywhere(arm: Arm) -> Floats:
     """(STARTS, n) random joint values over the whole range of the joints."""
     low, high = arm.usual_range
-    spread = np.random.default_rng(0).random((STARTS, arm.n))
+    spread = np.random.default_rng(0).random((N_STARTS, arm.n))
     return arm.complete(low + spread * (high - low))
 
 
@@ -190,9 +190,9 @@ def _nearest(arm: Arm, tool: Floats, name: str, near: Floats, goal: Floats) -> F
             q = q + 2 * np.pi * np.round((near - q) / (2 * np.pi)) * ~arm.slides
             q = np.where((q < arm.q_min) | (q > arm.q_max), solved.q, q)
         inside = ((q >= arm.q_min) & (q <= arm.q_max)).all(axis=1)
-        distance = np.linalg.norm(q - near, axis=1) + np.where(inside, 0.0, BEYOND)
+        distance = np.linalg.norm(q - near, axis=1) + np.where(inside, 0.0, LIMIT_PENALTY)
         distance = np.where(solved.solved, distance, np.inf)
-        if distance.min() < NEAR:
+        if distance.min() < NEAREST_RAD:
             break
         if len(starts) == 1:
             starts = np.concatenate([near[None], _everywhere(arm)])
@@ -215,7 +215,7 @@ def _form(path: Path) -> FileFormat:
         return FileFormat()  # the reader reports it
     if not any(mark in header for mark in (";", "\t", "|")):
         return FileFormat()
-    how = sniff(path).how
+    how = sniff(path).file_keys
     return FileFormat(**{key: how[key] for key in ("separator", "decimal") if key in how})
 
 
@@ -224,19 +224,19 @@ def _guessed(path: Path, arm: Arm) -> tuple[PointMapping, str]:
     proposed = propose(path, joints=arm.n)
     proposal = proposed.proposal
     understood = [
-        f"{u.what} = {', '.join(u.columns)}" + f" ({u.meaning})" * bool(u.meaning)
-        for u in proposal.understood
+        f"{u.section} = {', '.join(u.columns)}" + f" ({u.meaning})" * bool(u.meaning)
+        for u in proposal.quantities
     ]
     # names of loads are checked against the campaign, and names of poses are arbitrary
     certain = ["pose", "load", *["position"] * _certain_unit(proposed, arm)]
     doubts = [
         f"{about}: {'no convention stated' if doubt == GUESSED else doubt}"
-        for about, doubt in proposal.unsure
+        for about, doubt in proposal.doubts
         if about not in certain
     ]
     doubts += [f"{name} is not understood" for name, _ in proposal.unused]
     if not {"joints", "position"} & proposal.sections.keys():
-        doubts = proposal.lacking
+        doubts = proposal.missing
     if doubts:
         raise InputError(
             f"{path}: its columns are not those of a table of points, and cannot be guessed: "
@@ -248,7 +248,7 @@ def _guessed(path: Path, arm: Arm) -> tuple[PointMapping, str]:
     return proposal.mapping(PointMapping), f"taken, in base axes: {'; '.join(understood)}"
 
 
-def _certain_unit(proposed: Proposed, arm: Arm) -> bool:
+def _certain_unit(proposed: GridProposal, arm: Arm) -> bool:
     """Whether positions lie within the arm's reach in the guessed unit alone."""
     section = proposed.proposal.sections.get("position")
     if section is None or section["unit"] not in ("m", "mm"):
@@ -301,7 +301,7 @@ def _checked(
     exchanged = set(known_columns(arm.units))
     ours = {*listed, *exchanged} - {"pose", "load", "target"}
     for name in header:
-        if name not in (*listed, "pose", "load", *exchanged) and not name.startswith(OWN_PREFIX):
+        if name not in (*listed, "pose", "load", *exchanged) and not name.startswith(USER_PREFIX):
             if not ours & set(header):
                 raise _OtherNamesError(f"{path}: no column of a table of points")
             valid = ", ".join(("pose", "load", *listed))

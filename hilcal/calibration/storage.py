@@ -2,7 +2,7 @@
 
 The covariance is stored in the smaller of two forms. One is its factor, as 32-bit floats, each row
 scaled by its parameter's standard deviation. The other is the source that it is computed from
-(`learnt`), if that reproduces the standard deviations at fitted states to `AGREES`, which is
+(`learnt`), if that reproduces the standard deviations at fitted states to `STD_TOLERANCE`, which is
 checked before writing. Everything else is decimal numbers, exactly.
 """
 
@@ -18,7 +18,7 @@ import numpy as np
 from hilcal import __version__, limits
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.covariance_source import CovarianceSource
-from hilcal.calibration.measured import WORDS, Condition, Measured, SensorMount
+from hilcal.calibration.measured import CONDITION_NAMES, Condition, MeasuredRanges, SensorMount
 from hilcal.calibration.scatter import Scatter
 from hilcal.cell import Cell, Observer
 from hilcal.effects.catalogue import Catalogue, installed
@@ -32,11 +32,11 @@ from hilcal.store.codec import decode, encode, frames, numbers, read_document
 from hilcal.types import Floats
 
 FORMAT, VERSION = "hilcal-calibration", 2
-BY_FACTOR = 1
+FACTOR_VERSION = 1
 """Version of a file with the factor of the covariance, which older programs read."""
-AGREES = 5e-3
+STD_TOLERANCE = 5e-3
 """Largest relative change of a standard deviation by the source form; a choice."""
-TRIED = 40
+CHECKED_STATES = 40
 """Fitted states at which that is checked."""
 _CELL = (
     *("target", "load_point", "tool_mass", "tool_com", "gravity", "registration", "targets"),
@@ -59,7 +59,7 @@ def to_json(c: Calibration) -> dict[str, object]:
     ]
     content = {
         "format": FORMAT,
-        "version": BY_FACTOR if small is None else VERSION,
+        "version": FACTOR_VERSION if small is None else VERSION,
         "hilcal": __version__,
         "source": dict(c.source),
         "readings": c.mode,
@@ -83,7 +83,7 @@ def to_json(c: Calibration) -> dict[str, object]:
 def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) -> Calibration:
     """Return the calibration that `to_json` wrote."""
     read = partial(_read, catalogue=catalogue or installed())
-    return read_document(content, "calibration", FORMAT, (BY_FACTOR, VERSION), read)
+    return read_document(content, "calibration", FORMAT, (FACTOR_VERSION, VERSION), read)
 
 
 def _read(content: Mapping[str, Any], catalogue: Catalogue) -> Calibration:
@@ -103,7 +103,7 @@ def _read(content: Mapping[str, Any], catalogue: Catalogue) -> Calibration:
             f"written by hilcal {content['hilcal']}, whose effects have other parameters"
         )
     theta = numbers("theta", content["theta"], (len(names),))
-    std = numbers("std", content["std"], (len(names),), least=0.0)
+    std = numbers("std", content["std"], (len(names),), minimum=0.0)
     root = learnt = None
     if "learnt" in content:
         learnt = CovarianceSource.from_json(content["learnt"])
@@ -119,10 +119,10 @@ def _read(content: Mapping[str, Any], catalogue: Catalogue) -> Calibration:
         theta=theta,
         mode=MODES[MODES.index(content["readings"])],
         root=root,
-        learnt=learnt,
+        covariance_source=learnt,
         misfit=float(content["misfit_m2"]),
         scatter=scatter,
-        measured=decode(Measured, content["measured"]),
+        measured=decode(MeasuredRanges, content["measured"]),
         loads=decode(Mapping[str, Floats], content["loads"]),
         source=content["source"],
         sensor=decode(SensorMount | None, content.get("force_sensor")),
@@ -134,19 +134,19 @@ def _read(content: Mapping[str, Any], catalogue: Catalogue) -> Calibration:
 
 def _small(c: Calibration) -> dict[str, object] | None:
     """Source of the covariance as JSON; None if it is not smaller or does not reproduce it."""
-    if c.learnt is None:
+    if c.covariance_source is None:
         return None
-    small = c.learnt.to_json()
+    small = c.covariance_source.to_json()
     if c.root is None:
         return small
     if len(json.dumps(small)) > 4 * c.root.size * 4 / 3:
         return None
-    states = c.learnt.readings.states
-    states = states[:: max(len(states) // TRIED, 1)]
+    states = c.covariance_source.readings.states
+    states = states[:: max(len(states) // CHECKED_STATES, 1)]
     jacobian = c.model.jacobian(c.model.predict(states, c.theta), c.theta, 3)
     copy = CovarianceSource.from_json(small).root(c.model, c.theta, c.mode)
     stated, copied = (np.linalg.norm(jacobian @ root, axis=(1, 2)) for root in (c.root, copy))
-    return small if np.all(np.abs(copied - stated) <= AGREES * stated) else None
+    return small if np.all(np.abs(copied - stated) <= STD_TOLERANCE * stated) else None
 
 
 def _cell(content: Mapping[str, Any], arm: Arm) -> Cell:
@@ -156,7 +156,7 @@ def _cell(content: Mapping[str, Any], arm: Arm) -> Cell:
         arm=arm,
         target=frames("target", content["target"]),
         registration=frames("registration", content["registration"]),
-        tool_mass=float(numbers("tool_mass", content["tool_mass"], least=0.0)),
+        tool_mass=float(numbers("tool_mass", content["tool_mass"], minimum=0.0)),
         load_point=numbers("load_point", content["load_point"], (3,)),
         tool_com=numbers("tool_com", content["tool_com"], (3,)),
         gravity=numbers("gravity", content["gravity"], (3,)),
@@ -183,9 +183,9 @@ def _check_arm(arm: Arm) -> None:
     if n < 1:
         raise ValueError("the arm has no joints")
     frames("links", arm.links, several=True)
-    numbers("masses", arm.masses, (n,), least=0.0)
+    numbers("masses", arm.masses, (n,), minimum=0.0)
     numbers("coms", arm.coms, (n, 3))
-    numbers("payload", arm.payload, least=0.0)
+    numbers("payload", arm.payload, minimum=0.0)
     for name, shape in (("coupling", (n, n)), ("drive", (n, n)), ("mimic", (n, n + 1))):
         if getattr(arm, name) is not None:
             numbers(name, getattr(arm, name), shape)
@@ -199,18 +199,18 @@ def _check_arm(arm: Arm) -> None:
 
 
 def _check(c: Calibration, n: int) -> None:
-    numbers("misfit_m2", c.misfit, least=0.0)
-    numbers("joint_std", c.scatter.joint_std, (n,), least=0.0)
-    numbers("std_m", c.scatter.std_m, least=0.0)
+    numbers("misfit_m2", c.misfit, minimum=0.0)
+    numbers("joint_std", c.scatter.joint_std, (n,), minimum=0.0)
+    numbers("std_m", c.scatter.std_m, minimum=0.0)
     if np.isnan(c.measured.most_std_m):
         raise ValueError("most_std_m is no number")
     for r in c.measured.ranges:
         numbers(f"range of {r.variable}", np.array([r.low, r.high]), (2,))
     for name, x in c.conditions.items():
-        if name not in WORDS:
+        if name not in CONDITION_NAMES:
             raise ValueError(f"{name!r} is no condition")
         numbers(name, x.mean, (n,) if name in ("joint_temperature", "approach") else ())
-        numbers(f"variance by {name}", x.variance_m2, least=0.0)
+        numbers(f"variance by {name}", x.variance_m2, minimum=0.0)
     for name, wrench in c.loads.items():
         numbers(f"load {name}", wrench, (6,))
     if c.sensor is not None:

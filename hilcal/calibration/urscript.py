@@ -39,9 +39,9 @@ from hilcal.types import Bools, Floats
 
 JOINTS = 6
 STRAIGHT = ("movel", "movep")
-MOVES = {"movej": 4, "movel": 4, "movep": 3, "servoj": None}
+MOVE_FUNCTIONS = {"movej": 4, "movel": 4, "movep": 3, "servoj": None}
 """Functions that move to a waypoint, with the index of the argument that is the blend radius."""
-NAMED = 5
+MAX_NAMED = 5
 """Most lines that an error names."""
 _OTHER_MOVES = ("movec", "servoc", "speedj", "speedl")
 """Functions of other motions, which are not corrected."""
@@ -95,16 +95,17 @@ class Waypoint:
     """One waypoint of a program, or another motion."""
 
     line: int  # of the program, from 1
-    begin: int  # offset of its target in the text
+    start: int  # offset of its target in the text
     end: int  # offset of the target's end
     q: Floats | None = None
     """(6,) joint values, or those that select the branch of `pose`, rad; None if not stated."""
     pose: Floats | None = None  # (4, 4) T_base_tool; None where the joint values are the target
     tool: Floats | None = None  # (4, 4) T_flange_tool that was set; None if none
     blend_m: float = 0.0  # radius within which the arm passes without a stop, m
-    left: str = ""  # why it is not corrected; empty if it is understood
+    not_corrected: str = ""  # why it is not corrected; empty if it is understood
     straight: bool = False  # whether the motion to it is a straight line
-    follows: bool = False  # whether the previous waypoint of the text always comes right before it
+    follows_previous: bool = False
+    """Whether the previous waypoint of the text always comes right before it."""
 
 
 def waypoints(program: str) -> tuple[Waypoint, ...]:
@@ -114,7 +115,9 @@ def waypoints(program: str) -> tuple[Waypoint, ...]:
     except RecursionError:
         raise InputError("nested too deeply; valid: a URScript program") from None
     if not motions:
-        raise InputError(f"no waypoints; valid: a URScript program with {', '.join(MOVES)}")
+        raise InputError(
+            f"no waypoints; valid: a URScript program with {', '.join(MOVE_FUNCTIONS)}"
+        )
     return motions
 
 
@@ -131,10 +134,10 @@ def program_points(
         every = waypoints(program)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    understood = [w for w in every if not w.left]
+    understood = [w for w in every if not w.not_corrected]
     for w in every:
-        if w.left and not (leave and understood):
-            raise InputError(f"{path}: line {w.line}: {w.left}; {_VALID}")
+        if w.not_corrected and not (leave and understood):
+            raise InputError(f"{path}: line {w.line}: {w.not_corrected}; {_VALID}")
     no_joints, no_pose = np.full(JOINTS, np.nan), np.full((4, 4), np.nan)
     q = np.stack([no_joints if w.q is None else w.q for w in understood])
     poses = np.stack([no_pose if w.pose is None else w.pose for w in understood])
@@ -146,7 +149,7 @@ def with_joints(program: str, corrected: Sequence[Waypoint], q: Floats) -> str:
     """Return the program with joint values (N, 6) in place of its waypoints."""
     parts, end = [], 0
     for waypoint, values in zip(corrected, q, strict=True):
-        parts += [program[end : waypoint.begin], urscript_list(values)]
+        parts += [program[end : waypoint.start], urscript_list(values)]
         end = waypoint.end
     return "".join([*parts, program[end:]])
 
@@ -195,7 +198,7 @@ class _Program:
                     values = {name: None}
                     elements.add(name)
             for name, value in values.items():
-                reserved = ("p", *MOVES, *_OTHER_MOVES, *_STOPS, *_SETUP)
+                reserved = ("p", *MOVE_FUNCTIONS, *_OTHER_MOVES, *_STOPS, *_SETUP)
                 if name in reserved or _HARMLESS.fullmatch(name) or _WHERE.fullmatch(name):
                     raise InputError(
                         f"line {s.line}: '{name}' is a name of URScript's own; valid: another name"
@@ -241,13 +244,13 @@ class _Program:
         if len(bound) != 1 or self.aliased:
             return None
         ((assignment, node),) = bound
-        if node is None or assignment >= k or not self.around(assignment, k):
+        if node is None or assignment >= k or not self.contains(assignment, k):
             return None
         if assignment not in self.computed:
             self.computed[assignment] = self.value(node, assignment)
         return self.computed[assignment]
 
-    def around(self, outer: int, k: int) -> bool:
+    def contains(self, outer: int, k: int) -> bool:
         """Whether the block of statement `outer` contains statement k."""
         blocks = self.statements[outer].blocks
         return self.statements[k].blocks[: len(blocks)] == blocks
@@ -270,11 +273,11 @@ class _Program:
 
     def why_not(self, node: ast.expr, s: Statement) -> str:
         """Say why a target is not understood."""
-        reason = f"the waypoint '{s.written(node)[:40]}' is computed while the program runs"
+        reason = f"the waypoint '{s.text_of(node)[:40]}' is computed while the program runs"
         if isinstance(node, ast.Name) and node.id in self.bound:
             bound = self.bound[node.id]  # a line with several, of parameters, is named once
-            lines = list(dict.fromkeys(str(self.statements[k].line) for k, _ in bound[:NAMED]))
-            more = f" and {len(bound) - NAMED} more" if len(bound) > NAMED else ""
+            lines = list(dict.fromkeys(str(self.statements[k].line) for k, _ in bound[:MAX_NAMED]))
+            more = f" and {len(bound) - MAX_NAMED} more" if len(bound) > MAX_NAMED else ""
             source = f"line{'s' * (len(lines) > 1)} {', '.join(lines)}{more}"
             reason += f" ('{node.id[:40]}' has its value from {source})"
         return reason
@@ -286,8 +289,8 @@ def _waypoints(p: _Program) -> tuple[Waypoint, ...]:
     last_blocks: tuple[int, ...] | None = None  # of the waypoint that the arm is at, if known
     at_start = True  # the arm has not moved yet
     setup: dict[str, tuple[int, list[Value | None]]] = {}
-    moving = {*MOVES, *_OTHER_MOVES}
-    called = {name for s in p.statements for name in s.called.values()}
+    moving = {*MOVE_FUNCTIONS, *_OTHER_MOVES}
+    called = {name for s in p.statements for name in s.calls.values()}
     head = p.statements[0].node if p.statements else None
     wrapped = (  # the whole program is one function, which runs once
         isinstance(head, ast.FunctionDef)
@@ -296,18 +299,18 @@ def _waypoints(p: _Program) -> tuple[Waypoint, ...]:
     )
     moved_by = {*moving, *_STOPS, *p.functions}
     side_by_side = any(
-        {"thread", "sec"} & set(s.kinds) and moved_by & set(s.called.values()) for s in p.statements
+        {"thread", "sec"} & set(s.kinds) and moved_by & set(s.calls.values()) for s in p.statements
     )
     idle = {  # blocks of nested functions that are never called
-        s.number
+        s.block
         for s in p.statements
         if isinstance(s.node, ast.FunctionDef) and s.blocks and s.node.name not in called
     }
     for k, s in enumerate(p.statements):
         if idle.isdisjoint(s.blocks):
             _check_calls(p, s)
-        name = "" if s.call is None else s.called[s.call]
-        if p.functions & set(s.called.values()) or name in _STOPS:
+        name = "" if s.call is None else s.calls[s.call]
+        if p.functions & set(s.calls.values()) or name in _STOPS:
             last_blocks, at_start = None, False
         if name in _SETUP:
             _set_up(p, k, setup, moved=bool(out))
@@ -317,10 +320,13 @@ def _waypoints(p: _Program) -> tuple[Waypoint, ...]:
             follows = last_blocks == s.blocks and not side_by_side
             branch_known = follows or (at_start and not repeated and not side_by_side)
             if waypoint.pose is not None and waypoint.q is None and not branch_known:
-                waypoint = replace(waypoint, left=_NO_BRANCH)
-            waypoint = replace(waypoint, straight=name in STRAIGHT, follows=follows)
+                waypoint = replace(waypoint, not_corrected=_NO_BRANCH)
+            waypoint = replace(waypoint, straight=name in STRAIGHT, follows_previous=follows)
             # servoj ends after its time, wherever the arm is
-            last_blocks, at_start = None if waypoint.left or name == "servoj" else s.blocks, False
+            last_blocks, at_start = (
+                None if waypoint.not_corrected or name == "servoj" else s.blocks,
+                False,
+            )
             out.append(waypoint)
     return tuple(out)
 
@@ -328,23 +334,23 @@ def _waypoints(p: _Program) -> tuple[Waypoint, ...]:
 def _waypoint(p: _Program, k: int, setup: Mapping[str, tuple[int, list[Value | None]]]) -> Waypoint:
     s = p.statements[k]
     assert s.call is not None  # noqa: S101 - see `_check_calls`
-    name, named = s.called[s.call], {n.arg: n.value for n in s.call.keywords}
+    name, named = s.calls[s.call], {n.arg: n.value for n in s.call.keywords}
     targets = [*s.call.args[:1], *(named[n] for n in ("q", "pose") if n in named)]
     if name in _OTHER_MOVES or len(targets) != 1:
-        return Waypoint(s.line, 0, 0, left=f"{name} is not corrected")
+        return Waypoint(s.line, 0, 0, not_corrected=f"{name} is not corrected")
     (target,) = targets
-    out = Waypoint(s.line, *s.place(target))
-    if (index := MOVES[name]) is not None:
+    out = Waypoint(s.line, *s.span(target))
+    if (index := MOVE_FUNCTIONS[name]) is not None:
         radius = named.get("r", s.call.args[index] if len(s.call.args) > index else None)
         blend = 0.0 if radius is None else p.value(radius, k)
         if not isinstance(blend, float):
-            return replace(out, left="its blend radius is computed while the program runs")
+            return replace(out, not_corrected="its blend radius is computed while the program runs")
         out = replace(out, blend_m=blend)
     target_values = p.target(target, k)
     if target_values is None or (name == "servoj" and target_values[1] is not None):
-        return replace(out, left=p.why_not(target, s))
+        return replace(out, not_corrected=p.why_not(target, s))
     for setting, _ in setup.values():
-        if not p.around(setting, k):
+        if not p.contains(setting, k):
             raise InputError(
                 f"line {s.line}: the set_tcp or payload of line {p.statements[setting].line} need "
                 "not come before it; valid: once before the first motion, not in if or while"
@@ -359,7 +365,7 @@ def _set_up(
     """Record a tool centre point, a payload or gravity in `setup`."""
     s = p.statements[k]
     assert s.call is not None  # noqa: S101 - see `_check_calls`
-    name = s.called[s.call]
+    name = s.calls[s.call]
     values = [p.value(a, k) for a in (*s.call.args, *(n.value for n in s.call.keywords))]
     if name == _TOOL:
         values = values[:1]
@@ -378,9 +384,9 @@ def _set_up(
 
 
 def _check_calls(p: _Program, s: Statement) -> None:
-    moves = s.call is not None and s.called[s.call] in MOVES
+    moves = s.call is not None and s.calls[s.call] in MOVE_FUNCTIONS
     targets = [*s.call.args[:1], *(n.value for n in s.call.keywords)] if moves and s.call else []
-    for call, name in s.called.items():
+    for call, name in s.calls.items():
         if _WHERE.fullmatch(name):
             near = len(call.args) > 1 or any(n.arg == "qnear" for n in call.keywords)
             stated = name == "get_forward_kin" and call.args
@@ -389,7 +395,7 @@ def _check_calls(p: _Program, s: Statement) -> None:
                     f"line {s.line}: {name} depends on where the arm stands, which corrections "
                     "change; valid: values that do not"
                 )
-        elif name in MOVES or name in (*_OTHER_MOVES, *_STOPS, *_SETUP):
+        elif name in MOVE_FUNCTIONS or name in (*_OTHER_MOVES, *_STOPS, *_SETUP):
             if call is not s.call:
                 raise InputError(f"line {s.line}: {name} within an expression; valid: on its own")
         elif name not in p.functions and not _HARMLESS.fullmatch(name):
@@ -422,10 +428,10 @@ STEPS = 40
 LARGEST_STEP = 0.5
 """Turn of a joint between two of these poses above which the motion passes a singularity, rad; a
 choice."""
-SAME = 1e-6
+SAME_SOLUTION = 1e-6
 """Largest difference of joint values of the same solution, rad: far above the residual of one, far
 below the distance of two."""
-AS_NEAR = 0.05
+BRANCH_MARGIN = 0.05
 """Margin by which any other solution must be farther for this one to count as the nearest, rad. A
 controller has its own calibrated arm: of 1,024 motions of ur3e, ur5e and ur10e the branch is wrong
 in 1 at 0.02 and in none from 0.05 on, if each joint of each solution is up to 10 mrad off; 17
@@ -449,7 +455,9 @@ def doubts(
         return []
     previous = np.concatenate([q[:1] if near is None else near[None], q[:-1]])
     stated = np.stack([previous[k] if w.q is None else w.q for k, w in enumerate(waypoints)])
-    on_line = np.array([k > 0 and w.straight and w.follows for k, w in enumerate(waypoints)])
+    on_line = np.array(
+        [k > 0 and w.straight and w.follows_previous for k, w in enumerate(waypoints)]
+    )
     chosen = np.array([w.pose is not None for w in waypoints])
     chosen &= ~on_line | np.array([w.q is not None for w in waypoints])
     tied = chosen & ~_nearest(arm, tool, stated, q)
@@ -468,10 +476,10 @@ def _nearest(arm: Arm, tool: Floats, near: Floats, q: Floats) -> Bools:
     out = np.ones(len(q), dtype=bool)
     for start in _flipped(q):
         solution = invert_nominal(arm, tool, start, rotation, position)
-        different = solution.solved & (np.abs(_turn(solution.q - q)).max(axis=1) > SAME)
+        different = solution.solved & (np.abs(_turn(solution.q - q)).max(axis=1) > SAME_SOLUTION)
         other_distance = _turn(solution.q - near)
         for order in (1, 2, np.inf):
-            least = np.linalg.norm(distance, order, axis=1) + AS_NEAR
+            least = np.linalg.norm(distance, order, axis=1) + BRANCH_MARGIN
             farther = np.linalg.norm(other_distance, order, axis=1) > least
             out &= ~different | farther
     return out
@@ -507,7 +515,7 @@ def _straight(arm: Arm, tool: Floats, begin: Floats, q: Floats) -> Bools:
         solution = invert_nominal(arm, tool, joints, rotation, p0 + share * (p1 - p0))
         out &= solution.solved & (np.abs(solution.q - joints).max(axis=1) < LARGEST_STEP)
         joints = solution.q
-    return np.asarray(out & (np.abs(_turn(joints - q)).max(axis=1) < SAME))
+    return np.asarray(out & (np.abs(_turn(joints - q)).max(axis=1) < SAME_SOLUTION))
 
 
 def _turn(angle: Floats) -> Floats:

@@ -36,13 +36,13 @@ class Statement:
     """One statement."""
 
     line: int  # of the program, from 1
-    number: int  # of the block that it opens, if any
-    begin: int  # offset of `text` in the program
+    block: int  # of the block that it opens, if any
+    start: int  # offset of `text` in the program
     text: str  # from which `node` was parsed
     node: ast.stmt  # of `if`, `while` and `def` only the head
     blocks: tuple[int, ...]  # numbers of the blocks around it, the outermost first
     kinds: tuple[str, ...]  # first words of these blocks
-    called: dict[ast.Call, str]  # all calls in it, with the names of their functions
+    calls: dict[ast.Call, str]  # all calls in it, with the names of their functions
 
     @property
     def call(self) -> ast.Call | None:
@@ -50,15 +50,15 @@ class Statement:
         value = self.node.value if isinstance(self.node, ast.Expr) else None
         return value if isinstance(value, ast.Call) else None
 
-    def place(self, node: ast.expr) -> tuple[int, int]:
+    def span(self, node: ast.expr) -> tuple[int, int]:
         """Offsets of the beginning and end of one of its expressions in the program."""
         ends = (node.col_offset, node.end_col_offset or 0)
         first, last = (len(self.text.encode()[:end].decode()) for end in ends)
-        return self.begin + first, self.begin + last
+        return self.start + first, self.start + last
 
-    def written(self, node: ast.expr) -> str:
+    def text_of(self, node: ast.expr) -> str:
         """Return the text of an expression."""
-        first, last = (offset - self.begin for offset in self.place(node))
+        first, last = (offset - self.start for offset in self.span(node))
         return self.text[first:last]
 
 

@@ -41,13 +41,13 @@ from hilcal.readings.whitening import Mode, usual_mode
 from hilcal.refinement import Refinement
 from hilcal.shown import Brief
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.kept_texts import CALIBRATION_FILE, ROBOT_FILE, check_robot, typed_now
+from hilcal.store.kept_texts import CALIBRATION_FILE, ROBOT_FILE, check_robot, running_command
 from hilcal.store.overview import overview
 from hilcal.store.procedure_log import refuse_fitting
-from hilcal.store.revision import CELL, STORED, RevisionRecord
+from hilcal.store.revision import CELL, STORED_HASH, RevisionRecord
 from hilcal.store.rows import content_hash
 from hilcal.store.run_log import PLAN, RunLog
-from hilcal.tables.table import with_what_rounding_does, write_table
+from hilcal.tables.table import covers_with_rounding, write_table
 from hilcal.types import Floats
 
 Say = Callable[[str], None]
@@ -245,7 +245,7 @@ class Campaign(Brief):
             about["readings_sha256"] = content_hash(readings)
             restated = _restates(self.file, self.changes)
             readings = _with_instrument(readings, self.config, restated, self.noise)
-        covers = with_what_rounding_does(covers, readings)
+        covers = covers_with_rounding(covers, readings)
         write_table(readings, path, covers, about, self.cell.arm.units)
 
     def close(self) -> None:
@@ -334,7 +334,7 @@ class Campaign(Brief):
     def fitted_readings(self, record: RevisionRecord) -> Readings:
         """Return the readings that a revision was fitted to, which are the first ones."""
         self._require_its_cell(record)
-        with revisions.sound(record):
+        with revisions.damage_refused(record):
             return self.readings[: int(record.result_json["identify"]["n_readings"])]
 
     def restore_model(self, record: RevisionRecord) -> tuple[Model, Floats]:
@@ -415,7 +415,7 @@ class Campaign(Brief):
             return ()
         last = revisions.chain(self.file.revisions())[-len(records) :]
         comparable = last and last[0].made_from == parent and len(last) == len(records)
-        if comparable and all(map(revisions.is_again, records, last)):
+        if comparable and all(map(revisions.equal_but_for_origin, records, last)):
             return tuple(r.number for r in last)
         numbers = []
         for record in records:
@@ -457,7 +457,7 @@ class Campaign(Brief):
             raise InputError(f"{self.path}: the fit is of other readings than this campaign's")
         document = None if diagnosis is None else diagnosis.to_dict()
         record = revisions.to_record(found, document, added, hashed, removed, parent)
-        options = {**record.options, STORED: self.data_hash, **typed_now()}
+        options = {**record.options, STORED_HASH: self.data_hash, **running_command()}
         if self.changes:
             options[CELL] = self.changes
         return replace(record, options=options)

@@ -23,10 +23,10 @@ Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Changed:
+class StoredChange:
     """A revision and the one that it was made from."""
 
-    before_number: int  # number of the previous revision
+    parent: int  # number of the previous revision
     before: Fit
     number: int  # number of the new revision
     fit: Fit
@@ -46,11 +46,11 @@ def add_effect(
     effect: str,
     options: Options,
     say: Say,
-    judged: Diagnosis | None = None,
-) -> Changed:
+    before_diagnosis: Diagnosis | None = None,
+) -> StoredChange:
     """Add an effect to a revision's model, and store the fit as a revision made from it.
 
-    `number` is None where no revision exists; then `before`, of diagnosis `judged`, is stored, too,
+    `number` is None where no revision exists; then `before` and `before_diagnosis` are stored, too,
     once the effect is fitted.
 
     Raises:
@@ -61,7 +61,7 @@ def add_effect(
     say(f"adding {named}")
     after = add(before, effect, options=options)
     added = named if effect in before.model.names else effect
-    return _stored(o, number, before, after, say, judged, added=added)
+    return _stored(o, number, before, after, say, before_diagnosis, added=added)
 
 
 def remove_effect(
@@ -70,11 +70,11 @@ def remove_effect(
     before: Fit,
     effect: str,
     say: Say,
-    judged: Diagnosis | None = None,
-) -> Changed:
+    before_diagnosis: Diagnosis | None = None,
+) -> StoredChange:
     """Remove an effect from a revision's model; else as `add_effect`."""
     say(f"removing {effect}")
-    return _stored(o, number, before, remove(before, effect), say, judged, removed=effect)
+    return _stored(o, number, before, remove(before, effect), say, before_diagnosis, removed=effect)
 
 
 def _stored(
@@ -83,10 +83,10 @@ def _stored(
     before: Fit,
     after: Fit,
     say: Say,
-    judged: Diagnosis | None,
+    before_diagnosis: Diagnosis | None,
     added: str | None = None,
     removed: str | None = None,
-) -> Changed:
+) -> StoredChange:
     say("diagnosing")
     previous = o.history(number)
     history = History(
@@ -99,11 +99,11 @@ def _stored(
         _ = f.holdout
         say("computing standard uncertainties")
         _ = f.uncertainty
-    number = o.store(before, judged) if number is None else number
+    number = o.store(before, before_diagnosis) if number is None else number
     new_number = o.store(after, d, added, removed, number)
     promised = added is not None and before.scaling == "gc"
     expected = added_suspect(before, after) if promised else None
-    return Changed(number, before, new_number, after, d, added, removed, expected)
+    return StoredChange(number, before, new_number, after, d, added, removed, expected)
 
 
 def refit(
@@ -139,11 +139,11 @@ def change_cell(
     before: Fit,
     changes: Changes,
     say: Say,
-    judged: Diagnosis | None = None,
+    before_diagnosis: Diagnosis | None = None,
 ) -> tuple[Campaign, int, Diagnosis]:
     """Fit a revision's model in a changed cell, and store the fit with the changes as a revision.
 
-    `number`, `before` and `judged` are as in `add_effect`, which raises the same errors.
+    `number`, `before` and `before_diagnosis` are as in `add_effect`, which raises the same errors.
 
     Returns:
         The campaign in the changed cell, number and diagnosis of the new revision.
@@ -151,5 +151,5 @@ def change_cell(
     changed = o.with_cell(changes)
     record = o.record(before) if number is None else o.file.revision(number)
     diagnosis = refit(changed, record, say, o.history(number))
-    number = o.store(before, judged) if number is None else number
+    number = o.store(before, before_diagnosis) if number is None else number
     return changed, changed.store(diagnosis.fit, diagnosis, parent=number), diagnosis

@@ -25,7 +25,7 @@ from hilcal.readings.readings import ArmScatter, Readings, SerialNoise
 from hilcal.readings.whitening import MODES, SCALINGS, Mode, Scaling
 from hilcal.store.codec import LARGEST, frames, numbers
 from hilcal.store.kept_texts import COMMAND
-from hilcal.store.revision import CARRIED, STORED, RevisionRecord, to_text
+from hilcal.store.revision import CARRIED, STORED_HASH, RevisionRecord, to_text
 from hilcal.store.rows import content_hash
 from hilcal.types import Floats
 
@@ -100,7 +100,7 @@ def _names(model: Model) -> list[str]:
     return [f"{e.name}.{p.name}" for e in model.effects for p in e.parameters]
 
 
-def is_again(new: RevisionRecord, stored: RevisionRecord) -> bool:
+def equal_but_for_origin(new: RevisionRecord, stored: RevisionRecord) -> bool:
     """Whether a stored revision equals a new one but for time, command and parent."""
 
     def plain(r: RevisionRecord) -> Any:
@@ -117,19 +117,19 @@ def restore(
     cell: Cell,
     readings: Readings,
     catalogue: Catalogue | None = None,
-    stored: str | None = None,
+    stored_hash: str | None = None,
 ) -> Fit:
     """Restore a fit: fit its model again, from the stored parameters as start.
 
-    `stored` is the hash of the readings as the file stores them, where there is a file.
+    `stored_hash` is the hash of the readings as the file stores them, where there is a file.
     """
-    if not _fitted_to(record, readings, stored):
+    if not _fitted_to(record, readings, stored_hash):
         raise InputError(
             f"revision {record.number} was fitted before readings were appended; "
             "run hilcal identify again"
         )
     model, theta = restore_model(record, cell, readings, catalogue)
-    with sound(record):
+    with damage_refused(record):
         prior, mode = _prior(record), mode_of(record)
         scaling: Scaling = SCALINGS[SCALINGS.index(record.options["scaling"])]
         scatter = record.parameters_json.get("arm_scatter")
@@ -144,22 +144,22 @@ def restore(
 def _fitted_to(record: RevisionRecord, readings: Readings, stored: str | None) -> bool:
     """Whether a revision was fitted to these readings.
 
-    Records older than the key `STORED` only have the hash of computed covariances, whose last bits
-    depend on the machine; on other machines the number of readings must suffice. Stored readings
-    are never changed, only appended, and each has a checksum.
+    Records older than the key `STORED_HASH` only have the hash of computed covariances, whose last
+    bits depend on the machine; on other machines the number of readings must suffice. Stored
+    readings are never changed, only appended, and each has a checksum.
     """
     reported = record.result_json.get("identify")
     count = reported.get("n_readings") if isinstance(reported, Mapping) else None
     if count is not None and count != len(readings):
         return False
-    if stored is not None and stored == record.options.get(STORED):
+    if stored is not None and stored == record.options.get(STORED_HASH):
         return True
     matches = record.data_hash == content_hash(readings)
-    return matches or (STORED not in record.options and count is not None)
+    return matches or (STORED_HASH not in record.options and count is not None)
 
 
 @contextmanager
-def sound(record: RevisionRecord) -> Iterator[None]:
+def damage_refused(record: RevisionRecord) -> Iterator[None]:
     """Raise an InputError where the block fails since the entries of a revision are damaged."""
     try:
         yield
@@ -184,7 +184,7 @@ def restore_model(
     """Return model and parameters (P,) of a revision, in the cell as registered by its fit."""
     catalogue = catalogue or installed()
     stored: Mapping[str, Any] = record.parameters_json
-    with sound(record):
+    with damage_refused(record):
         cell = _registered(record, cell, readings)
         options, random_effects = record.options["effects"], stored.get(RANDOM)
         names = tuple(random_effects["effects"] if random_effects else record.effects)
@@ -239,7 +239,7 @@ def restore_predictive(
 ) -> Predictive:
     """Return the predictive distribution of a stored fit with parameters (P,)."""
     stored: Mapping[str, Any] = record.parameters_json
-    with sound(record):
+    with damage_refused(record):
         prior, mode = _prior(record), mode_of(record)
         used = np.delete(np.arange(len(readings)), np.array(stored["outliers"], dtype=int))
         sigma = float(record.result_json["identify"]["error"]["holdout"]["rms_sigma"])

@@ -21,7 +21,7 @@ from hilcal import __version__, errors
 from hilcal.cli import commands
 from hilcal.names import escaped
 from hilcal.optional import missing_package
-from hilcal.store.kept_texts import typed
+from hilcal.store.kept_texts import recording_command
 
 DEBUG = "HILCAL_DEBUG"
 _COMPLETE = "_HILCAL_COMPLETE"
@@ -51,7 +51,7 @@ def error_document(message: object, code: int) -> dict[str, object]:
     return {"error": {"message": one_line(message), "kind": kind, "exit_code": code}}
 
 
-class Watched:
+class WatchedStream:
     """A stream that knows whether anything was written to it."""
 
     def __init__(self, stream: TextIO) -> None:
@@ -74,10 +74,10 @@ class Failures:
     """Tells people, and with --json scripts, why a command failed."""
 
     as_json: bool
-    out: Watched  # where the document goes
+    out: WatchedStream  # where the document goes
     debug: bool  # whether tracebacks are shown
 
-    def tell(self, error: BaseException | None, message: str, code: int) -> int:
+    def report(self, error: BaseException | None, message: str, code: int) -> int:
         """Print the failure as one line, with --json as a document, too; return the exit code."""
         if self.debug and error is not None:
             traceback.print_exception(error)
@@ -209,7 +209,7 @@ def execute(make: Callable[[], typer.Typer], name: str, arguments: Sequence[str]
             stream.reconfigure(errors="replace")
     debug = os.environ.get(DEBUG, "") not in ("", "0")
     argv = list(arguments)
-    out = Watched(sys.stdout)
+    out = WatchedStream(sys.stdout)
     with warnings.catch_warnings(), redirect_stdout(out):
         if not debug:
             warnings.simplefilter("ignore")
@@ -235,24 +235,24 @@ def _run(
     out = failures.out
     try:
         app = make()
-        with _computing(), typed((name, *arguments)):
+        with _computing(), recording_command((name, *arguments)):
             result = app(arguments, prog_name=name, standalone_mode=False)
         out.flush()
     except errors.HilcalError as error:
-        return failures.tell(error, str(error), error.exit_code)
+        return failures.report(error, str(error), error.exit_code)
     except BrokenPipeError:
         # The reader is gone; flushing the buffer at exit must not raise again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), out.fileno())
         return _BROKEN_PIPE
     except KeyboardInterrupt:
-        return failures.tell(None, "interrupted", _INTERRUPTED)
+        return failures.report(None, "interrupted", _INTERRUPTED)
     except Exception as error:
         if type(error).__name__ == "NoArgsIsHelpError":
             print(error, file=sys.stderr)
             return _USAGE
-        return failures.tell(error, *_explained(error, name))
+        return failures.report(error, *_explained(error, name))
     if result == _INTERRUPTED:
-        return failures.tell(None, "interrupted", _INTERRUPTED)
+        return failures.report(None, "interrupted", _INTERRUPTED)
     return result if isinstance(result, int) else 0
 
 

@@ -12,12 +12,12 @@ from hilcal.cli.fitting import PriorOptions
 from hilcal.cli.options import POSES, catalogue_with, command
 from hilcal.cli.planning import answers_of, read_cell, refuse_unready
 from hilcal.cli.refining import chapters_of, errors_by_revision
-from hilcal.cli.running import lasting_cell, measure, to_the_end
-from hilcal.cli.showing import followed
-from hilcal.cli.terminal import Terminal, agreed, somebody_there, terminal
+from hilcal.cli.running import lasting_cell, measure, retry_after_failures
+from hilcal.cli.showing import live_viewer
+from hilcal.cli.terminal import Terminal, confirmed, person_present, terminal
 from hilcal.config import CellConfig
 from hilcal.design.nominal_model import check_effects
-from hilcal.drivers.simulated.rehearsal import NOTHING, as_told
+from hilcal.drivers.simulated.rehearsal import NO_EFFECT, program_config
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import (
     CannotAnswerError,
@@ -46,7 +46,7 @@ from hilcal.tables.units import parse_duration, parse_length
 
 VALIDATION = 20  # Poses of a validation campaign; a choice: they determine the mean error to 10 %
 FITTED_LATER = ("plan", "measure", "refine", "decide")  # Steps that a fit may follow
-LONGEST = "2 h"  # Longest time for measuring; a choice
+DEFAULT_MAX_TIME = "2 h"  # Longest time for measuring; a choice
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ class CalibrationOptions:
         return {key: value for key, value in stated.items() if value is not None}
 
 
-AS_USUAL = CalibrationOptions()
+DEFAULT_OPTIONS = CalibrationOptions()
 
 
 @command(f"""
@@ -90,15 +90,15 @@ AS_USUAL = CalibrationOptions()
         compensation, as far as that can be had.
     limit | --limit LENGTH | The largest error allowed at the corrected targets, as measured; exit 5
         where it is not kept.
-    max_time | --max-time TIME | The longest that measuring to fit may take in all, "{LONGEST}"
-        unless given.
+    max_time | --max-time TIME | The longest that measuring to fit may take in all,
+        "{DEFAULT_MAX_TIME}" unless given.
     poses | --poses | Size of the plan, {POSES} unless given.
     validation | --validation | Poses of the validation campaign, {VALIDATION} unless given.
     rehearse | --rehearse | In one simulated cell, from the first to the last.
     yes | --yes -y | Do not ask before the arm moves; for scripts.
     """)
 def calibrate(
-    cell: Path, output: Path, resume: bool = False, options: CalibrationOptions = AS_USUAL,
+    cell: Path, output: Path, resume: bool = False, options: CalibrationOptions = DEFAULT_OPTIONS,
     rehearse: bool = False, yes: bool = False, view: bool = False,
     effects_from: list[Path] | None = None, as_json: bool = False,
 ) -> None:  # fmt: skip
@@ -122,13 +122,13 @@ def calibrate(
                 f"campaign names it; give it yourself: --prior {quoted(prior)}"
             )
         if p.next().kind in FITTED_LATER:
-            p = replace(p, known=PriorOptions(Path(prior)).load(catalogue))
-    if not (yes or rehearse or somebody_there(t)) and p.next().kind != "done":
+            p = replace(p, prior=PriorOptions(Path(prior)).load(catalogue))
+    if not (yes or rehearse or person_present(t)) and p.next().kind != "done":
         raise InputError(
             "nobody can be asked before the arm moves; give --yes, or run it at a terminal"
         )
     with go_on.explained(p), ExitStack() as stack:
-        live = stack.enter_context(followed(t, view, output))
+        live = stack.enter_context(live_viewer(t, view, output))
         CalibrationOperator(t, p, stack, rehearse, yes, live).to_the_end()
         with working(t.progress) as say:
             improvement = p.compare(say)
@@ -189,20 +189,20 @@ def _procedure(
     stated: dict[str, Any],
     go_on: _Continuation,
 ) -> Procedure:
-    hide = (config.simulation.hide or NOTHING) if rehearse else None
+    hide = (config.simulation.hide or NO_EFFECT) if rehearse else None
     base_dir = path.absolute().parent
     if rehearse:
-        config = as_told(config, hide or NOTHING, catalogue)
+        config = program_config(config, hide or NO_EFFECT, catalogue)
         cell = cell_from_config(config, base_dir)
     if not output.exists():
         may_write(output, False)
         check_effects(cell, config, catalogue)
         if resume:
             go_on.t.notice(f"{output} is not there yet: the calibration begins")
-        _refuse_goal(config.fitted, stated, path)
-        max_time_s, seed = parse_duration(LONGEST, "--max-time"), config.simulation.seed
+        _refuse_goal(config.readings_mode, stated, path)
+        max_time_s, seed = parse_duration(DEFAULT_MAX_TIME, "--max-time"), config.simulation.seed
         defaults = Settings(POSES, VALIDATION, max_time_s, seed=seed)
-        settings = replace(defaults, readings=config.fitted, hide=hide, **stated)
+        settings = replace(defaults, readings=config.readings_mode, hide=hide, **stated)
         p = Procedure(output, cell, config, base_dir, catalogue, settings)
         p.check_files()
         return p
@@ -211,13 +211,13 @@ def _procedure(
         kind = "no rehearsal; leave --rehearse out" if rehearse else "a rehearsal; give --rehearse"
         raise InputError(f"{output}: its calibration is {kind}")
     if not resume:
-        message = f"{output}: a calibration is there already, {words.standing(p.next())}"
+        message = f"{output}: a calibration is there already, {words.state_clause(p.next())}"
         raise InputError(f"{message}; go on with: {go_on.resume}")
     _refuse_goal(p.settings.readings, stated, path)
     p = replace(p, settings=replace(p.settings, **stated))
     with CampaignFile.open(output) as campaign:
         p.resume(campaign)
-    go_on.t.notice(f"{output}: a calibration, {words.standing(p.next())}")
+    go_on.t.notice(f"{output}: a calibration, {words.state_clause(p.next())}")
     return p
 
 
@@ -285,9 +285,9 @@ class CalibrationOperator:
                 self.t.show(f"{a.device}: {name}, {'; '.join(a.problems) or 'ready'}")
             refuse_unready(answers)
             self.ready = True
-        if not self.yes and somebody_there(self.t):
+        if not self.yes and person_present(self.t):
             warning = "The simulated arm will move." if self.rehearse else "The arm will move."
-            if not agreed(self.t, f"Measure now? {warning}"):
+            if not confirmed(self.t, f"Measure now? {warning}"):
                 raise StoppedError("not measured, nothing has moved")
         config = self._config()
 
@@ -295,7 +295,9 @@ class CalibrationOperator:
             measure(self.t, config, self.p.cell, campaign, epoch=epoch, viewer=self.viewer)
 
         if self.rehearse:
-            to_the_end(self.t, lambda: self.p.measure(step, work), lambda: _count(step.path))
+            retry_after_failures(
+                self.t, lambda: self.p.measure(step, work), lambda: _count(step.path)
+            )
         else:
             self.p.measure(step, work)
 

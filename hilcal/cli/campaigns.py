@@ -147,12 +147,12 @@ def show_preview(
     t.document(
         mapping=proposal.sections,
         understood=[
-            {"section": u.what, "columns": u.columns, "meaning": u.meaning, "first": u.example}
-            for u in proposal.understood
+            {"section": u.section, "columns": u.columns, "meaning": u.meaning, "first": u.example}
+            for u in proposal.quantities
         ],
-        unsure=[{"section": what, "what": line} for what, line in proposal.unsure],
+        unsure=[{"section": what, "what": line} for what, line in proposal.doubts],
         unused=[{"column": name, "why": why} for name, why in proposal.unused],
-        missing=proposal.lacking,
+        missing=proposal.missing,
         outcome=outcome,
         written=None if output is None else str(output),
     )
@@ -223,7 +223,7 @@ def repair(run: Path, robot: Path | None = None, as_json: bool = False) -> None:
     if result is not None:
         numbers = ", ".join(map(str, result.revisions))
         t.show(
-            f"{run}: {result.why}. Set aside: revision{'s' * (len(result.revisions) > 1)} "
+            f"{run}: {result.defect}. Set aside: revision{'s' * (len(result.revisions) > 1)} "
             f"{numbers}. All readings are there; the file as it was is {result.original}. Fit "
             "again with:"
         )
@@ -251,7 +251,7 @@ def fleet(
     """Pool many campaigns: a prior for other arms, arms unlike their type, drift."""
     # these import the modules for fitting and reports
     from hilcal.cli.fitting import check_record
-    from hilcal.cli.showing import opening
+    from hilcal.cli.showing import open_command
     from hilcal.engine import open_engine
     from hilcal.present.comparison import fleet_report
     from hilcal.store.codec import write_document
@@ -281,6 +281,6 @@ def fleet(
         from hilcal.present.viewer.fleet import record_fleet  # loads the viewer's library
 
         record_fleet(pooled, record)
-        t.notice(f"recorded {record}; open it with: {opening(record)}")
+        t.notice(f"recorded {record}; open it with: {open_command(record)}")
         document["recording"] = str(record)
     t.document(document)

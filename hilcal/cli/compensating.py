@@ -13,7 +13,7 @@ from hilcal.calibration import urscript
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensation import Compensation
 from hilcal.calibration.points import Points, on_branch, read_points
-from hilcal.calibration.programs.languages import READERS, UnderstoodProgram, understood
+from hilcal.calibration.programs.languages import READERS, ResolvedProgram, read_program
 from hilcal.campaign.campaign import Campaign
 from hilcal.cli.options import catalogue_with, check_new, command
 from hilcal.cli.terminal import terminal
@@ -21,7 +21,12 @@ from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit_document import with_nulls
 from hilcal.names import csv_text
-from hilcal.present.calibration import compensation_report, fates, refusals, waypoints_table
+from hilcal.present.calibration import (
+    compensation_report,
+    refusals,
+    waypoint_outcomes,
+    waypoints_table,
+)
 from hilcal.present.progress import working
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
@@ -31,8 +36,8 @@ from hilcal.types import Bools, Floats
 from hilcal.whole_file import replace_file
 
 PROGRAMS = (".script", ".urscript")
-WRITTEN = (".csv", ".json", *PROGRAMS)
-NAMED = 5  # Most refused points that an error names
+TABLE_SUFFIXES = (".csv", ".json", *PROGRAMS)
+MAX_NAMED = 5  # Most refused points that an error names
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,12 +46,12 @@ class _Task:
     tool: Floats | None  # (4, 4) T_flange_tool; the tracked target where None
     program: str | None = None  # text of a UR program
     waypoints: tuple[urscript.Waypoint, ...] = ()  # all waypoints of a UR program
-    foreign: UnderstoodProgram | None = None  # a program of another maker than UR
+    foreign: ResolvedProgram | None = None  # a program of another maker than UR
 
     @property
     def corrected(self) -> list[urscript.Waypoint]:
         """The waypoints that are corrected."""
-        return [w for w in self.waypoints if not w.left]
+        return [w for w in self.waypoints if not w.not_corrected]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +67,7 @@ class CompensationOptions:
     leave: bool = False
 
 
-AS_USUAL = CompensationOptions()
+DEFAULT_OPTIONS = CompensationOptions()
 
 
 @command("""
@@ -85,7 +90,7 @@ AS_USUAL = CompensationOptions()
     """)
 def compensate(
     model: Path, points: Path, output: list[Path] | None = None,
-    options: CompensationOptions = AS_USUAL, revision: int | None = None,
+    options: CompensationOptions = DEFAULT_OPTIONS, revision: int | None = None,
     effects_from: list[Path] | None = None, kind: str = "table", force: bool = False,
     as_json: bool = False,
 ) -> None:  # fmt: skip
@@ -102,15 +107,21 @@ def compensate(
         task = _task(points, calibration, options, start, kind)
         targets, foreign = task.points, task.foreign
         arm = calibration.controller if task.program else arm
-        for remark in filter(None, (targets.taken, *(foreign.said if foreign else ()))):
+        for remark in filter(None, (targets.guess, *(foreign.remarks if foreign else ()))):
             t.notice(f"{points}: {remark}")
         wrench = _wrench(targets, calibration, options)
         say(f"compensating {len(targets.names)} points")
         on_flange = calibration.tool_pose(task.tool)
-        begin = calibration.measured.middle(arm.n) if start is None and not task.program else start
+        begin = (
+            calibration.measured.mid_range_q(arm.n) if start is None and not task.program else start
+        )
         q = on_branch(targets, arm, on_flange, begin)
         unclear = urscript.doubts(arm, on_flange, task.corrected, q, start) or [""] * len(q)
-        acting = wrench if targets.sensed is None else calibration.load_wrench(q, targets.sensed)
+        acting = (
+            wrench
+            if targets.sensor_wrench is None
+            else calibration.load_wrench(q, targets.sensor_wrench)
+        )
         poses = _program_poses(task, calibration, q, arm)
         result = calibration.compensate(
             q, acting, tool=task.tool, wanted=poses, recorded=targets.recorded
@@ -121,7 +132,7 @@ def compensate(
         )
     pairs = zip(unclear, refusals(result, options.outside), strict=True)
     refused = ["; ".join(filter(None, pair)) for pair in pairs]
-    outcomes = fates(foreign.program.points if foreign else task.waypoints, refused)
+    outcomes = waypoint_outcomes(foreign.program.points if foreign else task.waypoints, refused)
     retained = [k for k, why in enumerate(refused) if not why]
     if not options.leave or not retained:
         wrong = ~result.inverse.solved | result.singular | result.limits.any(axis=1)
@@ -149,7 +160,7 @@ def _program_poses(task: _Task, calibration: Calibration, q: Floats, arm: Arm) -
     at the same joint values `q`. Points stated as joint values have the pose of the nominal arm.
     A calibration of deflections has no geometry: its unloaded arm is that of the controller.
     """
-    targets = task.points.wanted
+    targets = task.points.target_poses
     if targets is None or arm is calibration.model.cell.arm or calibration.mode == "deflection":
         return None
     prediction = calibration.predict(q, tool=task.tool, std=False)
@@ -179,7 +190,7 @@ def _task(
         six = _numbers(options.tool, 6, "--tool")
         tool = se3.matrix(se3.rotation(six[3:]), six[:3])
     if path.suffix.lower() in READERS:
-        foreign = understood(
+        foreign = read_program(
             path, arm, frames=options.frames, tool=tool, near=near, leave=options.leave
         )
         return _Task(foreign.points, foreign.tool, foreign=foreign)
@@ -193,8 +204,8 @@ def _task(
     if arm.n != urscript.JOINTS:
         raise InputError(f"{path}: a UR program, and {arm.name} has {arm.n} joints")
     program, waypoints, points, tcp = urscript.program_points(path, options.leave)
-    if tcp is None and tool is None and points.wanted is not None:
-        for k in np.flatnonzero(np.isfinite(points.wanted[:, 0, 0]))[:1].tolist():
+    if tcp is None and tool is None and points.target_poses is not None:
+        for k in np.flatnonzero(np.isfinite(points.target_poses[:, 0, 0]))[:1].tolist():
             raise InputError(
                 f"{path}: {points.names[k]} is a pose of a tool centre point that the program does "
                 'not set; give --tool "X Y Z RX RY RZ" as the installation has it'
@@ -208,14 +219,16 @@ def _only(task: _Task, retained: list[int], refused: list[str]) -> _Task:
     if task.foreign is not None:
         foreign = task.foreign.without(refused)
         return replace(task, points=foreign.points, foreign=foreign)
-    poses = task.points.wanted
+    poses = task.points.target_poses
     points = Points(
         tuple(task.points.names[k] for k in retained),
         task.points.q[retained],
         None if poses is None else poses[retained],
     )
     reasons = iter(refused)
-    waypoints = tuple(w if w.left else replace(w, left=next(reasons)) for w in task.waypoints)
+    waypoints = tuple(
+        w if w.not_corrected else replace(w, not_corrected=next(reasons)) for w in task.waypoints
+    )
     return replace(task, points=points, waypoints=waypoints)
 
 
@@ -223,7 +236,7 @@ def _wrench(
     points: Points, calibration: Calibration, options: CompensationOptions
 ) -> Floats | None:
     load, wrench = options.load, options.wrench
-    if sum(x is not None for x in (load, wrench, points.wrench, points.sensed)) > 1:
+    if sum(x is not None for x in (load, wrench, points.wrench, points.sensor_wrench)) > 1:
         raise InputError("the load is given twice; valid: one of --load, --wrench, columns")
     if wrench is not None:
         return _numbers(wrench, 6, "--wrench")
@@ -250,8 +263,8 @@ def _refuse(path: Path, names: tuple[str, ...], refused: list[str], wrong: Bools
     bad = [k for k, why in enumerate(refused) if why]
     if not bad:
         return
-    named = "; ".join(f"{names[k]}: {refused[k]}" for k in bad[:NAMED])
-    ending = f"; and {len(bad) - NAMED} more" if len(bad) > NAMED else ""
+    named = "; ".join(f"{names[k]}: {refused[k]}" for k in bad[:MAX_NAMED])
+    ending = f"; and {len(bad) - MAX_NAMED} more" if len(bad) > MAX_NAMED else ""
     message = f"{path}: {len(bad)} of {len(names)} points are refused: {named}{ending}"
     if wrong[bad].any():
         raise InputError(message)
@@ -260,7 +273,7 @@ def _refuse(path: Path, names: tuple[str, ...], refused: list[str], wrong: Bools
 
 def _check_output(path: Path, points: Path, force: bool) -> None:
     kind = points.suffix.lower()
-    valid = (".csv", ".json", points.suffix) if kind in READERS else WRITTEN
+    valid = (".csv", ".json", points.suffix) if kind in READERS else TABLE_SUFFIXES
     if path.suffix not in valid:
         raise InputError(f"{path}: unknown kind of file; valid: {', '.join(valid)}")
     check_new(path, force)

@@ -14,14 +14,14 @@ from hilcal.calibration.improvement import Improvement
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.revisions import to_record
 from hilcal.cli import running
-from hilcal.cli.fitting import check_record, finish, record_story
+from hilcal.cli.fitting import check_record, compute_errors, record_story
 from hilcal.cli.options import catalogue_with, check_seed, command
 from hilcal.cli.planning import separates
 from hilcal.cli.refining import changed, chapters_of, errors_by_revision, revisions_json
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import load_config
-from hilcal.design.next import measure_next
-from hilcal.design.planner import Request
+from hilcal.design.next import plan_separating
+from hilcal.design.planner import PlanRequest
 from hilcal.design.summary import refuse
 from hilcal.diagnosis.diagnosis import History
 from hilcal.diagnosis.diagnosis import in_doubt as left_open
@@ -33,13 +33,13 @@ from hilcal.discovery.search import SAME_CORRELATION
 from hilcal.drivers.simulated.injected_effects import HARD_TO_SEPARATE, RESEMBLING
 from hilcal.drivers.simulated.rehearsal import (
     INVENTED,
-    NOTHING,
+    NO_EFFECT,
     RANDOM,
     Rehearsal,
     case_of_plan,
     check_choice,
     invented_law,
-    read_plan,
+    simulate_plan,
 )
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError
@@ -49,7 +49,13 @@ from hilcal.identification.linearisation import linearise
 from hilcal.measuring.route import dry_run
 from hilcal.names import quoted
 from hilcal.present.calibration import improvement_report
-from hilcal.present.diagnosis import compared, refined_laws, step_report, truth_table, verdict_line
+from hilcal.present.diagnosis import (
+    refined_laws,
+    step_report,
+    true_and_fitted,
+    truth_table,
+    verdict_line,
+)
 from hilcal.present.document import heading
 from hilcal.present.fit import model_name
 from hilcal.present.plan import next_report
@@ -67,24 +73,24 @@ from hilcal.store.revision import RevisionRecord
 from hilcal.store.rows import content_hash
 
 STRENGTH = 4.0  # Size of the hidden effect, in units of the noise: significant in so few readings
-FIRST = 6  # Poses of the first campaign
+FIRST_POSES = 6  # Poses of the first campaign
 CANDIDATES = 60  # Candidate poses of the first campaign. A choice: planning takes a second
-ARMS = 4  # Arms drawn per plan. A choice
-TRIES = 200  # Most arms drawn. 10 seeds took 1 to 32 arms and once 105, in 2 to 34 s
-DRAWS = 5  # Draws of the noise for which a rival has to be as good. A choice
-CAMPAIGNS = 3
+ARMS_PER_PLAN = 4  # Arms drawn per plan. A choice
+MAX_ARMS = 200  # Most arms drawn. 10 seeds took 1 to 32 arms and once 105, in 2 to 34 s
+NOISE_DRAWS = 5  # Draws of the noise for which a rival has to be as good. A choice
+MAX_CAMPAIGNS = 3
 """Most first campaigns measured until one leaves a doubt. Without devices the first one always
 does; with other draws of the noise four in five do (38 of 48)."""
-CLOSE = 2.0
+MAX_EVIDENCE_GAP = 2.0
 """Largest difference in log evidence between the hidden effect and its rival in each draw.
 A choice: the difference scatters by about 1.3, and `SAME_EVIDENCE` is 3."""
-SHARE = 0.8
+SECOND_SHARE = 0.8
 """Poses of the second campaign, as a share of `--poses`: both campaigns together last about as long
 as a single one otherwise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Doubted:
+class FirstDiagnosis:
     """A first diagnosis, and the plan that would settle it."""
 
     readings: int
@@ -99,26 +105,27 @@ def doubtful_case(
     """Draw an effect to hide and a small campaign that leaves it in doubt, by seed and `number`.
 
     A case is doubtful when a rival explains the readings about as well as the hidden effect in each
-    of `DRAWS` draws of the noise, and when the diagnosis of the first draw names both and says that
-    further readings would separate them. Returned are settings, plan, and whether it is doubtful.
+    of `NOISE_DRAWS` draws of the noise, and when the diagnosis of the first draw names both and
+    says that further readings would separate them. Returned are settings, plan, and whether it is
+    doubtful.
     """
     loads = settings.config.loads[1::2] or settings.config.loads
     quick = {"candidates": min(settings.config.planning.candidates, CANDIDATES), "against": ()}
     few = settings.config.with_keys("planning", **quick).model_copy(update={"loads": loads})
     strong = settings.config.with_keys("simulation", strength_sigma=STRENGTH)
     say("drawing an arm and a small campaign that leaves its effect in doubt")
-    for k in range(TRIES):
+    for k in range(MAX_ARMS):
         rng = np.random.default_rng([settings.seed, number, k])
         choice = hide or str(rng.choice(HARD_TO_SEPARATE))
         case = replace(settings, config=strong, choice=choice, seed=int(rng.integers(2**31)))
-        if k % ARMS == 0:
-            plan = running.first_plan(case, few, FIRST, lambda text: None)
+        if k % ARMS_PER_PLAN == 0:
+            plan = running.first_plan(case, few, FIRST_POSES, lambda text: None)
         secret = case_of_plan(strong, plan, choice, case.seed, case.world)
-        drawn = [read_plan(secret, plan, [case.seed, 1 + j]) for j in range(DRAWS)]
-        if choice == NOTHING or (
+        drawn = [simulate_plan(secret, plan, [case.seed, 1 + j]) for j in range(NOISE_DRAWS)]
+        if choice == NO_EFFECT or (
             all(_resembled(r, case) for r in drawn) and _left_open(drawn[0], case)
         ):
-            return case, plan, choice != NOTHING
+            return case, plan, choice != NO_EFFECT
     return case, plan, False
 
 
@@ -135,7 +142,7 @@ def _resembled(r: Rehearsal, case: running.RehearsalSettings) -> bool:
     if hidden is None or not (hidden.passes or any(s.passes for s in suspects.values())):
         return False
     evidence = hidden.score.log_evidence
-    return any(abs(s.score.log_evidence - evidence) < CLOSE for s in suspects.values())
+    return any(abs(s.score.log_evidence - evidence) < MAX_EVIDENCE_GAP for s in suspects.values())
 
 
 def _left_open(r: Rehearsal, case: running.RehearsalSettings) -> bool:
@@ -144,10 +151,10 @@ def _left_open(r: Rehearsal, case: running.RehearsalSettings) -> bool:
     return r.hidden in left_open(d) and all(rival.possible for rival in d.separability)
 
 
-def doubted(
-    t: Terminal, r: Rehearsal, seed: int, first: Plan, poses: int, catalogue: Catalogue
-) -> Doubted:
-    """Diagnose a first campaign; plan what separates the suspects, at a `SHARE` of `poses`."""
+def diagnose_first(
+    t: Terminal, r: Rehearsal, seed: int, first_plan: Plan, poses: int, catalogue: Catalogue
+) -> FirstDiagnosis:
+    """Diagnose a first campaign; plan what separates the suspects, at `SECOND_SHARE` of `poses`."""
     with working(t.progress) as say:
         say("fitting and diagnosing the first readings")
         fitted = _fit(r, catalogue)
@@ -155,21 +162,21 @@ def doubted(
     document: dict[str, object] = {"verdict": d.verdict, "message": message(d), "suspects": []}
     suspects = left_open(d)
     if not suspects:
-        return Doubted(len(r.readings), None, None, document)
+        return FirstDiagnosis(len(r.readings), None, None, document)
     t.show(step_report(1, model_name(fitted.model.named), d))
     t.show(heading(f"Ambiguous between {numbers.names(suspects)}: what would settle it?"))
     with working(t.progress) as say:
-        place = first.joints(REFERENCE) if REFERENCE in first.pose_names else None
+        place = first_plan.joints(REFERENCE) if REFERENCE in first_plan.pose_names else None
         rng = np.random.default_rng(seed)
-        request = Request(max(round(SHARE * poses), 1))
-        chosen = measure_next(r.cell, r.config, fitted, suspects, request, rng, say, place)
+        request = PlanRequest(max(round(SECOND_SHARE * poses), 1))
+        chosen = plan_separating(r.cell, r.config, fitted, suspects, request, rng, say, place)
         plan = plan_of(chosen, suspects)
         refuse(dry_run(r.cell, r.config, plan), "the plan")
     visited = len({s.pose for s in plan.steps} - {REFERENCE})
     t.show(next_report(chosen, visited, len(plan.steps)))
     document |= {"suspects": list(suspects), **separates(chosen)}
     record = to_record(fitted, d.to_dict(), None, content_hash(r.readings))
-    return Doubted(len(r.readings), record, plan, document)
+    return FirstDiagnosis(len(r.readings), record, plan, document)
 
 
 CELL = "demo_ur10e.toml"
@@ -220,7 +227,7 @@ def demo(
                 laws.write(refinement.names)
                 catalogue = refinement.fit.model.catalogue
             for step in refinement.steps:
-                finish(step.fit, say)
+                compute_errors(step.fit, say)
         settings = Settings(poses, validation, seed=number, readings=r.mode, hide=case.choice)
         p = Procedure(output, r.cell, r.config, case.base_dir, catalogue, settings)
         with Campaign.open(output, catalogue) as o:
@@ -235,19 +242,19 @@ def demo(
             t.show(refined_laws(laws))
         t.show(heading("The error, revision by revision"))
         t.show(errors_by_revision(chapters))
-        truth = compared(refinement.steps[-1].fit, r.world.truth)
+        truth = true_and_fitted(refinement.steps[-1].fit, r.world.truth)
         if truth:
             t.show(heading("What was found against what is true"))
             t.show([*truth_table(truth)])
-        improved = _put_to_use(t, p, m.measure, without_devices)
+        improved = _put_to_use(t, p, m.measure_missing, without_devices)
     ok, outcome = _judge(r, refinement) if laws is None else _judge_law(r, refinement, laws)
     t.show([verdict_line(refinement.diagnosis), "", heading(outcome)])
-    if r.world.own is not None and laws is not None:
+    if r.world.own_law is not None and laws is not None:
         t.show(
-            f"The simulated arm moved by {r.world.own.effect.summary} with the model's own "
+            f"The simulated arm moved by {r.world.own_law.effect.summary} with the model's own "
             "mechanics, like a law of a user's own: this shows whether such a campaign reveals it."
         )
-    elif r.world.own is not None:
+    elif r.world.own_law is not None:
         t.show(
             f"The simulated arm moved by the law of {r.hidden} itself: this shows whether such a "
             "campaign reveals it, not whether the law is right."
@@ -290,11 +297,11 @@ def demo(
 @contextmanager
 def _campaign(
     t: Terminal, case: running.RehearsalSettings, poses: int, without_devices: bool, ambiguous: bool
-) -> Iterator[tuple[running.RehearsedCampaign, Rehearsal, Doubted | None]]:
+) -> Iterator[tuple[running.RehearsedCampaign, Rehearsal, FirstDiagnosis | None]]:
     """Measure a campaign in a cell that lasts as the block; with `ambiguous` settle a doubt."""
     measured = running.in_process if without_devices else running.on_devices
     existed, first = case.output.exists(), case
-    for tries in range(1, CAMPAIGNS + 1):
+    for tries in range(1, MAX_CAMPAIGNS + 1):
         another = False
         with working(t.progress) as say:
             if ambiguous:
@@ -312,14 +319,14 @@ def _campaign(
             if not ambiguous:
                 yield m, r, None
                 return
-            doubt = doubted(t, r, first.seed, plan, poses, case.catalogue)
+            doubt = diagnose_first(t, r, first.seed, plan, poses, case.catalogue)
             if doubt.plan is not None:
-                r = m.further(doubt.plan)
+                r = m.measure_plan(doubt.plan)
                 new = len(r.readings) - doubt.readings
                 t.show(f"\n{new} readings were added. All {len(r.readings)} together:\n")
                 yield m, r, doubt
                 return
-            if not another or tries == CAMPAIGNS:
+            if not another or tries == MAX_CAMPAIGNS:
                 t.show("These readings leave no doubt; another --seed or --hide may.\n")
                 yield m, r, doubt
                 return
@@ -352,7 +359,7 @@ def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:
     loads = [name for k, name in enumerate(r.readings.load_names) if k in used and name != "none"]
     poses = len(np.unique(r.readings.pose))
     secret = {
-        NOTHING: "Nothing is hidden in it; the program does not know that.",
+        NO_EFFECT: "Nothing is hidden in it; the program does not know that.",
         RANDOM: "An effect, drawn at random, is hidden in it.",
         INVENTED: "A law is hidden in it that no effect of the catalogue describes; the program "
         "does not know that.",
@@ -367,14 +374,14 @@ def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:
 
 
 def _judge_law(r: Rehearsal, refinement: Refinement, laws: LawSearch) -> tuple[bool, str]:
-    hidden_law = r.world.own
+    hidden_law = r.world.own_law
     if hidden_law is None:
         return False, "Nothing was hidden."
     ((_, true),) = hidden_law.truth.items()
     unit, factor = numbers.unit_for(hidden_law.effect.parameters[0].unit, [true])
     hidden = f"Hidden was a law: {hidden_law.effect.summary}, a = {factor * true:.3g} {unit}"
     soft = r.world.physics.joint_compliance
-    moved, _ = hidden_law.moved(r.cell, r.world.registration, soft, r.readings.states)
+    moved, _ = hidden_law.displacements(r.cell, r.world.registration, soft, r.readings.states)
     for previous, step in pairwise(refinement.steps):
         d = next((d for d in laws.discoveries if d.laws and d.laws[0].name == step.added), None)
         if d is not None:
@@ -386,7 +393,7 @@ def _judge_law(r: Rehearsal, refinement: Refinement, laws: LawSearch) -> tuple[b
 
 def _judge(r: Rehearsal, refinement: Refinement) -> tuple[bool, str]:
     added = [s.added for s in refinement.steps if s.added]
-    if r.hidden == NOTHING:
+    if r.hidden == NO_EFFECT:
         if not added and refinement.verdict == "adequate":
             return True, "Nothing was hidden, and nothing was found."
         verdict = refinement.verdict.replace("_", " ")

@@ -12,7 +12,7 @@ import tomli_w
 
 from hilcal.calibration import dh_table, handover
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.handover import Corrected, corrected
+from hilcal.calibration.handover import CorrectedArm, corrected_arm
 from hilcal.calibration.own_files.correct import KINDS, correct_file
 from hilcal.campaign.campaign import Campaign
 from hilcal.cli.options import catalogue_with, check_new, command
@@ -29,7 +29,9 @@ from hilcal.store.revision import RevisionRecord
 from hilcal.tables.write import check_suffix, revision_table, write_columns
 from hilcal.whole_file import replace_file
 
-MANY = 10.0  # m; distance along a joint's axis beyond which a note about cancellation is printed
+LARGE_OFFSET_M = (
+    10.0  # m; distance along a joint's axis beyond which a note about cancellation is printed
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,12 +244,12 @@ def _write_model(
 
 def _write_geometry(calibration: Calibration, options: ExportOptions) -> Iterator[str]:
     """Write the files of the corrected geometry; yield a line on each."""
-    arm = corrected(calibration)
+    arm = corrected_arm(calibration)
     cell, beyond = calibration.model.cell, None
     nominal = cell.arm
     note = f"{nominal.name} as calibrated with hilcal, {calibration.source['campaign']}"
     base = base_line(cell, calibration.frames, calibration.mode)
-    holds = ", ".join(arm.within) or "the nominal geometry"
+    holds = ", ".join(arm.included) or "the nominal geometry"
     messages: list[str] = []
     files: dict[Path, str | bytes] = {}
     if options.ur_kinematics is not None:
@@ -282,12 +284,13 @@ def _write_geometry(calibration: Calibration, options: ExportOptions) -> Iterato
     for path in options.into or ():
         description = correct_file(path, nominal, arm, *_ends(calibration, options, path))
         files[path] = description.content
-        messages.append(description.said)
+        messages.append(description.note)
     for path, content in files.items():
         replace_file(path, content)
     yield from (*messages, base)
-    if arm.beyond:
-        yield f"Not in it, since not constant: {', '.join(arm.beyond)}; hilcal compensate has it"
+    if arm.not_included:
+        effects = ", ".join(arm.not_included)
+        yield f"Not in it, since not constant: {effects}; hilcal compensate has it"
 
 
 def _ends(
@@ -301,10 +304,10 @@ def _ends(
     return config.robot.base_link, config.robot.tip_link
 
 
-def _ur_note(note: str, base: str, arm: Corrected, digest: str | None) -> str:
+def _ur_note(note: str, base: str, arm: CorrectedArm, digest: str | None) -> str:
     lines = [f"{note}; for kinematics_params_file of ur_robot_driver.", base]
-    if arm.beyond:
-        lines.append(f"Not in it, since not constant: {', '.join(arm.beyond)}.")
+    if arm.not_included:
+        lines.append(f"Not in it, since not constant: {', '.join(arm.not_included)}.")
     if digest is None:
         lines += [
             "The hash is of this file. The driver logs that it is not that of the connected arm's",
@@ -325,7 +328,7 @@ def _dh_words(path: Path, rows: dh_table.DhRows, holds: str, alone: bool) -> Ite
     elif rows.disagreement <= dh_table.EXACT:
         yield "Forward kinematics of the rows is that of the corrected arm, to 1 nm."
     far = abs(rows.d).max()
-    if far > MANY:
+    if far > LARGE_OFFSET_M:
         yield (
             f"Nearly parallel axes have distant common normals: d up to {far:.0f} m, which cancel; "
             "compute in double precision."

@@ -45,7 +45,7 @@ from hilcal.tables.parquet_stream import open_stream
 
 def fit_of(t: Terminal, run: Campaign, say: Say, revision: int | None) -> tuple[int | None, Fit]:
     """Return number and fit of the revision in use; without one, a baseline that is not stored."""
-    _tell_accepted(t, run, revision)
+    _notice_accepted(t, run, revision)
     number, fitted = run.fit_in_use(say, revision)
     if number is None:
         t.notice(
@@ -59,13 +59,13 @@ def record_of(t: Terminal, run: Campaign, say: Say, revision: int | None) -> Rev
     record = run.in_use(revision)
     if record is None:
         return run.record(fit_of(t, run, say, revision)[1])
-    _tell_accepted(t, run, revision)
+    _notice_accepted(t, run, revision)
     return record
 
 
 def stored_fit(t: Terminal, run: Campaign, say: Say, revision: int | None) -> tuple[int, Fit]:
     """Return number and fit of the revision in use; without one, store the baseline as one."""
-    _tell_accepted(t, run, revision)
+    _notice_accepted(t, run, revision)
     number, fitted = run.fit_in_use(say, revision)
     if number is None:
         number = run.store(fitted)
@@ -77,7 +77,7 @@ def _summary(fitted: Fit) -> str:
     return f"({model_name(fitted.model.named)}; {fitted.mode} readings)"
 
 
-def _tell_accepted(t: Terminal, run: Campaign, revision: int | None) -> None:
+def _notice_accepted(t: Terminal, run: Campaign, revision: int | None) -> None:
     accepted, latest = run.file.accepted(), run.latest()
     if revision is None and latest is not None and accepted not in (None, latest.number):
         t.notice(f"using revision {accepted}, which is accepted; the latest is {latest.number}")
@@ -95,7 +95,7 @@ def starting_model(
     return with_effects(o.cell, o.readings, mode, effects, effects, o.catalogue, prior)
 
 
-def finish(fitted: Fit, say: Say) -> None:
+def compute_errors(fitted: Fit, say: Say) -> None:
     """Compute, with progress, the properties of a fit that its report and its JSON need."""
     say("predicting the poses left out")
     _ = fitted.holdout
@@ -103,7 +103,7 @@ def finish(fitted: Fit, say: Say) -> None:
     _ = fitted.uncertainty
 
 
-def called(number: int | None) -> str:
+def revision_name(number: int | None) -> str:
     """Return a revision's name in a heading; None is the baseline that is not stored."""
     return "Baseline, not kept" if number is None else f"Revision {number}"
 
@@ -125,7 +125,7 @@ def scalings(name: str) -> tuple[Scaling, ...]:
     return matching
 
 
-def wanted_effects(
+def effects_of_option(
     text: str | None, catalogue: Catalogue, option: str = "--effects"
 ) -> dict[str, dict[str, object]] | None:
     """Read `--effects "a, b(option=value)"`: options by effect, see `read_effects_text`."""
@@ -143,16 +143,16 @@ def check_options(o: Campaign, effects: Mapping[str, Options]) -> None:
         o.catalogue.make(name, o.cell, o.readings.states, options).prior_std()
 
 
-def chosen(model: Model, readings: Readings) -> dict[str, dict[str, object]]:
+def effect_options(model: Model, readings: Readings) -> dict[str, dict[str, object]]:
     """Return the options that differ from the defaults for the readings, by effect."""
     named = (e for e in model.effects if e.name not in model.background)
     options = {e.name: chosen_options(e, readings.states, readings.m) for e in named}
     return {name: values for name, values in options.items() if values}
 
 
-def titles(model: Model, readings: Readings) -> tuple[str, ...]:
+def effect_titles(model: Model, readings: Readings) -> tuple[str, ...]:
     """Return the names of a model's effects, with the options that differ from the defaults."""
-    options = chosen(model, readings)
+    options = effect_options(model, readings)
     return tuple(write_effect(name, options.get(name, {})) for name in model.named)
 
 
@@ -208,7 +208,7 @@ def fitted_with(prior: CarriedPrior, o: Campaign, fitted: Fit) -> Fit:
     prior_effects = [e.name for e in prior.posterior.effects]
     computable = [n for n in prior_effects if o.catalogue[n].computable(o.readings.states)]
     names = dict.fromkeys((*fitted.model.names, *computable))
-    options = chosen(fitted.model, fitted.readings)
+    options = effect_options(fitted.model, fitted.readings)
     model = with_effects(o.cell, o.readings, fitted.mode, names, options, o.catalogue, prior)
     return with_serial_noise(fit(model, with_prior_scatter(model, fitted.readings), fitted.mode))
 
@@ -248,7 +248,7 @@ def identify(
     A Parquet table in place of the campaign is read as a stream, in passes that need little memory.
     """
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
-    requested, named = scalings(scaling), wanted_effects(effects, catalogue)
+    requested, named = scalings(scaling), effects_of_option(effects, catalogue)
     carried = prior.load(catalogue)
     if run.suffix == ".parquet" or is_parquet(run):
         if scaling != "gc" or readings not in (None, "absolute") or fit_validation:
@@ -277,9 +277,9 @@ def identify(
             model = starting_model(o, mode, named, carried)
             fitted = with_prior_scatter(model, o.readings)
             for s in requested:
-                say(f"fitting {model_name(titles(model, o.readings))}, scaling {s}")
+                say(f"fitting {model_name(effect_titles(model, o.readings))}, scaling {s}")
                 fits[s] = with_serial_noise(fit(model, fitted, mode, s))
-                finish(fits[s], say)
+                compute_errors(fits[s], say)
             stored = fits[requested[-1]]
             n_revisions = len(o.file.revisions())
             number = o.append(stored)
@@ -307,7 +307,7 @@ def identify(
 
 def options_line(fitted: Fit) -> list[str]:
     """Return a line with the options that differ from the defaults; none where no option does."""
-    options = chosen(fitted.model, fitted.readings)
+    options = effect_options(fitted.model, fitted.readings)
     written = [write_effect(name, values) for name, values in options.items()]
     return [f"Options: {', '.join(written)}."] if written else []
 

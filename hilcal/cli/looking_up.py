@@ -178,14 +178,14 @@ def scaling(
 ) -> None:  # fmt: skip
     """Show what the scalings none, gu and gc do to the same data."""
     from hilcal.engine import open_engine
-    from hilcal.study import check, experiments, scaling_study, table
+    from hilcal.study import check, n_experiments, scaling_study, table
 
     t = terminal(as_json)
     check(runs)
     task = f"experiments of {runs} campaigns, each with every scaling"
     with (
         open_engine(*one_by_default(workers, scheduler)) as engine,
-        counting(t.progress, task, experiments()) as advance,
+        counting(t.progress, task, n_experiments()) as advance,
     ):
         rng = np.random.default_rng(check_seed(seed))
         study = scaling_study(rng, runs, engine=engine, advance=advance)

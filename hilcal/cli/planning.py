@@ -13,10 +13,10 @@ from hilcal.cli import fitting
 from hilcal.cli.options import POSES, catalogue_with, check_seed, command
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import CellConfig, load_config
-from hilcal.design.choice import CRITERIA, canonical
-from hilcal.design.next import Next, PairPower
+from hilcal.design.choice import CRITERIA, criterion_name
+from hilcal.design.next import PairPower, SeparatingPlan
 from hilcal.design.nominal_model import check_effects
-from hilcal.design.planner import Request, make
+from hilcal.design.planner import PlanRequest, plan_readings
 from hilcal.design.summary import CheckedPlan, about, checked, refusal, summarise
 from hilcal.diagnosis.diagnosis import MOST_IN_DOUBT
 from hilcal.diagnosis.verdict import diagnose
@@ -24,13 +24,13 @@ from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import DeviceError, HilcalError, InputError
 from hilcal.identification.carried import CarriedPrior
 from hilcal.identification.fit_document import with_nulls
-from hilcal.measuring.connect import ConnectionResult, connect, told_by, with_kinematics
+from hilcal.measuring.connect import ConnectionResult, connect, reported_kinematics, with_kinematics
 from hilcal.measuring.route import DryRun, dry_run
 from hilcal.names import quoted
 from hilcal.present.campaign import check_report
 from hilcal.present.plan import brief_plan, next_report, plan_report, plan_screen, poses_report
 from hilcal.present.progress import Say, working
-from hilcal.procedure.next_plan import Doubt, doubt_to_settle, next_plan, without
+from hilcal.procedure.next_plan import Doubt, doubt_to_settle, fit_without, next_plan
 from hilcal.procedure.procedure import with_origin
 from hilcal.procedure.state import reference_in
 from hilcal.store.plan import Plan, load_plan
@@ -86,16 +86,16 @@ def plan(
     carried = prior.load(catalogue)
     config, numbers = read_cell(cell)
     unloaded: Literal["around", "first"] = "first" if unloaded_first else "around"
-    if criterion is not None and canonical(criterion) not in CRITERIA:
+    if criterion is not None and criterion_name(criterion) not in CRITERIA:
         raise InputError(f"--criterion {criterion!r} is unknown; valid: {', '.join(CRITERIA)}")
-    request = Request(poses, readings, criterion, unloaded=unloaded)
+    request = PlanRequest(poses, readings, criterion, unloaded=unloaded)
     with working(t.progress) as say:
         fitted, reference = None, None
         if after is not None:
             with Campaign.open(after, catalogue, read_only=True) as run:
                 fitted, reference = fitting.fit_of(t, run, say, revision)[1], reference_in(run.file)
         rng = np.random.default_rng(check_seed(seed))
-        chosen = make(
+        chosen = plan_readings(
             numbers, config, request, rng, fitted, say, catalogue, carried, reference=reference
         )
         plan_ = replace(chosen.ordered.plan, about=about(chosen))
@@ -142,7 +142,7 @@ def check(
         answers = ()
     t.show(check_report(answers, dry))
     if save_calibration is not None:
-        kinematics = told_by(answers)
+        kinematics = reported_kinematics(answers)
         if kinematics is None:
             raise DeviceError("arm: it does not tell its kinematics; nothing is written")
         replace_file(save_calibration, kinematics.to_toml(), must_be_new=True)
@@ -200,7 +200,7 @@ def make_plan(
 ) -> Plan:
     """Return a plan whose poses are each read unloaded and under every load that they bear."""
     rng = np.random.default_rng(check_seed(seed))
-    return with_origin(make(cell, config, Request(poses), rng, None, say, catalogue))
+    return with_origin(plan_readings(cell, config, PlanRequest(poses), rng, None, say, catalogue))
 
 
 def answer_json(answer: ConnectionResult) -> dict[str, object]:
@@ -249,10 +249,10 @@ def next_(
         compare = (details or as_json) and not quick
         planned = next_plan(o, doubt, poses, rng, say, cell=changed, compare=compare)
         config, numbers = (o.config, o.cell) if changed is None else changed
-    chosen, checked_plan, effects = planned.found, planned.made, doubt.suspects
+    chosen, checked_plan, effects = planned.separating, planned.checked, doubt.suspects
     write(t, numbers, config, checked_plan, output, csv, record, chosen.powers)
     t.show(f"In doubt: {words_of.names(effects, 'or')}.\n")
-    report = next_report if doubt.alone is None else poses_report
+    report = next_report if doubt.pose_alone is None else poses_report
     t.show(report(chosen, checked_plan.summary.poses, checked_plan.summary.readings, details))
     t.show(plan_report(checked_plan.summary) if details else brief_plan(checked_plan.summary))
     t.show(f"The plan is in {output}. Measure it into the same campaign with:")
@@ -265,11 +265,11 @@ def next_(
     )
 
 
-def separates(chosen: Next) -> dict[str, object]:
+def separates(chosen: SeparatingPlan) -> dict[str, object]:
     """Return the pairs of effects for JSON; "separates" is with the planned readings."""
     return {
-        "separates": [[t.effect, t.rival, t.then] for t in chosen.powers],
-        "separates_now": [[t.effect, t.rival, t.now] for t in chosen.powers],
+        "separates": [[t.effect, t.rival, t.power_planned] for t in chosen.powers],
+        "separates_now": [[t.effect, t.rival, t.power_now] for t in chosen.powers],
         "inseparable": [[t.effect, t.rival] for t in chosen.powers if t.not_separable],
         "difference": chosen.shares,
         "notes": list(chosen.notes),
@@ -291,13 +291,13 @@ def _without_suspects(
         say("fitting with the prior")
         newest = fitting.fitted_with(prior, o, newest)
     if named is not None:
-        return Doubt(without(newest, named, say), named, None)
+        return Doubt(fit_without(newest, named, say), named, None)
     say("diagnosing" if number is None else f"diagnosing revision {number}")
     return doubt_to_settle(o, diagnose(newest, o.history(number), say), say)
 
 
 def _named(text: str | None, catalogue: Catalogue) -> tuple[str, ...] | None:
-    effects = fitting.wanted_effects(text, catalogue, "--suspects")
+    effects = fitting.effects_of_option(text, catalogue, "--suspects")
     if effects is None:
         return None
     for name in (name for name, options in effects.items() if options):

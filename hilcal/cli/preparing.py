@@ -12,7 +12,7 @@ import hilcal
 from hilcal import doctor as machine
 from hilcal.cell import cell_from_config
 from hilcal.cli.options import check_folder, check_new, command
-from hilcal.cli.terminal import Terminal, agreed, somebody_there, terminal
+from hilcal.cli.terminal import Terminal, confirmed, person_present, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.config.reference import cell_text
 from hilcal.config.sections import GEOMETRY, LOADED
@@ -241,9 +241,11 @@ def init(
     """Write a commented CELL.toml: asks at a terminal, else takes the options."""
     t = terminal(as_json)
     options = {f"--{name.replace('_', '-')}": value for name, value in locals().items()}
-    asks = somebody_there(t) and not as_json
+    asks = person_present(t) and not as_json
     check_folder(cell, str(cell))
-    check_new(cell, force or (asks and cell.exists() and agreed(t, f"{cell} exists. Replace it?")))
+    check_new(
+        cell, force or (asks and cell.exists() and confirmed(t, f"{cell} exists. Replace it?"))
+    )
     draft = Draft(cell.absolute().parent)
     if asks:
         t.notice(f"Enter alone leaves a thing open; Ctrl-C ends, and {cell} is not written.\n")

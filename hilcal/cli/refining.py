@@ -11,7 +11,7 @@ from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.changes import add_effect, remove_effect
 from hilcal.cli import fitting
 from hilcal.cli.options import catalogue_with, check_folder, command
-from hilcal.cli.showing import followed
+from hilcal.cli.showing import live_viewer
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.diagnosis.serial_noise import with_serial_noise
@@ -36,10 +36,15 @@ from hilcal.identification.torques import check_torques
 from hilcal.names import quoted
 from hilcal.present import diagnosis as words
 from hilcal.present import fit as fit_words
-from hilcal.present.calibration import opening, shares_report, validation_failure, validation_report
+from hilcal.present.calibration import (
+    fit_and_test_lines,
+    shares_report,
+    validation_failure,
+    validation_report,
+)
 from hilcal.present.comparison import comparison_json, comparison_report, next_command
 from hilcal.present.document import Block, heading
-from hilcal.present.fit import follows, model_name, prior_lines, set_aside
+from hilcal.present.fit import dependence_sentence, gross_error_lines, model_name, prior_lines
 from hilcal.present.progress import working
 from hilcal.present.registration import covariance_words, fitted_lines, other_arm_line, torque_lines
 from hilcal.present.story import Chapter
@@ -87,7 +92,7 @@ def diagnose(
         o.require_gc(number, fitted.scaling, "diagnosing")
         say("diagnosing" if number is None else f"diagnosing revision {number}")
         d = judge(fitted, o.history(number), say)
-        fitting.finish(fitted, say)
+        fitting.compute_errors(fitted, say)
     t.show(words.diagnosis_report(d))
     t.show(torque_lines(check_torques(fitted.model.cell, fitted.readings)))
     t.document({"revision": number, **d.to_dict()})
@@ -135,7 +140,7 @@ def _change(
     """Make a revision with an additional effect; without `options`, with the effect removed."""
     adds = options is not None
     fitting.check_record(record)
-    with Campaign.open(run, catalogue) as o, followed(t, view, run) as live:
+    with Campaign.open(run, catalogue) as o, live_viewer(t, view, run) as live:
         fitting.check_options(o, {effect: options or {}} if adds else {})
         with working(t.progress) as say:
             number, previous = fitting.stored_fit(t, o, say, revision)
@@ -154,7 +159,11 @@ def _change(
         pair = [Chapter(number, old.added, previous, None, old.removed), new]
         t.show(errors_by_revision(pair, verdict))
         named = write_effect(effect, options or {})
-        t.show(words.fell(previous, c.fit, named) if adds else words.rose(previous, c.fit, effect))
+        t.show(
+            words.added_effect_sentence(previous, c.fit, named)
+            if adds
+            else words.removed_effect_sentence(previous, c.fit, effect)
+        )
         t.show([] if c.expected is None else words.addition_lines(c.expected))
         t.show(["", words.verdict_line(d)])
         if record is not None:
@@ -188,7 +197,7 @@ def refine(
 ) -> None:  # fmt: skip
     """Diagnose and add until the model is adequate."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
-    named = fitting.wanted_effects(effects, catalogue)
+    named = fitting.effects_of_option(effects, catalogue)
     fitting.check_record(record)
     start = "--revision" if revision is not None else "--from-latest" if from_latest else ""
     stated = named is not None or readings is not None or prior.prior is not None
@@ -196,7 +205,7 @@ def refine(
         raise InputError(f"{start} keeps effects and readings; leave out the other options")
     carried = prior.load(catalogue)
     laws = LawSearch(run.absolute().parent) if discover else None
-    with Campaign.open(run, catalogue) as o, followed(t, view, run) as live:
+    with Campaign.open(run, catalogue) as o, live_viewer(t, view, run) as live:
         refuse_fitting(o.file)
         latest = o.latest() if from_latest else None if not start else o.in_use(revision)
         if start and latest is None:
@@ -223,7 +232,7 @@ def refine(
             if laws is not None:
                 laws.write(refinement.names)
             for step in refinement.steps:
-                fitting.finish(step.fit, say)
+                fitting.compute_errors(step.fit, say)
             new = refinement.steps[len(origin) :]
             records = [o.record(s.fit, s.diagnosis, s.added, s.removed) for s in new]
             n_revisions = len(o.file.revisions())
@@ -233,7 +242,7 @@ def refine(
         t.show(fitting.options_line(refinement.fit))
         if o.noise is not None:
             t.show(numbers.sentence(covariance_words(o.covariance_parts, o.noise)))
-        t.show(set_aside(refinement.fit, details))
+        t.show(gross_error_lines(refinement.fit, details))
         t.show(words.verdict_line(refinement.diagnosis))
         if numbered[-1] <= n_revisions:
             t.show(f"Revision {numbered[-1]} is this model already; nothing was stored.")
@@ -250,7 +259,7 @@ def refine(
             t.show(words.refined_laws(laws))
         diagnosis = refinement.diagnosis
         if diagnosis.verdict != "adequate" and not diagnosis.dependences:
-            t.show(follows(diagnosis.misfit_breakdown))
+            t.show(dependence_sentence(diagnosis.misfit_breakdown))
         t.show([*words.curves(diagnosis.dependences, len(diagnosis.dependences) if details else 1)])
         if live is not None:  # its verdict may have changed when further effects were tried
             live.revised(chapters[-1])
@@ -324,7 +333,7 @@ def discover(
     document = {"revision": number, **discovery_json(d), "written": None}
     t.show(words.discovery_report(d))
     if not d.laws:
-        t.document(document, CannotAnswerError(words.silence(d)))
+        t.document(document, CannotAnswerError(words.no_law_sentence(d)))
     rivals = rival_sources(d) if alternatives else {}
     written = {name: d.source, **rivals}
     places = {effect: output.with_name(f"{effect}.py") for effect in written}
@@ -352,7 +361,7 @@ def _effects_against(
     if model == "baseline":
         return {}
     if model is None or not model.endswith(".json"):
-        return fitting.wanted_effects(model, catalogue)
+        return fitting.effects_of_option(model, catalogue)
     return {
         e.name: {key: value for key, value in e.options.items() if not key.startswith("prior_")}
         for e in Calibration.load(model, catalogue).model.effects
@@ -387,8 +396,8 @@ def compare(
         comparison = compare_campaigns(
             o, later_run, revision, same_setup=same_setup or None, say=say
         )
-    name = model_name(fitting.titles(comparison.fit.model, comparison.fit.readings))
-    t.show(heading(f"{run.name}: {fitting.called(comparison.number)} ({name})"))
+    name = model_name(fitting.effect_titles(comparison.fit.model, comparison.fit.readings))
+    t.show(heading(f"{run.name}: {fitting.revision_name(comparison.number)} ({name})"))
     t.show(comparison_report(comparison, run.name, later.name))
     command = next_command(comparison, str(run), str(later))
     if command is not None:
@@ -402,15 +411,23 @@ def _show_misfit(t: Terminal, run: Path, revision: int | None, catalogue: Catalo
         o.require_gc(number, fitted.scaling, "comparing")
         say("looking where it fails")
         places = misfit_breakdown(linearise(fitted))
-        fitting.finish(fitted, say)
+        fitting.compute_errors(fitted, say)
         e, left_out = full_prediction(fitted), bool(fitted.model.background)
         if left_out:  # a background follows the fitted poses more closely than others
             raw, w = all_left_out(fitted)
             e = replace(e, raw=raw, whitening=w)
         worst = fit_words.worst_poses(e)
-    name = model_name(fitting.titles(fitted.model, fitted.readings))
-    t.show(heading(f"{fitting.called(number)}: {name}"))
-    t.show([fit_words.misses(fitted), follows(places), "", fit_words.errors(fitted), ""])
+    name = model_name(fitting.effect_titles(fitted.model, fitted.readings))
+    t.show(heading(f"{fitting.revision_name(number)}: {name}"))
+    t.show(
+        [
+            fit_words.holdout_sentence(fitted),
+            dependence_sentence(places),
+            "",
+            fit_words.errors(fitted),
+            "",
+        ]
+    )
     t.show([*fit_words.where_table(places), ""])
     t.show(fit_words.worst_table(worst, left_out))
     t.document(
@@ -426,7 +443,9 @@ def _show_misfit(t: Terminal, run: Path, revision: int | None, catalogue: Catalo
     )
 
 
-OVER = 5.0  # RMS error, in units of the noise, above which a moved tracker is suspected; a guess
+MOVED_TRACKER_SIGMA = (
+    5.0  # RMS error, in units of the noise, above which a moved tracker is suspected; a guess
+)
 
 
 @command("""
@@ -449,13 +468,13 @@ def validate(
     ):
         record = fitting.record_of(t, o, say, revision)
         result = validate_campaign(o, unseen, record, limit_m, register=register, say=say)
-        name = model_name(fitting.titles(result.model, o.fitted_readings(record)))
+        name = model_name(fitting.effect_titles(result.model, o.fitted_readings(record)))
     judged, prediction, shares = result.judged, result.prediction, result.shares
-    t.show(heading(f"{fitting.called(judged.number)}: {name}"))
-    t.show(opening(judged, prediction))
+    t.show(heading(f"{fitting.revision_name(judged.number)}: {name}"))
+    t.show(fit_and_test_lines(judged, prediction))
     t.show(validation_report(judged, prediction, result.beyond))
     t.show(shares_report(shares))
-    if prediction.error.rms_sigma > OVER and not register:
+    if prediction.error.rms_sigma > MOVED_TRACKER_SIGMA and not register:
         t.show(
             "Was the tracker set up anew for these readings? Then --register fits its place first."
         )

@@ -17,21 +17,21 @@ from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.options import POSES, catalogue_with, check_seed, command
 from hilcal.cli.planning import answer_json, dry_checked, make_plan, read_cell, refuse_unready
-from hilcal.cli.showing import followed
-from hilcal.cli.terminal import Terminal, agreed, handled, somebody_there, terminal, told_to_end
+from hilcal.cli.showing import live_viewer
+from hilcal.cli.terminal import Terminal, confirmed, end_signals, handled, person_present, terminal
 from hilcal.config import CellConfig
 from hilcal.config.reference import to_toml
 from hilcal.design.goal import GoalRule
 from hilcal.design.summary import refuse
 from hilcal.diagnosis.live_model import LiveModel
 from hilcal.drivers.simulated.rehearsal import (
-    NOTHING,
+    NO_EFFECT,
     RANDOM,
     Rehearsal,
     SimulationCase,
-    as_told,
     case_of_plan,
-    read_plan,
+    program_config,
+    simulate_plan,
     simulated_cell,
 )
 from hilcal.effects.catalogue import Catalogue
@@ -91,7 +91,7 @@ def run(
     goal = None if until is None else GoalRule(until, numbers, config, catalogue)
     base_dir = cell.absolute().parent
     if rehearse:  # refuses an effect that cannot be hidden before anything is planned
-        as_told(config, config.simulation.hide or NOTHING, catalogue)
+        program_config(config, config.simulation.hide or NO_EFFECT, catalogue)
     with ExitStack() as stack:
         further: Plan | None = None
         if resume or append:
@@ -120,7 +120,7 @@ def run(
         if rehearse:
             with working(t.progress) as say:
                 say("starting the simulated devices")
-                choice, seed = config.simulation.hide or NOTHING, config.simulation.seed
+                choice, seed = config.simulation.hide or NO_EFFECT, config.simulation.seed
                 secret = case_of_plan(config, campaign_plan, choice, seed, catalogue, base_dir)
                 config = stack.enter_context(simulated_cell(secret, seed, base_dir)).config
         if further is not None:
@@ -132,7 +132,7 @@ def run(
         options += [] if until is None else ["--until", until]
         options += [word for path in effects_from or () for word in ("--effects-from", str(path))]
         line = shlex.join(("hilcal", "run", str(cell), "-o", str(output), "--resume", *options))
-        live = stack.enter_context(followed(t, view, output))
+        live = stack.enter_context(live_viewer(t, view, output))
         with _resumable(campaign, planned, line):
             measured = measure(t, config, numbers, campaign, goal, viewer=live)
     document: dict[str, object] = {"campaign": str(output), "readings": measured}
@@ -164,10 +164,10 @@ def _default_plan(
     if notes := len(planned.summary.remarks):
         t.show(f"What it assumes and leaves out ({notes} note{'s' * (notes > 1)}):")
         t.command(line)
-    if yes or not somebody_there(t):
+    if yes or not person_present(t):
         return planned.plan
     t.notice("")
-    if not agreed(t, "Measure this plan now? The arm will move."):
+    if not confirmed(t, "Measure this plan now? The arm will move."):
         raise StoppedError(
             f"not measured, nothing has moved. To see, keep or change the whole plan: {line}"
         )
@@ -282,7 +282,7 @@ def _ends_as_interrupt(t: Terminal) -> Iterator[None]:
 
 
 TRIES = 4
-BREAK = 600.0  # Time between two plans of a campaign that is drawn at random, s
+BREAK_S = 600.0  # Time between two plans of a campaign that is drawn at random, s
 
 
 @dataclass(frozen=True, slots=True)
@@ -307,13 +307,15 @@ class RehearsedCampaign:
     """A first campaign, in a simulated cell that can measure again."""
 
     rehearsal: Rehearsal  # the cell, and all readings
-    further: Callable[[Plan], Rehearsal]  # measures one more plan into it; returns all readings
-    measure: Measure  # measures the missing readings of another campaign in the same cell
+    measure_plan: Callable[
+        [Plan], Rehearsal
+    ]  # measures one more plan into it; returns all readings
+    measure_missing: Measure  # measures the missing readings of another campaign in the same cell
 
 
 def first_plan(settings: RehearsalSettings, config: CellConfig, poses: int, say: Say) -> Plan:
     """Plan a campaign without knowledge of the hidden effect, in a cell that may lack loads."""
-    config = as_told(config, settings.choice, settings.world)
+    config = program_config(config, settings.choice, settings.world)
     cell = cell_from_config(config, settings.base_dir)
     plan = make_plan(cell, config, poses, settings.seed, settings.catalogue, say)
     refuse(dry_run(cell, config, plan), "the plan")
@@ -337,7 +339,7 @@ def on_devices(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator
             def work() -> None:
                 measure(t, world.config, secret.cell, file, epoch=epoch)
 
-            to_the_end(t, work, lambda: file.n_readings)
+            retry_after_failures(t, work, lambda: file.n_readings)
 
         def measured() -> Rehearsal:
             missing(campaign)
@@ -366,7 +368,7 @@ def in_process(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator
         str(settings.base_dir),
         source,
         overwrite=True,
-        more={COVERS_KEY: INSTRUMENT_AND_ARM},
+        more_texts={COVERS_KEY: INSTRUMENT_AND_ARM},
     ) as campaign:
 
         def last_time() -> float:
@@ -374,37 +376,39 @@ def in_process(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator
             return 0.0 if time is None else float(time.max())
 
         def measured(part: Plan, number: int, start: float) -> Rehearsal:
-            r = read_plan(secret, part, [settings.seed, number], start)
+            r = simulate_plan(secret, part, [settings.seed, number], start)
             _write(t, campaign, r.readings)
             return secret.measured(campaign.readings())
 
         def further(next_plan: Plan) -> Rehearsal:
-            return measured(with_new_names(next_plan, plan, 2), 2, last_time() + BREAK)
+            return measured(with_new_names(next_plan, plan, 2), 2, last_time() + BREAK_S)
 
         def missing(file: CampaignFile, epoch: float | None = None) -> None:
             # Campaigns are told apart by the number of letters appended to the first one's name.
             log, number = RunLog(file), 3 + len(file.path.stem) - len(settings.output.stem)
-            start = last_time() + number * BREAK
-            drawn = read_plan(secret, log.plan, [settings.seed, number], start).readings
+            start = last_time() + number * BREAK_S
+            drawn = simulate_plan(secret, log.plan, [settings.seed, number], start).readings
             for k, step in enumerate(log.plan.steps):
                 log.record(drawn[slice(k, k + 1)], step, {"drawn": True})
 
         yield RehearsedCampaign(measured(plan, 1, 0.0), further, missing)
 
 
-def to_the_end(t: Terminal, work: Callable[[], object], count: Callable[[], int]) -> None:
+def retry_after_failures(
+    t: Terminal, work: Callable[[], object], stored_count: Callable[[], int]
+) -> None:
     """Measure the missing readings by `work`; try again after a device failure.
 
     On a busy computer a simulated device may stall, which a driver takes for a failure. At most
-    `TRIES` - 1 failures in a row without a new reading, which `count` counts, are accepted.
+    `TRIES` - 1 failures in a row without a new reading, which `stored_count` counts, are accepted.
     """
-    tries, stored = TRIES, count()
+    tries, stored = TRIES, stored_count()
     while True:
         try:
             work()
             return
         except DeviceError as error:
-            current = count()
+            current = stored_count()
             tries, stored = (TRIES if current > stored else tries) - 1, current
             if tries <= 0:
                 raise
@@ -435,16 +439,16 @@ def lasting_cell(p: Procedure) -> Iterator[CellConfig]:
         starts = [entry for entry in log.entries() if entry["kind"] == WORLD]
         wall_s = time.time()
         log.append(WORLD, {"wall_s": wall_s})
-    choice, seed = p.settings.hide or NOTHING, p.settings.seed
+    choice, seed = p.settings.hide or NO_EFFECT, p.settings.seed
     secret = case_of_plan(p.config, plan, choice, seed, p.catalogue, p.base_dir)
     passed = wall_s - starts[0]["wall_s"] if starts else 0.0
     start = max(passed, 0.0) * p.config.simulation.clock
     device_seed = seed + NEXT_SEED * len(starts)
-    with simulated_cell(secret, device_seed, p.base_dir, begun=start) as simulated:
+    with simulated_cell(secret, device_seed, p.base_dir, start_s=start) as simulated:
         yield simulated.config
 
 
-FASTEST = 200.0  # Largest clock rate of a simulated world, as in `[simulation] clock`
+MAX_CLOCK = 200.0  # Largest clock rate of a simulated world, as in `[simulation] clock`
 
 
 @command("""
@@ -464,12 +468,14 @@ def simulate(
     config, numbers = read_cell(cell)
     number = check_seed(config.simulation.seed if seed is None else seed)
     if clock is not None:
-        if not 1.0 <= clock <= FASTEST:
-            raise InputError(f"--clock {clock:g}; valid: a number from 1 to {FASTEST:g}")
+        if not 1.0 <= clock <= MAX_CLOCK:
+            raise InputError(f"--clock {clock:g}; valid: a number from 1 to {MAX_CLOCK:g}")
         config = config.with_keys("simulation", clock=clock)
     base_dir = cell.absolute().parent
-    choice = hide or config.simulation.hide or NOTHING
-    as_told(config, choice, catalogue)  # refuses an effect that cannot be hidden, before planning
+    choice = hide or config.simulation.hide or NO_EFFECT
+    program_config(
+        config, choice, catalogue
+    )  # refuses an effect that cannot be hidden, before planning
     with working(t.progress) as say:
         if plan is None:
             say("planning a campaign, to know how strong an effect has to be")
@@ -478,13 +484,16 @@ def simulate(
             campaign_plan = load_plan(plan)
         say("preparing the simulated cell")
         secret = case_of_plan(config, campaign_plan, choice, number, catalogue, base_dir)
-    if secret.hidden != NOTHING and (config.fitted, secret.mode) == ("deflection", "absolute"):
+    if secret.hidden != NO_EFFECT and (config.readings_mode, secret.mode) == (
+        "deflection",
+        "absolute",
+    ):
         why = f"{choice} hides what they may not show" if choice == RANDOM else f"{choice} cancels"
         t.notice(
             f"warning: deflections are planned and fitted, and {why} in them; set readings = "
             f'"absolute" in [planning] of {cell} for a campaign that shows it'
         )
-    with told_to_end(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as wait, ExitStack() as stack:
+    with end_signals(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as wait, ExitStack() as stack:
         with working(t.progress) as say:
             say("starting the devices")
             simulated = stack.enter_context(simulated_cell(secret, number, base_dir, output))
@@ -524,7 +533,7 @@ def factory_check(
     yes: bool,
 ) -> dict[str, object]:
     """Compare the arm with its factory kinematics on a campaign; measure it unless it exists."""
-    factory = connect.told_by(answers) or cell.factory
+    factory = connect.reported_kinematics(answers) or cell.factory
     if factory is None:
         raise InputError(
             "--factory: the arm's controller does not tell its kinematics; give [robot] calibration"
@@ -551,11 +560,11 @@ def _measure_without_loads(
     refuse(dry_checked(t, numbers, bare, plan), "the plan")
     steps = len(plan.steps)
     if not yes:
-        if not somebody_there(t):
+        if not person_present(t):
             raise InputError(
                 f"--factory measures {steps} readings, the arm moves; agree with --yes"
             )
-        if not agreed(t, f"Measure {steps} readings without a load? The arm will move."):
+        if not confirmed(t, f"Measure {steps} readings without a load? The arm will move."):
             raise StoppedError("not measured, nothing has moved")
     with create_run(output, bare, cell.base_dir, plan) as campaign:
         measure(t, bare, numbers, campaign)

@@ -13,7 +13,7 @@ from pathlib import Path
 from hilcal.campaign.campaign import Campaign
 from hilcal.cli.fitting import check_record, record_story
 from hilcal.cli.options import catalogue_with, command
-from hilcal.cli.terminal import Terminal, terminal, told_to_end
+from hilcal.cli.terminal import Terminal, end_signals, terminal
 from hilcal.errors import InputError
 from hilcal.names import quoted
 from hilcal.present.live_viewer import PORT, LiveViewer
@@ -72,7 +72,7 @@ def report(
     )
 
 
-ENDING = 5.0  # Longest delay of the end of the process by a server of a page or viewer, s
+END_DELAY_S = 5.0  # Longest delay of the end of the process by a server of a page or viewer, s
 
 
 @command("""
@@ -98,7 +98,7 @@ def view(
         story = build_story(chapters)
     guard = _end_of_process()  # an unresponsive viewer may delay the end; the campaign is closed
     try:
-        with told_to_end(signal.SIGINT, signal.SIGTERM) as wait, serve(story, port=port) as url:
+        with end_signals(signal.SIGINT, signal.SIGTERM) as wait, serve(story, port=port) as url:
             t.show("Open the viewer with:")
             t.command(f"{viewer_command()} {url}")
             t.document({"url": url, "revisions": [c.number for c in chapters]})
@@ -112,13 +112,13 @@ def view(
 
 def _end_of_process() -> threading.Timer:
     """Return a timer that ends the process, if its threads do not end by themselves."""
-    guard = threading.Timer(ENDING, os._exit, (0,))
+    guard = threading.Timer(END_DELAY_S, os._exit, (0,))
     guard.daemon = True
     return guard
 
 
 @contextmanager
-def followed(t: Terminal, requested: bool, run: Path) -> Iterator[LiveViewer | None]:
+def live_viewer(t: Terminal, requested: bool, run: Path) -> Iterator[LiveViewer | None]:
     """Start a live viewer for the block if requested; it records beside the campaign."""
     if not requested:
         yield None
@@ -135,10 +135,10 @@ def followed(t: Terminal, requested: bool, run: Path) -> Iterator[LiveViewer | N
     finally:
         live.close()
         if live.record.exists():
-            t.notice(f"recorded {live.record}; open it with: {opening(live.record)}")
+            t.notice(f"recorded {live.record}; open it with: {open_command(live.record)}")
 
 
-def opening(recording: Path) -> str:
+def open_command(recording: Path) -> str:
     """Return the command that opens a recording."""
     return shlex.join([viewer_command(), str(recording)])
 

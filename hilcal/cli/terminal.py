@@ -89,7 +89,7 @@ def _console(stream: TextIO) -> Console:
 YES, NO = ("y", "yes"), ("n", "no", "q")
 
 
-def somebody_there(t: Terminal) -> bool:
+def person_present(t: Terminal) -> bool:
     """Whether a person sees questions and can answer them."""
     try:
         return t.progress.is_terminal and sys.stdin.isatty()
@@ -97,7 +97,7 @@ def somebody_there(t: Terminal) -> bool:
         return False
 
 
-def agreed(t: Terminal, question: str) -> bool:
+def confirmed(t: Terminal, question: str) -> bool:
     """Ask until what is typed after the question is yes or no; the end of the input is no."""
     with contextlib.suppress(termios.error, OSError, ValueError):
         termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
@@ -119,7 +119,7 @@ POLL = 0.2  # Longest delay of the reaction to a signal that does not interrupt 
 
 
 @contextmanager
-def told_to_end(*kinds: signal.Signals) -> Iterator[Callable[[], None]]:
+def end_signals(*kinds: signal.Signals) -> Iterator[Callable[[], None]]:
     """Catch signals; yields a function that waits for the first of them.
 
     The handler runs in the waiting thread, so it must take no lock: `threading.Event.set` would

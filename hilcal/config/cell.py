@@ -319,7 +319,7 @@ class CellConfig(sections.CellSection):
         return self
 
     @property
-    def fitted(self) -> Literal["deflection", "absolute"]:
+    def readings_mode(self) -> Literal["deflection", "absolute"]:
         """Kind of readings that will be fitted: `[planning] readings`; "absolute" without loads."""
         return self.planning.readings if self.loads else "absolute"
 

@@ -136,7 +136,7 @@ def _is_list(field: FieldInfo) -> bool:
     return getattr(field.annotation, "__origin__", None) is tuple
 
 
-SHOWN = {
+SHOWN_KEYS = {
     "robot": ("model", "repeatability_m", "driver", "host"),
     "tool": ("target_m", "load_point_m", "mass_kg", "com_m"),
     "tracker": (
@@ -162,7 +162,7 @@ _HEAD = """\
 def cell_text(data: Mapping[str, Any], title: str) -> str:
     """Return a commented CELL.toml with the sections and keys of `data`, and with examples."""
     lines, sections = [_HEAD.format(title=escaped(title))], tables()
-    for name, keys in SHOWN.items():
+    for name, keys in SHOWN_KEYS.items():
         lines += [*_section(table(name, sections), keys, data.get(name)), ""]
     return "\n".join(lines)
 

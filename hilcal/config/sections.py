@@ -27,9 +27,9 @@ class CellSection(Section):
     }
 
 
-def check_distinct(section: str, things: Sequence[Any]) -> None:
+def check_distinct(section: str, named: Sequence[Any]) -> None:
     """Refuse two sections of the same name."""
-    names = [thing.name for thing in things]
+    names = [thing.name for thing in named]
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f'two [[{section}]] have the name "{name}"; names must differ')

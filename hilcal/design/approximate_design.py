@@ -23,7 +23,7 @@ class BarrierProgram:
 
     objective: Objective  # φ and M0, of n units
     budget: float  # B
-    most: float  # upper bound of each weight; may be infinite
+    max_weight: float  # upper bound of each weight; may be infinite
 
     def information(self, weight: Floats) -> Floats:
         """Return (P, P) M."""
@@ -40,7 +40,9 @@ class BarrierProgram:
         units, prior = self.objective.units, self.objective.prior
         above = prices(units.rows, smooth.above)
         below = None if smooth.below is None else prices(units.rows, smooth.below)
-        return above, upper_bound(smooth, prior, above, units.cost, self.budget, self.most, below)
+        return above, upper_bound(
+            smooth, prior, above, units.cost, self.budget, self.max_weight, below
+        )
 
     def curvature(self, smooth: Smooth) -> Floats:
         """Return (n, n) −∂²f/∂w_k∂w_l, positive semidefinite."""
@@ -107,10 +109,10 @@ def solve(program: BarrierProgram, start: Floats, tolerance: float, order: float
     to 0 from `order` / n. Criteria with a kink have a surrogate of order μ.
     """
     w, n, criterion = start, len(start), program.objective.criterion
-    capped = np.isfinite(program.most)
+    capped = np.isfinite(program.max_weight)
     m = program.information(w)
     mu = max(min(order, 1.0), tolerance) / n
-    z, y = mu / w, mu / (program.most - w)
+    z, y = mu / w, mu / (program.max_weight - w)
     best: Optimum | None = None
     central = False
     for step in range(_STEPS):
@@ -129,7 +131,7 @@ def solve(program: BarrierProgram, start: Floats, tolerance: float, order: float
             surrogate = criterion.surrogate(m, mu)
             smooth = surrogate(m) or smooth
         slope = prices(program.objective.units.rows, smooth.gradient)
-        top = program.most - w
+        top = program.max_weight - w
         lean = slope + mu / w - mu / top
         move = _newton(program, program.curvature(smooth) + np.diag(z / w + y / top), lean, w)
         if move is None:
@@ -143,7 +145,7 @@ def solve(program: BarrierProgram, start: Floats, tolerance: float, order: float
         z = _dual(z, mu / w - z - z / w * move)
         y = _dual(y, mu / top - y + y / top * move)
         w = w + length * move
-        m, top = program.information(w), program.most - w
+        m, top = program.information(w), program.max_weight - w
         z = np.clip(z, mu / (_CLAMP * w), _CLAMP * mu / w)
         y = np.clip(y, mu / (_CLAMP * top), _CLAMP * mu / top)
         complement = float(z @ w) / n
@@ -192,12 +194,12 @@ def _search(
     slope: float,
 ) -> float:  # fmt: skip
     """Return the step length, halved until the barrier function rises; 0 if it never does."""
-    capped = np.isfinite(program.most)
+    capped = np.isfinite(program.max_weight)
     (w, m), (move, moved) = point, step
 
     def barrier(x: Floats) -> float:
         out = float(np.log(x).sum())
-        return out + (float(np.log(program.most - x).sum()) if capped else 0.0)
+        return out + (float(np.log(program.max_weight - x).sum()) if capped else 0.0)
 
     start = barrier(w)
     noise = 1e-13 * (1.0 + abs(current.value))
@@ -253,7 +255,7 @@ def relax(
     objective: Objective,
     budget: float,  # B, in the units of the cost
     *,
-    most: int | None = None,  # largest weight of a unit; unlimited by default
+    max_weight: int | None = None,  # largest weight of a unit; unlimited by default
     tolerance: float | None = None,  # relative gap to stop at; by default 1e-7, with kinks 1e-3
     start: ApproximateDesign | None = None,  # optimum of a similar problem over the same units
 ) -> ApproximateDesign:
@@ -266,7 +268,7 @@ def relax(
     units, criterion = objective.units, objective.criterion
     if tolerance is None:
         tolerance = KINKED_TOLERANCE if criterion.kinked else TOLERANCE
-    cap = np.inf if most is None else float(most)
+    cap = np.inf if max_weight is None else float(max_weight)
     share = min(budget / float(units.cost.sum()), cap)
     spread = objective.information(np.full(len(units), share))
     criterion.require(spread, objective.names)
@@ -320,7 +322,7 @@ def _solved(
     """Return the optimum over active units; a criterion that is not monotone may spend less."""
     units = program.objective.units[active]
     rows, cost = units.rows, units.cost
-    start = _feasible(weight, cost, program.budget, program.most)
+    start = _feasible(weight, cost, program.budget, program.max_weight)
     if not program.objective.criterion.monotone:  # one more unit without information
         rows = np.concatenate([rows, np.zeros((1, *rows.shape[1:]))])
         cost = np.append(cost, program.budget)
@@ -348,7 +350,9 @@ def _first(program: BarrierProgram, spread: Floats) -> tuple[Ints, Floats]:
     """
     units, criterion = program.objective.units, program.objective.criterion
     budget = program.budget
-    count = min(len(units), max(_SHORT, int(4 * budget / (program.most * float(units.cost.min())))))
+    count = min(
+        len(units), max(_SHORT, int(4 * budget / (program.max_weight * float(units.cost.min()))))
+    )
     smooth = criterion.surrogate(spread, 0.1)(spread)
     if smooth is None or count == len(units):
         short = np.arange(len(units))
@@ -367,7 +371,7 @@ def _first(program: BarrierProgram, spread: Floats) -> tuple[Ints, Floats]:
         rate = np.maximum(prices(rows, smooth.gradient) / cost, 0.0)
         w = w * (rate + 1e-3 * float(rate.max())) ** (2 / 3)
         w *= budget / float(w @ cost)
-    needed = budget / program.most
+    needed = budget / program.max_weight
     order = np.argsort(-w * cost, kind="stable")
     size = max(units.size, int(np.searchsorted(np.cumsum(cost[order]), 2 * needed)) + 1)
     while size < len(short):
@@ -386,7 +390,7 @@ def _exchanged(
 ) -> tuple[Ints, Floats]:
     """Return the active units and weights: drop units of no weight, add units of best prices."""
     units = program.objective.units
-    cost, inner = units.cost, weight < 0.99 * program.most
+    cost, inner = units.cost, weight < 0.99 * program.max_weight
     price = float(rate[active[inner]].max()) if inner.any() else float(rate[active].min())
     share = weight * cost[active] / program.budget
     retained = (share > 1e-5 / len(active)) | (rate[active] > 0.999 * price)
@@ -409,7 +413,7 @@ def _pruned(
     retained = share > 1e-8 * float(share.max())
     index, w = active[retained], weight[retained]
     if criterion.monotone:
-        w = np.minimum(w * (program.budget / float(w @ units.cost[index])), program.most)
+        w = np.minimum(w * (program.budget / float(w @ units.cost[index])), program.max_weight)
     m = program.objective.information(w, index)
     smooth = criterion.surrogate(m, 1e-3)(m)
     value = float(criterion.value(m))

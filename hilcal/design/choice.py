@@ -22,18 +22,18 @@ from hilcal.design.criterion import CandidateSet, Objective
 from hilcal.design.discriminated_pairs import discriminated_pairs
 from hilcal.design.information import DesignProblem
 from hilcal.design.mixed_design import balanced, mixed_design
-from hilcal.design.optimum import Design, best
+from hilcal.design.optimum import Design, best_design
 from hilcal.design.predicted import PredictionPoses
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.types import Bools, Ints
 
 CRITERIA = ("D", "A", "E", "K", "I", "separate")
-LOOSE = 1e-2  # relative duality gap, for a plan's bound and for comparing loads; a choice
+COARSE_GAP = 1e-2  # relative duality gap, for a plan's bound and for comparing loads; a choice
 EFFORT = 200  # of the exchange search: 98 % of the bound of the demo's plan in a second
 SAMPLE = 75  # poses at which sets of loads are compared; a choice
 
 
-def canonical(name: str) -> str:
+def criterion_name(name: str) -> str:
     """Return the name of a criterion; "test" is an old name of I."""
     return "I" if name == "test" else name
 
@@ -47,7 +47,7 @@ def objective_of(
     parameters in A); I judges predictions with all effects (`mixed_design`); E and K judge the
     model's parameters without a prior.
     """
-    name = canonical(name)
+    name = criterion_name(name)
     names = tuple(t.name for t in problem.terms)
     of_all = Objective(problem.units, D(), problem.prior, names)
     if name == "D":
@@ -61,18 +61,18 @@ def objective_of(
     if name == "separate":
         apart = discriminated_pairs(problem)
         units, pairs, prior = condensed(problem.units, apart.pairs, apart.prior)
-        return Objective(units, Separate(pairs), prior, apart=apart)
+        return Objective(units, Separate(pairs), prior, discriminated_pairs=apart)
     if name == "E":
-        return replace(of_all, criterion=E(unknown(problem)))
+        return replace(of_all, criterion=E(without_prior(problem)))
     if name == "K":  # of the model alone: information on other parameters may lower it
-        free = unknown(problem)
+        free = without_prior(problem)
         rows, prior = problem.units.rows[:, :, free], problem.measured[np.ix_(free, free)]
         units = CandidateSet(np.ascontiguousarray(rows), problem.units.cost)
         return Objective(units, K(), prior, tuple(names[k] for k in free))
     raise InputError(f"criterion {name!r}; valid: {', '.join(CRITERIA)}")
 
 
-def unknown(problem: DesignProblem) -> Ints:
+def without_prior(problem: DesignProblem) -> Ints:
     """Return the indices of the model's parameters that have no prior."""
     return np.flatnonzero(np.isinf(problem.nominal.prior_std[problem.nominal.live]))
 
@@ -89,10 +89,10 @@ class PoseUnits:
 def pose_units(objective: Objective, problem: DesignProblem) -> PoseUnits:
     """Return the poses of a design problem as units of cost 1."""
     by_pose: dict[int, list[int]] = {}
-    for k, (pose, loads) in enumerate(problem.what):
+    for k, (pose, loads) in enumerate(problem.contents):
         members = by_pose.setdefault(pose, [])
         if problem.mode == "deflection" and members:  # the unit with all loads includes the others
-            if len(loads) <= len(problem.what[members[0]][1]):
+            if len(loads) <= len(problem.contents[members[0]][1]):
                 continue
             members.clear()
         members.append(k)
@@ -122,7 +122,7 @@ def choose_poses(
     among = replace(objective, units=candidates.units[usable])
     most = -(-poses // max(len(among.units), 1))
     relaxed = None if start is None else start.among(usable)
-    design = best(among, float(poses), rng, most=most, effort=effort, relaxed=relaxed)
+    design = best_design(among, float(poses), rng, max_count=most, effort=effort, relaxed=relaxed)
     counts = np.zeros(len(objective.units), dtype=np.int64)
     index = np.flatnonzero(usable)
     for k, count in zip(index, design.counts.tolist(), strict=True):
@@ -132,7 +132,7 @@ def choose_poses(
     return counts, replace(design.relaxed, index=index[design.relaxed.index], price=price)
 
 
-def certified(
+def certified_design(
     objective: Objective, counts: Ints, usable: Bools, start: ApproximateDesign | None = None
 ) -> Design:
     """Return the design of (K,) counts among usable units, with the bound for its cost.
@@ -144,13 +144,13 @@ def certified(
     information = among.information(chosen.astype(float))
     value = float(objective.criterion.value(information))
     near = None if start is None else start.among(usable)
-    relaxed = relax(among, cost, tolerance=LOOSE, start=near)
+    relaxed = relax(among, cost, tolerance=COARSE_GAP, start=near)
     return Design(chosen, value, max(relaxed.bound, value), information, cost, relaxed)
 
 
-def promising(objective: Objective, budget: float) -> tuple[Ints, ApproximateDesign]:
+def promising_units(objective: Objective, budget: float) -> tuple[Ints, ApproximateDesign]:
     """Return the units of the best prices, of which a plan is likely made, and the optimum."""
-    tolerance = KINKED_TOLERANCE if objective.criterion.kinked else LOOSE
+    tolerance = KINKED_TOLERANCE if objective.criterion.kinked else COARSE_GAP
     relaxed = relax(objective, budget, tolerance=tolerance)
     count = min(2 * len(relaxed.index), len(objective.units))
     best_first = np.argsort(-relaxed.price / objective.units.cost, kind="stable")
@@ -167,9 +167,9 @@ def costly_loads(
     readings instead. The continuous optima over a sample of the poses are compared, one load after
     the other.
     """
-    poses = np.array([pose for pose, _ in problem.what])
+    poses = np.array([pose for pose, _ in problem.contents])
     sample = np.isin(poses, rng.permutation(len(problem.candidates))[:SAMPLE])
-    used = {name for _, names in problem.what for name in names}
+    used = {name for _, names in problem.contents for name in names}
     loads = tuple(name for name in problem.candidates.loads[1:] if name in used)
     costly: list[tuple[str, float]] = []
     if len(loads) < 2 or change <= 0:
@@ -180,7 +180,7 @@ def costly_loads(
         without = {name: tuple(load for load in loads if load != name) for name in loads}
         values = {n: _value(objective, problem, sample, o, budget) for n, o in without.items()}
         value, name = max((value, name) for name, value in values.items())
-        if not value > current * (1.0 + LOOSE):
+        if not value > current * (1.0 + COARSE_GAP):
             break
         costly.append((name, value / current - 1.0))
         loads, current = without[name], value
@@ -193,9 +193,9 @@ def _value(
 ) -> float:  # fmt: skip
     """Return φ of the continuous optimum; 0 where the loads do not determine all parameters."""
     allowed = {*loads, problem.candidates.loads[0]}
-    possible = np.array([set(names) <= allowed for _, names in problem.what])
+    possible = np.array([set(names) <= allowed for _, names in problem.contents])
     try:
-        return relax(objective.among(sample & possible), budget, tolerance=LOOSE).value
+        return relax(objective.among(sample & possible), budget, tolerance=COARSE_GAP).value
     except (CannotAnswerError, InputError):
         return 0.0
 
@@ -209,7 +209,7 @@ def compound_objective(
     rng: np.random.Generator,  # draws the poses of these optima
 ) -> Objective:
     """Return a design problem with a criterion; D and A are compound with potential terms."""
-    name = canonical(name)
+    name = criterion_name(name)
     objective, size = objective_of(problem, config, name, work), problem.model_size
     if size == len(problem.terms) or name not in ("A", "D"):
         return objective
@@ -217,11 +217,11 @@ def compound_objective(
         return replace(objective, criterion=D(size))
     c = problem.mean_variance
     of_all, of_model = MeanVariance(c, name), MeanVariance(c[:size, :size], name)
-    poses = np.array([pose for pose, _ in problem.what])
+    poses = np.array([pose for pose, _ in problem.contents])
     sampled = objective.among(np.isin(poses, rng.permutation(len(problem.candidates))[:SAMPLE]))
     units = CandidateSet(sampled.units.rows[:, :, :size], sampled.units.cost)
     names = tuple(t.name for t in problem.terms[:size])
     model_alone = Objective(units, of_model, objective.prior[:size, :size], names)
     both = replace(sampled, criterion=of_all), model_alone
-    total, alone = (relax(q, budget, tolerance=LOOSE).value / 2.0 for q in both)
+    total, alone = (relax(q, budget, tolerance=COARSE_GAP).value / 2.0 for q in both)
     return replace(objective, criterion=MeanVariance(total * c, name, alone * c[:size, :size]))

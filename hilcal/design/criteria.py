@@ -14,7 +14,7 @@ from hilcal.design.criterion import (
     Smooth,
     factors,
     inverse_factor,
-    soft_least,
+    soft_min,
 )
 from hilcal.errors import CannotAnswerError
 from hilcal.regression.schur import (
@@ -170,7 +170,7 @@ class E(Criterion):
         def smooth(m: Floats) -> Smooth | None:
             s = differentiable_schur_complement(m, self.interest)
             values, vectors = np.linalg.eigh(s.matrix)
-            part = _smooth_least(values, s.lift @ vectors, order * scale)
+            part = _smooth_min(values, s.lift @ vectors, order * scale)
             if s.inverse is not None and self.interest is not None:
                 nuisance = np.setdiff1d(np.arange(len(m)), self.interest)
                 root = np.zeros((len(m), len(nuisance)))
@@ -210,8 +210,8 @@ class K(Criterion):
 
         def smooth(m: Floats) -> Smooth | None:
             values, vectors = np.linalg.eigh(m)
-            least = _smooth_least(values, vectors, order * scale)
-            largest = _smooth_least(-values, vectors, order * most)  # F_max(M) = −F_min(−M)
+            least = _smooth_min(values, vectors, order * scale)
+            largest = _smooth_min(-values, vectors, order * most)  # F_max(M) = −F_min(−M)
             a, b = least.scaled(1.0 / scale), largest.scaled(ratio / scale)
             return Smooth(
                 a.value + b.value, a.gradient - b.gradient, a.products + b.products,
@@ -221,14 +221,14 @@ class K(Criterion):
         return smooth
 
 
-def _smooth_least(values: Floats, vectors: Floats, width: float) -> Smooth:
+def _smooth_min(values: Floats, vectors: Floats, width: float) -> Smooth:
     """Return the smooth least of eigenvalues (I,), with vectors (P, I) lifted to the space of M.
 
     With S = M − t 1, μ the width, the second derivative is
 
         −μ tr(S⁻¹ H_k S⁻¹ H_l) + μ tr(S⁻² H_k) tr(S⁻² H_l) / tr(S⁻²)
     """
-    value, p = soft_least(values, width)
+    value, p = soft_min(values, width)
     root = vectors * np.sqrt(p)
     gradient = root @ root.T
     squares = (np.outer(p**2, p**2) / (width * float(p @ p)), vectors)
@@ -331,7 +331,7 @@ class Separate(Criterion):
         parts = np.einsum("ni,ij,nj->n", us, m, us)
         if not np.isfinite(parts).all() or width <= 0.0:
             return None
-        value, p = soft_least(parts, width)
+        value, p = soft_min(parts, width)
         gradient = (us.T * p) @ us
         # F'' = Σ p s'' − Σ p²/μ (s' − mean)(s' − mean)ᵀ, the mean weighted by p²
         weighty = p > _WEIGHTY

@@ -165,7 +165,8 @@ class Objective:
     criterion: Criterion  # φ
     prior: Floats  # (P, P) M0: prior information, or of fixed readings
     names: tuple[str, ...] | None = None  # of the parameters, for messages
-    apart: DiscriminatedPairs | None = None  # of "separate", before they are condensed
+    discriminated_pairs: DiscriminatedPairs | None = None
+    """Of "separate", before they are condensed."""
 
     def among(self, which: Ints | Bools) -> "Objective":
         """Return the objective with a subset of the units."""
@@ -212,7 +213,7 @@ def factors(m: Floats) -> tuple[Floats, Bools]:
     return np.asarray(factor, dtype=np.float64), np.asarray(good, dtype=np.bool_)
 
 
-def soft_least(values: Floats, width: float) -> tuple[float, Floats]:
+def soft_min(values: Floats, width: float) -> tuple[float, Floats]:
     """Return the smooth least F = max over t of t + μ Σ log((s_i − t) / μ) of numbers s, and p.
 
     Its derivatives p_i = μ / (s_i − t) sum to 1, so that min s' ≤ Σ p_i s'_i for any
@@ -263,7 +264,7 @@ def upper_bound(
     gains: Floats,  # (K,) tr(Z H_k)
     cost: Floats,  # (K,) c
     budget: float,  # B
-    most: float,  # largest count of a unit
+    max_count: float,  # largest count of a unit
     below: Floats | None = None,  # (K,) tr(Y H_k)
 ) -> float:
     """Return an upper bound of φ of all plans within the budget, with real counts too.
@@ -275,13 +276,13 @@ def upper_bound(
     """
     fixed = float(np.sum(smooth.above * prior))
     if below is None or smooth.below is None:
-        return fixed + float(gains @ spend(gains, cost, budget, most))
+        return fixed + float(gains @ fractional_knapsack(gains, cost, budget, max_count))
     fixed_below = float(np.sum(smooth.below * prior))
     if fixed_below <= 0.0:  # the best unit alone
         return min(1.0, float(np.max(gains / np.maximum(below, np.finfo(float).tiny))))
     ratio = fixed / fixed_below
     for _ in range(100):
-        weight = spend(gains - ratio * below, cost, budget, most)
+        weight = fractional_knapsack(gains - ratio * below, cost, budget, max_count)
         raised = (fixed + float(gains @ weight)) / (fixed_below + float(below @ weight))
         if raised <= ratio * (1.0 + 1e-13):
             break
@@ -289,13 +290,13 @@ def upper_bound(
     return min(1.0, ratio)
 
 
-def spend(gains: Floats, cost: Floats, budget: float, most: float) -> Floats:
+def fractional_knapsack(gains: Floats, cost: Floats, budget: float, max_count: float) -> Floats:
     """Return the weights (K,) of the fractional knapsack: best gain per cost first."""
     rate = gains / cost
     # the budget reaches at most so many of the best
-    best = best_first(rate, int(np.ceil(budget / (most * float(cost.min())))) + 1)
-    spent = np.concatenate([[0.0], np.cumsum(most * cost[best[:-1]])])
-    amount = np.clip((budget - spent) / cost[best], 0.0, most)
+    best = best_first(rate, int(np.ceil(budget / (max_count * float(cost.min())))) + 1)
+    spent = np.concatenate([[0.0], np.cumsum(max_count * cost[best[:-1]])])
+    amount = np.clip((budget - spent) / cost[best], 0.0, max_count)
     weight = np.zeros(len(gains))
     weight[best] = np.where(rate[best] > 0.0, amount, 0.0)
     return weight

@@ -34,7 +34,7 @@ from hilcal.types import Floats
 LEVEL = 0.01  # of the test
 DRAWS = 3
 # a pair is not separable if the best plan of MANY readings has a lower power; both are guesses
-MANY = 100
+MANY_READINGS = 100
 LEAST_POWER = 0.2
 _LOOSE = 0.05
 _SEED = 20240609
@@ -44,10 +44,10 @@ SUPPORTED = 3.0  # log evidence above which readings support an effect: odds of 
 def discriminated_pairs(problem: DesignProblem) -> DiscriminatedPairs:
     """Return the ordered pairs of potential terms that some measurement separates.
 
-    A pair is not separable where the best plan of `MANY` readings, with the prior information, has
-    a power below `LEAST_POWER` at the effect's first parameters. Parameters are drawn from the
-    posterior of supported effects. For other effects, a few directions are drawn with a fixed seed,
-    each with an RMS of 1 σ over the measured elements of all units.
+    A pair is not separable where the best plan of `MANY_READINGS` readings, with the prior
+    information, has a power below `LEAST_POWER` at the effect's first parameters. Parameters are
+    drawn from the posterior of supported effects. For other effects, a few directions are drawn
+    with a fixed seed, each with an RMS of 1 σ over the measured elements of all units.
     """
     names = tuple(e.name for e in problem.families)
     if len(names) < 2:
@@ -62,7 +62,7 @@ def discriminated_pairs(problem: DesignProblem) -> DiscriminatedPairs:
     prior, size = problem.measured.copy(), problem.model_size
     prior[:size, :size] = problem.prior[:size, :size]
     spread = prior + problem.units.information(
-        np.full(len(problem.units), MANY / float(problem.units.cost.sum()))
+        np.full(len(problem.units), MANY_READINGS / float(problem.units.cost.sum()))
     )
     not_separable = []
     for of_both, alike in groupby(pairs, key=lambda pair: pair.names):
@@ -71,7 +71,7 @@ def discriminated_pairs(problem: DesignProblem) -> DiscriminatedPairs:
         if best < LEAST_POWER:
             with suppress(CannotAnswerError):
                 alone = Objective(problem.units, Separate((first,)), prior)
-                best = power(first, relax(alone, MANY, tolerance=_LOOSE).information)
+                best = power(first, relax(alone, MANY_READINGS, tolerance=_LOOSE).information)
         if best < LEAST_POWER:
             not_separable.append(of_both)
     separable = tuple(pair for pair in pairs if pair.names not in not_separable)
@@ -130,8 +130,8 @@ def not_ruled_out(pairs: Sequence[tuple[str, str]]) -> str:
     """Return a message on pairs (present effect, rival) whose rival cannot be ruled out."""
     listed = [f"{fs} where {e} is there" for e, fs in _by_effect(pairs).items()]
     return (
-        f"no measurement in this cell rules out {', nor '.join(listed)}: {MANY} of the best "
-        f"readings would do so with a chance of less than {100 * LEAST_POWER:.0f} %"
+        f"no measurement in this cell rules out {', nor '.join(listed)}: {MANY_READINGS} of the "
+        f"best readings would do so with a chance of less than {100 * LEAST_POWER:.0f} %"
     )
 
 
@@ -147,7 +147,7 @@ def _directions(problem: DesignProblem, effect: str) -> list[Floats]:
     rows = problem.units.rows[:, :, columns]
     elements = problem.nominal.elements * sum(
         len([name for name in loads if name != UNLOADED or problem.mode == "absolute"])
-        for _, loads in problem.what
+        for _, loads in problem.contents
     )
     flat = rows.reshape(-1, len(columns))
     gram = flat.T @ flat / elements

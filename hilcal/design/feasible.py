@@ -10,13 +10,15 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.errors import CannotAnswerError
 from hilcal.measuring.clearance import TRACKER_UNKNOWN
-from hilcal.measuring.feasibility import STATE, Feasibility, Margins
+from hilcal.measuring.feasibility import STATE_CHECKS, Feasibility, Margins
 from hilcal.measuring.route import beside
 from hilcal.robot.chain import evaluate, joint_jacobian
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Bools, Floats
 
-PLANNED = Margins(joint=1e-6, inside=0.02, clear=0.02, itself=0.01, bear=0.98)  # choices
+PLANNING_MARGINS = Margins(
+    joint=1e-6, workspace=0.02, clearance=0.02, self_collision=0.01, torque_share=0.98
+)  # choices
 
 REASONS = {
     "joint limits": ("keep the joint limits", "[limits] joint_margin_rad"),
@@ -38,10 +40,10 @@ REASONS = {
 the states that pass, and the keys of the configuration that decide."""
 
 
-class Space(Feasibility):
+class FeasibleSpace(Feasibility):
     """Feasible states of a plan: `Feasibility` with margins, at most half a turn per joint."""
 
-    def __init__(self, cell: Cell, config: CellConfig, margins: Margins = PLANNED) -> None:
+    def __init__(self, cell: Cell, config: CellConfig, margins: Margins = PLANNING_MARGINS) -> None:
         """Build the shapes once."""
         super().__init__(cell, config, margins)
         low, high = cell.arm.usual_range
@@ -56,14 +58,14 @@ class Space(Feasibility):
 
     def reasons(self, q: Floats, load: str = UNLOADED) -> dict[str, Bools]:
         """Return which of (N, n) states pass each reason (N,), in the order of `REASONS`."""
-        return {reason: self.keeps(reason, q, load) for reason in REASONS}
+        return {reason: self.passes(reason, q, load) for reason in REASONS}
 
-    def keeps(self, kind: str, q: Floats, load: str = UNLOADED) -> Bools:
+    def passes(self, kind: str, q: Floats, load: str = UNLOADED) -> Bools:
         """Return (N,) which states pass one of `REASONS` under a load."""
         if kind == "joint limits":
             return np.asarray(np.all((q >= self.low) & (q <= self.high), axis=1))
         if kind != "singularity":
-            return super().keeps(kind, q, load)
+            return super().passes(kind, q, load)
         # σ_min ≥ [planning] singularity · σ_max of the flange's Jacobian over the reach
         least = self.config.planning.singularity
         if least == 0.0 or not len(q):
@@ -80,7 +82,7 @@ class Space(Feasibility):
         """Return (N,) which states pass all of some reasons under a load; cheap ones first."""
         return super().allowed(q, load, kinds)
 
-    def clear(self, q: Floats) -> Bools:
+    def collision_free(self, q: Floats) -> Bools:
         """Return (N,) which states pass the geometric reasons under every load."""
         geometry = tuple(r for r in REASONS if r not in ("torque", "payload", "force sensor"))
         good = self.allowed(q, UNLOADED, geometry)
@@ -88,11 +90,11 @@ class Space(Feasibility):
             good[good] = self.allowed(q[good], load, ("sight", "hanging"))
         return good
 
-    def begins(self, q: Floats, loads: Iterable[str]) -> bool:
+    def can_start(self, q: Floats, loads: Iterable[str]) -> bool:
         """Return whether a run may begin and read again at a state (n,) under some loads."""
         away = beside(q, self.cell.arm, self.config.limits.joint_margin_rad)[None]
         return all(
-            self.allowed(away, load, STATE).all() and self.passable(q, away, load).all()
+            self.allowed(away, load, STATE_CHECKS).all() and self.passable(q, away, load).all()
             for load in loads
         )
 
@@ -115,13 +117,13 @@ class DrawnPoses:
     remarks: tuple[str, ...]  # for people
 
 
-def draw(
-    space: Space,
+def draw_poses(
+    space: FeasibleSpace,
     count: int,  # poses at most
     rng: np.random.Generator,  # shift of the sequence
     *,
-    least: int = 1,  # poses at least
-    most: int | None = None,  # states drawn at most; by default many times `count`
+    min_poses: int = 1,  # poses at least
+    max_states: int | None = None,  # states drawn at most; by default many times `count`
 ) -> DrawnPoses:
     """Return poses from a Sobol sequence over the joint space, shifted at random modulo 1."""
     low, high = space.low, space.high
@@ -136,13 +138,13 @@ def draw(
     remaining, lost = dict.fromkeys(REASONS, 0), dict[str, Floats]()
     parts = [np.empty((0, len(low)))]
     drawn = have = 0
-    most = max(_MOST[0], _MOST[1] * count) if most is None else most
-    while have < count and drawn < (most if have else _VAIN):
+    max_states = max(_MOST[0], _MOST[1] * count) if max_states is None else max_states
+    while have < count and drawn < (max_states if have else _VAIN):
         u = (sequence.random(_CHUNK) + shift) % 1.0
         q = space.cell.arm.complete(low + u * (high - low))
         for reason in REASONS:
             if len(q):
-                passes = space.keeps(reason, q, UNLOADED)
+                passes = space.passes(reason, q, UNLOADED)
                 if not passes.all():
                     lost[reason] = q[~passes][:_LOOK]
                 q = q[passes]
@@ -150,8 +152,8 @@ def draw(
         parts.append(q)
         drawn += _CHUNK
         have += len(q)
-    if have < least:
-        raise CannotAnswerError(_too_few(space, drawn, remaining, lost, least))
+    if have < min_poses:
+        raise CannotAnswerError(_too_few(space, drawn, remaining, lost, min_poses))
     q = np.vstack(parts)[:count]
     allowed = np.ones((len(q), len(space.loads)), dtype=np.bool_)
     remarks = [*space.remarks]
@@ -167,7 +169,7 @@ def draw(
 
 
 def _too_few(
-    space: Space, drawn: int, remaining: dict[str, int], lost: dict[str, Floats], least: int
+    space: FeasibleSpace, drawn: int, remaining: dict[str, int], lost: dict[str, Floats], least: int
 ) -> str:
     """Return a message: the first reason that leaves no state, else the one that rejects most."""
     counts = list(remaining.values())
@@ -185,12 +187,14 @@ def _too_few(
     return f"{head}: of {drawn:,} drawn states {', '.join(phrases)} ({why})"
 
 
-def _touching(space: Space, reason: str, lost: dict[str, Floats]) -> str:
+def _touching(space: FeasibleSpace, reason: str, lost: dict[str, Floats]) -> str:
     """Name the bodies that touch in most of the rejected states, and the keys to look at."""
     if reason not in _OF_PAIRS or reason not in lost:
         return ""
     met = Counter(
-        finding.of for q in lost[reason] for finding in space.findings(q[None], UNLOADED, (reason,))
+        finding.subject
+        for q in lost[reason]
+        for finding in space.findings(q[None], UNLOADED, (reason,))
     )
     if not met:
         return ""
@@ -198,13 +202,13 @@ def _touching(space: Space, reason: str, lost: dict[str, Floats]) -> str:
     return f"{pair} touch in {100 * count // len(lost[reason])} % of the others; look at {look}"
 
 
-def _unusable(space: Space, q: Floats, load: str) -> str:
+def _unusable(space: FeasibleSpace, q: Floats, load: str) -> str:
     if (heavy := space.unbearable(load).get("payload")) is not None:
         return heavy
     phrases = []
     count = len(q)
     for reason in _OF_LOADS:
-        q = q[space.keeps(reason, q, load)]
+        q = q[space.passes(reason, q, load)]
         if len(q) < count:
             phrases.append(f"{len(q):,} {REASONS[reason][0]}")
         if not len(q):

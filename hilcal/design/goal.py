@@ -9,8 +9,8 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.design.feasible import Space
-from hilcal.design.nominal_model import after, nominal_model, planned_effects
+from hilcal.design.feasible import FeasibleSpace
+from hilcal.design.nominal_model import model_after, nominal_model, planned_effects
 from hilcal.design.predicted import positions_of, prediction_poses, rms
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.joint_compliance import JointCompliance
@@ -43,7 +43,7 @@ class Goal:
     """Standard uncertainties to be reached."""
 
     text: str  # as the user wrote it
-    what: str  # "position" or "deflection", or a parameter or an effect by name
+    quantity: str  # "position" or "deflection", or a parameter or an effect by name
     limit: float  # largest standard uncertainty: a share of the value, or SI
     relative: bool  # whether it is a share of the parameter's value
     unit: str  # SI unit of the limit; "" for a share
@@ -51,16 +51,16 @@ class Goal:
     @property
     def of_position(self) -> bool:
         """Whether the goal is about predictions where the robot will work, not about parameters."""
-        return self.what in POSITIONS
+        return self.quantity in POSITIONS
 
     def names(self, parameters: Iterable[str]) -> tuple[str, ...]:
         """Return the parameters that the goal is about, out of `parameters`."""
         parameters = tuple(parameters)
-        names = tuple(n for n in parameters if self.what in (n, n.split(".")[0]))
+        names = tuple(n for n in parameters if self.quantity in (n, n.split(".")[0]))
         if not names:
             effects = dict.fromkeys(name.split(".")[0] for name in parameters)
             raise InputError(
-                f'goal "{self.text}": {self.what} is not in the model; valid: position, '
+                f'goal "{self.text}": {self.quantity} is not in the model; valid: position, '
                 f"{', '.join(effects)}, or one parameter, e.g. {next(iter(parameters), 'none')}"
             )
         return names
@@ -73,7 +73,7 @@ class Goal:
                     f'goal "{self.text}": {name} is in {units[name]}; give that unit, or %'
                 )
 
-    def met(
+    def status(
         self,
         stds: Mapping[str, float],  # of each parameter, SI; infinite where not identifiable
         values: Mapping[str, float],
@@ -88,8 +88,8 @@ class Goal:
                     "work_min_m and work_max_m"
                 )
             ratio = _ratio(float(position), self.limit)
-            quantity = f"standard uncertainty (rms) of the predicted {predicted or self.what}"
-            return self._status(ratio, self.what, float(position), "m", quantity)
+            quantity = f"standard uncertainty (rms) of the predicted {predicted or self.quantity}"
+            return self._status(ratio, self.quantity, float(position), "m", quantity)
         status, worst = GoalStatus(self.text, True), -1.0
         for name in self.names(stds):
             std = float(stds[name])
@@ -137,7 +137,7 @@ def parse_goal(text: str) -> Goal:
     return Goal(text, quantity, number, False, unit)
 
 
-def figures(fit: Fit) -> tuple[dict[str, float], dict[str, float]]:
+def stds_and_values(fit: Fit) -> tuple[dict[str, float], dict[str, float]]:
     """Return the standard uncertainties and values of a fit's parameters by name, SI."""
     names = [f"{e.name}.{p.name}" for e in fit.model.effects for p in e.parameters]
     stds = {n: float(s) for n, s in zip(names, fit.uncertainty.std, strict=True)}
@@ -158,7 +158,7 @@ def _wrong(text: str, why: str) -> InputError:
     return InputError(f'goal "{text}": {why}; valid: {", ".join(FORMS)}')
 
 
-SHARE = 0.1  # of the time, for fits while measuring, at most
+FIT_TIME_SHARE = 0.1  # of the time, for fits while measuring, at most
 
 
 class GoalRule:
@@ -167,7 +167,7 @@ class GoalRule:
     The goal is met if the fit converged and the readings determine the goal's quantity. Where the
     residual exceeds the noise, the stated uncertainty is itself an estimate, and one of many checks
     finds it small by chance: then two consecutive fits have to meet the goal, except at the plan's
-    end. Fits take at most a share `SHARE` of the time.
+    end. Fits take at most a share `FIT_TIME_SHARE` of the time.
     """
 
     def __init__(
@@ -189,27 +189,27 @@ class GoalRule:
         self._work_q: tuple[tuple[float, ...], ...] = ()
         self._predicted = ""
         if self.goal.of_position:
-            shown = "position" if config.fitted == "absolute" else "deflection"
-            if self.goal.what != shown:
+            shown = "position" if config.readings_mode == "absolute" else "deflection"
+            if self.goal.quantity != shown:
                 raise InputError(
-                    f'goal "{text}": [planning] readings = "{config.fitted}", which show the '
-                    f"{shown}; valid: {shown}"
+                    f'goal "{text}": [planning] readings = "{config.readings_mode}", which show '
+                    f"the {shown}; valid: {shown}"
                 )
             planning = config.planning
             if not planning.work_q_rad and planning.work_min_m is None:
-                self.goal.met({}, {})  # raises: names the missing keys
+                self.goal.status({}, {})  # raises: names the missing keys
             work = prediction_poses(
-                model, config, np.zeros((0, cell.arm.n)), Space(cell, config).clear
+                model, config, np.zeros((0, cell.arm.n)), FeasibleSpace(cell, config).collision_free
             )
             self._work_q = tuple(dict.fromkeys(tuple(q) for q in work.q.tolist()))
-            self._predicted = work.what
+            self._predicted = work.description
         self._good = False  # whether the last fit met the goal
         self._ended = self._took = -np.inf
 
     def __call__(self, readings: Readings, last: bool) -> GoalStatus:
         """Return the status of the goal, see `measuring.stopping_rule.StoppingRule`."""
         start = self._now()
-        if last or (start - self._ended >= self._took / SHARE and self._news(readings)):
+        if last or (start - self._ended >= self._took / FIT_TIME_SHARE and self._news(readings)):
             try:
                 status, fitted = self._fit(readings)
                 good = status.met and fitted.solution.converged
@@ -242,11 +242,11 @@ class GoalRule:
         effects = planned_effects(self._config, self._catalogue)
         model = with_effects(self._cell, readings, mode, effects, effects, self._catalogue)
         fitted = fit(model, readings, mode)
-        std, value = figures(fitted)
+        std, value = stds_and_values(fitted)
         held = dict(zip(std, fitted.solution.prior == 0, strict=True))
         std = {name: s for name, s in std.items() if not held[name]}
         position = self._position(fitted) if self._work_q else None
-        status = self.goal.met(std, value, position, self._predicted)
+        status = self.goal.status(std, value, position, self._predicted)
         return replace(status, model=fitted.model.named, fitted=fitted.mode), fitted
 
     def _position(self, fitted: Fit) -> float:
@@ -263,7 +263,7 @@ class GoalRule:
         where = {"work_q_rad": self._work_q, "work_min_m": None, "work_max_m": None}
         planning = self._config.planning.model_copy(update=where)
         config = self._config.model_copy(update={"planning": planning})
-        model = after(fitted, config)
+        model = model_after(fitted, config)
         work = prediction_poses(model, config, np.zeros((0, self._cell.arm.n)))
         solution, u = fitted.solution, fitted.uncertainty
         basis, scale = solution.equations.basis, scales_of(fitted.model)

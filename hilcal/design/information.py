@@ -17,7 +17,7 @@ from hilcal.config import CellConfig
 from hilcal.design.criterion import CandidateSet
 from hilcal.design.nominal_model import (
     NominalModel,
-    build,
+    build_effect,
     expected_std,
     nominal_states,
     potential_names,
@@ -210,7 +210,7 @@ class DesignProblem:
     mode: Mode  # "deflection" or "absolute"
     candidates: Candidates
     units: CandidateSet  # K units; parameters of the model first, then potential terms
-    what: tuple[tuple[int, tuple[str, ...]], ...]  # pose and loads per unit; "none" is unloaded
+    contents: tuple[tuple[int, tuple[str, ...]], ...]  # pose and loads per unit; "none" is unloaded
     terms: tuple[DesignTerm, ...]
     families: tuple[Effect, ...]  # effects of the potential terms
     prior: Floats  # (P, P) information of priors and of the readings so far
@@ -280,7 +280,7 @@ def problem(
     cost = np.array([float(len(readings_of(unit, mode))) for unit in contents])
     return DesignProblem(
         nominal=nominal, mode=mode, candidates=candidates, units=CandidateSet(rows, cost),
-        what=contents, terms=terms, families=families, prior=measured + np.diag(precision),
+        contents=contents, terms=terms, families=families, prior=measured + np.diag(precision),
         measured=measured, notes=(*nominal.notes, *notes, *layout_notes),
     )  # fmt: skip
 
@@ -391,7 +391,7 @@ def potential(
         return (), np.zeros(0), ()
     names = potential_names(config, nominal.model)
     catalogue = nominal.model.catalogue
-    families = tuple(build(catalogue, name, nominal.cell, nominal.m) for name in names)
+    families = tuple(build_effect(catalogue, name, nominal.cell, nominal.m) for name in names)
     std = expected_std(nominal.model, families)
     strength = _strengths(nominal, config, candidates, families, std)
     chosen: list[int] = []

@@ -28,7 +28,7 @@ from hilcal.config import CellConfig
 from hilcal.design.criteria import MeanVariance
 from hilcal.design.criterion import CandidateSet, Objective, inverse_factor
 from hilcal.design.information import DesignProblem, information_of, reading_derivatives, unit_rows
-from hilcal.design.nominal_model import NominalModel, build, expected_std, potential_names
+from hilcal.design.nominal_model import NominalModel, build_effect, expected_std, potential_names
 from hilcal.design.predicted import PredictionPoses, position_derivative
 from hilcal.effects.protocol import Effect
 from hilcal.identification.mixed_fit import HARMONICS, SCATTER_RAD
@@ -55,7 +55,7 @@ def mixed_design(problem: DesignProblem, config: CellConfig, work: PredictionPos
         """Yield rows of the units of every `step`-th pose, with the columns of all effects."""
         poses = problem.candidates[slice(None, None, step)]
         parts = reading_derivatives(nominal, config, poses, effects, scale)
-        return unit_rows(parts, problem.candidates.loads, problem.what, problem.mode, step)
+        return unit_rows(parts, problem.candidates.loads, problem.contents, problem.mode, step)
 
     sample = all_rows(max(1, len(problem.candidates) // SAMPLE))
     coordinates = _coordinates(information, flat, sample)
@@ -106,7 +106,7 @@ def other_effects(nominal: NominalModel, config: CellConfig) -> tuple[tuple[Effe
     periodic = [name for name in names if "harmonics" in catalogue[name].option_help]
     finest = {name: {"harmonics": HARMONICS} for name in periodic}
     cell, m = nominal.cell, nominal.m
-    effects = tuple(build(catalogue, name, cell, m, finest.get(name, {})) for name in names)
+    effects = tuple(build_effect(catalogue, name, cell, m, finest.get(name, {})) for name in names)
     return effects, expected_std(model, effects)
 
 

@@ -16,10 +16,10 @@ from hilcal.design.discriminated_pairs import (
     power,
     supported_parameters,
 )
-from hilcal.design.feasible import Space
+from hilcal.design.feasible import FeasibleSpace
 from hilcal.design.information import DesignProblem, readings_of
-from hilcal.design.planner import Planned, Request, Say, make, ordered
-from hilcal.design.predicted import predicted
+from hilcal.design.planner import Planned, PlanRequest, Say, order_readings, plan_readings
+from hilcal.design.predicted import predicted_uncertainty
 from hilcal.design.run_order import Ordering
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit
@@ -31,7 +31,7 @@ from hilcal.types import Floats, Ints
 
 CANDIDATES = 600  # poses to choose from, at most; a choice: more hardly raise the power
 DRAWS = 24  # parameter vectors of each suspect over which power is averaged; a choice
-SURE = 0.9  # power from which two suspects count as separated; a choice
+SEPARATED_POWER = 0.9  # power from which two suspects count as separated; a choice
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,13 +40,13 @@ class PairPower:
 
     effect: str  # present
     rival: str  # fitted in its place
-    now: float  # probability that the readings so far reject the rival, by a test at 1 %
-    then: float  # the same with the planned readings
+    power_now: float  # probability that the readings so far reject the rival, by a test at 1 %
+    power_planned: float  # the same with the planned readings
     not_separable: bool  # neither the planned readings nor `MANY` others reach `LEAST_POWER`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Next:
+class SeparatingPlan:
     """The measurements that separate suspects."""
 
     planned: Planned
@@ -58,16 +58,16 @@ class Next:
     notes: tuple[str, ...]  # on omitted effects and pairs, one line each
 
 
-def measure_next(
+def plan_separating(
     cell: Cell,
     config: CellConfig,
     fit: Fit,  # of the readings so far, with scaling gc and without the suspects
     suspects: Sequence[str],  # two effects or more
-    request: Request,  # readings, or poses under every load
+    request: PlanRequest,  # readings, or poses under every load
     rng: np.random.Generator,
     say: Say = lambda _: None,
     reference: Floats | None = None,  # (n,) reference pose of the campaign, rad; else a new one
-) -> Next:
+) -> SeparatingPlan:
     """Plan the measurements that separate suspects.
 
     The criterion is the least non-centrality over all their pairs; see `discriminated_pairs`.
@@ -82,7 +82,7 @@ def measure_next(
     readings = request.readings or request.poses * (1 + len(config.loads))
     asked = replace(request, criterion="separate", readings=readings)
     try:
-        planned = make(cell, config, asked, rng, fit, say)
+        planned = plan_readings(cell, config, asked, rng, fit, say)
     except InputError as error:
         if "effects to tell apart" not in str(error):
             raise
@@ -91,7 +91,7 @@ def measure_next(
     if reference is not None and not np.array_equal(reference, planned.ordered.plan.q[0]):
         planned = _from_reference(cell, config, planned, reference, rng, request)
     say("predicting the powers")
-    pairs = planned.asked.apart
+    pairs = planned.objective.discriminated_pairs
     assert pairs is not None  # noqa: S101  (by the criterion)
     information = pairs.prior + planned.problem.units.information(planned.counts)
     powers = tuple(_pair_powers(planned.problem, pairs, names, information))
@@ -103,10 +103,10 @@ def measure_next(
         notes = (*notes, not_ruled_out(never))
     weakest = min(pairs.pairs, key=lambda pair: power(pair, information))
     shares, reach_ratio = _where(planned, weakest, information)
-    return Next(planned, powers, shares, reach_ratio, notes)
+    return SeparatingPlan(planned, powers, shares, reach_ratio, notes)
 
 
-def expected(
+def expected_power(
     problem: DesignProblem, names: tuple[str, str], betas: Sequence[Floats], information: Floats
 ) -> float:
     """Return the power of a pair (effect, rival), averaged over parameters β (E,) of the effect."""
@@ -132,25 +132,27 @@ def _pair_powers(
             if e not in observable:
                 yield PairPower(e, f, LEVEL, LEVEL, True)
                 continue
-            now = expected(problem, (e, f), betas, pairs.prior)
-            planned = expected(problem, (e, f), betas, information)
+            now = expected_power(problem, (e, f), betas, pairs.prior)
+            planned = expected_power(problem, (e, f), betas, information)
             never = (e, f) in pairs.not_separable and planned < LEAST_POWER
             yield PairPower(e, f, now, planned, never)
 
 
 def _from_reference(
     cell: Cell, config: CellConfig, planned: Planned, reference: Floats, rng: np.random.Generator,
-    request: Request,
+    request: PlanRequest,
 ) -> Planned:  # fmt: skip
     """Return the plan ordered from another reference pose, without poses unreachable from it."""
-    space, problem = Space(cell, config), planned.problem
+    space, problem = FeasibleSpace(cell, config), planned.problem
     counts = planned.counts.astype(np.int64)
     for load in problem.candidates.loads:
         units = [
-            k for k in np.flatnonzero(counts) if load in readings_of(problem.what[k], problem.mode)
+            k
+            for k in np.flatnonzero(counts)
+            if load in readings_of(problem.contents[k], problem.mode)
         ]
         if units:
-            q = problem.candidates.q[[problem.what[k][0] for k in units]]
+            q = problem.candidates.q[[problem.contents[k][0] for k in units]]
             counts[np.array(units)[~space.passable(reference, q, load)]] = 0
     if not counts.any():
         raise CannotAnswerError(
@@ -160,11 +162,11 @@ def _from_reference(
     steps = planned.ordered.plan.steps
     repeats = sum(s.load == UNLOADED and s.cycle > 0 and s.pose != REFERENCE for s in steps)
     ordering = Ordering(unloaded=request.unloaded, repeats=repeats)
-    return reordered(space, planned, counts, reference, rng, ordering)
+    return with_reference(space, planned, counts, reference, rng, ordering)
 
 
-def reordered(
-    space: Space,
+def with_reference(
+    space: FeasibleSpace,
     planned: Planned,
     counts: Ints,  # (K,) of units
     reference: Floats,  # (n,) reference pose, from which all units are reachable, rad
@@ -172,19 +174,19 @@ def reordered(
     ordering: Ordering,
 ) -> Planned:
     """Return a plan with other counts of its units, ordered anew."""
-    problem, usable, objective = planned.problem, np.flatnonzero(planned.usable), planned.asked
+    problem, usable, objective = planned.problem, np.flatnonzero(planned.usable), planned.objective
     information = objective.prior + objective.units.information(counts.astype(float))
     value, cost = float(objective.criterion.value(information)), counts @ problem.units.cost
     design = replace(planned.design, counts=counts[usable], value=value, information=information)
-    order = ordered(space, problem, reference, counts, rng, ordering)
-    precision = predicted(problem, counts.astype(float), work=planned.work)
+    order = order_readings(space, problem, reference, counts, rng, ordering)
+    precision = predicted_uncertainty(problem, counts.astype(float), work=planned.work)
     return replace(
         planned, ordered=order, design=replace(design, cost=float(cost)), predicted=precision
     )
 
 
 def _where(planned: Planned, pair: Pair, information: Floats) -> tuple[dict[str, float], float]:
-    """Return the loads' shares in uᵀ M u of a pair, and the reach ratio (see `Next`)."""
+    """Return the loads' shares in uᵀ M u of a pair, and the reach ratio (see `SeparatingPlan`)."""
     problem, u = planned.problem, pair.residual(information)
     units = np.flatnonzero(planned.counts)
     parts = np.array([float(np.sum((problem.units.rows[k] @ u) ** 2)) for k in units])
@@ -192,7 +194,7 @@ def _where(planned: Planned, pair: Pair, information: Floats) -> tuple[dict[str,
     total = max(float(parts.sum()), 1e-300)
     shares: dict[str, float] = {}
     for k, part in zip(units, parts, strict=True):
-        loads = problem.what[k][1]
+        loads = problem.contents[k][1]
         m = problem.nominal.elements
         rows = problem.units.rows[k][: m * len(loads)] @ u
         squares = np.sum(rows.reshape(len(loads), m) ** 2, axis=1)
@@ -203,7 +205,7 @@ def _where(planned: Planned, pair: Pair, information: Floats) -> tuple[dict[str,
     arm, cell = problem.nominal.cell.arm, problem.nominal.cell
     targets = evaluate(arm, problem.candidates.q).point(cell.target[:3, 3])
     reaches = np.linalg.norm(targets[:, :2], axis=1)
-    poses = np.array([problem.what[k][0] for k in units])
+    poses = np.array([problem.contents[k][0] for k in units])
     reach = float(reaches[poses] @ parts) / total
     return shares, reach / float(np.mean(reaches))
 
@@ -214,7 +216,7 @@ LEAST = 60  # candidates at least, so that a reference is found; a choice
 REPEATED = 10  # one pose in so many is visited twice, for the arm's repeatability; a choice
 
 
-def measure_poses(
+def plan_poses(
     cell: Cell,
     config: CellConfig,
     fit: Fit,  # of the absolute readings so far
@@ -232,13 +234,13 @@ def measure_poses(
     count = max(SPARE * poses, LEAST)
     planning = config.planning.model_copy(update={"readings": fit.mode, "candidates": count})
     config = config.model_copy(update={"loads": [], "planning": planning})
-    request = Request(poses, readings=poses, criterion=CRITERION, effort=0)
-    planned = make(cell, config, request, rng, fit, say)
+    request = PlanRequest(poses, readings=poses, criterion=CRITERION, effort=0)
+    planned = plan_readings(cell, config, request, rng, fit, say)
     say("spreading the poses")
-    problem, space = planned.problem, Space(cell, config)
+    problem, space = planned.problem, FeasibleSpace(cell, config)
     home = planned.ordered.plan.q[0] if reference is None else reference
     usable = np.flatnonzero(planned.usable)
-    q = problem.candidates.q[[problem.what[k][0] for k in usable]]
+    q = problem.candidates.q[[problem.contents[k][0] for k in usable]]
     chosen = usable[space.passable(home, q, UNLOADED)][:poses]
     if not len(chosen):
         raise CannotAnswerError(
@@ -247,4 +249,4 @@ def measure_poses(
     counts = np.zeros(len(planned.usable), dtype=np.int64)
     counts[chosen] = 1
     ordering = Ordering(repeats=max(2, len(chosen) // REPEATED))
-    return reordered(space, planned, counts, home, rng, ordering)
+    return with_reference(space, planned, counts, home, rng, ordering)

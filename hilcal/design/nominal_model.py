@@ -106,7 +106,7 @@ def nominal_model(
     chosen |= {name: o for name, o in of_prior.items() if name not in chosen}
     if config.planning.readings == "deflection":
         chosen |= {name: {**FRAME_PRIOR, **chosen[name]} for name in frames}
-    effects = tuple(build(catalogue, name, registered, m, o) for name, o in chosen.items())
+    effects = tuple(build_effect(catalogue, name, registered, m, o) for name, o in chosen.items())
     model = Model(registered, effects, catalogue, prior=prior)
     parts = [(e.role == "baseline") * np.array([p.scale for p in e.parameters]) for e in effects]
     notes += random_columns(effects)
@@ -132,7 +132,7 @@ def _effects_of_prior(
     for e in prior.posterior.effects:
         if catalogue[e.name].computable(plain):
             options = dict(e.options)
-            if build(catalogue, e.name, cell, m, options).groups() is None:
+            if build_effect(catalogue, e.name, cell, m, options).groups() is None:
                 included[e.name] = options
     return included
 
@@ -150,7 +150,7 @@ def carried_information(model: Model, live: Ints) -> Floats | None:
     return information[np.ix_(live, live)]
 
 
-def after(fit: Fit, config: CellConfig) -> NominalModel:
+def model_after(fit: Fit, config: CellConfig) -> NominalModel:
     """Return the nominal model of further readings, from the fit of the readings so far."""
     if fit.scaling != "gc":
         raise InputError(f"planning on needs a fit with scaling gc, this one has {fit.scaling}")
@@ -167,7 +167,7 @@ def after(fit: Fit, config: CellConfig) -> NominalModel:
     return NominalModel(fit.model, fit.theta, live, std, station, m, fit, notes, carried)
 
 
-def build(
+def build_effect(
     catalogue: Catalogue, name: str, cell: Cell, m: int, options: Options | None = None
 ) -> Effect:
     """Make an effect for a plan, from a first and a last reading in one pose."""

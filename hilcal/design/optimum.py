@@ -31,12 +31,12 @@ class Design:
         return min(1.0, self.value / self.bound)
 
 
-def best(
+def best_design(
     objective: Objective,
     budget: float,  # B, in the units of the cost
     rng: np.random.Generator | None = None,  # the only source of randomness
     *,
-    most: int | None = None,  # largest count of a unit; unlimited by default
+    max_count: int | None = None,  # largest count of a unit; unlimited by default
     effort: int | None = None,  # units put into plans until the search ends; `EFFORT` by default
     relaxed: ApproximateDesign | None = None,  # the continuous optimum, or a start near it
 ) -> Design:
@@ -51,10 +51,10 @@ def best(
     units, criterion = objective.units, objective.criterion
     tolerance = KINKED_TOLERANCE if criterion.kinked else TOLERANCE
     if relaxed is None or relaxed.gap > tolerance:
-        relaxed = relax(objective, budget, most=most, tolerance=tolerance, start=relaxed)
+        relaxed = relax(objective, budget, max_weight=max_count, tolerance=tolerance, start=relaxed)
     objective = checked(objective, budget)
     relevant = criterion.relevant(units, objective.prior, budget)
-    search = _Search(replace(objective, criterion=relevant), budget, relaxed, most)
+    search = _Search(replace(objective, criterion=relevant), budget, relaxed, max_count)
     usual, enough = (KINKED_EFFORT, KINKED_ENOUGH) if relevant.kinked else (EFFORT, ENOUGH)
     counts = search.counts(rng, usual if effort is None else effort, relaxed.bound, enough)
     used = np.flatnonzero(counts)
@@ -101,7 +101,7 @@ class _Search:
     """The search for a plan in a pool: the units of positive weight or of the best prices."""
 
     def __init__(
-        self, objective: Objective, budget: float, relaxed: ApproximateDesign, most: int | None
+        self, objective: Objective, budget: float, relaxed: ApproximateDesign, max_count: int | None
     ) -> None:
         units, prior = objective.units, objective.prior
         most_of_one = budget / float(units.cost.min())
@@ -114,7 +114,7 @@ class _Search:
         self.of_pool = objective.among(index)
         self.count, self.index, self.ideal_weight = len(units), index, weight[index]
         self.pool = self.of_pool.units
-        self.most = int(np.floor(most_of_one * (1 + _SLACK))) if most is None else most
+        self.most = int(np.floor(most_of_one * (1 + _SLACK))) if max_count is None else max_count
         spent = float(units.cost[relaxed.index] @ relaxed.weight)
         # information per cost of the continuous optimum, without M0
         self.ideal = (relaxed.information - prior) / max(spent, _SLACK * budget)

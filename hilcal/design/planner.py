@@ -12,17 +12,17 @@ from hilcal.config import CellConfig
 from hilcal.design import choice
 from hilcal.design.approximate_design import ApproximateDesign
 from hilcal.design.criterion import CandidateSet, Objective
-from hilcal.design.feasible import DrawnPoses, Space, draw
+from hilcal.design.feasible import DrawnPoses, FeasibleSpace, draw_poses
 from hilcal.design.information import DesignProblem, problem, reading_covariance, readings_of
-from hilcal.design.nominal_model import after, nominal_model
-from hilcal.design.optimum import Design, best
+from hilcal.design.nominal_model import model_after, nominal_model
+from hilcal.design.optimum import Design, best_design
 from hilcal.design.predicted import (
     PredictedUncertainty,
     PredictionPoses,
-    predicted,
+    predicted_uncertainty,
     prediction_poses,
 )
-from hilcal.design.run_order import Chosen, Ordered, Ordering, order_plan
+from hilcal.design.run_order import Ordered, Ordering, PoseReadings, order_plan
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.per_joint import PerJoint
 from hilcal.errors import CannotAnswerError, InputError
@@ -132,7 +132,7 @@ Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class PlanRequest:
     """Size and criterion of a plan."""
 
     poses: int = 20  # each read once unloaded and under every load that it bears
@@ -150,10 +150,10 @@ class Planned:
     design: Design  # counts of the usable units, with the certificate
     costly: tuple[tuple[str, float], ...]  # loads not worth their change, with the gain
     problem: DesignProblem
-    asked: Objective  # the design problem with its criterion
+    objective: Objective  # the design problem with its criterion
     usable: Bools  # (K,) units to choose from
     work: PredictionPoses
-    drawn: DrawnPoses
+    candidates: DrawnPoses
     budget: float  # readings of the design
     criterion: str
     predicted: PredictedUncertainty  # of a fit to the readings
@@ -168,33 +168,33 @@ class Planned:
         return out
 
 
-def make(
+def plan_readings(
     cell: Cell,
     config: CellConfig,  # limits, loads, noise and `[planning]`
-    request: Request,
+    request: PlanRequest,
     rng: np.random.Generator,
-    known: Fit | None = None,  # of the readings so far
+    fit: Fit | None = None,  # of the readings so far
     say: Say = lambda _: None,
-    catalogue: Catalogue | None = None,  # by default that of `known`, or the installed effects
-    prior: CarriedPrior | None = None,  # of another campaign, without `known`
+    catalogue: Catalogue | None = None,  # by default that of `fit`, or the installed effects
+    prior: CarriedPrior | None = None,  # of another campaign, without `fit`
     reference: Floats | None = None,  # (n,) reference pose of the campaign, rad; else a new one
 ) -> Planned:
     """Return a plan of a cell."""
     usual = "I" if config.planning.readings == "absolute" else "D"
-    criterion = choice.canonical(request.criterion or config.planning.criterion or usual)
+    criterion = choice.criterion_name(request.criterion or config.planning.criterion or usual)
     say("drawing candidate poses")
-    space, home = Space(cell, config), reference
-    drawn = draw(space, config.planning.candidates, rng, least=2)
+    space, home = FeasibleSpace(cell, config), reference
+    drawn = draw_poses(space, config.planning.candidates, rng, min_poses=2)
     if home is None:
         home, poses = _reference(space, drawn, rng)
         drawn = replace(drawn, q=drawn.q[poses], allowed=drawn.allowed[poses])
     say("computing the information of each pose")
-    if known is None:
+    if fit is None:
         model = nominal_model(cell, config, 3, catalogue, prior)
     else:
-        model = after(known, config)
+        model = model_after(fit, config)
     reduced, undetermined = without_undetermined(problem(model, config, drawn.q, drawn.allowed))
-    work = prediction_poses(reduced.nominal, config, drawn.q, space.clear)
+    work = prediction_poses(reduced.nominal, config, drawn.q, space.collision_free)
     by_poses = request.readings is None
     count, unit = (request.poses, "poses") if by_poses else (request.readings or 0, "readings")
     if count < 1:
@@ -207,8 +207,8 @@ def make(
         change = config.planning.load_change_s / seconds_at_rest(config)
         costly = choice.costly_loads(objective, reduced, budget, change, rng)
     say(f"choosing poses by criterion {criterion}")
-    pose_of = np.array([pose for pose, _ in reduced.what])
-    first, relaxed = choice.promising(objective, budget)
+    pose_of = np.array([pose for pose, _ in reduced.contents])
+    first, relaxed = choice.promising_units(objective, budget)
     usable = ~np.isin(pose_of, _unreachable(space, reduced, home, first))
     candidates = choice.pose_units(objective, reduced) if by_poses else None
     reached: set[int] = set()
@@ -224,7 +224,7 @@ def make(
         else:
             start = relaxed.among(usable)
             asked = objective.among(usable)
-            design = best(asked, budget, rng, effort=request.effort, relaxed=start)
+            design = best_design(asked, budget, rng, effort=request.effort, relaxed=start)
             counts = np.zeros(len(usable), dtype=np.int64)
             counts[usable] = design.counts
         units = np.flatnonzero(counts)
@@ -232,16 +232,16 @@ def make(
         if not len(unreachable):
             break
         usable &= ~np.isin(pose_of, unreachable)
-        reached |= {reduced.what[k][0] for k in units} - set(unreachable.tolist())
+        reached |= {reduced.contents[k][0] for k in units} - set(unreachable.tolist())
     else:
         raise CannotAnswerError(
             f"after {ROUNDS} rounds there are still poses that no clear straight motion from the "
             "reference pose reaches; widen the workspace"
         )
     if by_poses:
-        design = choice.certified(objective, counts, usable, relaxed)
-    visited = len({reduced.what[k][0] for k in units}) + 1
-    if not cell.registration_known and known is None and visited < MIN_POSES:
+        design = choice.certified_design(objective, counts, usable, relaxed)
+    visited = len({reduced.contents[k][0] for k in units}) + 1
+    if not cell.registration_known and fit is None and visited < MIN_POSES:
         raise CannotAnswerError(
             f"the plan has {visited} poses, the reference among them; an unknown registration "
             f"needs at least {MIN_POSES}: ask for more {unit}"
@@ -252,15 +252,17 @@ def make(
     covariance = reading_covariance(nominal, config, nominal.model.predict(sampled, nominal.theta))
     std = float(np.sqrt(np.mean(np.diagonal(covariance[:, :3, :3], axis1=1, axis2=2))))
     ordering = Ordering(unloaded=request.unloaded, repeats=repeats, reading_std=std)
-    order = ordered(space, reduced, home, counts, rng, ordering)
-    precision = predicted(reduced, counts.astype(float), work=work)
+    order = order_readings(space, reduced, home, counts, rng, ordering)
+    precision = predicted_uncertainty(reduced, counts.astype(float), work=work)
     return Planned(
         order, design, costly, reduced, objective, usable, work, drawn, budget, criterion,
         precision, undetermined, request.poses if by_poses else None,
     )  # fmt: skip
 
 
-def _reference(space: Space, drawn: DrawnPoses, rng: np.random.Generator) -> tuple[Floats, Ints]:
+def _reference(
+    space: FeasibleSpace, drawn: DrawnPoses, rng: np.random.Generator
+) -> tuple[Floats, Ints]:
     """Return the reference (n,), which bears every load, and the indices of the other poses.
 
     It is the one of several central poses from which most poses are reachable.
@@ -275,7 +277,7 @@ def _reference(space: Space, drawn: DrawnPoses, rng: np.random.Generator) -> tup
     q = drawn.q[bears]
     nearest = bears[np.argsort(np.linalg.norm(q - np.median(drawn.q, axis=0), axis=1))]
     usable = [name for name, used in zip(drawn.loads, useful, strict=True) if used]
-    begins = (k for k in nearest if space.begins(drawn.q[k], usable))
+    begins = (k for k in nearest if space.can_start(drawn.q[k], usable))
     central = list(islice(begins, HOMES))
     if not central:
         raise CannotAnswerError(
@@ -287,10 +289,10 @@ def _reference(space: Space, drawn: DrawnPoses, rng: np.random.Generator) -> tup
     return drawn.q[home], np.delete(np.arange(len(drawn.q)), home)
 
 
-def _unreachable(space: Space, problem: DesignProblem, home: Floats, units: Ints) -> Ints:
+def _unreachable(space: FeasibleSpace, problem: DesignProblem, home: Floats, units: Ints) -> Ints:
     """Return the poses of the units that no clear straight motion reaches from home."""
     by_load: dict[str, set[int]] = {}
-    for unit in (problem.what[k] for k in units):
+    for unit in (problem.contents[k] for k in units):
         for load in readings_of(unit, problem.mode):
             by_load.setdefault(load, set()).add(unit[0])
     unreachable: set[int] = set()
@@ -301,8 +303,8 @@ def _unreachable(space: Space, problem: DesignProblem, home: Floats, units: Ints
     return np.array(sorted(unreachable), dtype=np.int64)
 
 
-def ordered(
-    space: Space,
+def order_readings(
+    space: FeasibleSpace,
     problem: DesignProblem,
     home: Floats,  # (n,) reference pose, from which all units are reachable, rad
     counts: Ints,  # (K,) of units
@@ -310,9 +312,9 @@ def ordered(
     ordering: Ordering,
 ) -> Ordered:
     """Name the poses of the chosen units p1, p2, ..., and put their readings in order."""
-    units = [(problem.what[k], int(counts[k])) for k in np.flatnonzero(counts)]
+    units = [(problem.contents[k], int(counts[k])) for k in np.flatnonzero(counts)]
     poses = sorted({pose for (pose, _), _ in units})
     names = {pose: f"p{k}" for k, pose in enumerate(poses, start=1)}
-    chosen = [Chosen(names[u[0]], readings_of(u, problem.mode), count) for u, count in units]
+    chosen = [PoseReadings(names[u[0]], readings_of(u, problem.mode), count) for u, count in units]
     q, site = problem.candidates.q[poses], (space.cell, space.config)
     return order_plan(*site, list(names.values()), q, home, chosen, space.passable, rng, ordering)

@@ -17,11 +17,11 @@ from hilcal.robot.chain import evaluate
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Bools, Floats
 
-COUNT = 500  # poses drawn where none is named; a choice: a plan overfits 100
+N_POSES = 500  # poses drawn where none is named; a choice: a plan overfits 100
 _DRAWN = 4096
 _ROUNDS = 60
 _SEED = 20240608
-Clear = Callable[[Floats], Bools]  # which of (N, n) states are feasible
+CollisionFree = Callable[[Floats], Bools]  # which of (N, n) states are feasible
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,14 +32,14 @@ class PredictionPoses:
     wrench: Floats  # (T, 6) at the load point, base axes, N and N·m
     deflection: bool  # whether the change from the unloaded position is predicted
     derivative: Floats  # (T, 3, L) V, by the live parameters over their scales, m
-    what: str  # in words, e.g. "deflection under 5kg at 100 poses"
+    description: str  # in words, e.g. "deflection under 5kg at 100 poses"
 
 
 def prediction_poses(
     nominal: NominalModel,
     config: CellConfig,  # `[planning] work_*`, loads
     feasible: Floats,  # (N, n) feasible states to draw from, rad
-    is_clear: Clear | None = None,  # tests poses drawn in a box
+    is_clear: CollisionFree | None = None,  # tests poses drawn in a box
 ) -> PredictionPoses:
     """Return the prediction poses of `[planning]`: named, within a box, or of the candidates.
 
@@ -84,7 +84,7 @@ def position_derivative(
 
 
 def _poses(
-    nominal: NominalModel, config: CellConfig, feasible: Floats, is_clear: Clear | None
+    nominal: NominalModel, config: CellConfig, feasible: Floats, is_clear: CollisionFree | None
 ) -> tuple[Floats, str]:
     """Return prediction poses (T, n), and in words where they are."""
     planning, cell = config.planning, nominal.cell
@@ -101,7 +101,7 @@ def _poses(
     if planning.work_min_m is None or planning.work_max_m is None:
         if not len(feasible):
             raise CannotAnswerError("no feasible state to test a plan at")
-        chosen = rng.permutation(len(feasible))[:COUNT]
+        chosen = rng.permutation(len(feasible))[:N_POSES]
         return feasible[np.sort(chosen)], f"at {len(chosen)} feasible poses"
     box = np.array(planning.work_min_m), np.array(planning.work_max_m)
     inside = _inside(nominal, feasible, *box)
@@ -109,7 +109,7 @@ def _poses(
     margin = config.limits.joint_margin_rad
     low, high = low + margin, high - margin
     for _ in range(_ROUNDS if is_clear is not None else 0):
-        if len(inside) >= COUNT:
+        if len(inside) >= N_POSES:
             break
         drawn = cell.arm.complete(rng.uniform(low, high, (_DRAWN, n)))
         drawn = _inside(nominal, drawn, *box)
@@ -120,7 +120,7 @@ def _poses(
             f"no feasible pose holds the target between work_min_m = {box[0].tolist()} and "
             f"work_max_m = {box[1].tolist()}; widen the box or move it within reach"
         )
-    chosen = rng.permutation(len(inside))[:COUNT]
+    chosen = rng.permutation(len(inside))[:N_POSES]
     return inside[np.sort(chosen)], f"at {len(chosen)} poses in the work box"
 
 
@@ -150,7 +150,7 @@ class PredictedUncertainty:
         return {t.name: float(s) for t, s in zip(self.terms, self.std, strict=True)}
 
 
-def predicted(
+def predicted_uncertainty(
     problem: DesignProblem,
     counts: Floats | None = None,  # (K,) of units
     *,

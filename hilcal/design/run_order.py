@@ -182,7 +182,7 @@ _SHRINK = 0.75  # factor on the time of the walks after a draw that is too long;
 _TRIES = 10  # draws of one order that may be too long; a choice
 _MOVES = 30  # steps of a random walk per stop; a choice
 Passable = Callable[[Floats, Floats, str], Bools]  # start (n,), ends (M, n), load -> (M,)
-NEAR = 24  # neighbours with tested motions; to others by the reference; a choice
+N_NEIGHBOURS = 24  # neighbours with tested motions; to others by the reference; a choice
 _ALL = 6  # number of loads up to which every order is tried
 
 
@@ -203,12 +203,12 @@ class LoadBlock:
 
 
 @dataclass(frozen=True, slots=True)
-class Chosen:
+class PoseReadings:
     """Readings to take at a pose."""
 
     pose: str
     loads: tuple[str, ...]  # "none" for an unloaded reading
-    count: int = 1  # cycles
+    cycles: int = 1  # cycles
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,10 +252,10 @@ def order_plan(
     names: Sequence[str],  # (P) names of poses
     q: Floats,  # (P, n) their joint angles, rad
     reference: Floats,  # (n,) joint angles of the reference pose, rad
-    chosen: Sequence[Chosen],
+    chosen: Sequence[PoseReadings],
     passable: Passable,
     rng: np.random.Generator,
-    how: Ordering | None = None,
+    ordering: Ordering | None = None,
 ) -> Ordered:
     """Put chosen readings in order.
 
@@ -272,20 +272,20 @@ def order_plan(
       the least ρ (rerandomisation, Morgan & Rubin 2012, Ann. Statist. 40, 1263), which is still
       random with respect to other variables, such as temperatures.
     """
-    how = how or Ordering()
+    ordering = ordering or Ordering()
     used = [name for name in names if any(c.pose == name for c in chosen)]
     indices = np.array([names.index(name) for name in used])
-    poses, stops = np.vstack([reference, q[indices]]), stops_of(used, chosen, how.repeats, rng)
-    draws = OrderDraws(cell, config, tuple(used), poses, how, rng, stops, passable)
-    shortest = draws.plan(draws.short, half=False, mixed=False)
-    shortest_time, shortest_loss = draws.figures(shortest)
+    poses, stops = np.vstack([reference, q[indices]]), stops_of(used, chosen, ordering.repeats, rng)
+    draws = OrderDraws(cell, config, tuple(used), poses, ordering, rng, stops, passable)
+    shortest = draws.plan(draws.short_tours, half=False, mixed=False)
+    shortest_time, shortest_loss = draws.duration_and_confounding(shortest)
     best = (shortest_loss.correlation, shortest, shortest_time, shortest_loss)
-    allowance = how.slack * shortest_time.total
-    for _ in range(how.draws if how.slack > 0 else 0):
+    allowance = ordering.slack * shortest_time.total
+    for _ in range(ordering.draws if ordering.slack > 0 else 0):
         extra = allowance * rng.random()
         for _ in range(_TRIES):
             plan = draws.draw(extra)
-            time, loss = draws.figures(plan)
+            time, loss = draws.duration_and_confounding(plan)
             if time.total <= shortest_time.total + allowance:
                 if loss.correlation < best[0]:
                     best = loss.correlation, plan, time, loss
@@ -296,7 +296,7 @@ def order_plan(
         "duration_s": time.about(),
         "order": {
             **loss.about(),
-            "reference_every_s": how.reference_every_s,
+            "reference_every_s": ordering.reference_every_s,
             "shortest_s": round(shortest_time.total, 1),
             "longer": round(time.total / shortest_time.total - 1.0, 4),
             "correlation_shortest": round(shortest_loss.correlation, 4),
@@ -306,13 +306,13 @@ def order_plan(
 
 
 def stops_of(
-    used: Sequence[str], chosen: Sequence[Chosen], repeats: int, rng: np.random.Generator
+    used: Sequence[str], chosen: Sequence[PoseReadings], repeats: int, rng: np.random.Generator
 ) -> dict[str, list[PlannedStop]]:
     """Return the stops by load; each visit gets the first cycle without any of its loads."""
     cycles_of: dict[tuple[int, str], set[int]] = {}
     for c in chosen:
         pose = used.index(c.pose) + 1
-        for _ in range(c.count):
+        for _ in range(c.cycles):
             used_cycles = [cycles_of.setdefault((pose, load), set()) for load in c.loads]
             cycle = next(k for k in range(10**9) if not any(k in cycles for cycles in used_cycles))
             for cycles in used_cycles:
@@ -337,14 +337,16 @@ class OrderDraws:
     config: CellConfig  # its loads, motion and acquisition
     names: tuple[str, ...]  # (P) names of the poses
     q: Floats  # (P + 1, n) joint angles of the reference and of the poses, rad
-    how: Ordering
+    ordering: Ordering
     rng: np.random.Generator
     stops: dict[str, list[PlannedStop]]  # by load
     passable: InitVar[Passable]
-    # by load, between the reference and the stops: see `ways`
+    # by load, between the reference and the stops: see `motion_times`
     direct: dict[str, Floats] = field(default_factory=dict)
     seconds: dict[str, Floats] = field(default_factory=dict)
-    short: dict[str, list[int]] = field(default_factory=dict)  # shortest tours of stops, from 1
+    short_tours: dict[str, list[int]] = field(
+        default_factory=dict
+    )  # shortest tours of stops, from 1
 
     def __post_init__(self, passable: Passable) -> None:
         """Find the ways and the shortest tour under each load."""
@@ -353,12 +355,12 @@ class OrderDraws:
         for load, load_stops in self.stops.items():
             poses = np.array([pose for pose, _ in load_stops])
             visited = np.unique(poses)
-            between = ways(self.q[[0, *visited]], load, passable, self.pace)
+            between = motion_times(self.q[[0, *visited]], load, passable, self.pace)
             # between two stops at one pose, the arm moves by the reference, to arrive anew
             place = np.concatenate([[0], np.searchsorted(visited, poses) + 1])
             self.direct[load], seconds = (way[np.ix_(place, place)] for way in between)
-            self.seconds[load], self.short[load] = seconds, tour.shortest(seconds, self.rng)
-            order = [0, *self.short[load], 0]
+            self.seconds[load], self.short_tours[load] = seconds, tour.short_tour(seconds, self.rng)
+            order = [0, *self.short_tours[load], 0]
             legs = seconds[order[:-1], order[1:]]
             if legs.max() >= tour.NEVER:
                 k = int(np.argmax(legs >= tour.NEVER))
@@ -380,15 +382,15 @@ class OrderDraws:
         after = self._block(UNLOADED, free[cut:], mixed)
         loaded = [self._block(load, orders[load], mixed) for load in loads]
         order = load_order(before, loaded, after, self.wrenches, self.pace)
-        steps = assembled(self.names, before, [loaded[k] for k in order], after)
+        steps = steps_of(self.names, before, [loaded[k] for k in order], after)
         return Plan((REFERENCE, *self.names), self.q, steps)
 
     def draw(self, extra: float) -> Plan:
         """Return a random plan that takes about `extra` s longer than the shortest."""
         total = sum(len(load_stops) for load_stops in self.stops.values())
-        half = self.how.unloaded == "around"
+        half = self.ordering.unloaded == "around"
         orders = {}
-        for load, short in self.short.items():
+        for load, short in self.short_tours.items():
             seconds = self.seconds[load]
             spare = extra * len(short) / total
             if load != UNLOADED or not half or len(short) < 2:
@@ -396,7 +398,7 @@ class OrderDraws:
                 continue
             first = set(self.rng.permutation(short)[: (len(short) + 1) // 2].tolist())
             halves = ([k for k in short if (k in first) == early] for early in (True, False))
-            parts = [tour.improved(seconds, half_of) for half_of in halves]
+            parts = [tour.improved_tour(seconds, half_of) for half_of in halves]
             lengths = [tour.length(seconds, part) for part in parts]
             if max(lengths) >= tour.NEVER:  # a pose is in another part than its only access
                 half, orders[load] = False, self._walk(seconds, short, spare)
@@ -408,14 +410,14 @@ class OrderDraws:
     def _walk(self, seconds: Floats, order: Sequence[int], spare: float) -> list[int]:
         """Return a random tour of some stops, at most `spare` s longer than `order`."""
         budget = tour.length(seconds, order) + max(spare, 0.0)
-        return tour.shaken(seconds, order, budget, self.rng, _MOVES * len(order))
+        return tour.random_tour(seconds, order, budget, self.rng, _MOVES * len(order))
 
     def _block(self, load: str, order: Sequence[int], mixed: bool) -> LoadBlock:
         """Cut an order into loops; `mixed` loops are in random order and direction."""
         if not order:
             return LoadBlock(load, (), 0.0)
         direct, pace = self.direct[load], self.pace
-        parts = tour.loops(direct, order, pace.reading_s, self.how.reference_every_s)
+        parts = tour.loops(direct, order, pace.reading_s, self.ordering.reference_every_s)
         if parts is None:  # the loop of a pose without a direct way takes too long
             parts = tour.loops(direct, order, pace.reading_s, np.inf)
         assert parts is not None  # noqa: S101 - every way of the order exists
@@ -431,14 +433,14 @@ class OrderDraws:
         stops = tuple(tuple(load_stops[k - 1] for k in part) for part in parts)
         return LoadBlock(load, stops, seconds)
 
-    def figures(self, plan: Plan) -> tuple[Duration, Confounding]:
+    def duration_and_confounding(self, plan: Plan) -> tuple[Duration, Confounding]:
         """Return duration and confounding of a plan."""
-        margin, how = self.config.limits.joint_margin_rad, self.how
+        margin, how = self.config.limits.joint_margin_rad, self.ordering
         time, times = timeline(plan, self.cell.arm, margin, self.pace)
         return time, confounding(plan, times, self.wrenches, how.drift, how.reading_std)
 
 
-def ways(q: Floats, load: str, passable: Passable, pace: Pace) -> tuple[Floats, Floats]:
+def motion_times(q: Floats, load: str, passable: Passable, pace: Pace) -> tuple[Floats, Floats]:
     """Return times (P + 1, P + 1) between poses (P + 1, n) under a load, the reference first, s.
 
     Of straight motions, `NEVER` if not known to be clear; and of the same, or by the reference with
@@ -446,7 +448,7 @@ def ways(q: Floats, load: str, passable: Passable, pace: Pace) -> tuple[Floats, 
     """
     legs = pace.legs(q, q)
     count = len(q)
-    close = np.argsort(legs, axis=1, kind="stable")[:, : NEAR + 1]
+    close = np.argsort(legs, axis=1, kind="stable")[:, : N_NEIGHBOURS + 1]
     tested = np.zeros((count, count), dtype=np.bool_)
     tested[np.arange(count)[:, None], close] = True
     tested |= tested.T
@@ -496,7 +498,7 @@ def load_order(
     return [int(k) for k in tries[int(np.argmin(np.round(worst, 9)))]]
 
 
-def assembled(
+def steps_of(
     names: Sequence[str], before: LoadBlock, loaded: Sequence[LoadBlock], after: LoadBlock
 ) -> tuple[Step, ...]:
     """Return the steps of the blocks, with a reading at the reference before and after every loop.

@@ -13,17 +13,17 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.design.approximate_design import relax
 from hilcal.design.choice import (
-    LOOSE,
-    certified,
+    COARSE_GAP,
+    certified_design,
     choose_poses,
     compound_objective,
     pose_units,
-    unknown,
+    without_prior,
 )
 from hilcal.design.information import DesignProblem, reading_derivatives
-from hilcal.design.optimum import best
+from hilcal.design.optimum import best_design
 from hilcal.design.planner import Planned, Say
-from hilcal.design.predicted import predicted
+from hilcal.design.predicted import predicted_uncertainty
 from hilcal.design.run_order import Confounding, Duration
 from hilcal.effects.protocol import FRAME_ROLES, Role
 from hilcal.errors import CannotAnswerError, InputError
@@ -37,7 +37,9 @@ from hilcal.whole_file import replace_file
 
 COMPARED = ("D", "A", "E", "K", "I")  # all but T-optimality, which needs suspects
 SHARES = (0.5, 1.0, 1.5, 2.0, 3.0)  # budgets of the curve over that of the plan; a choice
-WORTH = 0.9  # efficiency below which a remark states what a better plan would give; a choice
+NOTABLE_EFFICIENCY = (
+    0.9  # efficiency below which a remark states what a better plan would give; a choice
+)
 _LEFT_OUT = {
     "deflection": "geometry, registration, repeatability and effects outside of the model",
     "position": "repeatability and effects outside of the model",
@@ -201,7 +203,7 @@ def summarise(
         loads={name: sum(s.load == name for s in plan.steps) for name in plan.loads},
         duration=planned.ordered.duration, criterion=planned.criterion,
         efficiency=planned.design.efficiency, parameters=_parameters(planned),
-        position_std_m=_finite(precision.position), position=planned.work.what,
+        position_std_m=_finite(precision.position), position=planned.work.description,
         criteria=tuple(_criteria(planned, config, rng)) if compare else (),
         curve=tuple(_curve(planned)) if curve else (),
         detectable=tuple(detectable_effects(planned, config)), longer=planned.ordered.longer,
@@ -241,10 +243,10 @@ def remarks(planned: Planned) -> tuple[str, ...]:
         for name, gain in planned.costly
     )
     readings, efficiency = int(planned.design.cost), planned.design.efficiency
-    suboptimal = planned.asked_poses is not None and efficiency < WORTH
+    suboptimal = planned.asked_poses is not None and efficiency < NOTABLE_EFFICIENCY
     if planned.criterion == "I":
         std = 1e6 / np.sqrt(planned.design.value)
-        quantity = planned.work.what.split(" ")[0]
+        quantity = planned.work.description.split(" ")[0]
         best = (
             f"; as many readings, at the most informative poses and loads (--readings "
             f"{readings}), to no less than {std * np.sqrt(efficiency):.3g} µm"
@@ -259,7 +261,7 @@ def remarks(planned: Planned) -> tuple[str, ...]:
             f"{readings}), are up to {100 / efficiency - 100:.0f} % more efficient",
         )
     undetermined = (u.remark for u in planned.undetermined)
-    notes = (*undetermined, *omitted, *planned.drawn.remarks, *planned.problem.notes)
+    notes = (*undetermined, *omitted, *planned.candidates.remarks, *planned.problem.notes)
     return tuple(dict.fromkeys(notes))
 
 
@@ -274,9 +276,9 @@ def about(planned: Planned) -> dict[str, object]:
         "predicted_std": {n: _finite(s) for n, s in precision.by_name().items()}
         | {u.name: None for u in planned.undetermined},
         "position_std_m": _finite(precision.position),
-        "position": planned.work.what,
-        "position_note": position_note(planned.work.what.split(" ")[0]),
-        "candidates": len(planned.drawn.q),
+        "position": planned.work.description,
+        "position_note": position_note(planned.work.description.split(" ")[0]),
+        "candidates": len(planned.candidates.q),
     }
 
 
@@ -288,7 +290,7 @@ def _criteria(
     planned: Planned, config: CellConfig, rng: np.random.Generator
 ) -> Iterator[CriterionResult]:
     problem = planned.problem
-    usable_poses = [problem.what[k][0] for k in np.flatnonzero(planned.usable)]
+    usable_poses = [problem.contents[k][0] for k in np.flatnonzero(planned.usable)]
     for name in dict.fromkeys((*COMPARED, planned.criterion)):
         if name == planned.criterion:
             yield _result(planned, name, planned.counts, planned.design.efficiency)
@@ -299,9 +301,9 @@ def _criteria(
                 candidates = pose_units(objective, problem)
                 among = np.isin(candidates.poses, usable_poses)
                 chosen, _ = choose_poses(objective, candidates, among, planned.asked_poses, rng, 1)
-                design = certified(objective, chosen, planned.usable)
+                design = certified_design(objective, chosen, planned.usable)
             else:
-                design = best(objective.among(planned.usable), planned.budget, rng, effort=1)
+                design = best_design(objective.among(planned.usable), planned.budget, rng, effort=1)
         except CannotAnswerError:
             continue
         counts = np.zeros(len(problem.units))
@@ -310,8 +312,8 @@ def _criteria(
 
 
 def _result(planned: Planned, name: str, counts: Floats, efficiency: float) -> CriterionResult:
-    problem, free = planned.problem, unknown(planned.problem)
-    precision = predicted(problem, counts, work=planned.work)
+    problem, free = planned.problem, without_prior(planned.problem)
+    precision = predicted_uncertainty(problem, counts, work=planned.work)
     used = np.flatnonzero(counts)
     information = problem.units.information(counts[used], used)
     schur = schur_complement(problem.prior + information, free)
@@ -337,17 +339,19 @@ def _prefixes(problem: DesignProblem, *roles: Role) -> tuple[str, ...]:
 
 def _curve(planned: Planned) -> Iterator[CurvePoint]:
     problem = planned.problem
-    objective, usable = planned.asked.among(planned.usable), np.flatnonzero(planned.usable)
-    n_poses = len({problem.what[k][0] for k in np.flatnonzero(planned.counts)})
+    objective, usable = planned.objective.among(planned.usable), np.flatnonzero(planned.usable)
+    n_poses = len({problem.contents[k][0] for k in np.flatnonzero(planned.counts)})
     last, previous = planned.design.relaxed, 0
     for share in SHARES:
         budget, poses = share * planned.budget, max(1, round(share * n_poses))
         if budget < objective.units.cost.max() or poses == previous:
             continue
         previous = poses
-        last = relax(objective, budget, tolerance=LOOSE, start=last)
+        last = relax(objective, budget, tolerance=COARSE_GAP, start=last)
         information = problem.prior + problem.units.information(last.weight, usable[last.index])
-        position = _finite(predicted(problem, information=information, work=planned.work).position)
+        position = _finite(
+            predicted_uncertainty(problem, information=information, work=planned.work).position
+        )
         if position is not None:
             yield CurvePoint(poses, position)
 
@@ -363,7 +367,7 @@ def detectable_effects(planned: Planned, config: CellConfig) -> Iterator[Detecta
     information = problem.measured + problem.units.information(planned.counts[used], used)
     model_prior = problem.prior[:size, :size] - problem.measured[:size, :size]
     information[:size, :size] += model_prior
-    chosen = problem.candidates[sorted({problem.what[k][0] for k in used})]
+    chosen = problem.candidates[sorted({problem.contents[k][0] for k in used})]
     parts = reading_derivatives(problem.nominal, config, chosen, problem.families, problem.scale)
     blocks = [part.jacobian[..., :3, :] for part in parts]
     if problem.mode == "deflection":
@@ -438,4 +442,4 @@ def refuse(dry: DryRun, what: str) -> None:
 
 def refusal(dry: DryRun, what: str) -> InputError | None:
     """Return the error of `refuse` without raising it; None if the dry run passed."""
-    return InputError(f"{what} cannot be run: {dry.first}") if dry.problems else None
+    return InputError(f"{what} cannot be run: {dry.first_problem}") if dry.problems else None

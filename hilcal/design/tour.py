@@ -24,7 +24,7 @@ def length(seconds: Floats, order: Sequence[int]) -> float:
     return float(seconds[way[:-1], way[1:]].sum())
 
 
-def shortest(seconds: Floats, rng: np.random.Generator) -> list[int]:
+def short_tour(seconds: Floats, rng: np.random.Generator) -> list[int]:
     """Return an order of stops 1 to m whose tour is short; up to 7 stops, the shortest.
 
     Nearest insertion, then 2-opt and Or-opt exchanges until none helps. The exchanges are repeated
@@ -36,11 +36,11 @@ def shortest(seconds: Floats, rng: np.random.Generator) -> list[int]:
         ways = np.pad(orders, ((0, 0), (1, 1)))
         first = int(np.argmin(seconds[ways[:, :-1], ways[:, 1:]].sum(axis=1)))
         return [int(k) for k in orders[first]]
-    best = improved(seconds, _inserted(seconds))
+    best = improved_tour(seconds, _inserted(seconds))
     least = length(seconds, best)
     for _ in range(_KICKS):
         a, b, c = sorted(int(k) for k in rng.choice(np.arange(1, count), 3, replace=False))
-        order = improved(seconds, best[:a] + best[b:c] + best[a:b] + best[c:])
+        order = improved_tour(seconds, best[:a] + best[b:c] + best[a:b] + best[c:])
         if (total := length(seconds, order)) < least - _GAIN:
             best, least = order, total
     return best
@@ -63,7 +63,7 @@ def _inserted(seconds: Floats) -> list[int]:
     return way[1:-1]
 
 
-def improved(seconds: Floats, order: Sequence[int]) -> list[int]:
+def improved_tour(seconds: Floats, order: Sequence[int]) -> list[int]:
     """Return an order that no 2-opt or Or-opt exchange shortens; the best exchange first."""
     way = np.array([0, *order, 0])
     while len(way) > 3:
@@ -120,8 +120,8 @@ def _moved(p: Floats) -> _Change:
     return best
 
 
-def shaken(
-    seconds: Floats, order: Sequence[int], budget: float, rng: np.random.Generator, moves: int
+def random_tour(
+    seconds: Floats, order: Sequence[int], budget: float, rng: np.random.Generator, n_moves: int
 ) -> list[int]:
     """Return a random order whose tour takes at most `budget`, s, or no more than that of `order`.
 
@@ -134,8 +134,8 @@ def shaken(
         return list(order)
     symmetric = bool(np.array_equal(seconds, seconds.T))
     w = seconds.tolist()
-    draws = rng.integers(1, count + 1, (moves, 2)).tolist()
-    turns = (rng.random(moves) < 0.5).tolist()
+    draws = rng.integers(1, count + 1, (n_moves, 2)).tolist()
+    turns = (rng.random(n_moves) < 0.5).tolist()
     for (a, b), turn in zip(draws, turns, strict=True):
         if a == b:
             continue

@@ -114,7 +114,7 @@ class Situation:
 
     def along(self, change: Floats) -> Floats:
         """Torques or forces (..., n) along the joints, of slot wrenches (..., n + 1, 6)."""
-        return self.cell.arm.along(change)
+        return self.cell.arm.joint_components(change)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

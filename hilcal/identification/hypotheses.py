@@ -11,7 +11,7 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.config.sections import Conventions
 from hilcal.robot import se3
-from hilcal.robot.arm import Arm, as_counted, may_follow, with_conventions
+from hilcal.robot.arm import Arm, may_follow, with_controller_conventions, with_conventions
 from hilcal.robot.catalogue import load_arm, other_arms
 from hilcal.types import Bools, Floats
 
@@ -104,7 +104,9 @@ def _recounted(d: Description, h: Hypothesis) -> Description:
 
 def _another_arm(d: Description, h: Hypothesis) -> Description:
     arm = load_arm(h.arm)
-    return replace(d, arm=arm if d.conventions is None else as_counted(arm, d.conventions))
+    return replace(
+        d, arm=arm if d.conventions is None else with_controller_conventions(arm, d.conventions)
+    )
 
 
 def _mapped(name: str, change: Callable[[Any], Any]) -> Applied:

@@ -46,7 +46,7 @@ from hilcal.identification.registration import Registration, register
 from hilcal.identification.residual import noise_floor
 from hilcal.numbers import length
 from hilcal.readings.readings import Readings
-from hilcal.robot.arm import Arm, as_counted
+from hilcal.robot.arm import Arm, with_controller_conventions
 from hilcal.robot.catalogue import other_arms
 from hilcal.robot.chain import evaluate
 from hilcal.types import Bools, Floats, Ints
@@ -434,7 +434,10 @@ def other_arm(registered: Registration, readings: Readings) -> OtherArm | None:
     if cell.observers or registered.rms <= BEYOND_NOISE * noise_floor(readings.covariance):
         return None
     robot = None if cell.config is None else cell.config.robot
-    arms = (arm if robot is None else as_counted(arm, robot) for arm in other_arms(cell.arm))
+    arms = (
+        arm if robot is None else with_controller_conventions(arm, robot)
+        for arm in other_arms(cell.arm)
+    )
     some = readings[np.unique(np.linspace(0, len(readings) - 1, ARM_ROWS).astype(int))]
     tried = [(_misfit_with(cell, arm, some), arm) for arm in arms]
     least, arm = min(tried, key=lambda pair: pair[0], default=(np.inf, cell.arm))

@@ -31,8 +31,15 @@ from hilcal.robot.chain import evaluate
 from hilcal.tables.guess_values import BY_VALUES, RIVALS
 from hilcal.tables.mapped import import_readings
 from hilcal.tables.mapping import Mapping
-from hilcal.tables.proposal import FAR, GUESSED, SIDE_BY_SIDE, TURN, Proposal, UnderstoodColumn
-from hilcal.tables.propose import Proposed, propose
+from hilcal.tables.proposal import (
+    GUESSED,
+    MAX_ANGLE_RAD,
+    MAX_POSITION_M,
+    SIDE_BY_SIDE,
+    Proposal,
+    ProposedQuantity,
+)
+from hilcal.tables.propose import GridProposal, propose
 from hilcal.tables.units import ANGLES, CONVENTIONS, LENGTHS, NUMBERS, rotations
 from hilcal.toml import check_section
 from hilcal.types import Floats
@@ -121,11 +128,11 @@ def _name_targets(proposal: Proposal, names: list[str]) -> None:
     if names and len(names) == len(section.get("targets", ())):
         section["targets"] = names
         note = f"the targets are {', '.join(names)}, in the cell's order"
-        doubts = [doubt for doubt in proposal.unsure if doubt != ("position", SIDE_BY_SIDE)]
-        proposal.unsure[:] = [*doubts, ("position", note)]
+        doubts = [doubt for doubt in proposal.doubts if doubt != ("position", SIDE_BY_SIDE)]
+        proposal.doubts[:] = [*doubts, ("position", note)]
 
 
-def _decide_travels(proposed: Proposed, arm: Arm) -> None:
+def _decide_travels(proposed: GridProposal, arm: Arm) -> None:
     """Decide columns and units of joints that slide, by their names and by the arm's limits.
 
     External axes E1, E2, … are the joints that slide. Travels beyond ten times the limits are mm.
@@ -141,29 +148,29 @@ def _decide_travels(proposed: Proposed, arm: Arm) -> None:
             names.insert(j, name)
         proposal.unused[:] = [(n, why) for n, why in proposal.unused if n not in external]
         counted = f"{len(names) - len(slides)} c"
-        doubts = [d for d in proposal.unsure if not d[1].startswith(counted)]
-        proposal.unsure[:] = [*doubts, ("joints", f"{', '.join(external)} taken for what slides")]
+        doubts = [d for d in proposal.doubts if not d[1].startswith(counted)]
+        proposal.doubts[:] = [*doubts, ("joints", f"{', '.join(external)} taken for what slides")]
     if len(names) != arm.n:
         return
     q = np.abs(np.stack([grid.numbers(name) for name in names], axis=1))
     far = np.nanmax(q, axis=0)
     turning, unit = far[~arm.slides].max(initial=0.0), section["unit"]
-    if unit == "deg" and turning <= TURN and not any("deg" in n for n in names):
+    if unit == "deg" and turning <= MAX_ANGLE_RAD and not any("deg" in n for n in names):
         unit = "rad"
-        proposal.unsure.append(("joints", f"rad, since none turns by more than {turning:.3g}"))
+        proposal.doubts.append(("joints", f"rad, since none turns by more than {turning:.3g}"))
     mm = bool(np.any(far[slides] > 10 * arm.travels[slides]))
     section |= {"columns": names, "unit": unit, "slide_unit": "mm" if mm else "m"}
     if mm:
         note = f"what slides in mm, since it goes to {far[slides].max():.4g}"
-        proposal.unsure.append(("joints", note))
+        proposal.doubts.append(("joints", note))
     row = int(np.flatnonzero(np.isfinite(q).all(axis=1))[0])
     example = tuple(f"{grid.numbers(name)[row]:g}" for name in names)
-    k = next(k for k, u in enumerate(proposal.understood) if u.what == "joints")
+    k = next(k for k, u in enumerate(proposal.quantities) if u.section == "joints")
     meaning = f"{unit}, {section['slide_unit']}"
-    proposal.understood[k] = UnderstoodColumn("joints", tuple(names), meaning, example)
+    proposal.quantities[k] = ProposedQuantity("joints", tuple(names), meaning, example)
 
 
-def _decide_convention(proposed: Proposed, arm: Arm) -> list[str]:
+def _decide_convention(proposed: GridProposal, arm: Arm) -> list[str]:
     """Decide a guessed convention by the nominal arm; return a sentence where it is decided."""
     proposal, grid = proposed.proposal, proposed.grid
     sections = [proposal.sections.get(name) for name in ("joints", "position", "orientation")]
@@ -184,7 +191,7 @@ def _decide_convention(proposed: Proposed, arm: Arm) -> list[str]:
     if not ranked:
         return []
     guess = ("orientation", GUESSED)
-    proposal.unsure[:] = [doubt for doubt in proposal.unsure if doubt != guess]
+    proposal.doubts[:] = [doubt for doubt in proposal.doubts if doubt != guess]
     best, second = ranked[:2]
     decided = clearly_best(ranked)
     if decided is None:
@@ -192,15 +199,16 @@ def _decide_convention(proposed: Proposed, arm: Arm) -> list[str]:
             f"the nominal {arm.name} does not decide the convention: "
             f"{best.convention} leaves {best.words}, {second.convention} {second.words}"
         )
-        proposal.unsure.append(("orientation", note))
+        proposal.doubts.append(("orientation", note))
         return []
     guessed, fitting = (rotations(name, values, unit) for name in (section["convention"], decided))
     if not np.allclose(guessed, fitting):
         section["convention"] = decided
     proposal.open_convention = False
     meaning = ", ".join(str(v) for key, v in section.items() if key != "columns")
-    proposal.understood[:] = [
-        replace(u, meaning=meaning) if u.what == "orientation" else u for u in proposal.understood
+    proposal.quantities[:] = [
+        replace(u, meaning=meaning) if u.section == "orientation" else u
+        for u in proposal.quantities
     ]
     return [
         f"orientation: {section['convention']}, since the nominal {arm.name} fits best with it: "
@@ -208,7 +216,9 @@ def _decide_convention(proposed: Proposed, arm: Arm) -> list[str]:
     ]
 
 
-def _decide_columns(table: Path, proposed: Proposed, settings: CellConfig, cell: Cell) -> list[str]:
+def _decide_columns(
+    table: Path, proposed: GridProposal, settings: CellConfig, cell: Cell
+) -> list[str]:
     """Decide columns that their values leave open by the nominal arm; a sentence if it decides."""
     proposal, grid = proposed.proposal, proposed.grid
     if len(proposal.alternatives) < 2:
@@ -217,8 +227,8 @@ def _decide_columns(table: Path, proposed: Proposed, settings: CellConfig, cell:
     for position, joints in proposal.alternatives[:MOST_TRIED]:
         changed = dict(proposal.sections)
         for name, columns, limit, units in (
-            ("position", position, FAR, ("mm", "m")),
-            ("joints", joints, TURN, ("deg", "rad")),
+            ("position", position, MAX_POSITION_M, ("mm", "m")),
+            ("joints", joints, MAX_ANGLE_RAD, ("deg", "rad")),
         ):
             if columns:
                 size = max(np.nanmax(np.abs(grid.numbers(c))) for c in columns)
@@ -231,14 +241,14 @@ def _decide_columns(table: Path, proposed: Proposed, settings: CellConfig, cell:
     if not fits or fits[0][0] > CLOSE_SHARE * cell.arm.reach or not (clear or len(fits) == 1):
         return []
     proposal.sections = fits[0][1]
-    for k, u in enumerate(proposal.understood):
-        if u.what in ("position", "joints"):
-            section = proposal.sections[u.what]
+    for k, u in enumerate(proposal.quantities):
+        if u.section in ("position", "joints"):
+            section = proposal.sections[u.section]
             chosen = tuple(section["columns"])
             example = tuple(grid.text(c)[0] for c in chosen)
-            proposal.understood[k] = UnderstoodColumn(u.what, chosen, section["unit"], example)
-    doubts = [d for d in proposal.unsure if RIVALS not in d[1] and BY_VALUES not in d[1]]
-    proposal.unsure[:] = doubts
+            proposal.quantities[k] = ProposedQuantity(u.section, chosen, section["unit"], example)
+    doubts = [d for d in proposal.doubts if RIVALS not in d[1] and BY_VALUES not in d[1]]
+    proposal.doubts[:] = doubts
     second = f", others {1e3 * fits[1][0]:.0f} mm" if len(fits) > 1 else ""
     return [
         f"columns: the nominal {cell.arm.name} fits best with these: "
@@ -259,7 +269,7 @@ def _misfit_with(
 
 
 def _try_import(table: Path, proposal: Proposal, settings: CellConfig, cell: Cell) -> list[str]:
-    if proposal.lacking:
+    if proposal.missing:
         return []
     try:
         result = import_readings(table, proposal.mapping(Mapping), settings, cell.arm)

@@ -29,7 +29,7 @@ class Clearance:
         self.scene = Scene(cell.arm, _tool(cell), config.obstacles)
         # names of the shapes that touch the load point, by the radius of the load or cable, m
         radii = {CABLE_RADIUS, *(load.radius_m for load in config.loads)}
-        self._at_hook = {radius: self.near(cell.load_point, radius) for radius in radii}
+        self._at_hook = {radius: self.shapes_touching(cell.load_point, radius) for radius in radii}
 
     @cached_property
     def sight(self) -> "LineOfSight | None":
@@ -72,7 +72,7 @@ class Clearance:
             out.append(Segment(f"the cable ({load})", points, end, CABLE_RADIUS, near))
         return tuple(out)
 
-    def near(self, point: Floats, radius: float) -> frozenset[str]:
+    def shapes_touching(self, point: Floats, radius: float) -> frozenset[str]:
         """Return names of the shapes on the flange that touch a point (3,), flange axes, m."""
         arm = self.cell.arm
         centre = on_flange(arm, point)
@@ -110,16 +110,16 @@ class LineOfSight:
     clearance: Clearance  # the cell's shapes
     tracker: Floats  # (3,) place of the tracker, base axes, m
 
-    def free(self, q: Floats, load: str) -> Bools:
+    def unobstructed(self, q: Floats, load: str) -> Bools:
         """Return (N,) in which states all shapes keep [sight] clearance_m from every beam.
 
         A beam ends shortly before its target. Ignored are parts of the tool next to the target,
         whose shape is unknown, and obstacles that the tracker stands in or on.
         """
         count = len(self.clearance.cell.all_targets)
-        return np.asarray(np.all([self.sees(q, load, k) for k in range(count)], axis=0))
+        return np.asarray(np.all([self.target_visible(q, load, k) for k in range(count)], axis=0))
 
-    def sees(self, q: Floats, load: str, target: int) -> Bools:
+    def target_visible(self, q: Floats, load: str, target: int) -> Bools:
         """Return (N,) in which states the beam to one target is free."""
         beam = self.beam(q, target)
         out = ~self.clearance.scene.free.touching(q, 0.0, beam)
@@ -152,19 +152,19 @@ class LineOfSight:
                 f"{where}: the beam meets the reflector at {float(angle.max()):.3g} rad; [sight] "
                 f"incidence_max_rad is {most:g}"
             )
-        hidden, targets = self.hidden(q, load), self.clearance.cell.all_targets
+        hidden, targets = self.hidden_targets(q, load), self.clearance.cell.all_targets
         if len(hidden) == len(targets):  # some hidden targets only cost readings
-            hits = self.clearance.scene.free.named(q, 0.0, self.beam(q))
+            hits = self.clearance.scene.free.close_pairs(q, 0.0, self.beam(q))
             names = tuple(dict.fromkeys(name for name, _ in hits))
             names += tuple(x.name for x in self.clearance.segments(q, load) if not names)
             noun = "target" if len(hidden) == 1 else "targets"
             out.append(f"{where}: {' and '.join(names)} between tracker and {noun}")
         return out
 
-    def hidden(self, q: Floats, load: str) -> tuple[int, ...]:
+    def hidden_targets(self, q: Floats, load: str) -> tuple[int, ...]:
         """Return the indices of the targets that are hidden in one state (1, n)."""
         count = len(self.clearance.cell.all_targets)
-        return tuple(k for k in range(count) if not self.sees(q, load, k).all())
+        return tuple(k for k in range(count) if not self.target_visible(q, load, k).all())
 
     def beam(self, q: Floats, number: int = 0) -> Segment:
         """Return the beam to a target in N states (N, n)."""
@@ -176,21 +176,21 @@ class LineOfSight:
         gap = np.minimum(_SHY * (TOOL_RADIUS + radius), 0.5 * length)
         end = target - gap * way / np.where(length > 0.0, length, 1.0)
         start = np.broadcast_to(self.tracker, end.shape)
-        stands = [x.name for x in config.obstacles if holds(x, self.tracker, radius)]
-        near = self.clearance.near(offset, radius)
+        stands = [x.name for x in config.obstacles if contains(x, self.tracker, radius)]
+        near = self.clearance.shapes_touching(offset, radius)
         return Segment("beam", start, end, max(radius, 1e-4), near.union(stands))
 
 
-def holds(thing: Obstacle, points: Floats, margin: float = 0.0) -> Bools:
+def contains(obstacle: Obstacle, points: Floats, margin: float = 0.0) -> Bools:
     """Return which points (..., 3) are inside of an obstacle enlarged by `margin`, m."""
-    if thing.center_m is not None and thing.size_m is not None:
-        off = np.abs(points - np.array(thing.center_m)) - 0.5 * np.array(thing.size_m)
+    if obstacle.center_m is not None and obstacle.size_m is not None:
+        off = np.abs(points - np.array(obstacle.center_m)) - 0.5 * np.array(obstacle.size_m)
         return np.asarray(np.all(off <= margin, axis=-1))
-    if thing.bottom_m is None or thing.radius_m is None or thing.height_m is None:
+    if obstacle.bottom_m is None or obstacle.radius_m is None or obstacle.height_m is None:
         return np.zeros(points.shape[:-1], dtype=np.bool_)
-    off = points - np.array(thing.bottom_m)
-    upright = (off[..., 2] >= -margin) & (off[..., 2] <= thing.height_m + margin)
-    return np.asarray(upright & (np.hypot(off[..., 0], off[..., 1]) <= thing.radius_m + margin))
+    off = points - np.array(obstacle.bottom_m)
+    upright = (off[..., 2] >= -margin) & (off[..., 2] <= obstacle.height_m + margin)
+    return np.asarray(upright & (np.hypot(off[..., 0], off[..., 1]) <= obstacle.radius_m + margin))
 
 
 def segment_distance(a: Floats, b: Floats, c: Floats, d: Floats) -> Floats:

@@ -23,9 +23,9 @@ from hilcal.measuring.progress import Watcher
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm, robot_names
 from hilcal.robot.factory import (
-    FAR,
-    LINEARISED,
-    SAME,
+    LINEARISED_STATUS,
+    OTHER_ARM_M,
+    SAME_FLANGE_M,
     FactoryKinematics,
     flange_difference,
     with_factory,
@@ -153,7 +153,7 @@ def _failure(device: str, why: Exception) -> str:
     return text if text.startswith(device) else f"{device}: {text}"
 
 
-def told_by(answers: tuple[ConnectionResult, ...]) -> FactoryKinematics | None:
+def reported_kinematics(answers: tuple[ConnectionResult, ...]) -> FactoryKinematics | None:
     """Return the kinematics of the arm's controller; None where unknown."""
     return next((a.report.kinematics for a in answers if a.report and a.report.kinematics), None)
 
@@ -186,7 +186,7 @@ def _compared(report: Report, kinematics: FactoryKinematics, cell: Cell) -> Repo
     except InputError as error:  # an arm with other joints, or a campaign without its file
         return replace(report, facts=(*report.facts, (fact, str(error))))
     rms, most = flange_difference(controller_arm, nominal)
-    measured = "measured" if kinematics.status == LINEARISED else "not measured"
+    measured = "measured" if kinematics.status == LINEARISED_STATUS else "not measured"
     text = (
         f"{measured} by the factory: the flange is {1e3 * rms:.2f} mm (rms; most "
         f"{1e3 * most:.2f} mm) from nominal"
@@ -194,12 +194,12 @@ def _compared(report: Report, kinematics: FactoryKinematics, cell: Cell) -> Repo
     difference = 0.0
     if cell.factory is not None:
         difference = flange_difference(controller_arm, with_factory(nominal, cell.factory))[1]
-    if robot.model in robot_names() and most > FAR:
+    if robot.model in robot_names() and most > OTHER_ARM_M:
         problems.append(
             f"its kinematics are not those of a {robot.model}: the flange is up to "
             f"{1e3 * most:.0f} mm elsewhere; check [robot] model"
         )
-    elif difference > SAME:
+    elif difference > SAME_FLANGE_M:
         problems.append(
             f"its kinematics are not those of [robot] calibration = {robot.calibration!r}: the "
             f"flange is up to {1e3 * difference:.3f} mm elsewhere; hilcal check CELL.toml "

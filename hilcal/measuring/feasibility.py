@@ -18,10 +18,10 @@ from hilcal.types import Bools, Floats, Ints
 JOINTS, WORKSPACE, ITSELF = "joint limits", "workspace", "self-collision"
 OBSTACLE, HANGING, TORQUE = "obstacle", "hanging", "torque"
 SENSOR, PAYLOAD, SIGHT, INCIDENCE = "force sensor", "payload", "sight", "incidence"
-STATE = (JOINTS, WORKSPACE, TORQUE, SENSOR, ITSELF, OBSTACLE, HANGING)
+STATE_CHECKS = (JOINTS, WORKSPACE, TORQUE, SENSOR, ITSELF, OBSTACLE, HANGING)
 """Checks of every state, in motion too."""
-WAY = tuple(kind for kind in STATE if kind != JOINTS)
-"""Checks of a straight motion between ends that pass `STATE`: joint limits hold between them."""
+MOTION_CHECKS = tuple(kind for kind in STATE_CHECKS if kind != JOINTS)
+"""Checks of a straight motion between ends that pass `STATE_CHECKS`: joint limits hold between."""
 
 BETWEEN_M = 0.001
 """Largest undershoot of a margin by an allowed motion, m."""
@@ -38,27 +38,27 @@ class Margins:
     """Margins beyond the limits; negative: slack."""
 
     joint: float = 0.0  # from `[limits] joint_margin_rad`, rad
-    inside: float = 0.0  # from the sides of the workspace and from the floor, m
-    clear: float = 0.005  # between arm, obstacles and hanging load, m
-    itself: float = 0.005  # between parts of the arm, m
-    bear: float = 1.0  # share of the usable torque and of the force sensor's moment
+    workspace: float = 0.0  # from the sides of the workspace and from the floor, m
+    clearance: float = 0.005  # between arm, obstacles and hanging load, m
+    self_collision: float = 0.005  # between parts of the arm, m
+    torque_share: float = 1.0  # share of the usable torque and of the force sensor's moment
 
 
 @dataclass(frozen=True, slots=True)
 class Violation:
     """A limit that a state or a motion violates."""
 
-    kind: str  # one of `STATE`
-    of: str  # body, side or joint
+    kind: str  # one of `STATE_CHECKS`
+    subject: str  # body, side or joint
     load: str  # name of the load if its weight or pull is the cause
     text: str  # body, distance and limit, without the place
 
     @property
-    def what(self) -> tuple[str, str, str]:
+    def key(self) -> tuple[str, str, str]:
         """Key among the violations of one place."""
-        return self.kind, self.of, self.load
+        return self.kind, self.subject, self.load
 
-    def at(self, where: str) -> str:
+    def line(self, where: str) -> str:
         """Return the line for people: place, load and text."""
         return f"{where}{'' if self.load == UNLOADED else f' under {self.load}'}: {self.text}"
 
@@ -98,10 +98,10 @@ class Feasibility:
 
     # states
 
-    def keeps(self, kind: str, q: Floats, load: str = UNLOADED) -> Bools:
-        """Return (N,) which states (N, n) pass one of `STATE`, payload, sight or incidence."""
+    def passes(self, kind: str, q: Floats, load: str = UNLOADED) -> Bools:
+        """Return (N,) which states (N, n) pass a check of `STATE_CHECKS`, payload or sight."""
         if kind == SIGHT:
-            return self._always(q) if self.sight is None else self.sight.free(q, load)
+            return self._always(q) if self.sight is None else self.sight.unobstructed(q, load)
         if kind == INCIDENCE:
             angle = None if self.sight is None else self.sight.incidence(q)
             most = self.config.sight.incidence_max_rad
@@ -110,17 +110,21 @@ class Feasibility:
             return ~self._always(q)
         return self._always(q) if kind == PAYLOAD else ~self._beyond(kind, q, load)
 
-    def allowed(self, q: Floats, load: str = UNLOADED, kinds: tuple[str, ...] = STATE) -> Bools:
+    def allowed(
+        self, q: Floats, load: str = UNLOADED, kinds: tuple[str, ...] = STATE_CHECKS
+    ) -> Bools:
         """Return (N,) which states pass all of some kinds under a load, in their order."""
         good = self._always(q)
         for kind in kinds:
             remaining = np.flatnonzero(good)
             if not len(remaining):
                 break
-            good[remaining] = self.keeps(kind, q[remaining], load)
+            good[remaining] = self.passes(kind, q[remaining], load)
         return good
 
-    def findings(self, q: Floats, load: str, kinds: tuple[str, ...] = STATE) -> Iterator[Violation]:
+    def findings(
+        self, q: Floats, load: str, kinds: tuple[str, ...] = STATE_CHECKS
+    ) -> Iterator[Violation]:
         """Yield the violations of the states (N, n) under a load, each at its worst."""
         chain = evaluate(self.cell.arm, q)
         for kind in kinds:
@@ -150,14 +154,14 @@ class Feasibility:
     def passable(self, start: Floats, ends: Floats, load: str) -> Bools:
         """Return (M,) which straight motions to `ends` (M, n) are clear under a load."""
         good = self._always(ends)
-        for kind in WAY:
+        for kind in MOTION_CHECKS:
             remaining = np.flatnonzero(good)
             good[remaining] = self._search(kind, start, ends[remaining], load)[0]
         return good
 
     def findings_between(self, start: Floats, end: Floats, load: str) -> Iterator[Violation]:
         """Yield the violations of a straight motion between two states (n,), at their worst."""
-        for kind in WAY:
+        for kind in MOTION_CHECKS:
             good, bad = self._search(kind, start, end[None], load)
             if not good[0]:
                 share = np.linspace(0.0, 1.0, _SHOWN)[:, None]
@@ -211,9 +215,11 @@ class Feasibility:
         elif kind == SENSOR and (sensor := self.config.force_sensor) is not None:
             yield self._moment(sensor, chain, load)
         elif kind == ITSELF:
-            yield _Touch(scene.itself, q, margins.itself, scene.itself.rates, guessed=self._guessed)
+            yield _Touch(
+                scene.itself, q, margins.self_collision, scene.itself.rates, guessed=self._guessed
+            )
         elif kind == OBSTACLE:
-            yield _Touch(scene.around, q, margins.clear, scene.around.rates)
+            yield _Touch(scene.around, q, margins.clearance, scene.around.rates)
         elif kind == HANGING:
             segments = self.shapes.segments_at(chain.point(self.cell.load_point), load)
             if segments:
@@ -223,7 +229,7 @@ class Feasibility:
                 radius = np.array([x.radius for x in segments])
                 yield self._inside([x.name for x in segments], places, radius, held, rates)
             for segment in segments:
-                yield _Touch(scene.free, q, margins.clear, self._towards, segment)
+                yield _Touch(scene.free, q, margins.clearance, self._towards, segment)
 
     def _joints(self, q: Floats) -> "_Bounds":
         arm, margin = self.cell.arm, self.config.limits.joint_margin_rad
@@ -248,7 +254,7 @@ class Feasibility:
         low, high = places.min(axis=2) - radius[:, None], places.max(axis=2) + radius[:, None]
         over = np.stack([self._box[0] - low, high - self._box[1]], axis=3)
         body, side = np.nonzero(held)
-        margin = self.margins.inside
+        margin = self.margins.workspace
 
         def violation(k: int, state: int) -> Violation:
             name, (axis, below) = names[body[k]], _SIDES[side[k]]
@@ -270,7 +276,7 @@ class Feasibility:
         pull = self._pull(load)
         wrench = np.broadcast_to(pull, (chain.position.shape[1], 6))
         carried = Load(wrench, cell.load_point, cell.tool_mass, cell.tool_com, cell.gravity)
-        torque = np.abs(arm.drive_torques(arm.along(slot_wrenches(arm, chain, carried))))
+        torque = np.abs(arm.drive_torques(arm.joint_components(slot_wrenches(arm, chain, carried))))
         usable = share * np.asarray(arm.torque_max, dtype=float)
         slides = arm.slides
 
@@ -293,7 +299,7 @@ class Feasibility:
         force = weights.sum() + np.linalg.norm(pull[:3])
         rates = np.where(slides[:, None] | slides, force, rates)
         drive = np.eye(arm.n) if arm.drive is None else np.abs(arm.drive)
-        limit = self.margins.bear * usable
+        limit = self.margins.torque_share * usable
         return _Bounds(torque - limit, drive.T @ rates, BETWEEN_SHARE * usable, violation)
 
     def _moment(self, sensor: ForceSensor, chain: Chain, load: str) -> "_Bounds":
@@ -315,7 +321,7 @@ class Feasibility:
         )
         rate = sum(float(np.linalg.norm(a) * np.linalg.norm(f)) for a, f in levers)
         rates = np.full((1, cell.arm.n), rate)
-        limit = self.margins.bear * most
+        limit = self.margins.torque_share * most
         return _Bounds(size - limit, rates, np.array([BETWEEN_SHARE * most]), violation)
 
     # helpers
@@ -339,7 +345,7 @@ class Feasibility:
         everywhere = np.ones((int(mount.sum()), len(_SIDES)), dtype=np.bool_)
         names = [self._names[k] for k in np.flatnonzero(mount)]
         fixed = self._inside(names, places, self._radius[mount], everywhere, self._rates[mount])
-        outside = fixed.over.reshape(-1, len(_SIDES)) - self.margins.inside
+        outside = fixed.over.reshape(-1, len(_SIDES)) - self.margins.workspace
         respected = mount.any() & np.all(outside <= 0.0, axis=0)
         self._held |= (~moving & ~mount)[:, None] & respected
         hook = on_flange(arm, self.cell.load_point)[None]
@@ -396,8 +402,8 @@ class _Bounds:
             over = float(self.over[state, k])
             if not over <= _ROUNDING:
                 broken = self.violation(k, state)
-                if broken.of not in worst or worst[broken.of][0] < over:
-                    worst[broken.of] = over, broken
+                if broken.subject not in worst or worst[broken.subject][0] < over:
+                    worst[broken.subject] = over, broken
         yield from (broken for _, broken in worst.values())
 
 
@@ -425,7 +431,7 @@ class _Touch:
         return out
 
     def findings(self, kind: str) -> Iterator[Violation]:
-        for (a, b), gap in self.pairs.named(self.q, self.margin, self.segment).items():
+        for (a, b), gap in self.pairs.close_pairs(self.q, self.margin, self.segment).items():
             if gap < 0.0:
                 text = f"they overlap by {-gap:.3g} m"
             else:

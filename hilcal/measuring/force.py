@@ -292,7 +292,7 @@ class ForceMeter:
         moment = cell.tool_mass * self._com
         self.tool = ToolLoad(np.zeros(6), cell.tool_mass, moment, nothing, cell.gravity, 0.0, 0)
 
-    def felt(self) -> Floats:
+    def present_wrench(self) -> Floats:
         """Return the present tared wrench (6,), sensor axes."""
         return np.asarray(self.sensor.latest().wrench - self.zero)
 
@@ -335,7 +335,7 @@ class ForceMeter:
         if not self.identified:
             self.tool = replace(zero, bias=np.zeros(6))
 
-    def turned(self, q: Floats) -> float:
+    def gravity_change(self, q: Floats) -> float:
         """Return the change of gravity in sensor axes since the tare, m/s², at q (n,).
 
         |R(q)ᵀ g - R_tareᵀ g| is the force of each kg that [tool] lacks; before any tare it is twice

@@ -33,7 +33,7 @@ class Hook:
     """The hanging load and its changes; WrongLoadError after `TRIES` wrong loads."""
 
     def __init__(self, setup: Setup, meter: ForceMeter | None, mover: Mover) -> None:
-        """Start with an unknown load, until `begin`."""
+        """Start with an unknown load, until `take_all_off`."""
         self.hanging, self.since, self._doubted = UNLOADED, setup.clock.now(), False
         self._arm, self._operator, self._meter = setup.rig.arm, setup.rig.operator, meter
         self._cell, self._config, self._mover = setup.cell, setup.config, mover
@@ -44,7 +44,7 @@ class Hook:
         """Return a load by name; None for the unloaded state."""
         return self._loads.get(name)
 
-    def begin(self) -> None:
+    def take_all_off(self) -> None:
         """Have every load taken off before anything moves, as the load is unknown."""
         self._ask(None, self._still_hangs)
         self.hanging, self.since = UNLOADED, self._clock.now()
@@ -134,7 +134,7 @@ class Hook:
             if answered is not None:
                 answered(load)
             self._mover.put_back(self.confirm)
-            self._mover.look()
+            self._mover.checked_sample()
             why = wrong()
             if not why:
                 return
@@ -151,7 +151,7 @@ class Hook:
         text = ""
         for pause in (self._config.acquire.settle_s, SWINGING_S):
             self._mover.wait(pause)
-            sample = self._mover.look()
+            sample = self._mover.checked_sample()
             tared = self._meter.tared(self._meter.average(), sample.q)
             good, text = self._meter.verify(load, tared, self._config.operator)
             if good:
@@ -168,7 +168,7 @@ class Hook:
             return ""
         has_zero = bool(np.any(self._meter.zero))
         believed, self._doubted = self._doubted and not has_zero, True
-        sample = self._mover.look()
+        sample = self._mover.checked_sample()
         tared = self._meter.tared(self._meter.average(), sample.q)
         force = self._meter.load_wrench(tared)[:3]
         felt = float(np.linalg.norm(force))

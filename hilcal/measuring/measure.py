@@ -138,8 +138,8 @@ SCATTER_P = 0.001
 SHRINKING_P = 0.05
 NEGLIGIBLE = 0.5
 """Negligible drift over the window, as a share of the standard deviation of the mean."""
-FEW = 12  # least number of samples to estimate a scatter
-LONGEST = 10  # largest window, over K samples
+MIN_SAMPLES = 12  # least number of samples to estimate a scatter
+MAX_WINDOW = 10  # largest window, over K samples
 
 
 class SettleWindow:
@@ -157,7 +157,7 @@ class SettleWindow:
     def add(self, sample: TrackerSample) -> None:
         """Add the next sample."""
         self._samples.append(sample)
-        del self._samples[: -2 * LONGEST * self._count]
+        del self._samples[: -2 * MAX_WINDOW * self._count]
         self.settled = len(self._samples) >= self._count and self._judge()
 
     def _judge(self) -> bool:
@@ -167,7 +167,7 @@ class SettleWindow:
             return False  # all at one time: no trend
         noise = 1.0
         if trend.scatter_p < SCATTER_P:
-            enough = max(2 * self._count, FEW) * max(1.0, np.log10(trend.scatter))
+            enough = max(2 * self._count, MIN_SAMPLES) * max(1.0, np.log10(trend.scatter))
             if len(self._samples) < enough or self._shrinking():
                 return False
             noise = trend.scatter
@@ -216,9 +216,9 @@ def _trend(samples: Sequence[TrackerSample]) -> _Trend:
     return _Trend(root @ slope, moment, span, scatter, p, dof)
 
 
-SEARCHES = 2  # searches of a lost target in one reading, at most
-AGAIN = 3  # attempts at a reading, if void: the arm moved, or the samples disagree
-PATIENCE = 4  # windows of measurements after which, and after its time-out, settling fails
+MAX_SEARCHES = 2  # searches of a lost target in one reading, at most
+MAX_ATTEMPTS = 3  # attempts at a reading, if void: the arm moved, or the samples disagree
+MAX_WINDOWS = 4  # windows of measurements after which, and after its time-out, settling fails
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -232,7 +232,7 @@ class MeasuredStop:
     tracker: tuple[TrackerSample, ...]
     force: WrenchSample | None  # mean wrench of the force sensor; None without one
     settling: float  # settling time, cell s
-    ended: float  # cell s
+    end_time: float  # cell s
     remarks: tuple[str, ...]
     torque: Floats | None = None
     """(n,) mean measured torques of the drives, N·m; None where the arm does not report them."""
@@ -271,8 +271,8 @@ class Measurer:
                 remarks += measured.mean.warnings
                 return replace(measured, remarks=tuple(remarks), target=target)
             repeats += 1
-            if repeats == AGAIN:
-                raise DeviceError(f"{name}: measured {AGAIN} times without success: {why}")
+            if repeats == MAX_ATTEMPTS:
+                raise DeviceError(f"{name}: measured {MAX_ATTEMPTS} times without success: {why}")
             remarks.append(f"measured again: {why}")
             self._watcher.notify(Remark(f"{name}: {why}; measuring again"))
 
@@ -283,7 +283,7 @@ class Measurer:
         rest_start: float | None = None
         window = SettleWindow(acquire.samples)
         while True:
-            if not self._mover.at_rest(self._mover.look()):
+            if not self._mover.at_rest(self._mover.checked_sample()):
                 rest_start, window = None, SettleWindow(acquire.samples)
                 clock.sleep(POLL_S * clock.scale)
             else:
@@ -293,7 +293,7 @@ class Measurer:
                 if clock.now() - rest_start >= acquire.settle_s and window.settled:
                     return clock.now() - start
             late = clock.now() - start > acquire.settle_timeout_s
-            if late and (rest_start is None or count >= PATIENCE * acquire.samples):
+            if late and (rest_start is None or count >= MAX_WINDOWS * acquire.samples):
                 reason = "the readings drift"
                 if rest_start is None:
                     reason = "the arm does not rest at its goal"
@@ -306,16 +306,16 @@ class Measurer:
         self, settling: float, force: WrenchSample | None
     ) -> tuple[MeasuredStop | None, str]:
         """Average over the window; None and the reason where the reading is void."""
-        watch, before = self._mover.watch, self._mover.look()
+        watch, before = self._mover.watch, self._mover.checked_sample()
         differed = 0 if watch is None else watch.differed
         tracker: list[TrackerSample] = []
         arm_samples = [before]
         for _ in range(self._config.acquire.samples):
             tracker.append(self._tracker.measure())
-            arm_samples.append(self._mover.look())
+            arm_samples.append(self._mover.checked_sample())
         if force is None and self._meter is not None:
             force = self._meter.average()
-        after = self._mover.look()
+        after = self._mover.checked_sample()
         if (why := self._mover.check_still(before, after)) is not None:
             return None, why
         if watch is not None and watch.differed != differed and not self._wrong(force, after):
@@ -348,13 +348,13 @@ class Measurer:
         watch, meter = self._mover.watch, self._meter
         if watch is None or meter is None or force is None:
             return False
-        return bool(watch.wrong(meter.tared(force, sample.q)))
+        return bool(watch.difference(meter.tared(force, sample.q)))
 
     def _search(
         self, error: TargetLostError, name: str, searches: int, find: Callable[[], None]
     ) -> int:
         """Search the target; return the number of searches so far."""
-        while searches < SEARCHES:
+        while searches < MAX_SEARCHES:
             searches += 1
             self._watcher.notify(Remark(f"{name}: {error}; searching the target"))
             try:
@@ -362,9 +362,9 @@ class Measurer:
             except TargetLostError as again:
                 error = again
             else:
-                self._mover.look()
+                self._mover.checked_sample()
                 return searches
         raise TargetLostError(
-            f"{error} (at {name}, searched {SEARCHES} times). Clear the line of sight and have "
+            f"{error} (at {name}, searched {MAX_SEARCHES} times). Clear the line of sight and have "
             "the tracker see the target"
         )

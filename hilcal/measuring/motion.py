@@ -12,15 +12,17 @@ from hilcal.measuring.connect import Setup
 from hilcal.measuring.devices import ArmSample, LoadChangedError
 from hilcal.measuring.feasibility import Feasibility, Margins
 from hilcal.measuring.force import ForceMeter, TaredWrench, judged_part
-from hilcal.measuring.progress import ArmAt
-from hilcal.measuring.route import Stop, duration, on_route
+from hilcal.measuring.progress import ArmPosition
+from hilcal.measuring.route import Stop, duration, route_problems
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
 NORMAL = "normal"  # safety state of an arm without problems
 HOW_ON = "drive it by hand to a free place in the middle of its workspace"
 SLACK_M = 0.005  # allowed sag beyond the edge of the workspace, m
-SLACK = Margins(joint=-0.01, inside=-SLACK_M, clear=0.0, itself=0.0, bear=1.02)
+SLACK = Margins(
+    joint=-0.01, workspace=-SLACK_M, clearance=0.0, self_collision=0.0, torque_share=1.02
+)
 """Margins in motion, smaller than those of a dry run: an arm sags and lags, and a motion is checked
 at samples. Nothing may touch."""
 
@@ -33,9 +35,9 @@ class Guard:
         self._limits = Feasibility(cell, config, SLACK)
 
     def check(
-        self, sample: ArmSample, felt: Floats | None = None, hanging: str = UNLOADED
+        self, sample: ArmSample, wrench: Floats | None = None, hanging: str = UNLOADED
     ) -> str | None:
-        """Return the violated limit in one line, or None; `felt` is the sensor's wrench (6,)."""
+        """Return the violated limit in one line, or None; `wrench` is the sensor's wrench (6,)."""
         if (unfit := self.state(sample)) is not None:
             return unfit
         speed, limit = np.abs(sample.qd), self.config.limits.joint_speed_rad_s
@@ -44,7 +46,7 @@ class Guard:
             name = self.cell.arm.joint_names[k]
             return f"arm: {name} moves at {speed[k]:.3g} rad/s; joint_speed_rad_s is {limit:g}"
         violation = next(self._limits.findings(sample.q[None], hanging), None)
-        return self._pull(felt) if violation is None else f"{violation.at('arm')}; {HOW_ON}"
+        return self._pull(wrench) if violation is None else f"{violation.line('arm')}; {HOW_ON}"
 
     def state(self, sample: ArmSample) -> str | None:
         """Return why a sample is not one of this arm, ready to move, in one line; or None."""
@@ -57,13 +59,13 @@ class Guard:
             return "arm: it reports joint angles that are not numbers"
         return None
 
-    def _pull(self, felt: Floats | None) -> str | None:
+    def _pull(self, wrench: Floats | None) -> str | None:
         sensor = self.config.force_sensor
-        if felt is None or sensor is None:
+        if wrench is None or sensor is None:
             return None
         for part, unit, key, limit in (
-            (felt[:3], "N", "max_force_N", sensor.max_force_N),
-            (felt[3:], "N·m", "max_moment_Nm", sensor.max_moment_Nm),
+            (wrench[:3], "N", "max_force_N", sensor.max_force_N),
+            (wrench[3:], "N·m", "max_moment_Nm", sensor.max_moment_Nm),
         ):
             size = float(np.linalg.norm(part))
             if not size <= limit:  # negated, to refuse NaN
@@ -75,15 +77,15 @@ class Guard:
 
 
 # choices, no study set them; tests/unit/measuring/test_run_watched.py shows what they detect
-ALLOWED = 2.0
+TOLERANCE_FACTOR = 2.0
 """Tolerance of a hanging load, over the tolerance when it is hung: a sensor's zero drifts."""
-SWING = 0.3  # lateral force of a load that swings in motion, as a share of its weight: 17°
-PULL = 0.5
+SWING_SHARE = 0.3  # lateral force of a load that swings in motion, as a share of its weight: 17°
+PULL_SHARE = 0.5
 """Tolerance of a pull, as a share: its rope turns with the arm, its weight is on a pulley."""
 UNKNOWN_KG = 1.0
 """Tolerance of a tool that is not weighed yet, kg, or half of its mass in [tool] if larger."""
 HOLD_S = 0.2  # least duration of a difference in motion and between readings, real s
-LOOKS = 3  # the same, in samples
+HOLD_SAMPLES = 3  # the same, in samples
 
 
 class LoadWatch:
@@ -91,10 +93,10 @@ class LoadWatch:
 
     d = |R (f - f_tool) - f_load| with f the measured force, sensor axes, f_tool that of the tool
     and R the sensor's orientation; for a load that is a moment alone see `judged_part`. The limit
-    is `ALLOWED` times that of `[operator]` for hanging a load; it is larger for a pull (`PULL`),
-    and in motion for swinging (`SWING`) and acceleration. A tool that is not weighed yet may differ
-    from [tool] by `UNKNOWN_KG`. The tare removes that difference at its pose, so the limit grows
-    with the rotation of the sensor against gravity since then.
+    is `TOLERANCE_FACTOR` times that of `[operator]` for hanging a load; it is larger for a pull
+    (`PULL_SHARE`), and in motion for swinging (`SWING_SHARE`) and acceleration. A tool that is not
+    weighed yet may differ from [tool] by `UNKNOWN_KG`. The tare removes that difference at its
+    pose, so the limit grows with the rotation of the sensor against gravity since then.
     """
 
     def __init__(self, meter: ForceMeter, cell: Cell, config: CellConfig) -> None:
@@ -114,11 +116,11 @@ class LoadWatch:
         """Stop comparing, for a change of the load."""
         self.watching = False
 
-    def look(self, sample: ArmSample, felt: Floats, *, moving: bool) -> None:
+    def check_frame(self, sample: ArmSample, wrench: Floats, *, moving: bool) -> None:
         """Compare a frame of the sensor: a tared wrench (6,), sensor axes, N and N·m."""
         if not self.watching:
             return
-        tared = TaredWrench(felt, np.zeros((6, 6)), sample.q)
+        tared = TaredWrench(wrench, np.zeros((6, 6)), sample.q)
         difference, limit = self._compared(tared, moving=moving)
         if difference <= limit:
             self._since = None
@@ -126,10 +128,10 @@ class LoadWatch:
         self.differed += 1
         first, count = self._since or (sample.host_ns, 0)
         self._since = first, count + 1
-        if count + 1 >= LOOKS and sample.host_ns - first >= HOLD_S * 1e9:
+        if count + 1 >= HOLD_SAMPLES and sample.host_ns - first >= HOLD_S * 1e9:
             raise LoadChangedError(self._message(tared))
 
-    def wrong(self, tared: TaredWrench) -> str:
+    def difference(self, tared: TaredWrench) -> str:
         """Return why a mean wrench is not that of the expected load, in one line; else ""."""
         if not self.watching:
             return ""
@@ -147,20 +149,20 @@ class LoadWatch:
         part, _, lever = judged_part(self._hung)
         size, deviation = (float(np.linalg.norm(w[part])) / lever for w in (self._hung, difference))
         pulled = load is not None and any((*load.force_N, *load.moment_Nm))
-        share = max(ALLOWED * operator.tolerance_share, PULL if pulled else 0.0)
-        limit = max(ALLOWED * operator.tolerance_N, share * size)
+        share = max(TOLERANCE_FACTOR * operator.tolerance_share, PULL_SHARE if pulled else 0.0)
+        limit = max(TOLERANCE_FACTOR * operator.tolerance_N, share * size)
         mass = cell.tool_mass + (0.0 if load is None else load.mass_kg)
         if not self._meter.identified:
             unweighed = max(UNKNOWN_KG, 0.5 * cell.tool_mass)
-            limit += unweighed * self._meter.turned(tared.q)
+            limit += unweighed * self._meter.gravity_change(tared.q)
         if moving:
             motion = self._config.motion
             brief = motion.speed_rad_s < HOLD_S * motion.acceleration_rad_s2
             ramp = 0.0 if brief else motion.acceleration_rad_s2  # brief: shorter than HOLD_S
             limit += mass * cell.arm.reach * (ramp + motion.speed_rad_s**2)
             down = abs(float(difference[:3] @ cell.gravity)) / float(np.linalg.norm(cell.gravity))
-            lifted = limit + SWING**2 / 2 * size
-            limit += SWING * size
+            lifted = limit + SWING_SHARE**2 / 2 * size
+            limit += SWING_SHARE * size
             if load is not None and not pulled and down / lifted > deviation / limit:
                 return down, lifted
         return deviation, limit
@@ -178,7 +180,7 @@ class LoadWatch:
 
 POLL_S = 0.02  # between two samples of the devices while the arm moves, real s
 GRACE_S = 15.0  # allowed excess of a motion over three times its usual time, real s
-SLOWEST = 0.02  # share of the speed slider below which the time limit does not grow
+MIN_SPEED_SHARE = 0.02  # share of the speed slider below which the time limit does not grow
 STILL_RAD = 1e-4  # largest variation of the joints of an arm at rest, rad (some encoder steps)
 MOVED_RAD = 0.005
 """Largest distance of a joint from its last goal, rad, beyond which it was moved; brakes and sag
@@ -214,23 +216,23 @@ class Mover:
         self._under_way = False
         self._ticked: tuple[float, int] = (-1.0, 0)
 
-    def look(self) -> ArmSample:
+    def checked_sample(self) -> ArmSample:
         """Return a sample of the arm, after checks of the arm and of the force sensor."""
         sample = self._arm.sample()
-        felt = None if self._meter is None else self._meter.felt()
+        felt = None if self._meter is None else self._meter.present_wrench()
         checked = (self.guard.check(sample, felt, load) for load in self.hanging)
         reason = next(filter(None, checked), None) or self._clock_stands(sample)
         if reason is not None:
             if sample.safety != NORMAL:
                 self._arm.moving()  # in motion the driver raises the cause and the remedy
             raise DeviceError(reason)
-        if not self._under_way and (moved := self.moved(sample)) is not None:
+        if not self._under_way and (moved := self.moved_by_others(sample)) is not None:
             raise DeviceError(f"arm: {moved}")
         if self.watch is not None and felt is not None:
-            self.watch.look(sample, felt, moving=self._under_way)
+            self.watch.check_frame(sample, felt, moving=self._under_way)
         return sample
 
-    def moved(self, sample: ArmSample) -> str | None:
+    def moved_by_others(self, sample: ArmSample) -> str | None:
         """Return who seems to have moved the arm from its goal, and how far; else None."""
         if self.goal is None:
             return None
@@ -248,27 +250,30 @@ class Mover:
         end = self._clock.now() + seconds
         while (remaining := end - self._clock.now()) > 0:
             self._clock.sleep(min(remaining, 0.5 * self._clock.scale))
-            self.look()
+            self.checked_sample()
 
     def is_at(self, q: Floats) -> bool:
         """Whether the last motion went to exactly these joint angles (n,)."""
         return self.goal is not None and np.array_equal(q, self.goal)
 
-    def agreed(self, goal: Floats, name: str, left: Floats, ask: Callable[[str], None]) -> Floats:
+    def agreed_start(
+        self, goal: Floats, name: str, expected: Floats, ask: Callable[[str], None]
+    ) -> Floats:
         """Return the position (n,) of the arm, once its way to a goal is free and people agree.
 
-        If it does not stand where it was `left`, people are asked first, and it is checked anew.
+        If it does not stand where it is `expected`, people are asked first, and the way is checked
+        again.
         """
         while True:
             q = self.free_way(goal, name).q
-            joint, distance = self._worst(q - left)
+            joint, distance = self._worst(q - expected)
             if distance <= MOVED_RAD:
                 return q
             ask(
                 f"the arm does not stand where it was left: {joint} is {distance:.3g} rad off. Its "
                 f"way from there to {name} has been checked. It goes there next"
             )
-            left = q
+            expected = q
 
     def free_way(self, goal: Floats, name: str) -> ArmSample:
         """Return a sample of the arm; refuse one not ready, or whose way to `goal` is not free."""
@@ -279,14 +284,14 @@ class Mover:
         return sample
 
     def put_back(self, ask: Callable[[str], None]) -> None:
-        """Move an arm back that was moved during a question; see `agreed`."""
-        if self.goal is None or self.moved(self._arm.sample()) is None:
+        """Move an arm back that was moved during a question; see `agreed_start`."""
+        if self.goal is None or self.moved_by_others(self._arm.sample()) is None:
             return
         goal, name = self.goal, "where it was left"
-        self.goal = self.agreed(goal, name, goal, ask)
+        self.goal = self.agreed_start(goal, name, goal, ask)
         self.move(goal, name)
 
-    def left_here(self) -> None:
+    def set_goal_here(self) -> None:
         """Set the goal to the position of an arm that was stopped in motion."""
         if self.goal is None:
             self.goal = self._arm.sample().q
@@ -295,7 +300,7 @@ class Mover:
         """Check the straight line in joint space between two states (n,), rad."""
         for load in self.hanging:
             stops = Stop("where the arm stands", start, load), Stop(name, goal, load)
-            problems = on_route(self._limits, stops)
+            problems = route_problems(self._limits, stops)
             if problems:
                 raise DeviceError(
                     f"arm: it cannot go to {name} from where it stands: {problems[0]}; {HOW_ON}"
@@ -303,7 +308,7 @@ class Mover:
 
     def move(self, q: Floats, name: str) -> None:
         """Move straight to `q` (n,), rad; the way is checked from the arm's actual position."""
-        start = self.look().q
+        start = self.checked_sample().q
         if self.goal is not None and np.abs(start - self.goal).max() <= self._motion.arrival_rad:
             start = self.goal
         self.check_way(start, q, name)
@@ -324,10 +329,10 @@ class Mover:
         start_time, slowest = self._clock.now(), 1.0
         last: ArmSample | None = None
         while self._arm.moving():
-            sample = self.look()
+            sample = self.checked_sample()
             last = self._check_progress(start, q, sample, last, name)
-            self._watcher.notify(ArmAt(tuple(sample.q.tolist())))
-            slowest = min(slowest, max(sample.speed_scaling, SLOWEST))
+            self._watcher.notify(ArmPosition(tuple(sample.q.tolist())))
+            slowest = min(slowest, max(sample.speed_scaling, MIN_SPEED_SHARE))
             allowed = 3.0 * usual / slowest + GRACE_S * self._clock.scale
             if self._clock.now() - start_time > allowed:
                 raise DeviceError(
@@ -335,8 +340,8 @@ class Mover:
                     f"{usual:.0f} s are usual"
                 )
             self._clock.sleep(POLL_S * self._clock.scale)
-        arrived = self.look().q
-        self._watcher.notify(ArmAt(tuple(arrived.tolist())))
+        arrived = self.checked_sample().q
+        self._watcher.notify(ArmPosition(tuple(arrived.tolist())))
         joint, distance = self._worst(arrived - q)
         if not distance <= motion.arrival_rad:
             raise DeviceError(
@@ -370,7 +375,7 @@ class Mover:
         if last is None or np.abs(sample.q - last.q).max() > FROZEN_RAD:
             return sample
         near = np.abs(sample.q - goal).max() <= MOVED_RAD
-        if near or sample.speed_scaling < SLOWEST:
+        if near or sample.speed_scaling < MIN_SPEED_SHARE:
             return replace(last, host_ns=sample.host_ns)
         if sample.host_ns - last.host_ns > FROZEN_S * 1e9:
             raise DeviceError(

@@ -22,7 +22,7 @@ class Remark:
 
 
 @dataclass(frozen=True, slots=True)
-class ArmAt:
+class ArmPosition:
     """Joint angles of the moving arm, rad; several times a second."""
 
     q: tuple[float, ...]
@@ -94,10 +94,9 @@ class ReadingStored:
     """A reading has been stored."""
 
     step: Step
-    done: int  # stored readings of the whole campaign
+    stored: int  # stored readings of the whole campaign
     total: int  # readings of the plan
-    left_real: float  # estimated remaining time, real s
-    left_cell: float  # the same, cell s; differs in a simulated cell only
+    remaining_s: float  # estimated remaining time, real s
     deflection: float | None = None
     """Distance from the unloaded reading of the same pose and cycle, m; None for an unloaded
     reading, and where there is none yet."""
@@ -106,7 +105,7 @@ class ReadingStored:
     settling: float = 0.0  # settling time of the readings, cell s
     goal: GoalStatus | None = None  # status of the campaign's goal; None without one
     target: int = 0  # index of the first target read, in the cell
-    others: tuple[tuple[int, LiveResidual], ...] = ()
+    other_targets: tuple[tuple[int, LiveResidual], ...] = ()
     """Residuals of the other targets of the arrival, with their indices."""
 
 

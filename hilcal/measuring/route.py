@@ -106,7 +106,7 @@ class DryRun:
     load_changes: int  # number of load changes by a person
 
     @property
-    def first(self) -> str:
+    def first_problem(self) -> str:
         """The first problem, and the number of others."""
         others = len(self.problems) - 1
         suffix = f" (and {others} more: hilcal check --plan shows all)" if others else ""
@@ -126,7 +126,7 @@ def dry_run(cell: Cell, config: CellConfig, plan: Plan) -> DryRun:
         wrong = f"the plan has {width} joint angles per pose; {cell.arm.name} has {n} joints"
         return DryRun((wrong, *problems), (), 0.0, 0, 0)
     stops = route(plan, cell.arm, config.limits.joint_margin_rad)
-    problems += on_route(limits, stops)
+    problems += route_problems(limits, stops)
     moves = [(a, b) for a, b in pairwise(stops) if not np.array_equal(a.q, b.q)]
     pace = config.motion.speed_rad_s, config.motion.acceleration_rad_s2
     changes = sum(stop.change_to is not None for stop in stops)
@@ -166,26 +166,21 @@ def _load_problems(limits: Feasibility, plan: Plan) -> list[str]:
     return out
 
 
-def route_problems(cell: Cell, config: CellConfig, stops: tuple[Stop, ...]) -> list[str]:
-    """Return the problems of stops and of the paths between them, one line each."""
-    return on_route(Feasibility(cell, config), stops)
-
-
-def on_route(limits: Feasibility, stops: tuple[Stop, ...]) -> list[str]:
+def route_problems(limits: Feasibility, stops: tuple[Stop, ...]) -> list[str]:
     """Return the problems of stops and of the paths between them, one line each."""
     lines, at_stops = [], []
     for stop in stops:
         where, loads = f"pose {stop.name}", {stop.hanging: None, stop.change_to: None}
         violations = [x for load in loads if load for x in limits.findings(stop.q[None], load)]
-        at_stops.append({x.what for x in violations})
-        lines += [x.at(where) for x in violations]
+        at_stops.append({x.key for x in violations})
+        lines += [x.line(where) for x in violations]
         if stop.step is not None and limits.sight is not None:
             lines += limits.sight.problems(stop.q[None], stop.step.load, where)
     for (a, b), (at_a, at_b) in zip(pairwise(stops), pairwise(at_stops), strict=True):
         if not np.array_equal(a.q, b.q):
             where = f"between {a.name} and {b.name}"
             between = limits.findings_between(a.q, b.q, b.hanging)
-            lines += [x.at(where) for x in between if x.what not in at_a | at_b]
+            lines += [x.line(where) for x in between if x.key not in at_a | at_b]
     return list(dict.fromkeys(lines))
 
 
@@ -194,7 +189,7 @@ def _remarks(plan: Plan, limits: Feasibility) -> list[str]:
     is_test = "purpose" in plan.about  # of a model: unloaded readings may be in another file
     unloaded = {(s.pose, s.cycle) for s in plan.steps if s.load == UNLOADED}
     unpaired = [s for s in plan.steps if (s.pose, s.cycle) not in unloaded]
-    if unpaired and not is_test and limits.config.fitted == "deflection":
+    if unpaired and not is_test and limits.config.readings_mode == "deflection":
         first = Step(unpaired[0].pose, UNLOADED, unpaired[0].cycle)
         out.append(
             f"{len(unpaired)} loaded readings have no unloaded one of the same pose and cycle, "
@@ -221,24 +216,25 @@ def seconds_at_rest(config: CellConfig) -> float:
 
 
 def way_home(
-    cell: Cell, config: CellConfig, plan: Plan, behind: Sequence[Stop], done: frozenset[Step]
+    cell: Cell, config: CellConfig, plan: Plan, visited: Sequence[Stop], done: frozenset[Step]
 ) -> tuple[Stop, ...]:
     """Return the route to the reference pose, where the load is taken off and the drift is read.
 
     The arm moves straight if that is clear; else back along its route, which is clear, until the
-    straight motion is. The reading is the plan's next return to the reference pose. `behind` are
+    straight motion is. The reading is the plan's next return to the reference pose. `visited` are
     the stops of this session; the arm stands at the last one.
     """
     base = home(plan)
-    q_home, last = plan.joints(base), behind[-1]
+    q_home, last = plan.joints(base), visited[-1]
     hanging = last.hanging if last.change_to is None else last.change_to
     destination = Stop(base, q_home, hanging, change_to=None if hanging == UNLOADED else UNLOADED)
     way: list[Stop] = []
     limits = Feasibility(cell, config)
-    for stop in reversed(behind):
+    for stop in reversed(visited):
         candidate = Stop(stop.name, stop.q, hanging)
         way.append(candidate)
-        if np.array_equal(candidate.q, q_home) or not on_route(limits, (candidate, destination)):
+        at_home = np.array_equal(candidate.q, q_home)
+        if at_home or not route_problems(limits, (candidate, destination)):
             break
     way = [*way[1:], destination]
     returned = last.step is not None and (last.step.pose, last.step.load) == (base, UNLOADED)

@@ -128,7 +128,7 @@ class Session:
             self._meter.zero = np.array(felt["zero"])
             self._identify()
 
-    def walk(self, stops: tuple[Stop, ...]) -> None:
+    def visit(self, stops: tuple[Stop, ...]) -> None:
         """Visit all stops; move home as soon as the goal is met."""
         self._event("start", {"missing": sum(s.step is not None for s in stops)})
         self._begin(stops[:2])
@@ -141,12 +141,14 @@ class Session:
             behind.append(stop)
             result = self._watched(partial(self._visit, stop))
             if stop.step is not None and result is not None:
-                pace.read()
+                pace.note_reading()
                 if self._goal_newly_met(last=all(s.step is None for s in ahead)):
                     done = self._store.done()
                     ahead = way_home(self._cell, self._config, self._plan, behind, done)
                 readings_left = sum(s.step is not None for s in ahead)
-                remaining = pace.left(readings_left, sum(s.change_to is not None for s in ahead))
+                remaining = pace.remaining(
+                    readings_left, sum(s.change_to is not None for s in ahead)
+                )
                 self._tell(stop.step, *result, remaining)
         self._finish()
 
@@ -167,12 +169,12 @@ class Session:
         self._move(stop)
         change = None if stop.change_to == self._hook.hanging else stop.change_to
         if change is not None:
-            self._pace.arrived()
+            self._pace.note_motion()
             self._change(change)
         if not self._tared:
             self._tare()
         if change is not None:
-            self._pace.changed()
+            self._pace.note_load_change()
         return None if stop.step is None else self._reading(stop, stop.step)
 
     def _watched(self, do: Callable[[], Done]) -> Done:
@@ -184,7 +186,7 @@ class Session:
                 self._rig.arm.stop()
                 if not remaining:
                     raise
-                self._mover.left_here()
+                self._mover.set_goal_here()
                 self._event("load", {"hanging": None, "why": str(error)})
                 self._remark(f"{error} The arm stands")
                 self._hook.restore(str(error))
@@ -203,9 +205,11 @@ class Session:
         sample = self._mover.free_way(first.q, first.name)
         if self._temperatures is None:
             self._temperatures = bool(np.isfinite(sample.joint_temperature).all())
-        self._hook.begin()
+        self._hook.take_all_off()
         expected = sample.q if last_q is None else last_q
-        self._mover.goal = self._mover.agreed(first.q, first.name, expected, self._hook.confirm)
+        self._mover.goal = self._mover.agreed_start(
+            first.q, first.name, expected, self._hook.confirm
+        )
         self.in_control = True
         self._rig.arm.take_control(*payload(self._cell, None))
         self._watched(self._zero)
@@ -244,8 +248,8 @@ class Session:
         self._watcher.notify(Phase("taring the force sensor"))
         self._mover.wait(self._config.acquire.settle_s)
         sample = meter.average()
-        q = self._mover.look().q
-        wrong = watch.wrong(meter.tared(sample, q))
+        q = self._mover.checked_sample().q
+        wrong = watch.difference(meter.tared(sample, q))
         if wrong:
             raise LoadChangedError(wrong)
         meter.set_zero(sample, q)
@@ -338,7 +342,7 @@ class Session:
         if stray is not None:
             return DeviceError(stray)
         watch, tared = self._mover.watch, self._tared_wrench(measured)
-        wrong = "" if watch is None or tared is None else watch.wrong(tared)
+        wrong = "" if watch is None or tared is None else watch.difference(tared)
         return LoadChangedError(wrong) if wrong else None
 
     def _row(
@@ -350,13 +354,13 @@ class Session:
             measured.target,
             self._cell.target_names,
         )
-        elapsed = self._elapsed + measured.ended - self._start
+        elapsed = self._elapsed + measured.end_time - self._start
         temperature, torque = self._temperature(measured), self._torque(measured)
         states = States(
             q=stop.q[None].copy(),
             wrench=self._wrench(step, tared)[None].copy(),
             time=np.array([elapsed]),
-            load_time=np.array([measured.ended - self._hook.since]),
+            load_time=np.array([measured.end_time - self._hook.since]),
             joint_temperature=None if temperature is None else temperature[None],
             approach=self._mover.side[None].copy(),
             q_actual=measured.q[None].copy(),
@@ -445,7 +449,6 @@ class Session:
             self._done,
             len(self._plan.steps),
             self._clock.real(remaining),
-            remaining,
             self._state.deflection(step, reading.value[0, :3], number),
             live,
             settling,
@@ -472,7 +475,7 @@ class Session:
         estimate = repeatability(self._state.visits)
         if estimate is not None:
             self._event("repeatability", asdict(estimate))
-            self._remark(estimate.words(self._joint_std))
+            self._remark(estimate.sentence(self._joint_std))
         self._event("finished", {"readings": self._done})
         self._watcher.notify(Phase("finished"))
 
@@ -520,7 +523,7 @@ def run(
     setup = Setup(rig, cell, config, clock, watcher)
     session = Session(setup, plan, store, live, wall, goal, epoch)
     try:
-        session.walk(route(missing, cell.arm, config.limits.joint_margin_rad))
+        session.visit(route(missing, cell.arm, config.limits.joint_margin_rad))
     except BaseException as error:
         trouble = _stop(rig.arm) if session.in_control else ""
         _note(store, error, trouble)
@@ -530,7 +533,7 @@ def run(
 def _safe(checked: DryRun) -> DryRun:
     """Refuse a plan with problems: InputError names the first, and how many more there are."""
     if checked.problems:
-        raise InputError(f"the plan is not safe to run, nothing has moved: {checked.first}")
+        raise InputError(f"the plan is not safe to run, nothing has moved: {checked.first_problem}")
     return checked
 
 

@@ -41,23 +41,23 @@ class RepeatabilityEstimate:
     with the instrument's noise; NaN in campaigns of older versions."""
 
     @property
-    def shown(self) -> bool:
+    def significant(self) -> bool:
         """Whether the scatter exceeds the instrument's noise (false alarms: about 1 in 100)."""
         total, noise = self.scatter**2, self.instrument**2
         return bool(total - noise > 3.0 * noise * np.sqrt(2.0 / (3.0 * max(self.dof, 1))))
 
     @property
-    def returns(self) -> str:
+    def returns_text(self) -> str:
         """Numbers of returns and poses, in words."""
         dof, poses = self.dof, self.poses
         return f"{dof} return{'s' * (dof != 1)} to {poses} pose{'s' * (poses != 1)}"
 
-    def words(self, configured: Floats) -> str:
+    def sentence(self, configured: Floats) -> str:
         """Return the estimate for people, with the configured standard deviations (n,), rad."""
         stated = float(np.sqrt(np.mean(configured**2)))
-        joints = f"is about {self.joint_std:.1g}" if self.shown else "is too small to be seen"
+        joints = f"is about {self.joint_std:.1g}" if self.significant else "is too small to be seen"
         return (
-            f"{self.returns} scatter{'s' * (self.dof == 1)} by {1e6 * self.scatter:.0f} µm, "
+            f"{self.returns_text} scatter{'s' * (self.dof == 1)} by {1e6 * self.scatter:.0f} µm, "
             f"the instrument alone by {1e6 * self.instrument:.0f} µm: joint_std_rad {joints}, "
             f"configured {stated:.1g}"
         )
@@ -170,20 +170,20 @@ class Eta:
         self._readings: list[float] = []
         self._changes: list[float] = []
 
-    def arrived(self) -> None:
+    def note_motion(self) -> None:
         """Note the end of a motion to a load change; it counts for the next reading."""
         self._moving += self._lap()
 
-    def changed(self) -> None:
+    def note_load_change(self) -> None:
         """Note the end of a load change."""
         self._changes.append(self._lap())
 
-    def read(self) -> None:
+    def note_reading(self) -> None:
         """Note a stored reading."""
         self._readings.append(self._moving + self._lap())
         self._moving = 0.0
 
-    def left(self, readings: int, changes: int) -> float:
+    def remaining(self, readings: int, changes: int) -> float:
         """Return the expected time of readings and changes, cell s."""
         reading = float(np.mean(self._readings)) if self._readings else 0.0
         change = float(np.mean(self._changes)) if self._changes else LOADING_S

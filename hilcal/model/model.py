@@ -157,7 +157,7 @@ class Model(Brief):
         angle = states.q if states.q_actual is None else states.q_actual
         angle = along_states(angle)
         parts = self._parts(theta)
-        turns = chains.turns(cell.arm, angle)
+        turns = chains.joint_motions(cell.arm, angle)
         chain = near.situation.chain if near else None
         chain = chain or chains.evaluate(cell.arm, angle, nominal=turns)
         nothing = zeros(len(states), cell.arm.n + 1, 6)

@@ -10,7 +10,7 @@ from hilcal import numbers
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensation import BAND, Compensation
 from hilcal.calibration.improvement import Improvement
-from hilcal.calibration.measured import WORDS, Outside
+from hilcal.calibration.measured import CONDITION_NAMES, Outside
 from hilcal.calibration.programs.program import ProgramPoint
 from hilcal.calibration.urscript import Waypoint
 from hilcal.identification import validation
@@ -19,7 +19,7 @@ from hilcal.identification.carried import names_of
 from hilcal.numbers import length
 from hilcal.present.document import Block, Table, heading, load_name, note, table
 from hilcal.present.fit import error_words, kind, model_name
-from hilcal.present.progress import spoken
+from hilcal.present.progress import duration_text
 from hilcal.present.registration import base_line
 from hilcal.present.verdict import UNCALIBRATED, repeatability_source
 from hilcal.readings.whitening import Mode
@@ -58,7 +58,7 @@ DOES: Mapping[str, str] = {
 """Steps that compute, with their duration for a campaign of some hundred readings."""
 MOST_LEFT, LISTED = 6, 12  # listed points without a correction; listed compensated points
 MOST, WORST = 4, 6  # listed variables; listed poses
-DOUBTED = 1.5  # least rms ratio of error to stated standard deviation that is reported
+MIN_ERROR_RATIO = 1.5  # least rms ratio of error to stated standard deviation that is reported
 WIDER = 1.5
 """Ratio of drawn to stated standard uncertainty above which the stated one is called too small; a
 choice. 200 draws determine a standard deviation to 5 %, few poses much less well."""
@@ -74,16 +74,17 @@ def step_heading(step: "ProcedureStep", clock: float = 1.0) -> Iterator[Block]:
     of_planned = "" if step.missing == step.planned else f" of {step.planned}"
     changes = step.load_changes
     load_changes = f", {changes} load change{'s' * (changes != 1)}" if changes else ""
-    yield f"{step.missing}{of_planned} readings{load_changes}: {lasting(step.seconds, clock)}.\n"
+    duration = cell_duration(step.seconds, clock)
+    yield f"{step.missing}{of_planned} readings{load_changes}: {duration}.\n"
 
 
-def lasting(seconds: float, clock: float = 1.0) -> str:
+def cell_duration(seconds: float, clock: float = 1.0) -> str:
     """Return a duration, in cell seconds; a simulated cell runs `clock` times faster."""
     faster = "" if clock == 1.0 else f" ({clock:g} times faster in this simulated cell)"
-    return f"about {spoken(seconds)}{faster}"
+    return f"about {duration_text(seconds)}{faster}"
 
 
-def standing(step: "ProcedureStep") -> str:
+def state_clause(step: "ProcedureStep") -> str:
     """Return the state of a calibration in a clause."""
     if step.kind == "done":
         return "it is complete"
@@ -101,7 +102,7 @@ def decision_report(
     band = length(d.error.now_m)
     yield f"Predicted after compensation: {100 * BAND:.0f} % of the points within {band}."
     goal, then = ("" if x is None else length(x) for x in (goal_m, d.then_m))
-    cost = f"further readings ({lasting(d.seconds, clock)})"
+    cost = f"further readings ({cell_duration(d.seconds, clock)})"
     cost = "" if d.plan is None else f"{len(d.plan.steps)} {cost}"
     names = numbers.names(d.suspects)
     would = f"separate {names}" if d.suspects else f"lower the predicted error to {then}"
@@ -225,7 +226,7 @@ def refusals(c: Compensation, allowed_outside: bool) -> list[str]:
 
 
 def _outside(o: Outside, k: int) -> str:
-    value, r = float(o.values[k]), o.of
+    value, r = float(o.values[k]), o.range
     if r.unit == "rad" or (r.unit == "m" and r.variable.endswith(" travel")):
         at_point, low, high = (numbers.joint_value(x, r.unit) for x in (value, r.low, r.high))
         return f"{r.variable} {at_point}, measured {low} to {high}"
@@ -263,9 +264,10 @@ def compensation_report(
     yield from ("", rows)
     for o in c.turned_on:
         yield (
-            f"{o.of.variable}: in {int(o.points.sum())} of {len(names)} points whole turns from "
-            f"what was measured, {np.degrees(o.of.low):.1f}° to {np.degrees(o.of.high):.1f}°. The "
-            "model is the same there; what cables do is not in it."
+            f"{o.range.variable}: in {int(o.points.sum())} of {len(names)} points whole turns from "
+            f"what was measured, {np.degrees(o.range.low):.1f}° to "
+            f"{np.degrees(o.range.high):.1f}°. "
+            "The model is the same there; what cables do is not in it."
         )
     if len(names) > LISTED:
         yield f"The {LISTED} of {len(names)} points with the largest error before are listed."
@@ -275,7 +277,7 @@ def _contributions(calibration: Calibration, untold: Sequence[str]) -> Iterator[
     yield "the parameters"
     for name in untold:
         moved = length(float(np.sqrt(3 * calibration.conditions[name].variance_m2)))
-        yield f"{WORDS[name]}, which the points do not tell ({moved} rms)"
+        yield f"{CONDITION_NAMES[name]}, which the points do not tell ({moved} rms)"
     if calibration.misfit > 0:
         yield f"what the model leaves ({length(float(np.sqrt(3 * calibration.misfit)))} rms)"
     source = repeatability_source(calibration.scatter.source, calibration.model.cell.arm)
@@ -284,7 +286,7 @@ def _contributions(calibration: Calibration, untold: Sequence[str]) -> Iterator[
 
 
 @dataclass(frozen=True, slots=True)
-class Fate:
+class WaypointOutcome:
     """Outcome of the correction of one waypoint of a program."""
 
     line: int  # of the program
@@ -293,17 +295,19 @@ class Fate:
     blend_m: float  # radius within which the arm passes the waypoint without a stop
 
 
-def fates(waypoints: Sequence[Waypoint | ProgramPoint], refused: Sequence[str]) -> list[Fate]:
+def waypoint_outcomes(
+    waypoints: Sequence[Waypoint | ProgramPoint], refused: Sequence[str]
+) -> list[WaypointOutcome]:
     """Return the outcome of each waypoint; `refused`: a reason or "" per understood waypoint."""
     reasons, out = iter(refused), []
     for w in waypoints:
-        why = w.left or next(reasons)
-        done = "left" if w.left else "refused" if why else "corrected"
-        out.append(Fate(w.line, done, why or None, w.blend_m))
+        why = w.not_corrected or next(reasons)
+        done = "left" if w.not_corrected else "refused" if why else "corrected"
+        out.append(WaypointOutcome(w.line, done, why or None, w.blend_m))
     return out
 
 
-def waypoints_table(outcomes: Sequence[Fate]) -> Iterator[Block]:
+def waypoints_table(outcomes: Sequence[WaypointOutcome]) -> Iterator[Block]:
     """Yield a table of all waypoints of a program; nothing without waypoints."""
     if not outcomes:
         return
@@ -316,7 +320,7 @@ def waypoints_table(outcomes: Sequence[Fate]) -> Iterator[Block]:
         yield "Of a blended waypoint the corner of the path is corrected; the radius stays."
 
 
-def opening(judged: validation.Judged, test: validation.Validation) -> Iterator[str]:
+def fit_and_test_lines(judged: validation.Judged, test: validation.Validation) -> Iterator[str]:
     """Yield the number of readings that were fitted, and the error of the tested ones."""
     error = f"{length(test.error.rms_m)} rms"
     noise = f"noise alone would leave {length(test.noise_floor)}.\n"
@@ -370,7 +374,7 @@ def validation_report(
         yield from (f"  {_beyond(v)}" for v in beyond.variables[:MOST])
         unlisted = len(beyond.variables) - MOST
         yield f"  and {unlisted} more variables\n" if unlisted > 0 else ""
-    if (z_all := _rms(beyond.z)) > DOUBTED:
+    if (z_all := _rms(beyond.z)) > MIN_ERROR_RATIO:
         yield f"These readings are {z_all:.2g} times as far off as the fit states.\n"
 
 

@@ -14,7 +14,7 @@ from hilcal.identification.fit import Fit
 from hilcal.measuring.session_state import RepeatabilityEstimate
 from hilcal.present.document import Block, Table, Words, heading, note, pairs, table
 from hilcal.present.fit import error_words, model_name
-from hilcal.present.progress import spoken
+from hilcal.present.progress import duration_text
 from hilcal.present.registration import observed_words
 from hilcal.store.overview import Overview
 from hilcal.store.revision import RevisionRecord, change
@@ -34,7 +34,7 @@ begin with.
 """
 MARKS = {"ok": "✓", "warning": "!", "problem": "✗"}
 WIDEST, LISTED = 34, 12  # most characters of a table cell; most unused columns that are listed
-SHOWN = ("start", "load", "doubted", "goal", "interrupted", "failed", "finished")
+LISTED_EVENTS = ("start", "load", "doubted", "goal", "interrupted", "failed", "finished")
 """Kinds of events that are always listed; drift is listed only above its limit."""
 MOST_EVENTS = 30
 NONE, UNSEEN = "–", "not determined"
@@ -100,7 +100,7 @@ def import_preview(proposal: Proposal, rows: int, source: str) -> Iterator[Block
     if file := proposal.sections.get("file", {}):
         yield "  " + ", ".join(f"{key} = {value!r}" for key, value in file.items())
     understood = [
-        (u.what, _short(u.columns), u.meaning, _short(u.example)) for u in proposal.understood
+        (u.section, _short(u.columns), u.meaning, _short(u.example)) for u in proposal.quantities
     ]
     if understood:
         yield table("what", "columns", "meaning", "first row", rows=understood, left=(0, 1, 2, 3))
@@ -108,8 +108,8 @@ def import_preview(proposal: Proposal, rows: int, source: str) -> Iterator[Block
     if len(unused) > LISTED:
         unused = [*unused[:LISTED], f"and {len(unused) - LISTED} more"]
     for title, sentences in (
-        ("missing:", proposal.lacking),
-        ("unsure:", [f"{column}: {doubt}" for column, doubt in proposal.unsure]),
+        ("missing:", proposal.missing),
+        ("unsure:", [f"{column}: {doubt}" for column, doubt in proposal.doubts]),
         ("not used:", [", ".join(unused)] if unused else []),
     ):
         if sentences:
@@ -149,7 +149,7 @@ def check_report(answers: "tuple[ConnectionResult, ...]", dry: "DryRun | None") 
     else:
         yield (
             f"The plan keeps every limit: {dry.motions} motions, {dry.load_changes} load changes, "
-            f"about {spoken(dry.duration)}."
+            f"about {duration_text(dry.duration)}."
         )
     yield from (f"note: {remark}" for remark in dry.remarks)
 
@@ -252,15 +252,17 @@ def _checks(o: Overview) -> Iterator[tuple[str, str]]:
     if o.repeatability is not None:
         r = RepeatabilityEstimate(**o.repeatability)
         joints = "that of the joints is too small to be seen"
-        if r.shown:
+        if r.significant:
             joints = f"joints {numbers.digits(1e6 * r.joint_std, 2)} µrad"
         scatter, alone = numbers.length(r.scatter), numbers.length(r.instrument)
-        returns = f"{r.returns} scatter{'s' * (r.dof == 1)} by {scatter}"
+        returns = f"{r.returns_text} scatter{'s' * (r.dof == 1)} by {scatter}"
         yield "repeatability", f"{returns}, the instrument alone by {alone}; {joints}"
 
 
 def _events(o: Overview) -> Iterator[Block]:
-    shown = [e for e in o.events if e["kind"] in SHOWN or (e["kind"] == "drift" and e["over"])]
+    shown = [
+        e for e in o.events if e["kind"] in LISTED_EVENTS or (e["kind"] == "drift" and e["over"])
+    ]
     if not shown:
         yield "None yet."
         return

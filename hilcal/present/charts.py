@@ -22,7 +22,7 @@ from hilcal.identification.carried import names_of
 from hilcal.identification.fit import Fit
 from hilcal.names import escaped
 from hilcal.present.document import load_name
-from hilcal.present.fit import CERTAIN, follows
+from hilcal.present.fit import CERTAIN, dependence_sentence
 from hilcal.present.story import (
     LEVEL_NAMES,
     LIMITS,
@@ -49,7 +49,7 @@ CONFIG: dict[str, object] = {"displayModeBar": False, "responsive": True, "scrol
 SIGMA_LIMITS = np.sqrt(chi2.ppf(LIMITS, 3)).tolist()
 """Mahalanobis distances above which a reading is doubtful, and outside."""
 _INK = {False: ("#24272e", "#d9dbe0"), True: ("#e4e5e9", "#3b3f48")}
-MOST = 1500  # points of a chart; a choice that limits a page to 8 MB
+MAX_POINTS = 1500  # points of a chart; a choice that limits a page to 8 MB
 MOST_POSES, LONGEST_NAME = 16, 12  # poses that are all named at the axis; characters of a name
 LONGEST, MOST_ARROWS = 0.25, 300  # drawn length of the largest residual, m; arrows of a level
 MOST_VARIABLES, MOST_CORRELATED, MOST_FAMILIES = 12, 30, 16
@@ -83,7 +83,7 @@ def template(dark: bool) -> go.layout.Template:
 
 
 def figure(
-    says: str,
+    description: str,
     x: str = "",
     y: str = "",
     height: int = 360,
@@ -92,10 +92,10 @@ def figure(
 ) -> go.Figure:
     """Return a figure in the light scheme, `height` CSS pixels high and as wide as the page.
 
-    `says` is the sentence below the chart; `x` and `y` are the titles of the axes, with units.
+    `description` is the sentence below the chart; `x` and `y` are titles of the axes, with units.
     """
     out = go.Figure(data=list(traces))
-    out.update_layout(template=template(False), height=height, meta={"says": escaped(says)})
+    out.update_layout(template=template(False), height=height, meta={"says": escaped(description)})
     out.update_layout(xaxis={"title": {"text": x}}, yaxis={"title": {"text": y}})
     out.update_layout(**layout)
     return out
@@ -107,14 +107,16 @@ def line(
     """Return a line without hover text."""
     look = {"color": color, "width": 2, "dash": dash}
     options = {"name": name, "showlegend": bool(name), "hoverinfo": "skip"}
-    return go.Scatter(x=single(x), y=single(y), mode="lines", line=look, **options)
+    return go.Scatter(
+        x=single_precision(x), y=single_precision(y), mode="lines", line=look, **options
+    )
 
 
 def marks(
     x: object, y: object, color: str = MEASURED, symbol: str = "circle", size: int = 6, **more: Any
 ) -> go.Scatter:
     """Return points at numbers or names; `more` has further options of plotly, e.g. hover text."""
-    x, y = (single(v) if isinstance(v, np.ndarray) else v for v in (x, y))
+    x, y = (single_precision(v) if isinstance(v, np.ndarray) else v for v in (x, y))
     marker = {"color": color, "symbol": symbol, "size": size}
     return go.Scatter(**{"x": x, "y": y, "mode": "markers", "marker": marker, **more})
 
@@ -131,7 +133,7 @@ def bars(
     names: Sequence[str],
     values: Sequence[float],
     hover: Sequence[str],
-    says: str,
+    description: str,
     x: str,
     colors: Sequence[str] | str = MEASURED,
 ) -> go.Figure:
@@ -140,7 +142,7 @@ def bars(
     formats = ((v, ".0f" if abs(v) >= 10 else ".2g") for v in values)
     text = ["0" if abs(v) < 0.005 else format(v, spec) for v, spec in formats]
     trace = bar(values, [label(n) for n in names], colors, text, **options)
-    out = figure(says, x=x, traces=[trace], height=90 + 28 * len(names))
+    out = figure(description, x=x, traces=[trace], height=90 + 28 * len(names))
     out.update_yaxes(autorange="reversed")
     return out
 
@@ -162,7 +164,7 @@ def empty(why: str) -> go.Figure:
     return figure(why, height=160, annotations=[note], xaxis=hidden, yaxis=hidden)
 
 
-def single(values: Floats) -> Floats:
+def single_precision(values: Floats) -> Floats:
     """Return numbers in single precision, which halves the size of pages."""
     return np.asarray(values, dtype=np.float32)
 
@@ -191,7 +193,7 @@ class ChartReadings:
         level = self.revision.level[self.index]
         yield from ((int(k), np.flatnonzero(level == k)) for k in np.unique(level))
 
-    def named(self, members: Ints | slice = slice(None)) -> list[str]:
+    def hover_texts(self, members: Ints | slice = slice(None)) -> list[str]:
         """Return the hover text of readings: pose, load, target if there are several, distance."""
         story, size, sigma = self.story, self.revision.size_m, self.revision.sigma
         out = []
@@ -205,18 +207,20 @@ class ChartReadings:
     def marks(self, x: Floats, y: Floats, level: int, members: Ints, **more: Any) -> go.Scatter:
         """Return the members of a level as points at x, y (K,)."""
         points = x[members], y[members], LEVELS[level], SYMBOLS[level]
-        more |= {"name": LEVEL_NAMES[level], "text": self.named(members)}
+        more |= {"name": LEVEL_NAMES[level], "text": self.hover_texts(members)}
         return marks(*points, **more, hovertemplate="%{text}<extra></extra>")
 
 
-def drawn(story: Story, revision: StoryRevision, most: int = MOST) -> ChartReadings:
-    """Choose at most `most` readings to draw."""
-    return ChartReadings(story, revision, worst_and_even(revision.whitened_norm2, most))
+def chart_readings(
+    story: Story, revision: StoryRevision, max_points: int = MAX_POINTS
+) -> ChartReadings:
+    """Choose at most `max_points` readings to draw."""
+    return ChartReadings(story, revision, worst_and_even(revision.whitened_norm2, max_points))
 
 
 def residual_by_pose(story: Story, revision: StoryRevision) -> go.Figure:
     """Draw the residual of each reading in σ over its pose, poses by number."""
-    d, full = drawn(story, revision), [story.pose_name(int(i)) for i in story.first]
+    d, full = chart_readings(story, revision), [story.pose_name(int(i)) for i in story.first]
     out = _residuals(d, story.row[d.index].astype(float), "", _extremes(story, revision, "pose"))
     short = [n if len(n) <= LONGEST_NAME else f"…{n[1 - LONGEST_NAME :]}" for n in full]
     names, step = [label(n) for n in short], -(-len(full) // MOST_POSES)
@@ -225,7 +229,7 @@ def residual_by_pose(story: Story, revision: StoryRevision) -> go.Figure:
 
 def residual_by_load(story: Story, revision: StoryRevision) -> go.Figure:
     """Draw the residual of each reading in σ over its load."""
-    d = drawn(story, revision)
+    d = chart_readings(story, revision)
     loads = list(dict.fromkeys(story.load_names))
     position = np.array([loads.index(name) for name in story.load_names], dtype=float)
     # scattered within a load, so that points do not hide each other
@@ -239,7 +243,7 @@ def residual_over(
     story: Story, revision: StoryRevision, values: Floats, name: str, unit: str
 ) -> go.Figure:
     """Draw residuals in σ over values (N,) in a display unit; NaN: unknown."""
-    d = drawn(story, revision)
+    d = chart_readings(story, revision)
     finite = np.isfinite(values)
     x = np.where(finite, values, np.median(values[finite]) if finite.any() else 0.0)
     high = x > np.median(x)
@@ -294,11 +298,11 @@ def _residuals(d: ChartReadings, x: Floats, title: str, sentence: str) -> go.Fig
 
 def measured_predicted(story: Story, revision: StoryRevision) -> go.Figure:
     """Draw measured over predicted deviations from the nominal arm, along the base axes."""
-    d = drawn(story, revision, most=500)  # three points each
+    d = chart_readings(story, revision, max_points=500)  # three points each
     x, y = (1e6 * story.deviation(v) for v in (revision.predicted, story.measured))
     ends = np.array([min(x.min(), y.min()), max(x.max(), y.max())])
     traces: list[object] = [line(ends, ends, "exact", dash="dash")]
-    colors, text = (MEASURED, HOLDOUT, AMBER), d.named()
+    colors, text = (MEASURED, HOLDOUT, AMBER), d.hover_texts()
     for k, (axis, color) in enumerate(zip("xyz", colors, strict=True)):
         values = "measured %{y:.1f} µm, predicted %{x:.1f} µm<extra></extra>"
         hover = f"%{{text}}<br>{axis}: {values}"
@@ -319,7 +323,7 @@ def workspace(
     story: Story, revision: StoryRevision, plane: Literal["xy", "xz"] = "xy"
 ) -> go.Figure:
     """Draw target and residual of each reading, by level; "xy" is the view from above."""
-    d = drawn(story, revision, most=1000)
+    d = chart_readings(story, revision, max_points=1000)
     axes = ["xyz".index(a) for a in plane]
     target, residual = story.anchor[d.index][:, axes], revision.residual[d.index][:, axes]
     largest = float(revision.size_m.max(initial=0.0))
@@ -348,7 +352,7 @@ def workspace(
 
 def added_variable(r: DependenceCurve, effect: str) -> go.Figure:
     """Draw the added-variable plot of an effect; its slope is 1 if the effect is the right one."""
-    rows = worst_and_even(np.abs(r.y), MOST)
+    rows = worst_and_even(np.abs(r.y), MAX_POINTS)
     ends = np.array([r.x.min(), r.x.max()])
     slope = float(r.x @ r.y / max(float(r.x @ r.x), 1e-300))
     hover = "would explain %{x:.1f}, residual %{y:.1f}<extra></extra>"
@@ -373,7 +377,7 @@ def misfit_shares(d: Diagnosis) -> go.Figure:
     shares, names = [100 * v.share for v in rows], [v.variable for v in rows]
     hover = [f"{v.variable}: {100 * v.share:.0f} %, {numbers.p_equals(v.p_value)}" for v in rows]
     colors = [MEASURED if v.p_value < CERTAIN else GREY for v in rows]
-    says = f"{follows(d.misfit_breakdown)} Grey bars are within chance."
+    says = f"{dependence_sentence(d.misfit_breakdown)} Grey bars are within chance."
     return bars(names, shares, hover, says, "share of the misfit [%]", colors)
 
 
@@ -390,7 +394,7 @@ def curve_chart(c: DependenceCurve) -> go.Figure:
         hovertemplate="%{x}: %{y:.3g} ± %{error_y.array:.2g}<extra></extra>",
         showlegend=c.line is not None,
     )
-    says = f"{c.y_label} over {c.x_label}, from {c.y.min():.3g} to {c.y.max():.3g}; {c.says}"
+    says = f"{c.y_label} over {c.x_label}, from {c.y.min():.3g} to {c.y.max():.3g}; {c.description}"
     traces = [points] if c.line is None else [line(c.line[0], c.line[1], "law"), points]
     x, y = label(c.x_label), label(c.y_label)
     return figure(says, x=x, y=y, traces=traces, height=320)
@@ -423,7 +427,7 @@ def correlations(fit: Fit) -> go.Figure:
         says += f" The {len(some)} most correlated of {len(names)} parameters are drawn."
     shown = [label(names[k]) for k in some]
     trace = go.Heatmap(
-        z=single(rho[np.ix_(some, some)]),
+        z=single_precision(rho[np.ix_(some, some)]),
         y=shown,
         hovertext=[[f"{a}<br>{b}" for a in shown] for b in shown],
         zmin=-1,
@@ -501,7 +505,7 @@ def error_per_revision(story: Story) -> go.Figure:
     return out.update_xaxes(rangemode="tozero")
 
 
-def made_of(sizes: Sequence[FamilySize]) -> go.Figure:
+def family_sizes(sizes: Sequence[FamilySize]) -> go.Figure:
     """Draw the size of each family, relative to an ordinary arm, with its 95 % interval."""
     shown, first = sizes[:MOST_FAMILIES], sizes[0]
     traces = []

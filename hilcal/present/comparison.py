@@ -12,7 +12,7 @@ from hilcal.present.document import Block, Table, heading, note, table
 from hilcal.present.fit import error_words, measurements
 
 if TYPE_CHECKING:
-    from hilcal.transfer.fleet import Fleet, Odd, Pooled
+    from hilcal.transfer.fleet import Fleet, PooledType, UnlikeParameter
     from hilcal.transfer.members import TypeSize
 
 MOST_PARAMETERS, MOST_ROWS = 6, 12  # listed parameters of a change; of both fits
@@ -262,14 +262,14 @@ def fleet_report(fleet: "Fleet") -> Iterator[Block]:
 
 def closing(fleet: "Fleet") -> Iterator[Block]:
     """Yield how arms were identified, and the files that were not used."""
-    sources = {m.known for m in fleet.members}
+    sources = {m.arm_source for m in fleet.members}
     yield f"Which arm a campaign is of: by {'; '.join(KNOWN[k] for k in KNOWN if k in sources)}."
     if fleet.failures:
         yield from ("", heading(f"Not used: {len(fleet.failures)}"))
         yield from (f"  {f.name}: {f.reason}" for f in fleet.failures)
 
 
-def type_report(t: "Pooled") -> Iterator[Block]:
+def type_report(t: "PooledType") -> Iterator[Block]:
     """Yield the pooled parameters, unusual arms and drifts of one type."""
     yield heading(f"{t.type}: {len(t.arms)} arms, {len(t.campaigns)} campaigns")
     repeated = any(p.within is not None for p in t.parameters)
@@ -288,8 +288,8 @@ def type_report(t: "Pooled") -> Iterator[Block]:
     )
     if not repeated:
         yield "No arm was measured twice: what changes with time is part of the arms' spread.\n"
-    yield "Unlike the others:" if t.odd else "No arm is unlike the others."
-    yield from (f"  {unlike_words(o)}" for o in t.odd)
+    yield "Unlike the others:" if t.unlike else "No arm is unlike the others."
+    yield from (f"  {unlike_words(o)}" for o in t.unlike)
     if t.wear:
         drifts = {p.parameter: p for p in t.parameters}
         yield "Common drift with time (wear):"
@@ -297,9 +297,9 @@ def type_report(t: "Pooled") -> Iterator[Block]:
             p = drifts[name]
             value, std, unit = numbers.measured(p.unit, p.per_year or 0.0, p.per_year_std or 0.0)
             yield f"  {name}: {value} ± {std} {unit} a year"
-    if t.seen:
+    if t.effects_added:
         yield "Effects that the diagnoses added:"
-        for s in t.seen:
+        for s in t.effects_added:
             who = f": {', '.join(s.arms)}" if s.kind == "defect" else ""
             yield f"  {s.effect}: on {len(s.arms)} of {s.of} arms{KINDS[s.kind]}{who}"
     yield from (*size_lines(t.sizes), "")
@@ -315,7 +315,7 @@ def size_lines(sizes: Sequence["TypeSize"]) -> Iterator[str]:
             yield f"  {s.effect} = {factor} # 95 %: {low} to {high}"
 
 
-def unlike_words(o: "Odd") -> str:
+def unlike_words(o: "UnlikeParameter") -> str:
     """Return the parameter of an unusual arm and its deviation."""
     unit, factor = numbers.unit_for(o.unit, [o.off])
     off = f"{'+' if o.off > 0 else '−'}{numbers.digits(factor * abs(o.off))} {unit}"

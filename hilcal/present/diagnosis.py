@@ -19,7 +19,14 @@ from hilcal.identification.fit import Fit
 from hilcal.identification.full_prediction import full_prediction
 from hilcal.numbers import length, percent
 from hilcal.present.document import Block, Table, Tone, Words, heading, note, table
-from hilcal.present.fit import CERTAIN, error_words, follows, misses, model_name, where_table
+from hilcal.present.fit import (
+    CERTAIN,
+    dependence_sentence,
+    error_words,
+    holdout_sentence,
+    model_name,
+    where_table,
+)
 from hilcal.present.verdict import broken, headline, implausible, message
 from hilcal.readings.readings import Readings
 from hilcal.types import Floats
@@ -81,9 +88,9 @@ def addition_lines(s: Suspect) -> Iterator[str]:
 
 def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
     """Yield verdict, suspects and the variables that the misfit follows."""
-    yield from (heading(f"Model: {model_name(d.fit.model.named)}"), misses(d.fit))
+    yield from (heading(f"Model: {model_name(d.fit.model.named)}"), holdout_sentence(d.fit))
     if d.verdict != "adequate" and not d.dependences:
-        yield follows(d.misfit_breakdown)
+        yield dependence_sentence(d.misfit_breakdown)
     yield from ("", verdict_line(d), "")
     if d.significant:
         yield suspects_table(d)
@@ -99,7 +106,7 @@ def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
                     f"Let joints differ: {s.coarse} has one parameter for several joints; to give "
                     f'each its own: hilcal add RUN "{s.effect}".'
                 )
-        yield from doubtful(d)
+        yield from doubtful_lines(d)
         yield from (*where_table(d.misfit_breakdown), "")
     if d.verdict in ("unknown_effect", "noise_misjudged"):
         if d.verdict == "noise_misjudged" or d.predictable_share >= LEAST_SHARE:
@@ -124,7 +131,7 @@ def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
                 f"{low:.2f} to {high:.2f}; {numbers.p_equals(w.p_value)})."
             )
     yield from redundant_line(d)
-    yield from could_have_been_seen(d)
+    yield from detectable_sizes(d)
 
 
 def revisions_table(rows: Sequence[tuple[int, str, Fit, str]]) -> Table:
@@ -151,7 +158,7 @@ def key(readings: Readings) -> Words:
     )
 
 
-def fell(before: Fit, after: Fit, effect: str) -> str:
+def added_effect_sentence(before: Fit, after: Fit, effect: str) -> str:
     """Return a sentence on the change of the error on poses left out by an added effect."""
     change = f"from {length(before.holdout.rms_m)} to {length(after.holdout.rms_m)}"
     if after.holdout.rms_sigma < before.holdout.rms_sigma:
@@ -162,7 +169,7 @@ def fell(before: Fit, after: Fit, effect: str) -> str:
     )
 
 
-def rose(before: Fit, after: Fit, effect: str) -> str:
+def removed_effect_sentence(before: Fit, after: Fit, effect: str) -> str:
     """Return a sentence on the change of the error on poses left out by a removed effect."""
     needed = predicts_better(after, before)
     verb, end = ("rises", "it belongs there") if needed else ("goes", "it is not needed")
@@ -170,7 +177,7 @@ def rose(before: Fit, after: Fit, effect: str) -> str:
     return f"Without {effect} the error on poses left out {verb} {change}: {end}."
 
 
-def could_have_been_seen(d: Diagnosis) -> Iterator[Block]:
+def detectable_sizes(d: Diagnosis) -> Iterator[Block]:
     """Yield the minimum detectable sizes of the effects that were not found, smallest first."""
     not_named = [s for s in d.suspects if not s.passes]
     visible = sorted((s for s in not_named if s.shown), key=lambda s: s.least.displacement_m)
@@ -191,7 +198,7 @@ def could_have_been_seen(d: Diagnosis) -> Iterator[Block]:
         yield f"At no plausible size would these readings show {numbers.names(hidden, 'or')}.\n"
 
 
-def doubtful(d: Diagnosis) -> Iterator[str]:
+def doubtful_lines(d: Diagnosis) -> Iterator[str]:
     """Yield suspects with an implausible size, or with less gain than predicted."""
     for s in d.suspects:
         if not s.plausible and s.score.p_value < CERTAIN:
@@ -216,7 +223,7 @@ def curves(dependences: Sequence[Dependence], most: int = CURVES) -> Iterator[Bl
     for d in carrying:
         carries = f"{d.variable} carries {percent(d.share)}"
         if d.determined:
-            yield f"{carries}; {moves(d)} errs by:"
+            yield f"{carries}; {erring_quantity(d)} errs by:"
             head = f"{d.variable} [{d.unit}]" if d.unit else d.variable
             yield from (_binned((head, "error"), d.y_unit, (d.x, d.y, d.error), d.labels), "")
         else:
@@ -225,7 +232,7 @@ def curves(dependences: Sequence[Dependence], most: int = CURVES) -> Iterator[Bl
         yield note("±: standard uncertainty; the mean over the bins is taken as zero.")
 
 
-def moves(d: Dependence) -> str:
+def erring_quantity(d: Dependence) -> str:
     """Return the name of the quantity whose error depends on the variable."""
     if d.y_unit == "rad":
         return d.moves
@@ -260,16 +267,16 @@ def _binned(
 def step_report(number: int, change: str, d: Diagnosis) -> Iterator[Block]:
     """Yield the error of one revision, the variables that it follows, and the suspects."""
     yield heading(f"Revision {number}: {change or model_name(d.fit.model.named)}")
-    yield misses(d.fit)
+    yield holdout_sentence(d.fit)
     if d.verdict != "adequate":
-        yield follows(d.misfit_breakdown)
+        yield dependence_sentence(d.misfit_breakdown)
     if d.significant:
         yield from ("", suspects_table(d))
     yield from (message(d), "")
 
 
 @dataclass(frozen=True, slots=True)
-class Compared:
+class TrueAndFitted:
     """An estimated parameter and its true value; SI."""
 
     name: str
@@ -279,7 +286,7 @@ class Compared:
     unit: str
 
 
-def compared(fit: Fit, truth: Mapping[str, float]) -> list[Compared]:
+def true_and_fitted(fit: Fit, truth: Mapping[str, float]) -> list[TrueAndFitted]:
     """Return the identifiable parameters with a true value, without families that are shrunk."""
     rows = []
     for effect, s in zip(fit.model.effects, fit.model.slices(), strict=True):
@@ -288,11 +295,11 @@ def compared(fit: Fit, truth: Mapping[str, float]) -> list[Compared]:
             comparable = name in truth and effect.groups() is None
             if comparable and fit.uncertainty.identifiable[k]:
                 value, std = float(fit.theta[k]), float(fit.uncertainty.std[k])
-                rows.append(Compared(name, truth[name], value, std, p.unit))
+                rows.append(TrueAndFitted(name, truth[name], value, std, p.unit))
     return rows
 
 
-def truth_table(rows: Sequence[Compared]) -> Iterator[Block]:
+def truth_table(rows: Sequence[TrueAndFitted]) -> Iterator[Block]:
     """Yield the table of estimated and true parameters."""
     out = table("parameter", "true", "found", "±", "unit", "off by", left=(0, 4))
     for r in rows[:COMPARED]:
@@ -311,7 +318,7 @@ def discovery_report(d: Discovery) -> Iterator[Block]:
     """Yield the discovered laws, or the reason for none."""
     yield heading(f"Laws for what {model_name(d.fit.model.named)} leaves unexplained")
     if not d.laws:
-        yield numbers.sentence(silence(d))
+        yield numbers.sentence(no_law_sentence(d))
         yield from curves(d.carried)
         return
     yield (
@@ -343,7 +350,7 @@ def discovery_report(d: Discovery) -> Iterator[Block]:
         yield f"{law_name} {NOT_TRIED} ({why})."
 
 
-def silence(d: Discovery) -> str:
+def no_law_sentence(d: Discovery) -> str:
     """Return the reason why no law is proposed, and the effects that could not be tried."""
     tried = f"{d.candidates} candidates were tried"
     helps = "measure more poses, or record what else may matter"
@@ -414,7 +421,7 @@ def refined_laws(s: LawSearch) -> Iterator[Block]:
     """Yield the laws that a refinement retained, or the reason for none, of each search."""
     for d in s.discoveries:
         if not d.laws:
-            yield numbers.sentence(silence(d))
+            yield numbers.sentence(no_law_sentence(d))
         elif (law := d.laws[0]).name not in s.files:
             yield f"{law.formula} was tried, and did not lower the error on poses left out."
         else:

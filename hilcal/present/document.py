@@ -108,7 +108,7 @@ class Table:
         for gap in GAPS:
             room = options.max_width - gap * (len(natural) - 1)
             if sum(natural) <= room or (gap == GAPS[-1] and sum(least) <= room):
-                yield self._columns(gap, shared(least, natural, room))
+                yield self._columns(gap, shared_widths(least, natural, room))
                 return
         heads = [" ".join(head.split()) for head in self.heads]
         for row in self.rows:
@@ -144,7 +144,7 @@ class Chart:
     height: int = 230
 
     def __rich__(self) -> RenderableType:
-        return says(self.figure)
+        return description_of(self.figure)
 
 
 Block = str | Words | Items | Table | Chart
@@ -159,7 +159,7 @@ class PageSection:
     blocks: tuple[Block, ...]
 
 
-def says(figure: "go.Figure") -> str:
+def description_of(figure: "go.Figure") -> str:
     """Return the sentence of a chart, for readers who do not see it."""
     return str((figure.layout.meta or {}).get("says", ""))
 
@@ -220,7 +220,7 @@ def captioned(blocks: Iterable[Block], caption: str = "") -> tuple[Block, ...]:
     return tuple(out)
 
 
-def shared(least: Sequence[int], full: Sequence[int], room: int) -> list[int]:
+def shared_widths(least: Sequence[int], full: Sequence[int], room: int) -> list[int]:
     """Share a width `room` ≥ Σ least: a column gets `full`, or `least` and an equal addition."""
     level = max(t for t in range(room + 1) if sum(map(min, full, (x + t for x in least))) <= room)
     out = [max(x, min(w, x + level)) for x, w in zip(least, full, strict=True)]

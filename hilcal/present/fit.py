@@ -73,13 +73,13 @@ def fit_report(fit: Fit, details: bool = True) -> Iterator[Block]:
     if null := [str(d) for d in fit.uncertainty.null]:
         several = f"{len(null)} directions" if len(null) > 1 else "1 direction"
         yield f"{several} cannot be seen in these readings: {numbers.few(null, 1)}."
-    yield from set_aside(fit, details=False)
+    yield from gross_error_lines(fit, details=False)
     if (masses := masses_note(fit)) is not None:
         yield numbers.sentence(masses)
     yield from list(fitted_lines(fit))[:1]
 
 
-def set_aside(fit: Fit, details: bool) -> Iterator[str]:
+def gross_error_lines(fit: Fit, details: bool) -> Iterator[str]:
     """Yield the number of gross errors, which no error of a fit includes; in detail a list."""
     if not (gross := gross_errors(fit)):
         return
@@ -203,7 +203,7 @@ def remarks(fit: Fit) -> Iterator[Block]:
         yield from _listed([f"  {d}" for d in null], DIRECTIONS)
     yield from fitted_lines(fit)
     yield from (f"{remark[0].upper()}{remark[1:]}." for remark in notes(fit))
-    yield from set_aside(fit, details=True)
+    yield from gross_error_lines(fit, details=True)
 
 
 def background_line(fit: Fit) -> Iterator[str]:
@@ -237,7 +237,7 @@ def _scaling_remark(fit: Fit) -> str:
     )
 
 
-def misses(fit: Fit) -> str:
+def holdout_sentence(fit: Fit) -> str:
     """Return a sentence on the error on poses left out."""
     what, floor = measurements(fit.mode, fit.readings), length(full_prediction(fit).noise_floor)
     error = f"are off by {length(fit.holdout.rms_m)} rms"
@@ -251,7 +251,7 @@ def measurements(mode: str, readings: Readings) -> str:
     return "readings" if readings.scalar.any() else "positions"
 
 
-def follows(places: Sequence[MisfitShare]) -> str:
+def dependence_sentence(places: Sequence[MisfitShare]) -> str:
     """Return a sentence on the variables that the misfit follows."""
     clear = [p for p in places if p.p_value < CERTAIN and p.share > 0.05]
     sides = [p for p in clear if p.variable.startswith("direction") and p.share > 0.5]

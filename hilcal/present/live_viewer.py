@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from hilcal.cell import Cell
-from hilcal.measuring.progress import ArmAt
+from hilcal.measuring.progress import ArmPosition
 from hilcal.present.progress import Say
 from hilcal.present.story import Chapter, build_story
 from hilcal.robot.arm import Arm
@@ -34,22 +34,22 @@ from hilcal.types import Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measuring:
+class MeasuringStart:
     """Message: the measurement of a campaign begins or resumes."""
 
     name: str
     arm: Arm
     targets: Floats  # (T, 3) tracked targets, flange axes, m
     plan: Plan
-    earlier: tuple[tuple[float, Step], ...] = ()  # (wall time in s, step) of earlier sessions
+    earlier_steps: tuple[tuple[float, Step], ...] = ()  # (wall time in s, step) of earlier sessions
     names: tuple[str, ...] = ()  # of the targets, if there are several
 
 
 PORT = 9877  # not 9876, on which a viewer itself listens; it opens no window if that is occupied
-MOST = 2000  # most messages in the queue, some 500 bytes each; a choice
+MAX_MESSAGES = 2000  # most messages in the queue, some 500 bytes each; a choice
 ARM_S = 0.2  # between two recorded arm positions: smooth motion, small files; a choice
 START_S, END_S = 20.0, 10.0  # most time of the process to load its library, and to finish; choices
-NICE = 15  # low priority, so that the arm's watchdog never waits for a picture; a choice
+NICENESS = 15  # low priority, so that the arm's watchdog never waits for a picture; a choice
 _ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -62,7 +62,7 @@ class LiveViewer:
         self.dropped = 0  # messages that were not sent because the process did not keep up
         self.url: str | None = None  # for a viewer to open; None if nothing is served
         self._say, self._port = say, port
-        self._queue: queue.Queue[tuple[float, object] | None] = queue.Queue(MOST)
+        self._queue: queue.Queue[tuple[float, object] | None] = queue.Queue(MAX_MESSAGES)
         self._process: subprocess.Popen[bytes] | None = None
         self._threads: list[threading.Thread] = []
         self._ready, self._closing, self._arm_sent = threading.Event(), False, 0.0
@@ -96,9 +96,9 @@ class LiveViewer:
     def notify(self, event: object) -> None:
         """Send an event of `measuring.progress`; returns at once."""
         wall = time.time()
-        if isinstance(event, ArmAt):
+        if isinstance(event, ArmPosition):
             # Half of the queue is reserved for readings, which matter more than arm positions.
-            if wall - self._arm_sent < ARM_S or self._queue.qsize() > MOST // 2:
+            if wall - self._arm_sent < ARM_S or self._queue.qsize() > MAX_MESSAGES // 2:
                 return
             self._arm_sent = wall
         self._send(wall, event)
@@ -108,7 +108,7 @@ class LiveViewer:
         stored = (d for d in log.details() if "wall_s" in d)
         steps = tuple((float(d["wall_s"]), Step(**d["step"])) for d in stored)
         targets, names = cell.all_targets[:, :3, 3], cell.target_names
-        self._send(time.time(), Measuring(name, cell.arm, targets, log.plan, steps, names))
+        self._send(time.time(), MeasuringStart(name, cell.arm, targets, log.plan, steps, names))
 
     def revised(self, chapter: Chapter) -> None:
         """Send a revision; a failure to draw it goes to `say` and is not raised."""
@@ -170,7 +170,7 @@ class LiveViewer:
 def main() -> None:
     """Run the process: serve and record until standard input ends."""
     if hasattr(os, "nice"):
-        os.nice(NICE)  # before the viewer's library starts threads, which inherit the priority
+        os.nice(NICENESS)  # before the viewer's library starts threads, which inherit the priority
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "SIGXFSZ"):
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # OSError at the limit of file size instead

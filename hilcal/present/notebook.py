@@ -15,7 +15,12 @@ from hilcal.identification.full_prediction import residual_table
 from hilcal.identification.validation import CampaignValidation
 from hilcal.optional import needed_by
 from hilcal.present import diagnosis
-from hilcal.present.calibration import bootstrap_report, opening, shares_report, validation_report
+from hilcal.present.calibration import (
+    bootstrap_report,
+    fit_and_test_lines,
+    shares_report,
+    validation_report,
+)
 from hilcal.present.comparison import comparison_report
 from hilcal.present.document import Block
 from hilcal.present.fit import fit_report, stream_report
@@ -56,7 +61,7 @@ _blocks.register(
 
 @_blocks.register
 def _(tested: CampaignValidation) -> Iterator[Block]:
-    yield from opening(tested.judged, tested.prediction)
+    yield from fit_and_test_lines(tested.judged, tested.prediction)
     yield from validation_report(tested.judged, tested.prediction, tested.beyond)
     yield from shares_report(tested.shares)
 

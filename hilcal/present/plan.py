@@ -4,12 +4,12 @@ import math
 from collections.abc import Iterator, Sequence
 
 from hilcal import numbers
-from hilcal.design.next import SURE, Next, PairPower
+from hilcal.design.next import SEPARATED_POWER, PairPower, SeparatingPlan
 from hilcal.design.run_order import Confounding
 from hilcal.design.summary import CurvePoint, PlanSummary, PredictedParameter
 from hilcal.numbers import digits, length
 from hilcal.present.document import Block, Table, heading, load_name, note, pairs, table
-from hilcal.present.progress import spoken
+from hilcal.present.progress import duration_text
 from hilcal.store.plan import UNLOADED
 
 CRITERIA = {
@@ -23,7 +23,7 @@ CRITERIA = {
 BAR = 30
 SCREEN = 4  # remarks on the first screen; the most important come first
 UNCERTAIN = 1e-3  # least certified efficiency that is reported: the last printed digit
-LIKE = 1.1
+SIMILAR_RATIO = 1.1
 """Poses are enough if their predicted uncertainty is at most this multiple of that at the end of
 the curve. A choice."""
 _STRETCHED, _MOST_LOADS, _LEAST_SHARE = 1.15, 2, 0.1
@@ -84,7 +84,7 @@ def plan_report(s: PlanSummary) -> Iterator[Block]:
         yield from _criteria_table(s)
     if s.curve:
         yield heading("Sample-size curve: how many poses are enough")
-        yield from (_curve(s), f"{enough(s.curve)}\n")
+        yield from (_curve(s), f"{enough_poses_sentence(s.curve)}\n")
     if s.detectable:
         yield heading("Minimum detectable effects outside of the model")
         if detectable := _detectable(s):
@@ -96,7 +96,7 @@ def plan_report(s: PlanSummary) -> Iterator[Block]:
     yield from (f"note: {remark}" for remark in s.remarks)
 
 
-def certified(efficiency: float) -> str:
+def efficiency_sentence(efficiency: float) -> str:
     """Return a sentence on a certified efficiency, rounded down because it is a lower bound."""
     if efficiency < UNCERTAIN:
         return "of the plan: not certified, since the bound of the best plan did not close"
@@ -117,13 +117,13 @@ def cost_rows(s: PlanSummary) -> Iterator[tuple[str, str]]:
     yield "readings", f"{s.readings}: {loads}"
     time = s.duration
     changes = f"{s.load_changes} load change{'s' * (s.load_changes != 1)}"
-    parts = f"motion {spoken(time.motion)}, readings {spoken(time.readings)}"
-    yield "takes about", spoken(time.total)
-    yield "", f"{parts}, {changes} by hand {spoken(time.load_changes)}"
+    parts = f"motion {duration_text(time.motion)}, readings {duration_text(time.readings)}"
+    yield "takes about", duration_text(time.total)
+    yield "", f"{parts}, {changes} by hand {duration_text(time.load_changes)}"
     meaning = CRITERIA.get(s.criterion)
     yield "criterion", f"{s.criterion}: {meaning}" if meaning else s.criterion
     if s.efficiency is not None:
-        yield "efficiency", certified(s.efficiency)
+        yield "efficiency", efficiency_sentence(s.efficiency)
     if s.position_std_m is not None:
         yield s.quantity, f"± {length(s.position_std_m)}, predicted for the {s.position}"
         yield "", s.position_note
@@ -216,10 +216,10 @@ def _curve(s: PlanSummary) -> Table:
     return out
 
 
-def enough(curve: Sequence[CurvePoint]) -> str:
+def enough_poses_sentence(curve: Sequence[CurvePoint]) -> str:
     """Return a sentence on the number of poses from which more of them change little."""
     last = curve[-1]
-    first = next(p for p in curve if p.position_std_m <= LIKE * last.position_std_m)
+    first = next(p for p in curve if p.position_std_m <= SIMILAR_RATIO * last.position_std_m)
     if first is last:
         return f"More than {last.poses} poses still improve the prediction."
     gain = numbers.percent(1.0 - last.position_std_m / first.position_std_m)
@@ -241,14 +241,16 @@ def _undetectable(s: PlanSummary) -> Iterator[str]:
 def brief_plan(s: PlanSummary) -> str:
     """Return two sentences on the cost and the efficiency of a plan."""
     loads = numbers.names([load_name(name) for name in s.loads])
-    certain = "" if s.efficiency is None else f" Efficiency {certified(s.efficiency)}."
+    certain = "" if s.efficiency is None else f" Efficiency {efficiency_sentence(s.efficiency)}."
     return (
         f"Plan: {s.readings} readings at {s.poses} poses and the reference, {loads}; takes about "
-        f"{spoken(s.duration.total)}.{certain} --details shows the rest.\n"
+        f"{duration_text(s.duration.total)}.{certain} --details shows the rest.\n"
     )
 
 
-def next_report(plan: Next, poses: int, readings: int, details: bool = True) -> Iterator[Block]:
+def next_report(
+    plan: SeparatingPlan, poses: int, readings: int, details: bool = True
+) -> Iterator[Block]:
     """Yield the powers of pairs of suspects; without `details` of each suspect's weakest pair."""
     yield heading("Telling the suspects apart")
     yield power_table(plan.powers if details else _weakest(plan.powers))
@@ -260,7 +262,9 @@ def next_report(plan: Next, poses: int, readings: int, details: bool = True) -> 
     yield from (f"note: {remark}" for remark in plan.notes)
 
 
-def poses_report(plan: Next, poses: int, readings: int, details: bool = True) -> Iterator[Block]:
+def poses_report(
+    plan: SeparatingPlan, poses: int, readings: int, details: bool = True
+) -> Iterator[Block]:
     """Yield the plan of poses for a misfit that depends on the pose alone; see `next_report`."""
     yield heading("Poses where nothing was read yet")
     yield (
@@ -279,7 +283,7 @@ def _weakest(powers: Sequence[PairPower]) -> tuple[PairPower, ...]:
     """Return for each possible effect the pair with the lowest power."""
     least: dict[str, PairPower] = {}
     for t in powers:
-        if t.effect not in least or t.then < least[t.effect].then:
+        if t.effect not in least or t.power_planned < least[t.effect].power_planned:
             least[t.effect] = t
     return tuple(least.values())
 
@@ -292,8 +296,8 @@ def power_table(powers: Sequence[PairPower], rival: str = "this is ruled out") -
 def power_rows(powers: Sequence[PairPower]) -> Iterator[tuple[str, str, str, str]]:
     """Yield effect, rival, and the powers with the readings so far and with the plan."""
     for t in powers:
-        then = "not in this cell" if t.not_separable else _chance(t.then)
-        yield t.effect, t.rival, _chance(t.now), then
+        then = "not in this cell" if t.not_separable else _chance(t.power_planned)
+        yield t.effect, t.rival, _chance(t.power_now), then
 
 
 def _chance(power: float) -> str:
@@ -307,21 +311,21 @@ def powers_summary(powers: Sequence[PairPower], poses: int, readings: int) -> st
     head = f"{readings} readings at {poses} poses"
     if not able:
         return f"{head} rule out none of the suspects."
-    least = min(able, key=lambda t: t.then)
-    if least.then < SURE:
+    least = min(able, key=lambda t: t.power_planned)
+    if least.power_planned < SEPARATED_POWER:
         return (
             f"{head}: the weakest pair is {least.effect}, where it is there, and {least.rival}, "
-            f"which they rule out with a chance of {_chance(least.then)} ({_chance(least.now)} "
-            "now); more poses raise it."
+            f"which they rule out with a chance of {_chance(least.power_planned)} "
+            f"({_chance(least.power_now)} now); more poses raise it."
         )
     what = "what can be separated in this cell: each of these pairs"
     if len(able) == len(powers):
         what = "the suspects: whichever is there, each of the others is ruled out"
-    at_least = min(int(100 * least.then + 1e-9), 99)  # rounded down
+    at_least = min(int(100 * least.power_planned + 1e-9), 99)  # rounded down
     return f"{head} separate {what} with a chance of at least {at_least} %."
 
 
-def _difference(plan: Next) -> str:
+def _difference(plan: SeparatingPlan) -> str:
     shares = sorted(plan.shares.items(), key=lambda item: -item[1])
     named = [
         f"{'the unloaded readings' if load == UNLOADED else load} ({numbers.percent(share)})"

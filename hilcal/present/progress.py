@@ -69,7 +69,7 @@ def counting(console: Console, task_name: str, total: int) -> Iterator[Advance]:
         yield lambda step: bar.advance(task, step)
 
 
-def spoken(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
     """Return a duration in display units: "45 s", "12 min", "3 h 05 min"."""
     if seconds < 99.5:
         return f"{seconds:.0f} s"
@@ -88,7 +88,7 @@ def status_words(status: events.GoalStatus) -> str:
         return f"predicted {kind} {f'± {value}' if value else 'not determined yet'}"
     match = re.match(r"[\w.]+", status.text.strip())
     name = "" if match is None else match[0]
-    worst = "" if status.worst in (name, goal.what) else f" ({status.worst.split('.')[-1]})"
+    worst = "" if status.worst in (name, goal.quantity) else f" ({status.worst.split('.')[-1]})"
     return f"{name} std {value or 'not determined yet'}{worst}"
 
 
@@ -190,10 +190,10 @@ class _Watcher:
         elif isinstance(event, events.Phase):
             self._update(event.text, phase=event.text)
         elif isinstance(event, events.ReadingStored):
-            left = f"{spoken(event.left_real)} left" if event.left_real > 0 else ""
-            last = f"{event.step}{figures(event)}"
-            text = f"{event.done}/{event.total} {last}{', ' * bool(left)}{left}"
-            self._update(text, left=left, last=last, done=event.done, total=event.total)
+            left = f"{duration_text(event.remaining_s)} left" if event.remaining_s > 0 else ""
+            last = f"{event.step}{reading_text(event)}"
+            text = f"{event.stored}/{event.total} {last}{', ' * bool(left)}{left}"
+            self._update(text, left=left, last=last, done=event.stored, total=event.total)
 
     def _update(self, text: str, **fields: Any) -> None:
         self._fields |= fields
@@ -217,7 +217,7 @@ def watching(
         watcher.end()
 
 
-def figures(event: events.ReadingStored) -> str:
+def reading_text(event: events.ReadingStored) -> str:
     """Return deflection (≈: from a predicted unloaded position) and residual of a reading."""
     parts, live = [], event.live
     if event.deflection is not None:

@@ -19,7 +19,7 @@ from hilcal.readings.whitening import Mode
 from hilcal.robot import se3
 from hilcal.types import Floats
 
-PLACES = 5, 4  # decimals of a position in m and of an angle in degrees. A choice
+DECIMALS = 5, 4  # decimals of a position in m and of an angle in degrees. A choice
 ALONG = 0.98  # least component of a unit vector that is named after its axis
 WORDS: dict[CovarianceParts, str] = {
     "instrument": "the instrument alone; the arm's own scatter is not in it ([repeatability] "
@@ -92,7 +92,7 @@ def base_line(cell: Cell, frames: RobotFrames, mode: Mode = "absolute") -> str:
     """Return the pose of the robot's base; deflections determine it to 1 mm only."""
     if np.array_equal(frames.base, np.eye(4)) and frames.base_stated:
         return "The robot's base: the axes that the positions are given in."
-    why, places = "as the cell states it", PLACES
+    why, places = "as the cell states it", DECIMALS
     if not frames.base_stated:
         why = "the nominal arm on it has the axis of joint 1 where the readings have it"
         if mode == "deflection":
@@ -154,7 +154,7 @@ def _targets(cell: Cell) -> str:
     return "; ".join(f"target {name} is at {_place(t)} on the flange" for name, t in named)
 
 
-def _place(t: Floats, places: tuple[int, int] = PLACES) -> str:
+def _place(t: Floats, places: tuple[int, int] = DECIMALS) -> str:
     place = ", ".join(f"{x:.{places[0]}f}" for x in t[:3, 3])
     turn = np.degrees(se3.rotation_vector(t[:3, :3]))
     if not np.any(np.abs(turn) > 1e-9):

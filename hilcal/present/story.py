@@ -24,7 +24,7 @@ from hilcal.identification.residual import ErrorBlock
 from hilcal.model.model import Model
 from hilcal.present import diagnosis
 from hilcal.present.document import Block
-from hilcal.present.fit import errors, misses, model_name, parameters
+from hilcal.present.fit import errors, holdout_sentence, model_name, parameters
 from hilcal.present.verdict import message
 from hilcal.robot.arm import Arm
 from hilcal.robot.scene import body_poses
@@ -34,12 +34,12 @@ from hilcal.types import Floats, Ints
 Mode = Literal["deflection", "absolute"]
 LEVEL_NAMES = ("inside the noise", "doubtful", "outside the noise")
 LIMITS = (0.99, 0.9999)  # quantiles of χ²(3) above which a reading is doubtful, and outside
-MOST_NUMBER = 10**9
+MAX_NUMBER = 10**9
 UNDIAGNOSED = "not diagnosed"
-LITTLE = 0.2
+MIN_SHARE = 0.2
 """Least share of the predictable misfit that the first suspect explains for its chart to be shown
 instead of that of the strongest variable; a guess."""
-LEAST_CARRIED = 0.02  # share of the misfit below which a variable is not shown; a guess
+MIN_CARRIED_SHARE = 0.02  # share of the misfit below which a variable is not shown; a guess
 MOST_SUSPECTS, MOST_PARAMETERS = 3, 40
 
 
@@ -48,13 +48,13 @@ def levels(norm2: Floats) -> Ints:
     return np.digitize(norm2, stats.chi2.ppf(LIMITS, 3)).astype(np.int64)
 
 
-def worst_and_even(badness: Floats, most: int) -> Ints:
-    """Return at most `most` ascending indices: the worst fifth, and evenly chosen others."""
-    if len(badness) <= most:
+def worst_and_even(badness: Floats, count: int) -> Ints:
+    """Return at most `count` ascending indices: the worst fifth, and evenly chosen others."""
+    if len(badness) <= count:
         return np.arange(len(badness))
-    worst = np.argsort(-badness, kind="stable")[: max(1, most // 5)]
+    worst = np.argsort(-badness, kind="stable")[: max(1, count // 5)]
     others = np.setdiff1d(np.arange(len(badness)), worst)
-    even = others[np.linspace(0, len(others) - 1, most - len(worst)).round().astype(np.int64)]
+    even = others[np.linspace(0, len(others) - 1, count - len(worst)).round().astype(np.int64)]
     return np.sort(np.concatenate([worst, np.unique(even)]))
 
 
@@ -63,7 +63,7 @@ class DependenceCurve:
     """A quantity over a variable that it may depend on; its labels state the units."""
 
     title: str  # name of the variable, the suspect or the law
-    says: str
+    description: str
     x: Floats  # (K,) the variable, of single readings or at centres of bins
     y: Floats  # (K,) residual, or its mean in the bin
     x_label: str  # the variable with its unit
@@ -89,7 +89,7 @@ class StoryRevision:
     cells: tuple[str, ...] = ()  # row of a table of revisions
     panels: Mapping[str, tuple[Block, ...]] = field(default_factory=dict)
     """Blocks of the panels "verdict", "details" and "parameters"."""
-    follows: DependenceCurve | None = None  # the residual over its strongest cause
+    dependence: DependenceCurve | None = None  # the residual over its strongest cause
     laws: tuple[DependenceCurve, ...] = ()  # curves of laws that the catalogue lacks
 
     @property
@@ -257,7 +257,7 @@ def pose_numbers(names: Sequence[str]) -> Ints:
     """
     ends = [re.search(r"[0-9]+$", name) for name in names]
     stated = [int(end.group()) for end in ends if end is not None]
-    if not stated or len(set(stated)) < len(stated) or max(stated) >= MOST_NUMBER:
+    if not stated or len(set(stated)) < len(stated) or max(stated) >= MAX_NUMBER:
         return np.arange(1, len(names) + 1)
     free = (k for k in itertools.count() if k not in set(stated))
     numbers = [next(free) if end is None else int(end.group()) for end in ends]
@@ -268,16 +268,16 @@ def _revision(c: Chapter, e: FullPrediction, residual: Floats, measured: Floats)
     d, judged, drawn = c.diagnosis, UNDIAGNOSED, None
     changed = change(c.added, c.removed, c.fit.readings.arm_scatter is not None)
     verdict: list[Block] = [f"{UNDIAGNOSED.capitalize()}: run hilcal diagnose for a verdict."]
-    details: list[Block] = [misses(c.fit)]
+    details: list[Block] = [holdout_sentence(c.fit)]
     if d is not None:
-        judged, drawn = d.verdict, follows(d)
+        judged, drawn = d.verdict, strongest_dependence(d)
         verdict = [
             message(d),
             *([diagnosis.suspects_table(d, MOST_SUSPECTS)] if d.significant else []),
         ]
         details = list(diagnosis.diagnosis_report(d))
         if drawn is not None:
-            details.append(f"Drawn: {drawn.y_label} against {drawn.x_label}. {drawn.says}")
+            details.append(f"Drawn: {drawn.y_label} against {drawn.x_label}. {drawn.description}")
     return StoryRevision(
         revision=c.number,
         change=changed,
@@ -293,16 +293,16 @@ def _revision(c: Chapter, e: FullPrediction, residual: Floats, measured: Floats)
             "details": (*details, errors(c.fit)),
             "parameters": tuple(parameters(c.fit, MOST_PARAMETERS)),
         },
-        follows=drawn,
+        dependence=drawn,
         laws=laws(c.fit),
     )
 
 
-def follows(d: Diagnosis) -> DependenceCurve | None:
+def strongest_dependence(d: Diagnosis) -> DependenceCurve | None:
     """Return the residual over the first suspect, or over the strongest variable."""
     by_lead = 0.0 if d.lead is None else d.lead.holdout_share
-    explained = d.insufficiency is None and by_lead >= LITTLE * d.predictable_share
-    carried = [v for v in d.dependences if v.share >= LEAST_CARRIED and v.determined]
+    explained = d.insufficiency is None and by_lead >= MIN_SHARE * d.predictable_share
+    carried = [v for v in d.dependences if v.share >= MIN_CARRIED_SHARE and v.determined]
     if carried and d.verdict != "adequate" and not explained:
         return curve(carried[0])
     suspects = [] if d.lead is None else diagnosis.shown_suspects(d)
@@ -341,7 +341,11 @@ def curve(d: Dependence) -> DependenceCurve:
     y_unit, y_factor = numbers.unit_for(d.y_unit, list(d.y))
     says = f"{numbers.percent(d.share)} of the misfit on poses left out follows {d.variable}."
     over = f"{d.variable} [{x_unit}]" if x_unit else d.variable
-    error, x, y = f"error of {diagnosis.moves(d)} [{y_unit}]", x_factor * d.x, y_factor * d.y
+    error, x, y = (
+        f"error of {diagnosis.erring_quantity(d)} [{y_unit}]",
+        x_factor * d.x,
+        y_factor * d.y,
+    )
     return DependenceCurve(d.variable, says, x, y, over, error, y_factor * d.error, d.labels)
 
 

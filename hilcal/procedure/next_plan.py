@@ -9,9 +9,9 @@ from hilcal.calibration.compensation import band, tool_of
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.design.next import Next, PairPower, measure_next, measure_poses
-from hilcal.design.planner import Request, make
-from hilcal.design.predicted import predicted
+from hilcal.design.next import PairPower, SeparatingPlan, plan_poses, plan_separating
+from hilcal.design.planner import PlanRequest, plan_readings
+from hilcal.design.predicted import predicted_uncertainty
 from hilcal.design.summary import CheckedPlan, about, checked, summarise
 from hilcal.diagnosis.diagnosis import Diagnosis, in_doubt
 from hilcal.diagnosis.effect_ranking import Suspect
@@ -22,7 +22,7 @@ from hilcal.identification.fit import Fit
 from hilcal.names import quoted
 from hilcal.present.progress import Say
 from hilcal.procedure.state import Settings, duration_of, reference_in, reference_of
-from hilcal.procedure.validation_plan import recorded
+from hilcal.procedure.validation_plan import recorded_columns
 from hilcal.readings.readings import States
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import Plan
@@ -38,7 +38,7 @@ class Doubt:
 
     fit: Fit  # of a model without the suspects
     suspects: tuple[str, ...]
-    alone: PoseAlone | None = None
+    pose_alone: PoseAlone | None = None
     """The misfit that depends on the pose alone, where further unloaded poses settle the doubt."""
 
 
@@ -49,10 +49,10 @@ def doubt_of(d: Diagnosis, say: Say = lambda text: None) -> Doubt | None:
         return None
     a = d.pose_alone
     alone = a if a is not None and a.chance is not None and d.fit.mode == "absolute" else None
-    return Doubt(without(d.fit, suspects, say), suspects, alone)
+    return Doubt(fit_without(d.fit, suspects, say), suspects, alone)
 
 
-def without(fitted: Fit, suspects: tuple[str, ...], say: Say = lambda text: None) -> Fit:
+def fit_without(fitted: Fit, suspects: tuple[str, ...], say: Say = lambda text: None) -> Fit:
     """Return the fit of a model without some effects."""
     for name in suspects:
         if name in fitted.model.names:
@@ -61,7 +61,7 @@ def without(fitted: Fit, suspects: tuple[str, ...], say: Say = lambda text: None
     return fitted
 
 
-def separating(
+def separating_plan(
     cell: Cell,
     config: CellConfig,
     doubt: Doubt,
@@ -69,23 +69,23 @@ def separating(
     rng: np.random.Generator,
     say: Say,
     reference: Floats | None,  # (n,) joints of the campaign's reference pose, rad
-    usual: int = POSES,  # poses where the doubt does not determine their number
-) -> Next:
+    default_poses: int = POSES,  # poses where the doubt does not determine their number
+) -> SeparatingPlan:
     """Plan the measurements that separate the suspects of a doubt, or raise a CannotAnswerError."""
     fitted, effects = doubt.fit, doubt.suspects
-    if doubt.alone is None:
-        request = Request(usual if poses is None else poses)
-        return measure_next(cell, config, fitted, effects, request, rng, say, reference)
-    count = doubt.alone.more if poses is None else poses
-    planned = measure_poses(cell, config, fitted, count, rng, say, reference)
+    if doubt.pose_alone is None:
+        request = PlanRequest(default_poses if poses is None else poses)
+        return plan_separating(cell, config, fitted, effects, request, rng, say, reference)
+    count = doubt.pose_alone.more if poses is None else poses
+    planned = plan_poses(cell, config, fitted, count, rng, say, reference)
     say("predicting the powers")
     powers = tuple(PairPower(*row, False) for row in pose_powers(fitted, effects, count))
-    return Next(planned, powers, {}, 1.0, ())
+    return SeparatingPlan(planned, powers, {}, 1.0, ())
 
 
-def plan_of(chosen: Next, suspects: tuple[str, ...]) -> Plan:
+def plan_of(chosen: SeparatingPlan, suspects: tuple[str, ...]) -> Plan:
     """Return the plan with its origin, the suspects and the powers of separating them."""
-    powers = [[t.effect, t.rival, round(t.then, 4)] for t in chosen.powers]
+    powers = [[t.effect, t.rival, round(t.power_planned, 4)] for t in chosen.powers]
     content = {**about(chosen.planned), "suspects": list(suspects), "separates": powers}
     return replace(chosen.planned.ordered.plan, about=content)
 
@@ -94,8 +94,8 @@ def plan_of(chosen: Next, suspects: tuple[str, ...]) -> Plan:
 class NextPlan:
     """The next measurements."""
 
-    found: Next  # the powers, pair by pair
-    made: CheckedPlan  # the plan, all motions checked
+    separating: SeparatingPlan  # the powers, pair by pair
+    checked: CheckedPlan  # the plan, all motions checked
 
 
 def next_plan(
@@ -110,12 +110,12 @@ def next_plan(
 ) -> NextPlan:
     """Plan the measurements that settle a doubt, and check every motion in a dry run.
 
-    `poses` is as in `separating`. `cell` replaces the campaign's where it has changed. To `compare`
-    criteria and numbers of poses takes longer. Raises as `separating` does.
+    `poses` is as in `separating_plan`. `cell` replaces the campaign's where it has changed. To
+    `compare` criteria and numbers of poses takes longer. Raises as `separating_plan` does.
     """
     config, numbers = (o.config, o.cell) if cell is None else cell
-    chosen = separating(numbers, config, doubt, poses, rng, say, reference_in(o.file))
-    compare = compare and not doubt.alone
+    chosen = separating_plan(numbers, config, doubt, poses, rng, say, reference_in(o.file))
+    compare = compare and not doubt.pose_alone
     summary = summarise(chosen.planned, config, rng, say, compare=compare, curve=compare)
     say("checking every motion in a dry run")
     checked_plan = checked(numbers, config, plan_of(chosen, doubt.suspects), summary)
@@ -183,14 +183,14 @@ def _differ(o: Campaign, s: Suspect) -> str:
     )
 
 
-WORTH = 0.05
+MIN_ERROR_GAIN = 0.05
 """Least share by which a further plan must lower the predicted error; a choice."""
-LEAST_GAIN = 0.1
+MIN_POWER_GAIN = 0.1
 """Least power that a further plan must add for a pair of suspects; a choice."""
-MOST_PLANS = 6
+MAX_PLANS = 6
 """Most plans of a campaign; a choice: a doubt left by five further plans survives a sixth of the
 same size."""
-MOST = 200
+MAX_POINTS = 200
 """Most points at which the error is predicted; a choice."""
 
 
@@ -272,7 +272,7 @@ class FurtherMeasuring:
             return further
         if sum(map(duration_of, self.plans)) + further.seconds > settings.max_time_s:
             return replace(further, reason="time")
-        return replace(further, reason="plans") if len(self.plans) >= MOST_PLANS else further
+        return replace(further, reason="plans") if len(self.plans) >= MAX_PLANS else further
 
     def _reference(self) -> Floats | None:
         return reference_of(self.plans[0])
@@ -285,13 +285,15 @@ class FurtherMeasuring:
         nothing = Decision("inseparable", self.d.verdict, error, suspects=doubt.suspects)
         poses, site = self.settings.poses, (self.cell, self.config)
         try:
-            chosen = separating(*site, doubt, None, self.rng, self.say, self._reference(), poses)
+            chosen = separating_plan(
+                *site, doubt, None, self.rng, self.say, self._reference(), poses
+            )
         except (CannotAnswerError, InputError):
             return nothing
         separable = [p for p in chosen.powers if not p.not_separable]
-        if max((p.then - p.now for p in separable), default=0.0) < LEAST_GAIN:
+        if max((p.power_planned - p.power_now for p in separable), default=0.0) < MIN_POWER_GAIN:
             return nothing
-        plan, power = plan_of(chosen, doubt.suspects), min(p.then for p in separable)
+        plan, power = plan_of(chosen, doubt.suspects), min(p.power_planned for p in separable)
         seconds = duration_of(plan)
         return replace(nothing, reason="doubt", power=power, plan=plan, seconds=seconds)
 
@@ -307,19 +309,19 @@ class FurtherMeasuring:
         planning = self.config.planning.model_copy(update={"readings": self.d.fit.mode})
         config, poses = self.config.model_copy(update={"planning": planning}), self.settings.poses
         try:
-            planned = make(
-                *(self.cell, config, Request(poses), self.rng, self.d.fit, self.say),
+            planned = plan_readings(
+                *(self.cell, config, PlanRequest(poses), self.rng, self.d.fit, self.say),
                 reference=self._reference(),
             )
         except (CannotAnswerError, InputError):
             return decision
-        std = predicted(planned.problem, work=planned.work).position
+        std = predicted_uncertainty(planned.problem, work=planned.work).position
         std_then, share = planned.predicted.position, 1.0
         if std is not None and std_then is not None and np.isfinite(std_then):
             share = (std_then / std) ** 2 if np.isfinite(std) and std > 0 else 0.0
         parameter_variance = max(error.now_m**2 - error.floor_m**2, 0.0)
         then = float(np.sqrt(error.floor_m**2 + share * parameter_variance))
-        if then > (1.0 - WORTH) * error.now_m:
+        if then > (1.0 - MIN_ERROR_GAIN) * error.now_m:
             return replace(decision, then_m=then)
         plan = replace(planned.ordered.plan, about=about(planned))
         seconds = duration_of(plan)
@@ -333,7 +335,7 @@ def predicted_error(calibration: Calibration, fitted: States, config: CellConfig
     of the readings.
     """
     states = _work(fitted, config)
-    prediction = calibration.predict(states.q, states.wrench, recorded=recorded(states))
+    prediction = calibration.predict(states.q, states.wrench, recorded=recorded_columns(states))
     assert prediction.covariance is not None  # noqa: S101  (asked for by default)
     tool = tool_of(calibration.model, calibration.theta, None)
     chain = evaluate(calibration.model.cell.arm, states.q)
@@ -347,7 +349,7 @@ def predicted_error(calibration: Calibration, fitted: States, config: CellConfig
 def _work(fitted: States, config: CellConfig) -> States:
     loaded = np.flatnonzero(np.any(fitted.wrench != 0, axis=1))
     rows = loaded if len(loaded) else np.arange(len(fitted))
-    rows = rows[np.linspace(0, len(rows) - 1, min(MOST, len(rows))).astype(np.int64)]
+    rows = rows[np.linspace(0, len(rows) - 1, min(MAX_POINTS, len(rows))).astype(np.int64)]
     q = fitted.q[rows]
     between = 0.5 * (q + np.roll(q, -max(len(q) // 3, 1), axis=0))
     if config.planning.work_q_rad:

@@ -26,7 +26,7 @@ from hilcal.calibration.improvement import Improvement, improvement
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.design.planner import Planned, Request, make
+from hilcal.design.planner import Planned, PlanRequest, plan_readings
 from hilcal.design.summary import CheckedPlan, about, checked, remarks, summarise
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue, installed
@@ -85,7 +85,7 @@ class Procedure:
     base_dir: Path  # that paths in the configuration are relative to
     catalogue: Catalogue  # the effects that a model can have
     settings: state.Settings  # goals, sizes and seed
-    known: CarriedPrior | None = None  # the prior of every fit, from `settings.prior`
+    prior: CarriedPrior | None = None  # the prior of every fit, from `settings.prior`
     _refinements: list[Refinement] = field(default_factory=list, repr=False)  # the latest, if any
 
     @classmethod
@@ -134,7 +134,9 @@ class Procedure:
         self.check_files()
         first = entry(state.BEGUN, {"settings": self.settings.to_json()})
         texts = {COVERS_KEY: covers, ENTRY.format(1): first}
-        create_run(self.run, config, self.base_dir, plan, source=self._source(), more=texts).close()
+        create_run(
+            self.run, config, self.base_dir, plan, source=self._source(), more_texts=texts
+        ).close()
 
     def check_files(self) -> None:
         """Refuse existing files under the names of this calibration's test campaigns."""
@@ -181,7 +183,7 @@ class Procedure:
         with Campaign.open(self.run, self.catalogue) as o:
             mode = usual_mode(o.readings, self.settings.readings)
             say("registering")
-            model = baseline(o.cell, o.readings, mode, o.catalogue, self.known)
+            model = baseline(o.cell, o.readings, mode, o.catalogue, self.prior)
             numbers = itertools.count(len(o.file.revisions()) + 1)
             refinement = refine(
                 model, o.readings, mode, say, on_step=lambda step: seen(next(numbers), step)
@@ -354,7 +356,7 @@ class Procedure:
         texts = {PURPOSE: purpose, CALIBRATION: state.identity(self.run), COVERS_KEY: covers}
         config = CellConfig.from_json(o.file.config_json)
         source = self._source(f"{purpose} campaign of {self.run.name}, ")
-        create_run(path, config, self.base_dir, plan, source=source, more=texts).close()
+        create_run(path, config, self.base_dir, plan, source=source, more_texts=texts).close()
 
     def _source(self, prefix: str = "") -> str:
         origin = "measured" if self.settings.hide is None else "rehearsed in a simulated cell"
@@ -375,7 +377,7 @@ def checked_plan(
     say: Say,
 ) -> CheckedPlan:
     """Choose a plan, each pose under every load that it bears; check all motions."""
-    chosen = make(cell, config, Request(poses), rng, None, say, catalogue)
+    chosen = plan_readings(cell, config, PlanRequest(poses), rng, None, say, catalogue)
     summary = summarise(chosen, config, rng, say, compare=False)
     say("checking every motion in a dry run")
     return checked(cell, config, with_origin(chosen), summary)

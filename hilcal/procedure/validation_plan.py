@@ -15,8 +15,8 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensation import Compensation, tool_of, tool_poses
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.design.feasible import REASONS, Space, draw
-from hilcal.design.run_order import Chosen, Ordering, order_plan, pace, timeline
+from hilcal.design.feasible import REASONS, FeasibleSpace, draw_poses
+from hilcal.design.run_order import Ordering, PoseReadings, order_plan, pace, timeline
 from hilcal.design.summary import refuse
 from hilcal.errors import CannotAnswerError
 from hilcal.measuring.route import approach_sides, dry_run, duration, route
@@ -29,16 +29,16 @@ from hilcal.robot.arm import Arm
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
 from hilcal.types import Bools, Floats, Ints
 
-DRAWN = 4
+DRAWS_PER_POSE = 4
 """Poses drawn per requested pose; a choice: few cannot be reached or are far from all fitted ones.
 """
 LEAST_RANGE = 1e-4
 """Least range of a joint, rad, for joints that did not move in the campaign; a choice."""
-DRAWS = 4
+ORDER_DRAWS = 4
 """Orders drawn; a choice: only the duration matters, not the drift."""
 
 
-def recorded(states: States) -> dict[str, Floats]:
+def recorded_columns(states: States) -> dict[str, Floats]:
     """Return the columns that a model may need besides joint angles and wrench, by name."""
     names = ("time", "load_time", "air_temperature", "joint_temperature", "approach")
     return {name: v for name in names if (v := getattr(states, name)) is not None}
@@ -66,9 +66,9 @@ def validation_plan(
     loads, count = _loads(calibration, fitted, settings.under_load), settings.validation
     hung = [load for load in config.loads if load.name in loads]
     tested_config = config.model_copy(update={"loads": tuple(hung)})
-    space = Space(_within(cell, config, fitted.states.q), tested_config)
+    space = FeasibleSpace(_within(cell, config, fitted.states.q), tested_config)
     base = fitted.states.q[0] if reference is None else reference
-    drawn = draw(space, DRAWN * count, rng)
+    drawn = draw_poses(space, DRAWS_PER_POSE * count, rng)
     usable = {
         name: drawn.allowed[:, drawn.loads.index(name)] & space.passable(base, drawn.q, name)
         for name in (UNLOADED, *loads)
@@ -92,23 +92,29 @@ def validation_plan(
         )
     say("ordering the readings")
     unloaded = (UNLOADED,) if calibration.mode == "deflection" else ()
-    chosen = [Chosen(f"v{i}", (*unloaded, name)) for i, (_, name) in enumerate(selected, start=1)]
+    chosen = [
+        PoseReadings(f"v{i}", (*unloaded, name)) for i, (_, name) in enumerate(selected, start=1)
+    ]
     plan = _ordered(space, chosen, drawn.q[[k for k, _ in selected]], base, rng)
     refuse(dry_run(cell, config, plan), "the validation plan")
     return replace(plan, about={**plan.about, "purpose": "validation"})
 
 
 def _ordered(
-    space: Space, chosen: Sequence[Chosen], q: Floats, reference: Floats, rng: np.random.Generator
+    space: FeasibleSpace,
+    chosen: Sequence[PoseReadings],
+    q: Floats,
+    reference: Floats,
+    rng: np.random.Generator,
 ) -> Plan:
     """Order the chosen poses with joint values (P, n), from the reference pose (n,)."""
-    names, order = [c.pose for c in chosen], Ordering(repeats=0, draws=DRAWS)
+    names, order = [c.pose for c in chosen], Ordering(repeats=0, draws=ORDER_DRAWS)
     site = (space.cell, space.config)
     best = order_plan(*site, names, q, reference, chosen, space.passable, rng, order)
     return fewer_returns(best.plan, space)
 
 
-def fewer_returns(plan: Plan, space: Space) -> Plan:
+def fewer_returns(plan: Plan, space: FeasibleSpace) -> Plan:
     """Return the plan without readings at the reference pose where a load is changed.
 
     The arm still moves there. The first and last reference readings stay, which measure the drift;
@@ -150,10 +156,10 @@ def _within(cell: Cell, config: CellConfig, q: Floats) -> Cell:
 
 def _far(calibration: Calibration, states: States, wrench: Floats) -> Bools:
     """Return whether each state is outside the measured range (N,); temperature is ignored."""
-    prediction = calibration.predict(states.q, wrench, recorded=recorded(states))
+    prediction = calibration.predict(states.q, wrench, recorded=recorded_columns(states))
     far = np.zeros(len(states), dtype=np.bool_)
     for o in prediction.outside:
-        far |= o.points & ("temperature" not in o.of.variable)
+        far |= o.points & ("temperature" not in o.range.variable)
     return far
 
 
@@ -218,7 +224,7 @@ def corrected_plan(
     points, time = points_of(validation, calibration.mode), validation.states.time
     start = 0.0 if time is None else float(time[-1])
     reference = validation.states.q[0] if reference is None else reference
-    space, last = Space(cell, config), validation.states[slice(len(validation) - 1, None)]
+    space, last = FeasibleSpace(cell, config), validation.states[slice(len(validation) - 1, None)]
     names, q = points.names, validation.states.q[points.rows]
     blocked = _blocked(space, q, reference, points.loads)
     left_out = {names[k]: why for k, why in blocked.items()}
@@ -226,7 +232,7 @@ def corrected_plan(
         keep = np.array([k for k, name in enumerate(names) if name not in left_out], dtype=int)
         if not len(keep):
             break
-        chosen = [Chosen(names[k], (points.loads[k],)) for k in keep]
+        chosen = [PoseReadings(names[k], (points.loads[k],)) for k in keep]
         plan = _ordered(space, chosen, q[keep], reference, rng)
         order = np.array([names.index(s.pose) for s in plan.steps if s.pose != REFERENCE])
         wrenches = {names[k]: validation.states.wrench[points.rows[k]] for k in keep}
@@ -259,10 +265,14 @@ def _compensated(
         free = replace(points.readings.states[points.unloaded[order]], target=None)
         rotation, position = tool_poses(tool, tool.model.predict(free, tool.theta))
         poses = se3.matrix(rotation, position)
-    return calibration.compensate(nominal, states.wrench, wanted=poses, recorded=recorded(states))
+    return calibration.compensate(
+        nominal, states.wrench, wanted=poses, recorded=recorded_columns(states)
+    )
 
 
-def _blocked(space: Space, q: Floats, reference: Floats, loads: Sequence[str]) -> dict[int, str]:
+def _blocked(
+    space: FeasibleSpace, q: Floats, reference: Floats, loads: Sequence[str]
+) -> dict[int, str]:
     """Return why the cell does not allow joint values (K, n) under their loads, by row."""
     out: dict[int, str] = {}
     names = np.array(loads)

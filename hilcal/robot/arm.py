@@ -34,20 +34,20 @@ NO_MASSES = (
 )
 
 
-def missing(
+def description_gaps(
     file: str,
-    weighed: bool,
-    unlimited: Sequence[str],
-    weak: Sequence[str],  # joints without a torque or effort
-    forceless: Sequence[str] = (),  # prismatic joints without a force or effort
+    has_masses: bool,
+    without_limits: Sequence[str],
+    without_torque: Sequence[str],  # joints without a torque or effort
+    without_force: Sequence[str] = (),  # prismatic joints without a force or effort
 ) -> tuple[str, ...]:
     """Return the gaps of a description and their consequences, a sentence each."""
-    out = [] if weighed else [NO_MASSES.format(file)]
-    if unlimited:
-        out.append(f"no limits in {file} for {', '.join(unlimited)}: ±360° is assumed")
+    out = [] if has_masses else [NO_MASSES.format(file)]
+    if without_limits:
+        out.append(f"no limits in {file} for {', '.join(without_limits)}: ±360° is assumed")
     for joints, kind, usual in (
-        (weak, "torque", f"{UNKNOWN_TORQUE:g} N·m"),
-        (forceless, "force", f"{UNKNOWN_FORCE:g} N"),
+        (without_torque, "torque", f"{UNKNOWN_TORQUE:g} N·m"),
+        (without_force, "force", f"{UNKNOWN_FORCE:g} N"),
     ):
         if joints:
             out.append(
@@ -129,7 +129,7 @@ class Arm(Brief):
         known = np.isfinite(rated) & (rated > 0)
         return np.where(known, rated, np.where(self.slides, UNKNOWN_FORCE, UNKNOWN_TORQUE))
 
-    def along(self, wrench: Floats) -> Floats:
+    def joint_components(self, wrench: Floats) -> Floats:
         """Return torques or forces (..., n) along the joints, from wrenches (..., n + 1, 6)."""
         return np.where(self.slides, wrench[..., :-1, 2], wrench[..., :-1, 5])
 
@@ -158,7 +158,7 @@ class Arm(Brief):
         return torque if self.drive is None else np.asarray(torque @ self.drive)
 
     @property
-    def own(self) -> Bools:
+    def independent(self) -> Bools:
         """(n,) which joints have an independent value."""
         if self.mimic is None:
             return np.ones(self.n, dtype=np.bool_)
@@ -168,7 +168,7 @@ class Arm(Brief):
         """Return joint values (..., n) with those of mimic joints computed from the others."""
         if self.mimic is None:
             return q
-        independent = np.where(self.own, q, 0.0)
+        independent = np.where(self.independent, q, 0.0)
         return np.asarray(independent @ self.mimic[:, :-1].T + self.mimic[:, -1])
 
     def __post_init__(self) -> None:
@@ -198,7 +198,7 @@ class Arm(Brief):
 _HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])  # Rx(π): Rz(−θ) = Rx(π) Rz(θ) Rx(π)
 
 
-def as_counted(arm: Arm, conventions: Conventions) -> Arm:
+def with_controller_conventions(arm: Arm, conventions: Conventions) -> Arm:
     """Return the arm with the controller's joint conventions."""
     for key in ("joint_sign", "joint_offset_deg"):
         values = getattr(conventions, key)
@@ -234,7 +234,7 @@ def as_counted(arm: Arm, conventions: Conventions) -> Arm:
 
 
 def with_conventions(
-    arm: Arm, sign: Floats, offset: Floats, coupling: Floats, counted: Floats | float = 0.0
+    arm: Arm, sign: Floats, offset: Floats, coupling: Floats, non_mechanical: Floats | float = 0.0
 ) -> Arm:
     """Return the arm with the controller's joint values: (n,) s and o, (n, n) k.
 
@@ -243,8 +243,7 @@ def with_conventions(
         M(s q + o) = M(o) X M(q) X⁻¹,  X = Rx(π) for s = −1, else 1;  M = Rz or Tz
 
     Limits are unchanged, as they are those of the controller's values. Existing couplings C of the
-    arm apply to the converted values: θ = C (S q + o + K q). `counted` is the part of K that is not
-    mechanical.
+    arm apply to the converted values: θ = C (S q + o + K q). `non_mechanical` is a part of K.
     """
     links, coms = arm.links.copy(), arm.coms.copy()
     existing = np.eye(arm.n) if arm.coupling is None else arm.coupling
@@ -258,14 +257,14 @@ def with_conventions(
     # θ = C (S q + o + K q), and S θ turns the links
     combined = sign[:, None] * (existing @ (np.diag(sign) + coupling))
     existing_drive = np.eye(arm.n) if arm.drive is None else arm.drive
-    drives = sign[:, None] * (existing_drive @ (np.diag(sign) + coupling - counted))
+    drives = sign[:, None] * (existing_drive @ (np.diag(sign) + coupling - non_mechanical))
     signs = sign if arm.sign is None else sign * arm.sign
     mimic = arm.mimic
     if mimic is not None:  # v = F v + f for the drawn values v = S q + o + K q
         factors, constants = mimic[:, :-1], mimic[:, -1]
         turned = sign[:, None] * (factors @ (np.diag(sign) + coupling) - coupling)
         moved = sign * (factors @ offset + constants - offset)
-        mimic = np.where(arm.own[:, None], mimic, np.column_stack([turned, moved]))
+        mimic = np.where(arm.independent[:, None], mimic, np.column_stack([turned, moved]))
     return replace(
         arm, links=links, coms=coms, coupling=_unless_one(combined), drive=_unless_one(drives),
         mimic=mimic, sign=signs if np.any(signs < 0) else None,

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from hilcal.config.sections import Conventions
 from hilcal.errors import InputError
 from hilcal.robot import se3
-from hilcal.robot.arm import Arm, as_counted, missing
+from hilcal.robot.arm import Arm, description_gaps, with_controller_conventions
 from hilcal.toml import NonNegative, Number, Positive, Section, Vector3, load_section, suggest
 
 _LENGTH = "a finite number in m"
@@ -138,7 +138,7 @@ def arm_from_dh(path: Path) -> Arm:
         payload=table.payload_kg or math.inf,
         joint_names=tuple(row.name for row in rows),
         source=table.source or f"DH rows of {path.name}",
-        notes=missing(
+        notes=description_gaps(
             path.name,
             any(row.mass_kg for row in rows),
             [row.name for row in rows if row.q_min_deg is None and row.q_min_m is None],
@@ -149,7 +149,7 @@ def arm_from_dh(path: Path) -> Arm:
         prismatic=slides if slides.any() else None,
     )
     try:
-        return as_counted(arm, table)
+        return with_controller_conventions(arm, table)
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from None
 

@@ -52,17 +52,17 @@ class Chain:
         return np.asarray(self.position[-1] + se3.apply(self.rotation[-1], offset))
 
 
-Turns = tuple[Floats, Floats, Floats]  # cos, sin (N, n); travel (N, n) of slides
+JointMotions = tuple[Floats, Floats, Floats]  # cos, sin (N, n); travel (N, n) of slides
 
 
-def turns(arm: Arm, q: Floats) -> Turns:
+def joint_motions(arm: Arm, q: Floats) -> JointMotions:
     """Return the motions of the chain's joints at the controller's values q (N, n)."""
     moved = along_states(arm.chain_angles(q))
     angle = moved * ~arm.slides
     return np.cos(angle), np.sin(angle), moved * arm.slides
 
 
-def _turned(nominal: Turns, dq: Floats, slides: Bools) -> Turns:
+def _turned(nominal: JointMotions, dq: Floats, slides: Bools) -> JointMotions:
     """Add displacements (N, n), by the addition theorems, which cost less than cos and sin."""
     cos, sin, slid = nominal
     dq, slid = dq * ~slides, slid + dq * slides
@@ -73,11 +73,14 @@ def _turned(nominal: Turns, dq: Floats, slides: Bools) -> Turns:
 
 
 def evaluate(
-    arm: Arm, q: Floats, deviation: Deviation | None = None, nominal: Turns | None = None
+    arm: Arm, q: Floats, deviation: Deviation | None = None, nominal: JointMotions | None = None
 ) -> Chain:
-    """Evaluate the deviated chain at the controller's values q (N, n); `nominal`: `turns` at q."""
+    """Evaluate the deviated chain at values q (N, n) of the controller.
+
+    `nominal` are the `joint_motions` at q, if already computed.
+    """
     deviation = deviation or Deviation()
-    moved = turns(arm, q) if nominal is None else nominal
+    moved = joint_motions(arm, q) if nominal is None else nominal
     if deviation.dq is not None:
         moved = _turned(moved, along_states(arm.driven(deviation.dq)), arm.slides)
     cos, sin, slid = moved

@@ -34,9 +34,11 @@ from hilcal.types import Floats
 
 N = 6
 KINDS = "a calibration.conf, a .yaml of ur_calibration, or a .toml of check --save-calibration"
-SAME = 1e-6  # m, flange difference of equal kinematics: files have at least 12 digits
-LINEARISED = 2  # calibration status of an arm that the factory has measured
-FAR = 0.05  # m, flange difference of another arm; factory kinematics differ by some millimetres
+SAME_FLANGE_M = 1e-6  # m, flange difference of equal kinematics: files have at least 12 digits
+LINEARISED_STATUS = 2  # calibration status of an arm that the factory has measured
+OTHER_ARM_M = (
+    0.05  # m, flange difference of another arm; factory kinematics differ by some millimetres
+)
 _KEYS = ("theta_rad", "a_m", "d_m", "alpha_rad")
 _DELTAS = ("delta_theta", "delta_a", "delta_d", "delta_alpha")
 _BODIES = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
@@ -71,7 +73,7 @@ class FactoryKinematics:
 
 
 def of_rows(
-    rows: Floats, source: str, status: int = LINEARISED, checksum: tuple[int, ...] = ()
+    rows: Floats, source: str, status: int = LINEARISED_STATUS, checksum: tuple[int, ...] = ()
 ) -> FactoryKinematics:
     """Return the kinematics of classic rows (4, 6): θ, a, d, α."""
     if rows.shape != (4, N) or not (np.abs(rows) < _LARGEST).all():
@@ -125,7 +127,7 @@ def read_factory(path: Path, nominal: Arm, text: str | None = None) -> FactoryKi
             f"{path}: not the kinematics of an arm ({_why(error)}); valid: {KINDS}"
         ) from None
     difference = flange_difference(with_factory(nominal, factory), nominal)[1]
-    if not difference < FAR:
+    if not difference < OTHER_ARM_M:
         raise InputError(
             f"{factory.source}: of another arm than {nominal.name}: its flange lies up to "
             f"{1e3 * difference:.0f} mm from where that one's does"
@@ -176,7 +178,7 @@ def _of_conf(text: str, nominal: Arm, source: str) -> FactoryKinematics:
     parser.read_string(text)
     mounting = parser["mounting"]
     deltas = np.array([[float(v) for v in _values(mounting[key])] for key in _DELTAS])
-    status = int(mounting.get("calibration_status", str(LINEARISED)), 0)
+    status = int(mounting.get("calibration_status", str(LINEARISED_STATUS)), 0)
     checksum = tuple(int(v, 0) for v in _values(mounting.get("joint_checksum", "")))
     return of_rows(nominal_rows(nominal) + deltas, source, status, checksum)
 
@@ -203,4 +205,4 @@ def _of_yaml(text: str, source: str) -> FactoryKinematics:
         if not np.abs(place).max() < _LARGEST:
             raise ValueError(f"{name} is nowhere")
         links[k] = se3.matrix(se3.of_rpy(place[3:]), place[:3])
-    return FactoryKinematics(links, None, LINEARISED, (), source)
+    return FactoryKinematics(links, None, LINEARISED_STATUS, (), source)

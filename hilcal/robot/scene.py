@@ -26,7 +26,7 @@ _Z = np.array([0.0, 0.0, 1.0])
 _RIM = 0.5  # of the radius: rounded end of a housing, by which the capsule's segment is shorter
 _THICK, _THIN = 0.047, 0.03  # radii of an unknown arm at base and flange, over its reach
 _LEAST_LINK = 1e-6  # m, length of a link with a capsule
-TURNED = np.array([1.0, -1.0, -1.0])  # half a turn about x
+HALF_TURN = np.array([1.0, -1.0, -1.0])  # half a turn about x
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,7 +92,7 @@ def capsules(arm: Arm) -> tuple[Capsule, ...]:
     # shapes of the drawn arm; bodies of opposite axes have frames turned about x
     turned = np.append(False, arm.sign < 0)
     return tuple(
-        replace(c, start=TURNED * c.start, end=TURNED * c.end) if turned[c.body] else c
+        replace(c, start=HALF_TURN * c.start, end=HALF_TURN * c.end) if turned[c.body] else c
         for c in capsules(as_drawn(arm))
     )
 
@@ -329,7 +329,7 @@ class Pairs:
             out[i] = self._pin.computeCollisions(self._geometry, self._state, True)
         return out
 
-    def named(
+    def close_pairs(
         self, q: Floats, margin: float = 0.0, segment: Segment | None = None
     ) -> dict[tuple[str, str], float]:
         """Return the pairs closer than a margin in any state (N, n), and their distance, m."""

@@ -47,7 +47,7 @@ def slot_wrenches(arm: Arm, chain: Chain, load: Load) -> Floats:
 
     at the configuration of `chain`; an additional first moment s_{k+1} of body k + 1 adds
     s_{k+1} × g to t_k. Element (k, 5) for k < n is the static torque τ_{k+1} of load and weight
-    about the axis of joint k + 1, element (k, 2) the force along it (`Arm.along`).
+    about the axis of joint k + 1, element (k, 2) the force along it (`Arm.joint_components`).
     """
     n, count = arm.n, len(load.wrench)
     flange = chain.position[n]

@@ -22,7 +22,7 @@ from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.names import check_name
 from hilcal.robot import se3
-from hilcal.robot.arm import Arm, missing
+from hilcal.robot.arm import Arm, description_gaps
 from hilcal.toml import suggest
 from hilcal.types import Bools, Floats
 
@@ -90,7 +90,7 @@ def _missing(model: pin.Model, masses: Floats, slides: Bools) -> tuple[str, ...]
     open_ended = [name for name, j in joints if _no_limits(model, j)]
     weak = [(n, j) for n, j in joints if not model.upperEffortLimit[model.joints[j].idx_v]]
     turning, sliding = ([n for n, j in weak if slides[j - 1] == s] for s in (False, True))
-    return missing("the URDF", bool(np.any(masses)), open_ended, turning, sliding)
+    return description_gaps("the URDF", bool(np.any(masses)), open_ended, turning, sliding)
 
 
 def _no_limits(model: pin.Model, joint: int) -> bool:

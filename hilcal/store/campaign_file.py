@@ -22,7 +22,7 @@ from hilcal.names import quoted
 from hilcal.readings.readings import ObserverKind, ObserverName, Readings
 from hilcal.store import rows, schema
 from hilcal.store.codec import decode
-from hilcal.store.kept_texts import robot_file_of, typed_now
+from hilcal.store.kept_texts import robot_file_of, running_command
 from hilcal.store.revision import (
     RevisionRecord,
     fitted_to,
@@ -75,7 +75,7 @@ class CampaignFile:
         source: str,
         *,
         overwrite: bool = False,
-        more: Mapping[str, str] | None = None,
+        more_texts: Mapping[str, str] | None = None,
         readings: Readings | None = None,
     ) -> Self:
         """Make a campaign; the file appears only when it is complete.
@@ -84,8 +84,8 @@ class CampaignFile:
         """
         path = Path(path)
         meta = {"config": config_json, "base_dir": base_dir, "source": source}
-        meta |= {"created": utc_now(), "program_version": __version__, **typed_now()}
-        meta |= robot_file_of(config_json, base_dir) | dict(more or {})
+        meta |= {"created": utc_now(), "program_version": __version__, **running_command()}
+        meta |= robot_file_of(config_json, base_dir) | dict(more_texts or {})
         with new_campaign(path, meta, overwrite) as connection:
             if readings is not None:
                 cls(path, connection).insert(readings)
@@ -225,7 +225,7 @@ class CampaignFile:
     def insert_revision(self, record: RevisionRecord) -> int:
         """Append a model revision within the caller's transaction."""
         number = rows.last_id(self.connection, "revisions") + 1
-        if record.parent == number - 1 and replace(record, parent=None).follows:
+        if record.parent == number - 1 and replace(record, parent=None).has_parent:
             record = replace(record, parent=None)
         record, key, posterior = split(record)
         text = to_text(record)

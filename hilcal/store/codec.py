@@ -71,13 +71,13 @@ def decode(kind: Any, content: Any) -> Any:
 
 
 def numbers(
-    name: str, values: object, shape: Sequence[int] = (), *, least: float = -LARGEST
+    name: str, values: object, shape: Sequence[int] = (), *, minimum: float = -LARGEST
 ) -> Floats:
     """Return numbers as an array; a ValueError for another shape, or a number out of range."""
     array = np.asarray(values, dtype=float)
     if array.shape != tuple(shape):
         raise ValueError(f"{name} has shape {array.shape}; expected {tuple(shape)}")
-    if not np.all((array >= least) & (array <= LARGEST)):
+    if not np.all((array >= minimum) & (array <= LARGEST)):
         raise ValueError(f"{name} has a number that cannot be")
     return array
 

@@ -68,20 +68,20 @@ def _robot_value(config_json: str, key: str) -> str:
 
 COMMAND = "command"
 """Key of the command, in the texts of a file and in the options of a revision."""
-_typed: ContextVar[str | None] = ContextVar("typed", default=None)
+_command: ContextVar[str | None] = ContextVar("typed", default=None)
 
 
 @contextmanager
-def typed(arguments: Sequence[str]) -> Iterator[None]:
+def recording_command(arguments: Sequence[str]) -> Iterator[None]:
     """Record a command as the origin of all that the block makes."""
-    token = _typed.set(shlex.join(arguments))
+    token = _command.set(shlex.join(arguments))
     try:
         yield
     finally:
-        _typed.reset(token)
+        _command.reset(token)
 
 
-def typed_now() -> dict[str, str]:
+def running_command() -> dict[str, str]:
     """Return the running command, by its key; empty without one."""
-    command = _typed.get()
+    command = _command.get()
     return {} if command is None else {COMMAND: command}

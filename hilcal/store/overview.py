@@ -41,7 +41,7 @@ class Tare:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Return:
+class ReferenceReturn:
     """A return to the reference pose."""
 
     utc: str  # time, ISO 8601
@@ -67,7 +67,7 @@ class Overview:
     plans: int  # number of plans
     instruments: tuple[MeasuringDevice, ...]  # connected devices, each once
     tares: tuple[Tare, ...]  # in order
-    returns: tuple[Return, ...]  # in order
+    returns: tuple[ReferenceReturn, ...]  # in order
     tool: Mapping[str, Any] | None
     """The tool as last identified by the force sensor: mass_kg, com_m, ...; None where it was not.
     """
@@ -108,7 +108,7 @@ def overview(file: CampaignFile) -> Overview:
             if e["kind"] == "tare"
         ),
         returns=tuple(
-            Return(e["utc"], np.array(e["shift_m"]), float(e["sigma"]), bool(e["over"]))
+            ReferenceReturn(e["utc"], np.array(e["shift_m"]), float(e["sigma"]), bool(e["over"]))
             for e in events
             if e["kind"] == "drift"
         ),

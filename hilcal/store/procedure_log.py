@@ -88,11 +88,11 @@ def _only_tests(campaign: CampaignFile) -> bool:
     return purpose_of(campaign) is not None and RELEASED not in campaign.texts()
 
 
-def release(campaign: CampaignFile, why: str) -> None:
+def release(campaign: CampaignFile, reason: str) -> None:
     """Release a test campaign for fitting; its file records it."""
     if _only_tests(campaign):
         with campaign.transaction() as connection:
-            rows.insert_meta(connection, RELEASED, json.dumps({"utc": utc_now(), "by": why}))
+            rows.insert_meta(connection, RELEASED, json.dumps({"utc": utc_now(), "by": reason}))
 
 
 def refuse_fitting(campaign: CampaignFile) -> None:

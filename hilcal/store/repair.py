@@ -16,15 +16,15 @@ from hilcal.whole_file import replace_file
 
 
 @dataclass(frozen=True, slots=True)
-class Repaired:
+class RepairResult:
     """The revisions that a repair has set aside."""
 
-    why: str  # the defect of the first one
+    defect: str  # the defect of the first one
     revisions: tuple[int, ...]
     original: Path  # copy of the file before the repair
 
 
-def repair(path: Path) -> Repaired | None:
+def repair(path: Path) -> RepairResult | None:
     """Set aside the first bad revision, all later ones, and all entries that name one of them.
 
     Later revisions may depend on the bad one. The readings must be undamaged.
@@ -45,7 +45,7 @@ def repair(path: Path) -> Repaired | None:
             numbers = tuple(int(number) for (number,) in cursor.fetchall())
             _delete(connection, "revisions", "id", numbers)
             _delete(connection, "meta", "key", _naming(file, first))
-    return Repaired(why, numbers, original)
+    return RepairResult(why, numbers, original)
 
 
 def put_robot(path: Path, file: Path) -> None:

@@ -13,7 +13,7 @@ from hilcal.names import check_names
 from hilcal.store.stored_schema import REVISION, check
 from hilcal.toml import parse_json
 
-STORED = "stored_sha256"
+STORED_HASH = "stored_sha256"
 """Key in the options of a revision: hash of the readings as the file stores them.
 
 `data_hash` includes the arm's scatter in the covariance, which is computed, so that its last bits
@@ -64,12 +64,12 @@ class RevisionRecord:
     @property
     def made_from(self) -> int | None:
         """Number of the revision that it was made from; None for a first model."""
-        if not self.follows or self.number <= 1:
+        if not self.has_parent or self.number <= 1:
             return None
         return self.number - 1 if self.parent is None else self.parent
 
     @property
-    def follows(self) -> bool:
+    def has_parent(self) -> bool:
         """Whether it was made from another revision."""
         changes = self.added, self.removed, self.parameters_json.get("arm_scatter"), self.parent
         return any(change is not None for change in changes)
@@ -113,7 +113,7 @@ def fitted_to(record: RevisionRecord) -> tuple[int, str] | None:
     """Return number and stored hash of the readings that were fitted; None without the hash."""
     identified = record.result_json.get("identify")
     count = identified.get("n_readings") if isinstance(identified, dict) else None
-    stored = record.options.get(STORED)
+    stored = record.options.get(STORED_HASH)
     if not isinstance(count, int) or not isinstance(stored, str):
         return None
     return count, stored

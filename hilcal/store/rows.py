@@ -24,7 +24,7 @@ Layout = tuple[tuple[str, int], ...]
 """Fields of a record in order, with their number of doubles; absent quantities are left out."""
 LARGEST = 1e12
 """Upper bound of all quantities of a reading, in SI units: times in s are below 1e11."""
-MAY_LACK = "torque"
+OPTIONAL_FIELDS = "torque"
 """Quantity of a state that single readings may lack; all of its numbers are NaN then."""
 _PER_JOINT = ("q", "joint_temperature", "approach", "q_actual", "torque")
 _STATE = (
@@ -72,7 +72,7 @@ def pack(readings: Readings) -> Floats:
             raise InputError(f"readings: {name} has shape {part.shape} for {count} readings")
         part = part.reshape(count, width)
         valid = np.isfinite(part).all(axis=1)
-        if name == MAY_LACK:
+        if name == OPTIONAL_FIELDS:
             valid |= np.isnan(part).all(axis=1)
         if not valid.all():
             i = int(np.argmin(valid))
@@ -258,7 +258,7 @@ def fetch_readings(
             records[number - 1] = np.frombuffer(record, "<f8")
             index[number - 1] = where
         plausible = np.abs(records) < LARGEST
-        if (lacking := _columns(layout).get(MAY_LACK)) is not None:
+        if (lacking := _columns(layout).get(OPTIONAL_FIELDS)) is not None:
             plausible[:, lacking] |= np.isnan(records[:, lacking]).all(axis=1, keepdims=True)
         if bad := np.flatnonzero(~plausible.all(axis=1))[:1].tolist():
             raise damaged(f" at reading {bad[0] + 1}")

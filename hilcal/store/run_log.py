@@ -26,9 +26,9 @@ PLAN = "plan"
 """Key of the first plan among the texts of a campaign ..."""
 FURTHER_PLAN = "plan {}"
 """... and of further ones, numbered from 2."""
-SAME = ("robot", "tool", "loads")
+FIXED_SECTIONS = ("robot", "tool", "loads")
 """Sections of the configuration that must not change during a campaign ..."""
-ADDRESSES = {"driver", "host", "port", "baud", "options"}
+ADDRESS_KEYS = {"driver", "host", "port", "baud", "options"}
 """... except these keys."""
 
 
@@ -40,12 +40,12 @@ def create_run(
     overwrite: bool = False,
     *,
     source: str = "measured by hilcal run",
-    more: Mapping[str, str] | None = None,
+    more_texts: Mapping[str, str] | None = None,
 ) -> CampaignFile:
     """Make the campaign file of a run, with its plan and further texts, without readings."""
-    texts = {PLAN: plan.to_json(), COVERS_KEY: INSTRUMENT, **(more or {})}
+    texts = {PLAN: plan.to_json(), COVERS_KEY: INSTRUMENT, **(more_texts or {})}
     return CampaignFile.create(
-        path, config.to_json(), str(base_dir), source, overwrite=overwrite, more=texts
+        path, config.to_json(), str(base_dir), source, overwrite=overwrite, more_texts=texts
     )
 
 
@@ -58,9 +58,9 @@ def check_same_cell(campaign: CampaignFile, config: CellConfig, base_dir: Path) 
                 f"{base_dir / getattr(config.robot, KEYS[key])} is not what it was when "
                 f"{campaign.path} was begun; a campaign is of one robot: start another one for this"
             )
-    for section in SAME:
+    for section in FIXED_SECTIONS:
         stored, current = (
-            c.model_dump(mode="json", include={section: True}, exclude={section: ADDRESSES})
+            c.model_dump(mode="json", include={section: True}, exclude={section: ADDRESS_KEYS})
             for c in (CellConfig.from_json(campaign.config_json), config)
         )
         if stored != current:

@@ -17,7 +17,7 @@ from hilcal.readings.covariance import smallest_correlation
 from hilcal.readings.readings import SAME_POSE, ObserverKind, ObserverName, Readings
 from hilcal.robot.arm import Arm
 from hilcal.tables.grid import ColumnTable, first_true
-from hilcal.tables.uncertainty import LEAST
+from hilcal.tables.uncertainty import MIN_STD
 from hilcal.types import Bools, Floats, Ints
 
 POSITION = ("x_m", "y_m", "z_m")
@@ -28,8 +28,10 @@ TARGET, COVERS, STATION = "target", "covers", "station"
 PREVIEW = "hilcal import TABLE --preview proposes a mapping for --format"
 SCALAR = {"point": ("distance_m", "from", "cov_d_d"), "gauge": ("gauge_m", "gauge", "cov_g_g")}
 """Columns of a reading that is one number, by kind of observer: value, observer, variance."""
-OWN_PREFIX = "x_"
-AGREES = 2e-3  # rad; largest difference from the arm's description: tables round to 0.1°. A choice
+USER_PREFIX = "x_"
+JOINT_TOLERANCE = (
+    2e-3  # rad; largest difference from the arm's description: tables round to 0.1°. A choice
+)
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 Units = int | Sequence[str]
@@ -123,7 +125,7 @@ def check_header(
         needed = needed[:-3]
     missing = [c for c in needed if c not in header and c not in spare]
     for name in header:
-        if name not in valid and not name.startswith(OWN_PREFIX):
+        if name not in valid and not name.startswith(USER_PREFIX):
             form = f"; for a table of another form: {PREVIEW}" if missing else ""
             advice = _advice(name, valid, header, len(_numbered(units)))
             raise InputError(f"{path}: unknown column '{name}'{advice}{form}")
@@ -161,13 +163,13 @@ def _advice(name: str, valid: Sequence[str], header: Sequence[str], n: int) -> s
     if column is not None and re.fullmatch(r"qa?[0-9]+_(rad|m)", name):
         return f"; this joint {'slides' if column.endswith('_m') else 'turns'}: '{column}'"
     close = _closest(name, (c for c in valid if c not in header)) or _closest(name, valid)
-    prefix = f"columns of your own start with '{OWN_PREFIX}'"
+    prefix = f"columns of your own start with '{USER_PREFIX}'"
     joints = f" (the arm has {n} joints)" if any(ch.isdigit() for ch in close or "") else ""
     return f"; did you mean '{close}'{joints}? Else: {prefix}" if close else f"; {prefix}"
 
 
 def _hint(missing: Sequence[str], header: Sequence[str], units: Units, arm: str) -> str:
-    user_columns = [c for c in header if c.startswith(OWN_PREFIX)]
+    user_columns = [c for c in header if c.startswith(USER_PREFIX)]
     close = _closest(missing[0], user_columns) if missing[0] not in TEXT else None
     if close:
         return f"; '{close}' is taken as a column of your own: positions must be '{missing[0]}'"
@@ -197,34 +199,38 @@ def check_covariance_columns(path: str, header: Sequence[str]) -> None:
 def following_columns(arm: Arm) -> tuple[str, ...]:
     """Columns of mimic joints, which a table may leave out."""
     names = (joint_columns(arm.units), actual_columns(arm.units))
-    return tuple(n for group in names for n, free in zip(group, arm.own, strict=True) if not free)
+    return tuple(
+        n for group in names for n, free in zip(group, arm.independent, strict=True) if not free
+    )
 
 
 def independent_columns(names: tuple[str, ...], count: int, arm: Arm) -> tuple[str, ...]:
     """Return the columns of all joints, or of those that mimic no other, by their `count`."""
     if count == len(names):
         return names
-    return tuple(name for name, free in zip(names, arm.own, strict=True) if free)
+    return tuple(name for name, free in zip(names, arm.independent, strict=True) if free)
 
 
 def with_following(table: ColumnTable, arm: Arm) -> ColumnTable:
     """Return the table with the values of mimic joints filled in; stated ones must agree."""
     number = dict(table.number)
     for names in (joint_columns(arm.units), actual_columns(arm.units)):
-        stated = independent_columns(names, int(arm.own.sum()), arm)
-        if arm.own.all() or not set(stated) <= number.keys():
+        stated = independent_columns(names, int(arm.independent.sum()), arm)
+        if arm.independent.all() or not set(stated) <= number.keys():
             continue
         nothing = np.full(len(number[stated[0]]), np.nan)
         q = np.stack([number.get(name, nothing) for name in names], axis=1)
         full = arm.complete(q)
-        off = (np.abs(q - full) > AGREES) & ~arm.own  # False where there is no value
+        off = (
+            np.abs(q - full) > JOINT_TOLERANCE
+        ) & ~arm.independent  # False where there is no value
         for i, k in first_true(off):
             raise InputError(
                 f"{table.at(i, names[k])}: {q[i, k]:g} {arm.unit(k)}, but by the arm's "
                 f"description {arm.joint_names[k]} follows to {full[i, k]:g}; leave the "
                 "column out, or correct <mimic> in the URDF"
             )
-        number |= {names[k]: full[:, k] for k in np.flatnonzero(~arm.own).tolist()}
+        number |= {names[k]: full[:, k] for k in np.flatnonzero(~arm.independent).tolist()}
     return replace(table, number=number)
 
 
@@ -392,21 +398,21 @@ KINDS: tuple[ObserverKind, ...] = ("point", "gauge")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Observed:
+class ObserverRows:
     """The observer of each row."""
 
-    number: Ints  # (N,) index of the observer of each row
+    observer: Ints  # (N,) index of the observer of each row
     names: tuple[ObserverName, ...]  # of the observers; stations come first
     scalar: Bools  # (N,) rows with one number
 
-    def put(
+    def fill(
         self, table: ColumnTable, value: Floats, cov: Floats, std: Mapping[ObserverName, float]
     ) -> tuple[Floats, Floats]:
         """Return values (N, m) and covariances (N, m, m) with distances and heights filled in."""
         value, cov = value.copy(), cov.copy()
         for kind in KINDS:
             column, _, variance_column = SCALAR[kind]
-            rows = np.flatnonzero([self.names[k].kind == kind for k in self.number])
+            rows = np.flatnonzero([self.names[k].kind == kind for k in self.observer])
             if not len(rows):
                 continue
             read = table.number[column][rows]
@@ -431,7 +437,7 @@ class Observed:
         nothing = np.full(len(table.rows), np.nan)
         variances = table.number.get(column, nothing)[rows].copy()
         for k, i in enumerate(rows.tolist()):
-            name = self.names[self.number[i]]
+            name = self.names[self.observer[i]]
             if np.isnan(variances[k]):
                 if name not in std:
                     raise InputError(
@@ -439,15 +445,15 @@ class Observed:
                         f"'{column}', the variance in m², or [{kind}s.{name.name}] std_m"
                     )
                 variances[k] = std[name] ** 2
-            if not LEAST[0] ** 2 <= variances[k] <= MAX_STD**2:
+            if not MIN_STD[0] ** 2 <= variances[k] <= MAX_STD**2:
                 raise InputError(
                     f"{table.at(i, column)}: a variance of {variances[k]:g} m² cannot be right; "
-                    f"expected standard deviations of {LEAST[0]:g} to {MAX_STD:g} m, squared"
+                    f"expected standard deviations of {MIN_STD[0]:g} to {MAX_STD:g} m, squared"
                 )
         return np.asarray(variances)
 
 
-def observed_of(table: ColumnTable) -> Observed | None:
+def observer_rows(table: ColumnTable) -> ObserverRows | None:
     """Return the observers of the rows; None where all are positions measured by one tracker."""
     count, station = len(table.rows), table.text.get(STATION)
     column = {kind: SCALAR[kind][0] for kind in KINDS}
@@ -473,7 +479,7 @@ def observed_of(table: ColumnTable) -> Observed | None:
             names.append(ObserverName("station", _name(table, i, STATION)))
     order = sorted(dict.fromkeys(names), key=lambda n: n.kind != "station")
     index = {name: k for k, name in enumerate(order)}
-    return Observed(np.array([index[n] for n in names]), tuple(order), np.asarray(~positioned))
+    return ObserverRows(np.array([index[n] for n in names]), tuple(order), np.asarray(~positioned))
 
 
 def _name(table: ColumnTable, row: int, column: str) -> str:

@@ -63,22 +63,22 @@ def open_tables(
 
 
 @limits.bounded
-def open_grid(path: str | Path, how: FileFormat, check: Check | None = None) -> Grid:
+def open_grid(path: str | Path, file_format: FileFormat, check: Check | None = None) -> Grid:
     """Open one file as a table of cells; `check` is given the names of its columns."""
     name, content = str(path), content_of(path)
     kind = kind_of(name, content)
     with undamaged(name, "damaged, or not what its first bytes say"):
         match kind:
             case "XLSX":
-                return _xlsx(name, content, how, check)
+                return _xlsx(name, content, file_format, check)
             case "Parquet":
-                return _parquet(name, content, how, check)
+                return _parquet(name, content, file_format, check)
             case "MAT":
-                return _mat(name, how, check)
-    if how.sheet or how.variable:
-        key = "sheet" if how.sheet else "variable"
+                return _mat(name, file_format, check)
+    if file_format.sheet or file_format.variable:
+        key = "sheet" if file_format.sheet else "variable"
         raise InputError(f"{name}: text has no {key}; remove [file] {key}")
-    return read_text(name, content, how, check)
+    return read_text(name, content, file_format, check)
 
 
 def content_of(path: str | Path) -> bytes:
@@ -357,22 +357,28 @@ def decoded(path: str, content: bytes, encoding: str | None) -> str:
     return text
 
 
-def read_text(path: str, content: bytes, how: FileFormat, check: Check | None = None) -> Grid:
+def read_text(
+    path: str, content: bytes, file_format: FileFormat, check: Check | None = None
+) -> Grid:
     """Read delimited text; `check` is given its header."""
-    text = decoded(path, content, how.encoding)
-    return grid_of_rows(path, list(records(path, text, how)), how, check)
+    text = decoded(path, content, file_format.encoding)
+    return grid_of_rows(path, list(records(path, text, file_format)), file_format, check)
 
 
-def records(path: str, text: str, how: FileFormat) -> Iterator[tuple[int, list[str]]]:
+def records(path: str, text: str, file_format: FileFormat) -> Iterator[tuple[int, list[str]]]:
     """Rows of cells that are neither blank nor comments, with their numbers from 1."""
-    separator = SEPARATORS.get(how.separator or ",", how.separator or ",")
-    blanks = how.separator == "blanks"
+    separator = SEPARATORS.get(file_format.separator or ",", file_format.separator or ",")
+    blanks = file_format.separator == "blanks"
     text = text.replace("\t", " ") if blanks else text
-    if how.comment is not None and how.header_row:  # a header as numpy.savetxt writes it
+    if (
+        file_format.comment is not None and file_format.header_row
+    ):  # a header as numpy.savetxt writes it
         split = text.splitlines(keepends=True)
-        for line in split[how.header_row - 1 : how.header_row]:
-            if line.lstrip().startswith(how.comment):
-                split[how.header_row - 1] = line.lstrip().removeprefix(how.comment).lstrip()
+        for line in split[file_format.header_row - 1 : file_format.header_row]:
+            if line.lstrip().startswith(file_format.comment):
+                split[file_format.header_row - 1] = (
+                    line.lstrip().removeprefix(file_format.comment).lstrip()
+                )
         text = "".join(split)
     lines = limits.Lines(path, io.StringIO(text, newline=None))
     reader = csv.reader(lines, delimiter=separator, skipinitialspace=blanks, strict=True)
@@ -383,7 +389,9 @@ def records(path: str, text: str, how: FileFormat) -> Iterator[tuple[int, list[s
             lines.row(len(cells))
             plain = [c.strip() for c in cells]
             plain = plain[: length_of(plain)] if blanks else plain
-            if any(plain) and not (how.comment and plain[0].startswith(how.comment)):
+            if any(plain) and not (
+                file_format.comment and plain[0].startswith(file_format.comment)
+            ):
                 yield row, plain
     except csv.Error as e:
         raise InputError(f"{path}: row {reader.line_num}: not delimited text ({e})") from e
@@ -391,31 +399,33 @@ def records(path: str, text: str, how: FileFormat) -> Iterator[tuple[int, list[s
 
 def grid_of_rows(
     path: str,
-    numbered: Sequence[tuple[int, Sequence[Cell]]],
-    how: FileFormat,
+    numbered_rows: Sequence[tuple[int, Sequence[Cell]]],
+    file_format: FileFormat,
     check: Check | None = None,
 ) -> Grid:
     """Make a grid of rows: checked header, units, rows of one length but for empty ends."""
-    by_row = dict(numbered)
-    if how.header_row and how.header_row not in by_row:
+    by_row = dict(numbered_rows)
+    if file_format.header_row and file_format.header_row not in by_row:
         raise InputError(
-            f"{path}: row {how.header_row} holds no header; set [file] header_row to its row, 0 "
-            f"where there is none"
+            f"{path}: row {file_format.header_row} holds no header; set [file] header_row to its "
+            f"row, 0 where there is none"
         )
-    titles = by_row[how.header_row] if how.header_row else []
+    titles = by_row[file_format.header_row] if file_format.header_row else []
     if check is not None:
         check([text_of(c) for c in titles])
     header = [" ".join(text_of(c).split()) for c in titles]
-    skipped = {how.units_row, *how.skip_rows}
-    body = [(row, c) for row, c in numbered if row > how.header_row and row not in skipped]
+    skipped = {file_format.units_row, *file_format.skip_rows}
+    body = [
+        (row, c) for row, c in numbered_rows if row > file_format.header_row and row not in skipped
+    ]
     if not body:
-        raise InputError(f"{path}: no readings below row {how.header_row}")
+        raise InputError(f"{path}: no readings below row {file_format.header_row}")
     width = len(header) or max(length_of(c) for _, c in body)
     while header and not header[-1] and all(length_of(c) < width for _, c in body):
         header.pop()
         width -= 1
     for row, cells in body:
-        if length_of(cells) > width or (how.header_row and len(cells) < width):
+        if length_of(cells) > width or (file_format.header_row and len(cells) < width):
             raise InputError(
                 f"{path}: row {row} has {length_of(cells)} cells, "
                 f"{'the header' if header else 'others'} {width}; a mapping lists rows that are "
@@ -426,10 +436,10 @@ def grid_of_rows(
     padded = [[*cells[:width], *[None] * (width - len(cells))] for _, cells in body]
     columns = tuple(list(column) for column in zip(*padded, strict=True))
     units = {}
-    if how.units_row is not None and how.units_row in by_row:
-        units = {n: text_of(c) for n, c in zip(names, by_row[how.units_row], strict=False)}
+    if file_format.units_row is not None and file_format.units_row in by_row:
+        units = {n: text_of(c) for n, c in zip(names, by_row[file_format.units_row], strict=False)}
     rows = np.array([row for row, _ in body], dtype=np.int64)
-    return Grid(path, names, rows, columns, (how,) * len(names), units)
+    return Grid(path, names, rows, columns, (file_format,) * len(names), units)
 
 
 def filled(cell: Cell) -> bool:

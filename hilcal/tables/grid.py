@@ -94,10 +94,10 @@ class Grid:
         columns = tuple([c[k] for k in chosen] for c in self.columns)
         return replace(self, rows=self.rows[chosen], columns=columns)
 
-    def with_column(self, name: str, cells: Sequence[Cell], like: str | int) -> "Grid":
-        """Return the table with a further column, in the format of the column `like`."""
+    def with_column(self, name: str, cells: Sequence[Cell], like_column: str | int) -> "Grid":
+        """Return the table with a further column, in the format of the column `like_column`."""
         names, columns = (*self.names, name), (*self.columns, cells)
-        formats = (*self.formats, self._format(like))
+        formats = (*self.formats, self._format(like_column))
         return replace(self, names=names, columns=columns, formats=formats)
 
     def _format(self, column: str | int) -> FileFormat:
@@ -163,24 +163,24 @@ def text_of(cell: Cell) -> str:
     return str(cell).strip()
 
 
-def number(cell: Cell, how: FileFormat) -> float:
+def number(cell: Cell, file_format: FileFormat) -> float:
     """Return a cell's number; NaN where it is missing, infinite where it is no finite number."""
     if isinstance(cell, bool | datetime):
         return float("inf")
     if cell is None or not isinstance(cell, str):
         return float("nan") if cell is None else float(cell)
     plain = cell.translate(_PLAIN).strip()
-    if plain.lower() in BLANK or plain in how.missing:
+    if plain.lower() in BLANK or plain in file_format.missing:
         return float("nan")
-    if how.thousands and how.thousands in plain:
-        groups = plain.split(how.decimal)[0].lstrip("+-").split(how.thousands)
+    if file_format.thousands and file_format.thousands in plain:
+        groups = plain.split(file_format.decimal)[0].lstrip("+-").split(file_format.thousands)
         if not 0 < len(groups[0]) <= 3 or any(len(part) != 3 for part in groups[1:]):
             return float("inf")
-        plain = plain.replace(how.thousands, "")
-    if "_" in plain or (how.decimal == "," and "." in plain):
+        plain = plain.replace(file_format.thousands, "")
+    if "_" in plain or (file_format.decimal == "," and "." in plain):
         return float("inf")
     try:
-        value = float(plain.replace(how.decimal, "."))
+        value = float(plain.replace(file_format.decimal, "."))
     except ValueError:
         return float("inf")
     return value if np.isfinite(value) else float("inf")

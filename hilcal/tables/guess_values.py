@@ -116,10 +116,10 @@ def guess_by_values(g: words.Guesser) -> None:
             continue
         score = 0.1 * ((len(free) - len(joints) - len(position)) % 3 == 0)
         if joints:
-            score += 2.0 if size(joints) <= words.TURN else 1.0
+            score += 2.0 if size(joints) <= words.MAX_ANGLE_RAD else 1.0
         if position:
             far = size(position)
-            score += 2.0 if far > 400 else (1.0 if far < words.FAR else 0.5)
+            score += 2.0 if far > 400 else (1.0 if far < words.MAX_POSITION_M else 0.5)
         ranked.append((score, position, joints))
     if not ranked:
         return
@@ -133,11 +133,11 @@ def guess_by_values(g: words.Guesser) -> None:
     ):
         if names:
             unit = unit_of(g, section, names)
-            g.take(section, names, unit, unit=unit)
-            g.unsure(section, BY_VALUES)
+            g.assign(section, names, unit, unit=unit)
+            g.doubt(section, BY_VALUES)
     if len(near) > 1:
         pair = [", ".join(part) for part in near[1] if part]
-        g.unsure("joints", f"{RIVALS} {' and '.join(pair)}")
+        g.doubt("joints", f"{RIVALS} {' and '.join(pair)}")
 
 
 def _orientation_by_values(g: words.Guesser, free: list[str]) -> None:
@@ -149,8 +149,8 @@ def _orientation_by_values(g: words.Guesser, free: list[str]) -> None:
         m = g.block(names).reshape(-1, 3, 3)
         m = m[np.isfinite(m).all(axis=(1, 2))]
         if len(m) and np.abs(m @ np.swapaxes(m, 1, 2) - np.eye(3)).max() < NORM:
-            g.take("orientation", names, "rotation matrix", convention="matrix")
-            g.unsure("orientation", "found by their values; row by row, or column by column?")
+            g.assign("orientation", names, "rotation matrix", convention="matrix")
+            g.doubt("orientation", "found by their values; row by row, or column by column?")
             return
     for k in range(len(free) - 3):
         names = free[k : k + 4]
@@ -161,7 +161,7 @@ def _orientation_by_values(g: words.Guesser, free: list[str]) -> None:
 
 def _take_quaternion(g: words.Guesser, names: list[str]) -> None:
     """Take four numbers for a quaternion; which of them is w is a guess."""
-    g.take("orientation", names, "quaternion, w first", convention="quaternion-wxyz")
+    g.assign("orientation", names, "quaternion, w first", convention="quaternion-wxyz")
     g.proposal.open_convention = True
 
 
@@ -184,7 +184,7 @@ Group = dict[str, dict[tuple[object, ...], dict[str, str]]]
 _KINDS = words.STD | words.ROTATION | words.QUATERNION | words.FORCE | words.MOMENT
 
 
-LARGE = 1e-6  # m²; a larger variance, of more than 1 mm, is in mm²
+LARGE_VARIANCE = 1e-6  # m²; a larger variance, of more than 1 mm, is in mm²
 
 
 def guess_axes(g: words.Guesser) -> None:
@@ -214,22 +214,22 @@ def guess_axes(g: words.Guesser) -> None:
         unit = words.length_unit(g, "position", names)
         targets = [str(s[-1]) for s in side_by_side]
         meaning = f"{unit}, {len(targets)} targets"
-        g.take("position", names, meaning, unit=unit, targets=targets)
-        g.unsure("position", words.SIDE_BY_SIDE)
+        g.assign("position", names, meaning, unit=unit, targets=targets)
+        g.doubt("position", words.SIDE_BY_SIDE)
     else:
         unit = words.length_unit(g, "position", names)
-        g.take("position", names, unit, unit=unit)
+        g.assign("position", names, unit, unit=unit)
     ranked = [s for s in ranked if s not in side_by_side]
     unused = [
         positions[s]["x"] for s in ranked if s != stem and not set(map(str, s)) & words.NOMINAL
     ]
     if unused:
-        listed = ", ".join(f"'{name}' ..." for name in unused[: words.SHOWN])
-        g.unsure("position", f"'{names[0]}' ... are used, not {listed}")
+        listed = ", ".join(f"'{name}' ..." for name in unused[: words.N_EXAMPLES])
+        g.doubt("position", f"'{names[0]}' ... are used, not {listed}")
     marks = sentinels(g.block(names))
     if marks:
         g.proposal.sections["file"] = {"missing": marks}
-        g.unsure("file", f"{', '.join(map('{:g}'.format, marks))} stands for a missing point")
+        g.doubt("file", f"{', '.join(map('{:g}'.format, marks))} stands for a missing point")
     _orientation(g, complete, stem)
     _forces(g, complete)
     _std(g, complete, stem, unit)
@@ -262,9 +262,9 @@ def _covariance(g: words.Guesser) -> None:
     upper = ["xx", "xy", "xz", "yy", "yz", "zz"]
     if all(axes in by_axes for axes in upper):
         names = [by_axes[axes] for axes in upper]
-        unit = "mm" if np.nanmedian(g.block(names[:1])) > LARGE else "m"
-        g.unsure("covariance", f"in {unit}², by their size")
-        g.take("covariance", names, f"upper triangle, {unit}²", unit=unit)
+        unit = "mm" if np.nanmedian(g.block(names[:1])) > LARGE_VARIANCE else "m"
+        g.doubt("covariance", f"in {unit}², by their size")
+        g.assign("covariance", names, f"upper triangle, {unit}²", unit=unit)
 
 
 def _orientation(g: words.Guesser, complete: Group, stem: tuple[object, ...]) -> None:
@@ -272,7 +272,7 @@ def _orientation(g: words.Guesser, complete: Group, stem: tuple[object, ...]) ->
     best = _columns_like(quaternions, stem)
     if best is not None:
         names = [best[axis] for axis in "wxyz"]
-        g.take("orientation", names, "quaternion, w first", convention="quaternion-wxyz")
+        g.assign("orientation", names, "quaternion, w first", convention="quaternion-wxyz")
         return
     if _numbered_quaternion(g) or _matrix(g):
         return
@@ -316,7 +316,7 @@ def _columns_like(
 
 def _angles(g: words.Guesser, names: list[str], convention: str) -> None:
     unit = words.angle_unit(g, "orientation", names)
-    g.take("orientation", names, f"{convention}, {unit}", convention=convention, unit=unit)
+    g.assign("orientation", names, f"{convention}, {unit}", convention=convention, unit=unit)
     g.proposal.open_convention = True
 
 
@@ -346,7 +346,7 @@ def _matrix(g: words.Guesser) -> bool:
             places = [(i + base, j + base) for i in range(3) for j in range(3)]
             if all(place in by_place for place in places):
                 names = [by_place[place] for place in places]
-                g.take("orientation", names, "rotation matrix", convention="matrix")
+                g.assign("orientation", names, "rotation matrix", convention="matrix")
                 return True
     return False
 
@@ -361,8 +361,8 @@ def _forces(g: words.Guesser, complete: Group) -> None:
         turning = [moment[axis] for axis in "xyz"]
         section["moment_unit"] = g.unit(turning, MOMENTS) or "Nm"
         names += turning
-    g.unsure("wrench", 'base axes, and of = "load" (exerted on the tool), or "reaction"?')
-    g.take("wrench", names, ", ".join(map(str, section.values())), **section)
+    g.doubt("wrench", 'base axes, and of = "load" (exerted on the tool), or "reaction"?')
+    g.assign("wrench", names, ", ".join(map(str, section.values())), **section)
 
 
 def _std(g: words.Guesser, complete: Group, stem: tuple[object, ...], position_unit: str) -> None:
@@ -383,14 +383,14 @@ def _std(g: words.Guesser, complete: Group, stem: tuple[object, ...], position_u
     kind = "std"
     if first.has(words.EXPANDED):
         kind, section["k"] = "expanded", 2.0
-        g.unsure("std", "expanded uncertainty: is k = 2 right?")
+        g.doubt("std", "expanded uncertainty: is k = 2 right?")
     elif first.has(words.VARIANCE):
         kind = "variance"
     elif first.has({"u", "unc", "uncertainty", "unsicherheit", "incertitude"}):
-        g.unsure("std", 'a standard deviation, or kind = "expanded" with its k?')
+        g.doubt("std", 'a standard deviation, or kind = "expanded" with its k?')
     section["kind"] = kind
     if axes is None:
-        g.unsure("std", 'one figure: of = "axis", or "point" (3-D length)?')
-    g.unsure("std", "scatter of samples only? Then set add_instrument = true")
-    g.take("std", names, f"{kind}, {', '.join(str(v) for v in section.values() if v != kind)}",
+        g.doubt("std", 'one figure: of = "axis", or "point" (3-D length)?')
+    g.doubt("std", "scatter of samples only? Then set add_instrument = true")
+    g.assign("std", names, f"{kind}, {', '.join(str(v) for v in section.values() if v != kind)}",
            **section)  # fmt: skip

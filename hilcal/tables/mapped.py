@@ -32,11 +32,13 @@ from hilcal.tables.uncertainty import check_joint_rounding, mapped_covariance, r
 from hilcal.tables.units import defect, rotations
 from hilcal.types import Bools, Floats, Ints
 
-MOST_LOST = 0.5  # Share of rows without a value beyond which the mapping is wrong; a choice
+MAX_LOST_SHARE = 0.5  # Share of rows without a value beyond which the mapping is wrong; a choice
 UNIT_LENGTH = 0.01  # Of a quaternion from 1, of a matrix from orthogonal; three digits stay below
 MOST_TURN = 2 * np.pi + 1e-3  # rad; a larger angle of an orientation is in another unit
-MOVED = 0.01  # rad; a joint commanded by more is sent to another pose; a choice
-STILL = 1e-4  # rad; a joint commanded by less did not move far enough to arrive from another side
+MOVED_RAD = 0.01  # rad; a joint commanded by more is sent to another pose; a choice
+STILL_RAD = (
+    1e-4  # rad; a joint commanded by less did not move far enough to arrive from another side
+)
 SIGMAS = 4.0  # Standard deviations within which two readings are the same; a choice
 REPEATED = 2e-4  # rad; rows whose joints differ by less repeat a pose; a choice
 REPEATS_TO = 4e-4  # m; ten times an arm's repeatability: of positions further apart some are wrong
@@ -81,8 +83,8 @@ def mapped_table(
     if mapping.approach is not None and mapping.approach.by_order and joints is not None:
         side = approach_by_order(_joint_units(joints, arm) * _block(raw, grid, joints.columns))
         notes.append(
-            f"approach: side of the move from the row before; moves below {STILL:g} rad keep the "
-            "last side, the first row counts as +1"
+            f"approach: side of the move from the row before; moves below {STILL_RAD:g} rad keep "
+            "the last side, the first row counts as +1"
         )
     missing_notes = _missing_positions(grid, mapping.position, raw)
     sparse: list[str] = []  # columns of readings; a row has one kind of reading
@@ -261,7 +263,7 @@ def _raw(grid: Grid, mapping: forms.PointMapping, arm: Arm) -> dict[str, Floats]
         section = getattr(mapping, name)
         if section is None or not section.columns:
             continue
-        count = {arm.n, int(arm.own.sum())} if name in per_joint[:2] else {arm.n}
+        count = {arm.n, int(arm.independent.sum())} if name in per_joint[:2] else {arm.n}
         if name in per_joint and len(section.columns) not in count:
             raise InputError(
                 f"{grid.path}: the mapping has {len(section.columns)} columns of {name}; "
@@ -303,7 +305,7 @@ def _complete(grid: Grid, raw: dict[str, Floats], sparse: Sequence[str]) -> tupl
     missing[:, some] = missing[:, some].all(axis=1, keepdims=True)
     bad: Bools = np.asarray(missing.any(axis=1))
     count, first = int(bad.sum()), int(np.argmax(bad))
-    if count > MOST_LOST * len(bad):
+    if count > MAX_LOST_SHARE * len(bad):
         column = list(raw)[int(np.argmax(missing[first]))]
         raise InputError(
             f"{grid.at(first, column)}: no value, and {count} of {len(bad)} rows lack one in some "
@@ -318,7 +320,7 @@ def _complete(grid: Grid, raw: dict[str, Floats], sparse: Sequence[str]) -> tupl
 def _stale(grid: Grid, position: Floats, q: Floats) -> list[str]:
     """Note rows that read the same position as the row before, though the joints moved on."""
     same = (np.diff(position, axis=0) == 0).all(axis=1) & (position.shape[1] > 0)
-    moved = np.abs(np.diff(q, axis=0)).max(axis=1, initial=0.0) > MOVED
+    moved = np.abs(np.diff(q, axis=0)).max(axis=1, initial=0.0) > MOVED_RAD
     rows = grid.rows[1:][same & moved]
     if not len(rows):
         return []
@@ -451,7 +453,7 @@ def approach_by_order(q: Floats) -> Floats:
 
     filled = pd.DataFrame(q).ffill().bfill().to_numpy()
     step = np.diff(filled, axis=0, prepend=filled[:1])
-    side = np.where(np.abs(step) > STILL, np.sign(step), np.nan)
+    side = np.where(np.abs(step) > STILL_RAD, np.sign(step), np.nan)
     side[0] = 1.0
     return np.asarray(pd.DataFrame(side).ffill().to_numpy(), dtype=float)
 
@@ -472,7 +474,7 @@ def _plausible(
     q, value = readings.states.q, readings.value
     variance = np.diagonal(scatter, axis1=1, axis2=2)
     stale = np.zeros(len(q), dtype=bool)
-    sent = np.abs(np.diff(q, axis=0)).max(axis=1) > MOVED
+    sent = np.abs(np.diff(q, axis=0)).max(axis=1) > MOVED_RAD
     limit = SIGMAS * np.sqrt(variance[1:] + variance[:-1])
     stale[1:] = sent & np.all(np.abs(np.diff(value, axis=0)) <= limit, axis=1)
     used = np.flatnonzero(~stale)

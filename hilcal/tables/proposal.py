@@ -169,20 +169,22 @@ def _unit(name: str) -> tuple[str, str | None]:
     return plain, None
 
 
-TURN = 2 * np.pi + 0.1  # rad; a larger angle is in degrees
-FAR = 50.0  # A position beyond this number is in millimetres: no arm is measured from 50 m
+MAX_ANGLE_RAD = 2 * np.pi + 0.1  # rad; a larger angle is in degrees
+MAX_POSITION_M = (
+    50.0  # A position beyond this number is in millimetres: no arm is measured from 50 m
+)
 GUESSED = "the convention is a guess; --config CELL.toml lets the arm decide"
 SIDE_BY_SIDE = "several targets: name them as in the cell's [[tool.targets]]"
 REPORTED = 5e-3  # rad; encoders at rest in one pose differ by less, commanded poses by more
 FEWEST_JOINTS, MOST_JOINTS = 4, 8
-SHOWN = 3
+N_EXAMPLES = 3
 
 
 @dataclass(frozen=True, slots=True)
-class UnderstoodColumn:
+class ProposedQuantity:
     """A quantity that the table holds."""
 
-    what: str  # section of the mapping
+    section: str  # section of the mapping
     columns: tuple[str, ...]
     meaning: str  # unit and convention
     example: tuple[str, ...]  # the cells of the first reading
@@ -193,10 +195,10 @@ class Proposal:
     """A mapping in the making."""
 
     sections: dict[str, dict[str, Any]] = field(default_factory=dict)  # of the mapping, by name
-    understood: list[UnderstoodColumn] = field(default_factory=list)  # quantities of the table
-    unsure: list[tuple[str, str]] = field(default_factory=list)  # by section: what to check
+    quantities: list[ProposedQuantity] = field(default_factory=list)  # quantities of the table
+    doubts: list[tuple[str, str]] = field(default_factory=list)  # by section: what to check
     unused: list[tuple[str, str]] = field(default_factory=list)  # columns, and why
-    lacking: list[str] = field(default_factory=list)  # sentences on quantities that an import needs
+    missing: list[str] = field(default_factory=list)  # sentences on quantities that an import needs
     open_convention: bool = False  # whether the orientation's convention is a guess
     alternatives: list[tuple[list[str], list[str]]] = field(default_factory=list)
     """columns of the position and of the joints that are as good by their values, the chosen ones
@@ -212,12 +214,12 @@ class Proposal:
             f"# How to read {source}; proposed by `hilcal import --preview`. Check what is",
             "# marked, change what is wrong, and give this file with --format.",
         ]
-        lines += [f"# missing: {text}" for text in self.lacking]
-        absent = [(about, text) for about, text in self.unsure if about not in self.sections]
+        lines += [f"# missing: {text}" for text in self.missing]
+        absent = [(about, text) for about, text in self.doubts if about not in self.sections]
         lines += [f"# {about}: {text}" for about, text in absent]
         for name, section in self.sections.items():
             lines.append("")
-            lines += [f"# check: {text}" for about, text in self.unsure if about == name]
+            lines += [f"# check: {text}" for about, text in self.doubts if about == name]
             lines.append(f"[{name}]")
             lines += [f"{key} = {inline(_escaped(value))}" for key, value in section.items()]
         if self.unused:
@@ -261,21 +263,21 @@ class Guesser:
         values = (self.values[name] for name in names)
         return np.stack([nothing if v is None else v for v in values], axis=1)
 
-    def take(self, name: str, columns: Sequence[str], meaning: str, **section: object) -> None:
+    def assign(self, name: str, columns: Sequence[str], meaning: str, **section: object) -> None:
         """Give columns a meaning."""
         key = "column" if "column" in section else "columns"
         section = {key: columns[0] if key == "column" else list(columns)} | section
         self.proposal.sections[name] = section
         examples = tuple(self.grid.text(column)[0] for column in columns)
-        self.proposal.understood.append(UnderstoodColumn(name, tuple(columns), meaning, examples))
+        self.proposal.quantities.append(ProposedQuantity(name, tuple(columns), meaning, examples))
         for column in columns:
             self.free.pop(column, None)
 
-    def unsure(self, about: str, sentence: str) -> None:
+    def doubt(self, about: str, sentence: str) -> None:
         """Note what should be checked."""
-        self.proposal.unsure.append((about, sentence))
+        self.proposal.doubts.append((about, sentence))
 
-    def drop(self, name: str, why: str) -> None:
+    def ignore(self, name: str, why: str) -> None:
         """Leave a column unused."""
         if self.free.pop(name, None) is not None:
             self.proposal.unused.append((name, why))
@@ -292,13 +294,13 @@ def angle_unit(g: Guesser, section: str, names: Sequence[str]) -> str:
     stated = g.unit(names, ANGLES)
     largest = float(np.nanmax(np.abs(g.block(names))))
     if stated is not None:
-        if stated == "rad" and largest > TURN:
-            g.unsure(section, f"named rad, but up to {largest:.4g}: read as degrees")
+        if stated == "rad" and largest > MAX_ANGLE_RAD:
+            g.doubt(section, f"named rad, but up to {largest:.4g}: read as degrees")
             return "deg"
         return stated
-    if largest > TURN:
+    if largest > MAX_ANGLE_RAD:
         return "deg"
-    g.unsure(section, f"no unit stated; rad, since no angle exceeds {largest:.3g}")
+    g.doubt(section, f"no unit stated; rad, since no angle exceeds {largest:.3g}")
     return "rad"
 
 
@@ -307,6 +309,6 @@ def length_unit(g: Guesser, section: str, names: Sequence[str]) -> str:
     if (stated := g.unit(names, LENGTHS)) is not None:
         return stated
     largest = float(np.nanmax(np.abs(g.block(names))))
-    unit = "mm" if largest > FAR else "m"
-    g.unsure(section, f"no unit stated; {unit}, since the largest is {largest:.4g}")
+    unit = "mm" if largest > MAX_POSITION_M else "m"
+    g.doubt(section, f"no unit stated; {unit}, since the largest is {largest:.4g}")
     return unit

@@ -24,7 +24,7 @@ from hilcal.tables.units import ANGLES, LENGTHS, MOMENTS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Proposed:
+class GridProposal:
     """A table and a proposed mapping for it."""
 
     grid: Grid
@@ -32,7 +32,7 @@ class Proposed:
 
 
 @limits.bounded
-def propose(path: Path, second: Path | None = None, joints: int | None = None) -> Proposed:
+def propose(path: Path, second: Path | None = None, joints: int | None = None) -> GridProposal:
     """Look at a table, or two that hold columns of the same readings, and propose a mapping."""
     first = sniff(path)
     grid, doubts = first.grid, [("file", sentence) for sentence in first.doubts]
@@ -41,7 +41,7 @@ def propose(path: Path, second: Path | None = None, joints: int | None = None) -
         sniffed = sniff(second)
         match = _match(grid, sniffed.grid)
         grid, lost = joined(grid, sniffed.grid, match)
-        second_file = {"path": str(second), **sniffed.how}
+        second_file = {"path": str(second), **sniffed.file_keys}
         doubts += [("second_file", sentence) for sentence in sniffed.doubts]
         if match is not None:
             second_file["match"] = list(match)
@@ -49,13 +49,13 @@ def propose(path: Path, second: Path | None = None, joints: int | None = None) -
         if lost:
             doubts.append(("second_file", f"{lost} rows of the first file have no partner"))
     proposal = guess(grid, joints)
-    file = {**first.how, **proposal.sections.pop("file", {})}
+    file = {**first.file_keys, **proposal.sections.pop("file", {})}
     head: dict[str, dict[str, Any]] = {"file": file} if file else {}
     if second_file is not None:
         head["second_file"] = second_file
     proposal.sections = head | proposal.sections
-    proposal.unsure[:0] = doubts
-    return Proposed(grid, proposal)
+    proposal.doubts[:0] = doubts
+    return GridProposal(grid, proposal)
 
 
 def _match(first: Grid, second: Grid) -> tuple[str, str] | None:
@@ -103,21 +103,21 @@ def guess(grid: Grid, joints: int | None = None) -> words.Proposal:
     guess_names(g)
     guess_scalars(g)
     for name, column in list(g.free.items()):
-        g.drop(name, _why_unused(g, column))
+        g.ignore(name, _why_unused(g, column))
     if set(required_columns(joints or 6)) <= set(grid.names):
-        g.unsure("file", "this is an exchange table: it is imported without --format")
+        g.doubt("file", "this is an exchange table: it is imported without --format")
     if g.proposal.open_convention:
-        g.unsure("orientation", words.GUESSED)
+        g.doubt("orientation", words.GUESSED)
     for section, sentence in (
         ("position", "no position: three columns x, y, z were not found"),
         ("joints", "no joint angles: where they are in a file of their own, give it with --second"),
     ):
         if section not in g.proposal.sections and not (section == "position" and read):
-            g.proposal.lacking.append(sentence)
+            g.proposal.missing.append(sentence)
     if "pose" not in g.proposal.sections and "joints" in g.proposal.sections:
-        g.unsure("pose", "no column names the pose: rows of the same joints count as one pose")
+        g.doubt("pose", "no column names the pose: rows of the same joints count as one pose")
     if not {"load", "hung_mass", "wrench"} & set(g.proposal.sections):
-        g.unsure("load", "no column tells the load: all readings count as unloaded")
+        g.doubt("load", "no column tells the load: all readings count as unloaded")
     return g.proposal
 
 
@@ -164,16 +164,16 @@ def _joints(g: words.Guesser) -> None:
     candidates.sort(key=lambda f: (f[0].has(words.MEASURED | {"qa"}), not f[0].has(words.NOMINAL)))
     first, names = candidates[0]
     if first.has(words.MEASURED | {"qa"}):
-        g.unsure("joints", f"'{names[0]}' ... are reported angles, used as the commanded ones")
+        g.doubt("joints", f"'{names[0]}' ... are reported angles, used as the commanded ones")
     unit = words.angle_unit(g, "joints", names)
-    g.take("joints", names, unit, unit=unit)
+    g.assign("joints", names, unit, unit=unit)
     if g.joints is not None and len(names) != g.joints:
-        g.unsure("joints", f"{len(names)} columns, the arm has {g.joints} joints")
+        g.doubt("joints", f"{len(names)} columns, the arm has {g.joints} joints")
     for parsed, reported in candidates[1:]:
         if parsed.has(words.MEASURED | {"qa"}) and len(reported) == len(names):
             same = np.nanmax(np.abs(g.block(reported) - g.block(names)))
             if same < (0.1 if unit == "rad" else 5.7):
-                g.take("actual_joints", reported, unit, unit=unit)
+                g.assign("actual_joints", reported, unit, unit=unit)
                 break
 
 
@@ -191,16 +191,16 @@ def _per_joint(g: words.Guesser, first: words.ColumnName, names: list[str]) -> N
     if (first.has(words.TORQUE) or first.unit in MOMENTS) and not first.has(words.NOMINAL):
         unit = g.unit(names, MOMENTS)
         if unit is None:
-            g.unsure("torques", "no unit stated; read as Nm")
+            g.doubt("torques", "no unit stated; read as Nm")
             unit = "Nm"
-        g.take("torques", names, unit, unit=unit)
-        g.unsure("torques", 'do they hold against the load? Where they are its: of = "load"')
+        g.assign("torques", names, unit, unit=unit)
+        g.doubt("torques", 'do they hold against the load? Where they are its: of = "load"')
         return
     if first.has(words.TEMPERATURE) or first.unit == "degC" or first.has({"degc"}):
         unit = first.unit if first.unit in ("degC", "degF", "K") else "degC"
-        g.take("joint_temperatures", names, unit, unit=unit)
+        g.assign("joint_temperatures", names, unit, unit=unit)
     elif first.has(words.APPROACH) and np.all(np.isin(values, (-1.0, 1.0))):
-        g.take("approach", names, "-1 or +1")
+        g.assign("approach", names, "-1 or +1")
 
 
 def _scalars(g: words.Guesser) -> None:
@@ -228,8 +228,8 @@ def _scalars(g: words.Guesser) -> None:
                 break
         else:
             section["name"] = "A" if kind == "distance" else "G"
-            g.unsure(kind, f"no column names what it is of: all count as of {section['name']}")
-        g.take(kind, plain[:1], unit, column=plain[0], **section)
+            g.doubt(kind, f"no column names what it is of: all count as of {section['name']}")
+        g.assign(kind, plain[:1], unit, column=plain[0], **section)
         for key in ("std_column", "name_column"):
             g.free.pop(section.get(key, ""), None)
 
@@ -245,7 +245,7 @@ def guess_names(g: words.Guesser) -> None:
                 unit = c.unit if c.unit in ("kg", "g", "lb") else "kg"
                 if "wrench" in g.proposal.sections:
                     continue
-                g.take("hung_mass", [c.name], unit, column=c.name, unit=unit)
+                g.assign("hung_mass", [c.name], unit, column=c.name, unit=unit)
     if "hung_mass" not in g.proposal.sections:
         _pick(g, "load", words.LOAD, lambda n: True)
     if not {"load", "hung_mass"} & set(g.proposal.sections):
@@ -253,14 +253,14 @@ def guess_names(g: words.Guesser) -> None:
             texts = [t.lower() for t in g.grid.text(c.name)]
             few = 1 < len(set(texts)) <= 20
             if not g.number(c.name) and few and set(texts) & (set(UNLOADED) - {"0", "-", "no"}):
-                g.take("load", [c.name], "name", column=c.name)
-                g.unsure("load", f"'{c.name}' has a value that means no load")
+                g.assign("load", [c.name], "name", column=c.name)
+                g.doubt("load", f"'{c.name}' has a value that means no load")
                 break
     if (load := g.proposal.sections.get("load")) is not None:
         values = {t.lower() for t in g.grid.text(load["column"])}
         if not values & {*UNLOADED, ""}:
-            shown = ", ".join(sorted(values)[: words.SHOWN])
-            g.unsure("load", f"which of its values means no load? Set none = [...] ({shown})")
+            shown = ", ".join(sorted(values)[: words.N_EXAMPLES])
+            g.doubt("load", f"which of its values means no load? Set none = [...] ({shown})")
     _pick(g, "station", words.STATION, lambda n: not g.number(n) and _few_values(g, n))
     _pick(g, "cycle", words.CYCLE, lambda n: g.number(n) and _whole_numbers(g, n))
     _pick(g, "target", words.REFLECTOR, lambda n: not g.number(n) and _few_values(g, n))
@@ -273,7 +273,7 @@ def _pick(
         named = not g.number(c.name) or _whole_numbers(g, c.name)
         usable = named and c.has(vocabulary) and not c.axis and not c.has(words.STD)
         if usable and fits(c.name):
-            g.take(section, [c.name], "name", column=c.name)
+            g.assign(section, [c.name], "name", column=c.name)
             return
 
 
@@ -299,11 +299,11 @@ def _names_poses(g: words.Guesser, name: str, joints: dict[str, Any]) -> bool:
     off = np.nan_to_num(np.abs(q - q[rows]))
     if off.max() > words.REPORTED:
         k = int(np.argmax(off.max(axis=1)))
-        g.unsure("joints", f"'{name}' is no pose: '{texts[k]}' stands at different joints")
+        g.doubt("joints", f"'{name}' is no pose: '{texts[k]}' stands at different joints")
         return False
     if off.max() > SAME_POSE and "actual_joints" not in g.proposal.sections:
         joints["reported"] = True
-        g.unsure("joints", f"they differ by up to {off.max():.2g} rad in a pose: reported angles")
+        g.doubt("joints", f"they differ by up to {off.max():.2g} rad in a pose: reported angles")
     return True
 
 
@@ -317,8 +317,8 @@ def guess_scalars(g: words.Guesser) -> None:
             if guessed is not None:
                 section, doubt = guessed
                 if doubt:
-                    g.unsure("time", doubt)
-                g.take("time", [c.name], str(section["unit"]), column=c.name, **section)
+                    g.doubt("time", doubt)
+                g.assign("time", [c.name], str(section["unit"]), column=c.name, **section)
         elif (
             "air" not in g.proposal.sections
             and (c.has(words.TEMPERATURE) or (c.has(words.AIR) and c.unit in ("degC", "K", "degF")))
@@ -328,7 +328,7 @@ def guess_scalars(g: words.Guesser) -> None:
             values = g.block([c.name])
             unit = c.unit or ("K" if np.nanmin(values) > 200 else "degC")
             if unit in ("degC", "degF", "K"):
-                g.take("air", [c.name], unit, column=c.name, unit=unit)
+                g.assign("air", [c.name], unit, column=c.name, unit=unit)
 
 
 HEAD = 400  # Lines that the dialect is guessed from
@@ -343,15 +343,15 @@ Rows = Sequence[tuple[int, Sequence[Cell]]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sniffed:
+class SniffedFile:
     """A file, opened as it seems to be written."""
 
-    how: dict[str, Any]  # keys of [file] that differ from a plain CSV file
+    file_keys: dict[str, Any]  # keys of [file] that differ from a plain CSV file
     grid: Grid
     doubts: tuple[str, ...]  # sentences on what is unsure
 
 
-def sniff(path: str | Path) -> Sniffed:
+def sniff(path: str | Path) -> SniffedFile:
     """Guess how a file is written, and open it."""
     content = files.content_of(path)
     name = str(path)
@@ -359,7 +359,7 @@ def sniff(path: str | Path) -> Sniffed:
     if kind == "XLSX":
         return _spreadsheet(name, content)
     if kind != "text":
-        return Sniffed({}, files.open_grid(path, FileFormat()), ())
+        return SniffedFile({}, files.open_grid(path, FileFormat()), ())
     how: dict[str, Any] = {}
     text = files.decoded(name, content, None)
     if not content.startswith(tuple(files.BYTE_ORDER_MARKS)):
@@ -384,7 +384,7 @@ def sniff(path: str | Path) -> Sniffed:
         del how["header_row"]
     if how.get("separator") == ",":
         del how["separator"]
-    return Sniffed(how, files.open_grid(path, FileFormat(**how)), doubts)
+    return SniffedFile(how, files.open_grid(path, FileFormat(**how)), doubts)
 
 
 def _dialect(path: str, lines: list[str], comment: str | None) -> dict[str, Any]:
@@ -477,7 +477,7 @@ def _commented_header(text: str, how: dict[str, Any], rows: Rows) -> dict[str, A
     return {"header_row": marked[-1]} if same else {}
 
 
-def _spreadsheet(path: str, content: bytes) -> Sniffed:
+def _spreadsheet(path: str, content: bytes) -> SniffedFile:
     """Choose the sheet with most numbers."""
     best: tuple[int, str, Rows] = (0, "", [])
     book = files.workbook(path, content)
@@ -495,4 +495,4 @@ def _spreadsheet(path: str, content: bytes) -> Sniffed:
     if how["header_row"] == 1:
         del how["header_row"]
     form = FileFormat(**how)
-    return Sniffed(how, files.grid_of_rows(path, best[2], form), doubts)
+    return SniffedFile(how, files.grid_of_rows(path, best[2], form), doubts)

@@ -23,14 +23,14 @@ from hilcal.tables import columns
 from hilcal.tables.files import open_grid
 from hilcal.tables.grid import ColumnTable, first_true
 from hilcal.tables.mapping import FileFormat
-from hilcal.tables.uncertainty import LEAST, floored, rounding_variance, with_rounding
+from hilcal.tables.uncertainty import MIN_STD, floored, rounding_variance, with_rounding
 from hilcal.tables.write import Column, write_columns
 from hilcal.toml import suggest
 from hilcal.types import Bools, Floats, Ints
 
 FROM_TABLE = "covariance: from the table"
 FROM_TRACKER = "covariance: from the tracker's noise in [tracker]"
-LONGEST = 1e12  # s; longer than a campaign: seconds since 1970 are 1e9, nanoseconds 1e18
+MAX_TIME_S = 1e12  # s; longer than a campaign: seconds since 1970 are 1e9, nanoseconds 1e18
 LARGEST_NM = 1e5  # N·m; more than any joint of an arm carries
 FORM = FileFormat(encoding="utf-8")
 
@@ -82,10 +82,12 @@ def readings_of(
     pose, pose_names = _index(table.text["pose"])
     load, load_names = _index(table.text["load"])
     target = _targets(table, targets)
-    observed = columns.observed_of(table)
+    observed = columns.observer_rows(table)
     positioned = np.ones(len(table.rows), dtype=np.bool_) if observed is None else ~observed.scalar
     states, value = measured_of(table, arm, positioned)
-    states = replace(states, target=target, observer=None if observed is None else observed.number)
+    states = replace(
+        states, target=target, observer=None if observed is None else observed.observer
+    )
     columns.check_same_pose(table, pose, pose_names, states.q, arm)
     columns.check_wrenches(table, states.wrench, load, load_names, arm)
     m = value.shape[1]
@@ -95,7 +97,7 @@ def readings_of(
             table.select(positioned), value[positioned], noise, station, covariance, rounding
         )
     if observed is not None:
-        value, cov = observed.put(table, value, cov, std or {})
+        value, cov = observed.fill(table, value, cov, std or {})
     readings = Readings(
         states=states,
         pose=pose,
@@ -127,7 +129,7 @@ def covariances_of(
         notes, covers, included = (FROM_TRACKER,), INSTRUMENT, False
     else:
         columns.check_covariances(table, stated)
-        tiny = np.any(np.diagonal(stated, axis1=1, axis2=2) < min(LEAST) ** 2)
+        tiny = np.any(np.diagonal(stated, axis1=1, axis2=2) < min(MIN_STD) ** 2)
         use_spec = bool(tiny) and noise is not None
         spec = _instrument_covariance(table, value, noise, station) if use_spec else None
         cov, raised = floored(table, stated, spec)
@@ -209,11 +211,11 @@ def _covers(table: ColumnTable) -> tuple[str, bool]:
     return stated[0].removesuffix(ROUNDING), stated[0].endswith(ROUNDING)
 
 
-def check_covers(word: str, where: str) -> None:
+def check_covers(covers: str, where: str) -> None:
     """Refuse an invalid word for what covariances cover."""
-    if word.removesuffix(ROUNDING) not in (INSTRUMENT, INSTRUMENT_AND_ARM):
+    if covers.removesuffix(ROUNDING) not in (INSTRUMENT, INSTRUMENT_AND_ARM):
         raise InputError(
-            f"{where}: {word!r} is unknown; valid: {INSTRUMENT} (the covariance of the tracker), "
+            f"{where}: {covers!r} is unknown; valid: {INSTRUMENT} (the covariance of the tracker), "
             f"{INSTRUMENT_AND_ARM} (the arm's repeatability is in it), each with {ROUNDING} "
             "where the rounding of the positions is in it"
         )
@@ -262,8 +264,8 @@ def _states(table: ColumnTable, arm: Arm) -> States:
         _in_range(table, torques, -LARGEST_NM, LARGEST_NM, "N·m or N")
     for name, low, high, unit in (
         ("air_degC", -50.0, 80.0, "°C"),
-        ("time_s", -LONGEST, LONGEST, "s"),
-        ("load_time_s", 0.0, LONGEST, "s"),
+        ("time_s", -MAX_TIME_S, MAX_TIME_S, "s"),
+        ("load_time_s", 0.0, MAX_TIME_S, "s"),
     ):
         if name in number:
             _in_range(table, (name,), low, high, unit)
@@ -399,7 +401,7 @@ def write_table(
 ) -> None:
     """Write an exchange table that `import_table` reads back exactly: CSV, or Parquet by its name.
 
-    `covers` says what the covariances cover, see `with_what_rounding_does`; `units` are those of
+    `covers` says what the covariances cover, see `covers_with_rounding`; `units` are those of
     the joints' values (`Arm.units`), all rad where None.
     """
     about = {"table": "readings", "covers": covers, **(about or {})}
@@ -423,7 +425,7 @@ def exchange_columns(
     return out | _number_columns(readings, units)
 
 
-def with_what_rounding_does(covers: str, readings: Readings) -> str:
+def covers_with_rounding(covers: str, readings: Readings) -> str:
     """Return the word of column `covers` that keeps reading from adding rounding's variance."""
     positioned = ~readings.scalar
     if not positioned.any():

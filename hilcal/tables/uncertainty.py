@@ -12,11 +12,15 @@ from hilcal.tables.mapping import Column, CovarianceColumns, Mapping, Std
 from hilcal.tables.units import angle_axes
 from hilcal.types import Bools, Floats
 
-FAR = 5.0  # Ratio of stated and instrument's standard deviation that is worth a note; a choice
-NEAR = 3.0  # Ratio within which another interpretation of the figures fits the instrument; a choice
-LEAST = (1e-7, 1e-7)  # m, rad; no instrument in air is better than 0.1 µm and 0.02": a choice
+FAR_RATIO = (
+    5.0  # Ratio of stated and instrument's standard deviation that is worth a note; a choice
+)
+NEAR_RATIO = (
+    3.0  # Ratio within which another interpretation of the figures fits the instrument; a choice
+)
+MIN_STD = (1e-7, 1e-7)  # m, rad; no instrument in air is better than 0.1 µm and 0.02": a choice
 DISTINCT = 10  # Values needed to recognise rounding: ten end in zero by chance once in 10^10
-COUNTS = 0.01  # Rounding is added where its variance is more than this share; a choice
+ROUNDING_SHARE = 0.01  # Rounding is added where its variance is more than this share; a choice
 _FINEST = 1e-9
 _PLAUSIBLE = (1e-6, 1e-3)  # m; what trackers and cameras state, to guess what was meant
 
@@ -162,11 +166,11 @@ def _doubt(mapping: Mapping, cov: Floats, instrument: Floats) -> tuple[str, ...]
     unit = units.LENGTHS[std.unit]
     stated = float(np.sqrt(np.median(cov[:, range(3), range(3)])))
     usual = float(np.sqrt(np.median(instrument[:, range(3), range(3)])))
-    if 1 / FAR < stated / usual < FAR:
+    if 1 / FAR_RATIO < stated / usual < FAR_RATIO:
         return ()
     figure = stated / unit
     guess = unit * (figure**2 if std.kind == "variance" else np.sqrt(figure))
-    if not 1 / NEAR < guess / usual < NEAR:
+    if not 1 / NEAR_RATIO < guess / usual < NEAR_RATIO:
         return ()
     kind = "standard deviations" if std.kind == "variance" else "variances"
     return (
@@ -188,7 +192,7 @@ def floored(
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     m = variance.shape[1]
     tiny = np.zeros(variance.shape, dtype=bool)
-    for block, least, unit in ((slice(0, 3), LEAST[0], "m"), (slice(3, m), LEAST[1], "rad")):
+    for block, least, unit in ((slice(0, 3), MIN_STD[0], "m"), (slice(3, m), MIN_STD[1], "rad")):
         v = variance[:, block]
         if not v.size:
             continue
@@ -254,7 +258,7 @@ def rounding_variance(position: Floats, unit: float) -> Floats:
 
 def with_rounding(covariance: Floats, extra: Floats) -> tuple[Floats, tuple[str, ...]]:
     """Add rounding's variances (3,), m², where they count beside covariances (N, m, m)."""
-    counts: Bools = extra > COUNTS * np.median(covariance[:, range(3), range(3)], axis=0)
+    counts: Bools = extra > ROUNDING_SHARE * np.median(covariance[:, range(3), range(3)], axis=0)
     if not counts.any():
         return covariance, ()
     out = covariance.copy()

@@ -37,14 +37,14 @@ SECONDS = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}  # Seconds in a unit 
 _SHAPE = re.compile(r"\s*(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(?P<unit>\S*)\s*")
 
 
-def parse_length(text: str, what: str) -> float:
+def parse_length(text: str, option: str) -> float:
     """Return a length in m, e.g. of "0.1 mm"."""
-    return _parse(text, what, METRIC, 'a length over 0 in m, mm, um, e.g. "0.1 mm"')
+    return _parse(text, option, METRIC, 'a length over 0 in m, mm, um, e.g. "0.1 mm"')
 
 
-def parse_duration(text: str, what: str) -> float:
+def parse_duration(text: str, option: str) -> float:
     """Return a duration in s, e.g. of "90 min"."""
-    return _parse(text, what, SECONDS, 'a duration over 0 in s, min, h, e.g. "90 min"')
+    return _parse(text, option, SECONDS, 'a duration over 0 in s, min, h, e.g. "90 min"')
 
 
 def _parse(text: str, what: str, units: Mapping[str, float], valid: str) -> float:

@@ -41,7 +41,7 @@ from hilcal.mixed.variances import estimate_variances
 from hilcal.names import quoted
 from hilcal.readings.readings import Readings
 from hilcal.readings.same_readings import never_fitted
-from hilcal.robot.arm import Arm, as_counted
+from hilcal.robot.arm import Arm, with_controller_conventions
 from hilcal.robot.factory import FactoryKinematics, with_factory
 from hilcal.shown import Shown
 from hilcal.store.revision import CARRIED, RevisionRecord
@@ -49,7 +49,7 @@ from hilcal.types import Bools
 
 LEVEL = 1e-3
 """p-value below which the geometry counts as changed; a choice."""
-LEAST = 8
+MIN_READINGS = 8
 """Least number of readings, in view of the nine unknowns of the frames; a choice."""
 
 
@@ -278,11 +278,13 @@ def check_factory(
     Raises:
         CannotAnswerError: too few readings, or readings that do not determine the frames.
     """
-    if len(readings) < LEAST:
-        raise CannotAnswerError(f"{len(readings)} readings; {LEAST} or more can answer")
+    if len(readings) < MIN_READINGS:
+        raise CannotAnswerError(f"{len(readings)} readings; {MIN_READINGS} or more can answer")
     robot = cell.configured().robot
-    factory_cell = replace(cell, arm=as_counted(with_factory(nominal, factory), robot))
-    nominal_cell = replace(cell, arm=as_counted(nominal, robot))
+    factory_cell = replace(
+        cell, arm=with_controller_conventions(with_factory(nominal, factory), robot)
+    )
+    nominal_cell = replace(cell, arm=with_controller_conventions(nominal, robot))
     fit = mixed_fit(baseline(factory_cell, readings, "absolute", catalogue), readings, "absolute")
     problem = fit.problem
     effects = fit.model.catalogue

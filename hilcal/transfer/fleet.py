@@ -1,8 +1,8 @@
 """A fleet: campaigns are fitted and diagnosed by the engine, and pooled by type of arm.
 
-Effects in at least the share `COMMON` of the campaigns are pooled; parameters with a strength of
-their own (shrunk families) are not. A parameter is pooled if at least two arms determine it. Time
-is in years since the arm's first campaign. See `regression.variance_components.hierarchy`.
+Effects in at least the share `TRAIT_SHARE` of the campaigns are pooled; parameters with a strength
+of their own (shrunk families) are not. A parameter is pooled if at least two arms determine it.
+Time is in years since the arm's first campaign. See `regression.variance_components.hierarchy`.
 """
 
 from collections import Counter
@@ -46,17 +46,17 @@ from hilcal.transfer.members import (
 )
 from hilcal.types import Floats
 
-COMMON = 0.5
+TRAIT_SHARE = 0.5
 """Least share of the arms with an effect for it to count as a trait of the type; a choice."""
-RARE = 0.1
+DEFECT_SHARE = 0.1
 """Largest share of the arms with an effect for it to count as a defect of single arms; a choice."""
-FEWEST_ARMS = 3
+MIN_ARMS = 3
 """Least number of arms to pool a type; a choice: two have no spread."""
 YEAR_S = 365.25 * 86400.0
 
 
 @dataclass(frozen=True, slots=True)
-class Odd:
+class UnlikeParameter:
     """A parameter of one arm that differs from the other arms of its type."""
 
     arm: str
@@ -95,15 +95,17 @@ class DiagnosedEffect:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pooled:
+class PooledType:
     """Pooled parameters of the arms of one type."""
 
     type: str
     arms: tuple[str, ...]
     campaigns: tuple[str, ...]
     parameters: tuple[Spread, ...]
-    odd: tuple[Odd, ...]  # differences of arms, then changes of arms; most certain first
-    seen: tuple[DiagnosedEffect, ...]  # effects that diagnoses added, most frequent first
+    unlike: tuple[
+        UnlikeParameter, ...
+    ]  # differences of arms, then changes of arms; most certain first
+    effects_added: tuple[DiagnosedEffect, ...]  # effects that diagnoses added, most frequent first
     wear: tuple[str, ...]  # parameters whose common drift is certain
     prior: Posterior  # prediction for another arm
     off: Floats  # (A, K) parameters of each arm minus the mean of the type, SI
@@ -123,7 +125,7 @@ class Pooled:
         return np.where(determined, self.off / std, np.nan)
 
 
-def effects_seen(members: Sequence[Member]) -> tuple[DiagnosedEffect, ...]:
+def diagnosed_effects(members: Sequence[Member]) -> tuple[DiagnosedEffect, ...]:
     """Return the effects that diagnoses added, with the arms that have them."""
     arms: dict[str, list[str]] = {}
     for m in members:
@@ -134,12 +136,12 @@ def effects_seen(members: Sequence[Member]) -> tuple[DiagnosedEffect, ...]:
     for name, names in arms.items():
         with_effect = tuple(dict.fromkeys(names))
         share = len(with_effect) / count
-        kind = "trait" if share >= COMMON else "defect" if share <= RARE else "some"
+        kind = "trait" if share >= TRAIT_SHARE else "defect" if share <= DEFECT_SHARE else "some"
         out.append(DiagnosedEffect(name, with_effect, count, kind))
     return tuple(sorted(out, key=lambda s: -len(s.arms)))
 
 
-def pooled(members: Sequence[Member], diagnosed: Sequence[DiagnosedEffect]) -> Pooled:
+def pool(members: Sequence[Member], diagnosed: Sequence[DiagnosedEffect]) -> PooledType:
     """Pool the campaigns of arms of one type.
 
     Raises:
@@ -147,10 +149,10 @@ def pooled(members: Sequence[Member], diagnosed: Sequence[DiagnosedEffect]) -> P
     """
     first = members[0].posterior
     arms = tuple(dict.fromkeys(m.arm for m in members))
-    if len(arms) < FEWEST_ARMS:
+    if len(arms) < MIN_ARMS:
         raise CannotAnswerError(
             f"{len(arms)} arms of the type {members[0].type}: two have no spread; give campaigns "
-            f"of at least {FEWEST_ARMS} arms, better 10"
+            f"of at least {MIN_ARMS} arms, better 10"
         )
     effects, names = _common(members)
     if not names:
@@ -170,7 +172,7 @@ def pooled(members: Sequence[Member], diagnosed: Sequence[DiagnosedEffect]) -> P
     odd = []
     for o, arm, campaign in (*of_arms, *of_campaigns):
         name, off = names[o.parameter], float(o.deviation * scale[o.parameter])
-        odd.append(Odd(arm, campaign, name, off, units[name], o.sigma, o.p_value))
+        odd.append(UnlikeParameter(arm, campaign, name, off, units[name], o.sigma, o.p_value))
     years = np.sqrt(np.diag(h.covariance)[len(names) :])
     certain = 2 * norm.sf(np.abs(h.slope) / np.where(years > 0, years, np.inf)) * len(names)
     timed = bool(np.any(h.slope != 0))
@@ -188,13 +190,13 @@ def pooled(members: Sequence[Member], diagnosed: Sequence[DiagnosedEffect]) -> P
         )
         for k, name in enumerate(names)
     ]
-    return Pooled(
+    return PooledType(
         type=members[0].type,
         arms=arms,
         campaigns=tuple(m.name for m in members),
         parameters=tuple(spreads),
-        odd=tuple(odd),
-        seen=tuple(diagnosed),
+        unlike=tuple(odd),
+        effects_added=tuple(diagnosed),
         wear=tuple(n for n, p in zip(names, certain, strict=True) if timed and p < FALSE_ALARM),
         prior=_prior(members, effects, names, scale, units, h, len(arms)),
         off=(h.arm_mean - h.mu) * scale,
@@ -209,7 +211,7 @@ def _common(members: Sequence[Member]) -> tuple[tuple[PosteriorEffect, ...], tup
     effects = []
     for name, n in count.items():
         alike = [e for m in members for e in m.posterior.effects if e.name == name]
-        if n >= COMMON * len(members) and all(e.options == alike[0].options for e in alike):
+        if n >= TRAIT_SHARE * len(members) and all(e.options == alike[0].options for e in alike):
             effects.append(alike[0])
     pooled_names = {e.name for e in effects}
     arms: dict[str, set[str]] = {}
@@ -309,7 +311,7 @@ Counting = Callable[[str, int], AbstractContextManager[Advance]]
 class Fleet:
     """Pooled results of a fleet."""
 
-    types: tuple[Pooled, ...]  # by type of arm
+    types: tuple[PooledType, ...]  # by type of arm
     members: tuple[Member, ...]  # campaigns that were used
     failures: tuple[Failure, ...]  # campaigns that were not, and types that could not be pooled
 
@@ -378,10 +380,10 @@ def fleet(directory: Path, engine: Engine, counting: Counting = _silent) -> Flee
 
 def _type(
     pairs: list[tuple[Entry, Member]], engine: Engine, counting: Counting
-) -> tuple[Pooled, list[Member], list[Failure]]:
+) -> tuple[PooledType, list[Member], list[Failure]]:
     """Pool a type; fit campaigns that lack one of its traits again, with all traits."""
     members = [member for _, member in pairs]
-    diagnosed = effects_seen(members)
+    diagnosed = diagnosed_effects(members)
     traits = tuple(s.effect for s in diagnosed if s.kind == "trait")
     lacking = [k for k, m in enumerate(members) if not set(traits) <= set(m.added)]
     lost: list[Failure] = []
@@ -394,7 +396,7 @@ def _type(
                 lost.append(replace(result, reason=f"with {', '.join(traits)}: {result.reason}"))
             else:
                 members[k] = replace(result, added=members[k].added)
-    return pooled(members, diagnosed), members, lost
+    return pool(members, diagnosed), members, lost
 
 
 def to_json(fleet: Fleet, priors: Mapping[str, str]) -> dict[str, object]:
@@ -406,8 +408,8 @@ def to_json(fleet: Fleet, priors: Mapping[str, str]) -> dict[str, object]:
                 "arms": list(t.arms),
                 "n_campaigns": len(t.campaigns),
                 "parameters": [asdict(p) for p in t.parameters],
-                "unlike": [asdict(o) for o in t.odd],
-                "effects_added": [asdict(s) for s in t.seen],
+                "unlike": [asdict(o) for o in t.unlike],
+                "effects_added": [asdict(s) for s in t.effects_added],
                 "wear": list(t.wear),
                 "sizes": [asdict(s) for s in t.sizes],
                 "prior": priors.get(t.type),
@@ -418,7 +420,7 @@ def to_json(fleet: Fleet, priors: Mapping[str, str]) -> dict[str, object]:
             {
                 "name": m.name,
                 "arm": m.arm,
-                "arm_known_by": m.known,
+                "arm_known_by": m.arm_source,
                 "type": m.type,
                 "date": m.date,
                 "verdict": m.verdict,

@@ -148,7 +148,7 @@ class Member:
 
     name: str  # its path within the directory
     arm: str
-    known: str  # source of `arm`: "list", "serial number", "folder" or "file"
+    arm_source: str  # source of `arm`: "list", "serial number", "folder" or "file"
     type: str  # name of the arm's type
     date: str  # of the measurement, ISO 8601
     posterior: Posterior  # of the arm's parameters
@@ -259,7 +259,7 @@ def _member(entry: Entry, run: Campaign, effects: tuple[str, ...]) -> Member:
     return Member(
         name=entry.name,
         arm=arm,
-        known=source,
+        arm_source=source,
         type=run.cell.arm.name,
         date=entry.date or about.created,
         posterior=replace(posterior, scatter=None),

@@ -19,9 +19,9 @@ from hilcal.names import escaped
 from hilcal.present import charts
 from hilcal.present.campaign import left_out_m, model_words, two_revisions, verdict_of
 from hilcal.present.diagnosis import shown_suspects, suspects_table
-from hilcal.present.document import Table, load_name, says
+from hilcal.present.document import Table, description_of, load_name
 from hilcal.present.document import table as block
-from hilcal.present.fit import follows, misses, model_name
+from hilcal.present.fit import dependence_sentence, holdout_sentence, model_name
 from hilcal.present.plan import power_rows, powers_summary
 from hilcal.present.story import laws as curves_of_laws
 from hilcal.present.verdict import headline, message
@@ -36,15 +36,15 @@ DIFFERENCES = 4
 DOWNLOADS = {"report": "Report", "calibration": "Calibration", "table": "Table of readings"}
 
 
-def waiting(view: View) -> None:
+def loading(view: View) -> None:
     """Draw the page before the first snapshot."""
     with ui.column().classes("part").style("margin-top: 16px"):
         title(view.session.path.name)
         if view.work.failure():
-            soft("There is nothing to show: see above.")
-            button(view, "Read it again", view.again, "outline")
+            small_print("There is nothing to show: see above.")
+            button(view, "Read it again", view.reload, "outline")
         else:
-            soft("The readings are fitted and judged; this takes some seconds.")
+            small_print("The readings are fitted and judged; this takes some seconds.")
 
 
 @contextmanager
@@ -60,7 +60,7 @@ def snapshot(view: View, d: Snapshot) -> None:
     kind, arm = "deflections" if d.fit.mode == "deflection" else "absolute readings", d.story.arm
     with ui.row().classes("items-baseline").style("gap: 4px 16px; padding-top: 16px"):
         ui.html(f"<h1 class='verdict'>{plain(view.session.path.name)}</h1>", sanitize=False)
-        soft(f"{arm.name} · {d.n_readings} readings, judged as {kind} · from {d.source}")
+        small_print(f"{arm.name} · {d.n_readings} readings, judged as {kind} · from {d.source}")
     _verdict(view, d)
     with ui.element("div").classes("two"):
         _fails(view, d)
@@ -73,7 +73,7 @@ def snapshot(view: View, d: Snapshot) -> None:
             with _part("How the error fell"):
                 chart(view, charts.error_per_revision(d.story)).props("data-part=fell")
             with _part("Model and measurement"):
-                soft(misses(d.fit))
+                small_print(holdout_sentence(d.fit))
                 chart(view, charts.measured_predicted(d.story, d.revision))
             _laws(view, d)
         with ui.column().classes("stack"):
@@ -82,7 +82,7 @@ def snapshot(view: View, d: Snapshot) -> None:
     _side_by_side(view, d)
     _cell(view, d)
     with _part("Downloads"):
-        soft(
+        small_print(
             f"Of {'the baseline' if d.number is None else f'revision {d.number}'}: the story as "
             "one page, the calibration for hilcal compensate, and the readings as an exchange "
             "table."
@@ -90,7 +90,7 @@ def snapshot(view: View, d: Snapshot) -> None:
         with ui.row().style("gap: 8px"):
             for file, name in DOWNLOADS.items():
                 button(view, name, partial(view.download, file), "outline")
-        answer(view, "download")
+        answer_label(view, "download")
     view.redraw("planned")
 
 
@@ -114,18 +114,18 @@ def _verdict(view: View, d: Snapshot) -> None:
                 ui.html(text, sanitize=False).classes("number")
         name = "Baseline, not kept yet" if d.number is None else f"Revision {d.number}"
         with ui.row().classes("items-center").style("gap: 6px 10px"):
-            soft(f"{name}: {model_name(fit.model.named)}")
+            small_print(f"{name}: {model_name(fit.model.named)}")
             for effect in d.removable:
                 button(view, f"Remove {effect}", partial(view.remove, effect), "outline dense")
-        answer(view, "model")
+        answer_label(view, "model")
 
 
 def _fails(view: View, d: Snapshot) -> None:
     with _part("Where it fails"):
         if d.diagnosis.residual_is_noise:
-            soft("Nowhere beyond the noise: what is left is what it explains.")
+            small_print("Nowhere beyond the noise: what is left is what it explains.")
             return
-        soft(follows(d.diagnosis.misfit_breakdown))
+        small_print(dependence_sentence(d.diagnosis.misfit_breakdown))
         names = [v.variable for v in d.diagnosis.misfit_breakdown]
 
         def clicked(e: events.GenericEventArguments) -> None:
@@ -134,7 +134,7 @@ def _fails(view: View, d: Snapshot) -> None:
 
         shown = chart(view, charts.misfit_shares(d.diagnosis)).props("data-part=fails")
         shown.on("plotly_click", clicked)
-        soft("Click a bar: the readings over that variable.")
+        small_print("Click a bar: the readings over that variable.")
 
 
 def _missing(view: View, d: Snapshot) -> None:
@@ -143,7 +143,7 @@ def _missing(view: View, d: Snapshot) -> None:
         if rows:
             shown = suspects_table(d.diagnosis)  # the last column is a sentence below
             shown = replace(shown, heads=shown.heads[:4], rows=[row[:4] for row in shown.rows])
-            table = drawn(shown, selection="single")
+            table = draw_table(shown, selection="single")
             table.props("hide-selected-banner data-part=missing").classes("choice")
             table.selected = [row for row in table.rows if row["0"] == view.tab.suspect]
 
@@ -158,20 +158,22 @@ def _missing(view: View, d: Snapshot) -> None:
             table.on("row-click", clicked)
             table.on_select(ticked)
             if same := rows[0].same_as if rows[0].passes else ():
-                soft(f"These readings do not separate {rows[0].effect} from {numbers.few(same)}.")
-            soft(
+                small_print(
+                    f"These readings do not separate {rows[0].effect} from {numbers.few(same)}."
+                )
+            small_print(
                 "explains: share of the misfit that adding it would remove; p-value: chance of "
                 "that much if it were not there."
             )
         else:
             # whether an effect is missing, only the verdict says
-            soft("No effect passes the tests by itself; what that means, the verdict says.")
+            small_print("No effect passes the tests by itself; what that means, the verdict says.")
         effects, view.adder = [s.effect for s in d.diagnosis.suspects], None
         if effects:
             kind = "unelevated" if rows else "outline"
             view.adder = button(view, f"Add {view.tab.suspect}", view.add, f"{kind} data-part=add")
             view.adder.set_visibility(view.tab.suspect is not None)
-        answer(view, "missing")
+        answer_label(view, "missing")
         if effects:
             ui.select(
                 effects,
@@ -186,10 +188,10 @@ def evidence(view: View, d: Snapshot) -> None:
     effect = view.tab.suspect
     title("The evidence" if effect is None else f"The evidence for {effect}")
     if effect is None:
-        soft("Choose an effect above to see what the readings say of it.")
+        small_print("Choose an effect above to see what the readings say of it.")
         return
     with ui.column().style("width: 100%; gap: 8px") as place:
-        soft("…")
+        small_print("…")
 
     async def draw() -> None:
         curve = await run.io_bound(view.session.evidence, d, effect)
@@ -198,7 +200,7 @@ def evidence(view: View, d: Snapshot) -> None:
         place.clear()
         with place:
             if curve is None:
-                soft("These readings say nothing of it.")
+                small_print("These readings say nothing of it.")
             else:
                 chart(view, charts.added_variable(curve, effect)).props("data-part=evidence")
 
@@ -218,11 +220,11 @@ def readings(view: View, d: Snapshot) -> None:
         figure = kind(d.story, d.revision)
     shown = chart(view, figure).props("data-part=readings")
     shown.on("plotly_click", lambda e: view.pick_pose(int(point(e).get("customdata", -1))))
-    picked = view.tab.picked
+    picked = view.tab.selected
     if picked is None:
-        soft("Click a point: the readings of its pose, and what sets them apart.")
+        small_print("Click a point: the readings of its pose, and what sets them apart.")
         return
-    ui.label(f"{view.tab.picked_title}:").style("font-weight: 500")
+    ui.label(f"{view.tab.selected_title}:").style("font-weight: 500")
     clear = [difference(x) for x in view.session.differences(d, np.array(picked)) if x.clear]
     apart = f"What sets them apart: {'; '.join(clear[:DIFFERENCES])}."
     text = apart if clear else "Nothing recorded sets them apart from the others."
@@ -232,9 +234,9 @@ def readings(view: View, d: Snapshot) -> None:
     for k in sorted(picked, key=lambda k: -sigma[k])[:FURTHEST]:
         error, load = numbers.length(float(size[k])), load_name(d.story.load_names[k])
         rows.add(d.story.pose_name(k), load, error, f"{sigma[k]:.1f} σ")
-    drawn(rows).props("data-part=picked")
+    draw_table(rows).props("data-part=picked")
     if len(picked) > FURTHEST:
-        soft(f"and {len(picked) - FURTHEST} more")
+        small_print(f"and {len(picked) - FURTHEST} more")
 
 
 def difference(x: Difference) -> str:
@@ -248,7 +250,7 @@ def difference(x: Difference) -> str:
     return f"{x.variable} {a} {unit}, the others {b} {unit}".replace(" ,", ",").rstrip()
 
 
-def furthest(d: Snapshot) -> list[int]:
+def worst_readings(d: Snapshot) -> list[int]:
     """Return the readings that are furthest off, in units of the noise."""
     norm2 = d.revision.whitened_norm2
     count = max(FURTHEST, round(FURTHEST_SHARE * len(norm2)))
@@ -258,7 +260,7 @@ def furthest(d: Snapshot) -> list[int]:
 def _revisions(view: View, d: Snapshot) -> None:
     with _part("Revisions"):
         if not d.records:
-            soft("None yet: the baseline is kept when something is added to it.")
+            small_print("None yet: the baseline is kept when something is added to it.")
         for r in reversed(d.records):
             marks = ["shown"] * (r.number == d.number)
             marks += ["used by every command"] * (r.number == d.in_use)
@@ -266,22 +268,22 @@ def _revisions(view: View, d: Snapshot) -> None:
                 with ui.column().style("gap: 0"):
                     ui.label(f"{r.number}: {model_words(r)}").style("font-weight: 500")
                     error = f"{numbers.length(left_out_m(r))} on poses left out"
-                    soft(" · ".join([error, verdict_of(r), *marks]))
+                    small_print(" · ".join([error, verdict_of(r), *marks]))
                 if r.number != d.number:
                     button(view, "Look", partial(view.show, r.number), "flat dense")
                 if r.number not in (d.number, d.in_use) or d.number != d.in_use:
                     text = "Go back to it" if r.number != d.number else "Use it"
                     button(view, text, partial(view.go_back, r.number), "outline dense")
         if d.accepted is not None:
-            soft(f"Revision {d.accepted} is accepted: every command uses it.")
-        answer(view, "revisions")
-        soft("Revisions are only appended: nothing that was tried is lost.")
+            small_print(f"Revision {d.accepted} is accepted: every command uses it.")
+        answer_label(view, "revisions")
+        small_print("Revisions are only appended: nothing that was tried is lost.")
 
 
 def _side_by_side(view: View, d: Snapshot) -> None:
     with _part("Two revisions side by side"):
         if len(d.records) < 2:
-            soft("There are two to compare once something was added, removed or changed.")
+            small_print("There are two to compare once something was added, removed or changed.")
             return
         by_number = {r.number: r for r in d.records}
         shown = d.number or d.records[-1].number
@@ -298,7 +300,7 @@ def _side_by_side(view: View, d: Snapshot) -> None:
             place.clear()
             with place:
                 table = two_revisions(by_number[chosen[0].value], by_number[chosen[1].value])
-                drawn(table).props("wrap-cells")
+                draw_table(table).props("wrap-cells")
 
         def changed() -> None:
             view.tab.pair = chosen[0].value, chosen[1].value
@@ -315,7 +317,7 @@ def _laws(view: View, d: Snapshot) -> None:
         return
     with _part("Laws beyond the catalogue"):
         for law in curves:
-            soft(f"{law.title}: " + "; ".join(f"{name}: {text}" for name, text in law.facts))
+            small_print(f"{law.title}: " + "; ".join(f"{name}: {text}" for name, text in law.facts))
             chart(view, charts.curve_chart(law)).props("data-part=law")
 
 
@@ -328,7 +330,7 @@ def viewer(view: View, d: Snapshot) -> None:
             frame.props["src"], frame.props["title"] = view.tab.viewer, "3-D view"
         else:
             button(view, "Open the 3-D view", view.open_viewer, "outline")
-            answer(view, "viewer")
+            answer_label(view, "viewer")
 
 
 def _cell(view: View, d: Snapshot) -> None:
@@ -338,16 +340,16 @@ def _cell(view: View, d: Snapshot) -> None:
         view.tab.texts[key] = e.value or ""
 
     with _part("Noise and cell"):
-        soft(
+        small_print(
             "Change values, written as in CELL.toml; an empty field leaves the key out. The shown "
             "model is then fitted anew, as a revision; what was measured stays as it is."
         )
-        soft(f"Now: {d.covariance}.")
-        for why in dict.fromkeys(f.fixed for f in d.figures if f.fixed):
-            keys = [f.key for f in d.figures if f.fixed == why]
-            soft(f"Not to be changed here: {', '.join(keys)}: {why}.")
+        small_print(f"Now: {d.covariance}.")
+        for why in dict.fromkeys(f.fixed for f in d.cell_keys if f.fixed):
+            keys = [f.key for f in d.cell_keys if f.fixed == why]
+            small_print(f"Not to be changed here: {', '.join(keys)}: {why}.")
         with ui.element("div").classes("figures").props("data-part=cell"):
-            for f in d.figures:
+            for f in d.cell_keys:
                 if not f.fixed:
                     key = f.section, f.key
                     value = view.tab.texts.get(key, f.text)
@@ -355,12 +357,12 @@ def _cell(view: View, d: Snapshot) -> None:
                     field.props["hint"] = f.valid
                     field.on_value_change(partial(keep, key))
         button(view, "Fit with these values", view.change_cell, "unelevated data-part=change")
-        answer(view, "cell")
+        answer_label(view, "cell")
 
 
 def _next_measurement(view: View, d: Snapshot) -> None:
     with _part("Measure next"):
-        soft("Plan the poses and loads that tell apart what these readings leave open.")
+        small_print("Plan the poses and loads that tell apart what these readings leave open.")
         with ui.row().classes("items-center").style("gap: 12px; width: 100%"):
             poses = ui.number("poses (as needed)", min=1, precision=0).props("dense outlined")
             poses.style("width: 190px")
@@ -373,22 +375,24 @@ def _next_measurement(view: View, d: Snapshot) -> None:
             view.plan(poses.value, file.value, quick=not compare.value)
 
         button(view, "Plan the next measurements", plan, "unelevated")
-        answer(view, "next")
+        answer_label(view, "next")
         view.places["planned"] = ui.column().style("width: 100%; gap: 8px")
 
 
-def planned(view: View, d: Snapshot) -> None:
+def plan_card(view: View, d: Snapshot) -> None:
     """Draw the planned next measurements, if any."""
     if view.session.planned is None:
         return
     next_, path = view.session.planned
-    summary, powers = next_.made.summary, next_.found.powers
+    summary, powers = next_.checked.summary, next_.separating.powers
     ui.label(powers_summary(powers, summary.poses, summary.readings)).props("data-part=planned")
     for effect, rival, power_now, power_then in power_rows(powers):
-        soft(f"If {effect} is there, {rival} is ruled out: {power_now} now, {power_then} then.")
+        small_print(
+            f"If {effect} is there, {rival} is ruled out: {power_now} now, {power_then} then."
+        )
     ui.label(f"The plan is in {path.name}. Measure it into the same campaign with:")
     ui.label(view.session.run_line()).classes("code")
-    soft("Then read the file again here.")
+    small_print("Then read the file again here.")
 
 
 class Status:
@@ -403,10 +407,10 @@ class Status:
             self.doing = ui.label().classes("soft").props("aria-live=polite")
         with self.answered:
             self.message = ui.label().classes("answer").props("role=alert data-answer=file")
-            self.refit = button(view, "Fit anew to all readings", view.fit_anew, "outline dense")
+            self.refit = button(view, "Fit anew to all readings", view.refit, "outline dense")
         with self.stale:
             ui.label("Another command has changed the file.").classes("bad")
-            button(view, "Read it again", view.again, "outline dense")
+            button(view, "Read it again", view.reload, "outline dense")
         for row in rows:
             row.set_visibility(False)
 
@@ -419,9 +423,9 @@ class Status:
         self.refit.set_visibility("readings were appended" in work.failure())
 
 
-def answer(view: View, place: str) -> None:
+def answer_label(view: View, section: str) -> None:
     """Draw the label for progress and answer of the buttons above."""
-    view.answers[place] = ui.label().classes("answer").props(f"role=status data-answer={place}")
+    view.answers[section] = ui.label().classes("answer").props(f"role=status data-answer={section}")
 
 
 def title(text: str) -> None:
@@ -429,12 +433,12 @@ def title(text: str) -> None:
     ui.html(f"<h2>{plain(text)}</h2>", sanitize=False)
 
 
-def soft(text: str) -> ui.label:
+def small_print(text: str) -> ui.label:
     """Draw an explanation."""
     return ui.label(text).classes("soft")
 
 
-def drawn(table: Table, selection: Literal["single"] | None = None) -> ui.table:
+def draw_table(table: Table, selection: Literal["single"] | None = None) -> ui.table:
     """Draw a table of a document; the keys of a row are the numbers of the columns."""
     columns = []
     for k, head in enumerate(table.heads):
@@ -456,7 +460,7 @@ def chart(view: View, figure: go.Figure) -> ui.plotly:
     """Draw a chart in the page's scheme, with its sentence for screen readers."""
     content = charts.in_scheme(figure, view.tab.dark).to_plotly_json()
     element = ui.plotly({**content, "config": charts.CONFIG}).classes("chart")
-    element.props["role"], element.props["aria-label"] = "img", says(figure)
+    element.props["role"], element.props["aria-label"] = "img", description_of(figure)
     return element
 
 

@@ -12,7 +12,7 @@ from nicegui import ui
 
 from hilcal import numbers
 from hilcal.present.campaign import refitted
-from hilcal.present.diagnosis import addition_lines, fell, rose
+from hilcal.present.diagnosis import added_effect_sentence, addition_lines, removed_effect_sentence
 from hilcal.present.progress import Say
 from hilcal.workbench import cards
 from hilcal.workbench.session import Answer, Snapshot, WorkbenchSession
@@ -30,8 +30,8 @@ class Tab:
     snapshot: Snapshot | None = None  # that the other fields refer to
     suspect: str | None = None  # the missing effect whose evidence is shown
     variable: str | None = None  # over which residuals are drawn; None for the pose
-    picked: list[int] | None = None  # selected measurements of the story
-    picked_title: str = ""  # their description
+    selected: list[int] | None = None  # selected measurements of the story
+    selected_title: str = ""  # their description
     dark: bool = False  # whether the browser prefers a dark page
     texts: dict[tuple[str, str], str] = field(default_factory=dict)
     """Values of the cell by section and key that were typed and not used yet."""
@@ -56,7 +56,7 @@ def install(app: FastAPI, session: WorkbenchSession) -> None:
         view = View(session, str(request.base_url))
         view.build()
         await ui.context.client.connected()
-        view.begin(dark=bool(await ui.run_javascript(DARK, timeout=5.0)))
+        view.draw_page(dark=bool(await ui.run_javascript(DARK, timeout=5.0)))
 
     bench.on_startup(lambda: read_file(session))
 
@@ -95,9 +95,9 @@ class View:
         self.status = cards.Status(self)
         self.body, self.places["viewer"] = (ui.column().classes("bench") for _ in range(2))
         ui.timer(TICK, self.tick)
-        ui.timer(LOOK, self.look)
+        ui.timer(LOOK, self.show_file_change)
 
-    def begin(self, *, dark: bool) -> None:
+    def draw_page(self, *, dark: bool) -> None:
         """Draw the page in the browser's colour scheme."""
         self.tab.dark, self._ready = dark, True
         self.draw()
@@ -128,14 +128,14 @@ class View:
     def show_answers(self) -> None:
         """Show at each place the progress of its task, or its last answer."""
         for place, label in self.answers.items():
-            busy = self.work.line if self.work.place == place else ""
+            busy = self.work.line if self.work.section == place else ""
             answer = self.work.answers.get(place)
             label.set_text(f"{busy} …" if busy else numbers.sentence(answer.text if answer else ""))
             label.set_visibility(bool(busy or answer))
             done = answer is not None and answer.done
             label.props(f"data-came={'busy' if busy else 'done' if done else 'failed'}")
 
-    def look(self) -> None:
+    def show_file_change(self) -> None:
         """Show whether another command has changed the file."""
         self.status.stale.set_visibility(self.work.task is None and self.session.stale)
 
@@ -150,7 +150,7 @@ class View:
         self.body.clear()
         with self.body:
             if snapshot is None:
-                cards.waiting(self)
+                cards.loading(self)
             else:
                 cards.snapshot(self, snapshot)
         self.redraw("viewer")
@@ -183,7 +183,9 @@ class View:
             act(snapshot, effect, say)
             if (c := self.session.changed) is None:
                 return ""
-            error = (fell if c.added else rose)(c.before, c.fit, c.added or c.removed or "")
+            error = (added_effect_sentence if c.added else removed_effect_sentence)(
+                c.before, c.fit, c.added or c.removed or ""
+            )
             warnings = () if c.expected is None else addition_lines(c.expected)
             return " ".join([error, f"It is revision {c.number}.", *warnings])
 
@@ -215,16 +217,16 @@ class View:
 
         self._do("revisions", f"Reading revision {number}", act)
 
-    def again(self) -> None:
+    def reload(self) -> None:
         """Read the file again."""
         read_file(self.session)
 
-    def fit_anew(self) -> None:
+    def refit(self) -> None:
         """Fit the model of the revision in use to all readings."""
         snapshot = self.session.snapshot
 
         def act(say: Say) -> str:
-            refit = self.session.fit_anew(snapshot, say)
+            refit = self.session.refit(snapshot, say)
             return f"Fitted to all {refit.n_readings} readings: revision {refit.number}."
 
         self.work.start("Fitting anew", act)
@@ -289,7 +291,7 @@ class View:
     def pick_variable(self, name: str) -> None:
         """Show the residuals over a variable, and the readings that are furthest off."""
         self.tab.variable = name
-        worst = cards.furthest(self.tab.snapshot) if self.tab.snapshot else []
+        worst = cards.worst_readings(self.tab.snapshot) if self.tab.snapshot else []
         self._pick(worst, "The readings that are furthest off")
 
     def pick_pose(self, measurement: int) -> None:
@@ -301,14 +303,14 @@ class View:
             self._pick(readings, f"The readings of pose {story.pose_name(measurement)}")
 
     def _pick(self, measurements: list[int], title: str) -> None:
-        self.tab.picked, self.tab.picked_title = measurements, title
+        self.tab.selected, self.tab.selected_title = measurements, title
         self.redraw("readings")
 
 
 REDRAWN: dict[str, Callable[[View, Snapshot], None]] = {
     "readings": cards.readings,
     "evidence": cards.evidence,
-    "planned": cards.planned,
+    "planned": cards.plan_card,
     "viewer": cards.viewer,
 }
 """Parts of the page that are redrawn separately."""

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from hilcal.campaign.campaign import Campaign
-from hilcal.campaign.changes import Changed, add_effect, change_cell, refit, remove_effect
+from hilcal.campaign.changes import StoredChange, add_effect, change_cell, refit, remove_effect
 from hilcal.campaign.revisions import chain_in_cell
 from hilcal.config import Target
 from hilcal.config.cell import (
@@ -57,7 +57,7 @@ Stamp = tuple[int, int, int]
 
 
 @dataclass(frozen=True, slots=True)
-class Figure:
+class CellKey:
     """A value of the cell that can be changed."""
 
     section: str  # of CELL.toml
@@ -81,7 +81,7 @@ class Snapshot:
     source: str  # of the readings
     covariance: str  # description of the contents of their covariance
     changes: Changes  # of the cell since the measurement
-    figures: tuple[Figure, ...]  # of the cell of the shown revision
+    cell_keys: tuple[CellKey, ...]  # of the cell of the shown revision
 
     @property
     def fit(self) -> Fit:
@@ -113,7 +113,7 @@ class Snapshot:
         return tuple(name for name in self.fit.model.named if name not in frames)
 
 
-def _figures(o: Campaign) -> tuple[Figure, ...]:
+def _figures(o: Campaign) -> tuple[CellKey, ...]:
     # with the instrument's noise, so that keys that need a stated noise are shown, too
     fixed, out = o.unchangeable({"tracker": dict.fromkeys(INSTRUMENT_NOISE)}), []
     for section, keys in CHANGEABLE.items():
@@ -127,11 +127,11 @@ def _figures(o: Campaign) -> tuple[Figure, ...]:
             estimated = o.noise is not None and key in INSTRUMENT_NOISE
             text = "" if value is None or estimated else write_value(value)
             why = fixed.get((section, key), "")
-            out.append(Figure(section, key, text, described(section, key), why))
+            out.append(CellKey(section, key, text, described(section, key), why))
     return tuple(out)
 
 
-def silent(text: str) -> None:
+def ignore_progress(text: str) -> None:
     """Ignore progress."""
 
 
@@ -146,13 +146,13 @@ class WorkbenchSession:
         self.path, self._catalogue = Path(path), catalogue
         self.work, self.viewer = Work(), WebViewer()
         self.snapshot: Snapshot | None = None  # current one; None before `load`
-        self.changed: Changed | None = None  # the change that led to it; None for other actions
+        self.changed: StoredChange | None = None  # the change that led to it; None: another action
         self.planned: tuple[NextPlan, Path] | None = None  # the last plan, and its file
         self.count = 0  # number of snapshots so far
         self._cache: dict[int, Chapter] = {}  # by number of the revision; 0: baseline
         self._hash = ""  # of the readings of the cache
 
-    def load(self, say: Say = silent, revision: int | None = None) -> Snapshot:
+    def load(self, say: Say = ignore_progress, revision: int | None = None) -> Snapshot:
         """Read the file, diagnose a revision and its predecessors, and show it.
 
         Nothing is written. `revision` None is the one in use. Raises as `Campaign.chapters`.
@@ -164,7 +164,7 @@ class WorkbenchSession:
             cell, number = ({}, None) if record is None else (record.cell, record.number)
             return self._show(o.at(cell), number, chapters, stamp=stamp)
 
-    def add(self, snapshot: Snapshot, effect: str, say: Say = silent) -> Snapshot:
+    def add(self, snapshot: Snapshot, effect: str, say: Say = ignore_progress) -> Snapshot:
         """Add an effect, in the syntax of `hilcal add`, to the shown model; see `changes`."""
         with self._writing(snapshot) as o:
             effects = read_effects_text(effect, "effect", o.catalogue)
@@ -175,20 +175,20 @@ class WorkbenchSession:
             base = snapshot.number, snapshot.fit
             return self._changed(o, add_effect(o, *base, name, options, say, snapshot.diagnosis))
 
-    def remove(self, snapshot: Snapshot, effect: str, say: Say = silent) -> Snapshot:
+    def remove(self, snapshot: Snapshot, effect: str, say: Say = ignore_progress) -> Snapshot:
         """Remove an effect from the shown model; raises as `add`."""
         with self._writing(snapshot) as o:
             base = snapshot.number, snapshot.fit
             return self._changed(o, remove_effect(o, *base, effect, say, snapshot.diagnosis))
 
-    def go_back(self, snapshot: Snapshot, number: int, say: Say = silent) -> Snapshot:
+    def go_back(self, snapshot: Snapshot, number: int, say: Say = ignore_progress) -> Snapshot:
         """Show a revision, and accept it for every command; no revision is deleted."""
         with self._writing(snapshot) as o:
             chapters = self._chapters(o, number, say)
             o.accept(None if number == len(o.file.revisions()) else number)
             return self._show(o.at(o.file.revision(number).cell), number, chapters)
 
-    def fit_anew(self, snapshot: Snapshot | None, say: Say = silent) -> Snapshot:
+    def refit(self, snapshot: Snapshot | None, say: Say = ignore_progress) -> Snapshot:
         """Fit the model and prior of the revision in use to all readings, including new ones."""
         with self._writing(snapshot, changed=True) as o:
             record = o.in_use()
@@ -200,7 +200,7 @@ class WorkbenchSession:
             return self._show(o, number, (self._cache[number],))
 
     def change_cell(
-        self, snapshot: Snapshot, texts: Mapping[tuple[str, str], str], say: Say = silent
+        self, snapshot: Snapshot, texts: Mapping[tuple[str, str], str], say: Say = ignore_progress
     ) -> Snapshot:
         """Fit the shown model in a changed cell, and show that revision; see `changes`.
 
@@ -208,7 +208,7 @@ class WorkbenchSession:
         effect, an empty text omits the key. Raises InputError for no change or an invalid value.
         """
         changes: dict[str, dict[str, Any]] = {}
-        for f in snapshot.figures:
+        for f in snapshot.cell_keys:
             text = texts.get((f.section, f.key), f.text)
             if text.strip() != f.text:
                 changes.setdefault(f.section, {})[f.key] = read_value(f.section, f.key, text)
@@ -218,9 +218,11 @@ class WorkbenchSession:
             base = snapshot.number, snapshot.fit
             in_cell, number, diagnosis = change_cell(o, *base, changes, say, snapshot.diagnosis)
             self._cache[number] = Chapter(number, None, diagnosis.fit, diagnosis)
-            return self._show(in_cell, number, self._chapters(in_cell, number, silent))
+            return self._show(in_cell, number, self._chapters(in_cell, number, ignore_progress))
 
-    def document(self, snapshot: Snapshot, kind: str, say: Say = silent) -> tuple[str, bytes]:
+    def document(
+        self, snapshot: Snapshot, kind: str, say: Say = ignore_progress
+    ) -> tuple[str, bytes]:
         """Return name and content of a file on the shown revision.
 
         `kind` is "report" (HTML), "calibration" (JSON; stores the baseline if it is shown) or
@@ -248,7 +250,7 @@ class WorkbenchSession:
         snapshot: Snapshot,
         poses: int | None,
         output: Path,
-        say: Say = silent,
+        say: Say = ignore_progress,
         *,
         quick: bool = True,
     ) -> NextPlan:
@@ -264,7 +266,7 @@ class WorkbenchSession:
             o = opened.at(snapshot.changes)
             doubt, rng = doubt_to_settle(o, snapshot.diagnosis, say), np.random.default_rng(0)
             plan = next_plan(o, doubt, poses, rng, say, compare=not quick)
-        plan.made.save(output)
+        plan.checked.save(output)
         self.planned = plan, output
         return plan
 
@@ -346,11 +348,11 @@ class WorkbenchSession:
         self._cache[number] = Chapter(number, None, diagnosis.fit, diagnosis)
         return number
 
-    def _changed(self, o: Campaign, c: Changed) -> Snapshot:
-        if c.before_number not in self._cache:  # the baseline, which the change has stored
-            self._cache[c.before_number] = self._cache[0]
+    def _changed(self, o: Campaign, c: StoredChange) -> Snapshot:
+        if c.parent not in self._cache:  # the baseline, which the change has stored
+            self._cache[c.parent] = self._cache[0]
         self._cache[c.number] = Chapter(c.number, c.added, c.fit, c.diagnosis, c.removed)
-        return self._show(o, c.number, self._chapters(o, c.number, silent), changed=c)
+        return self._show(o, c.number, self._chapters(o, c.number, ignore_progress), changed=c)
 
     def _show(
         self,
@@ -359,7 +361,7 @@ class WorkbenchSession:
         chapters: tuple[Chapter, ...],
         *,
         stamp: Stamp | None = None,
-        changed: Changed | None = None,
+        changed: StoredChange | None = None,
     ) -> Snapshot:
         """Show a revision; `stamp` is that of the file when it was read, None: its current one."""
         self.snapshot = Snapshot(
@@ -373,7 +375,7 @@ class WorkbenchSession:
             source=o.file.source,
             covariance=covariance_words(o.covariance_parts, o.noise),
             changes=o.changes,
-            figures=_figures(o),
+            cell_keys=_figures(o),
         )
         self.changed = changed
         self.count += 1
@@ -400,19 +402,19 @@ class Work:
     """The current task and the last answers."""
 
     task: str | None = None  # its description; None without a task
-    place: str = ""  # the part of the page that started it
+    section: str = ""  # the part of the page that started it
     progress: str = ""  # the last line of its progress
     answers: dict[str, Answer] = field(default_factory=dict)  # the last answer at each place
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def start(self, task: str, do: Callable[[Say], object], place: str = "file") -> bool:
+    def start(self, task: str, action: Callable[[Say], object], section: str = "file") -> bool:
         """Start a task in a thread unless one is running; its text or its error is the answer."""
         with self._lock:
             if self.task is not None:
                 return False
-            self.task, self.progress, self.place = task, "", place
-            self.answers.pop(place, None)
-        threading.Thread(target=self._run, args=(do,), name="workbench", daemon=True).start()
+            self.task, self.progress, self.section = task, "", section
+            self.answers.pop(section, None)
+        threading.Thread(target=self._run, args=(action,), name="workbench", daemon=True).start()
         return True
 
     def _run(self, do: Callable[[Say], object]) -> None:
@@ -427,7 +429,7 @@ class Work:
             answer = Answer(str(why), done=False)
         with self._lock:
             if answer is not None:
-                self.answers[self.place] = answer
+                self.answers[self.section] = answer
             self.task, self.progress = None, ""
 
     @property
@@ -438,7 +440,7 @@ class Work:
             return ""
         return task if progress.lower() in ("", task.lower()) else f"{task}: {progress}"
 
-    def failure(self, place: str = "file") -> str:
+    def failure(self, section: str = "file") -> str:
         """Return the error of the last task at a place; empty if it succeeded."""
-        answer = self.answers.get(place)
+        answer = self.answers.get(section)
         return "" if answer is None or answer.done else answer.text

@@ -55,7 +55,7 @@ class Campaign:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Made:
+class NoiselessTask:
     """A task without noise.
 
     Attributes:

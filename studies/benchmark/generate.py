@@ -28,7 +28,7 @@ from hilcal.errors import InputError
 from hilcal.types import Floats
 from hilcal.whole_file import replace_file
 from studies.benchmark import real
-from studies.benchmark.campaign import ARMS, CANDIDATES, Made, campaign, candidates
+from studies.benchmark.campaign import ARMS, CANDIDATES, NoiselessTask, campaign, candidates
 from studies.benchmark.laws import LAWS, law
 from studies.benchmark.mujoco_tasks import SHOWN, mujoco_task
 from studies.benchmark.task import JOINTS, POSITION, WRENCH
@@ -140,7 +140,7 @@ def make(spec: Spec, part: str, key: str) -> dict[str, str]:
     }
 
 
-def _simulated(spec: Spec, part: str, key: str, rng: np.random.Generator) -> Made:
+def _simulated(spec: Spec, part: str, key: str, rng: np.random.Generator) -> NoiselessTask:
     """Make a simulated task; over the tasks of a track effects take turns, arms are random."""
     turn = seeded(key, f"{part} {spec.track} effects")
     c = campaign(str(rng.choice(ARMS)), spec.poses, rng)
@@ -151,7 +151,7 @@ def _simulated(spec: Spec, part: str, key: str, rng: np.random.Generator) -> Mad
     order = turn.permutation(len(names))
     choice = [names[k] for k in np.roll(order, -(3 * spec.number // 2))]
     count = spec.count if spec.count < 2 else int(rng.integers(2, 4))
-    hide: Callable[..., Made] = elastic if spec.track == "elastic" else mujoco_task
+    hide: Callable[..., NoiselessTask] = elastic if spec.track == "elastic" else mujoco_task
     return hide(c, choice, count, spec.strength, rng)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from hilcal.errors import InputError
 from hilcal.types import Floats
-from studies.benchmark.campaign import SIGMA, Campaign, Made
+from studies.benchmark.campaign import SIGMA, Campaign, NoiselessTask
 from studies.benchmark.formula import Formula
 from studies.benchmark.world_elastic import bare
 from studies.temperatures import air
@@ -38,7 +38,7 @@ LAWS: tuple[tuple[str, str], ...] = (
 """Site and form of each law; the gain follows from the strength, constants in braces are drawn."""
 
 
-def law(c: Campaign, number: int, strength: float, rng: np.random.Generator) -> Made:
+def law(c: Campaign, number: int, strength: float, rng: np.random.Generator) -> NoiselessTask:
     """Hide law `number` at a strength, its rms motion of the training readings over the noise.
 
     The law of a joint is added to its angle before the elastic deflection; "base_z" displaces the
@@ -68,7 +68,7 @@ def law(c: Campaign, number: int, strength: float, rng: np.random.Generator) -> 
         phase=rng.uniform(0.0, 2.0 * np.pi),
         slack=rng.uniform(0.3, 0.8),
     )
-    still = world.sight(c.states).position
+    still = world.ideal_readings(c.states).position
 
     def moved(formula: str) -> Floats:
         value = Formula.parse(formula, columns).value(columns)
@@ -76,7 +76,7 @@ def law(c: Campaign, number: int, strength: float, rng: np.random.Generator) -> 
             return np.asarray(still + value[:, None] * world.registration[:3, 2])
         slip = np.zeros_like(c.states.q)
         slip[:, int(acts_on[1:]) - 1] = value
-        return world.sight(c.states, slip).position
+        return world.ideal_readings(c.states, slip).position
 
     tiny = 1e-6
     shift = (moved(f"{tiny:g}*({form})") - still)[: c.n_train]
@@ -96,4 +96,4 @@ def law(c: Campaign, number: int, strength: float, rng: np.random.Generator) -> 
         },
     }
     about = {"quantities": QUANTITIES, "acts_on": acts_on}
-    return Made(c, moved(formula), truth, further, about)
+    return NoiselessTask(c, moved(formula), truth, further, about)

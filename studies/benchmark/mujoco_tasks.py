@@ -6,7 +6,7 @@ import numpy as np
 
 from hilcal.calibration.handover import urdf
 from hilcal.drivers.simulated.injected_effects import Draw, joint_compliance, typical_torque
-from hilcal.drivers.simulated.world import stand
+from hilcal.drivers.simulated.world import place_tracker
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Floats
@@ -14,7 +14,7 @@ from studies.benchmark.campaign import (
     SIGMA,
     TARGET_SCATTER,
     Campaign,
-    Made,
+    NoiselessTask,
     hide_each,
     named,
 )
@@ -33,7 +33,7 @@ _CLOSE = 1e-3  # relative tolerance of the strength
 
 def mujoco_task(
     c: Campaign, choice: Sequence[str], count: int, strength: float, rng: np.random.Generator
-) -> Made:
+) -> NoiselessTask:
     """Hide effects of a strength, the rms motion of the training readings over the noise.
 
     Directions are drawn as for the other simulated arm; no mechanics are shared.
@@ -56,7 +56,7 @@ def mujoco_task(
         "joint_compliance": soft,
         "target_offset": TARGET_SCATTER * rng.standard_normal(3),
     }
-    registration, _ = stand(cell, rng)
+    registration, _ = place_tracker(cell, rng)
     draw = Draw(cell.arm, soft, typical_torque(cell.arm))
 
     def position(further: Hidden, states: States) -> Floats:
@@ -81,4 +81,4 @@ def mujoco_task(
 
     names = hide_each(choice, count, hide)
     parameters = {name: np.array(v).tolist() for name, v in hidden.items()}
-    return Made(c, position({}, c.states), named(names, strength, parameters))
+    return NoiselessTask(c, position({}, c.states), named(names, strength, parameters))

@@ -18,7 +18,7 @@ from hilcal.library import read_table
 from hilcal.readings.readings import States
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Floats
-from studies.benchmark.campaign import FRESH, Campaign, Made
+from studies.benchmark.campaign import FRESH, Campaign, NoiselessTask
 
 POSES = (30, 60, 120)
 SERIES: dict[str, tuple[str, str]] = {
@@ -41,7 +41,7 @@ UR5 is not published, but assumed; its noise is half of the tracker's maximum pe
 """
 
 
-def real_task(track: str, number: int, poses: int, rng: np.random.Generator) -> Made:
+def real_task(track: str, number: int, poses: int, rng: np.random.Generator) -> NoiselessTask:
     """Make a task: `poses` readings drawn from a series, and others to predict.
 
     UR10: 200 others of series B (even numbers) or C (odd). UR5: 200 others of the grid (even), or
@@ -79,7 +79,7 @@ def real_task(track: str, number: int, poses: int, rng: np.random.Generator) -> 
     c = Campaign(cell, states, names, ("none",) * len(q), poses)
     truth = {"kind": "real", "strength_sigma": 0.0, "effects": [], "either": []}
     source = {"file": str(file.relative_to(folder)), "licence": "MIT"}
-    return Made(c, position, truth, about={"source": source}, sigma=sigma)
+    return NoiselessTask(c, position, truth, about={"source": source}, sigma=sigma)
 
 
 def _ur5(path: Path) -> tuple[Floats, Floats]:

@@ -33,7 +33,7 @@ from hilcal.readings.whitening import Whitening, whitening
 from hilcal.types import Floats
 from tests.benchmarks.conftest import Claim
 from tests.support.arm_cases import arm_of, cell_of
-from tests.support.readings_cases import made
+from tests.support.readings_cases import readings_at
 from tests.support.timing import shortest
 
 pytestmark = pytest.mark.slow
@@ -68,7 +68,7 @@ def problem_of(count: int) -> Problem:
     root = rng.normal(size=(count, 3, 3))
     covariance = 4e-10 * (root @ np.swapaxes(root, 1, 2) + np.eye(3))
     value, poses = rng.normal(size=(count, 3)), number // 4
-    readings = made(q, value, wrench=wrench, pose=poses, load=loaded, covariance=covariance)
+    readings = readings_at(q, value, wrench=wrench, pose=poses, load=loaded, covariance=covariance)
     model = Model(cell, tuple(effect(cell, readings.states) for effect in EFFECTS))
     assert model.size == 30
     return Problem(model, readings, scales_of(model) * np.abs(rng.normal(size=model.size)))

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilcal.design.next import CANDIDATES, Next, measure_next
-from hilcal.design.planner import Request
+from hilcal.design.next import CANDIDATES, SeparatingPlan, plan_separating
+from hilcal.design.planner import PlanRequest
 from hilcal.diagnosis.effect_ranking import Suspect, candidates, rank_suspects
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline
@@ -23,7 +23,7 @@ from hilcal.model.model import Model
 from hilcal.readings.whitening import Mode
 from hilcal.refinement import Refinement, refine
 from tests.benchmarks.conftest import Claim
-from tests.support.campaigns import Campaign, campaign
+from tests.support.campaigns import SimulatedCampaign, campaign
 from tests.support.effect_cases import make
 from tests.support.plan_cases import config_of
 from tests.support.timing import shortest
@@ -35,7 +35,7 @@ ROUNDS = 3
 SUSPECTS = ("base_compliance", "joint_tilt_compliance", "link_compliance", "tool_compliance")
 
 
-def based(c: Campaign) -> Fit:
+def based(c: SimulatedCampaign) -> Fit:
     return fit(baseline(c.cell, c.readings, c.mode), c.readings, c.mode)
 
 
@@ -138,9 +138,9 @@ def test_what_separates_four_suspects(mode: Mode, poses: int, benchmark: Any, cl
         assert found.holdout.rms_m > 0
         return found
 
-    def planned(found: Fit) -> Next:
+    def planned(found: Fit) -> SeparatingPlan:
         rng = np.random.default_rng(0)
-        return measure_next(c.cell, config, found, SUSPECTS, Request(20), rng)
+        return plan_separating(c.cell, config, found, SUSPECTS, PlanRequest(20), rng)
 
     fitted()  # what is imported late
     start = time.process_time()

@@ -9,7 +9,7 @@ import pytest
 from playwright.sync_api import CDPSession
 from rerun.chunk import RrdReader
 
-from hilcal.present.charts import MOST
+from hilcal.present.charts import MAX_POINTS
 from hilcal.present.html.report import ReportContent
 from hilcal.present.html.report import page as page_of
 from hilcal.present.live_viewer import LiveViewer
@@ -40,7 +40,7 @@ def test_a_page_of_ten_thousand_readings_is_at_most_8_mb(
     size = len(html.encode())
     claim("report of 10,000 readings, size", f"{size / 1e6:.1f} MB", "8 MB")
     assert size <= 8e6
-    assert f"Of 10002 readings {MOST} are drawn" in html
+    assert f"Of 10002 readings {MAX_POINTS} are drawn" in html
 
 
 @needs_chromium

@@ -24,7 +24,7 @@ from hilcal.cell import Cell
 from hilcal.design.approximate_design import relax
 from hilcal.design.criteria import D
 from hilcal.design.criterion import CandidateSet, Objective
-from hilcal.design.optimum import best
+from hilcal.design.optimum import best_design
 from hilcal.drivers.simulated.injected_effects import Draw
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.carried import scales_of
@@ -108,7 +108,7 @@ def test_plan(benchmark: Any, claim: Claim, tmp_path: Path, count: int) -> None:
     units = CandidateSet(rows, np.ones(count))
     objective = Objective(units, D(), np.zeros((units.size, units.size)))
     relaxed, relaxed_seconds = timed(lambda: relax(objective, 1.0))
-    chosen, seconds = timed(lambda: best(objective, float(POSES)))
+    chosen, seconds = timed(lambda: best_design(objective, float(POSES)))
     benchmark.pedantic(relax, args=(objective, 1.0), rounds=1)
 
     def root(information: Floats) -> float:
@@ -151,7 +151,7 @@ def simulated(*, elastic: bool) -> Case:
     bare = campaigns.measured(world, plan, rng)[plan.load == 0]
     other = campaigns.plan(200, 2)
     states = other.states[other.load == 0]
-    return cell, bare, states, world.sight(states).value(3)
+    return cell, bare, states, world.ideal_readings(states).value(3)
 
 
 def real(data: Path) -> Case:
@@ -276,7 +276,7 @@ def test_cross_validation(benchmark: Any, claim: Claim) -> None:
     """
     rows: dict[str, dict[str, list[float]]] = {"hilcal": {}, "mrcal": {}}
     seconds = {"hilcal": 0.0, "mrcal": 0.0}
-    for effect in (campaigns.NOTHING, "transmission_error"):
+    for effect in (campaigns.NO_EFFECT, "transmission_error"):
         for seed in range(CAMPAIGNS):
             c = campaigns.campaign(effect, seed=seed, poses=20)
             states = campaigns.plan(40, 500).states
@@ -289,7 +289,7 @@ def test_cross_validation(benchmark: Any, claim: Claim) -> None:
     names = {"hilcal": "hilcal: poses left out", "mrcal": "mrcal's method: two halves"}
     table = []
     for who, found in rows.items():
-        right, wrong = (np.array(found[e]) for e in (campaigns.NOTHING, "transmission_error"))
+        right, wrong = (np.array(found[e]) for e in (campaigns.NO_EFFECT, "transmission_error"))
         figures = {
             "model right": float(np.median(right)),
             "largest": float(right.max()),

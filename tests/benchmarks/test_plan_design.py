@@ -16,7 +16,7 @@ import scipy.linalg as sl
 from hilcal.design.approximate_design import relax
 from hilcal.design.criteria import D
 from hilcal.design.criterion import CandidateSet, Objective
-from hilcal.design.optimum import best
+from hilcal.design.optimum import best_design
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.effects.link_geometry import LinkGeometry
 from hilcal.identification.carried import scales_of
@@ -78,7 +78,7 @@ def test_states_out_of_many(benchmark: Any, claim: Claim, kind: str) -> None:
     scan = shortest({"scan": lambda: leverage(units)}, 3)["scan"]
 
     def plan() -> float:
-        return best(by_volume(units), float(STATES), np.random.default_rng(1)).efficiency
+        return best_design(by_volume(units), float(STATES), np.random.default_rng(1)).efficiency
 
     start = time.process_time()
     efficiency = plan()

@@ -7,17 +7,13 @@ takes but how much longer than that of a small recording, in processor time of t
 import math
 import os
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import pytest
 
-from hilcal.measuring.progress import ArmAt
-from hilcal.present.live_viewer import Measuring
 from hilcal.present.viewer import live, save
-from hilcal.present.viewer.live import LiveScene
 from tests.benchmarks.conftest import Claim
 from tests.support.live_story import events, measuring, plan
 from tests.support.picture import opened, vulkan_available
@@ -44,9 +40,8 @@ def finished(readings: int, path: Path) -> None:
 def followed(readings: int, path: Path) -> None:
     """Write what a live viewer was told of a campaign, as `--view` does."""
     outlet = live._Outlet("speed", print, file=path)
-    for wall, what in events(measuring(plan(readings // 2))):
-        tell = partial(LiveScene.tell, wall=wall, what=what)
-        outlet.tell(tell, not isinstance(what, ArmAt), now=isinstance(what, Measuring))
+    for wall, event in events(measuring(plan(readings // 2))):
+        outlet.draw(wall, event)
     outlet.end()
 
 

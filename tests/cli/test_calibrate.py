@@ -14,7 +14,7 @@ from hilcal.store.procedure_log import ProcedureLog
 from tests.support.calibrate_process import CELL
 from tests.support.campaign_cases import STARVED, TRIES
 from tests.support.cli_cases import ok, refused, run
-from tests.support.procedure_cases import drawn, small
+from tests.support.procedure_cases import drawn_calibration, small_config
 from tests.support.random_cells import random_cell, random_options
 
 
@@ -31,9 +31,9 @@ def there(tmp_path_factory):
     path = tmp_path_factory.mktemp("run")
     from hilcal.config.reference import to_toml
 
-    config = small(1)
+    config = small_config(1)
     (path / "cell.toml").write_text(to_toml(config), encoding="utf-8")
-    d = drawn(path / "run.hilcal", config=config, poses=4, validation=4)
+    d = drawn_calibration(path / "run.hilcal", config=config, poses=4, validation=4)
     d.to_the_end()
     return d
 

@@ -12,7 +12,7 @@ import pytest
 
 import hilcal as hc
 from hilcal.config import CellConfig, Repeatability, load_config
-from hilcal.drivers.simulated.world import World, stand
+from hilcal.drivers.simulated.world import World, place_tracker
 from hilcal.identification.full_covariance import joint_factors
 from hilcal.readings.covariance import INSTRUMENT
 from hilcal.readings.readings import Readings
@@ -45,7 +45,7 @@ class Site:
     def measured(self, seed: int, zeros: Sequence[float] = (0.0,) * 6) -> Readings:
         """Fifteen readings with other zeros of the joints, by a tracker that stands elsewhere."""
         rng = np.random.default_rng(seed)
-        registration, station = stand(self.arm.cell, rng)
+        registration, station = place_tracker(self.arm.cell, rng)
         physics = self.arm.world.physics
         physics = physics.with_effect("encoder_offset", physics.encoder_offset + zeros)
         world: World = replace(

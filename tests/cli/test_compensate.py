@@ -248,7 +248,7 @@ def test_every_command_counts_from_one_base_which_is_the_worlds(capsys, fitted, 
     assert found["base_in_tracker"] == frames["base_in_tracker"]
     assert found["base_is"] == frames["base_is"] == "mechanical"
     corrected = np.array([p["q_corrected"] for p in found["points"]])
-    read = world.sight(States(corrected, np.tile(load, (len(q), 1)))).value(3)
+    read = world.ideal_readings(States(corrected, np.tile(load, (len(q), 1)))).value(3)
     off = np.linalg.norm((read - base[:3, 3]) @ base[:3, :3] - asked[:, :3, 3], axis=1)
     assert np.all(off <= [p["band_m"] for p in found["points"]])
     assert found["error_before"]["mean_m"] > 20 * off.mean()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilcal.cli.running import TRIES, first_plan, to_the_end
+from hilcal.cli.running import TRIES, first_plan, retry_after_failures
 from hilcal.cli.terminal import terminal
 from hilcal.config import load_config
 from hilcal.drivers.simulated.rehearsal import choices
@@ -201,14 +201,14 @@ def toml(tmp_path):
 def test_a_person_is_shown_the_plan_and_asked(columns, toml):
     home = toml.parent
     with AtTerminal("run", "cell.toml", "-o", "run.hilcal", columns=columns, home=home) as person:
-        person.keeps("The arm will move. y = yes, n = no:")
+        person.check_words_stay("The arm will move. y = yes, n = no:")
         for words in FACTS:
             assert words in person.text
-        person.types("maybe\n")
-        person.keeps("'maybe' is no answer. Type y or n, and press Enter.")
-        person.sees("n = no:", 2)
-        person.types("n\n")
-        assert person.ends() == 130
+        person.type_keys("maybe\n")
+        person.check_words_stay("'maybe' is no answer. Type y or n, and press Enter.")
+        person.wait_for_words("n = no:", 2)
+        person.type_keys("n\n")
+        assert person.wait_for_end() == 130
         assert "nothing has moved" in person.text
         assert person.lines[-1] == "  hilcal plan cell.toml -o plan.json --seed 4"
     assert not (home / "run.hilcal").exists()
@@ -218,9 +218,9 @@ def test_a_person_is_shown_the_plan_and_asked(columns, toml):
 def test_ctrl_c_at_the_question_and_the_end_of_the_input_are_no(toml):
     for keys, words in (("\x03", "error: interrupted"), ("\x04", "nothing has moved")):
         with AtTerminal("run", "cell.toml", "-o", "run.hilcal", home=toml.parent) as person:
-            person.keeps("n = no:")
-            person.types(keys)
-            assert person.ends() == 130
+            person.check_words_stay("n = no:")
+            person.type_keys(keys)
+            assert person.wait_for_end() == 130
             assert words in person.text
     assert not (toml.parent / "run.hilcal").exists()
 
@@ -254,7 +254,7 @@ def work(failures):
 def test_what_is_missing_is_measured_after_a_failure(failures, comes, capsys):
     """As long as readings come it goes on; without any only for some failures in a row."""
     once, calls = work(failures)
-    to_the_end(terminal(False), once, lambda: len(calls) // 2 if comes else 7)
+    retry_after_failures(terminal(False), once, lambda: len(calls) // 2 if comes else 7)
     said = capsys.readouterr()
     assert (said.out + said.err).count("nothing came for 0.2 s") == failures == len(calls) - 1
 
@@ -262,5 +262,5 @@ def test_what_is_missing_is_measured_after_a_failure(failures, comes, capsys):
 def test_a_device_that_always_fails_ends_it():
     once, calls = work(TRIES)
     with pytest.raises(DeviceError, match=r"nothing came for 0\.2 s"):
-        to_the_end(terminal(False), once, lambda: 7)
+        retry_after_failures(terminal(False), once, lambda: 7)
     assert len(calls) == TRIES

@@ -17,7 +17,7 @@ from hilcal.discovery.law import Coefficient, Form, LawPart, source_of_form
 from hilcal.discovery.law import Law as FoundLaw
 from hilcal.discovery.sites import sites
 from hilcal.discovery.structures import Structure
-from hilcal.drivers.simulated.injected_effects import nothing_hidden
+from hilcal.drivers.simulated.injected_effects import world_without_effect
 from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.effects.catalogue import read_effects
 from hilcal.effects.check import check_effect, example_cell, example_situation, example_states
@@ -181,7 +181,7 @@ def test_a_law_is_found_written_added_and_the_model_is_adequate(motion, formula,
         cell, 30, [(x.name, x.wrench(cell.gravity)) for x in loads], rng
     )
     std = config.repeatability.per_joint(6)
-    world = nothing_hidden(cell, rng, noise=measurement_noise(config), joint_std=std)
+    world = world_without_effect(cell, rng, noise=measurement_noise(config), joint_std=std)
     names = ("none", *(x.name for x in loads))
     readings = simulate(world, states, pose, load, cycle, names, rng)
     law = UnmodelledLaw("hidden", "", (), ("deflection",), motion)

@@ -16,9 +16,9 @@ from hilcal.readings.covariance import INSTRUMENT, INSTRUMENT_AND_ARM
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
 from hilcal.store.rows import content_hash
-from hilcal.tables.table import import_table, with_what_rounding_does, write_table
+from hilcal.tables.table import covers_with_rounding, import_table, write_table
 from tests.support.cli_cases import CELL, ok, refused, rehearsal, stored_readings
-from tests.support.readings_cases import make_arm, simple
+from tests.support.readings_cases import make_arm, simple_readings
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def test_a_campaign_imports_what_another_exported(capsys, tmp_path, kind, covers
     digits=st.sampled_from([3, 17]),
 )
 def test_tables_of_readings_keep_every_bit(tmp_path_factory, seed, m, parquet_file, digits):
-    rng, x = np.random.default_rng(seed), simple(20, m=m)
+    rng, x = np.random.default_rng(seed), simple_readings(20, m=m)
     n = x.states.q.shape[1]
     states = replace(
         x.states,
@@ -79,7 +79,7 @@ def test_tables_of_readings_keep_every_bit(tmp_path_factory, seed, m, parquet_fi
     )
     x = replace(x, covariance=0.5 * (x.covariance + np.swapaxes(x.covariance, 1, 2)))
     path = tmp_path_factory.mktemp("bits") / ("t.parquet" if parquet_file else "t.csv")
-    write_table(x, path, with_what_rounding_does(INSTRUMENT_AND_ARM, x))
+    write_table(x, path, covers_with_rounding(INSTRUMENT_AND_ARM, x))
     again = import_table(path, make_arm(), None)
     assert again.covers == INSTRUMENT_AND_ARM
     assert content_hash(again.readings) == content_hash(x)

@@ -25,7 +25,7 @@ from hilcal.drivers.simulated.rehearsal import (
     SimulationCase,
     case_of_plan,
     measurement_noise,
-    read_plan,
+    simulate_plan,
 )
 from hilcal.readings.readings import States
 from hilcal.robot.catalogue import load_arm
@@ -98,7 +98,7 @@ class Said:
 def at_terminal(home, *words, code=0):
     """Run a command there; it ends with the exit code, within 80 columns and without a rest."""
     with AtTerminal(*words, home=home, paper=300) as t:
-        found = Said(t.ends(LONG), [line.rstrip() for line in t.lines])
+        found = Said(t.wait_for_end(LONG), [line.rstrip() for line in t.lines])
     assert found.code == code, "\n".join(found.lines)
     assert "Traceback" not in found.text
     assert not re.search("[\u2800-\u28ff]", found.text)  # a spinner that nobody wiped away
@@ -157,9 +157,9 @@ def day(tmp_path_factory):
 def asked(home):
     with AtTerminal("init", home=home, paper=300) as t:
         for k, (question, answer) in enumerate(ANSWERS):
-            t.sees(question, 1 + [q for q, _ in ANSWERS[:k]].count(question))
-            t.types(f"{answer}\n")
-        assert t.ends() == 0
+            t.wait_for_words(question, 1 + [q for q, _ in ANSWERS[:k]].count(question))
+            t.type_keys(f"{answer}\n")
+        assert t.wait_for_end() == 0
         assert max(map(len, t.lines)) <= 80
         return Said(0, t.lines)
 
@@ -168,7 +168,7 @@ def rehearsed(home, words):
     """Measure; where this computer was too busy for the devices, go on as is said."""
     for _ in range(8):
         with AtTerminal(*words, home=home, paper=300) as t:
-            found = Said(t.ends(LONG), t.lines)
+            found = Said(t.wait_for_end(LONG), t.lines)
         if found.code == 0:
             return found
         assert found.code == 3, found.text
@@ -304,7 +304,7 @@ def test_every_export_puts_the_arm_where_the_tracker_finds_it(day):
 def test_the_table_of_a_colleague_tells_the_same(day):
     """Semicolons, decimal commas, degrees, millimetres, names in German, loads by name alone."""
     config, made = day.secret.config, load_plan(day.home / "plan.json")
-    r = read_plan(day.secret, made, [SEED, 9]).readings
+    r = simulate_plan(day.secret, made, [SEED, 9]).readings
     loads = ["ohne" if r.load_names[k] == "none" else r.load_names[k] for k in r.load]
     head = ["Messpunkt", "Last", *(f"A{k} [°]" for k in range(1, 7))]
     head += [*(f"{axis} [mm]" for axis in "XYZ"), "Bemerkung"]

@@ -14,9 +14,9 @@ from hilcal.errors import InputError
 from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.store import rows, schema
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.revision import STORED, fitted_to, from_text, to_text
+from hilcal.store.revision import STORED_HASH, fitted_to, from_text, to_text
 from hilcal.store.rows import content_hash
-from tests.support.appending import again, appending
+from tests.support.appending import appending, repeated_deflection
 from tests.support.cli_cases import CELL, ok, refused, rehearsal, stored_readings
 from tests.support.unguarded import unguarded
 
@@ -49,7 +49,7 @@ def more(path, cycle):
     """Measure one pose again, by another connection."""
     with CampaignFile.open(path) as file:
         x = file.readings()
-        file.append_readings(again(x, np.random.default_rng(cycle), cycle))
+        file.append_readings(repeated_deflection(x, np.random.default_rng(cycle), cycle))
 
 
 def checked(path):
@@ -142,7 +142,7 @@ def _mixed(path, found):
     with hc.Campaign.open(path) as o:
         record = o.record(found)
         more(path, 1)
-        record = replace(record, options={**record.options, STORED: o.file.data_hash()})
+        record = replace(record, options={**record.options, STORED_HASH: o.file.data_hash()})
         o.file.append_revision(record)
     more(path, 2)
 
@@ -169,7 +169,7 @@ def test_what_was_fitted_is_not_searched_for_ever(run, found, monkeypatch):
     for k in range(5):
         more(run, k + 1)
     with CampaignFile.open(run) as file:
-        file.append_revision(replace(first, options={**first.options, STORED: "0" * 64}))
+        file.append_revision(replace(first, options={**first.options, STORED_HASH: "0" * 64}))
         monkeypatch.setattr("hilcal.store.campaign_file.content_hash", counting)
         monkeypatch.setattr("hilcal.store.campaign_file._HASHED", 3 * len(found.readings))
         assert file.bad_revision() is not None
@@ -184,7 +184,7 @@ def spoil(path, found, how):
         o.accept(1)
         o.accept(3)
         wrong = replace(o.file.revision(2), parent=None)
-    wrong = replace(wrong, options={**wrong.options, STORED: "0" * 64})
+    wrong = replace(wrong, options={**wrong.options, STORED_HASH: "0" * 64})
     with closing(sqlite3.connect(path, isolation_level=None)) as db, unguarded(db):
         text = to_text(wrong) if how == "hash" else "{"
         crc = rows.text_crc("2", text) if how == "hash" else 0

@@ -20,7 +20,13 @@ from hilcal.present.html.report import page
 from hilcal.readings.covariance import COVERS_KEY, INSTRUMENT
 from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.kept_texts import CALIBRATION_FILE, COMMAND, ROBOT_FILE, typed, typed_now
+from hilcal.store.kept_texts import (
+    CALIBRATION_FILE,
+    COMMAND,
+    ROBOT_FILE,
+    recording_command,
+    running_command,
+)
 from hilcal.store.overview import overview
 from hilcal.store.plan import Plan, Step
 from hilcal.store.run_log import RunLog, check_same_cell, create_run
@@ -166,7 +172,7 @@ def test_a_campaign_that_holds_nothing_yet(tmp_path, capsys):
     path = tmp_path / "empty.hilcal"
     config = load_config(CELL).to_json()
     CampaignFile.create(
-        path, config, str(CELL.parent), "test", more={COVERS_KEY: INSTRUMENT}
+        path, config, str(CELL.parent), "test", more_texts={COVERS_KEY: INSTRUMENT}
     ).close()
     assert ok(capsys, "info", path, "--json").document["n_readings"] == 0
     assert "none yet" in ok(capsys, "info", path).out
@@ -201,11 +207,11 @@ def test_a_revision_keeps_its_command_and_the_page_shows_it(run, capsys):
 
 
 def test_a_campaign_keeps_the_command_that_made_it(tmp_path):
-    with typed(["hilcal", "import", "a table.csv"]):
+    with recording_command(["hilcal", "import", "a table.csv"]):
         content = configuration().to_json()
         with CampaignFile.create(tmp_path / "x.hilcal", content, "", "x") as file:
             assert file.about(COMMAND) == "hilcal import 'a table.csv'"
-    assert typed_now() == {}
+    assert running_command() == {}
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import tomli_w
 
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
-from hilcal.config.reference import SHOWN, tables
+from hilcal.config.reference import SHOWN_KEYS, tables
 from tests.support.cli_cases import CELL, ok, refused, run
 from tests.support.screen import AtTerminal
 
@@ -46,8 +46,8 @@ def test_comments_and_examples_are_those_of_the_configuration(options, tmp_path,
     ok(capsys, "init", path, *options)
     text = path.read_text(encoding="utf-8")
     for t in tables():
-        for key in t.keys if t.name in SHOWN else ():
-            if key.name in SHOWN[t.name] and (t.name != "loads" or "--load" not in options):
+        for key in t.keys if t.name in SHOWN_KEYS else ():
+            if key.name in SHOWN_KEYS[t.name] and (t.name != "loads" or "--load" not in options):
                 assert re.search(rf"^#?{key.name} = ", text, re.MULTILINE), key.name
     used = re.sub(r"^#(?=[\[\w])", "", text, flags=re.MULTILINE)  # every example taken
     assert used != text
@@ -83,7 +83,7 @@ def test_what_is_fitted_is_stated_and_absolute_unless_asked(tmp_path, capsys):
         ok(capsys, "init", path, *options, "--force")
         c = load_config(path)
         assert "readings" in c.planning.model_fields_set
-        assert (c.planning.readings, c.fitted) == (readings, readings)
+        assert (c.planning.readings, c.readings_mode) == (readings, readings)
         assert ("encoder_offset" in c.planning.model) == geometry
 
 
@@ -175,11 +175,11 @@ def test_a_person_is_asked_and_wrong_answers_are_explained(tmp_path):
             ("What height", "0.05", "Where does the tracker stand"),
             ("Where does the tracker stand", "", "Written: CELL.toml"),
         ):
-            t.sees(question)
+            t.wait_for_words(question)
             before = t.text.count(reply)
-            t.types(f"{answer}\n")
-            t.sees(reply, before + 1)
-        assert t.ends() == 0
+            t.type_keys(f"{answer}\n")
+            t.wait_for_words(reply, before + 1)
+        assert t.wait_for_end() == 0
         assert max(len(line) for line in t.lines) <= 80
     c = load_config(tmp_path / "CELL.toml")
     assert (c.robot.model, c.tracker.driver, c.tool.target_m) == (
@@ -200,16 +200,16 @@ def test_a_person_decides_whether_a_file_is_replaced(tmp_path):
     path = tmp_path / "CELL.toml"
     path.write_text("mine", encoding="utf-8")
     with AtTerminal("init", home=tmp_path) as t:
-        t.sees("CELL.toml exists. Replace it?")
-        t.types("n\n")
-        assert t.ends() == 2
+        t.wait_for_words("CELL.toml exists. Replace it?")
+        t.type_keys("n\n")
+        assert t.wait_for_end() == 2
     assert path.read_text(encoding="utf-8") == "mine"
     with AtTerminal("init", "--robot", "ur3", home=tmp_path) as t:
-        t.sees("Replace it?")
-        t.types("y\n")
-        t.sees("Address of its controller")
-        t.types("\x03")  # Ctrl-C: nothing is written
-        assert t.ends() == 130
+        t.wait_for_words("Replace it?")
+        t.type_keys("y\n")
+        t.wait_for_words("Address of its controller")
+        t.type_keys("\x03")  # Ctrl-C: nothing is written
+        assert t.wait_for_end() == 130
     assert path.read_text(encoding="utf-8") == "mine"
 
 

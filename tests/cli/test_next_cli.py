@@ -19,7 +19,7 @@ from hilcal.diagnosis.diagnosis import History, in_doubt
 from hilcal.diagnosis.evidence import Evidence
 from hilcal.diagnosis.verdict import judge
 from hilcal.drivers.simulated.injected_effects import HARD_TO_SEPARATE
-from hilcal.drivers.simulated.rehearsal import case_of_plan, read_plan
+from hilcal.drivers.simulated.rehearsal import case_of_plan, simulate_plan
 from hilcal.effects.catalogue import installed
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
@@ -213,14 +213,14 @@ def in_doubt_at_first(seed, path):
     assert doubtful
     assert case.choice in HARD_TO_SEPARATE
     secret = case_of_plan(case.config, plan, case.choice, case.seed)
-    r = read_plan(secret, plan, [case.seed, 1])  # as `in_process` draws them
+    r = simulate_plan(secret, plan, [case.seed, 1])  # as `in_process` draws them
     d = judge(Evidence(fit(baseline(r.cell, r.readings, r.mode), r.readings, r.mode)), History())
     return d.verdict == "ambiguous" and case.choice in in_doubt(d)
 
 
 @pytest.mark.long
 def test_an_ambiguous_demo_is_in_doubt(tmp_path, monkeypatch):
-    monkeypatch.setattr(demo, "DRAWS", 2)
+    monkeypatch.setattr(demo, "NOISE_DRAWS", 2)
     assert in_doubt_at_first(2, tmp_path / "x")
 
 
@@ -232,7 +232,7 @@ def test_every_ambiguous_demo_is_in_doubt(tmp_path):
 @pytest.mark.long
 def test_a_case_without_a_doubt_is_told(tmp_path, monkeypatch):
     """An effect that everything separates is hidden all the same, if that is asked for."""
-    monkeypatch.setattr(demo, "TRIES", 2)
+    monkeypatch.setattr(demo, "MAX_ARMS", 2)
     monkeypatch.setattr(demo, "_resembled", lambda r, case: False)
     case, _, doubtful = demo.doubtful_case(rehearsal_of(0, tmp_path / "x"), "creep", print)
     assert case.choice == "creep"
@@ -366,7 +366,7 @@ def further_plan(site):
 def test_a_further_plan_is_measured_into_the_campaign(site, capsys):
     path, first = site.directory / "run.hilcal", len(site.plan.steps)
     ok(capsys, *site.command(*site.fresh))
-    site.bench.world.again()
+    site.bench.world.restart()
     further = further_plan(site)
     d = ok(capsys, *site.command("--append", "--plan", str(further), "--json")).document
     added = d["readings"] - first
@@ -395,7 +395,7 @@ def test_a_further_plan_is_measured_into_the_campaign(site, capsys):
 def test_the_line_that_next_prints(site, capsys):
     """As `next` and the workbench print it; the cell that they do not know is CELL.toml there."""
     ok(capsys, *site.command(*site.fresh))
-    site.bench.world.again()
+    site.bench.world.restart()
     path, further = site.directory / "run.hilcal", further_plan(site)
     planned: Any = SimpleNamespace(path=path, planned=(None, further))
     line = WorkbenchSession.run_line(planned)
@@ -406,7 +406,7 @@ def test_the_line_that_next_prints(site, capsys):
 @pytest.mark.long
 def test_an_append_that_was_stopped_is_resumed(site, capsys):
     ok(capsys, *site.command(*site.fresh))
-    site.bench.world.again()
+    site.bench.world.restart()
     further = str(further_plan(site))
     with CampaignFile.open(site.directory / "run.hilcal") as campaign:  # stopped before it moved
         log = RunLog(campaign)

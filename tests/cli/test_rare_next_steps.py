@@ -14,7 +14,7 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.diagnosis.wrong_figures import WrongFigure
 from hilcal.discovery.discovery import Discovery
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.present.diagnosis import addition_lines, silence
+from hilcal.present.diagnosis import addition_lines, no_law_sentence
 from hilcal.present.story import build_story
 from hilcal.present.viewer import live
 from hilcal.present.viewer.live import GUIDE
@@ -167,7 +167,7 @@ def test_what_next_says_of_each_verdict(run, tmp_path, capsys, reason, words, st
 def test_a_law_that_effects_explain_as_well(run, capsys):
     ok(capsys, "identify", run)
     with Campaign.open(run) as o:
-        said = silence(Discovery(o.fit(), "catalogue", catalogue=("hysteresis",)))
+        said = no_law_sentence(Discovery(o.fit(), "catalogue", catalogue=("hysteresis",)))
     assert "hilcal refine adds them" in said
     assert ok(capsys, "refine", run, "--json").document["revisions"][-1]["added"] == "hysteresis"
 

@@ -19,8 +19,8 @@ from hilcal.cell import cell_from_config
 from hilcal.cli import planning
 from hilcal.cli.commands import COMMANDS
 from hilcal.config import load_config
-from hilcal.design.planner import Request, make
-from hilcal.drivers.simulated.rehearsal import case_of_plan, read_plan
+from hilcal.design.planner import PlanRequest, plan_readings
+from hilcal.drivers.simulated.rehearsal import case_of_plan, simulate_plan
 from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import load_plan, with_new_names
@@ -132,7 +132,7 @@ def draw(config, words, noise=1):
             RunLog(c).append(RunLog(c).with_new_names(made))
             further = with_new_names(made, first, 2)
             secret = case_of_plan(config, first, "nothing", SEED)
-            c.append_readings(read_plan(secret, further, [SEED, 2], 3000.0).readings)
+            c.append_readings(simulate_plan(secret, further, [SEED, 2], 3000.0).readings)
         return
     with create_run(path, config, path.absolute().parent, made) as c:
         c.append_readings(readings(config, made, noise))
@@ -151,7 +151,7 @@ def program(weld, frames):
 
 def readings(config, plan, noise):
     """Readings of a plan in the one world of this file."""
-    return read_plan(case_of_plan(config, plan, "nothing", SEED), plan, [SEED, noise]).readings
+    return simulate_plan(case_of_plan(config, plan, "nothing", SEED), plan, [SEED, noise]).readings
 
 
 def points(run, path):
@@ -166,7 +166,9 @@ def points(run, path):
 def others(config, directory):
     """Somebody else's tables: one in the exchange format, one as a spreadsheet in their units."""
 
-    plan = make(cell_from_config(config), config, Request(8), np.random.default_rng(2)).ordered.plan
+    plan = plan_readings(
+        cell_from_config(config), config, PlanRequest(8), np.random.default_rng(2)
+    ).ordered.plan
     r = readings(config, plan, 5)
     write_table(r, directory / "readings.csv", INSTRUMENT_AND_ARM)
     book = openpyxl.Workbook()

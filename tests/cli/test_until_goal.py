@@ -237,7 +237,8 @@ def site(tmp_path, monkeypatch):
     answers = tuple(ConnectionResult(d.report().device, "fake", d.report()) for d in devices)
     monkeypatch.setattr(running.connect, "connect", lambda config: (rig, answers))
     monkeypatch.setattr(running, "Clock", lambda scale: made.bench.clock)
-    monkeypatch.setattr(goal_rule, "SHARE", 1e9)  # judge after every reading, however slow that is
+    # judge after every reading, however slow that is
+    monkeypatch.setattr(goal_rule, "FIT_TIME_SHARE", 1e9)
     return made
 
 
@@ -265,7 +266,7 @@ def test_run_until(site, capsys):
         kinds = [e["kind"] for e in RunLog(c).events()]
     assert (kinds.count("goal"), kinds.count("start")) == (1, 1)
 
-    site.bench.world.again()
+    site.bench.world.restart()
     far = run(capsys, *site.command("--resume", "--until", "j2 std < 0.01 %", "--json"))
     assert far.code == 4
     assert far.document["readings"] == total

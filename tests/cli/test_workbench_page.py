@@ -27,7 +27,7 @@ from hilcal.library import import_campaign
 from hilcal.tables.table import write_table
 from hilcal.whole_file import replace_file
 from hilcal.workbench.guard import AccessGuard, Message
-from tests.support.bench_cases import BASE, TILT, stored
+from tests.support.bench_cases import BASE, TILT, store_campaign
 from tests.support.browser import DESKTOP, PHONE, needs_chromium, open_browser
 from tests.support.cli_cases import refused, start
 from tests.support.next_cases import SMALL, doubtful
@@ -95,7 +95,7 @@ class Served:
 @contextmanager
 def workbench(folder, browser=False, *given):
     """Serve a campaign, or what is given in its place."""
-    begun = given or (stored(folder / "run.hilcal"),)
+    begun = given or (store_campaign(folder / "run.hilcal"),)
     options = () if browser else ("--no-browser",)
     process = start("workbench", *begun, *options, "--port", "0", "--json", cwd=folder)
     try:
@@ -176,7 +176,7 @@ def test_the_token_is_good_for_one_exchange(served):
 
 @pytest.mark.long
 def test_the_session_ends_with_the_token_that_nobody_uses(tmp_path):
-    run = stored(tmp_path / "run.hilcal")
+    run = store_campaign(tmp_path / "run.hilcal")
     code = f"""
 from hilcal.workbench import guard
 guard.UNUSED_S = 0.5

@@ -14,10 +14,10 @@ from random import Random
 import numpy as np
 
 import hilcal as hc
-from hilcal.calibration.handover import Corrected, urdf
+from hilcal.calibration.handover import CorrectedArm, urdf
 from hilcal.calibration.own_files.correct import correct_file
 from hilcal.calibration.points import read_points
-from hilcal.calibration.programs.languages import understood
+from hilcal.calibration.programs.languages import read_program
 from hilcal.campaign.campaign import Campaign
 from hilcal.config import CellConfig, load_config
 from hilcal.identification import parameters_document
@@ -211,7 +211,7 @@ def _maker_program(bench: Bench, maker: str, name: str, frames: str | None) -> P
 
     def read(path: Path) -> None:
         given = None if frames is None else EXAMPLES / frames
-        program = understood(path, arm, frames=given, leave=True)
+        program = read_program(path, arm, frames=given, leave=True)
         if not np.all(np.isfinite(program.q)):
             raise Accepted(f"{maker}: points that are nowhere")
         corrected = program.corrected(program.q)
@@ -226,7 +226,7 @@ def _own_files(bench: Bench) -> list[Parser]:
     arm = maker_arm("krl", bench.folder)
     links = arm.links.copy()
     links[2, :3, 3] += 1e-4
-    new = Corrected(replace(arm, links=links), (), ())
+    new = CorrectedArm(replace(arm, links=links), (), ())
 
     def parser(name: str, text: str, base: str, tip: str) -> Parser:
         def make(by: Random) -> bytes:

@@ -173,10 +173,10 @@ def _program(path: Path) -> None:
         program, every, points, _ = program_points(path, leave)
     if not np.all(np.isfinite(points.q[~np.isnan(points.q).all(axis=1)])):
         raise Accepted("a program: joints that are not finite")
-    kept = [w for w in every if not w.left]
+    kept = [w for w in every if not w.not_corrected]
     path.write_text(with_joints(program, kept, np.ones((len(kept), 6))), "utf-8", newline="")
     _, again, points, _ = program_points(path, leave)
-    if [(w.line, w.left) for w in again] != [(w.line, w.left) for w in every]:
+    if [(w.line, w.not_corrected) for w in again] != [(w.line, w.not_corrected) for w in every]:
         raise Accepted("a program: other waypoints than before")
     if not np.array_equal(points.q, np.ones((len(kept), 6))):
         raise Accepted("a program: other joint values than were put in")

@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import binom
 
 from hilcal.readings.whitening import Mode
-from studies.diagnosis import KINDS, Kind, Outcome, run_case
+from studies.diagnosis import KINDS, DiagnosisOutcome, Kind, run_case
 from studies.diagnosis_claims import FOUND, Claim, claims
 from studies.diagnosis_command import simulate
 from studies.diagnosis_pool import run_all
@@ -26,7 +26,7 @@ ARMS = ("ur10e", "ur3e", "ur5e")
 RARE = 1e-3
 
 
-def studied(kind: Kind, mode: Mode, robots: tuple[str, ...] = ARMS) -> tuple[Outcome, ...]:
+def studied(kind: Kind, mode: Mode, robots: tuple[str, ...] = ARMS) -> tuple[DiagnosisOutcome, ...]:
     extent = Extent(
         kinds=(kind,),
         robots=robots,

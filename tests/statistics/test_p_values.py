@@ -16,7 +16,7 @@ from hilcal.identification.linearisation import linearise
 from hilcal.readings.covariance import PRIOR_REPEATS
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES
-from tests.support.campaigns import NOTHING, campaign
+from tests.support.campaigns import NO_EFFECT, campaign
 from tests.support.rows import first
 
 SAMPLES = 5
@@ -43,7 +43,7 @@ def unequal(readings: Readings, rng: np.random.Generator) -> Readings:
 def p_values(kind: str, mode: str, seeds: range) -> dict[str, list[float]]:
     out: dict[str, list[float]] = {}
     for seed in seeds:
-        c = campaign(NOTHING, mode, seed, poses=14, plan_seed=3, registration_known=True)
+        c = campaign(NO_EFFECT, mode, seed, poses=14, plan_seed=3, registration_known=True)
         rng = np.random.default_rng([seed, 77])
         readings = c.readings
         if kind == "estimated covariances":

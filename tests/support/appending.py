@@ -19,7 +19,7 @@ from hilcal.store.campaign_file import CampaignFile
 from tests.support.paths import ROOT
 
 
-def again(x: Readings, rng: np.random.Generator, cycle: int) -> Readings:
+def repeated_deflection(x: Readings, rng: np.random.Generator, cycle: int) -> Readings:
     """One deflection of those that are there, measured again."""
     of = np.flatnonzero((x.pose == rng.choice(x.pose)) & (x.cycle == 0))
     one = x[np.append(of[x.unloaded[of]][:1], rng.choice(of[~x.unloaded[of]]))]
@@ -35,7 +35,7 @@ def append(path: Path, seed: int, pause: float) -> None:
     first = int(x.cycle.max()) + 1
     for cycle in range(first, first + 100_000):
         with CampaignFile.open(path) as file:
-            print(file.append_readings(again(x, rng, cycle)), flush=True)
+            print(file.append_readings(repeated_deflection(x, rng, cycle)), flush=True)
         time.sleep(rng.uniform(0.0, pause))
 
 

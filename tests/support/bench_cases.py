@@ -7,16 +7,16 @@ from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
 from tests.support.next_cases import SMALL, doubtful
 
-FEW = ("base_frame", "joint_compliance", "base_compliance", "joint_tilt_compliance")
+FEW_EFFECTS = ("base_frame", "joint_compliance", "base_compliance", "joint_tilt_compliance")
 BASE, TILT = "base_compliance", "joint_tilt_compliance"
 
 
 def few_effects() -> Catalogue:
     """A catalogue of few effects, which judges quickly."""
-    return Catalogue(tuple(e for e in installed().effects if e.name in FEW))
+    return Catalogue(tuple(e for e in installed().effects if e.name in FEW_EFFECTS))
 
 
-def stored(path: Path) -> Path:
+def store_campaign(path: Path) -> Path:
     """Write the campaign as it was measured, without any revision."""
     base_dir = str(configs_dir() / "cells")
     with CampaignFile.create(path, SMALL.to_json(), base_dir, "a test", overwrite=True) as file:

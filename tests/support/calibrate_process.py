@@ -23,7 +23,7 @@ STARTING = 15.0
 """A device process that starts on a busy computer sees only then that its parent is gone, s."""
 
 
-class Calibration:
+class CalibrationProcess:
     """Starts `calibrate` in a session of its own, as often as it takes."""
 
     def __init__(self, directory: Path) -> None:
@@ -59,24 +59,24 @@ class Calibration:
             os.killpg(process.pid, signal.SIGKILL)
         code = process.wait()
         assert ended or code == -signal.SIGKILL
-        assert code <= 0, f"exit code {code}: {self.words[-500:]}"
-        left = self.left_behind()
+        assert code <= 0, f"exit code {code}: {self.output[-500:]}"
+        left = self.orphans()
         assert not left, left
         return not ended
 
     def finish(self) -> None:
         process = self.start()
-        assert process.wait(LONGEST) == 0, self.words
+        assert process.wait(LONGEST) == 0, self.output
 
     @property
-    def words(self) -> str:
+    def output(self) -> str:
         return self.log.read_text(encoding="utf-8", errors="replace")[-4000:]
 
-    def left_behind(self) -> list[str]:
+    def orphans(self) -> list[str]:
         """Return its processes that still run, after a moment: one may be starting just then."""
         return still_running(self._family, STARTING)
 
-    def every_reading_once(self) -> int:
+    def check_each_reading_once(self) -> int:
         """Check that each step of each plan was measured once; returns the number of readings."""
         count = 0
         for path in self._files():
@@ -87,10 +87,10 @@ class Calibration:
                 assert len(log.plan.steps) == campaign.n_readings
         return count
 
-    def stored(self) -> int:
+    def n_stored(self) -> int:
         return self._once(self.run) if self.run.exists() else 0
 
-    def sound(self) -> None:
+    def check_readable(self) -> None:
         """Check that what is there can be read."""
         for path in self._files():
             if path.exists():

@@ -126,10 +126,10 @@ def site(
         )
 
 
-BEGUN = "waiting for the operator to take everything off"
+STARTED = "waiting for the operator to take everything off"
 """What a run says as soon as every device is there and ready."""
-TAKEN = re.compile(r"\d+/\d+ ")
-SLOW = 0.1  # position of the speed slider while an arm is to be stopped on its way
+READING_COUNT = re.compile(r"\d+/\d+ ")
+SLOW_SLIDER = 0.1  # position of the speed slider while an arm is to be stopped on its way
 LOOK_S = 0.25
 """Time between two looks at the processes that a run has started; each reads those of the whole
 machine."""
@@ -173,7 +173,7 @@ class Run:
         site.runs.append(self)
 
     @property
-    def words(self) -> str:
+    def output(self) -> str:
         return self.log.read_text(encoding="utf-8", errors="replace")
 
     def wait_until(self, what: Callable[[], bool], words: str) -> None:
@@ -181,21 +181,21 @@ class Run:
         while not what():
             self._look()
             if self.process.poll() is not None:
-                raise EndedError(f"it ended before {words}:\n{self.words}")
-            assert time.monotonic() < end, f"no {words} in {DEADLINE} s:\n{self.words}"
+                raise EndedError(f"it ended before {words}:\n{self.output}")
+            assert time.monotonic() < end, f"no {words} in {DEADLINE} s:\n{self.output}"
             time.sleep(0.02)
 
     def some_readings(self) -> None:
-        self.wait_until(lambda: bool(TAKEN.search(self.words)), "a reading")
+        self.wait_until(lambda: bool(READING_COUNT.search(self.output)), "a reading")
 
     def moving(self) -> Floats:
         """Wait until the arm moves, so slowly and so far that it will not arrive soon."""
-        self.site.slider(SLOW)
+        self.site.slider(SLOW_SLIDER)
         plan = self.site.plan
         goal = np.zeros(6)
 
         def far() -> bool:
-            name = self.words.splitlines()[-1].partition("moving to ")[2]
+            name = self.output.splitlines()[-1].partition("moving to ")[2]
             state = self.site.ask("arm", "state")
             if name not in plan.pose_names or not state["moving"]:
                 return False
@@ -206,14 +206,16 @@ class Run:
         return goal
 
     def measuring(self) -> None:
-        count = len(self.words.splitlines())
+        count = len(self.output.splitlines())
         self.wait_until(
-            lambda: "measuring" in "".join(self.words.splitlines()[count:]), "measurement"
+            lambda: "measuring" in "".join(self.output.splitlines()[count:]), "measurement"
         )
 
     def next_reading(self, words: str) -> None:
-        count = len(TAKEN.findall(self.words))
-        self.wait_until(lambda: len(TAKEN.findall(self.words)) > count, f"a reading with {words}")
+        count = len(READING_COUNT.findall(self.output))
+        self.wait_until(
+            lambda: len(READING_COUNT.findall(self.output)) > count, f"a reading with {words}"
+        )
 
     def family(self) -> set[int]:
         """Process numbers of it and of all that it has started."""
@@ -244,11 +246,11 @@ class Run:
         end = time.monotonic() + longest
         while self.process.poll() is None:
             self._look()
-            assert time.monotonic() < end, f"it hangs:\n{self.words}"
+            assert time.monotonic() < end, f"it hangs:\n{self.output}"
             time.sleep(0.02)
-        return self.process.wait(), self.words
+        return self.process.wait(), self.output
 
-    def left_behind(self) -> list[str]:
+    def orphans(self) -> list[str]:
         """Processes that it has left behind, after a moment."""
         return still_running(self._family, 3.0)
 
@@ -277,7 +279,7 @@ def _alive(pid: int) -> str:
         return ""
 
 
-LONG = 900.0  # a whole campaign may take so long, s
+CAMPAIGN_S = 900.0  # a whole campaign may take so long, s
 STARVED = re.compile(
     r"no new data over RTDE|no answer within|by its watchdog|too busy|nothing came for|"
     r"nobody watched its motion"
@@ -294,10 +296,10 @@ class Fault:
     """What happens in the middle of a run, what is said, and how it is put right."""
 
     name: str  # of the test
-    do: Act  # makes it happen
-    undo: Act  # puts it right, as the operator would
-    says: tuple[str, ...]  # patterns that the one line has to contain
-    stops: bool = True  # whether the arm has to be stopped for it (else it stands already)
+    cause: Act  # makes it happen
+    mend: Act  # puts it right, as the operator would
+    patterns: tuple[str, ...]  # patterns that the one line has to contain
+    stops_arm: bool = True  # whether the arm has to be stopped for it (else it stands already)
     fast: bool = False  # whether it is one of the few that are long, not slow
 
 
@@ -305,7 +307,7 @@ def act(device: str, op: str, **arguments: object) -> Act:
     return lambda cell: cell.ask(device, op, **arguments)
 
 
-def nothing(cell: Site) -> None:
+def no_action(cell: Site) -> None:
     """Nothing has to be put right."""
 
 
@@ -313,13 +315,13 @@ def switch(name: str, device: str, op: str, *says: str, fast: bool = False) -> F
     return Fault(name, act(device, op, on=True), act(device, op, on=False), says, fast=fast)
 
 
-def each(faults: tuple[Fault, ...]) -> pytest.MarkDecorator:
+def parametrize_faults(faults: tuple[Fault, ...]) -> pytest.MarkDecorator:
     mark = {True: pytest.mark.long, False: pytest.mark.slow}
     rows = [pytest.param(one, id=one.name, marks=mark[one.fast]) for one in faults]
     return pytest.mark.parametrize("fault", rows)
 
 
-def begin(cell: Site, path: Path, then: Callable[[Run], Then]) -> tuple[Run, Then]:
+def start_run(cell: Site, path: Path, then: Callable[[Run], Then]) -> tuple[Run, Then]:
     """Start a run, wait for its first reading and for what comes then; returns both."""
     for left in reversed(range(TRIES)):
         run = Run(cell, path)
@@ -333,22 +335,22 @@ def begin(cell: Site, path: Path, then: Callable[[Run], Then]) -> tuple[Run, The
     raise AssertionError("unreachable")
 
 
-def meets(fault: Fault, cell: Site, path: Path, *, moving: bool) -> None:
+def check_fault(fault: Fault, cell: Site, path: Path, *, moving: bool) -> None:
     """Let a run meet a fault after its first reading, and check what the operator sees."""
     for left in reversed(range(TRIES)):
-        run, goal = begin(cell, path, Run.moving if moving else Run.measuring)
+        run, goal = start_run(cell, path, Run.moving if moving else Run.measuring)
         since = time.monotonic()
         try:
-            fault.do(cell)
+            fault.cause(cell)
             line = failed(run)
-            if goal is not None and fault.stops:
-                stopped_on_its_way(cell, since, goal)
+            if goal is not None and fault.stops_arm:
+                check_stopped_on_its_way(cell, since, goal)
             assert not cell.ask("arm", "state")["moving"]
         finally:
-            fault.undo(cell)
-        named = all(re.search(words, line) for words in fault.says)
+            fault.mend(cell)
+        named = all(re.search(words, line) for words in fault.patterns)
         assert "--resume" in line, line
-        right(cell, path)
+        check_readings(cell, path)
         if named:
             return
         assert left, line
@@ -363,34 +365,34 @@ def failed(run: Run, code: int = 3) -> str:
     assert "Traceback" not in words
     lines = [line for line in words.splitlines() if line.startswith("error:")]
     assert len(lines) == 1, words
-    assert run.left_behind() == []
+    assert run.orphans() == []
     return lines[0]
 
 
 def finish(site: Site, path: Path) -> None:
-    """Resume until it is done, and check the campaign; see `begin` for more than one try."""
+    """Resume until it is done, and check the campaign; see `start_run` for more than one try."""
     for left in reversed(range(TRIES)):
         run = Run(site, path)
-        code, words = run.end(LONG)
-        assert run.left_behind() == []
+        code, words = run.end(CAMPAIGN_S)
+        assert run.orphans() == []
         if code == 0:
             break
         assert left, words
         assert STARVED.search(words), words
-    whole(site, path)
+    check_complete(site, path)
 
 
-def whole(site: Site, path: Path) -> None:
+def check_complete(site: Site, path: Path) -> None:
     """Check that every step of the plan is there once, and that every reading is right."""
     with CampaignFile.open(path) as campaign:
         log = RunLog(campaign)
         stored = [Step(**d["step"]) for d in log.details()]
         assert sorted(map(str, stored)) == sorted(map(str, site.plan.steps))
         assert campaign.n_readings == len(site.plan.steps)
-    right(site, path)
+    check_readings(site, path)
 
 
-def right(site: Site, path: Path) -> None:
+def check_readings(site: Site, path: Path) -> None:
     """Check that every stored reading is what a tracker may read of the state it is stored with."""
     with CampaignFile.open(path) as campaign:
         log = RunLog(campaign)
@@ -405,7 +407,7 @@ def right(site: Site, path: Path) -> None:
         pull = np.zeros(6) if load is None else load.wrench(site.cell.gravity)
         rows = readings.load == k
         assert np.abs(readings.states.wrench[rows] - pull).max(initial=0.0) < 1.0
-    sight = site.world.sight(readings.states)
+    sight = site.world.ideal_readings(readings.states)
     off = readings.value - sight.value(readings.m)
     scatter = site.config.repeatability.per_joint(site.cell.arm.n)
     registered = replace(
@@ -421,13 +423,13 @@ def right(site: Site, path: Path) -> None:
     )
 
 
-def stopped_within(cell: Site, since: float) -> None:
+def check_stopped_within(cell: Site, since: float) -> None:
     """Check that the arm stands since at most half a second after `since` (monotonic, s)."""
     wait_until(lambda: not cell.ask("arm", "state")["moving"], "at rest", DEADLINE)
     assert cell.ask("arm", "state")["rest_ns"] * 1e-9 - since <= 0.5
 
 
-def stopped_on_its_way(cell: Site, since: float, goal: Floats) -> None:
+def check_stopped_on_its_way(cell: Site, since: float, goal: Floats) -> None:
     """Check that the arm came to rest in time after `since`, far from where it was to go (6,)."""
-    stopped_within(cell, since)
+    check_stopped_within(cell, since)
     assert np.abs(goal - cell.ask("arm", "state")["q"]).max() > 0.1

@@ -7,7 +7,7 @@ import numpy as np
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config
-from hilcal.drivers.simulated.injected_effects import hide, nothing_hidden
+from hilcal.drivers.simulated.injected_effects import hide_effect, world_without_effect
 from hilcal.drivers.simulated.rehearsal import simulate
 from hilcal.drivers.simulated.world import SimulatedNoise, World
 from hilcal.readings.readings import Readings, States
@@ -18,7 +18,7 @@ from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Floats, Ints
 from studies.random_campaigns import rehearsal_states
 
-NOTHING = "none"
+NO_EFFECT = "none"
 
 
 def configuration() -> CellConfig:
@@ -27,7 +27,7 @@ def configuration() -> CellConfig:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Plan:
+class CampaignPlan:
     """States of a campaign: every pose unloaded and under each load."""
 
     states: States
@@ -38,7 +38,7 @@ class Plan:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Campaign:
+class SimulatedCampaign:
     """A cell as the program believes it to be, the world as it is, and what was read."""
 
     cell: Cell
@@ -58,13 +58,13 @@ def cell_of(*, registration_known: bool = False, target_known: bool = True) -> C
 
 
 @cache
-def plan(poses: int = 12, seed: int = 0, cycles: int = 1) -> Plan:
+def plan(poses: int = 12, seed: int = 0, cycles: int = 1) -> CampaignPlan:
     """Feasible spread poses under all loads of the configuration; the same for equal arguments."""
     config, cell = configuration(), cell_of()
     pulls = [(load.name, load.wrench(cell.gravity)) for load in config.loads]
     rng = np.random.default_rng(seed)
     states, pose, load, cycle = rehearsal_states(cell, poses, pulls, rng, cycles=cycles)
-    return Plan(states, pose, load, cycle, ("none", *(name for name, _ in pulls)))
+    return CampaignPlan(states, pose, load, cycle, ("none", *(name for name, _ in pulls)))
 
 
 def world_of(cell: Cell, rng: np.random.Generator) -> World:
@@ -73,12 +73,12 @@ def world_of(cell: Cell, rng: np.random.Generator) -> World:
     t, joint_std = config.tracker, config.repeatability.per_joint(cell.arm.n)
     along, across = (t.range_std_m, t.range_std_per_m), (t.transverse_std_m, t.transverse_std_per_m)
     noise = SimulatedNoise(along, across, t.orientation_std_rad)
-    return nothing_hidden(cell, rng, noise=noise, joint_std=joint_std)
+    return world_without_effect(cell, rng, noise=noise, joint_std=joint_std)
 
 
 @cache
 def campaign(
-    effect: str = NOTHING,
+    effect: str = NO_EFFECT,
     mode: Mode = "absolute",
     seed: int = 0,
     *,
@@ -90,7 +90,7 @@ def campaign(
     cycles: int = 1,
     plan_seed: int | None = None,
     harmonics: int = 6,
-) -> Campaign:
+) -> SimulatedCampaign:
     """Measure a campaign in a world that hides one effect at `strength` σ."""
     cell = cell_of(registration_known=registration_known, target_known=target_known)
     p = plan(poses, 1000 + seed if plan_seed is None else plan_seed, cycles)
@@ -99,26 +99,26 @@ def campaign(
     if effect == "joint_stiffening":  # a gear that stiffens starts softer than its mean
         softer = 1.5 * world.physics.joint_compliance
         world = replace(world, physics=world.physics.with_effect("joint_compliance", softer))
-    if effect != NOTHING:
-        world = hide(
+    if effect != NO_EFFECT:
+        world = hide_effect(
             effect, cell, p.states, strength, mode, rng,
             world=world, m=m, pose=p.pose, cycle=p.cycle, harmonics=harmonics,
         )  # fmt: skip
     readings = measured(world, p, rng, m)
     for values in (readings.value, readings.covariance, readings.states.q, readings.states.wrench):
         values.flags.writeable = False
-    return Campaign(cell, world, readings, mode)
+    return SimulatedCampaign(cell, world, readings, mode)
 
 
-def measured(world: World, p: Plan, rng: np.random.Generator, m: int = 3) -> Readings:
+def measured(world: World, p: CampaignPlan, rng: np.random.Generator, m: int = 3) -> Readings:
     """What the tracker reads of a plan."""
     return simulate(world, p.states, p.pose, p.load, p.cycle, p.load_names, rng, m)
 
 
-def noiseless(world: World, p: Plan, m: int = 3) -> Readings:
+def noiseless(world: World, p: CampaignPlan, m: int = 3) -> Readings:
     """The same without any noise; the covariance stays."""
     readings = measured(world, p, np.random.default_rng(0), m)
-    return replace(readings, value=world.sight(p.states).value(m))
+    return replace(readings, value=world.ideal_readings(p.states).value(m))
 
 
 def with_noise(clean: Readings, rng: np.random.Generator, factor: float = 1.0) -> Readings:
@@ -138,11 +138,11 @@ def true_parameters(world: World, effect: str, *, m: int = 3) -> Floats:
     if effect == "target_offset" and m == 6:
         return np.concatenate([truth, np.zeros(3)])
     if effect == "joint_coupling":
-        return truth[followed(world.cell.arm)]
+        return truth[distal_factors(world.cell.arm)]
     return truth
 
 
-def followed(arm: Arm) -> Ints:
+def distal_factors(arm: Arm) -> Ints:
     """Where among n x n factors, row by row, those of joints behind one another are."""
     n = arm.n
     pairs = np.eye(n, k=-1)

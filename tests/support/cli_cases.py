@@ -98,7 +98,7 @@ def stored_readings(
     content, base_dir = (config or load_config(CELL)).to_json(), str(CELL.parent)
     more = {} if covers is None else {COVERS_KEY: covers}
     CampaignFile.create(
-        path, content, base_dir, "a test", overwrite=True, more=more, readings=readings
+        path, content, base_dir, "a test", overwrite=True, more_texts=more, readings=readings
     ).close()
     return path
 

@@ -5,11 +5,11 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.readings.readings import Readings
 from studies.study_cases import study_case
-from tests.support.campaigns import Campaign, configuration
-from tests.support.fit_cases import based
+from tests.support.campaigns import SimulatedCampaign, configuration
+from tests.support.fit_cases import fitted_model
 
 
-def fitted(c: Campaign, *effects: str, readings: Readings | None = None) -> Fit:
+def fitted_baseline(c: SimulatedCampaign, *effects: str, readings: Readings | None = None) -> Fit:
     """The baseline of a campaign, fitted, with effects added."""
     given = c.readings if readings is None else readings
     found = fit(baseline(c.cell, given, c.mode), given, c.mode)
@@ -21,4 +21,4 @@ def fitted(c: Campaign, *effects: str, readings: Readings | None = None) -> Fit:
 def studied(mode: str, *hidden: str, robot="ur5e", seed=1, strength=3.0, **more) -> Fit:
     """The baseline of a campaign of the studies, which hides effects or laws."""
     c = study_case(configuration(), robot, mode, hidden, strength, seed, **more)
-    return based(c.cell, c.readings, mode)
+    return fitted_model(c.cell, c.readings, mode)

@@ -48,7 +48,7 @@ class Killed(BaseException):
 
 
 @dataclass
-class World:
+class FakeWorld:
     """Arm, load and time, and the calls that reached any device."""
 
     config: CellConfig
@@ -57,8 +57,8 @@ class World:
     time: float = 100.0
     start: Floats = field(default_factory=lambda: np.zeros(6))
     goal: Floats = field(default_factory=lambda: np.zeros(6))
-    begun: float = 0.0
-    lasts: float = 0.0
+    motion_start: float = 0.0
+    motion_duration: float = 0.0
     is_moving: bool = False
     load: str = "none"
     payload: tuple[float, Floats] | None = None
@@ -79,9 +79,9 @@ class World:
     hurried: float = 1.0  # the same of the motion under way
     jitter: float = 0.0  # rad, of the joints from sample to sample at rest
     torques: float = 0  # the next so many samples at rest tell the torques of the joints
-    lost: int = 0  # the next so many measurements see no target
+    unseen_measurements: int = 0  # the next so many measurements see no target
     not_found: int = 0  # the next so many searches find none
-    wrong: list[str] = field(default_factory=list)  # loads that are hung instead, in order
+    wrong_loads: list[str] = field(default_factory=list)  # loads that are hung instead, in order
     at_start: list[tuple[Floats, str]] = field(default_factory=list)  # load at each motion
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(5))
 
@@ -100,7 +100,7 @@ class World:
         if k in self.fail:
             raise self.fail[k]
 
-    def again(self) -> None:
+    def restart(self) -> None:
         """Start the program anew: the arm has stopped where it was, the load still hangs."""
         self.joints()
         self.is_moving = self.control = self.killed = False
@@ -110,7 +110,7 @@ class World:
 
     def joints(self) -> Floats:
         if self.is_moving:
-            share = min(1.0, (self.time - self.begun) / self.lasts)
+            share = min(1.0, (self.time - self.motion_start) / self.motion_duration)
             self.q = self.start + share * (self.goal - self.start)
             self.is_moving = share < 1.0
         return self.q
@@ -142,7 +142,7 @@ class World:
 class MemoryStore:
     """Keeps what it is given, as JSON where a file would; may be full."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: FakeWorld) -> None:
         self.world = world
         self.refuses: dict[int, Exception] = {}  # by the number of rows that are there
         self.rows: list[tuple[Step, Readings, str]] = []
@@ -192,16 +192,16 @@ class MemoryStore:
 
 
 @dataclass
-class Notes:
+class EventLog:
     """A watcher that remembers."""
 
-    told: list[object] = field(default_factory=list)
+    events: list[object] = field(default_factory=list)
 
     def notify(self, event: object) -> None:
-        self.told.append(event)
+        self.events.append(event)
 
-    def of(self, kind: type) -> list[Any]:
-        return [event for event in self.told if isinstance(event, kind)]
+    def of_kind(self, kind: type) -> list[Any]:
+        return [event for event in self.events if isinstance(event, kind)]
 
 
 STD = 1e-5  # m, of one measurement
@@ -210,7 +210,7 @@ TORQUE = np.array([3.0, -40.0, 20.0, 5.0, 1.0, -0.5])  # N·m, of every pose
 
 @dataclass
 class FakeArm:
-    world: World
+    world: FakeWorld
 
     def report(self) -> Report:
         return Report("arm", "fake")
@@ -219,7 +219,7 @@ class FakeArm:
         w = self.world
         w.call("arm.sample")
         q = w.joints()
-        speed = (w.goal - w.start) / w.lasts / w.hurried if w.is_moving else np.zeros(6)
+        speed = (w.goal - w.start) / w.motion_duration / w.hurried if w.is_moving else np.zeros(6)
         if not w.is_moving:
             q = q + w.jitter * w.rng.standard_normal(6)
         w.torques -= not w.is_moving
@@ -257,10 +257,10 @@ class FakeArm:
         w = self.world
         w.call("arm.start_move")
         assert w.control, "a motion without control"
-        w.start, w.goal, w.begun = w.joints().copy(), q.copy(), w.time
+        w.start, w.goal, w.motion_start = w.joints().copy(), q.copy(), w.time
         way = float(np.abs(w.goal - w.start).max())
         w.hurried = w.hurry
-        w.lasts = max(way / speed / w.hurry, 1e-6)
+        w.motion_duration = max(way / speed / w.hurry, 1e-6)
         w.is_moving = True
         w.at_start.append((q.copy(), w.load))
 
@@ -282,7 +282,7 @@ class FakeArm:
 class FakeTracker:
     """A tracker with white noise."""
 
-    world: World
+    world: FakeWorld
 
     def report(self) -> Report:
         return Report("tracker", "fake")
@@ -291,8 +291,8 @@ class FakeTracker:
         w = self.world
         w.call("tracker.measure")
         w.time += 0.1
-        if w.lost > 0:
-            w.lost -= 1
+        if w.unseen_measurements > 0:
+            w.unseen_measurements -= 1
             raise TargetLostError("tracker: the beam is broken")
         assert not w.is_moving, "measured in motion"
         value = w.position() + STD * w.rng.standard_normal(3)
@@ -314,7 +314,7 @@ class FakeTracker:
 class FakeForce:
     """A force sensor of 100 Hz."""
 
-    world: World
+    world: FakeWorld
 
     def report(self) -> Report:
         return Report("force sensor", "fake")
@@ -341,10 +341,10 @@ class FakeForce:
 
 @dataclass
 class FakeOperator:
-    """Hangs what it is asked for, or what `World.wrong` says."""
+    """Hangs what it is asked for, or what `FakeWorld.wrong_loads` says."""
 
-    world: World
-    asked: list[tuple[str, str]] = field(default_factory=list)
+    world: FakeWorld
+    requests: list[tuple[str, str]] = field(default_factory=list)
 
     def report(self) -> Report:
         return Report("operator", "fake")
@@ -354,14 +354,14 @@ class FakeOperator:
         w.call("operator.hang")
         assert not w.is_moving, "a person asked to work at a moving arm"
         name = "none" if load is None else load.name
-        self.asked.append((name, why))
+        self.requests.append((name, why))
         w.time += 20.0
-        w.load = w.wrong.pop(0) if w.wrong else name
+        w.load = w.wrong_loads.pop(0) if w.wrong_loads else name
 
     def confirm(self, question: str) -> None:
         self.world.call("operator.confirm")
         assert not self.world.is_moving, "a person asked to look at a moving arm"
-        self.asked.append(("confirm", question))
+        self.requests.append(("confirm", question))
 
     def close(self) -> None:
         return
@@ -371,7 +371,7 @@ class FakeOperator:
 class FakeClock(Clock):
     """The world's time."""
 
-    world: World | None = None
+    world: FakeWorld | None = None
 
     def now(self) -> float:
         assert self.world is not None
@@ -438,21 +438,21 @@ class Bench:
         self.config = configuration(**changes)
         self.cell = cell_from_config(self.config)
         start = np.array([0.1, -1.3, 1.6, -1.4, -1.4, 0.1])
-        self.world = World(self.config, self.cell, start)
+        self.world = FakeWorld(self.config, self.cell, start)
         self.store = MemoryStore(self.world)
-        self.notes = Notes()
+        self.notes = EventLog()
         self.operator = FakeOperator(self.world)
         force = None if self.config.force_sensor is None else FakeForce(self.world)
         self.rig = Rig(FakeArm(self.world), FakeTracker(self.world), force, self.operator)
         self.clock = FakeClock(world=self.world)
 
     @property
-    def asked_for(self) -> list[str]:
+    def requested_loads(self) -> list[str]:
         """Names of the loads that were asked for, in order."""
-        return [name for name, _ in self.operator.asked]
+        return [name for name, _ in self.operator.requests]
 
     def remarks(self, words: str = "") -> list[str]:
-        return [note.text for note in self.notes.of(Remark) if words in note.text]
+        return [note.text for note in self.notes.of_kind(Remark) if words in note.text]
 
     def measure(self, plan: Plan | None = None, **more: Any) -> Readings:
         """Run a plan (the usual one if None) to its end; returns all readings."""
@@ -468,23 +468,23 @@ class Bench:
         try:
             self.measure(plan, **more)
         except Killed:
-            self.world.again()
+            self.world.restart()
         else:
             raise AssertionError("the run came to its end")
 
 
-def before(device: Any, call: str, do: Callable[..., None]) -> None:
+def call_before(device: Any, call: str, action: Callable[..., None]) -> None:
     """Have something done before each call of a device, with what the call is given."""
     real = getattr(device, call)
 
     def first(*given: Any) -> Any:
-        do(*given)
+        action(*given)
         return real(*given)
 
     setattr(device, call, first)
 
 
-def changed(device: Any, call: str, by: Callable[[Any], Any]) -> None:
+def change_result(device: Any, call: str, by: Callable[[Any], Any]) -> None:
     """Have something else returned by each call of a device, made of what it returns."""
     real = getattr(device, call)
     setattr(device, call, lambda *given: by(real(*given)))

@@ -17,21 +17,23 @@ from hilcal.robot import se3
 MODES = ("absolute", "deflection")
 
 
-def based(cell: Cell, readings: Readings, mode: Mode, names: Collection[str] | None = None) -> Fit:
+def fitted_model(
+    cell: Cell, readings: Readings, mode: Mode, names: Collection[str] | None = None
+) -> Fit:
     """The baseline, or the named effects beside unknown frames, fitted to readings."""
     if names is None:
         return fit(baseline(cell, readings, mode), readings, mode)
     return fit(with_effects(cell, readings, mode, names), readings, mode)
 
 
-def named(found: Fit) -> dict[str, tuple[float, float]]:
-    names = [f"{e.name}.{p.name}" for e in found.model.effects for p in e.parameters]
-    return dict(zip(names, zip(found.theta, found.uncertainty.std, strict=True), strict=True))
+def parameters_by_effect(fitted: Fit) -> dict[str, tuple[float, float]]:
+    names = [f"{e.name}.{p.name}" for e in fitted.model.effects for p in e.parameters]
+    return dict(zip(names, zip(fitted.theta, fitted.uncertainty.std, strict=True), strict=True))
 
 
-def compliances(found: Fit) -> np.ndarray:
-    rows = found.model.slices()[found.model.names.index("joint_compliance")]
-    return found.theta[rows]
+def compliances(fitted: Fit) -> np.ndarray:
+    rows = fitted.model.slices()[fitted.model.names.index("joint_compliance")]
+    return fitted.theta[rows]
 
 
 def predicted(model: Model, readings: Readings, theta: np.ndarray) -> Readings:

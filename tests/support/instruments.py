@@ -51,7 +51,7 @@ class Instrument:
     def start(self) -> None:
         """Start the server, and wait until it answers."""
         self.process.start()
-        wait_until(lambda: self.process.socket.exists() or self.process.ended, "started")
+        wait_until(lambda: self.process.socket.exists() or self.process.has_ended, "started")
         self.process.check()
 
     def close(self) -> None:

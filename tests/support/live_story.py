@@ -4,13 +4,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from hilcal.measuring.progress import ArmAt, LiveResidual, Phase, ReadingStored, Remark
-from hilcal.present.live_viewer import Measuring
+from hilcal.measuring.progress import ArmPosition, LiveResidual, Phase, ReadingStored, Remark
+from hilcal.present.live_viewer import MeasuringStart
 from hilcal.store.plan import Plan, Step
 from tests.support.viewer_story import ur10e
 
-BEGUN = 1_800_000_000.0  # the time of day at which it begins, s
-BLIND = 8  # readings before there is a model
+START_S = 1_800_000_000.0  # the time of day at which it begins, s
+READINGS_BEFORE_MODEL = 8  # readings before there is a model
 
 
 def plan(poses: int = 24, loads: tuple[str, ...] = ("none", "10kg"), seed: int = 3) -> Plan:
@@ -21,8 +21,12 @@ def plan(poses: int = 24, loads: tuple[str, ...] = ("none", "10kg"), seed: int =
     return Plan(names, rng.uniform(low, high, (poses, 6)), steps)
 
 
-def measuring(made: Plan | None = None, earlier: tuple[tuple[float, Step], ...] = ()) -> Measuring:
-    return Measuring("RUN.hilcal", ur10e(), np.array([[0.03, 0.0, 0.12]]), made or plan(), earlier)
+def measuring(
+    made: Plan | None = None, earlier: tuple[tuple[float, Step], ...] = ()
+) -> MeasuringStart:
+    return MeasuringStart(
+        "RUN.hilcal", ur10e(), np.array([[0.03, 0.0, 0.12]]), made or plan(), earlier
+    )
 
 
 def residual(rng: np.random.Generator, wrong: float) -> LiveResidual:
@@ -34,9 +38,11 @@ def residual(rng: np.random.Generator, wrong: float) -> LiveResidual:
     return LiveResidual(distance, distance / sigma / 3**0.5, False, None, 0.0, tuple(r), covariance)
 
 
-def events(told: Measuring, wrong: float = 6.0, seed: int = 5) -> Iterator[tuple[float, object]]:
+def events(
+    told: MeasuringStart, wrong: float = 6.0, seed: int = 5
+) -> Iterator[tuple[float, object]]:
     """Everything that a run tells, with its time of day; half of the loaded readings are off."""
-    rng, plan_, wall = np.random.default_rng(seed), told.plan, BEGUN
+    rng, plan_, wall = np.random.default_rng(seed), told.plan, START_S
     yield wall, told
     before, total = plan_.q[0], len(plan_.steps)
     for k, step in enumerate(plan_.steps):
@@ -44,12 +50,12 @@ def events(told: Measuring, wrong: float = 6.0, seed: int = 5) -> Iterator[tuple
         yield wall, Phase(f"moving to {step.pose}")
         for part in np.linspace(0.0, 1.0, 4):
             wall += 0.7
-            yield wall, ArmAt(tuple((before + part * (goal - before)).tolist()))
+            yield wall, ArmPosition(tuple((before + part * (goal - before)).tolist()))
         before = goal
         yield wall, Phase(f"measuring {step}")
         wall += 4.0
         off = wrong * (step.load != "none") * (k % 2)
-        live = LiveResidual() if k < BLIND else residual(rng, off)
+        live = LiveResidual() if k < READINGS_BEFORE_MODEL else residual(rng, off)
         yield wall, ReadingStored(step, k + 1, total, 7.0 * (total - k), 7.0, None, live)
         if k == 20:
             yield wall, Remark("the reference pose has drifted by 60 µm (4 σ)")

@@ -7,11 +7,16 @@ import numpy as np
 
 from hilcal.cell import cell_from_config
 from hilcal.config import load_config
-from hilcal.design.next import Next, measure_next
-from hilcal.design.planner import Request, make
+from hilcal.design.next import SeparatingPlan, plan_separating
+from hilcal.design.planner import PlanRequest, plan_readings
 from hilcal.diagnosis.diagnosis import Diagnosis, in_doubt
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.drivers.simulated.rehearsal import Rehearsal, SimulationCase, case_of_plan, read_plan
+from hilcal.drivers.simulated.rehearsal import (
+    Rehearsal,
+    SimulationCase,
+    case_of_plan,
+    simulate_plan,
+)
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.readings.readings import Readings
@@ -43,8 +48,8 @@ class Doubtful:
 def first_plan() -> Plan:
     """As many readings as six poses take under two of the four loads."""
     some = SMALL.model_copy(update={"loads": SMALL.loads[1::2]})
-    return make(
-        cell_from_config(some), some, Request(readings=18), np.random.default_rng(1)
+    return plan_readings(
+        cell_from_config(some), some, PlanRequest(readings=18), np.random.default_rng(1)
     ).ordered.plan
 
 
@@ -52,27 +57,27 @@ def first_plan() -> Plan:
 def doubtful(effect: str, seed: int) -> Doubtful:
     """A small campaign with a weak hidden effect."""
     secret = case_of_plan(SMALL, first_plan(), effect, seed)
-    r = read_plan(secret, first_plan(), [seed, 1])
+    r = simulate_plan(secret, first_plan(), [seed, 1])
     found = fit(baseline(r.cell, r.readings, r.mode), r.readings, r.mode)
     return Doubtful(secret, first_plan(), r, found, diagnose(found))
 
 
-def settled(first: Doubtful, poses: int = 20) -> tuple[Diagnosis, Next]:
+def after_further_plan(first: Doubtful, poses: int = 20) -> tuple[Diagnosis, SeparatingPlan]:
     """Plan what separates the suspects, measure it in the same world, and diagnose all."""
     cell = first.rehearsal.cell
     reference = first.plan.joints("reference")
-    found = measure_next(
-        cell, SMALL, first.fit, first.suspects, Request(poses), np.random.default_rng(1),
+    found = plan_separating(
+        cell, SMALL, first.fit, first.suspects, PlanRequest(poses), np.random.default_rng(1),
         reference=reference,
     )  # fmt: skip
     further = with_new_names(found.planned.ordered.plan, first.plan, 2)
-    more = read_plan(first.secret, further, [9, 2], 3000.0).readings
-    readings = both(first.rehearsal.readings, more)
+    more = simulate_plan(first.secret, further, [9, 2], 3000.0).readings
+    readings = joined_readings(first.rehearsal.readings, more)
     mode = first.rehearsal.mode
     return diagnose(fit(baseline(cell, readings, mode), readings, mode)), found
 
 
-def both(a: Readings, b: Readings) -> Readings:
+def joined_readings(a: Readings, b: Readings) -> Readings:
     names = tuple(dict.fromkeys((*a.pose_names, *b.pose_names)))
     place = [np.array([names.index(n) for n in r.pose_names])[r.pose] for r in (a, b)]
     parts = zip((a, b), place, strict=True)

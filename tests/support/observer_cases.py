@@ -8,7 +8,7 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.config.sections import Gauge, Point
-from hilcal.drivers.simulated.injected_effects import hide
+from hilcal.drivers.simulated.injected_effects import hide_effect
 from hilcal.drivers.simulated.world import World
 from hilcal.readings.covariance import INSTRUMENT_AND_ARM  # noqa: F401 - for the tests
 from hilcal.readings.readings import ObserverName, Readings
@@ -58,11 +58,11 @@ def observed(
     world = world_of(cell, rng)
     if effect is not None:
         kept = {"pose": p.pose, "cycle": p.cycle, "world": world}
-        world = hide(effect, cell, p.states, strength, "absolute", rng, **kept)
+        world = hide_effect(effect, cell, p.states, strength, "absolute", rng, **kept)
     if base:
         world = replace(world, registration=np.eye(4), station=se3.matrix(np.eye(3), np.ones(3)))
     slip = world.joint_std * rng.standard_normal(p.states.q.shape)
-    at = world.sight(p.states, slip).position
+    at = world.ideal_readings(p.states, slip).position
     parts, count = [], len(p.pose)
     names: list[ObserverName] = []
     for k, name in enumerate(who):

@@ -48,5 +48,5 @@ def everything_once(problem) -> np.ndarray:
     """Counts that take every reading of every pose once."""
     if problem.mode == "absolute":
         return np.ones(len(problem.units))
-    most = max(len(loads) for _, loads in problem.what)
-    return np.array([float(len(loads) == most) for _, loads in problem.what])
+    most = max(len(loads) for _, loads in problem.contents)
+    return np.array([float(len(loads) == most) for _, loads in problem.contents])

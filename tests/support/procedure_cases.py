@@ -5,7 +5,7 @@ from pathlib import Path
 
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
-from hilcal.drivers.simulated.rehearsal import SimulationCase, case_of_plan, read_plan
+from hilcal.drivers.simulated.rehearsal import SimulationCase, case_of_plan, simulate_plan
 from hilcal.effects.catalogue import installed
 from hilcal.procedure.procedure import Procedure
 from hilcal.procedure.state import ProcedureStep, Settings
@@ -23,7 +23,7 @@ class KilledError(BaseException):
     """The program was killed."""
 
 
-def small(loads: int = 2, **planning: object) -> CellConfig:
+def small_config(loads: int = 2, **planning: object) -> CellConfig:
     """The cell of the demo with few candidates, so that planning takes a second."""
     config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
     quick = changed(config, planning={"candidates": 60, "against": (), **planning})
@@ -31,7 +31,7 @@ def small(loads: int = 2, **planning: object) -> CellConfig:
 
 
 @dataclass
-class Drawn:
+class DrawnCalibration:
     """A calibration whose readings are drawn in one simulated world."""
 
     procedure: Procedure  # the calibration
@@ -53,7 +53,7 @@ class Drawn:
         begun = HOUR * (len(log.plans) - 1 + 10 * (epoch is not None))
         last = log.plans[-1]
         seed = [self.procedure.settings.seed, number, len(log.plans)]
-        drawn = read_plan(case, last, seed, begun).readings
+        drawn = simulate_plan(case, last, seed, begun).readings
         done, each = log.done(), len(case.cell.all_targets)
         for k, step in enumerate(last.steps):
             if step in done:
@@ -83,7 +83,7 @@ class Drawn:
         return result
 
 
-def drawn(
+def drawn_calibration(
     path: Path,
     hidden: str = "nothing",
     *,
@@ -93,17 +93,19 @@ def drawn(
     validation: int = 5,
     readings: Mode = "deflection",
     goal_m: float | None = None,
-) -> Drawn:
+) -> DrawnCalibration:
     """A small calibration in a file that need not be there yet."""
-    config = small() if config is None else config
+    config = small_config() if config is None else config
     settings = Settings(
         poses=poses, validation=validation, seed=seed, readings=readings, goal_m=goal_m
     )
     cell = cell_from_config(config)
-    return Drawn(Procedure(path, cell, config, path.parent, installed(), settings), hidden)
+    return DrawnCalibration(
+        Procedure(path, cell, config, path.parent, installed(), settings), hidden
+    )
 
 
-def again(d: Drawn) -> Drawn:
+def reopened(d: DrawnCalibration) -> DrawnCalibration:
     """The same calibration as another process finds it: nothing but its files."""
     p = d.procedure
     return replace(d, procedure=replace(p, _refinements=[]), dies_after=None)

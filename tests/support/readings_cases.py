@@ -90,7 +90,7 @@ def first_seen(numbers: list[int]) -> np.ndarray:
     return np.array([order[k] for k in numbers], dtype=np.int64)
 
 
-def made(q: Floats, value: Floats, **more: Any) -> Readings:
+def readings_at(q: Floats, value: Floats, **more: Any) -> Readings:
     """Readings of joint values (N, n), each of a pose of its own and unloaded unless more is said.
 
     `more` are fields of readings and of states, or `std` of every element for a covariance.
@@ -109,10 +109,10 @@ def made(q: Floats, value: Floats, **more: Any) -> Readings:
     return Readings(States(q, **states), pose=pose, load=load, value=value, **usual | told)
 
 
-def simple(count: int, m: int = 3, seed: int = 0) -> Readings:
+def simple_readings(count: int, m: int = 3, seed: int = 0) -> Readings:
     rng = np.random.default_rng(seed)
     q, time = rng.uniform(-3, 3, (count, 6)), np.arange(count, dtype=float)
-    return made(q, rng.uniform(-1, 1, (count, m)), time=time, std=1e-9**0.5)
+    return readings_at(q, rng.uniform(-1, 1, (count, m)), time=time, std=1e-9**0.5)
 
 
 def assert_same(a: Readings, b: Readings) -> None:

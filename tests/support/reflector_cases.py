@@ -5,10 +5,18 @@ from dataclasses import replace
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.drivers.simulated.injected_effects import hide
+from hilcal.drivers.simulated.injected_effects import hide_effect
 from hilcal.readings.readings import States
 from hilcal.types import Floats, Ints
-from tests.support.campaigns import NOTHING, Campaign, Plan, cell_of, measured, plan, world_of
+from tests.support.campaigns import (
+    NO_EFFECT,
+    CampaignPlan,
+    SimulatedCampaign,
+    cell_of,
+    measured,
+    plan,
+    world_of,
+)
 
 NAMES = ("R1", "R2", "R3")
 OFFSETS = np.array([[0.06, 0.02, 0.12], [-0.09, 0.05, 0.10], [0.02, -0.11, 0.15]])
@@ -22,15 +30,15 @@ def plate(*, known: tuple[bool, ...] = (True, True, True), **told: bool) -> Cell
     return cell.with_targets(poses, known)
 
 
-def each_target(p: Plan, count: int = 3) -> Plan:
+def each_target(p: CampaignPlan, count: int = 3) -> CampaignPlan:
     """The plan with every state read once per target, one after the other."""
     rows: Ints = np.repeat(np.arange(len(p.states)), count)
     states: States = replace(p.states[rows], target=np.tile(np.arange(count), len(p.states)))
-    return Plan(states, p.pose[rows], p.load[rows], p.cycle[rows], p.load_names)
+    return CampaignPlan(states, p.pose[rows], p.load[rows], p.cycle[rows], p.load_names)
 
 
 def reflectors(
-    effect: str = NOTHING,
+    effect: str = NO_EFFECT,
     seed: int = 0,
     *,
     mode: str = "absolute",
@@ -41,7 +49,7 @@ def reflectors(
     known: tuple[bool, ...] = (True, True, True),
     m: int = 3,
     **told: bool,
-) -> Campaign:
+) -> SimulatedCampaign:
     """Measure a campaign of three reflectors in a world that hides one effect."""
     cell = plate(known=known, **told)
     p = each_target(plan(poses, 3, cycles))
@@ -50,6 +58,6 @@ def reflectors(
     if joint_std is not None:
         spread = np.broadcast_to(np.asarray(joint_std, dtype=float), (cell.arm.n,)).copy()
         world = replace(world, joint_std=spread)
-    if effect != NOTHING:
-        world = hide(effect, cell, p.states, strength, mode, rng, world=world, m=m)
-    return Campaign(cell, world, measured(world, p, rng, m), mode)  # type: ignore[arg-type]
+    if effect != NO_EFFECT:
+        world = hide_effect(effect, cell, p.states, strength, mode, rng, world=world, m=m)
+    return SimulatedCampaign(cell, world, measured(world, p, rng, m), mode)  # type: ignore[arg-type]

@@ -33,11 +33,11 @@ def refusals(name: str) -> pytest.MarkDecorator:
     return pytest.mark.parametrize(("case", "given"), rows)
 
 
-def edited(given: str, **texts: str) -> str:
+def with_edits(source: str, **texts: str) -> str:
     """What a case gives: itself, or one of the texts with its edits."""
-    if not given.startswith("in "):
-        return given
-    name, _, edits = given[3:].partition("\n")
+    if not source.startswith("in "):
+        return source
+    name, _, edits = source[3:].partition("\n")
     text = texts[name]
     for blocks in EDIT.findall(edits):
         old, new = ("\n".join(line[2:] for line in block.splitlines()) for block in blocks)

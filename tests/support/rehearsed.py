@@ -1,18 +1,19 @@
 """Deflections of a simulated UR10e that hides nothing, under two weights, from seeded draws."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import load_config
-from hilcal.drivers.simulated.injected_effects import nothing_hidden
+from hilcal.drivers.simulated.injected_effects import world_without_effect
 from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.drivers.simulated.world import World
 from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import configs_dir
-from hilcal.types import Ints
-from studies.random_campaigns import dead_weights, rehearsal_states
+from hilcal.types import Floats, Ints
+from studies.random_campaigns import rehearsal_states
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,6 +23,14 @@ class Rehearsed:
     readings: Readings  # (D,) deflections with their noise
     pose: Ints  # (D,) number of each reading's pose
     cycle: Ints  # (D,) number of its load cycle
+
+
+def dead_weights(masses: Sequence[float], gravity: Floats) -> list[tuple[str, Floats]]:
+    """Return the wrenches of masses that hang at the load point, kg and m/s², by name."""
+    return [
+        (f"{mass:g}kg", np.concatenate([mass * np.asarray(gravity), np.zeros(3)]))
+        for mass in masses
+    ]
 
 
 def rehearsed(poses: int, seed: int) -> Rehearsed:
@@ -35,7 +44,7 @@ def rehearsed(poses: int, seed: int) -> Rehearsed:
     )
     states = replace(states, load_time=None)
     std = config.repeatability.per_joint(cell.arm.n)
-    world = nothing_hidden(cell, rng, noise=measurement_noise(config), joint_std=std)
+    world = world_without_effect(cell, rng, noise=measurement_noise(config), joint_std=std)
     names = ("none", *(name for name, _ in loads))
     readings = simulate(world, states, pose, load, cycle, names, rng)
     return Rehearsed(cell, world, readings, pose, cycle)

@@ -94,7 +94,7 @@ class AtTerminal:
 
     # what happens
 
-    def look(self, seconds: float = 0.05) -> bool:
+    def read_screen(self, seconds: float = 0.05) -> bool:
         """Let the screen change for a while; False where the program's end has been read."""
         end = time.monotonic() + seconds
         while self._open and (left := end - time.monotonic()) > 0:
@@ -113,33 +113,33 @@ class AtTerminal:
             self._stream.feed(found)
         return self._open
 
-    def sees(self, words: str, times: int = 1) -> None:
+    def wait_for_words(self, words: str, times: int = 1) -> None:
         """Wait until words stand there, so many times; line ends count as blanks."""
         self.wait(lambda: self.text.count(words) >= times, f"{words!r} for the {times}. time")
 
-    def keeps(self, words: str, times: int = 1) -> None:
+    def check_words_stay(self, words: str, times: int = 1) -> None:
         """Wait for words, and see that they still stand after a while."""
-        self.sees(words, times)
+        self.wait_for_words(words, times)
         end = time.monotonic() + STANDING_S
         while time.monotonic() < end:
-            self.look()
+            self.read_screen()
         assert self.text.count(words) >= times, f"wiped away: {words!r}\n" + "\n".join(self.lines)
 
     def wait(self, holds: Callable[[], bool], what: str) -> None:
         end = time.monotonic() + DEADLINE
         while not holds():
-            there = self.look()
+            there = self.read_screen()
             if holds():
                 return
             assert there, f"ended before {what}:\n" + "\n".join(self.lines)
             assert time.monotonic() < end, f"never {what}:\n" + "\n".join(self.lines)
 
-    def types(self, keys: str) -> None:
+    def type_keys(self, keys: str) -> None:
         os.write(self._master, keys.encode())
 
-    def ends(self, within: float = DEADLINE) -> int:
+    def wait_for_end(self, within: float = DEADLINE) -> int:
         end = time.monotonic() + within
-        while self.look(0.2):
+        while self.read_screen(0.2):
             assert time.monotonic() < end, "it does not end:\n" + "\n".join(self.lines)
         return self.process.wait(10.0)
 

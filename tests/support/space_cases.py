@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, Obstacle
-from hilcal.design.feasible import DrawnPoses, Space, draw
+from hilcal.design.feasible import DrawnPoses, FeasibleSpace, draw_poses
 from hilcal.measuring.clearance import Clearance
 from hilcal.robot.arm import Arm
 from hilcal.robot.scene import Capsule
@@ -164,12 +164,12 @@ def cell(**sections: Any) -> CellConfig:
     return CellConfig.model_validate(usual | sections)
 
 
-def space_of(config: CellConfig) -> Space:
-    return Space(cell_from_config(config), config)
+def space_of(config: CellConfig) -> FeasibleSpace:
+    return FeasibleSpace(cell_from_config(config), config)
 
 
 def drawn_of(config: CellConfig, count: int = 40, seed: int = 0, **how: Any) -> DrawnPoses:
-    return draw(space_of(config), count, np.random.default_rng(seed), **how)
+    return draw_poses(space_of(config), count, np.random.default_rng(seed), **how)
 
 
 place = st.tuples(st.floats(1.0, 3.0), st.floats(-np.pi, np.pi), st.floats(-0.5, 1.5)).map(

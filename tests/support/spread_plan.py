@@ -4,8 +4,8 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.design.feasible import Space, draw
-from hilcal.design.run_order import Chosen, Ordering, order_plan
+from hilcal.design.feasible import FeasibleSpace, draw_poses
+from hilcal.design.run_order import Ordering, PoseReadings, order_plan
 from hilcal.store.plan import Plan
 from hilcal.types import Bools, Floats
 
@@ -14,8 +14,8 @@ def spread_plan(
     cell: Cell, config: CellConfig, count: int, rng: np.random.Generator, repeats: int = 2
 ) -> Plan:
     """Return a plan of `count` poses in the shortest order; every pose bears every load."""
-    space = Space(cell, config)
-    drawn = draw(space, 30 * (count + 1), rng, least=count + 1)
+    space = FeasibleSpace(cell, config)
+    drawn = draw_poses(space, 30 * (count + 1), rng, min_poses=count + 1)
     q = drawn.q[drawn.allowed.all(axis=1)]
 
     def reaches(start: Floats, ends: Floats) -> Bools:
@@ -29,6 +29,6 @@ def spread_plan(
     poses = poses[reaches(q[home], poses)][:count]
     assert len(poses) == count
     names = [f"p{k + 1}" for k in range(count)]
-    chosen = [Chosen(name, space.loads) for name in names]
+    chosen = [PoseReadings(name, space.loads) for name in names]
     how = Ordering(slack=0.0, unloaded="first", repeats=repeats)
     return order_plan(cell, config, names, poses, q[home], chosen, space.passable, rng, how).plan

@@ -49,7 +49,7 @@ def controlled(sim: Sim, clock: float = 1.0) -> UrArm:
     return arm
 
 
-def away(arm: UrArm, by: float = 0.8) -> np.ndarray:
+def displaced_joints(arm: UrArm, by: float = 0.8) -> np.ndarray:
     """A goal that takes a while, and stays within the joint limits."""
     q = arm.sample().q.copy()
     q[0] += by if q[0] < 0 else -by
@@ -63,7 +63,7 @@ def finish(arm: UrArm) -> None:
 
 def under_way(arm: UrArm, sim: Sim) -> np.ndarray:
     """Start a motion and watch it until it has its full speed; returns the goal."""
-    goal = away(arm)
+    goal = displaced_joints(arm)
     arm.start_move(goal, SPEED, ACCELERATION)
     while abs(sim.admin()["qd"][0]) < 0.99 * SPEED:
         assert arm.moving()
@@ -116,7 +116,7 @@ def _words(process: psutil.Process) -> list[str]:
         return []
 
 
-def put_right(sim: Sim) -> None:
+def restore(sim: Sim) -> None:
     """Switch off every fault and bring the robot back to running (not a protective stop)."""
     for op in ("rtde_stall", "rtde_mute", "dashboard_mute", "refuse", "refuse_motion"):
         sim.admin(op, on=False)
@@ -191,6 +191,6 @@ def arm(sim: Sim) -> Iterator[UrArm]:
     """An arm under control; after the test there is no fault and no process."""
     opened = controlled(sim)
     yield opened
-    put_right(sim)
+    restore(sim)
     opened.close()
     assert children() == []

@@ -39,7 +39,7 @@ class Pose(list):
 
 
 @dataclass
-class Told:
+class ExecutedMotion:
     """What a motion was told: its name, line, target, and the tool that was set."""
 
     kind: str
@@ -54,12 +54,12 @@ class Machine:
     def __init__(self, seed: int, by_reference: bool) -> None:
         self.inputs = random.Random(seed)
         self.by_reference = by_reference
-        self.told: list[Told] = []
+        self.told: list[ExecutedMotion] = []
         self.tool: object = None
         self.fuel = 400
         self.threads: list[tuple[str, list, int]] = []
 
-    def run(self, program: str) -> list[Told]:
+    def run(self, program: str) -> list[ExecutedMotion]:
         """Run a program until it ends or fails; returns its motions."""
         lines = []
         for k, line in enumerate(re.split(r"\r?\n", program), start=1):
@@ -225,7 +225,7 @@ class Machine:
             target = given[0] if given else named.get("q", named.get("pose"))
             if isinstance(target, list):
                 target = type(target)(target)
-            self.told.append(Told(name, line, target, self.tool))
+            self.told.append(ExecutedMotion(name, line, target, self.tool))
             return None
         match name:
             case "d2r":

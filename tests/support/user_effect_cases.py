@@ -1,11 +1,11 @@
 """A small law in a file, for the tests of effects of a user's own."""
 
-HEAD = """\
+MODULE_HEAD = """\
 import numpy as np
 from hilcal.effects.protocol import Columns, Effect, Parameter, Response
 """
 CLASS = (
-    HEAD
+    MODULE_HEAD
     + """\
 
 class Mine(Effect):

@@ -97,7 +97,7 @@ def story(
 
 ANGLE = DependenceCurve(
     title="joint 4 angle",
-    says="71 % of the misfit on poses left out follows joint 4 angle.",
+    description="71 % of the misfit on poses left out follows joint 4 angle.",
     x=np.array([-150.0, -90.0, -20.0, 35.0, 110.0]),
     y=np.array([-40.0, 12.0, 31.0, 8.0, -25.0]),
     error=np.array([6.0, 4.0, 3.0, 4.0, 9.0]),
@@ -106,7 +106,7 @@ ANGLE = DependenceCurve(
 )
 LOAD = DependenceCurve(
     title="load",
-    says="23 % of the misfit on poses left out follows load.",
+    description="23 % of the misfit on poses left out follows load.",
     x=np.arange(3.0),
     y=np.array([-60.0, 5.0, 55.0]),
     error=np.array([8.0, 8.0, 9.0]),
@@ -121,7 +121,7 @@ def doubtful(names: str = "") -> Story:
     told = story(poses=12, names=names)
     first, second, third, last = told.revisions
     second = replace(second, verdict="ambiguous")
-    third = replace(third, verdict="unknown_effect", follows=ANGLE)
+    third = replace(third, verdict="unknown_effect", dependence=ANGLE)
     return replace(told, revisions=(first, second, third, last))
 
 
@@ -156,7 +156,7 @@ def _revision(k, parts, truth, offset, covariance, torque, names):
         holdout=ErrorBlock(**{key: 1.06 * v for key, v in error.to_json().items()}),
         cells=(str(k), EFFECTS[k], "", "", "", "", "", verdict),
         panels={"verdict": (words, *([suspects] if left else [])), "parameters": (suspects, words)},
-        follows=DependenceCurve(
+        dependence=DependenceCurve(
             left[0], "", torque[:, 1], 1e6 * residual[:, 2], "torque of joint 2 [Nm]", "z [µm]"
         )
         if left

@@ -16,7 +16,7 @@ from hilcal.robot.se3 import rotation_vector
 from hilcal.tables.table import write_table
 from hilcal.whole_file import replace_file
 from tests.support.bench_cases import BASE, few_effects
-from tests.support.campaigns import NOTHING, campaign, configuration
+from tests.support.campaigns import NO_EFFECT, campaign, configuration
 from tests.support.refusals import refusal, refusals, refuses
 
 COARSE = {"tracker": {"range_std_m": 4e-5, "transverse_std_m": 9e-5}}
@@ -50,7 +50,7 @@ def imported(folder, name, changes=None, **kinds):
     noise, stated = kinds.get("noise", True), kinds.get("stated", False)
     out = folder / f"{name}.hilcal"
     cell = cell_file(folder, f"{name}.toml", changes or {}, noise)
-    import_campaign(table(folder, stated, BASE if noise else NOTHING), cell, out)
+    import_campaign(table(folder, stated, BASE if noise else NO_EFFECT), cell, out)
     return out
 
 

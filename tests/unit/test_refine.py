@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
-from hilcal.drivers.simulated.injected_effects import hide
+from hilcal.drivers.simulated.injected_effects import hide_effect
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
@@ -15,9 +15,9 @@ from hilcal.present.verdict import message
 from hilcal.refinement import MOST_REVISIONS, add, refine
 from hilcal.regression.leave_out import LEAST_GAIN
 from tests.support.campaigns import campaign, cell_of, measured, plan, world_of
-from tests.support.diagnosis_cases import fitted
+from tests.support.diagnosis_cases import fitted_baseline
 from tests.support.effect_cases import make
-from tests.support.fit_cases import based, refined
+from tests.support.fit_cases import fitted_model, refined
 from tests.support.refusals import refusal
 
 
@@ -57,7 +57,7 @@ def test_two_hidden_effects_are_found_one_after_the_other():
     rng = np.random.default_rng(5)
     world = world_of(cell, rng)
     for effect in ("hysteresis", "encoder_offset"):
-        world = hide(effect, cell, p.states, 3.0, "absolute", rng, world=world)
+        world = hide_effect(effect, cell, p.states, 3.0, "absolute", rng, world=world)
     readings = measured(world, p, rng)
     r = refined(cell, readings, "absolute")
     check_steps(r)
@@ -101,7 +101,7 @@ def test_shares_on_poses_left_out_are_what_a_refit_reaches_there():
     """Random errors of each pose: a family of many columns explains them, but nowhere else."""
     c = campaign(seed=3, plan_seed=0, poses=15)
     readings = with_pose_errors(c.readings, 1)
-    before = based(c.cell, readings, "absolute")
+    before = fitted_model(c.cell, readings, "absolute")
     p = linearise(before)
     some = ("transmission_error", "link_geometry", "encoder_offset")
     suspects = [s for s in rank_suspects(p, candidates(p.fit)) if s.effect in some]
@@ -115,7 +115,7 @@ def test_shares_on_poses_left_out_are_what_a_refit_reaches_there():
 
 def test_adding_starts_where_the_fit_stands():
     c = campaign("hysteresis", seed=0, plan_seed=0)
-    before = fitted(c)
+    before = fitted_baseline(c)
     after = add(before, "hysteresis")
     again = fit(after.model, c.readings, "absolute")
     assert np.abs((after.theta - again.theta) / after.uncertainty.formal).max() < 1e-4
@@ -126,7 +126,7 @@ def test_adding_starts_where_the_fit_stands():
 def test_an_effect_cannot_be_added_twice_nor_without_its_columns_nor_unknown():
     c = campaign(plan_seed=0)
     readings = replace(c.readings, states=replace(c.readings.states, approach=None))
-    found = based(c.cell, readings, "absolute")
+    found = fitted_model(c.cell, readings, "absolute")
     refusal("joint_compliance is in the model already", add, found, "joint_compliance")
     refusal("unknown effect 'gear_wear'", add, found, "gear_wear")
     refusal("hysteresis needs approach", add, found, "hysteresis")

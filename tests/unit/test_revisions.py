@@ -20,12 +20,12 @@ from hilcal.store.revision import from_text, to_text
 from hilcal.store.rows import content_hash
 from tests.support.campaigns import configuration
 from tests.support.cli_cases import CELL, rehearsal, stored_readings
-from tests.support.fit_cases import based
+from tests.support.fit_cases import fitted_model
 from tests.support.refusals import refusal
 
 
 def baseline_fit(r):
-    return based(r.cell, r.readings, r.mode)
+    return fitted_model(r.cell, r.readings, r.mode)
 
 
 def record_of(r, found, added=None):
@@ -61,7 +61,7 @@ def test_a_gross_error_stays_set_aside():
     value = r.readings.value.copy()
     value[17] += 0.004
     readings = replace(r.readings, value=value)
-    found = based(r.cell, readings, "absolute")
+    found = fitted_model(r.cell, readings, "absolute")
     assert np.flatnonzero(found.outlier).tolist() == [17]
     record = to_record(found, None, None, content_hash(readings))
     assert record.parameters_json["outliers"] == [17]
@@ -101,7 +101,7 @@ def test_a_revision_is_found_again_on_a_machine_that_rounds_otherwise(tmp_path):
     readings = rehearsal("nothing").readings
     path = stored_readings(tmp_path / "run.hilcal", readings, covers=INSTRUMENT_AND_ARM)
     with Campaign.open(path) as run:
-        run.append(based(run.cell, run.readings, run.mode()))
+        run.append(fitted_model(run.cell, run.readings, run.mode()))
         other = replace(run.readings, covariance=run.readings.covariance * (1 + 1e-15))
         elsewhere = with_readings(run, other)
         np.testing.assert_allclose(elsewhere.fit().theta, run.fit().theta, rtol=1e-6, atol=1e-12)

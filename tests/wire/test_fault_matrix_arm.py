@@ -61,14 +61,14 @@ STALLED = cases.Fault("link stalled", arm("rtde_stall"), off("rtde_stall"), ("li
 ANYWHERE = (
     cases.Fault("emergency stop", arm("emergency_stop"), release, ("emergency stop",)),
     cases.Fault("local mode", arm("local_mode"), arm("remote_mode"), ("local",)),
-    cases.Fault("program stopped", arm("kill_script"), cases.nothing, ("program",)),
-    cases.Fault("link dropped", arm("rtde_drop"), cases.nothing, ("link",)),
-    cases.Fault("half a frame", arm("rtde_half_frame"), cases.nothing, ("link",)),
+    cases.Fault("program stopped", arm("kill_script"), cases.no_action, ("program",)),
+    cases.Fault("link dropped", arm("rtde_drop"), cases.no_action, ("link",)),
+    cases.Fault("half a frame", arm("rtde_half_frame"), cases.no_action, ("link",)),
     cases.Fault("controller mute", arm("rtde_mute"), off("rtde_mute"), ("arm",)),
 )
 MOTION = (
-    replace(PROTECTIVE, says=("protective stop", "unlock"), fast=True),
-    replace(STALLED, says=("link", "0.2 s")),
+    replace(PROTECTIVE, patterns=("protective stop", "unlock"), fast=True),
+    replace(STALLED, patterns=("link", "0.2 s")),
     *ANYWHERE,
     cases.Fault(
         "link dropped, dashboard mute",
@@ -88,7 +88,7 @@ MOTION = (
         arm("set", slider=0.0),
         arm("set", slider=1.0),
         ("speed",),
-        stops=False,  # it stands already
+        stops_arm=False,  # it stands already
     ),
 )
 REST = (
@@ -114,23 +114,23 @@ START = {
 }
 
 
-@cases.each(MOTION)
+@cases.parametrize_faults(MOTION)
 def test_a_fault_in_motion(fault: cases.Fault, cell: cases.Site, path: Path) -> None:
-    cases.meets(fault, cell, path, moving=True)
+    cases.check_fault(fault, cell, path, moving=True)
 
 
-@cases.each(REST)
+@cases.parametrize_faults(REST)
 def test_a_fault_at_rest(fault: cases.Fault, cell: cases.Site, path: Path) -> None:
-    cases.meets(fault, cell, path, moving=False)
+    cases.check_fault(fault, cell, path, moving=False)
 
 
 @pytest.mark.slow
 def test_the_controller_loses_power_in_motion(cell: cases.Site, path: Path) -> None:
-    run, _ = cases.begin(cell, path, cases.Run.moving)
+    run, _ = cases.start_run(cell, path, cases.Run.moving)
     cell.simulated.kill("arm")
     try:
         assert "link" in cases.failed(run)
-        cases.right(cell, path)
+        cases.check_readings(cell, path)
         line = cases.failed(cases.Run(cell, path))  # nobody answers
     finally:
         cell.simulated.restart("arm")
@@ -150,14 +150,14 @@ def test_a_dashboard_that_is_dropped_or_mute_costs_nothing_and_the_arm_is_stoppe
         return run.moving()
 
     try:
-        run, goal = cases.begin(cell, path, without)
+        run, goal = cases.start_run(cell, path, without)
         since = time.monotonic()
         run.interrupt()
         assert "interrupted" in cases.failed(run, 130)
-        cases.stopped_on_its_way(cell, since, goal)
+        cases.check_stopped_on_its_way(cell, since, goal)
     finally:
         cell.ask("arm", "dashboard_mute", on=False)
-    cases.right(cell, path)
+    cases.check_readings(cell, path)
 
 
 @pytest.mark.slow

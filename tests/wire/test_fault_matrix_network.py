@@ -30,7 +30,7 @@ PRISM = cases.Fault(
     fast=True,
 )
 DROP = cases.Fault(
-    "dropped", cases.act("tracker", "drop"), cases.nothing, ("tracker", "closed the connection")
+    "dropped", cases.act("tracker", "drop"), cases.no_action, ("tracker", "closed the connection")
 )
 SHAKEN = cases.Fault(
     "does not stand firmly",
@@ -56,19 +56,19 @@ ERROR = cases.Fault(
 )
 
 
-@cases.each(AT_REST)
+@cases.parametrize_faults(AT_REST)
 def test_a_fault_while_the_arm_rests(fault: cases.Fault, cell: cases.Site, path: Path) -> None:
-    cases.meets(fault, cell, path, moving=False)
+    cases.check_fault(fault, cell, path, moving=False)
 
 
 @pytest.mark.slow
 def test_an_error_of_the_force_sensor_stops_the_arm(cell: cases.Site, path: Path) -> None:
-    cases.meets(ERROR, cell, path, moving=True)
+    cases.check_fault(ERROR, cell, path, moving=True)
 
 
 def test_faults_that_are_overcome_cost_nothing(cell: cases.Site, path: Path) -> None:
     """A lock and zeros that are lost, axes of an object, lost records."""
-    run, _ = cases.begin(cell, path, cases.Run.measuring)
+    run, _ = cases.start_run(cell, path, cases.Run.measuring)
     cell.ask("force", "lose", share=0.05)
     for device, op, arguments in (
         ("tracker", "lock_lost", {}),
@@ -81,7 +81,7 @@ def test_faults_that_are_overcome_cost_nothing(cell: cases.Site, path: Path) -> 
     cell.ask("force", "lose", share=0.0)
     run.interrupt()
     cases.failed(run, 130)
-    cases.right(cell, path)
+    cases.check_readings(cell, path)
     assert cell.ask("tracker", "state")["initialized"]
 
 

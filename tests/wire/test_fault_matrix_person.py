@@ -47,12 +47,12 @@ MOTION = (
     cases.switch(
         "joint angles stand still", "arm", "freeze", "stood still|its angle is old", fast=True
     ),
-    cases.Fault("another program", another_program, cases.nothing, (FOREIGN,)),
+    cases.Fault("another program", another_program, cases.no_action, (FOREIGN,)),
     LEANING,
 )
 REST = (
-    cases.Fault("jogged", somebody_jogs, cases.nothing, ("moved it|has commanded it",)),
-    cases.Fault("another program", another_program, cases.nothing, (FOREIGN,), fast=True),
+    cases.Fault("jogged", somebody_jogs, cases.no_action, ("moved it|has commanded it",)),
+    cases.Fault("another program", another_program, cases.no_action, (FOREIGN,), fast=True),
     cases.switch("tracker stands still", "tracker", "freeze", "same to the last digit", fast=True),
     cases.switch("another reflector", "tracker", "stray", "follows a reflector|sees its target"),
     cases.switch("force sensor stands still", "force", "freeze", "same to the last digit"),
@@ -60,14 +60,14 @@ REST = (
 )
 
 
-@cases.each(MOTION)
+@cases.parametrize_faults(MOTION)
 def test_in_motion(fault: cases.Fault, cell: cases.Site, path: Path) -> None:
-    cases.meets(fault, cell, path, moving=True)
+    cases.check_fault(fault, cell, path, moving=True)
 
 
-@cases.each(REST)
+@cases.parametrize_faults(REST)
 def test_at_rest(fault: cases.Fault, cell: cases.Site, path: Path) -> None:
-    cases.meets(fault, cell, path, moving=False)
+    cases.check_fault(fault, cell, path, moving=False)
 
 
 def loaded(run: cases.Run) -> str:
@@ -77,7 +77,7 @@ def loaded(run: cases.Run) -> str:
     def under_load() -> bool:
         name = run.site.ask("world", "state")["load"]
         found[:] = [] if name is None else [name]
-        now = run.words.rstrip().rpartition("\n")[2]
+        now = run.output.rstrip().rpartition("\n")[2]
         return bool(found) and "measuring" in now and found[0] in now
 
     run.wait_until(under_load, "a reading under a load")
@@ -87,24 +87,24 @@ def loaded(run: cases.Run) -> str:
 def test_a_load_that_falls_off_is_asked_for_again_and_no_reading_is_without_it(
     cell: cases.Site, path: Path
 ) -> None:
-    run, name = cases.begin(cell, path, loaded)
+    run, name = cases.start_run(cell, path, loaded)
     cell.ask("world", "hang", name=None)
-    run.wait_until(lambda: "touch the tool" in run.words, "words about the load")
+    run.wait_until(lambda: "touch the tool" in run.output, "words about the load")
     run.wait_until(lambda: cell.ask("world", "state")["load"] == name, "the load again")
     run.next_reading("the load that was hung again")
     run.interrupt()
     cases.failed(run, 130)
-    cases.right(cell, path)
+    cases.check_readings(cell, path)
 
 
 @pytest.mark.slow
 def test_an_arm_jogged_before_a_campaign_goes_on_is_asked_for(cell: cases.Site, path: Path) -> None:
-    run, _ = cases.begin(cell, path, cases.Run.measuring)
+    run, _ = cases.start_run(cell, path, cases.Run.measuring)
     run.kill()
     run.end()
     somebody_jogs(cell)
     again = cases.Run(cell, path)
-    again.wait_until(lambda: "does not stand where it was left" in again.words, "a question")
+    again.wait_until(lambda: "does not stand where it was left" in again.output, "a question")
     again.interrupt()
     again.end()
 

@@ -72,7 +72,7 @@ def damage(device: str, op: str) -> cases.Fault:
 
 def once(device: str, op: str, **arguments: object) -> cases.Fault:
     """What is over after once."""
-    return cases.Fault(f"{device} {op}", cases.act(device, op, **arguments), cases.nothing, ())
+    return cases.Fault(f"{device} {op}", cases.act(device, op, **arguments), cases.no_action, ())
 
 
 OVERCOME = {
@@ -104,54 +104,54 @@ START = {
 }
 
 
-@cases.each(TRACKER)
+@cases.parametrize_faults(TRACKER)
 def test_a_fault_of_the_tracker(fault: cases.Fault, cell: cases.Site, path: Path) -> None:
-    cases.meets(fault, cell, path, moving=False)
+    cases.check_fault(fault, cell, path, moving=False)
 
 
-@cases.each(FORCE)
+@cases.parametrize_faults(FORCE)
 def test_a_fault_of_the_force_sensor_in_motion(
     fault: cases.Fault, cell: cases.Site, path: Path
 ) -> None:
-    cases.meets(fault, cell, path, moving=True)
+    cases.check_fault(fault, cell, path, moving=True)
 
 
 @pytest.mark.slow
-@cases.each(FORCE)
+@cases.parametrize_faults(FORCE)
 def test_a_fault_of_the_force_sensor_at_rest(
     fault: cases.Fault, cell: cases.Site, path: Path
 ) -> None:
-    cases.meets(fault, cell, path, moving=False)
+    cases.check_fault(fault, cell, path, moving=False)
 
 
 @pytest.mark.slow
 def test_a_hit_stops_the_arm(cell: cases.Site, path: Path) -> None:
     """A collision is over after a moment, for the arm bounces off."""
-    run, goal = cases.begin(cell, path, cases.Run.moving)
+    run, goal = cases.start_run(cell, path, cases.Run.moving)
     since = time.monotonic()
     cell.ask("force", "overload", force=HIT)
     time.sleep(0.1)
     cell.ask("force", "overload", force=NO_FORCE)
     line = cases.failed(run)
-    cases.stopped_on_its_way(cell, since, goal)
+    cases.check_stopped_on_its_way(cell, since, goal)
     assert re.search(TOO_MUCH, line), line
-    cases.right(cell, path)
+    cases.check_readings(cell, path)
 
 
 def test_faults_that_are_overcome_cost_nothing(cell: cases.Site, path: Path) -> None:
     """All of them in one run, each for a whole reading, at both lines at a time."""
-    run, _ = cases.begin(cell, path, cases.Run.measuring)
+    run, _ = cases.start_run(cell, path, cases.Run.measuring)
     for row in zip_longest(*OVERCOME.values()):
         faults = [fault for fault in row if fault is not None]
         for fault in faults:
-            fault.do(cell)
+            fault.cause(cell)
         run.measuring()
         run.next_reading(", ".join(fault.name for fault in faults))
         for fault in faults:
-            fault.undo(cell)
+            fault.mend(cell)
     run.interrupt()
     cases.failed(run, 130)
-    cases.right(cell, path)
+    cases.check_readings(cell, path)
 
 
 @pytest.mark.slow
@@ -161,13 +161,13 @@ def test_instruments_that_are_not_ready_are_named_at_once(
 ) -> None:
     arrivals = cell.ask("arm", "state")["arrivals"]
     for fault in START[what]:
-        fault.do(cell)
+        fault.cause(cell)
     try:
         line = cases.failed(cases.Run(cell, path))
         assert cell.ask("arm", "state")["arrivals"] == arrivals
     finally:
         for fault in START[what]:
-            fault.undo(cell)
+            fault.mend(cell)
     assert "tracker" in line
     assert "force sensor" in line
 
@@ -181,7 +181,7 @@ def test_the_operator_hangs_the_wrong_load_and_is_told(cell: cases.Site, tmp_pat
     code, words = run.end()
     assert code == 0, words
     assert "asked to take everything off: the force sensor feels" in words
-    cases.right(short, path)
+    cases.check_readings(short, path)
 
 
 @pytest.mark.slow
@@ -190,13 +190,13 @@ def test_an_operator_who_keeps_hanging_the_wrong_load_ends_the_run(
 ) -> None:
     path = tmp_path / "loads.hilcal"
     short = cell.shorter(tmp_path, poses=1)
-    run, _ = cases.begin(short, path, cases.Run.measuring)
+    run, _ = cases.start_run(short, path, cases.Run.measuring)
     for _ in range(3):
         cell.ask("world", "mistake", name="10kg")
     line = cases.failed(run)
     assert "asked 3 times to hang 5kg" in line
     assert "10.0 kg" in line
-    cases.right(short, path)
+    cases.check_readings(short, path)
     cases.finish(short, path)
 
 

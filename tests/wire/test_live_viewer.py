@@ -12,7 +12,15 @@ import pytest
 from rerun.chunk import RrdReader
 
 from hilcal.present.viewer.recording import executable
-from tests.support.campaign_cases import STARVED, TRIES, EndedError, Run, Site, right, whole
+from tests.support.campaign_cases import (
+    STARVED,
+    TRIES,
+    EndedError,
+    Run,
+    Site,
+    check_complete,
+    check_readings,
+)
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("nothing_goes_on")]
 
@@ -45,20 +53,20 @@ def test_whatever_happens_to_the_viewer_the_campaign_is_whole(
     # Ctrl-C: the recording is complete, and no process is left
     run = Run(cell, path, "--view")
     run.some_readings()
-    served = URL.search(run.words)
+    served = URL.search(run.output)
     assert served is not None
     run.interrupt()
     code, words = run.end()
     assert code == 130, words
     assert f"recorded {recording}" in words
     assert RrdReader(recording).store() is not None
-    assert run.left_behind() == []
-    right(cell, path)
+    assert run.orphans() == []
+    check_readings(cell, path)
 
     # a viewer that is frozen all the time, and then the process that is killed
     run = Run(cell, path, "--view")
-    run.wait_until(lambda: URL.search(run.words) is not None, "viewer")
-    found = URL.search(run.words)
+    run.wait_until(lambda: URL.search(run.output) is not None, "viewer")
+    found = URL.search(run.output)
     assert found is not None
     viewer = subprocess.Popen(
         [executable(), "--port", "auto", "--save", str(tmp_path / "frozen.rrd"), found.group()],
@@ -72,13 +80,13 @@ def test_whatever_happens_to_the_viewer_the_campaign_is_whole(
         run.next_reading("a frozen viewer")
         os.kill(live_process(run).pid, signal.SIGKILL)
         run.next_reading("a killed process")
-        assert "the live viewer has ended; everything else goes on" in run.words
+        assert "the live viewer has ended; everything else goes on" in run.output
         run.interrupt()
         run.end()
     finally:
         viewer.kill()
         viewer.wait()
-    right(cell, path)
+    check_readings(cell, path)
 
     # to the end; what earlier sessions measured is in the recording as well
     for left in reversed(range(TRIES)):
@@ -88,5 +96,5 @@ def test_whatever_happens_to_the_viewer_the_campaign_is_whole(
             break
         if not left or not STARVED.search(words):
             raise EndedError(words)
-    whole(cell, path)
+    check_complete(cell, path)
     assert drawn(recording) == len(cell.plan.steps)

@@ -29,8 +29,8 @@ from hilcal.store.run_log import RunLog
 from tests.support.calibrate_process import CELL
 from tests.support.cli_cases import Capsys, ok, refused, run
 from tests.support.factory_cases import write
-from tests.support.living_cell import config, world_of
 from tests.support.rows import first
+from tests.support.running_world import config, world_of
 
 NETFT = {"driver": "netft", "host": "192.168.1.1", "origin_m": [0.0, 0.0, 0.04]}
 

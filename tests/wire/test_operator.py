@@ -19,8 +19,8 @@ from hilcal.measuring import devices
 from hilcal.store.campaign_file import CampaignFile
 from tests.support.campaign_cases import STARVED, TRIES, Site
 from tests.support.cli_cases import Capsys, run
-from tests.support.living_cell import config
 from tests.support.paths import ROOT
+from tests.support.running_world import config
 from tests.support.screen import AtTerminal
 
 # the simulated person
@@ -141,30 +141,30 @@ def test_the_person_is_asked_and_presses_enter():
     )
     with sits(*asked) as person:
         for k, words in enumerate(told):
-            person.sees(ASKED, k + 1)
+            person.wait_for_words(ASKED, k + 1)
             question = person.text.rpartition("hung")[2]
             assert all(part in question for part in words)
             assert ("weight" in question) == (k == 0)
-            person.types("\n")
-        assert person.ends() == 0
+            person.type_keys("\n")
+        assert person.wait_for_end() == 0
         assert person.text.count("hung") == 3
         assert person.lines[0] == "problems:"
 
 
 def test_what_was_typed_before_the_question_is_no_answer():
     with sits(["5kg", ""]) as person:
-        person.types("q\n")  # typed ahead, while the program starts
-        person.sees(ASKED)
-        person.types("\n")
-        assert person.ends() == 0
+        person.type_keys("q\n")  # typed ahead, while the program starts
+        person.wait_for_words(ASKED)
+        person.type_keys("\n")
+        assert person.wait_for_end() == 0
         assert person.lines[-1] == "hung"
 
 
 def test_a_closed_terminal_is_no_answer():
     with sits(["5kg", ""]) as person:
-        person.sees(ASKED)
-        person.types("\x04")  # end of file
-        assert person.ends() == 0
+        person.wait_for_words(ASKED)
+        person.type_keys("\x04")  # end of file
+        assert person.wait_for_end() == 0
         assert "error: operator: the terminal was closed before it was answered" in person.lines
 
 
@@ -212,8 +212,8 @@ def test_questions_stay_answers_are_understood_and_ctrl_c_says_how_to_go_on(
                 if not left or not STARVED.search(person.text):
                     raise
                 continue
-            person.types("\x03")
-            assert person.ends() == 130
+            person.type_keys("\x03")
+            assert person.wait_for_end() == 130
             with CampaignFile.open(path) as campaign:
                 safe = campaign.n_readings
             assert safe >= 2
@@ -226,9 +226,9 @@ def test_questions_stay_answers_are_understood_and_ctrl_c_says_how_to_go_on(
             assert "banana" in person.text
         break
     with AtTerminal("run", toml.name, "-o", path.name, "--resume", home=tmp_path) as person:
-        person.keeps(ASKED)
-        person.types("q\n")
-        assert person.ends() == 3
+        person.check_words_stay(ASKED)
+        person.type_keys("q\n")
+        assert person.wait_for_end() == 3
         assert "error: stopped by the operator" in person.text
         assert f"{safe} of {planned} readings are safe" in person.text
         assert "Traceback" not in person.text
@@ -236,12 +236,12 @@ def test_questions_stay_answers_are_understood_and_ctrl_c_says_how_to_go_on(
 
 def at_the_first_question(person: AtTerminal) -> None:
     """Give a wrong answer, and then the right one."""
-    person.keeps(f"Take every load off the tool, and do not touch the arm. {ASKED}")
-    person.types("banana\n")
-    person.keeps(f"{ASKED} banana 'banana' is no answer. Press Enter when it is done")
-    person.keeps(ASKED, 2)
-    person.types("\n")
-    person.keeps("Done: nothing hangs.")
+    person.check_words_stay(f"Take every load off the tool, and do not touch the arm. {ASKED}")
+    person.type_keys("banana\n")
+    person.check_words_stay(f"{ASKED} banana 'banana' is no answer. Press Enter when it is done")
+    person.check_words_stay(ASKED, 2)
+    person.type_keys("\n")
+    person.check_words_stay("Done: nothing hangs.")
 
 
 def test_check_gives_every_fact_as_a_field(cell: Site, toml: Path, capsys: Capsys) -> None:

@@ -19,8 +19,8 @@ from hilcal.readings.readings import States
 from hilcal.robot.catalogue import configs_dir
 from tests.support.cli_cases import Capsys
 from tests.support.cli_cases import run as command
-from tests.support.living_cell import WEIGHT, Q, config, world_of
 from tests.support.reflector_cases import NAMES, OFFSETS
+from tests.support.running_world import WEIGHT, Q, config, world_of
 from tests.support.timing import wait_until
 
 RADIUS = 0.05
@@ -143,7 +143,9 @@ def test_the_tracker_sees_the_sag_under_the_load_that_the_force_sensor_feels(cel
         approach=np.tile(arm["side"], (2, 1)),
     )
     slip = np.tile(cell.ask("world", "state")["slip"], (2, 1))
-    position = world_of(made_cell(), hysteresis=np.full(6, 5e-5)).sight(both, slip).position
+    position = (
+        world_of(made_cell(), hysteresis=np.full(6, 5e-5)).ideal_readings(both, slip).position
+    )
     sag = position[1] - position[0]
     spread = empty[1] + loaded[1]
     assert chi_square(sag, spread) > 1e3  # there is something to see
@@ -168,6 +170,6 @@ def test_the_tracker_sees_the_arm_arrive_where_it_was_sent(cell):
         (value, covariance), state = measured(tracker), cell.ask("world", "state")
     side = np.sign(TURN)[None]  # from which it arrived
     last = States(q=goal[None], wrench=np.zeros((1, 6)), approach=side)
-    want = world.sight(last, np.array([state["slip"]])).position[0]
+    want = world.ideal_readings(last, np.array([state["slip"]])).position[0]
     assert chi_square(value - want, covariance) < 28.0
     np.testing.assert_allclose(state["encoder"], goal, atol=2e-5)

@@ -341,7 +341,7 @@ def test_an_address_in_use_is_refused(tmp_path, port):
         taken.listen()
         process = server(tmp_path, host)
         process.start()
-        wait_until(lambda: process.ended, "ended")
+        wait_until(lambda: process.has_ended, "ended")
         with pytest.raises(DeviceError, match=rf"exit code 3: .*{host}:{port} is in use"):
             process.check()
         process.end()

@@ -28,9 +28,9 @@ from hilcal.drivers.simulated.world import World
 from hilcal.drivers.simulated.world_server import write_world
 from hilcal.errors import DeviceError, InputError
 from tests.support.arm_cases import ODD, arm_of
-from tests.support.living_cell import WEIGHT, config, same, states, world_of
 from tests.support.paths import ROOT
 from tests.support.rows import first
+from tests.support.running_world import WEIGHT, config, same_bytes, states, world_of
 from tests.support.sim_ur_cases import SimulatedUr
 from tests.support.sim_ur_cases import start as start_server
 from tests.support.timing import runs, wait_until
@@ -142,8 +142,8 @@ def test_the_truth_goes_on_with_the_arm_after_a_restart_of_the_world(cell):
     truth, state = board.read("truth"), cell.ask("world", "state")
     arm = board.read("arm")
     state_of = replace(states(arm["q"], WEIGHT, 0.0), approach=arm["side"][None].copy())
-    want = world_of(whole()).sight(state_of, np.array([state["slip"]]))
-    assert same(truth["target"], want.position[0])
+    want = world_of(whole()).ideal_readings(state_of, np.array([state["slip"]]))
+    assert same_bytes(truth["target"], want.position[0])
     cell.ask("world", "hang", name=None)
 
 
@@ -166,7 +166,7 @@ def test_nothing_is_left_behind(tmp_path):
 PARENT = """
 import sys, time
 from pathlib import Path
-from tests.support.living_cell import config, world_of
+from tests.support.running_world import config, world_of
 from hilcal.drivers.simulated.cell_processes import SimulatedCell
 made = config(force_sensor={"driver": "bota", "port": "x"})
 cell = SimulatedCell.start(world_of(made), made, Path(sys.argv[1]), 3)
@@ -277,7 +277,7 @@ def process(tmp_path):
     arguments = ("--seed", "5")
     process = DeviceProcess("world", "hilcal.drivers.simulated.world_server", tmp_path, arguments)
     process.start()
-    wait_until(lambda: process.socket.exists() or process.ended, "started")
+    wait_until(lambda: process.socket.exists() or process.has_ended, "started")
     process.check()
     yield process
     process.end()
@@ -288,13 +288,13 @@ def test_a_world_that_died_goes_on_where_it_was(process, tmp_path):
     ask(process.socket, "hang", name="pull")
     since, begun = board.read("truth")["load_since"], board.time
     ask(process.socket, "die")
-    wait_until(lambda: process.ended, "ended")
+    wait_until(lambda: process.has_ended, "ended")
     with pytest.raises(DeviceError, match="ended with exit code 70"):
         process.check()
     with pytest.raises(DeviceError, match=r"simulated device at world\.sock"):
         ask(process.socket, "state")
     process.start()
-    wait_until(lambda: process.socket.exists() or process.ended, "started")
+    wait_until(lambda: process.socket.exists() or process.has_ended, "started")
     state = ask(process.socket, "state")
     assert (state["load"], state["load_since"]) == ("pull", since)
     assert state["time"] > begun
@@ -316,7 +316,7 @@ def test_a_process_without_a_world_says_so_in_one_line(tmp_path):
         "world", "hilcal.drivers.simulated.world_server", tmp_path, ("--seed", "5")
     )
     process.start()
-    wait_until(lambda: process.ended, "ended")
+    wait_until(lambda: process.has_ended, "ended")
     with pytest.raises(DeviceError, match=r"world: ended with exit code 2: .*world\.json"):
         process.check()
     process.end()

@@ -33,22 +33,22 @@ SLOW = 0.3  # position of the speed slider meanwhile: the arm moves for about ha
 def test_a_plea_to_end_stops_the_arm_first(
     kind: signal.Signals, cell: cases.Site, path: Path
 ) -> None:
-    run, goal = cases.begin(cell, path, cases.Run.moving)
+    run, goal = cases.start_run(cell, path, cases.Run.moving)
     since = time.monotonic()
     if kind == signal.SIGINT:
         run.interrupt()  # a terminal sends it to the whole group
     else:
         run.process.send_signal(kind)
     assert "interrupted" in cases.failed(run, 130)
-    cases.stopped_on_its_way(cell, since, goal)
-    cases.right(cell, path)
+    cases.check_stopped_on_its_way(cell, since, goal)
+    cases.check_readings(cell, path)
     with CampaignFile.open(path) as campaign:
         assert RunLog(campaign).events()[-1]["kind"] == "interrupted"
 
 
 @pytest.mark.slow
 def test_ctrl_c_twice_in_a_row_stops_it_too(cell: cases.Site, path: Path) -> None:
-    run, goal = cases.begin(cell, path, cases.Run.moving)
+    run, goal = cases.start_run(cell, path, cases.Run.moving)
     since = time.monotonic()
     run.interrupt()
     time.sleep(0.05)
@@ -58,9 +58,9 @@ def test_ctrl_c_twice_in_a_row_stops_it_too(cell: cases.Site, path: Path) -> Non
     assert code in (3, 130, -signal.SIGINT)
     assert words.splitlines()[-1].startswith("error: ")
     assert "Traceback" not in words
-    cases.stopped_on_its_way(cell, since, goal)
-    assert run.left_behind() == []
-    cases.right(cell, path)
+    cases.check_stopped_on_its_way(cell, since, goal)
+    assert run.orphans() == []
+    cases.check_readings(cell, path)
 
 
 def _kill_at_random(cell: cases.Site, path: Path, kills: int, seed: int) -> int:
@@ -73,7 +73,7 @@ def _kill_at_random(cell: cases.Site, path: Path, kills: int, seed: int) -> int:
         moment = rng.uniform(0.0, LONGEST)
         try:
             if killed % 2 == 1:
-                run.wait_until(lambda run=run: cases.BEGUN in run.words, "a beginning")
+                run.wait_until(lambda run=run: cases.STARTED in run.output, "a beginning")
             end = time.monotonic() + moment
             run.wait_until(lambda end=end: time.monotonic() >= end, "it was killed")
         except cases.EndedError as error:
@@ -86,10 +86,10 @@ def _kill_at_random(cell: cases.Site, path: Path, kills: int, seed: int) -> int:
         run.kill()
         run.process.wait()
         moves = cell.ask("arm", "state")["moving"]
-        assert run.left_behind() == []
-        assert "error:" not in run.words
+        assert run.orphans() == []
+        assert "error:" not in run.output
         if moves:
-            cases.stopped_within(cell, since)
+            cases.check_stopped_within(cell, since)
         moved += moves
         if path.exists():
             _sound(path)
@@ -130,20 +130,20 @@ def test_a_full_disk_stops_the_arm_and_loses_nothing(cell: cases.Site, tmp_path:
 @pytest.mark.slow
 def test_two_programs_at_one_cell(cell: cases.Site, tmp_path: Path) -> None:
     short = cell.shorter(tmp_path, poses=2)
-    first, _ = cases.begin(short, tmp_path / "first.hilcal", cases.Run.measuring)
+    first, _ = cases.start_run(short, tmp_path / "first.hilcal", cases.Run.measuring)
     second = cases.Run(short, tmp_path / "second.hilcal")
     line = cases.failed(second)
     assert line.count("in use by another program") == 2  # both serial ports
     code, words = first.end()
     assert code == 0, words
-    cases.whole(short, tmp_path / "first.hilcal")
+    cases.check_complete(short, tmp_path / "first.hilcal")
 
 
 @pytest.mark.slow
 def test_two_programs_at_one_campaign_file(cell: cases.Site, tmp_path: Path) -> None:
     short = cell.shorter(tmp_path, poses=1)
     path = tmp_path / "locked.hilcal"
-    run, _ = cases.begin(short, path, cases.Run.measuring)
+    run, _ = cases.start_run(short, path, cases.Run.measuring)
     with sqlite3.connect(path, isolation_level=None) as other:
         other.execute("BEGIN EXCLUSIVE")
         line = cases.failed(run, 2)
@@ -165,7 +165,7 @@ def test_a_campaign_that_is_gone_is_said_and_found(
     """Deleted, moved or replaced by another program: the arm stops, and nothing is lost."""
     short = cell.shorter(tmp_path, poses=2)
     path = tmp_path / "gone.hilcal"
-    run, _ = cases.begin(short, path, cases.Run.measuring)
+    run, _ = cases.start_run(short, path, cases.Run.measuring)
     with CampaignFile.open(path, read_only=True) as campaign:
         measured = campaign.n_readings
     if how == "moved":

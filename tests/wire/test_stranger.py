@@ -67,7 +67,7 @@ class Stranger:
         with self.sits(*words) as terminal:
             if person is not None:
                 person(terminal)
-            found = terminal.ends()
+            found = terminal.wait_for_end()
             shown = "\n".join(terminal.lines)
             assert found == code, shown
             assert "Traceback" not in shown
@@ -98,14 +98,14 @@ def plain(text: str) -> set[str]:
 def hangs_what_is_asked_for(terminal: AtTerminal, stop: str = "") -> None:
     """Answer every question; press Ctrl-C when so many readings are there."""
     answered = 0
-    while terminal.look():
+    while terminal.read_screen():
         if terminal.text.count(ASKED) > answered:
-            terminal.keeps(ASKED, answered + 1)
-            terminal.types("\n")
+            terminal.check_words_stay(ASKED, answered + 1)
+            terminal.type_keys("\n")
             answered += 1
-            terminal.sees("Done: ", answered)
+            terminal.wait_for_words("Done: ", answered)
         elif stop and terminal.page_with(stop):
-            terminal.types("\x03")
+            terminal.type_keys("\x03")
             stop = ""
 
 
@@ -115,7 +115,7 @@ def run_to_the_end(stranger: Stranger, *words: str) -> str:
         with stranger.sits(*words) as terminal:
             hangs_what_is_asked_for(terminal)
             shown = "\n".join(terminal.lines)
-            if terminal.ends() == 0:
+            if terminal.wait_for_end() == 0:
                 return shown
             assert STARVED.search(terminal.text), shown
             assert f"  hilcal {' '.join(words[:4])} --resume" in terminal.lines
@@ -129,15 +129,15 @@ def test_from_nothing_to_a_calibrated_arm(columns: int, tmp_path: Path) -> None:
 
     def answers(terminal: AtTerminal) -> None:
         for k, (question, answer) in enumerate(ANSWERS):
-            terminal.sees(question, sum(q == question for q, _ in ANSWERS[: k + 1]))
-            terminal.types(f"{answer}\n")
+            terminal.wait_for_words(question, sum(q == question for q, _ in ANSWERS[: k + 1]))
+            terminal.type_keys(f"{answer}\n")
 
     assert "Written: CELL.toml" in stranger.types("init", person=answers)
     plan = ("plan", "CELL.toml", "-o", "plan.json")
     assert "certified lower bound" in stranger.types(*plan, "--poses", "8")
     rehearsal = ("--plan", "plan.json", "--person", "--clock", "20", "--hide", HIDDEN)
     with stranger.sits("simulate", "CELL.toml", "-o", "DIR", *rehearsal) as devices:
-        devices.sees("Ctrl-C ends them.")
+        devices.wait_for_words("Ctrl-C ends them.")
         check = stranger.types("check", "DIR/cell.toml", "--plan", "plan.json")
         assert "All devices are ready. Nothing was moved." in check
         assert "The plan keeps every limit" in check
@@ -164,8 +164,8 @@ def test_from_nothing_to_a_calibrated_arm(columns: int, tmp_path: Path) -> None:
             found = stranger.types("refine", "run.hilcal")
         assert "Verdict: adequate" in found, found
         assert HIDDEN in found, found
-        devices.types("\x03")
-        assert devices.ends() == 0
+        devices.type_keys("\x03")
+        assert devices.wait_for_end() == 0
     stranger.same_words_as_a_file("compare", "run.hilcal")
     corrected(stranger, tmp_path)
     assert len(stranger.typed) <= COMMANDS

@@ -48,7 +48,7 @@ def test_opening_and_report_move_nothing_and_upload_nothing(sim):
 def put_right(sim):
     """After the test there is no fault."""
     yield
-    cases.put_right(sim)
+    cases.restore(sim)
 
 
 @pytest.mark.usefixtures("put_right")
@@ -144,7 +144,7 @@ def test_a_command_that_fails_since_the_program_has_ended_says_so(lost, arm, sim
 
     for name, command in (
         ("set_payload", lambda: arm.set_payload(4.0, cases.COM)),
-        ("move", lambda: arm.start_move(cases.away(arm, by=0.2), 0.5, 0.5)),
+        ("move", lambda: arm.start_move(cases.displaced_joints(arm, by=0.2), 0.5, 0.5)),
     ):
         arm.take_control(cases.MASS, cases.COM)
         with monkeypatch.context() as patched:
@@ -181,7 +181,7 @@ def test_motion_that_nobody_watches_stops_by_itself(arm, sim):
 
 
 def test_second_program_is_refused_and_disturbs_nothing(arm, sim):
-    goal = cases.away(arm, by=0.5)
+    goal = cases.displaced_joints(arm, by=0.5)
     with closing(open_arm(cases.config(sim.host))) as other:
         arm.start_move(goal, cases.SPEED, cases.ACCELERATION)
         assert arm.moving()
@@ -199,7 +199,7 @@ def test_motion_in_a_world_that_goes_faster(tmp_path):
         closing(cases.start(tmp_path, scale=20.0)) as running,
         closing(cases.controlled(running, clock=20.0)) as arm,
     ):
-        goal = cases.away(arm, by=2.0)
+        goal = cases.displaced_joints(arm, by=2.0)
         arm.start_move(goal, cases.SPEED, cases.ACCELERATION)
         cases.finish(arm)
         np.testing.assert_allclose(running.admin()["q"], goal, atol=2e-5)

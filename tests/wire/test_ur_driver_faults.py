@@ -45,9 +45,9 @@ def test_fault_in_motion_stops_the_arm_and_names_its_cause(arm, sim, fault):
     for command in (arm.moving, lambda: arm.start_move(np.zeros(6), 0.5, 0.5)):
         with pytest.raises(DeviceError, match="not under control"):  # it has not ended by itself
             command()
-    cases.put_right(sim)
+    cases.restore(sim)
     arm.take_control(cases.MASS, cases.COM)  # what the next run does
-    arm.start_move(cases.away(arm, by=0.1), cases.SPEED, cases.ACCELERATION)
+    arm.start_move(cases.displaced_joints(arm, by=0.1), cases.SPEED, cases.ACCELERATION)
     cases.finish(arm)
 
 
@@ -63,7 +63,7 @@ def test_program_that_ended_is_the_cause_though_the_process_that_commands_hangs(
 
 def test_motion_that_is_refused_is_told(arm, sim):
     sim.admin("refuse_motion", on=True)
-    goal = cases.away(arm)
+    goal = cases.displaced_joints(arm)
     text = cases.error_of(lambda: arm.start_move(goal, cases.SPEED, cases.ACCELERATION))
     assert "did not take the motion" in text
     assert not sim.admin()["moving"]
@@ -100,7 +100,7 @@ def test_program_that_a_protective_stop_left_paused_is_ended(tmp_path):
         os.kill(other.workers[1], signal.SIGKILL)
         assert running.wait("safety", 1)["runtime"] == 4
         with closing(cases.controlled(running)) as arm:
-            arm.start_move(cases.away(arm, by=0.1), cases.SPEED, cases.ACCELERATION)
+            arm.start_move(cases.displaced_joints(arm, by=0.1), cases.SPEED, cases.ACCELERATION)
             cases.finish(arm)
 
 
@@ -150,7 +150,7 @@ def test_motion_scaled_to_nothing_is_given_up(arm, sim):
 
 def test_slow_speed_slider_is_waited_for(arm, sim):
     sim.admin("set", slider=0.2)
-    goal = cases.away(arm, by=0.05)
+    goal = cases.displaced_joints(arm, by=0.05)
     arm.start_move(goal, cases.SPEED, cases.ACCELERATION)
     cases.finish(arm)
     np.testing.assert_allclose(sim.admin()["q"], goal, atol=2e-5)
@@ -163,7 +163,7 @@ def test_link_lost_at_rest_gives_no_old_values(arm, sim, fault):
     for _ in range(3):
         with pytest.raises(DeviceError, match="the link is lost"):
             arm.sample()
-    cases.put_right(sim)
+    cases.restore(sim)
     arm.take_control(cases.MASS, cases.COM)
     assert arm.sample().payload == cases.MASS
 
@@ -239,7 +239,7 @@ from tests.support import ur_driver_cases as cases
 from hilcal.drivers.ur import open_arm
 arm = open_arm(cases.config(sys.argv[1]))
 arm.take_control(1.0, np.array([0.0, 0.0, 0.1]))
-arm.start_move(cases.away(arm, 2.0), cases.SPEED, cases.ACCELERATION)
+arm.start_move(cases.displaced_joints(arm, 2.0), cases.SPEED, cases.ACCELERATION)
 while arm.moving():
     print("moves", flush=True)
     time.sleep(0.02)

@@ -41,7 +41,7 @@ from hilcal.store.campaign_file import CampaignFile
 from tests.support import ur_driver_cases as cases
 from tests.support.cli_cases import ok
 from tests.support.factory_cases import write
-from tests.support.living_cell import config, world_of
+from tests.support.running_world import config, world_of
 from tests.support.ur_driver_cases import server
 
 FIELDS = {

@@ -13,7 +13,7 @@ from rerun.chunk import RrdReader
 
 from hilcal.present.viewer.recording import executable
 from hilcal.store.campaign_file import CampaignFile
-from tests.support.bench_cases import BASE, stored
+from tests.support.bench_cases import BASE, store_campaign
 from tests.support.timing import wait_until
 
 pytestmark = pytest.mark.slow
@@ -51,7 +51,7 @@ def revisions(recording: Path) -> set[int]:
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
 def test_added_and_removed_a_viewer_sees_both_revisions(tmp_path: Path) -> None:
-    run = stored(tmp_path / "run.hilcal")
+    run = store_campaign(tmp_path / "run.hilcal")
     for word, seen in (("add", {1, 2}), ("remove", {1, 2, 3})):
         process, told = begun(tmp_path, word, run, BASE)
         wait_until(lambda told=told: URL.search(told.read_text()), "served", LONG)
@@ -78,7 +78,7 @@ def test_added_and_removed_a_viewer_sees_both_revisions(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
 def test_a_refinement_is_shown_to_its_last_revision(tmp_path: Path) -> None:
-    run = stored(tmp_path / "run.hilcal")
+    run = store_campaign(tmp_path / "run.hilcal")
     process, told = begun(tmp_path, "refine", run)
     assert process.wait(LONG) == 0, told.read_text()
     with CampaignFile.open(run, read_only=True) as file:
@@ -89,7 +89,7 @@ def test_a_refinement_is_shown_to_its_last_revision(tmp_path: Path) -> None:
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
 def test_sigterm_completes_the_recording_and_leaves_no_process(tmp_path: Path) -> None:
-    run = stored(tmp_path / "run.hilcal")
+    run = store_campaign(tmp_path / "run.hilcal")
     process, told = begun(tmp_path, "refine", run)
     recording = run.with_name("run.live.rrd")
     wait_until(lambda: recording.exists() and revisions(recording), "recorded", LONG)

@@ -32,12 +32,12 @@ from hilcal.robot import se3
 from hilcal.robot.arm import Arm, as_drawn
 from hilcal.types import Floats
 
-SAME = 1e-6
+FRAME_TOLERANCE = 1e-6
 """m, rad; frames that differ by less count as the same: descriptions have six decimals."""
 NEAR_M, NEAR_RAD = 5e-3, 1e-2
 """m, rad; a file with axes within these distances is of the same arm: many files are rounded to
 millimetres, others are corrected already. A choice; the corrected file is exact in any case."""
-LEFT = 1e-9
+EDIT_TOLERANCE = 1e-9
 """m, rad; a transform that changes less keeps its text."""
 Edits = list[tuple[Span, str]]
 LARGEST, SMALLEST = 1e6, 1e-6
@@ -52,22 +52,22 @@ class Node:
     tag: str
     attributes: dict[str, str]  # by name, as written
     line: int  # from 1
-    begin: int  # offset of its start tag
+    start: int  # offset of its start tag
     end: int  # offset of the start tag's end
-    close: int = 0  # offset of its end tag
+    end_tag: int = 0  # offset of its end tag
     parent: "Node | None" = None  # None for the root
     children: list["Node"] = field(default_factory=list)  # in the order of the text
 
-    def first(self, tag: str) -> "Node | None":
+    def child(self, tag: str) -> "Node | None":
         """Return the first child with a tag."""
         return next((c for c in self.children if c.tag == tag), None)
 
-    def every(self, *tags: str) -> Iterator["Node"]:
+    def descendants(self, *tags: str) -> Iterator["Node"]:
         """Yield descendants with some tags, in the order of the text."""
         for child in self.children:
             if child.tag in tags:
                 yield child
-            yield from child.every(*tags)
+            yield from child.descendants(*tags)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,24 +78,24 @@ class Document:
     text: str  # with one character per byte
     root: Node
 
-    def refused(self, node: Node, reason: str) -> InputError:
+    def error(self, node: Node, reason: str) -> InputError:
         """Return the error of an element."""
         return InputError(f"{self.name}: line {node.line}: {reason}")
 
-    def attribute(self, node: Node, name: str) -> Span | None:
+    def attribute_span(self, node: Node, name: str) -> Span | None:
         """Place of the value of an attribute; None if absent."""
-        tag = self.text[node.begin : node.end]
+        tag = self.text[node.start : node.end]
         m = re.search(rf"\s{re.escape(name)}\s*=\s*(\"([^\"]*)\"|'([^']*)')", tag)
         if m is None:
             return None
-        return Span(0, node.begin + m.start(1) + 1, node.begin + m.end(1) - 1)
+        return Span(0, node.start + m.start(1) + 1, node.start + m.end(1) - 1)
 
-    def put(self, node: Node, name: str, value: str) -> tuple[Span, str]:
+    def attribute_edit(self, node: Node, name: str, value: str) -> tuple[Span, str]:
         """Return the edit that sets an attribute, or adds it."""
-        place = self.attribute(node, name)
+        place = self.attribute_span(node, name)
         if place is not None:
             return place, value
-        begin = node.begin + 1 + len(node.tag)
+        begin = node.start + 1 + len(node.tag)
         return Span(0, begin, begin), f' {name}="{value}"'
 
     def numbers(self, node: Node, text: str, count: int) -> Floats:
@@ -106,14 +106,14 @@ class Document:
             values = np.empty(0)
         if len(values) != count or not (np.abs(values) <= LARGEST).all():
             reason = f"<{escaped(node.tag)}> has '{escaped(text[:40])}'; valid: {count} numbers"
-            raise self.refused(node, reason)
+            raise self.error(node, reason)
         return values
 
     def direction(self, node: Node, values: Floats) -> Floats:
         """Return a vector of length 1."""
         size = float(np.linalg.norm(values))
         if size < SMALLEST:
-            raise self.refused(node, f"<{escaped(node.tag)}> has a direction of length 0")
+            raise self.error(node, f"<{escaped(node.tag)}> has a direction of length 0")
         return np.asarray(values / size)
 
 
@@ -138,7 +138,7 @@ def read_xml(path: Path) -> Document:
             raise InputError(f"{path}: nested too deeply; valid: a robot's description")
 
     def end(tag: str) -> None:
-        open_.pop().close = parser.CurrentByteIndex
+        open_.pop().end_tag = parser.CurrentByteIndex
 
     def entity(*_: object) -> None:
         raise InputError(f"{path}: it has entities of its own; valid: XML without <!ENTITY>")
@@ -161,24 +161,24 @@ class ChainStep:
 
     name: str  # of the element, for people
     line: int  # of it, from 1
-    place: Floats  # (4, 4) in the previous frame
+    transform: Floats  # (4, 4) in the previous frame
     joint: Floats | None
-    """(4, 4) pose of the joint axis (its z) in the frame of `place`; None without a joint."""
+    """(4, 4) pose of the joint axis (its z) in the frame of `transform`; None without a joint."""
     write: Callable[[Floats], Edits]
     """Edits that write another place; raises `InputError` where the file cannot have one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Redrawn:
+class FittedChain:
     """A chain with a corrected arm."""
 
-    places: tuple[Floats, ...]  # (4, 4) new place of each step
+    transforms: tuple[Floats, ...]  # (4, 4) new place of each step
     tip: Floats  # (4, 4) from the flange of the arm to the tip of the file
-    lost: Floats  # (4, 4) transform after the last joint that the file cannot represent
-    rough: float  # largest distance of the file's axes from those of the nominal arm, m
+    unrepresented: Floats  # (4, 4) transform after the last joint that the file cannot represent
+    axis_distance: float  # largest distance of the file's axes from those of the nominal arm, m
 
 
-def redrawn(steps: Sequence[ChainStep], nominal: Arm, arm: Arm, file: str) -> Redrawn:
+def fitted_chain(steps: Sequence[ChainStep], nominal: Arm, arm: Arm, file: str) -> FittedChain:
     """Return the places of a corrected arm in a file."""
     turning = [k for k, s in enumerate(steps) if s.joint is not None]
     if len(turning) != arm.n:
@@ -193,14 +193,14 @@ def redrawn(steps: Sequence[ChainStep], nominal: Arm, arm: Arm, file: str) -> Re
     for k in (*turning, len(steps)):
         place, end = np.eye(4), np.eye(4)
         if k < len(steps):
-            place, end = steps[k].place, np.asarray(steps[k].joint)
+            place, end = steps[k].transform, np.asarray(steps[k].joint)
         fixed = _product(steps[last:k])
         drawn.append(se3.inverse(joint) @ fixed @ place @ end)
         starts.append((joint, fixed))
         axes.append(end)
         last, joint = k + 1, end
     left, right, rough = _frames(steps, turning, old, drawn, file, nominal.name)
-    places = [s.place for s in steps]
+    places = [s.transform for s in steps]
     lost = np.eye(4)
     for k, (joint, fixed) in enumerate(starts):
         target = se3.inverse(left[k]) @ new[k] @ right[k]
@@ -211,7 +211,7 @@ def redrawn(steps: Sequence[ChainStep], nominal: Arm, arm: Arm, file: str) -> Re
             places[turning[-1] + 1] = joint @ target @ se3.inverse(following)
         else:
             lost = joint @ target
-    return Redrawn(tuple(places), right[-1], lost, rough)
+    return FittedChain(tuple(places), right[-1], lost, rough)
 
 
 def _frames(
@@ -222,7 +222,7 @@ def _frames(
     file: str,
     name: str,
 ) -> tuple[list[Floats], list[Floats], float]:
-    """H_{−1} … H_{n−1}, G_0 … G_n, and `Redrawn.rough`; raises as `redrawn` does."""
+    """H_{−1} … H_{n−1}, G_0 … G_n, and the axis distance; raises as `fitted_chain` does."""
     half = np.diag([-1.0, -1.0, 1.0, 1.0])
     solutions: list[tuple[int, list[Floats], list[Floats], float]] = []
     misses: list[tuple[int, float, float]] = []
@@ -246,7 +246,7 @@ def _frames(
             left.append(right[-1])
         else:
             tip = se3.inverse(old[-1]) @ left[-1] @ drawn[-1]
-            tip = np.eye(4) if moved(tip, np.eye(4)) < NEAR_M else tip
+            tip = np.eye(4) if pose_difference(tip, np.eye(4)) < NEAR_M else tip
             solutions.append((zeros, left, [*right, tip], rough))
     if not solutions:
         k, away, tilt = max(misses)
@@ -269,13 +269,17 @@ def _off(g: Floats) -> tuple[float, float]:
     return float(np.hypot(*g[:2, 3])), float(np.arctan2(np.hypot(g[0, 2], g[1, 2]), g[2, 2]))
 
 
-def edits_of(steps: Sequence[ChainStep], places: Sequence[Floats]) -> tuple[Edits, list[str]]:
+def edits_of(steps: Sequence[ChainStep], transforms: Sequence[Floats]) -> tuple[Edits, list[str]]:
     """Edits of all steps that change, and the names of these steps."""
-    pairs = [(s, p) for s, p in zip(steps, places, strict=True) if moved(s.place, p) > LEFT]
+    pairs = [
+        (s, p)
+        for s, p in zip(steps, transforms, strict=True)
+        if pose_difference(s.transform, p) > EDIT_TOLERANCE
+    ]
     return [edit for s, place in pairs for edit in s.write(place)], [s.name for s, _ in pairs]
 
 
-def moved(a: Floats, b: Floats) -> float:
+def pose_difference(a: Floats, b: Floats) -> float:
     """Difference of two poses: distance in m or angle in rad, whichever is larger."""
     turn = se3.rotation_vector(a[:3, :3].T @ b[:3, :3])
     return float(max(np.linalg.norm(a[:3, 3] - b[:3, 3]), np.linalg.norm(turn)))
@@ -296,4 +300,4 @@ def numbers(values: Floats) -> str:
 
 
 def _product(steps: Sequence[ChainStep]) -> Floats:
-    return reduce(np.matmul, (s.place for s in steps), np.eye(4))
+    return reduce(np.matmul, (s.transform for s in steps), np.eye(4))

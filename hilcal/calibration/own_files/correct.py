@@ -8,8 +8,15 @@ import numpy as np
 
 from hilcal import limits
 from hilcal.calibration.dh_table import dh_rows
-from hilcal.calibration.handover import Corrected
-from hilcal.calibration.own_files.chain_text import LEFT, SAME, edits_of, moved, read_xml, redrawn
+from hilcal.calibration.handover import CorrectedArm
+from hilcal.calibration.own_files.chain_text import (
+    EDIT_TOLERANCE,
+    FRAME_TOLERANCE,
+    edits_of,
+    fitted_chain,
+    pose_difference,
+    read_xml,
+)
 from hilcal.calibration.own_files.link_trees import sdf_chain, urdf_steps
 from hilcal.calibration.own_files.mjcf_text import mjcf_steps
 from hilcal.calibration.programs.program import Span, edited
@@ -23,16 +30,20 @@ _DELTA = re.compile(r"^(\s*delta_(theta|a|d|alpha)\s*=\s*\[)([^\]\n]*)(\].*)$", 
 
 
 @dataclass(frozen=True, slots=True)
-class Correction:
+class CorrectedFile:
     """A corrected file."""
 
     content: bytes
-    said: str  # changes, and what the file cannot represent, for people
+    note: str  # changes, and what the file cannot represent, for people
 
 
 def correct_file(
-    path: Path, nominal: Arm, corrected: Corrected, base: str | None = None, tip: str | None = None
-) -> Correction:
+    path: Path,
+    nominal: Arm,
+    corrected: CorrectedArm,
+    base: str | None = None,
+    tip: str | None = None,
+) -> CorrectedFile:
     """Return a file with the corrected geometry in place of its own."""
     if path.suffix == ".conf":
         return _ur_conf(path, nominal, corrected.arm)
@@ -40,31 +51,32 @@ def correct_file(
     kind = document.root.tag
     if kind == "sdf":
         chain = sdf_chain(document, base, tip)
-        new = redrawn(chain.steps, nominal, corrected.arm, document.name)
-        edits, names = chain.edits(list(new.places))
+        new = fitted_chain(chain.steps, nominal, corrected.arm, document.name)
+        edits, names = chain.edits(list(new.transforms))
     elif kind in _STEPS:
         steps = _STEPS[kind](document, base, tip)
-        new = redrawn(steps, nominal, corrected.arm, document.name)
-        edits, names = edits_of(steps, new.places)
+        new = fitted_chain(steps, nominal, corrected.arm, document.name)
+        edits, names = edits_of(steps, new.transforms)
     else:
         raise InputError(f"{path}: an XML file of <{kind[:40]}>; valid: {KINDS}")
     note = f"{path}: {len(names)} places changed ({', '.join(names)}), all else as it was"
-    if new.rough > SAME:
-        note += f"; its axes lay up to {length(new.rough)} from those of the nominal {nominal.name}"
-    if (shift := moved(new.lost, np.eye(4))) > LEFT:
+    if new.axis_distance > FRAME_TOLERANCE:
+        note += f"; its axes lay up to {length(new.axis_distance)} from those of the nominal "
+        note += nominal.name
+    if (shift := pose_difference(new.unrepresented, np.eye(4))) > EDIT_TOLERANCE:
         note += (
             f"; its tip is the last moving one, which has no place for the flange's own shift "
             f"({length(shift)}): --tip-link"
         )
-    if moved(new.tip, np.eye(4)) > SAME:
+    if pose_difference(new.tip, np.eye(4)) > FRAME_TOLERANCE:
         note += (
             f"; its tip lies {length(float(np.linalg.norm(new.tip[:3, 3])))} from the flange of "
             f"{nominal.name}, and keeps that"
         )
-    return Correction(edited(document.text, edits).encode("latin-1"), note)
+    return CorrectedFile(edited(document.text, edits).encode("latin-1"), note)
 
 
-def _ur_conf(path: Path, nominal: Arm, arm: Arm) -> Correction:
+def _ur_conf(path: Path, nominal: Arm, arm: Arm) -> CorrectedFile:
     """Return UR's `calibration.conf` with the differences between the arm's and nominal DH rows.
 
     The controller adds `delta_theta`, `delta_a`, `delta_d`, `delta_alpha` to the classic rows of
@@ -95,4 +107,4 @@ def _ur_conf(path: Path, nominal: Arm, arm: Arm) -> Correction:
         f"where joint 1's axis lies in the base (up to {length(new.base_moves)}) and how the "
         f"flange sits on the last axis (up to {length(new.flange_moves)})"
     )
-    return Correction(edited(text, edits).encode("latin-1"), note)
+    return CorrectedFile(edited(text, edits).encode("latin-1"), note)

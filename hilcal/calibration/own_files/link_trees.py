@@ -20,13 +20,13 @@ import numpy as np
 
 from hilcal.calibration.handover import origin_of
 from hilcal.calibration.own_files.chain_text import (
-    LEFT,
+    EDIT_TOLERANCE,
     ChainStep,
     Document,
     Edits,
     Node,
-    moved,
     numbers,
+    pose_difference,
     z_to,
 )
 from hilcal.calibration.programs.program import Span
@@ -50,7 +50,7 @@ class LinkTree:
     """The links of a description, and the joints that lead to them."""
 
     document: Document
-    leads: Mapping[str, tuple[str, Node]]  # by child link: its parent link, and the joint
+    parents: Mapping[str, tuple[str, Node]]  # by child link: its parent link, and the joint
 
     def chain(self, base: str | None, tip: str | None) -> tuple[list[Node], list[Node]]:
         """Return the joints from a base up to its common ancestor with a tip, and down to the tip.
@@ -63,20 +63,20 @@ class LinkTree:
         if common is None:
             raise InputError(f"{self.document.name}: no chain from '{base}' to '{to_tip[0]}'")
         up, down = (links[: links.index(common)] for links in (to_base, to_tip))
-        return [self.leads[k][1] for k in up], [self.leads[k][1] for k in reversed(down)]
+        return [self.parents[k][1] for k in up], [self.parents[k][1] for k in reversed(down)]
 
     def _up(self, link: str) -> list[str]:
         """Return a link and its ancestors, the root last."""
         out = [link]
-        while out[-1] in self.leads:
-            out.append(self.leads[out[-1]][0])
-            if len(out) > len(self.leads) + 1:
+        while out[-1] in self.parents:
+            out.append(self.parents[out[-1]][0])
+            if len(out) > len(self.parents) + 1:
                 raise InputError(f"{self.document.name}: its joints go round in a circle")
         return out
 
     def _link(self, name: str) -> str:
         """Return the link of a name, which may omit the expressions of a xacro."""
-        links = {*self.leads, *(parent for parent, _ in self.leads.values())}
+        links = {*self.parents, *(parent for parent, _ in self.parents.values())}
         matching = [link for link in links if name in (link, EXPRESSION.sub("", link))]
         if len(matching) != 1:
             valid = ", ".join(sorted(escaped(EXPRESSION.sub("", link)) for link in links))
@@ -86,13 +86,13 @@ class LinkTree:
 
     def _last(self) -> str:
         """Return the only link after moving joints that has no children."""
-        parents = {parent for parent, _ in self.leads.values()}
+        parents = {parent for parent, _ in self.parents.values()}
 
         def moves(link: str) -> bool:
-            kinds = (self.leads[k][1].attributes.get("type") for k in self._up(link)[:-1])
+            kinds = (self.parents[k][1].attributes.get("type") for k in self._up(link)[:-1])
             return any(kind in TURNING for kind in kinds)
 
-        last = sorted(link for link in self.leads if link not in parents and moves(link))
+        last = sorted(link for link in self.parents if link not in parents and moves(link))
         if not last:
             raise InputError(f"{self.document.name}: no revolute joint; valid: one with the arm")
         if len(last) > 1:
@@ -112,15 +112,15 @@ def not_between(name: str, kind: str) -> str:
 def urdf_steps(document: Document, base: str | None, tip: str | None) -> list[ChainStep]:
     """Return the steps from a base link to a tip link."""
     parents: dict[str, tuple[str, Node]] = {}
-    for joint in document.root.every("joint"):
-        ends = [joint.first(tag) for tag in ("parent", "child")]
+    for joint in document.root.descendants("joint"):
+        ends = [joint.child(tag) for tag in ("parent", "child")]
         names = [e.attributes.get("link") for e in ends if e is not None]
         if len(names) != 2 or None in names:
             continue
         parent, child = (str(n) for n in names)
         if child in parents:
             reason = f"a second joint leads to link '{escaped(child)}'; valid: a tree"
-            raise document.refused(joint, reason)
+            raise document.error(joint, reason)
         parents[child] = (parent, joint)
     up, down = LinkTree(document, parents).chain(base, tip)
     turned = [_urdf_step(document, joint, turned=True) for joint in up]
@@ -130,11 +130,11 @@ def urdf_steps(document: Document, base: str | None, tip: str | None) -> list[Ch
 def _urdf_step(document: Document, joint: Node, *, turned: bool = False) -> ChainStep:
     """Return the step of a joint; if `turned`, from its child to its parent."""
     kind, name = joint.attributes.get("type", ""), joint.attributes.get("name", "")
-    axis = joint.first("axis")
+    axis = joint.child("axis")
     if kind not in (*TURNING, "fixed") or (turned and kind != "fixed"):
-        raise document.refused(joint, not_between(name, kind))
+        raise document.error(joint, not_between(name, kind))
     along = "1 0 0" if axis is None else axis.attributes.get("xyz", "1 0 0")
-    origin = joint.first("origin")
+    origin = joint.child("origin")
     written = {} if origin is None else origin.attributes
     xyz, rpy = (_values(document, origin or joint, written.get(k, "0 0 0")) for k in ("xyz", "rpy"))
     place = se3.matrix(se3.of_rpy(rpy), xyz)
@@ -155,13 +155,13 @@ def _urdf_step(document: Document, joint: Node, *, turned: bool = False) -> Chai
             if np.abs(old - values[key]).max() < 1e-12:
                 continue
             if "$" in written.get(key, ""):
-                raise document.refused(
+                raise document.error(
                     origin,
                     f"the place of joint '{escaped(name)}' is '{escaped(written[key][:60])}', and "
                     f"becomes '{numbers(values[key])}'; write numbers there, or correct what "
                     "xacro makes of it: xacro F.xacro > F.urdf",
                 )
-            out.append(document.put(origin, key, numbers(values[key])))
+            out.append(document.attribute_edit(origin, key, numbers(values[key])))
         return out
 
     return ChainStep(name, joint.line, se3.inverse(place) if turned else place, turn, write)
@@ -174,7 +174,7 @@ def _values(document: Document, node: Node, text: str) -> Floats:
         try:
             return repr(_constant(ast.parse(m[1].strip(), mode="eval").body))
         except (ValueError, SyntaxError, ZeroDivisionError, OverflowError, RecursionError):
-            raise document.refused(
+            raise document.error(
                 node,
                 f"'{escaped(m[0][:60])}' is not of numbers; correct what xacro makes of the file: "
                 "xacro F.xacro > F.urdf",
@@ -213,13 +213,11 @@ class SdfModel:
         self.nodes: dict[str, Node] = {}
         for child in node.children:
             if child.tag in ("model", "include"):
-                raise document.refused(child, "a model in a model; valid: one with the arm")
+                raise document.error(child, "a model in a model; valid: one with the arm")
             if child.tag in ("link", "joint", "frame"):
                 name = child.attributes.get("name", "")
                 if name in self.nodes:
-                    raise document.refused(
-                        child, f"a second '{escaped(name)}'; valid: names of one"
-                    )
+                    raise document.error(child, f"a second '{escaped(name)}'; valid: names of one")
                 self.nodes[name] = child
         self.joints = [n for n in self.nodes.values() if n.tag == "joint"]
 
@@ -227,41 +225,41 @@ class SdfModel:
         """Text of an element; empty for None."""
         if node is None:
             return ""
-        return self.document.text[node.end : node.close].strip()
+        return self.document.text[node.end : node.end_tag].strip()
 
-    def ends(self, joint: Node) -> tuple[str, str]:
+    def parent_and_child(self, joint: Node) -> tuple[str, str]:
         """Names of the parent and the child link."""
-        return self.text(joint.first("parent")), self.text(joint.first("child"))
+        return self.text(joint.child("parent")), self.text(joint.child("child"))
 
     def written_pose(self, name: str) -> Floats:
         """(4, 4) pose in its reference frame, as written."""
-        pose = self.nodes[name].first("pose")
+        pose = self.nodes[name].child("pose")
         if pose is None or not self.text(pose):
             return np.eye(4)
         if pose.attributes.get("degrees") == "true" or "rotation_format" in pose.attributes:
             reason = "a <pose> in degrees or quaternions; valid: x y z r p y, rad"
-            raise self.document.refused(pose, reason)
+            raise self.document.error(pose, reason)
         v = self.document.numbers(pose, self.text(pose), 6)
         return se3.matrix(se3.of_rpy(v[3:]), v[:3])
 
     def axis(self, joint: Node) -> tuple[Node | None, str]:
         """`<xyz>` of a joint, and its frame where that is not the joint's."""
-        axis = joint.first("axis")
-        xyz = None if axis is None else axis.first("xyz")
+        axis = joint.child("axis")
+        xyz = None if axis is None else axis.child("xyz")
         return xyz, "" if xyz is None else xyz.attributes.get("expressed_in", "")
 
     def reference(self, name: str) -> str:
         """Name of the frame that a pose is relative to."""
         node = self.nodes[name]
-        pose = node.first("pose")
+        pose = node.child("pose")
         relative_to = "" if pose is None else pose.attributes.get("relative_to", "")
         if relative_to:
             return relative_to
         if node.tag == "joint":
-            return self.ends(node)[1]
+            return self.parent_and_child(node)[1]
         return node.attributes.get("attached_to", "") or MODEL
 
-    def place(self, name: str, new: dict[str, Floats] | None = None, depth: int = 0) -> Floats:
+    def pose(self, name: str, new: dict[str, Floats] | None = None, depth: int = 0) -> Floats:
         """(4, 4) pose of a frame in the model; `new` overrides poses of frames."""
         if new is not None and name in new:
             return new[name]
@@ -272,67 +270,67 @@ class SdfModel:
                 f"{self.document.name}: frame '{escaped(name)}' is not there, or counts from "
                 "itself; valid: links, joints, frames of the model"
             )
-        return self.place(self.reference(name), new, depth + 1) @ self.written_pose(name)
+        return self.pose(self.reference(name), new, depth + 1) @ self.written_pose(name)
 
     def ordered(self) -> list[Node]:
         """Joints in order from parent to child."""
         out: list[Node] = []
         remaining = list(self.joints)
         while remaining:
-            children = {self.ends(j)[1] for j in remaining}
-            ready = [j for j in remaining if self.ends(j)[0] not in children]
+            children = {self.parent_and_child(j)[1] for j in remaining}
+            ready = [j for j in remaining if self.parent_and_child(j)[0] not in children]
             if not ready:
                 raise InputError(f"{self.document.name}: joints go round in a circle")
             out += ready
             remaining = [j for j in remaining if j not in ready]
         return out
 
-    def edits(self, places: list[Floats]) -> tuple[Edits, list[str]]:
+    def edits(self, transforms: list[Floats]) -> tuple[Edits, list[str]]:
         """Edits that give the steps other places, and the names of changed links and joints."""
         new: dict[str, Floats] = {}
-        new_places = dict(zip(self.chain, places, strict=True))
+        new_places = dict(zip(self.chain, transforms, strict=True))
         for joint in self.ordered():
-            parent, child = self.ends(joint)
+            parent, child = self.parent_and_child(joint)
             place = new_places.get(joint)
             if place is None:
                 if parent not in new:
                     continue
-                place = se3.inverse(self.place(parent)) @ self.place(child)
+                place = se3.inverse(self.pose(parent)) @ self.pose(child)
             name = joint.attributes.get("name", "")
-            from_child = se3.inverse(self.place(child)) @ self.place(name)
-            new[child] = (new[parent] if parent in new else self.place(parent)) @ place
+            from_child = se3.inverse(self.pose(child)) @ self.pose(name)
+            new[child] = (new[parent] if parent in new else self.pose(parent)) @ place
             new[name] = new[child] @ from_child
         out: Edits = []
         names = []
         for name, frame in new.items():
             node = self.nodes[name]
-            pose = se3.inverse(self.place(self.reference(name), new)) @ frame
-            if moved(self.written_pose(name), pose) > LEFT:
-                element, text = node.first("pose"), " ".join(map(numbers, origin_of(pose)))
+            pose = se3.inverse(self.pose(self.reference(name), new)) @ frame
+            if pose_difference(self.written_pose(name), pose) > EDIT_TOLERANCE:
+                element, text = node.child("pose"), " ".join(map(numbers, origin_of(pose)))
                 if element is None:
                     out.append((Span(0, node.end, node.end), f"<pose>{text}</pose>"))
-                elif element.close < element.end:  # <pose/>
-                    out.append((Span(0, element.begin, element.end), f"<pose>{text}</pose>"))
+                elif element.end_tag < element.end:  # <pose/>
+                    out.append((Span(0, element.start, element.end), f"<pose>{text}</pose>"))
                 else:
-                    out.append((Span(0, element.end, element.close), text))
+                    out.append((Span(0, element.end, element.end_tag), text))
                 names.append(name)
             along, axis_frame = self.axis(node)
             if along is not None and axis_frame:  # an axis in another frame turns with its joint
                 old_axis = self.document.numbers(along, self.text(along), 3)
-                local = self.place(name)[:3, :3].T @ self.place(axis_frame)[:3, :3] @ old_axis
-                new_axis = self.place(axis_frame, new)[:3, :3].T @ frame[:3, :3] @ local
-                if np.abs(new_axis - old_axis).max() > LEFT:
-                    out.append((Span(0, along.end, along.close), numbers(new_axis)))
+                local = self.pose(name)[:3, :3].T @ self.pose(axis_frame)[:3, :3] @ old_axis
+                new_axis = self.pose(axis_frame, new)[:3, :3].T @ frame[:3, :3] @ local
+                if np.abs(new_axis - old_axis).max() > EDIT_TOLERANCE:
+                    out.append((Span(0, along.end, along.end_tag), numbers(new_axis)))
         return out, names
 
 
 def sdf_chain(document: Document, base: str | None, tip: str | None) -> SdfModel:
     """Return the chain from a base link to a tip link."""
-    models = list(document.root.every("model"))
+    models = list(document.root.descendants("model"))
     if not models:
         raise InputError(f"{document.name}: no <model>; valid: an SDF with the arm")
     model = SdfModel(document, models[0])
-    ends = {joint: model.ends(joint) for joint in model.joints}
+    ends = {joint: model.parent_and_child(joint) for joint in model.joints}
     leads = {child: (parent, j) for j, (parent, child) in ends.items() if parent != "world"}
     up, model.chain = LinkTree(document, leads).chain(base, tip)
     if up:
@@ -343,16 +341,16 @@ def sdf_chain(document: Document, base: str | None, tip: str | None) -> SdfModel
 
 def _sdf_step(model: SdfModel, joint: Node) -> ChainStep:
     kind, name = joint.attributes.get("type", ""), joint.attributes.get("name", "")
-    parent, child = model.ends(joint)
-    place = se3.inverse(model.place(parent)) @ model.place(child)
+    parent, child = model.parent_and_child(joint)
+    place = se3.inverse(model.pose(parent)) @ model.pose(child)
     turn = None
     if kind in TURNING:
         xyz, axis_frame = model.axis(joint)
         along = model.document.numbers(xyz or joint, model.text(xyz) or "0 0 1", 3)
-        along, frame = model.document.direction(xyz or joint, along), model.place(name)
+        along, frame = model.document.direction(xyz or joint, along), model.pose(name)
         if axis_frame:
-            along = frame[:3, :3].T @ model.place(axis_frame)[:3, :3] @ along
-        turn = se3.inverse(model.place(child)) @ frame @ z_to(along)
+            along = frame[:3, :3].T @ model.pose(axis_frame)[:3, :3] @ along
+        turn = se3.inverse(model.pose(child)) @ frame @ z_to(along)
     elif kind != "fixed":
-        raise model.document.refused(joint, not_between(name, kind))
+        raise model.document.error(joint, not_between(name, kind))
     return ChainStep(name, joint.line, place, turn, lambda _: [])

@@ -23,12 +23,12 @@ _TURNS = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
 
 def mjcf_steps(document: Document, base: str | None, tip: str | None) -> list[ChainStep]:
     """Return the steps from a base body to a tip, a body or a site."""
-    world = document.root.first("worldbody")
+    world = document.root.child("worldbody")
     if world is None:
         raise InputError(f"{document.name}: no <worldbody>; valid: an MJCF with the arm in it")
-    for node in document.root.every("include", "attach", "replicate"):
-        raise document.refused(node, f"<{node.tag}>; valid: the arm in the file itself")
-    hinged = [b for b in world.every("body") if b.first("joint") is not None]
+    for node in document.root.descendants("include", "attach", "replicate"):
+        raise document.error(node, f"<{node.tag}>; valid: the arm in the file itself")
+    hinged = [b for b in world.descendants("body") if b.child("joint") is not None]
     if not hinged:
         raise InputError(f"{document.name}: no body with a joint; valid: an MJCF with the arm")
     if tip is None:
@@ -59,9 +59,9 @@ def _name(node: Node) -> str:
 
 
 def _named(document: Document, world: Node, name: str, tags: tuple[str, ...]) -> Node:
-    nodes = [n for n in world.every(*tags) if n.attributes.get("name") == name]
+    nodes = [n for n in world.descendants(*tags) if n.attributes.get("name") == name]
     if len(nodes) != 1:
-        valid = ", ".join(_name(n) for n in world.every(*tags) if "name" in n.attributes)
+        valid = ", ".join(_name(n) for n in world.descendants(*tags) if "name" in n.attributes)
         raise InputError(
             f"{document.name}: no {' or '.join(tags)} '{escaped(name)}'; valid: {valid}"
         )
@@ -72,7 +72,7 @@ def _step(document: Document, node: Node) -> ChainStep:
     joints = [c for c in node.children if c.tag in ("joint", "freejoint")]
     if node.tag == "frame" or len(joints) > 1:
         reason = f"{_name(node)} is a frame or has several joints; valid: one hinge in a body"
-        raise document.refused(node, reason)
+        raise document.error(node, reason)
     pos = document.numbers(node, node.attributes.get("pos", "0 0 0"), 3)
     place = se3.matrix(_rotation(document, node), pos)
     turn = None
@@ -81,7 +81,7 @@ def _step(document: Document, node: Node) -> ChainStep:
         kind = _default(document, joint, "type") or "hinge"
         if joint.tag != "joint" or kind != "hinge":
             reason = f"joint '{_name(joint)}' is no hinge; valid: hinges between base and tip"
-            raise document.refused(joint, reason)
+            raise document.error(joint, reason)
         axis = document.numbers(joint, _default(document, joint, "axis") or "0 0 1", 3)
         origin = document.numbers(joint, _default(document, joint, "pos") or "0 0 0", 3)
         turn = se3.matrix(np.eye(3), origin) @ z_to(document.direction(joint, axis))
@@ -89,16 +89,16 @@ def _step(document: Document, node: Node) -> ChainStep:
     def write(new: Floats) -> Edits:
         out: Edits = []
         if np.abs(new[:3, 3] - pos).max() > 1e-12:
-            out.append(document.put(node, "pos", numbers(new[:3, 3])))
+            out.append(document.attribute_edit(node, "pos", numbers(new[:3, 3])))
         turned = se3.rotation_vector(new[:3, :3] @ place[:3, :3].T)
         if np.linalg.norm(turned) > 1e-12:
             value = numbers(se3.quaternion(new[:3, :3]))
             key = next((k for k in _TURNS if k in node.attributes), "quat")
-            old = document.attribute(node, key)
+            old = document.attribute_span(node, key)
             if key == "quat" or old is None:
-                return [*out, document.put(node, "quat", value)]
-            head = document.text.rfind(key, node.begin, old.begin)
-            between = document.text[head + len(key) : old.begin]
+                return [*out, document.attribute_edit(node, "quat", value)]
+            head = document.text.rfind(key, node.start, old.start)
+            between = document.text[head + len(key) : old.start]
             out.append((Span(0, head, old.end), f"quat{between}{value}"))
         return out
 
@@ -112,7 +112,9 @@ def _rotation(document: Document, node: Node) -> Floats:
         return np.eye(3)
     key = keys[0]
     v = document.numbers(node, node.attributes[key], _TURNS[key])
-    compiler = {k: v for c in document.root.every("compiler") for k, v in c.attributes.items()}
+    compiler = {
+        k: v for c in document.root.descendants("compiler") for k, v in c.attributes.items()
+    }
     unit = 1.0 if compiler.get("angle") == "radian" else np.pi / 180
     if key == "quat":
         return se3.of_quaternion(document.direction(node, v))
@@ -141,13 +143,13 @@ def _default(document: Document, joint: Node, key: str) -> str | None:
     name = joint.attributes.get("class") or next(
         (n.attributes["childclass"] for n in _up(joint) if "childclass" in n.attributes), None
     )
-    classes = list(document.root.every("default"))
+    classes = list(document.root.descendants("default"))
     default = next(
         (d for d in classes if d.attributes.get("class") == name),
         next((d for d in classes if d.parent is document.root), None),
     )
     while default is not None and default.tag == "default":
-        joint_default = default.first("joint")
+        joint_default = default.child("joint")
         if joint_default is not None and key in joint_default.attributes:
             return joint_default.attributes[key]
         default = default.parent

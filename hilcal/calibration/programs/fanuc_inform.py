@@ -78,8 +78,8 @@ LS = Language(
     decimals=(3, 3, 3),
     axes=AXES,
     flags=config_flags,
-    of_shape=(True, True, True, *(False,) * JOINTS),
-    moves="J, L, C or A with P[…]",
+    shape_flags=(True, True, True, *(False,) * JOINTS),
+    motions="J, L, C or A with P[…]",
     padded=True,
 )
 
@@ -107,14 +107,18 @@ class _FanucReader(ProgramReader):
             if m is None:
                 continue
             if m[2] or not names:
-                self.leave(line, "a position register")
+                self.mark_not_corrected(line, "a position register")
                 continue
             for name, index in names:
                 if name is None:
-                    self.leave(line, f"the point P[{index[:20]}] is chosen while the program runs")
+                    self.mark_not_corrected(
+                        line, f"the point P[{index[:20]}] is chosen while the program runs"
+                    )
                 elif name not in positions:
                     left = f"P[{name}] is not in /POS"
-                    self.points.setdefault(name, ProgramPoint(line, f"P[{name}]", left=left))
+                    self.points.setdefault(
+                        name, ProgramPoint(line, f"P[{name}]", not_corrected=left)
+                    )
                 elif name not in self.points:
                     position, place = positions[name]
                     at_line = line_of(self.text, place)
@@ -133,23 +137,25 @@ class _FanucReader(ProgramReader):
                 continue
             if r := _REFUSED.search(body):
                 reason = f"'{r[0]}' changes a frame while the program runs"
-                raise self.refused(line, reason, "a program without it")
+                raise self.error(line, reason, "a program without it")
             yield line, re.sub(r"^\s*\d*\s*:\s*", "", body)
 
     def _point(self, bare: ProgramPoint, text: str, offset: int) -> ProgramPoint:
         """Return a position of `/POS`; its text begins at `offset`."""
         group = _GROUP.search(text)
         if group is None:
-            return replace(bare, left="no group GP1")
+            return replace(bare, not_corrected="no group GP1")
         body, begin = group[1], offset + group.start(1)
         fields = {m[1]: m for m in _FIELD.finditer(body)}
         if moving := [k for k, m in fields.items() if k.startswith("E") and float(m[2]) != 0]:
-            return replace(bare, left=f"{moving[0]} moves, and it is not known what that carries")
+            return replace(
+                bare, not_corrected=f"{moving[0]} moves, and it is not known what that carries"
+            )
         keys = J if all(k in fields for k in J) else XYZWPR
         frame, tool, config = (x.search(body) for x in (_FRAME, _TOOL, _CONFIG))
         complete = all(k in fields for k in keys)
         if keys is XYZWPR and not (complete and config and frame and tool):
-            return replace(bare, left="not a position of numbers with UF, UT and CONFIG")
+            return replace(bare, not_corrected="not a position of numbers with UF, UT and CONFIG")
         numbers = [Span(0, begin + fields[k].start(2), begin + fields[k].end(2)) for k in keys]
         values = np.array([float(fields[k][2]) for k in keys])
         tool_pose = self.controller.pose(
@@ -159,7 +165,7 @@ class _FanucReader(ProgramReader):
             return bare.at_joints(numbers, values, tool_pose)
         stated = self._flags(config)
         if isinstance(stated, str):
-            return replace(bare, left=stated)
+            return replace(bare, not_corrected=stated)
         base = self.controller.pose("bases", frame[1], f"frame {frame[1]}")
         return replace(bare, flags=stated).at_pose(numbers, values, tool_pose, base)
 
@@ -203,8 +209,8 @@ INFORM = Language(
     decimals=(3, 4, 4),
     axes=AXES,
     flags=rconf,
-    of_shape=(False, True, True, False, False, False),
-    moves="MOVJ, MOVL, MOVC, MOVS",
+    shape_flags=(False, True, True, False, False, False),
+    motions="MOVJ, MOVL, MOVC, MOVS",
 )
 
 
@@ -243,25 +249,25 @@ class _InformReader(ProgramReader):
             offset += len(full_line) + 1
         if base_line:
             reason = "a base axis moves the arm, and it is not known where to"
-            raise self.refused(base_line, reason, "jobs of an arm that stands")
+            raise self.error(base_line, reason, "jobs of an arm that stands")
         return self.program()
 
     def _instruction(self, code: str, line: int) -> None:
         if r := _CHANGES.match(code):
-            raise self.refused(line, f"{r[1]} changes what points mean", "a job without it")
+            raise self.error(line, f"{r[1]} changes what points mean", "a job without it")
         m = _MOV.match(code)
         names = [_key(*n.groups()) for n in _NAME.finditer(code)]
         if m is None or m[1].upper() == "IMOV":
             for name in names:
                 self.otherwise.setdefault(name, line)
             if m is not None:
-                self.leave(line, "IMOV is not corrected")
+                self.mark_not_corrected(line, "IMOV is not corrected")
         elif len(names) != 1 or names[0] not in self.positions:
-            self.leave(line, f"the point '{m[2][:20].strip()}' is not in this job")
+            self.mark_not_corrected(line, f"the point '{m[2][:20].strip()}' is not in this job")
         else:
-            old = self.points.get(names[0], replace(self.positions[names[0]], obeyed=False))
-            obeyed = old.obeyed or m[1].upper() == "MOVJ"
-            self.points[names[0]] = replace(old, obeyed=obeyed)
+            old = self.points.get(names[0], replace(self.positions[names[0]], flags_obeyed=False))
+            obeyed = old.flags_obeyed or m[1].upper() == "MOVJ"
+            self.points[names[0]] = replace(old, flags_obeyed=obeyed)
 
     def _point(
         self, m: re.Match[str], offset: int, line: int, head: dict[str, str]
@@ -270,7 +276,7 @@ class _InformReader(ProgramReader):
         bare = ProgramPoint(line, f"{m[1]}{m[2]} (line {line})")
         numbers = list(_NUMBER.finditer(m[3]))
         if len(numbers) != JOINTS or not re.fullmatch(r"[-+\d.,\s]+", m[3]):
-            return replace(bare, left=f"not {JOINTS} numbers")
+            return replace(bare, not_corrected=f"not {JOINTS} numbers")
         start = offset + m.start(3)
         spans = [Span(0, start + n.start(), start + n.end()) for n in numbers]
         values = np.array([float(n[0]) for n in numbers])
@@ -281,10 +287,10 @@ class _InformReader(ProgramReader):
         if kind == "PULSE":
             if self.controller.pulses is None:
                 left = "in pulses; give pulses_per_degree = [S, L, U, R, B, T] by --frames F.toml"
-                return replace(bare, left=left)
+                return replace(bare, not_corrected=left)
             return replace(bare.at_joints(spans, values, tool), scale=self.controller.pulses)
         if kind not in ("BASE", "ROBOT", "USER"):
-            return replace(bare, left=f"POSTYPE {kind} is not corrected")
+            return replace(bare, not_corrected=f"POSTYPE {kind} is not corrected")
         user = head.get("USER", "0") if kind == "USER" else "0"
         frame = self.controller.pose("bases", user, f"frame {user}")
         if kind == "USER" and user == "0":

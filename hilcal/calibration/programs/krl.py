@@ -100,9 +100,9 @@ KRL = Language(
     decimals=(6, 7, 7),
     axes=((0, 0, -1), (0, 1, 0), (0, 1, 0), (-1, 0, 0), (0, 1, 0), (-1, 0, 0)),
     flags=flags,
-    of_shape=(True, True, *(False,) * JOINTS),
-    moves="PTP, LIN, CIRC and their S…",
-    written=_written,
+    shape_flags=(True, True, *(False,) * JOINTS),
+    motions="PTP, LIN, CIRC and their S…",
+    config_texts=_written,
     frames="a copy of $config.dat, or TOML",
 )
 
@@ -245,7 +245,7 @@ class _KrlReader(ProgramReader):
                 self._forget(f"BAS(#INITMOV) of line {line} sets them to what $config.dat has")
         elif m := _FORBIDDEN.search(code):
             reason = f"'{m[0].strip()}' changes what points mean"
-            raise self.refused(line, reason, "$TOOL and $BASE as a whole, a tool on the flange")
+            raise self.error(line, reason, "$TOOL and $BASE as a whole, a tool on the flange")
         elif (m := _CALL.match(code)) and m[1].upper() not in _NO_CALLS:
             self._forget(f"{m[1][:40]} of line {line} may set them")
 
@@ -259,7 +259,7 @@ class _KrlReader(ProgramReader):
         fields = values[0].fields
         if fields.get("IPO_FRAME", ("#BASE",))[0].upper() != "#BASE":
             reason = f"{name} has its tool outside of the arm (IPO_FRAME #TCP)"
-            raise self.refused(line, reason, "a tool on the flange")
+            raise self.error(line, reason, "a tool on the flange")
         for kind in kinds:
             self._set(kind, f"{kind}_DATA[{fields.get(f'{kind}_NO', ('0',))[0]}]", line)
 
@@ -330,19 +330,21 @@ class _KrlReader(ProgramReader):
             if len(values) == 1 and values[0].file >= 0:
                 value = values[0]
                 name = f"{body} ({self.files[value.file]} line {value.line})"
-        bare = ProgramPoint(value.line if value.fields else line, name, left=left)
+        bare = ProgramPoint(value.line if value.fields else line, name, not_corrected=left)
         self.record(key, bare if left else self._point(bare, value, obeyed), line, obeyed)
 
     def _point(self, bare: ProgramPoint, value: _Value, obeyed: bool) -> ProgramPoint:
         axes = (k for k in value.fields if re.fullmatch(r"E[1-6]", k))
         moving = [k for k in axes if value.numbers([k]) is None or value.numbers([k]) != 0]
         if moving:
-            return replace(bare, left=f"{moving[0]} moves, and it is not known what that carries")
+            return replace(
+                bare, not_corrected=f"{moving[0]} moves, and it is not known what that carries"
+            )
         keys = AXES if AXES[0] in value.fields else POSE
         numbers = value.numbers(keys)
         if numbers is None:
             names = "A1 to A6" if keys is AXES else "X, Y, Z, A, B, C"
-            return replace(bare, left=f"not all of {names} are written")
+            return replace(bare, not_corrected=f"not all of {names} are written")
         tool, spans = self.state.tool, value.spans(keys)
         if keys is AXES:
             return bare.at_joints(spans, numbers, tool)
@@ -350,7 +352,7 @@ class _KrlReader(ProgramReader):
         status = [UNSTATED] * 2 if s is None else [int(s[0]) & OVERHEAD, int(s[0]) // ELBOW & 1]
         turn = [UNSTATED] * JOINTS if t is None else [int(t[0]) >> k & 1 for k in range(JOINTS)]
         config = () if t is None else value.spans([TURN])
-        bare = replace(bare, flags=(*status, *turn), config=config, obeyed=obeyed)
+        bare = replace(bare, flags=(*status, *turn), config=config, flags_obeyed=obeyed)
         return bare.at_pose(spans, numbers, tool, self.state.base)
 
     def _used_otherwise(self, lines: Sequence[tuple[int, int, str]]) -> dict[str, int]:

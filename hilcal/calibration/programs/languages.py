@@ -26,7 +26,7 @@ from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
 from hilcal.types import Bools, Floats, Ints
 
-LARGEST = 1e7
+LARGEST_NUMBER = 1e7
 """Largest number of a point: mm, degrees or pulses; a choice."""
 READERS: Mapping[str, Callable[[Path, Path | None, Floats | None], Program]] = {
     ".src": read_krl,
@@ -41,43 +41,46 @@ READERS: Mapping[str, Callable[[Path, Path | None, Floats | None], Program]] = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class UnderstoodProgram:
+class ResolvedProgram:
     """A program with N understood points."""
 
     program: Program
     arm: Arm
     q: Floats  # (N, 6) joint values at the points, rad
     tool: Floats  # (4, 4) T_flange_tool that errors are stated for
-    said: tuple[str, ...]  # remarks on the branches, for people
+    remarks: tuple[str, ...]  # remarks on the branches, for people
 
     @property
     def points(self) -> Points:
         """Points of `compensate`."""
-        return Points(tuple(p.name for p in self.program.understood), self.q)
+        return Points(tuple(p.name for p in self.program.correctable_points), self.q)
 
-    def without(self, refused: list[str]) -> "UnderstoodProgram":
+    def without(self, refused: list[str]) -> "ResolvedProgram":
         """Return the program without refused points; `refused` has "" for the others."""
         reasons = iter(refused)
-        points = tuple(p if p.left else replace(p, left=next(reasons)) for p in self.program.points)
+        points = tuple(
+            p if p.not_corrected else replace(p, not_corrected=next(reasons))
+            for p in self.program.points
+        )
         retained = [k for k, reason in enumerate(refused) if not reason]
         return replace(self, program=replace(self.program, points=points), q=self.q[retained])
 
     def corrected(self, q: Floats) -> dict[str, bytes]:
         """Return the files by suffix, with joint values (N, 6) in place of `q`."""
-        points, language = self.program.understood, self.program.language
-        unstated = (UNSTATED,) * len(language.of_shape)
+        points, language = self.program.correctable_points, self.program.language
+        unstated = (UNSTATED,) * len(language.shape_flags)
         stated = np.array([p.flags or unstated for p in points])
         computed = np.array([bool(p.template) for p in points])
         stated[computed] = flags_of(self.arm, language, self.q[computed])
         agreed, agrees = (_agree(self.arm, language, x, stated) for x in (self.q, q))
         changed = agreed & ~agrees & (stated != UNSTATED)
-        if unlike(self.arm, language):
-            changed &= ~np.array(language.of_shape)
+        if form_mismatch(self.arm, language):
+            changed &= ~np.array(language.shape_flags)
         flags = np.where(changed, flags_of(self.arm, language, q), stated)
         return self.program.corrected(self.arm, points, self.q, q, flags)
 
 
-def understood(
+def read_program(
     path: Path,
     arm: Arm,
     *,
@@ -85,7 +88,7 @@ def understood(
     tool: Floats | None = None,
     near: Floats | None = None,
     leave: bool = False,
-) -> UnderstoodProgram:
+) -> ResolvedProgram:
     """Read a program; the first pose is near to joint values `near` (6,), rad.
 
     `tool` (4, 4) T_flange_tool replaces tools that neither the program nor `frames` has.
@@ -97,49 +100,49 @@ def understood(
     points = []
     for p in program.points:
         numbers = np.concatenate([p.values, p.frame.ravel(), p.tool.ravel()])
-        usable = (np.abs(numbers) < LARGEST).all()
-        left = p.left if usable else "numbers that are none, in it, its tool or its base"
-        points.append(replace(p, left=left))
+        usable = (np.abs(numbers) < LARGEST_NUMBER).all()
+        left = p.not_corrected if usable else "numbers that are none, in it, its tool or its base"
+        points.append(replace(p, not_corrected=left))
     program = replace(program, points=tuple(points))
     _refuse(path, program.points, leave)
     q, doubts, said = resolve(program, arm, near)
-    poses = [p for p in program.understood if not p.joints] or program.understood
+    poses = [p for p in program.correctable_points if not p.joints] or program.correctable_points
     longest = max(poses, key=lambda p: float(np.linalg.norm(p.tool[:3, 3])))
     if any(not np.allclose(p.tool, longest.tool, atol=1e-9) for p in poses):
         said += (f"several tools; errors are stated for the longest, that of {longest.name}",)
-    result = UnderstoodProgram(program, arm, q, longest.tool, said).without(doubts)
+    result = ResolvedProgram(program, arm, q, longest.tool, said).without(doubts)
     _refuse(path, result.program.points, leave)
     return result
 
 
 def _refuse(path: Path, points: tuple[ProgramPoint, ...], leave: bool) -> None:
-    """Refuse points that cannot be corrected; raises as `understood` does."""
-    left = [p for p in points if p.left]
+    """Refuse points that cannot be corrected; raises as `read_program` does."""
+    left = [p for p in points if p.not_corrected]
     if left and not (leave and len(left) < len(points)):
         p = left[0]
         where = p.name if "line" in p.name else f"{p.name}, line {p.line}"
         further = f"; and {len(left) - 1} more" if len(left) > 1 else ""
-        reason = escaped(f"{where}: {p.left}{further}")
+        reason = escaped(f"{where}: {p.not_corrected}{further}")
         raise InputError(f"{path}: {reason}; --leave keeps such points as they are")
 
 
-ALONG = 0.02
+AXIS_TOLERANCE = 0.02
 """Largest difference of an axis direction from that of the maker's arms; a choice, above that of
 any calibrated arm."""
-MEET = 1e-3
+INTERSECTION_M = 1e-3
 """m; largest distance of intersecting axes; a choice."""
-BORDER = 1e-4
+FLAG_BORDER = 1e-4
 """rad; joint values within this distance of a flag's border have both values; a choice, above the
 rounding of numbers with four decimals."""
-AS_NEAR = 0.05
-"""rad, see `calibration.urscript.AS_NEAR`."""
+BRANCH_MARGIN = 0.05
+"""rad, see `calibration.urscript.BRANCH_MARGIN`."""
 
 
-def unlike(arm: Arm, language: Language) -> str:
+def form_mismatch(arm: Arm, language: Language) -> str:
     """Return why an arm is not of the maker's form; empty if it is."""
     chain = evaluate(arm, np.zeros((1, JOINTS)))
     axes = chain.rotation[:JOINTS, 0, :, 2]
-    wrong = np.linalg.norm(axes - np.array(language.axes), axis=1) > ALONG
+    wrong = np.linalg.norm(axes - np.array(language.axes), axis=1) > AXIS_TOLERANCE
     if wrong.any():
         k = int(np.argmax(wrong))
         is_, should = (
@@ -150,7 +153,7 @@ def unlike(arm: Arm, language: Language) -> str:
     p = chain.position[:JOINTS, 0]
     normals = {k: np.cross(axes[k], axes[4]) for k in (3, 5)}
     gap = max(abs((p[k] - p[4]) @ n) / np.linalg.norm(n) for k, n in normals.items())
-    return f"axes 4 to 6 miss each other by {1e3 * gap:.3g} mm" if gap > MEET else ""
+    return f"axes 4 to 6 miss each other by {1e3 * gap:.3g} mm" if gap > INTERSECTION_M else ""
 
 
 def shape(arm: Arm, q: Floats) -> Ints:
@@ -187,12 +190,12 @@ def resolve(
     language = program.language
     if arm.n != JOINTS or arm.mimic is not None:
         raise InputError(f"{arm.name}: {arm.n} joints; a {language.name} program is for {JOINTS}")
-    foreign = unlike(arm, language)
-    readable = np.array([not (foreign and by_shape) for by_shape in language.of_shape])
+    foreign = form_mismatch(arm, language)
+    readable = np.array([not (foreign and by_shape) for by_shape in language.shape_flags])
     joints: list[Floats] = []
     doubts: list[str] = []
     ignored = unfit = 0
-    for p in program.understood:
+    for p in program.correctable_points:
         previous = joints[-1] if joints and not doubts[-1] else None if joints else near
         if p.joints:
             joints.append(p.values / p.scale)
@@ -201,7 +204,7 @@ def resolve(
         stated = np.array(p.flags or (UNSTATED,) * len(readable))
         required = (stated != UNSTATED) & readable
         ignored += bool(np.any((stated != UNSTATED) & ~readable))
-        if not p.obeyed and previous is not None:
+        if not p.flags_obeyed and previous is not None:
             required[:] = False
         q, doubt = _solve(arm, language, p, previous, stated, required)
         all_stated = (stated != UNSTATED) & readable
@@ -262,7 +265,9 @@ def _solve(
     best = fitting[order[0]]
     poses = np.abs(np.sin((fitting - best) / 2)).max(axis=1) > 1e-6  # other than by whole turns
     nearest_other = distance[poses].min(initial=np.inf)
-    certain = not poses.any() if previous is None else nearest_other > distance[order[0]] + AS_NEAR
+    certain = (
+        not poses.any() if previous is None else nearest_other > distance[order[0]] + BRANCH_MARGIN
+    )
     if not certain:
         return best, "several branches of the arm are possible; joint values in its place say which"
     return best, ""
@@ -271,7 +276,7 @@ def _solve(
 def _agree(arm: Arm, language: Language, q: Floats, stated: Ints) -> Bools:
     """(K, F) which flags joint values (K, 6) agree with; at a border, those of both sides."""
     shapes = shape(arm, q)
-    near = (language.flags(q + d, shapes) for d in (0.0, -BORDER, BORDER))
+    near = (language.flags(q + d, shapes) for d in (0.0, -FLAG_BORDER, FLAG_BORDER))
     return np.asarray(np.any([have == stated for have in near], axis=0))
 
 

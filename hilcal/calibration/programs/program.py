@@ -45,7 +45,7 @@ class Span:
     """A piece of a text."""
 
     file: int
-    begin: int
+    start: int
     end: int
 
 
@@ -64,13 +64,13 @@ class ProgramPoint:
     tool: Floats = field(default_factory=lambda: np.eye(4))  # (4, 4) T_flange_tool
     flags: tuple[int, ...] = ()  # the configuration, see `Language.flags`
     config: tuple[Span, ...] = ()  # places of its changeable part; empty if it cannot change
-    obeyed: bool = True
+    flags_obeyed: bool = True
     """Whether the controller obeys the stated configuration; otherwise it stays on the branch of
     the previous point."""
     template: str = ""
     """For a point that the program computes (`Offs(p, …)`), the text that replaces `numbers[0]`,
     with fields for the numbers and the changeable configuration; else ""."""
-    left: str = ""  # why it is not corrected; empty if it is understood
+    not_corrected: str = ""  # why it is not corrected; empty if it is understood
     blend_m: float = 0.0  # 0, since only URScript states it at the point
 
     def at_joints(
@@ -85,7 +85,7 @@ class ProgramPoint:
     ) -> "ProgramPoint":
         """Return the point with a pose; it is not corrected if tool or frame is a reason (text)."""
         if isinstance(tool, str) or isinstance(frame, str):
-            return replace(self, left=tool if isinstance(tool, str) else str(frame))
+            return replace(self, not_corrected=tool if isinstance(tool, str) else str(frame))
         return replace(self, numbers=tuple(numbers), values=values, tool=tool, frame=frame)
 
 
@@ -104,13 +104,13 @@ class Language:
     values, in axes of the controller's base."""
     flags: Callable[[Floats, Ints], Ints]
     """(K, F) configuration at joint values (K, 6), with `languages.shape` (K, 2) there."""
-    of_shape: tuple[bool, ...]
+    shape_flags: tuple[bool, ...]
     """(F,) which flags depend on the shape of the arm, not on the joint values alone."""
-    moves: str  # its motions, for people
-    written: Callable[[Ints, Sequence[str]], list[str]] = lambda _, texts: list(texts)
+    motions: str  # its motions, for people
+    config_texts: Callable[[Ints, Sequence[str]], list[str]] = lambda _, texts: list(texts)
     """New texts at `ProgramPoint.config`, from the flags and the old texts."""
     padded: bool = False  # whether numbers are aligned in columns
-    count: int = JOINTS  # numbers of a pose
+    pose_numbers: int = JOINTS  # numbers of a pose
     frames: str = "F.toml"  # files that --frames accepts
 
 
@@ -125,9 +125,9 @@ class Program:
     encoding: str = "utf-8"
 
     @property
-    def understood(self) -> list[ProgramPoint]:
+    def correctable_points(self) -> list[ProgramPoint]:
         """Points that can be corrected."""
-        return [p for p in self.points if not p.left]
+        return [p for p in self.points if not p.not_corrected]
 
     def corrected(
         self, arm: Arm, points: Sequence[ProgramPoint], old_q: Floats, q: Floats, flags: Ints
@@ -163,8 +163,8 @@ class Program:
             return []
         new = language.numbers(goal, p.values)
         decimals = [language.decimals[0]] * 3 + [language.decimals[1]] * (len(new) - 3)
-        old = [self.texts[s.file][s.begin : s.end] for s in p.config]
-        config = language.written(flags, old) if p.config or p.template else []
+        old = [self.texts[s.file][s.start : s.end] for s in p.config]
+        config = language.config_texts(flags, old) if p.config or p.template else []
         if not config and np.any(flags != np.array(p.flags)):
             raise InputError(
                 f"{p.name}: the correction takes a joint into another configuration, which is "
@@ -182,7 +182,7 @@ class Program:
         """Edits that replace the numbers, with at least as many decimals as the old ones."""
         out = []
         for span, value, least in zip(p.numbers, new.tolist(), decimals, strict=True):
-            old = self.texts[span.file][span.begin : span.end]
+            old = self.texts[span.file][span.start : span.end]
             digits = old.lower().partition("e")[0].partition(".")[2]
             text = f"{value:.{max(least, len(digits.strip())) if least else 0}f}"
             if text.strip("-0.") == "":
@@ -197,8 +197,8 @@ class Program:
 def edited(text: str, edits: Sequence[tuple[Span, str]]) -> str:
     """Return a text with some spans replaced."""
     parts, end = [], 0
-    for span, new in sorted(edits, key=lambda e: e[0].begin):
-        parts += [text[end : span.begin], new]
+    for span, new in sorted(edits, key=lambda e: e[0].start):
+        parts += [text[end : span.start], new]
         end = span.end
     return "".join([*parts, text[end:]])
 
@@ -286,7 +286,7 @@ def controller_frames(
         return ControllerFrames(language, {"tools": {}, "bases": {}}, tool=tool)
     if path.suffix.lower() != ".toml":
         raise InputError(f"{path}: frames of {language.name} programs; valid: {language.frames}")
-    section, count = load_section(path, _FramesFile), language.count
+    section, count = load_section(path, _FramesFile), language.pose_numbers
     poses: dict[str, dict[str, Floats]] = {"tools": {}, "bases": {}}
     for key, group in (("tools", section.tools), ("bases", section.bases)):
         for name, numbers in group.items():
@@ -317,33 +317,35 @@ class ProgramReader:
         self.otherwise: dict[str, int] = {}
         """Points that statements other than motions use, with the line."""
 
-    def leave(self, line: int, why: str) -> None:
+    def mark_not_corrected(self, line: int, why: str) -> None:
         """Record a motion that is not corrected."""
-        self.points[f"line {line}"] = ProgramPoint(line, f"line {line}", left=why)
+        self.points[f"line {line}"] = ProgramPoint(line, f"line {line}", not_corrected=why)
 
-    def refused(self, line: int, reason: str, valid: str) -> InputError:
+    def error(self, line: int, reason: str, valid: str) -> InputError:
         """Return the error of a statement that changes the meaning of points."""
         return InputError(f"{self.path.name}: line {line}: {reason}; valid: {valid}")
 
-    def record(self, key: str, new: ProgramPoint, line: int, obeyed: bool = False) -> None:
+    def record(self, key: str, new: ProgramPoint, line: int, flags_obeyed: bool = False) -> None:
         """Record the point of a motion; a known point with other frames is not corrected."""
         old = self.points.get(key)
-        if old is None or (new.left and not old.left):
+        if old is None or (new.not_corrected and not old.not_corrected):
             self.points[key] = new
-        elif not old.left:
+        elif not old.not_corrected:
             same = np.array_equal(old.tool, new.tool) and np.array_equal(old.frame, new.frame)
             left = "" if same else f"line {line} has it with another tool or base"
-            self.points[key] = replace(old, left=left, obeyed=old.obeyed or obeyed)
+            self.points[key] = replace(
+                old, not_corrected=left, flags_obeyed=old.flags_obeyed or flags_obeyed
+            )
 
     def program(self, texts: Sequence[str] = (), suffixes: Sequence[str] = ()) -> Program:
         """Return the program with all recorded points."""
         for name, line in self.otherwise.items():
-            if name in self.points and not self.points[name].left:
+            if name in self.points and not self.points[name].not_corrected:
                 left = f"line {line} uses or changes it otherwise"
-                self.points[name] = replace(self.points[name], left=left)
+                self.points[name] = replace(self.points[name], not_corrected=left)
         language, points = self.controller.language, tuple(self.points.values())
         if not points:
-            raise InputError(f"{self.path.name}: no motions; valid: {language.moves}")
+            raise InputError(f"{self.path.name}: no motions; valid: {language.motions}")
         suffixes, texts = tuple(suffixes) or (self.path.suffix,), tuple(texts) or (self.text,)
         return Program(language, suffixes, texts, points, self.encoding)
 

@@ -101,10 +101,10 @@ RAPID = Language(
     decimals=(6, 9, 7),
     axes=((0, 0, 1), (0, 1, 0), (0, 1, 0), (1, 0, 0), (0, 1, 0), (1, 0, 0)),
     flags=flags,
-    of_shape=(False, False, False, True),
-    moves="MoveJ, MoveL, MoveC, MoveAbsJ",
-    written=lambda new, texts: [str(v) for v in new[:3]],
-    count=POSE,
+    shape_flags=(False, False, False, True),
+    motions="MoveJ, MoveL, MoveC, MoveAbsJ",
+    config_texts=lambda new, texts: [str(v) for v in new[:3]],
+    pose_numbers=POSE,
     frames="a module with its tooldata and wobjdata, or TOML",
 )
 
@@ -160,13 +160,15 @@ class _RapidReader(ProgramReader):
         for offset, code in self.statements:
             if m := _REFUSED.search(code):
                 line = line_of(self.text, offset + m.start())
-                raise self.refused(line, f"{m[1]} changes what points mean", "a program without it")
+                raise self.error(line, f"{m[1]} changes what points mean", "a program without it")
             if m := _CONF.search(code):
                 obeyed = m[2].upper() == "ON"
             elif m := _MOTION.search(code):
                 self._motion(offset, code, m, obeyed)
             elif (m := _OTHER_MOTION.search(code)) and m[1].upper() not in _MOVES_NOTHING:
-                self.leave(line_of(self.text, offset + m.start()), f"{m[1]} is not corrected")
+                self.mark_not_corrected(
+                    line_of(self.text, offset + m.start()), f"{m[1]} is not corrected"
+                )
         return self.program()
 
     def _collected(self, statements: Sequence[tuple[int, str]]) -> _Data:
@@ -198,7 +200,7 @@ class _RapidReader(ProgramReader):
         line = line_of(self.text, offset + m.start())
         targets, tool, options = self._targets(code, m)
         if not tool:
-            self.leave(line, f"{m[1]} without its arguments")
+            self.mark_not_corrected(line, f"{m[1]} without its arguments")
             return
         work_object = re.search(r"\\\s*WObj\s*:=\s*(\w+)", options, re.I)
         frames = (
@@ -247,19 +249,19 @@ class _RapidReader(ProgramReader):
             key, new = text.upper(), ProgramPoint(line, label)
             values = self.data.get(key, [])
             if not _NAME.fullmatch(text):
-                new = replace(new, left=_COMPUTED.format(text[:40]))
+                new = replace(new, not_corrected=_COMPUTED.format(text[:40]))
             elif len(values) != 1 or not values[0][1]:
                 reason = "has several values" if values else "is not in this module"
-                new = replace(new, left=f"the point '{text[:40]}' {reason}")
+                new = replace(new, not_corrected=f"the point '{text[:40]}' {reason}")
             elif key in self.used:
                 left = f"line {self.used[key]} uses or changes '{text[:40]}' otherwise"
-                new = replace(new, left=left)
+                new = replace(new, not_corrected=left)
             else:
                 kind, value, place = values[0]
                 name = f"{text} (line {line_of(self.text, place)})"
                 new = self._value(value, place, name, kind == "jointtarget")
-        if not new.left and not joints:
-            new = replace(new, obeyed=obeyed).at_pose(new.numbers, new.values, *frames)
+        if not new.not_corrected and not joints:
+            new = replace(new, flags_obeyed=obeyed).at_pose(new.numbers, new.values, *frames)
         self.record(key, new, line)
 
     def _value(self, text: str, offset: int, name: str, joints: bool) -> ProgramPoint:
@@ -268,14 +270,16 @@ class _RapidReader(ProgramReader):
         bare = ProgramPoint(line_of(self.text, offset), name)
         if _form(text) != (_JOINTTARGET if joints else _ROBTARGET):
             kind = "jointtarget" if joints else "robtarget"
-            return replace(bare, left=f"it is no {kind} of numbers")
+            return replace(bare, not_corrected=f"it is no {kind} of numbers")
         external = values[-JOINTS:]
         if np.any((external < UNUSED) & (external != 0)):
-            return replace(bare, left="an external axis moves, and it is not known what it carries")
+            return replace(
+                bare, not_corrected="an external axis moves, and it is not known what it carries"
+            )
         if joints:
             return bare.at_joints(spans[:JOINTS], values[:JOINTS], np.eye(4))
         if not np.isclose(np.linalg.norm(values[3:POSE]), 1.0, atol=1e-3):
-            return replace(bare, left="its quaternion is not of length 1")
+            return replace(bare, not_corrected="its quaternion is not of length 1")
         return replace(
             bare,
             numbers=tuple(spans[:POSE]),
@@ -294,12 +298,12 @@ class _RapidReader(ProgramReader):
         turns = [m for m in moves if m and m not in shift]
         plain = len(shift) == 3 and all(re.fullmatch(turn, m, re.I) for m in turns)
         if len(values) != 1 or not values[0][1] or not plain or base.upper() in self.assigned:
-            return replace(bare, left=_COMPUTED.format(text[:40]))
+            return replace(bare, not_corrected=_COMPUTED.format(text[:40]))
         _, value, begin = values[0]
         point = self._value(value, begin, bare.name, False)
-        if point.left:
-            return replace(bare, left=point.left)
-        places = [Span(0, s.begin - begin, s.end - begin) for s in (*point.numbers, *point.config)]
+        if point.not_corrected:
+            return replace(bare, not_corrected=point.not_corrected)
+        places = [Span(0, s.start - begin, s.end - begin) for s in (*point.numbers, *point.config)]
         t, displacement = of_quaternion(point.values), np.array([float(m) for m in shift])
         if relative:
             angle = {m[1:].strip()[:2].lower(): float(m.partition(":=")[2]) for m in turns}
@@ -331,7 +335,7 @@ class _RapidReader(ProgramReader):
                 for place, text in self._targets(code, m)[0]:
                     call = _MADE.match(text)  # of a point and numbers: replaced by a point
                     if _NAME.fullmatch(text) or (
-                        call and not self._computed(text, call, 0, 1).left
+                        call and not self._computed(text, call, 0, 1).not_corrected
                     ):
                         skipped.append((place, place + len(text)))
             for n in _NAME.finditer(code):

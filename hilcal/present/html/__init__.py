@@ -17,7 +17,7 @@ with needed_by("pages"):
 
 from hilcal.names import escaped
 from hilcal.present import charts as style
-from hilcal.present.document import Block, Chart, PageSection, captioned, says
+from hilcal.present.document import Block, Chart, PageSection, captioned, description_of
 
 HERE = Path(__file__).parent
 
@@ -73,7 +73,7 @@ def _figure(chart: Chart) -> dict[str, object]:
     bare.layout.height = chart.height or chart.figure.layout.height
     return {
         "json": Markup(in_script(bare.to_json())),  # noqa: S704  (escaped by in_script)
-        "says": says(chart.figure),
+        "says": description_of(chart.figure),
         "height": int(bare.layout.height),
     }
 

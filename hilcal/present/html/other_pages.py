@@ -25,9 +25,9 @@ from hilcal.present.html import FirstScreen, render
 from hilcal.present.html.report import identity
 
 if TYPE_CHECKING:
-    from hilcal.transfer.fleet import Fleet, Pooled
+    from hilcal.transfer.fleet import Fleet, PooledType
 
-Named = tuple[str, str]  # name and SHA-256 of a campaign's file
+NameAndHash = tuple[str, str]  # name and SHA-256 of a campaign's file
 
 
 def error_by_pose(c: Comparison) -> go.Figure:
@@ -65,10 +65,10 @@ def changes_chart(c: Comparison) -> go.Figure:
     return charts.bars(names, moved, hover, says, "moves the target by, rms [µm]")
 
 
-def arms_chart(t: "Pooled") -> go.Figure:
+def arms_chart(t: "PooledType") -> go.Figure:
     """Draw each arm's parameters as distances from the type, over the range of most arms."""
     names, off = [p.parameter for p in t.parameters], t.distance
-    odd = {(o.arm, o.parameter) for o in t.odd if not o.campaign}
+    odd = {(o.arm, o.parameter) for o in t.unlike if not o.campaign}
     traces = []
     for unlike, group, color, symbol in (
         (False, "like its type", charts.MEASURED, "circle"),
@@ -104,9 +104,9 @@ def arms_chart(t: "Pooled") -> go.Figure:
 
 
 def comparison_page(
-    c: Comparison, files: tuple[Named, Named], operator: str, made: str, version: str
+    c: Comparison, files: tuple[NameAndHash, NameAndHash], operator: str, created: str, version: str
 ) -> str:
-    """Return the comparison of an earlier and a later file as HTML; `made` is an ISO 8601 time."""
+    """Return the comparison of an earlier and a later file as HTML; `created` is ISO 8601."""
     (earlier, _), (later, _) = files
     arm = c.fit.model.cell.arm.name
     drawn: list[Block] = [Chart("Error today, by pose", error_by_pose(c), wide=True, height=0)]
@@ -118,7 +118,7 @@ def comparison_page(
         identity(
             ("Robot", arm),
             ("Operator", operator or "not stated"),
-            ("Report made", f"{utc(made)} UTC by hilcal {version}"),
+            ("Report made", f"{utc(created)} UTC by hilcal {version}"),
         ),
         heading("Commands that show the same"),
         Words(f"hilcal compare {quoted(earlier)} {quoted(later)}", "code"),
@@ -130,7 +130,7 @@ def comparison_page(
         PageSection("today", "The earlier calibration today", tuple(drawn)),
         PageSection("provenance", "Provenance", provenance),
     )
-    about = f"{arm}, {earlier} and {later}, {made[:10]}"
+    about = f"{arm}, {earlier} and {later}, {created[:10]}"
     return render("Comparison of two campaigns", about, comparison_screen(c, earlier), sections)
 
 
@@ -160,8 +160,8 @@ def comparison_screen(c: Comparison, earlier: str) -> FirstScreen:
     return FirstScreen(comparison.headline(c), tone, answers, tuple(cards))
 
 
-def fleet_page(fleet: "Fleet", directory: str, made: str, version: str) -> str:
-    """Return a fleet of campaigns in a directory as HTML; `made` is an ISO 8601 time, UTC."""
+def fleet_page(fleet: "Fleet", directory: str, created: str, version: str) -> str:
+    """Return a fleet of campaigns in a directory as HTML; `created` is an ISO 8601 time, UTC."""
     sections = []
     for k, t in enumerate(fleet.types):
         drawn: tuple[Block, ...] = (Chart("Arms of the type", arms_chart(t), wide=True, height=0),)
@@ -171,12 +171,12 @@ def fleet_page(fleet: "Fleet", directory: str, made: str, version: str) -> str:
     heads = ("campaign", "arm", "date", "verdict", "rms on poses left out")
     campaigns = table(*heads, rows=rows, caption="Campaigns")
     sections.append(PageSection("campaigns", "Campaigns", (campaigns, *comparison.closing(fleet))))
-    about = f"{directory}, {made[:10]}, hilcal {version}"
+    about = f"{directory}, {created[:10]}, hilcal {version}"
     return render("A fleet of arms", about, _fleet_screen(fleet), tuple(sections))
 
 
 def _fleet_screen(fleet: "Fleet") -> FirstScreen:
-    odd = [o for t in fleet.types for o in t.odd]
+    odd = [o for t in fleet.types for o in t.unlike]
     arms = list(dict.fromkeys(o.arm for o in odd))
     wear = ", ".join(name for t in fleet.types for name in t.wear)
     headline, todo = "No arm is unlike its type", "Nothing; the prior serves the next arm."

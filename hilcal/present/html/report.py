@@ -21,9 +21,19 @@ from hilcal.identification.validation import CampaignValidation
 from hilcal.numbers import length, percent
 from hilcal.present import charts
 from hilcal.present import fit as fit_words
-from hilcal.present.calibration import loads_report, opening, validation_report, worst_table
+from hilcal.present.calibration import (
+    fit_and_test_lines,
+    loads_report,
+    validation_report,
+    worst_table,
+)
 from hilcal.present.campaign import info_report, utc
-from hilcal.present.diagnosis import REVISION_HEADS, could_have_been_seen, doubtful, redundant_line
+from hilcal.present.diagnosis import (
+    REVISION_HEADS,
+    detectable_sizes,
+    doubtful_lines,
+    redundant_line,
+)
 from hilcal.present.document import (
     Block,
     Chart,
@@ -53,7 +63,7 @@ NOT_KEPT = "not kept: made by a program of one's own, at the workbench, or befor
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tested:
+class TestCampaign:
     """A validation by another campaign, with the name and the hash of its file."""
 
     name: str
@@ -67,7 +77,7 @@ class ReportContent:
 
     name: str  # of the campaign's file
     sha256: str  # of that file
-    made: str  # time of the report, ISO 8601, UTC
+    created: str  # time of the report, ISO 8601, UTC
     version: str  # of the program
     overview: Overview
     covariance: CovarianceParts
@@ -77,7 +87,7 @@ class ReportContent:
     left_out: StoryRevision  # the last revision with the errors of poses left out
     scalings: Mapping[Scaling, Fit]  # fits of the last model; empty without an appendix
     plan: Plan | None
-    tested: Tested | None  # on readings that were never fitted
+    test: TestCampaign | None  # on readings that were never fitted
     corrected: Mapping[str, Any] | None
     """Errors at uncorrected and corrected joint targets that `calibrate` measured with this
     revision: the stored JSON of `Improvement`."""
@@ -99,7 +109,7 @@ class ReportContent:
 
 def page(m: ReportContent) -> str:
     """Return the report of one campaign as HTML."""
-    about = f"{m.overview.config.robot.model}, {m.name}, {m.made[:10]}"
+    about = f"{m.overview.config.robot.model}, {m.name}, {m.created[:10]}"
     parts = (_certificate(m), *sections(m), *(_appendix(m) if m.appendix else ()))
     return render("Calibration report", about, first_screen(m), parts)
 
@@ -111,7 +121,7 @@ def sections(m: ReportContent) -> tuple[PageSection, ...]:
 
 def first_screen(m: ReportContent) -> FirstScreen:
     """Return the contents of the first screen."""
-    d, good = m.diagnosis, fit_words.misses(m.fit)
+    d, good = m.diagnosis, fit_words.holdout_sentence(m.fit)
     verdict = None if d is None else d.verdict
     if (prior := m.fit.model.prior) is not None:
         good += f" It also rests on a prior: {prior.posterior.source.campaign or 'a posterior'}."
@@ -136,14 +146,14 @@ def first_screen(m: ReportContent) -> FirstScreen:
             missing += f" {name} is: {d.fit.model.catalogue[name].summary}."
     answers = (
         ("Is the model good?", good),
-        ("Where is it wrong?", where_wrong(m)),
+        ("Where is it wrong?", misfit_sentence(m)),
         ("What is missing?", missing),
     )
     title, cards = f"{title[0].upper()}{title[1:]}", tuple(_cards(m))
     return FirstScreen(title, tone, answers, cards, *limit_words(m), verdict)
 
 
-def where_wrong(m: ReportContent) -> str:
+def misfit_sentence(m: ReportContent) -> str:
     """Return sentences on the worst pose and on the variables that the misfit follows."""
     d, fit, error = m.diagnosis, m.fit, left_out_errors(m.fit)
     furthest = int(fit.whitening.reading[np.argmax(error)])
@@ -153,7 +163,7 @@ def where_wrong(m: ReportContent) -> str:
     if d is None:
         return worst
     if not d.residual_is_noise:
-        return f"{worst} {fit_words.follows(d.misfit_breakdown)}"
+        return f"{worst} {fit_words.dependence_sentence(d.misfit_breakdown)}"
     # The sum of squares of R whitened elements of standard deviation 1 is distributed as χ²(R).
     count = fit.whitening.rank
     if fit.holdout.rms_sigma**2 * count <= chi2.isf((1 - CONFIDENCE) / 2, count):
@@ -173,9 +183,9 @@ def _cards(m: ReportContent) -> Iterator[tuple[str, str, str]]:
     if m.fit.mode == "deflection":
         model = "deflection under load; a rigid arm has none"
     yield card("Before", nominal_error(m.fit), f"; {model}")
-    if m.tested is not None:
-        kind = "never fitted" if m.tested.validation.judged.unseen else "fitted, so no test"
-        yield card("After, validation", m.tested.validation.prediction.error, f"; {kind}")
+    if m.test is not None:
+        kind = "never fitted" if m.test.validation.judged.unseen else "fitted, so no test"
+        yield card("After, validation", m.test.validation.prediction.error, f"; {kind}")
     if m.corrected is not None:
         error = m.corrected["error"]
         uncorrected, corrected = (length(float(error[k]["rms_m"])) for k in ("before", "after"))
@@ -189,10 +199,10 @@ def limit_words(m: ReportContent) -> tuple[str, bool | None]:
     """Return the verdict on the limit with its basis, and whether it is kept; "", None without."""
     if m.limit_m is None:
         return "", None
-    if m.tested is not None and m.tested.validation.judged.unseen:
-        a = m.tested.validation.shares
+    if m.test is not None and m.test.validation.judged.unseen:
+        a = m.test.validation.shares
         count, over, passed, most = a.everything.count, a.over, bool(a.passed), a.everything.max_m
-        end = f" (campaign {m.tested.name}, never fitted; largest {length(most)})."
+        end = f" (campaign {m.test.name}, never fitted; largest {length(most)})."
         if a.undecided:
             end += " Noise alone exceeds the limit, so that these readings cannot tell."
     else:
@@ -200,8 +210,8 @@ def limit_words(m: ReportContent) -> tuple[str, bool | None]:
         count, over = len(error), int(np.sum(error > m.limit_m))
         passed, most = over == 0, float(error.max())
         none = "No validation campaign was given"
-        if m.tested is not None:
-            none = f"{m.tested.name} was fitted itself"
+        if m.test is not None:
+            none = f"{m.test.name} was fitted itself"
         end = (
             f", each pose predicted without itself (largest {length(most)}). {none}: an "
             "independent test is missing."
@@ -272,10 +282,10 @@ def _limit(m: ReportContent) -> Iterator[Block]:
         yield "No limit was given (hilcal report --limit LENGTH), so nothing is passed or failed."
     else:
         yield Words(verdict, "strong")
-    if m.tested is not None:
-        t = m.tested.validation
-        yield f"Validation campaign {m.tested.name}"
-        yield from opening(t.judged, t.prediction)
+    if m.test is not None:
+        t = m.test.validation
+        yield f"Validation campaign {m.test.name}"
+        yield from fit_and_test_lines(t.judged, t.prediction)
         yield from captioned(validation_report(t.judged, t.prediction, t.beyond), "Validation")
         yield from captioned(loads_report(t.shares), "Errors of the validation campaign")
 
@@ -305,7 +315,7 @@ def _conditions(m: ReportContent) -> Iterator[Block]:
     ]
     heads = ("joint", *(str(j + 1) for j in range(q.shape[1])))
     yield table(*heads, caption="Joint angles that were measured", rows=rows)
-    if m.tested is not None:
+    if m.test is not None:
         return
     error, fitted = left_out_errors(m.fit), r[~m.fit.outlier][m.fit.whitening.reading]
     heads = ("load", "n", "rms", "largest", "at pose", *["limit"] * (m.limit_m is not None))
@@ -324,10 +334,10 @@ def _conditions(m: ReportContent) -> Iterator[Block]:
 
 def _not_tested(m: ReportContent) -> Iterator[str]:
     s, fit, d = m.fit.readings.states, m.fit, m.diagnosis
-    if m.tested is None:
+    if m.test is None:
         yield "No validation campaign: the errors are those of poses left out in turn."
-    elif not m.tested.validation.judged.unseen:
-        yield f"{m.tested.name} was fitted itself: it tests nothing."
+    elif not m.test.validation.judged.unseen:
+        yield f"{m.test.name} was fitted itself: it tests nothing."
     yield "Joint angles outside of the ranges above, and loads other than those above."
     if not np.any(s.wrench):
         yield "Any load: all readings are unloaded."
@@ -369,9 +379,9 @@ def _instruments(m: ReportContent) -> Iterator[Block]:
         ("Operator", m.operator or "not stated"),
         ("Campaign", f"{m.name}, made {utc(o.created)} UTC"),
         ("SHA-256", m.sha256),
-        *([("Validation SHA-256", m.tested.sha256)] if m.tested else []),
+        *([("Validation SHA-256", m.test.sha256)] if m.test else []),
         ("Revision", str(m.chapters[-1].number) if m.stored else "none stored: the baseline"),
-        ("Report made", f"{utc(m.made)} UTC by hilcal {m.version}"),
+        ("Report made", f"{utc(m.created)} UTC by hilcal {m.version}"),
     )
 
 
@@ -448,7 +458,7 @@ def _evidence(m: ReportContent) -> PageSection:
     if d.verdict == "adequate":  # other verdicts are on the first screen
         parts.append(message(d))
     parts.append(_suspects_table(d.suspects[:MOST_LISTED], "Suspects, best first"))
-    parts += [*doubtful(d), *redundant_line(d)]
+    parts += [*doubtful_lines(d), *redundant_line(d)]
     parts += _added_variables(d, [s for s in d.suspects if s.passes][:MOST_CURVES])
     return PageSection("evidence", title, tuple(parts))
 
@@ -503,7 +513,9 @@ def _parameters(m: ReportContent) -> PageSection:
                 parts.append(replace(part, caption=caption, heads=heads, rows=cut, narrow=True))
     parts += fit_words.background_line(fit)
     if sizes := family_sizes(fit):
-        parts.append(Chart("What this arm is made of", charts.made_of(sizes), wide=True, height=0))
+        parts.append(
+            Chart("What this arm is made of", charts.family_sizes(sizes), wide=True, height=0)
+        )
     return PageSection("parameters", "Parameters", tuple(parts))
 
 
@@ -512,8 +524,8 @@ def _appendix(m: ReportContent) -> Iterator[PageSection]:
         Chart(f"Over joint {j + 1}", charts.residual_by_joint(m.story, m.left_out, j))
         for j in range(m.story.arm.n)
     ]
-    if m.tested is not None:
-        joints.append(replace(worst_table(m.tested.validation.shares), caption="Worst poses"))
+    if m.test is not None:
+        joints.append(replace(worst_table(m.test.validation.shares), caption="Worst poses"))
     explained = (
         *captioned(fit_words.parameters(m.fit), "Parameters with standard uncertainties"),
         *captioned(fit_words.remarks(m.fit)),
@@ -541,7 +553,7 @@ def _rejected(m: ReportContent) -> Iterator[Block]:
         yield _suspects_table(d.suspects[MOST_LISTED:], "Other suspects")
     rejected = [s for s in d.suspects if not s.passes and s.plausible and s.share >= LEAST_SHARE]
     yield from _added_variables(d, rejected)
-    yield from captioned(could_have_been_seen(d), "What could have been seen")
+    yield from captioned(detectable_sizes(d), "What could have been seen")
 
 
 def _planned(m: ReportContent) -> Iterator[Block]:

@@ -23,7 +23,7 @@ from hilcal.present.story import (
     worst_and_even,
 )
 from hilcal.present.viewer import recording, style
-from hilcal.present.viewer.recording import LOOPBACK, along, fixed
+from hilcal.present.viewer.recording import LOOPBACK, log_static, send_states
 from hilcal.robot.scene import capsules
 from hilcal.types import Floats, Ints
 
@@ -75,7 +75,7 @@ it, over the recorded variable that carries most of it; the line above names bot
 def save(story: Story, path: Path) -> None:
     """Write a story as a recording file; see `recording.write`."""
     rec = _opened(story)
-    recording.write(rec, blueprint(story), lambda: tell(rec, story), Path(path))
+    recording.write(rec, blueprint(story), lambda: log_story(rec, story), Path(path))
 
 
 @contextlib.contextmanager
@@ -87,14 +87,14 @@ def serve(story: Story, port: int = PORT) -> Iterator[str]:
     """
     server = f"viewer server {LOOPBACK}:{port}"
     recording.disable_analytics()
-    if (why := recording.refused(port)) is not None:
+    if (why := recording.bind_error(port)) is not None:
         raise InputError(f"{server}: {why}; choose a free port of this machine")
     try:
         rec = _opened(story)
         rec.set_sinks(rr.GrpcServerSink(bind_ip=LOOPBACK, port=port))
         # Active, too: a viewer that showed another recording would keep its layout.
         rec.send_blueprint(blueprint(story), make_active=True, make_default=True)
-        tell(rec, story)
+        log_story(rec, story)
     except (OSError, RuntimeError) as error:
         raise HilcalError(f"{server}: {error}") from error
     try:
@@ -107,39 +107,41 @@ def _opened(story: Story) -> rr.RecordingStream:
     arrays = (story.q, story.pose, story.anchor, story.measured, story.covariance)
     names = (story.arm.name, story.mode, story.load_names, story.pose_names)
     texts = [(r.revision, r.change, r.verdict, r.cells, r.panels) for r in story.revisions]
-    return recording.opened(names, *arrays, texts, *(r.residual for r in story.revisions))
+    return recording.content_stream(names, *arrays, texts, *(r.residual for r in story.revisions))
 
 
-def tell(rec: rr.RecordingStream, story: Story) -> None:
+def log_story(rec: rr.RecordingStream, story: Story) -> None:
     """Log the complete story, flushed after each revision."""
-    rec.send_recording_name(f"hilcal: {style.safe(story.arm.name)}, {len(story)} readings")
-    begin(rec, story)
+    rec.send_recording_name(f"hilcal: {style.storable(story.arm.name)}, {len(story)} readings")
+    log_static_entities(rec, story)
     for r in story.revisions:
         rec.set_time("revision", sequence=r.revision)
-        tell_revision(rec, story, r)
+        log_revision(rec, story, r)
         recording.flush(rec)
     rec.reset_time()
     _poses(rec, story)
     recording.flush(rec)
 
 
-def begin(rec: rr.RecordingStream, story: Story) -> None:
+def log_static_entities(rec: rr.RecordingStream, story: Story) -> None:
     """Log the static entities: shapes of the arm, axes of the world, the guide."""
-    fixed(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+    log_static(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     parts = style.shapes(capsules(story.arm))
     style.log_shapes(rec, [*parts, *style.target_shapes(story.arm, story.targets)])
     if story.target is not None:
         names = [story.target_names[k] for k in np.unique(story.target)]
-        fixed(rec, f"world/arm/body{story.arm.n + 1}/names", style.labels(story.targets, names))
-    fixed(rec, "words/guide", style.document(GUIDE))
+        log_static(
+            rec, f"world/arm/body{story.arm.n + 1}/names", style.labels(story.targets, names)
+        )
+    log_static(rec, "words/guide", style.document(GUIDE))
 
 
-def tell_revision(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
+def log_revision(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
     """Log one revision at the recording's current time."""
     _scene(rec, story, r)
     _error_bars(rec, story)
     _pose_bars(rec, story, r)
-    _curve_bars(rec, "follows", r.follows)
+    _curve_bars(rec, "follows", r.dependence)
     if any(x.laws for x in story.revisions):
         _curve_bars(rec, "law", r.laws[0] if r.laws else None)
     for name, text in (
@@ -154,16 +156,16 @@ def tell_revision(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> No
         f"poses left out {numbers.length(r.holdout.rms_m)}, "
         f"noise {numbers.length(story.noise_floor_m)}: {r.verdict.replace('_', ' ')}"
     )
-    rec.log("log", rr.TextLog(style.safe(line), level="INFO"))
+    rec.log("log", rr.TextLog(style.storable(line), level="INFO"))
 
 
 def _poses(rec: rr.RecordingStream, story: Story) -> None:
     """Log the last revision on the timeline `pose`, and move the arm along it."""
     r, time = story.revisions[-1], rr.TimeColumn("pose", sequence=story.poses)
     rec.set_time("pose", sequence=int(story.poses[0]))
-    tell_revision(rec, story, r)
+    log_revision(rec, story, r)
     rec.reset_time()
-    style.send_stands(rec, time, story.bodies)
+    style.send_poses(rec, time, story.bodies)
     far = story.last_of_poses(r.whitened_norm2)
     place, (half, quaternions) = story.anchor[far], noise_balls(story, far)
     current = rr.Arrows3D.columns(
@@ -172,18 +174,20 @@ def _poses(rec: rr.RecordingStream, story: Story) -> None:
         colors=style.LEVEL_COLORS[r.level[far]],
         radii=np.full(len(far), 0.012),
     )
-    along(rec, "world/residual/current", time, current)
+    send_states(rec, "world/residual/current", time, current)
     bright = np.tile(np.array(style.PREDICTED, dtype=np.uint8), (len(far), 1))
     ball = rr.Ellipsoids3D.columns(
         centers=place, half_sizes=half, quaternions=quaternions, colors=bright
     )
-    along(rec, "world/residual/ball", time, ball)
+    send_states(rec, "world/residual/ball", time, ball)
     dots = [leader(p, h) for p, h in zip(place, half, strict=True)]
     strips = rr.LineStrips3D.columns(strips=np.concatenate(dots))
-    along(rec, "world/residual/leader", time, strips.partition([len(x) for x in dots]))
+    send_states(rec, "world/residual/leader", time, strips.partition([len(x) for x in dots]))
     labels = [f"pose {story.pose_name(i)}: {_size(story, r, i)}" for i in far.tolist()]
-    along(rec, "world/residual/worst", time, style.label_columns(place + _LABEL_ABOVE, labels))
-    along(rec, "words/verdict", time, style.documents(pose_cards(story)))
+    send_states(
+        rec, "world/residual/worst", time, style.label_columns(place + _LABEL_ABOVE, labels)
+    )
+    send_states(rec, "words/verdict", time, style.documents(pose_cards(story)))
     # the bar of the current pose; its entity's name, last in order, puts it in front
     for pose, left, width, height in zip(*_bar_places(story, r), strict=True):
         rec.set_time("pose", sequence=int(pose))
@@ -213,12 +217,12 @@ def blueprint(story: Story) -> rrb.Blueprint:
         ),
         row_shares=[5, 4],
     )
-    return style.whole(left, right, "revision", following=story.growing, fps=1.0)
+    return style.page_blueprint(left, right, "revision", following=story.growing, fps=1.0)
 
 
 def titles(story: Story) -> tuple[str, str, str]:
     """Return the titles of residuals, deflections and bars, with their scales and counts."""
-    some, n = len(shown(story, story.revisions[0])), len(story)
+    some, n = len(arrow_readings(story, story.revisions[0])), len(story)
     part = f" (about {some} of {n} readings)" if some < n else ""
     quantity = "Deflection" if story.mode == "deflection" else "Deviation from nominal"
     several = poses_per_bar(story)
@@ -237,7 +241,7 @@ def _view3d(story: Story, name: str, without: str) -> rrb.Spatial3DView:
     stands = story.bodies[story.row[far], :, :3, 3].reshape(-1, 3)
     points = np.vstack([story.anchor, stands, story.anchor[far] + _LABEL_ABOVE])
     middle, size = style.center(story.anchor, 0.3 * story.arm.reach)
-    place = style.near(middle, style.EYE * size, points)
+    place = style.nearest_eye(middle, style.EYE * size, points)
     contents = ["+ $origin/**", f"- $origin/{without}/**", "- $origin/live/**"]
     return style.view3d("world", name, place, middle, contents)
 
@@ -399,21 +403,21 @@ def worst(r: StoryRevision) -> int:
     return int(np.argmax(r.whitened_norm2))
 
 
-def balled(story: Story, r: StoryRevision) -> Ints:
+def ball_readings(story: Story, r: StoryRevision) -> Ints:
     """Return the readings whose balls are drawn: the worst reading of each chosen pose."""
     of_pose = story.last_of_poses(r.whitened_norm2)
     return np.asarray(of_pose[worst_and_even(r.whitened_norm2[of_pose], BALLS)])
 
 
-def shown(story: Story, r: StoryRevision) -> Ints:
+def arrow_readings(story: Story, r: StoryRevision) -> Ints:
     """Return the readings whose arrows are drawn: with balls, the worst, and evenly chosen ones."""
-    return np.union1d(worst_and_even(r.whitened_norm2, ARROWS), balled(story, r))
+    return np.union1d(worst_and_even(r.whitened_norm2, ARROWS), ball_readings(story, r))
 
 
 def _scene(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
     """Log one revision at the current time: arrows, balls, the arm in the worst pose."""
-    far, drawn, balls = worst(r), shown(story, r), balled(story, r)
-    style.stand(rec, story.bodies[story.row[far]])
+    far, drawn, balls = worst(r), arrow_readings(story, r), ball_readings(story, r)
+    style.log_poses(rec, story.bodies[story.row[far]])
     residuals = story.anchor[drawn], arrows(story, r, drawn), r.level[drawn]
     rec.log("world/residual/arrows", style.residual_arrows(*residuals))
     noise = style.noise_balls(story.anchor[balls], *noise_balls(story, balls))

@@ -13,14 +13,14 @@ from hilcal import numbers
 from hilcal.present.comparison import FAR, type_report, unlike_words
 from hilcal.present.document import heading
 from hilcal.present.viewer import recording, style
-from hilcal.present.viewer.recording import along, fixed
+from hilcal.present.viewer.recording import log_static, send_states
 from hilcal.robot.arm import Arm
 from hilcal.robot.scene import body_poses, capsules
 from hilcal.store.revision import seconds_of
 from hilcal.types import Bools, Floats
 
 if TYPE_CHECKING:  # above this layer
-    from hilcal.transfer.fleet import Fleet, Pooled
+    from hilcal.transfer.fleet import Fleet, PooledType
     from hilcal.transfer.members import Member
 
 _JOINT = re.compile(r"\.j(\d+)\b")
@@ -40,7 +40,7 @@ GUIDE = """### How to read this
 class DrawnType:
     """Data of the views of a type: A arms, K pooled parameters, C campaigns of `members`."""
 
-    def __init__(self, pooled: "Pooled", members: "tuple[Member, ...]") -> None:
+    def __init__(self, pooled: "PooledType", members: "tuple[Member, ...]") -> None:
         arms, links = list(pooled.arms), pooled.prior.links
         self.pooled, self.names = pooled, tuple(p.parameter for p in pooled.parameters)  # (K,)
         # (K,) joint of each parameter, from 1; 0 for none
@@ -54,7 +54,7 @@ class DrawnType:
         self.reach = max(self.arm.reach, 0.1)  # m, scale of drawn sizes
         # (A, K) whether a parameter of an arm is unlike the type
         self.odd: Bools = np.zeros((len(arms), len(self.names)), dtype=np.bool_)
-        for o in pooled.odd:
+        for o in pooled.unlike:
             self.odd[arms.index(o.arm), self.names.index(o.parameter)] = True
         of_type = [m for m in members if m.type == pooled.type and m.name in pooled.campaigns]
         of_type.sort(key=lambda m: (arms.index(m.arm), seconds_of(m.date)))
@@ -72,7 +72,7 @@ class DrawnType:
                     row[k] = (value - mean.mean) / np.hypot(mean.between, std)
 
 
-def places(d: DrawnType) -> Floats:
+def arm_positions(d: DrawnType) -> Floats:
     """Return the positions (A, 3) of the arms, m: in rows, the first in front."""
     count = len(d.pooled.arms)
     wide = max(math.ceil(math.sqrt(2.0 * count)), 1)
@@ -83,7 +83,7 @@ def places(d: DrawnType) -> Floats:
 
 def _arms(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
     """Log the arms; joints unlike the type are red, those beyond `FAR` σ amber."""
-    fixed(rec, path, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+    log_static(rec, path, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     parts = capsules(d.arm)
     poses = body_poses(d.arm, np.resize(np.array(_STANDS), d.arm.n)[None])[0]
     body, radius = (np.array([getattr(s, k) for s in parts]) for k in ("body", "radius"))
@@ -92,10 +92,12 @@ def _arms(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
         for x in (np.array([s.start for s in parts]), np.array([s.end for s in parts]))
     )
     top = np.array([0.0, 0.0, 1.06 * float((np.maximum(start, end)[:, 2] + radius).max())])
-    place, marked = places(d), np.asarray(d.odd.any(axis=1))
+    place, marked = arm_positions(d), np.asarray(d.odd.any(axis=1))
     low, high = (np.concatenate([x + p for p in place]) for x in (start, end))
     colors = np.concatenate([_colors(d, a)[body] for a in range(len(place))])
-    fixed(rec, f"{path}/arms", style.drawn_capsules(low, high, np.tile(radius, len(place)), colors))
+    log_static(
+        rec, f"{path}/arms", style.drawn_capsules(low, high, np.tile(radius, len(place)), colors)
+    )
     named = np.flatnonzero(marked | (len(place) <= _NAMED))
     # Long labels are placed above the names of the neighbours, at different heights.
     step = np.cumsum(marked)[named] * marked[named]
@@ -103,11 +105,11 @@ def _arms(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
     feet = place[named] + top
     thin = rr.Radius.ui_points(1.0)
     leaders = rr.LineStrips3D(np.stack([feet, feet + above], 1), colors=[style.RED], radii=thin)
-    fixed(rec, f"{path}/names/leader", leaders)
+    log_static(rec, f"{path}/names/leader", leaders)
     arms = [d.pooled.arms[a] for a in named]
-    unlike = [[unlike_words(o) for o in d.pooled.odd if o.arm == arm] for arm in arms]
+    unlike = [[unlike_words(o) for o in d.pooled.unlike if o.arm == arm] for arm in arms]
     texts = ["\n".join(lines[:3]) or arm for arm, lines in zip(arms, unlike, strict=True)]
-    fixed(rec, f"{path}/names", style.labels(feet + above, texts))
+    log_static(rec, f"{path}/names", style.labels(feet + above, texts))
     if marked.any():
         frames = rr.Boxes3D(
             centers=place[marked] + 0.5 * top,
@@ -116,7 +118,7 @@ def _arms(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
             radii=rr.Radius.ui_points(2.0),
             fill_mode="majorwireframe",
         )
-        fixed(rec, f"{path}/unlike", frames)
+        log_static(rec, f"{path}/unlike", frames)
 
 
 def _colors(d: DrawnType, a: int) -> "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]":
@@ -144,17 +146,17 @@ def _drift(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
             odd = bool(d.odd[a, k])
             entity = f"{path}/{k}/{'zunlike' if odd else 'like'}/{a}"
             color, width = (style.RED, 3.0) if odd else (style.GREY, 1.2)
-            fixed(rec, entity, *style.series(arm, color, width, 2 * width))
+            log_static(rec, entity, *style.series(arm, color, width, 2 * width))
             time = rr.TimeColumn("date", timestamp=d.seconds[determined])
-            along(rec, entity, time, rr.Scalars.columns(scalars=d.campaigns[determined, k]))
+            send_states(rec, entity, time, rr.Scalars.columns(scalars=d.campaigns[determined, k]))
 
 
 def record_fleet(fleet: "Fleet", path: Path) -> None:
     """Write a fleet as a recording file; equal fleets give equal recordings."""
     types = [DrawnType(t, fleet.members) for t in fleet.types]
-    names = [(d.pooled.type, d.pooled.arms, d.pooled.odd, d.names) for d in types]
+    names = [(d.pooled.type, d.pooled.arms, d.pooled.unlike, d.names) for d in types]
     content = (a for d in types for a in (d.pooled.distance, d.seconds, d.campaigns))
-    rec = recording.opened(names, *content)
+    rec = recording.content_stream(names, *content)
     recording.write(rec, _blueprint(types), lambda: _log(rec, types), Path(path))
 
 
@@ -163,13 +165,13 @@ def _log(rec: rr.RecordingStream, types: list[DrawnType]) -> None:
     for i, d in enumerate(types):
         _arms(rec, f"arms{i}", d)
         _drift(rec, f"date{i}", d)
-        odd = list(dict.fromkeys(o.arm for o in d.pooled.odd))
+        odd = list(dict.fromkeys(o.arm for o in d.pooled.unlike))
         verb = "is" if len(odd) == 1 else "are"
         title = f"{numbers.names(odd)} {verb} unlike the others" if odd else "No arm is unlike"
         name, table, note, *lines = type_report(d.pooled)
         text = style.markdown([heading(title), name, *lines, table, note])
-        fixed(rec, f"words/type{i}", style.document(text))
-    fixed(rec, "words/guide", style.document(GUIDE))
+        log_static(rec, f"words/type{i}", style.document(text))
+    log_static(rec, "words/guide", style.document(GUIDE))
     recording.flush(rec)
 
 
@@ -177,7 +179,7 @@ def _blueprint(types: list[DrawnType]) -> rrb.Blueprint:
     scenes, dates, texts = [], [], []
     for i, d in enumerate(types):
         title = f"{d.pooled.type}: " if len(types) > 1 else ""
-        place = places(d)
+        place = arm_positions(d)
         middle = place.mean(axis=0) + np.array([0.0, 0.0, 0.35 * d.reach])
         eye = middle + (np.ptp(place, axis=0).max() + d.reach) * np.array([0.68, 0.0, 0.36])
         name = f"{title}{len(place)} arms; a red frame: unlike the others, the red joint says where"
@@ -192,4 +194,6 @@ def _blueprint(types: list[DrawnType]) -> rrb.Blueprint:
             dates.append(view)
         texts.append(style.text(f"type{i}", f"{title}Unlike the type"))
     left = rrb.Vertical(rrb.Tabs(*scenes), rrb.Tabs(*dates), row_shares=[3, 2])
-    return style.whole(left, rrb.Tabs(*texts, style.text("guide", "How to read this")), "date")
+    return style.page_blueprint(
+        left, rrb.Tabs(*texts, style.text("guide", "How to read this")), "date"
+    )

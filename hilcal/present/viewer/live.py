@@ -19,13 +19,20 @@ from scipy import stats
 
 from hilcal import numbers
 from hilcal.errors import HilcalError, InputError
-from hilcal.measuring.progress import ArmAt, GoalMet, LiveResidual, Phase, ReadingStored, Remark
+from hilcal.measuring.progress import (
+    ArmPosition,
+    GoalMet,
+    LiveResidual,
+    Phase,
+    ReadingStored,
+    Remark,
+)
 from hilcal.present.document import Block, Items, heading, table
-from hilcal.present.live_viewer import Measuring
-from hilcal.present.progress import figures, met_words, spoken, status_words
+from hilcal.present.live_viewer import MeasuringStart
+from hilcal.present.progress import duration_text, met_words, reading_text, status_words
 from hilcal.present.story import LIMITS, Story, levels
 from hilcal.present.viewer import campaign, recording, style
-from hilcal.present.viewer.recording import along, fixed
+from hilcal.present.viewer.recording import log_static, send_states
 from hilcal.robot.scene import body_poses
 from hilcal.store.plan import Step
 from hilcal.types import Floats
@@ -42,7 +49,7 @@ WORST, REMARKS = 3, 3  # listed readings and remarks
 BALLS, MANY = 60, 300
 """Number of readings above which balls, and above which arrows, are drawn only for arrows that
 leave their balls; choices, for legibility."""
-FLUENT = 1000
+MAX_SINGLE_RESIDUALS = 1000
 """Most residuals that a viewer draws one by one; 10,000 take it 3.5 times the time of 100, 1000
 some 1.2 times (tests/benchmarks/test_viewer_speed.py)."""
 GROUPS = 150  # number of groups of more residuals; the number of bars of a finished recording
@@ -92,7 +99,7 @@ class LiveJudgement:
         return int(levels(np.array([self.norm2]))[0])
 
 
-def judged(step: Step, live: LiveResidual, target: str = "") -> LiveJudgement | None:
+def judgement_of(step: Step, live: LiveResidual, target: str = "") -> LiveJudgement | None:
     """Return the judgement of a reading; None if the reading was not compared with a model."""
     if live.vector is None or live.covariance is None:
         return None
@@ -103,7 +110,7 @@ def judged(step: Step, live: LiveResidual, target: str = "") -> LiveJudgement | 
 class LiveTally:
     """Running totals of a campaign that is being measured."""
 
-    def __init__(self, measured: Measuring) -> None:
+    def __init__(self, measured: MeasuringStart) -> None:
         plan, self.measured = measured.plan, measured
         # (P, n + 2, 4, 4) poses of the arm's bodies at each pose of the plan
         self.bodies = body_poses(measured.arm, plan.q)
@@ -114,7 +121,7 @@ class LiveTally:
         self.targets = position.reshape(-1, 3)
         self._anchor = dict(zip(plan.pose_names, position, strict=True))
         # numbers of planned and of stored readings; remaining real time, s
-        self.total, self.done = len(plan.steps), len({step for _, step in measured.earlier})
+        self.total, self.done = len(plan.steps), len({step for _, step in measured.earlier_steps})
         self.left, self.phase = 0.0, ""
         self.last: ReadingStored | None = None
         # numbers of readings that were compared with a model, and of those outside their ball
@@ -124,21 +131,21 @@ class LiveTally:
         self.remarks: list[str] = []  # newest last
         # number of successive residuals of which a viewer keeps those that stand out; 1: keeps all
         planned = self.total * len(measured.targets)
-        self.group = 1 if planned <= FLUENT else math.ceil(planned / GROUPS)
+        self.group = 1 if planned <= MAX_SINGLE_RESIDUALS else math.ceil(planned / GROUPS)
         self._group_worst = 0.0  # largest `LiveJudgement.norm2` of the present group
 
-    def place(self, step: Step, target: int = 0) -> Floats:
+    def target_position(self, step: Step, target: int = 0) -> Floats:
         """Return the nominal position (3,) of a target, m."""
         return np.asarray(self._anchor[step.pose][target])
 
     def add(self, event: ReadingStored) -> list[tuple[int, LiveResidual, LiveJudgement | None]]:
         """Count a reading; return each target's residual and its judgement, None without model."""
-        self.last, self.done, self.left = event, event.done, event.left_real
-        residuals = ((event.target, event.live), *event.others)
+        self.last, self.done, self.left = event, event.stored, event.remaining_s
+        residuals = ((event.target, event.live), *event.other_targets)
         return [(k, live, self._judge(event.step, k, live)) for k, live in residuals]
 
     def _judge(self, step: Step, target: int, live: LiveResidual) -> LiveJudgement | None:
-        j = judged(step, live, self.measured.names[target] if self.measured.names else "")
+        j = judgement_of(step, live, self.measured.names[target] if self.measured.names else "")
         if j is None:
             return None
         begins, outside = self.judged % self.group == 0, int(j.level > 0)
@@ -150,7 +157,7 @@ class LiveTally:
         self._group_worst = max(j.norm2, 0.0 if begins else self._group_worst)
         return j
 
-    def words(self) -> Iterator[Block]:
+    def report(self) -> Iterator[Block]:
         """Yield the progress of the campaign and the verdict so far."""
         if self.judged == 0:
             yield heading("Measuring: no judgement yet")
@@ -165,7 +172,7 @@ class LiveTally:
                 f"{self.outside} of {self.judged} ({numbers.percent(self.outside / self.judged)}) "
                 "compared readings are outside their 99 % noise ball (noise alone: 1 %)." + advice
             )
-        remaining = f", {spoken(self.left)} left" if self.left > 0 else ""
+        remaining = f", {duration_text(self.left)} left" if self.left > 0 else ""
         yield f"{self.done} of {self.total} readings{remaining}. {self.phase}"
         goal = None if self.last is None else self.last.goal
         if goal is not None and (value := status_words(goal)):
@@ -191,7 +198,7 @@ def live_blueprint(d: LiveTally, world: str, series: str) -> rrb.Blueprint:
     drawn = "Residual of each reading," if d.group == 1 else f"Worst of every {d.group} residuals,"
     middle, size = style.center(d.targets, 0.3 * d.measured.arm.reach)
     points = np.vstack([d.targets, d.bodies[0, :, :3, 3]])
-    place, more = style.near(middle, style.EYE * size, points), ("arrows", "balls", "dots")
+    place, more = style.nearest_eye(middle, style.EYE * size, points), ("arrows", "balls", "dots")
     overrides = {f"{world}/{name}": so_far for name in more}
     name = f"{drawn} {RESIDUALS}"
     scene = style.view3d("world", name, place, middle, [f"+ {world}/**"], overrides=overrides)
@@ -210,7 +217,7 @@ def live_blueprint(d: LiveTally, world: str, series: str) -> rrb.Blueprint:
     texts = (("measuring", "So far"), ("live_guide", "How to read this"))
     left = rrb.Vertical(scene, in_time, row_shares=[11, 4])
     right = rrb.Vertical(rrb.Tabs(*(style.text(*w) for w in texts)), log, row_shares=[3, 2])
-    return style.whole(left, right, TIMELINE, following=True)
+    return style.page_blueprint(left, right, TIMELINE, following=True)
 
 
 class LiveScene:
@@ -228,14 +235,14 @@ class LiveScene:
         self._story: Story | None = None
         self._titles: tuple[str, ...] = ()
 
-    def tell(self, wall: float, event: object) -> None:
+    def draw(self, wall: float, event: object) -> None:
         """Draw an event at a time of day, s."""
         self._rec.set_time(TIMELINE, timestamp=wall)
-        if isinstance(event, ArmAt):
+        if isinstance(event, ArmPosition):
             self._passed.append((wall, event.q))
         if not self._batches:
             self._move()
-        if isinstance(event, Measuring):
+        if isinstance(event, MeasuringStart):
             self.settle()
             self._measuring(wall, event)
         elif isinstance(event, Story):
@@ -258,36 +265,38 @@ class LiveScene:
             return
         self._rec.reset_time()
         story = replace(self._story, growing=False)
-        campaign.tell(self._rec, story)
+        campaign.log_story(self._rec, story)
         self._rec.reset_time()
         self._show(campaign.blueprint(story if to_open else self._story))
 
     def _show(self, views: rrb.Blueprint) -> None:
         self._rec.send_blueprint(views, make_active=True, make_default=True)
 
-    def _measuring(self, wall: float, start: Measuring) -> None:
+    def _measuring(self, wall: float, start: MeasuringStart) -> None:
         rec, d = self._rec, LiveTally(start)
         self._campaigns, self._tally = self._campaigns + 1, d
         self._series = f"live/{self._campaigns}"
         self._world = f"world/{self._series}"
-        rec.send_recording_name(f"hilcal: {style.safe(start.name)}")
-        fixed(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        rec.send_recording_name(f"hilcal: {style.storable(start.name)}")
+        log_static(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         self._arm = style.MovingArm(rec, f"{self._world}/arm", start.arm, start.targets)
-        fixed(rec, "words/live_guide", style.document(GUIDE))
+        log_static(rec, "words/live_guide", style.document(GUIDE))
         planned = rr.Points3D(d.targets, colors=[style.GREY], radii=[0.006])
-        fixed(rec, f"{self._world}/planned", planned)
+        log_static(rec, f"{self._world}/planned", planned)
         for name, color in zip(style.LEVEL_NAMES, style.LEVEL_COLORS, strict=True):
-            fixed(rec, f"{self._series}/{name}", style.series(name, color, 0.0, 4.0)[1])
+            log_static(rec, f"{self._series}/{name}", style.series(name, color, 0.0, 4.0)[1])
         line = rr.SeriesLines(colors=[style.NOISE], widths=[1.5], names=["99 %"])
-        fixed(rec, f"{self._series}/limit", line)
-        if start.earlier:  # readings of earlier sessions, as one batch
-            walls, steps = zip(*start.earlier, strict=True)
+        log_static(rec, f"{self._series}/limit", line)
+        if start.earlier_steps:  # readings of earlier sessions, as one batch
+            walls, steps = zip(*start.earlier_steps, strict=True)
             dots = rr.Points3D.columns(
-                positions=[d.place(step) for step in steps],
+                positions=[d.target_position(step) for step in steps],
                 colors=np.tile(np.array(style.MEASURED, dtype=np.uint8), (len(steps), 1)),
                 radii=np.full(len(steps), 0.01),
             )
-            along(rec, f"{self._world}/dots", rr.TimeColumn(TIMELINE, timestamp=list(walls)), dots)
+            send_states(
+                rec, f"{self._world}/dots", rr.TimeColumn(TIMELINE, timestamp=list(walls)), dots
+            )
         self._passed.append((wall, tuple(start.plan.q[0].tolist())))
         self._move()
         self._send_summary(d)
@@ -306,7 +315,7 @@ class LiveScene:
                 del self._passed[self._since : -1]
             self._since = len(self._passed)
             self._reading(d, event)
-            self._log(f"{event.done}/{event.total} {event.step}{figures(event)}")
+            self._log(f"{event.stored}/{event.total} {event.step}{reading_text(event)}")
         elif isinstance(event, Phase):
             d.phase = event.text
         elif isinstance(event, Remark | GoalMet):
@@ -323,7 +332,7 @@ class LiveScene:
         dots, arrows, balls, last = [], [], [], []
         judgements = d.add(event)
         for target, live, j in judgements:
-            place = d.place(event.step, target)
+            place = d.target_position(event.step, target)
             if j is None:
                 dots.append(place)
                 continue
@@ -355,14 +364,14 @@ class LiveScene:
         if worst is not None:
             size = f"{numbers.length(worst.length)} ({worst.sigma:.1f} σ)"
             label += f"{', ' * bool(worst.target)}{worst.target}: {size}"
-        above = d.place(event.step, target) + _ABOVE
+        above = d.target_position(event.step, target) + _ABOVE
         rec.log(f"{self._world}/last", style.labels([above], [label]))
 
     def _send_summary(self, d: LiveTally) -> None:
-        self._rec.log("words/measuring", style.document(style.markdown(d.words())))
+        self._rec.log("words/measuring", style.document(style.markdown(d.report())))
 
     def _log(self, text: str, level: str = "INFO") -> None:
-        self._rec.log("log", rr.TextLog(style.safe(text), level=level))
+        self._rec.log("log", rr.TextLog(style.storable(text), level=level))
 
     def _revised(self, story: Story) -> None:
         """Draw a revision after the previous ones of the same readings."""
@@ -371,9 +380,9 @@ class LiveScene:
         previous = tuple(r for r in drawn if r.revision < new.revision)
         self._story = story = replace(story, revisions=(*previous, *story.revisions), growing=True)
         if not previous:
-            campaign.begin(rec, story)
+            campaign.log_static_entities(rec, story)
         rec.set_time("revision", sequence=new.revision)
-        campaign.tell_revision(rec, story, new)
+        campaign.log_revision(rec, story, new)
         rec.disable_timeline("revision")
         titles = campaign.titles(story)
         if titles != self._titles or not previous:
@@ -388,7 +397,7 @@ def follow(messages: BinaryIO, reply: Callable[..., None], record: Path, port: i
     with contextlib.suppress(OSError):
         recording.disable_analytics()
     ports = range(port, port + PORTS)
-    free = next((p for p in ports if recording.refused(p) is None), None)
+    free = next((p for p in ports if recording.bind_error(p) is None), None)
     if free is None:
         reply(problem=f"no free port from {port} to {ports[-1]}: no live viewer is served")
         reply(url=None)
@@ -399,7 +408,7 @@ def follow(messages: BinaryIO, reply: Callable[..., None], record: Path, port: i
         while True:
             wall, event = pickle.load(messages)  # noqa: S301 - of the command that started us
             for outlet in outlets:
-                outlet.tell(wall, event)
+                outlet.draw(wall, event)
     guard = threading.Thread(target=lambda: list(map(_Outlet.end, outlets)), daemon=True)
     guard.start()
     guard.join(_END_S)
@@ -427,11 +436,11 @@ class _Outlet:
         except (OSError, RuntimeError, ValueError) as error:
             self._fail(error)
 
-    def tell(self, wall: float, event: object) -> None:
+    def draw(self, wall: float, event: object) -> None:
         """Draw an event, and flush at once or with a later event."""
-        complete = not isinstance(event, ArmAt)  # positions of the arm are sent in batches
-        at_once = isinstance(event, Measuring | Story)
-        self._draw(lambda scene: scene.tell(wall, event), complete, at_once)
+        complete = not isinstance(event, ArmPosition)  # positions of the arm are sent in batches
+        at_once = isinstance(event, MeasuringStart | Story)
+        self._draw(lambda scene: scene.draw(wall, event), complete, at_once)
 
     def _draw(self, draw: Callable[[LiveScene], None], complete: bool, at_once: bool) -> None:
         if self._scene is None:
@@ -450,7 +459,7 @@ class _Outlet:
         try:
             self._rec.flush(timeout_sec=_FLUSH_S)
         except (OSError, RuntimeError, ValueError, HilcalError) as error:
-            if not recording.slow(error):
+            if not recording.is_timeout(error):
                 self._fail(error)
             elif self._file and self._size() == size:  # rerun does not report a failed write
                 self._fail(f"nothing was written for {_FLUSH_S:.0f} s; is the disk full?")

@@ -21,9 +21,9 @@ from hilcal.measuring.clearance import Clearance
 from hilcal.measuring.route import route
 from hilcal.present import plan as plan_blocks
 from hilcal.present.document import Block, Words, heading, load_name, pairs, table
-from hilcal.present.progress import spoken
+from hilcal.present.progress import duration_text
 from hilcal.present.viewer import recording, style
-from hilcal.present.viewer.recording import along, fixed
+from hilcal.present.viewer.recording import log_static, send_states
 from hilcal.robot import chain as chains
 from hilcal.robot.scene import body_poses, capsules
 from hilcal.store.plan import UNLOADED, Plan
@@ -135,12 +135,12 @@ class PlanView:
             return np.full(len(self), UNKNOWN)
         free = np.zeros(len(self), dtype=np.bool_)
         for k, name in enumerate(self.plan.loads):
-            free[self.load == k] = self.view.free(self.q[self.load == k], name)
+            free[self.load == k] = self.view.unobstructed(self.q[self.load == k], name)
         angle, most = self.incidence, self.config.sight.incidence_max_rad
         turned = np.zeros(len(self), dtype=np.bool_) if angle is None else angle > most
         return np.where(~free, HIDDEN, np.where(turned, TURNED, SEEN)).astype(np.int64)
 
-    def why(self, step: int) -> str:
+    def sight_problem(self, step: int) -> str:
         """Return why the tracker does not see the target at a step; empty if it does."""
         if self.view is None or self.sight[step] == SEEN:
             return ""
@@ -148,11 +148,11 @@ class PlanView:
         problems = self.view.problems(q, load, "")
         if reasons := "; ".join(line.removeprefix(": ") for line in problems):
             return reasons
-        hidden = self.view.hidden(q, load)  # some of several targets
+        hidden = self.view.hidden_targets(q, load)  # some of several targets
         return f"hidden: {', '.join(self.cell.target_names[k] for k in hidden)}"
 
     @cached_property
-    def ways(self) -> tuple[Floats, ...]:
+    def paths(self) -> tuple[Floats, ...]:
         """Path (K, 3) of the target from the previous step to each step, linear in joint space."""
         stops = route(self.plan, self.cell.arm, self.config.limits.joint_margin_rad)
         legs: list[list[Floats]] = [[]]
@@ -169,7 +169,7 @@ class PlanView:
 
 
 def _static_scene(rec: rr.RecordingStream, d: PlanView) -> None:
-    fixed(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+    log_static(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     of_arm, parts = len(capsules(d.cell.arm)), d.shapes.scene.parts
     style.log_shapes(rec, style.shapes(parts[:of_arm], parts[of_arm:]))
     _obstacles(rec, d.config.obstacles)
@@ -177,9 +177,11 @@ def _static_scene(rec: rr.RecordingStream, d: PlanView) -> None:
     _beads(rec, d)
     if d.tracker is not None:
         low, high = ((d.tracker + k * _HEAD * _UP)[None] for k in (-1.2, 0.2))
-        fixed(rec, "world/tracker", style.drawn_capsules(low, high, np.array([_HEAD]), [_TRACKER]))
+        log_static(
+            rec, "world/tracker", style.drawn_capsules(low, high, np.array([_HEAD]), [_TRACKER])
+        )
         above = d.tracker + 2.2 * _HEAD * _UP
-        fixed(rec, "world/tracker/name", style.labels([above], ["tracker"]))
+        log_static(rec, "world/tracker/name", style.labels([above], ["tracker"]))
 
 
 def _obstacles(rec: rr.RecordingStream, things: tuple[Obstacle, ...]) -> None:
@@ -188,7 +190,7 @@ def _obstacles(rec: rr.RecordingStream, things: tuple[Obstacle, ...]) -> None:
         for part, mode, alpha in (("body", "solid", _SOLID), ("edge", "majorwireframe", 255)):
             look: dict[str, Any] = {"colors": [(*_OBSTACLE, alpha)], "fill_mode": mode}
             drawn = rr.Boxes3D(centers=centers, sizes=sizes, **look)
-            fixed(rec, f"world/obstacles/box/{part}", drawn)
+            log_static(rec, f"world/obstacles/box/{part}", drawn)
     if stood := [x for x in things if x.bottom_m is not None]:
         height = np.array([x.height_m for x in stood], dtype=float)
         cylinders = rr.Cylinders3D(
@@ -198,10 +200,10 @@ def _obstacles(rec: rr.RecordingStream, things: tuple[Obstacle, ...]) -> None:
             colors=[(*_OBSTACLE, _SOLID)],
             fill_mode="solid",
         )
-        fixed(rec, "world/obstacles/cylinder", cylinders)
+        log_static(rec, "world/obstacles/cylinder", cylinders)
     if things:
         names = style.labels([_named_at(x) for x in things], [x.name for x in things])
-        fixed(rec, "world/obstacles/names", names)
+        log_static(rec, "world/obstacles/names", names)
 
 
 def _named_at(thing: Obstacle) -> Floats:
@@ -229,7 +231,7 @@ def _workspace(rec: rr.RecordingStream, d: PlanView) -> None:
             sides.append(corners)
     if sides:
         lines = rr.LineStrips3D(sides, colors=[_BOX], radii=rr.Radius.ui_points(0.6))
-        fixed(rec, "world/workspace", lines)
+        log_static(rec, "world/workspace", lines)
 
 
 def _beads(rec: rr.RecordingStream, d: PlanView) -> None:
@@ -238,7 +240,7 @@ def _beads(rec: rr.RecordingStream, d: PlanView) -> None:
     steps = np.sort(np.unique(pairs, axis=0, return_index=True)[1])
     center = d.target[steps] + d.rank[steps, None] * BEAD_GAP * d.reach * _UP
     beads = rr.Points3D(center, colors=d.colors[d.load[steps]], radii=BEAD * d.reach)
-    fixed(rec, "world/target/beads", beads)
+    log_static(rec, "world/target/beads", beads)
     lost = d.unseen[steps]
     if lost.any():
         cages = rr.Ellipsoids3D(
@@ -248,22 +250,22 @@ def _beads(rec: rr.RecordingStream, d: PlanView) -> None:
             fill_mode="majorwireframe",
             line_radii=rr.Radius.ui_points(0.5),
         )
-        fixed(rec, "world/target/unseen", cages)
+        log_static(rec, "world/target/unseen", cages)
 
 
 def _step_scene(rec: rr.RecordingStream, d: PlanView) -> None:
     """Send the entities that change with every step, as columns on `step`."""
-    style.send_stands(rec, d.steps, d.bodies[:, :-1])
+    style.send_poses(rec, d.steps, d.bodies[:, :-1])
     colors, beams = d.colors[d.load], SIGHT_COLORS[d.sight]
 
     def lines(path: str, strips: Any, colors: Any, radius: float) -> None:
         radii = np.full(len(d), radius * d.reach)
         drawn = rr.LineStrips3D.columns(strips=strips, colors=colors, radii=radii)
-        along(rec, path, d.steps, drawn)
+        send_states(rec, path, d.steps, drawn)
 
     radii = np.full(len(d), 1.7 * BEAD * d.reach)
     points = rr.Points3D.columns(positions=d.target, colors=colors, radii=radii)
-    along(rec, "world/target/now", d.steps, points)
+    send_states(rec, "world/target/now", d.steps, points)
     above = d.target + (_LABEL_ABOVE + d.rank.max(initial=0) * BEAD_GAP * d.reach) * _UP
     texts = [
         f"{k + 1}: {s.pose}, {load_name(s.load)}"
@@ -271,18 +273,18 @@ def _step_scene(rec: rr.RecordingStream, d: PlanView) -> None:
         for k, s in enumerate(d.plan.steps)
     ]
     labels = style.label_columns(above + 0.25 * _LABEL_ABOVE * _UP, texts)
-    along(rec, "world/label", d.steps, labels)
+    send_states(rec, "world/label", d.steps, labels)
     lines("world/label/leader", np.stack([d.target, above], 1), beams, 0.0012)
     if d.tracker is not None:
         start = np.broadcast_to(d.tracker, d.target.shape)
         lines("world/beam", np.stack([start, d.target], 1), beams, 0.004)
-    lines("world/way/last", list(d.ways), colors, 0.0022)
+    lines("world/way/last", list(d.paths), colors, 0.0022)
     _loads(rec, d)
     # the target's complete path under the load of the step
     starts = [0, *(np.flatnonzero(np.diff(d.load)) + 1).tolist(), len(d)]
     for begin, end in pairwise(starts):
         rec.set_time("step", sequence=begin + 1)
-        way, color = [np.vstack(d.ways[begin:end])], (_DIM * d.colors[d.load[begin]])
+        way, color = [np.vstack(d.paths[begin:end])], (_DIM * d.colors[d.load[begin]])
         thin = rr.Radius.ui_points(0.6)
         drawn = rr.LineStrips3D(way, colors=[color.astype(np.uint8)], radii=thin)
         rec.log("world/way/whole", drawn)
@@ -330,29 +332,31 @@ def record_plan(
     `PlanView` and `recording.write`.
     """
     d = PlanView(cell, config, plan, summary, powers)
-    rec = recording.opened(d.config.to_json(), d.plan.to_json(), d.summary, d.powers)
+    rec = recording.content_stream(d.config.to_json(), d.plan.to_json(), d.summary, d.powers)
     recording.write(rec, blueprint(d), lambda: _log(rec, d), Path(path))
 
 
 def _log(rec: rr.RecordingStream, d: PlanView) -> None:
-    rec.send_recording_name(f"hilcal plan: {style.safe(d.cell.arm.name)}, {len(d)} readings")
+    rec.send_recording_name(f"hilcal plan: {style.storable(d.cell.arm.name)}, {len(d)} readings")
     _static_scene(rec, d)
     _, _, *tables = plan_blocks.plan_report(d.summary)
     times = pairs(row for row in plan_blocks.cost_rows(d.summary) if row[0] in NOT_FIRST)
     details = style.markdown([times, *tables])
     for name, text in (("plan", overview(d)), ("guide", GUIDE), ("details", details)):
-        fixed(rec, f"words/{name}", style.document(text))
+        log_static(rec, f"words/{name}", style.document(text))
     recording.flush(rec)
     _step_scene(rec, d)
     _schedule(rec, d)
-    along(rec, "words/step", d.steps, style.documents([step_card(d, k) for k in range(len(d))]))
+    send_states(
+        rec, "words/step", d.steps, style.documents([step_card(d, k) for k in range(len(d))])
+    )
     recording.flush(rec)
 
 
 def overview(d: PlanView) -> str:
     """Return purpose, cost and efficiency of a plan; short, to fit a small window."""
     s, tracker = d.summary, NO_TRACKER
-    title = f"Plan: {s.poses} poses, {s.readings} readings, {spoken(s.duration.total)}"
+    title = f"Plan: {s.poses} poses, {s.readings} readings, {duration_text(s.duration.total)}"
     if d.tracker is not None:
         lost, tracker = int(d.unseen.sum()), f"✓ sees the target in all {len(d)} readings"
         if lost:
@@ -386,7 +390,9 @@ def step_card(d: PlanView, k: int) -> str:
             way += f", {np.rad2deg(d.incidence[k]):.0f}° off the reflector's normal"
         sight = Words(f"✓ The tracker sees the target {way}.")
         if d.sight[k] != SEEN:
-            sight = Words(f"✗ The tracker does not see the target {way}: {d.why(k)}.", "strong")
+            sight = Words(
+                f"✗ The tracker does not see the target {way}: {d.sight_problem(k)}.", "strong"
+            )
     return style.markdown([head, when, *by_hand, sight, table("joint", "deg", rows=rows), place])
 
 
@@ -400,11 +406,13 @@ def _schedule(rec: rr.RecordingStream, d: PlanView) -> None:
         name = "not seen by the tracker"
         series.append(("unseen", name, d.unseen, style.RED, "cross", 2 * _DOT))
     for entity, name, members, color, marker, size in series:
-        named = f"{style.safe(name)}: {int(members.sum())}"
+        named = f"{style.storable(name)}: {int(members.sum())}"
         look: dict[str, Any] = {"colors": [color], "markers": [marker], "marker_sizes": [size]}
-        fixed(rec, f"schedule/{entity}", rr.SeriesPoints(names=[named], **look))
+        log_static(rec, f"schedule/{entity}", rr.SeriesPoints(names=[named], **look))
         time = rr.TimeColumn("step", sequence=np.flatnonzero(members) + 1)
-        along(rec, f"schedule/{entity}", time, rr.Scalars.columns(scalars=d.time[members] / 60.0))
+        send_states(
+            rec, f"schedule/{entity}", time, rr.Scalars.columns(scalars=d.time[members] / 60.0)
+        )
 
 
 def blueprint(d: PlanView) -> rrb.Blueprint:
@@ -420,7 +428,7 @@ def blueprint(d: PlanView) -> rrb.Blueprint:
     # and from a side where no obstacle hides the arm
     some = np.unique(np.linspace(0, len(d) - 1, _LOOKED_AT).round().astype(np.int64))
     arm = np.vstack([d.bodies[some, 1:, :3, 3].reshape(-1, 3), d.target[some]])
-    eye = style.direction(turn, middle, size, arm, d.config.obstacles)
+    eye = style.view_direction(turn, middle, size, arm, d.config.obstacles)
     scenes = [style.view3d("world", STEPS, middle + size * eye, middle)]
     if d.tracker is not None:
         hidden = [f"- $origin/{x}/**" for x in ("tracker", "beam", "workspace", "way")]
@@ -433,4 +441,4 @@ def blueprint(d: PlanView) -> rrb.Blueprint:
     left = rrb.Vertical(rrb.Tabs(*scenes), times, row_shares=[7, 2])
     tabs = rrb.Tabs(*(style.text(*t) for t in texts))
     right = rrb.Vertical(tabs, style.text("details", "Details"), row_shares=[5, 4])
-    return style.whole(left, right, "step", fps=_FPS)
+    return style.page_blueprint(left, right, "step", fps=_FPS)

@@ -22,7 +22,7 @@ _FLUSH_TIMEOUT = 10.0
 _LOG = logging.getLogger(__name__)
 
 
-def refused(port: int) -> Exception | None:
+def bind_error(port: int) -> Exception | None:
     """Return why a port cannot be bound, None if it can; a server would only log the error."""
     try:
         with socket.socket() as probe:
@@ -33,7 +33,7 @@ def refused(port: int) -> Exception | None:
     return None
 
 
-def opened(*content: object) -> rr.RecordingStream:
+def content_stream(*content: object) -> rr.RecordingStream:
     """Return a stream whose identifier is a hash of the content, values or arrays."""
     sha = hashlib.sha256()
     for part in content:
@@ -53,17 +53,17 @@ def stream(identifier: str, batches: rr.ChunkBatcherConfig | None) -> rr.Recordi
     return rec
 
 
-def slow(error: Exception) -> bool:
+def is_timeout(error: Exception) -> bool:
     """Return whether an error is only a timeout of the receiver."""
     return "timeout" in str(error).lower() or "timed out" in str(error).lower()
 
 
-def fixed(rec: rr.RecordingStream, path: str, *drawn: rr.AsComponents) -> None:
+def log_static(rec: rr.RecordingStream, path: str, *drawn: rr.AsComponents) -> None:
     """Log a static entity."""
     rec.log(path, *drawn, static=True)
 
 
-def along(
+def send_states(
     rec: rr.RecordingStream, path: str, time: rr.TimeColumn, columns: rr.ComponentColumnList
 ) -> None:
     """Send the states of an entity at several times."""
@@ -71,9 +71,9 @@ def along(
 
 
 def write(
-    rec: rr.RecordingStream, blueprint: rrb.Blueprint, tell: Callable[[], None], path: Path
+    rec: rr.RecordingStream, blueprint: rrb.Blueprint, log: Callable[[], None], path: Path
 ) -> None:
-    """Write what `tell` logs to a file, atomically, and close the stream.
+    """Write what `log` logs to a file, atomically, and close the stream.
 
     The recording is encoded in memory, since rerun's file sink can wait forever on a full disk.
     Raises InputError if the folder is missing, or the file cannot be written.
@@ -82,7 +82,7 @@ def write(
         raise InputError(f"recording {path}: no folder {path.parent}; make it first")
     memory = rec.memory_recording()
     rec.send_blueprint(blueprint, make_active=True, make_default=True)
-    tell()
+    log()
     try:
         replace_file(path, memory.drain_as_bytes())
     finally:
@@ -94,7 +94,7 @@ def flush(rec: rr.RecordingStream) -> None:
     try:
         rec.flush(timeout_sec=_FLUSH_TIMEOUT)
     except (ValueError, RuntimeError, OSError) as error:
-        if not slow(error):
+        if not is_timeout(error):
             raise HilcalError(f"the recording's sink failed: {error}") from error
         _LOG.warning("recording: a viewer is slow: %s", error)
 

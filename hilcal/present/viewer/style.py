@@ -11,10 +11,10 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from hilcal.config import Obstacle
-from hilcal.measuring.clearance import holds
+from hilcal.measuring.clearance import contains
 from hilcal.present import story
-from hilcal.present.document import Block, Chart, Items, Table, Words, says
-from hilcal.present.viewer.recording import along, fixed
+from hilcal.present.document import Block, Chart, Items, Table, Words, description_of
+from hilcal.present.viewer.recording import log_static, send_states
 from hilcal.robot.arm import Arm
 from hilcal.robot.scene import Capsule, capsules
 from hilcal.types import Bools, Floats
@@ -59,14 +59,14 @@ _FACTORS = np.arange(0.7, 2.51, 0.05)
 _WORTH = 0.02  # least share of points that must become visible for each next place of the eye
 
 
-def safe(text: str) -> str:
+def storable(text: str) -> str:
     """Return a text with question marks for characters that may lack a glyph."""
     return _UNSAFE.sub("?", text)
 
 
 def escaped(text: str) -> str:
     """Return a safe text on one line, escaped for markdown."""
-    return _MARKDOWN.sub(r"\\\1", safe(" ".join(text.translate(_BARS).split())))
+    return _MARKDOWN.sub(r"\\\1", storable(" ".join(text.translate(_BARS).split())))
 
 
 def markdown(blocks: Iterable[Block]) -> str:
@@ -85,7 +85,7 @@ def _block(block: Block) -> str:
     if isinstance(block, Items):
         return "\n".join(f"- {escaped(row)}" for row in block.rows)
     if isinstance(block, Chart):
-        return escaped(says(block.figure))
+        return escaped(description_of(block.figure))
     paragraph = block if isinstance(block, Words) else Words(block)
     lines = [escaped(line) for line in paragraph.text.split("\n") if line.strip()]
     if lines and paragraph.tone == "heading":
@@ -107,7 +107,7 @@ def documents(texts: list[str]) -> rr.ComponentColumnList:
 
 def series(name: str, color: Color, width: float, mark: float) -> tuple[rr.AsComponents, ...]:
     """Return the style of a series of numbers: width of its line, size of its marks."""
-    names, colors = [safe(name)], [color]
+    names, colors = [storable(name)], [color]
     return (
         rr.SeriesLines(names=names, colors=colors, widths=[width]),
         rr.SeriesPoints(names=names, colors=colors, markers=["circle"], marker_sizes=[mark]),
@@ -183,7 +183,7 @@ class MovingArm:
         self._start, self._end, radius, colors = _arrays(parts)
         lengths, _ = _along(self._end - self._start)
         look: dict[str, Any] = {"radii": radius, "colors": colors, "fill_mode": "solid"}
-        fixed(rec, path, rr.Capsules3D.from_fields(lengths=lengths, **look))
+        log_static(rec, path, rr.Capsules3D.from_fields(lengths=lengths, **look))
 
     def send(self, timeline: str, walls: list[float], bodies: Floats) -> None:
         """Send the poses of the bodies (K, n + 2, 4, 4) at K times of day, s."""
@@ -194,14 +194,14 @@ class MovingArm:
         placed = rr.Capsules3D.columns(
             translations=start.reshape(-1, 3), quaternions=quaternions
         ).partition([len(self._body)] * len(walls))
-        along(self._rec, self._path, rr.TimeColumn(timeline, timestamp=walls), placed)
+        send_states(self._rec, self._path, rr.TimeColumn(timeline, timestamp=walls), placed)
 
 
 def log_shapes(rec: rr.RecordingStream, parts: Shapes) -> None:
     """Log the shapes of every body at `world/arm/bodyI`."""
     for i in sorted({p.body for p, _ in parts}):
         of_body = _arrays([shape for shape in parts if shape[0].body == i])
-        fixed(rec, f"world/arm/body{i}", drawn_capsules(*of_body))
+        log_static(rec, f"world/arm/body{i}", drawn_capsules(*of_body))
 
 
 def quaternions_of(rotation: Floats) -> Floats:
@@ -209,7 +209,7 @@ def quaternions_of(rotation: Floats) -> Floats:
     return np.asarray(Rotation.from_matrix(rotation).as_quat(canonical=True))
 
 
-def stand(rec: rr.RecordingStream, bodies: Floats) -> None:
+def log_poses(rec: rr.RecordingStream, bodies: Floats) -> None:
     """Log the poses of the arm's bodies (n + 2, 4, 4) at the current time."""
     quaternion = quaternions_of(bodies[:, :3, :3])
     for i in range(1, len(bodies)):
@@ -217,44 +217,44 @@ def stand(rec: rr.RecordingStream, bodies: Floats) -> None:
         rec.log(f"world/arm/body{i}", rr.Transform3D(translation=bodies[i, :3, 3], quaternion=turn))
 
 
-def send_stands(rec: rr.RecordingStream, time: rr.TimeColumn, bodies: Floats) -> None:
+def send_poses(rec: rr.RecordingStream, time: rr.TimeColumn, bodies: Floats) -> None:
     """Send the poses of the arm's bodies (K, B, 4, 4) at K times."""
     for i in range(1, bodies.shape[1]):
         shift, turn = bodies[:, i, :3, 3], quaternions_of(bodies[:, i, :3, :3])
         placed = rr.Transform3D.columns(translation=shift, quaternion=turn)
-        along(rec, f"world/arm/body{i}", time, placed)
+        send_states(rec, f"world/arm/body{i}", time, placed)
 
 
 def labels(places: Sequence[Floats] | Floats, texts: Sequence[str]) -> rr.Points3D:
     """Return labels at points (K, 3), in a colour that is legible in both themes."""
-    safe_texts = [safe(t) for t in texts]
+    safe_texts = [storable(t) for t in texts]
     return rr.Points3D(places, labels=safe_texts, colors=[LABEL], radii=1e-4, show_labels=True)
 
 
 def label_columns(places: Floats, texts: Sequence[str]) -> rr.ComponentColumnList:
     """Return labels at points (K, 3), one per time."""
     count = len(places)
-    text, colors = [safe(t) for t in texts], np.full((count, 3), LABEL, dtype=np.uint8)
+    text, colors = [storable(t) for t in texts], np.full((count, 3), LABEL, dtype=np.uint8)
     look: dict[str, Any] = {"radii": np.full(count, 1e-4), "show_labels": [True] * count}
     return rr.Points3D.columns(positions=places, labels=text, colors=colors, **look)
 
 
-def hidden(eye: Floats, points: Floats, things: tuple[Obstacle, ...]) -> Bools:
+def hidden_points(eye: Floats, points: Floats, obstacles: tuple[Obstacle, ...]) -> Bools:
     """Return whether an obstacle hides each of the points (K, 3) from an eye (3,), m."""
     samples = eye + _SAMPLES[:, None] * (points - eye)[:, None]
     out = np.zeros(len(points), dtype=np.bool_)
-    for thing in things:
-        out |= holds(thing, samples).any(axis=1)
+    for thing in obstacles:
+        out |= contains(thing, samples).any(axis=1)
     return out
 
 
-def direction(
-    turn: float, middle: Floats, size: float, points: Floats, things: tuple[Obstacle, ...]
+def view_direction(
+    turn: float, middle: Floats, size: float, points: Floats, obstacles: tuple[Obstacle, ...]
 ) -> Floats:
     """Return the direction (3,) of an eye near `turn`, rad, that sees most of the points."""
     angles = [(turn + a, z) for z in _HEIGHTS for a in _TURNS]
     places = [np.array([1.7 * np.cos(a), 1.7 * np.sin(a), z]) for a, z in angles]
-    covered = [hidden(middle + size * place, points, things).mean() for place in places]
+    covered = [hidden_points(middle + size * place, points, obstacles).mean() for place in places]
     return places[int(np.argmin(covered + _WORTH * np.arange(len(places))))]
 
 
@@ -277,13 +277,13 @@ def center(points: Floats, least: float) -> tuple[Floats, float]:
     return (lo + hi) / 2, max(float(np.linalg.norm(hi - lo)) / 2, least)
 
 
-def near(look: Floats, way: Floats, points: Floats) -> Floats:
-    """Return the nearest position (3,) of the eye on `look` + f `way` that shows all points."""
-    places = [look + f * way for f in _FACTORS]
+def nearest_eye(look: Floats, direction: Floats, points: Floats) -> Floats:
+    """Return the nearest eye (3,) on `look` + f `direction` that shows all points."""
+    places = [look + f * direction for f in _FACTORS]
     return next((x for x in places if in_view(x, look, points).all()), places[-1])
 
 
-def whole(
+def page_blueprint(
     left: rrb.Container,
     right: rrb.Container,
     timeline: str,

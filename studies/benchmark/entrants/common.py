@@ -76,7 +76,7 @@ class ArmRows:
 
 
 @dataclass(frozen=True)
-class Asked:
+class TaskInput:
     """A task: its description, rows to train on and to predict, the nominal arm."""
 
     task: Task
@@ -85,7 +85,7 @@ class Asked:
     arm: "NominalArm"
 
     @classmethod
-    def read(cls, folder: Path) -> "Asked":
+    def read(cls, folder: Path) -> "TaskInput":
         """Read the folder of a task."""
         task = read_task(folder)
         arm = NominalArm.read(folder / "robot.urdf", task.about["arm"])
@@ -274,22 +274,24 @@ def left_out(rows: ArmRows, predict: Fitter, folds: int = 5) -> Floats:
     return out
 
 
-def spread(residual: Floats, asked: Asked) -> Floats:
+def spread(residual: Floats, data: TaskInput) -> Floats:
     """(M, 3) standard deviation of predictions: rms on poses left out, without the noise."""
-    variance = max(float(np.mean(residual**2)) - asked.sigma**2, (0.1 * asked.sigma) ** 2)
-    return np.full((len(asked.test.q), 3), np.sqrt(variance))
+    variance = max(float(np.mean(residual**2)) - data.sigma**2, (0.1 * data.sigma) ** 2)
+    return np.full((len(data.test.q), 3), np.sqrt(variance))
 
 
 def chosen(
-    asked: Asked, settings: Sequence[float], predict: Callable[[float, ArmRows, ArmRows], Floats]
+    data: TaskInput,
+    settings: Sequence[float],
+    predict: Callable[[float, ArmRows, ArmRows], Floats],
 ) -> tuple[float, Floats]:
     """Return the setting that predicts poses left out best, and their residual (N, 3)."""
-    tried = [left_out(asked.train, partial(predict, setting)) for setting in settings]
+    tried = [left_out(data.train, partial(predict, setting)) for setting in settings]
     best = int(np.argmin([np.sum(r**2) for r in tried]))
     return settings[best], tried[best]
 
 
-def ridge(asked: Asked) -> tuple[Callable[[ArmRows], Floats], Floats]:
+def ridge(data: TaskInput) -> tuple[Callable[[ArmRows], Floats], Floats]:
     """Choose the multiple of the prior of geometry and compliance on poses left out.
 
     Returns:
@@ -297,22 +299,22 @@ def ridge(asked: Asked) -> tuple[Callable[[ArmRows], Floats], Floats]:
     """
 
     def fit(multiple: float, rows: ArmRows, steps: int = 4) -> Floats:
-        return asked.arm.fit(rows, ORDINARY * multiple, asked.sigma, steps)
+        return data.arm.fit(rows, ORDINARY * multiple, data.sigma, steps)
 
     def predict(multiple: float, rows: ArmRows, tested: ArmRows) -> Floats:
-        return asked.arm.predict(fit(multiple, rows, 3), tested)
+        return data.arm.predict(fit(multiple, rows, 3), tested)
 
-    best, residual = chosen(asked, MULTIPLES, predict)
+    best, residual = chosen(data, MULTIPLES, predict)
     return lambda rows: fit(best, rows), residual
 
 
 def families(
-    asked: Asked, theta: Floats, rows: ArmRows, waves: int
+    data: TaskInput, theta: Floats, rows: ArmRows, waves: int
 ) -> tuple[Floats, dict[str, Floats]]:
     """Columns of frames and of families of effects, at a fit.
 
     Args:
-        asked: the task.
+        data: the task.
         theta: (51,) point of linearisation.
         rows: N readings.
         waves: K; waves of the joints, sin k q and cos k q, k = 1 ... K.
@@ -321,7 +323,7 @@ def families(
         (3N, 9) of the frames, and (3N, q) of each family in ordinary magnitudes: link lengths, link
         angles, compliances, and the waves, each octave a family.
     """
-    columns, joints = asked.arm.jacobian(theta, rows)
+    columns, joints = data.arm.jacobian(theta, rows)
     links = columns[:, :, GEOMETRY].reshape(len(columns), 3, 6, 6)
     z = {"length": 5e-4 * links[..., :3], "angle": 5e-4 * links[..., 3:]}
     z["give"] = 1e-5 * columns[:, :, COMPLIANCE]
@@ -339,40 +341,40 @@ def wave(name: str, k: int) -> tuple[Callable[[Floats], Floats], Callable[[str],
     return lambda x: np.asarray(f(k * x)), lambda x: f"{name}({k}*{x})"
 
 
-def learnt(
-    asked: Asked, fit: Callable[[ArmRows], Floats], make: Callable[[], Any]
+def with_residual_regression(
+    data: TaskInput, fit: Callable[[ArmRows], Floats], make: Callable[[], Any]
 ) -> dict[str, Any]:
     """Add a regression of the residual, in the tracker's axes, to a fit.
 
     Args:
-        asked: the task.
+        data: the task.
         fit: fits θ (51,) to rows.
         make: makes a regression with `fit` and `predict`, on sines and cosines of the joint angles,
             torques, and the task's other quantities of laws.
     """
-    named = [c for c in asked.task.about.get("quantities", {}).values() if "_rad" not in c]
+    named = [c for c in data.task.about.get("quantities", {}).values() if "_rad" not in c]
 
     def features(rows: ArmRows) -> Floats:
         further = [rows.columns[name][:, None] for name in named]
         return np.hstack([np.sin(rows.q), np.cos(rows.q), rows.torque, *further])
 
-    trained = features(asked.train)
+    trained = features(data.train)
     mean, scale = trained.mean(0), np.maximum(trained.std(0), 1e-9)
 
     def predict(rows: ArmRows, tested: ArmRows) -> Floats:
         theta = fit(rows)
-        residual = rows.y - asked.arm.predict(theta, rows)
+        residual = rows.y - data.arm.predict(theta, rows)
         size = np.sqrt(np.mean(residual**2))
         regression = make().fit((features(rows) - mean) / scale, residual / size)
         correction = size * regression.predict((features(tested) - mean) / scale)
-        return np.asarray(asked.arm.predict(theta, tested) + correction)
+        return np.asarray(data.arm.predict(theta, tested) + correction)
 
-    std = spread(left_out(asked.train, predict), asked)
-    return {"prediction_m": predict(asked.train, asked.test), "std_m": std}
+    std = spread(left_out(data.train, predict), data)
+    return {"prediction_m": predict(data.train, data.test), "std_m": std}
 
 
 @dataclass(frozen=True)
-class Sought:
+class FormulaSearch:
     """Input of a search for formulas: quantities, and a value from the residual of a fit.
 
     In a task with a law the value is v = D·r / D·D, with the residual r and its derivative D by the
@@ -383,33 +385,33 @@ class Sought:
         x: (N, m) quantities of the rows.
         y: (N, k) values, in units of their root mean square.
         size: this root mean square.
-        moves: (N, 3, k) derivative of the positions by the values.
-        known: (N, 3) positions by the fit.
+        derivative: (N, 3, k) derivative of the positions by the values.
+        fitted_position: (N, 3) positions by the fit.
     """
 
     names: list[str]
     x: Floats
     y: Floats
     size: float
-    moves: Floats
-    known: Floats
+    derivative: Floats
+    fitted_position: Floats
 
     @classmethod
-    def of(cls, asked: Asked, theta: Floats, rows: ArmRows) -> "Sought":
+    def of(cls, data: TaskInput, theta: Floats, rows: ArmRows) -> "FormulaSearch":
         """Prepare rows; values are NaN in rows to be predicted."""
-        named = asked.task.about.get("quantities")
+        named = data.task.about.get("quantities")
         named = named or {f"{n}{j}": f"{n}{j}{u}" for n, u in UNITS for j in range(1, 7)}
         names, x = [], []
         for name, column in named.items():
-            most = float(f"{np.abs(asked.train.columns[column]).max():.4g}")
+            most = float(f"{np.abs(data.train.columns[column]).max():.4g}")
             if most < 1e-9:  # as the torque of an upright axis
                 continue
             names.append(name if name[0] == "q" else f"({name}/{most})")
             x.append(rows.columns[column] / (1.0 if name[0] == "q" else most))
-        known, to = asked.arm.predict(theta, rows), asked.task.about.get("acts_on")
+        known, to = data.arm.predict(theta, rows), data.task.about.get("acts_on")
         off, moves = rows.y - known, np.broadcast_to(np.eye(3), (len(known), 3, 3))
         if to is not None:
-            joints = asked.arm.jacobian(theta, rows)[1]
+            joints = data.arm.jacobian(theta, rows)[1]
             up = np.broadcast_to(rotation(theta[:3])[:, 2], known.shape)
             moves = (up if to == "base_z" else joints[:, :, int(to[1:]) - 1])[:, :, None]
         square = np.sum(moves**2, axis=1)
@@ -425,17 +427,19 @@ class Sought:
 
     def positions(self, value: Floats) -> Floats:
         """(N, 3) positions of the fit plus the motion by values (N, k), in units of `size`."""
-        return np.asarray(self.known + self.size * np.einsum("nik,nk->ni", self.moves, value))
+        return np.asarray(
+            self.fitted_position + self.size * np.einsum("nik,nk->ni", self.derivative, value)
+        )
 
 
-def enter(entrant: Callable[[Asked], dict[str, Any]]) -> None:
+def enter(entrant: Callable[[TaskInput], dict[str, Any]]) -> None:
     """Run an entrant as the command `python entrant.py TASK_DIR OUT.json`.
 
     Its seconds are processor time, which does not depend on other load of the machine.
     """
     began = time.process_time()
     result: dict[str, Any] = {"std_m": None, "effects": None, "law": None, "note": ""}
-    result |= entrant(Asked.read(Path(sys.argv[1])))
+    result |= entrant(TaskInput.read(Path(sys.argv[1])))
     result["seconds"] = time.process_time() - began
     plain = {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in result.items()}
     Path(sys.argv[2]).write_text(json.dumps(plain), encoding="utf-8")

@@ -44,14 +44,14 @@ class Entrants:
     Attributes:
         home: folder with a folder for each entrant.
         envs: folder of the environments.
-        given: interpreters by entrant, instead of an environment.
+        environments: interpreters by entrant, instead of an environment.
         limit: time limit for a task, s.
         unable: reasons by entrant that cannot run on this machine; filled during the run.
     """
 
     home: Path
     envs: Path
-    given: Mapping[str, Path]
+    environments: Mapping[str, Path]
     limit: float
     unable: dict[str, str] = field(default_factory=dict)
 
@@ -61,7 +61,7 @@ class Entrants:
 
     def prepare(self, name: str) -> None:
         """Make the environment of an entrant, unless it exists; store the reason of a failure."""
-        if name in self.given:
+        if name in self.environments:
             return
         needs = self.home / name / "requirements.txt"
         mark, stamp = self.envs / name / "made", hashlib.sha256(needs.read_bytes()).hexdigest()
@@ -85,7 +85,7 @@ class Entrants:
 
     def python(self, name: str) -> Path:
         """Return the interpreter of an entrant."""
-        return self.given.get(name, self.envs.absolute() / name / "bin" / "python")
+        return self.environments.get(name, self.envs.absolute() / name / "bin" / "python")
 
     def run(self, name: str, task: Path, out: Path) -> None:
         """Run an entrant on a task, and store its answer or the reason of its failure."""
@@ -94,7 +94,9 @@ class Entrants:
             _put(out, json.dumps({"failed": reason}))
 
     def _answer(self, name: str, task: Path, out: Path) -> str:
-        env = {k: v for k, v in os.environ.items() if k != "PYTHONPATH" or name in self.given}
+        env = {
+            k: v for k, v in os.environ.items() if k != "PYTHONPATH" or name in self.environments
+        }
         with tempfile.TemporaryDirectory() as folder:
             copy, new = Path(folder, task.name), Path(folder, "out.json")
             for_entrants(task, copy)
@@ -181,7 +183,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         stored = _kept(options.beside) if options.beside else []
         valid = entrants.names()
         names = options.entrants.split(",") if options.entrants else valid
-        if unknown := [*{*names, *entrants.given} - {*valid}]:
+        if unknown := [*{*names, *entrants.environments} - {*valid}]:
             raise BenchmarkError(f"entrant {unknown[0]!r} is unknown; valid: {', '.join(valid)}")
         tasks = [t for t in folders(options.folder) if t.match(options.tasks)]
         if not tasks:

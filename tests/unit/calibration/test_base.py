@@ -10,13 +10,13 @@ import pytest
 
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.dh_table import dh_rows, to_toml
-from hilcal.calibration.handover import corrected, frames, ur_kinematics, urdf
+from hilcal.calibration.handover import corrected_arm, frames, ur_kinematics, urdf
 from hilcal.calibration.own_files.correct import correct_file
 from hilcal.identification.fit_document import frames_to_json
 from hilcal.robot import se3
 from hilcal.robot.catalogue import load_arm
 from tests.support.campaigns import campaign, measured, plan
-from tests.support.fit_cases import based
+from tests.support.fit_cases import fitted_model
 from tests.unit.calibration.other_eyes import by_pinocchio, by_ur, flanges, urdf_model
 
 POSES = 24
@@ -36,13 +36,13 @@ def site(effect, registration, target):
 def fitted(effect, registration, target):
     c = site(effect, registration, target)
     names = ["joint_compliance", *([] if effect == "none" else [effect])]
-    found = based(c.cell, c.readings, "absolute", names)
+    found = fitted_model(c.cell, c.readings, "absolute", names)
     return Calibration.of(found, {"campaign": "made"})
 
 
 def document(c):
-    rest = ur_kinematics(c.model.cell.arm, corrected(c).arm)[1]
-    return dict(json.loads(frames(c, corrected(c), rest)))
+    rest = ur_kinematics(c.model.cell.arm, corrected_arm(c).arm)[1]
+    return dict(json.loads(frames(c, corrected_arm(c), rest)))
 
 
 def pose(six):
@@ -56,7 +56,7 @@ def fresh(load):
 
 def seen(world, states, base):
     """(N, 3) where the tracker, without its noise, has the target, in axes of the base."""
-    return np.asarray((world.sight(states).value(3) - base[:3, 3]) @ base[:3, :3])
+    return np.asarray((world.ideal_readings(states).value(3) - base[:3, 3]) @ base[:3, :3])
 
 
 @pytest.mark.parametrize(("effect", "registration", "target"), CASES)
@@ -98,8 +98,8 @@ def test_the_base_is_the_worlds_where_no_geometry_is_wrong(target):
         pose(told["controller"]["tracker_in_base_m_rad"]), se3.inverse(true), atol=2e-5
     )
     assert told["base_is"] == "mechanical"
-    assert corrected(c).within == ()
-    np.testing.assert_allclose(corrected(c).arm.links, c.model.cell.arm.links, atol=1e-12)
+    assert corrected_arm(c).included == ()
+    np.testing.assert_allclose(corrected_arm(c).arm.links, c.model.cell.arm.links, atol=1e-12)
 
 
 def test_a_stated_base_is_the_base():
@@ -107,7 +107,7 @@ def test_a_stated_base_is_the_base():
     told = document(c)
     np.testing.assert_allclose(pose(told["base_in_tracker"]), c.model.cell.registration, atol=1e-9)
     assert told["base_is"] == "stated"
-    first = corrected(c).arm.links[0]
+    first = corrected_arm(c).arm.links[0]
     assert np.abs(first - c.model.cell.arm.links[0]).max() > 1e-5  # joint 1 is elsewhere on it
 
 
@@ -118,13 +118,13 @@ def test_every_export_puts_the_tool_where_the_tracker_finds_it(registration, tar
     stiff = replace(c.world.physics, joint_compliance=0 * c.world.physics.joint_compliance)
     world = replace(c.world, physics=stiff)
     readings = measured(world, plan(POSES, 1000), np.random.default_rng(0))
-    found = based(c.cell, readings, "absolute", ["link_geometry"])
+    found = fitted_model(c.cell, readings, "absolute", ["link_geometry"])
     cal = Calibration.of(found, {"campaign": "made"})
     told, states = document(cal), fresh(0)
     base, tool = pose(told["base_in_tracker"]), pose(told["tool_on_flange"])
     wanted = seen(world, states, base)
     band = cal.predict(states.q).band_m
-    arm = corrected(cal).arm
+    arm = corrected_arm(cal).arm
     (tmp_path / "a.toml").write_text(to_toml(dh_rows(arm), arm, "made"), encoding="utf-8")
     text, _ = ur_kinematics(cal.model.cell.arm, arm)
     exported = {
@@ -134,7 +134,7 @@ def test_every_export_puts_the_tool_where_the_tracker_finds_it(registration, tar
     }
     own, nominal = tmp_path / "own.urdf", cal.model.cell.arm
     own.write_text(urdf(nominal), encoding="utf-8")
-    into = correct_file(own, nominal, corrected(cal)).content.decode()
+    into = correct_file(own, nominal, corrected_arm(cal)).content.decode()
     exported["into a URDF"] = by_pinocchio(urdf_model(into), states.q) @ tool
     for name, poses in exported.items():
         off = np.linalg.norm(poses[:, :3, 3] - wanted, axis=1)

@@ -31,7 +31,7 @@ def pose(q):
 
 def told(*lines, near=None):
     found = waypoints("\n".join(lines) + "\n")
-    assert not any(w.left for w in found)
+    assert not any(w.not_corrected for w in found)
     none, nowhere = np.full(6, np.nan), np.full((4, 4), np.nan)
     points = Points(
         tuple(str(w.line) for w in found),

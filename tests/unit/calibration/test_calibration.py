@@ -11,7 +11,7 @@ import hilcal as hc
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensation import band, tool_poses
 from hilcal.calibration.covariance_source import CovarianceSource
-from hilcal.calibration.measured import Measured
+from hilcal.calibration.measured import MeasuredRanges
 from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.storage import from_json, to_json
 from hilcal.identification.baseline import baseline
@@ -48,7 +48,7 @@ def achieved(c, effect, seed, states, goal):
     world = campaign(effect, c.mode, seed, poses=POSES).world
     rng = np.random.default_rng(seed)
     scattered = states.q + rng.standard_normal(states.q.shape) * world.joint_std
-    read = world.sight(replace(states, q=scattered)).value(3)
+    read = world.ideal_readings(replace(states, q=scattered)).value(3)
     prediction = c.model.predict(states, c.theta)
     position = tool_poses(c._tracked, prediction)[1]
     base = c.base_in_tracker()[:3, :3]
@@ -102,9 +102,9 @@ def test_deflections_are_compensated_to_the_unloaded_arm():
     k = c.compensate(states.q, states.wrench)
     still = replace(states, wrench=0 * states.wrench)
     world = campaign("joint_tilt_compliance", "deflection", 0, poses=POSES).world
-    unloaded = world.sight(still).value(3)
+    unloaded = world.ideal_readings(still).value(3)
     before, after = (
-        np.linalg.norm(world.sight(replace(states, q=q)).value(3) - unloaded, axis=1)
+        np.linalg.norm(world.ideal_readings(replace(states, q=q)).value(3) - unloaded, axis=1)
         for q in (states.q, k.q)
     )
     assert before.mean() > 2e-4
@@ -151,11 +151,11 @@ def test_a_calibration_comes_back_from_its_file(effect, tmp_path):
     np.testing.assert_allclose(a.after.std_m, b.after.std_m, rtol=1e-5)
     assert again.source == calibration.source
     # as the version before wrote it
-    old = from_json(to_json(replace(calibration, learnt=None)))
+    old = from_json(to_json(replace(calibration, covariance_source=None)))
     c = old.compensate(states.q[:4], states.wrench[:4], recorded=of)
     np.testing.assert_allclose(a.after.std_m, c.after.std_m, rtol=1e-5)
-    assert [(o.of, o.points.tolist()) for o in a.after.outside] == [
-        (o.of, o.points.tolist()) for o in b.after.outside
+    assert [(o.range, o.points.tolist()) for o in a.after.outside] == [
+        (o.range, o.points.tolist()) for o in b.after.outside
     ]
 
 
@@ -199,7 +199,7 @@ def test_points_outside_of_what_was_measured_are_named():
     q[1, 2] = ranges["joint 3 angle"].high + 0.5
     heavy = np.array([0.0, 0.0, -3 * ranges["force"].high, 0.0, 0.0, 0.0])
     p = c.predict(q, np.stack([heavy, 0 * heavy]))
-    found = {o.of.variable: o.points.tolist() for o in p.outside}
+    found = {o.range.variable: o.points.tolist() for o in p.outside}
     assert found["joint 3 angle"] == [False, True]
     assert found["force"] == [True, False]
 
@@ -250,7 +250,7 @@ def test_coupled_joints_are_compensated_by_the_controllers_values():
         root=np.zeros((12, 1)),
         misfit=0.0,
         scatter=Scatter(np.zeros(6), 0.0, "unknown"),
-        measured=Measured((), 1.0),
+        measured=MeasuredRanges((), 1.0),
         loads={},
         source={},
     )
@@ -268,8 +268,8 @@ def test_coupled_joints_are_compensated_by_the_controllers_values():
 )
 def test_the_covariance_follows_from_the_fitted_states(effect, mode):
     c = calibrated(effect, mode)
-    small = json.loads(json.dumps(c.learnt.to_json()))
-    again = replace(c, root=None, learnt=CovarianceSource.from_json(small))
+    small = json.loads(json.dumps(c.covariance_source.to_json()))
+    again = replace(c, root=None, covariance_source=CovarianceSource.from_json(small))
     states = fresh(3)
     a, b = (x.predict(states.q, states.wrench) for x in (c, again))
     np.testing.assert_allclose(a.std_m, b.std_m, rtol=1e-5)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.calibration.handover import corrected, ur_kinematics
+from hilcal.calibration.handover import corrected_arm, ur_kinematics
 from hilcal.errors import CannotAnswerError
 from hilcal.robot.catalogue import load_arm, robot_names
 from hilcal.robot.chain import Deviation
@@ -18,9 +18,9 @@ from tests.unit.calibration.test_calibration import calibrated, fresh
 @pytest.mark.parametrize("effect", ["link_geometry", "encoder_offset"])
 def test_constant_effects_are_in_the_transforms_exactly(effect):
     c = calibrated(effect)
-    found = corrected(c)
-    assert found.within == (effect,)
-    assert found.beyond == ("joint_compliance",)
+    found = corrected_arm(c)
+    assert found.included == (effect,)
+    assert found.not_included == ("joint_compliance",)
     states = fresh()
     situation = c.model.predict(states, c.theta).situation
     deviation = Deviation()
@@ -36,9 +36,9 @@ def test_constant_effects_are_in_the_transforms_exactly(effect):
 @pytest.mark.parametrize("effect", ["joint_tilt_compliance", "transmission_error"])
 def test_what_is_not_constant_is_named_and_left_out(effect):
     c = calibrated(effect)
-    found = corrected(c)
-    assert effect in found.beyond
-    assert found.within == ()
+    found = corrected_arm(c)
+    assert effect in found.not_included
+    assert found.included == ()
     np.testing.assert_allclose(found.arm.links, c.model.cell.arm.links, atol=1e-12)
 
 
@@ -57,7 +57,7 @@ def test_the_nominal_arms_have_the_origins_of_ur_description(name):
 
 def test_deflections_and_foreign_arms_are_refused_in_words():
     refusal_of(
-        CannotAnswerError, "--readings absolute", corrected, calibrated("none", "deflection")
+        CannotAnswerError, "--readings absolute", corrected_arm, calibrated("none", "deflection")
     )
     arm = load_arm("ur10e")
     foreign = replace(arm, name="kr6")

@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilcal.calibration.handover import Corrected, matlab
+from hilcal.calibration.handover import CorrectedArm, matlab
 from hilcal.calibration.own_files.correct import correct_file
 from hilcal.errors import InputError
 from hilcal.robot import se3
@@ -18,7 +18,7 @@ from hilcal.robot.arm import with_conventions
 from hilcal.robot.catalogue import load_arm
 from tests.support.description_files import MJCF, SDF
 from tests.support.maker_arms import maker_arm, urdf_of
-from tests.support.refusals import edited, refusal, refusals, refuses
+from tests.support.refusals import refusal, refusals, refuses, with_edits
 from tests.unit.calibration.other_eyes import by_pinocchio, flanges, turned
 
 Q = np.random.default_rng(1).uniform(-2, 2, (12, 6))
@@ -42,7 +42,7 @@ def poses(arm):
 
 
 def correct(path, nominal, new, *ends):
-    return correct_file(path, nominal, Corrected(new, (), ()), *ends)
+    return correct_file(path, nominal, CorrectedArm(new, (), ()), *ends)
 
 
 def lines_changed(before, after):
@@ -69,7 +69,7 @@ def test_a_urdf_keeps_all_but_the_origins_of_its_joints(arm, tmp_path):
     assert len(lines_changed(text, after)) == 7
     joint_origin = re.compile(r"(<joint[^>]*>)(<origin[^>]*/>)?")
     assert joint_origin.sub(r"\1", after) == joint_origin.sub(r"\1", text)
-    assert "7 places changed (j1, j2, j3, j4, j5, j6, flange)" in found.said
+    assert "7 places changed (j1, j2, j3, j4, j5, j6, flange)" in found.note
     assert correct(tmp_path / "krl.urdf", arm, arm).content == (tmp_path / "krl.urdf").read_bytes()
 
 
@@ -102,7 +102,7 @@ def test_a_xacro_is_corrected_where_it_has_numbers(arm, tmp_path):
     path = tmp_path / "krl.xacro"
     path.write_text(text)
     found = correct(path, arm, changed(arm, slice(1, 5)), "base_link", "tool0")
-    assert "places changed (${prefix}j2, ${prefix}j3, ${prefix}j4, ${prefix}j5)" in found.said
+    assert "places changed (${prefix}j2, ${prefix}j3, ${prefix}j4, ${prefix}j5)" in found.note
     assert len(lines_changed(text, found.content.decode())) == 4
     assert found.content.decode().count("${pi/2}") == 1
     with pytest.raises(InputError, match=r"krl\.xacro: line 16: the place of joint 'flange' is"):
@@ -126,15 +126,15 @@ def test_an_mjcf_is_the_corrected_arm_to_pinocchio(arm, tmp_path):
     after = found.content.decode()
     assert len(lines_changed(MJCF, after)) == 7
     assert "<!-- the arm of bay 3 -->" in after
-    assert "1 places have" not in found.said
+    assert "1 places have" not in found.note
     rounded = MJCF.replace("0.61 0.1 0", "0.612 0.1 0").replace("0 0 0.66", "0 0 0.663")
     path.write_text(rounded)
     found = correct(path, arm, new, "base", "flange")
-    assert "its axes lay up to 3.00 mm from those of the nominal krl" in found.said
+    assert "its axes lay up to 3.00 mm from those of the nominal krl" in found.note
     path.write_bytes(found.content)
     np.testing.assert_allclose(seen(), poses(new), atol=NM)
     lost = correct(path, new, changed(new), "base")
-    assert "no place for the flange's own shift" in lost.said
+    assert "no place for the flange's own shift" in lost.note
 
 
 def sdf_flanges(text):
@@ -236,7 +236,7 @@ def test_a_matlab_function_builds_the_arm(arm):
 @refusals("own_files")
 def test_other_files_are_refused_by_line(case, given, arm, tmp_path):
     path = tmp_path / "mine.xml"
-    text = edited(given, krl=urdf_of("krl"), rapid=urdf_of("rapid"), MJCF=MJCF, SDF=SDF)
+    text = with_edits(given, krl=urdf_of("krl"), rapid=urdf_of("rapid"), MJCF=MJCF, SDF=SDF)
     path.write_text(text)
     tip = "flange" if "mujoco" in text else "tool0"
     base = "base" if "<mujoco" in text or "<sdf" in text else "base_link"

@@ -44,7 +44,7 @@ def test_joint_values_loads_and_records_are_read(tmp_path, unit):
     p = read_points(written(tmp_path, text), ARM, LOADS)
     assert p.names == ("a", "b")
     np.testing.assert_allclose(p.q, Q, atol=1e-11)
-    assert p.wanted is None
+    assert p.target_poses is None
     np.testing.assert_array_equal(p.wrench[:, 2], [-98.0665, 0.0])
     np.testing.assert_array_equal(p.recorded["air_temperature"], [21, 22])
 
@@ -112,10 +112,10 @@ def test_other_names_are_taken_where_nothing_is_unsure(tmp_path):
     told = other_names(f"{joints},X [mm],Y [mm],Z [mm]")
     found = read_points(written(tmp_path, told), ARM, LOADS)
     np.testing.assert_allclose(found.q, Q[:2], atol=1e-9)
-    np.testing.assert_allclose(found.wanted[:, :3, 3], poses(Q[:2])[:, :3, 3], atol=1e-9)
+    np.testing.assert_allclose(found.target_poses[:, :3, 3], poses(Q[:2])[:, :3, 3], atol=1e-9)
     assert found.wrench[0, 2] == -98.0665
     for part in ("joints = J1 [deg], J2 [deg]", "position = X [mm], Y [mm]", "load = Load"):
-        assert part in found.taken
+        assert part in found.guess
     vague = other_names(",".join("abcdefghi"))
     with pytest.raises(InputError, match=r"cannot be guessed: .*hilcal import .* --preview -o"):
         read_points(written(tmp_path, vague), ARM, LOADS)
@@ -134,7 +134,7 @@ def test_a_unit_is_taken_where_the_arm_tells_it(tmp_path, far):
         refusal("position: no unit stated", read_points, path, ARM, LOADS)
         return
     found = read_points(path, ARM, LOADS)
-    np.testing.assert_allclose(found.wanted[:, :3, 3], points[:, :3, 3], atol=1e-9)
+    np.testing.assert_allclose(found.target_poses[:, :3, 3], points[:, :3, 3], atol=1e-9)
 
 
 def test_joint_values_alone_under_other_names(tmp_path):
@@ -142,7 +142,7 @@ def test_joint_values_alone_under_other_names(tmp_path):
     path = written(tmp_path, "A1;A2;A3;A4;A5;A6\n" + rows.replace(".", ","))
     found = read_points(path, ARM, LOADS)
     np.testing.assert_allclose(found.q, Q, atol=1e-9)
-    assert found.wanted is None
+    assert found.target_poses is None
     assert found.wrench is None
 
 

@@ -16,7 +16,7 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compiled import Compiled, compiled
 from hilcal.calibration.dh_table import CONVENTIONS, dh_rows, flange_poses, to_toml
 from hilcal.calibration.handover import ur_kinematics, urdf
-from hilcal.calibration.measured import Measured
+from hilcal.calibration.measured import MeasuredRanges
 from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.storage import from_json, to_json
 from hilcal.effects.protocol import Columns, Parameter
@@ -120,7 +120,7 @@ def random_calibration(names, seed):
         root=1e-2 * np.diag(scale),
         misfit=1e-12,
         scatter=Scatter(np.full(6, 1e-5), 0.0, "stated"),
-        measured=Measured((), 1.0),
+        measured=MeasuredRanges((), 1.0),
         loads={"5kg": np.array([0.0, 0.0, -49.0, 0.0, 0.0, 0.0])},
         source={"campaign": "made"},
     )

@@ -12,7 +12,7 @@ from hilcal.diagnosis.noise import RP_PER_RMS
 from hilcal.identification.full_covariance import joint_factors
 from hilcal.readings.readings import Readings
 from tests.support.campaigns import campaign
-from tests.support.fit_cases import based
+from tests.support.fit_cases import fitted_model
 
 TRUE = 1e-5
 """rad; what the simulated arm scatters by."""
@@ -30,7 +30,7 @@ def fitted(c, mode, readings, rp=5e-5):
     """Fit a cell that says nothing of its repeatability."""
     config = c.cell.configured().model_copy(update={"repeatability": Repeatability()})
     cell = replace(c.cell, config=config, arm=replace(c.cell.arm, repeatability=rp))
-    return based(cell, readings, mode)
+    return fitted_model(cell, readings, mode)
 
 
 def once(readings):
@@ -88,5 +88,5 @@ def test_repeats_below_the_noise_say_how_much_it_can_be():
 
 def test_what_the_fit_or_the_cell_states_goes_first():
     c = campaign(poses=16, cycles=3)
-    found = based(c.cell, c.readings, "absolute")
+    found = fitted_model(c.cell, c.readings, "absolute")
     assert Calibration.of(found).scatter.source == "stated"

@@ -24,10 +24,14 @@ SETUP = "set_tcp(p[0,0,0.1,0,0,0])\n"
 def corrected(program):
     """The program with other joint values, these by line, and why lines are left."""
     every = waypoints(program)
-    found = [w for w in every if not w.left]
+    found = [w for w in every if not w.not_corrected]
     q = np.arange(6.0 * len(found)).reshape(-1, 6) + 100.0
     new = dict(zip((w.line for w in found), q, strict=True))
-    return with_joints(program, found, q), new, {w.line: w.left for w in every if w.left}
+    return (
+        with_joints(program, found, q),
+        new,
+        {w.line: w.not_corrected for w in every if w.not_corrected},
+    )
 
 
 def as_pose(six):
@@ -42,7 +46,7 @@ def check_understood(program, seeds=4):
     """
     again, new, left = corrected(program)
     every = {w.line: w for w in waypoints(program)}
-    order = [w.line for w in every.values() if not w.left]
+    order = [w.line for w in every.values() if not w.not_corrected]
     seen = 0
     for seed in range(seeds):
         for shared in (False, True):
@@ -53,7 +57,7 @@ def check_understood(program, seeds=4):
             for old, now in zip(before, after, strict=True):
                 w = every[old.line]
                 assert (w.line in new) != (w.line in left)
-                if w.left:
+                if w.not_corrected:
                     assert now.target == old.target
                 else:
                     seen += 1
@@ -146,7 +150,7 @@ def test_a_waypoint_that_is_not_understood_is_refused_by_line_or_left(case, give
         check_understood(given)
     path.write_text(f"{given}movej({SIX})\n")
     _, every, points, _ = program_points(path, leave=True)
-    assert [w.line for w in every if w.left] == [line]
+    assert [w.line for w in every if w.not_corrected] == [line]
     assert points.names[-1] == f"line {given.count(chr(10)) + 1}"
 
 

@@ -18,14 +18,14 @@ from hilcal.campaign.revisions import restore
 from hilcal.errors import InputError, MovedFileError
 from hilcal.store import schema
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.revision import STORED, RevisionRecord
+from hilcal.store.revision import STORED_HASH, RevisionRecord
 from hilcal.store.rows import _reading_crc, content_hash
 from hilcal.store.run_log import RunLog
 from hilcal.store.schema import sqlite_errors
 from tests.support import power_loss
 from tests.support.cli_cases import refused
 from tests.support.paths import ROOT
-from tests.support.readings_cases import assert_same, readings, simple
+from tests.support.readings_cases import assert_same, readings, simple_readings
 from tests.support.refusals import refusal, refusal_of
 from tests.support.unguarded import unguarded
 from tests.unit.data.test_run_log import STEPS, _campaign, _reading
@@ -92,7 +92,7 @@ def test_description_is_kept(tmp_path):
 @per_example_file
 @given(cuts=st.lists(st.integers(0, 12), max_size=4).map(sorted))
 def test_hash_does_not_depend_on_how_readings_were_appended(tmp_path, cuts):
-    x = simple(12)
+    x = simple_readings(12)
     with CampaignFile.create(tmp_path / "run.hilcal", "{}", "", "", overwrite=True) as campaign:
         for start, stop in zip([0, *cuts], [*cuts, 12], strict=True):
             campaign.append_readings(x[start:stop])
@@ -101,7 +101,7 @@ def test_hash_does_not_depend_on_how_readings_were_appended(tmp_path, cuts):
 
 
 def test_hash_sees_every_change_but_not_the_numbers_of_names():
-    x = simple(3)
+    x = simple_readings(3)
     value = x.value.copy()
     value[2, 1] = np.nextafter(value[2, 1], 9.0)
     q = x.states.q + 1e-15
@@ -119,13 +119,13 @@ def test_hash_sees_every_change_but_not_the_numbers_of_names():
     ]
     hashes = {content_hash(r) for r in (x, *others)}
     assert len(hashes) == len(others) + 1
-    x = simple(3)
+    x = simple_readings(3)
     other = replace(x, pose=np.array([3, 1, 0]), pose_names=("p2", "p1", "unused", "p0"))
     assert content_hash(other) == content_hash(x)
 
 
 def test_later_readings_bring_new_poses_and_loads(run):
-    x, y = simple(2), simple(3, seed=1)
+    x, y = simple_readings(2), simple_readings(3, seed=1)
     y = replace(y, pose_names=("p1", "new", "p0"), load_names=("plate",))
     q = y.states.q.copy()
     q[[0, 2]] = x.states.q[[1, 0]]
@@ -141,15 +141,17 @@ def test_later_readings_bring_new_poses_and_loads(run):
 
 
 def test_readings_that_do_not_fit_are_refused_whole(run):
-    x = simple(4)
+    x = simple_readings(4)
     run.append_readings(x[:2])
     nan = x.value.copy()
     nan[3, 0] = np.nan
     new = x[2:]
     bad = {
-        "covariance, value": simple(2, m=6),
+        "covariance, value": simple_readings(2, m=6),
         "differ from those before in time": replace(x, states=replace(x.states, time=None)),
-        "pose 'p1' is commanded to other joints": replace(x, states=simple(4, seed=1).states)[1:],
+        "pose 'p1' is commanded to other joints": replace(
+            x, states=simple_readings(4, seed=1).states
+        )[1:],
         "value of reading 4 is not finite": replace(x, value=nan),
         "wrench has shape": replace(x, states=replace(x.states, wrench=np.zeros((4, 5)))),
         "two poses have the same name": replace(new, pose_names=("a", "b", "c", "c")),
@@ -163,7 +165,7 @@ def test_readings_that_do_not_fit_are_refused_whole(run):
 
 @pytest.mark.parametrize("table", ["readings", "revisions", "poses", "loads", "meta"])
 def test_rows_cannot_be_changed_deleted_or_replaced(tmp_path, table):
-    path = make(tmp_path / "run.hilcal", simple(3))
+    path = make(tmp_path / "run.hilcal", simple_readings(3))
     with CampaignFile.open(path) as campaign:
         campaign.append_revision(REVISION)
     connection = sqlite3.connect(path)
@@ -177,7 +179,7 @@ def test_rows_cannot_be_changed_deleted_or_replaced(tmp_path, table):
             connection.execute(change)
     connection.close()
     with CampaignFile.open(path) as campaign:
-        assert_same(campaign.readings(), simple(3))
+        assert_same(campaign.readings(), simple_readings(3))
         assert len(campaign.revisions()) == 1
 
 
@@ -194,7 +196,7 @@ def test_revisions_are_numbered_and_come_back(run):
 
 
 def test_an_existing_file_is_not_overwritten_unasked(tmp_path):
-    path = make(tmp_path / "run.hilcal", simple(2))
+    path = make(tmp_path / "run.hilcal", simple_readings(2))
     refusal("the file exists", make, path)
     with CampaignFile.open(path) as campaign:
         assert campaign.n_readings == 2
@@ -213,10 +215,10 @@ def test_a_journal_left_by_another_file_is_not_rolled_into_a_new_one(tmp_path):
     path = tmp_path / "run.hilcal"
     stray = tmp_path / "run.hilcal-journal"
     stray.write_bytes(b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7" + bytes(1000))
-    make(path, simple(2))
+    make(path, simple_readings(2))
     assert not stray.exists()
     with CampaignFile.open(path) as campaign:
-        assert_same(campaign.readings(), simple(2))
+        assert_same(campaign.readings(), simple_readings(2))
 
 
 def test_files_that_are_no_campaign(tmp_path):
@@ -238,7 +240,7 @@ def test_files_that_are_no_campaign(tmp_path):
 
 
 def test_every_truncation_is_noticed(tmp_path):
-    whole = make(tmp_path / "run.hilcal", simple(60)).read_bytes()
+    whole = make(tmp_path / "run.hilcal", simple_readings(60)).read_bytes()
     cut = tmp_path / "cut.hilcal"
     rng = random.Random(3)
     pages = range(0, len(whole), 4096)
@@ -250,11 +252,11 @@ def test_every_truncation_is_noticed(tmp_path):
             CampaignFile.open(cut)
     cut.write_bytes(whole)
     with CampaignFile.open(cut) as campaign:
-        assert_same(campaign.readings(), simple(60))
+        assert_same(campaign.readings(), simple_readings(60))
 
 
 def test_damaged_bytes_never_give_wrong_data(tmp_path):
-    x = simple(40)
+    x = simple_readings(40)
     path = make(tmp_path / "run.hilcal", x)
     with CampaignFile.open(path) as campaign:
         campaign.append_revision(REVISION)
@@ -276,10 +278,10 @@ def test_damaged_bytes_never_give_wrong_data(tmp_path):
 
 
 def test_a_second_writer_waits_or_is_told(tmp_path):
-    path = make(tmp_path / "run.hilcal", simple(2))
+    path = make(tmp_path / "run.hilcal", simple_readings(2))
     with CampaignFile.open(path) as one, CampaignFile.open(path) as two:
-        one.append_readings(replace(simple(1), pose_names=("a",)))
-        two.append_readings(replace(simple(1), pose_names=("b",)))
+        one.append_readings(replace(simple_readings(1), pose_names=("a",)))
+        two.append_readings(replace(simple_readings(1), pose_names=("b",)))
         assert one.readings().pose_names == ("p0", "p1", "a", "b")
 
 
@@ -391,12 +393,12 @@ POWER_WRITER = """
 import os, sys
 from pathlib import Path
 from hilcal.store.campaign_file import CampaignFile
-from tests.support.readings_cases import simple
+from tests.support.readings_cases import simple_readings
 from tests.unit.data.test_campaign import REVISION
 folder = Path(sys.argv[1])
 ack = os.open(str(folder / "ack"), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
 with CampaignFile.create(folder / "run.hilcal", "{}", "", "a test") as run:
-    x = simple(BATCHES)
+    x = simple_readings(BATCHES)
     for k in range(BATCHES):
         if k == 2:
             run.append_revision(REVISION)
@@ -413,7 +415,7 @@ def _lost(tmp_path, batches, tries, writer=POWER_WRITER, syncs=4):
     recorder = power_loss.compiled(tmp_path)
     ops = power_loss.recorded(writer.replace("BATCHES", str(batches)), folder, recorder, ROOT)
     assert sum(op.kind == "sync" for op in ops) >= syncs * batches, "the recorder sees no syncs"
-    whole, count, seen = simple(batches), 0, set()
+    whole, count, seen = simple_readings(batches), 0, set()
     after = tmp_path / "after"
     for acknowledged, state in power_loss.crashes(ops, folder, "ack", 1, tries):
         content = tuple(sorted(state.items()))
@@ -504,15 +506,15 @@ def test_a_revision_that_another_processor_hashed(tmp_path):
     (path,) = (p for p in FILES if p.name.startswith("version-5.hilcal"))
     with Campaign.open(unpacked(path, tmp_path), read_only=True) as run:
         (record,) = run.file.revisions()
-        assert STORED not in record.options
+        assert STORED_HASH not in record.options
         elsewhere = replace(record, data_hash="0" * 64)
         found = restore(elsewhere, run.cell, run.readings)
         assert found.model.names == record.effects
         with pytest.raises(InputError, match="fitted before readings were appended"):
             restore(elsewhere, run.cell, run.readings[:29])
-        today = replace(elsewhere, options={**record.options, STORED: "1" * 64})
+        today = replace(elsewhere, options={**record.options, STORED_HASH: "1" * 64})
         with pytest.raises(InputError, match="fitted before readings were appended"):
-            restore(today, run.cell, run.readings, stored="2" * 64)
+            restore(today, run.cell, run.readings, stored_hash="2" * 64)
 
 
 def test_every_version_is_there():

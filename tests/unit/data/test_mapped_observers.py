@@ -15,7 +15,7 @@ from hilcal.tables.mapping import Mapping
 from hilcal.toml import check_section
 from tests.support.campaigns import cell_of, configuration, true_parameters
 from tests.support.cli_cases import CELL, ok
-from tests.support.fit_cases import based, named
+from tests.support.fit_cases import fitted_model, parameters_by_effect
 from tests.support.observer_cases import observed
 from tests.support.refusals import refusal
 
@@ -90,9 +90,9 @@ def test_a_ball_bars_table_gives_the_true_compliances(seed, tmp_path):
     wrench = replace(found.states, wrench=c.readings.states.wrench)  # of a load named alone
     joint_std = configuration().repeatability.per_joint(6)
     readings = with_joint_scatter(c.cell, replace(found, states=wrench), joint_std)
-    fitted = based(c.cell, readings, "absolute")
+    fitted = fitted_model(c.cell, readings, "absolute")
     truth = true_parameters(c.world, "joint_compliance")
-    told = [v for k, v in named(fitted).items() if k.startswith("joint_compliance")]
+    told = [v for k, v in parameters_by_effect(fitted).items() if k.startswith("joint_compliance")]
     z = np.array([(value - t) / std for (value, std), t in zip(told, truth, strict=True)])
     assert np.sqrt(np.mean(z**2)) < 2.5
     assert 0.75 < fitted.variance_factor < 1.3
@@ -124,8 +124,8 @@ def test_a_preview_proposes_the_mapping(who, tmp_path, capsys):
     (tmp_path / "t.csv").write_text(german(c.readings))
     (tmp_path / "c.toml").write_text(CELL.read_text() + "\n[gauges.G]\nstd_m = 1e-5\n")
     found = preview_table(tmp_path / "t.csv", cell_of())
-    assert not found.proposal.lacking
-    assert any('of = "load"' in words for _, words in found.proposal.unsure)
+    assert not found.proposal.missing
+    assert any('of = "load"' in words for _, words in found.proposal.doubts)
     sections = found.proposal.sections
     sections["torques"]["of"] = "load"
     same(imported(tmp_path / "t.csv", sections, tmp_path / "c.toml"), c.readings)

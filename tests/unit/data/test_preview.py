@@ -118,7 +118,7 @@ def test_a_file_for_the_positions_and_one_for_the_joints(tmp_path):
     assert (second.match, second.separator, second.decimal) == (("Point", "Name"), ";", ",")
     np.testing.assert_allclose(found.grid.numbers("A3"), DEG[:, 2], atol=1e-6)
     one = propose(tmp_path / "tracker.csv")
-    assert one.proposal.lacking == [
+    assert one.proposal.missing == [
         "no joint angles: where they are in a file of their own, give it with --second"
     ]
 
@@ -129,7 +129,7 @@ def test_a_missing_point(tmp_path):
     write(tmp_path / "t.csv", lines(["X", "Y", "Z", *six("A{}")], p, DEG))
     found = propose(tmp_path / "t.csv").proposal
     assert found.mapping(Mapping).file.missing == (-9999.0,)
-    assert ("file", "-9999 stands for a missing point") in found.unsure
+    assert ("file", "-9999 stands for a missing point") in found.doubts
 
 
 def test_lines_that_are_no_readings(tmp_path):
@@ -137,7 +137,7 @@ def test_lines_that_are_no_readings(tmp_path):
     found = propose(write(tmp_path / "t.csv", text))
     assert found.proposal.mapping(Mapping).file.header_row == 3
     assert len(found.grid.rows) == N
-    assert any("are left out" in words for _, words in found.proposal.unsure)
+    assert any("are left out" in words for _, words in found.proposal.doubts)
 
 
 def test_only_text(tmp_path):

@@ -19,7 +19,7 @@ from hilcal.store.rows import content_hash
 from hilcal.tables.table import write_table
 from hilcal.tables.units import parse_duration, parse_length
 from tests.support.campaigns import cell_of
-from tests.support.readings_cases import made, read_table
+from tests.support.readings_cases import read_table, readings_at
 from tests.support.refusals import refusals, refuses
 
 
@@ -90,7 +90,7 @@ def readings_of(target, names=NAMES, seed=0):
     pose = np.arange(count) % 2
     q, value = rng.uniform(-1.5, 1.5, (2, 6))[pose], rng.uniform(-0.5, 0.5, (count, 3))
     own = {"pose_names": ("p1", "p2"), "covariance": np.tile(1e-10 * np.eye(3), (count, 1, 1))}
-    return made(q, value, target=np.array(target), pose=pose, target_names=names, **own)
+    return readings_at(q, value, target=np.array(target), pose=pose, target_names=names, **own)
 
 
 def table_of(path, *targets):
@@ -200,7 +200,7 @@ def campaign(m=3, poses=40, seed=0):
     if m == 6:
         value[:, 3:] = Rotation.random(n, random_state=1).as_rotvec()
     q, wrench = rng.uniform(-3, 3, (poses, 6))[pose], rng.normal(size=(n, 6))
-    return made(q, value, wrench=wrench, pose=pose, load=load, std=NOISE_M)
+    return readings_at(q, value, wrench=wrench, pose=pose, load=load, std=NOISE_M)
 
 
 @pytest.mark.parametrize("m", [3, 6])

@@ -14,8 +14,8 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, Step, load_plan, read_plan
 from hilcal.store.run_log import PLAN, RunLog
 from hilcal.store.schema import transaction
-from tests.support.readings_cases import made
-from tests.support.refusals import edited, refusal, refusal_of, refusals, refuses
+from tests.support.readings_cases import readings_at
+from tests.support.refusals import refusal, refusal_of, refusals, refuses, with_edits
 
 STEPS = tuple(Step(pose, load, 0) for pose in ("p1", "p2", "p3") for load in ("none", "5kg"))
 MADE = Plan(("p1", "p2", "p3"), np.arange(18.0).reshape(3, 6) / 10, STEPS, {"seed": 3})
@@ -24,11 +24,11 @@ MADE = Plan(("p1", "p2", "p3"), np.arange(18.0).reshape(3, 6) / 10, STEPS, {"see
 def _reading(step):
     names = {"load_names": (step.load,), "pose_names": (step.pose,)}
     q = MADE.joints(step.pose)[None]
-    return made(q, np.ones((1, 3)), cycle=np.array([step.cycle]), **names)
+    return readings_at(q, np.ones((1, 3)), cycle=np.array([step.cycle]), **names)
 
 
 def _campaign(path):
-    return CampaignFile.create(path, "{}", ".", "test", more={PLAN: MADE.to_json()})
+    return CampaignFile.create(path, "{}", ".", "test", more_texts={PLAN: MADE.to_json()})
 
 
 def test_what_was_recorded_comes_back_after_reopening(tmp_path):
@@ -104,7 +104,7 @@ def test_a_plan_is_read_back_as_written(poses, rows, angle):
 @refusals("plans")
 def test_what_is_not_a_plan_is_refused_in_one_line(case, given, tmp_path):
     path = tmp_path / "plan.json"
-    path.write_text(edited(given, MADE=MADE.to_json()))
+    path.write_text(with_edits(given, MADE=MADE.to_json()))
     refuses(case, lambda: load_plan(path), path)
 
 

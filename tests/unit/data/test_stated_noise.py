@@ -18,7 +18,7 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.table import import_table, write_table
 from hilcal.tables.uncertainty import rounding_variance, step
 from tests.support.cli_cases import CELL, ok, rehearsal
-from tests.support.readings_cases import make_arm, simple
+from tests.support.readings_cases import make_arm, simple_readings
 from tests.support.refusals import refusal
 
 ARM = make_arm()
@@ -38,7 +38,7 @@ def with_variances(x, row, *variances):
 
 @pytest.mark.parametrize("tiny", [0.0, 1e-30, 1e-15])
 def test_one_variance_of_zero_is_the_instruments(tmp_path, tiny):
-    x = with_variances(simple(20), 4, 1e-10, tiny, 1e-10)
+    x = with_variances(simple_readings(20), 4, 1e-10, tiny, 1e-10)
     result = through_a_table(tmp_path, x)
     cov = result.readings.covariance
     spec = tracker_covariance(x.value, NOISE)
@@ -51,7 +51,7 @@ def test_one_variance_of_zero_is_the_instruments(tmp_path, tiny):
 
 
 def test_angles_have_a_floor_of_their_own(tmp_path):
-    x = with_variances(simple(20, m=6), 4, 1e-10, 1e-10, 1e-10, 1e-8, 0.0, 1e-8)
+    x = with_variances(simple_readings(20, m=6), 4, 1e-10, 1e-10, 1e-10, 1e-8, 0.0, 1e-8)
     assert through_a_table(tmp_path, x).readings.covariance[4, 4, 4] == NOISE.orientation_std**2
 
 
@@ -60,7 +60,7 @@ def test_angles_have_a_floor_of_their_own(tmp_path):
     (1e-10, "variances given as standard deviations"),
     (2e-8, "1000 times too small")])  # fmt: skip
 def test_precision_that_nothing_has_is_refused(tmp_path, sigma, looks):
-    x = simple(20)
+    x = simple_readings(20)
     cov = np.tile(sigma**2 * np.eye(3), (20, 1, 1))
     error = refusal("no instrument reaches", through_a_table, tmp_path, replace(x, covariance=cov))
     assert looks in error
@@ -69,7 +69,7 @@ def test_precision_that_nothing_has_is_refused(tmp_path, sigma, looks):
 
 @pytest.mark.parametrize(("m", "sigma", "unit"), [(3, 5e-3, "m"), (3, 40.0, "m"), (6, 0.1, "rad")])
 def test_noise_that_calibrates_nothing_is_refused(tmp_path, m, sigma, unit):
-    x = simple(20, m=m)
+    x = simple_readings(20, m=m)
     cov = x.covariance.copy()
     cov[:, -1, -1] = sigma**2
     with pytest.raises(InputError, match=rf"row 2: a standard deviation of {sigma:g} {unit}"):
@@ -77,7 +77,7 @@ def test_noise_that_calibrates_nothing_is_refused(tmp_path, m, sigma, unit):
 
 
 def test_rounding_is_found_and_added(tmp_path):
-    x = simple(20)
+    x = simple_readings(20)
     fine = through_a_table(tmp_path, x)
     np.testing.assert_array_equal(fine.readings.covariance, x.covariance)
     assert len(fine.notes) == 1

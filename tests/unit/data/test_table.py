@@ -12,7 +12,13 @@ from hypothesis import HealthCheck, given, settings
 from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise, tracker_covariance
 from hilcal.tables.table import write_table
-from tests.support.readings_cases import assert_same, make_arm, read_table, readings, simple
+from tests.support.readings_cases import (
+    assert_same,
+    make_arm,
+    read_table,
+    readings,
+    simple_readings,
+)
 from tests.support.refusals import refusal, refusals, refuses
 
 ARM = make_arm()
@@ -89,7 +95,7 @@ def test_round_trip_is_exact(tmp_path, x):
 
 
 def test_seven_joints(tmp_path):
-    x = simple(4)
+    x = simple_readings(4)
     x = replace(x, states=replace(x.states, q=np.hstack([x.states.q, np.ones((4, 1))]), time=None))
     write_table(x, tmp_path / "t.csv")
     assert_same(read_table(tmp_path / "t.csv", make_arm(7), None), x)
@@ -136,13 +142,13 @@ def test_bad_tables_are_refused_by_name(case, given, write):
 
 
 def test_positions_that_do_not_move_with_the_joints(tmp_path):
-    x = simple(20)
+    x = simple_readings(20)
     write_table(replace(x, value=1.0 + 1e-4 * x.value), tmp_path / "t.csv")
     refusal("all positions lie within", read_table, tmp_path / "t.csv", ARM, None)
 
 
 def test_row_numbers_count_blank_lines_and_all_blocks(tmp_path):
-    write_table(simple(9000), tmp_path / "t.csv")
+    write_table(simple_readings(9000), tmp_path / "t.csv")
     lines = (tmp_path / "t.csv").read_text().splitlines()
     lines[8000] = lines[8000].replace(",", ",oops,", 1)
     lines.insert(10, "")
@@ -189,5 +195,5 @@ def test_other_things_than_a_table(tmp_path, write):
     ],
 )
 def test_names_that_a_table_cannot_hold_are_not_written(tmp_path, names, message):
-    refusal(message, write_table, replace(simple(2), **names), tmp_path / "t.csv")
+    refusal(message, write_table, replace(simple_readings(2), **names), tmp_path / "t.csv")
     assert not list(tmp_path.iterdir())

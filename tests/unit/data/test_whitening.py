@@ -16,7 +16,7 @@ from hilcal.readings.covariance import (
 )
 from hilcal.readings.whitening import MODES, inverse_root, measured_values, whitening
 from hilcal.robot import se3
-from tests.support.readings_cases import made
+from tests.support.readings_cases import readings_at
 from tests.support.refusals import refusal
 
 NOISE = TrackerNoise(10e-6, 0.3e-6, 15e-6, 6e-6, 1e-4)
@@ -105,7 +105,7 @@ def random_units(rng, k):
 def make_readings(pose, cycle, load, value, covariance):
     """Readings with load 0 the unloaded state."""
     q = np.zeros((len(pose), 6))
-    return made(q, value, pose=pose, cycle=cycle, load=load, covariance=covariance)
+    return readings_at(q, value, pose=pose, cycle=cycle, load=load, covariance=covariance)
 
 
 def random_readings(rng, m, decades=3.0):

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilcal.cell import cell_from_config, tracker_place
-from hilcal.design.feasible import REASONS, Space, draw
+from hilcal.design.feasible import REASONS, FeasibleSpace, draw_poses
 from hilcal.errors import CannotAnswerError
-from hilcal.measuring.feasibility import BETWEEN_M, STATE, Feasibility, Margins
+from hilcal.measuring.feasibility import BETWEEN_M, STATE_CHECKS, Feasibility, Margins
 from hilcal.measuring.motion import SLACK, SLACK_M, Guard
 from hilcal.measuring.route import Stop, dry_run, route_problems
 from hilcal.robot.catalogue import load_arm
@@ -86,7 +86,7 @@ def test_no_candidate_ever_breaks_a_limit(sections, seed):
     config = cell(**sections)
     space = space_of(config)
     try:
-        drawn = draw(space, 15, np.random.default_rng(seed))
+        drawn = draw_poses(space, 15, np.random.default_rng(seed))
     except CannotAnswerError:
         return
     assert drawn.loads == (UNLOADED, "weight", "pull")
@@ -243,7 +243,7 @@ def test_what_leaves_nothing_is_named(sections, message):
 def test_too_few_is_told_by_what_takes_most():
     sight = {"tracker_m": [3, 0, 0.5], "target_normal": [0, 0, 1], "incidence_max_rad": 0.05}
     with pytest.raises(CannotAnswerError, match=r"only \d+ poses, 5,000 are needed: .* turn the t"):
-        drawn_of(cell(sight=sight), 5000, least=5000, most=1 << 16)
+        drawn_of(cell(sight=sight), 5000, min_poses=5000, max_states=1 << 16)
 
 
 def test_one_load_that_cannot_be_hung_is_a_remark():
@@ -432,11 +432,11 @@ def stopped(guard, q, load):
 @given(cells_of_same_feasibility(), SEED, LOAD)
 def test_a_state_is_refused_by_all_or_by_none(made, seed, load):
     c, config = made
-    space, guard = Space(c, config, Margins()), Guard(c, config)
+    space, guard = FeasibleSpace(c, config, Margins()), Guard(c, config)
     for q in states(c, seed, 4):
-        lines = route_problems(c, config, (Stop("p", q, load),))
+        lines = route_problems(Feasibility(c, config), (Stop("p", q, load),))
         told = [line for line in lines if "N·m" not in line]
-        assert told == [x.at("pose p") for x in space.findings(q[None], load, GEOMETRY)]
+        assert told == [x.line("pose p") for x in space.findings(q[None], load, GEOMETRY)]
         assert bool(told) is not space.allowed(q[None], load, GEOMETRY).all()
         inside, apart = gaps(space.shapes, q, load)
         outside = [x for x in told if "workspace" in x or "mounting plane" in x]
@@ -455,11 +455,11 @@ def test_all_checks_together_find_what_each_finds_alone(made, seed, load):
     c, config = made
     limits, q = Feasibility(c, config, SLACK), states(c, seed, 6)
     together = list(limits.findings(q, load))
-    assert together == [x for kind in STATE for x in limits.findings(q, load, (kind,))]
+    assert together == [x for kind in STATE_CHECKS for x in limits.findings(q, load, (kind,))]
     alone = [list(limits.findings(row[None], load)) for row in q]
-    assert {x.what for x in together} == {x.what for found in alone for x in found}
+    assert {x.key for x in together} == {x.key for found in alone for x in found}
     allowed = np.array([not found for found in alone])
-    np.testing.assert_array_equal(limits.allowed(q, load, STATE), allowed)
+    np.testing.assert_array_equal(limits.allowed(q, load, STATE_CHECKS), allowed)
     fresh = Feasibility(c, config, SLACK)
     assert list(fresh.findings(q[-1:], load)) == alone[-1]
 
@@ -470,15 +470,15 @@ def test_all_checks_together_find_what_each_finds_alone(made, seed, load):
 def test_a_motion_that_is_planned_passes_and_touches_nothing(made, seed, load):
     """What the planner allows the dry run allows; what that allows the guard allows."""
     c, config = made
-    space, guard = Space(c, config), Guard(c, config)
+    space, guard = FeasibleSpace(c, config), Guard(c, config)
     q = states(c, seed, 30)
-    planned = q[space.allowed(q, load, STATE)][:3]
+    planned = q[space.allowed(q, load, STATE_CHECKS)][:3]
     if len(planned):
         for end in planned[space.passable(planned[0], planned, load)]:
-            assert route_problems(c, config, _way(planned[0], end, load)) == []
-    loose = q[Space(c, config, Margins()).allowed(q, load, STATE)][:3]
+            assert route_problems(Feasibility(c, config), _way(planned[0], end, load)) == []
+    loose = q[FeasibleSpace(c, config, Margins()).allowed(q, load, STATE_CHECKS)][:3]
     for end in loose[1:]:
-        if route_problems(c, config, _way(loose[0], end, load)):
+        if route_problems(Feasibility(c, config), _way(loose[0], end, load)):
             continue
         for share in np.random.default_rng(seed).random(8):
             between = loose[0] + share * (end - loose[0])
@@ -496,8 +496,8 @@ def test_nothing_small_is_passed_between_two_samples(name, seed, share, load):
     """A cube of 4 mm where hook, elbow or what hangs comes by, and a side that they just pass."""
     free = cell(limits={"workspace_min_m": [-9.0, -9.0, -9.0], "joint_margin_rad": 0.0})
     c = replace(cell_from_config(free), arm=arm(name))
-    space, q = Space(c, free), states(c, seed, 30)
-    start, *ends = q[space.allowed(q, load, STATE)]
+    space, q = FeasibleSpace(c, free), states(c, seed, 30)
+    start, *ends = q[space.allowed(q, load, STATE_CHECKS)]
     clear = np.array(ends)[space.passable(start, np.array(ends), load)]
     for end in clear[:2]:
         between = start + share * (end - start)
@@ -505,12 +505,12 @@ def test_nothing_small_is_passed_between_two_samples(name, seed, share, load):
         for point in (placed(parts[-1], at)[-1], at[4][:3, 3]):
             cube = {"name": "cube", "center_m": point.tolist(), "size_m": [0.004] * 3}
             found = cell(limits=free.limits.model_dump(), obstacles=[cube])
-            assert not Space(c, found).passable(start, end[None], load).any()
-            problems = route_problems(c, found, _way(start, end, load))
+            assert not FeasibleSpace(c, found).passable(start, end[None], load).any()
+            problems = route_problems(Feasibility(c, found), _way(start, end, load))
             assert any("cube collide" in x for x in problems)
         low, _ = extent([p for p in parts if p.body > 2], c, between[None])
         box = free.limits.model_dump() | {"workspace_min_m": [-9.0, -9.0, low[2] + 0.002]}
-        assert route_problems(c, cell(limits=box), _way(start, end, load))
+        assert route_problems(Feasibility(c, cell(limits=box)), _way(start, end, load))
 
 
 def _way(start, end, load):

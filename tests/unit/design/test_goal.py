@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from hilcal.design.goal import figures, parse_goal
+from hilcal.design.goal import parse_goal, stds_and_values
 from hilcal.errors import InputError
 from tests.support.campaigns import campaign
-from tests.support.fit_cases import based
+from tests.support.fit_cases import fitted_model
 from tests.support.refusals import refusals, refuses
 
 UNITS = {"joint_compliance.j1": "rad/(N·m)", "joint_compliance.j3": "rad/(N·m)"}
@@ -31,7 +31,7 @@ STDS = {"joint_compliance.j1": 3e-7, "joint_compliance.j3": 2.5e-7, "base_frame.
     ],
 )
 def test_a_goal_is_met_by_the_worst_of_it(text, met, ratio, worst):
-    v = parse_goal(text).met(STDS, VALUES, 12e-6)
+    v = parse_goal(text).status(STDS, VALUES, 12e-6)
     assert (v.met, v.worst) == (met, worst)
     assert v.ratio == pytest.approx(ratio)
 
@@ -39,10 +39,10 @@ def test_a_goal_is_met_by_the_worst_of_it(text, met, ratio, worst):
 @pytest.mark.parametrize("bad", [np.inf, np.nan])
 def test_what_is_not_identifiable_never_meets_a_goal(bad):
     for text in ("joint std < 90 %", "joint std < 1 rad/(N·m)"):
-        v = parse_goal(text).met({**STDS, "joint_compliance.j1": bad}, VALUES)
+        v = parse_goal(text).status({**STDS, "joint_compliance.j1": bad}, VALUES)
         assert not v.met
         assert v.worst == "joint_compliance.j1"
-    assert not parse_goal("position std < 1 m").met(STDS, VALUES, bad).met
+    assert not parse_goal("position std < 1 m").status(STDS, VALUES, bad).met
 
 
 @refusals("goals")
@@ -59,13 +59,13 @@ def test_a_goal_must_fit_the_model():
     with pytest.raises(InputError, match="j9 is not in the model; valid: position, joint_comp"):
         parse_goal("j9 std < 1 %").check(UNITS)
     with pytest.raises(InputError, match="work_q_rad"):
-        parse_goal("position std < 1 mm").met(STDS, VALUES)
+        parse_goal("position std < 1 mm").status(STDS, VALUES)
 
 
 def test_a_fit_is_judged_by_what_it_states():
     c = campaign(mode="deflection", poses=8, registration_known=True)
-    found = based(c.cell, c.readings, "deflection")
-    stds, values = figures(found)
+    found = fitted_model(c.cell, c.readings, "deflection")
+    stds, values = stds_and_values(found)
     share = max(stds[n] / abs(values[n]) for n in stds if n.startswith("joint_compliance"))
-    assert parse_goal(f"joint std < {101 * share:.6f} %").met(stds, values).met
-    assert not parse_goal(f"joint std < {99 * share:.6f} %").met(stds, values).met
+    assert parse_goal(f"joint std < {101 * share:.6f} %").status(stds, values).met
+    assert not parse_goal(f"joint std < {99 * share:.6f} %").status(stds, values).met

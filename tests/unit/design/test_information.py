@@ -14,8 +14,8 @@ from hilcal.config import load_config
 from hilcal.config.cell import Target
 from hilcal.config.sections import Gauge, Point
 from hilcal.design.information import MOST_PARAMETERS, MOST_TIMES, problem, reading_covariance
-from hilcal.design.nominal_model import after, nominal_model, nominal_states
-from hilcal.design.predicted import predicted, prediction_poses
+from hilcal.design.nominal_model import model_after, nominal_model, nominal_states
+from hilcal.design.predicted import predicted_uncertainty, prediction_poses
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import baseline
@@ -43,7 +43,7 @@ from tests.support.campaigns import (
 )
 from tests.support.cli_cases import CELL as DEMO
 from tests.support.cli_cases import ok
-from tests.support.fit_cases import based, named
+from tests.support.fit_cases import fitted_model, parameters_by_effect
 from tests.support.fit_cases import predicted as read
 from tests.support.observer_cases import NORMAL, POINTS, STD, observed
 from tests.support.plan_cases import (
@@ -65,7 +65,7 @@ def test_prediction_is_what_identification_states(mode, known):
     # An unknown registration is planned with the tracker about where it stands.
     c = campaign(mode=mode, poses=16, seed=3, registration_known=known)
     config = config_of(mode)
-    found = based(c.cell, c.readings, mode)
+    found = fitted_model(c.cell, c.readings, mode)
     if not known:
         r = c.world.registration
         place = tuple(float(x) for x in -r[:3, :3].T @ r[:3, 3])
@@ -79,7 +79,7 @@ JOINTS = tuple(f"joint_compliance.j{k}" for k in range(1, 7))
 def as_stated(c, config, found, rel, names):
     """What a plan predicts for the readings of a campaign is what the fit to them states."""
     p = problem_of(c.cell, config, poses_in(c.readings))
-    foreseen = predicted(p, everything_once(p)).by_name()
+    foreseen = predicted_uncertainty(p, everything_once(p)).by_name()
     stated = dict(zip(foreseen, found.uncertainty.formal, strict=True))
     for name in names:
         assert foreseen[name] == pytest.approx(stated[name], rel=rel), name
@@ -91,7 +91,7 @@ def test_prediction_is_what_identification_states_of_several_targets(mode):
     c = reflectors(poses=14, joint_std=5e-5, known=(True, False, True), registration_known=True)
     # in deflections a prior of another size holds the offset
     offset = ("target_offset.R2.x",) if mode == "absolute" else ()
-    as_stated(c, config, based(c.cell, c.readings, mode), 0.05, (*offset, *JOINTS))
+    as_stated(c, config, fitted_model(c.cell, c.readings, mode), 0.05, (*offset, *JOINTS))
 
 
 @pytest.mark.parametrize("mode", first(1, MODES))
@@ -102,7 +102,7 @@ def test_parameters_and_positions_scatter_as_predicted(mode):
     a = nominal_model(cell, config)
     p = problem(a, config, q)
     work = prediction_poses(a, config, poses_of(12, 6))
-    expected = predicted(p, everything_once(p), work=work)
+    expected = predicted_uncertainty(p, everything_once(p), work=work)
     clean = read(a.model, noiseless(world_of(cell, np.random.default_rng(0)), plan(10, 5)), a.theta)
     thetas = []
     for k in range(60):
@@ -138,7 +138,7 @@ def test_a_deflection_unit_is_a_pose_whose_place_is_unknown(name, seed):
     prediction = model.predict(states, a.theta)
     jac = model.jacobian_of((*model.effects, *families), prediction, a.theta, 3) * units.scale
     v = reading_covariance(a, ab, prediction)
-    for k, (pose, loads) in enumerate(units.what):
+    for k, (pose, loads) in enumerate(units.contents):
         index = [0, *(units.candidates.loads.index(x) for x in loads)]
         rows = np.array([5 * pose + i for i in index])
         weight = np.linalg.inv(v[rows])
@@ -153,10 +153,10 @@ def test_a_deflection_unit_is_a_pose_whose_place_is_unknown(name, seed):
 @pytest.mark.parametrize("mode", MODES)
 def test_what_was_measured_is_known_exactly(mode):
     c = campaign(mode=mode, poses=12, seed=1, target_known=False)
-    found = based(c.cell, c.readings, mode)
+    found = fitted_model(c.cell, c.readings, mode)
     config = config_of(mode)
-    p = problem(after(found, config), config, poses_of(3))
-    mine = predicted(p)
+    p = problem(model_after(found, config), config, poses_of(3))
+    mine = predicted_uncertainty(p)
     flat = np.isinf(found.solution.prior)
     ratio = (mine.std / found.uncertainty.formal)[flat & found.uncertainty.identifiable]
     assert ratio == pytest.approx(np.ones(len(ratio)), rel=1e-6)
@@ -173,14 +173,14 @@ def test_planning_on_predicts_the_fit_to_all_readings():
     first = readings[readings.pose < 8]
     config = config_of("absolute", against=("joint_stiffening",))
     effects = ("joint_compliance", "encoder_offset")
-    begun = based(cell, first, "absolute", effects)
-    later = problem(after(begun, config), config, poses_of(20, 8)[8:])
-    expected = predicted(later, everything_once(later))
-    found = based(cell, readings, "absolute", effects)
+    begun = fitted_model(cell, first, "absolute", effects)
+    later = problem(model_after(begun, config), config, poses_of(20, 8)[8:])
+    expected = predicted_uncertainty(later, everything_once(later))
+    found = fitted_model(cell, readings, "absolute", effects)
     assert expected.std == pytest.approx(found.uncertainty.formal, rel=0.02)
     # The potential terms were measured as well: what is known of all together.
     wider = (*effects, "joint_stiffening")
-    whole = based(cell, readings, "absolute", wider)
+    whole = fitted_model(cell, readings, "absolute", wider)
     mine = later.information(everything_once(later))
     mine[np.arange(12, 18), np.arange(12, 18)] -= 1.0
     std = np.sqrt(np.diag(np.linalg.inv(mine))) * later.scale
@@ -190,7 +190,7 @@ def test_planning_on_predicts_the_fit_to_all_readings():
 def test_a_fit_that_is_not_whitened_is_refused():
     c = campaign(mode="absolute", poses=8, registration_known=True)
     found = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute", "none")
-    refusal("scaling gc, this one has none", after, found, config_of())
+    refusal("scaling gc, this one has none", model_after, found, config_of())
 
 
 @pytest.mark.parametrize("m", first(1, [3, 6]))
@@ -224,23 +224,23 @@ def test_units_are_what_may_be_taken():
     allowed[2] = [False, True, True, True, True]  # not unloaded
     allowed[3] = [True, False, False, False, True]  # one load only
     p = problem(a, config, poses_of(4), allowed)
-    of = [{loads for pose, loads in p.what if pose == k} for k in range(4)]
+    of = [{loads for pose, loads in p.contents if pose == k} for k in range(4)]
     assert (len(of[0]), len(of[1]), len(of[2])) == (4 + 6 + 1, 3 + 3 + 1, 0)
     assert tuple(names) in of[0]
     assert all("10kg" not in loads for loads in of[1])
     assert of[3] == {(names[3],)}
-    assert p.units.cost == pytest.approx([1 + len(loads) for _, loads in p.what])
+    assert p.units.cost == pytest.approx([1 + len(loads) for _, loads in p.contents])
     # A unit's rows do not depend on what else may be taken.
     free = problem(a, config, poses_of(4))
-    for k, what in enumerate(p.what):
-        if what in free.what:
-            other = free.units.rows[free.what.index(what)]
+    for k, what in enumerate(p.contents):
+        if what in free.contents:
+            other = free.units.rows[free.contents.index(what)]
             assert np.any(other)
             assert p.units.rows[k] == pytest.approx(other, abs=1e-12)
     single = problem_of(cell, config_of("absolute"), poses_of(4), allowed=allowed)
-    assert sum(1 for _ in single.what) == allowed.sum()
+    assert sum(1 for _ in single.contents) == allowed.sum()
     assert single.units.cost == pytest.approx(np.ones(len(single.units)))
-    assert (2, ("none",)) not in single.what
+    assert (2, ("none",)) not in single.contents
 
 
 def test_problems_that_cannot_be():
@@ -263,12 +263,12 @@ def test_what_cannot_be_seen_has_no_uncertainty():
     config, cell = config_of("deflection"), cell_of(registration_known=True)
     a = nominal_model(cell, config)
     p = problem(a, config, poses_of(1))
-    only = np.array([float(loads == ("5kg",)) for _, loads in p.what])
+    only = np.array([float(loads == ("5kg",)) for _, loads in p.contents])
     work = prediction_poses(a, config, poses_of(5))
-    mine = predicted(p, only, work=work)
+    mine = predicted_uncertainty(p, only, work=work)
     assert np.isinf(mine.std).any()  # three numbers measured, six compliances
     assert np.isinf(mine.position)
-    assert np.isfinite(predicted(p, everything_once(p) * 0 + 1.0).std).any()
+    assert np.isfinite(predicted_uncertainty(p, everything_once(p) * 0 + 1.0).std).any()
 
 
 CELL = cell_of(registration_known=True)
@@ -288,7 +288,7 @@ def test_potential_terms_are_as_large_as_arms_have_them(mode):
         expected = np.exp([e.expected_log_std(pool)[0] for pool in e.pools()]) * e.magnitudes
         assert p.scale[where] == pytest.approx(expected, rel=1e-12)
         assert p.prior[np.ix_(where, where)] == pytest.approx(np.eye(len(where)))
-    single = np.array([len(loads) == 1 for _, loads in p.what])
+    single = np.array([len(loads) == 1 for _, loads in p.contents])
     shift = p.units.rows[single][:, :3]
     for e in p.families:
         size = np.sqrt(np.mean(np.sum(shift[:, :, p.of_effect(e.name)] ** 2, axis=2)))
@@ -323,15 +323,15 @@ def test_a_load_that_no_pose_bears_is_as_good_as_none():
     allowed[:, -1] = False
     borne = problem_of(CELL, config, q, allowed=allowed)
     without = problem_of(CELL, config.model_copy(update={"loads": config.loads[:-1]}), q)
-    assert borne.what == without.what
+    assert borne.contents == without.contents
     assert borne.terms == without.terms
-    np.testing.assert_allclose(*(p.information(np.ones(len(p.what))) for p in (borne, without)))
+    np.testing.assert_allclose(*(p.information(np.ones(len(p.contents))) for p in (borne, without)))
 
 
 def test_potential_terms_only_add_uncertainty():
     problems = made(), made(against=())
     work = prediction_poses(problems[0].nominal, config_of("deflection"), poses_of(5, 9))
-    mine, bare = (predicted(p, everything_once(p), work=work) for p in problems)
+    mine, bare = (predicted_uncertainty(p, everything_once(p), work=work) for p in problems)
     assert mine.std == pytest.approx(bare.std, rel=1e-9)
     assert bare.position_open == pytest.approx(bare.position, rel=1e-9)
     assert mine.position_open > bare.position
@@ -372,7 +372,7 @@ def test_unloaded_work_with_deflections_is_under_each_load():
     config = config_of("deflection")
     a = nominal_model(CELL, config)
     work = prediction_poses(a, config, poses_of(3))
-    assert work.what == "deflection under each load at 3 feasible poses"
+    assert work.description == "deflection under each load at 3 feasible poses"
     assert len(work.q) == 12
     assert np.all(np.abs(work.derivative).max(axis=(1, 2)) > 0)
 
@@ -402,7 +402,7 @@ CARRIED = ("joint_compliance", "joint_tilt_compliance")
 @cache
 def learnt():
     c = campaign("joint_tilt_compliance", "absolute", 1, poses=30, registration_known=True)
-    found = based(c.cell, c.readings, "absolute", CARRIED)
+    found = fitted_model(c.cell, c.readings, "absolute", CARRIED)
     return Posterior.of(found)
 
 
@@ -413,7 +413,7 @@ def problem_with(prior, names=CARRIED):
 
 
 def std(of):
-    return predicted(of, np.ones(len(of.units))).by_name()
+    return predicted_uncertainty(of, np.ones(len(of.units))).by_name()
 
 
 def test_what_is_known_is_in_the_prediction():
@@ -457,19 +457,19 @@ def test_predicted_uncertainties_are_those_of_a_fit(what):
     c = observed(who, 7, cell=cell, base=True)
     joint_std = config.repeatability.per_joint(6)
     readings = with_joint_scatter(cell, c.readings, joint_std)
-    f = based(cell, readings, "absolute")
+    f = fitted_model(cell, readings, "absolute")
 
     _, first = np.unique(readings.pose, return_index=True)
     of = problem_of(cell, config, readings.states.q[first])
-    assert len(of.what) == len(first) * 5
-    information = of.information(np.ones(len(of.what))) - of.prior + of.measured
+    assert len(of.contents) == len(first) * 5
+    information = of.information(np.ones(len(of.contents))) - of.prior + of.measured
     names = [t.name for t in of.terms]
     own = [k for k, name in enumerate(names) if name.startswith("joint_compliance")]
     frames = [k for k, name in enumerate(names) if name.startswith("observer_frame")]
     kept = np.array([*own, *frames])
     covariance = np.linalg.pinv(information[np.ix_(kept, kept)], rcond=1e-12)
     std = np.sqrt(np.diagonal(covariance))[: len(own)] * of.scale[own]
-    fitted = named(f)
+    fitted = parameters_by_effect(f)
     for name, planned in zip((names[k] for k in own), std, strict=True):
         if np.isfinite(fitted[name][1]):
             assert planned == pytest.approx(fitted[name][1], rel=0.25), name
@@ -502,10 +502,10 @@ def test_sight_and_time_of_each_target():
     counts = set()
     for tracker in ([3.0, 0.5, 0.4], [-2.0, 0.0, 0.5], [0.0, 0.0, 2.5]):
         view = LineOfSight(Clearance(cell, several), np.array(tracker))
-        seen = np.array([view.sees(q, "none", k) for k in range(3)])
-        np.testing.assert_array_equal(view.free(q, "none"), seen.all(axis=0))
+        seen = np.array([view.target_visible(q, "none", k) for k in range(3)])
+        np.testing.assert_array_equal(view.unobstructed(q, "none"), seen.all(axis=0))
         for k in range(len(q)):
-            hidden = view.hidden(q[k : k + 1], "none")
+            hidden = view.hidden_targets(q[k : k + 1], "none")
             assert hidden == tuple(np.flatnonzero(~seen[:, k]))
             problems = " ".join(view.problems(q[k : k + 1], "none", "here"))
             assert ("between tracker and targets" in problems) == (len(hidden) == 3)

@@ -17,11 +17,11 @@ from hilcal.design.information import (
     reading_derivatives,
 )
 from hilcal.design.mixed_design import balanced, mixed_design, other_effects
-from hilcal.design.nominal_model import after, nominal_model
-from hilcal.design.optimum import best
+from hilcal.design.nominal_model import model_after, nominal_model
+from hilcal.design.optimum import best_design
 from hilcal.design.predicted import position_derivative, prediction_poses
 from tests.support.campaigns import campaign, cell_of
-from tests.support.fit_cases import based
+from tests.support.fit_cases import fitted_model
 from tests.support.plan_cases import changed, config_of, poses_of
 from tests.support.rows import first
 
@@ -38,7 +38,7 @@ def scene(mode, *, fitted):
     known = config(mode)
     if fitted:
         c = campaign(mode=mode, poses=8, seed=3, registration_known=True)
-        nominal = after(based(c.cell, c.readings, mode), known)
+        nominal = model_after(fitted_model(c.cell, c.readings, mode), known)
     else:
         nominal = nominal_model(cell_of(registration_known=True), known)
     of = problem(nominal, known, poses_of(6))
@@ -54,7 +54,7 @@ def mean_variance_of_all(of, work, mode, counts):
     prior = np.concatenate([~np.isinf(live), np.ones(len(std), dtype=bool)]).astype(float)
     m = information_of(nominal, more, scale) + np.diag(prior)
     (part,) = reading_derivatives(nominal, known, of.candidates, more, scale)
-    for (pose, loads), count in zip(of.what, counts, strict=True):
+    for (pose, loads), count in zip(of.contents, counts, strict=True):
         index = tuple(of.candidates.loads.index(name) for name in loads)
         if mode == "absolute":
             rows = absolute_rows(part)[pose, index[0]]
@@ -129,7 +129,7 @@ def test_a_plan_for_predictions_is_better_than_random_poses_and_certified():
     nominal = replace(nominal, live=nominal.live[:-6])  # no load tells the compliance
     of = problem(nominal, known, poses_of(80))
     asked = objective_of(of, known, "I", prediction_poses(of.nominal, known, poses_of(30, 9)))
-    design = best(asked, 20.0, np.random.default_rng(0), effort=EFFORT)
+    design = best_design(asked, 20.0, np.random.default_rng(0), effort=EFFORT)
     # the bound splits precise readings over all poses, which no plan can
     assert 0.1 < design.efficiency <= 1.0
     rng, others = np.random.default_rng(5), []

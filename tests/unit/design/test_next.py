@@ -20,9 +20,9 @@ from hilcal.design.discriminated_pairs import (
     supported_parameters,
 )
 from hilcal.design.information import problem
-from hilcal.design.next import DRAWS, measure_next, measure_poses
-from hilcal.design.nominal_model import after
-from hilcal.design.planner import Request
+from hilcal.design.next import DRAWS, plan_poses, plan_separating
+from hilcal.design.nominal_model import model_after
+from hilcal.design.planner import PlanRequest
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.pose_alone import pose_powers
 from hilcal.diagnosis.verdict import diagnose
@@ -45,8 +45,8 @@ from tests.support.campaigns import (
     true_parameters,
     with_noise,
 )
-from tests.support.fit_cases import based, refined
-from tests.support.next_cases import SMALL, doubtful, settled
+from tests.support.fit_cases import fitted_model, refined
+from tests.support.next_cases import SMALL, after_further_plan, doubtful
 from tests.support.plan_cases import config_of, poses_of
 
 TILT, LINK = "joint_tilt_compliance", "link_compliance"
@@ -87,8 +87,8 @@ def test_the_power_is_the_share_of_rejections_in_the_simulated_world():
     p = plan(8, 21)
     clean = noiseless(c.world, p)
     config = config_of("deflection", against=(TILT, LINK))
-    first = based(c.cell, c.readings, "deflection")
-    of = problem(after(first, config), config, poses_of(8, 21))
+    first = fitted_model(c.cell, c.readings, "deflection")
+    of = problem(model_after(first, config), config, poses_of(8, 21))
     where = of.of_effect(TILT)
     nuisance = np.concatenate([np.arange(of.model_size), of.of_effect(LINK)])
     beta = true_parameters(c.world, TILT) / of.scale[where]
@@ -114,8 +114,8 @@ def test_the_powers_of_a_plan_are_shares_of_rejections():
     """Of what is known and planned for, with the parameters that the readings support."""
     first = doubtful("base_compliance", 2)
     rng, trials = np.random.default_rng(3), 2000
-    asked = (first.rehearsal.cell, SMALL, first.fit, first.suspects, Request(6), rng)
-    found = measure_next(*asked, reference=first.plan.joints("reference"))
+    asked = (first.rehearsal.cell, SMALL, first.fit, first.suspects, PlanRequest(6), rng)
+    found = plan_separating(*asked, reference=first.plan.joints("reference"))
     of, known = found.planned.problem, discriminated_pairs(found.planned.problem).prior
     values, vectors = np.linalg.eigh(known)
     before = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
@@ -126,7 +126,7 @@ def test_the_powers_of_a_plan_are_shares_of_rejections():
         where, rival = of.of_effect(p.effect), of.of_effect(p.rival)
         fitted = np.concatenate([np.arange(of.model_size), rival])
         beta = supported[p.effect][rng.integers(DRAWS, size=trials)] / of.scale[where]
-        for rows, promised in ((before, p.now), (every, p.then)):
+        for rows, promised in ((before, p.power_now), (every, p.power_planned)):
             y = rows[:, where] @ beta.T + rng.standard_normal((len(rows), trials))
             both = (fitted, np.append(fitted, where))
             spanned = [sl.orth(rows[:, c], rcond=1e-7) for c in both]  # roots of rounding, 1e-8
@@ -141,9 +141,9 @@ def test_the_powers_of_a_plan_are_shares_of_rejections():
 
 def told(effect, strength, seed=2):
     c = campaign(effect, "deflection", seed, poses=10, strength=strength)
-    found = based(c.cell, c.readings, "deflection")
+    found = fitted_model(c.cell, c.readings, "deflection")
     config = config_of("deflection", against=(effect, LINK))
-    of = problem(after(found, config), config, poses_of(10, 1000 + seed))
+    of = problem(model_after(found, config), config, poses_of(10, 1000 + seed))
     return found, true_parameters(c.world, effect), of
 
 
@@ -177,9 +177,9 @@ def test_readings_that_do_not_speak_for_an_effect_tell_no_strength():
 def test_pairs_that_no_measurement_separates_are_said_so():
     """In deflections a scale of the tracker is a common factor on all compliances."""
     first = doubtful(TILT, 1)
-    asked = (SMALL, first.fit, ("tracker_scale", LINK), Request(4), np.random.default_rng(0))
+    asked = (SMALL, first.fit, ("tracker_scale", LINK), PlanRequest(4), np.random.default_rng(0))
     with pytest.raises(CannotAnswerError, match="no measurement separates them"):
-        measure_next(cell_from_config(SMALL), *asked)
+        plan_separating(cell_from_config(SMALL), *asked)
     assert not_separable_message([("a", "b"), ("a", "c"), ("b", "a"), ("c", "d")]) == (
         "no measurement in this cell separates a from b or c, nor c from d"
     )
@@ -188,17 +188,17 @@ def test_pairs_that_no_measurement_separates_are_said_so():
 @pytest.mark.parametrize("suspects", [(TILT,), (TILT, TILT)])
 def test_one_suspect_is_refused(suspects):
     first = doubtful(TILT, 1)
-    asked = (SMALL, first.fit, suspects, Request(4), np.random.default_rng(0))
+    asked = (SMALL, first.fit, suspects, PlanRequest(4), np.random.default_rng(0))
     with pytest.raises(InputError, match="two or more"):
-        measure_next(first.rehearsal.cell, *asked)
+        plan_separating(first.rehearsal.cell, *asked)
 
 
 def test_what_was_ambiguous_is_decided():
     first = doubtful("base_compliance", 2)
     assert "base_compliance" in first.suspects
     assert len(first.suspects) > 1
-    d, found = settled(first)
-    assert all(t.then > t.now for t in found.powers)
+    d, found = after_further_plan(first)
+    assert all(t.power_planned > t.power_now for t in found.powers)
     assert (d.suspects[0].effect, d.suspects[0].same_as) == ("base_compliance", ())
     plan = found.planned.ordered.plan
     assert found.planned.design.efficiency > 0.9
@@ -214,7 +214,7 @@ def test_most_doubts_are_settled(effect):
     assert len(seeds) >= 3
     alone = []
     for seed in seeds:
-        d, _ = settled(doubtful(effect, seed))
+        d, _ = after_further_plan(doubtful(effect, seed))
         alone.append(d.suspects[0].effect == effect and not d.suspects[0].same_as)
     print(f"\n{effect}: in doubt {len(seeds)} of 20, settled {sum(alone)}")
     assert np.mean(alone) >= 0.75
@@ -238,11 +238,11 @@ def fine_error():
 def test_the_poses_that_are_planned_end_in_the_effect_that_is_there():
     """Ambiguous at first, named when measured as planned: so it was with all seven of ten seeds."""
     c, before = fine_error()
-    first = based(c.cell, before, "absolute")
+    first = fitted_model(c.cell, before, "absolute")
     alone = diagnose(first).pose_alone
     assert alone.effects[0] == "transmission_error"
     config = configuration()
-    made = measure_poses(c.cell, config, first, alone.more, np.random.default_rng(1)).ordered.plan
+    made = plan_poses(c.cell, config, first, alone.more, np.random.default_rng(1)).ordered.plan
     states = planned_states(c.cell, config, made, 5000.0)
     number = states.pose + len(before.pose_names)
     after = simulate(c.world, states.states, number, states.load, states.cycle, before.load_names,
@@ -257,20 +257,20 @@ def test_the_poses_that_are_planned_end_in_the_effect_that_is_there():
 @pytest.mark.long
 def test_each_pose_is_a_new_one_and_read_unloaded():
     c, before = fine_error()
-    first = based(c.cell, before, "absolute")
-    made = measure_poses(c.cell, configuration(), first, 12, np.random.default_rng(1)).ordered.plan
+    first = fitted_model(c.cell, before, "absolute")
+    made = plan_poses(c.cell, configuration(), first, 12, np.random.default_rng(1)).ordered.plan
     assert len({s.pose for s in made.steps} - {REFERENCE}) == 12
     assert {s.load for s in made.steps} == {UNLOADED}
     assert len(np.unique(np.round(np.concatenate([made.q, before.states.q]), 6), axis=0)) == 13 + 30
     home = made.joints(REFERENCE) + 0.0
-    again = measure_poses(c.cell, configuration(), first, 12, np.random.default_rng(2),
+    again = plan_poses(c.cell, configuration(), first, 12, np.random.default_rng(2),
                           reference=home).ordered.plan  # fmt: skip
     np.testing.assert_array_equal(again.joints(REFERENCE), home)
 
 
 def test_the_chance_of_telling_it_from_a_rival_grows():
     c = campaign("transmission_error", "absolute", 0, **FINE)
-    first = based(c.cell, c.readings, "absolute")
+    first = fitted_model(c.cell, c.readings, "absolute")
     (told,) = pose_powers(first, ("transmission_error", "encoder_offset"), 140)
     assert (told.effect, told.rival) == ("transmission_error", "encoder_offset")
     assert told.power_now < 0.3 < 0.8 < told.power_then
@@ -288,7 +288,7 @@ def case(mode):
     # one that begins there are of the minimum, as the plan's are.
     found = fit(model, c.readings, mode, start=found.theta)
     config = config_of(mode, against=(TILT, LINK))
-    return found, problem(after(found, config), config, poses_of(8, 21))
+    return found, problem(model_after(found, config), config, poses_of(8, 21))
 
 
 def columns(of, found):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hilcal.design.approximate_design import BarrierProgram, relax
 from hilcal.design.criteria import D, E, K, MeanVariance, Separate
 from hilcal.design.criterion import CandidateSet, Objective, Pair
-from hilcal.design.optimum import best
+from hilcal.design.optimum import best_design
 from hilcal.errors import CannotAnswerError
 from tests.support.refusals import refusal, refusal_of
 
@@ -309,7 +309,7 @@ def test_no_plan_exceeds_the_bound(name, seed, costs, known, most):
     units = random_units(seed, 15, costs=costs)
     prior = prior_of(seed) if known else None
     base = np.zeros((3, 3)) if prior is None else prior
-    design = best(asked(units, criterion, prior), 9.0, most=most, effort=40)
+    design = best_design(asked(units, criterion, prior), 9.0, max_count=most, effort=40)
     rng = np.random.default_rng(seed)
     for _ in range(20):
         counts = np.zeros(len(units))
@@ -353,7 +353,7 @@ def test_tiny_plans_against_all_plans(name):
         plans = all_plans(1 if most else 5, 7, 5)
         plans = plans[plans @ units.cost <= budget]
         top = largest(criterion, units, plans, np.zeros((3, 3)) if prior is None else prior)
-        design = best(asked(units, criterion, prior), budget, most=most, effort=150)
+        design = best_design(asked(units, criterion, prior), budget, max_count=most, effort=150)
         assert design.bound >= top * (1 - 1e-9)
         assert design.value <= top * (1 + 1e-9)
         shares.append(design.value / top)
@@ -365,7 +365,7 @@ def test_tiny_plans_against_all_plans(name):
 def test_many_units(most):
     """Columns are generated until the equivalence theorem holds for all units."""
     units = random_units(3, 20_000, 8)
-    found = relax(asked(units, D()), 40.0, most=most)
+    found = relax(asked(units, D()), 40.0, max_weight=most)
     assert found.gap <= 1e-6
     inverse = np.linalg.inv(units.information(found.weight, found.index))
     leverage = np.einsum("krp,pq,krq->k", units.rows, inverse, units.rows)
@@ -379,7 +379,9 @@ def test_many_units(most):
 
 def test_the_plan_depends_on_the_generator_alone():
     units = random_units(5, 300, 6)
-    one, two = (best(asked(units, D()), 9.0, np.random.default_rng(3)).counts for _ in range(2))
+    one, two = (
+        best_design(asked(units, D()), 9.0, np.random.default_rng(3)).counts for _ in range(2)
+    )
     np.testing.assert_array_equal(one, two)
 
 
@@ -388,7 +390,7 @@ def test_scale_of_a_parameter_does_not_matter_to_d():
     factor = 10.0 ** np.arange(-6, 6, 2)
     scaled = CandidateSet(units.rows * factor, units.cost)
     one, two = (
-        best(u, 12.0, np.random.default_rng(3), relaxed=relax(u, 12.0))
+        best_design(u, 12.0, np.random.default_rng(3), relaxed=relax(u, 12.0))
         for u in (asked(units, D()), asked(scaled, D()))
     )
     assert two.efficiency == pytest.approx(one.efficiency, abs=0.01)
@@ -398,20 +400,20 @@ def test_scale_of_a_parameter_does_not_matter_to_d():
 def test_budget_too_small_for_the_parameters():
     units, message = random_units(9, 50, 6), "budget of 2 takes 2 units, too few.*raise the budget"
     for criterion in (D(), MeanVariance(np.eye(6) / 6), E(), K()):
-        refusal_of(CannotAnswerError, message, best, asked(units, criterion), 2.0, effort=50)
+        refusal_of(CannotAnswerError, message, best_design, asked(units, criterion), 2.0, effort=50)
 
 
 def test_names_what_no_candidate_determines():
     units = random_units(9, 50, 4)
     units.rows[:, :, 2] = 0.0
     with pytest.raises(CannotAnswerError, match="changes with wrist"):
-        best(replace(asked(units, D()), names=("base", "elbow", "wrist", "tool")), 9.0)
+        best_design(replace(asked(units, D()), names=("base", "elbow", "wrist", "tool")), 9.0)
     prior = np.diag([0.0, 0.0, 1.0, 0.0])
-    assert best(asked(units, D(), prior), 9.0).efficiency > 0.9  # known from elsewhere
+    assert best_design(asked(units, D(), prior), 9.0).efficiency > 0.9  # known from elsewhere
     units.rows[:, :, 2] = units.rows[:, :, 0] - units.rows[:, :, 1]
     caught = refusal_of(CannotAnswerError, "parameter 1", relax, asked(units, E()), 9.0)
     assert "parameter 4" not in caught
 
 
 def test_a_budget_below_the_least_cost_is_refused():
-    refusal("at least 1, the least cost", best, asked(random_units(1, 10), D()), 0.5)
+    refusal("at least 1, the least cost", best_design, asked(random_units(1, 10), D()), 0.5)

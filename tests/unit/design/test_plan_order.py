@@ -13,7 +13,7 @@ from scipy import stats
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
 from hilcal.design import tour
-from hilcal.design.run_order import Chosen, Ordering, order_plan, pace, timeline
+from hilcal.design.run_order import Ordering, PoseReadings, order_plan, pace, timeline
 from hilcal.errors import CannotAnswerError
 from hilcal.measuring.route import dry_run, route
 from hilcal.store.plan import REFERENCE, UNLOADED, Step
@@ -48,7 +48,7 @@ class World:
 
 
 def everything(world):
-    return [Chosen(name, (UNLOADED, *LOADS)) for name in world.names]
+    return [PoseReadings(name, (UNLOADED, *LOADS)) for name in world.names]
 
 
 @pytest.mark.long
@@ -67,14 +67,14 @@ def test_every_plan_keeps_its_promises(count, blocked, slack, unloaded, every, s
     chosen = []
     for name in (str(x) for x in rng.choice(world.names, count + 2)):  # some poses several times
         some = tuple(str(x) for x in rng.permutation(LOADS)[: rng.integers(0, len(LOADS) + 1)])
-        chosen.append(Chosen(name, (UNLOADED, *some), int(rng.integers(1, 3))))
+        chosen.append(PoseReadings(name, (UNLOADED, *some), int(rng.integers(1, 3))))
     how = Ordering(slack, unloaded, every, repeats=1, draws=3)
     made = world.ordered(chosen, seed, how)
     plan = made.plan
     taken = [s for s in plan.steps if s.pose != REFERENCE]
 
     assert len(set(plan.steps)) == len(plan.steps)
-    wanted = Counter((c.pose, load) for c in chosen for load in c.loads for _ in range(c.count))
+    wanted = Counter((c.pose, load) for c in chosen for load in c.loads for _ in range(c.cycles))
     extra = Counter((s.pose, s.load) for s in taken) - wanted
     assert not wanted - Counter((s.pose, s.load) for s in taken)
     assert sum(extra.values()) <= 1  # the repeat
@@ -82,7 +82,7 @@ def test_every_plan_keeps_its_promises(count, blocked, slack, unloaded, every, s
     assert all(Step(s.pose, UNLOADED, s.cycle) in plan.steps for s in plan.steps)
     arrivals = dict.fromkeys((s.pose, s.cycle) for s in taken)
     cycles = [tuple(sorted(s.load for s in taken if (s.pose, s.cycle) == k)) for k in arrivals]
-    together = Counter(tuple(sorted(c.loads)) for c in chosen for _ in range(c.count))
+    together = Counter(tuple(sorted(c.loads)) for c in chosen for _ in range(c.cycles))
     assert not together - Counter(cycles)  # what shares an unloaded reading is as it was chosen
 
     hung = [a.load for a, b in pairwise((*plan.steps, Step("", ""))) if a.load != b.load]
@@ -118,7 +118,11 @@ def test_the_same_seed_gives_the_same_order_and_another_one_another():
 
 def test_absolute_readings_of_a_pose_share_no_more_than_they_must():
     world = World(3, 0.0, 1)
-    chosen = [Chosen("p0", (UNLOADED,), 2), Chosen("p0", (LOADS[0],), 2), Chosen("p1", (LOADS[1],))]
+    chosen = [
+        PoseReadings("p0", (UNLOADED,), 2),
+        PoseReadings("p0", (LOADS[0],), 2),
+        PoseReadings("p1", (LOADS[1],)),
+    ]
     plan = world.ordered(chosen, 0, Ordering(repeats=0)).plan
     taken = {(s.pose, s.load, s.cycle) for s in plan.steps if s.pose != REFERENCE}
     assert taken == {
@@ -146,7 +150,7 @@ def test_a_pose_behind_another_one_is_reached_by_it():
         free[-1, 0] = free[0, -1] = False  # never straight between the reference and p0
         free[0, 2:] = free[2:, 0] = False  # only by p1
         free[1, 0] = free[0, 1] = True
-    chosen = [Chosen(name, (UNLOADED,)) for name in world.names]
+    chosen = [PoseReadings(name, (UNLOADED,)) for name in world.names]
     with pytest.raises(CannotAnswerError, match=r"pose p\d is not reached from the reference"):
         world.ordered(chosen, 0)  # in by p1, and out by p1 again, where it is not measured again
     for free in world.free.values():
@@ -243,7 +247,7 @@ def test_the_heaviest_of_three_loads_comes_in_the_middle():
     data = {**CONFIG.model_dump(exclude={"loads"}), "loads": loads}
     config = CellConfig.model_validate(data)
     world = World(12, 0.0, 4)
-    chosen = [Chosen(name, (UNLOADED, *masses)) for name in world.names]
+    chosen = [PoseReadings(name, (UNLOADED, *masses)) for name in world.names]
 
     def free(start, ends, load):
         return np.ones(len(ends), dtype=np.bool_)
@@ -295,7 +299,7 @@ def test_tours_are_the_shortest_or_nearly(symmetric):
     for seed in range(4):
         for count in range(1, 11):
             w = _seconds(count, seed, symmetric=symmetric)
-            order = tour.shortest(w, np.random.default_rng(seed))
+            order = tour.short_tour(w, np.random.default_rng(seed))
             assert sorted(order) == list(range(1, count + 1))
             ratio = tour.length(w, order) / _held_karp(w)
             assert ratio >= 1 - 1e-12
@@ -312,7 +316,7 @@ def test_local_search_alone_comes_near_the_shortest_tour():
         w = _seconds(10, 50 + seed, symmetric=seed % 2 == 0)
         rng = np.random.default_rng(seed)
         begun = [int(k) for k in rng.permutation(10) + 1]
-        order = tour.improved(w, begun)
+        order = tour.improved_tour(w, begun)
         assert sorted(order) == sorted(begun)
         assert tour.length(w, order) <= tour.length(w, begun)
         ratio.append(tour.length(w, order) / _held_karp(w))
@@ -344,14 +348,14 @@ def test_loops_are_cut_in_least_time(count, seed, limit):
 def test_random_orders_are_uniform_and_within_the_budget():
     rng = np.random.default_rng(5)
     w = _seconds(4, 1, symmetric=True)
-    free = Counter(tuple(tour.shaken(w, [1, 2, 3, 4], 1e6, rng, 40)) for _ in range(2400))
+    free = Counter(tuple(tour.random_tour(w, [1, 2, 3, 4], 1e6, rng, 40)) for _ in range(2400))
     assert len(free) == 24
     assert stats.chisquare(list(free.values())).pvalue > 1e-3
     for seed in range(10):
         w = _seconds(15, seed, symmetric=seed % 2 == 0)
-        short = tour.shortest(w, rng)
+        short = tour.short_tour(w, rng)
         budget = 1.1 * tour.length(w, short)
-        order = tour.shaken(w, short, budget, rng, 600)
+        order = tour.random_tour(w, short, budget, rng, 600)
         assert sorted(order) == sorted(short)
         assert order != short
         assert tour.length(w, order) <= budget + 1e-9

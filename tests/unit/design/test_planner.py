@@ -14,8 +14,13 @@ from hilcal.config.reference import to_toml
 from hilcal.config.sections import CellLoad
 from hilcal.design.choice import CRITERIA, costly_loads, objective_of
 from hilcal.design.nominal_model import nominal_model, planned_effects
-from hilcal.design.planner import Request, UndeterminedParameter, make, without_undetermined
-from hilcal.design.predicted import predicted
+from hilcal.design.planner import (
+    PlanRequest,
+    UndeterminedParameter,
+    plan_readings,
+    without_undetermined,
+)
+from hilcal.design.predicted import predicted_uncertainty
 from hilcal.design.summary import remarks, summarise
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError
@@ -40,8 +45,8 @@ def small(**planning):
 
 def planned(config, poses=5, seed=1, **wanted):
     cell = cell_from_config(config)
-    request = Request(poses, **wanted)
-    return make(cell, config, request, np.random.default_rng(seed))
+    request = PlanRequest(poses, **wanted)
+    return plan_readings(cell, config, request, np.random.default_rng(seed))
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +58,7 @@ def test_the_plan_is_what_the_design_chose(usual):
     plan = usual.ordered.plan
     wanted = Counter()
     for k in np.flatnonzero(usual.counts):
-        wanted.update({load: int(usual.counts[k]) for load in usual.problem.what[k][1]})
+        wanted.update({load: int(usual.counts[k]) for load in usual.problem.contents[k][1]})
     loaded = [s for s in plan.steps if s.pose != REFERENCE and s.load != UNLOADED]
     assert Counter(s.load for s in loaded) == wanted
     unloaded = {(s.pose, s.cycle) for s in plan.steps if s.load == UNLOADED}
@@ -78,7 +83,7 @@ def test_a_plan_to_append_is_made_for_the_reference_of_its_campaign(usual):
     config = small()
     cell, reference = cell_from_config(config), usual.ordered.plan.joints(REFERENCE)
     rng = np.random.default_rng(8)
-    made = make(cell, config, Request(5), rng, reference=reference).ordered.plan
+    made = plan_readings(cell, config, PlanRequest(5), rng, reference=reference).ordered.plan
     np.testing.assert_array_equal(made.joints(REFERENCE), reference)
     assert dry_run(cell, config, with_new_names(made, usual.ordered.plan, 2)).problems == ()
 
@@ -90,7 +95,7 @@ def test_the_last_round_takes_poses_that_are_reached(monkeypatch):
     reached, rounds = module._unreachable, []
 
     def lost(space, of, home, units):
-        chosen = {of.what[k][0] for k in units}
+        chosen = {of.contents[k][0] for k in units}
         odd = {pose for pose in chosen if pose % 2} if rounds else set()
         rounds.append(chosen)
         return np.array(sorted(odd | {*reached(space, of, home, units).tolist()}), dtype=np.int64)
@@ -107,8 +112,8 @@ def test_the_last_round_takes_poses_that_are_reached(monkeypatch):
 @pytest.mark.long
 def test_more_readings_promise_more():
     some, more = planned(small(), 10), planned(small(), 20)
-    before = predicted(some.problem, some.counts, work=some.work)
-    after = predicted(more.problem, more.counts, work=more.work)
+    before = predicted_uncertainty(some.problem, some.counts, work=some.work)
+    after = predicted_uncertainty(more.problem, more.counts, work=more.work)
     live = np.isfinite(before.std) & (before.std > 0)
     ratio = (after.std[live] / before.std[live])[: some.problem.model_size]
     # As at the continuous optimum, with the root of the readings; whole numbers move single ones.
@@ -152,7 +157,7 @@ def test_each_criterion_is_best_at_its_own(usual):
 
 def test_absolute_readings_are_planned_one_by_one():
     made = planned(small(readings="absolute"), readings=25)
-    assert all(len(loads) == 1 for _, loads in made.problem.what)
+    assert all(len(loads) == 1 for _, loads in made.problem.contents)
     assert made.counts.sum() == made.budget
     config = small(readings="absolute")
     assert dry_run(cell_from_config(config), config, made.ordered.plan).problems == ()
@@ -174,7 +179,7 @@ def test_a_load_that_is_there_twice_is_said_to_cost_more_than_it_tells():
 
 def test_no_load_costs_too_much_where_hanging_one_costs_nothing(usual):
     rng = np.random.default_rng(0)
-    assert costly_loads(usual.asked, usual.problem, 25.0, 0.0, rng) == ()
+    assert costly_loads(usual.objective, usual.problem, 25.0, 0.0, rng) == ()
 
 
 def test_the_summary_is_consistent(usual):
@@ -255,7 +260,7 @@ def test_a_plan_after_a_measured_campaign_starts_from_its_reference_pose(tmp_pat
     measured, run = planned(small(), seed=7).ordered.plan, tmp_path / "run.hilcal"
     cell, further = cell_file(tmp_path, small()), tmp_path / "p.json"
     with CampaignFile.create(
-        run, small().to_json(), str(tmp_path), "a test", more={PLAN: measured.to_json()}
+        run, small().to_json(), str(tmp_path), "a test", more_texts={PLAN: measured.to_json()}
     ) as campaign:
         campaign.append_readings(rehearsal("nothing").readings)
     ok(capsys, "identify", run)
@@ -339,7 +344,7 @@ def test_other_parameters_have_plain_words():
 def test_the_plan_goes_on_without_and_states_it():
     config = cell_with(WEIGHT, candidates=40, against=())
     cell, rng = cell_from_config(config), np.random.default_rng(1)
-    planned = make(cell, config, Request(5), rng)
+    planned = plan_readings(cell, config, PlanRequest(5), rng)
     s = summarise(planned, config, rng, compare=False)
     std = {p.name: p.std for p in s.parameters}
     assert std[J1] == np.inf

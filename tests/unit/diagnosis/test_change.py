@@ -7,9 +7,9 @@ import pytest
 
 import hilcal as hc
 from hilcal.diagnosis.change import candidates, find_changes
-from hilcal.drivers.simulated.injected_effects import nothing_hidden
+from hilcal.drivers.simulated.injected_effects import world_without_effect
 from hilcal.drivers.simulated.rehearsal import measurement_noise
-from hilcal.drivers.simulated.world import stand
+from hilcal.drivers.simulated.world import place_tracker
 from hilcal.effects.protocol import effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import with_effects
@@ -32,7 +32,7 @@ def later(arm, change, seed, *, anew=True, count=15):
     rng = np.random.default_rng(seed)
     world = replace(arm.world, physics=change(arm.world.physics))
     if anew:
-        registration, station = stand(arm.cell, rng)
+        registration, station = place_tracker(arm.cell, rng)
         world = replace(world, registration=registration, station=station)
     readings = remeasured(world, arm.loads, count, rng)
     return find_changes(later_readings(arm.earlier, readings, anew=anew))
@@ -138,7 +138,7 @@ def test_columns_that_the_later_readings_lack_are_named(arm):
 def test_a_misfit_that_is_of_poses_is_told_from_one_of_readings(arm):
     rng, off = np.random.default_rng(3), 1e-4
     noise, joints = measurement_noise(CONFIG), CONFIG.repeatability.per_joint(arm.cell.arm.n)
-    world = nothing_hidden(arm.cell, rng, noise=noise, joint_std=joints)
+    world = world_without_effect(arm.cell, rng, noise=noise, joint_std=joints)
     r = measured(world, arm.loads, 30, rng)
     model = with_effects(arm.cell, r, "absolute", ("joint_compliance",))  # much fewer than poses
     of_pose = off * rng.standard_normal((int(r.pose.max()) + 1, 3))[r.pose]

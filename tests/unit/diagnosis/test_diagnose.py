@@ -14,11 +14,11 @@ from hilcal.effects.catalogue import BUILT_IN
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
-from hilcal.present.diagnosis import could_have_been_seen
+from hilcal.present.diagnosis import detectable_sizes
 from hilcal.present.verdict import headline, message
 from hilcal.refinement import add
 from tests.support.campaigns import campaign, noiseless, plan, with_noise
-from tests.support.diagnosis_cases import fitted
+from tests.support.diagnosis_cases import fitted_baseline
 from tests.support.refusals import refusal
 
 MODES = ("absolute", "deflection")
@@ -46,7 +46,7 @@ def hidden(effect, mode, seed, poses=30, **options):
 @pytest.mark.parametrize("mode", MODES)
 def test_nothing_hidden_is_adequate(mode):
     for seed in range(2):
-        d = diagnose(fitted(campaign("none", mode, seed, poses=12)))
+        d = diagnose(fitted_baseline(campaign("none", mode, seed, poses=12)))
         assert d.verdict == "adequate", message(d)
         assert d.significant == ()
         of = "of the catalogue" if mode == "absolute" else "that deflections show"
@@ -59,8 +59,8 @@ def test_what_deflections_cannot_show_is_part_of_the_verdict():
     """Errors of geometry cancel in deflections: they are adequate, and the arm is off by them."""
     for effect in ("link_geometry", "transmission_error"):
         c = hidden(effect, "absolute", 0, strength=10.0)
-        assert diagnose(fitted(c)).verdict != "adequate"
-        d = diagnose(fitted(replace(c, mode="deflection")))
+        assert diagnose(fitted_baseline(c)).verdict != "adequate"
+        d = diagnose(fitted_baseline(replace(c, mode="deflection")))
         assert d.verdict == "adequate", message(d)
         assert effect in d.not_shown
         assert headline(d) == "adequate for deflections; geometry is not calibrated"
@@ -69,13 +69,13 @@ def test_what_deflections_cannot_show_is_part_of_the_verdict():
         told = d.to_dict()
         assert effect in told["not_shown"]
         assert {s["effect"] for s in told["suspects"] if not s["shown"]} >= set(d.not_shown)
-        table = "\n".join(str(x) for x in could_have_been_seen(d) if isinstance(x, str))
+        table = "\n".join(str(x) for x in detectable_sizes(d) if isinstance(x, str))
         assert effect in table.partition("At no plausible size would these readings show")[2]
 
 
 @pytest.mark.parametrize(("effect", "mode"), HIDDEN)
 def test_a_hidden_effect_leads(effect, mode):
-    p = linearise(fitted(hidden(effect, mode, 0)))
+    p = linearise(fitted_baseline(hidden(effect, mode, 0)))
     lead = rank_suspects(p, candidates(p.fit))[0]
     assert effect in (lead.effect, *lead.same_as)
     assert lead.score.p_value < 1e-6
@@ -86,7 +86,7 @@ def test_a_hidden_effect_leads(effect, mode):
 @pytest.mark.parametrize("mode", MODES)
 def test_scores_foretell_what_adding_does(mode):
     """The F-test of a family is that of the refit with all its columns free."""
-    found = fitted(hidden("joint_tilt_compliance", mode, 0, strength=0.8, poses=15))
+    found = fitted_baseline(hidden("joint_tilt_compliance", mode, 0, strength=0.8, poses=15))
     p = linearise(found)
     some = ("base_compliance", "hysteresis", "joint_tilt_compliance")
     suspects = [s for s in rank_suspects(p, candidates(p.fit)) if s.effect in some]
@@ -107,7 +107,7 @@ def test_scores_foretell_what_adding_does(mode):
 def test_misjudged_noise_is_told_from_a_missing_effect_by_repeats(mode, factor):
     c = campaign("none", mode, plan_seed=0, poses=6, cycles=3)
     clean = noiseless(c.world, plan(6, 0, 3))
-    d = diagnose(fitted(c, readings=with_noise(clean, np.random.default_rng(0), factor)))
+    d = diagnose(fitted_baseline(c, readings=with_noise(clean, np.random.default_rng(0), factor)))
     assert d.verdict == "noise_misjudged", message(d)
     assert d.significant == ()
     low, high = d.pure_error.interval
@@ -119,7 +119,7 @@ def test_misjudged_noise_is_told_from_a_missing_effect_by_repeats(mode, factor):
 def test_misjudged_noise_without_repeats_cannot_be_known_to_be_it():
     c = campaign("none", "absolute", plan_seed=0, poses=12)
     clean = noiseless(c.world, plan(12))
-    d = diagnose(fitted(c, readings=with_noise(clean, np.random.default_rng(0), 2.0)))
+    d = diagnose(fitted_baseline(c, readings=with_noise(clean, np.random.default_rng(0), 2.0)))
     assert d.verdict == "noise_misjudged"
     assert d.pure_error is None
     assert "Without repeated readings it cannot be known" in message(d)
@@ -135,7 +135,7 @@ def test_misjudged_noise_without_repeats_cannot_be_known_to_be_it():
     ],
 )
 def test_the_misfit_follows_the_variable_that_drives_it(effect, mode, kind):
-    places = misfit_breakdown(linearise(fitted(hidden(effect, mode, 0))))
+    places = misfit_breakdown(linearise(fitted_baseline(hidden(effect, mode, 0))))
     # "pose" and "direction" say where, not after what.
     follows = [v for v in places if v.variable != "pose" and "direction" not in v.variable]
     strongest = min(follows, key=lambda v: v.p_value)
@@ -145,7 +145,7 @@ def test_the_misfit_follows_the_variable_that_drives_it(effect, mode, kind):
 
 
 def test_where_names_each_variable_once_and_in_order():
-    places = misfit_breakdown(linearise(fitted(hidden("hysteresis", "absolute", 0))))
+    places = misfit_breakdown(linearise(fitted_baseline(hidden("hysteresis", "absolute", 0))))
     names = [v.variable for v in places]
     assert len(set(names)) == len(names)
     follows = [v.share for v in places if v.variable != "pose" and "direction" not in v.variable]
@@ -164,6 +164,6 @@ def test_a_diagnosis_needs_whitened_residuals():
 def test_effects_that_need_missing_columns_are_no_suspects():
     c = campaign(plan_seed=0)
     bare = replace(c.readings, states=replace(c.readings.states, time=None, approach=None))
-    d = diagnose(fitted(c, readings=bare))
+    d = diagnose(fitted_baseline(c, readings=bare))
     assert {"hysteresis", "tracker_drift"}.isdisjoint(s.effect for s in d.suspects)
     assert all("approach" not in v.variable and v.variable != "time" for v in d.misfit_breakdown)

@@ -28,9 +28,9 @@ from hilcal.identification.linearisation import effect_columns, linearise
 from hilcal.present.diagnosis import diagnosis_report
 from hilcal.present.verdict import message
 from hilcal.refinement import refine
-from tests.support.campaigns import NOTHING, campaign, configuration, measured, plan
-from tests.support.diagnosis_cases import fitted, studied
-from tests.support.fit_cases import based
+from tests.support.campaigns import NO_EFFECT, campaign, configuration, measured, plan
+from tests.support.diagnosis_cases import fitted_baseline, studied
+from tests.support.fit_cases import fitted_model
 from tests.support.refusals import refusal
 
 SECOND_ORDER = {"link_geometry", "encoder_offset", "joint_coupling", "link_mass"}
@@ -55,7 +55,7 @@ def test_every_effect_that_ships_states_what_is_plausible():
 
 def test_the_cell_may_allow_more():
     c = campaign("none", "absolute", 1)
-    found = fitted(c)
+    found = fitted_baseline(c)
 
     def largest(factor):
         config = configuration().model_copy(update={"plausible": factor})
@@ -72,7 +72,7 @@ def test_the_cell_may_allow_more():
 def test_unloaded_readings_bound_what_geometry_may_do_to_deflections():
     """A geometry that is off by so much is allowed as much, and not ten times as much."""
     c = campaign("link_geometry", "absolute", 1, strength=10.0)
-    found = fitted(replace(c, mode="deflection"))
+    found = fitted_baseline(replace(c, mode="deflection"))
     (e,) = (e for e in candidates(found) if e.name == "link_geometry")
     off = c.world.physics.link_geometry
     allowed = largest_plausible(effect_columns(found, e), unloaded_readings(found))
@@ -85,7 +85,7 @@ def test_unloaded_readings_bound_what_geometry_may_do_to_deflections():
 def test_true_effects_keep_their_promise(effect):
     mode = "absolute" if effect == "link_geometry" else "deflection"
     c = campaign(effect, mode, 1)
-    found = fitted(c)
+    found = fitted_baseline(c)
     p = linearise(found)
     (s,) = rank_suspects(p, [e for e in candidates(found) if e.name == effect])
     (e,) = (e for e in candidates(found) if e.name == effect)
@@ -107,7 +107,7 @@ def without_loads(seed, stiff):
         world = replace(world, physics=world.physics.with_effect("joint_compliance", 1e-6 * given))
         r = measured(world, plan(POSES, 0), np.random.default_rng(seed))
     r = r[r.load == 0]
-    return based(c.cell, r, "absolute")
+    return fitted_model(c.cell, r, "absolute")
 
 
 def test_a_stiff_arm_with_a_wrong_geometry_is_not_compliant():
@@ -136,7 +136,7 @@ def test_gravity_tells_of_a_compliant_arm():
 @pytest.mark.parametrize("seed", [1, 2])
 def test_it_is_named_in_absolute_readings(seed):
     c = campaign("joint_coupling", "absolute", seed, poses=30, strength=2.0)
-    d = diagnose(fitted(c))
+    d = diagnose(fitted_baseline(c))
     assert d.verdict == "missing_effect"
     assert d.suspects[0].effect == "joint_coupling"
     assert d.suspects[0].same_as == ()
@@ -148,7 +148,7 @@ EACH = "joint_compliance(joints=each)"
 @pytest.fixture(scope="module", params=[1, 2])
 def arm(request):
     """An arm whose joints differ, as simulated, and nothing hidden."""
-    return campaign(NOTHING, "deflection", request.param, poses=12, registration_known=True)
+    return campaign(NO_EFFECT, "deflection", request.param, poses=12, registration_known=True)
 
 
 def with_joints(c, joints):

@@ -28,8 +28,8 @@ from hilcal.identification.posterior import Posterior
 from hilcal.present.verdict import message
 from hilcal.refinement import refine
 from tests.support.campaigns import campaign, measured, plan
-from tests.support.diagnosis_cases import fitted, studied
-from tests.support.fit_cases import based
+from tests.support.diagnosis_cases import fitted_baseline, studied
+from tests.support.fit_cases import fitted_model
 
 
 @pytest.mark.parametrize("seeds", [(0,), pytest.param((1, 2, 3), marks=pytest.mark.slow)])
@@ -115,7 +115,7 @@ def test_a_fit_that_is_not_quite_at_rest_credits_no_effect_with_its_own_step():
 @pytest.fixture(scope="module")
 def shared():
     c = campaign("hysteresis", "deflection", poses=12)
-    return add(fitted(c), "encoder_offset")
+    return add(fitted_baseline(c), "encoder_offset")
 
 
 @pytest.mark.parametrize("together", [0, 20_000, 8_000_000])
@@ -160,7 +160,7 @@ NAMES = ("joint_compliance", HIDDEN)
 def before():
     """A campaign of an arm whose joints tilt, and what it taught."""
     c = campaign(HIDDEN, "absolute", 1, poses=20, registration_known=True)
-    found = based(c.cell, c.readings, "absolute", NAMES)
+    found = fitted_model(c.cell, c.readings, "absolute", NAMES)
     return c, carried_prior(Posterior.of(found))
 
 

@@ -6,17 +6,17 @@ from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.minimum_detectable_effect import least_strength
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.linearisation import effect_columns, linearise
-from hilcal.present.diagnosis import could_have_been_seen
+from hilcal.present.diagnosis import detectable_sizes
 from hilcal.regression.evidence import spectrum
 from tests.support.campaigns import campaign
-from tests.support.diagnosis_cases import fitted
+from tests.support.diagnosis_cases import fitted_baseline
 
 ERROR = "transmission_error"
 
 
 def found(poses):
     c = campaign("none", "absolute", 0, poses=poses, plan_seed=0)
-    return fitted(c)
+    return fitted_baseline(c)
 
 
 def test_a_family_is_seen_from_where_poses_left_out_show_it_and_not_finer_than_poses_resolve():
@@ -33,7 +33,7 @@ def test_a_family_is_seen_from_where_poses_left_out_show_it_and_not_finer_than_p
     assert s.least.displacement_m > alone.displacement_m
     assert s.least.finest_m == np.inf
     assert s.least.to_dict()["finer_than_poses"] == {"visible": False, "displacement_m": None}
-    said = [line for line in could_have_been_seen(diagnose(f)) if isinstance(line, str)]
+    said = [line for line in detectable_sizes(diagnose(f)) if isinstance(line, str)]
     assert f"A {ERROR} finer than these poses resolve would be seen at no size.\n" in said
 
 

@@ -15,8 +15,8 @@ from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
 from hilcal.present.verdict import message
 from tests.support.campaigns import campaign, measured, plan
-from tests.support.diagnosis_cases import fitted
-from tests.support.fit_cases import based
+from tests.support.diagnosis_cases import fitted_baseline
+from tests.support.fit_cases import fitted_model
 
 
 def dense(p):
@@ -58,7 +58,7 @@ def fine_error(seed, first):
     waves *= np.sqrt(size / np.sum(waves**2))
     world = replace(c.world, physics=replace(c.world.physics, transmission_error=waves))
     r = measured(world, plan(30, seed), np.random.default_rng(seed))
-    return diagnose(based(c.cell, r, "absolute"))
+    return diagnose(fitted_model(c.cell, r, "absolute"))
 
 
 @pytest.mark.parametrize("seed", [2, *(pytest.param(k, marks=pytest.mark.slow) for k in (0, 6))])
@@ -80,7 +80,7 @@ def test_the_chance_grows_with_the_poses():
     """Thirty poses hardly ever tell, many do."""
     options = {"plan_seed": 0, "poses": 30, "strength": 2.0, "harmonics": 21}
     c = campaign("transmission_error", "absolute", 0, **options)
-    p = linearise(fitted(c))
+    p = linearise(fitted_baseline(c))
     effect = next(e for e in candidates(p.fit) if e.name == "transmission_error")
     few, many = (detection_power(p, effect, n, 1e-4) for n in (0, 160))
     assert few < 0.2

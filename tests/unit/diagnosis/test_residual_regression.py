@@ -16,7 +16,7 @@ from hilcal.diagnosis.residual_regression import (
 )
 from hilcal.identification.linearisation import linearise
 from tests.support.campaigns import campaign, plan
-from tests.support.diagnosis_cases import fitted
+from tests.support.diagnosis_cases import fitted_baseline
 from tests.support.rows import first
 
 
@@ -59,7 +59,7 @@ def hidden(name, mode, seed, strength=3.0, poses=30):
     s = warm(p.states, seed)
     way, law, _ = LAWS[name]
     size = law(s)
-    at = c.world.sight(p.states).position
+    at = c.world.ideal_readings(p.states).position
     axes = c.cell.registration[:3, :3]
 
     def moved(a):
@@ -67,7 +67,7 @@ def hidden(name, mode, seed, strength=3.0, poses=30):
             return a * np.outer(size, axes @ np.array(way))
         off = np.zeros_like(s.q)
         off[:, way] = a * size
-        return c.world.sight(replace(p.states, q=s.q + off)).position - at
+        return c.world.ideal_readings(replace(p.states, q=s.q + off)).position - at
 
     def strong(shift):
         v = c.readings.covariance
@@ -82,7 +82,7 @@ def hidden(name, mode, seed, strength=3.0, poses=30):
 
 
 def told(c):
-    return residual_regression(linearise(fitted(c)))
+    return residual_regression(linearise(fitted_baseline(c)))
 
 
 QUICK = range(2)  # seeds

@@ -18,7 +18,7 @@ from hilcal.robot.catalogue import configs_dir
 from hilcal.store.rows import content_hash
 from studies.serial_noise import serial_readings
 from studies.study_cases import study_case
-from tests.support.fit_cases import based, refined
+from tests.support.fit_cases import fitted_model, refined
 from tests.support.rows import first
 
 
@@ -32,7 +32,7 @@ def campaign(rho, mode="absolute", seed=0, hidden="", poses=10):
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("rho", first(1, [0.9, 0.7, 0.99]))
 def test_the_correlation_comes_out(mode, rho):
-    found = serial_noise(based(*campaign(rho, mode), mode))
+    found = serial_noise(fitted_model(*campaign(rho, mode), mode))
     assert found.proved
     # In deflections half of the noise is of unloaded readings: less is known of it.
     assert abs(np.log1p(-found.rho) - np.log1p(-rho)) < (0.6 if mode == "absolute" else 1.2)
@@ -41,7 +41,7 @@ def test_the_correlation_comes_out(mode, rho):
 @pytest.mark.parametrize("mode", MODES)
 def test_white_noise_is_left_as_it_is(mode):
     for seed in range(5):
-        white = based(*campaign(0.0, mode, seed), mode)
+        white = fitted_model(*campaign(0.0, mode, seed), mode)
         assert with_serial_noise(white) is white
 
 
@@ -61,7 +61,7 @@ def test_nothing_is_named_for_it_and_it_is_said(mode):
 
 
 def test_intervals_of_a_frame_are_wider_and_of_differences_narrower():
-    white = based(*campaign(0.9), "absolute")
+    white = fitted_model(*campaign(0.9), "absolute")
     found = with_serial_noise(white)
     low, high = found.readings.serial.wider
     assert low < 0.7
@@ -89,7 +89,7 @@ def test_an_effect_is_named_beside_it():
 
 def test_a_fit_with_it_is_found_again():
     cell, readings = campaign(0.9, "deflection")
-    found = with_serial_noise(based(cell, readings, "deflection"))
+    found = with_serial_noise(fitted_model(cell, readings, "deflection"))
     record = to_record(found, None, None, content_hash(found.readings))
     again = restore(record, cell, readings)
     assert again.readings.serial == found.readings.serial
@@ -98,7 +98,7 @@ def test_a_fit_with_it_is_found_again():
 
 
 def test_what_effects_explain_as_well_is_in_doubt():
-    found = with_serial_noise(based(*campaign(0.9), "absolute"))
+    found = with_serial_noise(fitted_model(*campaign(0.9), "absolute"))
     serial = found.readings.serial
     doubt = replace(serial, proved=False, instead=("tracker_drift",))
     d = diagnose(replace(found, readings=found.readings.with_serial(doubt)))
@@ -113,19 +113,19 @@ def test_times_tell_a_pause():
     cell, readings = campaign(0.0, poses=12)
     rng, count = np.random.default_rng(5), len(readings)
     time = 1000.0 * (np.arange(count) // 2) + 5.0 * (np.arange(count) % 2)
-    clean = based(cell, readings, "absolute").solution.prediction.observation.position
+    clean = fitted_model(cell, readings, "absolute").solution.prediction.observation.position
     z = rng.standard_normal((count, 3))
     z[1::2] = 0.95 * z[::2] + np.sqrt(1 - 0.95**2) * z[1::2]
     root = symmetric_root(readings.covariance)
     value = clean + np.einsum("nij,nj->ni", root, z)
     told = replace(readings, value=value, states=replace(readings.states, time=time))
-    found = serial_noise(based(cell, told, "absolute"))
+    found = serial_noise(fitted_model(cell, told, "absolute"))
     assert found.clock == "time"
     assert 5.0 < found.length < 500.0
 
 
 def test_a_few_readings_and_very_many_are_not_judged():
-    white = based(*campaign(0.9), "absolute")
+    white = fitted_model(*campaign(0.9), "absolute")
     few = replace(white, raw=white.raw[:11])
     many = replace(white, raw=np.zeros((MOST_READINGS + 1, 3)))
     assert serial_noise(few) is None

@@ -15,19 +15,19 @@ from hilcal.diagnosis.evidence import (
 )
 from hilcal.diagnosis.minimum_detectable_effect import least_strength
 from hilcal.diagnosis.stepwise import add, exchange, remove, trial
-from hilcal.drivers.simulated.injected_effects import hide
+from hilcal.drivers.simulated.injected_effects import hide_effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.linearisation import effect_columns, linearise
 from hilcal.refinement import Path, refine
 from hilcal.regression.evidence import spectrum
-from tests.support.campaigns import NOTHING, campaign, measured, plan, world_of
-from tests.support.diagnosis_cases import fitted
+from tests.support.campaigns import NO_EFFECT, campaign, measured, plan, world_of
+from tests.support.diagnosis_cases import fitted_baseline
 from tests.support.refusals import refusal
 
 
 def work(c, *effects):
     """Revisions as refine would have made them, had it added these effects."""
-    path = Path(fitted(c))
+    path = Path(fitted_baseline(c))
     for name in effects:
         path.append(add(path.steps[-1].fit, name), name)
     return path
@@ -37,7 +37,7 @@ def test_an_effect_that_the_readings_cannot_determine_is_rejected():
     """The refinement goes on; with so few poses all effects predict together."""
     c = campaign("link_geometry", "absolute", 1, poses=12, strength=3.0)
     few = c.readings[c.readings.unloaded][np.arange(8)]
-    before = fitted(c, readings=few)
+    before = fitted_baseline(c, readings=few)
     assert trial(before, "link_geometry") is None
     with pytest.raises(CannotAnswerError, match="nothing is left to judge the model by"):
         add(before, "link_geometry")
@@ -56,8 +56,8 @@ def test_what_is_not_there_is_needless_but_for_chance(mode, effects):
     """p-values are uniform, so that one in a hundred is kept: 60 of them."""
     p_values = []
     for seed in range(30):
-        c = campaign(NOTHING, mode, seed, poses=12, plan_seed=1, registration_known=True)
-        found = fitted(c, *effects)
+        c = campaign(NO_EFFECT, mode, seed, poses=12, plan_seed=1, registration_known=True)
+        found = fitted_baseline(c, *effects)
         judged = {n: score.p_value for n, score in backward_elimination(found).items()}
         p_values += [judged.get(name, 0.0) for name in effects]
     assert set(effects) >= set(judged)
@@ -72,7 +72,7 @@ def test_what_is_not_there_is_needless_but_for_chance(mode, effects):
 def test_what_is_there_is_not_backward_elimination(effect):
     mode = "absolute" if effect == "transmission_error" else "deflection"
     c = campaign(effect, mode, 3, poses=30, strength=1.0)
-    assert effect not in backward_elimination(fitted(c, effect))
+    assert effect not in backward_elimination(fitted_baseline(c, effect))
 
 
 def test_an_early_addition_that_became_needless_is_removed():
@@ -102,7 +102,7 @@ def _two_in_the_guise_of_one():
     rng = np.random.default_rng(2)
     world = world_of(cell, rng)
     for effect in ("encoder_offset", "tracker_drift"):
-        world = hide(effect, cell, p.states, 3.0, "absolute", rng, world=world)
+        world = hide_effect(effect, cell, p.states, 3.0, "absolute", rng, world=world)
     return work(replace(c, world=world, readings=measured(world, p, rng)), "link_geometry")
 
 
@@ -119,7 +119,7 @@ def test_a_large_family_that_took_the_part_of_two_effects_is_exchanged_for_them(
 @pytest.mark.parametrize("mode", ["absolute", "deflection"])
 def test_algebra_tells_what_a_refit_would_of_an_effect_and_of_others_in_its_place(mode):
     c = campaign("hysteresis", mode, 4, poses=20, registration_known=True)
-    full = fitted(c, "hysteresis")
+    full = fitted_baseline(c, "hysteresis")
     without = remove(full, "hysteresis")
     p = linearise(without)
     scores = {s.effect: s.score for s in rank_suspects(p, candidates(without))}
@@ -149,7 +149,7 @@ def test_effects_added_by_algebra_explain_what_they_do_in_a_fit():
 
 
 def test_an_exchange_needs_an_effect_that_is_there_and_one_that_is_not():
-    found = fitted(campaign(NOTHING, "deflection", 1), "backlash")
+    found = fitted_baseline(campaign(NO_EFFECT, "deflection", 1), "backlash")
     for changed in (
         lambda: remove(found, "hysteresis"),
         lambda: exchange(found, "hysteresis", "creep"),
@@ -162,8 +162,8 @@ def test_an_exchange_needs_an_effect_that_is_there_and_one_that_is_not():
 @pytest.mark.parametrize("effect", ["backlash", "wrench_bias"])
 def test_at_its_least_strength_an_effect_is_found_as_often_as_said(effect):
     """In the linearised campaign, with random parameters of that strength."""
-    c = campaign(NOTHING, "deflection", 5, poses=20)
-    found = fitted(c)
+    c = campaign(NO_EFFECT, "deflection", 5, poses=20)
+    found = fitted_baseline(c)
     p = linearise(found)
     (e,) = (e for e in candidates(p.fit) if e.name == effect)
     of = effect_columns(p.fit, e)

@@ -24,14 +24,14 @@ from hilcal.present.verdict import message
 from hilcal.refinement import refine
 from studies.study_cases import study_case
 from tests.support.campaigns import campaign, configuration
-from tests.support.diagnosis_cases import fitted
-from tests.support.fit_cases import based, refined
+from tests.support.diagnosis_cases import fitted_baseline
+from tests.support.fit_cases import fitted_model, refined
 from tests.support.reflector_cases import reflectors
 
 
 def evidence(effect, mode, seed, **options):
     c = campaign(effect, mode, seed, **options)
-    return Evidence(fitted(c))
+    return Evidence(fitted_baseline(c))
 
 
 def check(d):
@@ -112,7 +112,7 @@ def test_an_unknown_scatter_is_found_and_not_taken_for_a_cause(mode, seed):
     """Taken for independent, these readings name a cause: transmission_error in the second."""
     c = reflectors(seed=seed, poses=20, known=KNOWN, joint_std=STD)
     readings = unstated(c)
-    found = based(c.cell, readings, mode)
+    found = fitted_model(c.cell, readings, mode)
     d = diagnose(found)
     assert found.variance_factor > 4
     assert (d.verdict, d.reason, d.significant) == ("adequate", "arm_scatter", ())
@@ -189,7 +189,7 @@ def case_of(mode, hidden, strength):
 def test_gears_that_all_give_in_one_direction_are_no_scale_of_the_tracker():
     # Their zero mean leaves what a scale of some per cent would explain; ordinary ones have 1e-5.
     case = case_of("deflection", ("joint_stiffening",), 1.0)
-    first = based(case.cell, case.readings, "deflection")
+    first = fitted_model(case.cell, case.readings, "deflection")
     found = with_background(first, first.model.names)
     tested = {b.effect: b for b in background_evidence(found)}
     assert tested["tracker_scale"].p_value < 0.001

@@ -12,7 +12,7 @@ from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline
 from hilcal.model.model import Model
 from hilcal.present.verdict import message
-from tests.support.campaigns import NOTHING, campaign
+from tests.support.campaigns import NO_EFFECT, campaign
 from tests.support.fit_cases import refined
 from tests.support.rows import first
 
@@ -31,9 +31,9 @@ def judged(cell, readings, mode):
 @pytest.mark.parametrize(
     ("load", "hidden", "said", "true"),
     [
-        ("5kg", NOTHING, "Load '5kg' seems to weigh", 5.0),
+        ("5kg", NO_EFFECT, "Load '5kg' seems to weigh", 5.0),
         ("10kg", "backlash", "Load '10kg' seems to weigh", 10.0),
-        ("pull x", NOTHING, "Load 'pull x' seems to pull with", 80.0),
+        ("pull x", NO_EFFECT, "Load 'pull x' seems to pull with", 80.0),
     ],
 )
 def test_a_load_at_twice_its_weight_is_named(mode, load, hidden, said, true):
@@ -67,7 +67,7 @@ def test_a_single_load_is_told_by_the_weight_of_the_arm(load, factor):
 @pytest.mark.parametrize("at", ["refit", "derivative"])
 def test_a_figure_without_an_equilibrium_explains_nothing(monkeypatch, at):
     """A trial that does not settle ends no diagnosis; a fit may be that close to the edge."""
-    c = campaign(NOTHING, "absolute", 1, poses=20)
+    c = campaign(NO_EFFECT, "absolute", 1, poses=20)
     spoilt = doubled(c.readings, "5kg")
     found = hc.fit(baseline(c.cell, spoilt, "absolute"), spoilt, "absolute")
     tried = []
@@ -84,7 +84,7 @@ def test_a_figure_without_an_equilibrium_explains_nothing(monkeypatch, at):
 
 @pytest.mark.long
 def test_a_tool_at_twice_its_mass_is_named_and_refine_adds_nothing():
-    c = campaign(NOTHING, "absolute", 1, poses=20)
+    c = campaign(NO_EFFECT, "absolute", 1, poses=20)
     cell = replace(c.cell, tool_mass=2 * c.cell.tool_mass)
     found = refined(cell, c.readings, "absolute")
     (step,) = found.steps
@@ -96,7 +96,7 @@ def test_a_tool_at_twice_its_mass_is_named_and_refine_adds_nothing():
 
 
 def test_a_tool_elsewhere_than_stated_is_named():
-    c = campaign(NOTHING, "absolute", 1, poses=20)
+    c = campaign(NO_EFFECT, "absolute", 1, poses=20)
     shift = np.array([0.0, 0.3, 0.0])
     d = judged(replace(c.cell, tool_com=c.cell.tool_com + shift), c.readings, "absolute")
     assert [f.kind for f in d.wrong_figures] == ["tool_com"]

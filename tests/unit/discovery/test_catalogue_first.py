@@ -21,7 +21,7 @@ from hilcal.effects.protocol import EffectSpec
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
-from hilcal.present.diagnosis import silence
+from hilcal.present.diagnosis import no_law_sentence
 from tests.unit.discovery.test_discover import campaign
 
 
@@ -96,7 +96,9 @@ def test_no_refit_fails_in_silence(monkeypatch):
     found = effects_replacing_law(fitted, p, law, known)
     assert found == Replacement((), ((known.names[0], "it finds no equilibrium"),))
     answer = Discovery(fitted, "no_law", unfitted=found.unfitted)
-    assert "load_point could not be tried in the exact model (it finds no eq" in silence(answer)
+    assert "load_point could not be tried in the exact model (it finds no eq" in no_law_sentence(
+        answer
+    )
     assert discovery_json(answer)["unfitted"] == [
         {"effect": "load_point", "why": found.unfitted[0][1]}
     ]

@@ -22,10 +22,10 @@ from hilcal.effects.check import check_effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import effect_columns, linearise
-from hilcal.present.diagnosis import discovery_report, refined_laws, silence
+from hilcal.present.diagnosis import discovery_report, no_law_sentence, refined_laws
 from hilcal.refinement import refine
 from studies.unmodelled_laws import law_named, shift
-from tests.support.fit_cases import based
+from tests.support.fit_cases import fitted_model
 from tests.support.rehearsed import rehearsed
 
 LAW = "compliance by another joint"
@@ -42,7 +42,7 @@ def campaign(law="", stated=1.0, seed=4):
             drawn, of.world, readings.states, 6.0, "deflection", of.pose, of.cycle
         )
     readings = replace(readings, value=value, covariance=stated**2 * readings.covariance)
-    return based(cell, readings, "deflection")
+    return fitted_model(cell, readings, "deflection")
 
 
 @cache
@@ -142,7 +142,7 @@ def test_noise_that_is_misjudged_is_no_law(stated):
     d = discover(campaign(stated=stated))
     assert d.laws == ()
     assert d.reason in ("adequate", "unpredictable", "catalogue", "no_law")
-    assert silence(d).startswith("no law")
+    assert no_law_sentence(d).startswith("no law")
 
 
 def test_a_drift_of_readings_without_times_is_said_to_need_them(monkeypatch):
@@ -151,11 +151,11 @@ def test_a_drift_of_readings_without_times_is_said_to_need_them(monkeypatch):
     value = of.readings.value.copy()
     value[:, 0] += 400e-6 * np.maximum(np.linspace(-1.0, 1.0, len(value)), 0.0)
     readings = replace(of.readings, states=timeless, value=value)
-    before = based(of.model.cell, readings, "absolute")
+    before = fitted_model(of.model.cell, readings, "absolute")
     monkeypatch.setattr(sys.modules[Discovery.__module__], "search", lambda problem: [])
     d = discover(before)
     assert (d.reason, d.carried[0].variable) == ("no_law", "row order")
-    assert "whose times are missing" in silence(d)
+    assert "whose times are missing" in no_law_sentence(d)
     assert "row order carries" in "".join(map(str, discovery_report(d)))
     assert discovery_json(d)["carried_by"][0]["variable"] == "row order"
 
@@ -281,7 +281,7 @@ def test_a_law_whose_refit_fails_is_named_with_the_reason(monkeypatch):
     monkeypatch.setattr(module, "refit_exactly", fails)
     d = discover(campaign(LAW), name="bent")
     assert d.reason == "no_law"
-    said = silence(d)
+    said = no_law_sentence(d)
     assert "dq_3 = a·cos(q_4)·τ_3 predicts" in said
     assert "it finds no equilibrium" in said
     assert "no law of this size" not in said

@@ -17,11 +17,11 @@ from hilcal.effects.check import example_cell, example_situation, example_states
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import fit
 from hilcal.present.charts import curve_chart
-from hilcal.present.document import says
+from hilcal.present.document import description_of
 from hilcal.present.story import Chapter, build_story
 from hilcal.present.viewer import save
 from studies.benchmark.formula import Formula
-from tests.support.campaigns import NOTHING, campaign
+from tests.support.campaigns import NO_EFFECT, campaign
 from tests.support.recordings import rows
 
 CELL = example_cell()
@@ -102,7 +102,7 @@ DRAWN = Form((LawPart(site("dq_3"), of("q_3", shapes.COS, 96.0), 0),))
 @cache
 def fitted(form):
     """A fit with a law that is not there, to readings of 12 poses."""
-    found = campaign(NOTHING, "deflection", poses=12)
+    found = campaign(NO_EFFECT, "deflection", poses=12)
     source = source_of_form(form, "twisted").encode()
     file = effects_of(source, Path("twisted.py"))
     known = replace(installed().with_effects(*file.effects), files=(file,))
@@ -142,7 +142,7 @@ def test_a_law_is_seen_on_the_page_and_in_the_viewer(tmp_path):
     assert one.x_label == "q_5 [°]"
     assert one.y_label == "dq_3/τ_3 of joint 3 [µrad/(N·m)]"
     assert dict(one.facts)["coefficients"].startswith("a = ")
-    assert "dq_3 = a·cos(q_5)·τ_3" in says(curve_chart(one))
+    assert "dq_3 = a·cos(q_5)·τ_3" in description_of(curve_chart(one))
     save(story, tmp_path / "x.rrd")
     law = rows(tmp_path / "x.rrd", "/law/law", "BarChart:values", "revision")
     assert set(law) == {2}

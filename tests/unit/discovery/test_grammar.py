@@ -20,7 +20,7 @@ from hilcal.effects.check import check_effect, example_cell, example_situation, 
 from hilcal.identification.linearisation import linearise
 from hilcal.readings.whitening import whitening
 from studies.law_scene import scene
-from tests.support.fit_cases import based
+from tests.support.fit_cases import fitted_model
 from tests.support.rehearsed import rehearsed
 
 
@@ -149,7 +149,7 @@ def campaign():
     w = whitening(readings, "deflection")
     moved = moved * (SIGMA / np.sqrt(np.mean(w.whiten(w.raw(moved)) ** 2)))
     readings = replace(readings, value=readings.value + moved)
-    return based(cell, readings, "deflection"), moved
+    return fitted_model(cell, readings, "deflection"), moved
 
 
 @cache

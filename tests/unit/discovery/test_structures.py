@@ -23,7 +23,7 @@ from hilcal.identification.residual import residual
 from hilcal.readings.whitening import whitening
 from hilcal.regression.evidence import STRENGTHS, score_family
 from hilcal.robot import se3
-from tests.support.fit_cases import based
+from tests.support.fit_cases import fitted_model
 from tests.unit.discovery.test_discover import LAW, campaign, found, screened
 
 
@@ -228,7 +228,7 @@ def misread():
     wrench = states.wrench.copy()
     wrench[:, :3] += se3.apply(turn, more)
     readings = replace(of.readings, states=replace(states, wrench=wrench))
-    return based(of.model.cell, readings, of.mode)
+    return fitted_model(of.model.cell, readings, of.mode)
 
 
 @cache

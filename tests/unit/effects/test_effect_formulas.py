@@ -12,7 +12,7 @@ from hilcal.effects.link_compliance import long_links
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.model.model import Model
 from hilcal.robot import chain as chains
-from hilcal.robot.arm import as_counted
+from hilcal.robot.arm import with_controller_conventions
 from hilcal.robot.catalogue import robot_names
 from hilcal.robot.chain import evaluate
 from tests.support.arm_cases import arm_of
@@ -102,7 +102,7 @@ def coupled(arm, **factors):
     entries = tuple(
         Coupling(joint=int(name[1]), follows=int(name[3]), factor=k) for name, k in factors.items()
     )
-    return as_counted(arm, Conventions(joint_coupling=entries))
+    return with_controller_conventions(arm, Conventions(joint_coupling=entries))
 
 
 @pytest.mark.parametrize("given", [{}, {"j3q2": -1.0, "j7q6": 0.5}])

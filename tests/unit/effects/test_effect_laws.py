@@ -8,7 +8,7 @@ import pytest
 from hilcal.drivers.simulated.truth import Truth
 from hilcal.drivers.simulated.world import SimulatedNoise, World
 from hilcal.model.model import Model
-from tests.support.campaigns import followed, true_parameters
+from tests.support.campaigns import distal_factors, true_parameters
 from tests.support.effect_cases import (
     ALL_NAMES,
     CELLS,
@@ -39,7 +39,7 @@ def truth_of(name, cell, rng, scale):
     if name == "joint_compliance":  # an arm that gives way, also where it stiffens
         drawn = 1 + np.abs(drawn)
     if name == "joint_coupling":
-        zero.reshape(-1)[followed(cell.arm)] = scale * ordinary * drawn
+        zero.reshape(-1)[distal_factors(cell.arm)] = scale * ordinary * drawn
         return zero
     return (scale * ordinary * drawn).reshape(zero.shape)
 
@@ -59,7 +59,7 @@ def both(names, cell, states, scale):
 
 def apart(b, states):
     """Largest distance, m, and angle, rad, of the model's readings from the world's."""
-    seen, told = b.model.predict(states, b.theta).observation, b.world.sight(states)
+    seen, told = b.model.predict(states, b.theta).observation, b.world.ideal_readings(states)
     turn = np.abs(seen.rotation - told.rotation).max()
     return float(np.linalg.norm(seen.position - told.position, axis=1).max()), float(turn)
 
@@ -108,7 +108,7 @@ def test_prediction_is_what_the_world_shows(names, arm):
     for scale in (1.0, 1e-2):
         b = both(names, cell, states, 0.3 * scale)
         rigid = replace(b.world, physics=Truth.rigid(cell.arm))
-        change = b.world.sight(states).position - rigid.sight(states).position
+        change = b.world.ideal_readings(states).position - rigid.ideal_readings(states).position
         moved = np.linalg.norm(change, axis=1).max()
         distance, turn = apart(b, states)
         reach = cell.arm.reach + np.linalg.norm(cell.registration[:3, 3])

@@ -11,7 +11,7 @@ from hilcal.model.model import Model
 from tests.support.campaigns import campaign as simulated
 from tests.support.campaigns import plan
 from tests.support.cli_cases import ok, refused
-from tests.support.refusals import check, edited, refusals
+from tests.support.refusals import check, refusals, with_edits
 from tests.support.user_effect_cases import CLASS, COLUMNS
 
 NAME = "soft_side"
@@ -34,7 +34,7 @@ ELASTIC = CLASS.replace(COLUMNS, "values = s.torque[:, :1] ** 3").replace(
 @refusals("user_effects")
 def test_a_bad_file_is_one_clear_line(case, given, tmp_path, capsys):
     path = tmp_path / "mine.py"
-    path.write_text(edited(given, CLASS=CLASS, ELASTIC=ELASTIC), encoding="utf-8")
+    path.write_text(with_edits(given, CLASS=CLASS, ELASTIC=ELASTIC), encoding="utf-8")
     line = refused(capsys, 2, "effects", "--effects-from", path)
     check(case, line.removeprefix("error: ").replace(str(path), path.name))
 

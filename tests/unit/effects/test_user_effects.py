@@ -43,7 +43,10 @@ def with_the_law(amplitude, plan_seed, noise_seed):
     torque = Model(c.cell, ()).predict(p.states, np.zeros(0)).situation.torque
     # What the deflection adds to the torque is below a thousandth of it.
     off = amplitude * np.sin(q) * torque
-    moved = c.world.sight(replace(p.states, q=q + off)).position - c.world.sight(p.states).position
+    moved = (
+        c.world.ideal_readings(replace(p.states, q=q + off)).position
+        - c.world.ideal_readings(p.states).position
+    )
     return replace(c.readings, value=c.readings.value + moved)
 
 

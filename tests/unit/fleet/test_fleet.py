@@ -14,7 +14,7 @@ from hilcal.present.html.other_pages import arms_chart, fleet_page
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.codec import write_document
-from hilcal.transfer.fleet import Fleet, effects_seen, pooled
+from hilcal.transfer.fleet import Fleet, diagnosed_effects, pool
 from hilcal.transfer.members import Failure, Member, entries, member_of
 from tests.support.calibrate_process import CELL
 from tests.support.campaigns import cell_of, configuration, noiseless, plan, with_noise, world_of
@@ -73,7 +73,7 @@ def members(one, seed, odd=0.0):
 @pytest.fixture(scope="module")
 def with_odd(one):
     fleet = members(one, 3, odd=1.5)
-    return fleet, pooled(fleet, effects_seen(fleet))
+    return fleet, pool(fleet, diagnosed_effects(fleet))
 
 
 def test_the_spread_of_arms_is_recovered_and_the_odd_one_named(one, with_odd):
@@ -83,18 +83,20 @@ def test_the_spread_of_arms_is_recovered_and_the_odd_one_named(one, with_odd):
         mean = one.mean[one.names.index(p.parameter)]
         assert abs(p.mean - mean) < 4.5 * p.mean_std
         assert abs(p.between - SPREAD * abs(mean)) < 4 * p.between_std
-    assert [(o.arm, o.campaign, o.parameter) for o in found.odd] == [
+    assert [(o.arm, o.campaign, o.parameter) for o in found.unlike] == [
         (f"arm{ODD}", "", "joint_compliance.j3")
     ]
-    odd, mean = found.odd[0], one.mean[one.names.index("joint_compliance.j3")]
+    odd, mean = found.unlike[0], one.mean[one.names.index("joint_compliance.j3")]
     assert odd.off == pytest.approx(1.5 * mean, abs=3 * odd.off / odd.sigma)
-    assert [(s.effect, s.kind, s.arms) for s in found.seen] == [("creep", "defect", (f"arm{ODD}",))]
+    assert [(s.effect, s.kind, s.arms) for s in found.effects_added] == [
+        ("creep", "defect", (f"arm{ODD}",))
+    ]
     assert not found.wear
 
 
 def test_in_an_ordinary_fleet_nobody_is_named(one):
     for seed in (11, 12, 13):
-        assert pooled(members(one, seed), ()).odd == ()
+        assert pool(members(one, seed), ()).unlike == ()
 
 
 def test_the_page_shows_who_is_unlike(with_odd):
@@ -112,7 +114,7 @@ def test_the_page_shows_who_is_unlike(with_odd):
 
 
 def test_two_arms_have_no_spread(one):
-    refusal_of(CannotAnswerError, "at least 3 arms", pooled, members(one, 3)[:4], ())
+    refusal_of(CannotAnswerError, "at least 3 arms", pool, members(one, 3)[:4], ())
 
 
 def error_of(readings, factors, prior):
@@ -126,7 +128,7 @@ def error_of(readings, factors, prior):
 
 
 def test_with_the_prior_a_new_arm_needs_fewer_poses(one):
-    prior = pooled(members(one, 3), ()).prior
+    prior = pool(members(one, 3), ()).prior
     rng = np.random.default_rng(50)
     with_it, without = [], []
     for seed in range(4):
@@ -139,7 +141,7 @@ def test_with_the_prior_a_new_arm_needs_fewer_poses(one):
 
 def prior_file(one, path):
     """What a fleet of 30 arms lets expect, as `fleet -o` writes it; and a small cell beside it."""
-    write_document(path, pooled(members(one, 3), ()).prior.to_json())
+    write_document(path, pool(members(one, 3), ()).prior.to_json())
     path.with_name("cell.toml").write_text(CELL, encoding="utf-8")
     return path
 

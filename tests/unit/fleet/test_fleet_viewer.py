@@ -5,9 +5,9 @@ import pytest
 import rerun as rr
 
 from hilcal.present.viewer import style
-from hilcal.present.viewer.fleet import DrawnType, places, record_fleet
+from hilcal.present.viewer.fleet import DrawnType, arm_positions, record_fleet
 from hilcal.robot.scene import capsules
-from hilcal.transfer.fleet import Fleet, pooled
+from hilcal.transfer.fleet import Fleet, pool
 from tests.support.picture import Shot, needs_vulkan, pictures
 from tests.support.recordings import chunks, entities, rows
 from tests.support.viewer_plan import rgb
@@ -22,7 +22,7 @@ def one():
 def fleet(one, odd):
     """30 arms in January and March, of which one may have a soft joint 3."""
     mine = members(one, 3, odd=odd)
-    of = pooled(mine, ())
+    of = pool(mine, ())
     return Fleet((of,), tuple(mine), ()), of
 
 
@@ -48,7 +48,7 @@ def test_campaigns_are_as_far_from_the_type_as_their_arm(one):
     assert d.seconds[1] - d.seconds[0] == 59 * 86400
     odd = d.campaigns[d.owner == ODD][:, d.names.index("joint_compliance.j3")]
     assert (odd > 5).all()
-    apart = np.linalg.norm(places(d)[:, None] - places(d), axis=2) + 10 * np.eye(ARMS)
+    apart = np.linalg.norm(arm_positions(d)[:, None] - arm_positions(d), axis=2) + 10 * np.eye(ARMS)
     assert apart.min() > 0.5
 
 
@@ -61,7 +61,7 @@ def test_the_odd_joint_alone_is_red_and_its_arm_framed(one, tmp_path):
     red = [k for k, c in enumerate(colors) if c == style.RED]
     assert red == [ODD * len(shapes) + k for k, s in enumerate(shapes) if s.body == 3]
     (centre,) = rows(path, "/arms0/unlike", "Boxes3D:centers")[0]
-    np.testing.assert_allclose(centre[:2], places(d)[ODD, :2], atol=1e-6)
+    np.testing.assert_allclose(centre[:2], arm_positions(d)[ODD, :2], atol=1e-6)
     words = rows(path, "/words/type0", "TextDocument:text")[0][0]
     assert f"arm{ODD} is unlike the others" in words
     drifts = {e for e in entities(path) if e.startswith("/date0/")}

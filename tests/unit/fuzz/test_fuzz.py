@@ -60,7 +60,12 @@ def test_the_sample_programs_are_understood(tmp_path):
     _, every, points, tool = program_points(path)
     assert (len(every), len(points.names), tool is None) == (5, 5, False)
     path.write_text(stored.LEFT, "utf-8")
-    assert [bool(w.left) for w in program_points(path, leave=True)[1]] == [True, True, True, False]
+    assert [bool(w.not_corrected) for w in program_points(path, leave=True)[1]] == [
+        True,
+        True,
+        True,
+        False,
+    ]
     assert PARSERS["program"].parse(stored.PROGRAM.encode())
     assert PARSERS["program_left"].parse(stored.LEFT.encode())
 

@@ -26,7 +26,7 @@ from hilcal.robot import se3
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.rows import content_hash
 from tests.support.campaigns import cell_of, configuration, noiseless, plan, with_noise, world_of
-from tests.support.fit_cases import MODES, based
+from tests.support.fit_cases import MODES, fitted_model
 from tests.support.reflector_cases import reflectors
 
 BOTH = pytest.mark.parametrize("mode", MODES)
@@ -80,7 +80,7 @@ def test_p_values_and_standard_errors(mode):
         c = reflectors(seed=seed, poses=8, joint_std=STD, known=(False, False, True))
         true = c.world.physics.joint_compliance
         for readings, found in ((c.readings, z), (replace(c.readings, common=None), apart)):
-            f = based(c.cell, readings, mode)
+            f = fitted_model(c.cell, readings, mode)
             found.append((f.theta[-6:] - true) / f.uncertainty.formal[-6:])
             if found is z:
                 p_values.append(chi2.sf(f.chi2, f.dof))
@@ -117,7 +117,7 @@ def test_a_hidden_reflector_is_a_missing_reading():
     r = c.readings
     third = (r.target == 2) & (r.pose == 3)
     kept = r[~((r.target == 1) & (r.pose % 4 == 0) | third & r.unloaded)]
-    f = based(c.cell, kept, "deflection", ["joint_compliance", "base_compliance"])
+    f = fitted_model(c.cell, kept, "deflection", ["joint_compliance", "base_compliance"])
     off = f.theta[-3:] - c.world.physics.base_compliance
     assert np.abs(off / f.uncertainty.std[-3:]).max() < 4.0
     assert chi2.sf(f.chi2, f.dof) > 1e-3
@@ -135,7 +135,7 @@ def scattering(std=2e-5, m=3, seed=0, noise=1.0, poses=16, loads=3, law=0.0):
     still = noiseless(replace(world, joint_std=np.zeros(6)), p, m)
     off = replace(p.states, q=p.states.q + std * rng.standard_normal(p.states.q.shape))
     off.q[:, 1] += law * np.sin(3 * p.states.q[:, 3])
-    readings = with_noise(replace(still, value=world.sight(off).value(m)), rng, noise)
+    readings = with_noise(replace(still, value=world.ideal_readings(off).value(m)), rng, noise)
     return cell, replace(readings, scatter_stated=False)
 
 
@@ -144,7 +144,7 @@ def scattering(std=2e-5, m=3, seed=0, noise=1.0, poses=16, loads=3, law=0.0):
 def test_the_scatter_comes_out_as_it_is(mode, m):
     truth, z = 2e-5, []
     for seed in range(3):
-        s = estimate_arm_scatter(based(*scattering(truth, m, seed), mode))
+        s = estimate_arm_scatter(fitted_model(*scattering(truth, m, seed), mode))
         assert s.kind == "joints"
         z.append((s.std[0] - truth) / s.std_error[0])
         assert s.std_error[0] < 0.15 * truth
@@ -154,14 +154,14 @@ def test_the_scatter_comes_out_as_it_is(mode, m):
 
 def test_joints_are_told_apart_where_the_readings_do():
     truth = np.array([6.0, 0.0, 6.0, 0.0, 0.0, 0.0]) * 1e-5
-    s = estimate_arm_scatter(based(*scattering(truth), "absolute"))
+    s = estimate_arm_scatter(fitted_model(*scattering(truth), "absolute"))
     assert s.kind == "each joint"
     off = (np.array(s.std) - truth)[[0, 2]] / np.array(s.std_error)[[0, 2]]
     assert np.all(np.abs(off) < 4)
 
 
 def judged(mode, std, **more):
-    d = diagnose(based(*scattering(std, **more), mode))
+    d = diagnose(fitted_model(*scattering(std, **more), mode))
     return d, str(d.to_dict()["message"])
 
 
@@ -186,7 +186,7 @@ def test_a_predictable_part_counts_from_a_third_of_the_rest_on(law, reason):
 
 @pytest.mark.parametrize(("share", "reason"), [(0.09, "arm_scatter"), (0.11, "no_suspect")])
 def test_a_negligible_part_that_is_predictable_is_said(share, reason):
-    e = Evidence(based(*scattering(), "absolute"))
+    e = Evidence(fitted_model(*scattering(), "absolute"))
     vars(e)["misfit_breakdown"] = (MisfitShare("joint 4 angle", share, 1e-9),)
     d = judge(e, History())
     assert (d.reason, d.predictable_share) == (reason, share)
@@ -212,7 +212,7 @@ def test_no_arm_scatters_by_half_a_millimetre():
 
 def test_scatter_that_is_stated_is_not_estimated():
     cell, readings = scattering()
-    d = diagnose(based(cell, replace(readings, scatter_stated=True), "absolute"))
+    d = diagnose(fitted_model(cell, replace(readings, scatter_stated=True), "absolute"))
     assert d.verdict == "noise_misjudged"
     assert d.scatter is None
 
@@ -228,7 +228,9 @@ def test_refine_ends_with_the_scatter_in_the_fit_and_the_file_keeps_it(tmp_path)
     tracker, none = config.tracker.model_copy(update=base), type(config.repeatability)()
     config = config.model_copy(update={"repeatability": none, "tracker": tracker})
     path, about = tmp_path / "run.hilcal", {COVERS_KEY: INSTRUMENT}
-    with CampaignFile.create(path, config.to_json(), str(tmp_path), "made", more=about) as file:
+    with CampaignFile.create(
+        path, config.to_json(), str(tmp_path), "made", more_texts=about
+    ) as file:
         file.append_readings(readings)
     with hc.Campaign.open(path) as run:
         assert not run.readings.scatter_stated
@@ -242,7 +244,7 @@ def test_refine_ends_with_the_scatter_in_the_fit_and_the_file_keeps_it(tmp_path)
         run.append(found)
     with hc.Campaign.open(path) as run:
         again = run.fit()
-        assert run.latest().follows
+        assert run.latest().has_parent
         assert [r.number for r in run.file.revisions()] == [1, 2]
         np.testing.assert_allclose(again.theta, last.fit.theta, rtol=1e-6, atol=1e-12)
         np.testing.assert_allclose(again.uncertainty.std, last.fit.uncertainty.std, rtol=1e-6)
@@ -269,7 +271,7 @@ def test_p_values_stay_uniform_with_an_estimated_covariance(seeds):
     p_values = []
     for seed in range(seeds):
         cell, readings = scattering(seed=seed)
-        plain = based(cell, readings, "absolute")
+        plain = fitted_model(cell, readings, "absolute")
         with_it = with_arm_scatter(plain.model.cell, readings, estimate_arm_scatter(plain))
         found = fit(plain.model, with_it, "absolute", start=plain.theta)
         absent = next(e for e in candidates(found) if e.name == "joint_tilt_compliance")
@@ -284,7 +286,7 @@ def test_targets_of_one_arrival_have_it_in_common(mode):
     (f,) = factors(true, c.readings, "joints")
     alone = c.readings.covariance - 9e-10 * f @ np.swapaxes(f, 1, 2)
     readings = replace(c.readings, covariance=alone, common=None, scatter_stated=False)
-    plain = based(c.cell, readings, mode)
+    plain = fitted_model(c.cell, readings, mode)
     s = estimate_arm_scatter(plain)
     assert s.kind == "joints"
     assert abs(s.std[0] - 3e-5) < 4 * s.std_error[0]
@@ -301,7 +303,7 @@ def test_an_orientation_stated_too_noisy_does_not_hide_the_arm():
     covariance = readings.covariance.copy()
     covariance[:, 3:, 3:] *= 9.0
     stated = replace(readings, covariance=covariance)
-    plain = based(cell, stated, "absolute")
+    plain = fitted_model(cell, stated, "absolute")
     with_it = with_arm_scatter(plain.model.cell, stated, estimate_arm_scatter(plain))
     found = fit(plain.model, with_it, "absolute")
     assert found.variance_factor < 0.8

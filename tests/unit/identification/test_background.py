@@ -23,14 +23,14 @@ from hilcal.refinement import BACKGROUND, refine
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.revision import from_text, to_text
 from hilcal.store.rows import content_hash
-from studies.all_effects_command import Case
+from studies.all_effects_command import AllEffectsCase
 from studies.all_effects_command import refined as all_effects
-from studies.diagnosis import Asked
+from studies.diagnosis import DiagnosisCase
 from studies.diagnosis_command import simulate
 from studies.random_campaigns import rehearsal_states
 from studies.study_cases import study_case, with_study_loads
 from tests.support.campaigns import configuration
-from tests.support.fit_cases import based, refined
+from tests.support.fit_cases import fitted_model, refined
 from tests.support.refusals import refusal
 
 UR10 = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
@@ -162,14 +162,14 @@ def test_an_arm_that_errs_in_many_ways_is_predicted_from_few_poses():
     alone = found.steps[added.index(BACKGROUND) - 1]
     _, loads = with_study_loads(config, "ur10e")
     fresh, *_ = rehearsal_states(case.cell, 20, loads, np.random.default_rng(2))
-    true = case.world.sight(fresh).position
+    true = case.world.ideal_readings(fresh).position
     error = np.linalg.norm(found.fit.predict(fresh).position - true, axis=1).mean()
     before = np.linalg.norm(alone.fit.predict(fresh).position - true, axis=1).mean()
     assert error < 0.6 * before
     stated = budget(found.fit)  # fitted poses are far nearer than any other is
     assert stated.combined >= found.fit.holdout.rms_m > 3 * found.fit.error.rms_m
     unloaded = replace(fresh, wrench=np.zeros_like(fresh.wrench))  # as what was fitted
-    off = found.fit.predict(unloaded).position - case.world.sight(unloaded).position
+    off = found.fit.predict(unloaded).position - case.world.ideal_readings(unloaded).position
     assert np.mean(np.linalg.norm(off, axis=1) <= stated.expanded) >= 0.9
     assert found.verdict in ("missing_effect", "ambiguous")
     assert set(found.fit.model.named) - {"base_frame"} <= set(HIDDEN)
@@ -178,7 +178,7 @@ def test_an_arm_that_errs_in_many_ways_is_predicted_from_few_poses():
 @pytest.mark.long
 def test_effects_of_implausible_size_do_not_stand_in_for_an_unknown_law():
     law = "compliance by another joint"  # link lengths of 14 mm would predict it
-    asked = Asked("outside", "ur3e", "deflection", (law,), 3.0, 0)
+    asked = DiagnosisCase("outside", "ur3e", "deflection", (law,), 3.0, 0)
     case = simulate(asked)
     found = refined(case.cell, case.readings, asked.mode)
     assert found.verdict == "unknown_effect"
@@ -187,7 +187,7 @@ def test_effects_of_implausible_size_do_not_stand_in_for_an_unknown_law():
 
 @pytest.mark.long
 def test_noise_that_is_stated_too_small_is_no_background():
-    asked = Asked("noise", "ur3e", "absolute", (), 0.0, 0, 0.5, cycles=2)
+    asked = DiagnosisCase("noise", "ur3e", "absolute", (), 0.0, 0, 0.5, cycles=2)
     case = simulate(asked)
     found = refined(case.cell, case.readings, asked.mode)
     assert found.verdict == "noise_misjudged"
@@ -208,7 +208,7 @@ def test_waves_of_gears_in_pools_predict_better_than_line_by_line():
         assert "transmission_error" in found.fit.model.random
         assert not found.fit.model.background
         fresh, *_ = rehearsal_states(case.cell, 40, [], np.random.default_rng(seed))
-        true = case.world.sight(fresh).position
+        true = case.world.ideal_readings(fresh).position
         errors = [
             np.linalg.norm(x.predict(fresh).position - true, axis=1).mean()
             for x in (found.fit, lines)
@@ -222,14 +222,14 @@ def test_waves_of_gears_in_pools_predict_better_than_line_by_line():
 
 def test_without_shrunk_effects_there_are_no_lines():
     case = study_case(configuration(), "ur10e", "absolute", (), 0.0, 1, n_poses=12)
-    plain = based(case.cell, case.readings, "absolute")
+    plain = fitted_model(case.cell, case.readings, "absolute")
     assert with_pooled_lines(plain) is None
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("poses", "seed"), [(600, 0), (600, 1), (1000, 2)])
 def test_many_poses_of_an_arm_with_every_effect_blame_no_noise_and_no_unknown_law(poses, seed):
-    found = all_effects(Case(poses, seed, factor=1.0, without=False))
+    found = all_effects(AllEffectsCase(poses, seed, factor=1.0, without=False))
     assert found.verdict in ("ambiguous", "adequate")
     assert found.rms_m < 1.03 * found.best_m
     assert found.inside > 0.92
@@ -246,7 +246,7 @@ def test_a_hidden_effect_is_predicted_at_fresh_poses_and_has_the_evidence():
     without = fit(start, case.readings, "absolute")
     _, loads = with_study_loads(CONFIG, "ur10e")
     fresh, *_ = rehearsal_states(case.cell, 20, loads, np.random.default_rng(2))
-    true = case.world.sight(fresh).position
+    true = case.world.ideal_readings(fresh).position
     prediction = found.model.predict(fresh, found.theta)
     x = found.problem.coordinates(found.model.jacobian(prediction, found.theta, 3))
     position, spread = prediction.observation.position, x @ found.covariance @ np.swapaxes(x, 1, 2)

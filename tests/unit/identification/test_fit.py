@@ -17,7 +17,13 @@ from hilcal.readings.whitening import SCALINGS
 from hilcal.robot import se3
 from tests.support.campaigns import campaign, noiseless, plan, with_noise
 from tests.support.effect_cases import make
-from tests.support.fit_cases import MODES, based, compliances, named, predicted
+from tests.support.fit_cases import (
+    MODES,
+    compliances,
+    fitted_model,
+    parameters_by_effect,
+    predicted,
+)
 from tests.support.refusals import refusal, refusal_of
 
 FRAMES = ("base_frame", "target_offset", "encoder_offset")
@@ -45,7 +51,7 @@ def test_parameters_are_recovered_exactly_without_noise(mode, m):
 @pytest.mark.parametrize("m", [3, 6])
 def test_unknown_frames_are_recovered_with_the_compliances(m):
     c = campaign(plan_seed=0, target_known=False, m=m)
-    found = based(c.cell, noiseless(c.world, plan(), m), "absolute")
+    found = fitted_model(c.cell, noiseless(c.world, plan(), m), "absolute")
     assert found.model.names == ("base_frame", "target_offset", "joint_compliance")
     np.testing.assert_allclose(compliances(found), c.world.physics.joint_compliance, rtol=1e-7)
     assert found.error.max_m < 1e-10
@@ -105,11 +111,11 @@ def test_the_same_data_give_the_same_numbers_and_a_fit_is_found_again_from_its_o
 
 def test_the_order_of_readings_and_of_effects_does_not_matter():
     c = campaign(plan_seed=0, target_known=False)
-    found = based(c.cell, c.readings, "absolute", ("joint_compliance", "hysteresis"))
+    found = fitted_model(c.cell, c.readings, "absolute", ("joint_compliance", "hysteresis"))
     shuffled = c.readings[np.random.default_rng(1).permutation(len(c.readings))]
     turned = replace(found.model, effects=found.model.effects[::-1])
-    other = named(fit(turned, shuffled, "absolute"))
-    for name, (value, std) in named(found).items():
+    other = parameters_by_effect(fit(turned, shuffled, "absolute"))
+    for name, (value, std) in parameters_by_effect(found).items():
         assert other[name][0] == pytest.approx(value, abs=1e-4 * std), name
         assert other[name][1] == pytest.approx(std, rel=1e-6), name
 
@@ -142,14 +148,14 @@ def test_an_over_complete_model_has_the_rank_that_the_arm_has(m, expected):
     c = campaign("link_geometry", plan_seed=0, poses=30, target_known=False, m=m)
     r = c.readings[c.readings.unloaded]
     r = replace(r, states=replace(r.states, wrench=0 * r.states.wrench))
-    found = based(replace(c.cell, gravity=np.zeros(3)), r, "absolute", ("link_geometry",))
+    found = fitted_model(replace(c.cell, gravity=np.zeros(3)), r, "absolute", ("link_geometry",))
     assert seen_directions(found.model, r, m) == found.rank == expected
     assert len(found.uncertainty.null) == found.model.size - expected
 
 
 def test_what_cannot_be_seen_is_named_and_has_no_number():
     c = campaign("link_geometry", plan_seed=0, poses=30)
-    found = based(c.cell, c.readings, "absolute", GEOMETRY)
+    found = fitted_model(c.cell, c.readings, "absolute", GEOMETRY)
     u, model, document = found.uncertainty, found.model, to_json(found)
     compliance, links = (model.slices()[model.names.index(name)] for name in GEOMETRY)
     assert found.rank < model.size
@@ -167,8 +173,8 @@ def test_what_cannot_be_seen_is_named_and_has_no_number():
 def test_an_over_complete_model_predicts_what_the_world_shows_elsewhere():
     c, other = campaign("link_geometry", plan_seed=0, poses=30), plan(12, 77).states
     clean = noiseless(c.world, plan(30))
-    told = based(c.cell, clean, "absolute", GEOMETRY).predict(other).position
-    off = np.linalg.norm(told - c.world.sight(other).position, axis=1)
+    told = fitted_model(c.cell, clean, "absolute", GEOMETRY).predict(other).position
+    off = np.linalg.norm(told - c.world.ideal_readings(other).position, axis=1)
     # Parts of a direction too weak to be estimated stay: 0.05 σ over all data together.
     sigma = np.sqrt(np.trace(clean.covariance, axis1=1, axis2=2).mean())
     assert off.max() < 0.05 * sigma
@@ -183,14 +189,14 @@ def test_no_more_elements_than_parameters_cannot_answer(mode, count):
     else:
         few = c.readings[np.flatnonzero(c.readings.load == 3)[:count]]
     told = rf"{3 * count} measured elements for \d parameters.*measure at least (\d+)"
-    line = refusal_of(CannotAnswerError, told, based, c.cell, few, mode)
+    line = refusal_of(CannotAnswerError, told, fitted_model, c.cell, few, mode)
     assert 3 * int(re.search(told, line)[1]) > 6
 
 
 @pytest.fixture(scope="module")
 def found():
     c = campaign(poses=8, mode="absolute")
-    return based(c.cell, c.readings, "absolute")
+    return fitted_model(c.cell, c.readings, "absolute")
 
 
 def test_parameters_are_those_of_the_document_and_of_the_data_frame(found):
@@ -276,7 +282,7 @@ def effect_in_other_lengths(effect, cell, k):
 def test_units_do_not_matter(mode, m, k):
     c = campaign("base_compliance", mode, plan_seed=0, target_known=False, m=m)
     cell, readings = in_other_lengths(c.cell, c.readings, k)
-    a = based(c.cell, c.readings, mode, (*WAVES, "joint_stiffening"))
+    a = fitted_model(c.cell, c.readings, mode, (*WAVES, "joint_stiffening"))
     registered, _ = in_other_lengths(a.model.cell, readings, k)
     effects = tuple(effect_in_other_lengths(e, registered, k) for e in a.model.effects)
     parameters = [p for e in a.model.effects for p in e.parameters]
@@ -340,7 +346,7 @@ class Rescaled(JointCompliance):
 @pytest.mark.parametrize("mode", MODES)
 def test_parameter_scaling_conditions_the_problem_but_not_the_answer(mode):
     c = campaign(plan_seed=0, registration_known=True)
-    plain = based(c.cell, c.readings, mode)
+    plain = fitted_model(c.cell, c.readings, mode)
     scaled = fit(Model(c.cell, (Rescaled(c.cell, c.readings.states),)), c.readings, mode)
     off = np.abs(scaled.theta - plain.theta)
     assert off.max() < 1e-4 * plain.uncertainty.std.min()
@@ -349,7 +355,7 @@ def test_parameter_scaling_conditions_the_problem_but_not_the_answer(mode):
 
 def test_scaling_parameters_of_different_units_lowers_the_condition():
     c = campaign(plan_seed=0, target_known=False)
-    found = based(c.cell, c.readings, "absolute")
+    found = fitted_model(c.cell, c.readings, "absolute")
     basis, cell = found.solution.equations.basis, found.model.cell
     assert basis.condition_scaled < 0.1 * basis.condition_unscaled
     # Both are properties of the data, not of the magnitudes that someone thought ordinary.
@@ -375,7 +381,7 @@ def under(*loads):
 
 @pytest.mark.parametrize("mode", MODES)
 def test_where_loads_differ_the_compliances_are_right(mode):
-    f, absolute = based(BARE, C.readings, mode), mode == "absolute"
+    f, absolute = fitted_model(BARE, C.readings, mode), mode == "absolute"
     assert ("link_mass" in f.model.names) == absolute
     assert ratios(f) == pytest.approx(1.0, abs=0.03)
     assert f.variance_factor == pytest.approx(1.0, abs=0.3)
@@ -388,7 +394,7 @@ def test_where_loads_differ_the_compliances_are_right(mode):
 
 def test_without_the_weight_they_are_too_soft_and_that_is_said():
     bare, told = (
-        based(cell, C.readings, "absolute", ("joint_compliance",)) for cell in (BARE, C.cell)
+        fitted_model(cell, C.readings, "absolute", ("joint_compliance",)) for cell in (BARE, C.cell)
     )
     assert ratios(bare).max() > 1.3
     assert "hilcal add RUN link_mass" in masses_note(bare)
@@ -398,7 +404,7 @@ def test_without_the_weight_they_are_too_soft_and_that_is_said():
 
 def test_under_one_load_nothing_tells_them_apart_and_that_is_said():
     light = under("5kg")
-    f = based(BARE, light, "absolute")
+    f = fitted_model(BARE, light, "absolute")
     assert "link_mass" not in f.model.names
     assert ratios(f)[0] > 2.0
     assert "no pose was read under two loads" in masses_note(f)

@@ -23,7 +23,7 @@ from hilcal.readings.whitening import whitening
 from hilcal.regression.normal_equations import TALL
 from tests.support.campaigns import cell_of
 from tests.support.effect_cases import make
-from tests.support.readings_cases import made
+from tests.support.readings_cases import readings_at
 from tests.support.rows import first
 
 SIGMA = 2e-5
@@ -48,7 +48,7 @@ def case(seed, names, soft=5.0):
     value = value + 2 * SIGMA * np.repeat(rng.normal(size=(POSES, 3)), LOADS, axis=0)
     value = value + SIGMA * rng.normal(size=value.shape)
     pose, load = np.divmod(np.arange(len(value)), LOADS)
-    return model, made(q, value, wrench=states.wrench, pose=pose, load=load, std=SIGMA)
+    return model, readings_at(q, value, wrench=states.wrench, pose=pose, load=load, std=SIGMA)
 
 
 def slope(found):

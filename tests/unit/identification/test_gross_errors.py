@@ -28,10 +28,10 @@ from hilcal.identification.misdescription import examine
 from hilcal.identification.registration import register
 from hilcal.present.verdict import message
 from hilcal.readings.whitening import MODES, inverse_root, whitening
-from studies.gross_errors import Spoilt, count, spoil
+from studies.gross_errors import GrossErrorCase, count, spoil
 from studies.study_cases import study_case
 from tests.support.campaigns import campaign, configuration, noiseless, plan, with_noise
-from tests.support.fit_cases import based, refined
+from tests.support.fit_cases import fitted_model, refined
 from tests.support.reflector_cases import reflectors
 from tests.support.rows import first
 
@@ -61,10 +61,10 @@ def shifted(readings, rows, shift):
 def test_three_gross_errors_are_set_aside_and_listed(mode, size):
     r, rows = C.readings, [7, 68, 134]
     assert not r.unloaded[rows].any()
-    found = based(C.cell, spoilt(r, rows, size), mode)
+    found = fitted_model(C.cell, spoilt(r, rows, size), mode)
     assert np.flatnonzero(found.outlier).tolist() == rows
     kept = r[np.delete(np.arange(150), rows)]
-    clean = based(C.cell, kept, mode)
+    clean = fitted_model(C.cell, kept, mode)
     assert np.abs((found.theta - clean.theta) / clean.uncertainty.formal).max() < 1e-4
     assert found.chi2 == pytest.approx(clean.chi2, rel=1e-6)
     assert found.dof == clean.dof
@@ -79,8 +79,8 @@ def test_three_gross_errors_are_set_aside_and_listed(mode, size):
 
 def test_a_gross_error_of_an_unloaded_reading_takes_its_deflections_along():
     assert C.readings.unloaded[45]
-    found = based(C.cell, spoilt(C.readings, [45], 5e-3), "deflection")
-    clean = based(C.cell, C.readings, "deflection")
+    found = fitted_model(C.cell, spoilt(C.readings, [45], 5e-3), "deflection")
+    clean = fitted_model(C.cell, C.readings, "deflection")
     assert set(C.readings.pose[found.outlier]) == {C.readings.pose[45]}
     # Four of 120 deflections less.
     assert np.abs((found.theta - clean.theta) / clean.uncertainty.formal).max() < 1.5
@@ -99,7 +99,7 @@ def test_gross_errors_say_what_they_look_like(mode):
     value[far, 2] += 2e-3
     value[stale] = value[stale - 1]
     value[bare] = value[30] + 1e-6
-    found = outliers(based(C.cell, replace(r, value=value), mode))
+    found = outliers(fitted_model(C.cell, replace(r, value=value), mode))
     listed = {(o["pose"], o["load"]): o["reason"] for o in found}
     reasons = [listed[r.pose_names[r.pose[k]], r.load_names[r.load[k]]] for k in (far, stale, bare)]
     assert len(listed) == 3
@@ -148,7 +148,7 @@ def test_a_true_effect_is_not_mistaken_for_gross_errors():
     for robot, seed in (("ur3e", 11), ("ur10e", 12)):
         of = study_case(CONFIG, robot, "deflection", ("wrench_bias",), 3.0, seed)
         cases.append((of.cell, of.readings, "deflection"))
-    assert not any(based(*case).outlier.any() for case in cases)
+    assert not any(fitted_model(*case).outlier.any() for case in cases)
 
 
 def gross(r, rng, share=0.05):
@@ -176,7 +176,7 @@ def check_verdict(effect, mode, seed):
     r = c.readings
 
     def judged(readings):
-        d = diagnose(based(c.cell, readings, mode))
+        d = diagnose(fitted_model(c.cell, readings, mode))
         return d.verdict, d.significant[:1]
 
     wrong, what = gross(r, np.random.default_rng(1000 + seed))
@@ -217,13 +217,13 @@ def test_all_of_many_gross_errors_are_found(share, size, mode, m):
     c = twelve(mode, m=m)
     r = c.readings
     readings, wrong = spoil(r, share, size, np.random.default_rng(0))
-    found = based(c.cell, readings, mode)
+    found = fitted_model(c.cell, readings, mode)
     # The same as without them; deflections go with their unloaded reading.
     out = np.isin(np.arange(len(readings)), wrong)
     if mode == "deflection":
         out |= np.isin(r.pose, r.pose[out & r.unloaded])
         out |= ~np.isin(r.pose, r.pose[~out & ~r.unloaded])
-    right = based(c.cell, r[~out], mode)
+    right = fitted_model(c.cell, r[~out], mode)
     out[np.flatnonzero(~out)[right.outlier]] = True
     np.testing.assert_array_equal(found.outlier, out)
     if m == 3:  # the target's axes, which attitudes show, are those of the registration
@@ -235,7 +235,7 @@ def test_all_of_many_gross_errors_are_found(share, size, mode, m):
 )
 def test_refine_finds_them_beside_an_effect_and_in_few_poses(seed, share):
     """24 to 180 readings, nothing or an unmodelled effect of 10 to 20 σ."""
-    found = count(CONFIG, Spoilt(share, 5e-3, seed))
+    found = count(CONFIG, GrossErrorCase(share, 5e-3, seed))
     assert found.found == found.wrong
     assert found.false <= 0.01 * found.readings
     assert found.outcome != "refused"
@@ -260,7 +260,7 @@ def test_a_block_off_alike_is_said_and_not_set_aside(of_tool):
         model = baseline(c.cell, c.readings, "absolute")
         axes = model.predict(c.readings.states, np.zeros(model.size)).observation.rotation
         shift = axes[rows] @ shift
-    found = based(c.cell, shifted(c.readings, rows, shift), "absolute")
+    found = fitted_model(c.cell, shifted(c.readings, rows, shift), "absolute")
     assert not found.outlier.any()
     np.testing.assert_array_equal(found.disagreement.rows, np.arange(12, 30))
     assert any("are off by the same shift" in note for note in notes(found))
@@ -269,7 +269,9 @@ def test_a_block_off_alike_is_said_and_not_set_aside(of_tool):
 def test_a_block_is_not_taken_for_random_errors_among_such():
     c = twelve()
     readings, wrong = spoil(c.readings, 0.1, 5e-3, np.random.default_rng(1))
-    found = based(c.cell, shifted(readings, slice(20, 32), np.array([0, 0, -8e-3])), "absolute")
+    found = fitted_model(
+        c.cell, shifted(readings, slice(20, 32), np.array([0, 0, -8e-3])), "absolute"
+    )
     inside = (wrong >= 20) & (wrong < 32)
     assert found.outlier[wrong[~inside]].all()
     assert found.disagreement is not None
@@ -280,7 +282,7 @@ def test_an_unloaded_reading_that_several_deflections_share():
     c = twelve("deflection")
     rows, value = np.flatnonzero(c.readings.unloaded)[::4], c.readings.value.copy()
     value[rows] += 5e-3 * np.random.default_rng(0).normal(size=(len(rows), 3))
-    found = based(c.cell, replace(c.readings, value=value), "deflection")
+    found = fitted_model(c.cell, replace(c.readings, value=value), "deflection")
     expected = np.isin(c.readings.pose, c.readings.pose[rows])
     np.testing.assert_array_equal(found.outlier, expected)
 
@@ -289,7 +291,7 @@ def test_an_unloaded_reading_that_several_deflections_share():
 def test_readings_of_several_targets(mode):
     c = reflectors(poses=10)
     readings, wrong = spoil(c.readings, 0.3, 5e-3, np.random.default_rng(0))
-    assert based(c.cell, readings, mode).outlier[wrong].all()
+    assert fitted_model(c.cell, readings, mode).outlier[wrong].all()
 
 
 def test_a_registration_does_not_follow_errors_of_centimetres():
@@ -415,7 +417,7 @@ def test_distances_are_those_of_least_squares_without_the_reading(mode):
 def test_a_step_of_the_linear_model_is_that_of_the_fit(mode, m):
     """At the minimum of a fit the step is zero, deflections through their offset as well."""
     c = campaign("none", mode, poses=12, m=m)
-    found = based(c.cell, c.readings, mode)
+    found = fitted_model(c.cell, c.readings, mode)
     y = found.solution.y
     of = linearised(DataSnooping(found.model, c.readings, mode, found.solution, y), y).linear
     delta, covariance = of.fitted(of.tested)

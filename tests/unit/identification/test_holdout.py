@@ -22,7 +22,7 @@ from hilcal.identification.residual import residual
 from hilcal.readings.whitening import MODES
 from studies.study_cases import study_case
 from tests.support.campaigns import campaign, configuration
-from tests.support.fit_cases import based
+from tests.support.fit_cases import fitted_model
 
 
 def fitted(mode, m=3, effect="none", **options):
@@ -87,7 +87,7 @@ def test_the_error_on_poses_left_out_exceeds_that_of_the_fit_by_what_parameters_
     gain, share = [], []
     for seed in range(8):
         c = campaign(seed=seed, plan_seed=0, registration_known=True)
-        found = based(c.cell, c.readings, "absolute", ("joint_compliance", "hysteresis"))
+        found = fitted_model(c.cell, c.readings, "absolute", ("joint_compliance", "hysteresis"))
         gain.append(found.holdout.rms_sigma**2 - found.error.rms_sigma**2)
         share.append(12 / (3 * len(c.readings)))
     assert np.mean(gain) == pytest.approx(2 * np.mean(share), rel=0.6)
@@ -149,7 +149,7 @@ def test_what_one_pose_alone_shows_of_an_effect_does_not_spoil_the_others():
     """Without pose 19 nothing tells a combination of the backlashes; flat, it erred by 42 σ."""
     config = configuration()
     c = study_case(config, "ur5e", "deflection", ("backlash",), 2.0, 901)
-    before = based(c.cell, c.readings, "deflection")
+    before = fitted_model(c.cell, c.readings, "deflection")
     found = add(before, "backlash")
     assert found.variance_factor == pytest.approx(1.0, abs=0.15)
     assert found.holdout.rms_sigma < 1.1 < 1.5 < before.holdout.rms_sigma

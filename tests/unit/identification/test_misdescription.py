@@ -13,7 +13,7 @@ from hilcal.identification.hypotheses import Description, Hypothesis
 from hilcal.identification.misdescription import BEYOND_NOISE, examine, other_arm, other_arm_of
 from hilcal.identification.registration import register
 from hilcal.identification.table_preview import clearly_best, rank_conventions
-from hilcal.robot.arm import as_counted
+from hilcal.robot.arm import with_controller_conventions
 from hilcal.robot.catalogue import load_arm, robot_names
 from studies.random_descriptions import draw, judge, read
 from studies.random_descriptions import readings_of as table_of
@@ -148,7 +148,7 @@ def test_another_arm_counts_its_joints_as_the_cell_says():
     cell = cell_from_config(config.model_copy(update={"robot": robot}))
     cell = replace(cell, registration_known=False, target_known=False)
     q = np.random.default_rng(2).uniform(-2, 2, (40, 6))
-    _, said = found_in(by_arm(as_counted(load_arm("ur5e"), robot), q), cell)
+    _, said = found_in(by_arm(with_controller_conventions(load_arm("ur5e"), robot), q), cell)
     assert "the arm is another one, ur5e" in said
     assert "turns the other way" not in said
 

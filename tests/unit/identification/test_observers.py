@@ -25,7 +25,7 @@ from hilcal.tables.table import write_table
 from tests.support.campaigns import campaign, cell_of, configuration, true_parameters
 from tests.support.cli_cases import CELL, ok
 from tests.support.effect_cases import numeric_slopes, random_theta, some_states
-from tests.support.fit_cases import based, named
+from tests.support.fit_cases import fitted_model, parameters_by_effect
 from tests.support.observer_cases import NORMAL, POINTS, base_cell, observed, stated
 from tests.support.readings_cases import read_table
 from tests.support.refusals import refusal, refusals, refuses
@@ -45,13 +45,13 @@ NAMES = [ObserverName(*each.split()) for each in ("station S1", "station S2", "p
 def fitted(c, mode="absolute", readings=None):
     joint_std = configuration().repeatability.per_joint(6)
     given = c.readings if readings is None else readings
-    return based(c.cell, with_joint_scatter(c.cell, given, joint_std), mode)
+    return fitted_model(c.cell, with_joint_scatter(c.cell, given, joint_std), mode)
 
 
 def apart(c, found):
     """Errors of the compliances over their standard uncertainties."""
     truth = true_parameters(c.world, "joint_compliance")
-    told = [v for k, v in named(found).items() if k.startswith("joint_compliance")]
+    told = [v for k, v in parameters_by_effect(found).items() if k.startswith("joint_compliance")]
     return np.array([(value - t) / std for (value, std), t in zip(told, truth, strict=True)])
 
 
@@ -102,7 +102,7 @@ def test_verdicts(case):
 
 def test_where_stations_points_and_gauges_are():
     f = fitted(observed(["S1", "S2", "A", "G"], 3))
-    values = named(f)
+    values = parameters_by_effect(f)
     _, station, point, gauge = f.model.cell.observers
     s2, a = (
         np.array([values[f"observer_frame.{name}.{e}"] for e in elements])
@@ -120,7 +120,7 @@ def test_fresh_readings_are_predicted_to_their_noise():
     c = observed(["A", "B", "C"], 5, base=True, poses=20)
     f, r = fitted(c), observed(["C", "A", "B"], 6, base=True).readings
     # The arm of seed 6 is another one: its readings are made anew by the arm of seed 5.
-    at = c.world.sight(r.states).position
+    at = c.world.ideal_readings(r.states).position
     centre = np.array([POINTS[r.observers[k].name] for k in r.observer])
     value, noise = r.value.copy(), np.random.default_rng(1).standard_normal(len(r))
     value[:, 0] = np.linalg.norm(at - centre, axis=1) + 1e-5 * noise
@@ -138,7 +138,7 @@ def test_a_bar_of_unknown_length():
     value = c.readings.value.copy()
     value[c.readings.scalar, 0] += 0.123
     f = fitted(c, readings=replace(c.readings, value=value))
-    found, std = named(f)["observer_frame.A.offset"]
+    found, std = parameters_by_effect(f)["observer_frame.A.offset"]
     offset = f.model.cell.observers[1].offset + found
     assert abs(offset - 0.123) < 4 * std
     assert std < 1e-3
@@ -149,7 +149,9 @@ def test_a_direction_that_is_known():
     gauges = {"G": Gauge(direction=tuple(2.0 * NORMAL))}
     c = observed(["S1", "G"], 4, cell=base_cell(gauges=gauges))
     f = fitted(c)
-    assert [k for k in named(f) if k.startswith("observer_frame")] == ["observer_frame.G.x"]
+    assert [k for k in parameters_by_effect(f) if k.startswith("observer_frame")] == [
+        "observer_frame.G.x"
+    ]
     assert 0.8 < f.variance_factor < 1.25
 
 
@@ -245,7 +247,7 @@ def test_stations_of_poses():
     cov = 0.5 * (cov + np.swapaxes(cov, 1, 2))
     readings = replace(whole, states=states, value=value, covariance=cov, observers=names)
     cell = cell_of(target_known=False)
-    found, one = (based(cell, r, "absolute") for r in (readings, whole))
+    found, one = (fitted_model(cell, r, "absolute") for r in (readings, whole))
     assert found.dof == one.dof - 6
     assert abs(one.variance_factor - 1.0) < 0.3
     assert abs(found.variance_factor - 1.0) < 0.3

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from hilcal.drivers.simulated.injected_effects import hide
+from hilcal.drivers.simulated.injected_effects import hide_effect
 from hilcal.effects.catalogue import installed
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
@@ -18,8 +18,8 @@ from hilcal.robot.chain import evaluate
 from hilcal.tables.table import write_table
 from tests.support.campaigns import cell_of, configuration, plan, true_parameters, world_of
 from tests.support.cli_cases import CELL, ok
-from tests.support.fit_cases import named
-from tests.support.readings_cases import made
+from tests.support.fit_cases import parameters_by_effect
+from tests.support.readings_cases import readings_at
 
 STD = 1e-5
 PLATES = {  # a point, and the normal, base axes
@@ -61,7 +61,7 @@ def touched(names, poses, seed, effect=""):
     if effect:
         p = plan(12, seed)
         kept = {"pose": p.pose, "cycle": p.cycle, "world": world}
-        world = hide(effect, cell, p.states, 5.0, "absolute", rng, **kept)
+        world = hide_effect(effect, cell, p.states, 5.0, "absolute", rng, **kept)
     world = replace(world, registration=np.eye(4), station=se3.matrix(np.eye(3), np.ones(3)))
     pulls = [load.wrench(cell.gravity) for load in configuration().loads[:2]]
     loads = [np.zeros(6), *pulls]
@@ -73,7 +73,7 @@ def touched(names, poses, seed, effect=""):
     n = n / np.linalg.norm(n, axis=1, keepdims=True)
 
     def heights(q):
-        return np.sum((world.sight(replace(states, q=q), slip).position - at) * n, axis=1)
+        return np.sum((world.ideal_readings(replace(states, q=q), slip).position - at) * n, axis=1)
 
     late = STD * rng.standard_normal(len(q))
     for _ in range(4):
@@ -86,7 +86,7 @@ def touched(names, poses, seed, effect=""):
     assert np.abs(heights(states.q) - late).max() < 1e-9
     cov = np.zeros((len(q), 3, 3))
     cov[:, 0, 0] = STD**2
-    readings = made(
+    readings = readings_at(
         states.q,
         np.zeros((len(q), 3)),
         wrench=states.wrench,
@@ -120,7 +120,7 @@ def test_what_heights_of_0_determine_is_right_and_the_rest_is_named(plates, effe
     for seed in range(8):
         cell, world, readings = touched(CASES[plates], 30, seed, effect)
         found = fitted(cell, readings, effect)
-        told = named(found)
+        told = parameters_by_effect(found)
         truth = np.concatenate([true_parameters(world, name) for name in names])
         of = np.array([v for k, v in told.items() if k.startswith(tuple(names))])
         free = np.isfinite(of[:, 1])

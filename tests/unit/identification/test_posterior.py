@@ -11,7 +11,7 @@ import hilcal as hc
 from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.revisions import restore, to_record
 from hilcal.diagnosis.stepwise import add, remove
-from hilcal.drivers.simulated.world import stand
+from hilcal.drivers.simulated.world import place_tracker
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline, with_effects
@@ -28,7 +28,7 @@ from hilcal.store.rows import content_hash
 from studies.change import measured as measured_again
 from studies.change import studied_arm
 from tests.support.campaigns import campaign, configuration, measured, noiseless, plan, with_noise
-from tests.support.fit_cases import based
+from tests.support.fit_cases import fitted_model
 from tests.support.refusals import refusal
 
 
@@ -39,7 +39,7 @@ def of_links(seed=2):
 @cache
 def fitted(*names):
     c = of_links()
-    return based(c.cell, c.readings, "absolute", names)
+    return fitted_model(c.cell, c.readings, "absolute", names)
 
 
 def places(found, p):
@@ -110,7 +110,7 @@ def test_a_harmonic_that_was_dropped_is_not_known_to_be_zero():
 def test_what_is_no_posterior_is_refused():
     c = of_links()
     with pytest.raises(CannotAnswerError, match="no effect of the arm"):
-        Posterior.of(based(c.cell, c.readings, "absolute", ()))
+        Posterior.of(fitted_model(c.cell, c.readings, "absolute", ()))
     model = with_effects(c.cell, c.readings, "absolute", ("joint_compliance",))
     refusal("scaling gc", Posterior.of, fit(model, c.readings, "absolute", "none"))
     p = Posterior.of(fitted("joint_compliance")).to_json()
@@ -139,7 +139,7 @@ def arm():
 def posterior(arm, seed, zero3=0.0):
     """Measure the arm by a tracker that stands anywhere, and fit it."""
     rng, physics = np.random.default_rng(seed), arm.world.physics
-    registration, station = stand(arm.cell, rng)
+    registration, station = place_tracker(arm.cell, rng)
     physics = physics.with_effect("encoder_offset", physics.encoder_offset + zero3 * np.eye(6)[2])
     world = replace(arm.world, physics=physics, registration=registration, station=station)
     readings = measured_again(world, arm.loads[:1], 12, rng)

@@ -13,7 +13,7 @@ from hilcal.identification.validation import extrapolation, validate
 from hilcal.readings.whitening import whitening
 from studies.random_descriptions import readings_of
 from tests.support.campaigns import campaign
-from tests.support.fit_cases import based
+from tests.support.fit_cases import fitted_model
 
 NOISE_FACTOR, FOLDS, EACH = 1.7, 10, 12
 
@@ -125,7 +125,7 @@ def split(seed, joint):
     first = np.random.default_rng(seed).permutation(len(r)) < len(r) // 2
     if joint is not None:
         first = r.states.q[:, joint] < np.median(r.states.q[:, joint])
-    found = based(c.cell, r[first], "absolute", ("joint_compliance", "transmission_error"))
+    found = fitted_model(c.cell, r[first], "absolute", ("joint_compliance", "transmission_error"))
     other = validate(found.model, found.theta, found.readings, r[~first], "absolute")
     return found, other, extrapolation(predictive_of(found), found.readings, other)
 
@@ -173,7 +173,7 @@ def test_waves_of_whole_turns_are_the_same_and_couplings_are_not(effect, same):
 
 def test_a_joint_that_turned_on_is_validated_as_inside():
     c = campaign(poses=16)
-    found = based(c.cell, c.readings, "absolute")
+    found = fitted_model(c.cell, c.readings, "absolute")
     q = c.readings.states.q.copy()
     q[:, 5] += 2 * np.pi
     on = replace(c.readings, states=replace(c.readings.states, q=q))

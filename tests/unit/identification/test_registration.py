@@ -20,7 +20,7 @@ from hilcal.robot.se3 import rotation_vector
 from studies.random_descriptions import readings_of
 from tests.support.arm_cases import slots_of
 from tests.support.campaigns import cell_of, plan
-from tests.support.fit_cases import based
+from tests.support.fit_cases import fitted_model
 from tests.support.reflector_cases import OFFSETS, reflectors
 from tests.support.rows import first
 
@@ -206,7 +206,7 @@ def test_an_undetermined_target_costs_no_accuracy(m):
     some, other = readings[:40], readings[40:]
     error = []
     for known in (True, False):
-        found = based(told(BASE, target, False, known), some, "absolute", [])
+        found = fitted_model(told(BASE, target, False, known), some, "absolute", [])
         off = found.predict(other.states).position - other.value[:, :3]
         error.append(np.sqrt(np.mean(np.sum(off**2, axis=1))))
     assert error[1] < 1.15 * error[0]
@@ -262,7 +262,7 @@ def test_swapped_names_and_a_displaced_reading_are_named(mode, known):
     number[[one, other]] = number[[other, one]]
     value[lone] += [1e-3, 0.0, 0.0]
     wrong = replace(r, states=replace(r.states, target=number), value=value)
-    reasons = {g.row: g.reason for g in gross_errors(based(c.cell, wrong, mode))}
+    reasons = {g.row: g.reason for g in gross_errors(fitted_model(c.cell, wrong, mode))}
     assert set(reasons) == {one, other, lone}
     assert reasons[one] == "target R2: lies where R1 is: were they swapped?"
     assert reasons[other] == "target R1: lies where R2 is: were they swapped?"
@@ -274,10 +274,10 @@ def test_the_misfit_of_a_displaced_reflector_follows_the_target():
     moved, by = c.cell.all_targets.copy(), np.array([2e-4, -1e-4, 1e-4])
     moved[1, :3, 3] += by
     cell = c.cell.with_targets(moved)
-    share = misfit_breakdown(linearise(based(cell, c.readings, "absolute")))[0]
+    share = misfit_breakdown(linearise(fitted_model(cell, c.readings, "absolute")))[0]
     assert share.variable == "target"
     assert share.share > 0.9
-    found = based(cell, c.readings, "absolute", ["joint_compliance", "target_offset"])
+    found = fitted_model(cell, c.readings, "absolute", ["joint_compliance", "target_offset"])
     rows = found.model.slices()[found.model.names.index("target_offset")]
     theta = found.theta[rows].reshape(3, 3)
     # A common displacement of all targets is hardly told from one of the base; a single one is.

@@ -17,7 +17,7 @@ from hilcal.store.rows import content_hash
 from hilcal.tables.table import write_table
 from tests.support.campaigns import cell_of, measured, plan, true_parameters, world_of
 from tests.support.cli_cases import CELL, ok
-from tests.support.fit_cases import based, compliances
+from tests.support.fit_cases import compliances, fitted_model
 from tests.support.readings_cases import read_table
 
 
@@ -67,7 +67,7 @@ def test_compliances_by_measured_torques_do_not_need_the_loads():
     found = {}
     for name in ("modelled", "measured"):
         cell = replace(cell_of(), measured_torques=name == "measured")
-        fitted = based(cell, told, "deflection")
+        fitted = fitted_model(cell, told, "deflection")
         found[name] = compliances(fitted)[:3] / truth[:3]
         if name == "measured":
             off = (compliances(fitted) - truth) / fitted.uncertainty.std[-6:]

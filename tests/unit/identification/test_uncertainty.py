@@ -18,7 +18,7 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES, whitening
 from tests.support.campaigns import campaign, noiseless, plan, with_noise
 from tests.support.effect_cases import make
-from tests.support.fit_cases import based
+from tests.support.fit_cases import fitted_model
 from tests.support.refusals import refusal, refusal_of
 from tests.support.rows import first
 
@@ -101,7 +101,7 @@ def halves(effect, mode, strength, seeds):
     for seed in seeds:
         c = campaign(effect, mode, seed, poses=40, plan_seed=0, strength=strength)
         for half in (c.readings.pose < 20, c.readings.pose % 2 == 0):
-            a, b = (based(c.cell, c.readings[rows], mode) for rows in (half, ~half))
+            a, b = (fitted_model(c.cell, c.readings[rows], mode) for rows in (half, ~half))
             rows = a.model.slices()[a.model.names.index("joint_compliance")]
             apart, u, v = a.theta[rows] - b.theta[rows], a.uncertainty, b.uncertainty
             stated.append(apart / np.hypot(u.std[rows], v.std[rows]))
@@ -141,7 +141,7 @@ COMPLIANCE = slice(6, 12)  # behind the base's frame
 
 def fitted(readings=None, poses=POSES):
     c = campaign("none", "absolute", poses=poses)
-    return based(c.cell, c.readings if readings is None else readings, "absolute")
+    return fitted_model(c.cell, c.readings if readings is None else readings, "absolute")
 
 
 def drawn(found, draws=100, seed=0):
@@ -226,7 +226,7 @@ def test_what_it_refuses():
 
 def test_its_document_says_which_parameters_are_compared():
     c = campaign("transmission_error", "absolute", poses=20)
-    found = drawn(based(c.cell, c.readings, "absolute"), 20)
+    found = drawn(fitted_model(c.cell, c.readings, "absolute"), 20)
     rows = found.to_dict()["parameters"]
     assert [r["name"] for r in rows][:2] == ["base_frame.x", "base_frame.y"]
     for r in rows:

@@ -8,7 +8,7 @@ import pytest
 
 from hilcal.cell import cell_from_config
 from hilcal.config import CellLoad, ForceSensor, Limits
-from hilcal.design.feasible import Space
+from hilcal.design.feasible import FeasibleSpace
 from hilcal.measuring.clearance import Clearance
 from hilcal.measuring.motion import SLACK_M, Guard
 from hilcal.measuring.route import dry_run
@@ -127,7 +127,7 @@ def stopped(config, q):
 
 
 def planned(config, q):
-    space = Space(cell_from_config(config), config)
+    space = FeasibleSpace(cell_from_config(config), config)
     return bool(space.allowed(np.array([q], dtype=float), UNLOADED, GEOMETRY).all())
 
 
@@ -171,4 +171,4 @@ def test_the_shape_of_an_unknown_arm_is_said_to_be_guessed():
     checked = dry_run(unknown, config, Plan(("reference",), q, (Step("reference", UNLOADED),)))
     said = "the shape of odd is not known: its links are guessed"
     assert said in checked.remarks
-    assert said in Space(unknown, config).remarks
+    assert said in FeasibleSpace(unknown, config).remarks

@@ -25,8 +25,8 @@ from tests.support.fake_bench import (
     STD,
     TORQUE,
     Bench,
-    before,
-    changed,
+    call_before,
+    change_result,
     plan_of,
     rows,
     usual_plan,
@@ -89,7 +89,7 @@ def test_wrench_is_that_at_the_load_point_wherever_the_sensor_sits(b):
         axes = se3.rotation(np.array(turned))
         return np.concatenate([axes.T @ f, axes.T @ m]) + b.world.offset
 
-    changed(b.world, "wrench", at_the_sensor)
+    change_result(b.world, "wrench", at_the_sensor)
     readings = b.measure()
     for name, force in (("3kg", [0, 0, -3.0 * 9.80665]), ("pull", [40.0, 0, 0])):
         assert np.allclose(
@@ -145,10 +145,10 @@ def test_progress(ran):
     assert [d["over"] for d in drifts] == [False, False]
     assert not b.remarks("has moved")
     assert not b.remarks("[tool]")
-    taken = b.notes.of(ReadingStored)
-    assert [t.done for t in taken] == list(range(1, len(plan.steps) + 1))
+    taken = b.notes.of_kind(ReadingStored)
+    assert [t.stored for t in taken] == list(range(1, len(plan.steps) + 1))
     assert {t.total for t in taken} == {len(plan.steps)}
-    assert taken[-1].left_real == 0.0
+    assert taken[-1].remaining_s == 0.0
     for t in taken:
         if t.step.load == "none":
             assert t.deflection is None
@@ -156,7 +156,7 @@ def test_progress(ran):
             force = 3.0 * 9.80665 if t.step.load == "3kg" else 40.0
             assert t.deflection == pytest.approx(SAG * force, abs=6 * STD)
     tenth = json.loads(b.store.rows[9][2])["tracker"][-1]["host_ns"] * 1e-9
-    assert taken[9].left_cell == pytest.approx(b.world.time - tenth, rel=0.5)
+    assert taken[9].remaining_s == pytest.approx(b.world.time - tenth, rel=0.5)
 
 
 def test_the_judge_sees_all_readings_and_may_not_know(b):
@@ -170,7 +170,7 @@ def test_the_judge_sees_all_readings_and_may_not_know(b):
 
     b.measure(live=judge)
     assert seen == list(range(1, len(usual_plan().steps) + 1))
-    taken = b.notes.of(ReadingStored)
+    taken = b.notes.of_kind(ReadingStored)
     assert [t.live.residual for t in taken[:4]] == [None, None, None, 1e-5]
     assert taken[-1].live.sigma == 0.5
 
@@ -180,7 +180,7 @@ def test_drift_of_the_reference_pose_is_told(b):
         if len(b.store.rows) == 6:
             b.world.shift = np.array([0.0, 0.0, 4e-4])
 
-    before(b.store, "record", shift)
+    call_before(b.store, "record", shift)
     b.measure()
     drifts = [content for kind, content in b.store.events if kind == "drift"]
     assert [d["over"] for d in drifts] == [True, True]
@@ -239,7 +239,7 @@ def test_an_arm_that_does_not_scatter_is_seldom_said_to():
         at = rng.normal(0.0, 1e-5, (8, 3))
         found = repeatability([UnloadedVisit("ab"[k % 2], x, 1e-10 * np.eye(3), 1.0)
                                for k, x in enumerate(at)])  # fmt: skip
-        said += "joint_std_rad is about" in found.words(np.zeros(6))
+        said += "joint_std_rad is about" in found.sentence(np.zeros(6))
     assert said < 12
 
 
@@ -249,7 +249,7 @@ def test_without_a_tool_and_without_a_force_sensor():
     b.measure()
     assert b.world.payload[0] == 0.0
     b = Bench(force_sensor=None)
-    b.world.wrong = ["none", "6kg"]
+    b.world.wrong_loads = ["none", "6kg"]
     readings = b.measure()
     assert len(readings) == len(usual_plan().steps)
     assert np.allclose(readings.states.wrench[rows(readings, "pull")], [40.0, 0, 0, 0, 0, 0])
@@ -257,30 +257,30 @@ def test_without_a_tool_and_without_a_force_sensor():
 
 
 def test_a_wrong_load_is_asked_for_again_with_the_reason(b):
-    b.world.wrong = ["none", "6kg"]  # the first answer is that to "take everything off"
+    b.world.wrong_loads = ["none", "6kg"]  # the first answer is that to "take everything off"
     readings = b.measure()
     assert len(readings) == len(usual_plan().steps)
-    assert b.asked_for[:3] == ["none", "3kg", "3kg"]
-    assert b.operator.asked[1][1] == ""
-    assert "6.0 kg" in b.operator.asked[2][1]
+    assert b.requested_loads[:3] == ["none", "3kg", "3kg"]
+    assert b.operator.requests[1][1] == ""
+    assert "6.0 kg" in b.operator.requests[2][1]
     assert b.remarks("asked to hang 3kg")
 
 
 @pytest.mark.long
 def test_three_wrong_loads_end_the_run(b):
-    b.world.wrong = ["none", "6kg", "none", "6kg"]
+    b.world.wrong_loads = ["none", "6kg", "none", "6kg"]
     refusal_of(DeviceError, r"asked 3 times to hang 3kg.*--resume$", b.measure)
     assert len(b.store.rows) == 5
     assert b.world.calls[-2] == "arm.stop"
-    b.world.again()
+    b.world.restart()
     assert len(b.measure()) == len(usual_plan().steps)
 
 
 def test_a_load_that_is_not_taken_off_is_noticed(b):
-    b.world.wrong = ["none", "3kg", "3kg"]
+    b.world.wrong_loads = ["none", "3kg", "3kg"]
     b.measure()
-    assert b.asked_for == ["none", "3kg", "none", "none", "pull", "none"]
-    assert "3.0 kg still hangs" in b.operator.asked[3][1]
+    assert b.requested_loads == ["none", "3kg", "none", "none", "pull", "none"]
+    assert "3.0 kg still hangs" in b.operator.requests[3][1]
 
 
 @pytest.mark.long
@@ -290,13 +290,13 @@ def test_a_swinging_load_is_weighed_twice(b):
     def swinging(seconds):
         times.append(b.world.time)
         b.world.extra = np.zeros(6)
-        if b.world.load == "3kg" and len(b.operator.asked) == 2 and len(b.store.rows) == 5:
+        if b.world.load == "3kg" and len(b.operator.requests) == 2 and len(b.store.rows) == 5:
             swings = len([t for t in times if t > b.world.time - 10.0]) == 1
             b.world.extra[0] = 8.0 if swings else 0.0
 
-    before(b.rig.force, "average", swinging)
+    call_before(b.rig.force, "average", swinging)
     b.measure()
-    assert b.asked_for == ["none", "3kg", "none", "pull", "none"]
+    assert b.requested_loads == ["none", "3kg", "none", "pull", "none"]
 
 
 def test_the_tool_is_identified_and_compared_with_the_configuration(b):
@@ -331,13 +331,13 @@ def test_resume_measures_exactly_what_is_missing_and_time_goes_on(b):
     done = len(b.store.rows)
     assert 5 < done < len(plan.steps)
     day[0] += 7200.0  # two hours later
-    loads = len(b.operator.asked)
+    loads = len(b.operator.requests)
     readings = b.measure(plan, wall=wall)
     assert [s for s, _, _ in b.store.rows] == list(plan.steps)
     gaps = np.diff(readings.states.time)
     assert 7200.0 < gaps[done - 1] < 7200.0 + 120.0
     assert np.all(np.delete(gaps, done - 1) < 60.0)
-    asked = b.asked_for[loads:]
+    asked = b.requested_loads[loads:]
     assert asked[0] == "none"  # nobody knows what hangs
     assert asked[1] == plan.steps[done].load == "3kg"
 
@@ -353,19 +353,19 @@ def test_time_never_goes_back_whatever_the_clock_on_the_wall_does(b):
 def test_a_load_that_still_hangs_at_a_resume_is_noticed(b):
     b.interrupt(7)
     assert b.world.load == "3kg"
-    b.world.wrong = ["3kg"]  # the first answer is wrong
+    b.world.wrong_loads = ["3kg"]  # the first answer is wrong
     # the sensor was off meanwhile
     b.world.offset = b.world.offset + np.array([2.0, 2.0, -2.0, 0, 0, 0])
-    seen = len(b.operator.asked)
+    seen = len(b.operator.requests)
     b.measure()
-    asked = b.operator.asked[seen:]
+    asked = b.operator.requests[seen:]
     assert [name for name, _ in asked[:3]] == ["none", "none", "3kg"]
     assert "3kg seems to hang still" in asked[1][1]
     assert [s for s, _, _ in b.store.rows] == list(usual_plan().steps)
 
 
 def test_a_load_left_on_at_the_very_beginning_is_asked_about_said_and_found_in_motion(b):
-    b.world.load, b.world.wrong = "3kg", ["3kg", "3kg"]  # both answers are wrong
+    b.world.load, b.world.wrong_loads = "3kg", ["3kg", "3kg"]  # both answers are wrong
     refusal_of(DeviceError, "take everything off", b.measure)
     assert b.remarks("answered twice that nothing hangs")
     # where gravity has not turned in the sensor since its tare, a load is a zero
@@ -377,7 +377,7 @@ def test_a_finished_campaign_touches_nothing(b):
     b.world.calls.clear()
     b.measure()
     assert b.world.calls == []
-    assert b.notes.of(Phase)[-1].text == "nothing is missing"
+    assert b.notes.of_kind(Phase)[-1].text == "nothing is missing"
 
 
 @pytest.mark.long

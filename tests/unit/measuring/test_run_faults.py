@@ -23,8 +23,8 @@ from tests.support.fake_bench import (
     Bench,
     FakeClock,
     Killed,
-    before,
-    changed,
+    call_before,
+    change_result,
     plan_of,
     usual_plan,
 )
@@ -100,7 +100,7 @@ def check_fault(fault, k):
         assert "\n" not in said
     check_stopped(b, k)
     before = [step for step, _, _ in b.store.rows]
-    b.world.again()
+    b.world.restart()
     b.measure(plan)
     assert [step for step, _, _ in b.store.rows][: len(before)] == before
     assert each_once(b, plan), k
@@ -136,7 +136,7 @@ def test_a_row_that_is_not_stored_stops_the_arm_and_says_what_to_do(error):
     assert b.world.calls[-2:] == ["arm.stop", "store.event"]
     assert len(b.store.rows) == 2
     b.store.refuses = {}
-    b.world.again()
+    b.world.restart()
     b.measure(plan)
     assert each_once(b, plan)
 
@@ -180,7 +180,7 @@ def test_impatience_does_not_keep_the_arm_from_stopping():
         if len(stops) == 1:
             raise KeyboardInterrupt
 
-    before(b.rig.arm, "stop", stop)
+    call_before(b.rig.arm, "stop", stop)
     b.world.fail[120] = DeviceError("tracker: silent")
     refusal_of(DeviceError, r"tracker: silent.*--resume$", b.measure, small_plan())
     assert len(stops) == 2
@@ -269,7 +269,7 @@ def test_order_of_the_start(b):
     tare = b.world.calls.index("force.average", first["arm.start_move"])
     assert first["force.average"] < first["arm.take_control"]  # does something still hang?
     assert tare < first["store.record"]
-    assert b.operator.asked[0] == ("none", "")
+    assert b.operator.requests[0] == ("none", "")
     assert b.store.kinds()[:2] == ["start", "tare"]
 
 
@@ -279,7 +279,7 @@ def test_payload_is_set_before_a_weight_is_hung_and_after_it_is_off(b):
     def payload(mass, com):
         given.append((b.world.load, mass, str(np.round(com, 6).tolist())))
 
-    before(b.rig.arm, "set_payload", payload)
+    call_before(b.rig.arm, "set_payload", payload)
     plan = plan_of(
         ("p1", "none", 0), ("p1", "3kg", 0), ("p1", "6kg", 0), ("p1", "3kg", 1), ("p1", "pull", 0)
     )
@@ -296,9 +296,9 @@ def test_payload_is_set_before_a_weight_is_hung_and_after_it_is_off(b):
 
 def test_loads_change_only_at_the_reference_and_motions_carry_them(b):
     where = []
-    before(b.operator, "hang", lambda *_: where.append(b.world.q.copy()))
+    call_before(b.operator, "hang", lambda *_: where.append(b.world.q.copy()))
     b.measure()
-    assert b.asked_for == ["none", "3kg", "none", "pull", "none"]
+    assert b.requested_loads == ["none", "3kg", "none", "pull", "none"]
     for q in where[1:]:
         assert np.allclose(q, POSES["reference"])
     assert {load for _, load in b.world.at_start} == {"none", "3kg", "pull"}
@@ -342,7 +342,7 @@ def test_limits_are_enforced_in_motion(change, said):
             since.append(b.world.time)
         return still
 
-    changed(b.rig.arm, "moving", exceeds)
+    change_result(b.rig.arm, "moving", exceeds)
     refusal_of(DeviceError, said, b.measure)
     assert b.world.calls[-2:] == ["arm.stop", "store.event"]
     assert not b.world.is_moving
@@ -357,7 +357,7 @@ def test_limits_are_enforced_at_rest():
         if len(b.store.rows) == 2:
             b.world.extra = np.array([0, 130.0, 0, 0, 0, 0])
 
-    before(b.rig.tracker, "measure", pushes)
+    call_before(b.rig.tracker, "measure", pushes)
     refusal_of(DeviceError, "max_force_N", b.measure)
     assert len(b.store.rows) == 2
     assert b.world.calls[-2] == "arm.stop"
@@ -381,7 +381,9 @@ def test_a_motion_that_never_ends_is_given_up(b):
 
 
 def test_a_lost_target_is_found_again(b):
-    b.world.lost = 3  # at both stops of the approach, where nothing is read, and at the reading
+    b.world.unseen_measurements = (
+        3  # at both stops of the approach, where nothing is read, and at the reading
+    )
     readings = b.measure()
     assert len(readings) == len(usual_plan().steps)
     assert b.world.calls.count("tracker.find_target") == 1
@@ -390,7 +392,7 @@ def test_a_lost_target_is_found_again(b):
 
 @pytest.mark.parametrize("lost", [5, 1000])
 def test_a_target_that_stays_lost_ends_the_run(b, lost):
-    b.world.lost, b.world.not_found = lost, 0 if lost == 5 else 1000
+    b.world.unseen_measurements, b.world.not_found = lost, 0 if lost == 5 else 1000
     refusal_of(DeviceError, r"line of sight.*--resume$", b.measure)
     assert b.store.rows == []
     assert b.world.calls.count("tracker.find_target") == 2
@@ -402,7 +404,7 @@ def test_another_reflector_is_not_believed(b):
         if len(b.store.rows) == 5:
             b.world.shift = np.array([0.0, 0.3, 0.0])
 
-    before(b.store, "event", other)
+    call_before(b.store, "event", other)
     refusal_of(DeviceError, "another reflector", b.measure)
     assert len(b.store.rows) == 5
 
@@ -426,13 +428,13 @@ def test_drift_that_ends_is_waited_for():
         since = arrived.setdefault((*b.world.joints(), len(b.world.at_start)), b.world.time)
         return place + 1e-3 * np.exp(-(b.world.time - since) / 0.5)
 
-    changed(b.world, "position", settles)
+    change_result(b.world, "position", settles)
     b.measure(few)
-    taken = b.notes.of(ReadingStored)
+    taken = b.notes.of_kind(ReadingStored)
     assert min(t.settling for t in taken) > 1.0
     quiet = Bench()
     quiet.measure(few)
-    assert max(t.settling for t in quiet.notes.of(ReadingStored)) < 1.0
+    assert max(t.settling for t in quiet.notes.of_kind(ReadingStored)) < 1.0
     away = b.store.readings().value - quiet.store.readings().value
     assert np.abs(away).max() < 6 * STD
 
@@ -452,7 +454,7 @@ def test_somebody_who_jogs_the_arm_meanwhile_spoils_the_reading(b):
             jogged.append(1)
             b.world.q = b.world.q + 3e-4
 
-    before(b.rig.force, "average", jog)
+    call_before(b.rig.force, "average", jog)
     b.measure()
     assert "measured again: arm: it moved by 0.0003" in b.store.rows[1][2]
     assert len(b.store.rows) == len(usual_plan().steps)
@@ -479,13 +481,13 @@ def test_everything_is_looked_at_twenty_times_a_second_in_motion(b, scale):
         nonlocal looks
         if name in gaps and b.world.is_moving:
             looks += 1
-            since = last.get(name, b.world.begun)
+            since = last.get(name, b.world.motion_start)
             gaps[name] = max(gaps[name], (b.world.time - since) / scale)
             last[name] = b.world.time
         elif name == "arm.start_move":
             last.clear()
 
-    before(b.world, "call", noted)
+    call_before(b.world, "call", noted)
     b.measure(plan_of(("p1", "none", 0), ("p1", "3kg", 0)))
     assert looks > 30
     assert max(gaps.values()) <= 0.05, gaps

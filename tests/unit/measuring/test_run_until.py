@@ -8,6 +8,7 @@ import pytest
 
 from hilcal.config import Limits, Obstacle
 from hilcal.errors import DeviceError
+from hilcal.measuring.feasibility import Feasibility
 from hilcal.measuring.progress import GoalMet, GoalStatus, ReadingStored
 from hilcal.measuring.route import Stop, route_problems, way_home
 from hilcal.present.progress import met_words
@@ -46,7 +47,7 @@ def test_a_goal_that_is_met_under_a_load():
     b.measure(goal=Enough(7))
     assert steps(b) == [*plan.steps[:7], Step("reference", "none", 1)]
     assert is_home(b)
-    assert b.asked_for == ["none", "3kg", "none"]
+    assert b.requested_loads == ["none", "3kg", "none"]
     assert b.world.payload[0] == b.cell.tool_mass
     kinds = b.store.kinds()
     assert kinds[kinds.index("goal") :] == [
@@ -54,8 +55,8 @@ def test_a_goal_that_is_met_under_a_load():
     ]  # fmt: skip
     goal = b.store.last("goal")
     assert (goal["met"], goal["readings"], goal["planned"]) == (True, 7, len(plan.steps))
-    assert [t.goal.std for t in b.notes.of(ReadingStored)[:3]] == [1.0, 2.0, 3.0]
-    (event,) = b.notes.of(GoalMet)
+    assert [t.goal.std for t in b.notes.of_kind(ReadingStored)[:3]] == [1.0, 2.0, 3.0]
+    (event,) = b.notes.of_kind(GoalMet)
     assert (event.status.std, event.readings, event.planned) == (7.0, 7, 15)
     assert met_words(event) == "goal met after 7 of 15 readings: j2 std 7.0 %"
 
@@ -94,14 +95,14 @@ def test_the_way_home_is_clear(b):
     post = Obstacle(name="post", center_m=tuple(place), size_m=(0.04, 0.04, 0.04))
     config = b.config.model_copy(update={"obstacles": (post,)})
     home, via, p2 = (Stop(name, np.array(q[name]), "3kg") for name in q)
-    assert "post" in route_problems(b.cell, config, (p2, home))[0]
-    assert route_problems(b.cell, config, (home, via, p2)) == []
+    assert "post" in route_problems(Feasibility(b.cell, config), (p2, home))[0]
+    assert route_problems(Feasibility(b.cell, config), (home, via, p2)) == []
     plan = plan_of(("p2", "none", 0), ("p2", "3kg", 0), poses=q)
     way = way_home(b.cell, config, plan, [home, via, p2], frozenset())
     assert [(s.name, s.hanging, s.change_to) for s in way] == [
         ("via", "3kg", None), ("reference", "3kg", "none"),
     ]  # fmt: skip
-    assert route_problems(b.cell, config, (p2, *way)) == []
+    assert route_problems(Feasibility(b.cell, config), (p2, *way)) == []
     free = way_home(b.cell, b.config, plan, [home, via, p2], frozenset())
     assert [s.name for s in free] == ["reference"]
 
@@ -110,7 +111,7 @@ def test_the_way_home_is_clear(b):
 def test_what_was_left_out_is_measured_on_resuming():
     b, plan = Bench(), usual_plan()
     b.measure(goal=Enough(7))
-    b.world.again()
+    b.world.restart()
     b.measure()
     assert Counter(steps(b)) == Counter(plan.steps)
     assert steps(b)[-1] == plan.steps[-1]  # the campaign still ends with a look at the drift
@@ -119,16 +120,16 @@ def test_what_was_left_out_is_measured_on_resuming():
 def test_resuming_towards_a_farther_goal():
     b, plan = Bench(), usual_plan()
     b.measure(goal=Enough(7))
-    b.world.again()
+    b.world.restart()
     b.measure(goal=Enough(11))
     assert len(steps(b)) == 12
     assert set(steps(b)) < set(plan.steps)
     assert is_home(b)
-    b.world.again()
-    b.operator.asked.clear()
+    b.world.restart()
+    b.operator.requests.clear()
     b.measure(goal=Enough(12))  # is met already
     assert len(steps(b)) == 12
-    assert b.asked_for == ["none"]
+    assert b.requested_loads == ["none"]
     assert is_home(b)
 
 
@@ -141,7 +142,7 @@ def test_a_goal_that_is_never_met():
     assert b.store.kinds().count("goal") == 1
     told = b.store.last("goal")
     assert (told["met"], told["readings"], told["planned"]) == (False, 15, 15)
-    assert not b.notes.of(GoalMet)
+    assert not b.notes.of_kind(GoalMet)
 
 
 def short():
@@ -178,7 +179,7 @@ def test_interrupted_on_the_way_home(fault):
         if not b.world.killed:
             assert b.world.calls[k:] == ["arm.stop", "store.event"]
         assert steps(b) in (wanted[:3], wanted)
-        b.world.again()
+        b.world.restart()
         b.measure(plan, goal=Enough(3))
         assert steps(b) == wanted, k
         assert is_home(b), k

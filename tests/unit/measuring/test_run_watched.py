@@ -10,7 +10,15 @@ from hilcal.errors import DeviceError
 from hilcal.measuring.measure import Measurer
 from hilcal.measuring.progress import Phase
 from hilcal.robot.chain import evaluate
-from tests.support.fake_bench import POSES, Bench, before, changed, plan_of, rows, usual_plan
+from tests.support.fake_bench import (
+    POSES,
+    Bench,
+    call_before,
+    change_result,
+    plan_of,
+    rows,
+    usual_plan,
+)
 from tests.support.refusals import refusal_of
 from tests.support.rows import first
 
@@ -23,17 +31,17 @@ def jogged(b, at, q, *, after=0):
     moves = []
 
     def moved(answer):
-        name = b.asked_for[-1]
-        if name == at and len(b.operator.asked) > after and not moves:
+        name = b.requested_loads[-1]
+        if name == at and len(b.operator.requests) > after and not moves:
             moves.append(name)
             b.world.q = np.array(q)
 
-    changed(b.operator, "hang", moved)
+    change_result(b.operator, "hang", moved)
 
 
 def confirmed(b):
     """What the operator was asked besides loads."""
-    return [words for name, words in b.operator.asked if name == "confirm"]
+    return [words for name, words in b.operator.requests if name == "confirm"]
 
 
 def carried(b):
@@ -43,7 +51,7 @@ def carried(b):
     def noted(*_):
         found.append((b.world.load, b.world.payload[0]))
 
-    before(b.rig.arm, "start_move", noted)
+    call_before(b.rig.arm, "start_move", noted)
     return found
 
 
@@ -77,13 +85,13 @@ def test_an_arm_that_is_moved_while_it_is_asked_for_is_asked_for_again(b):
         if places:
             b.world.q = places.pop()
 
-    before(b.operator, "confirm", again)
+    call_before(b.operator, "confirm", again)
     b.measure()
     assert len(confirmed(b)) == 2
 
 
 def test_an_arm_jogged_while_control_is_taken_is_not_moved(b):
-    before(b.rig.arm, "take_control", lambda *_: setattr(b.world, "q", FREE.copy()))
+    call_before(b.rig.arm, "take_control", lambda *_: setattr(b.world, "q", FREE.copy()))
     refusal_of(DeviceError, r"has commanded it since.*0\.5 rad", b.measure)
     assert "arm.start_move" not in b.world.calls
 
@@ -144,7 +152,7 @@ def test_an_arm_that_is_moved_at_rest_is_named_at_the_next_look(b, change, said)
         begun.append(b.world.time)
         return replace(here, **{name: getattr(here, name) + by for name, by in change.items()})
 
-    changed(b.rig.arm, "sample", moved)
+    change_result(b.rig.arm, "sample", moved)
     refusal_of(DeviceError, said, b.measure)
     assert b.world.time - begun[0] < 1.0
     assert b.world.calls[-2] == "arm.stop"
@@ -161,7 +169,7 @@ def in_motion(b, change, motion=4):
         begun.append(b.world.time)
         return change(here)
 
-    changed(b.rig.arm, "sample", later)
+    change_result(b.rig.arm, "sample", later)
     return begun
 
 
@@ -197,7 +205,7 @@ def test_an_arm_that_leaves_its_straight_way_is_stopped(b):
 def test_a_motion_at_the_slowest_slider_does_not_stand_still(b):
     near = np.array(POSES["reference"]) + 0.02
     b.world.hurry = 0.02
-    changed(b.rig.arm, "sample", lambda here: replace(here, speed_scaling=0.02))
+    change_result(b.rig.arm, "sample", lambda here: replace(here, speed_scaling=0.02))
     poses = {"reference": POSES["reference"], "p1": tuple(near)}
     b.measure(plan_of(("reference", "none", 0), ("p1", "none", 0), poses=poses))
 
@@ -212,10 +220,10 @@ def falls_in_motion(b, *wrong):
     def falls():
         b.world.hurry = 1.0 if len(b.store.rows) in (6, 7) else 20.0
         if b.world.load == "3kg" and len(b.store.rows) == 7 and b.world.is_moving and not fell:
-            b.world.load, b.world.wrong = "none", list(wrong)
+            b.world.load, b.world.wrong_loads = "none", list(wrong)
             fell.append(b.world.time)
 
-    before(b.rig.arm, "moving", falls)
+    call_before(b.rig.arm, "moving", falls)
     return fell
 
 
@@ -223,13 +231,13 @@ def test_a_load_that_falls_off_in_motion_stops_the_arm_and_is_asked_for_again(b)
     payloads = []
     stopped = []
     fell, motions = falls_in_motion(b), carried(b)
-    before(b.rig.arm, "set_payload", lambda mass, com: payloads.append((b.world.load, mass)))
-    before(b.rig.arm, "stop", lambda: stopped.append(b.world.time))
+    call_before(b.rig.arm, "set_payload", lambda mass, com: payloads.append((b.world.load, mass)))
+    call_before(b.rig.arm, "stop", lambda: stopped.append(b.world.time))
     readings = b.measure()
     assert len(readings) == len(usual_plan().steps)
     assert stopped[0] - fell[0] < 0.5
-    assert b.asked_for[1:3] == ["3kg", "3kg"]
-    assert "0.0 N where 3kg should hang (29.4 N)" in b.operator.asked[2][1]
+    assert b.requested_loads[1:3] == ["3kg", "3kg"]
+    assert "0.0 N where 3kg should hang (29.4 N)" in b.operator.requests[2][1]
     assert ("none", 0.8) in payloads  # the controller knows that nothing hangs
     assert set(motions) == KNOWN  # and that it was hung again
     assert [x["hanging"] for k, x in b.store.events if k == "load"][:3] == ["3kg", None, "3kg"]
@@ -246,7 +254,7 @@ def falls_at_rest(b, load, rows):
             b.world.load = "none"
             fell.append(load)
 
-    before(b.rig.tracker, "measure", falls)
+    call_before(b.rig.tracker, "measure", falls)
 
 
 def assert_true(b):
@@ -261,7 +269,7 @@ def test_a_load_that_falls_off_between_readings_leaves_no_reading_without_it(b):
     """It falls while the tracker measures: the reading is kept as doubted, and taken again."""
     falls_at_rest(b, "3kg", 7)
     b.measure()
-    assert b.asked_for[1:3] == ["3kg", "3kg"]
+    assert b.requested_loads[1:3] == ["3kg", "3kg"]
     assert_true(b)
 
 
@@ -276,14 +284,14 @@ def test_leaning_on_the_tool_during_a_reading_is_kept_as_doubted_and_measured_ag
             leaned.append(b.world.time)
             b.world.extra = np.array([0, 60.0, 0, 0, 0, 0])
 
-    before(b.rig.force, "average", leans)
+    call_before(b.rig.force, "average", leans)
     readings = b.measure()
     assert leaned
     assert len(readings) == len(usual_plan().steps)
     doubted = b.store.last("doubted")
     assert "60" in doubted["why"] or load != "none"
     assert doubted["reading"]["load"] == load
-    assert b.asked_for.count(load) > 1
+    assert b.requested_loads.count(load) > 1
     assert b.remarks("somebody touch the tool")
 
 
@@ -295,8 +303,8 @@ def test_a_light_load_that_falls_before_the_tool_is_weighed_is_noticed():
     falls_at_rest(b, load, 3)
     b.measure(plan_of(*steps, poses={k: POSES[k] for k in ("reference", "p1", "p3")}))
     assert "tool" not in b.store.kinds()
-    assert b.asked_for[-2:] == [load, load]
-    assert f"where {load} should hang" in b.operator.asked[-1][1]
+    assert b.requested_loads[-2:] == [load, load]
+    assert f"where {load} should hang" in b.operator.requests[-1][1]
 
 
 def leans_in_phase(b, phase, number):
@@ -309,7 +317,7 @@ def leans_in_phase(b, phase, number):
             now = phase in event.text and len(times) == number
             b.world.extra = np.array([0, 60.0 * now, 0, 0, 0, 0])
 
-    before(b.notes, "notify", leans)
+    call_before(b.notes, "notify", leans)
 
 
 @pytest.mark.parametrize(
@@ -321,7 +329,7 @@ def test_leaning_in_the_first_motion_or_during_a_tare_is_asked_for_and_not_tared
     b.world.hurry = 1.0
     leans_in_phase(b, phase, number)
     b.measure(SHORT)
-    assert any("feels 60.0 N where nothing should hang" in why for _, why in b.operator.asked)
+    assert any("feels 60.0 N where nothing should hang" in why for _, why in b.operator.requests)
     zeros = [d["felt"]["zero"] for d in b.store.details()]
     assert np.allclose(zeros, b.world.offset, atol=1e-6)
 
@@ -352,8 +360,8 @@ def test_leaning_in_most_samples_of_a_reading_and_not_at_its_end_is_measured_aga
     def lets_go(seconds):
         b.world.extra, b.world.shift = np.zeros(6), np.zeros(3)
 
-    before(b.rig.tracker, "measure", leans)
-    before(b.rig.force, "average", lets_go)
+    call_before(b.rig.tracker, "measure", leans)
+    call_before(b.rig.force, "average", lets_go)
     b.measure(SHORT)
     assert b.remarks("was the tool touched")
     assert_true(b)
@@ -363,7 +371,7 @@ def test_a_tool_far_from_its_configuration_is_refused_before_it_is_measured_with
     b.world.tool_mass = 4.0  # [tool] says 0.8 kg, which the controller is told
     with pytest.raises(DeviceError, match=r"asked 3 times") as raised:
         b.measure()
-    assert any("[tool] mass_kg" in why for _, why in b.operator.asked), raised.value
+    assert any("[tool] mass_kg" in why for _, why in b.operator.requests), raised.value
 
 
 @pytest.mark.long
@@ -373,7 +381,7 @@ def test_unloaded_readings_that_were_leaned_on_do_not_spoil_the_tool(b):
     def leans(seconds):
         b.world.extra = np.array([0, 5.0 * (len(b.store.rows) == 2), 0, 0, 0, 0])
 
-    before(b.rig.force, "average", leans)
+    call_before(b.rig.force, "average", leans)
     b.measure()
     assert b.store.last("tool")["mass_kg"] == pytest.approx(0.8, abs=1e-6)
     assert b.remarks("was the tool touched")
@@ -388,9 +396,9 @@ def test_a_load_that_swings_a_little_in_motion_is_let_swing(b):
             one.wrench[:3] += 6.0 * np.sin(2 * np.pi * b.world.time / 0.8)
         return one
 
-    changed(b.rig.force, "latest", swings)
+    change_result(b.rig.force, "latest", swings)
     b.measure()
-    assert b.asked_for == ["none", "3kg", "none", "pull", "none"]
+    assert b.requested_loads == ["none", "3kg", "none", "pull", "none"]
 
 
 @pytest.mark.long
@@ -400,17 +408,17 @@ def test_who_bears_a_part_of_a_heavy_load_in_motion_is_noticed_though_it_may_swi
 
     def bears(one):
         b.world.hurry = 1.0 if b.world.load == "6kg" else 20.0
-        if b.world.load == "6kg" and b.world.is_moving and b.asked_for.count("6kg") == 1:
+        if b.world.load == "6kg" and b.world.is_moving and b.requested_loads.count("6kg") == 1:
             borne.append(b.world.time)
             turned = evaluate(b.cell.arm, b.world.joints()[None]).rotation[-1][0]
             one.wrench[:3] += turned.T @ np.array([0.0, 0.0, 30.0])
         return one
 
-    changed(b.rig.force, "latest", bears)
+    change_result(b.rig.force, "latest", bears)
     b.measure(plan_of(("p1", "none", 0), ("p1", "6kg", 0), ("p2", "6kg", 0)))
     assert borne
     assert borne[-1] - borne[0] < 1.0
-    assert "6kg" in [name for name, why in b.operator.asked if "where 6kg should hang" in why]
+    assert "6kg" in [name for name, why in b.operator.requests if "where 6kg should hang" in why]
 
 
 @pytest.mark.long
@@ -436,7 +444,7 @@ def test_a_tracker_that_repeats_one_measurement_is_named(b):
             return replace(one, value=kept[0].value)
         return one
 
-    changed(b.rig.tracker, "measure", repeats)
+    change_result(b.rig.tracker, "measure", repeats)
     refusal_of(DeviceError, "the same to the last digit", b.measure)
     assert len(b.store.rows) == 3
 
@@ -451,7 +459,7 @@ def test_a_tracker_that_keeps_to_the_place_of_the_last_pose_is_named(b, good):
             kept[:] = [place]
         return kept[0]
 
-    changed(b.world, "position", stuck)
+    change_result(b.world, "position", stuck)
     refusal_of(DeviceError, "repeats an old reading", b.measure)
     assert len(b.store.rows) == good
     assert "why" in b.store.last("doubted")
@@ -472,6 +480,6 @@ def test_stored_readings_of_a_stuck_tracker_do_not_keep_a_campaign_from_going_on
 
 
 def test_a_force_sensor_that_repeats_itself_is_named(b):
-    changed(b.rig.force, "average", lambda one: replace(one, covariance=np.zeros((6, 6))))
+    change_result(b.rig.force, "average", lambda one: replace(one, covariance=np.zeros((6, 6))))
     refusal_of(DeviceError, "frames are the same to the last digit", b.measure)
     assert b.store.rows == []

@@ -24,8 +24,8 @@ from tests.support.fake_bench import (
     Bench,
     FakeTracker,
     Killed,
-    before,
-    changed,
+    call_before,
+    change_result,
     usual_plan,
 )
 from tests.support.reflector_cases import NAMES, OFFSETS
@@ -111,7 +111,7 @@ def test_each_target_is_read_at_each_stop(tmp_path):
     assert r.target.tolist() == [0] * BOOTSTRAP + [0, 1, 2] * (stops - BOOTSTRAP)
     assert len(np.unique(r.arrivals)) == stops
     assert len(b.remarks("only target R1")) == 1
-    assert [e.done for e in b.notes.of(ReadingStored)] == list(range(1, stops + 1))
+    assert [e.stored for e in b.notes.of_kind(ReadingStored)] == list(range(1, stops + 1))
     chain = chains.evaluate(b.cell.arm, r.states.q)
     held = chain.point(OFFSETS[r.target]) + SAG * r.states.wrench[:, :3]
     seen = held @ REGISTRATION[:3, :3].T + REGISTRATION[:3, 3]
@@ -154,7 +154,7 @@ def test_all_targets_of_an_arrival_that_was_leaned_on_are_kept_as_doubted(tmp_pa
     leaned = []
 
     def leans(seconds):
-        wanted = len(b.notes.of(ReadingStored)) == BOOTSTRAP and not leaned
+        wanted = len(b.notes.of_kind(ReadingStored)) == BOOTSTRAP and not leaned
         leaned.extend([seconds] * wanted)
         b.world.extra = np.array([0, 60.0 * wanted, 0, 0, 0, 0])
 
@@ -162,8 +162,8 @@ def test_all_targets_of_an_arrival_that_was_leaned_on_are_kept_as_doubted(tmp_pa
         b.world.extra = np.zeros(6)
         return sample
 
-    before(b.rig.force, "average", leans)
-    changed(b.rig.force, "average", lets_go)
+    call_before(b.rig.force, "average", leans)
+    change_result(b.rig.force, "average", lets_go)
     r = measure(b, tmp_path / "r.hilcal")
     assert len(by_key(r)) == len(r) == BOOTSTRAP + 3 * (len(usual_plan().steps) - BOOTSTRAP)
     with CampaignFile.open(tmp_path / "r.hilcal") as file:
@@ -185,7 +185,7 @@ def test_a_killed_run_goes_on_with_whole_arrivals(tmp_path, call):
         assert len(done) == len(np.unique(stored.arrivals))
         # After the start all targets of a stored arrival are there.
         assert stored.target.tolist()[BOOTSTRAP:] == [0, 1, 2] * (len(done) - BOOTSTRAP)
-    b.world.again()
+    b.world.restart()
     r = measure(b, tmp_path / "r.hilcal")
     assert len(by_key(r)) == len(r) == BOOTSTRAP + 3 * (len(usual_plan().steps) - BOOTSTRAP)
 

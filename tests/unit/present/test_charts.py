@@ -10,10 +10,10 @@ from hilcal import numbers
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.background import FamilySize
 from hilcal.present import charts
-from hilcal.present.document import says
+from hilcal.present.document import description_of
 from hilcal.present.story import LEVEL_NAMES, regressor, round_factor
 from tests.support.campaigns import campaign
-from tests.support.fit_cases import based
+from tests.support.fit_cases import fitted_model
 from tests.support.picture import contrast
 from tests.support.viewer_story import ANGLE, LOAD, story
 
@@ -21,7 +21,7 @@ from tests.support.viewer_story import ANGLE, LOAD, story
 @cache
 def judged():
     made = campaign("joint_tilt_compliance", "deflection", poses=12, strength=6.0)
-    return diagnose(based(made.cell, made.readings, made.mode))
+    return diagnose(fitted_model(made.cell, made.readings, made.mode))
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def test_each_revision_has_a_bar_for_both_errors_and_the_noise_is_shown(told):
         assert list(trace.text) == [numbers.digits(v) for v in rms]
     (floor,) = figure.layout.shapes
     assert floor.x0 == pytest.approx(1e6 * told.noise_floor_m)
-    assert says(figure).startswith("The rms error fell from")
+    assert description_of(figure).startswith("The rms error fell from")
 
 
 @pytest.mark.parametrize("mode", ["deflection", "absolute"])
@@ -75,7 +75,7 @@ def test_residuals_are_mahalanobis_distances_with_their_names_colours_and_marks(
         charts.residual_by_time(timed, r),
     ):
         np.testing.assert_allclose(points(figure, "y"), np.sort(r.sigma), rtol=1e-6)
-        assert says(figure)
+        assert description_of(figure)
         for trace in figure.data:
             k, y = LEVEL_NAMES.index(trace.name), np.asarray(trace.y, float)
             assert (trace.marker.color, trace.marker.symbol) == (
@@ -109,7 +109,7 @@ def test_arrows_are_the_residuals_enlarged(plane, first):
 def test_of_very_many_readings_the_worst_are_drawn_and_it_is_said():
     told = story(poses=100)
     r = told.revisions[0]
-    some = charts.drawn(told, r, most=50)
+    some = charts.chart_readings(told, r, max_points=50)
     assert set(np.argsort(-r.whitened_norm2)[:10]) <= set(some.index.tolist())
     assert len(some.index) == 50
     assert "Of 300 readings 50 are drawn" in some.note
@@ -128,7 +128,7 @@ def test_an_added_variable_plot_shows_its_slope():
     found = regressor(d.fit, d.suspects[0])
     figure = charts.added_variable(found, "joint_tilt_compliance")
     assert np.polyfit(found.x, found.y, 1)[0] == pytest.approx(1.0, abs=0.2)
-    assert f"slope {float(found.x @ found.y / (found.x @ found.x)):.2f}" in says(figure)
+    assert f"slope {float(found.x @ found.y / (found.x @ found.x)):.2f}" in description_of(figure)
     np.testing.assert_allclose(np.asarray(figure.data[0].y, float), found.y, atol=1e-3)
 
 
@@ -172,7 +172,7 @@ def test_the_noise_check_counts_every_element():
     assert int(np.sum(bar.y)) == len(f.white)
     step, width = float(normal.x[1] - normal.x[0]), float(bar.x[1] - bar.x[0])
     assert np.sum(normal.y) * step == pytest.approx(width * len(f.white), rel=1e-3)
-    assert "larger than the stated noise" in says(charts.noise_check(f))
+    assert "larger than the stated noise" in description_of(charts.noise_check(f))
 
 
 @pytest.mark.parametrize("color", [charts.MEASURED, charts.NOISE, charts.HOLDOUT, *charts.LEVELS])
@@ -186,7 +186,7 @@ def test_a_scheme_changes_the_look_and_nothing_else(told):
     figure = charts.error_per_revision(told)
     dark = charts.in_scheme(figure, dark=True)
     assert dark.layout.template.layout.font.color != figure.layout.template.layout.font.color
-    assert (dark.data, says(dark)) == (figure.data, says(figure))
+    assert (dark.data, description_of(dark)) == (figure.data, description_of(figure))
 
 
 def test_the_sizes_of_families_are_drawn_by_those_of_an_ordinary_arm_with_their_intervals():
@@ -194,7 +194,7 @@ def test_the_sizes_of_families_are_drawn_by_those_of_an_ordinary_arm_with_their_
         FamilySize(f"f{k}", f"f{k}", k == 0, 2.0, 1.0, 6.0, 4.0, "rad", 1e-3 / (k + 1))
         for k in range(charts.MOST_FAMILIES + 3)
     ]
-    figure = charts.made_of(sizes)
+    figure = charts.family_sizes(sizes)
     named, other = figure.data
     assert [*named.y, *other.y] == [s.name for s in sizes[: charts.MOST_FAMILIES]]
     for trace in figure.data:
@@ -202,5 +202,7 @@ def test_the_sizes_of_families_are_drawn_by_those_of_an_ordinary_arm_with_their_
         np.testing.assert_allclose(trace.x + trace.error_x.array, 1.5)
         np.testing.assert_allclose(trace.x - trace.error_x.arrayminus, 0.25)
     assert figure.layout.yaxis.categoryarray[-1] == "f0"  # on top
-    assert "f0 moves the target most, by 1.00 mm rms" in says(figure)
-    assert f"The {charts.MOST_FAMILIES} of {charts.MOST_FAMILIES + 3} families" in says(figure)
+    assert "f0 moves the target most, by 1.00 mm rms" in description_of(figure)
+    assert f"The {charts.MOST_FAMILIES} of {charts.MOST_FAMILIES + 3} families" in description_of(
+        figure
+    )

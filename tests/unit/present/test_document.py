@@ -3,7 +3,16 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilcal.present.document import Table, Words, captioned, heading, note, pairs, shared, table
+from hilcal.present.document import (
+    Table,
+    Words,
+    captioned,
+    heading,
+    note,
+    pairs,
+    shared_widths,
+    table,
+)
 
 WORD = st.text("abcdefghij_", min_size=1, max_size=26)
 WORDS = st.lists(WORD, min_size=1, max_size=6).map(" ".join)
@@ -81,6 +90,6 @@ def test_a_table_that_has_room_is_as_it_was_and_a_narrow_terminal_gets_lists(pri
 )
 def test_widths_share_the_room(columns, more):
     least, wanted = [a for a, _ in columns], [a + b for a, b in columns]
-    widths = shared(least, wanted, sum(least) + more)
+    widths = shared_widths(least, wanted, sum(least) + more)
     assert sum(widths) == min(sum(least) + more, sum(wanted))
     assert all(a <= w <= b for a, w, b in zip(least, widths, wanted, strict=True))

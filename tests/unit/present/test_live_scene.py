@@ -6,10 +6,18 @@ import numpy as np
 import pytest
 import rerun as rr
 
-from hilcal.measuring.progress import ArmAt, LiveResidual, ReadingStored, Remark
+from hilcal.measuring.progress import ArmPosition, LiveResidual, ReadingStored, Remark
 from hilcal.present.viewer import live, style
-from hilcal.present.viewer.live import BALL, FLUENT, GROUPS, LIMIT, MANY, LiveTally, judged
-from tests.support.live_story import BLIND, events, measuring, plan, residual
+from hilcal.present.viewer.live import (
+    BALL,
+    GROUPS,
+    LIMIT,
+    MANY,
+    MAX_SINGLE_RESIDUALS,
+    LiveTally,
+    judgement_of,
+)
+from tests.support.live_story import READINGS_BEFORE_MODEL, events, measuring, plan, residual
 from tests.support.picture import Shot, contrast, needs_vulkan, pictures
 from tests.support.recordings import chunks, values
 from tests.support.viewer_story import story
@@ -23,7 +31,7 @@ def recorded(path, told, end=True):
     rec.set_sinks(rr.FileSink(str(path)))
     scene = live.LiveScene(rec, batches=True)
     for wall, what in told:
-        scene.tell(wall, what)
+        scene.draw(wall, what)
     if end:
         scene.end(to_open=True)
     rec.disconnect()
@@ -56,10 +64,12 @@ def refined(tmp_path_factory):
 
 
 def test_each_reading_has_its_arrow_and_leaves_its_ball_where_the_model_is_wrong(measured):
-    found = [judged(e.step, e.live) for e in stored(measuring())[BLIND:]]
+    found = [judgement_of(e.step, e.live) for e in stored(measuring())[READINGS_BEFORE_MODEL:]]
     levels = np.array([j.level for j in found])
     arrows = np.array(values(measured, "/world/live/1/arrows", "Arrows3D:vectors"))[:, 0]
-    assert len(values(measured, "/world/live/1/dots", "Points3D:positions")) == BLIND
+    assert (
+        len(values(measured, "/world/live/1/dots", "Points3D:positions")) == READINGS_BEFORE_MODEL
+    )
     outside = np.linalg.norm(arrows, axis=1) > BALL
     assert outside.tolist() == (levels > 0).tolist()
     assert 5 < outside.sum() < len(found) / 2
@@ -72,7 +82,7 @@ def test_each_reading_has_its_arrow_and_leaves_its_ball_where_the_model_is_wrong
 def test_of_many_readings_only_those_outside_are_drawn_in_space(tmp_path):
     told = measuring(plan(200))
     path = recorded(tmp_path / "many.rrd", events(told))
-    outside = [judged(e.step, e.live).level > 0 for e in stored(told)[BLIND:]]
+    outside = [judgement_of(e.step, e.live).level > 0 for e in stored(told)[READINGS_BEFORE_MODEL:]]
     arrows = values(path, "/world/live/1/arrows", "Arrows3D:vectors")
     assert len(arrows) == MANY + sum(outside[MANY:]) < len(outside)
     assert sum(map(len, of_levels(path))) == len(outside)
@@ -80,9 +90,11 @@ def test_of_many_readings_only_those_outside_are_drawn_in_space(tmp_path):
 
 @pytest.mark.long
 def test_of_a_thousand_readings_and_more_the_worst_of_each_group_stay(tmp_path):
-    told = measuring(plan(FLUENT // 2 + 100))
+    told = measuring(plan(MAX_SINGLE_RESIDUALS // 2 + 100))
     path = recorded(tmp_path / "thousands.rrd", events(told, wrong=2.0))
-    sigma = np.array([judged(e.step, e.live).sigma for e in stored(told, 2.0)[BLIND:]])
+    sigma = np.array(
+        [judgement_of(e.step, e.live).sigma for e in stored(told, 2.0)[READINGS_BEFORE_MODEL:]]
+    )
     group = -(-len(told.plan.steps) // GROUPS)
     shown = np.sort(np.concatenate(of_levels(path)))
     assert LiveTally(told).group == group == 8
@@ -104,34 +116,34 @@ def test_every_target_of_an_arrival_is_drawn_where_it_is(tmp_path):
     shown, rng, d = [], np.random.default_rng(2), LiveTally(told)
     for wall, e in events(told, wrong=0.0):
         if isinstance(e, ReadingStored):
-            right = residual(rng, 9.0) if e.done > BLIND else LiveResidual()
-            e = replace(e, others=((1, right),))
+            right = residual(rng, 9.0) if e.stored > READINGS_BEFORE_MODEL else LiveResidual()
+            e = replace(e, other_targets=((1, right),))
             d.add(e)
         shown.append((wall, e))
     path = recorded(tmp_path / "two.rrd", shown)
     starts = values(path, "/world/live/1/arrows", "Arrows3D:origins")
-    both = [d.place(d.last.step, k) for k in (0, 1)]
+    both = [d.target_position(d.last.step, k) for k in (0, 1)]
     assert np.allclose(starts[-1], both, atol=1e-6)
     apart = np.linalg.norm(targets[1] - targets[0])
     assert np.linalg.norm(both[1] - both[0]) == pytest.approx(apart)
     assert "right" in values(path, "/world/live/1/last", "Points3D:labels")[-1][0]
-    assert d.judged == 2 * (len(told.plan.steps) - BLIND)
+    assert d.judged == 2 * (len(told.plan.steps) - READINGS_BEFORE_MODEL)
     assert {j.target for j in d.worst} == {"right"}
-    assert " right |" in style.markdown(d.words())
+    assert " right |" in style.markdown(d.report())
 
 
 def test_a_long_campaign_is_a_small_file(tmp_path):
     path = tmp_path / "long.rrd"
     outlet = live._Outlet("long", print, file=path)
     for wall, what in events(measuring(plan(250))):
-        outlet.tell(wall, what)
+        outlet.draw(wall, what)
     outlet.end()
     assert path.stat().st_size < 2.5e6  # 5.5 MB, when each reading was handed on by itself
-    assert sum(map(len, of_levels(path))) == 500 - BLIND
+    assert sum(map(len, of_levels(path))) == 500 - READINGS_BEFORE_MODEL
 
 
 def test_the_arm_moves_through_every_place_that_is_told(measured):
-    told = [e for _, e in events(measuring()) if isinstance(e, ArmAt)]
+    told = [e for _, e in events(measuring()) if isinstance(e, ArmPosition)]
     places = np.array(values(measured, "/world/live/1/arm", "Capsules3D:translations"))
     assert len(places) == len(told) + 1  # and where it begins
     assert np.abs(np.diff(places, axis=0)).max() > 0.05
@@ -140,13 +152,13 @@ def test_the_arm_moves_through_every_place_that_is_told(measured):
 def test_words_say_whether_the_model_fails_and_under_which_load():
     def status(wrong):
         d = LiveTally(measuring())
-        assert "no judgement yet" in style.markdown(d.words())
+        assert "no judgement yet" in style.markdown(d.report())
         for _, e in events(measuring(), wrong):
             if isinstance(e, ReadingStored):
                 d.add(e)
             elif isinstance(e, Remark):
                 d.remarks.append(e.text)
-        return style.markdown(d.words())
+        return style.markdown(d.report())
 
     bad, good = status(6.0), status(0.0)
     for words in (
@@ -158,7 +170,7 @@ def test_words_say_whether_the_model_fails_and_under_which_load():
     ):
         assert words in bad
     assert "✓ So far noise explains the readings" in good
-    assert style.safe(bad) == bad
+    assert style.storable(bad) == bad
 
 
 def test_what_earlier_sessions_stored_is_there_at_its_own_time(tmp_path):

@@ -17,7 +17,7 @@ from hilcal.present import live_viewer
 from hilcal.present.live_viewer import LiveViewer
 from hilcal.present.viewer.recording import executable
 from hilcal.present.viewer.style import LEVEL_NAMES
-from tests.support.live_story import BLIND, events, measuring, plan
+from tests.support.live_story import READINGS_BEFORE_MODEL, events, measuring, plan
 from tests.support.paths import ROOT
 from tests.support.timing import wait_until
 
@@ -55,7 +55,7 @@ def tell(live, poses=24, paced=False):
     """
     slowest = 0.0
     for _, what in events(measuring(plan(poses))):
-        while paced and live._queue.qsize() > live_viewer.MOST // 2:
+        while paced and live._queue.qsize() > live_viewer.MAX_MESSAGES // 2:
             time.sleep(0.01)
         begun = time.perf_counter()
         live._send(time.time(), what)
@@ -107,12 +107,15 @@ def test_a_viewer_that_comes_late_gets_all_and_the_recording_has_it_too(home, sa
         assert listening == ["127.0.0.1"]
         assert process.nice() > 0
         assert tell(live, 24) < SOON
-        wait_until(lambda: readings(live.record) >= 0.9 * (48 - BLIND), "recorded")  # in batches
+        in_batches = 0.9 * (48 - READINGS_BEFORE_MODEL)
+        wait_until(lambda: readings(live.record) >= in_batches, "recorded")
         with client(live.url, late := home / "late.rrd"):
-            wait_until(lambda: readings(late) == 48 - BLIND, "all with the late viewer")
+            wait_until(
+                lambda: readings(late) == 48 - READINGS_BEFORE_MODEL, "all with the late viewer"
+            )
     finally:
         live.close()
-    assert readings(live.record) == 48 - BLIND
+    assert readings(live.record) == 48 - READINGS_BEFORE_MODEL
     assert RrdReader(live.record).store() is not None  # it has its footer: whole
     assert (said, live.dropped, alive(process.pid)) == ([], 0, False)
 
@@ -130,7 +133,7 @@ def test_a_frozen_viewer_costs_nothing(live, said, home):
         grown = psutil.Process(live._process.pid).memory_info().rss - before
         assert grown < 400e6  # what the server keeps for late viewers, and what it is kept in
     live.close()
-    assert readings(live.record) == 980 - BLIND  # up to a thousand each is drawn
+    assert readings(live.record) == 980 - READINGS_BEFORE_MODEL  # up to a thousand each is drawn
     assert said == []
 
 
@@ -141,7 +144,7 @@ def test_a_process_that_is_frozen_is_dropped_and_ended(live, said, monkeypatch):
     pid = live._process.pid
     os.kill(pid, signal.SIGSTOP)
     assert tell(live, 1500) < SOON
-    assert live._queue.qsize() <= live_viewer.MOST
+    assert live._queue.qsize() <= live_viewer.MAX_MESSAGES
     assert live.dropped > 0
     begun = time.monotonic()
     live.close()
@@ -170,7 +173,7 @@ def test_no_free_port_is_said_and_the_recording_is_written_all_the_same(home, sa
     tell(live, 12)
     live.close()
     assert [s for s in said if s.startswith("no free port from 70000")] == said
-    assert readings(live.record) == 24 - BLIND
+    assert readings(live.record) == 24 - READINGS_BEFORE_MODEL
 
 
 PROGRAM = """
@@ -222,7 +225,7 @@ def test_the_recording_is_whole_although_the_command_was_killed(home, free_port)
     pid = int(run(KILLED, path, free_port).split()[-1])
     wait_until(lambda: not alive(pid), "ended")
     assert RrdReader(path).store() is not None
-    assert readings(path) == 48 - BLIND
+    assert readings(path) == 48 - READINGS_BEFORE_MODEL
 
 
 def test_what_has_no_process_is_silent(tmp_path, said):

@@ -9,8 +9,8 @@ from hilcal.design.discriminated_pairs import not_ruled_out
 from hilcal.design.next import PairPower
 from hilcal.design.summary import PredictedParameter
 from hilcal.present.plan import (
-    certified,
-    enough,
+    efficiency_sentence,
+    enough_poses_sentence,
     order_remark,
     plan_report,
     power_rows,
@@ -85,7 +85,7 @@ def test_other_poses_than_asked_for_and_parameters_left_open_are_explained(shown
     ],
 )
 def test_a_certificate_is_never_rounded_up(efficiency, words):
-    assert words in certified(efficiency)
+    assert words in efficiency_sentence(efficiency)
 
 
 def test_bars_are_as_long_as_what_they_show_and_the_plan_is_marked(shown):
@@ -95,8 +95,11 @@ def test_bars_are_as_long_as_what_they_show_and_the_plan_is_marked(shown):
     np.testing.assert_allclose(sizes / sizes[0], values / values[0], atol=0.02)
     assert ["this plan" in line for line in lines] == [False, True, False]
     falls = "From 3 to 6 poses the prediction's uncertainty falls by 4 % only."
-    assert enough(SUMMARY.curve) == falls
-    assert enough(SUMMARY.curve[:2]) == "More than 3 poses still improve the prediction."
+    assert enough_poses_sentence(SUMMARY.curve) == falls
+    assert (
+        enough_poses_sentence(SUMMARY.curve[:2])
+        == "More than 3 poses still improve the prediction."
+    )
 
 
 def test_the_order_is_stated_with_its_cost_and_what_it_saves():

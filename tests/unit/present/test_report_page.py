@@ -18,8 +18,8 @@ from hilcal.present.html.report import (
     first_screen,
     left_out_errors,
     limit_words,
+    misfit_sentence,
     sections,
-    where_wrong,
 )
 from hilcal.present.html.report import page as page_of
 from hilcal.present.story import Chapter
@@ -91,7 +91,7 @@ def large(m):
     pose, time_s = np.arange(count), 60.0 * np.arange(count)
     story = replace(told, revisions=many, pose_names=named, pose=pose, time_s=time_s)
     name, facts = "Leica AT960-MR", {"firmware": "3.1"}
-    device = MeasuringDevice("tracker", "leica", name, "750123", facts, m.made)
+    device = MeasuringDevice("tracker", "leica", name, "750123", facts, m.created)
     overview = replace(m.overview, instruments=(device,) * 5)
     return replace(plain(m), story=story, overview=overview)
 
@@ -168,7 +168,7 @@ def test_poses_left_out_beyond_the_noise_are_not_said_to_be_within_it(made, sigm
     m, fit = made[0], replace(made[0].fit)
     calm = replace(m.diagnosis, reason="residual_is_noise")
     fit.__dict__["holdout"] = replace(m.fit.holdout, rms_sigma=sigma)
-    said = where_wrong(replace(m, chapters=(Chapter(1, None, fit, calm),)))
+    said = misfit_sentence(replace(m, chapters=(Chapter(1, None, fit, calm),)))
     assert ("all poses and loads are predicted within it" in said) == within
     assert (f"by {sigma:.2f} times the noise" in said) != within
 

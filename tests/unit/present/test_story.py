@@ -15,7 +15,7 @@ from hilcal.present.story import Chapter, build_story, curve, of_left_out, pose_
 from hilcal.refinement import add
 from hilcal.robot.chain import evaluate
 from tests.support.cli_cases import rehearsal
-from tests.support.fit_cases import based
+from tests.support.fit_cases import fitted_model
 from tests.support.refusals import refusal
 from tests.unit.diagnosis.test_residual_regression import hidden
 
@@ -24,7 +24,7 @@ from tests.unit.diagnosis.test_residual_regression import hidden
 def told(effect):
     """A rehearsed campaign before and after its hidden effect is added."""
     r = rehearsal(effect)
-    first = based(r.cell, r.readings, r.mode)
+    first = fitted_model(r.cell, r.readings, r.mode)
     second = add(first, r.hidden)
     return build_story(
         [Chapter(4, None, first, diagnose(first)), Chapter(5, r.hidden, second, diagnose(second))]
@@ -37,7 +37,7 @@ def test_a_story_holds_together_and_the_right_suspect_lies_on_the_line_of_slope_
     first, last = story.revisions
     assert [(r.revision, r.change) for r in (first, last)] == [(4, ""), (5, f"+ {effect}")]
     assert (first.verdict, last.verdict) == ("missing_effect", "adequate")
-    assert last.follows is None
+    assert last.dependence is None
     for r in story.revisions:
         np.testing.assert_allclose(story.measured - r.predicted, r.residual, atol=1e-12)
     norm = np.mean(last.whitened_norm2)
@@ -45,7 +45,7 @@ def test_a_story_holds_together_and_the_right_suspect_lies_on_the_line_of_slope_
     assert np.mean(first.whitened_norm2) > 2 * norm
     floor = np.sqrt(np.trace(story.covariance, axis1=1, axis2=2).mean())
     assert story.noise_floor_m == pytest.approx(floor)
-    g = first.follows
+    g = first.dependence
     assert g.title == effect
     assert effect in g.x_label
     assert float(g.x @ g.y / (g.x @ g.x)) == pytest.approx(1.0, abs=0.1)
@@ -55,7 +55,7 @@ def test_a_story_holds_together_and_the_right_suspect_lies_on_the_line_of_slope_
 
 def test_vectors_are_in_base_axes():
     r, story = rehearsal("hysteresis"), told("hysteresis")
-    whitening = full_prediction(based(r.cell, r.readings, r.mode)).whitening
+    whitening = full_prediction(fitted_model(r.cell, r.readings, r.mode)).whitening
     expected = whitening.raw(r.readings.value) @ r.world.registration[:3, :3]
     # Deflections leave the base's turning open by what the closed form knows, some mrad.
     off = np.linalg.norm(story.measured - expected, axis=1)
@@ -74,20 +74,20 @@ def test_arrows_start_at_the_nominal_target():
 @cache
 def unknown():
     c = hidden("dq2 = sin 3 q4", "absolute", 0, 1.5)
-    return diagnose(based(c.cell, c.readings, c.mode))
+    return diagnose(fitted_model(c.cell, c.readings, c.mode))
 
 
 def test_an_unknown_effect_has_a_curve_in_units_for_people():
     d = unknown()
     r = build_story([Chapter(1, None, d.fit, d)]).revisions[0]
-    lead, of = r.follows, d.dependences[0]
+    lead, of = r.dependence, d.dependences[0]
     assert r.verdict == "unknown_effect"
     assert (lead.title, lead.x_label) == ("joint 4 angle", "joint 4 angle [°]")
     assert lead.y_label == "error of joint 2 [µrad]"
     np.testing.assert_allclose(np.deg2rad(lead.x), of.x)
     np.testing.assert_allclose(1e-6 * np.array([lead.y, lead.error]), [of.y, of.error])
     assert of.share > 0.9
-    assert lead.says.startswith(f"{100 * of.share:.0f} % of the misfit")
+    assert lead.description.startswith(f"{100 * of.share:.0f} % of the misfit")
 
 
 @pytest.mark.parametrize(("explains", "curves"), [(0.03, True), (0.6, False)])
@@ -96,7 +96,7 @@ def test_a_suspect_that_explains_little_leaves_the_picture_to_the_variable(expla
     lead = replace(d.suspects[1], left_out=lambda: HeldOut(explains, True), explains=True)
     named = replace(d, reason="one_suspect", suspects=(lead, d.suspects[0]))
     r = build_story([Chapter(1, None, d.fit, named)]).revisions[0]
-    assert r.follows.title == ("joint 4 angle" if curves else lead.effect)
+    assert r.dependence.title == ("joint 4 angle" if curves else lead.effect)
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_gross_errors_are_shown_as_well():
     r = rehearsal("nothing")
     value = r.readings.value.copy()
     value[17] += 0.004
-    found = based(r.cell, replace(r.readings, value=value), "absolute")
+    found = fitted_model(r.cell, replace(r.readings, value=value), "absolute")
     assert found.outlier.any()
     story = build_story([Chapter(1, None, found, None)])
     assert len(story) == len(value)
@@ -144,7 +144,7 @@ def test_gross_errors_are_shown_as_well():
 def test_other_readings_do_not_make_one_story():
     r = rehearsal("nothing")
     modes = ("absolute", "deflection")
-    chapters = [Chapter(1, None, based(r.cell, r.readings, mode), None) for mode in modes]
+    chapters = [Chapter(1, None, fitted_model(r.cell, r.readings, mode), None) for mode in modes]
     refusal("other readings", build_story, chapters)
     refusal("identify", build_story, [])
 

@@ -84,7 +84,7 @@ ONE = replace(ANGLE, x=np.ones(1), y=np.zeros(1), error=np.zeros(1))
 @pytest.mark.parametrize(("curve", "width"), [(ANGLE, None), (LOAD, 1.0), (ONE, 1.0)])
 def test_a_curve_is_drawn_by_bars_about_its_values(tmp_path, curve, width):
     told, path = doubtful(), tmp_path / "doubt.rrd"
-    revisions = (replace(told.revisions[2], follows=curve), told.revisions[3])
+    revisions = (replace(told.revisions[2], dependence=curve), told.revisions[3])
     save(replace(told, revisions=revisions), path)
     left, right, height = bars(path, "/follows/mean", 2)
     np.testing.assert_allclose(height, curve.y)
@@ -104,7 +104,7 @@ def test_readings_over_a_suspect_are_drawn_by_their_mean(told, recording):
     left, _, height = bars(recording, "/follows/mean", 0)
     assert 4 <= len(left) <= 12
     assert np.all(np.diff(left) > 0)
-    follows = told.revisions[0].follows
+    follows = told.revisions[0].dependence
     assert follows.y.min() <= height.min() <= height.max() <= follows.y.max()
 
 
@@ -202,7 +202,7 @@ def test_no_character_without_a_glyph_reaches_the_viewer(tmp_path):
     found = texts(path)
     assert any("joint_tilt_compliance" in t.replace("\\", "") for t in found)
     assert [c for t in found for c in t if c in FORBIDDEN or ord(c) > 0x2FFF] == []
-    assert [t for t in found if style.safe(t) != t] == []
+    assert [t for t in found if style.storable(t) != t] == []
 
 
 def test_user_names_cannot_break_a_table():

@@ -112,7 +112,7 @@ def test_a_reflector_that_looks_away_is_told_from_a_hidden_one(shadowed):
     assert status == {REFERENCE: TURNED, "p1": HIDDEN, "p2": SEEN, "p3": TURNED}
     assert "incidence" in plan.step_card(d, 0)
     assert "screen between" in plan.step_card(d, 1)
-    assert [bool(d.why(k)) for k in range(len(d))] == [s != SEEN for s in d.sight]
+    assert [bool(d.sight_problem(k)) for k in range(len(d))] == [s != SEEN for s in d.sight]
 
 
 def test_without_a_tracker_nothing_is_claimed(tmp_path):
@@ -160,16 +160,16 @@ def test_one_bead_per_pose_and_load_in_the_loads_colour(d, shadowed, recording):
 
 
 def test_ways_are_one_path_of_straight_joint_motions(d, shadowed):
-    assert len(d.ways) == len(PLAN.steps)
-    for k, way in enumerate(d.ways):
+    assert len(d.paths) == len(PLAN.steps)
+    for k, way in enumerate(d.paths):
         np.testing.assert_allclose(way[-1], d.target[k], atol=1e-12)
         if k:
             np.testing.assert_allclose(way[0], d.target[k - 1], atol=1e-12)
     half = evaluate(shadowed[0].arm, 0.5 * (Q[1:2] + Q[2:3])).point(shadowed[0].target[:3, 3])
-    near = np.linalg.norm(d.ways[2] - half, axis=1).min()
-    assert near <= np.linalg.norm(np.diff(d.ways[2], axis=0), axis=1).max()
+    near = np.linalg.norm(d.paths[2] - half, axis=1).min()
+    assert near <= np.linalg.norm(np.diff(d.paths[2], axis=0), axis=1).max()
     # a weight is hung at the reference pose on the way
-    assert np.linalg.norm(d.ways[5] - d.target[0], axis=1).min() < 1e-12
+    assert np.linalg.norm(d.paths[5] - d.target[0], axis=1).min() < 1e-12
 
 
 def test_only_sides_of_the_workspace_that_are_given_are_drawn(recording, tmp_path):
@@ -276,7 +276,7 @@ def test_no_character_without_a_glyph_reaches_the_viewer(tmp_path):
     record_plan(cell, config, made, summary, tmp_path / "x.rrd")
     found = texts(tmp_path / "x.rrd")
     assert len(found) > 10
-    assert [t for t in found if style.safe(t) != t] == []
+    assert [t for t in found if style.storable(t) != t] == []
 
 
 def test_what_does_not_fit_is_refused(shadowed, tmp_path):
@@ -308,8 +308,8 @@ def test_a_tripod_before_the_arm_makes_the_eye_go_elsewhere(tmp_path):
     cell, config = configured(obstacles=[tripod])
     record_plan(cell, config, PLAN, SUMMARY, path)
     arm = PlanView(cell, config, PLAN, SUMMARY).bodies[:, 1:, :3, 3].reshape(-1, 3)
-    assert style.hidden(preferred, arm, config.obstacles).mean() > 0.3
-    assert style.hidden(eye_place(path), arm, config.obstacles).mean() < 0.02
+    assert style.hidden_points(preferred, arm, config.obstacles).mean() > 0.3
+    assert style.hidden_points(eye_place(path), arm, config.obstacles).mean() < 0.02
 
 
 @pytest.mark.parametrize(
@@ -322,14 +322,14 @@ def test_a_tripod_before_the_arm_makes_the_eye_go_elsewhere(tmp_path):
 def test_what_stands_behind_an_obstacle_is_hidden_and_nothing_else(thing):
     behind, above, aside, before = [0, 0, 0.5], [0, 0, 2.0], [0, 1.5, 0.5], [1.5, 0, 0.5]
     points = np.array([behind, above, aside, before], dtype=float)
-    found = style.hidden(np.array([2.0, 0.0, 0.5]), points, (thing,))
+    found = style.hidden_points(np.array([2.0, 0.0, 0.5]), points, (thing,))
     assert found.tolist() == [True, False, False, False]
 
 
 def test_the_eye_is_as_near_as_shows_everything():
     look, way = np.array([0.0, 0.0, 0.5]), np.array([1.0, -1.3, 0.5])
     corners = np.array([[x, y, z] for x in (-0.6, 0.6) for y in (-0.6, 0.6) for z in (0.0, 1.0)])
-    place = style.near(look, way, corners)
+    place = style.nearest_eye(look, way, corners)
     assert style.in_view(place, look, corners).all()
     assert not style.in_view(look + 0.9 * (place - look), look, corners).all()
     assert not style.in_view(place, look, (2 * place - look)[None])[0]  # what is behind

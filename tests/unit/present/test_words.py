@@ -26,7 +26,7 @@ from hilcal.present.story import Chapter, build_story
 from hilcal.present.verdict import message
 from hilcal.present.viewer import campaign as viewer
 from tests.support.campaigns import campaign, cell_of, noiseless, plan, with_noise, world_of
-from tests.support.fit_cases import based
+from tests.support.fit_cases import fitted_model
 
 # numbers
 
@@ -114,7 +114,7 @@ def test_a_small_p_value_is_written_in_one_way(p, written):
 @cache
 def fitted(mode, effect="transmission_error"):
     c = campaign(effect, mode, 1, poses=12, strength=3.0)
-    return based(c.cell, c.readings, c.mode)
+    return fitted_model(c.cell, c.readings, c.mode)
 
 
 @pytest.fixture(scope="module")
@@ -224,7 +224,7 @@ def drifting(strength):
     along = np.linspace(-1, 1, len(r))[:, None] * np.array([0.0, 0.0, strength])
     states = replace(r.states, time=None, load_time=None)
     r = replace(r, value=r.value + along, states=states)
-    return diagnose(based(cell, r, "absolute"))
+    return diagnose(fitted_model(cell, r, "absolute"))
 
 
 def test_row_order_stands_for_the_time_where_there_is_none():
@@ -235,7 +235,7 @@ def test_row_order_stands_for_the_time_where_there_is_none():
     assert order.share > 0.5
     assert order.group == "time and air"
     c = campaign(plan_seed=0)
-    timed = based(c.cell, c.readings, "absolute")
+    timed = fitted_model(c.cell, c.readings, "absolute")
     assert ROW_ORDER not in {v.variable for v in misfit_breakdown(linearise(timed))}
 
 
@@ -255,7 +255,7 @@ def test_what_the_pose_alone_predicts_is_said_so(shown):
     kind = r.pose * 10 + r.load  # so that only repeats have the error in common
     off = 1e-4 * rng.standard_normal((int(kind.max()) + 1, 3))[kind]
     r = replace(r, value=r.value + off)
-    d = diagnose(based(cell, r, "absolute"))
+    d = diagnose(fitted_model(cell, r, "absolute"))
     assert d.verdict == "unknown_effect"
     assert d.repeated_share > 0.9
     same = f"{100 * d.repeated_share:.0f} % of the misfit is the same"

@@ -18,7 +18,13 @@ from hilcal.store.plan import REFERENCE
 from hilcal.store.procedure_log import ProcedureLog, purpose_of, release
 from hilcal.store.run_log import RunLog
 from tests.support.paths import ROOT
-from tests.support.procedure_cases import Drawn, KilledError, again, drawn, small
+from tests.support.procedure_cases import (
+    DrawnCalibration,
+    KilledError,
+    drawn_calibration,
+    reopened,
+    small_config,
+)
 from tests.support.refusals import refusal
 from tests.unit.test_docs import blocks
 
@@ -30,7 +36,7 @@ ALL = [*FIRST, "plan_validation", "measure_validation", *LAST]
 @pytest.fixture(scope="module")
 def done(tmp_path_factory):
     """A calibration that was stopped after each step, and in each measurement."""
-    d = drawn(tmp_path_factory.mktemp("run") / "run.hilcal", validation=6)
+    d = drawn_calibration(tmp_path_factory.mktemp("run") / "run.hilcal", validation=6)
     found = None
     while (step := d.procedure.next()).kind != "done":
         if step.moves and step.missing > 2:
@@ -39,7 +45,7 @@ def done(tmp_path_factory):
                 d.do(step)
         else:
             found = d.do(step)
-        d = again(d)
+        d = reopened(d)
     assert isinstance(found, Improvement)
     return d, found
 
@@ -153,7 +159,7 @@ def with_goal(d, goal_m):
 
 @pytest.mark.long
 def test_a_goal_below_the_repeatability_is_not_measured_for_but_another_is(tmp_path):
-    d = drawn(tmp_path / "run.hilcal", goal_m=5e-6)
+    d = drawn_calibration(tmp_path / "run.hilcal", goal_m=5e-6)
     kinds, found = until_decided(d)
     assert kinds == FIRST
     assert found.reason == "floor"
@@ -169,8 +175,10 @@ def test_a_goal_below_the_repeatability_is_not_measured_for_but_another_is(tmp_p
 @pytest.mark.long
 def test_a_calibration_without_a_stated_repeatability_goes_to_its_end(tmp_path):
     """The arm's scatter is then what the maker states, and no number of the decision is NaN."""
-    config = small(1).model_copy(update={"repeatability": Repeatability()})
-    d = drawn(tmp_path / "run.hilcal", config=config, poses=4, validation=4, goal_m=1e-3)
+    config = small_config(1).model_copy(update={"repeatability": Repeatability()})
+    d = drawn_calibration(
+        tmp_path / "run.hilcal", config=config, poses=4, validation=4, goal_m=1e-3
+    )
     assert isinstance(d.to_the_end(), Improvement)
     with CampaignFile.open(d.procedure.run) as campaign:
         found = ProcedureLog(campaign).last(DECIDED)
@@ -180,7 +188,7 @@ def test_a_calibration_without_a_stated_repeatability_goes_to_its_end(tmp_path):
 
 @pytest.mark.long
 def test_a_goal_within_reach_is_measured_for(tmp_path):
-    d = drawn(tmp_path / "run.hilcal", poses=4)
+    d = drawn_calibration(tmp_path / "run.hilcal", poses=4)
     for _ in range(3):
         d.do(d.procedure.next())
     first = d.procedure.predicted()
@@ -201,9 +209,11 @@ def test_a_goal_within_reach_is_measured_for(tmp_path):
 def test_the_python_of_the_guide_runs_as_it_stands(tmp_path, monkeypatch):
     (code,) = blocks(ROOT / "docs" / "how-to" / "calibrate.md")
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "CELL.toml").write_text(to_toml(small(1)), encoding="utf-8")
+    (tmp_path / "CELL.toml").write_text(to_toml(small_config(1)), encoding="utf-8")
     known = {}
-    known["measure"] = lambda campaign, epoch: Drawn(known["p"], "nothing").measure(campaign, epoch)
+    known["measure"] = lambda campaign, epoch: DrawnCalibration(known["p"], "nothing").measure(
+        campaign, epoch
+    )
     exec(code, known)
     every = known["p"].compare().everything
     assert every.count == 4
@@ -216,8 +226,8 @@ def test_what_an_earlier_calibration_taught_is_the_prior(done, tmp_path):
     known = carried_prior(load_posterior(first.run), "arm", {}, first.catalogue)
     errors = []
     for name, prior in (("alone", None), ("carried", known)):
-        d = drawn(tmp_path / f"{name}.hilcal", config=small(1), poses=4)
-        d = replace(d, procedure=replace(d.procedure, known=prior))
+        d = drawn_calibration(tmp_path / f"{name}.hilcal", config=small_config(1), poses=4)
+        d = replace(d, procedure=replace(d.procedure, prior=prior))
         for _ in range(3):
             d.do(d.procedure.next())
         errors.append(d.procedure.predicted().now_m)

@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 
 from hilcal.cell import cell_from_config
-from hilcal.design.feasible import Space
-from hilcal.design.run_order import LoadBlock, assembled
+from hilcal.design.feasible import FeasibleSpace
+from hilcal.design.run_order import LoadBlock, steps_of
 from hilcal.drivers.simulated.rehearsal import planned_states
 from hilcal.procedure.validation_plan import fewer_returns
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
-from tests.support.procedure_cases import small
+from tests.support.procedure_cases import small_config
 
 
 @pytest.fixture(scope="module")
 def space():
-    config = small()
-    return Space(cell_from_config(config, configs_dir() / "cells"), config)
+    config = small_config()
+    return FeasibleSpace(cell_from_config(config, configs_dir() / "cells"), config)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -33,7 +33,7 @@ def test_a_loaded_reading_keeps_its_unloaded_one(space, seed):
 
     before = LoadBlock(UNLOADED, loops(np.arange(1, 13)), 1.0)
     blocks = [LoadBlock(load, loops(own), 1.0) for load, own in zip(loads, each, strict=True)]
-    steps = assembled(names, before, blocks, LoadBlock(UNLOADED, (), 0.0))
+    steps = steps_of(names, before, blocks, LoadBlock(UNLOADED, (), 0.0))
     plan = Plan((REFERENCE, *names), rng.normal(size=(13, 6)), steps)
     kept = fewer_returns(plan, space).steps
     unloaded = {(s.pose, s.cycle) for s in kept if s.load == UNLOADED}

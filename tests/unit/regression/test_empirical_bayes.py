@@ -21,7 +21,7 @@ from hilcal.regression.empirical_bayes import (
 from hilcal.regression.schur import eliminate, projection
 from tests.support.campaigns import campaign, measured, plan
 from tests.support.effect_cases import make
-from tests.support.fit_cases import based
+from tests.support.fit_cases import fitted_model
 
 
 def linear(strength, count, rows=1200, flat=3, noise=1.0, seed=0):
@@ -108,7 +108,7 @@ def test_nothing_there_leaves_almost_nothing_and_costs_less_than_two_percent():
     for seed in range(5):
         found, _ = with_harmonics("none", seed, 6)
         c = campaign("none", "absolute", seed, plan_seed=0, poses=40)
-        plain = based(c.cell, c.readings, "absolute")
+        plain = fitted_model(c.cell, c.readings, "absolute")
         new = measured(c.world, plan(40, 77), np.random.default_rng(seed + 100))
         off = [validate(f.model, f.theta, f.readings, new, f.mode) for f in (found, plain)]
         worse.append(off[0].error.rms_sigma / off[1].error.rms_sigma)

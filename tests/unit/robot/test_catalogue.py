@@ -14,7 +14,7 @@ from hilcal.robot.scene import pinocchio_model
 from hilcal.robot.statics import Load, slot_wrenches
 from hilcal.robot.urdf import arm_from_urdf
 from tests.support.arm_cases import classic_flange, flange_at
-from tests.support.refusals import edited, refusal, refusals, refuses
+from tests.support.refusals import refusal, refusals, refuses, with_edits
 from tests.support.space_cases import frames
 
 PI2 = math.pi / 2
@@ -165,7 +165,9 @@ def test_arms_of_other_makers_are_those_of_their_urdfs(name):
         # it holds itself in every posture, with the torques that it has
         weight = np.array([0.0, 0.0, -9.81])
         load = Load(np.zeros((20, 6)), np.zeros(3), 0.0, np.zeros(3), weight)
-        assert np.all(np.abs(arm.along(slot_wrenches(arm, found, load))) < arm.torque_max)
+        assert np.all(
+            np.abs(arm.joint_components(slot_wrenches(arm, found, load))) < arm.torque_max
+        )
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
@@ -236,7 +238,7 @@ def test_dh_rows_alone_are_an_arm(tmp_path):
 @refusals("dh_tables")
 def test_a_wrong_dh_table_is_refused(case, given, tmp_path):
     text = (configs_dir() / "robots" / "ur5e.toml").read_text()
-    (tmp_path / "mine.toml").write_text(edited(given, ur5e=text))
+    (tmp_path / "mine.toml").write_text(with_edits(given, ur5e=text))
     refuses(case, lambda: load_arm("mine.toml", tmp_path))
 
 

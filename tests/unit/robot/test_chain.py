@@ -223,7 +223,7 @@ def test_torques_are_those_that_pinocchio_holds_against(name, gravity):
         jacobian = pin.computeFrameJacobian(model, data, angle, point, axes)
         held = pin.computeGeneralizedGravity(model, data, angle)
         torque = jacobian.T @ load.wrench[i] - held
-        np.testing.assert_allclose(arm.along(found)[i], torque, rtol=0, atol=1e-10)
+        np.testing.assert_allclose(arm.joint_components(found)[i], torque, rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("name", ["ur10e", ODD])

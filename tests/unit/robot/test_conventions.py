@@ -10,11 +10,11 @@ import pinocchio as pin
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
 from hilcal.config.sections import Conventions, Coupling
-from hilcal.design.feasible import Space, draw
+from hilcal.design.feasible import FeasibleSpace, draw_poses
 from hilcal.model.model import Model
 from hilcal.readings.covariance import TrackerNoise
 from hilcal.readings.readings import States
-from hilcal.robot.arm import as_counted
+from hilcal.robot.arm import with_controller_conventions
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import drive_jacobian, evaluate
 from hilcal.robot.urdf import arm_from_urdf
@@ -154,7 +154,7 @@ def own_states(count=6):
 def test_it_stands_and_is_pulled_as_pinocchio_says(tmp_path):
     path, q = urdf_of_mimic(tmp_path), own_states()
     arm = arm_from_urdf(path)
-    assert arm.own.tolist() == [True, True, False, False, True]
+    assert arm.independent.tolist() == [True, True, False, False, True]
     full = arm.complete(q)
     np.testing.assert_allclose(full[:, 2], -q[:, 1] + 0.3)
     np.testing.assert_allclose(full[:, 3], q[:, 0])
@@ -193,7 +193,7 @@ def test_signs_and_zeros_of_the_controller_go_with_it(tmp_path):
     arm, q = arm_from_urdf(urdf_of_mimic(tmp_path)), own_states()
     by = Conventions(joint_sign=(-1, 1, -1, 1, 1), joint_offset_deg=(10.0, -20.0, 5.0, 0.0, 30.0),
                      joint_coupling=(Coupling(joint=5, follows=1, factor=0.5),))  # fmt: skip
-    counted = as_counted(arm, by)
+    counted = with_controller_conventions(arm, by)
     drawn = q * by.joint_sign + np.radians(by.joint_offset_deg)
     drawn[:, 4] += 0.5 * q[:, 0]
     drawn = arm.complete(drawn)
@@ -238,5 +238,5 @@ def test_planned_poses_are_poses_of_the_arm(tmp_path):
     urdf_of_mimic(tmp_path)
     config = CellConfig.model_validate({"robot": {"model": "arm.urdf"}})
     cell = cell_from_config(config, tmp_path)
-    drawn = draw(Space(cell, config), 20, np.random.default_rng(0))
+    drawn = draw_poses(FeasibleSpace(cell, config), 20, np.random.default_rng(0))
     np.testing.assert_allclose(cell.arm.complete(drawn.q), drawn.q, atol=1e-12)

@@ -17,7 +17,7 @@ from hilcal.robot.chain import evaluate
 from hilcal.robot.scene import Scene, body_poses, capsules, is_known, pinocchio_model
 from tests.support.campaigns import true_parameters
 from tests.support.effect_cases import make, numeric_jacobian, some_states
-from tests.support.readings_cases import made
+from tests.support.readings_cases import readings_at
 
 SIGN = (1, -1, 1, 1, -1, 1)
 PAIRS = {(3, 2): 1.0, (6, 5): -0.5, (6, 4): 0.3}
@@ -129,7 +129,7 @@ def test_laws_of_coupled_drives_are_the_worlds(law, mechanical):
     theta = np.concatenate([true_parameters(world, n) for n in names])
     seen = model.predict(states, theta)
     order = 1e-3 if law == "joint_tilt_compliance" else 0.0  # of two tilts in succession
-    moved = np.abs(seen.observation.position - world.sight(states).position).max()
+    moved = np.abs(seen.observation.position - world.ideal_readings(states).position).max()
     rigid = Model(cell, ()).predict(states, np.zeros(0)).observation.position
     size = np.abs(seen.observation.position - rigid).max()
     assert moved <= order * size + 1e-11
@@ -173,9 +173,11 @@ def test_the_arms_scatter_is_that_of_its_drives(mechanical):
     world = World(cell, Truth.rigid(cell.arm), cell.registration, np.eye(4), SimulatedNoise(),
                   np.zeros(6))  # fmt: skip
     scatter = 1e-5 * np.arange(1.0, 7.0)
-    factors = joint_factors(cell, made(states.q, np.zeros((3, 3)), wrench=states.wrench), scatter)
+    factors = joint_factors(
+        cell, readings_at(states.q, np.zeros((3, 3)), wrench=states.wrench), scatter
+    )
     for j in range(6):
         one = np.tile(1e-6 * np.eye(6)[j], (3, 1))
-        ahead, back = (world.sight(states, s).position for s in (one, -one))
+        ahead, back = (world.ideal_readings(states, s).position for s in (one, -one))
         expected = scatter[j] * (ahead - back) / 2e-6
         np.testing.assert_allclose(factors[:, :, j], expected, rtol=1e-6, atol=1e-12)

@@ -17,7 +17,7 @@ from hilcal.robot.factory import (
 )
 from tests.support.arm_cases import classic_flange
 from tests.support.factory_cases import UR5E_YAML, factory_of, measured_arm
-from tests.support.refusals import edited, refusal, refusals, refuses
+from tests.support.refusals import refusal, refusals, refuses, with_edits
 
 CONF = """\
 [mounting]
@@ -92,7 +92,7 @@ def test_a_file_of_our_own_comes_back(tmp_path):
 @refusals("factory")
 def test_other_files_are_refused_in_one_line(case, given, tmp_path):
     name, _, text = given.partition("\n")
-    (tmp_path / name).write_text(edited(text, UR5E_YAML=UR5E_YAML))
+    (tmp_path / name).write_text(with_edits(text, UR5E_YAML=UR5E_YAML))
     refuses(case, lambda: read_factory(tmp_path / name, load_arm("ur5e")), tmp_path / name)
 
 

@@ -16,7 +16,7 @@ from hilcal.calibration.dh_table import dh_rows, flange_poses, to_toml
 from hilcal.calibration.handover import urdf
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
-from hilcal.drivers.simulated.rehearsal import case_of_plan, read_plan
+from hilcal.drivers.simulated.rehearsal import case_of_plan, simulate_plan
 from hilcal.effects.catalogue import installed
 from hilcal.errors import InputError
 from hilcal.robot.catalogue import configs_dir, load_arm
@@ -27,7 +27,7 @@ from hilcal.tables.table import write_table
 from tests.support.arm_cases import flange_at
 from tests.support.cli_cases import ok, refused
 from tests.support.readings_cases import read_table
-from tests.support.refusals import edited, refusals, refuses
+from tests.support.refusals import refusals, refuses, with_edits
 from tests.support.serial_urdf import serial_urdf
 
 TRACK = """title = "UR10e on a track"
@@ -71,7 +71,7 @@ LIFT = serial_urdf([
 def track(folder, change="in track"):
     rows = (configs_dir() / "robots" / "ur10e.toml").read_text()
     text = TRACK + rows[rows.index("[[joints]]") :]
-    (folder / "track.toml").write_text(edited(change, track=text))
+    (folder / "track.toml").write_text(with_edits(change, track=text))
     return load_arm("track.toml", folder)
 
 
@@ -107,7 +107,7 @@ def test_a_gantry_is_that_of_its_urdf(tmp_path):
 
 def test_a_column_of_two_stages_moves_by_both(tmp_path):
     arm = from_urdf(tmp_path, LIFT)
-    assert arm.own.tolist() == [True, False, True]
+    assert arm.independent.tolist() == [True, False, True]
     q = arm.complete(np.array([[0.2, np.nan, 0.0], [0.5, np.nan, 0.0]]))
     np.testing.assert_allclose(q[:, 1], [0.3, 0.6])
     np.testing.assert_allclose(evaluate(arm, q).position[-1][:, 2], [0.9, 1.5], atol=1e-12)
@@ -194,7 +194,7 @@ def campaign(folder, hidden, seed, poses=36):
     config = track_config(simulation={"strength_sigma": 3.0})
     plan = spread_plan(arm, poses)
     case = case_of_plan(config, plan, hidden, seed, installed(), folder)
-    return read_plan(case, plan, [seed, 1]), cell_from_config(config, folder)
+    return simulate_plan(case, plan, [seed, 1]), cell_from_config(config, folder)
 
 
 SEEDS = [1, *(pytest.param(k, marks=pytest.mark.long) for k in (2, 3, 4))]
@@ -228,7 +228,7 @@ def test_errors_of_three_guides_of_a_gantry_are_found_and_measured(tmp_path, see
     )
     plan = spread_plan(arm, 60)
     case = case_of_plan(config, plan, "guide_error", seed, installed(), tmp_path)
-    r, cell = read_plan(case, plan, [seed, 1]), cell_from_config(config, tmp_path)
+    r, cell = simulate_plan(case, plan, [seed, 1]), cell_from_config(config, tmp_path)
     path = hc.refine(hc.baseline(cell, r.readings), r.readings, readings="absolute")
     assert path.verdict == "adequate"
     assert path.fit.model.named == ("base_frame", "joint_compliance", "guide_error")

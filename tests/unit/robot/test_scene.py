@@ -38,14 +38,14 @@ def test_usual_poses_are_free_and_folded_ones_are_not(name):
     scene = Scene(load_arm(name), obstacles=(TABLE,))
     usual = np.array([UPRIGHT, [0.0, -1.5, 1.5, -1.5, -1.5, 0.0], *POSES.values()])
     assert is_known(load_arm(name)) == (name not in ("ur8long", "ur15", "ur18"))  # guessed
-    assert scene.itself.named(usual, 0.01) == {}
-    assert scene.around.named(usual, 0.01) == {}
+    assert scene.itself.close_pairs(usual, 0.01) == {}
+    assert scene.around.close_pairs(usual, 0.01) == {}
     folded = np.array([[0.0, -1.5, 3.0, -1.5, -1.5, 0.0]])
-    hit = {name for pair in scene.itself.named(folded) for name in pair}
+    hit = {name for pair in scene.itself.close_pairs(folded) for name in pair}
     assert {"upper arm", "wrist 1"} <= hit
     assert scene.itself.touching(folded).all()
     down = np.array([[0.0, 0.4, 0.3, -1.5, -1.5, 0.0]])  # through the table
-    assert ("forearm", "table") in scene.around.named(down)
+    assert ("forearm", "table") in scene.around.close_pairs(down)
     assert scene.around.touching(down).all()
 
 

@@ -40,7 +40,7 @@ from hilcal.calibration.dh_table import dh_rows, to_csv, to_toml
 from hilcal.calibration.handover import ur_kinematics, urdf
 from hilcal.calibration.points import read_points
 from hilcal.calibration.urscript import movej_program, waypoints
-from hilcal.cli import Failures, Watched
+from hilcal.cli import Failures, WatchedStream
 from hilcal.cli.compensating import _csv
 from hilcal.cli.terminal import Terminal
 from hilcal.config import load_config
@@ -68,7 +68,7 @@ from hilcal.tables.table import write_table
 from hilcal.tables.write import plan_csv, write_columns
 from hilcal.workbench.cards import plain
 from tests.support.paths import ROOT
-from tests.support.readings_cases import make_arm, read_table, simple
+from tests.support.readings_cases import make_arm, read_table, simple_readings
 from tests.support.refusals import refusal
 from tests.support.unguarded import unguarded
 from tests.unit.calibration.test_calibration import calibrated
@@ -195,8 +195,8 @@ def test_toml(name):
     assert content["title"] == escaped(name)
     assert [joint["name"] for joint in content["joints"]] == [escaped(name)] * 6
     p = Proposal({"position": {"unit": name, "columns": [name, "y", "z"]}}, unused=[(name, name)])
-    p.lacking.append(name)
-    p.unsure += [("position", name), ("elsewhere", name)]
+    p.missing.append(name)
+    p.doubts += [("position", name), ("elsewhere", name)]
     mapping = p.to_toml(name)
     assert harmless(mapping)
     assert tomllib.loads(mapping) == {
@@ -323,7 +323,7 @@ def test_html(name):
 @few
 @given(names)
 def test_rerun(name):
-    assert harmless(viewer_style.safe(name))
+    assert harmless(viewer_style.storable(name))
     words = viewer_style.escaped(name)
     assert "\n" not in words
     assert harmless(words)
@@ -364,7 +364,7 @@ def test_terminal(name):
             assert file.getvalue().count(markup) == 6 * name.count(markup)
     with redirect_stderr(io.StringIO()) as told:
         out = io.StringIO()
-        Failures(True, Watched(out), False).tell(None, f"{name}: no such file", 2)
+        Failures(True, WatchedStream(out), False).report(None, f"{name}: no such file", 2)
     assert told.getvalue().count("\n") == 1
     assert harmless(told.getvalue())
     assert harmless(json.loads(out.getvalue())["error"]["message"])
@@ -433,7 +433,7 @@ def test_tables_and_plans_refuse_a_name_or_keep_it(name):
 @few
 @given(names)
 def test_exchange_tables_are_read_back_or_refused(name):
-    readings = simple(4)
+    readings = simple_readings(4)
     whole = replace(readings, pose_names=(name, *readings.pose_names[1:]))
     for path in (FOLDER[0] / "t.csv", FOLDER[0] / "t.parquet"):
         if escaped(name) != name or name != name.strip():
@@ -467,7 +467,7 @@ def test_cells_and_documents_refuse_a_name_or_keep_it(name):
 def test_a_name_in_a_campaign_of_others_is_refused(table_, tmp_path):
     path = tmp_path / "run.hilcal"
     with CampaignFile.create(path, "{}", str(tmp_path), "made") as file:
-        file.append_readings(simple(4))
+        file.append_readings(simple_readings(4))
     with sqlite3.connect(path) as db:
         if table_ == "revisions":
             document = {
@@ -491,7 +491,7 @@ def test_a_name_in_a_campaign_of_others_is_refused(table_, tmp_path):
 
 
 def test_a_name_is_refused_where_it_goes_into_a_campaign(tmp_path):
-    readings = simple(4)
+    readings = simple_readings(4)
     named = replace(readings, pose_names=("a\nb", *readings.pose_names[1:]))
     with CampaignFile.create(tmp_path / "run.hilcal", "{}", "", "made") as file:
         refusal(r"holds the character \\u000a", file.append_readings, named)

@@ -54,7 +54,7 @@ FOREIGN = {
 
 def make(path, config, base=""):
     with CampaignFile.create(
-        path, config, base, "made", more={COVERS_KEY: INSTRUMENT_AND_ARM}
+        path, config, base, "made", more_texts={COVERS_KEY: INSTRUMENT_AND_ARM}
     ) as file:
         file.append_readings(rehearsal("nothing", poses=8).readings)
     return path

@@ -13,15 +13,16 @@ import hilcal.drivers.simulated
 from hilcal.drivers.simulated.injected_effects import (
     DEFLECTION_EFFECTS,
     EFFECTS,
-    hide,
-    nothing_hidden,
+    hide_effect,
+    world_without_effect,
 )
 from hilcal.drivers.simulated.truth import Truth
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
-from studies.random_campaigns import dead_weights, rehearsal_states
+from studies.random_campaigns import rehearsal_states
 from tests.support.example_cell import ur10e_cell
 from tests.support.refusals import refusals, refuses
+from tests.support.rehearsed import dead_weights
 
 CELL = ur10e_cell()
 WEIGHTS = dead_weights([4.0, 8.0, 12.0], CELL.gravity)
@@ -39,9 +40,9 @@ def without(world, effect):
 @pytest.mark.parametrize(("effect", "mode"), VISIBLE)
 def test_strength_is_the_one_asked_for(effect, mode, m):
     wanted = 2.0
-    world = hide(effect, CELL, STATES, wanted, mode, np.random.default_rng(11), m=m)
+    world = hide_effect(effect, CELL, STATES, wanted, mode, np.random.default_rng(11), m=m)
     clean = without(world, effect)
-    after, before = world.sight(STATES), clean.sight(STATES)
+    after, before = world.ideal_readings(STATES), clean.ideal_readings(STATES)
     change = after.position - before.position
     if m == 6:
         turn = after.rotation @ np.swapaxes(before.rotation, 1, 2)
@@ -57,7 +58,7 @@ def test_strength_is_the_one_asked_for(effect, mode, m):
 
 
 def rigid_world(**effects):
-    world = nothing_hidden(CELL, np.random.default_rng(2))
+    world = world_without_effect(CELL, np.random.default_rng(2))
     truth = replace(Truth.rigid(CELL.arm), **effects)
     return replace(world, physics=truth)
 
@@ -85,7 +86,7 @@ def test_effects_without_load_follow_their_laws():
     q = STATES.q
 
     def same(world, expected):
-        np.testing.assert_allclose(world.sight(STATES).position, expected, atol=1e-12)
+        np.testing.assert_allclose(world.ideal_readings(STATES).position, expected, atol=1e-12)
 
     o = 1e-3 * rng.standard_normal(6)
     world = rigid_world(encoder_offset=o)
@@ -123,7 +124,7 @@ def test_load_point_adds_the_moment_of_the_load():
     cell = replace(CELL, load_point=CELL.load_point + shift)
     told = replace(rigid_world(joint_compliance=compliance), cell=cell)
     np.testing.assert_allclose(
-        moved.sight(STATES).position, told.sight(STATES).position, atol=1e-14
+        moved.ideal_readings(STATES).position, told.ideal_readings(STATES).position, atol=1e-14
     )
 
 
@@ -139,28 +140,32 @@ def test_effects_that_cancel_hardly_show_in_deflections(effect):
         air_temperature=STATES.air_temperature[FIRST],
         joint_temperature=STATES.joint_temperature[FIRST],
     )
-    world = hide(effect, CELL, still, 3.0, "absolute", np.random.default_rng(1))
-    change = world.sight(still).position - without(world, effect).sight(still).position
+    world = hide_effect(effect, CELL, still, 3.0, "absolute", np.random.default_rng(1))
+    change = (
+        world.ideal_readings(still).position - without(world, effect).ideal_readings(still).position
+    )
     left = np.abs(change - change[FIRST]).max()
     assert left < 0.02 * np.abs(change).max()
 
 
 def test_truth_is_named_in_si():
-    world = hide("transmission_error", CELL, STATES, 1.0, "absolute", np.random.default_rng(1))
+    world = hide_effect(
+        "transmission_error", CELL, STATES, 1.0, "absolute", np.random.default_rng(1)
+    )
     assert len(world.truth) == 6 + 6 * 6 * 2
     assert world.truth["transmission_error.j2.sin3"] == world.physics.transmission_error[1, 2, 1]
     assert 4e-6 < world.truth["joint_compliance.j1"] < 8e-6
-    world = hide("joint_stiffening", CELL, STATES, 1.0, "absolute", np.random.default_rng(1))
+    world = hide_effect("joint_stiffening", CELL, STATES, 1.0, "absolute", np.random.default_rng(1))
     assert world.truth["joint_stiffening.j2"] < 0.0
 
 
 def test_unknown_registration_and_target_are_the_worlds_own():
     cell = replace(CELL, target_known=False)
-    world = nothing_hidden(cell, np.random.default_rng(1))
+    world = world_without_effect(cell, np.random.default_rng(1))
     assert np.hypot(*world.registration[:2, 3]) == pytest.approx(3.0)
     np.testing.assert_allclose(world.registration[2, :3], [0, 0, 1], atol=1e-15)
     assert np.any(world.physics.target_offset != 0.0)
-    told = nothing_hidden(ur10e_cell(registration_known=True), np.random.default_rng(1))
+    told = world_without_effect(ur10e_cell(registration_known=True), np.random.default_rng(1))
     np.testing.assert_array_equal(told.registration, np.eye(4))
     assert np.hypot(*told.station[:2, 3]) == pytest.approx(3.0)
 
@@ -169,7 +174,7 @@ def test_unknown_registration_and_target_are_the_worlds_own():
 def test_what_cannot_be_hidden_is_refused(case, given):
     effect, strength, mode = given.split()
     rng = np.random.default_rng(0)
-    refuses(case, lambda: hide(effect, CELL, STATES, float(strength), mode, rng))
+    refuses(case, lambda: hide_effect(effect, CELL, STATES, float(strength), mode, rng))
 
 
 @pytest.mark.parametrize(
@@ -185,21 +190,21 @@ def test_what_cannot_be_hidden_is_refused(case, given):
 def test_states_without_what_the_effect_needs_are_refused(effect, column):
     bare = States(q=STATES.q, wrench=STATES.wrench)
     with pytest.raises(InputError, match=f"^{column}: {effect} is hidden"):
-        hide(effect, CELL, bare, 3.0, "absolute", np.random.default_rng(0))
+        hide_effect(effect, CELL, bare, 3.0, "absolute", np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("effect", ["wrench_bias", "wrench_gain", "sensor_misalignment"])
 def test_a_sensor_cannot_misread_what_is_not_there(effect):
     unloaded = replace(STATES, wrench=np.zeros_like(STATES.wrench))
     with pytest.raises(InputError, match="no state has a load; valid: ") as caught:
-        hide(effect, CELL, unloaded, 3.0, "absolute", np.random.default_rng(0))
+        hide_effect(effect, CELL, unloaded, 3.0, "absolute", np.random.default_rng(0))
     assert "\n" not in str(caught.value)
 
 
 def test_a_pose_without_an_unloaded_reading_is_refused():
     keep = ~((POSE == 3) & (LOAD == 0))
     with pytest.raises(InputError, match="pose 3 has no unloaded reading"):
-        hide(
+        hide_effect(
             "base_compliance", CELL, STATES[keep], 3.0, "deflection", np.random.default_rng(0),
             pose=POSE[keep],
         )  # fmt: skip

@@ -7,13 +7,13 @@ import pytest
 
 from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.drivers.simulated.injected_effects import nothing_hidden
+from hilcal.drivers.simulated.injected_effects import world_without_effect
 from hilcal.drivers.simulated.own_law import own_law
 from hilcal.drivers.simulated.rehearsal import (
     case_of_plan,
     check_choice,
     own_choices,
-    read_plan,
+    simulate_plan,
 )
 from hilcal.drivers.simulated.world_server import read_world, write_world
 from hilcal.effects.catalogue import installed
@@ -41,8 +41,8 @@ def law(file):
 
 
 def world_with(law, theta):
-    world = nothing_hidden(cell_of(), np.random.default_rng(1))
-    return world, replace(world, own=replace(law, theta=np.array([theta])))
+    world = world_without_effect(cell_of(), np.random.default_rng(1))
+    return world, replace(world, own_law=replace(law, theta=np.array([theta])))
 
 
 def test_the_target_moves_as_the_world_moves_it_when_the_joint_turns(law):
@@ -51,15 +51,15 @@ def test_the_target_moves_as_the_world_moves_it_when_the_joint_turns(law):
     states = plan(6).states
     turned = np.zeros_like(states.q)
     turned[:, 1] = TURN * np.sin(2 * states.q[:, 0])
-    before, after = bare.sight(states), within.sight(states)
-    true = bare.sight(states, turned)
+    before, after = bare.ideal_readings(states), within.ideal_readings(states)
+    true = bare.ideal_readings(states, turned)
     shift = true.position - before.position
     assert np.linalg.norm(shift, axis=1).max() > 1e-4
     error = after.position - before.position - shift
     # The world sags under its load as it turns, the law is added to where it rests: 1 %.
     assert np.linalg.norm(error, axis=1).max() < 0.01 * np.linalg.norm(shift, axis=1).max()
     np.testing.assert_allclose(after.rotation, true.rotation, atol=0.01 * TURN)
-    assert within.ages
+    assert within.drifts
     assert within.truth["mine.a"] == TURN
 
 
@@ -68,7 +68,7 @@ def test_a_campaign_in_such_a_cell_reveals_it(law):
     config, catalogue = SMALL.model_copy(update={"simulation": strong}), law.catalogue
     secret = case_of_plan(config, first_plan(), "mine", 1, catalogue)
     assert (secret.hidden, secret.mode) == ("mine", "absolute")
-    r = read_plan(secret, first_plan(), [1, 1])
+    r = simulate_plan(secret, first_plan(), [1, 1])
     model = baseline(r.cell, r.readings, r.mode, catalogue)
     d = diagnose(fit(model, r.readings, r.mode))
     assert "mine" in (d.suspects[0].effect, *d.suspects[0].same_as)
@@ -82,7 +82,9 @@ def test_a_world_with_it_comes_back_from_its_file(law, tmp_path):
     write_world(tmp_path / "world.json", world, configuration())
     back, _ = read_world(tmp_path / "world.json")
     states = plan(6).states
-    np.testing.assert_array_equal(back.sight(states).position, world.sight(states).position)
+    np.testing.assert_array_equal(
+        back.ideal_readings(states).position, world.ideal_readings(states).position
+    )
     assert back.truth == world.truth
 
 

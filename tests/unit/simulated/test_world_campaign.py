@@ -7,13 +7,14 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from hilcal.drivers.simulated.injected_effects import hide, nothing_hidden
+from hilcal.drivers.simulated.injected_effects import hide_effect, world_without_effect
 from hilcal.drivers.simulated.rehearsal import simulate
 from hilcal.drivers.simulated.world import SimulatedNoise
 from hilcal.readings.readings import States
-from studies.random_campaigns import dead_weights, rehearsal_states
+from studies.random_campaigns import rehearsal_states
 from tests.support.example_cell import ur10e_cell
 from tests.support.refusals import refusal
+from tests.support.rehearsed import dead_weights
 
 CELL = ur10e_cell()
 WEIGHTS = dead_weights([5.0, 10.0], CELL.gravity)
@@ -71,8 +72,8 @@ def test_joints_warm_up_each_by_its_own_and_the_air_drifts():
 
 def test_poses_are_feasible_and_spread():
     states, pose, _, _ = rehearse(n=20)
-    sight = replace(nothing_hidden(CELL, np.random.default_rng(0)), registration=np.eye(4))
-    target = sight.sight(states).position
+    sight = replace(world_without_effect(CELL, np.random.default_rng(0)), registration=np.eye(4))
+    target = sight.ideal_readings(states).position
     assert target[:, 2].min() > 0.1
     assert np.hypot(target[:, 0], target[:, 1]).min() > 0.15
     assert np.all(np.abs(states.q) <= 0.9 * np.pi)
@@ -96,14 +97,14 @@ def test_approach_sides_follow_the_motion_and_change_with_the_load():
 @pytest.mark.parametrize("m", [3, 6])
 def test_readings_scatter_about_the_truth_within_their_covariance(m):
     states, pose, load, cycle = rehearse(n=30)
-    world = nothing_hidden(CELL, np.random.default_rng(1))
+    world = world_without_effect(CELL, np.random.default_rng(1))
     readings = simulate(world, states, pose, load, cycle, NAMES, np.random.default_rng(2), m)
     assert readings.m == m
     assert readings.load_names == NAMES
     assert readings.pose_names[-1] == "p30"
     np.testing.assert_array_equal(readings.unloaded, load == 0)
     np.testing.assert_allclose(readings.covariance, np.swapaxes(readings.covariance, 1, 2))
-    off = readings.value - world.sight(states).value(m)
+    off = readings.value - world.ideal_readings(states).value(m)
     white = np.linalg.solve(np.linalg.cholesky(readings.covariance[:, :3, :3]), off[:, :3, None])
     assert np.mean(white**2) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / white.size))
 
@@ -112,7 +113,7 @@ def test_the_same_seed_measures_the_same():
     def once(seed):
         rng = np.random.default_rng(seed)
         states, pose, load, cycle = rehearsal_states(CELL, 8, WEIGHTS, rng)
-        world = hide("hysteresis", CELL, states, 3.0, "deflection", rng)
+        world = hide_effect("hysteresis", CELL, states, 3.0, "deflection", rng)
         return simulate(world, states, pose, load, cycle, NAMES, rng)
 
     np.testing.assert_array_equal(once(3).value, once(3).value)
@@ -138,10 +139,10 @@ DRAWS = 4000
 
 @pytest.mark.parametrize(("m", "known"), [(3, False), (6, False), (6, True)])
 def test_sample_covariance_is_the_reported_one(m, known):
-    world = nothing_hidden(ur10e_cell(registration_known=known), np.random.default_rng(4))
+    world = world_without_effect(ur10e_cell(registration_known=known), np.random.default_rng(4))
     q = np.array([0.4, -1.2, 1.3, -0.4, 0.9, 0.3])
     states = States(np.tile(q, (DRAWS, 1)), np.tile([0.0, 0, -90, 0, 0, 0], (DRAWS, 1)))
-    sight = world.sight(states[:1])
+    sight = world.ideal_readings(states[:1])
     cov = world.covariance(sight, m)[0]
     value = world.observe(states, np.random.default_rng(5), m)
     off = value[:, :3] - sight.position

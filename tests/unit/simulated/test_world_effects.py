@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilcal.drivers.simulated.injected_effects import nothing_hidden
+from hilcal.drivers.simulated.injected_effects import world_without_effect
 from hilcal.drivers.simulated.truth import Truth
-from studies.random_campaigns import dead_weights, rehearsal_states
+from studies.random_campaigns import rehearsal_states
 from tests.support.example_cell import ur10e_cell
-from tests.support.living_cell import frames, moment_beyond
+from tests.support.rehearsed import dead_weights
+from tests.support.running_world import frames, moment_beyond
 
 CELL = ur10e_cell()
 ARM = CELL.arm
@@ -27,7 +28,7 @@ SOFT = {
 
 
 def world(cell=CELL, **effects):
-    base = nothing_hidden(CELL, np.random.default_rng(2))
+    base = world_without_effect(CELL, np.random.default_rng(2))
     return replace(base, cell=cell, physics=replace(Truth.rigid(cell.arm), **effects))
 
 
@@ -37,7 +38,7 @@ def cell_with(**changes):
 
 def close(a, b, states=STATES, atol=1e-13):
     """Both rest alike and are seen alike."""
-    one, two = a.sight(states), b.sight(states)
+    one, two = a.ideal_readings(states), b.ideal_readings(states)
     np.testing.assert_allclose(one.position, two.position, rtol=0, atol=atol)
     np.testing.assert_allclose(one.rotation, two.rotation, rtol=0, atol=atol)
 
@@ -53,13 +54,13 @@ def rigid_torques(states):
 
 
 def drive_angles(w, states):
-    return w.rest(states).deflection[:, w.drives]
+    return w.equilibrium(states).deflection[:, w.drives]
 
 
 def test_the_flange_turns_by_the_moment_there_along_and_across_its_axis():
     small = 1e-8  # the next order is smaller by c M, about 1e-6
     along, across = 2.0 * small, 5.0 * small
-    rest = world(tool_compliance=np.array([along, across])).rest(STATES)
+    rest = world(tool_compliance=np.array([along, across])).equilibrium(STATES)
     for i in range(len(STATES)):
         stiff = frames(ARM, STATES.q[i])[2]
         turn = stiff[:3, :3]
@@ -109,14 +110,14 @@ def test_links_grow_with_the_temperature_of_the_air():
     alpha, count = 2e-4, len(STATES)
     states = replace(STATES, air_temperature=np.linspace(10.0, 40.0, count))
     grown = world(**SOFT, thermal_growth=np.array([alpha]))
-    seen = grown.sight(states)
+    seen = grown.ideal_readings(states)
     for i in range(0, count, 5):
         links = ARM.links.copy()
         links[:, :3, 3] *= 1.0 + alpha * (states.air_temperature[i] - 20.0)
-        long = world(cell_with(links=links), **SOFT).sight(states[i : i + 1])
+        long = world(cell_with(links=links), **SOFT).ideal_readings(states[i : i + 1])
         np.testing.assert_allclose(seen.position[i], long.position[0], rtol=0, atol=1e-13)
         np.testing.assert_allclose(seen.jacobian[i], long.jacobian[0], rtol=0, atol=1e-12)
-    rigid = world(thermal_growth=np.array([alpha])).rest(states).flange
+    rigid = world(thermal_growth=np.array([alpha])).equilibrium(states).flange
     stiff = np.array([frames(ARM, q)[2] for q in states.q])
     factor = 1.0 + alpha * (states.air_temperature - 20.0)
     np.testing.assert_allclose(rigid[:, :3, 3], factor[:, None] * stiff[:, :3, 3], atol=1e-12)
@@ -128,7 +129,10 @@ def test_joints_drift_with_their_own_temperature_from_a_reference():
     drifting = replace(world(thermal_joint_drift=kappa), joint_reference=25.0)
     turned = replace(STATES, q=STATES.q + kappa * (STATES.joint_temperature - 25.0))
     np.testing.assert_allclose(
-        drifting.sight(STATES).position, world().sight(turned).position, rtol=0, atol=1e-13
+        drifting.ideal_readings(STATES).position,
+        world().ideal_readings(turned).position,
+        rtol=0,
+        atol=1e-13,
     )
     assert world().joint_reference == 22.0
 
@@ -170,12 +174,12 @@ def acting(flange, said, *, bias=0.0, gain=0.0, turn=(0.0, 0.0, 0.0)):
 )
 def test_the_arm_rests_under_what_acts_where_the_sensor_misreads_it(hidden, told):
     misread = world(**SOFT, **hidden)
-    flange = misread.rest(STATES).flange
+    flange = misread.equilibrium(STATES).flange
     truly = replace(STATES, wrench=acting(flange, STATES.wrench, **told))
     perfect = world(**SOFT)
-    np.testing.assert_allclose(perfect.rest(truly).flange, flange, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(perfect.equilibrium(truly).flange, flange, rtol=0, atol=1e-12)
     loaded = LOAD > 0
-    moved = np.abs(perfect.rest(STATES).flange - flange).max(axis=(1, 2))
+    moved = np.abs(perfect.equilibrium(STATES).flange - flange).max(axis=(1, 2))
     assert moved[loaded].min() > 1e-6
     assert moved[~loaded].max() == 0.0
     torque = misread.drive_torque(STATES) - perfect.drive_torque(truly)
@@ -201,6 +205,6 @@ def test_parameters_are_named_in_the_order_of_their_arrays():
     }
     for effect, labels in names.items():
         value = rng.normal(size=getattr(rigid, effect).shape)
-        named = rigid.with_effect(effect, value).named(ARM)
+        named = rigid.with_effect(effect, value).nonzero_parameters(ARM)
         assert list(named) == [f"{effect}.{label}" for label in labels.split()]
         assert list(named.values()) == value.ravel().tolist()

@@ -11,8 +11,8 @@ from hilcal.drivers.simulated.truth import Truth
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
 from tests.support.example_cell import ur10e_cell
-from tests.support.living_cell import frames, moment_beyond
 from tests.support.refusals import refusal
+from tests.support.running_world import frames, moment_beyond
 
 CELL = ur10e_cell()
 ARM = CELL.arm

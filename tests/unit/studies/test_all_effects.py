@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from studies.all_effects_command import Case, refined
+from studies.all_effects_command import AllEffectsCase, refined
 
 
 @pytest.mark.long
@@ -12,7 +12,7 @@ def test_few_positions_predict_nearly_as_well_as_can_be():
 
     Without a background the error of these two arms is 1.5 times as large or more.
     """
-    found = [refined(Case(30, seed, 1.0, True)) for seed in (0, 2)]
+    found = [refined(AllEffectsCase(30, seed, 1.0, True)) for seed in (0, 2)]
     ratios = [f.rms_m / f.best_m for f in found if f is not None]
     assert len(ratios) == 2
     assert np.mean(ratios) < 1.2
@@ -23,4 +23,4 @@ def test_few_positions_predict_nearly_as_well_as_can_be():
 
 
 def test_an_arm_that_is_not_as_described_is_refused():
-    assert refined(Case(30, 1, 10.0, False)) is None
+    assert refined(AllEffectsCase(30, 1, 10.0, False)) is None

@@ -13,8 +13,8 @@ from hilcal.robot.chain import evaluate
 from hilcal.robot.urdf import arm_from_urdf
 from studies.benchmark.entrants.common import (
     COMPLIANCE,
-    Asked,
-    Sought,
+    FormulaSearch,
+    TaskInput,
     chosen,
     families,
     left_out,
@@ -70,7 +70,7 @@ def test_what_others_need_imports_numpy_alone(name):
 @pytest.fixture(scope="module")
 def asked():
     """The smallest task of the elastic track."""
-    return Asked.read(first_task("elastic"))
+    return TaskInput.read(first_task("elastic"))
 
 
 def test_positions_and_torques_are_those_of_another_mechanics(asked):
@@ -80,7 +80,7 @@ def test_positions_and_torques_are_those_of_another_mechanics(asked):
     point = evaluate(arm, asked.train.q).point(asked.arm.target)
     expected = point @ rotation(theta[:3]).T + theta[3:6]
     np.testing.assert_allclose(asked.arm.predict(theta, asked.train), expected, atol=1e-12)
-    law = Asked.read(first_task("law"))
+    law = TaskInput.read(first_task("law"))
     stated = np.stack([law.train.columns[f"x_tau{j}_Nm"] for j in range(1, 7)], axis=1)
     np.testing.assert_allclose(law.train.torque, stated, atol=6e-4)  # they are rounded to 1e-3
 
@@ -132,7 +132,7 @@ def test_what_poses_left_out_ask_for_is_chosen(asked):
 
 def test_a_sought_law_is_a_formula_of_its_terms(asked):
     theta = asked.arm.registered(asked.train)
-    sought = replace(Sought.of(asked, theta, asked.train), size=2.0)
+    sought = replace(FormulaSearch.of(asked, theta, asked.train), size=2.0)
     found = sought.law(np.array([0.5, 0.0, -0.25]), ["sin(2*q1)", "q2", "q3 (tau2/8.1)"])
     assert found == {"formula": "1*sin(2*q1) + -0.5*q3*(tau2/8.1)"}
     assert sought.law(np.zeros(1), ["q1"]) is None

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from studies.compensation_command import FINAL, Left, _figures, _parts, judged
+from studies.compensation_command import FINAL, SplitErrors, _figures, _parts, judged
 from tests.support.campaigns import campaign, measured, plan
 from tests.unit.calibration.test_calibration import POSES, calibrated
 
-LEFT = Left(
+LEFT = SplitErrors(
     split="random half 1",
     model=FINAL,
     scatter=True,

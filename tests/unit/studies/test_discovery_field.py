@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from studies.formulas import FORMULAS, Answer, asked, claims, drawn, hilcal, mark, run_case
-from studies.odds import Drawn
+from studies.odds import OddsCase
 from studies.odds import claims as odds_claims
 from studies.records import resumed
 
@@ -71,9 +71,9 @@ def test_a_case_that_is_in_the_file_is_not_run_again(tmp_path):
 
 def test_frequencies_are_counted_by_what_was_said():
     """Two laws, said with 0.9 and right; a third, with 0.6 and wrong: expected 2.4 ± 0.65."""
-    both = [Drawn("a", "a", ((0.9, True), (0.1, False)), (2.0, 0.8), (1.0, 0.95))] * 2
-    wrong = Drawn("a", "b", ((0.6, False), (0.3, True)), (1.0, 0.9), (1.0, 0.95))
-    none = Drawn("a")
+    both = [OddsCase("a", "a", ((0.9, True), (0.1, False)), (2.0, 0.8), (1.0, 0.95))] * 2
+    wrong = OddsCase("a", "b", ((0.6, False), (0.3, True)), (1.0, 0.9), (1.0, 0.95))
+    none = OddsCase("a")
     cases = [json.loads(json.dumps(asdict(o))) for o in (*both, wrong, none)]
     figures = {f.what: f for f in odds_claims(cases)}
     assert figures["laws drawn, and proposed"].measured == "4, 3"

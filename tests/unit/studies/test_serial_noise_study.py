@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from studies.serial_noise import Outcome, SerialCase, serial_case, serial_readings
+from studies.serial_noise import SerialCase, SerialNoiseOutcome, serial_case, serial_readings
 from studies.serial_noise_command import _figures
 from studies.study_cases import study_case
 from tests.support.campaigns import configuration
@@ -35,8 +35,8 @@ def test_a_case_counts_what_is_within():
 
 
 def test_requirements_are_of_strong_noise_and_of_white():
-    good = Outcome("adequate", (), (95, 100), (95, 100))
-    bad = Outcome("unknown_effect", ("creep",), (80, 100), (92, 100))
+    good = SerialNoiseOutcome("adequate", (), (95, 100), (95, 100))
+    bad = SerialNoiseOutcome("unknown_effect", ("creep",), (80, 100), (92, 100))
     strong = SerialCase(0, 0.9, "", bad, good, 0.91, proved=True)
     met = [f.met for f in _figures([strong], [0.9]) if f.required]
     assert met == [True, True]

@@ -9,14 +9,14 @@ from hilcal.drivers.simulated.injected_effects import EFFECTS
 from hilcal.errors import InputError
 from hilcal.readings.whitening import whitening
 from studies.diagnosis import intervals
-from studies.random_campaigns import dead_weights
 from studies.study_cases import effects_shown, study_case, with_study_loads
 from studies.study_more import measure_more, suspects
 from studies.unmodelled_laws import LAWS, law_named, shift
 from tests.support.campaigns import configuration
 from tests.support.effect_cases import make
-from tests.support.fit_cases import based
+from tests.support.fit_cases import fitted_model
 from tests.support.refusals import refusal
+from tests.support.rehearsed import dead_weights
 
 
 def case(*hidden, mode="absolute", strength=2.0, **given):
@@ -77,7 +77,7 @@ def test_a_law_outside_of_the_catalogue_acts_at_the_strength_asked(law):
     for mode in law.readings:
         c = case(law.name, mode=mode, strength=3.0)
         assert c.variables == law.variables
-        clean = c.world.sight(c.readings.states)
+        clean = c.world.ideal_readings(c.readings.states)
         change = seen(c) - clean.position
         covariance = c.world.covariance(clean)
         if mode == "deflection":
@@ -120,7 +120,7 @@ def test_true_parameters_have_the_program_s_names():
 
 def test_intervals_hold_true_parameters_and_no_others():
     c = study_case(configuration(), "ur10e", "absolute", (), 0.0, 1)
-    f = based(c.cell, c.readings, "absolute")
+    f = fitted_model(c.cell, c.readings, "absolute")
     (told,) = intervals(f, c.world.truth)
     assert (told.effect, told.parameters) == ("joint_compliance", 6)
     assert told.inside >= 4
@@ -130,7 +130,7 @@ def test_intervals_hold_true_parameters_and_no_others():
 
 
 def diagnosed(c):
-    return diagnose(based(c.cell, c.readings, "deflection"))
+    return diagnose(fitted_model(c.cell, c.readings, "deflection"))
 
 
 @pytest.mark.long
@@ -148,7 +148,7 @@ def test_a_further_round_adds_readings_of_new_poses_in_the_same_world():
     # Every loaded reading has its unloaded one, and noise is what the covariance says.
     loaded = whitening(all_, "deflection", "gc")
     assert len(loaded.reading) == np.count_nonzero(~all_.unloaded)
-    clean = c.world.sight(all_.states).position
+    clean = c.world.ideal_readings(all_.states).position
     white = np.einsum(
         "nij,nj->ni", np.linalg.inv(np.linalg.cholesky(all_.covariance)), all_.value - clean
     )

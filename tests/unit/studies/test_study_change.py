@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from studies.change import Case, case, studied_arm
+from studies.change import ChangeCase, case, studied_arm
 from studies.change_command import figures_of
 from tests.support.campaigns import configuration
 
@@ -30,13 +30,13 @@ def test_a_case_says_how_visible_its_change_was_and_what_was_named():
 
 
 def test_figures_count_what_was_found_missed_and_claimed():
-    good = Case(
+    good = ChangeCase(
         "ur10e", "zero", 3, False, 1, 1e-3, strength=20.0, limit=5.0, parts="joint 3", z=(1.0,)
     )
     small = replace(good, repair="compliance", joint=6, strength=1.0, parts="", z=(), moved_m=6e-6)
     turned = replace(small, repair="zero", joint=1, anew=True, moved_m=1e-3)
     also = replace(good, others=("link 2",), z=(4.0,))
-    quiet = Case("ur10e", "nothing", 0, True, 2)
+    quiet = ChangeCase("ur10e", "nothing", 0, True, 2)
     claimed = replace(quiet, parts="joint 2", of_arm=True, other=True)
     figures = {f.what: f for f in figures_of([good, small, turned, also, *[quiet] * 3, claimed])}
     of = {what: f.measured.split(" (")[0] for what, f in figures.items()}

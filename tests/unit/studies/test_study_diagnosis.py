@@ -8,7 +8,15 @@ from rich.console import Console
 
 from hilcal.errors import InputError
 from hilcal.readings.whitening import MODES
-from studies.diagnosis import Added, Asked, Inside, Judgement, Outcome, Refined, run_case
+from studies.diagnosis import (
+    AddedEffect,
+    DiagnosisCase,
+    DiagnosisOutcome,
+    IntervalCount,
+    Judgement,
+    RefinementResult,
+    run_case,
+)
 from studies.diagnosis_claims import claims
 from studies.diagnosis_document import document
 from studies.diagnosis_pool import run_all
@@ -35,7 +43,7 @@ def asked(**given):
         "kind": "hidden", "robot": "ur10e", "mode": "absolute",
         "hidden": ("creep",), "strength": 2.0, "seed": 0,
     }  # fmt: skip
-    return Asked(**{**usual, **given})
+    return DiagnosisCase(**{**usual, **given})
 
 
 def said(lead="creep", *same_as, verdict="missing_effect", variables=("time", "load"), carriers=()):
@@ -44,20 +52,20 @@ def said(lead="creep", *same_as, verdict="missing_effect", variables=("time", "l
 
 def refined(*added, same_as=(), verdict="adequate", holdout=1.0, inside=()):
     model = ("joint_compliance", *added)
-    sets = tuple(Added(a, same_as) for a in added)
-    return Refined(said(verdict=verdict), sets, model, holdout, holdout, inside)
+    sets = tuple(AddedEffect(a, same_as) for a in added)
+    return RefinementResult(said(verdict=verdict), sets, model, holdout, holdout, inside)
 
 
 def outcome(lead="creep", *same_as, **given):
     """The answer that `lead` is first, to a question about creep."""
-    return Outcome(asked(**given), said(lead, *same_as))
+    return DiagnosisOutcome(asked(**given), said(lead, *same_as))
 
 
 def quick(question):
     """An answer without any work; by module and name, so that other processes find it."""
     if question.seed < 0:
         raise RuntimeError("a seed below 0")
-    return Outcome(question, said(f"effect {question.seed}"))
+    return DiagnosisOutcome(question, said(f"effect {question.seed}"))
 
 
 def extent(*kinds, **given):
@@ -93,7 +101,7 @@ def test_what_came_first_instead_is_counted():
         outcome("hysteresis"),
         outcome("hysteresis"),
         outcome("load_point", "a", "b", "creep"),
-        Outcome(asked(), failure="InputError: no"),
+        DiagnosisOutcome(asked(), failure="InputError: no"),
     ]
     (row,) = by_effect(cases)
     assert (row.found.hits, row.found.cases) == (2, 6)
@@ -105,7 +113,10 @@ def test_what_came_first_instead_is_counted():
 
 def test_a_further_round_is_counted_by_itself():
     again = asked(again=True)
-    cases = [Outcome(again, said("a"), again=said()), Outcome(again, said("a"), again=said("b"))]
+    cases = [
+        DiagnosisOutcome(again, said("a"), again=said()),
+        DiagnosisOutcome(again, said("a"), again=said("b")),
+    ]
     (row,) = by_effect(cases)
     assert (row.found.hits, row.again.hits, row.again.cases) == (0, 1, 2)
     assert row.size_again == 1.0
@@ -114,10 +125,10 @@ def test_a_further_round_is_counted_by_itself():
 
 
 def test_refinements_count_where_the_effect_was_found_and_named():
-    inside = (Inside("creep", 1, 1), Inside("joint_compliance", 4, 6))
-    right = Outcome(asked(), said(), refined("creep", inside=inside))
-    more = Outcome(asked(), said(), refined("creep", "backlash", holdout=1.06))
-    wrong = Outcome(asked(), said("backlash"), refined("backlash", holdout=9.0))
+    inside = (IntervalCount("creep", 1, 1), IntervalCount("joint_compliance", 4, 6))
+    right = DiagnosisOutcome(asked(), said(), refined("creep", inside=inside))
+    more = DiagnosisOutcome(asked(), said(), refined("creep", "backlash", holdout=1.06))
+    wrong = DiagnosisOutcome(asked(), said("backlash"), refined("backlash", holdout=9.0))
     (row,) = afterwards([right, more, wrong])
     assert (row.right.hits, row.right.cases) == (1, 2)
     assert (row.holdout.hits, row.holdout.cases) == (1, 2)
@@ -128,33 +139,39 @@ def test_refinements_count_where_the_effect_was_found_and_named():
 
 def test_of_two_effects_a_set_that_was_added_stands_for_its_members():
     pair = asked(kind="pairs", hidden=("creep", "backlash"))
-    both = Outcome(pair, said(), refined("creep", "backlash"))
-    stand_in = Outcome(pair, said(), refined("creep", "load_point", same_as=("backlash", "x")))
-    one = Outcome(pair, said(), refined("creep"))
+    both = DiagnosisOutcome(pair, said(), refined("creep", "backlash"))
+    stand_in = DiagnosisOutcome(
+        pair, said(), refined("creep", "load_point", same_as=("backlash", "x"))
+    )
+    one = DiagnosisOutcome(pair, said(), refined("creep"))
     assert [both_added(o) for o in (both, stand_in, one)] == [True, False, False]
     assert [both_found(o) for o in (both, stand_in, one)] == [True, True, False]
 
 
 def test_outside_of_the_catalogue_the_verdict_and_the_variable_count():
     law = asked(kind="outside", hidden=("swaying bench",))
-    late = Outcome(law, said(), refined("creep", verdict="unknown_effect"), variables=("time",))
-    never = Outcome(law, said(), refined("creep"), variables=("joint 2 angle",))
+    late = DiagnosisOutcome(
+        law, said(), refined("creep", verdict="unknown_effect"), variables=("time",)
+    )
+    never = DiagnosisOutcome(law, said(), refined("creep"), variables=("joint 2 angle",))
     carried = said(variables=("pose", "load"), carriers=("joint 2 angle",))
     assert [unknown(o) for o in (late, never)] == [True, False]
     assert [followed(o) for o in (late, never)] == [True, False]
-    assert followed(Outcome(law, carried, variables=("joint 2 angle",)))
-    assert not followed(Outcome(law, carried, variables=("time",)))
+    assert followed(DiagnosisOutcome(law, carried, variables=("joint 2 angle",)))
+    assert not followed(DiagnosisOutcome(law, carried, variables=("time",)))
 
 
 def test_claims_are_met_or_not_by_what_is_asked():
-    quiet = [Outcome(asked(kind="nothing", hidden=()), said(verdict="adequate"))] * 99
-    loud = Outcome(asked(kind="nothing", hidden=()), said())
+    quiet = [DiagnosisOutcome(asked(kind="nothing", hidden=()), said(verdict="adequate"))] * 99
+    loud = DiagnosisOutcome(asked(kind="nothing", hidden=()), said())
     (claim,) = claims([*quiet, loud])
     assert (claim.rate.share, claim.met) == (0.99, True)
     (claim,) = claims([*quiet, loud, loud])
     assert claim.met is False
     # An interval may hold too often as well.
-    often = Outcome(asked(), said(), refined("creep", inside=(Inside("creep", 9, 9),)))
+    often = DiagnosisOutcome(
+        asked(), said(), refined("creep", inside=(IntervalCount("creep", 9, 9),))
+    )
     (always,) = (c for c in claims([often]) if "intervals" in c.words)
     assert always.met is False
 
@@ -205,7 +222,7 @@ def test_ctrl_c_leaves_what_there_is(jobs):
     outcomes, complete = run_all(every, quick, jobs, interrupted)
     assert not complete
     assert len(outcomes) == 5
-    assert all(o.asked in every for o in outcomes)
+    assert all(o.case in every for o in outcomes)
 
 
 @pytest.mark.slow
@@ -223,7 +240,7 @@ def written(outcomes):
 
 
 def test_the_document_is_json_and_holds_every_case():
-    cases = [outcome(), Outcome(asked(), failure="InputError: no")]
+    cases = [outcome(), DiagnosisOutcome(asked(), failure="InputError: no")]
     d = document(cases, complete=False)
     again = json.loads(json.dumps(d))
     assert again["complete"] is False

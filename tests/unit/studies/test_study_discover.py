@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from studies.discover import Asked, Outcome
+from studies.discover import DiscoveryCase, DiscoveryOutcome
 from studies.discover_command import claims
 from studies.foreign_laws import KINDS
 from studies.law_scene import scene
 from tests.unit.studies.test_study_cases import case
 
-GOOD = Asked("ur5e", "absolute", law="wear")
+GOOD = DiscoveryCase("ur5e", "absolute", law="wear")
 
 
 def test_every_law_displaces_the_target_as_it_is_drawn():
@@ -29,10 +29,10 @@ def test_every_law_displaces_the_target_as_it_is_drawn():
 
 
 def test_claims_count_what_they_say():
-    right = Outcome(GOOD, "law", "dq_2 = a", "wear", True, True, 0.99, 2.0, 1.1)
-    wrong = Outcome(GOOD, "law", "dq_3 = a", "wear", False, True, 0.9, 2.0, 1.6)
-    silent = Outcome(Asked("ur5e", "absolute"), "adequate")
-    alarm = Outcome(Asked("ur5e", "absolute", stated=0.5), "law", "dq_1 = a")
+    right = DiscoveryOutcome(GOOD, "law", "dq_2 = a", "wear", True, True, 0.99, 2.0, 1.1)
+    wrong = DiscoveryOutcome(GOOD, "law", "dq_3 = a", "wear", False, True, 0.9, 2.0, 1.6)
+    silent = DiscoveryOutcome(DiscoveryCase("ur5e", "absolute"), "adequate")
+    alarm = DiscoveryOutcome(DiscoveryCase("ur5e", "absolute", stated=0.5), "law", "dq_1 = a")
     found = {f.what: f for f in claims([right, wrong, silent, alarm])}
     assert found["site right"].measured == "50 % (1 of 2)"
     assert found["error at fresh poses at most 1.15 times the noise"].met is False
@@ -42,8 +42,8 @@ def test_claims_count_what_they_say():
     assert found["no law where the noise is misjudged by two"].met is False
     assert "no law where an effect of the catalogue is hidden" not in found  # none was
     plain = replace(GOOD, strength=10.0, poses=100)
-    nine = [Outcome(plain, "law", "dq_2 = a", "wear", True, True, 0.99, 2.0, 1.1)] * 9
-    wrong = Outcome(plain, "law", "dq_3 = a", "wear", False, True, 0.99, 2.0, 1.1)
+    nine = [DiscoveryOutcome(plain, "law", "dq_2 = a", "wear", True, True, 0.99, 2.0, 1.1)] * 9
+    wrong = DiscoveryOutcome(plain, "law", "dq_3 = a", "wear", False, True, 0.99, 2.0, 1.1)
     found = {f.what: f for f in claims([*nine, wrong])}
     assert found["site right"].met is False  # nine of ten are enough elsewhere
     assert found["variables right"].required == "95 %"

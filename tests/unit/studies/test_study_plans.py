@@ -10,9 +10,9 @@ from hilcal.design.information import reading_covariance
 from hilcal.engine import open_engine
 from studies.plans import DOUBLE, GRID, PARAMETERS, RANDOM, TEST, plans_study
 from studies.plans_command import arms, with_robot
-from studies.plans_errors import Errors, readings_asked
+from studies.plans_errors import Errors, planned_readings
 from studies.plans_kinds import at_random, grid, matching, optimal, scene
-from studies.plans_statistics import Measured, summary
+from studies.plans_statistics import MeanAndStd, summary
 from studies.plans_table import as_predicted, halved
 from tests.support.campaigns import configuration
 from tests.support.cli_cases import run
@@ -90,7 +90,7 @@ def test_the_stated_uncertainty_of_the_simulation_is_that_of_repeated_studies():
     [(1.09, 0.01, "yes"), (0.91, 0.2, "yes"), (1.15, 0.03, "unclear"), (0.8, 0.04, "no")],
 )
 def test_a_verdict_tells_a_miss_from_noise(value, std, verdict):
-    assert as_predicted(Measured(value, std)) == verdict
+    assert as_predicted(MeanAndStd(value, std)) == verdict
 
 
 @pytest.mark.parametrize("mode", ["deflection", "absolute"])
@@ -99,7 +99,7 @@ def test_every_plan_keeps_its_readings_and_the_limits_of_the_cell(mode, request)
     plans = [at_random(of, 60, np.random.default_rng(k)) for k in range(3)]
     plans += [grid(of, 60), optimal(of, TEST, 60, np.random.default_rng(0))]
     for plan in plans:
-        asked = readings_asked(plan)
+        asked = planned_readings(plan)
         assert 58 <= len(asked.pose) == plan.readings <= 60
         assert len(np.unique(asked.pose)) == plan.poses
         for k, name in enumerate(asked.load_names):
@@ -113,7 +113,7 @@ def test_every_plan_keeps_its_readings_and_the_limits_of_the_cell(mode, request)
 def test_deflections_have_their_own_unloaded_reading_each_time(deflection):
     plan = optimal(deflection, PARAMETERS, 60, np.random.default_rng(0))
     assert plan.counts.max() > 1  # a unit is taken again
-    asked = readings_asked(plan)
+    asked = planned_readings(plan)
     groups = Counter(zip(asked.pose.tolist(), asked.cycle.tolist(), strict=True))
     unloaded = Counter(
         (p, c)
@@ -144,7 +144,7 @@ def test_the_readings_of_random_plans_for_an_accuracy_are_found(deflection):
 @pytest.mark.parametrize("known", [False, True])
 def test_the_simulated_noise_is_the_planned_one(known):
     of = scene_of(configured(known=known))
-    asked = readings_asked(at_random(of, 60, np.random.default_rng(0)))
+    asked = planned_readings(at_random(of, 60, np.random.default_rng(0)))
     measured = arms(0)(of.cell, of.config, 4).measure(asked, np.random.default_rng(0))
     model, theta = of.nominal.model, of.nominal.theta
     planned = reading_covariance(of.nominal, of.config, model.predict(asked.states, theta))

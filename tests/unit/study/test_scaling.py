@@ -20,9 +20,9 @@ from hilcal.study import (
     TARGET,
     UNITS,
     WRENCHES,
-    bound,
-    experiments,
+    cramer_rao_bound,
     make_design,
+    n_experiments,
     scaling_study,
     table,
 )
@@ -154,7 +154,7 @@ def test_observation_matrix_is_the_motion_under_load(design):
 def test_bound_is_the_inverse_of_the_dense_information(design, shared):
     a, v = dense(design, 0.9, shared)
     expected = np.linalg.inv(a.T @ np.linalg.solve(v, a))
-    found = bound(design, design.covariance(0.9), shared)
+    found = cramer_rao_bound(design, design.covariance(0.9), shared)
     np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-10 * expected.max())
 
 
@@ -194,8 +194,8 @@ def test_the_same_bits_on_several_workers():
         alone = on(engine)
     with open_engine(2) as engine:
         assert on(engine) == alone
-    assert len(done) == 2 * experiments(correlations)
-    assert experiments() == 2 * len(CORRELATIONS)
+    assert len(done) == 2 * n_experiments(correlations)
+    assert n_experiments() == 2 * len(CORRELATIONS)
 
 
 def test_json_holds_every_cell(study):

@@ -5,7 +5,7 @@ import pytest
 from hilcal.cell import cell_from_config
 from hilcal.cli.planning import make_plan
 from hilcal.config import CellConfig
-from hilcal.drivers.simulated.rehearsal import case_of_plan, read_plan
+from hilcal.drivers.simulated.rehearsal import case_of_plan, simulate_plan
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError
 from hilcal.robot.catalogue import load_arm
@@ -27,7 +27,7 @@ def readings(folder, hide, seed):
     config = CellConfig.model_validate(CELL)
     plan = make_plan(cell_from_config(config, folder), config, 20, 1, installed())
     secret = case_of_plan(config, plan, hide, seed, None, folder)
-    return config, read_plan(secret, plan, [seed]).readings
+    return config, simulate_plan(secret, plan, [seed]).readings
 
 
 @pytest.mark.parametrize(

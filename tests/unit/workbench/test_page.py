@@ -14,12 +14,14 @@ from hilcal.diagnosis.diagnosis import Reason
 from hilcal.present.verdict import HEADLINES
 from hilcal.workbench.page import View
 from hilcal.workbench.session import WorkbenchSession
-from tests.support.bench_cases import few_effects, stored
+from tests.support.bench_cases import few_effects, store_campaign
 
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
-    made = WorkbenchSession(stored(tmp_path_factory.mktemp("page") / "run.hilcal"), few_effects())
+    made = WorkbenchSession(
+        store_campaign(tmp_path_factory.mktemp("page") / "run.hilcal"), few_effects()
+    )
     made.load()
     return made
 
@@ -29,7 +31,7 @@ async def opened(session: WorkbenchSession) -> AsyncIterator[User]:
     def page():
         view = View(session, "http://test/")
         view.build()
-        view.begin(dark=False)
+        view.draw_page(dark=False)
 
     async with user_simulation(root=page) as user:
         await user.open("/")

@@ -15,14 +15,14 @@ from hilcal.present.campaign import left_out_m, two_revisions, verdict_of
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.whole_file import replace_file
 from hilcal.workbench.session import WorkbenchSession
-from tests.support.bench_cases import BASE, few_effects, stored
+from tests.support.bench_cases import BASE, few_effects, store_campaign
 from tests.support.campaigns import campaign, configuration
 from tests.support.refusals import refusal
 
 
 @pytest.fixture
 def run(tmp_path):
-    return stored(tmp_path / "run.hilcal")
+    return store_campaign(tmp_path / "run.hilcal")
 
 
 @pytest.fixture
@@ -110,7 +110,7 @@ def test_a_changed_cell_keeps_how_the_model_was_reached(run, session, snapshot):
     again = WorkbenchSession(run, few_effects()).load()
     assert (again.number, again.diagnosis.verdict) == (3, found.diagnosis.verdict)
     assert [c.number for c in again.chapters] == [3]
-    assert next(f.text for f in again.figures if f.key == "mass_kg") == "1.4"
+    assert next(f.text for f in again.cell_keys if f.key == "mass_kg") == "1.4"
     before = WorkbenchSession(run, few_effects()).load(revision=2)
     assert (before.changes, before.diagnosis.verdict) == ({}, added.diagnosis.verdict)
     rows = {row[0]: row for row in two_revisions(*again.records[1:]).rows}
@@ -131,7 +131,7 @@ def test_readings_that_came_later_are_fitted_anew(run, session, snapshot):
         o.append(snapshot.fit)
         o.file.append_readings(o.file.readings()[:6])
     refusal("was fitted before readings were appended", session.load)
-    found = session.fit_anew(snapshot)  # on a snapshot older than the file
+    found = session.refit(snapshot)  # on a snapshot older than the file
     assert session.snapshot is found
     assert not session.stale
     assert (found.number, found.fit.model.names) == (2, snapshot.fit.model.names)
@@ -150,7 +150,7 @@ def test_fitting_anew_keeps_the_prior_of_another_campaign(run):
         prior = carried_prior(o.posterior(), "arm", {}, o.catalogue)
     with Campaign.open(later, few_effects()) as o:
         o.append(fitted_with(prior, o, o.fit_in_use()[1]))
-    anew = WorkbenchSession(later, few_effects()).fit_anew(None)
+    anew = WorkbenchSession(later, few_effects()).refit(None)
     kept = anew.fit.model.prior
     assert kept.with_drift(None).to_json() == prior.to_json()  # the drift is chosen anew
     with Campaign.open(later, few_effects(), read_only=True) as o:

@@ -9,14 +9,14 @@ from sklearn.ensemble import HistGradientBoostingRegressor
 from sklearn.multioutput import MultiOutputRegressor
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import Asked, enter, learnt  # type: ignore[import-not-found]
+from benchmark.entrants.common import TaskInput, enter, with_residual_regression  # type: ignore[import-not-found]
 
 
-def boosting(asked: Asked) -> dict[str, Any]:
+def boosting(data: TaskInput) -> dict[str, Any]:
     """Learn the residual, an axis at a time."""
 
     def fit(rows: Any) -> Any:
-        return asked.arm.fit(rows, np.zeros(42), asked.sigma)
+        return data.arm.fit(rows, np.zeros(42), data.sigma)
 
     def make() -> Any:
         trees = HistGradientBoostingRegressor(
@@ -24,7 +24,7 @@ def boosting(asked: Asked) -> dict[str, Any]:
         )
         return MultiOutputRegressor(trees)
 
-    out: dict[str, Any] = learnt(asked, fit, make)
+    out: dict[str, Any] = with_residual_regression(data, fit, make)
     return out
 
 

@@ -16,7 +16,7 @@ from figaroh.calibration.calibration_tools import calc_updated_fkm  # type: igno
 from figaroh.tools.robot import Robot  # type: ignore[import-not-found]
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import Asked, enter, spread  # type: ignore[import-not-found]
+from benchmark.entrants.common import TaskInput, enter, spread  # type: ignore[import-not-found]
 
 CONFIG = """tasks: {{calibration: {{kinematics: {{base_frame: universe, tool_frame: tool0}},
   measurements: {{markers: [{{measurable_dof: [true, true, true, false, false, false]}}]}},
@@ -37,21 +37,21 @@ class PlacedArm(BaseCalibration):  # type: ignore[misc]
         return calc_updated_fkm(self.model, self.data, var, q, config)
 
 
-def geometry(asked: Asked) -> dict[str, Any]:
+def geometry(data: TaskInput) -> dict[str, Any]:
     """Fit all placements at once."""
-    robot = Robot(str(asked.task.folder / "robot.urdf"), package_dirs=None)
-    rows, joints = asked.train, [n for n in robot.model.names if n != "universe"]
+    robot = Robot(str(data.task.folder / "robot.urdf"), package_dirs=None)
+    rows, joints = data.train, [n for n in robot.model.names if n != "universe"]
     with TemporaryDirectory() as folder:
         data, config = Path(folder, "data.csv"), Path(folder, "config.yaml")
         head = ",".join(["x1", "y1", "z1", *joints])
         np.savetxt(data, np.hstack([rows.y, rows.q]), delimiter=",", header=head, comments="")
-        config.write_text(CONFIG.format(s=asked.sigma, n=len(rows.q), data=data), "utf-8")
+        config.write_text(CONFIG.format(s=data.sigma, n=len(rows.q), data=data), "utf-8")
         arm = PlacedArm(robot, str(config))
         arm.calib_config |= {"known_baseframe": False, "known_tipframe": False}
         arm.initialize()
         var = arm.solve(enable_logging=False).x
-    prediction = arm.predicted(var, asked.test.q).reshape(3, -1).T
-    std = spread(arm.cost_function(var).reshape(3, -1).T, asked)
+    prediction = arm.predicted(var, data.test.q).reshape(3, -1).T
+    std = spread(arm.cost_function(var).reshape(3, -1).T, data)
     return {"prediction_m": prediction, "std_m": std, "note": "std from the fit itself"}
 
 

@@ -9,12 +9,12 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import Asked, enter, learnt, ridge  # type: ignore[import-not-found]
+from benchmark.entrants.common import TaskInput, enter, ridge, with_residual_regression  # type: ignore[import-not-found]
 
 
-def gaussian_process(asked: Asked) -> dict[str, Any]:
+def gaussian_process(data: TaskInput) -> dict[str, Any]:
     """Learn the residual with one length for all features."""
-    fit, _ = ridge(asked)
+    fit, _ = ridge(data)
     kernel = ConstantKernel(0.5, (1e-4, 10.0)) * RBF(5.0, (1.0, 100.0)) + WhiteKernel(
         0.5, (1e-4, 10.0)
     )
@@ -22,7 +22,7 @@ def gaussian_process(asked: Asked) -> dict[str, Any]:
     def make() -> Any:
         return GaussianProcessRegressor(kernel, n_restarts_optimizer=1, random_state=0)
 
-    out: dict[str, Any] = learnt(asked, fit, make)
+    out: dict[str, Any] = with_residual_regression(data, fit, make)
     return out
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import hilcal as hc
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import JOINTS, WRENCH, Asked, enter  # type: ignore[import-not-found]
+from benchmark.entrants.common import JOINTS, WRENCH, TaskInput, enter  # type: ignore[import-not-found]
 
 CELL = """robot = {{model = "{urdf}", gravity_m_s2 = {gravity_m_s2}}}
 tool = {{mass_kg = {tool[mass_kg]}, com_m = {tool[com_m]}, load_point_m = {load_point_m}}}
@@ -23,15 +23,15 @@ repeatability.joint_std_rad = {r}
 """
 
 
-def calibrated(asked: Asked) -> dict[str, Any]:
+def calibrated(data: TaskInput) -> dict[str, Any]:
     """Refine from the baseline, or from the baseline with a discovered law."""
-    about, law, note = asked.task.about, None, ""
+    about, law, note = data.task.about, None, ""
     r = 0.0 if about["track"] in ("ur10", "ur5") else 1e-9  # no arm scatters in a simulated task
     with TemporaryDirectory() as folder:
-        urdf, file = (asked.task.folder / "robot.urdf").resolve(), Path(folder, "CELL.toml")
-        file.write_text(CELL.format(**about["arm"], urdf=urdf, s=asked.sigma, r=r), "utf-8")
+        urdf, file = (data.task.folder / "robot.urdf").resolve(), Path(folder, "CELL.toml")
+        file.write_text(CELL.format(**about["arm"], urdf=urdf, s=data.sigma, r=r), "utf-8")
         cell = hc.Cell.load(file)
-    readings = hc.read_table(asked.task.folder / "train.csv", cell)
+    readings = hc.read_table(data.task.folder / "train.csv", cell)
     model = hc.baseline(cell, readings, "absolute")
     if "acts_on" in about:
         d = hc.discover(hc.fit(model, readings, "absolute"))
@@ -41,7 +41,7 @@ def calibrated(asked: Asked) -> dict[str, Any]:
             note, law = f"; {d.laws[0].formula}", d.laws[0].expressions.get(site)
             model = d.after.model
     path = hc.refine(model, readings, "absolute")
-    test, names = asked.task.test, {"time": "time_s", "air_temperature": "air_degC"}
+    test, names = data.task.test, {"time": "time_s", "air_temperature": "air_degC"}
     recorded = {n: test.numbers[c] for n, c in names.items() if c in test.numbers}
     states = hc.States(test.of(JOINTS), test.of(WRENCH), **recorded)
     calibration = hc.Calibration.of(path.fit)

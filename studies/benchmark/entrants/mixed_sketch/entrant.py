@@ -15,24 +15,24 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import Asked, enter, families, ridge  # type: ignore[import-not-found]
+from benchmark.entrants.common import TaskInput, enter, families, ridge  # type: ignore[import-not-found]
 
 WAVES, SPREAD = 32, 3.0
 OFTEN: Any = {"maxiter": 4, "xtol": 0.05, "ftol": 1e-4}
 
 
-def mixed(asked: Asked) -> dict[str, Any]:
+def mixed(data: TaskInput) -> dict[str, Any]:
     """Estimate the variances, predict by the BLUP, and state its standard deviation."""
-    theta = ridge(asked)[0](asked.train)
+    theta = ridge(data)[0](data.train)
     theta[9:] = 0.0
-    (a, z), (at, zt) = (families(asked, theta, r, WAVES) for r in (asked.train, asked.test))
-    r = (asked.train.y - asked.arm.predict(theta, asked.train)).ravel()
+    (a, z), (at, zt) = (families(data, theta, r, WAVES) for r in (data.train, data.test))
+    r = (data.train.y - data.arm.predict(theta, data.train)).ravel()
     gram = [c @ c.T for c in z.values()]
     mean = np.r_[0.0, 0.0, 0.0, -0.7 * np.arange(len(z) - 3), 0.0]
 
     def solved(s: Any) -> tuple[Any, Any, Any, Any]:
         v = sum(np.exp(2 * x) * g for x, g in zip(s, gram, strict=False))
-        root = cho_factor(v + np.exp(2 * s[-1]) * asked.sigma**2 * np.eye(len(r)), lower=True)
+        root = cho_factor(v + np.exp(2 * s[-1]) * data.sigma**2 * np.eye(len(r)), lower=True)
         wa = cho_solve(root, a)
         inner = np.linalg.inv(a.T @ wa)
         b = inner @ (wa.T @ r)
@@ -52,7 +52,7 @@ def mixed(asked: Asked) -> dict[str, Any]:
     frames = at - across @ cho_solve(root, a)
     variance = np.sum(test**2, 1) - np.sum(across * cho_solve(root, across.T).T, 1)
     std = np.sqrt(np.maximum(variance + np.sum((frames @ inner) * frames, 1), 0.0))
-    position = asked.arm.predict(theta, asked.test) + (at @ b + across @ w).reshape(-1, 3)
+    position = data.arm.predict(theta, data.test) + (at @ b + across @ w).reshape(-1, 3)
     return {"prediction_m": position, "std_m": std.reshape(-1, 3)}
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pysindy as ps  # type: ignore[import-not-found]
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import Asked, Sought, chosen, enter, ridge, spread, wave  # type: ignore[import-not-found]
+from benchmark.entrants.common import FormulaSearch, TaskInput, chosen, enter, ridge, spread, wave  # type: ignore[import-not-found]
 
 THRESHOLDS = (0.1, 0.2, 0.3, 0.5, 10.0)  # least share of a term in what is explained; 10: no term
 
@@ -36,19 +36,19 @@ def model(sought: Any, threshold: float) -> Any:
     return sindy.fit(sought.x, t=1.0, x_dot=sought.y, feature_names=sought.names)
 
 
-def sparse(asked: Asked) -> dict[str, Any]:
+def sparse(data: TaskInput) -> dict[str, Any]:
     """Choose the threshold on poses left out."""
-    fit, _ = ridge(asked)
+    fit, _ = ridge(data)
 
     def predict(threshold: float, rows: Any, tested: Any) -> Any:
         theta = fit(rows)
-        train, test = Sought.of(asked, theta, rows), Sought.of(asked, theta, tested)
+        train, test = FormulaSearch.of(data, theta, rows), FormulaSearch.of(data, theta, tested)
         return replace(test, size=train.size).positions(model(train, threshold).predict(test.x))
 
-    best, residual = chosen(asked, THRESHOLDS, predict)
-    out = {"prediction_m": predict(best, asked.train, asked.test), "std_m": spread(residual, asked)}
-    if "acts_on" in asked.task.about:
-        train = Sought.of(asked, fit(asked.train), asked.train)
+    best, residual = chosen(data, THRESHOLDS, predict)
+    out = {"prediction_m": predict(best, data.train, data.test), "std_m": spread(residual, data)}
+    if "acts_on" in data.task.about:
+        train = FormulaSearch.of(data, fit(data.train), data.train)
         sindy = model(train, best)
         out["law"] = train.law(sindy.coefficients()[0], sindy.get_feature_names())
     return out

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import Asked, Sought, enter, ridge, spread  # type: ignore[import-not-found]
+from benchmark.entrants.common import FormulaSearch, TaskInput, enter, ridge, spread  # type: ignore[import-not-found]
 
 
 def regression() -> Any:
@@ -28,12 +28,15 @@ def regression() -> Any:
     )  # fmt: skip
 
 
-def symbolic(asked: Asked) -> dict[str, Any]:
+def symbolic(data: TaskInput) -> dict[str, Any]:
     """Search a formula of each column of the values."""
     search = regression()
-    fit, residual = ridge(asked)
-    theta = fit(asked.train)
-    train, test = Sought.of(asked, theta, asked.train), Sought.of(asked, theta, asked.test)
+    fit, residual = ridge(data)
+    theta = fit(data.train)
+    train, test = (
+        FormulaSearch.of(data, theta, data.train),
+        FormulaSearch.of(data, theta, data.test),
+    )
     names = [f"x{k}" for k in range(train.x.shape[1])]
     value, text = np.zeros((len(test.x), train.y.shape[1])), ""
     for k in range(train.y.shape[1]):
@@ -42,9 +45,9 @@ def symbolic(asked: Asked) -> dict[str, Any]:
         text = f"{train.size!r}*({search.sympy()})".replace("Max", "max").replace("Abs", "abs")
     for name, plain in sorted(zip(names, train.names, strict=True), reverse=True):
         text = text.replace(name, plain)
-    law = {"formula": text} if "acts_on" in asked.task.about else None
-    moved = test.known + np.einsum("nik,nk->ni", test.moves, value)
-    return {"prediction_m": moved, "std_m": spread(residual, asked), "law": law}
+    law = {"formula": text} if "acts_on" in data.task.about else None
+    moved = test.fitted_position + np.einsum("nik,nk->ni", test.derivative, value)
+    return {"prediction_m": moved, "std_m": spread(residual, data), "law": law}
 
 
 if __name__ == "__main__":

@@ -5,14 +5,14 @@ from pathlib import Path
 from typing import Any
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import Asked, enter, ridge, spread  # type: ignore[import-not-found]
+from benchmark.entrants.common import TaskInput, enter, ridge, spread  # type: ignore[import-not-found]
 
 
-def geometry(asked: Asked) -> dict[str, Any]:
+def geometry(data: TaskInput) -> dict[str, Any]:
     """Fit 51 parameters."""
-    fit, residual = ridge(asked)
-    position = asked.arm.predict(fit(asked.train), asked.test)
-    return {"prediction_m": position, "std_m": spread(residual, asked)}
+    fit, residual = ridge(data)
+    position = data.arm.predict(fit(data.train), data.test)
+    return {"prediction_m": position, "std_m": spread(residual, data)}
 
 
 if __name__ == "__main__":

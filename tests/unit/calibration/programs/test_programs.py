@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.calibration.programs.fanuc_inform import INFORM, LS
 from hilcal.calibration.programs.krl import KRL
-from hilcal.calibration.programs.languages import flags_of, resolve, understood, unlike
+from hilcal.calibration.programs.languages import flags_of, form_mismatch, read_program, resolve
 from hilcal.calibration.programs.program import UNSTATED, Language, Program, ProgramPoint
 from hilcal.calibration.programs.rapid import RAPID
 from hilcal.errors import InputError
@@ -156,7 +156,7 @@ def flange(maker, q):
 def read(maker, arms, folder=EXAMPLES, **more):
     e = EXAMPLE[maker]
     frames = None if e.frames is None else EXAMPLES / e.frames
-    return understood(folder / e.file, arms[maker], frames=frames, **more)
+    return read_program(folder / e.file, arms[maker], frames=frames, **more)
 
 
 def copied(maker, folder, change):
@@ -227,7 +227,7 @@ def test_offs_and_reltool_move_as_abb_defines_them():
 @pytest.mark.parametrize("maker", first(2, list(EXAMPLE)))
 def test_flags_tell_every_branch_and_turn(maker, arms):
     arm, language = arms[maker], EXAMPLE[maker].language
-    assert unlike(arm, language) == ""
+    assert form_mismatch(arm, language) == ""
     q = np.random.default_rng(5).uniform(0.9 * arm.q_min, 0.9 * arm.q_max, (12, 6))
     q[:, 4] = np.where(np.abs(q[:, 4]) < 0.2, 0.5, q[:, 4])
     chain = evaluate(arm, q)
@@ -285,11 +285,11 @@ def test_what_is_left_and_all_that_it_counts_from_stay_as_they_are(
 ):
     copied(maker, tmp_path, lambda text: text.replace(old, new))
     found = read(maker, arms, tmp_path, leave=True)
-    assert [p.name for p in found.program.points if p.left] == left
+    assert [p.name for p in found.program.points if p.not_corrected] == left
     for suffix, content in found.corrected(found.q + DELTA).items():
         before = (tmp_path / f"weld{suffix}").read_bytes().split(b"\r\n")
         for p in found.program.points:
-            if p.left and (p.name.startswith("line") != (suffix == ".dat")):
+            if p.not_corrected and (p.name.startswith("line") != (suffix == ".dat")):
                 assert content.split(b"\r\n")[p.line - 1] == before[p.line - 1]
 
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
 from hilcal.drivers.simulated.blackboard import Blackboard
-from hilcal.drivers.simulated.injected_effects import nothing_hidden
+from hilcal.drivers.simulated.injected_effects import world_without_effect
 from hilcal.drivers.simulated.truth import Truth
 from hilcal.drivers.simulated.world import World
 from hilcal.drivers.simulated.world_server import WorldState
@@ -76,8 +76,8 @@ def moment_beyond(cell, q, wrench, j):
     return total, slots[j][:3, 2], point, where
 
 
-def further(seed):
-    """A bit of the effects that `living_cell.everything` has not, all numbers odd."""
+def remaining_effects(seed):
+    """A bit of the effects that `every_effect` has not, all numbers odd."""
     rng, rigid = np.random.default_rng(seed), Truth.rigid(ur10e_arm())
     size = {
         "tool_compliance": 1e-5,
@@ -122,11 +122,11 @@ def config(**sections: Any) -> CellConfig:
 def world_of(made: CellConfig, seed: int = 1, joint_std: float = 1e-5, **hidden: Any) -> World:
     """The world of a configuration with the given parts of its truth."""
     rng = np.random.default_rng(seed)
-    world = nothing_hidden(cell_from_config(made), rng, joint_std=joint_std)
+    world = world_without_effect(cell_from_config(made), rng, joint_std=joint_std)
     return replace(world, physics=replace(world.physics, **hidden))
 
 
-class Life:
+class RunningWorld:
     """A living world in this process, with a controller that does what the test says."""
 
     def __init__(self, world: World, made: CellConfig, path: Path, seed: int = 5) -> None:
@@ -141,9 +141,9 @@ class Life:
         self.arrivals += 1
         fields = {"q": q, "side": SIDE, "arrivals": self.arrivals, "moving": 0.0, "alive": 1.0}
         self.board.write("arm", **fields)
-        return self.look()
+        return self.truth_after()
 
-    def look(self, seconds: float = 1.0) -> Any:
+    def truth_after(self, seconds: float = 1.0) -> Any:
         """Let the world look once, so many real seconds later, and return the truth."""
         self.now_ns += round(seconds * 1e9)
         self.living.step(self.now_ns)
@@ -164,7 +164,7 @@ WEIGHT = np.array([0.0, 0.0, -5.0 * 9.80665, 0.0, 0.0, 0.0])
 PULL = np.array([80.0, 10.0, 0.0, 0.0, 6.0, -3.0])
 
 
-def everything(rng):
+def every_effect(rng):
     """A bit of every effect, all numbers odd."""
     arm = arm_of("ur10e")
     rigid = Truth.rigid(arm, harmonics=3)
@@ -186,10 +186,10 @@ def everything(rng):
     return {n: s * rng.uniform(0.5, 1.0, getattr(rigid, n).shape) for n, s in size.items()}
 
 
-def life(tmp_path, joint_std=1e-5, sections=None, **hidden):
+def running_world(tmp_path, joint_std=1e-5, sections=None, **hidden):
     made = config(**(sections or {}))
-    return Life(world_of(made, joint_std=joint_std, **hidden), made, tmp_path)
+    return RunningWorld(world_of(made, joint_std=joint_std, **hidden), made, tmp_path)
 
 
-def same(a, b):
+def same_bytes(a, b):
     return np.asarray(a).tobytes() == np.asarray(b).tobytes()
