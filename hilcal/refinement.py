@@ -4,6 +4,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cache
 
+import numpy as np
+
 from hilcal import limits
 from hilcal.diagnosis.background_evidence import (
     JOINT_LEVEL,
@@ -172,7 +174,8 @@ def refine(
     # The misfit of the first model may have hidden a correlation of the noise, or imitated one.
     white = last
     if last.readings.serial is not None:
-        white = fit(last.model, last.readings.with_serial(None), mode, start=last.theta)
+        plain = last.readings.with_serial(None)
+        white = fit(last.model, plain, mode, start=last.theta, outlier=last.kept_outlier)
     noise = serial_noise(white)
     if (noise is None) == (last.readings.serial is None):
         return refinement
@@ -368,10 +371,21 @@ class Path:
             return False
         self._say("fitting all effects of the catalogue together")
         fitted = with_background(last.fit, self._start)
-        if fitted is None or not background_is_better(last.fit, fitted):
+        if fitted is None:
+            return False
+        named = last.fit
+        if np.any(fitted.outlier & ~named.outlier):  # compared without the same gross errors
+            try:
+                named = fit(
+                    named.model, named.readings, named.mode,
+                    start=named.theta, outlier=fitted.outlier,
+                )  # fmt: skip
+            except CannotAnswerError:  # as many parameters as measured elements
+                return False
+        if not background_is_better(named, fitted):
             return False
         doubtful = not proved_together or d.verdict == "unknown_effect"
-        if doubtful and not predicts_better(last.fit, fitted):
+        if doubtful and not predicts_better(named, fitted):
             return False
         self._say("the background of all effects predicts better; diagnosing")
         tested = background_evidence(fitted)

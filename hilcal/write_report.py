@@ -170,7 +170,8 @@ def _scalings(last: Fit, say: Say) -> dict[Scaling, Fit]:
     for s in SCALINGS if last.scaling == "gc" else ():
         say(f"fitting with scaling {s}")
         try:
-            out[s] = last if s == "gc" else fit(last.model, last.readings, last.mode, s)
+            args = last.model, last.readings, last.mode, s
+            out[s] = last if s == "gc" else fit(*args, outlier=last.kept_outlier)
         except CannotAnswerError:
             continue
     return out

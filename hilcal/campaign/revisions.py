@@ -138,7 +138,9 @@ def restore(
         serial = record.parameters_json.get(SERIAL)
         if serial is not None:
             readings = readings.with_serial(SerialNoise.from_json(serial))
-    return fit(model, readings, mode, scaling, theta, prior)
+        outlier = np.isin(np.arange(len(readings)), record.parameters_json["outliers"])
+    # Only the mixed model with re-estimated variances tells the gross errors beside a background.
+    return fit(model, readings, mode, scaling, theta, prior, outlier if model.background else None)
 
 
 def _fitted_to(record: RevisionRecord, readings: Readings, stored: str | None) -> bool:

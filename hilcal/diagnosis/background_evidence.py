@@ -82,12 +82,16 @@ def p_value_of_others(fit: Fit) -> float:
 def background_is_better(named: Fit, background: Fit) -> bool:
     """Whether a fit with a background is better than one with the named effects alone.
 
-    The rms error on poses left out must fall by the share `LEAST_GAIN`; both errors are whitened by
-    the noise of the fit with the background.
+    The rms error on poses left out must fall by the share `LEAST_GAIN`; both errors are whitened by the
+    noise of the fit with the background. Gross errors of both fits do not count.
     """
     raw, w = all_left_out(background)
-    square = float(np.sum(w.whiten(all_left_out(named)[0]) ** 2))
-    return float(np.sum(w.whiten(raw) ** 2)) <= (1 - LEAST_GAIN) ** 2 * square
+    other, scaling = all_left_out(named)
+    place = np.empty(len(named.readings), dtype=np.int64)
+    place[scaling.reading] = np.arange(len(other))
+    counts = ~(background.outlier & named.outlier)[w.reading, None]
+    square = float(np.sum(w.whiten(counts * other[place[w.reading]]) ** 2))
+    return float(np.sum(w.whiten(counts * raw) ** 2)) <= (1 - LEAST_GAIN) ** 2 * square
 
 
 def background_evidence(fit: Fit) -> tuple[BackgroundEffect, ...]:

@@ -312,7 +312,8 @@ class Evidence:
         if self.arm_scatter is None or prefers_instrument(self.arm_scatter):
             return None
         scattered = with_arm_scatter(model.cell, readings, self.arm_scatter)
-        fitted = fit(model, scattered, self.fit.mode, start=self.fit.theta)
+        outlier = self.fit.kept_outlier
+        fitted = fit(model, scattered, self.fit.mode, start=self.fit.theta, outlier=outlier)
         return Evidence(fitted, self._refit, self._say, self._regressions)
 
     @cached_property

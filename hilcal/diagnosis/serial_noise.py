@@ -265,7 +265,7 @@ class _SerialProblem:
         inverse = half + np.tril(half, -1).T
         b = inverse @ self.columns
         h = self.columns.T @ b + np.diag(self.ridge)
-        h += ROUNDING * float(np.trace(h)) / len(h) * np.eye(len(h))
+        h += ROUNDING * float(np.trace(h)) / max(len(h), 1) * np.eye(len(h))
         lifted = b @ inverse_root(h).T
         p = inverse - lifted @ lifted.T
         log_det = 2 * float(np.log(np.diag(lower)).sum()) + float(np.linalg.slogdet(h)[1])
@@ -395,7 +395,8 @@ def _problem(white: Fit, clock: Clock) -> _SerialProblem | None:
     s = white.solution
     live = np.flatnonzero(s.estimated)
     jacobian = white.model.jacobian(s.prediction, s.theta, m, live)[rows]
-    columns = whitened @ (jacobian.reshape(-1, len(live)) @ s.transform[live])
+    flat = jacobian.reshape(len(rows) * m, len(live))  # also of a model without parameters
+    columns = whitened @ (flat @ s.transform[live])
     y = inverse @ white.raw[place[loaded], :m].reshape(-1) + columns @ s.coordinates()
     of_readings = whitened.reshape(len(y), len(rows), m)
     factor = np.einsum("rni,nij->rnj", of_readings, instrument_root(used, m))

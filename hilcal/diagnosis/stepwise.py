@@ -30,7 +30,9 @@ def add(before: Fit, effect: str, options: Options | None = None) -> Fit:
             cannot show; an unknown option, or a bad value.
     """
     model, start = _grown(before.model, before.theta, effect, before.readings, options)
-    return fit(model, before.readings, before.mode, before.scaling, start)
+    return fit(
+        model, before.readings, before.mode, before.scaling, start, outlier=before.kept_outlier
+    )
 
 
 def trial(before: Fit, effect: str) -> Fit | None:
@@ -48,7 +50,9 @@ def remove(before: Fit, effect: str) -> Fit:
         InputError: an effect that the model lacks.
     """
     model, start = _reduced(before.model, before.theta, effect)
-    return fit(model, before.readings, before.mode, before.scaling, start)
+    return fit(
+        model, before.readings, before.mode, before.scaling, start, outlier=before.kept_outlier
+    )
 
 
 def _reduced(model: Model, theta: Floats, effect: str) -> tuple[Model, Floats]:
@@ -93,7 +97,9 @@ def exchange(before: Fit, effect: str, replacement: str) -> Fit:
     if replacement in names:
         raise InputError(f"effect {replacement} is in the model already: {', '.join(names)}")
     model, start = _grown(model, start, replacement, before.readings)
-    return fit(model, before.readings, before.mode, before.scaling, start)
+    return fit(
+        model, before.readings, before.mode, before.scaling, start, outlier=before.kept_outlier
+    )
 
 
 def predicts_better(before: Fit, after: Fit) -> bool:

@@ -461,7 +461,8 @@ class LawSearch:
         effect = catalogue.make(name, model.cell, fitted.readings.states, m=fitted.readings.m)
         grown = replace(model, effects=(*model.effects, effect), catalogue=catalogue)
         self._sources[name] = d.source
-        return fit(grown, fitted.readings, fitted.mode, fitted.scaling, after.theta), name
+        of = fitted.readings, fitted.mode, fitted.scaling, after.theta
+        return fit(grown, *of, outlier=fitted.kept_outlier), name
 
     def path(self, name: str) -> Path:
         """Return the file of a law."""

@@ -104,7 +104,8 @@ def refit_exactly(
         effect = kind(before.model.cell, s.states)
         model = replace(before.model, effects=(*before.model.effects, effect))
         start = np.concatenate([before.theta, np.zeros(form.count)])
-        after = fit(model, before.readings, before.mode, before.scaling, start)
+        outlier = before.kept_outlier
+        after = fit(model, before.readings, before.mode, before.scaling, start, outlier=outlier)
         rows = model.slices()[-1]
         theta, std = after.theta[rows], after.uncertainty.std[rows]
         determined = np.isfinite(std)

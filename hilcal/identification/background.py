@@ -19,6 +19,7 @@ from hilcal.errors import CannotAnswerError
 from hilcal.identification.arm_scatter import some_poses, with_arm_scatter
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.full_covariance import joint_factors
+from hilcal.identification.gross_errors import gross_errors_beside
 from hilcal.identification.mixed_fit import (
     INSTRUMENT,
     MOST_NOISE_ROWS,
@@ -188,8 +189,9 @@ def with_background(fitted: Fit, named: Collection[str]) -> Fit | None:
 
     The noise is that of the mixed model. The arm's scatter is added to the covariance. Instead of
     multiplying the instrument's noise by its estimated factor, the standard deviations of the
-    effects are divided by this factor, which gives the same fit. Gross errors stay set aside. The
-    `named` effects do not belong to the background.
+    effects are divided by this factor, which gives the same fit. Gross errors stay set aside, and
+    those that only show beside all effects are (`gross_errors_beside`). The `named` effects do not
+    belong to the background.
 
     With more than `MOST_NOISE_ROWS` elements of readings, the ratio of the arm's scatter to the
     instrument's noise is estimated from poses chosen at random; all readings then determine the
@@ -197,19 +199,27 @@ def with_background(fitted: Fit, named: Collection[str]) -> Fit | None:
     """
     readings = fitted.readings.as_stated()
     model = with_all_effects(fitted.model, readings[~fitted.outlier].states)
-    sample = readings[~fitted.outlier]
+    outlier, sample = fitted.outlier.copy(), readings[~fitted.outlier]
+    few = sample.value.size <= MOST_NOISE_ROWS
     sample = sample[some_poses(sample, MOST_NOISE_ROWS / sample.value.size, SEED)]
     try:
         mixed = mixed_fit_of(model, sample, fitted.mode)
+        if few and (gross := gross_errors_beside(mixed, fitted.mode)).any():
+            outlier[np.flatnonzero(~outlier)[gross]] = True
+            sample = readings[~outlier]
+            mixed = mixed_fit_of(model, sample, fitted.mode)
         if not readings.scatter_stated:
             readings = with_arm_scatter(model.cell, readings, _scatter(mixed))
-        inliers = readings[~fitted.outlier]
+        inliers = readings[~outlier]
         if len(sample) < len(inliers):
             inliers = replace(inliers, scatter_stated=True)
             mixed = mixed_fit_of(model, inliers, fitted.mode, start=mixed)
         if _implausible(mixed) - set(fitted.model.names):
             return None
-        return fit(background_model(mixed, named), readings, fitted.mode, start=mixed.theta)
+        return fit(
+            background_model(mixed, named), readings, fitted.mode, start=mixed.theta,
+            outlier=outlier if few else None,
+        )  # fmt: skip
     except CannotAnswerError:
         return None
 

@@ -205,6 +205,14 @@ class Fit(WithVarianceFactor, Tabular):
         return self.solution.theta
 
     @property
+    def kept_outlier(self) -> Bools | None:
+        """`outlier` of a fit with a background, which its refits keep; None without one.
+
+        They were sought beside all effects, with the sizes of these estimated anew.
+        """
+        return self.outlier if self.model.background else None
+
+    @property
     def rank(self) -> int:
         """Number of directions of the parameters that the data determine."""
         return int(self.solution.equations.basis.transform.shape[1])
@@ -309,13 +317,15 @@ def fit(
     scaling: Scaling = "gc",
     start: Floats | None = None,
     prior: Floats | None = None,
+    outlier: Bools | None = None,
 ) -> Fit:
     """Fit a model to readings.
 
     `start` and `prior` of a previous fit reproduce it in few steps. The drift of a carried prior is
     estimated from the readings, unless `prior` is given.
 
-    Gross errors are set aside: they stay in the file and are listed, but are not fitted.
+    Gross errors are set aside: they stay in the file and are listed, but are not fitted. They are
+    sought unless `outlier` (N,) says which readings they are.
 
     Raises:
         CannotAnswerError: fewer measured elements than identifiable parameters.
@@ -324,7 +334,7 @@ def fit(
     limits.check_fitted(len(readings), readings.m)
     if model.prior is not None and prior is None:
         model = replace(model, prior=model.prior.with_drift(None))
-    used, disagreement, (w, solution) = _set_aside(model, readings, mode, start, prior)
+    used, disagreement, (w, solution) = _set_aside(model, readings, mode, start, prior, outlier)
     if model.prior is not None and prior is None:
         for _ in range(DRIFT_ROUNDS):
             drift, old = chosen_drift(model, solution, w), model.prior.drift
@@ -333,7 +343,9 @@ def fit(
                 break
             model = replace(model, prior=model.prior.with_drift(drift))
             restart = solution.theta
-            used, disagreement, (w, solution) = _set_aside(model, readings, mode, restart, None)
+            used, disagreement, (w, solution) = _set_aside(
+                model, readings, mode, restart, None, outlier
+            )
     inliers, fitted = readings[used], w
     if scaling != "gc":
         fitted, solution = _solve(model, inliers, mode, scaling, start, prior)
@@ -359,9 +371,16 @@ def fit(
 
 
 def _set_aside(
-    model: Model, readings: Readings, mode: Mode, start: Floats | None, prior: Floats | None
+    model: Model,
+    readings: Readings,
+    mode: Mode,
+    start: Floats | None,
+    prior: Floats | None,
+    outlier: Bools | None,
 ) -> tuple[Bools, Disagreement | None, _Solved]:
     """Readings (N,) without gross errors, their disagreement, and their gc-scaled solution."""
+    if outlier is not None:
+        return ~outlier, None, _solve(model, readings[~outlier], mode, "gc", start, prior)
     used = np.ones(len(readings), dtype=bool)
     w, solution = _solve(model, readings, mode, "gc", start, prior)
     distance2 = mahalanobis2(solution.raw, w.covariance)

@@ -170,6 +170,18 @@ def linearised_problem(model: Model, readings: Readings, mode: Mode, theta: Floa
     return problem.compressed() if many else problem
 
 
+def shift_rows(model: Model, readings: Readings, mode: Mode) -> Floats:
+    """(R, N, m) rows of `linearised_problem` by a unit shift of each element of each reading.
+
+    For at most `MOST_NOISE_ROWS` elements of readings.
+    """
+    readings = readings.as_stated()
+    w, count = whitening(readings, mode, "gc"), readings.value.size
+    shifts = np.eye(count).reshape(len(readings), readings.m, count)
+    rows, _ = _noise(model, readings, w, w.whiten_readings(shifts))
+    return rows.reshape(len(rows), len(readings), readings.m)
+
+
 def sizes_at(problem: MixedProblem, model: Model, theta: Floats) -> Floats:
     """Log s and η (F + N,) from the standard deviations of the model, or else from theta (P,).
 

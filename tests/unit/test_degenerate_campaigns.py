@@ -90,3 +90,14 @@ def test_odd_campaigns_are_judged_or_refused_in_words(of, extra):
 @given(odd_campaigns(), st.sampled_from([None, *EXTRA]))
 def test_many_odd_campaigns_are_judged_or_refused_in_words(of, extra):
     judged_or_refused(of, extra)
+
+
+def test_a_campaign_in_which_nothing_is_unknown_is_judged():
+    """Known frames and no load: the first model has no parameter at all."""
+    cell = cell_of(registration_known=True)
+    rng = np.random.default_rng(3)
+    whole = with_noise(noiseless(world_of(cell, rng), plan(16)), rng)
+    some = whole[np.flatnonzero(whole.unloaded)]
+    model = hc.baseline(cell, some, "absolute")
+    assert model.size == 0
+    assert hc.refine(model, some, "absolute").verdict in VERDICTS.values()

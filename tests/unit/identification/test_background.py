@@ -9,11 +9,14 @@ from scipy.stats import chi2
 from hilcal.calibration.scatter import budget
 from hilcal.campaign.revisions import restore, to_record
 from hilcal.cell import Cell
+from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.diagnosis.stepwise import add, remove
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.background import background_of, family_sizes, with_pooled_lines
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
+from hilcal.identification.gross_errors import gross_errors_beside
+from hilcal.identification.linearisation import linearise
 from hilcal.identification.mixed_fit import mixed_fit
 from hilcal.identification.predictive import predictive_of
 from hilcal.library import read_table
@@ -287,3 +290,53 @@ def test_a_hidden_effect_of_deflections_has_the_evidence():
     assert min(p.values()) > 0.01
     # the registration is known by its prior, and nothing else is of its size
     assert found.std("base_frame") == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("gross", [[4, 17], [2, 9, 21]])
+def test_gross_errors_that_all_effects_together_hide_are_set_aside(gross, found, series):
+    """3 mm, where the named effects alone leave 0.5 mm."""
+    some, rng = series[:30], np.random.default_rng(8)
+    value, off = some.value.copy(), rng.standard_normal((len(gross), 3))
+    value[gross] += 3e-3 * off / np.linalg.norm(off, axis=1, keepdims=True)
+    off = replace(some, value=value)
+    again = refine(baseline(UR10, off, "absolute"), off, "absolute")
+    assert np.flatnonzero(again.fit.outlier).tolist() == gross
+    assert not found.fit.outlier.any()
+    assert error(again.fit, series[500:]) < 1.15 * error(found.fit, series[500:])
+    assert again.verdict == found.verdict
+    record = to_record(again.fit, again.diagnosis.to_dict(), BACKGROUND, content_hash(off))
+    stored = restore(from_text(to_text(record), 2), UR10, off)
+    assert stored.outlier.tolist() == again.fit.outlier.tolist()
+
+
+def test_an_unloaded_reading_with_a_gross_error_takes_its_deflections_along():
+    config = configuration()
+    case = study_case(config, "ur10e", "deflection", (TILT,), 3.0, 1, n_poses=8)
+    row = int(np.flatnonzero(case.readings.unloaded)[3])
+    value = case.readings.value.copy()
+    value[row] += [2e-3, 0.0, 1e-3]
+    off = replace(case.readings, value=value)
+    mixed = mixed_fit(baseline(case.cell, off, "deflection"), off, "deflection")
+    gross = gross_errors_beside(mixed, "deflection")
+    assert np.flatnonzero(gross).tolist() == np.flatnonzero(off.pose == off.pose[row]).tolist()
+
+
+def test_beside_a_background_chance_explains_nothing(found):
+    """Of an arm with the sizes of the background no variable explains the residual."""
+    f = found.fit
+    root, p_values = np.linalg.cholesky(f.readings.covariance), []
+    std = np.concatenate(
+        [f.model.random.get(e.name, np.zeros(len(e.parameters))) for e in f.model.effects]
+    )
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        theta = np.where(std > 0, std * rng.standard_normal(len(std)), f.theta)
+        value = f.model.predict(f.readings.states, theta).observation.position
+        value = value + np.einsum("nij,nj->ni", root, rng.standard_normal(value.shape))
+        again = fit(
+            f.model, replace(f.readings, value=value), "absolute", start=f.theta, outlier=f.outlier
+        )
+        shares = misfit_breakdown(linearise(again))
+        p_values += [s.p_value for s in shares if s.group not in ("pose", "direction")]
+    assert min(p_values) > 0.001
+    assert 0.35 < np.mean(p_values) < 0.65

@@ -1,0 +1,106 @@
+"""Gross errors beside all effects at once: readings that the mixed model takes for contaminated.
+
+Where an arm has every effect, the misfit of its named effects alone is as large as a gross error,
+which data snooping (`identification.data_snooping`) then cannot tell. The mixed model of all
+effects predicts each reading from the others ten times as well. A reading k with a gross error has
+a shift γ_k ~ N(0, G²) in each element, which a good one has not, and is one with the probability π.
+The odds that the readings of a set O have gross errors and no others, with the variances of all
+effects estimated anew,
+
+    log odds = ℓ(x̂_O) − ℓ(x̂) − |O| log 1/π
+
+with ℓ the log posterior of `mixed.variances`, increase where readings agree much better without O.
+The set grows by the reading that the others predict worst, by Baarda's test of a shift at the
+present variances, and that of the largest odds is taken: while several gross errors inflate the
+variances, the odds of the first may be low, but the largest test is not small.
+
+Source: Box and Tiao, *A Bayesian approach to some outlier problems*, Biometrika 55 (1968) 119.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from hilcal.identification.least_trimmed_squares import FALSE_ALARMS, MOST
+from hilcal.identification.mixed_fit import MixedFit, linearised_problem, shift_rows
+from hilcal.mixed.families import KNOWN, Families, Family, LogStdPrior
+from hilcal.mixed.problem import MixedProblem
+from hilcal.mixed.variances import estimate_variances
+from hilcal.readings.whitening import Mode, has_unloaded
+from hilcal.types import Bools, Floats, Ints
+
+SHIFT = 1e-2
+"""G, m and rad: a reflector that is not seated, a pose that was not reached; a choice. Much larger
+errors are gross by any G."""
+SUSPECT = 0.05
+"""Chance that the worst of good readings is tried; a choice."""
+VISIBLE = 1e-9  # share of a reading's information that its other elements must leave
+
+
+def gross_errors_beside(mixed: MixedFit, mode: Mode) -> Bools:
+    """Return which of the readings (N,) of a mixed fit have gross errors.
+
+    Deflections of an unloaded reading with a gross error are marked as well.
+    """
+    readings, m = mixed.readings, mixed.readings.m
+    count = len(readings)
+    problem = linearised_problem(mixed.model, readings, mode, mixed.theta)
+    shifts = shift_rows(mixed.model, readings, mode)
+    estimate = estimate_variances(problem, mixed.variances.log_std)
+    without, families = estimate.log_posterior, len(problem.families.random)
+    log_std = estimate.log_std
+    shifted: list[int] = []
+    best, found = 0.0, 0
+    while len(shifted) < int(MOST * count):
+        inner, score = estimate.equations.score(shifts.reshape(len(problem.y), count * m))
+        p = _p_values(inner, score, m)
+        p[shifted] = 1.0
+        worst = int(np.argmin(p))
+        if p[worst] * count > SUSPECT:
+            break
+        shifted.append(worst)
+        # The families of shifts stand between those of the effects and the noise.
+        start = np.insert(log_std, families, np.zeros(len(shifted)))
+        estimate = estimate_variances(_with_shifts(problem, shifts, shifted), start, search=True)
+        log_std = np.delete(estimate.log_std, families + np.arange(len(shifted)))
+        price = len(shifted) * np.log(count / FALSE_ALARMS)
+        odds = estimate.log_posterior - without - price
+        if odds > best:
+            best, found = odds, len(shifted)
+    out = np.zeros(count, dtype=np.bool_)
+    out[shifted[:found]] = True
+    if mode == "deflection" and out.any():
+        good = np.flatnonzero(~out)
+        out[good[~has_unloaded(readings[good])]] = True
+    return out
+
+
+def _p_values(inner: Floats, score: Floats, m: int) -> Floats:
+    """P-value (N,) of no shift, from Zᵀ P Z (N m, N m) and Zᵀ P y (N m,) of all shifts."""
+    count = len(score) // m
+    rows = np.arange(count)
+    block = inner.reshape(count, m, count, m)[rows, :, rows]
+    values, vectors = np.linalg.eigh((block + np.swapaxes(block, 1, 2)) / 2)
+    along = np.einsum("nij,ni->nj", vectors, score.reshape(count, m))
+    visible = values > VISIBLE * np.maximum(values.max(axis=1, keepdims=True), 1e-300)
+    square = np.sum(np.where(visible, along**2 / np.where(visible, values, 1.0), 0.0), axis=1)
+    return np.asarray(chi2.sf(square, np.maximum(visible.sum(axis=1), 1)))
+
+
+def _with_shifts(problem: MixedProblem, shifts: Floats, readings: list[int]) -> MixedProblem:
+    """Return the problem with shifts (R, N, m) of some readings as families of known size."""
+    m, random = shifts.shape[2], problem.families.random
+    none: Ints = np.zeros(0, dtype=np.int64)
+    size = LogStdPrior(0.0, KNOWN)
+    added = tuple(
+        Family(f"shift {k}", f"shift {k}", none, np.zeros(0), size, known=True) for k in readings
+    )
+    columns = SHIFT * shifts[:, readings].reshape(len(problem.y), len(readings) * m)
+    number = len(random) + np.repeat(np.arange(len(readings)), m)
+    return replace(
+        problem,
+        x=np.hstack([problem.x, columns]),
+        families=Families(problem.families.frames, (*random, *added)),
+        family=np.concatenate([problem.family, number]),
+    )
