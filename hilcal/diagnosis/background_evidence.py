@@ -82,8 +82,8 @@ def p_value_of_others(fit: Fit) -> float:
 def background_is_better(named: Fit, background: Fit) -> bool:
     """Whether a fit with a background is better than one with the named effects alone.
 
-    The rms error on poses left out must fall by the share `LEAST_GAIN`; both errors are whitened by the
-    noise of the fit with the background. Gross errors of both fits do not count.
+    The rms error on poses left out must fall by the share `LEAST_GAIN`; both errors are whitened by
+    the noise of the fit with the background. Gross errors of both fits do not count.
     """
     raw, w = all_left_out(background)
     other, scaling = all_left_out(named)

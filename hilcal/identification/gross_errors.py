@@ -22,11 +22,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2
 
-from hilcal.identification.least_trimmed_squares import FALSE_ALARMS, MOST
+from hilcal.identification.least_trimmed_squares import FALSE_ALARMS, MOST_WRONG
 from hilcal.identification.mixed_fit import MixedFit, linearised_problem, shift_rows
-from hilcal.mixed.families import KNOWN, Families, Family, LogStdPrior
+from hilcal.mixed.families import KNOWN_SPREAD, Families, Family, LogStdPrior
 from hilcal.mixed.problem import MixedProblem
-from hilcal.mixed.variances import estimate_variances
+from hilcal.mixed.variances import estimate_variances, log_posterior
 from hilcal.readings.whitening import Mode, has_unloaded
 from hilcal.types import Bools, Floats, Ints
 
@@ -48,11 +48,11 @@ def gross_errors_beside(mixed: MixedFit, mode: Mode) -> Bools:
     problem = linearised_problem(mixed.model, readings, mode, mixed.theta)
     shifts = shift_rows(mixed.model, readings, mode)
     estimate = estimate_variances(problem, mixed.variances.log_std)
-    without, families = estimate.log_posterior, len(problem.families.random)
+    without, families = log_posterior(estimate.equations), len(problem.families.random)
     log_std = estimate.log_std
     shifted: list[int] = []
     best, found = 0.0, 0
-    while len(shifted) < int(MOST * count):
+    while len(shifted) < int(MOST_WRONG * count):
         inner, score = estimate.equations.score(shifts.reshape(len(problem.y), count * m))
         p = _p_values(inner, score, m)
         p[shifted] = 1.0
@@ -65,7 +65,7 @@ def gross_errors_beside(mixed: MixedFit, mode: Mode) -> Bools:
         estimate = estimate_variances(_with_shifts(problem, shifts, shifted), start, search=True)
         log_std = np.delete(estimate.log_std, families + np.arange(len(shifted)))
         price = len(shifted) * np.log(count / FALSE_ALARMS)
-        odds = estimate.log_posterior - without - price
+        odds = log_posterior(estimate.equations) - without - price
         if odds > best:
             best, found = odds, len(shifted)
     out = np.zeros(count, dtype=np.bool_)
@@ -92,7 +92,7 @@ def _with_shifts(problem: MixedProblem, shifts: Floats, readings: list[int]) -> 
     """Return the problem with shifts (R, N, m) of some readings as families of known size."""
     m, random = shifts.shape[2], problem.families.random
     none: Ints = np.zeros(0, dtype=np.int64)
-    size = LogStdPrior(0.0, KNOWN)
+    size = LogStdPrior(0.0, KNOWN_SPREAD)
     added = tuple(
         Family(f"shift {k}", f"shift {k}", none, np.zeros(0), size, known=True) for k in readings
     )
