@@ -204,6 +204,11 @@ KINDS: dict[str, Kind] = {
     "inverse": Kind(
         _inverse, "the poses are the inverse ones, of the tracker in the target's axes"
     ),
+    "attitudes": Kind(
+        lambda d, _: replace(d, turn=None),
+        "the positions fit by themselves, but not the attitudes, which are in another convention "
+        "than stated (hilcal import TABLE --preview proposes one)",
+    ),
     "inverse_attitude": Kind(_mapped("turn", np.negative), "the attitudes are the inverse ones"),
     "shift": Kind(
         lambda d, h: replace(d, q=np.roll(d.q, -h.shift, axis=0), shift=d.shift + h.shift),
@@ -263,6 +268,9 @@ def mended(way: Way, cell: Cell) -> str:
     lines = [f'[robot] model = "{h.arm}"' for h in way if h.arm][:1]
     lines += [f"[robot] {key} = {value}" for key, value in keys(way, cell).items()]
     where = [KINDS[h.kind].mended for h in way]
+    if cell.config is not None and cell.config.tracker.frame == "base":
+        stated = KINDS["base_unknown"].mended
+        where = ['[tracker] frame = "tracker"' if line == stated else line for line in where]
     lines += [line for line in where if line]
     advice = f"; in CELL.toml: {', '.join(lines)}" if lines else ""
     return f"{advice}; correct it in the table" if None in where else advice
