@@ -325,6 +325,8 @@ def test_the_preview_writes_nothing_unless_asked(tmp_path, capsys):
     out = tmp_path / "run.hilcal"
     ok(capsys, "import", path, "--config", CELL, "--format", mapping, "-o", out)
     assert "exists" in refused(capsys, 2, "import", path, "--preview", "-o", mapping)
+    again = ("import", path, "--config", CELL, "--format", mapping, "-o", out)
+    assert "give --force" in refused(capsys, 2, *again)
 
 
 def test_the_preview_says_what_is_wrong_with_the_description(tmp_path, capsys):
