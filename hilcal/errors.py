@@ -46,3 +46,10 @@ class StoppedError(HilcalError):
     """A person stopped the program; the message states what is stored and how to resume."""
 
     exit_code = 130
+
+
+def expect(value: object, classes: type | tuple[type, ...], name: str, valid: str) -> None:
+    """Refuse an argument of another class, in words for the author of a script."""
+    if not isinstance(value, classes):
+        given = "None" if value is None else f"of class {type(value).__name__}"
+        raise InputError(f"{name} is {given}; valid: {valid}")

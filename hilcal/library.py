@@ -19,7 +19,7 @@ from hilcal.discovery.discovery import LawSearch
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import Options
 from hilcal.engine import open_engine
-from hilcal.errors import InputError
+from hilcal.errors import InputError, expect
 from hilcal.identification import baseline as starting_models
 from hilcal.identification import bootstrap as bootstraps
 from hilcal.identification import fit as fits
@@ -46,6 +46,15 @@ from hilcal.tables.mapped import import_readings
 from hilcal.tables.parquet_stream import open_stream
 from hilcal.types import Floats
 
+PATHS = (str, Path)
+A_CELL = "a Cell, as hc.Cell.load('CELL.toml')"
+A_FIT = "a Fit, as of hc.fit(model, readings)"
+A_PRIOR = "a Posterior, as of hc.load_posterior('run.hilcal')"
+A_MODEL = "a Model, as of hc.baseline(cell, readings)"
+READINGS = (
+    "Readings, as of hc.read_table('t.csv', cell), or a Campaign, as hc.Campaign('run.hilcal')"
+)
+
 if TYPE_CHECKING:  # needs Pinocchio, which a fit does not
     from hilcal.design.summary import CheckedPlan
     from hilcal.drivers.simulated.rehearsal import Rehearsal, SimulationCase
@@ -70,6 +79,8 @@ def read_table(path: str | Path, cell: Cell, mapping: str | Path | None = None) 
     Raises:
         InputError: an invalid value, with row and column.
     """
+    expect(path, PATHS, "path", "the path of a table")
+    expect(cell, Cell, "cell", A_CELL)
     form, config = "table" if mapping is None else mapping, cell.configured()
     imported = import_readings(Path(path), form, config, cell.arm)
     estimated, noise = with_estimated_noise(imported, cell, config)
@@ -217,12 +228,16 @@ def baseline(
         cell = cell.cell
     if data is None:
         raise InputError("a cell without readings; valid: baseline(cell, readings), baseline(run)")
+    expect(cell, Cell, "cell", A_CELL)
     data, carried = _readings(data), _carried(prior, catalogue)
     return starting_models.baseline(cell, data, _mode(readings, data, cell), catalogue, carried)
 
 
 def _readings(data: Readings | Campaign) -> Readings:
-    return data.readings if isinstance(data, Campaign) else data
+    if isinstance(data, Campaign):
+        return data.readings
+    expect(data, Readings, "data", READINGS)
+    return data
 
 
 def _with_prior(model: Model, data: Readings, prior: Posterior | CarriedPrior) -> Model:
@@ -235,6 +250,7 @@ def _with_prior(model: Model, data: Readings, prior: Posterior | CarriedPrior) -
 def _carried(
     prior: Posterior | CarriedPrior | None, catalogue: Catalogue | None
 ) -> CarriedPrior | None:
+    expect(prior, (Posterior, CarriedPrior, type(None)), "prior", A_PRIOR)
     return carried_prior(prior, catalogue=catalogue) if isinstance(prior, Posterior) else prior
 
 
@@ -271,9 +287,10 @@ def fit(
             reading.
         CannotAnswerError: fewer measured elements than identifiable parameters.
     """
+    expect(model, Model, "model", A_MODEL)
     data, readings = _readings(data), _either(readings, mode)
     std: Floats | None = None
-    if isinstance(prior, Posterior | CarriedPrior):
+    if isinstance(prior, (Posterior, CarriedPrior, *PATHS)):
         model = _with_prior(model, data, prior)
     else:
         std = prior
@@ -307,6 +324,7 @@ def diagnose(
     """
     if isinstance(fit, Campaign):
         return judge_fit(fit.fit(), fit.history(), say)
+    expect(fit, Fit, "fit", f"{A_FIT}, or a Campaign with a revision")
     return judge_fit(fit, history, say)
 
 
@@ -375,6 +393,7 @@ def refine(
         model = baseline(model, data, readings, prior=prior)
     elif data is None:
         raise InputError("a model without readings; valid: refine(model, readings), refine(run)")
+    expect(model, Model, "model", f"{A_MODEL}, or a Campaign")
     data = _readings(data)
     if prior is not None:
         model = _with_prior(model, data, prior)
@@ -419,6 +438,9 @@ def plan(
         from hilcal.design.planner import PlanRequest, plan_readings
         from hilcal.design.summary import about, checked, summarise
 
+    expect(cell, Cell, "cell", A_CELL)
+    expect(poses, (int, np.integer), "poses", "a whole number from 1")
+    expect(given, (Fit, type(None)), "given", A_FIT)
     config, rng = cell.configured(), np.random.default_rng(seed)
     if given is not None and prior is not None:
         raise InputError("a plan after a fit has the prior of that fit; leave out one of both")
@@ -463,9 +485,12 @@ def simulate(
         InputError: an effect that cannot be hidden; lists the valid ones.
     """
     with needed_by("a simulated cell"):
+        from hilcal.design.summary import CheckedPlan
         from hilcal.drivers.simulated import rehearsal  # needed here alone
 
+    expect(plan, (CheckedPlan, Plan), "plan", "a plan, as of hc.plan(cell)")
     bare_plan = plan if isinstance(plan, Plan) else plan.plan
+    expect(cell, (Cell, rehearsal.SimulationCase), "cell", f"{A_CELL}, or a previous result")
     if not isinstance(cell, Cell):
         return rehearsal.simulate_plan(cell, bare_plan, [seed])
     if hide == rehearsal.INVENTED:

@@ -68,6 +68,9 @@ from hilcal.store.schema import is_campaign
 from hilcal.stream import StreamFit
 from hilcal.types import Bools, Floats, Ints
 
+LARGEST_RAD = 4.0 * np.pi
+"""rad; a choice, twice the range of most joints: larger values of joints are degrees."""
+
 
 @dataclass(frozen=True, eq=False)
 class Calibration(Brief):
@@ -306,16 +309,19 @@ class Calibration(Brief):
     ) -> tuple[States, tuple[str, ...]]:
         """Return points as states, and the columns that means fill; raises as `predict` does."""
         n, example = self.model.cell.arm.n, state_with_every_column(self.model.cell)
-        q = np.array(q, dtype=float, order="C", ndmin=2)
+        q = np.array(_numbers(q, "q"), order="C", ndmin=2)
         if q.shape[1:] != (n,) or not len(q):
             raise InputError(f"q has shape {q.shape}; valid: ({n},) or (N, {n})")
+        size = np.where(np.isfinite(q) & ~self.model.cell.arm.slides, np.abs(q), 0.0)
+        if np.any(np.sum(size > LARGEST_RAD, axis=1) > 1):  # one alone may be an endless wrist
+            raise InputError(f"q has joints at {size.max():.4g} rad; valid: rad, as np.radians(q)")
         arguments = {"wrench": np.zeros(6) if wrench is None else wrench, **(recorded or {})}
         columns = {}
         for name, value in arguments.items():
             kind = None if name == "q" else getattr(example, name, None)
             if kind is None:
                 raise InputError(f"{name}: no column of hilcal.States that a prediction takes")
-            shape, values = (len(q), *kind.shape[1:]), np.asarray(value, dtype=float)
+            shape, values = (len(q), *kind.shape[1:]), _numbers(value, name)
             if values.shape not in (shape, shape[1:]):
                 raise InputError(f"{name} has shape {values.shape}; valid: {shape} or {shape[1:]}")
             columns[name] = np.array(np.broadcast_to(values, shape), order="C")
@@ -420,3 +426,11 @@ def calibration_of_stream(fit: StreamFit, source: Mapping[str, Any]) -> Calibrat
         measured=replace(measured, most_std_m=float(share * measured.most_std_m)),
         covariance_source=None,
     )
+
+
+def _numbers(values: object, name: str) -> Any:
+    """Return numbers as an array; InputError for what is none."""
+    try:
+        return np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} = {values!r:.60} is not an array of numbers") from None

@@ -25,6 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from hilcal import limits
+from hilcal.calibration.calibration import LARGEST_RAD
 from hilcal.calibration.compensation import invert_nominal, nominal_pose
 from hilcal.errors import InputError
 from hilcal.names import quoted
@@ -59,8 +60,6 @@ LIMIT_PENALTY = 1e3
 """rad; added to the distance of a solution beyond the joints' limits."""
 LEAST_REACH, LONGEST_TOOL = 0.05, 0.5
 """Least distance of the farthest point over the reach, and largest beyond it, m; choices."""
-LARGEST_RAD = 4.0 * np.pi
-"""rad; a choice, twice the range of most joints: larger values in a column of rad are degrees."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,7 +20,7 @@ from hilcal.diagnosis.evidence import Evidence
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.diagnosis.verdict import diagnose, judge_naming
 from hilcal.effects.catalogue import Catalogue, installed
-from hilcal.errors import InputError
+from hilcal.errors import InputError, expect
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.full_covariance import (
@@ -400,6 +400,7 @@ class Campaign(Brief):
         elif isinstance(found, Diagnosis):
             records = [self.record(found.fit, found)]
         else:
+            expect(found, Fit, "found", "a Fit, a Diagnosis or a Refinement")
             records = [self.record(found)]
         return self.append_records(records)[-1]
 
@@ -566,5 +567,6 @@ def opened(run: Campaign | str | Path) -> Iterator[Campaign]:
     if isinstance(run, Campaign):
         yield run
         return
+    expect(run, (str, Path), "run", "a Campaign, or the path of one")
     with Campaign(run) as campaign:
         yield campaign

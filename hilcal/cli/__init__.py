@@ -29,6 +29,7 @@ _BROKEN_PIPE = 141
 _INTERRUPTED = errors.StoppedError.exit_code
 _USAGE = 2
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_CLOSED = (errno.EROFS, errno.EACCES, errno.EPERM)
 _LIBRARY = re.compile(r"(\S+): cannot open shared object file")
 _COMMAND = re.compile(r"(.*:) (hilcal [^,;()]*)$")
 _KINDS = {
@@ -270,6 +271,8 @@ def _explained(error: Exception, name: str) -> tuple[str, int]:
         hint = "make room on the disks of output, program and temporary files"
         message = f"{file} cannot be written ({os.strerror(error.errno)}): {hint}"
         return message, errors.DeviceError.exit_code
+    if isinstance(error, OSError) and error.errno in _CLOSED and error.filename:
+        return f"{error.filename}: no access ({os.strerror(error.errno)})", _USAGE
     if isinstance(error, ImportError) and (library := _LIBRARY.match(str(error))):
         package = " (libgomp1 on Debian)" if library[1] == "libgomp.so.1" else ""
         return f"the system library {library[1]} is missing: install its package{package}", _USAGE

@@ -58,6 +58,7 @@ def import_(
     if config is None or output is None:
         missing = "--config CELL.toml" if config is None else "-o RUN.hilcal"
         raise InputError(f"{missing} is missing; without it only --preview is possible")
+    check_new(output, force)
     from hilcal.library import import_campaign  # imports the whole library
 
     with working(t.progress) as say:

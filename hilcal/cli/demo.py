@@ -208,9 +208,10 @@ def demo(
     hidden = hide or config.simulation.hide
     world = invented_law(catalogue) if hidden == INVENTED else catalogue
     check_choice(hidden or RANDOM, world)
+    may_write(output, True)  # before the planning, which takes a while
     files = Files(output)
-    for path in (output, files.validation, files.corrected):
-        may_write(path, True)  # before the planning, which takes a while
+    for path in (files.validation, files.corrected):
+        may_write(path, True)
     case = running.RehearsalSettings(
         config, hidden or RANDOM, number, output, configs_dir() / "cells", catalogue, world
     )

@@ -110,6 +110,8 @@ def check_effect(kind: type[Effect], cell: Cell | None = None) -> None:
     Raises:
         InputError: what is wrong, in one line: the file, the class or effect, what would be valid.
     """
+    if not (isinstance(kind, type) and issubclass(kind, Effect)):
+        raise InputError(f"{kind!r:.60} is no class of an effect; valid: a subclass of Effect")
     where = source_of(kind)
     try:
         _class(kind)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 import numpy as np
 
 from hilcal import limits
-from hilcal.errors import CannotAnswerError, InputError
+from hilcal.errors import CannotAnswerError, InputError, expect
 from hilcal.identification.data_snooping import DataSnooping, Disagreement
 from hilcal.identification.drift import Conflict, chosen_drift, conflicts
 from hilcal.identification.folds import distinct_poses, leave_out, random_folds
@@ -263,6 +263,10 @@ class Fit(WithVarianceFactor, Tabular):
             InputError: no static equilibrium.
         """
         states = at.states if isinstance(at, Readings) else at
+        expect(
+            states, States, "at",
+            "Readings or States; at joint values: hc.Calibration.of(fit).predict(q, wrench)",
+        )  # fmt: skip
         return self.model.predict(states, self.theta).observation
 
 

@@ -210,6 +210,11 @@ KINDS: dict[str, HypothesisKind] = {
     "inverse": HypothesisKind(
         _inverse, "the poses are the inverse ones, of the tracker in the target's axes"
     ),
+    "attitudes": HypothesisKind(
+        lambda d, _: replace(d, turn=None),
+        "the positions fit by themselves, but not the attitudes, which are in another convention "
+        "than stated (hilcal import TABLE --preview proposes one)",
+    ),
     "inverse_attitude": HypothesisKind(
         _mapped("turn", np.negative), "the attitudes are the inverse ones"
     ),
@@ -273,6 +278,9 @@ def correction(combination: Combination, cell: Cell) -> str:
     lines = [f'[robot] model = "{h.arm}"' for h in combination if h.arm][:1]
     lines += [f"[robot] {key} = {value}" for key, value in robot_keys(combination, cell).items()]
     where = [KINDS[h.kind].correction for h in combination]
+    if cell.config is not None and cell.config.tracker.frame == "base":
+        stated = KINDS["base_unknown"].correction
+        where = ['[tracker] frame = "tracker"' if line == stated else line for line in where]
     lines += [line for line in where if line]
     advice = f"; in CELL.toml: {', '.join(lines)}" if lines else ""
     return f"{advice}; correct it in the table" if None in where else advice

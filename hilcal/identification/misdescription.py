@@ -203,7 +203,11 @@ def examine(registered: Registration, readings: Readings) -> DescriptionFinding 
     few = bool(bad.any() and bad.mean() <= MOST_WRONG_ROWS)
     if few and near <= search.enough:
         return DescriptionFinding(rms, gate, (), bad, search.swapped(bad), 1)
-    explanations = search.explain(gate, DEPTH if rms > gate else 1)
+    alone: Combination = (Hypothesis("attitudes"),)
+    in_attitudes = readings.m == 6 and search.score(alone) <= search.enough
+    explanations = search.explain(gate, DEPTH if rms > gate and not in_attitudes else 1)
+    if not explanations and rms > gate and readings.m == 6:
+        explanations = search.explain(gate, DEPTH, alone)
     if not explanations and rms <= gate:
         return None
     if not explanations and few and near <= gate:
@@ -232,12 +236,17 @@ class _DescriptionSearch:
         self.score = lru_cache(maxsize=None)(self._score)
         self.robust = lru_cache(maxsize=None)(self._robust)
 
-    def explain(self, gate: float, most: int) -> tuple[Explanation, ...]:
-        """Return the shortest combination that explains the readings, and those that do as well."""
+    def explain(self, gate: float, most: int, begin: Combination = ()) -> tuple[Explanation, ...]:
+        """Return the shortest combination that explains the readings, and those that do as well.
+
+        All of them contain the hypotheses of `begin`.
+        """
         base, slides = self.score(()), self._cell.arm.slides
-        singles = tuple(hypotheses(self._stated))
-        beam: list[Combination] = [()]
-        tried: dict[Combination, float] = {}
+        singles = tuple(hypotheses(self._described(begin)))
+        beam: list[Combination] = [begin]
+        tried: dict[Combination, float] = {begin: self.score(begin)} if begin else {}
+        if begin and (explanations := self._enough(tried, base)):
+            return explanations
         for depth in range(most):
             additions = [h for h in singles if depth == 0 or h.kind not in SEPARATE_FIRST]
             ways = [

@@ -11,7 +11,7 @@ from hilcal.cell import Cell
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import typical_compliances
 from hilcal.effects.protocol import Columns, Effect, EffectSpec, Situation, total
-from hilcal.errors import CannotAnswerError, InputError
+from hilcal.errors import CannotAnswerError, InputError, expect
 from hilcal.model.equilibrium import ReadingColumns, SlotResponse, at_equilibrium, compliance
 from hilcal.model.observe import Observation, ReadingDerivative, motion, observe
 from hilcal.readings.readings import Readings, States
@@ -123,6 +123,9 @@ class Model(Brief):
         """Return the model with one more effect; one that is only named is built for it."""
         spec = EffectSpec(effect) if isinstance(effect, str | type) else effect
         if not isinstance(spec, EffectSpec):
+            expect(
+                spec, Effect, "effect", "a name of an effect, or hc.effect('creep', joints='each')"
+            )
             return replace(self, effects=(*self.effects, spec))
         if self.readings is None:
             raise InputError(

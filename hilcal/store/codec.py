@@ -132,7 +132,9 @@ def read_file(path: Path, name: str, read: Callable[[Any], T]) -> T:
     """Return the value that `read` makes of a JSON file's content."""
     try:
         content = parse_json(limits.read_text(path, limits.DOCUMENT))
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except ValueError as error:
         raise InputError(f"{path}: no {name}: {error}") from None
     try:
         return read(content)

@@ -39,8 +39,15 @@ MAGIC = {
         "a Python pickle, which is never loaded; save it as CSV",
     ),
     b"%PDF": "a PDF; save the table as CSV",
+    **dict.fromkeys(
+        [b'{"', b"{\n", b"{\r", b"[{", b"[[", b"[\n", b"[\r"], "JSON; save the table as CSV"
+    ),
+    **dict.fromkeys(
+        [b"<!", b"<?", b"<html", b"<HTML", b"<table"],
+        "HTML or XML, which some programs save as XLS; save it as XLSX or CSV",
+    ),
 }
-"""First bytes of files that are no text: their kind, or why they are not read."""
+"""First bytes of files that are no tables of text: their kind, or why they are not read."""
 KINDS = ("XLSX", "Parquet", "MAT", "text")
 
 

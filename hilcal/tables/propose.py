@@ -22,6 +22,11 @@ from hilcal.tables.guess_values import guess_axes, guess_by_values, is_quaternio
 from hilcal.tables.mapping import UNLOADED, FileFormat
 from hilcal.tables.units import ANGLES, LENGTHS, MOMENTS
 
+EXCHANGE_NAMES = (
+    "its columns are named as an exchange table's, which (commas, header in row 1, SI units, "
+    "rotation vectors) is imported without --format"
+)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GridProposal:
@@ -105,7 +110,7 @@ def guess(grid: Grid, joints: int | None = None) -> words.Proposal:
     for name, column in list(g.free.items()):
         g.ignore(name, _why_unused(g, column))
     if set(required_columns(joints or 6)) <= set(grid.names):
-        g.doubt("file", "this is an exchange table: it is imported without --format")
+        g.doubt("file", EXCHANGE_NAMES)
     if g.proposal.open_convention:
         g.doubt("orientation", words.GUESSED)
     for section, sentence in (

@@ -141,12 +141,12 @@ def covariances_of(
 
 
 def _choose(path: str, header: Sequence[str], arm: Arm) -> tuple[Sequence[str], Sequence[str]]:
-    check_names(header, f"{path}: row 1, column")
     if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
         raise InputError(
             f"{path}: columns must be separated by ',' with '.' as decimal mark; for any other "
             f"table: {columns.PREVIEW}"
         )
+    check_names(header, f"{path}: row 1, column")
     valid = columns.known_columns(arm.units)
     if not any(name in valid for name in header):
         raise InputError(

@@ -1,5 +1,6 @@
 """The help of every command, completion, errors as JSON, widths; what is loaded at the start."""
 
+import errno
 import inspect
 import io
 import subprocess
@@ -108,6 +109,10 @@ def test_an_unexpected_error_and_an_interrupt_are_documents(capsys, monkeypatch)
     assert (found.code, found.document["error"]["kind"]) == (1, "unexpected")
     assert "ZeroDivisionError: by zero" in found.document["error"]["message"]
     assert "Traceback" not in found.err
+    closed = OSError(errno.EROFS, "as the system words it", "run.hilcal")
+    monkeypatch.setattr(looking_up, "example_cell", fails(closed))
+    assert refused(capsys, 2, "effects") == "error: run.hilcal: no access (Read-only file system)"
+    monkeypatch.setattr(looking_up, "example_cell", fails(ZeroDivisionError("by zero")))
     monkeypatch.setenv("HILCAL_DEBUG", "1")
     found = run(capsys, "effects")
     assert (found.code, "Traceback" in found.err) == (1, True)

@@ -276,6 +276,44 @@ def test_a_table_of_another_form_says_what_to_do(tmp_path, capsys):
     assert "--format" in refused(capsys, 2, "import", path, *both)
 
 
+@pytest.mark.parametrize(("text", "said"), [
+    ("pose\tload\tq1_rad\nP1\tnone\t0.1\n", "columns must be separated by ','"),
+    ('[{"pose": "P1"}]', "JSON; save the table as CSV"),
+    ('{\n "pose": "P1"\n}', "JSON; save the table as CSV"),
+    ("<html><table><tr><td>1</td></tr></table></html>", "HTML or XML")])  # fmt: skip
+def test_a_file_of_another_form_is_named(text, said, tmp_path, capsys):
+    path = write(tmp_path / "t.csv", text)
+    line = refused(capsys, 2, "import", path, "--config", CELL, "-o", tmp_path / "x.hilcal")
+    assert said in line
+
+
+def exchange(tmp_path, orientation):
+    """An exchange table of 40 poses, and the cell of an arm whose frames are not stated."""
+    c = campaign(40)
+    names = [f"q{k}_rad" for k in range(1, 7)]
+    header = ["pose", "load", *names, "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad"]
+    text = lines(header, [f"P{k}" for k in range(40)], ["none"] * 40, c.q, c.position,
+                 orientation(c), separator=",")  # fmt: skip
+    cell = write(tmp_path / "CELL.toml", '[robot]\nmodel = "ur10e"\n[tracker]\nframe = "tracker"\n')
+    return write(tmp_path / "t.csv", text), cell
+
+
+def test_attitudes_of_another_convention_are_told_from_a_wrong_arm(tmp_path, capsys):
+    path, cell = exchange(tmp_path, lambda c: np.radians(c.angles("xyz")))
+    d = ok(capsys, "import", path, "--config", cell, "-o", tmp_path / "x.hilcal", "--json").document
+    assert "the positions fit by themselves, but not the attitudes" in d["description"]["message"]
+    assert [c["kind"] for c in d["description"]["explanations"][0]["changes"]] == ["attitudes"]
+    preview = ok(capsys, "import", path, "--preview", "--config", cell, "--json").document
+    assert preview["mapping"]["orientation"]["convention"] == "fixed-xyz"
+
+
+def test_a_tracker_whose_frame_is_stated_as_the_base_is_told_to_be_one(tmp_path, capsys):
+    path, cell = exchange(tmp_path, lambda c: c.attitude.as_rotvec())
+    cell.write_text(cell.read_text().replace('"tracker"', '"base"'))
+    d = ok(capsys, "import", path, "--config", cell, "-o", tmp_path / "x.hilcal", "--json").document
+    assert d["description"]["message"].endswith('in CELL.toml: [tracker] frame = "tracker"')
+
+
 def test_the_preview_writes_nothing_unless_asked(tmp_path, capsys):
     path = write(tmp_path / "t.csv", GOOD)
     d = ok(capsys, "import", path, "--preview", "--json").document
@@ -287,6 +325,8 @@ def test_the_preview_writes_nothing_unless_asked(tmp_path, capsys):
     out = tmp_path / "run.hilcal"
     ok(capsys, "import", path, "--config", CELL, "--format", mapping, "-o", out)
     assert "exists" in refused(capsys, 2, "import", path, "--preview", "-o", mapping)
+    again = ("import", path, "--config", CELL, "--format", mapping, "-o", out)
+    assert "give --force" in refused(capsys, 2, *again)
 
 
 def test_the_preview_says_what_is_wrong_with_the_description(tmp_path, capsys):

@@ -147,6 +147,41 @@ def test_wrong_words_are_refused_with_the_valid_ones(site):
     refusal("valid: one of both", hc.fit, model, readings, **wrong)
 
 
+@pytest.mark.parametrize(("guess", "said"), [
+    (lambda s: hc.read_table(s.table, s.cell), r"cell is of class .*Path; valid: a Cell"),
+    (lambda s: hc.read_table(hc.read_table(s.table, s.loaded), s.loaded), "the path of a table"),
+    (lambda s: hc.baseline(s.readings, s.loaded), "cell is of class Readings; valid: a Cell"),
+    (lambda s: hc.fit(s.readings, s.model), "model is of class Readings; valid: a Model"),
+    (lambda s: hc.fit(s.model, "run.hilcal"), r"data is of class str; valid: .*hc\.Campaign"),
+    (lambda s: hc.fit(s.model, s.readings, prior="x.hilcal"), "hc.load_posterior"),
+    (lambda s: hc.fit(s.model, s.readings).predict([[0.0] * 6]), r"hc\.Calibration\.of"),
+    (lambda s: hc.diagnose(s.model), "fit is of class Model; valid: a Fit"),
+    (lambda s: hc.discover(str(s.run)), "fit is of class str; valid: a Fit"),
+    (lambda s: hc.validate(s.model, s.run), "run is of class Model; valid: a Campaign"),
+    (lambda s: hc.plan(str(s.cell)), "cell is of class str; valid: a Cell"),
+    (lambda s: hc.plan(s.loaded, poses="ten"), "poses is of class str; valid: a whole number"),
+    (lambda s: hc.simulate(s.loaded, None), "plan is None; valid: a plan"),
+    (lambda s: hc.check_effect("creep"), "'creep' is no class of an effect"),
+    (lambda s: s.model + 2, "effect is of class int; valid: a name of an effect")])  # fmt: skip
+def test_an_argument_of_another_class_is_refused_with_what_is_valid(guess, said, site):
+    cell = hc.Cell.load(site.cell)
+    readings = hc.read_table(site.table, cell)
+    model = hc.baseline(cell, readings)
+    given = SimpleNamespace(**vars(site), loaded=cell, readings=readings, model=model)
+    refusal(said, guess, given)
+
+
+@pytest.mark.parametrize(("q", "wrench", "said"), [
+    ([10, -90, 90, -90, -90, 0], None, "q has joints at 90 rad; valid: rad, as np.radians"),
+    ("home", None, "q = 'home' is not an array of numbers"),
+    ([0.1] * 6, "5kg", "wrench = '5kg' is not an array of numbers")])  # fmt: skip
+def test_points_in_degrees_and_names_are_refused(q, wrench, said, site):
+    with hc.Campaign(site.run) as run:
+        calibration = hc.Calibration.of(hc.fit(hc.baseline(run), run))
+    for asked in (calibration.predict, calibration.compensate):
+        refusal(said, asked, q, wrench)
+
+
 def test_what_a_stranger_guesses_works(site, tmp_path):
     path = tmp_path / "run.hilcal"
     with hc.Campaign(site.run, read_only=True) as other:
