@@ -19,7 +19,7 @@ from functools import partial
 from typing import ClassVar, TypeVar
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from hilcal.cell import Cell
 from hilcal.effects.catalogue import Catalogue
@@ -369,7 +369,7 @@ class _StreamMinimum:
         formal = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         spent = spent_parameters(self.equations, beta, groups)
         dof = max(point.elements - spent, 1.0)
-        inflated = bool(chi2.sf(point.rss, dof) < MISFIT_LEVEL)
+        inflated = bool(scipy.stats.chi2.sf(point.rss, dof) < MISFIT_LEVEL)
         std = formal
         if inflated:
             change = self.change[list(point.folds)]

@@ -16,10 +16,10 @@ from dataclasses import asdict, dataclass
 from functools import partial
 
 import numpy as np
+import scipy
 from rich import box
 from rich.table import Table
 from rich.text import Text
-from scipy import stats
 from scipy.linalg import solve_triangular
 
 from hilcal.engine import IN_PROCESS, Advance, Engine
@@ -325,8 +325,8 @@ def _cells(experiment: _Experiment, design: StudyDesign, runs: int) -> list[Stud
             square, inside = (error / limit) ** 2, np.abs(error) <= half
             square_run, inside_run = square.mean(axis=0), inside.mean(axis=0)
             rms = float(np.sqrt(square_run.mean()))
-            rms_mc = float(stats.sem(square_run)) / (2 * rms)
-            coverage, coverage_mc = float(inside_run.mean()), float(stats.sem(inside_run))
+            rms_mc = float(scipy.stats.sem(square_run)) / (2 * rms)
+            coverage, coverage_mc = float(inside_run.mean()), float(scipy.stats.sem(inside_run))
             by_parameter = tuple(np.sqrt(square.mean(axis=1)).tolist())
             covered = tuple(inside.mean(axis=1).tolist())
             shift = float(np.abs((error - first) / limit).max())
@@ -349,8 +349,8 @@ def _fit(w: Whitening, blocks: Floats, noise: Floats) -> tuple[Floats, Floats, f
     dof = w.rank - len(r)
     factor = (np.sum(e * e, axis=0) - np.sum(projected * projected, axis=0)) / dof
     if w.scaling == "none":  # unknown noise: use the variance of the residual
-        return error, stats.t.ppf((1 + LEVEL) / 2, dof) * spread * np.sqrt(factor), None
-    half = np.broadcast_to(stats.norm.ppf((1 + LEVEL) / 2) * spread, error.shape)
+        return error, scipy.stats.t.ppf((1 + LEVEL) / 2, dof) * spread * np.sqrt(factor), None
+    half = np.broadcast_to(scipy.stats.norm.ppf((1 + LEVEL) / 2) * spread, error.shape)
     return error, half, float(factor.mean())
 
 

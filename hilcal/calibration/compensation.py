@@ -20,7 +20,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from hilcal.calibration.measured import Outside
 from hilcal.effects.protocol import FRAME_ROLES, Effect
@@ -264,7 +264,7 @@ def band(covariance: Floats) -> Floats:
     shape = covariance / np.where(size > 0, size, 1.0)[:, None, None]
     second = np.einsum("nij,nji->n", shape, shape)
     second = np.where(size > 0, second, 1.0)
-    return np.asarray(np.sqrt(size * second * chi2.ppf(BAND, 1.0 / second)))
+    return np.asarray(np.sqrt(size * second * scipy.stats.chi2.ppf(BAND, 1.0 / second)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import f as f_distribution
+import scipy
 
 from hilcal.cell import Cell
 from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE
@@ -303,7 +303,7 @@ def find_changes(
         limits=_limits(after, possible, [s[0] for s in steps], tested),
         tested=tested,
         hidden=hidden,
-        unexplained=float(f_distribution.sf(factor, after.dof, earlier.fit.dof)),
+        unexplained=float(scipy.stats.f.sf(factor, after.dof, earlier.fit.dof)),
         scatter=float(np.sqrt(factor)),
         earlier=earlier,
     )
@@ -397,7 +397,7 @@ def _exact(before: LaterFit, after: LaterFit, count: int) -> tuple[float, float]
     explained *= gain / max(float(explained.sum()), 1e-300)
     evidence = float(log_evidence(values[shown], explained, rss, dof)[0].max())
     variance = max((rss - gain) / (dof - rank), 1e-300)
-    return evidence, float(f_distribution.sf(gain / rank / variance, rank, dof - rank))
+    return evidence, float(scipy.stats.f.sf(gain / rank / variance, rank, dof - rank))
 
 
 def _needed(minimum: LaterFit, steps: list[_Step], tested: int) -> tuple[LaterFit, list[_Step]]:
@@ -409,7 +409,7 @@ def _needed(minimum: LaterFit, steps: list[_Step], tested: int) -> tuple[LaterFi
             moving = [s[0].effect_directions for s in steps if s is not step]
             reduced, count = fit_later(minimum.later, moving), len(step[0].parameters)
             gain = max(reduced.rss - minimum.rss, 0.0)
-            p_value = float(f_distribution.sf(gain / count * dof / rss, count, dof))
+            p_value = float(scipy.stats.f.sf(gain / count * dof / rss, count, dof))
             without.append((p_value, k, reduced))
         p_value, k, reduced = max(without, key=lambda w: w[0])
         if p_value * tested < LEVEL:

@@ -10,8 +10,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
+import scipy
 
 from hilcal.diagnosis.change import LEVEL, Changes
 from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE
@@ -146,7 +145,7 @@ def with_missing_effects(
         except HilcalError:
             break
         added.append(effect)
-    if fit.readings.arm_scatter is None and chi2.sf(fit.chi2, fit.dof) <= MISFIT_LEVEL:
+    if fit.readings.arm_scatter is None and scipy.stats.chi2.sf(fit.chi2, fit.dof) <= MISFIT_LEVEL:
         say("estimating the scatter of the earlier readings")
         scatter = estimate_arm_scatter(fit)
         if scatter is not None:
@@ -198,6 +197,6 @@ def error_today(later: LaterReadings, changes: Changes, drawing: float | None) -
         prediction=prediction,
         beyond=extrapolation(predictive, fit.readings[~fit.outlier], prediction),
         z=float(np.sqrt(ratio)),
-        p_value=float(f_distribution.sf(ratio, before.dof, fit.dof)),
+        p_value=float(scipy.stats.f.sf(ratio, before.dof, fit.dof)),
         drawing_m=drawing,
     )

@@ -29,7 +29,7 @@ from functools import cached_property
 from itertools import takewhile
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from hilcal.diagnosis.background_evidence import BackgroundEffect, background_evidence
 from hilcal.diagnosis.effect_ranking import (
@@ -280,7 +280,7 @@ class Evidence:
     @cached_property
     def misfit(self) -> bool:
         """Whether χ² is larger than the stated noise allows."""
-        return float(chi2.sf(self.fit.chi2, self.fit.dof)) < MISFIT_ALARM
+        return float(scipy.stats.chi2.sf(self.fit.chi2, self.fit.dof)) < MISFIT_ALARM
 
     @cached_property
     def regression(self) -> ResidualRegression:
@@ -327,7 +327,7 @@ class Evidence:
         current, names, misfit = self.fit, list[str](), self.fit.chi2 - self.fit.dof
         while True:
             effects, square, dof = whole_catalogue(current)
-            is_noise = float(chi2.sf(square, dof)) >= MISFIT_ALARM
+            is_noise = float(scipy.stats.chi2.sf(square, dof)) >= MISFIT_ALARM
             if is_noise or square - dof < LEAST_REMAINDER * misfit:
                 return None
             if not effects or len(names) == MOST_REFITS:

@@ -26,8 +26,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
+import scipy
 
 from hilcal.diagnosis.recorded import state_variables
 from hilcal.identification.linearisation import Linearisation
@@ -179,7 +178,9 @@ def _axes(p: Linearisation) -> list[MisfitShare]:
     total = sum(max(value - count, 0.0) for value in square.values())
     least = max(total, 3 * np.sqrt(6 * count))
     return [
-        MisfitShare(f"direction {n}", max(x - count, 0.0) / least, float(chi2.sf(x, count)))
+        MisfitShare(
+            f"direction {n}", max(x - count, 0.0) / least, float(scipy.stats.chi2.sf(x, count))
+        )
         for n, x in square.items()
     ]
 
@@ -225,7 +226,7 @@ def pose_constants(p: Linearisation) -> PoseConstants | None:
     within = (p.rss - gain) / (fit.dof - rank)
     exact = np.inf if gain > 0 else 0.0  # where readings of a pose agree exactly
     ratio = gain / rank / within if within > 0 else exact
-    p_value = float(f_distribution.sf(ratio, rank, fit.dof - rank))
+    p_value = float(scipy.stats.f.sf(ratio, rank, fit.dof - rank))
     return PoseConstants(p.projection, columns, shared, t, rank, gain, p_value)
 
 

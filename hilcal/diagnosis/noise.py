@@ -30,8 +30,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
+import scipy
 
 from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE
 from hilcal.identification.fit import Fit
@@ -134,8 +133,8 @@ class NoiseVerdict:
 
 def judge_noise(fit: Fit, repeats: PureError | None, predictable: bool) -> NoiseVerdict:
     """Judge the noise of a fit without suspects; `predictable`: something predicts the residual."""
-    high = float(chi2.sf(fit.chi2, fit.dof)) < MISFIT_ALARM
-    low = float(chi2.cdf(fit.chi2, fit.dof)) < MISFIT_ALARM
+    high = float(scipy.stats.chi2.sf(fit.chi2, fit.dof)) < MISFIT_ALARM
+    low = float(scipy.stats.chi2.cdf(fit.chi2, fit.dof)) < MISFIT_ALARM
     if not high and not low:
         return NoiseVerdict("as_stated")
     differ = repeats is not None and not repeats.interval[0] <= 1 <= repeats.interval[1]
@@ -178,7 +177,7 @@ def pure_error(fit: Fit) -> PureError | None:
     lack = max(float(np.sum(c.whitening.whiten(fit.raw) ** 2)) / c.bias - pure, 0.0)
     lack_dof, p = fit.dof - c.dof, 1.0
     if lack_dof > 0 and pure > 0:
-        p = float(f_distribution.sf((lack / lack_dof) / (pure / c.dof), lack_dof, c.dof))
+        p = float(scipy.stats.f.sf((lack / lack_dof) / (pure / c.dof), lack_dof, c.dof))
     # A direction is wrong itself if it is further off than all together, to the same side.
     overall = max(pure / c.dof, 1e-300)
     off = [
@@ -413,7 +412,7 @@ def judge_directions(fit: Fit, c: Contrasts) -> list[NoiseWhere]:
         dof = 2 * (mean / spread) ** 2 if mean > 0 else 0.0
         if dof >= FEWEST_DOF_OF_DIRECTION:
             factor = float(t[0]) / mean / c.bias
-            low, high = (factor * dof / float(chi2.isf(q, dof)) for q in (0.025, 0.975))
+            low, high = (factor * dof / float(scipy.stats.chi2.isf(q, dof)) for q in (0.025, 0.975))
             out.append(NoiseWhere(kind, name, factor, (low, high), _p(t / square)))
     return [replace(v, p_value=min(v.p_value * len(out), 1.0)) for v in out]
 

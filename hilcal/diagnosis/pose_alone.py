@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM, largest_plausible, unloaded_readings
 from hilcal.diagnosis.minimum_detectable_effect import SuspectTests
@@ -79,7 +79,7 @@ def pose_alone(
     fit, rank = p.fit, constants.rank
     remainder = p.rss - constants.gain
     share = p.share(constants.gain - rank * remainder / (fit.dof - rank))
-    if share < LEAST_SHARE or float(chi2.sf(remainder, fit.dof - rank)) < MISFIT_ALARM:
+    if share < LEAST_SHARE or float(scipy.stats.chi2.sf(remainder, fit.dof - rank)) < MISFIT_ALARM:
         return None
     able, states = [], fit.readings[~fit.outlier].states
     for e in (*(e for e in fit.model.effects if e.fine(states)), *effects):

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from hilcal.diagnosis.noise import MISFIT_ALARM, PREDICTABLE
 from hilcal.diagnosis.residual_regression import Dependence, residual_regression
@@ -130,7 +130,7 @@ def discover(
     expect(fit, Fit, "fit", "a Fit, as of hc.fit(model, readings)")
     if fit.scaling != "gc":
         raise InputError(f"scaling {fit.scaling!r}: laws are searched in a fit scaled by gc")
-    if float(chi2.sf(fit.chi2, fit.dof)) >= MISFIT_ALARM:
+    if float(scipy.stats.chi2.sf(fit.chi2, fit.dof)) >= MISFIT_ALARM:
         return Discovery(fit, "adequate")
     linear = linearise(fit)
     say("forming all candidates")

@@ -25,7 +25,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from scipy.stats import beta, binom, chi2
+import scipy
 
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.carried import scales_of
@@ -122,7 +122,9 @@ class DataSnooping:
             if np.array_equal(updated, used):
                 break
             used = updated
-        core = float(chi2.ppf(START_QUANTILE, linear.m)) * trimmed_variance(linear, t2, centre)
+        core = float(scipy.stats.chi2.ppf(START_QUANTILE, linear.m)) * trimmed_variance(
+            linear, t2, centre
+        )
         return self._screened(point, (t2 <= core) | centre, misfit)
 
     def retest(self, screened: SnoopingResult) -> SnoopingResult:
@@ -194,7 +196,10 @@ class DataSnooping:
         shared = self.readings.unloaded & linear.tested & (linear.group >= 0)
         unloaded = int(np.count_nonzero(shared[off]))
         share = float(np.mean(shared[linear.tested]))
-        return unloaded > 0 and float(binom.sf(unloaded - 1, len(off), share)) < SHARED_LEVEL
+        return (
+            unloaded > 0
+            and float(scipy.stats.binom.sf(unloaded - 1, len(off), share)) < SHARED_LEVEL
+        )
 
     def _fittable(self, linear: ReadingModel, agree: Bools) -> Bools:
         """Return `agree` (N,) without groups that lack a good loaded or a good unloaded reading."""
@@ -417,11 +422,14 @@ def along_one_site(shift: Floats, columns: Floats, pose: Ints) -> Bools:
     square, length = np.sum(shift**2, axis=1), np.linalg.norm(columns, axis=1)
     along = np.einsum("fi,fip->fp", shift, columns) / np.where(length > 0, length, np.inf)
     normal = np.maximum(square[:, None] - along**2, 0.0)
-    near = normal <= (chi2.isf(SITE_LEVEL, m - 1) + LINEARISATION_SHARE**2 * square)[:, None]
-    p = np.where(near, beta.cdf(normal / square[:, None], (m - 1) / 2, 0.5), 1.0)
+    near = (
+        normal
+        <= (scipy.stats.chi2.isf(SITE_LEVEL, m - 1) + LINEARISATION_SHARE**2 * square)[:, None]
+    )
+    p = np.where(near, scipy.stats.beta.cdf(normal / square[:, None], (m - 1) / 2, 0.5), 1.0)
     ascending: Floats = np.sort(p[_different(shift, pose)], axis=0)
     count = len(ascending)
-    so_many = np.asarray(binom.sf(np.arange(count)[:, None], count, ascending))
+    so_many = np.asarray(scipy.stats.binom.sf(np.arange(count)[:, None], count, ascending))
     law = [
         k
         for k, least in enumerate(np.argmin(so_many, axis=0))

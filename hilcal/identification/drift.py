@@ -34,8 +34,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 import scipy.linalg as sl
-from scipy.stats import norm
 
 from hilcal.identification.carried import CarriedPrior, DriftGroup, coordinates_of, names_of
 from hilcal.identification.gauss_newton import Solution, whitened_jacobian
@@ -63,7 +63,7 @@ class Conflict:
     @property
     def moved_sigma(self) -> float:
         """Distance in standard deviations of a normal variable of that p-value, two-sided."""
-        return float(norm.isf(max(self.p_value, LEAST_P) / 2))
+        return float(scipy.stats.norm.isf(max(self.p_value, LEAST_P) / 2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

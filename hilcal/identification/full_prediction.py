@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.identification.fit import Fit, all_left_out, mahalanobis2, with_outliers
@@ -224,7 +224,7 @@ def _like_another(r: Readings, row: int) -> str:
         for k in np.flatnonzero(candidates).tolist()
     }
     closest = min(away, key=lambda k: away[k], default=-1)
-    if closest < 0 or away[closest] ** 2 >= float(chi2.isf(ALIKE_QUANTILE, r.m)):
+    if closest < 0 or away[closest] ** 2 >= float(scipy.stats.chi2.isf(ALIKE_QUANTILE, r.m)):
         return ""
     load = r.load_names[r.load[closest]]
     if load == "none":

@@ -20,7 +20,7 @@ Source: Box and Tiao, *A Bayesian approach to some outlier problems*, Biometrika
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from hilcal.identification.least_trimmed_squares import FALSE_ALARMS, MOST_WRONG
 from hilcal.identification.mixed_fit import MixedFit, linearised_problem, shift_rows
@@ -85,7 +85,7 @@ def _p_values(inner: Floats, score: Floats, m: int) -> Floats:
     along = np.einsum("nij,ni->nj", vectors, score.reshape(count, m))
     visible = values > VISIBLE * np.maximum(values.max(axis=1, keepdims=True), 1e-300)
     square = np.sum(np.where(visible, along**2 / np.where(visible, values, 1.0), 0.0), axis=1)
-    return np.asarray(chi2.sf(square, np.maximum(visible.sum(axis=1), 1)))
+    return np.asarray(scipy.stats.chi2.sf(square, np.maximum(visible.sum(axis=1), 1)))
 
 
 def _with_shifts(problem: MixedProblem, shifts: Floats, readings: list[int]) -> MixedProblem:

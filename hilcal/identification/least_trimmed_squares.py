@@ -24,7 +24,7 @@ from functools import cached_property
 from typing import Protocol, Self, TypeVar
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from hilcal.identification.gauss_newton import shortened
 from hilcal.readings.whitening import inverse_root
@@ -179,7 +179,11 @@ class ReadingModel:
         if not less.any():
             return t2
         near, out = np.minimum(t2[less], LARGEST_CHI2), t2.copy()
-        out[less] = chi2.isf(chi2.sf(near, self.elements_read[less]), self.m) + t2[less] - near
+        out[less] = (
+            scipy.stats.chi2.isf(scipy.stats.chi2.sf(near, self.elements_read[less]), self.m)
+            + t2[less]
+            - near
+        )
         return out
 
     def _fitted(self, used: Bools) -> tuple[Floats, Floats, Floats, Floats]:
@@ -263,7 +267,7 @@ def robust_start(model: L, rng: np.random.Generator) -> tuple[L, Bools]:
 
 def bulk_scale(distance2: Floats, m: int) -> float:
     """Scale of most squared distances: their median over that of χ²_m."""
-    return float(np.median(distance2) / chi2.median(m))
+    return float(np.median(distance2) / scipy.stats.chi2.median(m))
 
 
 def rejection_limit(m: int, count: int, scale: float = 1.0) -> float:
@@ -272,7 +276,7 @@ def rejection_limit(m: int, count: int, scale: float = 1.0) -> float:
     The χ²_m quantile that a good reading exceeds in one of a thousand campaigns, times the scale of
     the bulk where that is wider than the stated noise.
     """
-    far = float(chi2.isf(FALSE_ALARMS / count, m)) * max(1.0, scale)
+    far = float(scipy.stats.chi2.isf(FALSE_ALARMS / count, m)) * max(1.0, scale)
     chance, sure = MISFIT_SCALES
     return far * float(MISFIT_FACTOR ** np.clip((scale - chance) / (sure - chance), 0.0, 1.0))
 
@@ -281,7 +285,7 @@ def trimmed_variance(model: ReadingModel, d2: Floats, centre: Bools) -> float:
     """Variance of good readings by the median of the h least squared distances (N,)."""
     candidates = np.sort(d2[model.tested & ~centre])
     half = (_trusted(model, len(candidates)) + 1) // 2
-    return float(candidates[half - 1] / chi2.ppf(half / (len(candidates) + 1), model.m))
+    return float(candidates[half - 1] / scipy.stats.chi2.ppf(half / (len(candidates) + 1), model.m))
 
 
 def nearest(model: ReadingModel, d2: Floats, centre: Bools) -> tuple[Bools, float]:

@@ -18,7 +18,7 @@ from functools import lru_cache, reduce
 from itertools import combinations
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+import scipy
 
 from hilcal.cell import Cell
 from hilcal.errors import CannotAnswerError, InputError
@@ -324,7 +324,7 @@ class _DescriptionSearch:
 
         begin = min(ZERO_STARTS, key=lambda zero: self.score(zeroed(zero), True))
         bounds = (begin - ZERO_WIDTH, begin + ZERO_WIDTH)
-        minimum = minimize_scalar(
+        minimum = scipy.optimize.minimize_scalar(
             square, bounds=bounds, method="bounded", options={"xatol": ZERO_EXACT}
         )
         count = int(np.count_nonzero(self._described(way).paired[self._rows]))

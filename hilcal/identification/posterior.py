@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from hilcal import __version__, limits
 from hilcal.readings.readings import ArmScatter, Range
@@ -322,4 +322,6 @@ def _effect(effect: str, covariance: Floats, d: Floats, rows: Ints) -> EffectDif
     compared = values > 1.0
     total = float(np.sum(values[compared] * (vectors[:, compared].T @ d[rows]) ** 2))
     rank = int(compared.sum())
-    return EffectDifference(effect, total, rank, float(chi2.sf(total, rank)) if rank else 1.0)
+    return EffectDifference(
+        effect, total, rank, float(scipy.stats.chi2.sf(total, rank)) if rank else 1.0
+    )

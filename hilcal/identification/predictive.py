@@ -39,7 +39,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.errors import CannotAnswerError, InputError
@@ -139,7 +139,7 @@ def excess(
         if (
             free < 1.0
             or total <= free
-            or (not sure and float(chi2.sf(total, free)) >= EXCESS_LEVEL)
+            or (not sure and float(scipy.stats.chi2.sf(total, free)) >= EXCESS_LEVEL)
         ):
             continue
         if part.start:

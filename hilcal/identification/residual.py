@@ -3,7 +3,7 @@
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from hilcal.model.model import Prediction
 from hilcal.readings.readings import Readings
@@ -90,4 +90,6 @@ class WithVarianceFactor(Shown):
 def variance_interval(total: float, dof: float) -> tuple[float, float]:
     """95 % confidence interval of χ²/dof."""
     tail = (1 - CONFIDENCE) / 2
-    return float(total / chi2.isf(tail, dof)), float(total / chi2.ppf(tail, dof))
+    return float(total / scipy.stats.chi2.isf(tail, dof)), float(
+        total / scipy.stats.chi2.ppf(tail, dof)
+    )

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from scipy.stats import t as student
+import scipy
 
 from hilcal.cell import Cell
 from hilcal.errors import InputError
@@ -166,11 +166,11 @@ def _fitted(
         std = np.maximum(np.sqrt(square / dof_of_each), 1e-9 * (1 + np.abs(b).max()))
     null = np.abs(vt[~regular]).max(axis=0, initial=0.0)
     dof = max(n * (count - lost) - a.shape[1], 1)
-    half, out = float(student.ppf(0.5 + CONFIDENCE / 2, dof)), {}
+    half, out = float(scipy.stats.t.ppf(0.5 + CONFIDENCE / 2, dof)), {}
     for k, name in enumerate(names):
         if null[k] <= 1e-6:
             value, size = float(x[k]), float(np.sqrt(cov[k, k]))
-            p = 2 * float(student.sf(abs(value - 1) / max(size, 1e-12), dof))
+            p = 2 * float(scipy.stats.t.sf(abs(value - 1) / max(size, 1e-12), dof))
             out[name] = (value, value - half * size, value + half * size, p)
     return out, std
 

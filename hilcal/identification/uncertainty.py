@@ -27,7 +27,7 @@ integrated out with a prior of that size: with M the projection off their column
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from hilcal.identification.carried import Coordinates, names_of, prior_of, scales_of
 from hilcal.identification.folds import block_folds, parameter_changes, region_folds
@@ -77,7 +77,10 @@ def uncertainty(
     variance[space.index] += space.omitted_variance / solution.beta
     noise = solution.beta if w.scaling == "none" else 1.0
     formal = np.sqrt(np.maximum(variance, 0.0) * noise)
-    misfit, std = w.scaling != "none" and bool(chi2.sf(total, dof) < MISFIT_LEVEL), formal
+    misfit, std = (
+        w.scaling != "none" and bool(scipy.stats.chi2.sf(total, dof) < MISFIT_LEVEL),
+        formal,
+    )
     if misfit:
         std = formal * np.sqrt(total / dof)
         angle = readings.states.q[w.reading]

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.errors import CannotAnswerError, InputError
@@ -341,7 +341,7 @@ def acceptance(
     error = np.linalg.norm(validation.raw[:, :3], axis=1)
     variance = np.diagonal(validation.whitening.covariance, axis1=1, axis2=2)
     read = np.maximum(np.count_nonzero(variance > 0, axis=1), 1)
-    inside = beyond.z**2 * read <= chi2.ppf(BAND, read)
+    inside = beyond.z**2 * read <= scipy.stats.chi2.ppf(BAND, read)
     load, pose = (r.load[rows], r.load_names), (r.pose[rows], r.pose_names)
 
     def share(name: str, members: Bools, opposite: tuple[Ints, Sequence[str]]) -> Share:

@@ -26,7 +26,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from hilcal.errors import DeviceError
 from hilcal.measuring.connect import Setup
@@ -80,7 +80,7 @@ def average(samples: Sequence[TrackerSample], systematic_share: float = 0.0) -> 
     mean, residuals = deviations(values[retained])
     total = float(np.sum((residuals @ inverse_root(prior).T) ** 2))  # Σ_k r_kᵀ Σ̄⁻¹ r_k
     dof = residuals.shape[1] * (len(residuals) - 1)
-    ratio, p = total / dof, float(stats.chi2.sf(total, dof))
+    ratio, p = total / dof, float(scipy.stats.chi2.sf(total, dof))
     factor = 1.0 if p >= UNEXPLAINED else ratio
     covariance = covariance_of_mean(prior, residuals, systematic_share, factor)
     warnings = [f"reading {k + 1} of {len(samples)} is a gross outlier, left out" for k in left_out]
@@ -121,11 +121,11 @@ def _not_gross(values: Floats, stated: Floats) -> Bools:
     m = values.shape[1]
     white = deviations(values)[1] @ inverse_root(stated).T
     square = np.sum((white - np.median(white, axis=0)) ** 2, axis=1)
-    usual = max(1.0, float(np.median(square) / stats.chi2.median(m)))
-    return np.asarray(stats.chi2.logsf(square / usual, m) > _LOG_GROSS)
+    usual = max(1.0, float(np.median(square) / scipy.stats.chi2.median(m)))
+    return np.asarray(scipy.stats.chi2.logsf(square / usual, m) > _LOG_GROSS)
 
 
-_LOG_GROSS = float(np.log(2) + stats.norm.logsf(GROSS_SIGMA))
+_LOG_GROSS = float(np.log(2) + scipy.special.log_ndtr(-GROSS_SIGMA))
 
 
 DRIFT_P = 0.04
@@ -176,9 +176,9 @@ class SettleWindow:
             return True
         m, drift = len(trend.white_slope), trend.moment * float(np.sum(trend.white_slope**2))
         if noise == 1.0:
-            p = float(stats.chi2.sf(drift, m))
+            p = float(scipy.stats.chi2.sf(drift, m))
         else:
-            p = float(stats.f.sf(drift / (m * noise), m, trend.dof))
+            p = float(scipy.stats.f.sf(drift / (m * noise), m, trend.dof))
         self._has_drifted = self._has_drifted or p <= DRIFT_P
         return bool(p > (AFTER_DRIFT_P if self._has_drifted else DRIFT_P))
 
@@ -188,7 +188,7 @@ class SettleWindow:
         first = _trend(self._samples[:half])
         second = _trend(self._samples[-half:])
         ratio = first.scatter / max(second.scatter, np.finfo(float).tiny)
-        return bool(stats.f.sf(ratio, first.dof, second.dof) < SHRINKING_P)
+        return bool(scipy.stats.f.sf(ratio, first.dof, second.dof) < SHRINKING_P)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -212,7 +212,7 @@ def _trend(samples: Sequence[TrackerSample]) -> _Trend:
     about = (residuals - np.outer(time, slope)) @ root.T
     dof = residuals.shape[1] * (len(samples) - 2)
     total = float(np.sum(about**2))
-    scatter, p = (total / dof, float(stats.chi2.sf(total, dof))) if dof else (0.0, 1.0)
+    scatter, p = (total / dof, float(scipy.stats.chi2.sf(total, dof))) if dof else (0.0, 1.0)
     return _Trend(root @ slope, moment, span, scatter, p, dof)
 
 

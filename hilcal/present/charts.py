@@ -12,7 +12,8 @@ from typing import Any, Literal
 
 import numpy as np
 import plotly.graph_objects as go
-from scipy.stats import chi2, norm
+import scipy
+from scipy.special import chdtri
 
 from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
@@ -46,7 +47,7 @@ LEVELS = (GREY, AMBER, RED)
 SYMBOLS = ("circle", "diamond", "x")  # of the levels, distinct without colours
 CONFIG: dict[str, object] = {"displayModeBar": False, "responsive": True, "scrollZoom": False}
 """Options for plotly.js: no toolbar, and the wheel scrolls the page."""
-SIGMA_LIMITS = np.sqrt(chi2.ppf(LIMITS, 3)).tolist()
+SIGMA_LIMITS = np.sqrt(chdtri(3, 1.0 - np.array(LIMITS))).tolist()
 """Mahalanobis distances above which a reading is doubtful, and outside."""
 _INK = {False: ("#24272e", "#d9dbe0"), True: ("#e4e5e9", "#3b3f48")}
 MAX_POINTS = 1500  # points of a chart; a choice that limits a page to 8 MB
@@ -449,7 +450,7 @@ def noise_check(fit: Fit) -> go.Figure:
     counts, _ = np.histogram(np.clip(white, -reach + 1e-9, reach - 1e-9), edges)
     expected = np.sqrt(min(fit.dof / max(len(white), 1), 1.0))
     fine = np.linspace(-reach, reach, 401)
-    density = len(white) * width * norm.pdf(fine, scale=max(expected, 1e-9))
+    density = len(white) * width * scipy.stats.norm.pdf(fine, scale=max(expected, 1e-9))
     look = {"width": 0.9 * width, "name": "measured", "marker": {"color": MEASURED}}
     hover = "%{x:.2f} σ: %{y} elements<extra></extra>"
     traces = [

@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
@@ -45,7 +45,7 @@ MOST_SUSPECTS, MOST_PARAMETERS = 3, 40
 
 def levels(norm2: Floats) -> Ints:
     """Return the index (N,) into `LEVEL_NAMES` of squared Mahalanobis distances (N,), 3 dof."""
-    return np.digitize(norm2, stats.chi2.ppf(LIMITS, 3)).astype(np.int64)
+    return np.digitize(norm2, scipy.stats.chi2.ppf(LIMITS, 3)).astype(np.int64)
 
 
 def worst_and_even(badness: Floats, count: int) -> Ints:

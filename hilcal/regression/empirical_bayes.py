@@ -28,9 +28,9 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+import scipy
 import scipy.linalg as sl
 from scipy.special import exp1
-from scipy.stats import chi2
 
 from hilcal.regression.schur import eliminate
 from hilcal.types import Floats, Ints
@@ -123,7 +123,7 @@ def spent_by_groups(share: Floats, size: Ints) -> Floats:
     (a dropped group uses none).
     """
     k = np.asarray(size, dtype=float)
-    retained, mean = chi2.sf(k, k), k * chi2.sf(k, k + 2.0)
+    retained, mean = scipy.stats.chi2.sf(k, k), k * scipy.stats.chi2.sf(k, k + 2.0)
     inverse = np.array([_mean_inverse(float(v)) for v in k.reshape(-1)]).reshape(k.shape)
     excess = (mean - k**2 * inverse - k * retained) / (k * inverse)
     return np.asarray(size + excess * (1.0 - np.clip(share, 0.0, 1.0)))
@@ -133,11 +133,11 @@ def spent_by_groups(share: Floats, size: Ints) -> Floats:
 def _mean_inverse(k: float) -> float:
     """E[1/x; x > k] of χ²_k; for k = 1, 2, where χ²_{k−2} does not exist, by parts."""
     if k > 2:
-        return float(chi2.sf(k, k - 2.0)) / (k - 2.0)
+        return float(scipy.stats.chi2.sf(k, k - 2.0)) / (k - 2.0)
     if k == 2:
         return float(exp1(1.0)) / 2.0
     density = float(np.exp(-0.5) / np.sqrt(2.0 * np.pi))
-    return 2.0 * density - float(chi2.sf(1.0, 1.0))
+    return 2.0 * density - float(scipy.stats.chi2.sf(1.0, 1.0))
 
 
 def _inverse_root(g: Floats, std: Floats, beta: float) -> Floats:

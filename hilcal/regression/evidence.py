@@ -36,9 +36,8 @@ Biometrika 86 (1999) 929-935; Lugannani and Rice, Adv. Appl. Prob. 12 (1980).
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy
 from scipy.special import log_ndtr
-from scipy.stats import chi2, ncf, ncx2, norm
-from scipy.stats import f as f_distribution
 
 from hilcal.types import Bools, Floats
 
@@ -160,7 +159,7 @@ def score_family(
     if small:
         gain = min(float(explained.sum()), (1 - ROUNDING) * rss)
         variance = max((rss - gain) / (free - rank), 1e-300)
-        p_value = float(f_distribution.sf(gain / rank / variance, rank, free - rank))
+        p_value = float(scipy.stats.f.sf(gain / rank / variance, rank, free - rank))
     else:
         p_value = ratio_tail(lam, free, float(c @ c) / rss)
     evidence, remaining = log_evidence(lam, explained, rss, dof)
@@ -236,7 +235,7 @@ def ratio_tail(eigenvalues: Floats, dimension: float, c: float) -> float:
     if w > 8:
         # Deep tail, in logarithms: sf(w) + φ(w) (1/v − 1/w)
         return float(np.exp(log_ndtr(-(w + np.log(v / w) / w))))
-    return float(np.clip(norm.sf(w + np.log(v / w) / w), 0.0, 1.0))
+    return float(np.clip(scipy.stats.norm.sf(w + np.log(v / w) / w), 0.0, 1.0))
 
 
 def family_power(s: Floats, beta: Floats, level: float, dof: float = np.inf) -> float:
@@ -257,15 +256,15 @@ def power_of_test(noncentrality: float, rank: int, dof: float, level: float) -> 
     if noncentrality <= 0.0:
         return level
     if np.isinf(dof):
-        return float(ncx2.sf(chi2.isf(level, rank), rank, noncentrality))
-    return float(ncf.sf(f_distribution.isf(level, rank, dof), rank, dof, noncentrality))
+        return float(scipy.stats.ncx2.sf(scipy.stats.chi2.isf(level, rank), rank, noncentrality))
+    return float(scipy.stats.ncf.sf(scipy.stats.f.isf(level, rank, dof), rank, dof, noncentrality))
 
 
 def noncentrality_of_power(rank: int, dof: float, level: float, power: float) -> float:
     """Return the non-centrality at which the F-test at `level` has the given power."""
     from scipy.optimize import brentq  # slow to import
 
-    high = 10.0 * (rank + 1.0) + 4.0 * rank * float(f_distribution.isf(level, rank, dof))
+    high = 10.0 * (rank + 1.0) + 4.0 * rank * float(scipy.stats.f.isf(level, rank, dof))
 
     def excess(value: float) -> float:
         return power_of_test(value, rank, dof, level) - power

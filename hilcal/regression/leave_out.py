@@ -13,7 +13,7 @@ standard deviation is their magnitude in the full fit: a direction that the othe
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm, wilcoxon
+import scipy
 
 from hilcal.regression.normal_equations import NormalEquations
 from hilcal.regression.schur import Projection, inverse_root, positive_solve
@@ -43,7 +43,9 @@ def improves(before: Floats, after: Floats, standard_errors: float = STANDARD_ER
         return True
     if np.count_nonzero(gain) < FEWEST_POSES:
         return False
-    return float(wilcoxon(gain, alternative="greater").pvalue) < float(norm.sf(standard_errors))
+    return float(scipy.stats.wilcoxon(gain, alternative="greater").pvalue) < float(
+        scipy.stats.norm.sf(standard_errors)
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -38,7 +38,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t as student
+import scipy
 
 from hilcal.regression.schur import inverse_root, positive_solve
 from hilcal.types import Bools, Floats, Ints
@@ -275,7 +275,7 @@ def find_outliers(values: Floats, variance: Floats) -> tuple[Outlier, ...]:
             off, sd = np.array(deviations).T
             worst = int(np.argmax(np.abs(off / sd)))
             sigma = abs(float(off[worst] / sd[worst]))
-            p = min(1.0, 2 * tests * float(student.sf(sigma, len(units) - 2)))
+            p = min(1.0, 2 * tests * float(scipy.stats.t.sf(sigma, len(units) - 2)))
             if p >= FALSE_ALARM:
                 break
             named.append(Outlier(int(units[worst]), k, float(off[worst]), sigma, p))

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from hilcal.campaign.campaign import Campaign, opened
 from hilcal.campaign.revisions import mode_of
@@ -293,7 +293,7 @@ def check_factory(
         problem.without(kinematic), np.delete(fit.variances.log_std, kinematic), search=True
     )
     gain = fit.variances.equations.log_likelihood - without.equations.log_likelihood
-    p = float(chi2.sf(max(2.0 * gain, 0.0), len(kinematic)))
+    p = float(scipy.stats.chi2.sf(max(2.0 * gain, 0.0), len(kinematic)))
     moved, std = _displacement(fit, readings, np.isin(problem.family, kinematic))
     covariance = readings.covariance[:, :3, :3]
     return FactoryCheck(

@@ -15,7 +15,7 @@ from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import norm
+import scipy
 
 from hilcal.engine import Advance, Engine
 from hilcal.errors import CannotAnswerError, InputError
@@ -174,7 +174,9 @@ def pool(members: Sequence[Member], diagnosed: Sequence[DiagnosedEffect]) -> Poo
         name, off = names[o.parameter], float(o.deviation * scale[o.parameter])
         odd.append(UnlikeParameter(arm, campaign, name, off, units[name], o.sigma, o.p_value))
     years = np.sqrt(np.diag(h.covariance)[len(names) :])
-    certain = 2 * norm.sf(np.abs(h.slope) / np.where(years > 0, years, np.inf)) * len(names)
+    certain = (
+        2 * scipy.stats.norm.sf(np.abs(h.slope) / np.where(years > 0, years, np.inf)) * len(names)
+    )
     timed = bool(np.any(h.slope != 0))
     spreads = [
         Spread(

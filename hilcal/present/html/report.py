@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from hilcal import numbers
 from hilcal.calibration.scatter import COVERAGE, budget
@@ -166,7 +166,7 @@ def misfit_sentence(m: ReportContent) -> str:
         return f"{worst} {fit_words.dependence_sentence(d.misfit_breakdown)}"
     # The sum of squares of R whitened elements of standard deviation 1 is distributed as χ²(R).
     count = fit.whitening.rank
-    if fit.holdout.rms_sigma**2 * count <= chi2.isf((1 - CONFIDENCE) / 2, count):
+    if fit.holdout.rms_sigma**2 * count <= scipy.stats.chi2.isf((1 - CONFIDENCE) / 2, count):
         return "Nowhere beyond the noise: all poses and loads are predicted within it."
     return (
         "Nowhere in particular: what is left of the fitted poses is noise. Poses left out are off "

@@ -14,8 +14,8 @@ from typing import BinaryIO
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+import scipy
 from rerun.blueprint import archetypes
-from scipy import stats
 
 from hilcal import numbers
 from hilcal.errors import HilcalError, InputError
@@ -164,7 +164,7 @@ class LiveTally:
             yield "The first readings tell where tracker and target are; then each one is compared."
         else:
             title, advice = "✓ So far noise explains the readings", ""
-            if stats.binom.sf(self.outside - 1, self.judged, 1.0 - LIMITS[0]) < ALARM:
+            if scipy.stats.binom.sf(self.outside - 1, self.judged, 1.0 - LIMITS[0]) < ALARM:
                 title = "✗ The simple model fails: look at the red arrows"
                 advice = " Something is missing in it: hilcal refine says what, after measuring."
             yield heading(title)

@@ -7,8 +7,8 @@ from typing import Any, Literal
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from scipy import stats
 from scipy.spatial.transform import Rotation
+from scipy.special import chdtri
 
 from hilcal.config import Obstacle
 from hilcal.measuring.clearance import contains
@@ -36,7 +36,7 @@ LABEL: Color = (255, 255, 255)
 LEADER: Color = (165, 168, 176)
 LEVEL_NAMES = tuple(name.split()[0] for name in story.LEVEL_NAMES)  # of entities
 MARKS = {"good": "✓ ", "doubt": "✗ "}
-BALL_SIGMAS = float(np.sqrt(stats.chi2.ppf(story.LIMITS[0], 3)))
+BALL_SIGMAS = float(np.sqrt(chdtri(3, 1.0 - story.LIMITS[0])))
 ROD, TARGET = 0.0065, 0.012  # radii of the tool's rod and of the target, shares of the reach
 EYE = np.array([1.05, -1.35, 0.55])
 # 3-D views use light colours and stay dark in the light theme, too.
