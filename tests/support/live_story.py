@@ -56,7 +56,7 @@ def events(
         wall += 4.0
         off = wrong * (step.load != "none") * (k % 2)
         live = LiveResidual() if k < READINGS_BEFORE_MODEL else residual(rng, off)
-        yield wall, ReadingStored(step, k + 1, total, 7.0 * (total - k), 7.0, None, live)
+        yield wall, ReadingStored(step, k + 1, total, 7.0 * (total - k), None, live)
         if k == 20:
             yield wall, Remark("the reference pose has drifted by 60 µm (4 σ)")
     yield wall, Phase("finished")

@@ -81,7 +81,7 @@ def test_nothing_is_told_before_there_are_poses_to_learn_from():
 
 def test_words_tell_what_is_measured_from_what_is_inferred():
     def words(**more):
-        return reading_text(ReadingStored(Step("p1", "5kg", 0), 1, 2, 0.0, 0.0, **more))
+        return reading_text(ReadingStored(Step("p1", "5kg", 0), 1, 2, 0.0, **more))
 
     assert words() == ""
     seen = LiveResidual(50e-6, 1.04, False, 4.2138e-3, 52e-6)

@@ -230,6 +230,6 @@ def test_the_recording_is_whole_although_the_command_was_killed(home, free_port)
 
 def test_what_has_no_process_is_silent(tmp_path, said):
     live = LiveViewer(tmp_path / "x.rrd", said.append)
-    live.notify(ReadingStored(plan().steps[0], 1, 2, 0.0, 0.0))
+    live.notify(ReadingStored(plan().steps[0], 1, 2, 0.0))
     live.close()
     assert (said, live.dropped, live._process) == ([], 0, None)
