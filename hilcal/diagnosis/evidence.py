@@ -98,19 +98,19 @@ class Alternative:
     """Other effects that could replace an effect of the model."""
 
     effect: str
-    effect_log_evidence: float  # log evidence of the effect, against the model without it
+    effect_log_evidence: float  # against the model without the effect
     same_as: tuple[str, ...]  # single effects that the readings do not separate from the effect
     replacements: tuple[str, ...]  # effects that replace it together, in the order of adding
-    log_evidence: float  # of the others together
+    log_evidence: float  # of the replacements together
 
     @property
     def better(self) -> bool:
-        """Whether the readings prefer the others, beyond doubt."""
+        """Whether the readings prefer the replacements, beyond doubt."""
         return self.log_evidence > self.effect_log_evidence + SAME_EVIDENCE
 
     @property
     def as_good(self) -> bool:
-        """Whether the others explain as much as the effect."""
+        """Whether the replacements explain as much as the effect."""
         return self.log_evidence > self.effect_log_evidence - SAME_EVIDENCE
 
     @property

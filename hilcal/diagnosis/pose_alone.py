@@ -63,8 +63,8 @@ class PosePower(NamedTuple):
 
     effect: str  # present with the size that explains the misfit
     rival: str  # in the model
-    power_now: float  # chance with the readings so far
-    power_then: float  # chance with further poses as well
+    power_now: float  # with the readings so far
+    power_then: float  # with further poses as well
 
 
 def pose_alone(

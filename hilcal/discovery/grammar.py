@@ -19,7 +19,7 @@ from hilcal.types import Floats, Ints
 
 HARMONICS = 4  # Multiples of an angle; as in the diagnosis
 HIGHEST_MULTIPLE = 512
-"""Highest multiple of an angle, at most one per pose; a choice, as for encoders."""
+"""Of an angle, at most one per pose; a choice, as for encoders."""
 
 
 def functions(v: Variable, x: Floats, most: int) -> list[Factor]:

@@ -29,7 +29,7 @@ class KnownEffects:
 
     names: tuple[str, ...]  # effects that explain the misfit together, in the order of adding
     odds: tuple[float, ...]  # that each adds: log evidence minus the log of the choice
-    variance_factors: tuple[float, ...]  # variance factor of the linearisation after each
+    variance_factors: tuple[float, ...]  # of the linearisation, after each
     white: Floats  # (R, P) whitened columns of all effects that could be added
     columns: dict[str, slice]  # of each effect
 

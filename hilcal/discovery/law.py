@@ -205,7 +205,7 @@ class Law:
     p_value: float  # of the joint test of its columns, times the number of candidates
     odds: float  # logarithm of the odds against no law, corrected for the size of the search
     holdout_share: float  # share of the misfit that it explains on poses left out
-    variance_factor: float  # variance factor of the fit with the law
+    variance_factor: float  # of the fit with the law
     probability: float  # posterior, of its structure
     resembles: tuple[Resemblance, ...]  # effects of the catalogue that are near, the nearest first
     ranges: tuple[tuple[str, float, float, str], ...]  # of each quantity in the readings

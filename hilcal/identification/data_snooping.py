@@ -54,14 +54,14 @@ SHARED_LEVEL = 1e-3  # probability of so many shared unloaded readings among gro
 START_QUANTILE = 0.99  # probability of the χ² quantile up to which readings enter the robust start
 MOST_COLUMNS = 200  # parameters fitted anew with each set; of more, only those without a prior
 DISAGREEMENT_M = 1e-3  # scatter of most readings, m, that no arm reaches: the readings disagree
-MOST_ROUNDS = 20  # most rounds in which readings enter and leave
+MOST_ROUNDS = 20  # in which readings enter and leave
 WHITENED_AT_ONCE = 4096  # readings whitened at a time
 COVARIANCE_RIDGE = 1e-6
 """Share of a group's mean covariance added to each reading, as exact ones have none."""
 MOST_SHARE = 0.35  # most nuisance columns, as a share of the whitened rows
-SAME_SHIFT = 0.25  # largest difference of two equal shifts, as a share of the larger one
+SAME_SHIFT = 0.25  # difference of two equal shifts at most, as a share of the larger one
 MOST_BETWEEN = 1  # most readings with another shift between two with equal shifts
-FEWEST_IN_RUN = 4  # fewest readings with an equal shift: two in a row agree by chance
+FEWEST_IN_RUN = 4  # readings with an equal shift: two in a row agree by chance
 MOST_ALIKE_SHARE = 0.05
 """Share of readings up to which those with equal shifts count as gross errors."""
 SITE_LEVEL = 1e-2  # of so many near one site by chance, and of noise so far from a law's direction

@@ -44,7 +44,7 @@ FALSE_ALARMS = 1e-3  # expected good readings set aside per campaign under the r
 MISFIT_FACTOR = 6.25  # of the limit with a misfit, 2.5 in distance: its tails are heavier
 MISFIT_SCALES = (1.25, 1.5)
 """Scales of the bulk between which `MISFIT_FACTOR` is reached: noise alone, and a sure misfit."""
-SINGULAR_RIDGE = 1e-9  # ridge, as a share of a column's square: few readings determine few columns
+SINGULAR_RIDGE = 1e-9  # as a share of a column's square: few readings determine few columns
 READINGS_AT_ONCE = 4096  # readings whose covariance is formed at a time
 LARGEST_CHI2 = 100.0  # χ² beyond which its probability is not evaluated
 LEAST_INFORMATION_SHARE = 1e-6  # share of a reading's information that must remain for a test

@@ -55,13 +55,13 @@ SPREAD = 3.0  # of the log of a factor: 20 either way; cameras see by a hundred 
 HARMONICS = 6  # waves of a gear that take part, for speed; finer ones act as the arm's scatter
 MOST_ROWS = 900  # elements of readings, of poses chosen at random: a σ is known to some per cent
 FEWEST_POSES = 10  # below which frames and effects leave nothing to estimate a noise from
-MOST_ROUNDS = 3  # most estimates, each after a new test for gross errors
+MOST_ROUNDS = 3  # of an estimate after a new test for gross errors
 SEVERAL_LEVEL = 0.05  # chance of finding several effects where there is one at most
 SEED = 20251125  # of the poses that are chosen, and of simulated likelihood ratios
 NOISE_KEY = "noise"
 """Key among the texts about an imported campaign, and kind of event of a measured one: the
 estimate; absent where the noise is stated, or as the samples show it."""
-STANDARD_ERRORS = 3.0  # standard errors of a factor's log by which readings contradict covariances
+STANDARD_ERRORS = 3.0  # of a factor's log, by which readings contradict covariances
 LEAST_FACTOR = 1.3  # from which on the noise of readings differs from that of their samples
 ALONG, ACROSS, ORIENTATION, ARM_AS_STATED = "along", "across", "orientation", "arm as stated"
 
