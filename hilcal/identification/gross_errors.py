@@ -14,6 +14,8 @@ The set grows by the reading that the others predict worst, by Baarda's test of 
 present variances, and that of the largest odds is taken: while several gross errors inflate the
 variances, the odds of the first may be low, but the largest test is not small.
 
+Readings that were set aside beside fewer effects return if the others predict them well.
+
 Source: Box and Tiao, *A Bayesian approach to some outlier problems*, Biometrika 55 (1968) 119.
 """
 
@@ -24,9 +26,11 @@ from scipy.stats import chi2
 
 from hilcal.identification.least_trimmed_squares import FALSE_ALARMS, MOST
 from hilcal.identification.mixed_fit import MixedFit, linearised_problem, shift_rows
+from hilcal.mixed.equations import equations
 from hilcal.mixed.families import KNOWN, Families, Family, LogStdPrior
 from hilcal.mixed.problem import MixedProblem
 from hilcal.mixed.variances import estimate_variances
+from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode, has_unloaded
 from hilcal.types import Bools, Floats, Ints
 
@@ -73,6 +77,28 @@ def gross_errors_beside(mixed: MixedFit, mode: Mode) -> Bools:
     if mode == "deflection" and out.any():
         good = np.flatnonzero(~out)
         out[good[~has_unloaded(readings[good])]] = True
+    return out
+
+
+def returned(mixed: MixedFit, readings: Readings, outlier: Bools, mode: Mode) -> Bools:
+    """Return which of all readings (N,) still have gross errors, of those set aside.
+
+    The mixed fit is to the others. Each of those set aside has a shift; it returns if no shift at
+    all is as probable as one of the size found.
+    """
+    problem = linearised_problem(mixed.model, readings, mode, mixed.theta)
+    rows = np.flatnonzero(outlier)
+    shifts, families = shift_rows(mixed.model, readings, mode), len(problem.families.random)
+    log_std = np.insert(mixed.variances.log_std, families, np.zeros(len(rows)))
+    e = equations(_with_shifts(problem, shifts, rows.tolist()), log_std)
+    count, m = len(rows), readings.m
+    size = e.coordinates[-count * m :].reshape(count, m)
+    index = np.arange(count)
+    spread = e.covariance[-count * m :, -count * m :].reshape(count, m, count, m)
+    spread = spread[index, :, index]
+    square = np.einsum("ni,nij,nj->n", size, np.linalg.pinv(spread, hermitian=True), size)
+    out = outlier.copy()
+    out[rows] = chi2.sf(square, m) * len(readings) <= SUSPECT
     return out
 
 

@@ -12,7 +12,12 @@ from hilcal.cell import Cell
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.diagnosis.stepwise import add, remove
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.identification.background import background_of, family_sizes, with_pooled_lines
+from hilcal.identification.background import (
+    background_of,
+    family_sizes,
+    with_background,
+    with_pooled_lines,
+)
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.gross_errors import gross_errors_beside
@@ -307,6 +312,17 @@ def test_gross_errors_that_all_effects_together_hide_are_set_aside(gross, found,
     record = to_record(again.fit, again.diagnosis.to_dict(), BACKGROUND, content_hash(off))
     stored = restore(from_text(to_text(record), 2), UR10, off)
     assert stored.outlier.tolist() == again.fit.outlier.tolist()
+
+
+def test_good_readings_that_were_set_aside_beside_fewer_effects_return(series):
+    some = series[:30]
+    value = some.value.copy()
+    value[7, 1] += 20e-3
+    off, aside = replace(some, value=value), np.isin(np.arange(30), [3, 7, 11, 12, 25])
+    named = fit(baseline(UR10, off, "absolute"), off, "absolute", outlier=aside)
+    together = with_background(named, named.model.names)
+    assert together is not None
+    assert np.flatnonzero(together.outlier).tolist() == [7]
 
 
 def test_an_unloaded_reading_with_a_gross_error_takes_its_deflections_along():
