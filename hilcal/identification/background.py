@@ -19,7 +19,7 @@ from hilcal.errors import CannotAnswerError
 from hilcal.identification.arm_scatter import some_poses, with_arm_scatter
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.full_covariance import joint_factors
-from hilcal.identification.gross_errors import gross_errors_beside, returned
+from hilcal.identification.gross_errors import gross_errors_beside, gross_errors_of
 from hilcal.identification.mixed_fit import (
     INSTRUMENT,
     MOST_NOISE_ROWS,
@@ -204,8 +204,8 @@ def with_background(fitted: Fit, named: Collection[str]) -> Fit | None:
     sample = sample[some_poses(sample, MOST_NOISE_ROWS / sample.value.size, SEED)]
     try:
         mixed = mixed_fit_of(model, sample, fitted.mode)
-        for _ in range(RETURNS if few and outlier.any() else 0):
-            still = returned(mixed, readings, outlier, fitted.mode)
+        for _ in range(RETURNS if few else 0):
+            still = gross_errors_of(mixed, readings, outlier, fitted.mode)
             if np.array_equal(still, outlier):
                 break
             outlier, sample = still, readings[~still]

@@ -24,6 +24,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2
 
+from hilcal.errors import CannotAnswerError
 from hilcal.identification.least_trimmed_squares import FALSE_ALARMS, MOST
 from hilcal.identification.mixed_fit import MixedFit, linearised_problem, shift_rows
 from hilcal.mixed.equations import equations
@@ -74,23 +75,25 @@ def gross_errors_beside(mixed: MixedFit, mode: Mode) -> Bools:
             best, found = odds, len(shifted)
     out = np.zeros(count, dtype=np.bool_)
     out[shifted[:found]] = True
-    if mode == "deflection" and out.any():
-        good = np.flatnonzero(~out)
-        out[good[~has_unloaded(readings[good])]] = True
-    return out
+    return _with_deflections(out, readings, mode)
 
 
-def returned(mixed: MixedFit, readings: Readings, outlier: Bools, mode: Mode) -> Bools:
-    """Return which of all readings (N,) still have gross errors, of those set aside.
+def gross_errors_of(mixed: MixedFit, readings: Readings, outlier: Bools, mode: Mode) -> Bools:
+    """Return which of all readings (N,) have gross errors, of those set aside.
 
-    The mixed fit is to the others. Each of those set aside has a shift; it returns if no shift at
-    all is as probable as one of the size found.
+    The mixed fit is to the others. Each of those set aside has a shift; it has no gross error if a
+    good reading would be as far from the prediction by chance.
     """
-    problem = linearised_problem(mixed.model, readings, mode, mixed.theta)
     rows = np.flatnonzero(outlier)
+    if not len(rows):
+        return outlier
+    problem = linearised_problem(mixed.model, readings, mode, mixed.theta)
     shifts, families = shift_rows(mixed.model, readings, mode), len(problem.families.random)
     log_std = np.insert(mixed.variances.log_std, families, np.zeros(len(rows)))
-    e = equations(_with_shifts(problem, shifts, rows.tolist()), log_std)
+    try:
+        e = equations(_with_shifts(problem, shifts, rows.tolist()), log_std)
+    except np.linalg.LinAlgError as error:
+        raise CannotAnswerError("the mixed model's equations have no solution") from error
     count, m = len(rows), readings.m
     size = e.coordinates[-count * m :].reshape(count, m)
     index = np.arange(count)
@@ -99,6 +102,15 @@ def returned(mixed: MixedFit, readings: Readings, outlier: Bools, mode: Mode) ->
     square = np.einsum("ni,nij,nj->n", size, np.linalg.pinv(spread, hermitian=True), size)
     out = outlier.copy()
     out[rows] = chi2.sf(square, m) * len(readings) <= SUSPECT
+    return _with_deflections(out, readings, mode)
+
+
+def _with_deflections(outlier: Bools, readings: Readings, mode: Mode) -> Bools:
+    """Add the loaded readings (N,) whose unloaded ones are all gross errors."""
+    if mode == "absolute" or not outlier.any():
+        return outlier
+    out, good = outlier.copy(), np.flatnonzero(~outlier)
+    out[good[~has_unloaded(readings[good])]] = True
     return out
 
 

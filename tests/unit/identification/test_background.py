@@ -332,9 +332,14 @@ def test_an_unloaded_reading_with_a_gross_error_takes_its_deflections_along():
     value = case.readings.value.copy()
     value[row] += [2e-3, 0.0, 1e-3]
     off = replace(case.readings, value=value)
-    mixed = mixed_fit(baseline(case.cell, off, "deflection"), off, "deflection")
-    gross = gross_errors_beside(mixed, "deflection")
-    assert np.flatnonzero(gross).tolist() == np.flatnonzero(off.pose == off.pose[row]).tolist()
+    model = baseline(case.cell, off, "deflection")
+    gross = gross_errors_beside(mixed_fit(model, off, "deflection"), "deflection")
+    of_pose = np.flatnonzero(off.pose == off.pose[row]).tolist()
+    assert np.flatnonzero(gross).tolist() == of_pose
+    aside = np.isin(np.arange(len(off)), [*of_pose, *np.flatnonzero(off.pose == 0)])
+    together = with_background(fit(model, off, "deflection", outlier=aside), model.names)
+    assert together is not None
+    assert np.flatnonzero(together.outlier).tolist() == of_pose
 
 
 def test_beside_a_background_chance_explains_nothing(found):
