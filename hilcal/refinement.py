@@ -378,7 +378,7 @@ class Path:
             try:
                 named = fit(
                     named.model, named.readings, named.mode,
-                    start=named.theta, outlier=fitted.outlier,
+                    start=named.theta, outlier=fitted.outlier | named.outlier,
                 )  # fmt: skip
             except CannotAnswerError:  # as many parameters as measured elements
                 return False

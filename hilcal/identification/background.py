@@ -19,7 +19,7 @@ from hilcal.errors import CannotAnswerError
 from hilcal.identification.arm_scatter import some_poses, with_arm_scatter
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.full_covariance import joint_factors
-from hilcal.identification.gross_errors import gross_errors_beside
+from hilcal.identification.gross_errors import gross_errors_beside, gross_errors_of
 from hilcal.identification.mixed_fit import (
     INSTRUMENT,
     MOST_NOISE_ROWS,
@@ -42,6 +42,8 @@ MOST_ROWS_OF_LINES = 2000
 IMPLAUSIBLE_FACTOR = 2.0
 """Factor by which an estimated standard deviation may exceed the plausible one, as few readings
 determine it to such a factor only; a choice."""
+RETURNS = 3
+"""Most times that readings set aside beside fewer effects return; a choice."""
 
 HALF_WIDTH_95 = 1.96
 """Half width of a 95 % interval, in standard errors of log s."""
@@ -189,9 +191,9 @@ def with_background(fitted: Fit, named: Collection[str]) -> Fit | None:
 
     The noise is that of the mixed model. The arm's scatter is added to the covariance. Instead of
     multiplying the instrument's noise by its estimated factor, the standard deviations of the
-    effects are divided by this factor, which gives the same fit. Gross errors stay set aside, and
-    those that only show beside all effects are (`gross_errors_beside`). The `named` effects do not
-    belong to the background.
+    effects are divided by this factor, which gives the same fit. Gross errors are sought beside all
+    effects (`identification.gross_errors`): some show only there, others are none. The `named`
+    effects do not belong to the background.
 
     With more than `MOST_NOISE_ROWS` elements of readings, the ratio of the arm's scatter to the
     instrument's noise is estimated from poses chosen at random; all readings then determine the
@@ -200,10 +202,16 @@ def with_background(fitted: Fit, named: Collection[str]) -> Fit | None:
     readings = fitted.readings.as_stated()
     model = with_all_effects(fitted.model, readings[~fitted.outlier].states)
     outlier, sample = fitted.outlier.copy(), readings[~fitted.outlier]
-    few = sample.value.size <= MOST_NOISE_ROWS
+    few = readings.value.size <= MOST_NOISE_ROWS
     sample = sample[some_poses(sample, MOST_NOISE_ROWS / sample.value.size, SEED)]
     try:
         mixed = mixed_fit_of(model, sample, fitted.mode)
+        for _ in range(RETURNS if few else 0):
+            still = gross_errors_of(mixed, readings, outlier, fitted.mode)
+            if np.array_equal(still, outlier):
+                break
+            outlier, sample = still, readings[~still]
+            mixed = mixed_fit_of(model, sample, fitted.mode)
         if few and (gross := gross_errors_beside(mixed, fitted.mode)).any():
             outlier[np.flatnonzero(~outlier)[gross]] = True
             sample = readings[~outlier]

@@ -14,6 +14,8 @@ The set grows by the reading that the others predict worst, by Baarda's test of 
 present variances, and that of the largest odds is taken: while several gross errors inflate the
 variances, the odds of the first may be low, but the largest test is not small.
 
+Readings that were set aside beside fewer effects return if the others predict them well.
+
 Source: Box and Tiao, *A Bayesian approach to some outlier problems*, Biometrika 55 (1968) 119.
 """
 
@@ -22,11 +24,14 @@ from dataclasses import replace
 import numpy as np
 import scipy
 
+from hilcal.errors import CannotAnswerError
 from hilcal.identification.least_trimmed_squares import FALSE_ALARMS, MOST_WRONG
 from hilcal.identification.mixed_fit import MixedFit, linearised_problem, shift_rows
+from hilcal.mixed.equations import equations
 from hilcal.mixed.families import KNOWN_SPREAD, Families, Family, LogStdPrior
 from hilcal.mixed.problem import MixedProblem
 from hilcal.mixed.variances import estimate_variances, log_posterior
+from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode, has_unloaded
 from hilcal.types import Bools, Floats, Ints
 
@@ -70,9 +75,42 @@ def gross_errors_beside(mixed: MixedFit, mode: Mode) -> Bools:
             best, found = odds, len(shifted)
     out = np.zeros(count, dtype=np.bool_)
     out[shifted[:found]] = True
-    if mode == "deflection" and out.any():
-        good = np.flatnonzero(~out)
-        out[good[~has_unloaded(readings[good])]] = True
+    return _with_deflections(out, readings, mode)
+
+
+def gross_errors_of(mixed: MixedFit, readings: Readings, outlier: Bools, mode: Mode) -> Bools:
+    """Return which of all readings (N,) have gross errors, of those set aside.
+
+    The mixed fit is to the others. Each of those set aside has a shift; it has no gross error if a
+    good reading would be as far from the prediction by chance.
+    """
+    rows = np.flatnonzero(outlier)
+    if not len(rows):
+        return outlier
+    problem = linearised_problem(mixed.model, readings, mode, mixed.theta)
+    shifts, families = shift_rows(mixed.model, readings, mode), len(problem.families.random)
+    log_std = np.insert(mixed.variances.log_std, families, np.zeros(len(rows)))
+    try:
+        e = equations(_with_shifts(problem, shifts, rows.tolist()), log_std)
+    except np.linalg.LinAlgError as error:
+        raise CannotAnswerError("the mixed model's equations have no solution") from error
+    count, m = len(rows), readings.m
+    size = e.coordinates[-count * m :].reshape(count, m)
+    index = np.arange(count)
+    spread = e.covariance[-count * m :, -count * m :].reshape(count, m, count, m)
+    spread = spread[index, :, index]
+    square = np.einsum("ni,nij,nj->n", size, np.linalg.pinv(spread, hermitian=True), size)
+    out = outlier.copy()
+    out[rows] = scipy.stats.chi2.sf(square, m) * len(readings) <= SUSPECT
+    return _with_deflections(out, readings, mode)
+
+
+def _with_deflections(outlier: Bools, readings: Readings, mode: Mode) -> Bools:
+    """Add the loaded readings (N,) whose unloaded ones are all gross errors."""
+    if mode == "absolute" or not outlier.any():
+        return outlier
+    out, good = outlier.copy(), np.flatnonzero(~outlier)
+    out[good[~has_unloaded(readings[good])]] = True
     return out
 
 

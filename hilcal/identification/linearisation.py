@@ -166,6 +166,23 @@ class Linearisation:
         return float(self.residual @ self.residual)
 
     @cached_property
+    def test_noise(self) -> tuple[float, float]:
+        """Square and degrees of freedom that tests of further columns take for the noise.
+
+        ‖r‖² and those of the fit. A background leaves a small residual of few degrees of freedom,
+        but further columns have all directions except those of parameters without a prior: with
+        the whitened y and the sizes σ of the random parameters, Cov(y) = M⁻¹ beside these, so that
+
+            yᵀ M y = ‖r‖² + ‖u/σ‖² ~ f χ²,    R less the parameters without a prior
+        """
+        if not self.fit.model.background:
+            return self.rss, self.fit.dof
+        s, random = self.fit.solution, self.projection.ridge > 0
+        y = s.white + self.rows @ np.where(random, s.coordinates(), 0.0)
+        free = self.fit.whitening.rank - int(np.count_nonzero(~random))
+        return float(y @ self.residual), float(max(free, 1))
+
+    @cached_property
     def left_out(self) -> Floats:
         """(poses,) squared whitened residual of each pose, predicted without it.
 
@@ -203,7 +220,7 @@ class Linearisation:
 
     def score_of(self, s: Floats | Spectrum, g: Floats, largest: float = np.inf) -> FamilyScore:
         """Score a family by S, or its spectrum, g = Xᵀ r (P,), and the largest plausible size."""
-        return score_family(s, g, self.rss, self.fit.dof, largest=largest)
+        return score_family(s, g, *self.test_noise, largest=largest)
 
     def families(self, columns: Sequence[EffectColumns]) -> list[tuple[Floats, Floats]]:
         """Return S (P, P) and g = Xᵀ r (P,) of effects whose columns were whitened together."""

@@ -12,7 +12,12 @@ from hilcal.cell import Cell
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.diagnosis.stepwise import add, remove
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.identification.background import background_of, family_sizes, with_pooled_lines
+from hilcal.identification.background import (
+    background_of,
+    family_sizes,
+    with_background,
+    with_pooled_lines,
+)
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.gross_errors import gross_errors_beside
@@ -309,6 +314,17 @@ def test_gross_errors_that_all_effects_together_hide_are_set_aside(gross, found,
     assert stored.outlier.tolist() == again.fit.outlier.tolist()
 
 
+def test_good_readings_that_were_set_aside_beside_fewer_effects_return(series):
+    some = series[:30]
+    value = some.value.copy()
+    value[7, 1] += 20e-3
+    off, aside = replace(some, value=value), np.isin(np.arange(30), [3, 7, 11, 12, 25])
+    named = fit(baseline(UR10, off, "absolute"), off, "absolute", outlier=aside)
+    together = with_background(named, named.model.names)
+    assert together is not None
+    assert np.flatnonzero(together.outlier).tolist() == [7]
+
+
 def test_an_unloaded_reading_with_a_gross_error_takes_its_deflections_along():
     config = configuration()
     case = study_case(config, "ur10e", "deflection", (TILT,), 3.0, 1, n_poses=8)
@@ -316,9 +332,14 @@ def test_an_unloaded_reading_with_a_gross_error_takes_its_deflections_along():
     value = case.readings.value.copy()
     value[row] += [2e-3, 0.0, 1e-3]
     off = replace(case.readings, value=value)
-    mixed = mixed_fit(baseline(case.cell, off, "deflection"), off, "deflection")
-    gross = gross_errors_beside(mixed, "deflection")
-    assert np.flatnonzero(gross).tolist() == np.flatnonzero(off.pose == off.pose[row]).tolist()
+    model = baseline(case.cell, off, "deflection")
+    gross = gross_errors_beside(mixed_fit(model, off, "deflection"), "deflection")
+    of_pose = np.flatnonzero(off.pose == off.pose[row]).tolist()
+    assert np.flatnonzero(gross).tolist() == of_pose
+    aside = np.isin(np.arange(len(off)), [*of_pose, *np.flatnonzero(off.pose == 0)])
+    together = with_background(fit(model, off, "deflection", outlier=aside), model.names)
+    assert together is not None
+    assert np.flatnonzero(together.outlier).tolist() == of_pose
 
 
 def test_beside_a_background_chance_explains_nothing(found):
