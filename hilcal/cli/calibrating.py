@@ -27,7 +27,7 @@ from hilcal.errors import (
     MovedFileError,
     StoppedError,
 )
-from hilcal.measuring.connect import with_kinematics
+from hilcal.measuring.connect import drivers_of, with_kinematics
 from hilcal.measuring.run import HOW_ON
 from hilcal.names import quoted
 from hilcal.present import calibration as words
@@ -127,6 +127,8 @@ def calibrate(
         raise InputError(
             "nobody can be asked before the arm moves; give --yes, or run it at a terminal"
         )
+    if not (rehearse or output.exists()):
+        drivers_of(config)  # refuses a cell without them before anything is planned
     with go_on.explained(p), ExitStack() as stack:
         live = stack.enter_context(live_viewer(t, view, output))
         CalibrationOperator(t, p, stack, rehearse, yes, live).to_the_end()

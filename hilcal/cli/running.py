@@ -92,6 +92,8 @@ def run(
     base_dir = cell.absolute().parent
     if rehearse:  # refuses an effect that cannot be hidden before anything is planned
         program_config(config, config.simulation.hide or NO_EFFECT, catalogue)
+    elif plan is None:
+        connect.drivers_of(config)  # refuses a cell without them before anything is planned
     with ExitStack() as stack:
         further: Plan | None = None
         if resume or append:
@@ -123,6 +125,8 @@ def run(
                 choice, seed = config.simulation.hide or NO_EFFECT, config.simulation.seed
                 secret = case_of_plan(config, campaign_plan, choice, seed, catalogue, base_dir)
                 config = stack.enter_context(simulated_cell(secret, seed, base_dir)).config
+        else:
+            connect.drivers_of(config)  # before a campaign is begun
         if further is not None:
             RunLog(campaign).append(further)
         elif not resume:

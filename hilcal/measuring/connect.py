@@ -105,11 +105,11 @@ def driver(group: str, name: str | None, key: str) -> Factory:
     return factory
 
 
-def connect(config: CellConfig) -> tuple[Rig | None, tuple[ConnectionResult, ...]]:
-    """Open every device at once; nothing moves.
+def drivers_of(config: CellConfig) -> list[tuple[str, str, Factory]]:
+    """Return part, name of the driver, and factory of each device; nothing is opened.
 
-    Returns the rig, or None if a device did not open (the others are closed again), and the result
-    of each device. InputError: a driver is missing in the configuration, or unknown.
+    Raises:
+        InputError: a driver is missing in the configuration, unknown, or cannot be loaded.
     """
     parts = [
         ("arm", devices.ARMS, config.robot.driver, "[robot] driver"),
@@ -119,14 +119,23 @@ def connect(config: CellConfig) -> tuple[Rig | None, tuple[ConnectionResult, ...
     if config.force_sensor is not None:
         sensor = config.force_sensor.driver
         parts.append(("force sensor", devices.FORCE_SENSORS, sensor, "[force_sensor] driver"))
-    factories = [driver(group, name, key) for _, group, name, key in parts]
+    return [(part, name or "", driver(group, name, key)) for part, group, name, key in parts]
+
+
+def connect(config: CellConfig) -> tuple[Rig | None, tuple[ConnectionResult, ...]]:
+    """Open every device at once; nothing moves.
+
+    Returns the rig, or None if a device did not open (the others are closed again), and the result
+    of each device. InputError: a driver is missing in the configuration, or unknown.
+    """
+    parts = drivers_of(config)
     with ThreadPoolExecutor(len(parts)) as pool:
-        opened = list(pool.map(lambda factory: _tried(factory, config), factories))
+        opened = list(pool.map(lambda part: _tried(part[2], config), parts))
     answers: list[ConnectionResult] = []
-    for (part, _, name, _), (device, error) in zip(parts, opened, strict=True):
+    for (part, name, _), (device, error) in zip(parts, opened, strict=True):
         report, why = (None, error) if error is not None else _tried(methodcaller("report"), device)
         failure = "" if why is None else _failure(part, why)
-        answers.append(ConnectionResult(part, name or "", report, failure))
+        answers.append(ConnectionResult(part, name, report, failure))
     arm, tracker, operator, *force = (device for device, _ in opened)
     rig = Rig(arm, tracker, force[0] if force else None, operator)
     if not any(answer.failure for answer in answers):

@@ -224,9 +224,15 @@ def test_the_command(tmp_path, capsys):
 
 @pytest.mark.long
 def test_a_run_without_a_plan_keeps_the_same_rule(tmp_path, capsys):
-    cell = cell_file(tmp_path, quickly_planned(configuration()))
-    result = run(capsys, "run", cell, "-o", tmp_path / "run.hilcal", "--yes")
-    assert "driver is missing, so there is no arm" in result.err  # after the plan
+    path, config = tmp_path / "run.hilcal", quickly_planned(configuration())
+    begin = ("run", cell_file(tmp_path, config), "-o", path, "--yes")
+    assert "driver is missing, so there is no arm" in refused(capsys, 2, *begin)
+    assert not path.exists()
+    for section in ("robot", "tracker", "force_sensor"):
+        config = config.with_keys(section, driver="os:getcwd")  # opens no device
+    cell_file(tmp_path, config)
+    result = run(capsys, *begin)
+    assert result.code == 3  # after the plan
     words = " ".join(result.out.split())
     assert "poses 20 and the reference " in words
     assert all(f", {name} " in words for name in ("10kg", "pull x", "pull y"))
