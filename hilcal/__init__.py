@@ -27,8 +27,8 @@ _NAMES = {
     "hilcal.effects.protocol": ("Effect", "effect"),
     "hilcal.errors": ("CannotAnswerError", "DeviceError", "HilcalError", "InputError"),
     "hilcal.identification.fit": ("Fit",),
-    "hilcal.identification.posterior": ("Posterior",),
-    "hilcal.identification.table_preview": ("preview_table",),
+    "hilcal.identification.carried.posterior": ("Posterior",),
+    "hilcal.identification.registration.table_preview": ("preview_table",),
     "hilcal.library": (
         "baseline",
         "bootstrap",
@@ -70,9 +70,9 @@ if TYPE_CHECKING:
     from hilcal.errors import DeviceError as DeviceError
     from hilcal.errors import HilcalError as HilcalError
     from hilcal.errors import InputError as InputError
+    from hilcal.identification.carried.posterior import Posterior as Posterior
     from hilcal.identification.fit import Fit as Fit
-    from hilcal.identification.posterior import Posterior as Posterior
-    from hilcal.identification.table_preview import preview_table as preview_table
+    from hilcal.identification.registration.table_preview import preview_table as preview_table
     from hilcal.library import baseline as baseline
     from hilcal.library import bootstrap as bootstrap
     from hilcal.library import diagnose as diagnose

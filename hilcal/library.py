@@ -23,12 +23,20 @@ from hilcal.errors import InputError, expect
 from hilcal.identification import baseline as starting_models
 from hilcal.identification import bootstrap as bootstraps
 from hilcal.identification import fit as fits
-from hilcal.identification.arm_scatter import with_prior_scatter
-from hilcal.identification.carried import CarriedPrior, carried_prior, check_prior
+from hilcal.identification.carried.carried_prior import CarriedPrior, carried_prior, check_prior
+from hilcal.identification.carried.posterior import Posterior, read_posterior
 from hilcal.identification.fit import Fit
-from hilcal.identification.full_covariance import CovarianceParts, covariance_parts, full_readings
-from hilcal.identification.noise_estimate import NOISE_KEY, NoiseEstimate, with_estimated_noise
-from hilcal.identification.posterior import Posterior, read_posterior
+from hilcal.identification.noise.arm_scatter import with_prior_scatter
+from hilcal.identification.noise.full_covariance import (
+    CovarianceParts,
+    covariance_parts,
+    full_readings,
+)
+from hilcal.identification.noise.noise_estimate import (
+    NOISE_KEY,
+    NoiseEstimate,
+    with_estimated_noise,
+)
 from hilcal.model.model import Model
 from hilcal.optional import needed_by
 from hilcal.present.story import build_story

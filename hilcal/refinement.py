@@ -24,15 +24,15 @@ from hilcal.diagnosis.stepwise import add, exchange, predicts_better, remove, tr
 from hilcal.diagnosis.verdict import NO_HISTORY, judge, judge_naming
 from hilcal.discovery.discovery import LawSearch
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.arm_scatter import with_arm_scatter, with_prior_scatter
 from hilcal.identification.background import (
     allows_background,
     with_background,
     with_pooled_lines,
 )
-from hilcal.identification.drift import carried_effects
+from hilcal.identification.carried.drift import carried_effects
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.mixed_fit import MOST_NOISE_ROWS
+from hilcal.identification.noise.arm_scatter import with_arm_scatter, with_prior_scatter
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode

@@ -27,11 +27,15 @@ from hilcal.effects.options import Options
 from hilcal.engine import Advance, Engine
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline, with_effects
-from hilcal.identification.carried import CarriedPrior, coordinates_of, prior_of, scales_of
+from hilcal.identification.carried.carried_prior import (
+    CarriedPrior,
+    coordinates_of,
+    prior_of,
+    scales_of,
+)
 from hilcal.identification.fit import Estimates, Fit, fit
 from hilcal.identification.fit_document import finite_or_null
 from hilcal.identification.folds import FOLDS
-from hilcal.identification.full_covariance import joint_factors, with_joint_scatter
 from hilcal.identification.gauss_newton import (
     LinearProblem,
     NewtonPoint,
@@ -44,7 +48,8 @@ from hilcal.identification.gauss_newton import (
     spent_parameters,
     whitened_jacobian,
 )
-from hilcal.identification.least_trimmed_squares import bulk_scale, rejection_limit
+from hilcal.identification.noise.full_covariance import joint_factors, with_joint_scatter
+from hilcal.identification.outliers.least_trimmed_squares import bulk_scale, rejection_limit
 from hilcal.identification.residual import ErrorBlock, WithVarianceFactor, residual
 from hilcal.identification.uncertainty import (
     MISFIT_LEVEL,

@@ -23,12 +23,12 @@ from hilcal.config import CellConfig
 from hilcal.engine import open_engine
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
-from hilcal.identification.full_covariance import joint_factors
 from hilcal.identification.mixed_fit import (
     SCATTER_RAD,
     linearised_problem,
     with_all_effects,
 )
+from hilcal.identification.noise.full_covariance import joint_factors
 from hilcal.mixed.equations import equations
 from hilcal.mixed.families import families_of
 from hilcal.model.model import Model

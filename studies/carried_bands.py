@@ -19,11 +19,11 @@ from hilcal.config import CellConfig
 from hilcal.drivers.simulated.injected_effects import Draw, typical_torque, world_without_effect
 from hilcal.drivers.simulated.rehearsal import measurement_noise
 from hilcal.drivers.simulated.world import World, place_tracker
-from hilcal.identification.arm_scatter import with_prior_scatter
 from hilcal.identification.baseline import baseline, with_effects
-from hilcal.identification.carried import carried_prior
+from hilcal.identification.carried.carried_prior import carried_prior
+from hilcal.identification.carried.posterior import Posterior
 from hilcal.identification.fit import fit
-from hilcal.identification.posterior import Posterior
+from hilcal.identification.noise.arm_scatter import with_prior_scatter
 from studies.change import GEOMETRY, measured
 from studies.compensation_command import judged
 from studies.study_cases import with_study_loads

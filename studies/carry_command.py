@@ -16,11 +16,11 @@ from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import terminal
 from hilcal.engine import open_engine
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.arm_scatter import with_prior_scatter
 from hilcal.identification.baseline import baseline
-from hilcal.identification.carried import CarriedPrior, carried_prior
+from hilcal.identification.carried.carried_prior import CarriedPrior, carried_prior
+from hilcal.identification.carried.posterior import Posterior
 from hilcal.identification.fit import Fit, fit
-from hilcal.identification.posterior import Posterior
+from hilcal.identification.noise.arm_scatter import with_prior_scatter
 from hilcal.library import read_table
 from hilcal.present.progress import counting, working
 from hilcal.readings.readings import Readings

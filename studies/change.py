@@ -27,8 +27,8 @@ from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.drivers.simulated.world import World, place_tracker
 from hilcal.errors import HilcalError
 from hilcal.identification.baseline import with_effects
+from hilcal.identification.carried.later_readings import EarlierFit, earlier_fit, later_readings
 from hilcal.identification.fit import fit
-from hilcal.identification.later_readings import EarlierFit, earlier_fit, later_readings
 from hilcal.readings.readings import Readings
 from hilcal.regression.evidence import noncentrality_of_power
 from hilcal.types import Floats

@@ -14,8 +14,8 @@ from hilcal.cell import Cell
 from hilcal.diagnosis.change import find_changes
 from hilcal.diagnosis.comparison import with_missing_effects
 from hilcal.identification.baseline import with_effects
+from hilcal.identification.carried.later_readings import EarlierFit, earlier_fit, later_readings
 from hilcal.identification.fit import fit
-from hilcal.identification.later_readings import EarlierFit, earlier_fit, later_readings
 from hilcal.library import read_table
 from hilcal.readings.readings import Readings
 from hilcal.robot import se3

@@ -18,7 +18,7 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
-from hilcal.identification.full_prediction import full_prediction
+from hilcal.identification.prediction.full_prediction import full_prediction
 from hilcal.present.verdict import message
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode

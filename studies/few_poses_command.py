@@ -28,10 +28,10 @@ from hilcal.design.optimum import best_design
 from hilcal.design.planner import without_undetermined
 from hilcal.design.predicted import prediction_poses
 from hilcal.engine import open_engine
-from hilcal.identification.arm_scatter import with_arm_scatter
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit
-from hilcal.identification.predictive import predictive
+from hilcal.identification.noise.arm_scatter import with_arm_scatter
+from hilcal.identification.prediction.predictive import predictive
 from hilcal.library import read_table
 from hilcal.present.progress import counting
 from hilcal.readings.readings import Readings

@@ -7,7 +7,7 @@ import numpy as np
 from hilcal.config import CellConfig
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import baseline
-from hilcal.identification.full_prediction import gross_errors
+from hilcal.identification.prediction.full_prediction import gross_errors
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES, Mode
 from hilcal.refinement import refine

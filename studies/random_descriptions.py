@@ -11,9 +11,9 @@ import numpy as np
 
 from hilcal.cell import STANDARD_GRAVITY, Cell
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.hypotheses import Description, Hypothesis
-from hilcal.identification.misdescription import DescriptionFinding, examine
-from hilcal.identification.registration import register
+from hilcal.identification.registration.hypotheses import Description, Hypothesis
+from hilcal.identification.registration.misdescription import DescriptionFinding, examine
+from hilcal.identification.registration.registration import register
 from hilcal.readings.readings import Readings, States
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm, may_follow, with_conventions

@@ -8,7 +8,7 @@ from hilcal.config import CellConfig
 from hilcal.drivers.simulated.rehearsal import simulate
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
-from hilcal.identification.predictive import predictive
+from hilcal.identification.prediction.predictive import predictive
 from hilcal.identification.residual import residual
 from hilcal.model.model import Model
 from hilcal.readings.covariance import symmetric_root

@@ -5,9 +5,9 @@ The true position of the tool differs from the prediction by
     Σ = κ J C Jᵀ + s² 1 + J_q Σ_q J_qᵀ
 
 C is the covariance of the parameters, which includes what families of parameters may do where
-nothing was measured (see `identification.predictive`). κ ≥ 1 scales C to the mean square position
-error at held-out poses. s² is the variance of the position residuals beyond the noise, where χ² is
-larger than chance allows. Σ_q is the arm's scatter from one arrival to the next.
+nothing was measured (see `identification.prediction.predictive`). κ ≥ 1 scales C to the mean square
+position error at held-out poses. s² is the variance of the position residuals beyond the noise,
+where χ² is larger than chance allows. Σ_q is the arm's scatter from one arrival to the next.
 
 Columns of `States` that the points lack add a further variance, see `calibration.measured`.
 
@@ -48,8 +48,8 @@ from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import InputError
 from hilcal.identification.fit import Fit
-from hilcal.identification.predictive import position_factor, predictive
-from hilcal.identification.robot_frames import (
+from hilcal.identification.prediction.predictive import position_factor, predictive
+from hilcal.identification.registration.robot_frames import (
     RobotFrames,
     robot_frames,
     state_with_every_column,
@@ -291,7 +291,7 @@ class Calibration(Brief):
         return whole_turns(self.model, self.theta)
 
     def base_in_tracker(self) -> Floats:
-        """(4, 4) T_sensor_base, see `identification.robot_frames`."""
+        """(4, 4) T_sensor_base, see `identification.registration.robot_frames`."""
         return self.frames.base
 
     def _tool(self, pose: Floats | None) -> ToolPose:

@@ -4,7 +4,7 @@ The tool in base axes, without the instruments (effects with fields "station" an
 
     T_base_tool = T_base_chain T_chain_flange(q, w) T_chainflange_flange T_flange_tool
 
-`identification.robot_frames` declares base and flange.
+`identification.registration.robot_frames` declares base and flange.
 
 Newton's method on T(q) = T_wanted starts from the commanded joint values and stays on their branch:
 
@@ -25,7 +25,7 @@ import scipy
 from hilcal.calibration.measured import Outside
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.errors import InputError
-from hilcal.identification.robot_frames import robot_frames, state_with_every_column
+from hilcal.identification.registration.robot_frames import robot_frames, state_with_every_column
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import States
 from hilcal.robot import se3

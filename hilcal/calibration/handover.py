@@ -11,8 +11,8 @@ see `frames`.
 
 An effect whose deviation is the same in every state and under every load (an encoder's zero, a link
 of another length or angle) goes into the constant transforms, from the declared base to the
-declared flange, see `identification.robot_frames`. All other effects (compliances, gear waves,
-temperature) are listed as not included.
+declared flange, see `identification.registration.robot_frames`. All other effects (compliances,
+gear waves, temperature) are listed as not included.
 """
 
 import hashlib

@@ -24,7 +24,7 @@ import numpy as np
 
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensation import BAND, ErrorSize, band, tool_of, tool_poses
-from hilcal.identification.predictive import Predictive
+from hilcal.identification.prediction.predictive import Predictive
 from hilcal.identification.residual import noise_floor, residual
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import Mode, whitening

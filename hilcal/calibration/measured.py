@@ -21,8 +21,8 @@ from typing import Any, Self
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.identification.predictive import Predictive
-from hilcal.identification.validation import FAR
+from hilcal.identification.prediction.predictive import Predictive
+from hilcal.identification.prediction.validation import FAR
 from hilcal.measuring.force import shift
 from hilcal.model.model import Model
 from hilcal.readings.readings import (

@@ -31,8 +31,8 @@ from hilcal.cell import Cell
 from hilcal.diagnosis.noise import FEWEST_DOF, RP_PER_RMS, repeat_classes, stated_repeatability
 from hilcal.errors import InputError
 from hilcal.identification.fit import Fit
-from hilcal.identification.full_covariance import joint_factors
-from hilcal.identification.predictive import position_factor, predictive
+from hilcal.identification.noise.full_covariance import joint_factors
+from hilcal.identification.prediction.predictive import position_factor, predictive
 from hilcal.identification.residual import noise_floor
 from hilcal.robot.chain import Chain, drive_jacobian, evaluate
 from hilcal.types import Floats

@@ -23,7 +23,7 @@ from hilcal.calibration.scatter import Scatter
 from hilcal.cell import Cell, Observer
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
-from hilcal.identification.robot_frames import state_with_every_column
+from hilcal.identification.registration.robot_frames import state_with_every_column
 from hilcal.model.model import Model
 from hilcal.readings.readings import ObserverName
 from hilcal.readings.whitening import MODES

@@ -22,16 +22,16 @@ from hilcal.diagnosis.verdict import diagnose, judge_naming
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError, expect
 from hilcal.identification.baseline import baseline
+from hilcal.identification.carried.posterior import Posterior, Source
 from hilcal.identification.fit import Fit, fit
-from hilcal.identification.full_covariance import (
+from hilcal.identification.noise.full_covariance import (
     CovarianceParts,
     covariance_parts,
     full_readings,
     with_noise_of,
 )
-from hilcal.identification.noise_estimate import NOISE_KEY, NoiseEstimate, with_noise_factors
-from hilcal.identification.posterior import Posterior, Source
-from hilcal.identification.predictive import Predictive
+from hilcal.identification.noise.noise_estimate import NOISE_KEY, NoiseEstimate, with_noise_factors
+from hilcal.identification.prediction.predictive import Predictive
 from hilcal.model.model import Model
 from hilcal.names import quoted
 from hilcal.present.story import Chapter

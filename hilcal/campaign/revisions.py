@@ -15,10 +15,10 @@ from hilcal.diagnosis.diagnosis import History
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
 from hilcal.identification import fit_document
-from hilcal.identification.arm_scatter import with_arm_scatter
-from hilcal.identification.carried import CarriedPrior
+from hilcal.identification.carried.carried_prior import CarriedPrior
 from hilcal.identification.fit import Fit, fit
-from hilcal.identification.predictive import Predictive, predictive
+from hilcal.identification.noise.arm_scatter import with_arm_scatter
+from hilcal.identification.prediction.predictive import Predictive, predictive
 from hilcal.model.model import Model
 from hilcal.names import quoted
 from hilcal.readings.readings import ArmScatter, Readings, SerialNoise

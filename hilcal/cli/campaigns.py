@@ -13,10 +13,10 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.options import check_new, command
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.full_covariance import covariance_parts
-from hilcal.identification.misdescription import examine, other_arm
-from hilcal.identification.registration import register
-from hilcal.identification.table_preview import preview_table
+from hilcal.identification.noise.full_covariance import covariance_parts
+from hilcal.identification.registration.misdescription import examine, other_arm
+from hilcal.identification.registration.registration import register
+from hilcal.identification.registration.table_preview import preview_table
 from hilcal.identification.torques import check_torques
 from hilcal.names import quoted
 from hilcal.present import registration as words

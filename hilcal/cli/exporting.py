@@ -19,7 +19,7 @@ from hilcal.cli.options import catalogue_with, check_new, command
 from hilcal.cli.terminal import terminal
 from hilcal.errors import InputError
 from hilcal.identification import parameters_document
-from hilcal.identification.full_prediction import residual_table
+from hilcal.identification.prediction.full_prediction import residual_table
 from hilcal.numbers import length
 from hilcal.present.progress import Say, working
 from hilcal.present.registration import base_line

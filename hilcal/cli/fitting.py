@@ -17,14 +17,14 @@ from hilcal.effects.options import Options
 from hilcal.effects.written import chosen_options, read_effects_text, write_effect
 from hilcal.engine import open_engine
 from hilcal.errors import InputError
-from hilcal.identification.arm_scatter import with_prior_scatter
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.bootstrap import DRAWS, check_draws
 from hilcal.identification.bootstrap import bootstrap as draw_again
-from hilcal.identification.carried import CarriedPrior, carried_prior
+from hilcal.identification.carried.carried_prior import CarriedPrior, carried_prior
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import to_json
-from hilcal.identification.misdescription import other_arm_of
+from hilcal.identification.noise.arm_scatter import with_prior_scatter
+from hilcal.identification.registration.misdescription import other_arm_of
 from hilcal.identification.torques import check_torques
 from hilcal.model.model import Model
 from hilcal.present.calibration import bootstrap_remarks, bootstrap_report

@@ -22,7 +22,7 @@ from hilcal.diagnosis.diagnosis import MOST_IN_DOUBT
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import DeviceError, HilcalError, InputError
-from hilcal.identification.carried import CarriedPrior
+from hilcal.identification.carried.carried_prior import CarriedPrior
 from hilcal.identification.fit_document import with_nulls
 from hilcal.measuring.connect import ConnectionResult, connect, reported_kinematics, with_kinematics
 from hilcal.measuring.route import DryRun, dry_run

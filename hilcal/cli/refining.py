@@ -29,9 +29,9 @@ from hilcal.identification.background import background_of
 from hilcal.identification.baseline import masses_note
 from hilcal.identification.fit import all_left_out, fit
 from hilcal.identification.fit_document import frames_to_json, prior_to_json
-from hilcal.identification.full_prediction import full_prediction
 from hilcal.identification.linearisation import linearise
-from hilcal.identification.misdescription import other_arm_of
+from hilcal.identification.prediction.full_prediction import full_prediction
+from hilcal.identification.registration.misdescription import other_arm_of
 from hilcal.identification.torques import check_torques
 from hilcal.names import quoted
 from hilcal.present import diagnosis as words

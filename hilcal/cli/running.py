@@ -43,8 +43,8 @@ from hilcal.errors import (
     MovedFileError,
     StoppedError,
 )
-from hilcal.identification.full_covariance import full_readings
-from hilcal.identification.noise_estimate import NOISE_KEY, measured_noise
+from hilcal.identification.noise.full_covariance import full_readings
+from hilcal.identification.noise.noise_estimate import NOISE_KEY, measured_noise
 from hilcal.measuring import connect
 from hilcal.measuring.devices import Clock
 from hilcal.measuring.route import dry_run

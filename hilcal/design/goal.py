@@ -16,9 +16,9 @@ from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.errors import HilcalError, InputError
 from hilcal.identification.baseline import with_effects
-from hilcal.identification.carried import scales_of
+from hilcal.identification.carried.carried_prior import scales_of
 from hilcal.identification.fit import Fit, fit
-from hilcal.identification.full_covariance import with_joint_scatter
+from hilcal.identification.noise.full_covariance import with_joint_scatter
 from hilcal.measuring.progress import GoalStatus
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode, has_unloaded

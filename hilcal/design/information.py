@@ -25,7 +25,7 @@ from hilcal.design.nominal_model import (
 )
 from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.carried import scales_of
+from hilcal.identification.carried.carried_prior import scales_of
 from hilcal.identification.gauss_newton import whitened_jacobian
 from hilcal.identification.linearisation import computable, effect_columns
 from hilcal.model.model import Prediction

@@ -11,7 +11,7 @@ from hilcal.effects.options import Options
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.effects.written import read_effects_text
 from hilcal.errors import InputError
-from hilcal.identification.carried import (
+from hilcal.identification.carried.carried_prior import (
     CarriedPrior,
     check_arm,
     coordinates_of,

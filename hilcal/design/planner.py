@@ -26,9 +26,9 @@ from hilcal.design.run_order import Ordered, Ordering, PoseReadings, order_plan
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.per_joint import PerJoint
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.carried import CarriedPrior
+from hilcal.identification.carried.carried_prior import CarriedPrior
 from hilcal.identification.fit import Fit
-from hilcal.identification.placement import MIN_POSES
+from hilcal.identification.registration.placement import MIN_POSES
 from hilcal.measuring.route import seconds_at_rest
 from hilcal.regression.normal_equations import INFORMATION
 from hilcal.regression.schur import DETERMINED

@@ -12,7 +12,6 @@ import numpy as np
 
 from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE, Suspect
 from hilcal.diagnosis.minimum_detectable_effect import Strength
-from hilcal.identification.arm_scatter import some_poses
 from hilcal.identification.background import IMPLAUSIBLE_FACTOR
 from hilcal.identification.fit import Fit, all_left_out
 from hilcal.identification.linearisation import HeldOut
@@ -23,6 +22,7 @@ from hilcal.identification.mixed_fit import (
     sizes_at,
     with_all_effects,
 )
+from hilcal.identification.noise.arm_scatter import some_poses
 from hilcal.mixed.variances import evidence
 from hilcal.regression.evidence import FamilyScore
 from hilcal.types import Floats

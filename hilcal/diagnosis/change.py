@@ -6,10 +6,10 @@ the tool, the instrument and the temperature are candidates, too: they look like
 arm.
 
 At later readings the earlier fit leaves the residual r with rᵀ M r (see
-`identification.later_readings`): its posterior is the prior, and the place of a tracker that was
-set up anew is free. Every candidate is scored by the evidence of its columns beside that, as in the
-diagnosis (`regression.evidence`). The scatter σ² is estimated from r and from the earlier fit,
-whose statement counts as ν_0 degrees of freedom, so that a few lucky readings make no change:
+`identification.carried.later_readings`): its posterior is the prior, and the place of a tracker
+that was set up anew is free. Every candidate is scored by the evidence of its columns beside that,
+as in the diagnosis (`regression.evidence`). The scatter σ² is estimated from r and from the earlier
+fit, whose statement counts as ν_0 degrees of freedom, so that a few lucky readings make no change:
 
     ‖r‖² = rᵀ M r + ν_0,    ν = dof + ν_0
 
@@ -30,7 +30,7 @@ from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.protocol import Changeable, Directions, Effect, Kind
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.later_readings import (
+from hilcal.identification.carried.later_readings import (
     EarlierFit,
     EffectDirections,
     LaterFit,

@@ -16,19 +16,19 @@ from hilcal.diagnosis.change import LEVEL, Changes
 from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE
 from hilcal.diagnosis.stepwise import add
 from hilcal.errors import HilcalError
-from hilcal.identification.arm_scatter import estimate_arm_scatter, with_arm_scatter
-from hilcal.identification.fit import Fit
-from hilcal.identification.fit import fit as solve
-from hilcal.identification.later_readings import (
+from hilcal.identification.carried.later_readings import (
     LaterReadings,
     directions_beside_frames,
     fit_later,
     with_frames_only,
 )
+from hilcal.identification.carried.posterior import Differences
+from hilcal.identification.fit import Fit
+from hilcal.identification.fit import fit as solve
 from hilcal.identification.linearisation import columns_of_each, linearise
-from hilcal.identification.posterior import Differences
+from hilcal.identification.noise.arm_scatter import estimate_arm_scatter, with_arm_scatter
+from hilcal.identification.prediction.validation import Extrapolation, Validation, extrapolation
 from hilcal.identification.residual import error_block
-from hilcal.identification.validation import Extrapolation, Validation, extrapolation
 from hilcal.readings.whitening import Mode
 from hilcal.shown import Shown
 

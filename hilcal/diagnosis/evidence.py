@@ -56,8 +56,7 @@ from hilcal.diagnosis.stepwise import trial
 from hilcal.diagnosis.wrong_figures import WrongFigure, wrong_figures
 from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
-from hilcal.identification.arm_scatter import estimate_arm_scatter, with_arm_scatter
-from hilcal.identification.drift import carried_effects, evidence_of_carried
+from hilcal.identification.carried.drift import carried_effects, evidence_of_carried
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import (
     Linearisation,
@@ -66,6 +65,7 @@ from hilcal.identification.linearisation import (
     linearise,
     model_columns,
 )
+from hilcal.identification.noise.arm_scatter import estimate_arm_scatter, with_arm_scatter
 from hilcal.readings.readings import ArmScatter
 from hilcal.regression.evidence import FamilyScore
 from hilcal.regression.forward_selection import (

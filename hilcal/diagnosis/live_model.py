@@ -9,11 +9,11 @@ from hilcal.config import CellConfig
 from hilcal.effects.catalogue import installed
 from hilcal.errors import HilcalError
 from hilcal.identification.baseline import with_effects
-from hilcal.identification.carried import scales_of
+from hilcal.identification.carried.carried_prior import scales_of
 from hilcal.identification.fit import mahalanobis2
 from hilcal.identification.folds import distinct_poses
-from hilcal.identification.full_covariance import with_joint_scatter
 from hilcal.identification.gauss_newton import solve, whitened_jacobian
+from hilcal.identification.noise.full_covariance import with_joint_scatter
 from hilcal.identification.residual import residual
 from hilcal.measuring.progress import LiveResidual
 from hilcal.model.model import Model

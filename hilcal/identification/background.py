@@ -16,10 +16,7 @@ import numpy as np
 
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.arm_scatter import some_poses, with_arm_scatter
 from hilcal.identification.fit import Fit, fit
-from hilcal.identification.full_covariance import joint_factors
-from hilcal.identification.gross_errors import gross_errors_beside, gross_errors_of
 from hilcal.identification.mixed_fit import (
     INSTRUMENT,
     MOST_NOISE_ROWS,
@@ -31,6 +28,9 @@ from hilcal.identification.mixed_fit import (
     mixed_fit_of,
     with_all_effects,
 )
+from hilcal.identification.noise.arm_scatter import some_poses, with_arm_scatter
+from hilcal.identification.noise.full_covariance import joint_factors
+from hilcal.identification.outliers.gross_errors import gross_errors_beside, gross_errors_of
 from hilcal.model.model import Model
 from hilcal.readings.readings import ArmScatter
 from hilcal.types import Floats
@@ -192,8 +192,8 @@ def with_background(fitted: Fit, named: Collection[str]) -> Fit | None:
     The noise is that of the mixed model. The arm's scatter is added to the covariance. Instead of
     multiplying the instrument's noise by its estimated factor, the standard deviations of the
     effects are divided by this factor, which gives the same fit. Gross errors are sought beside all
-    effects (`identification.gross_errors`): some show only there, others are none. The `named`
-    effects do not belong to the background.
+    effects (`identification.outliers.gross_errors`): some show only there, others are none. The
+    `named` effects do not belong to the background.
 
     With more than `MOST_NOISE_ROWS` elements of readings, the ratio of the arm's scatter to the
     instrument's noise is estimated from poses chosen at random; all readings then determine the

@@ -21,11 +21,11 @@ from hilcal.cell import Cell
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import Options
 from hilcal.effects.protocol import EffectSpec
-from hilcal.identification.carried import CarriedPrior, check_prior
+from hilcal.identification.carried.carried_prior import CarriedPrior, check_prior
 from hilcal.identification.fit import Fit
-from hilcal.identification.misdescription import refuse_misdescribed
-from hilcal.identification.placement import DETERMINED_SHARE, TARGET_M
-from hilcal.identification.registration import register
+from hilcal.identification.registration.misdescription import refuse_misdescribed
+from hilcal.identification.registration.placement import DETERMINED_SHARE, TARGET_M
+from hilcal.identification.registration.registration import register
 from hilcal.identification.torques import require_torques
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings

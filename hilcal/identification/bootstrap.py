@@ -25,7 +25,7 @@ import numpy as np
 
 from hilcal.engine import Engine
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.carried import names_of, prior_of
+from hilcal.identification.carried.carried_prior import names_of, prior_of
 from hilcal.identification.fit import Fit
 from hilcal.identification.folds import distinct_poses
 from hilcal.identification.gauss_newton import solve

@@ -9,13 +9,13 @@ import numpy as np
 
 from hilcal import limits
 from hilcal.errors import CannotAnswerError, InputError, expect
-from hilcal.identification.data_snooping import DataSnooping, Disagreement
-from hilcal.identification.drift import Conflict, chosen_drift, conflicts
+from hilcal.identification.carried.drift import Conflict, chosen_drift, conflicts
 from hilcal.identification.folds import distinct_poses, leave_out, random_folds
 from hilcal.identification.gauss_newton import Solution, solve
-from hilcal.identification.least_trimmed_squares import rejection_limit
+from hilcal.identification.outliers.data_snooping import DataSnooping, Disagreement
+from hilcal.identification.outliers.least_trimmed_squares import rejection_limit
+from hilcal.identification.registration.robot_frames import RobotFrames, robot_frames
 from hilcal.identification.residual import ErrorBlock, WithVarianceFactor, error_block, residual
-from hilcal.identification.robot_frames import RobotFrames, robot_frames
 from hilcal.identification.uncertainty import Uncertainty, uncertainty
 from hilcal.model.model import Model
 from hilcal.model.observe import Observation

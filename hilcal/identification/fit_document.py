@@ -8,13 +8,13 @@ import numpy as np
 from hilcal.identification.background import background_of
 from hilcal.identification.baseline import masses_note
 from hilcal.identification.fit import Fit
-from hilcal.identification.full_prediction import (
+from hilcal.identification.prediction.full_prediction import (
     disagreement_words,
     full_prediction,
     gross_errors,
     nominal_error,
 )
-from hilcal.identification.registration import register
+from hilcal.identification.registration.registration import register
 
 
 def to_json(fit: Fit) -> dict[str, object]:

@@ -11,7 +11,7 @@ effect's parameters in the full fit if that is larger.
 
 import numpy as np
 
-from hilcal.identification.carried import START_STD, prior_of, scales_of
+from hilcal.identification.carried.carried_prior import START_STD, prior_of, scales_of
 from hilcal.identification.gauss_newton import Solution, whitened_jacobian
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings

@@ -19,7 +19,12 @@ from typing import ClassVar, Generic, NamedTuple, TypeVar
 import numpy as np
 
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.carried import Coordinates, coordinates_of, prior_of, scales_of
+from hilcal.identification.carried.carried_prior import (
+    Coordinates,
+    coordinates_of,
+    prior_of,
+    scales_of,
+)
 from hilcal.identification.residual import residual
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import Readings

@@ -20,7 +20,7 @@ from itertools import chain
 import numpy as np
 
 from hilcal.effects.protocol import Effect
-from hilcal.identification.carried import scales_of
+from hilcal.identification.carried.carried_prior import scales_of
 from hilcal.identification.fit import Fit
 from hilcal.identification.folds import folds_of, random_folds
 from hilcal.identification.gauss_newton import columns_of

@@ -12,7 +12,7 @@ import numpy as np
 
 from hilcal.effects.protocol import FRAME_ROLES, EffectSpec
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.full_covariance import joint_factors, whitened_blocks
+from hilcal.identification.noise.full_covariance import joint_factors, whitened_blocks
 from hilcal.identification.residual import residual
 from hilcal.mixed.equations import Equations
 from hilcal.mixed.families import Families, LogStdPrior, families_of

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from hilcal.identification.carried import Coordinates, names_of, prior_of, scales_of
+from hilcal.identification.carried.carried_prior import Coordinates, names_of, prior_of, scales_of
 from hilcal.identification.folds import block_folds, parameter_changes, region_folds
 from hilcal.identification.gauss_newton import Solution, whitened_jacobian
 from hilcal.model.model import Model

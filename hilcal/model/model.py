@@ -24,7 +24,7 @@ from hilcal.shown import Brief
 from hilcal.types import Floats, Ints
 
 if TYPE_CHECKING:  # a model only carries this value; fits interpret it
-    from hilcal.identification.carried import CarriedPrior
+    from hilcal.identification.carried.carried_prior import CarriedPrior
 
 EQUILIBRIUM_TOLERANCE = 1e-13  # motion of the flange that may be missing, m
 MAX_EQUILIBRIUM_STEPS = 30

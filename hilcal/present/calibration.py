@@ -13,9 +13,9 @@ from hilcal.calibration.improvement import Improvement
 from hilcal.calibration.measured import CONDITION_NAMES, Outside
 from hilcal.calibration.programs.program import ProgramPoint
 from hilcal.calibration.urscript import Waypoint
-from hilcal.identification import validation
 from hilcal.identification.bootstrap import Bootstrap
-from hilcal.identification.carried import names_of
+from hilcal.identification.carried.carried_prior import names_of
+from hilcal.identification.prediction import validation
 from hilcal.numbers import length
 from hilcal.present.document import Block, Table, heading, load_name, note, table
 from hilcal.present.fit import error_words, kind, model_name

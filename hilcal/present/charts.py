@@ -19,7 +19,7 @@ from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE
 from hilcal.identification.background import FamilySize
-from hilcal.identification.carried import names_of
+from hilcal.identification.carried.carried_prior import names_of
 from hilcal.identification.fit import Fit
 from hilcal.names import escaped
 from hilcal.present.document import load_name

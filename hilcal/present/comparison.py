@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from hilcal import numbers
 from hilcal.diagnosis.change import LEVEL, POWER, Candidate, Change, Limit
 from hilcal.diagnosis.comparison import Comparison
-from hilcal.identification.posterior import Differences
+from hilcal.identification.carried.posterior import Differences
 from hilcal.names import quoted
 from hilcal.present.document import Block, Table, heading, note, table
 from hilcal.present.fit import error_words, measurements

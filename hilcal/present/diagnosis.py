@@ -16,7 +16,7 @@ from hilcal.discovery.discovery import Discovery, LawSearch
 from hilcal.discovery.law import Coefficient, Law
 from hilcal.discovery.structures import pareto
 from hilcal.identification.fit import Fit
-from hilcal.identification.full_prediction import full_prediction
+from hilcal.identification.prediction.full_prediction import full_prediction
 from hilcal.numbers import length, percent
 from hilcal.present.document import Block, Table, Tone, Words, heading, note, table
 from hilcal.present.fit import (

@@ -13,13 +13,13 @@ from hilcal.identification.background import background_of
 from hilcal.identification.baseline import masses_note
 from hilcal.identification.fit import Fit
 from hilcal.identification.fit_document import notes
-from hilcal.identification.full_prediction import (
+from hilcal.identification.prediction.full_prediction import (
     FullPrediction,
     full_prediction,
     gross_errors,
     nominal_error,
 )
-from hilcal.identification.predictive import belongs_to_arm
+from hilcal.identification.prediction.predictive import belongs_to_arm
 from hilcal.identification.residual import ErrorBlock
 from hilcal.numbers import length, percent
 from hilcal.present.document import Block, Table, heading, note, table

@@ -11,8 +11,8 @@ from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.discovery.discovery import Discovery
 from hilcal.identification.bootstrap import Bootstrap
 from hilcal.identification.fit import Fit
-from hilcal.identification.full_prediction import residual_table
-from hilcal.identification.validation import CampaignValidation
+from hilcal.identification.prediction.full_prediction import residual_table
+from hilcal.identification.prediction.validation import CampaignValidation
 from hilcal.optional import needed_by
 from hilcal.present import diagnosis
 from hilcal.present.calibration import (

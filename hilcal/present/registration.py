@@ -8,11 +8,11 @@ import numpy as np
 from hilcal import numbers
 from hilcal.cell import Cell, Observer
 from hilcal.identification.fit import Fit
-from hilcal.identification.full_covariance import CovarianceParts
-from hilcal.identification.misdescription import OtherArm
-from hilcal.identification.noise_estimate import NoiseEstimate
-from hilcal.identification.registration import Registration, Undetermined, register
-from hilcal.identification.robot_frames import RobotFrames
+from hilcal.identification.noise.full_covariance import CovarianceParts
+from hilcal.identification.noise.noise_estimate import NoiseEstimate
+from hilcal.identification.registration.misdescription import OtherArm
+from hilcal.identification.registration.registration import Registration, Undetermined, register
+from hilcal.identification.registration.robot_frames import RobotFrames
 from hilcal.identification.torques import ARM, TOOL, TorqueCheck, TorqueFactor
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode

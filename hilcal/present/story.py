@@ -19,7 +19,7 @@ from hilcal.discovery.curve import drawn_laws
 from hilcal.discovery.law import Coefficient
 from hilcal.errors import InputError
 from hilcal.identification.fit import Fit, all_left_out, mahalanobis2
-from hilcal.identification.full_prediction import FullPrediction, full_prediction
+from hilcal.identification.prediction.full_prediction import FullPrediction, full_prediction
 from hilcal.identification.residual import ErrorBlock
 from hilcal.model.model import Model
 from hilcal.present import diagnosis

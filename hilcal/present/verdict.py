@@ -17,7 +17,7 @@ from hilcal.diagnosis.noise import (
     separates_instrument,
 )
 from hilcal.diagnosis.wrong_figures import WrongFigure
-from hilcal.identification.full_prediction import disagreement_words
+from hilcal.identification.prediction.full_prediction import disagreement_words
 from hilcal.numbers import few, length, p_equals, percent, sizes
 from hilcal.readings.readings import ArmScatter, SerialNoise
 from hilcal.robot.arm import Arm

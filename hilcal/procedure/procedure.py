@@ -31,12 +31,12 @@ from hilcal.design.summary import CheckedPlan, about, checked, remarks, summaris
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
-from hilcal.identification import validation
-from hilcal.identification.arm_scatter import with_arm_scatter
 from hilcal.identification.baseline import baseline
-from hilcal.identification.carried import CarriedPrior
-from hilcal.identification.full_covariance import full_readings
-from hilcal.identification.validation import Acceptance, acceptance, extrapolation
+from hilcal.identification.carried.carried_prior import CarriedPrior
+from hilcal.identification.noise.arm_scatter import with_arm_scatter
+from hilcal.identification.noise.full_covariance import full_readings
+from hilcal.identification.prediction import validation
+from hilcal.identification.prediction.validation import Acceptance, acceptance, extrapolation
 from hilcal.present.progress import Say
 from hilcal.procedure import state
 from hilcal.procedure.next_plan import Decision, FurtherMeasuring, PredictedError, predicted_error

@@ -57,8 +57,9 @@ def validation_plan(
     """Choose random poses, assign the loads in turn, and order the readings.
 
     The poses are uniform in the measured range of joint angles. Poses that the cell does not allow,
-    that cannot be reached, or that are far from all fitted ones (see `identification.validation`)
-    are left out, so there may be fewer than `settings.validation`. Each pose is measured under one
+    that cannot be reached, or that are far from all fitted ones (see
+    `identification.prediction.validation`) are left out, so there may be fewer than
+    `settings.validation`. Each pose is measured under one
     load, for deflections also unloaded; for positions "unloaded" is one of the loads, unless
     `settings.under_load` excludes it.
     """

@@ -8,8 +8,8 @@ the scatter of the joints from one arrival to the next, J the Jacobian of the ta
 (`joint_scatter`).
 
 The third term needs the registration; it is added when the readings are opened
-(`identification.full_covariance`), with σ_q from [repeatability]. The file states what the stored
-covariances cover (`COVERS_KEY`):
+(`identification.noise.full_covariance`), with σ_q from [repeatability]. The file states what the
+stored covariances cover (`COVERS_KEY`):
 
 - a measured campaign stores the first two terms: `INSTRUMENT`, the third is added;
 - an imported campaign stores what its table states, or `tracker_covariance` where the table states

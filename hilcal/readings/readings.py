@@ -95,7 +95,7 @@ class ObserverName:
 
 @dataclass(frozen=True, slots=True)
 class ArmScatter:
-    """An estimate of the arm's scatter; see `identification.arm_scatter`.
+    """An estimate of the arm's scatter; see `identification.noise.arm_scatter`.
 
     Attributes:
         kind: "joints" (one σ for all of them), "each joint" (one σ per joint), or "isotropic" (of

@@ -28,15 +28,20 @@ from hilcal.diagnosis.change import changing, find_changes
 from hilcal.diagnosis.comparison import Comparison, error_today, with_missing_effects
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification import validation
 from hilcal.identification.baseline import baseline
+from hilcal.identification.carried.later_readings import earlier_fit, later_readings
+from hilcal.identification.carried.posterior import Differences, Posterior, parameter_differences
 from hilcal.identification.fit import Fit
-from hilcal.identification.later_readings import earlier_fit, later_readings
-from hilcal.identification.misdescription import refuse_misdescribed
 from hilcal.identification.mixed_fit import MixedFit, mixed_fit
-from hilcal.identification.posterior import Differences, Posterior, parameter_differences
-from hilcal.identification.registration import register
-from hilcal.identification.validation import CampaignValidation, Judged, acceptance, extrapolation
+from hilcal.identification.prediction import validation
+from hilcal.identification.prediction.validation import (
+    CampaignValidation,
+    Judged,
+    acceptance,
+    extrapolation,
+)
+from hilcal.identification.registration.misdescription import refuse_misdescribed
+from hilcal.identification.registration.registration import register
 from hilcal.mixed.variances import estimate_variances
 from hilcal.names import quoted
 from hilcal.readings.readings import Readings

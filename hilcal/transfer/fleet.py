@@ -19,8 +19,8 @@ import scipy
 
 from hilcal.engine import Advance, Engine
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.carried import SAME_M
-from hilcal.identification.posterior import Posterior, PosteriorEffect, Source
+from hilcal.identification.carried.carried_prior import SAME_M
+from hilcal.identification.carried.posterior import Posterior, PosteriorEffect, Source
 from hilcal.readings.readings import Range
 from hilcal.readings.same_readings import shared
 from hilcal.regression.schur import schur_complement

@@ -30,10 +30,10 @@ from hilcal.effects.protocol import failure_of
 from hilcal.errors import CannotAnswerError, HilcalError, InputError
 from hilcal.identification.background import MOST_ROWS
 from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.carried.posterior import Posterior, Source
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.mixed_fit import mixed_fit
-from hilcal.identification.posterior import Posterior, Source
-from hilcal.identification.predictive import belongs_to_arm
+from hilcal.identification.prediction.predictive import belongs_to_arm
 from hilcal.mixed.families import ARM_SPREAD, EFFECT_SPREAD
 from hilcal.mixed.variances import Variances
 from hilcal.model.model import Model

@@ -33,7 +33,7 @@ from hilcal.effects.protocol import failure_of
 from hilcal.effects.written import read_effects_text
 from hilcal.errors import HilcalError, InputError
 from hilcal.identification.fit import Fit
-from hilcal.identification.full_prediction import full_prediction
+from hilcal.identification.prediction.full_prediction import full_prediction
 from hilcal.names import quoted
 from hilcal.present.progress import Say
 from hilcal.present.registration import covariance_words

@@ -19,7 +19,7 @@ from hilcal.effects.encoder_offset import EncoderOffset
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.effects.joint_tilt_compliance import JointTiltCompliance
 from hilcal.effects.target_offset import TargetOffset
-from hilcal.identification.carried import prior_of, scales_of
+from hilcal.identification.carried.carried_prior import prior_of, scales_of
 from hilcal.identification.gauss_newton import (
     NewtonPoint,
     linear_problem,

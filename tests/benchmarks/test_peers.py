@@ -27,7 +27,7 @@ from hilcal.design.criterion import CandidateSet, Objective
 from hilcal.design.optimum import best_design
 from hilcal.drivers.simulated.injected_effects import Draw
 from hilcal.identification.baseline import baseline, with_effects
-from hilcal.identification.carried import scales_of
+from hilcal.identification.carried.carried_prior import scales_of
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.gauss_newton import solve, whitened_jacobian
 from hilcal.identification.residual import residual

@@ -19,7 +19,7 @@ from hilcal.design.criterion import CandidateSet, Objective
 from hilcal.design.optimum import best_design
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.effects.link_geometry import LinkGeometry
-from hilcal.identification.carried import scales_of
+from hilcal.identification.carried.carried_prior import scales_of
 from hilcal.model.model import Model
 from hilcal.readings.readings import States
 from hilcal.types import Floats

@@ -19,7 +19,7 @@ import pytest
 
 from hilcal import stream as passes
 from hilcal.effects.protocol import Effect
-from hilcal.identification.carried import scales_of
+from hilcal.identification.carried.carried_prior import scales_of
 from hilcal.model.model import Model
 from hilcal.regression.normal_equations import Triangle
 from hilcal.tables.parquet_stream import ReadingStream, open_stream

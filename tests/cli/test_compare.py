@@ -13,7 +13,7 @@ import pytest
 import hilcal as hc
 from hilcal.config import CellConfig, Repeatability, load_config
 from hilcal.drivers.simulated.world import World, place_tracker
-from hilcal.identification.full_covariance import joint_factors
+from hilcal.identification.noise.full_covariance import joint_factors
 from hilcal.readings.covariance import INSTRUMENT
 from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import configs_dir

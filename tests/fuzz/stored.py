@@ -17,8 +17,8 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.urscript import program_points, with_joints
 from hilcal.effects import template
 from hilcal.effects.catalogue import installed
-from hilcal.identification.carried import carried_prior, check_arm
-from hilcal.identification.posterior import read_posterior
+from hilcal.identification.carried.carried_prior import carried_prior, check_arm
+from hilcal.identification.carried.posterior import read_posterior
 from hilcal.present.campaign import info_report, two_revisions
 from hilcal.procedure.state import next_step, settings_of
 from hilcal.robot.catalogue import load_arm

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from hilcal.identification.baseline import with_effects
-from hilcal.identification.carried import carried_prior
+from hilcal.identification.carried.carried_prior import carried_prior
+from hilcal.identification.carried.posterior import Posterior
 from hilcal.identification.fit import fit
-from hilcal.identification.posterior import Posterior
 from tests.support.campaigns import campaign, noiseless, plan, true_parameters, with_noise
 
 NAMES = ("joint_compliance", "joint_tilt_compliance")

@@ -11,7 +11,7 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.config import load_config
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import Fit, fit
-from hilcal.identification.validation import validate
+from hilcal.identification.prediction.validation import validate
 from hilcal.library import read_table
 from hilcal.readings.readings import Readings
 from hilcal.refinement import Refinement, refine

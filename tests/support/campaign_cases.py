@@ -24,7 +24,7 @@ from hilcal.config.reference import to_toml
 from hilcal.drivers.simulated.cell_processes import SimulatedCell
 from hilcal.drivers.simulated.rehearsal import case_of_plan, simulated_cell
 from hilcal.drivers.simulated.world import World
-from hilcal.identification.full_covariance import with_joint_scatter
+from hilcal.identification.noise.full_covariance import with_joint_scatter
 from hilcal.measuring.route import dry_run
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hilcal.cell import Cell
-from hilcal.identification.carried import scales_of
+from hilcal.identification.carried.carried_prior import scales_of
 from hilcal.model.model import Model
 from hilcal.readings.readings import States
 from hilcal.robot import se3

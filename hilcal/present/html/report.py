@@ -14,10 +14,10 @@ from hilcal.diagnosis.effect_ranking import LEAST_SHARE, Suspect
 from hilcal.diagnosis.noise import repeat_classes
 from hilcal.identification.background import family_sizes
 from hilcal.identification.fit import Fit
-from hilcal.identification.full_covariance import CovarianceParts
-from hilcal.identification.full_prediction import nominal_error, reading_name
+from hilcal.identification.noise.full_covariance import CovarianceParts
+from hilcal.identification.prediction.full_prediction import nominal_error, reading_name
+from hilcal.identification.prediction.validation import CampaignValidation
 from hilcal.identification.residual import CONFIDENCE, ErrorBlock
-from hilcal.identification.validation import CampaignValidation
 from hilcal.numbers import length, percent
 from hilcal.present import charts
 from hilcal.present import fit as fit_words

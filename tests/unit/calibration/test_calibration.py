@@ -16,7 +16,7 @@ from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.storage import from_json, to_json
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
-from hilcal.identification.robot_frames import state_with_every_column
+from hilcal.identification.registration.robot_frames import state_with_every_column
 from hilcal.model.model import Model
 from hilcal.robot import se3
 from hilcal.robot.arm import with_conventions

@@ -20,7 +20,7 @@ from hilcal.calibration.measured import MeasuredRanges
 from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.storage import from_json, to_json
 from hilcal.effects.protocol import Columns, Parameter
-from hilcal.identification.robot_frames import state_with_every_column
+from hilcal.identification.registration.robot_frames import state_with_every_column
 from hilcal.model.model import Model
 from hilcal.robot import se3
 from hilcal.robot.catalogue import load_arm, robot_names

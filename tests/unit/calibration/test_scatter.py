@@ -9,7 +9,7 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.scatter import budget
 from hilcal.config import Repeatability
 from hilcal.diagnosis.noise import RP_PER_RMS
-from hilcal.identification.full_covariance import joint_factors
+from hilcal.identification.noise.full_covariance import joint_factors
 from hilcal.readings.readings import Readings
 from tests.support.campaigns import campaign
 from tests.support.fit_cases import fitted_model

@@ -7,8 +7,8 @@ import pytest
 
 from hilcal.config import load_config
 from hilcal.errors import InputError
-from hilcal.identification.full_covariance import with_joint_scatter
-from hilcal.identification.table_preview import preview_table
+from hilcal.identification.noise.full_covariance import with_joint_scatter
+from hilcal.identification.registration.table_preview import preview_table
 from hilcal.identification.torques import check_torques
 from hilcal.tables.mapped import import_readings
 from hilcal.tables.mapping import Mapping

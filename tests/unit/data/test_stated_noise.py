@@ -7,7 +7,7 @@ import pytest
 
 import hilcal as hc
 from hilcal.errors import InputError
-from hilcal.identification.full_covariance import with_joint_scatter
+from hilcal.identification.noise.full_covariance import with_joint_scatter
 from hilcal.readings.covariance import (
     COVERS_KEY,
     INSTRUMENT_AND_ARM,

@@ -19,10 +19,10 @@ from hilcal.design.predicted import predicted_uncertainty, prediction_poses
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import baseline
-from hilcal.identification.carried import carried_prior
+from hilcal.identification.carried.carried_prior import carried_prior
+from hilcal.identification.carried.posterior import Posterior
 from hilcal.identification.fit import fit
-from hilcal.identification.full_covariance import with_joint_scatter
-from hilcal.identification.posterior import Posterior
+from hilcal.identification.noise.full_covariance import with_joint_scatter
 from hilcal.measuring.clearance import Clearance, LineOfSight
 from hilcal.measuring.devices import TrackerSample
 from hilcal.measuring.measure import average

@@ -13,7 +13,7 @@ from hilcal.drivers.simulated.world import place_tracker
 from hilcal.effects.protocol import effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import with_effects
-from hilcal.identification.later_readings import earlier_fit, later_readings
+from hilcal.identification.carried.later_readings import earlier_fit, later_readings
 from studies.change import measured, remeasured, studied_arm
 from tests.support.campaigns import configuration
 from tests.support.refusals import refusal_of

@@ -19,12 +19,12 @@ from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification import linearisation as columns_module
 from hilcal.identification.baseline import baseline
-from hilcal.identification.carried import carried_prior, names_of
-from hilcal.identification.drift import carried_effects, evidence_of_carried
+from hilcal.identification.carried.carried_prior import carried_prior, names_of
+from hilcal.identification.carried.drift import carried_effects, evidence_of_carried
+from hilcal.identification.carried.posterior import Posterior
 from hilcal.identification.fit import fit
 from hilcal.identification.gauss_newton import whitened_jacobian
 from hilcal.identification.linearisation import columns_of_each, effect_columns, linearise
-from hilcal.identification.posterior import Posterior
 from hilcal.present.verdict import message
 from hilcal.refinement import refine
 from tests.support.campaigns import campaign, measured, plan

@@ -7,9 +7,9 @@ import pytest
 
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline
-from hilcal.identification.carried import carried_prior
+from hilcal.identification.carried.carried_prior import carried_prior
+from hilcal.identification.carried.posterior import Posterior
 from hilcal.identification.fit import fit
-from hilcal.identification.posterior import Posterior
 from hilcal.present.html.other_pages import arms_chart, fleet_page
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile

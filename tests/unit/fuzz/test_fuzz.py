@@ -10,8 +10,8 @@ from hilcal.calibration.urscript import program_points
 from hilcal.config import CellConfig
 from hilcal.errors import HilcalError
 from hilcal.identification import parameters_document
-from hilcal.identification.placement import inverse_roots
-from hilcal.identification.posterior import read_posterior
+from hilcal.identification.carried.posterior import read_posterior
+from hilcal.identification.registration.placement import inverse_roots
 from hilcal.readings.covariance import is_covariance
 from hilcal.store.plan import load_plan, read_plan
 from hilcal.tables.mapping import Mapping, load_mapping

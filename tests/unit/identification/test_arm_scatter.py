@@ -13,11 +13,11 @@ from hilcal.diagnosis.effect_ranking import candidates
 from hilcal.diagnosis.evidence import Evidence
 from hilcal.diagnosis.misfit_breakdown import MisfitShare
 from hilcal.diagnosis.verdict import diagnose, judge
-from hilcal.identification.arm_scatter import estimate_arm_scatter, factors, with_arm_scatter
 from hilcal.identification.fit import fit
-from hilcal.identification.full_covariance import with_common_scatter, with_joint_scatter
 from hilcal.identification.linearisation import effect_columns, linearise
-from hilcal.identification.registration import register
+from hilcal.identification.noise.arm_scatter import estimate_arm_scatter, factors, with_arm_scatter
+from hilcal.identification.noise.full_covariance import with_common_scatter, with_joint_scatter
+from hilcal.identification.registration.registration import register
 from hilcal.present.verdict import message
 from hilcal.readings.covariance import COVERS_KEY, INSTRUMENT
 from hilcal.readings.readings import ArmScatter

@@ -20,10 +20,10 @@ from hilcal.identification.background import (
 )
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
-from hilcal.identification.gross_errors import gross_errors_beside
 from hilcal.identification.linearisation import linearise
 from hilcal.identification.mixed_fit import mixed_fit
-from hilcal.identification.predictive import predictive_of
+from hilcal.identification.outliers.gross_errors import gross_errors_beside
+from hilcal.identification.prediction.predictive import predictive_of
 from hilcal.library import read_table
 from hilcal.mixed.variances import evidence
 from hilcal.readings.whitening import whitening

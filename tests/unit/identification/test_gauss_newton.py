@@ -7,7 +7,7 @@ import pytest
 import scipy.linalg as sl
 
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.carried import scales_of
+from hilcal.identification.carried.carried_prior import scales_of
 from hilcal.identification.fit import fit
 from hilcal.identification.gauss_newton import (
     NewtonPoint,

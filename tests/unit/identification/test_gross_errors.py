@@ -9,23 +9,23 @@ from scipy.stats import binom, poisson
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
-from hilcal.identification.data_snooping import (
+from hilcal.identification.fit import fit
+from hilcal.identification.fit_document import notes, outliers
+from hilcal.identification.outliers.data_snooping import (
     SITE_LEVEL,
     DataSnooping,
     along_one_site,
     linearised,
     site_columns,
 )
-from hilcal.identification.fit import fit
-from hilcal.identification.fit_document import notes, outliers
-from hilcal.identification.least_trimmed_squares import (
+from hilcal.identification.outliers.least_trimmed_squares import (
     FALSE_ALARMS,
     ReadingModel,
     bulk_scale,
     rejection_limit,
 )
-from hilcal.identification.misdescription import examine
-from hilcal.identification.registration import register
+from hilcal.identification.registration.misdescription import examine
+from hilcal.identification.registration.registration import register
 from hilcal.present.verdict import message
 from hilcal.readings.whitening import MODES, inverse_root, whitening
 from studies.gross_errors import GrossErrorCase, count, spoil

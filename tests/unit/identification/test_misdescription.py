@@ -9,10 +9,15 @@ from scipy.spatial.transform import Rotation
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
 from hilcal.identification.baseline import baseline
-from hilcal.identification.hypotheses import Description, Hypothesis
-from hilcal.identification.misdescription import BEYOND_NOISE, examine, other_arm, other_arm_of
-from hilcal.identification.registration import register
-from hilcal.identification.table_preview import clearly_best, rank_conventions
+from hilcal.identification.registration.hypotheses import Description, Hypothesis
+from hilcal.identification.registration.misdescription import (
+    BEYOND_NOISE,
+    examine,
+    other_arm,
+    other_arm_of,
+)
+from hilcal.identification.registration.registration import register
+from hilcal.identification.registration.table_preview import clearly_best, rank_conventions
 from hilcal.robot.arm import with_controller_conventions
 from hilcal.robot.catalogue import load_arm, robot_names
 from studies.random_descriptions import draw, judge, read

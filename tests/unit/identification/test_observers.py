@@ -12,9 +12,9 @@ from hilcal.config.sections import Gauge, Point
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.full_covariance import with_joint_scatter
-from hilcal.identification.registration import register
-from hilcal.identification.validation import validate
+from hilcal.identification.noise.full_covariance import with_joint_scatter
+from hilcal.identification.prediction.validation import validate
+from hilcal.identification.registration.registration import register
 from hilcal.model.model import Model
 from hilcal.present.registration import undetermined_lines
 from hilcal.readings.readings import ObserverName

@@ -11,7 +11,7 @@ from hilcal.drivers.simulated.injected_effects import hide_effect
 from hilcal.effects.catalogue import installed
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
-from hilcal.identification.full_covariance import with_joint_scatter
+from hilcal.identification.noise.full_covariance import with_joint_scatter
 from hilcal.readings.readings import ObserverName, States
 from hilcal.robot import se3
 from hilcal.robot.chain import evaluate

@@ -15,12 +15,17 @@ from hilcal.drivers.simulated.world import place_tracker
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline, with_effects
-from hilcal.identification.carried import carried_prior
+from hilcal.identification.carried.carried_prior import carried_prior
+from hilcal.identification.carried.posterior import (
+    Posterior,
+    Source,
+    parameter_differences,
+    read_posterior,
+)
 from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import to_json
 from hilcal.identification.parameters_document import covariance_of
-from hilcal.identification.posterior import Posterior, Source, parameter_differences, read_posterior
-from hilcal.identification.predictive import predictive
+from hilcal.identification.prediction.predictive import predictive
 from hilcal.robot.catalogue import load_arm
 from hilcal.store.codec import write_document
 from hilcal.store.revision import from_text, to_text

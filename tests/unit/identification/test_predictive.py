@@ -7,9 +7,14 @@ import pytest
 
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import fit
-from hilcal.identification.predictive import Excess, excess, left_out_variances, predictive_of
-from hilcal.identification.robot_frames import whole_turns
-from hilcal.identification.validation import extrapolation, validate
+from hilcal.identification.prediction.predictive import (
+    Excess,
+    excess,
+    left_out_variances,
+    predictive_of,
+)
+from hilcal.identification.prediction.validation import extrapolation, validate
+from hilcal.identification.registration.robot_frames import whole_turns
 from hilcal.readings.whitening import whitening
 from studies.random_descriptions import readings_of
 from tests.support.campaigns import campaign

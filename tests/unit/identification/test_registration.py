@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import with_effects
-from hilcal.identification.full_prediction import gross_errors
 from hilcal.identification.linearisation import linearise
-from hilcal.identification.registration import register
+from hilcal.identification.prediction.full_prediction import gross_errors
+from hilcal.identification.registration.registration import register
 from hilcal.present.registration import registration_lines
 from hilcal.readings.whitening import MODES
 from hilcal.robot.se3 import rotation_vector

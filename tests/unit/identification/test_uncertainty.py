@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from hilcal.engine import open_engine
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.bootstrap import bootstrap, resample
-from hilcal.identification.carried import prior_of
+from hilcal.identification.carried.carried_prior import prior_of
 from hilcal.identification.fit import fit
 from hilcal.identification.folds import distinct_poses
 from hilcal.model.model import Model

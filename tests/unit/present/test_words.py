@@ -18,8 +18,8 @@ from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.options import typical_compliances
 from hilcal.identification.fit_document import to_json
-from hilcal.identification.full_prediction import full_prediction, nominal_error
 from hilcal.identification.linearisation import linearise
+from hilcal.identification.prediction.full_prediction import full_prediction, nominal_error
 from hilcal.present.diagnosis import curves, diagnosis_report, suspects_table
 from hilcal.present.fit import before_and_after, errors, fit_report, where_table, worst_poses
 from hilcal.present.story import Chapter, build_story

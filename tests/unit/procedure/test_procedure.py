@@ -9,7 +9,7 @@ import hilcal as hc
 from hilcal.calibration.improvement import Improvement
 from hilcal.config.cell import Repeatability
 from hilcal.config.reference import to_toml
-from hilcal.identification.carried import carried_prior
+from hilcal.identification.carried.carried_prior import carried_prior
 from hilcal.library import load_posterior
 from hilcal.procedure.state import DECIDED, FROZEN
 from hilcal.readings.same_readings import found_among

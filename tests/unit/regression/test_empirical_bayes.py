@@ -6,12 +6,12 @@ import pytest
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.gauss_newton import effective_parameters
+from hilcal.identification.prediction.validation import validate
 from hilcal.identification.uncertainty import (
     DROPPED_VARIANCE,
     dropped_group_factors,
     hyperparameter_factors,
 )
-from hilcal.identification.validation import validate
 from hilcal.regression.empirical_bayes import (
     FamilyProblem,
     maximise_evidence,

@@ -10,7 +10,7 @@ from hilcal.drivers.simulated.mechanics import rotation_vector
 from hilcal.drivers.simulated.truth import Truth
 from hilcal.drivers.simulated.ur_state import GRAVITY, Kinematics
 from hilcal.drivers.simulated.world import SimulatedNoise, World
-from hilcal.identification.full_covariance import joint_factors
+from hilcal.identification.noise.full_covariance import joint_factors
 from hilcal.model.model import Model
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate

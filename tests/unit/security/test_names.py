@@ -48,7 +48,7 @@ from hilcal.config.reference import cell_text
 from hilcal.discovery.law import source_of_form
 from hilcal.drivers.terminal_operator import TerminalOperator
 from hilcal.errors import InputError
-from hilcal.identification import posterior
+from hilcal.identification.carried import posterior
 from hilcal.names import check_name, check_names, csv_text, escaped, from_csv, quoted
 from hilcal.present import charts as chart_style
 from hilcal.present import html as page

@@ -10,7 +10,7 @@ from hilcal.campaign.campaign import Campaign
 from hilcal.cli.fitting import fitted_with
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.carried import carried_prior
+from hilcal.identification.carried.carried_prior import carried_prior
 from hilcal.present.campaign import left_out_m, two_revisions, verdict_of
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.whole_file import replace_file

@@ -29,10 +29,8 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig, Tracker
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import HilcalError, InputError
-from hilcal.identification.arm_scatter import some_poses
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
-from hilcal.identification.full_covariance import with_joint_scatter, with_noise_of
 from hilcal.identification.mixed_fit import (
     SCATTER,
     SCATTER_RAD,
@@ -41,6 +39,8 @@ from hilcal.identification.mixed_fit import (
     variances_with_noise,
     with_all_effects,
 )
+from hilcal.identification.noise.arm_scatter import some_poses
+from hilcal.identification.noise.full_covariance import with_joint_scatter, with_noise_of
 from hilcal.mixed.families import KNOWN_SPREAD, LogStdPrior
 from hilcal.mixed.variances import Variances, evidence
 from hilcal.model.model import Model

@@ -34,7 +34,7 @@ import scipy.linalg as sl
 
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
-from hilcal.identification.posterior import Posterior, spectrum
+from hilcal.identification.carried.posterior import Posterior, spectrum
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.same_readings import found_among_prints

@@ -21,14 +21,14 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.effects.target_offset import TargetOffset
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.data_snooping import runs_of_equal_shifts
-from hilcal.identification.least_trimmed_squares import (
+from hilcal.identification.outliers.data_snooping import runs_of_equal_shifts
+from hilcal.identification.outliers.least_trimmed_squares import (
     MOST_WRONG,
     rejection_limit,
     robust_start,
     trimmed_variance,
 )
-from hilcal.identification.placement import (
+from hilcal.identification.registration.placement import (
     MIN_POSES,
     FrameData,
     Frames,

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from hilcal.cell import Cell, Observer, plane_frame
-from hilcal.identification.least_trimmed_squares import ReadingModel
+from hilcal.identification.outliers.least_trimmed_squares import ReadingModel
 from hilcal.model.observe import Observation, by_observer_frame, observed
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import inverse_root

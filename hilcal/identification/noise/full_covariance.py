@@ -8,7 +8,7 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.config import CellConfig, Tracker
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.registration import register
+from hilcal.identification.registration.registration import register
 from hilcal.model.model import Model
 from hilcal.readings.covariance import (
     INSTRUMENT,

@@ -37,7 +37,12 @@ import numpy as np
 import scipy
 import scipy.linalg as sl
 
-from hilcal.identification.carried import CarriedPrior, DriftGroup, coordinates_of, names_of
+from hilcal.identification.carried.carried_prior import (
+    CarriedPrior,
+    DriftGroup,
+    coordinates_of,
+    names_of,
+)
 from hilcal.identification.gauss_newton import Solution, whitened_jacobian
 from hilcal.model.model import Model
 from hilcal.readings.whitening import Whitening

@@ -20,7 +20,7 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.identification.fit import Fit
-from hilcal.identification.full_covariance import joint_factors, whitened_blocks
+from hilcal.identification.noise.full_covariance import joint_factors, whitened_blocks
 from hilcal.model.model import Model
 from hilcal.readings.covariance import scatter_alone, with_scatter
 from hilcal.readings.readings import ArmScatter, Readings, ScatterKind

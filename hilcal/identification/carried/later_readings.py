@@ -28,15 +28,15 @@ from hilcal.cell import Cell
 from hilcal.config.cell import Tool
 from hilcal.effects.protocol import Effect, Role
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.arm_scatter import with_arm_scatter
 from hilcal.identification.baseline import LEVER_M
-from hilcal.identification.carried import scales_of
+from hilcal.identification.carried.carried_prior import scales_of
 from hilcal.identification.fit import Fit
 from hilcal.identification.gauss_newton import shortened
-from hilcal.identification.predictive import Predictive, predictive_of
-from hilcal.identification.registration import register, targets_as_fitted
+from hilcal.identification.noise.arm_scatter import with_arm_scatter
+from hilcal.identification.prediction.predictive import Predictive, predictive_of
+from hilcal.identification.prediction.validation import require_columns
+from hilcal.identification.registration.registration import register, targets_as_fitted
 from hilcal.identification.residual import residual
-from hilcal.identification.validation import require_columns
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening, covariance_blocks, whitening

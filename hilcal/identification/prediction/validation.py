@@ -17,10 +17,10 @@ import scipy
 
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.predictive import Predictive
-from hilcal.identification.registration import register, targets_as_fitted
+from hilcal.identification.prediction.predictive import Predictive
+from hilcal.identification.registration.registration import register, targets_as_fitted
+from hilcal.identification.registration.robot_frames import whole_turns
 from hilcal.identification.residual import ErrorBlock, error_block, noise_floor, residual
-from hilcal.identification.robot_frames import whole_turns
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings, ranges_of, turning_variables, variables
 from hilcal.readings.whitening import Mode, Whitening, inverse_root, whitening

@@ -28,9 +28,9 @@ import numpy as np
 import scipy
 
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.carried import scales_of
+from hilcal.identification.carried.carried_prior import scales_of
 from hilcal.identification.gauss_newton import Solution
-from hilcal.identification.least_trimmed_squares import (
+from hilcal.identification.outliers.least_trimmed_squares import (
     MISFIT_SCALES,
     MOST_WRONG,
     ReadingModel,

@@ -123,7 +123,7 @@ class Posterior(Brief):
             InputError: a fit of another scaling than gc.
             CannotAnswerError: a model without any effect of the arm.
         """
-        from hilcal.identification.predictive import posterior_of
+        from hilcal.identification.prediction.predictive import posterior_of
 
         return posterior_of(fit, source)
 

@@ -22,7 +22,7 @@ import scipy
 
 from hilcal.cell import Cell
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.hypotheses import (
+from hilcal.identification.registration.hypotheses import (
     Combination,
     Description,
     Hypothesis,
@@ -32,7 +32,7 @@ from hilcal.identification.hypotheses import (
     robot_keys,
     shifts,
 )
-from hilcal.identification.placement import (
+from hilcal.identification.registration.placement import (
     FrameData,
     Frames,
     Placement,
@@ -42,7 +42,7 @@ from hilcal.identification.placement import (
     given_and_free,
     minimise,
 )
-from hilcal.identification.registration import Registration, register
+from hilcal.identification.registration.registration import Registration, register
 from hilcal.identification.residual import noise_floor
 from hilcal.numbers import length
 from hilcal.readings.readings import Readings

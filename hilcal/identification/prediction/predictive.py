@@ -43,12 +43,12 @@ import scipy
 
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.carried import coordinates_of, scales_of
+from hilcal.identification.carried.carried_prior import coordinates_of, scales_of
+from hilcal.identification.carried.posterior import Posterior, PosteriorEffect, Source, determined
 from hilcal.identification.fit import Fit
 from hilcal.identification.folds import distinct_poses, ordinary_magnitudes, random_folds
 from hilcal.identification.gauss_newton import whitened_jacobian
 from hilcal.identification.mixed_fit import INSTRUMENT, mixed_fit_at
-from hilcal.identification.posterior import Posterior, PosteriorEffect, Source, determined
 from hilcal.identification.residual import residual
 from hilcal.mixed.equations import equations, left_out
 from hilcal.mixed.variances import Variances, log_posterior

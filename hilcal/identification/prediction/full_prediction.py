@@ -12,7 +12,7 @@ import scipy
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.identification.fit import Fit, all_left_out, mahalanobis2, with_outliers
 from hilcal.identification.gauss_newton import solve
-from hilcal.identification.least_trimmed_squares import MOST_WRONG
+from hilcal.identification.outliers.least_trimmed_squares import MOST_WRONG
 from hilcal.identification.residual import ErrorBlock, error_block, noise_floor, residual
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import Readings

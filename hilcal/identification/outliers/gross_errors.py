@@ -1,11 +1,11 @@
 """Gross errors beside all effects at once: readings that the mixed model takes for contaminated.
 
 Where an arm has every effect, the misfit of its named effects alone is as large as a gross error,
-which data snooping (`identification.data_snooping`) then cannot tell. The mixed model of all
-effects predicts each reading from the others ten times as well. A reading k with a gross error has
-a shift γ_k ~ N(0, G²) in each element, which a good one has not, and is one with the probability π.
-The odds that the readings of a set O have gross errors and no others, with the variances of all
-effects estimated anew,
+which data snooping (`identification.outliers.data_snooping`) then cannot tell. The mixed model of
+all effects predicts each reading from the others ten times as well. A reading k with a gross error
+has a shift γ_k ~ N(0, G²) in each element, which a good one has not, and is one with the
+probability π. The odds that the readings of a set O have gross errors and no others, with the
+variances of all effects estimated anew,
 
     log odds = ℓ(x̂_O) − ℓ(x̂) − |O| log 1/π
 
@@ -25,8 +25,8 @@ import numpy as np
 import scipy
 
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.least_trimmed_squares import FALSE_ALARMS, MOST_WRONG
 from hilcal.identification.mixed_fit import MixedFit, linearised_problem, shift_rows
+from hilcal.identification.outliers.least_trimmed_squares import FALSE_ALARMS, MOST_WRONG
 from hilcal.mixed.equations import equations
 from hilcal.mixed.families import KNOWN_SPREAD, Families, Family, LogStdPrior
 from hilcal.mixed.problem import MixedProblem

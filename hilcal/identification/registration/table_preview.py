@@ -22,9 +22,9 @@ from hilcal import numbers
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.misdescription import examine
-from hilcal.identification.placement import nearest_rotation, rotation_of_attitudes
-from hilcal.identification.registration import register
+from hilcal.identification.registration.misdescription import examine
+from hilcal.identification.registration.placement import nearest_rotation, rotation_of_attitudes
+from hilcal.identification.registration.registration import register
 from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate

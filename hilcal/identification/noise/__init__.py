@@ -1,0 +1,1 @@
+"""The arm's scatter and the instrument's noise, estimated from readings."""

@@ -1,0 +1,1 @@
+"""Gross errors among the readings."""

@@ -1,0 +1,1 @@
+"""Predictions with their uncertainty, errors at poses that were not fitted, and validation."""
