@@ -10,6 +10,8 @@ from pathlib import Path
 
 from hilcal.errors import InputError
 
+SQLITE = b"SQLite format 3\x00"  # first bytes of a campaign
+
 
 def replace_file(path: str | Path, content: str | bytes, *, must_be_new: bool = False) -> None:
     """Write a file, UTF-8 where it is text; raises as `replacing` does."""
@@ -17,8 +19,17 @@ def replace_file(path: str | Path, content: str | bytes, *, must_be_new: bool = 
         new.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
+def spare_campaign(path: str | Path) -> None:
+    """Refuse the path of a campaign for anything else: its readings cannot be made again."""
+    with suppress(OSError), Path(path).open("rb") as stream:
+        if stat.S_ISREG(os.fstat(stream.fileno()).st_mode) and stream.read(len(SQLITE)) == SQLITE:
+            raise InputError(f"{path}: a campaign is there, which is kept; choose another name")
+
+
 @contextmanager
-def replacing(path: str | Path, *, must_be_new: bool = False) -> Iterator[Path]:
+def replacing(
+    path: str | Path, *, must_be_new: bool = False, campaign: bool = False
+) -> Iterator[Path]:
     """Yield the path of an empty file, which replaces `path` at the end of the block.
 
     If the block or the process ends early, an existing file is unchanged. Of a link, the file that
@@ -27,9 +38,10 @@ def replacing(path: str | Path, *, must_be_new: bool = False) -> Iterator[Path]:
 
     Args:
         must_be_new: refuse to replace a file.
+        campaign: the new file is a campaign; nothing else replaces one.
 
     Raises:
-        InputError: the file cannot be written, or exists and `must_be_new`.
+        InputError: the file cannot be written, exists and `must_be_new`, or is a campaign.
     """
     try:
         old = _status(Path(path))
@@ -38,6 +50,8 @@ def replacing(path: str | Path, *, must_be_new: bool = False) -> Iterator[Path]:
         if old is not None and _written_in_place(old):
             yield Path(path)
             return
+        if not campaign:
+            spare_campaign(path)
         place = Path(os.path.realpath(path))
         if old is not None and not os.access(place, os.W_OK):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))

@@ -37,6 +37,7 @@ from hilcal.tables.columns import (
     USER_PREFIX,
     WRENCH,
     approach_columns,
+    check_rotations,
     joint_columns,
     known_columns,
     temperature_columns,
@@ -101,6 +102,8 @@ def read_points(
             f"{table.at(k)}: a joint at {np.abs(q[k]).max():.4g} rad; columns q1_rad … are in rad, "
             "q1_deg … in degrees"
         )
+    if ROTATION[0] in table.number:
+        check_rotations(table, columns["rotation"])
     pose_names = table.text.get("pose")
     names = tuple(pose_names) if pose_names else tuple(str(k + 1) for k in range(len(table.rows)))
     wrench, sensed = columns.pop("wrench", None), columns.pop("sensed", None)

@@ -188,6 +188,10 @@ def _task(
     arm, tool = calibration.model.cell.arm, None
     if options.tool is not None:
         six = _numbers(options.tool, 6, "--tool")
+        if np.abs(six[:3]).max() > 5.0:
+            raise InputError(f"--tool {options.tool!r} lies over 5 m off the flange; is it in m?")
+        if np.linalg.norm(six[3:]) > 2 * np.pi + 1e-6:
+            raise InputError(f"--tool {options.tool!r} is turned by over a turn; is it in rad?")
         tool = se3.matrix(se3.rotation(six[3:]), six[:3])
     if path.suffix.lower() in READERS:
         foreign = read_program(

@@ -1,5 +1,6 @@
 """`plan`, `next`: choose poses, loads and their order; `check`: examine devices and a plan."""
 
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Literal
@@ -33,9 +34,9 @@ from hilcal.present.progress import Say, working
 from hilcal.procedure.next_plan import Doubt, doubt_to_settle, fit_without, next_plan
 from hilcal.procedure.procedure import with_origin
 from hilcal.procedure.state import reference_in
-from hilcal.store.plan import Plan, load_plan
+from hilcal.store.plan import FORMAT, Plan, load_plan
 from hilcal.tables.write import plan_csv
-from hilcal.whole_file import replace_file
+from hilcal.whole_file import replace_file, spare_campaign
 
 
 def write(
@@ -61,6 +62,14 @@ def write(
             record_plan(cell, config, checked_plan.plan, checked_plan.summary, record, powers)
 
 
+def _check_plan_place(output: Path) -> None:
+    """Refuse to replace anything but a plan, before planning, which takes a while."""
+    spare_campaign(output)
+    with suppress(OSError):  # said when it is written
+        if output.is_file() and FORMAT.encode() not in output.read_bytes()[:10_000]:
+            raise InputError(f"{output}: exists and is not a plan; it is not overwritten")
+
+
 @command(f"""
     readings | --readings | Or so many readings, repeats not counted, at as many poses and under
         those loads that are most informative.
@@ -79,6 +88,7 @@ def plan(
     """Choose poses, loads and their order, with a proof of how near to the best they are."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     fitting.check_record(record)
+    _check_plan_place(output)
     if revision is not None and after is None:
         raise InputError("--revision is one of a campaign; give the campaign with --after")
     if prior.prior is not None and after is not None:
@@ -239,6 +249,7 @@ def next_(
     """Plan the measurements that separate the leading suspects; exit 4 where none are in doubt."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     fitting.check_record(record)
+    _check_plan_place(output)
     carried = prior.load(catalogue)
     rng = np.random.default_rng(check_seed(seed))
     if poses is not None and poses < 1:

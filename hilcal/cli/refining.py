@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from hilcal.diagnosis.verdict import NO_HISTORY
 from hilcal.diagnosis.verdict import diagnose as judge
 from hilcal.discovery.discovery import LawSearch, discovery_json, laws_json, rival_sources
 from hilcal.discovery.discovery import discover as search
+from hilcal.discovery.law import PROPOSED
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.check import NAME
 from hilcal.effects.options import Options
@@ -320,6 +322,9 @@ def discover(
     if effects is not None and revision is not None:
         raise InputError("--against and --revision: give one of them")
     check_folder(output, f"-o {output}")
+    with suppress(OSError):  # said when it is written
+        if output.is_file() and PROPOSED.encode() not in output.read_bytes():
+            raise InputError(f"{output}: exists and is no law of hilcal discover; it is kept")
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         number: int | None = None
         if effects is None:

@@ -248,9 +248,10 @@ class Law:
 
 
 ORDINARY_COEFFICIENT = 1e-4  # Ordinary magnitude of an unknown coefficient, SI; a choice
+PROPOSED = "Proposed by `hilcal discover`"  # in the head of every file of a law
 _HEAD = '''"""`{name}`: {formula}
 
-Proposed by `hilcal discover`; change it as you like. Every command takes it:
+{proposed}; change it as you like. Every command takes it:
 
     hilcal effects --effects-from {file}
     hilcal add RUN.hilcal {name} --effects-from {file}
@@ -331,7 +332,7 @@ def source_of_form(
         needs = "".join(f'"{n}", ' for n in form.needs).rstrip()
         attributes.append(f"    needs = ({needs})\n")
     source = _HEAD.format(
-        name=name, formula=form.text(), file=_in_docstring(quoted(file)),
+        name=name, formula=form.text(), proposed=PROPOSED, file=_in_docstring(quoted(file)),
         evidence="\n".join(map(_in_docstring, evidence.split("\n"))),
         imports=", Response" if form.elastic else "",
         class_name="".join(part.capitalize() for part in name.split("_")),

@@ -426,7 +426,7 @@ def new_campaign(
 ) -> Iterator[sqlite3.Connection]:
     """Yield an empty campaign to be filled; the file appears at the end of the block."""
     may_write(path, overwrite)
-    with replacing(path) as new:
+    with replacing(path, campaign=True) as new:
         try:
             with schema.sqlite_errors(path):
                 connection = schema.connect(new)

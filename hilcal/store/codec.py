@@ -133,7 +133,7 @@ def read_file(path: Path, name: str, read: Callable[[Any], T]) -> T:
     try:
         content = parse_json(limits.read_text(path, limits.DOCUMENT))
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+        raise InputError(f"{path}: no {name}: it cannot be read ({error.strerror})") from None
     except ValueError as error:
         raise InputError(f"{path}: no {name}: {error}") from None
     try:

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from hilcal import limits
 from hilcal.errors import DeviceError, HilcalError, InputError
+from hilcal.whole_file import SQLITE
 
 APPLICATION_ID = 0x68696C63  # "hilc"
 ONE_TARGET, SEVERAL_TARGETS, CHOSEN_REVISION = 2, 3, 4
@@ -27,7 +28,7 @@ CARRIED_PRIOR, CHANGED_CELL, MORE_COLUMNS = 5, 6, 7
 from the previous one; a revision with a prior of another campaign, or in a changed cell; readings
 with joint torques, or of several observers. Older programs would misread a file of a newer one."""
 VERSION = MORE_COLUMNS
-HEADER = b"SQLite format 3\x00"
+HEADER = SQLITE
 _JOURNAL = bytes.fromhex("d9d505f920a163d7")
 """Magic number of a journal; it ends a journal that ends in a name, too."""
 

@@ -1,5 +1,6 @@
 """What is wrong is said in one line, with the exit code of its kind."""
 
+import re
 import signal
 import socket
 import sys
@@ -66,6 +67,36 @@ def test_files_that_are_no_campaigns(good, campaign, tmp_path, capsys):
     assert "run.hilcal" in line
     refused(capsys, 2, "import", good, "--config", CELL, "-o", good, "--force")
     assert rows_of(good)  # a file of another kind is never overwritten
+
+
+@pytest.mark.parametrize("arguments", [
+    ("plan", CELL, "-o", "RUN"),
+    ("plan", CELL, "-o", "p.json", "--record", "RUN"),
+    ("next", "RUN", "-o", "RUN"),
+    ("refine", "RUN", "--record", "RUN"),
+    ("view", "RUN", "--record", "RUN"),
+    ("export", "RUN", "--calibration", "RUN", "--force"),
+    ("export", "RUN", "--cell", "RUN", "--force"),
+    ("report", "RUN", "-o", "RUN"),
+    ("init", "RUN", "--robot", "ur5e", "--force")])  # fmt: skip
+def test_nothing_but_an_import_replaces_a_campaign(arguments, campaign, capsys, monkeypatch):
+    monkeypatch.chdir(campaign.parent)
+    ok(capsys, "identify", campaign)
+    kept = campaign.read_bytes()
+    given = [campaign.name if a == "RUN" else a for a in arguments]
+    assert re.search("choose another name|name another file", refused(capsys, 2, *given))
+    assert campaign.read_bytes() == kept
+
+
+def test_a_plan_and_a_law_replace_no_file_of_another_kind(campaign, tmp_path, capsys):
+    cell, law = tmp_path / "CELL.toml", tmp_path / "mine.py"
+    cell.write_bytes(CELL.read_bytes())
+    law.write_text("of my own", encoding="utf-8")
+    ok(capsys, "identify", campaign)
+    for command in (("plan", cell), ("next", campaign)):
+        assert "exists and is not a plan" in refused(capsys, 2, *command, "-o", cell)
+    assert "is no law of hilcal discover" in refused(capsys, 2, "discover", campaign, "-o", law)
+    assert (cell.read_bytes(), law.read_text("utf-8")) == (CELL.read_bytes(), "of my own")
 
 
 def test_unknown_names_list_the_valid_ones(campaign, good, tmp_path, capsys):
