@@ -92,7 +92,7 @@ def run(
     base_dir = cell.absolute().parent
     if rehearse:  # refuses an effect that cannot be hidden before anything is planned
         as_told(config, config.simulation.hide or NOTHING, catalogue)
-    elif plan is None:
+    elif plan is None and not resume:
         connect.drivers_of(config)  # refuses a cell without them before anything is planned
     with ExitStack() as stack:
         further: Plan | None = None
