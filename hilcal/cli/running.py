@@ -92,7 +92,7 @@ def run(
     base_dir = cell.absolute().parent
     if rehearse:  # refuses an effect that cannot be hidden before anything is planned
         program_config(config, config.simulation.hide or NO_EFFECT, catalogue)
-    elif plan is None:
+    elif plan is None and not resume:
         connect.drivers_of(config)  # refuses a cell without them before anything is planned
     with ExitStack() as stack:
         further: Plan | None = None

@@ -236,6 +236,7 @@ def site(tmp_path, monkeypatch):
     devices = [d for d in (rig.arm, rig.tracker, rig.force, rig.operator) if d is not None]
     answers = tuple(ConnectionResult(d.report().device, "fake", d.report()) for d in devices)
     monkeypatch.setattr(running.connect, "connect", lambda config: (rig, answers))
+    monkeypatch.setattr(running.connect, "drivers_of", lambda config: [])
     monkeypatch.setattr(running, "Clock", lambda scale: made.bench.clock)
     # judge after every reading, however slow that is
     monkeypatch.setattr(goal_rule, "FIT_TIME_SHARE", 1e9)
