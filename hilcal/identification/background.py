@@ -202,17 +202,19 @@ def with_background(fitted: Fit, named: Collection[str]) -> Fit | None:
     readings = fitted.readings.as_stated()
     model = with_all_effects(fitted.model, readings[~fitted.outlier].states)
     outlier, sample = fitted.outlier.copy(), readings[~fitted.outlier]
-    few = readings.value.size <= MOST_NOISE_ROWS
+    disagreement = fitted.disagreement  # readings off alike are not set aside one by one
+    alike = disagreement is not None and disagreement.kind == "alike"
+    seek = readings.value.size <= MOST_NOISE_ROWS and not alike
     sample = sample[some_poses(sample, MOST_NOISE_ROWS / sample.value.size, SEED)]
     try:
         mixed = mixed_fit_of(model, sample, fitted.mode)
-        for _ in range(RETURNS if few else 0):
+        for _ in range(RETURNS if seek else 0):
             still = gross_errors_of(mixed, readings, outlier, fitted.mode)
             if np.array_equal(still, outlier):
                 break
             outlier, sample = still, readings[~still]
             mixed = mixed_fit_of(model, sample, fitted.mode)
-        if few and (gross := gross_errors_beside(mixed, fitted.mode)).any():
+        if seek and (gross := gross_errors_beside(mixed, fitted.mode)).any():
             outlier[np.flatnonzero(~outlier)[gross]] = True
             sample = readings[~outlier]
             mixed = mixed_fit_of(model, sample, fitted.mode)
@@ -226,7 +228,7 @@ def with_background(fitted: Fit, named: Collection[str]) -> Fit | None:
             return None
         return fit(
             background_model(mixed, named), readings, fitted.mode, start=mixed.theta,
-            outlier=outlier if few else None,
+            outlier=outlier if seek else None,
         )  # fmt: skip
     except CannotAnswerError:
         return None

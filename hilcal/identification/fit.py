@@ -12,7 +12,7 @@ from hilcal.errors import CannotAnswerError, InputError, expect
 from hilcal.identification.carried.drift import Conflict, chosen_drift, conflicts
 from hilcal.identification.folds import distinct_poses, leave_out, random_folds
 from hilcal.identification.gauss_newton import Solution, solve
-from hilcal.identification.outliers.data_snooping import DataSnooping, Disagreement
+from hilcal.identification.outliers.data_snooping import DataSnooping, Disagreement, SnoopingResult
 from hilcal.identification.outliers.least_trimmed_squares import rejection_limit
 from hilcal.identification.registration.robot_frames import RobotFrames, robot_frames
 from hilcal.identification.residual import ErrorBlock, WithVarianceFactor, error_block, residual
@@ -329,7 +329,8 @@ def fit(
     estimated from the readings, unless `prior` is given.
 
     Gross errors are set aside: they stay in the file and are listed, but are not fitted. They are
-    sought unless `outlier` (N,) says which readings they are.
+    sought unless `outlier` (N,) says which readings they are; whether the others disagree is tested
+    all the same.
 
     Raises:
         CannotAnswerError: fewer measured elements than identifiable parameters.
@@ -384,14 +385,19 @@ def _set_aside(
 ) -> tuple[Bools, Disagreement | None, _Solved]:
     """Readings (N,) without gross errors, their disagreement, and their gc-scaled solution."""
     if outlier is not None:
-        return ~outlier, None, _solve(model, readings[~outlier], mode, "gc", start, prior)
+        used = ~outlier
+        w, solution = _solve(model, readings[used], mode, "gc", start, prior)
+        screened = _screened(model, readings[used], mode, (w, solution), start)
+        disagreement = None if screened is None else screened.disagreement
+        if disagreement is not None:
+            rows = np.flatnonzero(used)[disagreement.rows]
+            disagreement = replace(disagreement, rows=rows)
+        return used, disagreement, (w, solution)
     used = np.ones(len(readings), dtype=bool)
     w, solution = _solve(model, readings, mode, "gc", start, prior)
-    distance2 = mahalanobis2(solution.raw, w.covariance)
-    if distance2.max() <= rejection_limit(w.m, len(distance2)):
+    screened = _screened(model, readings, mode, (w, solution), start)
+    if screened is None:
         return used, None, (w, solution)
-    y = np.zeros(model.size) if start is None else solution.space.of_theta(start)
-    screened = DataSnooping(model, readings, mode, solution, y).test(np.random.default_rng(SEED))
     for _ in range(OUTLIER_ROUNDS):
         if np.array_equal(screened.used, used):
             break
@@ -399,6 +405,18 @@ def _set_aside(
         w, solution = _solve(model, readings[used], mode, "gc", solution.theta, prior)
         screened = DataSnooping(model, readings, mode, solution, solution.y).retest(screened)
     return used, screened.disagreement, (w, solution)
+
+
+def _screened(
+    model: Model, readings: Readings, mode: Mode, solved: _Solved, start: Floats | None
+) -> SnoopingResult | None:
+    """Test the readings of a solution for gross errors; None where none deviates strongly."""
+    w, solution = solved
+    distance2 = mahalanobis2(solution.raw, w.covariance)
+    if distance2.max() <= rejection_limit(w.m, len(distance2)):
+        return None
+    y = np.zeros(model.size) if start is None else solution.space.of_theta(start)
+    return DataSnooping(model, readings, mode, solution, y).test(np.random.default_rng(SEED))
 
 
 def _solve(
