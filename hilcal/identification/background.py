@@ -30,7 +30,7 @@ from hilcal.identification.mixed_fit import (
 )
 from hilcal.identification.noise.arm_scatter import some_poses, with_arm_scatter
 from hilcal.identification.noise.full_covariance import joint_factors
-from hilcal.identification.outliers.gross_errors import gross_errors_beside, gross_errors_of
+from hilcal.identification.outliers.gross_errors import confirmed_gross_errors, find_gross_errors
 from hilcal.model.model import Model
 from hilcal.readings.readings import ArmScatter
 from hilcal.types import Floats
@@ -202,19 +202,20 @@ def with_background(fitted: Fit, named: Collection[str]) -> Fit | None:
     readings = fitted.readings.as_stated()
     model = with_all_effects(fitted.model, readings[~fitted.outlier].states)
     outlier, sample = fitted.outlier.copy(), readings[~fitted.outlier]
-    disagreement = fitted.disagreement  # readings off alike are not set aside one by one
+    # A run of equal shifts is not set aside reading by reading.
+    disagreement = fitted.disagreement
     alike = disagreement is not None and disagreement.kind == "alike"
-    seek = readings.value.size <= MOST_NOISE_ROWS and not alike
+    search = readings.value.size <= MOST_NOISE_ROWS and not alike
     sample = sample[some_poses(sample, MOST_NOISE_ROWS / sample.value.size, SEED)]
     try:
         mixed = mixed_fit_of(model, sample, fitted.mode)
-        for _ in range(RETURNS if seek else 0):
-            still = gross_errors_of(mixed, readings, outlier, fitted.mode)
+        for _ in range(RETURNS if search else 0):
+            still = confirmed_gross_errors(mixed, readings, outlier, fitted.mode)
             if np.array_equal(still, outlier):
                 break
             outlier, sample = still, readings[~still]
             mixed = mixed_fit_of(model, sample, fitted.mode)
-        if seek and (gross := gross_errors_beside(mixed, fitted.mode)).any():
+        if search and (gross := find_gross_errors(mixed, fitted.mode)).any():
             outlier[np.flatnonzero(~outlier)[gross]] = True
             sample = readings[~outlier]
             mixed = mixed_fit_of(model, sample, fitted.mode)
@@ -228,7 +229,7 @@ def with_background(fitted: Fit, named: Collection[str]) -> Fit | None:
             return None
         return fit(
             background_model(mixed, named), readings, fitted.mode, start=mixed.theta,
-            outlier=outlier if seek else None,
+            outlier=outlier if search else None,
         )  # fmt: skip
     except CannotAnswerError:
         return None

@@ -1,8 +1,8 @@
-"""Gross errors beside all effects at once: readings that the mixed model takes for contaminated.
+"""Gross errors of an arm that has every effect, found in the mixed model of all effects.
 
 Where an arm has every effect, the misfit of its named effects alone is as large as a gross error,
 which data snooping (`identification.outliers.data_snooping`) then cannot tell. The mixed model of
-all effects predicts each reading from the others ten times as well. A reading k with a gross error
+all effects predicts each reading from the others much better. A reading k with a gross error
 has a shift γ_k ~ N(0, G²) in each element, which a good one has not, and is one with the
 probability π. The odds that the readings of a set O have gross errors and no others, with the
 variances of all effects estimated anew,
@@ -43,7 +43,7 @@ SUSPECT = 0.05
 VISIBLE = 1e-9  # share of a reading's information that its other elements must leave
 
 
-def gross_errors_beside(mixed: MixedFit, mode: Mode) -> Bools:
+def find_gross_errors(mixed: MixedFit, mode: Mode) -> Bools:
     """Return which of the readings (N,) of a mixed fit have gross errors.
 
     Deflections of an unloaded reading with a gross error are marked as well.
@@ -78,11 +78,16 @@ def gross_errors_beside(mixed: MixedFit, mode: Mode) -> Bools:
     return _with_deflections(out, readings, mode)
 
 
-def gross_errors_of(mixed: MixedFit, readings: Readings, outlier: Bools, mode: Mode) -> Bools:
-    """Return which of all readings (N,) have gross errors, of those set aside.
+def confirmed_gross_errors(
+    mixed: MixedFit, readings: Readings, outlier: Bools, mode: Mode
+) -> Bools:
+    """Return which of the set-aside readings, `outlier` (N,), are confirmed as gross errors (N,).
 
-    The mixed fit is to the others. Each of those set aside has a shift; it has no gross error if a
-    good reading would be as far from the prediction by chance.
+    The mixed fit is to all other readings. A reading is not confirmed if a good one would be as far
+    from the prediction by chance.
+
+    Raises:
+        CannotAnswerError: the mixed model's equations have no solution.
     """
     rows = np.flatnonzero(outlier)
     if not len(rows):

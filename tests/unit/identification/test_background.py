@@ -22,7 +22,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
 from hilcal.identification.mixed_fit import mixed_fit
-from hilcal.identification.outliers.gross_errors import gross_errors_beside
+from hilcal.identification.outliers.gross_errors import find_gross_errors
 from hilcal.identification.prediction.predictive import predictive_of
 from hilcal.library import read_table
 from hilcal.mixed.variances import evidence
@@ -333,7 +333,7 @@ def test_an_unloaded_reading_with_a_gross_error_takes_its_deflections_along():
     value[row] += [2e-3, 0.0, 1e-3]
     off = replace(case.readings, value=value)
     model = baseline(case.cell, off, "deflection")
-    gross = gross_errors_beside(mixed_fit(model, off, "deflection"), "deflection")
+    gross = find_gross_errors(mixed_fit(model, off, "deflection"), "deflection")
     of_pose = np.flatnonzero(off.pose == off.pose[row]).tolist()
     assert np.flatnonzero(gross).tolist() == of_pose
     aside = np.isin(np.arange(len(off)), [*of_pose, *np.flatnonzero(off.pose == 0)])
