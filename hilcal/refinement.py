@@ -284,12 +284,20 @@ class Path:
         last = self.steps[-1]
         d = last.diagnosis
         unexplained = d.verdict == "unknown_effect" or d.reason == "arm_scatter"
-        if self._laws is None or not unexplained or last.fit.readings.arm_scatter is not None:
+        if self._laws is None or not unexplained:
+            return False
+        if last.fit.readings.arm_scatter is not None and not last.fit.model.background:
             return False
         proposed = self._laws.propose(last.fit, self._say)
         if proposed is None or not predicts_better(last.fit, proposed[0]):
             return False
-        self.append(*proposed, message=f"added {proposed[1]}")
+        larger, law = proposed
+        if not larger.model.background:
+            self.append(larger, law, message=f"added {law}")
+            return True
+        # The sizes were estimated without the law, and are larger by what they took up of it.
+        anew = with_background(larger, [*last.fit.model.named, law])
+        self._append_background(larger if anew is None else anew, law)
         return True
 
     def _add_suspect(self) -> bool:
@@ -350,8 +358,8 @@ class Path:
         neither the noise nor an unknown effect. They stay as the model's background if the error on
         poses left out falls by a share (`background_is_better`); also by more than it scatters from
         pose to pose, if the readings do not prove them, or the verdict `unknown_effect` says that
-        they may imitate an effect that the catalogue lacks. Those proved beside all others are then
-        named.
+        they may imitate an effect that the catalogue lacks. See `_append_background` for their
+        names.
         """
         last = self.steps[-1]
         tried = self._background_tried or bool(last.fit.model.background)
@@ -388,19 +396,29 @@ class Path:
         if doubtful and not predicts_better(named, fitted):
             return False
         self._say("the background of all effects predicts better; diagnosing")
+        self._append_background(fitted, BACKGROUND)
+        return True
+
+    def _append_background(self, fitted: Fit, added: str) -> None:
+        """Append a fit with a background, and the same fit with more and more effects named.
+
+        Those are named that the readings prove beside all others; none where smooth laws predict
+        what the background leaves on poses left out, as any may only resemble what is missing.
+        """
         tested = background_evidence(fitted)
-        names = proved(tested)[: MOST_REVISIONS - len(self.steps) - 1]
+        unknown = self._evidence_of(fitted, tested).regression.significant
+        names = () if unknown else proved(tested)[: MOST_REVISIONS - len(self.steps) - 1]
         fits = [fitted]
         for name in names:
             model = fits[-1].model
             model = replace(model, background=model.background - {name})
             fits.append(replace(fits[-1], model=model))
+            self._regressions.same(fits[-1], fitted)
         diagnoses, self._evidence = judge_naming(
             fits, tested, self._history, lambda unnamed: self._evidence_of(fits[-1], unnamed)
         )
-        for step in map(RefinementStep, fits, diagnoses, (BACKGROUND, *names)):
+        for step in map(RefinementStep, fits, diagnoses, (added, *names)):
             self._append(step)
-        return True
 
     def add_scatter(self) -> bool:
         """Fit with the arm's scatter in the covariance; returns whether the covariance changed.

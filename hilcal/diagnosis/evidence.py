@@ -133,8 +133,9 @@ class StepwiseAlternatives:
         reduced = eliminate_effect(self._fit, self._model, effect)
         evidence = reduced.score().log_evidence
         information = reduced.information(self._x, self._gram, self._products)
+        noise = reduced.rss, reduced.dof
         families = families_beside(
-            information, reduced.residual, reduced.dof, self._x, self._columns, self._most
+            information, reduced.residual, noise, self._x, self._columns, self._most
         )
         # A finer form of an effect is no alternative: it contains the effect.
         barred = {*excluded, *(name for name in self._columns if name.startswith(f"{effect}("))}
@@ -211,7 +212,7 @@ def catalogue_families(
 ) -> CandidateFamilies:
     """Return the effects of `catalogue_columns` beside a fit."""
     p = linearise(fit)
-    return families_beside(p.information(x), p.residual, fit.dof, x, columns, largest)
+    return families_beside(p.information(x), p.residual, p.test_noise, x, columns, largest)
 
 
 def significant(families: CandidateFamilies) -> list[Addition]:

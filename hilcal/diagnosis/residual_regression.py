@@ -131,6 +131,11 @@ class Regressions:
             self._of[p.fit] = smooth
         return self._of[p.fit]
 
+    def same(self, renamed: Fit, fit: Fit) -> None:
+        """Reuse the regression of a fit for one that differs in the effects it names only."""
+        if fit in self._of:
+            self._of[renamed] = self._of[fit]
+
     def tree_share(self, p: Linearisation, other_share: float) -> float:
         """Cached `tree_share`."""
         shares = self._trees.setdefault(p.fit, {})
@@ -154,7 +159,8 @@ class _Laws:
         self._p, self._fold = p, fold
         self._chosen: dict[int, Floats] = {}
         self.ridge = np.maximum(p.projection.ridge, LEAST_RIDGE)
-        parts = [(p.rows[fold == f], p.fit.white[fold == f]) for f in range(int(fold.max()) + 1)]
+        self._y = p.with_prior
+        parts = [(p.rows[fold == f], self._y[fold == f]) for f in range(int(fold.max()) + 1)]
         self._grams = [rows.T @ rows for rows, _ in parts]
         self._sides = [rows.T @ white for rows, white in parts]
 
@@ -192,20 +198,22 @@ class _Laws:
             h[size:, :size] = x.T @ self._p.rows[rows]
             h[:size, size:] = h[size:, :size].T
             h[size:, size:] = x.T @ x + LAW_RIDGE * np.eye(width)
-            b[size:] = x.T @ self._p.fit.white[rows]
+            b[size:] = x.T @ self._y[rows]
         step = positive_solve(h, b)
         return step[:size], list(step[size:].reshape(-1, LAW_COLUMNS))
 
 
 def smooth_laws(p: Linearisation) -> ResidualRegression:
     """Find the laws that predict the misfit of poses left out, and the variables that carry it."""
-    white, w = p.fit.white, p.fit.whitening
+    white, w = p.with_prior, p.fit.whitening
     fold = w.rows_of(random_folds(p.fit.pose, FOLDS))
     laws, count = _Laws(p, fold), int(fold.max()) + 1
     # For speed, the laws are selected on every n-th measurement: about `MOST_ROWS` rows per fit.
     every = max(-(-len(white) * (FOLDS - 1) // (FOLDS * MOST_ROWS)), 1)
     used = np.arange(len(white)) // w.m % every == 0
-    selection = BlockSelection(p.rows[used], laws.ridge, laws.at(used), white[used], fold[used])
+    selection = BlockSelection(
+        p.rows[used], laws.ridge, laws.at(used), white[used], fold[used], p.flat
+    )
     rng = np.random.default_rng(20250302)
     # Errors of rows left out: by the model alone, and with laws.
     without, with_laws = np.zeros(len(white)), np.zeros(len(white))
@@ -268,7 +276,7 @@ def _best(p: Linearisation, laws: _Laws, numbers: list[int]) -> int:
         grams.append(blocks @ blocks.transpose(0, 2, 1) - explained @ explained.transpose(0, 2, 1))
         slopes.append((flat.T @ p.residual - product.T @ solved).reshape(-1, LAW_COLUMNS))
     gram, slope = np.concatenate(grams), np.concatenate(slopes)
-    return numbers[int(np.argmax(block_evidence(gram, slope, p.rss, p.fit.dof, STRENGTHS)))]
+    return numbers[int(np.argmax(block_evidence(gram, slope, *p.test_noise, STRENGTHS)))]
 
 
 def _curve(
@@ -309,7 +317,8 @@ def _least_squares(p: Linearisation, x: Floats) -> tuple[Floats, Floats]:
     gram = (free.T @ x + x.T @ free) / 2
     inverse = np.linalg.pinv(gram, rcond=1e-9, hermitian=True)
     y = inverse @ (free.T @ p.residual)
-    variance = max(p.rss - float(y @ gram @ y), 0.0) / max(p.fit.dof - len(y), 1.0)
+    square, dof = p.test_noise
+    variance = max(square - float(y @ gram @ y), 0.0) / max(dof - len(y), 1.0)
     return y, np.asarray(inverse * max(variance, 1e-300))
 
 

@@ -28,8 +28,8 @@ The rules, in this order:
    arm's repeatability is stated, too, the noise is complete, and wrong.
 
 Noise that was estimated from the readings (`Readings.noise_stated`) is too large where an effect
-outside the catalogue is missing, so χ² does not show the effect: rule 4 holds as well where laws
-surely predict the residual on poses left out.
+outside the catalogue is missing, and a background takes up a part of it, so that χ² does not show
+the effect: rule 4 holds as well where laws surely predict the residual on poses left out.
 
 If several targets are read in one arrival, the arm's scatter is not stated and χ² is too large, the
 rules are applied to the fit with the estimated scatter in its covariance (see
@@ -179,8 +179,10 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
             reason = "inseparable_suspects" if rivals else "one_suspect"
         follows = _carrying(regression)
     else:
-        # Noise that was estimated while an effect is missing is too large to show the effect.
-        hidden = not readings.noise_stated and e.regression.significant
+        # Noise that was estimated while an effect is missing is too large to show the effect, and a
+        # background takes up what it can of the effect.
+        hides = e.fit.model.background or not readings.noise_stated
+        hidden = hides and e.regression.significant
         regression = e.regression if e.misfit or hidden else ResidualRegression(0.0, ())
         significant = _significant(e.misfit_breakdown)
         follows = _carrying(regression) or tuple(v.variable for v in significant)

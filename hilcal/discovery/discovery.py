@@ -130,9 +130,11 @@ def discover(
     expect(fit, Fit, "fit", "a Fit, as of hc.fit(model, readings)")
     if fit.scaling != "gc":
         raise InputError(f"scaling {fit.scaling!r}: laws are searched in a fit scaled by gc")
-    if float(scipy.stats.chi2.sf(fit.chi2, fit.dof)) >= MISFIT_ALARM:
-        return Discovery(fit, "adequate")
     linear = linearise(fit)
+    noise = float(scipy.stats.chi2.sf(fit.chi2, fit.dof)) >= MISFIT_ALARM
+    # A background takes up a part of what a law would explain.
+    if noise and not (fit.model.background and residual_regression(linear).significant):
+        return Discovery(fit, "adequate")
     say("forming all candidates")
     screening = screen(linear)
     say(f"searching among {screening.candidates} candidates")
@@ -253,7 +255,7 @@ def _law(
 ) -> Law:  # fmt: skip
     linear = problem.screen.linear
     x = np.hstack([problem.columns(t) for t in s.terms])
-    score = score_family(linear.information(x), x.T @ linear.residual, linear.rss, linear.fit.dof)
+    score = score_family(linear.information(x), x.T @ linear.residual, *linear.test_noise)
     price = sum(t.price for t in s.terms)
     p_value = float(np.exp(min(np.log(max(score.p_value, 1e-300)) + price, 0.0)))
     near = tuple(r for r in resembling(problem, s, effects) if r.cosine >= LEAST_COSINE)
@@ -301,7 +303,7 @@ def left_out_residual(problem: SearchProblem, selection: Selection | None, out: 
     """Residual of rows that are left out, by model and law refitted to the other rows."""
     screen = problem.screen
     linear = screen.linear
-    rows, white = linear.rows, linear.fit.white
+    rows, white = linear.rows, linear.with_prior
     terms = () if selection is None else selection.terms
     x = np.hstack([rows, *map(screen.columns_of, terms)])
     used = problem.rows

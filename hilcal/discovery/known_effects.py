@@ -47,7 +47,7 @@ def known_effects(fit: Fit) -> KnownEffects:
     return KnownEffects(
         tuple(s.name for s in steps),
         tuple(s.score.log_evidence - choice for s in steps),
-        tuple(s.after.rss / max(fit.dof - s.after.spent, 1.0) for s in steps),
+        tuple(s.after.rss / max(s.after.dof - s.after.spent, 1.0) for s in steps),
         x,
         columns,
     )
@@ -151,7 +151,7 @@ def needed_beside_effect(
     count = both.shape[1] - law.shape[1]
     places = {"effect": slice(0, count), "law": slice(count, both.shape[1])}
     families = families_beside(
-        problem.model.information(both), problem.residual, problem.dof, both, places, {}
+        problem.model.information(both), problem.residual, problem.noise, both, places, {}
     )
     score = families.scores()["effect"]
     if not score.rank:

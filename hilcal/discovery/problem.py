@@ -44,9 +44,8 @@ class SearchProblem:
         self.residual = linear.residual
         if rows is not None:
             self.model, self.residual = _refitted(linear, rows)
-        self.rss = float(self.residual @ self.residual)
         self.share = float(self.rows.mean())
-        self.dof = max(linear.fit.dof - (1.0 - self.share) * len(self.rows), 1.0)
+        self.rss, self.dof = self.noise = linear.noise_of(self.residual, self.rows)
         self.square = self.share * screen.square
         self.across = self.share * screen.across
         self.across_one = self.share * screen.across_constant

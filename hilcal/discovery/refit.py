@@ -64,7 +64,7 @@ def refine(screen: Screen, form: Form) -> Form:
     values = [float(f"{v:.{DIGITS}g}") for v in numbers_at(result.x)]
     refined = with_values(form, free, values)
     after = rss_with_law(screen, refined, s)
-    dof = linear.fit.dof
+    dof = linear.test_noise[1]
     gain = 0.5 * dof * np.log(best / max(after, 1e-300))
     return refined if gain > len(free) * (0.5 * np.log(dof)) + LEAST_GAIN else form
 
@@ -75,7 +75,7 @@ def rss_with_law(screen: Screen, form: Form, s: Situation) -> float:
     x = form.columns(screen, s)
     if not np.isfinite(x).all():
         return np.inf
-    return linear.rss - float(x.T @ linear.residual @ _step(linear, x))
+    return linear.test_noise[0] - float(x.T @ linear.residual @ _step(linear, x))
 
 
 def _step(linear: Linearisation, x: Floats) -> Floats:

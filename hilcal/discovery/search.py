@@ -220,7 +220,7 @@ def scored_stepwise(problem: SearchProblem, terms: tuple[LawTerm, ...]) -> list[
     places = {str(k): slice(int(a), int(b)) for k, (a, b) in enumerate(pairwise(ends))}
     columns = np.hstack(x)
     families = families_beside(
-        problem.model.information(columns), problem.residual, problem.dof, columns, places, {}
+        problem.model.information(columns), problem.residual, problem.noise, columns, places, {}
     )
     out = []
     for name in places:

@@ -166,21 +166,36 @@ class Linearisation:
         return float(self.residual @ self.residual)
 
     @cached_property
-    def test_noise(self) -> tuple[float, float]:
-        """Square and degrees of freedom that tests of further columns take for the noise.
+    def with_prior(self) -> Floats:
+        """(R,) whitened residual of the model with its parameters that have a prior zero."""
+        s, random = self.fit.solution, self.projection.ridge > 0
+        return np.asarray(s.white + self.rows @ np.where(random, s.coordinates(), 0.0))
 
-        ‖r‖² and those of the fit. A background leaves a small residual of few degrees of freedom,
-        but further columns have all directions except those of parameters without a prior: with
-        the whitened y and the sizes σ of the random parameters, Cov(y) = M⁻¹ beside these, so that
+    @cached_property
+    def flat(self) -> int:
+        """Number of coordinates without a prior."""
+        return int(np.count_nonzero(self.projection.ridge == 0))
+
+    @cached_property
+    def test_noise(self) -> tuple[float, float]:
+        """Square and degrees of freedom that tests of further columns take for the noise."""
+        return self.noise_of(self.residual, np.ones(len(self.residual), dtype=np.bool_))
+
+    def noise_of(self, residual: Floats, rows: Bools) -> tuple[float, float]:
+        """`test_noise` of the residual (R',) of the model refitted to some of the rows (R,).
+
+        ‖r‖² and the degrees of freedom of the fit. A background leaves a small residual of few
+        degrees of freedom, but further columns have all directions except those of parameters
+        without a prior: with the whitened y and the sizes σ of the random parameters, Cov(y) = M⁻¹
+        beside these, so that
 
             yᵀ M y = ‖r‖² + ‖u/σ‖² ~ f χ²,    R less the parameters without a prior
         """
+        less = len(rows) - np.count_nonzero(rows)
         if not self.fit.model.background:
-            return self.rss, self.fit.dof
-        s, random = self.fit.solution, self.projection.ridge > 0
-        y = s.white + self.rows @ np.where(random, s.coordinates(), 0.0)
-        free = self.fit.whitening.rank - int(np.count_nonzero(~random))
-        return float(y @ self.residual), float(max(free, 1))
+            return float(residual @ residual), max(self.fit.dof - less, 1.0)
+        free = self.fit.whitening.rank - less - self.flat
+        return float(self.with_prior[rows] @ residual), float(max(free, 1))
 
     @cached_property
     def left_out(self) -> Floats:

@@ -224,6 +224,13 @@ def _no_suspect(d: Diagnosis) -> list[str]:
         repeats += [f"{percent(d.repeated_share)} of the misfit is the same in them."]
     predicted = percent(share) if share >= 0.005 else f"{100 * share:.1g} %"
     follows = f"; it follows {' and '.join(d.follows)}" if d.follows else ""
+    if d.fit.model.background:
+        return [
+            "All effects of the catalogue together explain the fitted poses (residuals are "
+            f"{_spread(d)}), but not poses left out: {predicted} of the misfit there is predicted "
+            f"by what the catalogue lacks{follows}.",
+            "All of them take part in predictions; each may only resemble the missing effect.",
+        ]
     return [
         f"Residuals are {_spread(d)}.",
         f"{predicted} of the misfit is predicted on poses left out{follows}.",

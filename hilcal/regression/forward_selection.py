@@ -6,14 +6,16 @@ by the elimination of its columns (`schur.eliminate`). The log evidences of a ch
 up to ln p(r | all) − ln p(r | none), so that one large family can be compared with several small
 ones.
 
-Blocks are chosen without each fold. With B (R, K) the columns of the model with the ridge Λ,
-X_l (R, W) the blocks, y the residual, and M = 1 − B H⁻¹ Bᵀ, H = BᵀB + Λ, on the rows outside of the
-fold, blocks are columns M X_l that explain M y:
+Blocks are chosen without each fold. With B (R, K) the columns of the model, Λ the precision of
+their prior (zero for those without one), X_l (R, W) the blocks, y the measurements less the model
+with the parameters zero, and M = 1 − B H⁻¹ Bᵀ, H = BᵀB + Λ, on the rows outside of the fold,
+generalised least squares needs
 
-    X_kᵀ M M X_l = X_kᵀ X_l − E_kᵀ C_l − C_kᵀ Λ C_l,    E = Bᵀ X,  C = H⁻¹ E
+    X_kᵀ M X_l = X_kᵀ X_l − E_kᵀ C_l,    E = Bᵀ X,  C = H⁻¹ E
 
-and likewise with y in the place of a block. All products are sums over rows: they are formed once
-for each fold, and those without a fold are the sums over the other folds.
+and likewise with y in the place of a block: M is the inverse covariance of y beside the columns
+without a prior. All products are sums over rows: they are formed once for each fold, and those
+without a fold are the sums over the other folds.
 """
 
 from collections.abc import Collection, Iterator, Mapping
@@ -66,14 +68,13 @@ class CandidateFamilies:
 def families_beside(
     information: Floats,  # (P, P) S of all families' columns
     residual: Floats,  # (R,) r of the model
-    dof: float,
+    noise: tuple[float, float],  # ‖r‖², with a background yᵀ M y, and its degrees of freedom
     x: Floats,  # (R, P) whitened columns of all families, in ordinary magnitudes
     columns: Mapping[str, slice],
     largest: Mapping[str, float],  # largest plausible strength of each family that has one
 ) -> CandidateFamilies:
     """Return the families that can be added to a model."""
-    rss = float(residual @ residual)
-    return CandidateFamilies(information, x.T @ residual, rss, dof, columns, largest=largest)
+    return CandidateFamilies(information, x.T @ residual, *noise, columns, largest=largest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,13 +124,15 @@ def block_evidence(gram: Floats, g: Floats, rss: float, dof: float, strengths: F
 class BlockSelection:
     """Blocks that can be added to a model."""
 
-    def __init__(self, b: Floats, ridge: Floats, x: Floats, y: Floats, fold: Ints) -> None:
+    def __init__(
+        self, b: Floats, ridge: Floats, x: Floats, y: Floats, fold: Ints, flat: int
+    ) -> None:
         """Form all products of B (R, K), Λ (K,), all blocks (R, L, W) and y (R,), fold by fold.
 
-        y is the residual of the model; folds are numbered from 0.
+        Folds are numbered from 0; `flat` is the number of columns of B without a prior.
         """
         self._shape, self._b, self._ridge, self._y = x.shape[1:], b, ridge, y
-        self._x, self._fold = x.reshape(len(y), -1), fold
+        self._x, self._fold, self._flat = x.reshape(len(y), -1), fold, flat
         self._of_fold = [self._sums(fold == f) for f in range(int(fold.max()) + 1)]
         self._all = [reduce(np.add, parts) for parts in zip(*self._of_fold, strict=True)]
 
@@ -153,15 +156,13 @@ class BlockSelection:
         )
         count, width = self._shape
         c = positive_solve(inner + np.diag(self._ridge), cross)
-        e, by_ridge = cross[:, :-1], self._ridge[:, None] * c
-        c, step = c[:, :-1], c[:, -1]
-        lifted, pull = e + by_ridge[:, :-1], by_ridge[:, -1]
-        blocks = [m.reshape(len(e), count, width).transpose(1, 2, 0) for m in (c, lifted)]
+        e, c, step = cross[:, :-1], c[:, :-1], c[:, -1]
+        blocks = [m.reshape(len(e), count, width).transpose(1, 2, 0) for m in (c, e)]
         gram = square - blocks[0] @ blocks[1].transpose(0, 2, 1)
         gram = (gram + gram.transpose(0, 2, 1)) / 2
-        g = slope - e.T @ step - c.T @ pull
-        rss = float(rss - (cross[:, -1] + pull) @ step)
-        dof, rows = max(count_of_rows - len(e), 1), self._fold != f
+        g = slope - e.T @ step
+        rss = float(rss - cross[:, -1] @ step)
+        dof, rows = max(count_of_rows - self._flat, 1), self._fold != f
         chosen: list[int] = []
         explained = np.zeros((0, count * width))
         for _ in range(most):
@@ -171,7 +172,7 @@ class BlockSelection:
                 break
             chosen.append(best)
             block = slice(best * width, (best + 1) * width)
-            products = self._x[rows].T @ self._x[rows, block] - lifted.T @ c[:, block]
+            products = self._x[rows].T @ self._x[rows, block] - e.T @ c[:, block]
             products -= explained.T @ explained[:, block]
             lam, u = np.linalg.eigh(gram[best])
             free = lam > SPANNED * lam[-1]

@@ -12,6 +12,7 @@ from hilcal.cell import Cell
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.diagnosis.stepwise import add, remove
 from hilcal.diagnosis.verdict import diagnose
+from hilcal.discovery.discovery import LawSearch
 from hilcal.identification.background import (
     background_of,
     family_sizes,
@@ -31,7 +32,7 @@ from hilcal.refinement import BACKGROUND, refine
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.revision import from_text, to_text
 from hilcal.store.rows import content_hash
-from studies.all_effects_command import AllEffectsCase
+from studies.all_effects_command import AllEffectsCase, campaign_of
 from studies.all_effects_command import refined as all_effects
 from studies.diagnosis import DiagnosisCase
 from studies.diagnosis_command import simulate
@@ -232,6 +233,43 @@ def test_without_shrunk_effects_there_are_no_lines():
     case = study_case(configuration(), "ur10e", "absolute", (), 0.0, 1, n_poses=12)
     plain = fitted_model(case.cell, case.readings, "absolute")
     assert with_pooled_lines(plain) is None
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_law_that_the_catalogue_lacks_is_seen_beside_all_its_effects(seed):
+    """All effects together hide a crossed gear of half a milliradian on the fitted poses."""
+    found = all_effects(AllEffectsCase(60, seed, factor=1.0, without=False, law_rad=5e-4))
+    assert (found.verdict, found.named) == ("unknown_effect", ())
+    without = all_effects(AllEffectsCase(60, seed, factor=1.0, without=False))
+    assert without.verdict in ("ambiguous", "adequate")
+
+
+@pytest.mark.slow
+def test_a_law_beside_all_effects_is_found_and_the_others_are_named(tmp_path):
+    case = AllEffectsCase(60, 0, factor=1.0, without=False, law_rad=5e-4)
+    cell, some, test = campaign_of(case)
+    path = refine(baseline(cell, some, "absolute"), some, "absolute", laws=LawSearch(tmp_path))
+    added = [step.added for step in path.steps]
+    before = path.steps[added.index(BACKGROUND)].fit
+    assert error(path.fit, test) < 0.6 * error(before, test)
+    assert "dq_2 = a·sin(3·q_4)" in (tmp_path / "found.py").read_text()
+    assert added.index("found") < added.index("transmission_error")
+    assert {"found", "link_geometry", "transmission_error"} <= set(path.fit.model.named)
+    assert path.verdict == "ambiguous"
+
+
+def test_a_slip_in_time_that_all_effects_fit_is_unknown():
+    sample = simulate(
+        DiagnosisCase("outside", "ur10e", "absolute", ("slip in time",), strength=3.0, seed=0)
+    )
+    model = baseline(sample.cell, sample.readings, "absolute")
+    path = refine(model, sample.readings, "absolute")
+    assert path.fit.model.background
+    assert not chi2.sf(path.fit.chi2, path.fit.dof) < 0.0005  # the fitted poses do not show it
+    assert path.verdict == "unknown_effect"
+    assert path.diagnosis.follows
+    assert path.fit.model.named == model.named
 
 
 @pytest.mark.slow

@@ -229,11 +229,17 @@ TRIED = np.logspace(-2, 3, 21)
 ROWS, MODEL, BLOCKS, WIDTH, FOLDS = 400, 12, 15, 4, 5
 
 
-def chosen_by_columns(own, ridge, x, y, most, least):
-    """Project all columns off the model, and what is left off each block that is chosen."""
-    h = np.linalg.inv(own.T @ own + np.diag(ridge))
-    m = np.eye(len(y)) - own @ h @ own.T
-    blocks, r, dof = np.tensordot(m, x, axes=1), m @ y, max(len(y) - own.shape[1], 1)
+def chosen_by_columns(own, ridge, flat, x, y, most, least):
+    """Whiten all columns by the covariance of the random part, and project them off the flat."""
+    random = own[:, flat:] / np.sqrt(ridge[flat:])
+    root = np.linalg.cholesky(np.eye(len(y)) + random @ random.T)
+    b = np.linalg.qr(np.linalg.solve(root, own[:, :flat]))[0]
+    blocks = np.linalg.solve(root, x.reshape(len(y), -1)).reshape(x.shape)
+    r, dof = np.linalg.solve(root, y), len(y) - flat
+    blocks, r = (
+        blocks - np.tensordot(b, np.tensordot(b.T, blocks, axes=1), axes=1),
+        r - b @ (b.T @ r),
+    )
     chosen = []
     for _ in range(most):
         gram = np.einsum("rlv,rlw->lvw", blocks, blocks)
@@ -261,10 +267,10 @@ def test_the_same_blocks_in_the_same_order():
         y = x[:, 2] @ rng.normal(size=WIDTH) + x[:, 7, 0] + x[:, 9, 1] + rng.normal(size=ROWS)
         y += own @ rng.normal(size=MODEL)
         fold = rng.integers(0, FOLDS, ROWS)
-        selection = BlockSelection(own, ridge, x, y, fold)
+        selection = BlockSelection(own, ridge, x, y, fold, 6)
         for f in range(FOLDS):
             rest = fold != f
-            expected = chosen_by_columns(own[rest], ridge, x[rest], y[rest], 4, 8.0)
+            expected = chosen_by_columns(own[rest], ridge, 6, x[rest], y[rest], 4, 8.0)
             assert selection.without(f, 4, 8.0, TRIED) == expected
             lengths.append(len(expected))
     assert min(lengths) >= 3
@@ -274,7 +280,7 @@ def test_nothing_is_chosen_of_noise():
     rng = np.random.default_rng(1)
     own, x = rng.normal(size=(ROWS, MODEL)), rng.normal(size=(ROWS, BLOCKS, WIDTH))
     y, fold = rng.normal(size=ROWS), np.arange(ROWS) % FOLDS
-    selection = BlockSelection(own, np.full(MODEL, 1e-6), x, y, fold)
+    selection = BlockSelection(own, np.full(MODEL, 1e-6), x, y, fold, MODEL)
     assert [selection.without(f, 4, 8.0, TRIED) for f in range(FOLDS)] == [[]] * FOLDS
 
 
@@ -283,6 +289,6 @@ def test_a_fold_that_the_sample_has_no_row_of_is_left_out_of_nothing():
     rng = np.random.default_rng(0)
     own, x = rng.normal(size=(60, 2)), rng.normal(size=(60, 3, 2))
     y = x[:, 1, 0] + 0.1 * rng.normal(size=60)
-    first = BlockSelection(own, np.ones(2), x, y, np.arange(60) % 3)
+    first = BlockSelection(own, np.ones(2), x, y, np.arange(60) % 3, 0)
     strengths = np.array([0.1, 1.0])
     assert first.without(3, 2, 3.0, strengths) == first.without(7, 2, 3.0, strengths) == [1]
