@@ -191,11 +191,11 @@ class Linearisation:
 
             yᵀ M y = ‖r‖² + ‖u/σ‖² ~ f χ²,    R less the parameters without a prior
         """
-        less = len(rows) - np.count_nonzero(rows)
+        less = len(rows) - int(np.count_nonzero(rows))
         if not self.fit.model.background:
             return float(residual @ residual), max(self.fit.dof - less, 1.0)
-        free = self.fit.whitening.rank - less - self.flat
-        return float(self.with_prior[rows] @ residual), float(max(free, 1))
+        free = float(self.fit.whitening.rank - less - self.flat)
+        return float(self.with_prior[rows] @ residual), max(free, 1.0)
 
     @cached_property
     def left_out(self) -> Floats:

@@ -12,7 +12,6 @@ from hilcal.cell import Cell
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.diagnosis.stepwise import add, remove
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.discovery.discovery import LawSearch
 from hilcal.identification.background import (
     background_of,
     family_sizes,
@@ -26,6 +25,7 @@ from hilcal.identification.mixed_fit import mixed_fit
 from hilcal.identification.outliers.gross_errors import find_gross_errors
 from hilcal.identification.prediction.predictive import predictive_of
 from hilcal.library import read_table
+from hilcal.library import refine as search_laws
 from hilcal.mixed.variances import evidence
 from hilcal.readings.whitening import whitening
 from hilcal.refinement import BACKGROUND, refine
@@ -249,7 +249,7 @@ def test_a_law_that_the_catalogue_lacks_is_seen_beside_all_its_effects(seed):
 def test_a_law_beside_all_effects_is_found_and_the_others_are_named(tmp_path):
     case = AllEffectsCase(60, 0, factor=1.0, without=False, law_rad=5e-4)
     cell, some, test = campaign_of(case)
-    path = refine(baseline(cell, some, "absolute"), some, "absolute", laws=LawSearch(tmp_path))
+    path = search_laws(baseline(cell, some, "absolute"), some, "absolute", discover=tmp_path)
     added = [step.added for step in path.steps]
     before = path.steps[added.index(BACKGROUND)].fit
     assert error(path.fit, test) < 0.6 * error(before, test)
