@@ -17,7 +17,7 @@ from hilcal.drivers.simulated.truth import warm_up
 from hilcal.drivers.simulated.world import SimulatedNoise, World
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
-from hilcal.measuring.route import approach_sides, home, route
+from hilcal.measuring.route import approach_sides, route
 from hilcal.readings.covariance import COVERS_KEY, INSTRUMENT_AND_ARM
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import Mode
@@ -287,7 +287,7 @@ def case_of_plan(
         base_dir,
     )
     world = replace(case.world, noise=measurement_noise(config))
-    return replace(case, world=world, home=plan.joints(home(plan)))
+    return replace(case, world=world, home=plan.joints(plan.home))
 
 
 def simulate_plan(

@@ -159,14 +159,21 @@ def urscript_list(values: Floats) -> str:
     return f"[{', '.join(f'{v:.9f}' for v in values)}]"
 
 
+UNCHECKED = (
+    "the ways to and between these points are not checked against limits, obstacles and the floor; "
+    "set the payload first"
+)
+
+
 def movej_program(names: Sequence[str], q: Floats) -> str:
     """Return a program that moves to joint values (N, 6) one after the other.
 
-    The controller runs it when it is sent to a script port (30001 to 30003).
+    The controller runs it when it is sent to a script port (30001 to 30003). Nobody has checked
+    its motions, which begin wherever the arm stands; its first line says so.
     """
     rows = zip(names, q, strict=True)
     lines = [f"  movej({urscript_list(row)})  # {escaped(name)}" for name, row in rows]
-    return "\n".join(["def compensated():", *lines, "end", ""])
+    return "\n".join([f"def compensated():  # {UNCHECKED}", *lines, "end", ""])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -85,6 +85,7 @@ DEFAULT_OPTIONS = CalibrationOptions()
     output | -o --output RUN.hilcal | The campaign file; RUN.validation.hilcal and
         RUN.corrected.hilcal go beside it.
     resume | --resume | Go on with what RUN.hilcal holds, after any stop.
+    skip | --skip POSE | With --resume: leave out a pose that cannot be measured; repeatable.
     goal | --goal LENGTH | The error of the position that is wanted, e.g. "0.1 mm"; of absolute
         readings: it is measured on until 95 % of points are predicted to be within it after
         compensation, as far as that can be had.
@@ -98,8 +99,9 @@ DEFAULT_OPTIONS = CalibrationOptions()
     yes | --yes -y | Do not ask before the arm moves; for scripts.
     """)
 def calibrate(
-    cell: Path, output: Path, resume: bool = False, options: CalibrationOptions = DEFAULT_OPTIONS,
-    rehearse: bool = False, yes: bool = False, view: bool = False,
+    cell: Path, output: Path, resume: bool = False, skip: list[str] | None = None,
+    options: CalibrationOptions = DEFAULT_OPTIONS, rehearse: bool = False, yes: bool = False,
+    view: bool = False,
     effects_from: list[Path] | None = None, as_json: bool = False,
 ) -> None:  # fmt: skip
     """Plan, measure, fit, measure what is in doubt, validate, correct, and measure the gain."""
@@ -127,6 +129,12 @@ def calibrate(
         raise InputError(
             "nobody can be asked before the arm moves; give --yes, or run it at a terminal"
         )
+    if skip:
+        step = p.next()
+        if not (resume and step.moves):
+            raise InputError("--skip leaves out what --resume would measure; nothing is missing")
+        with CampaignFile.open(step.path) as campaign:
+            RunLog(campaign).skip(skip)
     if not (rehearse or output.exists()):
         drivers_of(config)  # refuses a cell without them before anything is planned
     with go_on.explained(p), ExitStack() as stack:
@@ -285,7 +293,8 @@ class CalibrationOperator:
             for a in answers:
                 name = "no answer" if a.report is None else a.report.name
                 self.t.show(f"{a.device}: {name}, {'; '.join(a.problems) or 'ready'}")
-            refuse_unready(answers)
+            # a tracker that has lost its target searches for it before the first motion
+            refuse_unready(tuple(a for a in answers if a.device != "tracker" or a.report is None))
             self.ready = True
         if not self.yes and person_present(self.t):
             warning = "The simulated arm will move." if self.rehearse else "The arm will move."

@@ -150,6 +150,9 @@ def compensate(
     t.show(waypoints_table(outcomes))
     hint = "Nothing is written; -o F.csv, F.json or F.script keeps the joint values."
     t.show(f"\nWritten: {', '.join(written)}." if written else f"\n{hint}")
+    for path in files if task.program is None and task.foreign is None else ():
+        if path.suffix in PROGRAMS:
+            t.notice(f"note: {path}: {urscript.UNCHECKED}")
     t.document({**document, "written": written})
 
 

@@ -5,7 +5,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -46,7 +46,7 @@ from hilcal.errors import (
 from hilcal.identification.noise.full_covariance import full_readings
 from hilcal.identification.noise.noise_estimate import NOISE_KEY, measured_noise
 from hilcal.measuring import connect
-from hilcal.measuring.devices import Clock
+from hilcal.measuring.devices import Clock, TargetLostError
 from hilcal.measuring.route import dry_run
 from hilcal.measuring.run import HOW_ON
 from hilcal.measuring.run import run as run_plan
@@ -73,6 +73,7 @@ from hilcal.whole_file import replace_file
 @command("""
     output | -o --output RUN.hilcal | The campaign file.
     resume | --resume | Go on with what is missing in RUN.hilcal.
+    skip | --skip POSE | With --resume: leave out a pose that cannot be measured; repeatable.
     append | --append | Measure a further plan into RUN.hilcal, see hilcal next.
     rehearse | --rehearse | On simulated devices, started for this run.
     until | --until GOAL | End as soon as a goal is met, e.g. "joint std < 2 %" or "deflection std <
@@ -82,14 +83,17 @@ from hilcal.whole_file import replace_file
     """)
 def run(
     cell: Path, output: Path, plan: Path | None = None, resume: bool = False, append: bool = False,
-    rehearse: bool = False, until: str | None = None, yes: bool = False, view: bool = False,
-    effects_from: list[Path] | None = None, as_json: bool = False,
+    skip: list[str] | None = None, rehearse: bool = False, until: str | None = None,
+    yes: bool = False, view: bool = False, effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:  # fmt: skip
     """Measure a campaign: every step of the plan, each reading stored before the next motion."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     config, numbers = read_cell(cell)
     goal = None if until is None else GoalRule(until, numbers, config, catalogue)
     base_dir = cell.absolute().parent
+    if skip and not resume:
+        raise InputError("--skip leaves out what is missing of a campaign; give it with --resume")
     if rehearse:  # refuses an effect that cannot be hidden before anything is planned
         program_config(config, config.simulation.hide or NO_EFFECT, catalogue)
     elif plan is None and not resume:
@@ -127,6 +131,8 @@ def run(
                 config = stack.enter_context(simulated_cell(secret, seed, base_dir)).config
         else:
             connect.drivers_of(config)  # before a campaign is begun
+        if skip:
+            RunLog(campaign).skip(skip)
         if further is not None:
             RunLog(campaign).append(further)
         elif not resume:
@@ -250,17 +256,27 @@ def estimate_noise(t: Terminal, config: CellConfig, cell: Cell, campaign: Campai
         log.event(NOISE_KEY, {"factors": None})
 
 
+IN_SIGHT = "where the arm hides the target, drive it by hand to where the tracker sees it"
+
+
 def _sighted(
     rig: connect.Rig, answer: connect.ConnectionResult, say: Say
 ) -> connect.ConnectionResult:
     """Let a tracker that has lost its target search for it; the arm does not move."""
     if answer.device != "tracker" or not answer.problems:
         return answer
-    say(f"tracker: {answer.problems[0]}; searching")
-    with suppress(DeviceError):  # the tracker's report decides
+    say(f"{answer.problems[0]}; searching")
+    try:
         rig.tracker.find_target()
         return replace(answer, report=rig.tracker.report())
-    return answer
+    except TargetLostError:
+        if answer.report is None:
+            return answer
+        *others, last = answer.report.problems
+        advice = f"{last}; {IN_SIGHT}"
+        return replace(answer, report=replace(answer.report, problems=(*others, advice)))
+    except DeviceError:  # the tracker's report decides
+        return answer
 
 
 @contextmanager

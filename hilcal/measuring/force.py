@@ -235,7 +235,8 @@ def _measured_text(e: Floats, f: Floats, limit: float, unit: str, gravity: Float
     kilograms = f"about {along / g**2:.1f} kg"
     if expected_size == 0.0:
         return f"{kilograms} still hangs" if is_weight else "something still pulls"
-    if is_weight and _mass(e, gravity) is not None:
+    sideways = float(np.sqrt(max(measured_size**2 - (along / g) ** 2, 0.0))) if g > 0.0 else 0.0
+    if is_weight and _mass(e, gravity) is not None and sideways <= limit:
         return f"that is {kilograms}"
     angle = np.degrees(np.arccos(np.clip(e @ f / (expected_size * measured_size), -1.0, 1.0)))
     return (

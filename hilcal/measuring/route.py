@@ -31,11 +31,6 @@ class Stop:
     step: Step | None = None  # the reading at the stop; None without
 
 
-def home(plan: Plan) -> str:
-    """Return the pose where loads are changed: "reference", or else the first pose."""
-    return REFERENCE if REFERENCE in plan.pose_names else plan.pose_names[0]
-
-
 def beside(q: Floats, arm: Arm, margin: float) -> Floats:
     """Return (n,) the stop before a reference pose, `margin` from the limits, rad."""
     side = np.where(q - APPROACH_RAD >= arm.q_min + margin, 1.0, -1.0)
@@ -49,7 +44,7 @@ def route(plan: Plan, arm: Arm, margin: float = 0.0) -> tuple[Stop, ...]:
     sides of all readings are known. Loads are changed at the reference pose. A repeated reading is
     approached anew.
     """
-    base = home(plan)
+    base = plan.home
     q_home = plan.joints(base)
     first = Stop(f"beside {base}", beside(q_home, arm, margin), UNLOADED)
     stops = [first, Stop(base, q_home, UNLOADED)]
@@ -197,7 +192,7 @@ def _remarks(plan: Plan, limits: Feasibility) -> list[str]:
         )
     if REFERENCE not in plan.pose_names:
         out.append(
-            f'no pose has the name "{REFERENCE}": loads are changed at {home(plan)}, and drift '
+            f'no pose has the name "{REFERENCE}": loads are changed at {plan.home}, and drift '
             "is not checked"
         )
     if limits.config.sight.target_normal is not None and limits.sight is None:
@@ -224,7 +219,7 @@ def way_home(
     straight motion is. The reading is the plan's next return to the reference pose. `visited` are
     the stops of this session; the arm stands at the last one.
     """
-    base = home(plan)
+    base = plan.home
     q_home, last = plan.joints(base), visited[-1]
     hanging = last.hanging if last.change_to is None else last.change_to
     destination = Stop(base, q_home, hanging, change_to=None if hanging == UNLOADED else UNLOADED)

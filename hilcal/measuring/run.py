@@ -4,6 +4,7 @@ Nothing moves without a checked plan, every reading is stored before the next mo
 failure stops the arm before anything else.
 """
 
+import shlex
 import time
 import traceback
 from collections.abc import Callable
@@ -50,13 +51,16 @@ from hilcal.measuring.session_state import (
     stored_wrench,
 )
 from hilcal.readings.readings import Readings, States
-from hilcal.store.plan import UNLOADED, Plan, Step
+from hilcal.store.plan import REFERENCE, SEEN, UNLOADED, Plan, Step
 from hilcal.store.run_log import RunLog
 from hilcal.types import Floats
 
 HOW_ON = "The campaign is safe: run again with --resume"
 EMERGENCY = "press the emergency stop"
 _STOPS = 3
+MOVED_M = 1e-3
+"""Distance of the target at the reference pose from where earlier readings have it that a person is
+asked about, m; an arm returns by less, also as it warms up. A choice."""
 Done = TypeVar("Done")
 LiveModel = Callable[[Readings], LiveResidual]
 """Returns the residual of the last reading by a model fitted to the previous ones."""
@@ -86,6 +90,7 @@ class Session:
         self._plan, self._store, self._live, self._wall = plan, store, live, wall
         self._rule = goal
         self._goal: GoalStatus | None = None
+        self.pose: str | None = None  # of the reading that is under way
         self._meter: ForceMeter | None = None
         if rig.force is not None and config.force_sensor is not None:
             window = setup.clock.real(config.acquire.force_window_s)
@@ -104,7 +109,7 @@ class Session:
         start = wall()
         self._epoch = start if epoch is None else epoch
         self._start = setup.clock.now()
-        self._elapsed = (start - self._epoch) * setup.clock.scale
+        self._elapsed = max(start - self._epoch, 0.0) * setup.clock.scale
         self._remember()
 
     def _remember(self) -> None:
@@ -166,6 +171,8 @@ class Session:
         return status.met
 
     def _visit(self, stop: Stop) -> tuple[Readings, float] | None:
+        step = stop.step
+        self.pose = None if step is None or step.pose == self._plan.home else step.pose
         self._move(stop)
         change = None if stop.change_to == self._hook.hanging else stop.change_to
         if change is not None:
@@ -214,11 +221,12 @@ class Session:
         self._rig.arm.take_control(*payload(self._cell, None))
         self._watched(self._zero)
         registration = RoughRegistration(self._cell)  # of this session: the tracker may have moved
-        positions = []
+        positions: list[tuple[Floats, Floats]] = []
         for stop in start:
             self._watched(partial(self._move, stop))
             with suppress(TargetLostError):  # a reading will search it
                 positions.append((stop.q, self._rig.tracker.measure().value[:3]))
+                self._compare_place(stop, positions[-1][1])
         for position in positions:
             if (wrong := registration.implausible(*position)) is not None:
                 raise DeviceError(wrong)
@@ -226,6 +234,24 @@ class Session:
         for position in positions:
             self._state.registration.add(*position)
         self._watched(self._tare)
+
+    def _compare_place(self, stop: Stop, position: Floats) -> None:
+        """Ask a person if the target at the reference pose is not where it was before."""
+        before = self._state.reference
+        if before is None:
+            before = self._plan.about.get(SEEN)
+        if before is None or stop.name != REFERENCE or self._cell.targets is not None:
+            return
+        moved = float(np.linalg.norm(position - np.asarray(before)))
+        if moved > MOVED_M:
+            reason = (
+                f"the target at the reference pose is {1e3 * moved:.3g} mm from where it was before"
+            )
+            self._event("moved", {"reason": reason, "moved_m": moved})
+            self._hook.confirm(
+                f"{reason}. If the tracker or the target has been moved, readings before and after "
+                "do not belong together: put it back, or give up and begin a new campaign"
+            )
 
     def _move(self, stop: Stop) -> None:
         if not self._mover.is_at(stop.q):
@@ -502,8 +528,9 @@ def run(
     """Measure the missing steps of a plan, until the goal is met.
 
     Every reading is stored before the next motion. After any exception, a keyboard interrupt
-    included, the arm is stopped before anything else. The rig stays open. `live` compares each
-    reading with a model. Once the `goal` is met, the arm moves home, the load is taken off, and the
+    included, the arm is stopped before anything else. The rig stays open. What has been measured
+    already is not checked again: limits may have been narrowed since. `live` compares each reading
+    with a model. Once the `goal` is met, the arm moves home, the load is taken off, and the
     other steps are not measured. `wall` is the time of day, s, which continues the campaign's time
     after a pause; it counts from `epoch`, by default the start of the first session.
 
@@ -512,13 +539,13 @@ def run(
         DeviceError: a device failed, a limit was exceeded, a person gave up.
         KeyboardInterrupt: unchanged; the arm stands.
     """
-    full = _safe(dry_run(cell, config, plan))
-    missing = plan.without(store.done())
+    done = store.done()
+    missing = plan.without(done)
     if not missing.steps:
         watcher.notify(Phase("nothing is missing"))
         return
-    _safe(dry_run(cell, config, missing))  # its route differs
-    for text in full.remarks:
+    _refuse_unsafe(dry_run(cell, config, missing), bool(done))
+    for text in dry_run(cell, config, plan).remarks:
         watcher.notify(Remark(text))
     setup = Setup(rig, cell, config, clock, watcher)
     session = Session(setup, plan, store, live, wall, goal, epoch)
@@ -526,15 +553,18 @@ def run(
         session.visit(route(missing, cell.arm, config.limits.joint_margin_rad))
     except BaseException as error:
         trouble = _stop(rig.arm) if session.in_control else ""
-        _note(store, error, trouble)
-        _raise(error, trouble)
+        again = session.pose is not None and _failed_at(store) == session.pose
+        _note(store, error, trouble, session.pose)
+        _raise(error, trouble, session.pose if again else None)
 
 
-def _safe(checked: DryRun) -> DryRun:
+def _refuse_unsafe(checked: DryRun, begun: bool) -> None:
     """Refuse a plan with problems: InputError names the first, and how many more there are."""
     if checked.problems:
-        raise InputError(f"the plan is not safe to run, nothing has moved: {checked.first_problem}")
-    return checked
+        advice = "; --skip POSE leaves a pose out" if begun else ""
+        raise InputError(
+            f"the plan is not safe to run, nothing has moved: {checked.first_problem}{advice}"
+        )
 
 
 def _stop(arm: ArmDevice) -> str:
@@ -550,9 +580,16 @@ def _stop(arm: ArmDevice) -> str:
     return "interrupted"
 
 
-def _note(store: RunLog, error: BaseException, trouble: str) -> None:
-    """Store why the session ended, if possible."""
-    content: dict[str, Any] = {"wall_s": time.time(), "reason": _line(error)}
+def _failed_at(store: RunLog) -> str | None:
+    """Return the pose at which the last session that failed did so; None where unknown."""
+    with suppress(Exception):  # the error that ends this session is raised
+        return (store.last("failed") or {}).get("pose")
+    return None
+
+
+def _note(store: RunLog, error: BaseException, trouble: str, pose: str | None) -> None:
+    """Store why the session ended, and at which pose, if possible."""
+    content: dict[str, Any] = {"wall_s": time.time(), "reason": _line(error), "pose": pose}
     if trouble:
         content["arm_not_stopped"] = trouble
     if not isinstance(error, HilcalError | KeyboardInterrupt):
@@ -564,7 +601,8 @@ def _note(store: RunLog, error: BaseException, trouble: str) -> None:
         return
 
 
-def _raise(error: BaseException, trouble: str) -> None:
+def _raise(error: BaseException, trouble: str, again: str | None) -> None:
+    """Raise the error with advice; `again`: the pose where an earlier session failed, too."""
     if not isinstance(error, Exception) and not trouble:
         raise error
     sentences = [_line(error)]
@@ -572,6 +610,9 @@ def _raise(error: BaseException, trouble: str) -> None:
         sentences = [f"unexpected {sentences[0]} (its details are in the campaign)"]
     if trouble and EMERGENCY not in sentences[0]:
         sentences.append(f"THE ARM MAY STILL MOVE ({trouble}): {EMERGENCY}")
+    elif again is not None and isinstance(error, Exception):
+        skip = shlex.join(["--skip", again])
+        sentences.append(f"It failed at {again} before, too: {skip} goes on without that pose")
     ended = [x if x.endswith(("?", "!")) else f"{x}." for x in sentences]
     kind = type(error) if isinstance(error, HilcalError) and not trouble else DeviceError
     raise kind(" ".join([*ended, HOW_ON])) from error

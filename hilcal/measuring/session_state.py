@@ -245,6 +245,11 @@ class SessionState:
         square = float(d @ np.linalg.solve(instrument + scatter + self._reference[1], d))
         return Shift(d, float(np.sqrt(max(square, 0.0))))
 
+    @property
+    def reference(self) -> Floats | None:
+        """(3,) first position at the reference pose, sensor axes, m; None without one."""
+        return None if self._reference is None else self._reference[0]
+
     def deflection(self, step: Step, position: Floats, target: int = 0) -> float | None:
         """Return the distance of a loaded reading from its unloaded one, m; None without one."""
         unloaded = self._unloaded.get((step.pose, step.cycle, target))

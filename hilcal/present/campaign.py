@@ -34,7 +34,7 @@ begin with.
 """
 MARKS = {"ok": "✓", "warning": "!", "problem": "✗"}
 WIDEST, LISTED = 34, 12  # most characters of a table cell; most unused columns that are listed
-LISTED_EVENTS = ("start", "load", "doubted", "goal", "interrupted", "failed", "finished")
+LISTED_EVENTS = ("start", "load", "moved", "doubted", "goal", "interrupted", "failed", "finished")
 """Kinds of events that are always listed; drift is listed only above its limit."""
 MOST_EVENTS = 30
 NONE, UNSEEN = "–", "not determined"

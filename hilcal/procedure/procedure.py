@@ -48,7 +48,7 @@ from hilcal.readings.whitening import usual_mode
 from hilcal.refinement import Refinement, refine
 from hilcal.refinement import RefinementStep as RefinementStep
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import Plan, read_plan
+from hilcal.store.plan import REFERENCE, SEEN, Plan, read_plan
 from hilcal.store.procedure_log import (
     CALIBRATION,
     CORRECTED,
@@ -312,7 +312,7 @@ class Procedure:
             calibration, record = self._calibration(o)
             first, last = (self._readings(o, record, file) for file in (unseen, moved))
             uncorrected, corrected = paired(first, last, calibration.mode)
-            left_out = left_out_of(read_plan(moved.about(PLAN) or "", f"{moved.path}, its plan"))
+            left_out = left_out_of(RunLog(moved).plans[-1])
             p = o.predictive(record, *o.restore_model(record))
             gain = improvement(calibration, p, uncorrected, corrected, uncorrected.states, left_out)
             log = ProcedureLog(o.file)
@@ -354,7 +354,11 @@ class Procedure:
     def _create(self, path: Path, purpose: str, plan: Plan, o: Campaign) -> None:
         covers = o.file.about(COVERS_KEY) or INSTRUMENT
         texts = {PURPOSE: purpose, CALIBRATION: state.identity(self.run), COVERS_KEY: covers}
-        config = CellConfig.from_json(o.file.config_json)
+        config, readings = CellConfig.from_json(o.file.config_json), o.file.readings()
+        at_reference = np.array(readings.pose_names)[readings.pose] == REFERENCE
+        if (at_reference & readings.unloaded).any():
+            seen = readings.value[at_reference & readings.unloaded][-1, :3]
+            plan = replace(plan, about={**plan.about, SEEN: seen.tolist()})
         source = self._source(f"{purpose} campaign of {self.run.name}, ")
         create_run(path, config, self.base_dir, plan, source=source, more_texts=texts).close()
 

@@ -26,7 +26,7 @@ from hilcal.procedure.state import Settings
 from hilcal.readings.readings import Readings, States
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
-from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
+from hilcal.store.plan import LEFT_OUT, REFERENCE, UNLOADED, Plan, Step
 from hilcal.types import Bools, Floats, Ints
 
 DRAWS_PER_POSE = 4
@@ -162,9 +162,6 @@ def _far(calibration: Calibration, states: States, wrench: Floats) -> Bools:
     for o in prediction.outside:
         far |= o.points & ("temperature" not in o.range.variable)
     return far
-
-
-LEFT_OUT = "left_out"  # Key in a plan's file: the omitted points, with reasons
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,10 @@ VERSION = 1
 UNLOADED = "none"
 REFERENCE = "reference"
 """The pose of drift checks and load changes."""
+SEEN = "reference_seen_m"
+"""Key of `Plan.about`: where the unloaded target was seen at the reference pose, sensor axes, m."""
+LEFT_OUT = "left_out"
+"""Key of `Plan.about`: points that are not measured, each with the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +62,11 @@ class Plan(Brief):
         """Names of the loads in the order of their first use, "none" included."""
         return tuple(dict.fromkeys(step.load for step in self.steps))
 
+    @property
+    def home(self) -> str:
+        """The pose where loads are changed: "reference", or else the first pose."""
+        return REFERENCE if REFERENCE in self.pose_names else self.pose_names[0]
+
     def without(self, done: frozenset[Step]) -> "Plan":
         """Return the plan without the steps in `done`."""
         return replace(self, steps=tuple(step for step in self.steps if step not in done))
@@ -68,6 +78,40 @@ class Plan(Brief):
         steps = [asdict(step) for step in self.steps]
         head = {"format": FORMAT, "version": VERSION}
         return json.dumps({**head, **self.about, "poses": poses, "steps": steps}, indent=1)
+
+    def skipping(self, poses: Sequence[str], done: frozenset[Step], cycle: int) -> "Plan":
+        """Return what is missing besides `done`, without some poses; `about` lists these.
+
+        Across a gap the arm moves by the pose where loads are changed, and reads it, as the planner
+        has it where a straight motion is not known to be clear. `cycle` is new in the campaign.
+        """
+        missing, home = self.without(done).steps, self.home
+        valid = list(dict.fromkeys(s.pose for s in missing if s.pose != home))
+        for pose in poses:
+            if pose not in valid:
+                why = "loads are changed there" if pose == home else "nothing is missing there"
+                raise InputError(
+                    f"pose {pose!r} cannot be left out: {why}{suggest(pose, valid)}; valid: "
+                    f"{', '.join(valid) or 'none'}"
+                )
+        cycles, gap = itertools.count(cycle), False
+        steps: list[Step] = []
+        for step in missing:
+            if step.pose in poses:
+                gap = True
+                continue
+            last = steps[-1] if steps else None
+            if gap and last and last.load == step.load and home not in (last.pose, step.pose):
+                steps.append(Step(home, step.load, next(cycles)))
+            steps.append(step)
+            gap = False
+        steps = steps or [Step(home, UNLOADED, cycle)]
+        left_out = [{"point": p, "why": "left out by the operator"} for p in dict.fromkeys(poses)]
+        about = {**self.about, LEFT_OUT: [*self.about.get(LEFT_OUT, []), *left_out]}
+        if isinstance(durations := self.about.get("duration_s"), dict):
+            share = len(steps) / len(self.steps)
+            about["duration_s"] = {"total": share * float(durations.get("total", 0.0))}
+        return replace(self, steps=tuple(steps), about=about)
 
 
 @limits.bounded

@@ -119,6 +119,11 @@ class RunLog:
         with self._campaign.transaction():
             self.insert(plan)
 
+    def skip(self, poses: Sequence[str]) -> None:
+        """Append what is missing without some poses, see `Plan.skipping`, as a further plan."""
+        cycle = 1 + max(step.cycle for step in self.plan.steps)
+        self.append(self.plans[-1].skipping(poses, self.done(), cycle))
+
     def insert(self, plan: Plan) -> None:
         """Append a further plan within the caller's transaction."""
         key = FURTHER_PLAN.format(len(self.plans) + 1)

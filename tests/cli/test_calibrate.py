@@ -79,6 +79,9 @@ def test_the_plain_command_says_what_is_there(there, capsys):
     line = refused(capsys, 2, "calibrate", path.with_name("cell.toml"), "-o", path, "--yes")
     assert "a calibration is there already, it is complete; go on with: hilcal calibrate" in line
     assert line.endswith("--resume --yes")
+    again = ("calibrate", path.with_name("cell.toml"), "-o", path, "--yes", "--resume")
+    told = run(capsys, *again, "--skip", "v1")
+    assert (told.code, "nothing is missing" in told.err) == (2, True)
 
 
 def test_a_complete_one_is_told_again(there, capsys):

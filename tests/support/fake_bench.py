@@ -187,8 +187,8 @@ class MemoryStore:
     def kinds(self) -> list[str]:
         return [kind for kind, _ in self.events]
 
-    def last(self, kind: str) -> dict[str, Any]:
-        return next(content for k, content in reversed(self.events) if k == kind)
+    def last(self, kind: str) -> Any:
+        return next((content for k, content in reversed(self.events) if k == kind), None)
 
 
 @dataclass

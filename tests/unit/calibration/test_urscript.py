@@ -193,6 +193,7 @@ def test_a_name_of_a_point_is_no_line_of_the_program():
     name = "P1\n movej([0,0,0,0,0,0], a=10, v=3)\n #\r\x85\u2028\x0b\x0c\x1e"
     text = movej_program([name, "b"], np.zeros((2, 6)))
     assert len(text.splitlines()) == 4
+    assert "not checked" in text.splitlines()[0]
     assert len(waypoints(text)) == 2
     assert "# P1\\u000a movej(" in text
 

@@ -59,6 +59,28 @@ def test_a_step_is_never_there_twice_and_its_refusal_leaves_no_reading(tmp_path)
         assert campaign.n_readings == 1
 
 
+def test_what_is_missing_goes_on_without_a_pose_that_is_skipped(tmp_path):
+    path = tmp_path / "run.hilcal"
+    with _campaign(path) as campaign:
+        log = RunLog(campaign)
+        log.record(_reading(STEPS[0]), STEPS[0], {})
+        log.record(_reading(STEPS[2]), STEPS[2], {})  # p2 without its load
+        log.skip(["p2"])
+    with CampaignFile.open(path) as campaign:
+        log = RunLog(campaign)
+        # loads are changed at p1, where no pose is the reference
+        assert log.plan.without(log.done()).steps == (STEPS[1], *STEPS[4:])
+        assert {STEPS[0], STEPS[2]} < set(log.plan.steps)
+        assert np.array_equal(log.plan.joints("p2"), MADE.joints("p2"))
+        assert log.plan.about["left_out"] == [{"point": "p2", "why": "left out by the operator"}]
+        assert log.plan.about["seed"] == 3
+        assert "p2" in refusal("valid: p3$", log.skip, ["p2"])
+        log.record(_reading(STEPS[1]), STEPS[1], {})
+        log.skip(["p3"])  # nothing is left to be measured: the arm goes home and reads
+        assert log.plan.without(log.done()).steps == (Step("p1", "none", 1),)
+        assert [x["point"] for x in log.plan.about["left_out"]] == ["p2", "p3"]
+
+
 def test_a_table_cannot_be_resumed(tmp_path):
     made = CampaignFile.create(tmp_path / "run.hilcal", "{}", ".", "a table")
     with made as campaign, pytest.raises(InputError, match="cannot be resumed"):

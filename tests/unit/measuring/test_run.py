@@ -349,6 +349,12 @@ def test_time_never_goes_back_whatever_the_clock_on_the_wall_does(b):
     assert np.all(np.diff(readings.states.time) > 0)
 
 
+def test_a_clock_set_back_since_the_epoch_makes_no_time_before_it(b):
+    plan = plan_of(("reference", "none", 0), ("p1", "none", 0))
+    readings = b.measure(plan, wall=lambda: 1000.0 + b.world.time, epoch=5000.0)
+    assert np.all(readings.states.time > 0)
+
+
 @pytest.mark.long
 def test_a_load_that_still_hangs_at_a_resume_is_noticed(b):
     b.interrupt(7)

@@ -399,6 +399,43 @@ def test_a_target_that_stays_lost_ends_the_run(b, lost):
     assert b.world.calls[-2] == "arm.stop"
 
 
+def test_a_pose_that_fails_twice_is_named_and_can_be_left_out(b):
+    def hidden():
+        if np.allclose(b.world.joints(), POSES["p2"]):
+            b.world.unseen_measurements, b.world.not_found = 1000, 1000
+
+    call_before(b.rig.tracker, "measure", hidden)
+    for again in (False, True, True):
+        said = refusal_of(DeviceError, r"line of sight.*--resume$", b.measure)
+        assert ("It failed at p2 before, too: --skip p2 goes on" in said) == again
+        b.world.restart()
+        b.world.unseen_measurements = b.world.not_found = 0
+    assert [s.pose for s, _, _ in b.store.rows] == ["reference", "p1"]
+    plan = usual_plan()
+    for pose, why in (("reference", "loads are changed there"), ("p1", "nothing is missing there")):
+        bare = replace(plan, steps=tuple(s for s in plan.steps if s.load == "none"))
+        refusal(f"{pose!r} cannot be left out: {why}", bare.skipping, [pose], b.store.done(), 3)
+    b.measure(plan.skipping(["p2"], b.store.done(), 3))
+    steps = [s for s, _, _ in b.store.rows]
+    assert {s for s in plan.steps if s.pose != "p2"} < set(steps)
+    # across the gap between p1 and p3 the arm moves by the reference
+    assert [s for s in steps if s not in plan.steps] == [
+        Step("reference", load, cycle) for cycle, load in enumerate(("3kg", "pull"), start=3)
+    ]
+    assert steps[2] == Step("p3", "none", 0)  # from the reference, where the session begins
+
+
+def test_limits_that_were_narrowed_meanwhile_do_not_lock_a_campaign(b):
+    b.interrupt(stored=4)  # p2, which reaches farthest in y, is measured without a load
+    limits = Limits(workspace_min_m=(-1.2, -1.2, 0.05), workspace_max_m=(1.2, 0.3, 1.5))
+    b.config = b.config.model_copy(update={"limits": limits})
+    done, plan = b.store.done(), usual_plan()
+    refusal("p2.*ends at 0.3 m.*--skip POSE leaves a pose out", b.measure)
+    assert "arm.start_move" not in b.world.calls
+    b.measure(replace(plan, steps=(*done, *plan.skipping(["p2"], done, 3).steps)))
+    assert {s for s in plan.steps if s.pose != "p2"} < b.store.done()
+
+
 def test_another_reflector_is_not_believed(b):
     def other(*_):
         if len(b.store.rows) == 5:

@@ -136,6 +136,23 @@ def test_a_campaign_that_goes_on_says_that_the_arm_stands_elsewhere_and_asks():
         assert len(confirmed(b)) == questions
 
 
+@pytest.mark.parametrize("elsewhere", [False, True])
+@pytest.mark.parametrize(("moved", "asked"), [(3e-4, False), (2e-3, True)])
+def test_a_tracker_that_was_moved_between_sessions_is_asked_about(moved, asked, elsewhere):
+    b = Bench()
+    plan = plan_of(("reference", "none", 0), ("p1", "none", 0), ("reference", "none", 1))
+    b.interrupt(2, plan)
+    if elsewhere:  # the readings of before are in another file, as of a calibration that is tested
+        seen = b.store.readings().value[0, :3].tolist()
+        b.store.rows.clear()
+        plan = replace(plan, about={"reference_seen_m": seen})
+    b.world.shift = np.array([0.0, moved, 0.0])
+    b.measure(plan)
+    questions = [q for q in confirmed(b) if "mm from where it was before" in q]
+    assert len(questions) == asked
+    assert ("moved" in b.store.kinds()) == asked
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

@@ -189,6 +189,8 @@ def test_a_load_is_right_within_newtons_or_its_share(size, share, off):
     assert "\n" not in text
 
 
+SIN, COS = np.sin(np.radians(14.0)), np.cos(np.radians(14.0))
+ASLANT = np.linalg.norm(WEIGHT[:3]) * np.array([SIN, 0.0, -COS, 0.0, 0.0, 0.0])
 MOMENT = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 10.0])
 OFF = np.array([1.0, -1.0, 1.0, 5.0, -3.0, 1.0])
 UNSURE = "asked for 10 kg (98.1 N), felt 98.1 N ± 6.0 N: too uncertain to tell"
@@ -200,6 +202,10 @@ UNSURE = "asked for 10 kg (98.1 N), felt 98.1 N ± 6.0 N: too uncertain to tell"
         (WEIGHT, WEIGHT + OFF, 0.1, True, "asked for 10 kg (98.1 N), felt 97.1 N"),
         (0 * WEIGHT, np.full(6, 0.5), 0.1, True, "asked for nothing, felt 0.9 N"),
         (WEIGHT, WEIGHT / 2, 0.1, False, "asked for 10 kg (98.1 N), felt 49.0 N: that is about 5"),
+        (
+            WEIGHT, ASLANT, 0.1, False,  # a sensor that is mounted otherwise than described
+            "asked for 10 kg (98.1 N), felt 98.1 N: that is 100 % of it, 14° off its direction",
+        ),
         (WEIGHT, 0.01 * WEIGHT, 0.1, False, "asked for 10 kg (98.1 N), felt 1.0 N: that is"),
         (0 * WEIGHT, WEIGHT / 2, 0.1, False, "asked for nothing, felt 49.0 N: about 5.0 kg still"),
         (0 * WEIGHT, PULL, 0.1, False, "asked for nothing, felt 50.0 N: something still pulls"),

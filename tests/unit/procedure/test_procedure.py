@@ -53,13 +53,16 @@ def done(tmp_path_factory):
 def test_it_goes_on_after_any_stop(done):
     d, _ = done
     assert list(dict.fromkeys(d.kinds)) == ALL
-    files = d.procedure.files
+    files, places = d.procedure.files, []
     for path in (files.run, files.validation, files.corrected):
         with CampaignFile.open(path) as campaign:
             log = RunLog(campaign)
             steps = log.plans[-1].steps
             assert len(log.details()) == campaign.n_readings == len(steps)
             assert log.done() == frozenset(steps)
+            if places:  # the tracker has to see the target where it did before
+                assert np.allclose(log.plans[-1].about["reference_seen_m"], places[-1], atol=1e-3)
+            places.append(campaign.readings().value[0, :3])
 
 
 def test_it_is_of_as_many_poses_as_asked_for_under_every_load(done):
@@ -71,6 +74,30 @@ def test_it_is_of_as_many_poses_as_asked_for_under_every_load(done):
     assert loads == {"none", *(load.name for load in d.procedure.config.loads)}
     for load in ("none", "pull x"):  # which every pose of this plan bears
         assert [s.load for s in steps if not s.cycle].count(load) == d.procedure.settings.poses
+
+
+def test_a_pose_that_cannot_be_measured_does_not_lock_it(tmp_path):
+    d = drawn_calibration(tmp_path / "run.hilcal", validation=6)
+    skipped, files = [], d.procedure.files
+    while (step := d.procedure.next()).kind != "done":
+        if step.moves and step.path not in [path for path, _ in skipped]:
+            d.dies_after = step.missing // 2
+            with pytest.raises(KilledError):
+                d.do(step)
+            d.dies_after = None
+            with CampaignFile.open(step.path) as campaign:
+                log = RunLog(campaign)
+                missing = [s.pose for s in log.plan.without(log.done()).steps]
+                pose = next(name for name in missing if name != REFERENCE)
+                log.skip([pose])
+            skipped.append((step.path, pose))
+        else:
+            found = d.do(step)
+    assert [path for path, _ in skipped] == [files.run, files.validation, files.corrected]
+    (_, validated), (_, corrected) = skipped[1:]
+    assert found.everything.count == 4
+    assert corrected in dict(found.left_out)
+    assert validated not in corrected
 
 
 def test_the_error_falls_as_far_as_predicted(done):
