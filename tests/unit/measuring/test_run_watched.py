@@ -70,7 +70,7 @@ def test_an_arm_jogged_into_a_blocked_place_during_a_question_is_not_moved(b, lo
 
 def test_an_arm_jogged_to_a_free_place_is_asked_for_and_the_way_checked_from_there(b):
     jogged(b, "none", FREE)
-    b.measure()
+    b.measure(SHORT)
     (asked,) = confirmed(b)
     assert "shoulder_pan is 0.5 rad off" in asked
     assert b.world.calls.index("operator.confirm") < b.world.calls.index("arm.take_control")
