@@ -55,14 +55,15 @@ def pytest_configure() -> None:
 
 
 FIRST = (
-    "test_stops", "test_run_watched", "test_fault_matrix_serial", "test_fault_matrix_arm",
-    "test_fault_matrix_person", "test_network_cell", "test_ur_driver_parts",
-    "test_effect_jacobian", "test_force_drivers", "test_next_cli", "test_ur_driver_faults",
-    "test_workbench_page", "test_library", "test_planner", "test_diagnose", "test_simulated_cell",
-    "test_geocom_driver", "test_evidence", "test_devices", "test_operator", "test_user_effects",
-    "test_cli", "test_report_page", "test_procedure", "test_demo", "test_p_values",
-    "test_study_plans", "test_docs", "test_missing_library", "test_run_until",
-    "test_plane_contact",
+    "test_stops", "test_fault_matrix_serial", "test_fault_matrix_arm", "test_fault_matrix_person",
+    "test_run", "test_force_drivers", "test_library", "test_effect_jacobian", "test_run_faults",
+    "test_run_watched", "test_ur_driver_faults", "test_ur_driver", "test_devices",
+    "test_gross_errors", "test_diagnose", "test_planner", "test_geocom_driver", "test_next_cli",
+    "test_simulated_cell", "test_workbench_page", "test_arm_scatter", "test_background",
+    "test_stepwise", "test_natnet_driver", "test_misdescription", "test_network_cell",
+    "test_ur_driver_parts", "test_user_effects", "test_evidence", "test_cli", "test_report_page",
+    "test_procedure", "test_demo", "test_p_values", "test_study_plans", "test_docs",
+    "test_run_until", "test_verdict", "test_operator",
 )  # fmt: skip
 """Files that take longest: they begin first, so that none of them is left over at the end."""
 

@@ -9,18 +9,12 @@ import hilcal as hc
 from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.tables.table import write_table
 from studies.gross_errors import spoil
-from tests.support.cli_cases import CELL, ok, refused, rehearsal, table
+from tests.support.cli_cases import CELL, imported, ok, refused, rehearsal
 from tests.support.cli_cases import run as command
 
 
-@pytest.fixture(scope="module")
-def csv(tmp_path_factory):
-    return table(tmp_path_factory.mktemp("bootstrap") / "t.csv", "nothing", poses=12)
-
-
-def test_words_and_document_and_nothing_is_written(csv, capsys):
-    run = csv.with_name("run.hilcal")
-    ok(capsys, "import", csv, "--config", CELL, "-o", run)
+def test_words_and_document_and_nothing_is_written(tmp_path, capsys):
+    run = imported(tmp_path / "run.hilcal", "nothing", poses=12)
     before = run.read_bytes()
     words = ok(capsys, "bootstrap", run, "--draws", "20", "--workers", "1")
     assert "20 times to 12 poses drawn from its 12" in " ".join(words.out.split())
@@ -35,11 +29,8 @@ def test_words_and_document_and_nothing_is_written(csv, capsys):
     assert run.read_bytes() == before
 
 
-def test_what_it_refuses(csv, capsys):
-    few = csv.with_name("few.hilcal")
-    lines = csv.read_text().splitlines(keepends=True)
-    csv.with_name("few.csv").write_text("".join(lines[: 1 + 5 * (len(lines) - 1) // 12]))
-    ok(capsys, "import", csv.with_name("few.csv"), "--config", CELL, "-o", few)
+def test_what_it_refuses(tmp_path, capsys):
+    few = imported(tmp_path / "few.hilcal", "nothing", poses=5)
     said = refused(capsys, 2, "bootstrap", few, "--draws", "3")
     assert "draws 3, seed 0; valid: at least 20 draws" in said
     ended = command(capsys, "bootstrap", few, "--workers", "1")
@@ -48,9 +39,8 @@ def test_what_it_refuses(csv, capsys):
 
 
 def test_the_next_campaign_starts_from_what_the_last_one_taught(tmp_path, capsys):
-    old, new = tmp_path / "old.hilcal", tmp_path / "new.hilcal"
-    ok(capsys, "import", table(tmp_path / "a.csv", "nothing", 1, 12), "--config", CELL, "-o", old)
-    ok(capsys, "import", table(tmp_path / "b.csv", "nothing", 2, 6), "--config", CELL, "-o", new)
+    old = imported(tmp_path / "old.hilcal", "nothing", 1, 12)
+    new = imported(tmp_path / "new.hilcal", "nothing", 2, 6)
     assert "no revision yet" in refused(capsys, 2, "identify", new, "--prior", old)
     ok(capsys, "identify", old)
     alone = ok(capsys, "identify", new, "--json").document
@@ -68,11 +58,8 @@ def test_the_next_campaign_starts_from_what_the_last_one_taught(tmp_path, capsys
 
 @pytest.mark.long
 def test_a_misfit_that_the_prior_does_not_know_is_told(tmp_path, capsys):
-    old, new = tmp_path / "old.hilcal", tmp_path / "new.hilcal"
-    hidden = table(tmp_path / "b.csv", "joint_tilt_compliance", 1, 8)
-    ok(capsys, "import", table(tmp_path / "a.csv", "nothing", 2, 8), "--config", CELL, "-o", old)
-    ok(capsys, "import", hidden, "--config", CELL, "-o", new)
-    ok(capsys, "identify", old)
+    old = imported(tmp_path / "old.hilcal", "nothing", 2, then=("identify",))
+    new = imported(tmp_path / "new.hilcal", "joint_tilt_compliance")
     out = ok(capsys, "identify", new, "--prior", old).out
     assert "leaves more than the noise; hilcal compare EARLIER LATER" in " ".join(out.split())
     more = "base_frame,joint_compliance,joint_tilt_compliance"
@@ -81,9 +68,7 @@ def test_a_misfit_that_the_prior_does_not_know_is_told(tmp_path, capsys):
 
 
 def test_priors_that_cannot_be_are_refused(tmp_path, capsys):
-    old = tmp_path / "old.hilcal"
-    ok(capsys, "import", table(tmp_path / "a.csv", "nothing", 1, 8), "--config", CELL, "-o", old)
-    ok(capsys, "identify", old)
+    old = imported(tmp_path / "old.hilcal", "nothing", then=("identify",))
     other = tmp_path / "other.json"
     other.write_text("{}")
     for words, said in (
@@ -97,7 +82,7 @@ def test_priors_that_cannot_be_are_refused(tmp_path, capsys):
         assert said in refused(capsys, 2, "identify", old, *words)
 
 
-def imported(readings, folder, capsys):
+def imported_readings(readings, folder, capsys):
     write_table(readings, folder / "t.csv", INSTRUMENT_AND_ARM)
     run = folder / "run.hilcal"
     said = ok(capsys, "import", folder / "t.csv", "--config", CELL, "-o", run).out
@@ -107,7 +92,7 @@ def imported(readings, folder, capsys):
 @pytest.mark.long
 def test_wrong_readings_are_listed_and_the_others_fitted(tmp_path, capsys):
     readings, wrong = spoil(rehearsal("nothing").readings, 0.2, 5e-3, np.random.default_rng(0))
-    run, _ = imported(readings, tmp_path, capsys)
+    run, _ = imported_readings(readings, tmp_path, capsys)
     d = ok(capsys, "refine", run, "--readings", "absolute", "--json").document
     assert d["verdict"] == "adequate"
     d = ok(capsys, "identify", run, "--readings", "absolute", "--json").document
@@ -130,7 +115,7 @@ def test_what_is_set_aside_is_in_no_figure_of_the_fit(tmp_path, capsys):
     for name, r in (("good", readings), ("off", replace(readings, value=value))):
         folder = tmp_path / name
         folder.mkdir()
-        run, _ = imported(r, folder, capsys)
+        run, _ = imported_readings(r, folder, capsys)
         d = ok(capsys, "identify", run, "--readings", "absolute", "--json").document
         with hc.Campaign.open(run, read_only=True) as opened:
             q = opened.readings.states.q[::7] + 0.01
@@ -145,7 +130,7 @@ def test_what_is_set_aside_is_in_no_figure_of_the_fit(tmp_path, capsys):
 
 def test_errors_of_centimetres_are_named_at_import(tmp_path, capsys):
     readings, wrong = spoil(rehearsal("nothing").readings, 0.3, 5e-2, np.random.default_rng(0))
-    run, said = imported(readings, tmp_path, capsys)
+    run, said = imported_readings(readings, tmp_path, capsys)
     assert f"{len(wrong)} of {len(readings)} rows do not fit" in said
     d = ok(capsys, "identify", run, "--readings", "absolute", "--json").document
     assert len(d["outliers"]) == len(wrong)
@@ -156,7 +141,7 @@ def test_a_bumped_tracker_is_said_and_never_adequate(tmp_path, capsys):
     readings = rehearsal("nothing").readings
     value = readings.value.copy()
     value[40:62, :3] += [4e-3, 3e-3, 0.0]
-    run, _ = imported(replace(readings, value=value), tmp_path, capsys)
+    run, _ = imported_readings(replace(readings, value=value), tmp_path, capsys)
     d = ok(capsys, "identify", run, "--readings", "absolute", "--json").document
     assert d["outliers"] == []
     assert any("22 of 70 readings" in n and "by the same shift" in n for n in d["notes"])

@@ -12,7 +12,17 @@ import pytest
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.errors import InputError
 from hilcal.store.campaign_file import CampaignFile
-from tests.support.cli_cases import CELL, ok, refused, rehearsal, run, start, stored_readings, table
+from tests.support.cli_cases import (
+    CELL,
+    imported,
+    ok,
+    refused,
+    rehearsal,
+    run,
+    start,
+    stored_readings,
+    table,
+)
 
 
 @pytest.fixture(scope="module")
@@ -21,10 +31,8 @@ def good(tmp_path_factory):
 
 
 @pytest.fixture
-def campaign(good, tmp_path, capsys):
-    path = tmp_path / "run.hilcal"
-    ok(capsys, "import", good, "--config", CELL, "-o", path)
-    return path
+def campaign(tmp_path):
+    return imported(tmp_path / "run.hilcal", "nothing", poses=6)
 
 
 def rows_of(path):
@@ -158,9 +166,8 @@ def test_a_reader_that_leaves_early_is_no_error(campaign):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
-@pytest.mark.parametrize(
-    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.long
 def test_view_serves_until_it_is_told_to_stop(campaign, number, capsys):
     ok(capsys, "identify", campaign)
     with start("view", campaign, "--port", str(free_port())) as process:

@@ -227,6 +227,7 @@ def test_ctrl_c_at_the_question_and_the_end_of_the_input_are_no(toml):
     assert not (toml.parent / "run.hilcal").exists()
 
 
+@pytest.mark.long
 def test_a_script_is_shown_the_plan_and_goes_on(toml, capsys):
     path = toml.parent / "run.hilcal"
     result = run(capsys, "run", toml, "-o", path, "--json")

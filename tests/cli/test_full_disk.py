@@ -14,7 +14,6 @@ from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.tables.table import write_table
 from tests.support.cli_cases import CELL, ok, rehearsal, run, stored_readings
 from tests.support.paths import ROOT
-from tests.support.rows import first
 
 OLD = "what was there"
 POINTS = "pose,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad\n" + "\n".join(
@@ -61,7 +60,8 @@ COMMANDS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("size", first(1, [0, 200]))
+@pytest.mark.long
+@pytest.mark.parametrize("size", [0, 200])
 def test_a_full_disk_leaves_no_half_file(capsys, fitted, monkeypatch, size):
     monkeypatch.chdir(fitted)
     for command in COMMANDS:
@@ -116,7 +116,8 @@ def test_a_link_stays_and_output_may_be_a_pipe(capsys, fitted, monkeypatch):
     assert Path("none.csv").read_text().startswith("pose,")
 
 
-@pytest.mark.parametrize("redirected", first(1, [False, True]))
+@pytest.mark.long
+@pytest.mark.parametrize("redirected", [False, True])
 def test_standard_output_is_written_straight(fitted, redirected):
     """`--preview -o /dev/stdout` would be no .toml: a link gives the name."""
     link, out = fitted / f"out-{redirected}.toml", fitted / "redirected"

@@ -231,6 +231,7 @@ def whole(pages):
         assert new == lists, width
 
 
+@pytest.mark.long
 def test_the_words_of_a_campaign_stay_whole(readings, home, capsys, pages):
     run = "run.hilcal"
     ok(capsys, "import", readings, "--preview", "--config", CELL)

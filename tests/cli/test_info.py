@@ -13,7 +13,6 @@ import hilcal as hc
 from hilcal.calibration.handover import urdf
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import cell_from_config
-from hilcal.cli import main
 from hilcal.config import load_config
 from hilcal.errors import InputError
 from hilcal.present.html.report import page
@@ -32,7 +31,8 @@ from hilcal.store.plan import Plan, Step
 from hilcal.store.run_log import RunLog, check_same_cell, create_run
 from hilcal.write_report import ReportOptions, content_of
 from tests.support.campaigns import campaign, configuration
-from tests.support.cli_cases import CELL, ok, refused, rehearsal, stored_readings, table
+from tests.support.cli_cases import CELL, done, ok, refused, rehearsal, stored_readings
+from tests.support.cli_cases import imported as campaign_file
 from tests.unit.discovery.test_discover import campaign as simulated
 
 
@@ -40,15 +40,8 @@ from tests.unit.discovery.test_discover import campaign as simulated
 def imported(tmp_path_factory):
     """An imported campaign with two revisions, the second one from the first."""
     run = tmp_path_factory.mktemp("info") / "run.hilcal"
-    csv = table(run.with_name("t.csv"), "hysteresis", poses=8)
-    for command in (
-        ["import", csv, "--config", CELL, "-o", run],
-        ["add", run, "hysteresis"],
-        ["add", run, "load_point", "--revision", "1"],
-    ):
-        with pytest.raises(SystemExit) as ended:
-            main([str(a) for a in command])
-        assert ended.value.code == 0
+    campaign_file(run, then=("add", "hysteresis"))
+    done("add", run, "load_point", "--revision", "1")
     return run
 
 
@@ -57,7 +50,7 @@ def test_an_imported_campaign(imported, capsys):
     d = ok(capsys, "info", imported, "--json").document
     assert (d["n_readings"], d["n_poses"], d["robot"]) == (40, 8, "ur10e")
     assert d["loads"] == dict.fromkeys(["none", "5kg", "10kg", "pull x", "pull y"], 8)
-    assert d["source"] == "t.csv (table)"
+    assert d["source"] == "run.csv (table)"
     assert (d["planned"], d["instruments"], d["events"]) == (None, [], [])
     assert (d["accepted"], d["in_use"]) == (None, 3)
     first, second, third = d["revisions"]

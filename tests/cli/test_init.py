@@ -150,6 +150,7 @@ def test_a_wrong_option_is_one_line_and_writes_nothing(case, tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.long
 def test_a_person_is_asked_and_wrong_answers_are_explained(tmp_path):
     with AtTerminal("init", home=tmp_path) as t:
         for question, answer, reply in (

@@ -30,7 +30,7 @@ from hilcal.store.run_log import RunLog
 from hilcal.workbench.session import WorkbenchSession
 from tests.cli.test_until_goal import site
 from tests.support.campaigns import configuration
-from tests.support.cli_cases import CELL, ok, refused, stored_readings, table
+from tests.support.cli_cases import CELL, imported, ok, refused, stored_readings
 from tests.support.next_cases import SMALL, doubtful
 from tests.unit.data.test_run_log import MADE, STEPS, _campaign, _reading
 from tests.unit.design.test_next import fine_error
@@ -52,7 +52,7 @@ def ambiguous(tmp_path):
 def test_next_in_json_and_in_words(ambiguous, tmp_path, capsys):
     ok(capsys, "identify", ambiguous)
     plan, table = tmp_path / "next.json", tmp_path / "next.csv"
-    arguments = ("--quick", "--poses", "8", "--csv", table, "--json")
+    arguments = ("--quick", "--poses", "4", "--csv", table, "--json")
     result = ok(capsys, "next", ambiguous, "-o", plan, *arguments)
     d = result.document
     assert d["suspects"] == [BASE, TILT]
@@ -70,7 +70,7 @@ def test_next_in_json_and_in_words(ambiguous, tmp_path, capsys):
     assert "ruled out" in result.err  # words are on stderr
 
     again = tmp_path / "again.json"
-    words = ok(capsys, "next", ambiguous, "-o", again, "--quick", "--poses", "8", "--details").out
+    words = ok(capsys, "next", ambiguous, "-o", again, "--quick", "--poses", "4", "--details").out
     assert again.read_bytes() == plan.read_bytes()
     for part in (
         f"In doubt: {BASE} or {TILT}.",
@@ -85,9 +85,8 @@ def test_next_in_json_and_in_words(ambiguous, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_a_prior_makes_the_powers_of_now_larger_and_is_not_stored(ambiguous, tmp_path, capsys):
-    old, plan = tmp_path / "old.hilcal", tmp_path / "next.json"
-    ok(capsys, "import", table(tmp_path / "a.csv", "nothing", 3, 12), "--config", CELL, "-o", old)
-    ok(capsys, "identify", old)
+    plan = tmp_path / "next.json"
+    old = imported(tmp_path / "old.hilcal", "nothing", 3, 12, ("identify",))
     ok(capsys, "identify", ambiguous)
     words = ("--suspects", f"{BASE},{TILT}", "--quick", "--poses", "4", "--json")
     alone, known = (
@@ -99,9 +98,7 @@ def test_a_prior_makes_the_powers_of_now_larger_and_is_not_stored(ambiguous, tmp
 
 
 def test_a_revision_with_a_prior_takes_no_other(ambiguous, tmp_path, capsys):
-    old = tmp_path / "old.hilcal"
-    ok(capsys, "import", table(tmp_path / "a.csv", "nothing", 3, 8), "--config", CELL, "-o", old)
-    ok(capsys, "identify", old)
+    old = imported(tmp_path / "old.hilcal", "nothing", then=("identify",))
     ok(capsys, "identify", ambiguous, "--prior", old)
     said = refused(capsys, 2, "next", ambiguous, "-o", tmp_path / "p.json", "--prior", old)
     assert "has a prior already, old.hilcal" in said

@@ -1,6 +1,5 @@
 """Every message that names a next step names one that works: it is taken as it stands."""
 
-import ast
 import html
 import json
 import re
@@ -10,12 +9,10 @@ from dataclasses import replace
 import pytest
 
 import hilcal as hc
-from hilcal.cli.commands import COMMANDS
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.store.campaign_file import CampaignFile
-from tests.support.cli_cases import CELL, ok, refused, table
+from tests.support.cli_cases import CELL, imported, ok, refused
 from tests.support.cli_cases import run as command
-from tests.support.paths import ROOT
 
 
 def follow(capsys, said, step, **places):
@@ -26,22 +23,21 @@ def follow(capsys, said, step, **places):
     return ok(capsys, *chosen[1:])
 
 
-def imported(capsys, path, hidden="hysteresis", seed=1, poses=8):
-    """A campaign without revisions."""
-    csv = table(path.with_suffix(".csv"), hidden, seed, poses)
-    ok(capsys, "import", csv, "--config", CELL, "-o", path)
-    return path
+@pytest.fixture
+def run(tmp_path):
+    """A campaign without revisions; its name must be quoted."""
+    return imported(tmp_path / "a run.hilcal")
 
 
 @pytest.fixture
-def run(tmp_path, capsys):
-    """Its name must be quoted."""
-    return imported(capsys, tmp_path / "a run.hilcal")
+def fitted(tmp_path):
+    """The same with the baseline."""
+    return imported(tmp_path / "a run.hilcal", then=("identify",))
 
 
 @pytest.mark.long
 def test_without_a_revision(run, tmp_path, capsys):
-    out, later = tmp_path / "p.json", imported(capsys, tmp_path / "later.hilcal", seed=2)
+    out, later = tmp_path / "p.json", imported(tmp_path / "later.hilcal", seed=2)
     for arguments in (
         ("accept", run),
         ("export", run, "--parameters", out),
@@ -59,8 +55,8 @@ def test_without_a_revision(run, tmp_path, capsys):
     assert "no revision" not in ok(capsys, "compare", run, later).err
 
 
-def test_readings_were_appended(run, capsys):
-    ok(capsys, "identify", run)
+def test_readings_were_appended(fitted, capsys):
+    run = fitted
     ok(capsys, "accept", run)
     with hc.Campaign.open(run) as opened:
         first = opened.readings[opened.readings.pose == 0]
@@ -115,7 +111,7 @@ def test_deflections_lack_the_unloaded_arm(run, tmp_path, capsys):
 
 @pytest.mark.long
 def test_nothing_to_carry_over(run, tmp_path, capsys):
-    later = imported(capsys, tmp_path / "later.hilcal", poses=9)
+    later = imported(tmp_path / "later.hilcal", poses=9)
     ok(capsys, "identify", run, "--readings", "absolute", "--effects", "base_frame")
     said = refused(capsys, 4, "identify", later, "--prior", run)
     assert "run hilcal refine first" in said
@@ -139,12 +135,12 @@ def test_what_a_diagnosis_says(run, tmp_path, capsys):
 def test_what_next_says(tmp_path, capsys):
     cell, plan = tmp_path / "cell.toml", tmp_path / "PLAN.json"
     cell.write_text(re.sub(r"candidates = \d+", "candidates = 60\nagainst = []", CELL.read_text()))
-    run = imported(capsys, tmp_path / "run.hilcal", "nothing")
+    run = imported(tmp_path / "run.hilcal", "nothing")
     ok(capsys, "identify", run)
     said = refused(capsys, 4, "next", run, "-o", plan)
     places = {"CELL.toml": cell, "PLAN.json": plan}
     follow(capsys, said, f"hilcal plan CELL.toml -o PLAN.json --after {run}", **places)
-    run = imported(capsys, tmp_path / "one.hilcal")
+    run = imported(tmp_path / "one.hilcal")
     ok(capsys, "identify", run)
     said = refused(capsys, 4, "next", run, "-o", tmp_path / "n.json")
     follow(capsys, said, f"hilcal add {run} hysteresis")
@@ -152,7 +148,7 @@ def test_what_next_says(tmp_path, capsys):
 
 @pytest.mark.long
 def test_what_a_comparison_says(run, tmp_path, capsys):
-    later = imported(capsys, tmp_path / "later.hilcal", "creep", poses=9)
+    later = imported(tmp_path / "later.hilcal", "creep", poses=9)
     ok(capsys, "identify", run)
     said = command(capsys, "compare", run, later).out
     follow(capsys, said, f"hilcal refine {later} --prior '{run}'")
@@ -209,38 +205,7 @@ def test_a_campaign_that_calibrate_did_not_make(run, capsys):
 
 @pytest.mark.long
 def test_another_arm_is_calibrated_by_itself(run, tmp_path, capsys, monkeypatch):
-    later = imported(capsys, tmp_path / "later.hilcal", seed=2)
+    later = imported(tmp_path / "later.hilcal", seed=2)
     ok(capsys, "identify", run)
     monkeypatch.setattr(Comparison, "another_arm", True)
     follow(capsys, ok(capsys, "compare", run, later).out, f"hilcal refine {later}")
-
-
-STEP = re.compile(rf"\bhilcal ({'|'.join(COMMANDS)})\b((?: (?:--?[a-z][\w-]*|[A-Z.]+|\{{\}}))*)")
-"""A command in a message, and the options and places behind it."""
-
-
-def sentences(path):
-    """Yield the strings of a module, no docstrings and no helps of options, that name a command."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    left_out = {id(s.value) for s in ast.walk(tree) if isinstance(s, ast.Expr)}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.JoinedStr):
-            left_out.update(id(part) for part in node.values)
-        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("command", "_declared"):
-            left_out.update(id(given) for given in node.args)
-    for node in ast.walk(tree):
-        parts = node.values if isinstance(node, ast.JoinedStr) else [node]
-        texts = [str(p.value) if isinstance(p, ast.Constant) else "{}" for p in parts]
-        text = "".join(texts) if isinstance(node, ast.JoinedStr | ast.Constant) else ""
-        if id(node) not in left_out and re.search(rf"\bhilcal ({'|'.join(COMMANDS)})\b", text):
-            yield text
-
-
-def test_every_command_of_a_message_has_the_options_that_it_names(capsys):
-    said = [text for path in (ROOT / "hilcal").rglob("*.py") for text in sentences(path)]
-    named = [found for text in said for found in re.findall(STEP, text)]
-    helps = {name: ok(capsys, name, "--help").out for name in {name for name, _ in named}}
-    assert len(named) > 80
-    for name, words in named:
-        for option in re.findall(r"(?<![\w-])--?[a-z][\w-]*", words):
-            assert re.search(rf"(?<![\w-]){option}\b", helps[name]), (name, option)

@@ -25,18 +25,18 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.parquet_stream import open_stream
 from hilcal.tables.table import write_table
 from tests.cli.test_fit_beside_run import spoil
-from tests.cli.test_next_steps import follow, imported, run
-from tests.support.cli_cases import CELL, ok, refused, rehearsal
+from tests.cli.test_next_steps import fitted, follow, run
+from tests.support.cli_cases import CELL, imported, ok, refused, rehearsal
 
-__all__ = ["run"]
+__all__ = ["fitted", "run"]
 
 
 def quiet(text):
     """Take progress."""
 
 
-def test_a_revision_in_a_cell_that_was_changed(run, capsys):
-    ok(capsys, "identify", run)
+def test_a_revision_in_a_cell_that_was_changed(fitted, capsys):
+    run = fitted
     with Campaign.open(run) as o:
         change_cell(o, 1, o.fit(), {"tool": {"mass_kg": 1.4}}, quiet)
     said = refused(capsys, 2, "diagnose", run, "--revision", "1")
@@ -44,8 +44,8 @@ def test_a_revision_in_a_cell_that_was_changed(run, capsys):
     ok(capsys, "diagnose", run, "--revision", "1")
 
 
-def test_what_accept_says(run, capsys):
-    ok(capsys, "identify", run)
+def test_what_accept_says(fitted, capsys):
+    run = fitted
     ok(capsys, "identify", run, "--effects", "joint_compliance")
     follow(capsys, ok(capsys, "accept", run, "1").out, f"hilcal accept '{run}' --release")
     assert ok(capsys, "info", run, "--json").document["accepted"] is None
@@ -66,8 +66,8 @@ def test_a_revision_of_other_targets(run, capsys):
     ok(capsys, "diagnose", run)
 
 
-def test_a_bad_revision_is_set_aside_and_fitted_again(run, capsys):
-    ok(capsys, "identify", run)
+def test_a_bad_revision_is_set_aside_and_fitted_again(fitted, capsys):
+    run = fitted
     with Campaign.open(run) as o:
         found = o.fit()
     spoil(run, found, "damage")
@@ -103,7 +103,7 @@ def test_masses_that_a_description_lacks(tmp_path, capsys):
 
 @pytest.mark.long
 def test_an_effect_that_an_earlier_model_lacks(run, tmp_path, capsys):
-    later = imported(capsys, tmp_path / "later.hilcal", seed=2)
+    later = imported(tmp_path / "later.hilcal", seed=2)
     ok(capsys, "identify", run)
     said = ok(capsys, "compare", run, later).out
     follow(capsys, said, "hilcal refine EARLIER", EARLIER=run)
@@ -121,7 +121,7 @@ def test_an_addition_that_breaks_its_promise(run, capsys):
 
 @pytest.mark.long
 def test_joints_that_differ(tmp_path, capsys):
-    path = imported(capsys, tmp_path / "run.hilcal", "nothing")
+    path = imported(tmp_path / "run.hilcal", "nothing")
     common = ("--effects", "base_frame,joint_compliance(joints=common)")
     ok(capsys, "identify", path, *common)
     each, plan = "joint_compliance(joints=each)", tmp_path / "n.json"
@@ -146,10 +146,10 @@ PLAN_AFTER = "hilcal plan CELL.toml -o PLAN.json --after {run}"
             ("residual_is_noise", "is adequate", PLAN_AFTER),
         )
     )])  # fmt: skip
-def test_what_next_says_of_each_verdict(run, tmp_path, capsys, reason, words, step):
+def test_what_next_says_of_each_verdict(fitted, tmp_path, capsys, reason, words, step):
+    run = fitted
     cell = tmp_path / "cell.toml"
     cell.write_text(re.sub(r"candidates = \d+", "candidates = 60\nagainst = []", CELL.read_text()))
-    ok(capsys, "identify", run)
     with Campaign.open(run) as o:
         d = replace(diagnose(o.fit(), o.history()), reason=reason)
         wrong = (
@@ -225,7 +225,7 @@ def test_sections_of_a_cell(tmp_path, capsys):
 
 @pytest.mark.long
 def test_a_page_with_a_validation_names_its_command(run, tmp_path, capsys, monkeypatch):
-    other = imported(capsys, tmp_path / "other one.hilcal", seed=2)
+    other = imported(tmp_path / "other one.hilcal", seed=2)
     ok(capsys, "refine", run)
     page = tmp_path / "page.html"
     ok(capsys, "report", run, "--validation", other, "--appendix", "-o", page)

@@ -9,25 +9,18 @@ import pytest
 
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.revisions import chain
-from hilcal.cli import main
 from hilcal.config import load_config
 from hilcal.errors import InputError
 from hilcal.store import schema
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.revision import from_text, to_text
-from tests.support.cli_cases import CELL, ok, refused, table
+from tests.support.cli_cases import CELL, done, ok, refused, table
 from tests.support.cli_cases import run as command
 from tests.support.paths import ROOT
+from tests.support.rows import first
 
 Capsys = pytest.CaptureFixture[str]
 BASE = ["base_frame", "joint_compliance"]
-
-
-def done(*arguments):
-    """Run a command that must succeed."""
-    with pytest.raises(SystemExit) as ended:
-        main([str(a) for a in arguments])
-    assert ended.value.code == 0
 
 
 @pytest.fixture(scope="module")
@@ -250,16 +243,12 @@ def take(said, run, capsys):
 
 
 @pytest.mark.parametrize("made", [outdated, of_another_scaling])
-@pytest.mark.parametrize("asked", [
-    ("compare",),
-    ("diagnose",),
-    pytest.param(("next", "-o", "{out}/p.json"), marks=pytest.mark.long),
-], ids=lambda x: x[0])  # fmt: skip
+@pytest.mark.parametrize("asked", first(1, ["compare", "diagnose", "next -o {out}/p.json"]))
 def test_what_is_said_of_an_accepted_revision_that_will_not_do_leads_on(
     run, tmp_path, capsys, made, asked
 ):
     words = made(run, capsys)
-    name, *rest = (part.format(out=tmp_path) for part in asked)
+    name, *rest = (part.format(out=tmp_path) for part in asked.split())
     result = command(capsys, name, run, *rest)
     said = result.err.splitlines()[-1]
     assert result.code == 2

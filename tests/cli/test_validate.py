@@ -1,12 +1,13 @@
 """`validate`: what was fitted is told from what was not; a limit by load and by pose."""
 
 import csv
+import shutil
 
 import pytest
 
 from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.tables.table import write_table
-from tests.support.cli_cases import CELL, ok, refused, rehearsal, run
+from tests.support.cli_cases import CELL, done, ok, refused, rehearsal, run
 
 FITTED, POSES = 10, 14
 
@@ -21,14 +22,20 @@ def tables(tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def folder(tables, tmp_path, capsys):
+@pytest.fixture(scope="module")
+def campaigns(tables):
     """The same as campaigns; the first one has a revision with hysteresis."""
     for name in ("fit", "rest", "all"):
-        source = tables / f"{name}.csv"
-        ok(capsys, "import", source, "--config", CELL, "-o", tmp_path / f"{name}.hilcal")
-    model = ("--effects", "joint_compliance,hysteresis")
-    ok(capsys, "identify", tmp_path / "fit.hilcal", *model)
+        done("import", tables / f"{name}.csv", "--config", CELL, "-o", tables / f"{name}.hilcal")
+    done("identify", tables / "fit.hilcal", "--effects", "joint_compliance,hysteresis")
+    return tables
+
+
+@pytest.fixture
+def folder(campaigns, tmp_path):
+    """Copies of them."""
+    for path in campaigns.glob("*.hilcal"):
+        shutil.copy(path, tmp_path)
     return tmp_path
 
 

@@ -1,10 +1,17 @@
 """Campaigns for the tests of the command line, and a way to run it."""
 
+import atexit
+import contextlib
+import io
 import json
 import os
+import shutil
 import subprocess
 import sys
+import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +69,17 @@ def ok(capsys: Capsys, *arguments: str | Path) -> Outcome:
     return result
 
 
+def done(*arguments: str | Path) -> None:
+    """Run a command that must succeed, where a fixture makes something once for many tests."""
+    with (
+        contextlib.redirect_stdout(io.StringIO()),
+        contextlib.redirect_stderr(io.StringIO()) as said,
+        pytest.raises(SystemExit) as ended,
+    ):
+        main([str(a) for a in arguments])
+    assert ended.value.code == 0, said.getvalue()
+
+
 def refused(capsys: Capsys, code: int, *arguments: str | Path) -> str:
     """Run a command that must be refused; returns the one line on stderr that says why."""
     result = run(capsys, *arguments)
@@ -105,4 +123,32 @@ def stored_readings(
 
 def table(path: Path, hidden: str, seed: int = 1, poses: int = POSES) -> Path:
     write_table(rehearsal(hidden, seed, poses).readings, path, INSTRUMENT_AND_ARM)
+    return path
+
+
+@cache
+def _imported(hidden: str, seed: int, poses: int, then: tuple[str, ...]) -> Path:
+    """A campaign as a command has left it; made once in a process."""
+    folder = Path(tempfile.mkdtemp(prefix="hilcal-tests-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    run = folder / "run.hilcal"
+    if then:
+        shutil.copy(_imported(hidden, seed, poses, ()), run)
+        done(then[0], run, *then[1:])
+    else:
+        csv = table(folder / "run.csv", hidden, seed, poses)
+        done("import", csv, "--config", CELL, "-o", run)
+    return run
+
+
+def imported(
+    path: Path, hidden: str = "hysteresis", seed: int = 1, poses: int = 8, then: Sequence[str] = ()
+) -> Path:
+    """A campaign imported from a table into the cell of the demo, and what one command adds.
+
+    The table lies beside the campaign.
+    """
+    made = _imported(hidden, seed, poses, tuple(then))
+    shutil.copy(made, path)
+    shutil.copy(_imported(hidden, seed, poses, ()).with_suffix(".csv"), path.with_suffix(".csv"))
     return path

@@ -421,14 +421,17 @@ def plan_of(*steps: tuple[str, str, int], poses: dict[str, Any] | None = None) -
     return Plan(tuple(poses), np.array(list(poses.values())), tuple(Step(*step) for step in steps))
 
 
-def usual_plan() -> Plan:
+def usual_plan(names: tuple[str, ...] = ("p1", "p2", "p3", "p4")) -> Plan:
     """Four poses unloaded and under each load, with returns to the reference pose."""
-    names = ("p1", "p2", "p3", "p4")
     steps = [("reference", "none", 0), *((p, "none", 0) for p in names)]
     for cycle, load in enumerate(("3kg", "pull"), start=1):
         steps += [(p, load, 0) for p in names]
         steps += [("reference", "none", cycle)]
     return plan_of(*steps)
+
+
+FEW_POSES = usual_plan(("p1", "p3"))
+"""The same with two poses, for what does not depend on how many there are."""
 
 
 class Bench:

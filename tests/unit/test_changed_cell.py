@@ -2,7 +2,9 @@
 
 import csv
 import json
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -55,8 +57,14 @@ def imported(folder, name, changes=None, **kinds):
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def made(tmp_path_factory):
     return imported(tmp_path_factory.mktemp("run"), "run")
+
+
+@pytest.fixture
+def run(made, tmp_path):
+    """A campaign of its own for each test."""
+    return Path(shutil.copy(made, tmp_path))
 
 
 def test_a_stated_noise_is_that_of_a_new_import(tmp_path):
@@ -78,8 +86,8 @@ def test_a_stated_noise_is_that_of_a_new_import(tmp_path):
             assert there.data_hash == o.data_hash
 
 
-def test_a_change_is_a_revision_and_can_be_taken_back(tmp_path):
-    run, catalogue = imported(tmp_path, "run"), few_effects()
+def test_a_change_is_a_revision_and_can_be_taken_back(run):
+    catalogue = few_effects()
     with Campaign.open(run, catalogue) as o:
         before, stored = o.fit_in_use()[1], o.file.readings()
         there, number, found = change_cell(o, None, before, COARSE, lambda words: None)
@@ -101,8 +109,7 @@ def test_a_change_is_a_revision_and_can_be_taken_back(tmp_path):
         assert o.fit().variance_factor == pytest.approx(before.variance_factor, rel=1e-6)
 
 
-def test_the_tools_figures_and_frames_are_those_of_the_change(tmp_path):
-    run = imported(tmp_path, "run")
+def test_the_tools_figures_and_frames_are_those_of_the_change(run):
     with Campaign.open(run, few_effects()) as o:
         before = o.fit_in_use()[1]
         place = before.model.cell.registration
@@ -125,8 +132,7 @@ def test_a_change_is_checked_as_cell_toml_is(case, given, run):
         refuses(case, lambda: o.with_cell(json.loads(given)), run)
 
 
-def test_a_received_campaign_with_a_cell_that_cannot_be(tmp_path):
-    run = imported(tmp_path, "run")
+def test_a_received_campaign_with_a_cell_that_cannot_be(run, tmp_path):
     with Campaign.open(run, few_effects()) as o:
         record = o.record(o.fit_in_use()[1])
         for cell in ({"tool": {"mass_kg": "heavy"}}, {"robot": {"model": "/etc/passwd"}}):

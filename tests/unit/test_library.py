@@ -59,6 +59,18 @@ def site(tmp_path_factory):
     return SimpleNamespace(table=table, run=run, later=later, cell=cell, folder=folder)
 
 
+@pytest.fixture(scope="module")
+def refined(site):
+    """What `refine` makes of the campaign, which stays as it is."""
+    with hc.Campaign.open(site.run, read_only=True) as run:
+        return hc.refine(hc.baseline(run.cell, run.readings), run.readings)
+
+
+@pytest.fixture(scope="module")
+def planned(site):
+    return hc.plan(hc.Cell.load(site.cell), poses=3, seed=1)
+
+
 def names():
     return [name for name in hc.__all__ if not name.startswith("__")]
 
@@ -182,7 +194,7 @@ def test_points_in_degrees_and_names_are_refused(q, wrench, said, site):
         refusal(said, asked, q, wrench)
 
 
-def test_what_a_stranger_guesses_works(site, tmp_path):
+def test_what_a_stranger_guesses_works(site, refined, tmp_path):
     path = tmp_path / "run.hilcal"
     with hc.Campaign(site.run, read_only=True) as other:
         stored_readings(path, other.file.readings(), load_config(CELL))
@@ -200,7 +212,7 @@ def test_what_a_stranger_guesses_works(site, tmp_path):
         assert fit.residuals.to_frame().equals(fit.to_frame())
         refusal("no revision yet", hc.diagnose, run)
         found = hc.refine(run)
-        assert found.fit.model.names == hc.refine(model, run.readings).fit.model.names
+        assert found.fit.model.names == refined.fit.model.names
         run.append(found)
         assert hc.diagnose(run).verdict == found.verdict
     assert hc.validate(path, site.later).judged.unseen
@@ -215,15 +227,13 @@ def _free_port():
         return int(probe.getsockname()[1])
 
 
-def test_what_a_console_prints_of_a_value_is_at_most_fifteen_lines(site):
+def test_what_a_console_prints_of_a_value_is_at_most_fifteen_lines(site, refined, planned):
     with hc.Campaign.open(site.run, read_only=True) as run:
-        model = hc.baseline(run.cell, run.readings)
-        found = hc.refine(model, run.readings)
-        fit, judged = found.fit, found.diagnosis
-        values = [run, run.cell, run.cell.arm, run.readings, run.readings.states, model, fit]
+        found, fit, judged = refined, refined.fit, refined.diagnosis
+        values = [run, run.cell, run.cell.arm, run.readings, run.readings.states, fit.model, fit]
         values += [fit.parameters, fit.predict(run.readings.states), judged, judged.suspects[0]]
         calibration, q = hc.Calibration.of(fit), run.readings.states.q
-        values += [fit.residuals, hc.plan(run.cell, poses=3), hc.validate(run, run), calibration]
+        values += [fit.residuals, planned, hc.validate(run, run), calibration]
         values += [calibration.predict(q), calibration.compensate(q)]
         for value in (*values, found, found.steps[0]):
             text = repr(value)
@@ -238,7 +248,7 @@ def test_what_a_console_prints_of_a_value_is_at_most_fifteen_lines(site):
     assert "the file is closed" in repr(run)
 
 
-def test_results_are_data_frames(site, tmp_path):
+def test_results_are_data_frames(site, planned, tmp_path):
     with hc.Campaign.open(site.run, read_only=True) as run:
         frame = run.readings.to_frame()
         frame.to_csv(tmp_path / "t.csv", index=False)
@@ -253,8 +263,7 @@ def test_results_are_data_frames(site, tmp_path):
         judged = hc.diagnose(fit)
         assert judged.to_frame()["effect"].tolist() == [s.effect for s in judged.suspects]
         assert fit.parameters.to_frame().index.tolist() == [p.name for p in fit.parameters]
-    made = hc.plan(hc.Cell.load(site.cell), poses=3, seed=1)
-    frame = made.to_frame()
+    made, frame = planned, planned.to_frame()
     assert frame["pose"].tolist() == [step.pose for step in made.plan.steps]
     assert frame["load"].tolist() == [step.load for step in made.plan.steps]
     q = frame[[f"q{j}_rad" for j in range(1, 7)]].to_numpy()

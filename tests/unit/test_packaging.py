@@ -1,6 +1,5 @@
 """What is installed is what is in the tree."""
 
-import ast
 import hashlib
 import re
 import shutil
@@ -23,17 +22,6 @@ def test_every_directory_with_code_is_a_package():
     modules = [path for top in ("hilcal", "drivers") for path in (ROOT / top).rglob("*.py")]
     missing = {path.parent for path in modules if not (path.parent / "__init__.py").is_file()}
     assert not missing  # setup.py would leave them out
-
-
-def test_a_class_has_a_name_of_its_own():
-    """In the whole tree, so that a reader finds it by its name alone."""
-    places = {}
-    for top in ("hilcal", "drivers"):
-        for path in (ROOT / top).rglob("*.py"):
-            for node in ast.parse(path.read_text(encoding="utf-8")).body:
-                if isinstance(node, ast.ClassDef):
-                    places.setdefault(node.name, []).append(str(path.relative_to(ROOT)))
-    assert {name: at for name, at in places.items() if len(at) > 1} == {}
 
 
 def _pinned(lock):

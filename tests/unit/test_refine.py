@@ -19,6 +19,7 @@ from tests.support.diagnosis_cases import fitted_baseline
 from tests.support.effect_cases import make
 from tests.support.fit_cases import fitted_model, refined
 from tests.support.refusals import refusal
+from tests.support.rows import first
 
 
 def check_steps(r):
@@ -35,7 +36,8 @@ def check_steps(r):
 
 
 @pytest.mark.parametrize(
-    ("effect", "mode"), [("encoder_offset", "absolute"), ("joint_stiffening", "deflection")]
+    ("effect", "mode"),
+    first(1, [("encoder_offset", "absolute"), ("joint_stiffening", "deflection")]),
 )
 def test_a_hidden_effect_is_added_and_the_error_falls_to_the_noise(effect, mode):
     c = campaign(effect, mode, 1, poses=30)
@@ -52,6 +54,7 @@ def test_a_hidden_effect_is_added_and_the_error_falls_to_the_noise(effect, mode)
     assert f"adding {effect}" in said
 
 
+@pytest.mark.long
 def test_two_hidden_effects_are_found_one_after_the_other():
     cell, p = cell_of(), plan(30, 5)
     rng = np.random.default_rng(5)

@@ -202,6 +202,7 @@ def test_a_simulated_arm_outside_of_its_cell_is_refused() -> None:
         open_arm(config.model_copy(update={"robot": robot}))
 
 
+@pytest.mark.long
 def test_eight_joints_with_two_slides_stand_where_their_kinematics_say(tmp_path: Path) -> None:
     (tmp_path / "eight.toml").write_text(EIGHT)
     config = config_of("eight.toml")

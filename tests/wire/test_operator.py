@@ -244,6 +244,7 @@ def at_the_first_question(person: AtTerminal) -> None:
     person.check_words_stay("Done: nothing hangs.")
 
 
+@pytest.mark.long
 def test_check_gives_every_fact_as_a_field(cell: Site, toml: Path, capsys: Capsys) -> None:
     result = run(capsys, "check", toml, "--json")
     assert result.code == 3  # nobody is at a terminal here

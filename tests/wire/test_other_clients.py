@@ -19,9 +19,9 @@ from tests.support.sim_ur_cases import ClientError, SimulatedUr, Wire, client, s
 from tests.support.timing import wait_until
 
 
-@pytest.fixture
-def arm(tmp_path: Path) -> Iterator[SimulatedUr]:
-    running = start(tmp_path)
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimulatedUr]:
+    running = start(tmp_path_factory.mktemp("ur"))
     yield running
     running.close()
 

@@ -6,7 +6,7 @@ import socket
 import stat
 import subprocess
 import sys
-from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,8 +31,6 @@ from tests.support.arm_cases import ODD, arm_of
 from tests.support.paths import ROOT
 from tests.support.rows import first
 from tests.support.running_world import WEIGHT, config, same_bytes, states, world_of
-from tests.support.sim_ur_cases import SimulatedUr
-from tests.support.sim_ur_cases import start as start_server
 from tests.support.timing import runs, wait_until
 
 DEVICES = ("world", "arm", "tracker", "force")
@@ -270,45 +268,45 @@ def test_what_cannot_be_simulated_is_refused_before_anything_starts(tmp_path):
     assert not list(tmp_path.glob("*.log"))
 
 
-@pytest.fixture
-def process(tmp_path):
+def test_a_world_that_died_goes_on_where_it_was(tmp_path):
     made = config()
     write_world(tmp_path / "world.json", world_of(made), made)
     arguments = ("--seed", "5")
     process = DeviceProcess("world", "hilcal.drivers.simulated.world_server", tmp_path, arguments)
-    process.start()
-    wait_until(lambda: process.socket.exists() or process.has_ended, "started")
-    process.check()
-    yield process
-    process.end()
 
-
-def test_a_world_that_died_goes_on_where_it_was(process, tmp_path):
-    board = Blackboard(tmp_path / "world.bin")
-    ask(process.socket, "hang", name="pull")
-    since, begun = board.read("truth")["load_since"], board.time
-    ask(process.socket, "die")
-    wait_until(lambda: process.has_ended, "ended")
-    with pytest.raises(DeviceError, match="ended with exit code 70"):
+    def begin():
+        process.start()
+        wait_until(lambda: process.socket.exists() or process.has_ended, "started")
         process.check()
-    with pytest.raises(DeviceError, match=r"simulated device at world\.sock"):
-        ask(process.socket, "state")
-    process.start()
-    wait_until(lambda: process.socket.exists() or process.has_ended, "started")
-    state = ask(process.socket, "state")
-    assert (state["load"], state["load_since"]) == ("pull", since)
-    assert state["time"] > begun
+
+    with ExitStack() as ending:
+        ending.callback(process.end)
+        begin()
+        board = Blackboard(tmp_path / "world.bin")
+        ask(process.socket, "hang", name="pull")
+        since, begun = board.read("truth")["load_since"], board.time
+        ask(process.socket, "die")
+        wait_until(lambda: process.has_ended, "ended")
+        with pytest.raises(DeviceError, match="ended with exit code 70"):
+            process.check()
+        with pytest.raises(DeviceError, match=r"simulated device at world\.sock"):
+            ask(process.socket, "state")
+        begin()
+        state = ask(process.socket, "state")
+        assert (state["load"], state["load_since"]) == ("pull", since)
+        assert state["time"] > begun
 
 
-def test_requests_that_cannot_be_are_answered_with_what_is_valid(process):
+def test_requests_that_cannot_be_are_answered_with_what_is_valid(cell):
+    before = cell.ask("world", "log")
     with pytest.raises(DeviceError, match=r"no load '7kg'.*valid: none, 5kg, pull"):
-        ask(process.socket, "hang", name="7kg")
+        cell.ask("world", "hang", name="7kg")
     with pytest.raises(DeviceError, match="unknown op 'heng'; valid: hang, mistake"):
-        ask(process.socket, "heng")
+        cell.ask("world", "heng")
     with pytest.raises(DeviceError, match="six numbers"):
-        ask(process.socket, "push", wrench=[1.0])
-    ask(process.socket, "swing", wrench=[1.0] * 6, period=1.0, decay=1.0)
-    assert ask(process.socket, "log") == []
+        cell.ask("world", "push", wrench=[1.0])
+    cell.ask("world", "swing", wrench=[1.0] * 6, period=1.0, decay=1.0)
+    assert cell.ask("world", "log") == before
 
 
 def test_a_process_without_a_world_says_so_in_one_line(tmp_path):
@@ -321,13 +319,6 @@ def test_a_process_without_a_world_says_so_in_one_line(tmp_path):
         process.check()
     process.end()
     assert len((tmp_path / "world.log").read_text().splitlines()) == 1
-
-
-@pytest.fixture
-def arm(tmp_path: Path) -> Iterator[SimulatedUr]:
-    running = start_server(tmp_path)
-    yield running
-    running.close()
 
 
 def listening(pid: int) -> list[str]:
@@ -344,13 +335,14 @@ def listening(pid: int) -> list[str]:
     return out
 
 
-def test_the_simulated_arm_listens_on_loopback_alone(arm: SimulatedUr) -> None:
-    found = listening(arm.process.pid)
+def test_the_simulated_arm_listens_on_loopback_alone(cell) -> None:
+    found = listening(cell.processes()["arm"])
     assert len(found) == 4  # RTDE, dashboard, primary, script
     assert all(address.startswith("127.") for address in found)
 
 
-def test_admin_lines_are_of_the_user_who_started_them(arm: SimulatedUr) -> None:
-    line = arm.process.socket
-    assert stat.S_IMODE(line.stat().st_mode) == 0o600
-    assert line.stat().st_uid == os.getuid()
+def test_admin_lines_are_of_the_user_who_started_them(cell) -> None:
+    for device in DEVICES:
+        line = (cell.directory / f"{device}.sock").stat()
+        assert stat.S_IMODE(line.st_mode) == 0o600
+        assert line.st_uid == os.getuid()

@@ -25,7 +25,7 @@ SLOW = 0.3  # position of the speed slider meanwhile: the arm moves for about ha
 @pytest.mark.parametrize(
     "kind",
     [
-        signal.SIGINT,
+        pytest.param(signal.SIGINT, marks=pytest.mark.long),
         pytest.param(signal.SIGTERM, marks=pytest.mark.slow),
         pytest.param(signal.SIGHUP, marks=pytest.mark.slow),
     ],

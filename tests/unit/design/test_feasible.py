@@ -79,7 +79,7 @@ cells = st.fixed_dictionaries(
 )
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(cells, st.integers(0, 99))
 def test_no_candidate_ever_breaks_a_limit(sections, seed):
     """Each limit is looked at by other means than the planner's."""

@@ -75,7 +75,7 @@ def test_what_deflections_cannot_show_is_part_of_the_verdict():
 
 @pytest.mark.parametrize(("effect", "mode"), HIDDEN)
 def test_a_hidden_effect_leads(effect, mode):
-    p = linearise(fitted_baseline(hidden(effect, mode, 0)))
+    p = linearise(fitted_baseline(hidden(effect, mode, 0, poses=20)))
     lead = rank_suspects(p, candidates(p.fit))[0]
     assert effect in (lead.effect, *lead.same_as)
     assert lead.score.p_value < 1e-6

@@ -41,7 +41,7 @@ def test_an_effect_that_the_readings_cannot_determine_is_rejected():
     assert trial(before, "link_geometry") is None
     with pytest.raises(CannotAnswerError, match="nothing is left to judge the model by"):
         add(before, "link_geometry")
-    assert refine(before.model, few, "absolute").fit.theta.size
+    assert refine(before.model, few, "absolute", background=False).fit.theta.size
 
 
 @pytest.mark.slow

@@ -186,6 +186,7 @@ def case_of(mode, hidden, strength):
     return study_case(configuration(), "ur10e", mode, hidden, strength, 0)
 
 
+@pytest.mark.long
 def test_gears_that_all_give_in_one_direction_are_no_scale_of_the_tracker():
     # Their zero mean leaves what a scale of some per cent would explain; ordinary ones have 1e-5.
     case = case_of("deflection", ("joint_stiffening",), 1.0)

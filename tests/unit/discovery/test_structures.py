@@ -175,6 +175,7 @@ def products(s, count):
     raise AssertionError("too few products")
 
 
+@pytest.mark.long
 def test_a_pair_is_found_of_which_neither_part_explains_anything_alone():
     """As where a temperature is far from its zero all the time: T d and d are nearly the same."""
     s = screened()

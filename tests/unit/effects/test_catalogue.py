@@ -1,12 +1,8 @@
-"""The catalogue is a value, and nothing but it and the effects themselves knows their names."""
-
-import ast
-from pathlib import Path
+"""The catalogue is a value; effects are added by name, by class and by package."""
 
 import numpy as np
 import pytest
 
-import hilcal
 from hilcal.diagnosis.effect_ranking import candidates
 from hilcal.effects.catalogue import installed
 from hilcal.effects.protocol import Columns, Effect, Parameter, Role, effect, failure_of
@@ -15,13 +11,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.model.model import Model
 from tests.support.campaigns import campaign
-from tests.support.effect_cases import NAMES
 from tests.support.refusals import refusal
-
-CONFIGURATION = "config"
-"""Holds defaults and examples that a person would write: effects by name."""
-OF_THE_CELL = {"load_point"}
-"""Names that are also those of something in the cell."""
 
 
 class Sag(Effect):
@@ -37,18 +27,6 @@ class Sag(Effect):
 
     def columns(self, s):
         return (Columns("dq", np.array([0]), np.array([0]), np.cos(s.angle[:, 1:2])),)
-
-
-def test_no_module_outside_of_the_effects_asks_for_one_by_its_name():
-    root, names = Path(hilcal.__file__).parent, {*NAMES} - OF_THE_CELL
-    found = [
-        f"{path.relative_to(root)}:{node.lineno}: {node.value}"
-        for path in sorted(root.rglob("*.py"))
-        if path.parent.name not in ("effects", CONFIGURATION)
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Constant) and str(node.value).split(".")[0] in names
-    ]
-    assert not found
 
 
 def test_an_effect_is_added_by_name_and_options():

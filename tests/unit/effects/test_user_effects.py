@@ -157,10 +157,11 @@ def test_a_process_of_its_own_and_an_installed_package(run_file, file, tmp_path,
     ("point", "said"),
     [
         ("mine:Effect", "class Effect lacks columns and parameters"),
-        pytest.param("mine:np", "not an Effect class", marks=pytest.mark.slow),
-        pytest.param("mine:No", "cannot be loaded (AttributeError", marks=pytest.mark.slow),
+        ("mine:np", "not an Effect class"),
+        ("mine:No", "cannot be loaded (AttributeError"),
     ],
 )
+@pytest.mark.long
 def test_a_broken_package_is_one_clear_line(point, said, file, tmp_path):
     package = package_of(tmp_path / "site", file.read_text(encoding="utf-8"), point)
     code, out, err = hilcal(package, "effects")

@@ -18,6 +18,7 @@ from hilcal.tables.mapping import Mapping, load_mapping
 from tests.fuzz import files, harness, stored, wire
 from tests.fuzz.bench import Bench
 from tests.support.refusals import refusal
+from tests.support.rows import first
 
 FEW = {
     "chain": 2,
@@ -35,13 +36,18 @@ FEW = {
 PARSERS = {parser.name: parser for parser in (*wire.parsers(), *files.parsers())}
 
 
-COSTLY = ("campaign_fit", "preview", "measured", "krl", "rapid", "inform")
-"""Parsers that take long: a third of the inputs every time, all of them in the long tests."""
+COSTLY = (
+    *("campaign_fit", "preview", "measured", "krl", "rapid", "inform"),
+    *("discovered", "table"),
+)
+"""Parsers that take long: a fifth of the inputs every time."""
 INPUTS = {name: FEW.get(name, 150) for name in PARSERS}
-RUNS = [
-    *((name, INPUTS[name] // 3 if name in COSTLY else INPUTS[name]) for name in PARSERS),
-    *(pytest.param(name, INPUTS[name], marks=pytest.mark.long) for name in COSTLY),
-]
+QUICK = {
+    name: count // 5 if name in COSTLY else count // 3 if count > 60 else count
+    for name, count in INPUTS.items()
+}
+RUNS = first(len(QUICK), [*QUICK.items(), *sorted(INPUTS.items() - QUICK.items())])
+"""A part of the inputs every time, all of them in the long tests."""
 
 
 @pytest.mark.parametrize(("name", "inputs"), RUNS)

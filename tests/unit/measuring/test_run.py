@@ -19,6 +19,7 @@ from hilcal.store.plan import Step
 from hilcal.store.rows import content_hash
 from hilcal.tables.table import write_table
 from tests.support.fake_bench import (
+    FEW_POSES,
     POSES,
     REGISTRATION,
     SAG,
@@ -66,7 +67,7 @@ def test_wrench_is_measured_or_told_as_the_cell_says(use, mass, pull):
     b = Bench(force_sensor=ForceSensor(driver="fake", port="nowhere", use=use))
     loads = (CellLoad(name="3kg", mass_kg=3.03), CellLoad(name="pull", force_N=(38.0, 0.0, 0.0)))
     b.world.config = b.config.model_copy(update={"loads": loads})
-    readings = b.measure()
+    readings = b.measure(FEW_POSES)
     weight = [0, 0, -mass * 9.80665, 0, 0, 0]
     for load, wrench in (("none", np.zeros(6)), ("3kg", weight), ("pull", [pull, 0, 0, 0, 0, 0])):
         felt = readings.states.wrench[rows(readings, load)]
@@ -168,8 +169,8 @@ def test_the_judge_sees_all_readings_and_may_not_know(b):
             raise CannotAnswerError("too few readings")
         return LiveResidual(1e-5, 0.5) if len(readings) > 3 else LiveResidual()
 
-    b.measure(live=judge)
-    assert seen == list(range(1, len(usual_plan().steps) + 1))
+    b.measure(FEW_POSES, live=judge)
+    assert seen == list(range(1, len(FEW_POSES.steps) + 1))
     taken = b.notes.of_kind(ReadingStored)
     assert [t.live.residual for t in taken[:4]] == [None, None, None, 1e-5]
     assert taken[-1].live.sigma == 0.5
@@ -246,20 +247,20 @@ def test_an_arm_that_does_not_scatter_is_seldom_said_to():
 def test_without_a_tool_and_without_a_force_sensor():
     b = Bench(tool=Tool(target_m=(0.0, 0.0, 0.1)))
     b.world.tool_mass = 0.0
-    b.measure()
+    b.measure(FEW_POSES)
     assert b.world.payload[0] == 0.0
     b = Bench(force_sensor=None)
     b.world.wrong_loads = ["none", "6kg"]
-    readings = b.measure()
-    assert len(readings) == len(usual_plan().steps)
+    readings = b.measure(FEW_POSES)
+    assert len(readings) == len(FEW_POSES.steps)
     assert np.allclose(readings.states.wrench[rows(readings, "pull")], [40.0, 0, 0, 0, 0, 0])
     assert json.loads(b.store.rows[0][2])["force"] is None
 
 
 def test_a_wrong_load_is_asked_for_again_with_the_reason(b):
     b.world.wrong_loads = ["none", "6kg"]  # the first answer is that to "take everything off"
-    readings = b.measure()
-    assert len(readings) == len(usual_plan().steps)
+    readings = b.measure(FEW_POSES)
+    assert len(readings) == len(FEW_POSES.steps)
     assert b.requested_loads[:3] == ["none", "3kg", "3kg"]
     assert b.operator.requests[1][1] == ""
     assert "6.0 kg" in b.operator.requests[2][1]
@@ -278,7 +279,7 @@ def test_three_wrong_loads_end_the_run(b):
 
 def test_a_load_that_is_not_taken_off_is_noticed(b):
     b.world.wrong_loads = ["none", "3kg", "3kg"]
-    b.measure()
+    b.measure(FEW_POSES)
     assert b.requested_loads == ["none", "3kg", "none", "none", "pull", "none"]
     assert "3.0 kg still hangs" in b.operator.requests[3][1]
 
@@ -379,9 +380,9 @@ def test_a_load_left_on_at_the_very_beginning_is_asked_about_said_and_found_in_m
 
 
 def test_a_finished_campaign_touches_nothing(b):
-    b.measure()
+    b.measure(FEW_POSES)
     b.world.calls.clear()
-    b.measure()
+    b.measure(FEW_POSES)
     assert b.world.calls == []
     assert b.notes.of_kind(Phase)[-1].text == "nothing is missing"
 
@@ -402,7 +403,7 @@ LOST = "no longer tells the torques"
 
 def test_torques_are_averaged_over_the_reading(b):
     b.world.torques = np.inf
-    torque = b.measure().states.torque
+    torque = b.measure(FEW_POSES).states.torque
     # means of at least three samples that scatter by 0.1 N·m
     assert np.abs(torque - TORQUE).max() < 5 * 0.1 / np.sqrt(3)
     assert not b.remarks(LOST)
@@ -445,9 +446,9 @@ def test_a_lost_link_is_said_once_and_readings_go_on(b, tmp_path):
 @pytest.mark.parametrize("first", [0, np.inf])
 def test_a_campaign_goes_on_as_it_began(b, first):
     b.world.torques = first
-    b.interrupt(4)
+    b.interrupt(4, FEW_POSES)
     b.world.torques = -1 if first else np.inf
-    torque = b.measure().states.torque
+    torque = b.measure(FEW_POSES).states.torque
     if not first:
         assert torque is None
     else:

@@ -18,6 +18,7 @@ from hilcal.robot import chain as chains
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.plan import Step
 from tests.support.fake_bench import (
+    FEW_POSES,
     POSES,
     STD,
     Bench,
@@ -263,7 +264,7 @@ LIMIT = ForceSensor(driver="fake", port="nowhere", max_force_N=120.0)
 
 def test_order_of_the_start(b):
     """The hook is cleared before anything moves, the tare comes before the first reading."""
-    b.measure()
+    b.measure(FEW_POSES)
     first = {name: b.world.calls.index(name) for name in set(b.world.calls)}
     assert first["operator.hang"] < first["arm.take_control"] < first["arm.start_move"]
     tare = b.world.calls.index("force.average", first["arm.start_move"])
@@ -297,7 +298,7 @@ def test_payload_is_set_before_a_weight_is_hung_and_after_it_is_off(b):
 def test_loads_change_only_at_the_reference_and_motions_carry_them(b):
     where = []
     call_before(b.operator, "hang", lambda *_: where.append(b.world.q.copy()))
-    b.measure()
+    b.measure(FEW_POSES)
     assert b.requested_loads == ["none", "3kg", "none", "pull", "none"]
     for q in where[1:]:
         assert np.allclose(q, POSES["reference"])
@@ -384,8 +385,8 @@ def test_a_lost_target_is_found_again(b):
     b.world.unseen_measurements = (
         3  # at both stops of the approach, where nothing is read, and at the reading
     )
-    readings = b.measure()
-    assert len(readings) == len(usual_plan().steps)
+    readings = b.measure(FEW_POSES)
+    assert len(readings) == len(FEW_POSES.steps)
     assert b.world.calls.count("tracker.find_target") == 1
     assert any("found again" in x for x in json.loads(b.store.rows[0][2])["remarks"])
 

@@ -11,6 +11,7 @@ from hilcal.measuring.measure import Measurer
 from hilcal.measuring.progress import Phase
 from hilcal.robot.chain import evaluate
 from tests.support.fake_bench import (
+    FEW_POSES,
     POSES,
     Bench,
     call_before,
@@ -70,7 +71,7 @@ def test_an_arm_jogged_into_a_blocked_place_during_a_question_is_not_moved(b, lo
 
 def test_an_arm_jogged_to_a_free_place_is_asked_for_and_the_way_checked_from_there(b):
     jogged(b, "none", FREE)
-    b.measure()
+    b.measure(SHORT)
     (asked,) = confirmed(b)
     assert "shoulder_pan is 0.5 rad off" in asked
     assert b.world.calls.index("operator.confirm") < b.world.calls.index("arm.take_control")
@@ -284,8 +285,8 @@ def assert_true(b):
 
 def test_a_load_that_falls_off_between_readings_leaves_no_reading_without_it(b):
     """It falls while the tracker measures: the reading is kept as doubted, and taken again."""
-    falls_at_rest(b, "3kg", 7)
-    b.measure()
+    falls_at_rest(b, "3kg", 4)
+    b.measure(FEW_POSES)
     assert b.requested_loads[1:3] == ["3kg", "3kg"]
     assert_true(b)
 

@@ -92,6 +92,7 @@ def alive(pid):
 
 
 @growing
+@pytest.mark.long
 def test_a_viewer_that_comes_late_gets_all_and_the_recording_has_it_too(home, said):
     with socket.socket() as taken:  # the wanted port: the next one is taken instead
         taken.bind(("127.0.0.1", 0))

@@ -263,6 +263,7 @@ def test_it_prints_on_six_pages_at_most(made, browser, tmp_path, of):
 
 
 @needs_chromium
+@pytest.mark.long
 def test_long_names_of_many_poses_do_not_lie_over_each_other_on_a_phone(made, browser, tmp_path):
     path = tmp_path / "page.html"
     path.write_text(page_of(large(made[0])), encoding="utf-8")

@@ -259,6 +259,7 @@ def colors(png):
     return len(np.unique(png.reshape(-1, png.shape[2]), axis=0))
 
 
+@pytest.mark.long
 @pytest.mark.vulkan
 @needs_vulkan
 def test_the_picture_shows_the_red_vanish(told, recording, tmp_path):

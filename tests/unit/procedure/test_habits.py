@@ -51,6 +51,7 @@ def test_the_error_falls(config, poses, readings, tmp_path):
     assert ({"none"} == set(found.loads)) == (config.loads == ())
 
 
+@pytest.mark.long
 def test_points_in_the_way_of_something_are_left_out_by_name(tmp_path):
     d = drawn_calibration(
         tmp_path / "run.hilcal", config=in_base_axes(), poses=6, readings="absolute"

@@ -22,6 +22,7 @@ from hilcal.regression.schur import eliminate, projection
 from tests.support.campaigns import campaign, measured, plan
 from tests.support.effect_cases import make
 from tests.support.fit_cases import fitted_model
+from tests.support.rows import first
 
 
 def linear(strength, count, rows=1200, flat=3, noise=1.0, seed=0):
@@ -133,7 +134,7 @@ def test_a_dropped_harmonic_is_not_counted_nor_listed():
     assert np.all(found.theta[found.model.slices()[-1]][prior == 0] == 0)
 
 
-@pytest.mark.parametrize("size", [1, 2, 3, 8])
+@pytest.mark.parametrize("size", first(2, [1, 8, 2, 3]))
 def test_groups_of_noise_spend_what_they_lower_the_sum_of_squares_by(size):
     x = np.random.default_rng(size).chisquare(size, 200_000)
     kept = x > size

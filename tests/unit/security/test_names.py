@@ -215,43 +215,6 @@ def test_command_lines(name):
     assert shlex.split(line) == ["hilcal", "refine", escaped(name), "--prior", "a"]
 
 
-COMMANDS = (
-    "accept|add|check|compare|diagnose|export|identify|info|plan|refine|repair|report|run|view"
-)
-RUN_BY_PEOPLE = re.compile(
-    rf"hilcal ({COMMANDS}) $|hilcal .* -o $|\S.*--(effects-from|prior|after|plan) $", re.DOTALL
-)
-
-
-def unquoted(tree):
-    """Lines in which a value stands as it is in a command line that people are told to run."""
-    found = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.JoinedStr):
-            text = ""
-            for part in node.values:
-                if isinstance(part, ast.Constant):
-                    text += part.value
-                    continue
-                called = getattr(getattr(part.value, "func", None), "id", "")
-                if RUN_BY_PEOPLE.search(text) and called != "quoted":
-                    found.append(node.lineno)
-                text += "X"
-    return found
-
-
-def test_values_in_command_lines_are_quoted():
-    texts = {p: p.read_text(encoding="utf-8") for p in (ROOT / "hilcal").rglob("*.py")}
-    found = {
-        path.relative_to(ROOT).as_posix(): lines
-        for path, text in texts.items()
-        if re.search(r"(hilcal|--\w).*\{", text) and (lines := unquoted(ast.parse(text)))
-    }
-    assert found == {}
-    assert unquoted(ast.parse('f"see hilcal refine {run}"')) == [1]
-    assert unquoted(ast.parse('f"give it: --effects-from {file}"')) == [1]
-
-
 @few
 @given(names)
 def test_json(name):

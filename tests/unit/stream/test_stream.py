@@ -87,6 +87,7 @@ def test_errors_are_those_of_the_noise(found, in_memory):
     assert abs(found.variance_factor - 1) < 4 * np.sqrt(2 / found.dof)
 
 
+@pytest.mark.long
 def test_two_workers_give_the_same_bits(stream, found):
     with open_engine(2) as engine:
         again = fit_stream(opened(stream), cell(), engine, EFFECT)

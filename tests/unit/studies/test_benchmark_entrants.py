@@ -228,6 +228,7 @@ def test_what_was_run_is_not_run_again(tmp_path, fakes):
     assert told.read_text() == page(date, rows, fakes)
 
 
+@pytest.mark.long
 def test_a_row_that_is_reproduced_stands_beside_the_published_ones(tmp_path, capsys):
     words = (str(TASKS), "--entrants", "frames", "--tasks", "elastic-00[123]")
     assert run(tmp_path, *words, "--beside", str(KEPT)) == 0

@@ -104,6 +104,7 @@ def test_laws_and_effects_that_do_not_fit_are_refused():
         shift(law_named("swaying bench"), c.world, still[none], 3.0, "absolute", none, none)
 
 
+@pytest.mark.long
 def test_true_parameters_have_the_program_s_names():
     for effect in EFFECTS:
         if effect == "joint_compliance":

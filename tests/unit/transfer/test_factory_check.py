@@ -16,7 +16,7 @@ CELL = {
     "robot": {"model": "ur15", "kinematics": "factory", "calibration": "arm.toml"},
     "tool": {"target_m": [0.06, 0.02, 0.12], "mass_kg": 0.8, "com_m": [0.01, 0.0, 0.06]},
     "repeatability": {"joint_std_rad": 1e-5},
-    "planning": {"readings": "absolute", "candidates": 150},
+    "planning": {"readings": "absolute", "candidates": 60, "against": []},
     "simulation": {"strength_sigma": 20.0},
 }
 

@@ -74,6 +74,7 @@ def test_the_sizes_of_a_type_are_in_their_intervals(sizes):
     assert high[truth == 1.0].max() > 2.0  # what no campaign tells stays open
 
 
+@pytest.mark.long
 def test_what_a_cell_says_already_does_not_count_twice(sizes):
     for s in sizes_told(TRUTH):
         assert s.factor == pytest.approx(sizes[s.effect].factor, rel=0.5)
