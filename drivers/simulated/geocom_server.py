@@ -6,7 +6,7 @@
 Admin operations beside those of the line (`PtyPort.faults`): `beam {on}` blocks it, `hide
 {targets}` covers reflectors by number, `lock_lost`, `freeze {on}` repeats the last measurement,
 `stray {on}` follows a reflector at rest 0.2 m behind the target,
-`dist_error {on}`, `warn {code}` (1283 or 1284, 0 is none), `busy {on}`, `delay {rpc, seconds,
+`dist_error {on}`, `warn {code}` (1283 or 1284; 0 ends it), `busy {on}`, `delay {rpc, seconds,
 count}` in real time, `wrong_trid {count}`, `meas_s {seconds}` of world time, `log`, `state`.
 
 Sources: Leica Geosystems, "TPS1200+ GeoCOM Reference Manual"; its chapter "ASCII protocol" has the

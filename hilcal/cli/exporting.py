@@ -151,7 +151,7 @@ def export(
     with Campaign.open(run, catalogue, read_only=True) as campaign:
         record = campaign.in_use(revision)
         if record is None and (options.of_model or options.revisions is not None):
-            raise InputError(f"{run}: no revision yet, so nothing of it; run hilcal identify first")
+            raise InputError(f"{run}: no revision to export yet; run hilcal identify first")
         t.show(_write_data(campaign, options, force))
         if options.revisions is not None and record is not None:
             records = campaign.file.revisions()

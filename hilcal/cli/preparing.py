@@ -247,7 +247,7 @@ def init(
     )
     draft = Draft(cell.absolute().parent)
     if asks:
-        t.notice(f"Enter alone leaves a thing open; Ctrl-C ends, and {cell} is not written.\n")
+        t.notice(f"Enter alone leaves a question open; Ctrl-C ends, and {cell} is not written.\n")
     for question in questions():
         stated = options[question.option]
         if stated is not None:

@@ -491,9 +491,9 @@ def simulate(
         "deflection",
         "absolute",
     ):
-        why = f"{choice} hides what they may not show" if choice == RANDOM else f"{choice} cancels"
+        cancels = "the hidden effect may cancel" if choice == RANDOM else f"{choice} cancels"
         t.notice(
-            f"warning: deflections are planned and fitted, and {why} in them; set readings = "
+            f"warning: deflections are planned and fitted, and {cancels} in them; set readings = "
             f'"absolute" in [planning] of {cell} for a campaign that shows it'
         )
     with end_signals(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as wait, ExitStack() as stack:

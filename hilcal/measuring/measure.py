@@ -344,7 +344,7 @@ class Measurer:
         ), ""
 
     def _wrong(self, force: WrenchSample | None, sample: ArmSample) -> bool:
-        """Whether the mean wrench, too, is not that of the load; such a reading is kept."""
+        """Whether the mean wrench differs from the load, too; such a reading is kept."""
         watch, meter = self._mover.watch, self._meter
         if watch is None or meter is None or force is None:
             return False
