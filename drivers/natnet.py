@@ -349,7 +349,7 @@ class NatNetTracker:
 
     def _greet(self) -> NatNetServer:
         content = self._ask(connect(NEWEST), SERVER_INFO)
-        with self._parsing("what answers is no NatNet server; is this its command port?"):
+        with self._parsing("the answer is not a NatNet server's; is this its command port?"):
             found = server(content)
         if found.version > NEWEST:
             command = f"Bitstream,{NEWEST[0]}.{NEWEST[1]}".encode() + b"\0"

@@ -320,8 +320,8 @@ class Measurer:
             return None, why
         if watch is not None and watch.differed != differed and not self._wrong(force, after):
             return None, (
-                "the force sensor felt something else than what hangs for a moment: was the tool "
-                "touched?"
+                "for a moment the force sensor felt something else than tool and load: was the "
+                "tool touched?"
             )
         if len({sample.value.tobytes() for sample in tracker}) == 1:
             return None, (
@@ -333,7 +333,7 @@ class Measurer:
         except DeviceError as error:
             return None, str(error)
         if not (np.isfinite(mean.value).all() and np.isfinite(mean.covariance).all()):
-            return None, "the tracker gives what is not a number"
+            return None, "the tracker gives a value that is not a number"
         arm_samples.append(after)
         q = np.mean([sample.q for sample in arm_samples], axis=0)
         torques = [sample.torque for sample in arm_samples[1:] if sample.torque is not None]
