@@ -20,7 +20,7 @@ _STATUS = ((2, "is loaded over its range; take the load off"), (4, "measures not
 
 
 def _overload(wrench: Floats, status: int) -> str:
-    """The error that the status reports; bit 0 (fewer samples averaged) is none."""
+    """The error that the status reports; bit 0 (fewer samples averaged) is no error."""
     for bit, problem in _STATUS:
         if status & bit:
             return f"the Bota sensor {problem} (status {status:#06x})"

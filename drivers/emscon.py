@@ -108,7 +108,7 @@ class EmsconConnection:
             kind, body = self._packet(deadline)
             if kind in (es.SINGLE, es.SINGLE2, es.PROBE):
                 if len(body) < 4:
-                    self._strange("a packet that is cut short")
+                    self.strange("a packet that is cut short")
                 return kind, int.from_bytes(body[:4], "little"), body[4:]
             if kind == es.ERROR and self._two(body)[0] in (es.START_MEASUREMENT, es.UNKNOWN):
                 return kind, self._two(body)[1], b""
@@ -124,11 +124,11 @@ class EmsconConnection:
         try:
             return struct.unpack_from(layout, body)
         except struct.error:
-            self._strange("an answer that is too short")
+            self.strange("an answer that is too short")
 
     def _two(self, body: bytes) -> tuple[int, int]:
         if len(body) < 8:
-            self._strange("a packet that is cut short")
+            self.strange("a packet that is cut short")
         number, status = struct.unpack_from("<II", body)
         return number, status
 
@@ -156,7 +156,7 @@ class EmsconConnection:
             if len(self._buffer) >= es.HEADER.size:
                 size, kind = es.HEADER.unpack_from(self._buffer)
                 if not es.HEADER.size <= size <= es.LARGEST:
-                    self._strange("what is no packet of emScon")
+                    self.strange("what is no packet of emScon")
                 if len(self._buffer) >= size:
                     body = bytes(self._buffer[es.HEADER.size : size])
                     del self._buffer[:size]
@@ -183,10 +183,11 @@ class EmsconConnection:
             raise DeviceError(f"{DEVICE} at {self.where}: the tracker has closed the connection")
         self._buffer += data
 
-    def _strange(self, content: str) -> NoReturn:
+    def strange(self, content: str) -> NoReturn:
+        """Refuse what the server sent, and close the connection."""
         self.close()
         raise DeviceError(
-            f"{DEVICE} at {self.where}: {content} comes; is an emScon server at this address?"
+            f"{DEVICE} at {self.where}: it sends {content}; is an emScon server at this address?"
         )
 
 
@@ -310,10 +311,7 @@ class EmsconTracker:
         try:
             result = es.measurement(kind, body)
         except struct.error:
-            self._line.close()
-            raise DeviceError(
-                f"{DEVICE}: measuring: a result of {len(body)} bytes comes; is this emScon?"
-            ) from None
+            self._line.strange(f"a result of {len(body)} bytes")
         if (result.quaternion is None) == (self._options.target == "pose"):
             raise DeviceError(f"{DEVICE}: measuring: the tracker measures in another mode than set")
         size = float(np.linalg.norm(result.position))

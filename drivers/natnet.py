@@ -25,7 +25,6 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from hilcal.config import CellConfig
-from hilcal.config.sections import Whole
 from hilcal.drivers.links import address, check_own_axes, network_failures
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import Report, Row, TargetLostError, TrackerSample, report_of
@@ -210,7 +209,9 @@ class NatNetOptions(Section):
     target: Literal["position", "pose"] = Field(
         "pose", description='"pose" (position and orientation) or "position" (of its pivot)'
     )
-    frames: Whole = Field(20, description="frames averaged for one measurement, 2 or more")
+    frames: int = Field(
+        20, strict=True, ge=2, description="frames averaged for one measurement, 2 or more"
+    )
     local: str = Field(
         "0.0.0.0",  # noqa: S104 - of a multicast group
         min_length=1,
@@ -348,7 +349,7 @@ class NatNetTracker:
 
     def _greet(self) -> NatNetServer:
         content = self._ask(connect(NEWEST), SERVER_INFO)
-        with self._parsing("what answers is no NatNet server; is this its command port?"):
+        with self._parsing("the answer is not a NatNet server's; is this its command port?"):
             found = server(content)
         if found.version > NEWEST:
             command = f"Bitstream,{NEWEST[0]}.{NEWEST[1]}".encode() + b"\0"
@@ -438,6 +439,4 @@ def open_tracker(config: CellConfig) -> NatNetTracker:
     host, port = address("[tracker]", "natnet", tracker.host, PORT)
     check_own_axes(tracker)
     options = check_section(tracker.options, NatNetOptions, "[tracker] options")
-    if options.frames < 2:
-        raise InputError("[tracker] options: frames = 1; valid: 2 or more, which show the scatter")
     return NatNetTracker(host, port, options)

@@ -129,7 +129,7 @@ class Datagrams:
 
 
 def _overload(wrench: Floats, status: int) -> str:
-    """The error that the status reports; a threshold once exceeded (bit 16) is none."""
+    """The error that the status reports; that a threshold was exceeded (bit 16) is no error."""
     if status in (0, LATCHED, ERROR | LATCHED) or not status & (ERROR | SATURATED[0]):
         return ""  # other bits of an Axia report a change of settings
     over = any(status & bits for bits in SATURATED)

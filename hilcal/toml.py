@@ -119,7 +119,7 @@ def check_json(text: str, section: type[S], where: str) -> S:
 
 
 def read_json(text: str, where: str) -> Any:
-    """Return what a JSON document holds; an InputError where it is none, too deep or too large."""
+    """Return what a JSON document holds; an InputError if it is not JSON, too deep or too large."""
     try:
         return parse_json(text)
     except json.JSONDecodeError as error:

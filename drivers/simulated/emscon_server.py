@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from hilcal.drivers import emscon_packets as es
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.blackboard import Blackboard, settled_truth
-from hilcal.drivers.simulated.geocom_server import Beam, PolarPoint, Station
+from hilcal.drivers.simulated.geocom_server import PolarPoint, Station
 from hilcal.drivers.simulated.world import SimulatedNoise
 from hilcal.types import Floats
 
@@ -70,7 +70,6 @@ class SimulatedTracker:
     """Settings and answers of the tracker."""
 
     station: Station
-    noise: SimulatedNoise
     rng: np.random.Generator  # of the orientation's noise
     initialized: bool = True
     settings: dict[int, bytes] = field(default_factory=lambda: dict(DEFAULTS))
@@ -169,7 +168,7 @@ class SimulatedTracker:
 
     def _measure(self) -> None:
         """Measure and send the result, in the units and coordinates set."""
-        station, noise = self.station, self.noise
+        station, noise = self.station, self.station.noise
         station.meas_s = self.setting(es.GET_STATIONARY, "<2i")[0] * 1e-3
         station.start_ranging()
         station.finish_ranging(station.meas_s)
@@ -295,9 +294,8 @@ def start(options: admin.Arguments) -> admin.Device:
     polar, orientation = np.random.default_rng(options.seed).spawn(2)
     along, across = tuple(options.range_std), tuple(options.transverse_std)
     board = Blackboard(options.directory / "world.bin")
-    station = Station(board, Beam(along, across), polar)
     noise = SimulatedNoise(along, across, options.orientation_std)
-    tracker = SimulatedTracker(station, noise, orientation)
+    tracker = SimulatedTracker(Station(board, noise, polar), orientation)
     door = socket.create_server((options.host, options.port or 7000), backlog=1)
     return operations(tracker), partial(serve, tracker, door)
 

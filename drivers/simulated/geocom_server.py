@@ -6,7 +6,7 @@
 Admin operations beside those of the line (`PtyPort.faults`): `beam {on}` blocks it, `hide
 {targets}` covers reflectors by number, `lock_lost`, `freeze {on}` repeats the last measurement,
 `stray {on}` follows a reflector at rest 0.2 m behind the target,
-`dist_error {on}`, `warn {code}` (1283 or 1284, 0 is none), `busy {on}`, `delay {rpc, seconds,
+`dist_error {on}`, `warn {code}` (1283 or 1284; 0 ends it), `busy {on}`, `delay {rpc, seconds,
 count}` in real time, `wrong_trid {count}`, `meas_s {seconds}` of world time, `log`, `state`.
 
 Sources: Leica Geosystems, "TPS1200+ GeoCOM Reference Manual"; its chapter "ASCII protocol" has the
@@ -30,6 +30,7 @@ from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.admin import setter
 from hilcal.drivers.simulated.blackboard import Blackboard, settled_truth
 from hilcal.drivers.simulated.pty_port import PtyPort
+from hilcal.drivers.simulated.world import SimulatedNoise
 from hilcal.types import Floats
 
 
@@ -59,34 +60,6 @@ class PolarPoint:
         return np.array([level * np.sin(self.hz), level * np.cos(self.hz), np.cos(self.v)])
 
 
-@dataclass(frozen=True, slots=True)
-class Beam:
-    """Noise of one measurement at the distance d.
-
-    sigma_range = a + b d,   sigma_transverse = c + e d in each direction across the beam,
-    sigma_v = sigma_transverse / d,   sigma_hz = sigma_transverse / (d sin v)
-    """
-
-    range_std: tuple[float, float]  # (a, b) in m and m/m
-    transverse_std: tuple[float, float]  # (c, e) in m and m/m
-
-    def angle_std(self, distance: float) -> float:
-        """Return sigma_transverse / d, rad."""
-        return self.transverse_std[0] / distance + self.transverse_std[1]
-
-    def observe(self, true: PolarPoint, rng: np.random.Generator) -> PolarPoint:
-        """Return one measurement of a target, with new noise."""
-        across = self.angle_std(true.distance)
-        draw = rng.standard_normal(3)
-        # straight above the station the horizontal angle is arbitrary
-        hz = true.hz + draw[0] * min(across / max(np.sin(true.v), 1e-12), np.pi)
-        v = true.v + draw[1] * across
-        if not 0.0 <= v <= np.pi:  # over the zenith or the nadir
-            hz, v = hz + np.pi, (-v if v < 0.0 else 2 * np.pi - v)
-        along = self.range_std[0] + self.range_std[1] * true.distance
-        return PolarPoint(float(hz % (2 * np.pi)), float(v), float(true.distance + draw[2] * along))
-
-
 WARNINGS = (0, 1283, 1284)
 BEHIND_M = 0.2  # distance of a stray reflector behind the target, m
 AIM_S = 0.3  # world time of a search, a fine adjustment, a lock-in or a turn, s
@@ -99,7 +72,7 @@ class Station:
     """A tracking station; it holds its target through jumps while the beam is free."""
 
     board: Blackboard
-    beam: Beam
+    noise: SimulatedNoise
     rng: np.random.Generator
     meas_s: float = 0.3  # world time of one distance measurement, s
     locked: bool = True  # whether the target is held; without lock no distance
@@ -192,9 +165,19 @@ class Station:
         true = self.held_target()
         if true is None:
             return None
-        self.pointing = self.newest = self.stuck or self.beam.observe(true, self.rng)
+        self.pointing = self.newest = self.stuck or self._observed(true)
         self.measured += 1
         return self.newest
+
+    def _observed(self, true: PolarPoint) -> PolarPoint:
+        """Return one measurement of a point, with new noise."""
+        place = true.distance * true.direction()
+        return PolarPoint.of(self.noise.observe(place[None], self.rng)[0])
+
+    def angle_std(self, distance: float) -> float:
+        """Return the standard deviation of a direction at a distance, rad."""
+        fixed, growing = self.noise.transverse_std
+        return fixed / distance + growing
 
     def wait(self, world_seconds: float) -> None:
         """Wait for `world_seconds` of world time."""
@@ -400,7 +383,7 @@ def _with_distance(station: Station, patience_ms: int, *, full: bool) -> Answer:
     code = station.warning if distance > 0.0 else ANGLES_ONLY
     if not full:
         return code, _numbers(station, polar.hz, polar.v, distance)
-    accuracy = station.beam.angle_std(distance) if distance > 0.0 else 0.0
+    accuracy = station.angle_std(distance) if distance > 0.0 else 0.0
     values = (polar.hz, polar.v, accuracy, *station.inclination(), distance)
     return code, [*_numbers(station, *values), str(station.distance_ms)]
 
@@ -507,8 +490,8 @@ def serve(station: Station, port: PtyPort, buffer: bytearray) -> None:
 def start(options: admin.Arguments) -> admin.Device:
     """Return the station on its serial line."""
     measuring, faults = np.random.default_rng(options.seed).spawn(2)
-    beam = Beam(tuple(options.range_std), tuple(options.transverse_std))
-    station = Station(Blackboard(options.directory / "world.bin"), beam, measuring)
+    noise = SimulatedNoise(tuple(options.range_std), tuple(options.transverse_std))
+    station = Station(Blackboard(options.directory / "world.bin"), noise, measuring)
     port = PtyPort(options.directory / "tracker", options.baud, faults)
     return operations(station, port), partial(serve, station, port, bytearray())
 

@@ -188,8 +188,8 @@ class Calibration(Brief):
             InputError: a wrong shape, or the model needs a missing column whose mean the
                 calibration does not know.
         """
-        (states, untold), tool_pose = self._states(q, wrench, recorded), self._tool(tool)
-        return self.poses(tool_pose, states, self.nominal(tool_pose, states), std, untold)
+        (states, unstated), tool_pose = self._states(q, wrench, recorded), self._tool(tool)
+        return self.poses(tool_pose, states, self.nominal(tool_pose, states), std, unstated)
 
     def compensate(
         self,
@@ -213,7 +213,7 @@ class Calibration(Brief):
         Raises:
             InputError: as for `predict`.
         """
-        (states, untold), tool_pose = self._states(q, wrench, recorded), self._tool(tool)
+        (states, unstated), tool_pose = self._states(q, wrench, recorded), self._tool(tool)
         goal = None
         if wanted is not None:
             pose = np.broadcast_to(np.asarray(wanted, dtype=float), (len(states), 4, 4))
@@ -232,7 +232,7 @@ class Calibration(Brief):
 
             target = in_chain(tool_pose, *(goal or self.nominal(tool_pose, states)))
             inverse = invert(self.model.cell.arm, poses, states.q, *target)
-        return Compensation(inverse, self, tool_pose, states, goal, std, untold)
+        return Compensation(inverse, self, tool_pose, states, goal, std, unstated)
 
     @cached_property
     def controller(self) -> Arm:
@@ -329,8 +329,8 @@ class Calibration(Brief):
             if not np.isfinite(column).all():
                 raise InputError(f"{name} has values that are not finite")
         missing = missing_columns(self.model, States(q, **columns))
-        untold = tuple(c for c in missing if c in self.conditions)
-        for name in untold:
+        unstated = tuple(c for c in missing if c in self.conditions)
+        for name in unstated:
             mean = self.conditions[name].mean
             columns[name] = np.broadcast_to(mean, (len(q), *mean.shape)).copy()
         states = States(q, **columns)
@@ -339,7 +339,7 @@ class Calibration(Brief):
                 raise InputError(
                     f"the model has {e.name}, which needs {', '.join(e.needs)}; give it"
                 )
-        return states, untold
+        return states, unstated
 
     def nominal(self, tool: ToolPose, states: States) -> tuple[Floats, Floats]:
         """Orientation (N, 3, 3) and position (N, 3) of the tool that errors are relative to."""
@@ -355,12 +355,12 @@ class Calibration(Brief):
         states: States,
         nominal: tuple[Floats, Floats],
         std: bool,
-        untold: tuple[str, ...] = (),
+        unstated: tuple[str, ...] = (),
     ) -> ToolPoses:
         """Return the poses of a tool at N points.
 
-        Errors are relative to `nominal`, orientations (N, 3, 3) and positions (N, 3). `untold` are
-        columns of the states that are filled with means of `conditions`.
+        Errors are relative to `nominal`, orientations (N, 3, 3) and positions (N, 3). `unstated`
+        are columns of the states that are filled with means of `conditions`.
         """
         prediction = tool.model.predict(states, tool.theta)
         rotation, position = tool_poses(tool, prediction)
@@ -374,7 +374,7 @@ class Calibration(Brief):
             turn, chain = tool.base[:3, :3], prediction.situation.chain
             point = (position - tool.base[:3, 3]) @ turn
             scatter = self.scatter.covariance(tool.model.cell, chain, point)
-            isotropic = self.misfit + sum(self.conditions[name].variance_m2 for name in untold)
+            isotropic = self.misfit + sum(self.conditions[name].variance_m2 for name in unstated)
             covariance = turn @ (by_parameters + scatter) @ turn.T + isotropic * np.eye(3)
             std_m = np.sqrt(np.trace(by_parameters, axis1=1, axis2=2))
         outside = tuple(self.measured.outside(states, std_m, self.turns))
@@ -429,7 +429,7 @@ def calibration_of_stream(fit: StreamFit, source: Mapping[str, Any]) -> Calibrat
 
 
 def _numbers(values: object, name: str) -> Any:
-    """Return numbers as an array; InputError for what is none."""
+    """Return numbers as an array; InputError for anything else."""
     try:
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError):

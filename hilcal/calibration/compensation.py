@@ -277,7 +277,7 @@ class Compensation(Brief):
     _states: States
     _wanted: tuple[Floats, Floats] | None
     _std: bool
-    untold: tuple[str, ...] = ()
+    unstated: tuple[str, ...] = ()
     """Columns of `States` that the model needs and the points lack."""
 
     def _brief(self) -> dict[str, str]:
@@ -312,7 +312,7 @@ class Compensation(Brief):
     def after(self) -> ToolPoses:
         """The tool at the corrected joint values."""
         states = replace(self._states, q=self.q)
-        return self._calibration.poses(self._tool, states, self._goal, self._std, self.untold)
+        return self._calibration.poses(self._tool, states, self._goal, self._std, self.unstated)
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -356,7 +356,7 @@ class Compensation(Brief):
         return self._wanted
 
     def to_dict(self, names: Sequence[str]) -> dict[str, object]:
-        """Return the document of `compensate --json`, SI; `names` are those of the points.
+        """Return the document of `compensate --json`, SI; `names` of the points.
 
         `expected_error_m` is the root sum square of the inversion's residual and the position's
         standard deviation.

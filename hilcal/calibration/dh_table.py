@@ -18,8 +18,6 @@ Source: Craig, *Introduction to Robotics*, sections 3.3 and 3.4; Hayati, "Robot 
 parameter estimation", IEEE CDC 1983, for parallel axes.
 """
 
-import csv
-import io
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Literal
@@ -28,10 +26,11 @@ import numpy as np
 import tomli_w
 
 from hilcal.errors import InputError
-from hilcal.names import csv_text, escaped
+from hilcal.names import escaped
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
+from hilcal.tables.write import Column, csv_of
 from hilcal.types import Floats
 
 Convention = Literal["standard", "modified"]
@@ -116,13 +115,8 @@ def flange_poses(rows: DhRows, q: Floats, *, whole: bool = True) -> Floats:
 
 def to_csv(rows: DhRows, arm: Arm) -> str:
     """Return the rows alone, in m and rad."""
-    stream = io.StringIO()
-    out = csv.writer(stream, lineterminator="\n")
-    out.writerow(("joint", "a_m", "d_m", "alpha_rad", "offset_rad"))
-    numbers = zip(*(x.tolist() for x in (rows.a, rows.d, rows.alpha, rows.offset)), strict=True)
-    for name, row in zip(arm.joint_names, numbers, strict=True):
-        out.writerow((csv_text(name), *map(repr, row)))
-    return stream.getvalue()
+    columns: dict[str, Column] = {"joint": arm.joint_names, "a_m": rows.a, "d_m": rows.d}
+    return csv_of({**columns, "alpha_rad": rows.alpha, "offset_rad": rows.offset})
 
 
 def to_toml(rows: DhRows, arm: Arm, title: str) -> str:

@@ -152,7 +152,7 @@ def improvement(
 def _errors(
     calibration: Calibration, p: Predictive, readings: Readings, goal: States
 ) -> tuple[Floats, Floats, Floats]:
-    """Errors (D, 3), their predicted covariances (D, m, m), and those of the noise."""
+    """Errors (D, 3), their predicted covariances, and the covariances of the noise (D, m, m)."""
     model, theta = calibration.model, calibration.theta
     w = whitening(readings, calibration.mode, "gc")
     prediction = model.predict(readings.states, theta)

@@ -1,9 +1,9 @@
 """A calibration as one JSON file with everything that predicting and compensating needs.
 
 The covariance is stored in the smaller of two forms. One is its factor, as 32-bit floats, each row
-scaled by its parameter's standard deviation. The other is the source that it is computed from
-(`learnt`), if that reproduces the standard deviations at fitted states to `STD_TOLERANCE`, which is
-checked before writing. Everything else is decimal numbers, exactly.
+scaled by its parameter's standard deviation. The other (key `learnt`) is the source that it is
+computed from, if that reproduces the standard deviations at fitted states to `STD_TOLERANCE`, which
+is checked before writing. Everything else is decimal numbers, exactly.
 """
 
 import base64
@@ -104,10 +104,10 @@ def _read(content: Mapping[str, Any], catalogue: Catalogue) -> Calibration:
         )
     theta = numbers("theta", content["theta"], (len(names),))
     std = numbers("std", content["std"], (len(names),), minimum=0.0)
-    root = learnt = None
+    root = source = None
     if "learnt" in content:
-        learnt = CovarianceSource.from_json(content["learnt"])
-        learnt.check(model)
+        source = CovarianceSource.from_json(content["learnt"])
+        source.check(model)
     else:
         flat = np.frombuffer(base64.b64decode(content["covariance_root"]), dtype="<f4")
         root = flat.reshape(len(std), -1).astype(float) * std[:, None]
@@ -119,7 +119,7 @@ def _read(content: Mapping[str, Any], catalogue: Catalogue) -> Calibration:
         theta=theta,
         mode=MODES[MODES.index(content["readings"])],
         root=root,
-        covariance_source=learnt,
+        covariance_source=source,
         misfit=float(content["misfit_m2"]),
         scatter=scatter,
         measured=decode(MeasuredRanges, content["measured"]),

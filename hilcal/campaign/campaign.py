@@ -563,7 +563,7 @@ def _covers(file: CampaignFile, changes: Changes) -> str | None:
 
 @contextmanager
 def opened(run: Campaign | str | Path) -> Iterator[Campaign]:
-    """Yield a campaign, or open that of a path for the block."""
+    """Yield a campaign as it is; open that of a path, and close it after the block."""
     if isinstance(run, Campaign):
         yield run
         return

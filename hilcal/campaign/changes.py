@@ -113,7 +113,7 @@ def refit(
 
     Frames that the cell does not know are estimated. The prior of another campaign, a background
     and the arm's scatter are used where the revision has them; the latter two are estimated again.
-    Nothing is stored. `history` is that of the model. Raises as `add_effect` does.
+    Nothing is stored. `history` tells how the model was reached. Raises as `add_effect` does.
     """
     mode = mode_of(record)
     frames = o.catalogue.unknown_frames(o.at(record.cell).cell)

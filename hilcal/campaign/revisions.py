@@ -196,7 +196,9 @@ def restore_model(
         random = {name: np.array(values, dtype=float) for name, values in std.items()}
         for name, values in random.items():
             if values.shape != (size.get(name),) or not np.all((values > 0) & (values < LARGEST)):
-                raise ValueError("random effects with standard deviations that are none")
+                raise ValueError(
+                    "standard deviations of random effects that are not positive numbers"
+                )
         background = frozenset(names) - frozenset(record.effects)
         if not background <= random.keys() or not set(record.effects) <= set(names):
             raise ValueError("a background that is not random")

@@ -9,12 +9,12 @@ from typing import Any
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.fitting import PriorOptions
-from hilcal.cli.options import POSES, catalogue_with, command
+from hilcal.cli.options import POSES, command
 from hilcal.cli.planning import answers_of, read_cell, refuse_unready
 from hilcal.cli.refining import chapters_of, errors_by_revision
 from hilcal.cli.running import lasting_cell, measure, retry_after_failures
 from hilcal.cli.showing import live_viewer
-from hilcal.cli.terminal import Terminal, confirmed, person_present, terminal
+from hilcal.cli.terminal import Terminal, confirmed, person_present
 from hilcal.config import CellConfig
 from hilcal.design.nominal_model import check_effects
 from hilcal.drivers.simulated.rehearsal import NO_EFFECT, program_config
@@ -99,13 +99,12 @@ DEFAULT_OPTIONS = CalibrationOptions()
     yes | --yes -y | Do not ask before the arm moves; for scripts.
     """)
 def calibrate(
-    cell: Path, output: Path, resume: bool = False, skip: list[str] | None = None,
-    options: CalibrationOptions = DEFAULT_OPTIONS, rehearse: bool = False, yes: bool = False,
-    view: bool = False,
-    effects_from: list[Path] | None = None, as_json: bool = False,
+    t: Terminal, catalogue: Catalogue, cell: Path, output: Path, resume: bool = False,
+    skip: list[str] | None = None, options: CalibrationOptions = DEFAULT_OPTIONS,
+    rehearse: bool = False, yes: bool = False, view: bool = False,
+    effects_from: list[Path] | None = None,
 ) -> None:  # fmt: skip
     """Plan, measure, fit, measure what is in doubt, validate, correct, and measure the gain."""
-    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     config, numbers = read_cell(cell)
     settings = options.settings()
     if config.limits.accuracy_m is not None and not resume:

@@ -11,7 +11,7 @@ import numpy as np
 from hilcal.campaign.campaign import estimated_noise
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.options import check_new, command
-from hilcal.cli.terminal import Terminal, terminal
+from hilcal.cli.terminal import Terminal
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.noise.full_covariance import covariance_parts
 from hilcal.identification.registration.misdescription import examine, other_arm
@@ -45,11 +45,10 @@ from hilcal.whole_file import replace_file
     preview | --preview | Show how the table could be read; make no campaign.
     """)
 def import_(
-    table: Path, config: Path | None = None, output: Path | None = None, kind: str = "table",
-    second: Path | None = None, preview: bool = False, force: bool = False, as_json: bool = False,
+    t: Terminal, table: Path, config: Path | None = None, output: Path | None = None,
+    kind: str = "table", second: Path | None = None, preview: bool = False, force: bool = False,
 ) -> None:  # fmt: skip
     """Make a campaign file from a table of readings."""
-    t = terminal(as_json)
     if preview:
         if kind != "table":
             raise InputError(f"--preview proposes a mapping; leave out --format {kind}")
@@ -160,9 +159,8 @@ def show_preview(
 
 
 @command()
-def info(run: Path, as_json: bool = False) -> None:
+def info(t: Terminal, run: Path) -> None:
     """Say what a campaign holds: readings, instruments, drift, events, revisions."""
-    t = terminal(as_json)
     with CampaignFile.open(run, read_only=True) as file:
         content = overview(file)
         parts = covariance_parts(file.about(COVERS_KEY), content.config)
@@ -181,11 +179,8 @@ def info(run: Path, as_json: bool = False) -> None:
     number | N | The revision; the latest one if left out.
     release | --release | Accept none: the latest one is used again.
     """)
-def accept(
-    run: Path, number: int | None = None, release: bool = False, as_json: bool = False
-) -> None:
+def accept(t: Terminal, run: Path, number: int | None = None, release: bool = False) -> None:
     """Choose the revision that every command uses from now on, whatever is added later."""
-    t = terminal(as_json)
     if release and number is not None:
         raise InputError("--release accepts no revision; leave out the number")
     with CampaignFile.open(run) as file:
@@ -212,9 +207,8 @@ def accept(
 @command("""
     robot | --robot FILE | URDF or DH table of its robot, for a campaign that does not hold it.
     """)
-def repair(run: Path, robot: Path | None = None, as_json: bool = False) -> None:
+def repair(t: Terminal, run: Path, robot: Path | None = None) -> None:
     """Open a campaign again that a bad revision closes: it is set aside, no reading is."""
-    t = terminal(as_json)
     result = repaired(run)
     if robot is not None:
         put_robot(run, robot)
@@ -246,8 +240,8 @@ def _named(record: RevisionRecord) -> str:
     report | --report F.html | Write it as one HTML page.
     """)
 def fleet(
-    directory: Path, out: Path, report: Path | None = None, record: Path | None = None,
-    workers: int | None = None, scheduler: str | None = None, as_json: bool = False,
+    t: Terminal, directory: Path, out: Path, report: Path | None = None, record: Path | None = None,
+    workers: int | None = None, scheduler: str | None = None,
 ) -> None:  # fmt: skip
     """Pool many campaigns: a prior for other arms, arms unlike their type, drift."""
     # these import the modules for fitting and reports
@@ -261,7 +255,6 @@ def fleet(
     from hilcal.transfer.members import entries
     from hilcal.write_report import write_fleet_report
 
-    t = terminal(as_json)
     check_record(record)
     entries(directory)  # refuses a directory before workers are started
     with open_engine(workers, scheduler) as engine:

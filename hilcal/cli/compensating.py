@@ -15,8 +15,8 @@ from hilcal.calibration.compensation import Compensation
 from hilcal.calibration.points import Points, on_branch, read_points
 from hilcal.calibration.programs.languages import READERS, ResolvedProgram, read_program
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.options import catalogue_with, check_new, command
-from hilcal.cli.terminal import terminal
+from hilcal.cli.options import check_new, command
+from hilcal.cli.terminal import Terminal
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit_document import with_nulls
@@ -89,13 +89,11 @@ DEFAULT_OPTIONS = CompensationOptions()
     force | --force | Replace existing files.
     """)
 def compensate(
-    model: Path, points: Path, output: list[Path] | None = None,
+    t: Terminal, catalogue: Catalogue, model: Path, points: Path, output: list[Path] | None = None,
     options: CompensationOptions = DEFAULT_OPTIONS, revision: int | None = None,
-    effects_from: list[Path] | None = None, kind: str = "table", force: bool = False,
-    as_json: bool = False,
+    kind: str = "table", force: bool = False,
 ) -> None:  # fmt: skip
     """Find the joint values that put the tool where it was asked to be, under a load."""
-    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     for path in output or ():
         _check_output(path, points, force)
     with working(t.progress) as say:

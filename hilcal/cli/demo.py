@@ -15,10 +15,10 @@ from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.revisions import to_record
 from hilcal.cli import running
 from hilcal.cli.fitting import check_record, compute_errors, record_story
-from hilcal.cli.options import catalogue_with, check_seed, command
+from hilcal.cli.options import check_seed, command
 from hilcal.cli.planning import separates
 from hilcal.cli.refining import changed, chapters_of, errors_by_revision, revisions_json
-from hilcal.cli.terminal import Terminal, terminal
+from hilcal.cli.terminal import Terminal
 from hilcal.config import load_config
 from hilcal.design.next import plan_separating
 from hilcal.design.planner import PlanRequest
@@ -195,13 +195,12 @@ VALIDATION = 10  # Poses of the validation campaign; a choice for the same reaso
         settles it.
     """)
 def demo(
-    hide: str | None = None, seed: int | None = None, output: Path = Path("demo.hilcal"),
-    poses: int = POSES, validation: int = VALIDATION, without_devices: bool = False,
-    ambiguous: bool = False, record: Path | None = None, effects_from: list[Path] | None = None,
-    as_json: bool = False,
+    t: Terminal, catalogue: Catalogue, hide: str | None = None, seed: int | None = None,
+    output: Path = Path("demo.hilcal"), poses: int = POSES, validation: int = VALIDATION,
+    without_devices: bool = False, ambiguous: bool = False, record: Path | None = None,
+    effects_from: list[Path] | None = None,
 ) -> None:  # fmt: skip
     """Rehearse the whole story on a simulated cell, through real drivers and wires."""
-    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)
     config = load_config(configs_dir() / "cells" / CELL)
     number = check_seed(config.simulation.seed if seed is None else seed)

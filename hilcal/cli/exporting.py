@@ -15,8 +15,9 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.handover import CorrectedArm, corrected_arm
 from hilcal.calibration.own_files.correct import KINDS, correct_file
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.options import catalogue_with, check_new, command
-from hilcal.cli.terminal import terminal
+from hilcal.cli.options import check_new, command
+from hilcal.cli.terminal import Terminal
+from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
 from hilcal.identification import parameters_document
 from hilcal.identification.prediction.full_prediction import residual_table
@@ -140,18 +141,17 @@ class ExportOptions:
     force | --force | Replace existing files.
     """)
 def export(
-    run: Path, options: ExportOptions, revision: int | None = None, force: bool = False,
-    effects_from: list[Path] | None = None, as_json: bool = False,
+    t: Terminal, catalogue: Catalogue, run: Path, options: ExportOptions,
+    revision: int | None = None, force: bool = False,
 ) -> None:  # fmt: skip
     """Hand over: readings, parameters, calibration, URDF, DH, frames."""
-    t = terminal(as_json)
     options.check(force)
     if revision is not None and not options.of_model:
         raise InputError("--revision is about the model; give --parameters or --calibration, too")
-    with Campaign.open(run, catalogue_with(effects_from), read_only=True) as campaign:
+    with Campaign.open(run, catalogue, read_only=True) as campaign:
         record = campaign.in_use(revision)
         if record is None and (options.of_model or options.revisions is not None):
-            raise InputError(f"{run}: no revision yet, so nothing of it; run hilcal identify first")
+            raise InputError(f"{run}: no revision to export yet; run hilcal identify first")
         t.show(_write_data(campaign, options, force))
         if options.revisions is not None and record is not None:
             records = campaign.file.revisions()

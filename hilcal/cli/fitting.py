@@ -9,8 +9,8 @@ from hilcal import numbers
 from hilcal.calibration.calibration import calibration_of_stream
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
-from hilcal.cli.options import catalogue_with, check_folder, check_workers, command
-from hilcal.cli.terminal import Terminal, terminal
+from hilcal.cli.options import check_folder, check_workers, command
+from hilcal.cli.terminal import Terminal
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.options import Options
@@ -239,17 +239,15 @@ def _drifts(text: str | None) -> dict[str, float]:
     out | -o F.json | Of a stream: write its calibration.
     """)
 def identify(
-    run: Path, effects: str | None = None, scaling: str = "gc", readings: str | None = None,
-    fit_validation: bool = False, prior: PriorOptions = NO_PRIOR,
+    t: Terminal, catalogue: Catalogue, run: Path, effects: str | None = None, scaling: str = "gc",
+    readings: str | None = None, fit_validation: bool = False, prior: PriorOptions = NO_PRIOR,
     effects_from: list[Path] | None = None, cell: Path | None = None, out: Path | None = None,
     workers: int | None = None, scheduler: str | None = None, details: bool = False,
-    as_json: bool = False,
 ) -> None:  # fmt: skip
     """Fit a model to the readings, and keep it as a revision.
 
     A Parquet table in place of the campaign is read as a stream, in passes that need little memory.
     """
-    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     requested, named = scalings(scaling), effects_of_option(effects, catalogue)
     carried = prior.load(catalogue)
     if run.suffix == ".parquet" or is_parquet(run):
@@ -354,12 +352,11 @@ def identify_stream(
     seed | --seed | Of the draws.
     """)
 def bootstrap(
-    run: Path, revision: int | None = None, draws: int = DRAWS, seed: int = 0,
-    workers: int | None = None, scheduler: str | None = None,
-    effects_from: list[Path] | None = None, as_json: bool = False,
+    t: Terminal, catalogue: Catalogue, run: Path, revision: int | None = None, draws: int = DRAWS,
+    seed: int = 0, workers: int | None = None, scheduler: str | None = None,
+    effects_from: list[Path] | None = None,
 ) -> None:  # fmt: skip
     """Draw the poses again, refit, and compare the scatter with the stated uncertainties."""
-    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_draws(draws, seed)
     count = check_workers(workers, scheduler, effects_from)
     with (

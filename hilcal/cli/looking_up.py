@@ -9,7 +9,7 @@ import numpy as np
 import typer
 
 from hilcal.cli.options import catalogue_with, check_seed, command, one_by_default
-from hilcal.cli.terminal import terminal
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import reference
 from hilcal.drivers.emscon import EmsconOptions as EmsconOptions
 from hilcal.drivers.geocom import GeoComOptions as GeoComOptions
@@ -114,9 +114,8 @@ def _document(e: Effect, defaults: dict[str, object], catalogue: Catalogue) -> d
     name | NAME | Lower case, digits and _.
     output | -o --output FILE.py | The file; NAME.py by default.
     """)
-def new(name: str, output: Path | None = None, as_json: bool = False) -> None:
+def new(t: Terminal, name: str, output: Path | None = None) -> None:
     """Write a file with one effect that works as it stands, to be changed into your own."""
-    t = terminal(as_json)
     path = Path(f"{name}.py") if output is None else output
     if not NAME.fullmatch(name) or keyword.iskeyword(name):
         raise InputError(
@@ -159,9 +158,9 @@ DRIVERS_OWN: dict[str, type[Section]] = {
 @command("""
     section | SECTION | One of them, e.g. tracker.
     """)
-def config(section: str | None = None, as_json: bool = False) -> None:
+def config(t: Terminal, section: str | None = None) -> None:
     """Explain the sections and keys of CELL.toml: unit, default, example."""
-    t, tables = terminal(as_json), reference.tables(DRIVERS_OWN)
+    tables = reference.tables(DRIVERS_OWN)
     sections = tables if section is None else (reference.table(section, tables),)
     t.show(sections_overview(sections) if section is None else section_report(sections[0]))
     t.document(sections=[asdict(s) for s in sections])
@@ -173,14 +172,13 @@ def config(section: str | None = None, as_json: bool = False) -> None:
     workers | --workers N | Processes of this machine; 1 by default.
     """)
 def scaling(
-    runs: int = 2000, seed: int = 1, workers: int | None = None, scheduler: str | None = None,
-    as_json: bool = False,
+    t: Terminal, runs: int = 2000, seed: int = 1, workers: int | None = None,
+    scheduler: str | None = None,
 ) -> None:  # fmt: skip
     """Show what the scalings none, gu and gc do to the same data."""
     from hilcal.engine import open_engine
     from hilcal.study import check, n_experiments, scaling_study, table
 
-    t = terminal(as_json)
     check(runs)
     task = f"experiments of {runs} campaigns, each with every scaling"
     with (

@@ -10,6 +10,7 @@ from typing import Annotated, Any, TypeVar, cast
 
 import typer
 
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
 
@@ -79,26 +80,60 @@ OneJob = Annotated[int | None, SHARED["own_jobs"]]
 Scheduler = Annotated[str | None, SHARED["scheduler"]]
 
 
+def catalogue_with(paths: list[Path] | None) -> Catalogue:
+    """Return the installed effects and those of files."""
+    catalogue = installed()
+    for path in paths or ():
+        catalogue = catalogue.with_file(path)
+    return catalogue
+
+
+def _option(name: str, kind: Any, default: object) -> inspect.Parameter:
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    return inspect.Parameter(name, keyword, default=default, annotation=kind)
+
+
+_MADE: dict[Any, tuple[inspect.Parameter, Callable[[Any], object]]] = {
+    Terminal: (_option("as_json", bool, False), terminal),
+    Catalogue: (_option("effects_from", list[Path] | None, None), catalogue_with),
+}
+"""Types of parameters that are made from an option: the option, and how they are made."""
+
+
 def command(text: str = "") -> Callable[[F], F]:
-    """Declare a command's parameters by a text and `SHARED`; fields of a dataclass are options."""
+    """Declare a command's parameters by a text and `SHARED`.
+
+    Fields of a dataclass are options. The options of `_MADE` come last.
+    """
     declarations, annotated = SHARED | _declared(text), cast(Any, Annotated)
 
     def declare(function: F) -> F:
-        params = inspect.signature(function).parameters.values()
-        joint: dict[str, Any] = {p.name: p.annotation for p in params if is_dataclass(p.annotation)}
+        params = inspect.signature(function).parameters
+        kinds: dict[str, Any] = {name: p.annotation for name, p in params.items()}
+        made = {name: _MADE[kind] for name, kind in kinds.items() if kind in _MADE}
+        joint: dict[str, Any] = {
+            name: kind for name, kind in kinds.items() if is_dataclass(kind) and name not in made
+        }
+        parts: dict[str, inspect.Parameter] = {}
+        for name, p in params.items():
+            if name in joint:
+                parts |= inspect.signature(joint[name]).parameters
+            elif name not in made:
+                parts[name] = p
+        for option, _ in reversed(made.values()):
+            parts.setdefault(option.name, option)
         flattened = []
-        for p in params:
-            joined = p.name in joint
-            for part in inspect.signature(joint[p.name]).parameters.values() if joined else (p,):
-                info = declarations.get(part.name)
-                kind = annotated[part.annotation, info] if info else part.annotation
-                flattened.append(part.replace(annotation=kind))
+        for name, part in parts.items():
+            info = declarations.get(name)
+            kind = annotated[part.annotation, info] if info else part.annotation
+            flattened.append(part.replace(annotation=kind))
 
         @wraps(function)
         def wrapper(**options: Any) -> None:
+            values = {name: make(options[option.name]) for name, (option, make) in made.items()}
             for name, kind in joint.items():
-                options[name] = kind(**{f.name: options.pop(f.name) for f in fields(kind)})
-            function(**options)
+                values[name] = kind(**{f.name: options[f.name] for f in fields(kind)})
+            function(**{name: (options | values)[name] for name in params})
 
         declared: Any = wrapper
         declared.__signature__ = inspect.Signature(flattened)
@@ -106,14 +141,6 @@ def command(text: str = "") -> Callable[[F], F]:
         return cast(F, wrapper)
 
     return declare
-
-
-def catalogue_with(paths: list[Path] | None) -> Catalogue:
-    """Return the installed effects and those of files."""
-    catalogue = installed()
-    for path in paths or ():
-        catalogue = catalogue.with_file(path)
-    return catalogue
 
 
 def one_by_default(workers: int | None, scheduler: str | None) -> tuple[int | None, str | None]:

@@ -11,8 +11,8 @@ from hilcal import numbers as words_of
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli import fitting
-from hilcal.cli.options import POSES, catalogue_with, check_seed, command
-from hilcal.cli.terminal import Terminal, terminal
+from hilcal.cli.options import POSES, check_seed, command
+from hilcal.cli.terminal import Terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.design.choice import CRITERIA, criterion_name
 from hilcal.design.next import PairPower, SeparatingPlan
@@ -79,14 +79,13 @@ def _check_plan_place(output: Path) -> None:
         drift costs more.
     """)
 def plan(
-    cell: Path, output: Path, poses: int = POSES, readings: int | None = None,
-    criterion: str | None = None, after: Path | None = None, revision: int | None = None,
-    prior: fitting.PriorOptions = fitting.NO_PRIOR, seed: int = 0, unloaded_first: bool = False,
-    quick: bool = False, csv: Path | None = None, record: Path | None = None, details: bool = False,
-    effects_from: list[Path] | None = None, as_json: bool = False,
+    t: Terminal, catalogue: Catalogue, cell: Path, output: Path, poses: int = POSES,
+    readings: int | None = None, criterion: str | None = None, after: Path | None = None,
+    revision: int | None = None, prior: fitting.PriorOptions = fitting.NO_PRIOR, seed: int = 0,
+    unloaded_first: bool = False, quick: bool = False, csv: Path | None = None,
+    record: Path | None = None, details: bool = False,
 ) -> None:  # fmt: skip
     """Choose poses, loads and their order, with a proof of how near to the best they are."""
-    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     fitting.check_record(record)
     _check_plan_place(output)
     if revision is not None and after is None:
@@ -126,12 +125,10 @@ def plan(
     yes | --yes -y | With --factory: do not ask before the arm moves.
     """)
 def check(
-    cell: Path, plan: Path | None = None, save_calibration: Path | None = None,
-    factory: Path | None = None, yes: bool = False, effects_from: list[Path] | None = None,
-    as_json: bool = False,
+    t: Terminal, catalogue: Catalogue, cell: Path, plan: Path | None = None,
+    save_calibration: Path | None = None, factory: Path | None = None, yes: bool = False,
 ) -> None:  # fmt: skip
     """Connect to every device and report its state; nothing moves without --factory."""
-    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     if save_calibration is not None and save_calibration.suffix.lower() != ".toml":
         raise InputError(f"--save-calibration {save_calibration}; valid: a name that ends in .toml")
     if save_calibration is not None and save_calibration.exists():
@@ -240,14 +237,13 @@ def refuse_unready(answers: tuple[ConnectionResult, ...]) -> None:
     cell | --cell CELL.toml | The cell, where it has other loads now.
     """)
 def next_(
-    run: Path, output: Path, poses: int | None = None, suspects: str | None = None,
-    cell: Path | None = None, seed: int = 0, quick: bool = False, csv: Path | None = None,
-    revision: int | None = None, prior: fitting.PriorOptions = fitting.NO_PRIOR,
-    record: Path | None = None, effects_from: list[Path] | None = None, details: bool = False,
-    as_json: bool = False,
+    t: Terminal, catalogue: Catalogue, run: Path, output: Path, poses: int | None = None,
+    suspects: str | None = None, cell: Path | None = None, seed: int = 0, quick: bool = False,
+    csv: Path | None = None, revision: int | None = None,
+    prior: fitting.PriorOptions = fitting.NO_PRIOR, record: Path | None = None,
+    details: bool = False,
 ) -> None:  # fmt: skip
     """Plan the measurements that separate the leading suspects; exit 4 where none are in doubt."""
-    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     fitting.check_record(record)
     _check_plan_place(output)
     carried = prior.load(catalogue)
@@ -257,7 +253,7 @@ def next_(
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         changed = None if cell is None else read_cell(cell)
         doubt = _without_suspects(t, o, revision, _named(suspects, catalogue), say, carried)
-        compare = (details or as_json) and not quick
+        compare = (details or t.json) and not quick
         planned = next_plan(o, doubt, poses, rng, say, cell=changed, compare=compare)
         config, numbers = (o.config, o.cell) if changed is None else changed
     chosen, checked_plan, effects = planned.separating, planned.checked, doubt.suspects

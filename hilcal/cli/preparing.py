@@ -12,7 +12,7 @@ import hilcal
 from hilcal import doctor as machine
 from hilcal.cell import cell_from_config
 from hilcal.cli.options import check_folder, check_new, command
-from hilcal.cli.terminal import Terminal, confirmed, person_present, terminal
+from hilcal.cli.terminal import Terminal, confirmed, person_present
 from hilcal.config import CellConfig, load_config
 from hilcal.config.reference import cell_text
 from hilcal.config.sections import GEOMETRY, LOADED
@@ -230,25 +230,24 @@ tracker_place | Where does the tracker stand, roughly? x, y, z in m, base axes |
     tracker_place | --tracker-place X,Y,Z | Of the tracker in base axes, m.
     """)
 def init(
-    cell: Path = Path("CELL.toml"), robot: str | None = None, host: str | None = None,
+    t: Terminal, cell: Path = Path("CELL.toml"), robot: str | None = None, host: str | None = None,
     repeatability: str | None = None, tracker: str | None = None, tracker_port: str | None = None,
     tracker_accuracy: str | None = None, force_sensor: str | None = None,
     force_port: str | None = None, target: str | None = None, load_point: str | None = None,
     tool_mass: str | None = None, tool_com: str | None = None, load: list[str] | None = None,
     readings: str | None = None, floor: str | None = None, tracker_place: str | None = None,
-    force: bool = False, as_json: bool = False,
+    force: bool = False,
 ) -> None:  # fmt: skip
     """Write a commented CELL.toml: asks at a terminal, else takes the options."""
-    t = terminal(as_json)
     options = {f"--{name.replace('_', '-')}": value for name, value in locals().items()}
-    asks = person_present(t) and not as_json
+    asks = person_present(t) and not t.json
     check_folder(cell, str(cell))
     check_new(
         cell, force or (asks and cell.exists() and confirmed(t, f"{cell} exists. Replace it?"))
     )
     draft = Draft(cell.absolute().parent)
     if asks:
-        t.notice(f"Enter alone leaves a thing open; Ctrl-C ends, and {cell} is not written.\n")
+        t.notice(f"Enter alone leaves a question open; Ctrl-C ends, and {cell} is not written.\n")
     for question in questions():
         stated = options[question.option]
         if stated is not None:
@@ -337,9 +336,8 @@ def _complete(draft: Draft) -> None:
     cell | CELL.toml | Also look at this cell's ports and addresses.
     folder | --folder DIR | Where campaigns are stored.
     """)
-def doctor(cell: Path | None = None, folder: Path = Path("."), as_json: bool = False) -> None:
+def doctor(t: Terminal, cell: Path | None = None, folder: Path = Path(".")) -> None:
     """Look at packages, ports, permissions, network, clock and disk of this computer."""
-    t = terminal(as_json)
     findings: list[machine.Finding] = []
     with working(t.progress) as say:
         say("looking at what is installed")

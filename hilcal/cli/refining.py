@@ -11,9 +11,9 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.changes import add_effect, remove_effect
 from hilcal.cli import fitting
-from hilcal.cli.options import catalogue_with, check_folder, command
+from hilcal.cli.options import check_folder, command
 from hilcal.cli.showing import live_viewer
-from hilcal.cli.terminal import Terminal, terminal
+from hilcal.cli.terminal import Terminal
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.diagnosis.verdict import NO_HISTORY
@@ -83,12 +83,8 @@ def _verdict(c: Chapter, stored: str) -> str:
 
 
 @command()
-def diagnose(
-    run: Path, revision: int | None = None, effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:  # fmt: skip
+def diagnose(t: Terminal, catalogue: Catalogue, run: Path, revision: int | None = None) -> None:
     """Say which effect the model lacks."""
-    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         number, fitted = fitting.fit_of(t, o, say, revision)
         o.require_gc(number, fitted.scaling, "diagnosing")
@@ -104,11 +100,10 @@ def diagnose(
     effect | EFFECT | See hilcal effects; with options: "creep(joints=each)".
     """)
 def add(
-    run: Path, effect: str, revision: int | None = None, record: Path | None = None,
-    view: bool = False, effects_from: list[Path] | None = None, as_json: bool = False,
+    t: Terminal, catalogue: Catalogue, run: Path, effect: str, revision: int | None = None,
+    record: Path | None = None, view: bool = False,
 ) -> None:  # fmt: skip
     """Add an effect to the model: error before and after."""
-    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     effects = read_effects_text(effect, "EFFECT", catalogue)
     if len(effects) != 1:
         raise InputError(f"EFFECT {effect!r} has {len(effects)} effects; valid: one")
@@ -120,11 +115,10 @@ def add(
     effect | EFFECT | One of the model.
     """)
 def remove(
-    run: Path, effect: str, revision: int | None = None, record: Path | None = None,
-    view: bool = False, effects_from: list[Path] | None = None, as_json: bool = False,
+    t: Terminal, catalogue: Catalogue, run: Path, effect: str, revision: int | None = None,
+    record: Path | None = None, view: bool = False,
 ) -> None:  # fmt: skip
     """Take an effect out of the model: error before and after."""
-    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     catalogue[effect]  # an unknown name is refused
     _change(t, run, revision, effect, record, view, catalogue, None)
 
@@ -191,14 +185,12 @@ def _change(
         all others of the catalogue, as a background that predicts.
     """)
 def refine(
-    run: Path, effects: str | None = None, readings: str | None = None, from_latest: bool = False,
-    revision: int | None = None, prior: fitting.PriorOptions = fitting.NO_PRIOR,
-    discover: bool = False, background: bool = True, record: Path | None = None,
-    view: bool = False, details: bool = False, effects_from: list[Path] | None = None,
-    as_json: bool = False,
+    t: Terminal, catalogue: Catalogue, run: Path, effects: str | None = None,
+    readings: str | None = None, from_latest: bool = False, revision: int | None = None,
+    prior: fitting.PriorOptions = fitting.NO_PRIOR, discover: bool = False, background: bool = True,
+    record: Path | None = None, view: bool = False, details: bool = False,
 ) -> None:  # fmt: skip
     """Diagnose and add until the model is adequate."""
-    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     named = fitting.effects_of_option(effects, catalogue)
     fitting.check_record(record)
     start = "--revision" if revision is not None else "--from-latest" if from_latest else ""
@@ -307,11 +299,10 @@ def revisions_json(chapters: Iterable[Chapter], stored: str = "") -> list[dict[s
         F_or_1.py; hilcal next plans what separates them.
     """)
 def discover(
-    run: Path, output: Path, against: str | None = None, alternatives: bool = False,
-    revision: int | None = None, effects_from: list[Path] | None = None, as_json: bool = False,
+    t: Terminal, catalogue: Catalogue, run: Path, output: Path, against: str | None = None,
+    alternatives: bool = False, revision: int | None = None,
 ) -> None:  # fmt: skip
     """Search a law for what no effect explains, and write it as an effect."""
-    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     effects = _effects_against(against, catalogue)
     name = output.stem
     if output.suffix != ".py" or not NAME.fullmatch(name) or name in catalogue.names:
@@ -381,11 +372,10 @@ def _effects_against(
         place is estimated from the later readings.
     """)
 def compare(
-    run: Path, later: Path | None = None, same_setup: bool = False, revision: int | None = None,
-    effects_from: list[Path] | None = None, as_json: bool = False,
+    t: Terminal, catalogue: Catalogue, run: Path, later: Path | None = None,
+    same_setup: bool = False, revision: int | None = None,
 ) -> None:  # fmt: skip
     """Show where the model fails; with a later campaign, what has changed on the arm."""
-    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     if later is None:
         if same_setup:
             raise InputError("--same-setup goes with a later campaign: compare A.hilcal B.hilcal")
@@ -460,11 +450,10 @@ MOVED_TRACKER_SIGMA = (
         is not kept.
     """)
 def validate(
-    run: Path, other: Path, register: bool = False, limit: str | None = None,
-    revision: int | None = None, effects_from: list[Path] | None = None, as_json: bool = False,
+    t: Terminal, catalogue: Catalogue, run: Path, other: Path, register: bool = False,
+    limit: str | None = None, revision: int | None = None,
 ) -> None:  # fmt: skip
     """Predict readings of another campaign with the model."""
-    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     limit_m = None if limit is None else parse_length(limit, "--limit")
     with (
         Campaign.open(run, catalogue, read_only=True) as o,

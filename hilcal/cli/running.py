@@ -15,7 +15,7 @@ import numpy as np
 
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell, cell_from_config
-from hilcal.cli.options import POSES, catalogue_with, check_seed, command
+from hilcal.cli.options import POSES, check_seed, command
 from hilcal.cli.planning import answer_json, dry_checked, make_plan, read_cell, refuse_unready
 from hilcal.cli.showing import live_viewer
 from hilcal.cli.terminal import Terminal, confirmed, end_signals, handled, person_present, terminal
@@ -82,13 +82,12 @@ from hilcal.whole_file import replace_file
     yes | --yes -y | Without --plan: do not ask whether to measure what was planned.
     """)
 def run(
-    cell: Path, output: Path, plan: Path | None = None, resume: bool = False, append: bool = False,
-    skip: list[str] | None = None, rehearse: bool = False, until: str | None = None,
-    yes: bool = False, view: bool = False, effects_from: list[Path] | None = None,
-    as_json: bool = False,
+    t: Terminal, catalogue: Catalogue, cell: Path, output: Path, plan: Path | None = None,
+    resume: bool = False, append: bool = False, skip: list[str] | None = None,
+    rehearse: bool = False, until: str | None = None, yes: bool = False, view: bool = False,
+    effects_from: list[Path] | None = None,
 ) -> None:  # fmt: skip
     """Measure a campaign: every step of the plan, each reading stored before the next motion."""
-    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     config, numbers = read_cell(cell)
     goal = None if until is None else GoalRule(until, numbers, config, catalogue)
     base_dir = cell.absolute().parent
@@ -479,12 +478,12 @@ MAX_CLOCK = 200.0  # Largest clock rate of a simulated world, as in `[simulation
     clock | --clock N | The simulated world goes so many times faster than real time, e.g. 20.
     """)
 def simulate(
-    cell: Path, output: Path, plan: Path | None = None, hide: str | None = None,
-    seed: int | None = None, person: bool = False, clock: float | None = None,
-    effects_from: list[Path] | None = None,
+    catalogue: Catalogue, cell: Path, output: Path, plan: Path | None = None,
+    hide: str | None = None, seed: int | None = None, person: bool = False,
+    clock: float | None = None,
 ) -> None:  # fmt: skip
     """Run simulated devices for a cell until Ctrl-C, for `check` and `run` to talk to."""
-    t, catalogue = terminal(False), catalogue_with(effects_from)
+    t = terminal(False)
     config, numbers = read_cell(cell)
     number = check_seed(config.simulation.seed if seed is None else seed)
     if clock is not None:
@@ -508,9 +507,9 @@ def simulate(
         "deflection",
         "absolute",
     ):
-        why = f"{choice} hides what they may not show" if choice == RANDOM else f"{choice} cancels"
+        cancels = "the hidden effect may cancel" if choice == RANDOM else f"{choice} cancels"
         t.notice(
-            f"warning: deflections are planned and fitted, and {why} in them; set readings = "
+            f"warning: deflections are planned and fitted, and {cancels} in them; set readings = "
             f'"absolute" in [planning] of {cell} for a campaign that shows it'
         )
     with end_signals(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as wait, ExitStack() as stack:

@@ -12,8 +12,9 @@ from pathlib import Path
 
 from hilcal.campaign.campaign import Campaign
 from hilcal.cli.fitting import check_record, record_story
-from hilcal.cli.options import catalogue_with, command
-from hilcal.cli.terminal import Terminal, end_signals, terminal
+from hilcal.cli.options import command
+from hilcal.cli.terminal import Terminal, end_signals
+from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
 from hilcal.names import quoted
 from hilcal.present.live_viewer import PORT, LiveViewer
@@ -37,14 +38,13 @@ from hilcal.tables.units import parse_length
         correlations, scalings, commands, hashes of revisions.
     """)
 def report(
-    run: Path, later: Path | None = None, output: Path | None = None, limit: str | None = None,
-    validation: Path | None = None, operator: str = "", revision: int | None = None,
-    appendix: bool = False, effects_from: list[Path] | None = None, as_json: bool = False,
+    t: Terminal, catalogue: Catalogue, run: Path, later: Path | None = None,
+    output: Path | None = None, limit: str | None = None, validation: Path | None = None,
+    operator: str = "", revision: int | None = None, appendix: bool = False,
 ) -> None:  # fmt: skip
     """Write the whole story as one HTML page, a certificate first; it prints on six pages."""
     from hilcal.write_report import ReportOptions, write_report
 
-    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     limit_m = None if limit is None else parse_length(limit, "--limit")
     output = run.with_suffix(".html") if output is None else output
     with ExitStack() as stack, working(t.progress) as say:
@@ -79,11 +79,10 @@ END_DELAY_S = 5.0  # Longest delay of the end of the process by a server of a pa
     port | --port | Port to serve viewers on.
     """)
 def view(
-    run: Path, revision: int | None = None, record: Path | None = None, port: int = PORT,
-    effects_from: list[Path] | None = None, as_json: bool = False,
+    t: Terminal, catalogue: Catalogue, run: Path, revision: int | None = None,
+    record: Path | None = None, port: int = PORT,
 ) -> None:  # fmt: skip
     """Tell the story of the revisions in rerun."""
-    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         chapters = o.chapters(say, revision)
@@ -161,12 +160,11 @@ def viewer_command() -> str:
     no_browser | --no-browser | Do not open the page, only print its address.
     """)
 def workbench(
-    run: Path, config: Path | None = None, kind: str = "table", second: Path | None = None,
-    output: Path | None = None, port: int | None = None, no_browser: bool = False,
-    effects_from: list[Path] | None = None, as_json: bool = False,
+    t: Terminal, catalogue: Catalogue, run: Path, config: Path | None = None, kind: str = "table",
+    second: Path | None = None, output: Path | None = None, port: int | None = None,
+    no_browser: bool = False,
 ) -> None:  # fmt: skip
     """Compare, add, remove, change the cell, measure next on one page of this machine alone."""
-    t, catalogue = terminal(as_json), catalogue_with(effects_from)
     from hilcal.workbench.guard import UNUSED_S
     from hilcal.workbench.server import require_nicegui, serve
     from hilcal.workbench.session import WorkbenchSession

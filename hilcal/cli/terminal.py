@@ -39,7 +39,7 @@ class Terminal:
             self.people.print(part, markup=False, highlight=False)
 
     def notice(self, message: str) -> None:
-        """Print a remark besides the result; a terminal wraps it between words."""
+        """Print a remark to stderr; a terminal wraps it between words."""
         self.progress.print(
             message, markup=False, highlight=False, soft_wrap=not self.progress.is_terminal
         )

@@ -56,7 +56,7 @@ class RoughRegistration:
     def add(self, q: Floats, position: Floats, target: int = 0, step: Step | None = None) -> None:
         """Add a reading for a step: joint angles (n,), rad, and position (3,), sensor axes, m.
 
-        A reading that repeats the previous one is skipped; older versions stored such readings.
+        A reading that repeats the previous one is skipped: files of older versions have some.
         """
         if self._stuck(q, position, target) is None:
             held = self._positions(q)[target]

@@ -111,7 +111,7 @@ class LineOfSight:
     tracker: Floats  # (3,) place of the tracker, base axes, m
 
     def unobstructed(self, q: Floats, load: str) -> Bools:
-        """Return (N,) in which states all shapes keep [sight] clearance_m from every beam.
+        """Return (N,) whether all shapes keep [sight] clearance_m from every beam.
 
         A beam ends shortly before its target. Ignored are parts of the tool next to the target,
         whose shape is unknown, and obstacles that the tracker stands in or on.
@@ -120,7 +120,7 @@ class LineOfSight:
         return np.asarray(np.all([self.target_visible(q, load, k) for k in range(count)], axis=0))
 
     def target_visible(self, q: Floats, load: str, target: int) -> Bools:
-        """Return (N,) in which states the beam to one target is free."""
+        """Return (N,) whether the beam to one target is free."""
         beam = self.beam(q, target)
         out = ~self.clearance.scene.free.touching(q, 0.0, beam)
         for hung in self.clearance.segments(q, load):

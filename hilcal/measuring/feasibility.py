@@ -99,7 +99,7 @@ class Feasibility:
     # states
 
     def passes(self, kind: str, q: Floats, load: str = UNLOADED) -> Bools:
-        """Return (N,) which states (N, n) pass a check of `STATE_CHECKS`, payload or sight."""
+        """Return (N,) whether states (N, n) pass a check of `STATE_CHECKS`, payload or sight."""
         if kind == SIGHT:
             return self._always(q) if self.sight is None else self.sight.unobstructed(q, load)
         if kind == INCIDENCE:
@@ -113,7 +113,7 @@ class Feasibility:
     def allowed(
         self, q: Floats, load: str = UNLOADED, kinds: tuple[str, ...] = STATE_CHECKS
     ) -> Bools:
-        """Return (N,) which states pass all of some kinds under a load, in their order."""
+        """Return (N,) whether states pass the checks of some kinds under a load, made in order."""
         good = self._always(q)
         for kind in kinds:
             remaining = np.flatnonzero(good)
@@ -191,7 +191,7 @@ class Feasibility:
         return good, np.vstack(shown)
 
     def _beyond(self, kind: str, q: Floats, load: str, turn: Floats | None = None) -> Bools:
-        """Return (N,) which states violate a kind, or may within turns (N, n) of the joints."""
+        """Return (N,) whether states violate a kind, or may after turns of up to (N, n)."""
         out = ~self._always(q)
         if not len(q):
             return out
@@ -390,7 +390,7 @@ class _Bounds:
     violation: Callable[[int, int], Violation]  # of column k in a state
 
     def beyond(self, rows: Ints, turn: Floats | None) -> Bools:
-        """Return (R,) which states violate a constraint, or may within turns (R, n)."""
+        """Return (R,) whether states violate a constraint, or may after turns of up to (R, n)."""
         over = self.over[rows]
         if turn is not None:
             over = over + np.maximum(turn @ self.rates.T - self.fine, 0.0)
@@ -419,7 +419,7 @@ class _Touch:
     guessed: str = ""  # remark on guessed shapes; empty where they are known
 
     def beyond(self, rows: Ints, turn: Floats | None) -> Bools:
-        """Return (R,) in which states shapes are too close, or may be within turns (R, n)."""
+        """Return (R,) whether shapes are too close, or may be after turns of up to (R, n)."""
         if turn is None:
             return self.pairs.touching(self.q[rows], self.margin, self._segment(rows))
         out = np.zeros(len(rows), dtype=np.bool_)

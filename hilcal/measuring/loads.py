@@ -66,8 +66,8 @@ class Hook:
     def restore(self, why: str) -> None:
         """Have a wrong load corrected, where the arm stands.
 
-        The payload in the controller is set at once if nothing hangs any more, and again after the
-        person has confirmed the load.
+        If nothing hangs any more, the payload in the controller is set before the person is asked.
+        It is set again after the person has confirmed the load.
         """
         name, load = self.hanging, self.load(self.hanging)
         self._suspend(UNLOADED, name)

@@ -320,8 +320,8 @@ class Measurer:
             return None, why
         if watch is not None and watch.differed != differed and not self._wrong(force, after):
             return None, (
-                "the force sensor felt something else than what hangs for a moment: was the tool "
-                "touched?"
+                "for a moment the force sensor felt something else than tool and load: was the "
+                "tool touched?"
             )
         if len({sample.value.tobytes() for sample in tracker}) == 1:
             return None, (
@@ -333,7 +333,7 @@ class Measurer:
         except DeviceError as error:
             return None, str(error)
         if not (np.isfinite(mean.value).all() and np.isfinite(mean.covariance).all()):
-            return None, "the tracker gives what is not a number"
+            return None, "the tracker gives a value that is not a number"
         arm_samples.append(after)
         q = np.mean([sample.q for sample in arm_samples], axis=0)
         torques = [sample.torque for sample in arm_samples[1:] if sample.torque is not None]
@@ -344,7 +344,7 @@ class Measurer:
         ), ""
 
     def _wrong(self, force: WrenchSample | None, sample: ArmSample) -> bool:
-        """Whether the mean wrench, too, is not that of the load; such a reading is kept."""
+        """Whether the mean wrench differs from the load, too; such a reading is kept."""
         watch, meter = self._mover.watch, self._meter
         if watch is None or meter is None or force is None:
             return False

@@ -91,9 +91,9 @@ HOLD_SAMPLES = 3  # the same, in samples
 class LoadWatch:
     """Compares the measured force with tool and load, at every sample and reading.
 
-    d = |R (f - f_tool) - f_load| with f the measured force, sensor axes, f_tool that of the tool
+    d = |R (f - f_tool) - f_load| with f the measured force and f_tool the tool's, in sensor axes,
     and R the sensor's orientation; for a load that is a moment alone see `judged_part`. The limit
-    is `TOLERANCE_FACTOR` times that of `[operator]` for hanging a load; it is larger for a pull
+    is `TOLERANCE_FACTOR` times the [operator] tolerance for hanging a load; it is larger for a pull
     (`PULL_SHARE`), and in motion for swinging (`SWING_SHARE`) and acceleration. A tool that is not
     weighed yet may differ from [tool] by `UNKNOWN_KG`. The tare removes that difference at its
     pose, so the limit grows with the rotation of the sensor against gravity since then.

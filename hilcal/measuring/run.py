@@ -451,7 +451,7 @@ class Session:
             return None
         if lost and not self._torques_lost:
             self._remark(
-                "arm: it no longer tells the torques of its joints; readings go on without them"
+                "arm: it no longer reports the torques of its joints; readings go on without them"
             )
         self._torques_lost = lost
         return np.full(self._cell.arm.n, np.nan) if measured.torque is None else measured.torque

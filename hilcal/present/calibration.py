@@ -253,7 +253,7 @@ def compensation_report(
         f"  error after    {100 * BAND:.0f} % of the points within "
         f"{length(float(bands.max()))}; expected {expected} rms"
     )
-    yield f"  the latter includes {', '.join(_contributions(calibration, c.untold))}"
+    yield f"  the latter includes {', '.join(_contributions(calibration, c.unstated))}"
     yield f"  {base_line(calibration.model.cell, calibration.frames, calibration.mode)}"
     rows = table("point", "before", "after, 95 %", "largest correction")
     for k in sorted(np.argsort(-errors, kind="stable")[:LISTED]):
@@ -273,11 +273,11 @@ def compensation_report(
         yield f"The {LISTED} of {len(names)} points with the largest error before are listed."
 
 
-def _contributions(calibration: Calibration, untold: Sequence[str]) -> Iterator[str]:
+def _contributions(calibration: Calibration, unstated: Sequence[str]) -> Iterator[str]:
     yield "the parameters"
-    for name in untold:
+    for name in unstated:
         moved = length(float(np.sqrt(3 * calibration.conditions[name].variance_m2)))
-        yield f"{CONDITION_NAMES[name]}, which the points do not tell ({moved} rms)"
+        yield f"{CONDITION_NAMES[name]}, which the points do not state ({moved} rms)"
     if calibration.misfit > 0:
         yield f"what the model leaves ({length(float(np.sqrt(3 * calibration.misfit)))} rms)"
     source = repeatability_source(calibration.scatter.source, calibration.model.cell.arm)

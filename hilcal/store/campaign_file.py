@@ -147,7 +147,7 @@ class CampaignFile:
         return int(count)
 
     def about(self, key: str) -> str | None:
-        """A further text about the campaign, as given to `create`; None where there is none."""
+        """A further text about the campaign, as given to `create`; None if it was not given."""
         return self._meta.get(key)
 
     @contextmanager

@@ -83,7 +83,7 @@ def numbers(
 
 
 def frames(name: str, values: object, *, several: bool = False) -> Floats:
-    """Return a frame (4, 4), or K frames; a ValueError where the matrix is none."""
+    """Return a frame (4, 4), or K frames; a ValueError if a matrix is not a frame."""
     array = np.asarray(values, dtype=float)
     numbers(name, array, (*array.shape[:several], 4, 4))
     turn = array[..., :3, :3]

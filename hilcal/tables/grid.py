@@ -149,7 +149,7 @@ class ColumnTable:
 
 
 def first_true(bad: Bools) -> list[list[int]]:
-    """Place of the first true element of a mask; none where there is none."""
+    """Place of the first true element of a mask, as a list of one; empty if all are false."""
     places: list[list[int]] = np.argwhere(bad)[:1].tolist()
     return places
 

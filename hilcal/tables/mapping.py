@@ -152,8 +152,8 @@ class CommandedJoints(Joints):
 
     reported: bool = Field(
         False,
-        description="true where they are what the encoders reported: those of a pose's first row "
-        "then count as commanded, else false",
+        description="true where the encoders reported them: those of a pose's first row then "
+        "count as commanded; else false",
     )
 
 

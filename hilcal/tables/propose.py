@@ -199,7 +199,7 @@ def _per_joint(g: words.Guesser, first: words.ColumnName, names: list[str]) -> N
             g.doubt("torques", "no unit stated; read as Nm")
             unit = "Nm"
         g.assign("torques", names, unit, unit=unit)
-        g.doubt("torques", 'do they hold against the load? Where they are its: of = "load"')
+        g.doubt("torques", 'are they of the drives, against the load? If not: of = "load"')
         return
     if first.has(words.TEMPERATURE) or first.unit == "degC" or first.has({"degc"}):
         unit = first.unit if first.unit in ("degC", "degF", "K") else "degC"
@@ -304,7 +304,7 @@ def _names_poses(g: words.Guesser, name: str, joints: dict[str, Any]) -> bool:
     off = np.nan_to_num(np.abs(q - q[rows]))
     if off.max() > words.REPORTED:
         k = int(np.argmax(off.max(axis=1)))
-        g.doubt("joints", f"'{name}' is no pose: '{texts[k]}' stands at different joints")
+        g.doubt("joints", f"'{name}' names no poses: '{texts[k]}' has different joint values")
         return False
     if off.max() > SAME_POSE and "actual_joints" not in g.proposal.sections:
         joints["reported"] = True

@@ -183,11 +183,11 @@ def _doubt(mapping: Mapping, cov: Floats, instrument: Floats) -> tuple[str, ...]
 def floored(
     table: ColumnTable, covariance: Floats, instrument: Floats | None
 ) -> tuple[Floats, tuple[str, ...]]:
-    """Raise variances that are zero, or far below the others, to those of the instrument.
+    """Raise variances that are zero, or far below the others, to the instrument's.
 
-    An instrument that writes 0.000 has a scatter below its last digit, not none; such a reading
+    An instrument that writes 0.000 has some scatter below its last digit; a reading without any
     would outweigh all others. Adding to a diagonal element of a covariance (N, m, m) keeps it
-    positive. `instrument` is that of the noise in [tracker]; None where it is not known.
+    positive. `instrument` is the covariance of the noise in [tracker]; None if unknown.
     """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     m = variance.shape[1]

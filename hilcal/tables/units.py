@@ -34,7 +34,9 @@ FORCES = {"N": 1.0, "kN": 1e3, "kgf": 9.80665, "lbf": 4.4482216152605}  # Newton
 MOMENTS = {"Nm": 1.0, "Nmm": 1e-3, "kNm": 1e3}  # Newton metres in a unit
 MASSES = {"kg": 1.0, "g": 1e-3, "lb": 0.45359237}  # Kilograms in a unit
 SECONDS = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}  # Seconds in a unit of time
-_SHAPE = re.compile(r"\s*(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(?P<unit>\S*)\s*")
+_QUANTITY = re.compile(
+    r"\s*(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(?P<unit>\S*)\s*"
+)
 
 
 def parse_length(text: str, option: str) -> float:
@@ -48,18 +50,14 @@ def parse_duration(text: str, option: str) -> float:
 
 
 def _parse(text: str, what: str, units: Mapping[str, float], valid: str) -> float:
-    match = _SHAPE.fullmatch(text)
-    try:
-        number = math.nan if match is None else float(match["number"])
-    except ValueError:
-        number = math.nan
-    if match is None or math.isnan(number):
+    match = _QUANTITY.fullmatch(text)
+    if match is None:
         raise InputError(f'{what} "{text}" is not understood; valid: {valid}')
     if match["unit"] not in units:
         wrong = f'has the unit "{match["unit"]}"' if match["unit"] else "has no unit"
         raise InputError(f'{what} "{text}" {wrong}; valid: {valid}')
-    number *= units[match["unit"]]
-    if not (math.isfinite(number) and number > 0):
+    number = float(match["number"]) * units[match["unit"]]
+    if not 0 < number < math.inf:
         raise InputError(f'{what} "{text}" is not over 0; valid: {valid}')
     return number
 

@@ -123,7 +123,7 @@ def _verdict(view: View, d: Snapshot) -> None:
 def _fails(view: View, d: Snapshot) -> None:
     with _part("Where it fails"):
         if d.diagnosis.residual_is_noise:
-            small_print("Nowhere beyond the noise: what is left is what it explains.")
+            small_print("Nowhere: the residuals are no larger than the noise.")
             return
         small_print(dependence_sentence(d.diagnosis.misfit_breakdown))
         names = [v.variable for v in d.diagnosis.misfit_breakdown]
@@ -200,7 +200,7 @@ def evidence(view: View, d: Snapshot) -> None:
         place.clear()
         with place:
             if curve is None:
-                small_print("These readings say nothing of it.")
+                small_print("These readings do not show this effect.")
             else:
                 chart(view, charts.added_variable(curve, effect)).props("data-part=evidence")
 

@@ -16,8 +16,9 @@ from geocompy.geo.gctypes import GeoComCode
 from scipy import stats
 
 from hilcal.drivers.simulated.admin import Operations
-from hilcal.drivers.simulated.geocom_server import Beam, PolarPoint
+from hilcal.drivers.simulated.geocom_server import PolarPoint
 from hilcal.drivers.simulated.pty_port import PtyPort
+from hilcal.drivers.simulated.world import SimulatedNoise
 from tests.support.instruments import Instrument, tracker
 
 BAUD = 115200
@@ -278,9 +279,9 @@ def test_noise_is_as_specified_and_fresh(target: tuple[float, float, float], sca
 
 @pytest.mark.parametrize("point", [(0.0, 0.0, 2.0), (0.0, 0.0, -2.0), (1e-9, 0.0, 2.0)])
 def test_straight_above_and_below(point: tuple[float, float, float]) -> None:
-    beam, rng = Beam((0.0, 0.0), (1e-4, 0.0)), np.random.default_rng(1)
+    noise, rng = SimulatedNoise((0.0, 0.0), (1e-4, 0.0)), np.random.default_rng(1)
     for _ in range(100):
-        seen = beam.observe(PolarPoint.of(np.array(point)), rng)
+        seen = PolarPoint.of(noise.observe(np.array([point]), rng)[0])
         assert 0.0 <= seen.hz < 2 * np.pi
         assert 0.0 <= seen.v <= np.pi
         np.testing.assert_allclose(cartesian(seen.hz, seen.v, seen.distance), point, atol=2e-3)

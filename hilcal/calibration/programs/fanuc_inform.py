@@ -115,9 +115,9 @@ class _FanucReader(ProgramReader):
                         line, f"the point P[{index[:20]}] is chosen while the program runs"
                     )
                 elif name not in positions:
-                    left = f"P[{name}] is not in /POS"
+                    reason = f"P[{name}] is not in /POS"
                     self.points.setdefault(
-                        name, ProgramPoint(line, f"P[{name}]", not_corrected=left)
+                        name, ProgramPoint(line, f"P[{name}]", not_corrected=reason)
                     )
                 elif name not in self.points:
                     position, place = positions[name]
@@ -286,8 +286,8 @@ class _InformReader(ProgramReader):
             return bare.at_joints(spans, values, tool)
         if kind == "PULSE":
             if self.controller.pulses is None:
-                left = "in pulses; give pulses_per_degree = [S, L, U, R, B, T] by --frames F.toml"
-                return replace(bare, not_corrected=left)
+                reason = "in pulses; give pulses_per_degree = [S, L, U, R, B, T] by --frames F.toml"
+                return replace(bare, not_corrected=reason)
             return replace(bare.at_joints(spans, values, tool), scale=self.controller.pulses)
         if kind not in ("BASE", "ROBOT", "USER"):
             return replace(bare, not_corrected=f"POSTYPE {kind} is not corrected")

@@ -301,18 +301,18 @@ class _KrlReader(ProgramReader):
                     self._of_form(form[1], line, [kind])
                 else:
                     self._set(kind, text, line)
-        left = ""
+        reason = ""
         if word.endswith("_REL") or word == "ASYPTP":
-            left = f"{word} is not corrected"
+            reason = f"{word} is not corrected"
         elif "CIRC" in word and re.search(r"\bCA\b", head, re.I):
-            left = "a circle with CA does not end at the point that is stated"
+            reason = "a circle with CA does not end at the point that is stated"
         approximation = re.compile(r"\s*(CA|C_\w+)\b", re.IGNORECASE)
         targets = [(b, t) for b, t in arguments_of(head) if not approximation.match(t)]
         for begin, target in targets[: 2 if "CIRC" in word else 1]:
-            self._target(line, offset + m.end() + begin, target, word in ("PTP", "SPTP"), left)
+            self._target(line, offset + m.end() + begin, target, word in ("PTP", "SPTP"), reason)
         self.state = previous
 
-    def _target(self, line: int, offset: int, text: str, obeyed: bool, left: str) -> None:
+    def _target(self, line: int, offset: int, text: str, obeyed: bool, reason: str) -> None:
         body = re.sub(r"\s+C_(PTP|DIS|VEL|ORI|SPL)\b.*", "", text, flags=re.I).strip()
         offset += len(text) - len(text.lstrip())
         key, name, value = _key(body), f"line {line}", _Value(0, line, "", {})
@@ -321,17 +321,17 @@ class _KrlReader(ProgramReader):
         else:
             values = self.data.get(key, [])
             if not _NAME.fullmatch(body):
-                left = left or f"the point '{body[:40]}' is computed while the program runs"
+                reason = reason or f"the point '{body[:40]}' is computed while the program runs"
             elif len(values) != 1 or values[0].file < 0:
-                reason = "is not in this program" if not values else "has several values"
-                left = left or f"the point '{body[:40]}' {reason}"
+                lack = "is not in this program" if not values else "has several values"
+                reason = reason or f"the point '{body[:40]}' {lack}"
             elif key in self.used:
-                left = left or f"line {self.used[key]} uses or changes '{body[:40]}' otherwise"
+                reason = reason or f"line {self.used[key]} uses or changes '{body[:40]}' otherwise"
             if len(values) == 1 and values[0].file >= 0:
                 value = values[0]
                 name = f"{body} ({self.files[value.file]} line {value.line})"
-        bare = ProgramPoint(value.line if value.fields else line, name, not_corrected=left)
-        self.record(key, bare if left else self._point(bare, value, obeyed), line, obeyed)
+        bare = ProgramPoint(value.line if value.fields else line, name, not_corrected=reason)
+        self.record(key, bare if reason else self._point(bare, value, obeyed), line, obeyed)
 
     def _point(self, bare: ProgramPoint, value: _Value, obeyed: bool) -> ProgramPoint:
         axes = (k for k in value.fields if re.fullmatch(r"E[1-6]", k))

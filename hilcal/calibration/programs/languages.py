@@ -101,16 +101,16 @@ def read_program(
     for p in program.points:
         numbers = np.concatenate([p.values, p.frame.ravel(), p.tool.ravel()])
         usable = (np.abs(numbers) < LARGEST_NUMBER).all()
-        left = p.not_corrected if usable else "numbers that are none, in it, its tool or its base"
-        points.append(replace(p, not_corrected=left))
+        wrong = "a number of it, its tool or its base is not finite or too large"
+        points.append(p if usable else replace(p, not_corrected=wrong))
     program = replace(program, points=tuple(points))
     _refuse(path, program.points, leave)
-    q, doubts, said = resolve(program, arm, near)
+    q, doubts, remarks = resolve(program, arm, near)
     poses = [p for p in program.correctable_points if not p.joints] or program.correctable_points
     longest = max(poses, key=lambda p: float(np.linalg.norm(p.tool[:3, 3])))
     if any(not np.allclose(p.tool, longest.tool, atol=1e-9) for p in poses):
-        said += (f"several tools; errors are stated for the longest, that of {longest.name}",)
-    result = ResolvedProgram(program, arm, q, longest.tool, said).without(doubts)
+        remarks += (f"several tools; errors are stated for the longest, that of {longest.name}",)
+    result = ResolvedProgram(program, arm, q, longest.tool, remarks).without(doubts)
     _refuse(path, result.program.points, leave)
     return result
 
@@ -274,7 +274,7 @@ def _solve(
 
 
 def _agree(arm: Arm, language: Language, q: Floats, stated: Ints) -> Bools:
-    """(K, F) which flags joint values (K, 6) agree with; at a border, those of both sides."""
+    """(K, F) whether joint values (K, 6) agree with each flag; at a border, with either value."""
     shapes = shape(arm, q)
     near = (language.flags(q + d, shapes) for d in (0.0, -FLAG_BORDER, FLAG_BORDER))
     return np.asarray(np.any([have == stated for have in near], axis=0))

@@ -332,17 +332,17 @@ class ProgramReader:
             self.points[key] = new
         elif not old.not_corrected:
             same = np.array_equal(old.tool, new.tool) and np.array_equal(old.frame, new.frame)
-            left = "" if same else f"line {line} has it with another tool or base"
+            reason = "" if same else f"line {line} has it with another tool or base"
             self.points[key] = replace(
-                old, not_corrected=left, flags_obeyed=old.flags_obeyed or flags_obeyed
+                old, not_corrected=reason, flags_obeyed=old.flags_obeyed or flags_obeyed
             )
 
     def program(self, texts: Sequence[str] = (), suffixes: Sequence[str] = ()) -> Program:
         """Return the program with all recorded points."""
         for name, line in self.otherwise.items():
             if name in self.points and not self.points[name].not_corrected:
-                left = f"line {line} uses or changes it otherwise"
-                self.points[name] = replace(self.points[name], not_corrected=left)
+                reason = f"line {line} uses or changes it otherwise"
+                self.points[name] = replace(self.points[name], not_corrected=reason)
         language, points = self.controller.language, tuple(self.points.values())
         if not points:
             raise InputError(f"{self.path.name}: no motions; valid: {language.motions}")

@@ -254,8 +254,8 @@ class _RapidReader(ProgramReader):
                 reason = "has several values" if values else "is not in this module"
                 new = replace(new, not_corrected=f"the point '{text[:40]}' {reason}")
             elif key in self.used:
-                left = f"line {self.used[key]} uses or changes '{text[:40]}' otherwise"
-                new = replace(new, not_corrected=left)
+                reason = f"line {self.used[key]} uses or changes '{text[:40]}' otherwise"
+                new = replace(new, not_corrected=reason)
             else:
                 kind, value, place = values[0]
                 name = f"{text} (line {line_of(self.text, place)})"

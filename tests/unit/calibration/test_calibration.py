@@ -177,18 +177,20 @@ def test_a_file_of_another_kind_is_refused_in_words(tmp_path):
     refusal(r"none\.json", Calibration.load, tmp_path / "none.json")
 
 
-@pytest.mark.parametrize(("effect", "untold"), [("hysteresis", "approach"), ("creep", "load_time")])
-def test_what_a_table_does_not_tell_of_a_state_is_in_the_band(effect, untold):
+@pytest.mark.parametrize(
+    ("effect", "unstated"), [("hysteresis", "approach"), ("creep", "load_time")]
+)
+def test_what_a_table_does_not_tell_of_a_state_is_in_the_band(effect, unstated):
     """Points and programs seldom have sides of approach or times; campaigns do."""
     c, states = calibrated(effect), fresh()
     k = c.compensate(states.q, states.wrench)
-    told = c.compensate(states.q, states.wrench, recorded={untold: getattr(states, untold)})
-    assert (k.untold, told.untold) == ((untold,), ())
-    good = k.usable & told.usable
+    stated = c.compensate(states.q, states.wrench, recorded={unstated: getattr(states, unstated)})
+    assert (k.unstated, stated.unstated) == ((unstated,), ())
+    good = k.usable & stated.usable
     assert good.mean() > 0.6
     after = achieved(c, effect, 0, replace(states, q=k.q), k.after.nominal_position)[good]
     assert np.mean(np.linalg.norm(after, axis=1) <= k.after.band_m[good]) > 0.9
-    assert np.all(k.after.band_m[good] > told.after.band_m[good])
+    assert np.all(k.after.band_m[good] > stated.after.band_m[good])
     known = from_json(json.loads(json.dumps(to_json(c)))).compensate(states.q, states.wrench)
     np.testing.assert_allclose(known.after.band_m, k.after.band_m, rtol=1e-4)
 

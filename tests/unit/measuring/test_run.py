@@ -398,7 +398,7 @@ def test_the_tool_is_known_from_an_earlier_session_after_the_sensor_was_off(b):
     assert np.allclose(felt, [40.0, 0, 0, 0, 0, 0], atol=1e-6)
 
 
-LOST = "no longer tells the torques"
+LOST = "no longer reports the torques"
 
 
 def test_torques_are_averaged_over_the_reading(b):
