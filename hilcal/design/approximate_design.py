@@ -72,18 +72,8 @@ def _product(rows: Floats, x: Floats, y: Floats) -> Floats:
                 out += products if i == j else products + products.T
         return out
     # by the matrices T_k = L_xᵀ H_k L_y: the sum of T_k ∘ T_l
-    n, t = len(rows), np.matmul(left.transpose(0, 2, 1), right)
-    if y is x:  # symmetric: half of each is enough
-        up, across = np.triu_indices(t.shape[1])
-        half = np.take(t.reshape(n, -1), up * t.shape[1] + across, axis=1)
-        half *= np.where(up == across, 1.0, np.sqrt(2.0))
-        return _gram(half)
-    return _gram(t.reshape(n, -1))
-
-
-def _gram(t: Floats) -> Floats:
-    upper = np.asarray(sl.blas.dsyrk(1.0, t.T, trans=1))
-    return upper + np.triu(upper, 1).T
+    t = np.matmul(left.transpose(0, 2, 1), right).reshape(len(rows), -1)
+    return np.asarray(t @ t.T)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
