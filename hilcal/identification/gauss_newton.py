@@ -31,7 +31,6 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening
 from hilcal.regression.empirical_bayes import maximise_evidence, spent_by_groups
 from hilcal.regression.normal_equations import (
-    TALL,
     Basis,
     NormalEquations,
     find_basis,
@@ -42,6 +41,8 @@ from hilcal.regression.schur import Projection, projection
 from hilcal.types import Bools, Floats, Ints
 
 # All of these are choices.
+TALL = 10_000  # rows from which a step reduces them to their triangle first: its rank analysis and
+# normal equations of 150,000 rows of 30 then take a tenth of the time
 MAX_ITERATIONS = 20  # steps; the tests of convergence allow 8
 CONVERGED = 1e-5  # motion of the whitened readings by the last step, in units of the noise
 SETTLED = 0.02  # priors and rank are chosen anew until the residual changes by less than this share

@@ -10,6 +10,7 @@ from hilcal.errors import CannotAnswerError
 from hilcal.identification.carried.carried_prior import scales_of
 from hilcal.identification.fit import fit
 from hilcal.identification.gauss_newton import (
+    TALL,
     NewtonPoint,
     linear_problem,
     regularise,
@@ -19,7 +20,6 @@ from hilcal.identification.residual import residual
 from hilcal.model.model import Model
 from hilcal.readings.readings import States
 from hilcal.readings.whitening import whitening
-from hilcal.regression.normal_equations import TALL
 from tests.support.campaigns import cell_of
 from tests.support.effect_cases import make
 from tests.support.readings_cases import readings_at
