@@ -6,7 +6,6 @@ from functools import cache
 
 import numpy as np
 
-from hilcal import limits
 from hilcal.diagnosis.background_evidence import (
     JOINT_LEVEL,
     BackgroundEffect,
@@ -163,7 +162,6 @@ def refine(
     Raises:
         InputError: too many readings.
     """
-    limits.check_fitted(len(readings), readings.m)
     say(f"fitting {' + '.join(model.names) or 'the bare arm'}")
     readings = with_prior_scatter(model, readings.with_serial(None))
     first = with_serial_noise(fit(model, readings, mode))
