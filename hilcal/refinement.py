@@ -147,7 +147,7 @@ def refine(
 
     Args:
         model: the starting model. Its effects stay, except those of a carried prior that the
-            readings contradict (`carried_evidence`). The prior is in every fit, with the arm's
+            readings contradict (`contradicted_effects`). The prior is in every fit, with the arm's
             scatter if the earlier campaign estimated it.
         readings: all readings.
         mode: "deflection" or "absolute".

@@ -2,11 +2,11 @@
 
     minimise ‖w(θ)‖² + β ‖y/σ‖²,    θ = m + U y
 
-with w (R,) the whitened residual; y coordinates in which the prior is independent and about zero,
-θ itself without a carried prior (`carried.Coordinates`); σ their prior standard deviations. The
-noise factor β is the variance of the residual in units of the stated noise, at least 1. Priors of
-shrunk families maximise the evidence (`regression.empirical_bayes`). The rank is the number of flat
-directions that the data determine better than the residual's scatter.
+with w (R,) the whitened residual. In the coordinates y the prior is independent and about zero
+(`carried_prior.Coordinates`); without a carried prior they are θ itself. σ are their prior standard
+deviations. The noise factor β is the variance of the residual in units of the stated noise, at
+least 1. Priors of shrunk families maximise the evidence (`regression.empirical_bayes`). The rank is
+the number of flat directions that the data determine better than the residual's scatter.
 
 A `NewtonProblem` states the objective at a point and the linear problem there, whose rows may be
 replaced by any rows with the same products.

@@ -1,6 +1,6 @@
 """The whitened linear problem: rank analysis, parameter scaling, priors, solution; QR in parts.
 
-    minimise ‖r − A δ‖² + β ‖(θ + δ − 0)/σ‖²  over δ
+    minimise ‖r − A δ‖² + β ‖(θ + δ)/σ‖²  over δ
 
 A (R, P) whitened Jacobian, r (R,) whitened residual, σ (P,) prior standard deviations
 (infinite for flat parameters), β the noise variance factor that multiplies the prior precision.

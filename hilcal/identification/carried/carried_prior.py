@@ -325,7 +325,7 @@ def prior_of(model: Model) -> tuple[Floats, Ints]:
     """Starting prior (P,) of a model, and the shrinkage group (P,) of each parameter or −1.
 
     Random effects have the standard deviations stated in the model. Parameters with a carried prior
-    are flat here, see `carried.Coordinates`.
+    are flat here, see `Coordinates`.
     """
     prior, groups, used = [np.zeros(0)], [np.zeros(0, dtype=np.int64)], 0
     for e in model.effects:

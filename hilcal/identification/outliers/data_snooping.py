@@ -12,12 +12,14 @@ Readings that deviate by one common cause are no gross errors: readings in a row
 in the axes of the sensor or of the target, as by another reflector, a target that was moved on the
 tool, or a bumped tracker (`runs_of_equal_shifts`); and readings with shifts along the directions of
 one site of the arm (`along_one_site`), as a law of a joint, of a link that bends, or of the force
-sensor moves each reading along one direction, whatever it depends on. For a random error in m
-dimensions the share of its square normal to a direction is sin² ~ Beta((m − 1)/2, 1/2), so that its
-distribution function p is uniform. With p_(n) ascending, n of F gross errors are as near to the
-directions of a site as p_(n) with the probability P(B(F, p_(n)) ≥ n). Its minimum over n and the
-sites is multiplied by F and the number of sites; where the product is too small, the readings near
-these directions, if of at least two poses, are ascribed to a law.
+sensor moves each reading along one direction, whatever it depends on.
+
+The shift of a gross error has no preferred direction: in m dimensions the share of its square that
+is normal to a given direction is sin² ~ Beta((m − 1)/2, 1/2), whose distribution function p is
+uniform. Of F gross errors, with p_(n) ascending, at least n are as near to the directions of a site
+as p_(n) with the probability P(B ≥ n), B binomial with F and p_(n). The least of these, over n and
+the sites, is multiplied by F and the number of sites. Where the product is too small for chance,
+the readings near these directions, if of at least two poses, are ascribed to a law.
 """
 
 from dataclasses import dataclass, replace

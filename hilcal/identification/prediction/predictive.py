@@ -8,18 +8,18 @@ A (R, P) of the fitted readings, whitened by W, σ² their noise factor, Λ the 
 
     C = (AᵀA/σ² + Λ)⁻¹,    Cov(measured − predicted) = κ (σ² W + J C Jᵀ)
 
-W is the stated covariance V, with more for positions or attitudes where their residual asks for it:
-a misfit has not the shape of an instrument's noise, which is small along the beam. W, C and the
-residual of parameters with this W and Λ are computed in turns. Where the model has a background, σ
-is the factor of the instrument's noise in the mixed model; otherwise σ² is from the residual, at
-least 1.
+W is the stated covariance V plus the excess of the residual over it (see below): a misfit does not
+have the shape of an instrument's noise, which is small along the beam. W depends on the residual of
+the parameters, these on W and Λ, so that both are computed in turn until W settles. Where the model
+has a background, σ is the factor of the instrument's noise in the mixed model; otherwise σ² is the
+variance of the whitened residual, at least 1.
 
-κ, at least 1, makes the mean variance on poses left out, in units of V, equal to the mean square
-error there. Of the folds as they are left out, F of rows Y, with X the same whitened by W and
-multiplied by the root of C, it is the mean of Y (1 − XᵀX/σ²)⁻¹ Yᵀ.
+κ, at least 1, makes the mean predicted variance of poses left out, in units of V, equal to their
+mean square error. With Y the rows of a fold times the root of C, and X the same rows whitened by W,
+the variance of its prediction from the other folds is the mean of Y (1 − XᵀX/σ²)⁻¹ Yᵀ.
 
 The uncertainty of the variances of a background makes C larger by how far it moves the parameters
-(`mixed.prediction`), and κ is at least its mean effect on predictions (Kackar and Harville, JASA 79
+(`mixed.variances`), and κ is at least its mean effect on predictions (Kackar and Harville, JASA 79
 (1984) 853). At given variances rows predicted without their fold are off by e with the variance v.
 With x = (log s, η) drawn from its posterior, by weights from the normal approximation at its
 maximum x̂, the mean square is E[Σ v] + E|e − E e|²; its ratio to Σ v at x̂ is that least κ. With
@@ -72,7 +72,7 @@ DRAWS, SEED = 30, 0  # of the posterior; a choice: 20 poses of that UR10 give 1.
 # log of the largest weight of a draw over the median: tails are not normal; a choice
 LARGEST_LOG_WEIGHT = 2.0
 EXCESS_LEVEL = 0.0005
-"""P-value of χ² below which there is an excess: that of `diagnosis.noise_verdict`."""
+"""P-value of χ² below which there is an excess: that of `diagnosis.noise.MISFIT_ALARM`."""
 LEVERAGE_SAMPLE = 400  # measurements, evenly spaced, for a mean leverage, for speed; a choice
 NEGLIGIBLE_CHANGE = 0.05  # relative change of s² and of the factor that is negligible; a choice
 
