@@ -403,7 +403,7 @@ def site_columns(model: Model, theta: Floats, prediction: Prediction, readings: 
             wrench = states.wrench.copy()
             wrench[:, part] += axis
             try:
-                o = model.predict(replace(states, wrench=wrench), theta, p).observation
+                o = model.predict(replace(states, wrench=wrench), theta).observation
             except CannotAnswerError:  # parameters so large that there is no equilibrium
                 continue
             turn = se3.rotation_vector(o.rotation @ observation.rotation.swapaxes(1, 2))
