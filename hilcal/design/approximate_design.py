@@ -122,12 +122,12 @@ def solve(program: BarrierProgram, start: Floats, tolerance: float, order: float
             smooth = surrogate(m) or smooth
         slope = prices(program.objective.units.rows, smooth.gradient)
         top = program.max_weight - w
-        lean = slope + mu / w - mu / top
-        move = _newton(program, program.curvature(smooth) + np.diag(z / w + y / top), lean, w)
+        rise = slope + mu / w - mu / top
+        move = _newton(program, program.curvature(smooth) + np.diag(z / w + y / top), rise, w)
         if move is None:
             break
         length = min(1.0, _BACK * _room(w, move), _BACK * _room(top, -move))
-        push = float(lean @ move)
+        push = float(rise @ move)
         moved = program.change(move)
         length = _search(program, surrogate, smooth, (w, m), (move, moved), length, mu, push)
         if length == 0.0 and (criterion.kinked or mu <= tolerance / (10 * n)):
@@ -151,8 +151,8 @@ def solve(program: BarrierProgram, start: Floats, tolerance: float, order: float
     return best
 
 
-def _newton(program: BarrierProgram, matrix: Floats, lean: Floats, w: Floats) -> Floats | None:
-    """Return the step that spends the budget: K dw + λ c = lean, c·dw = B − c·w."""
+def _newton(program: BarrierProgram, matrix: Floats, rise: Floats, w: Floats) -> Floats | None:
+    """Return the step that spends the budget: K dw + λ c = rise, c·dw = B − c·w."""
     diagonal = np.diag(matrix).copy()
     for ridge in (1e-14, 1e-10, 1e-6):
         matrix[np.diag_indices_from(matrix)] = diagonal * (1.0 + ridge)
@@ -161,7 +161,7 @@ def _newton(program: BarrierProgram, matrix: Floats, lean: Floats, w: Floats) ->
         except (np.linalg.LinAlgError, ValueError):
             continue
         cost = program.objective.units.cost
-        solved = sl.cho_solve(factor, np.column_stack([lean, cost]), check_finite=False)
+        solved = sl.cho_solve(factor, np.column_stack([rise, cost]), check_finite=False)
         if np.isfinite(solved).all():
             unspent = program.budget - float(cost @ w)
             price = (float(cost @ solved[:, 0]) - unspent) / float(cost @ solved[:, 1])

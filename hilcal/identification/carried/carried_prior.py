@@ -185,7 +185,7 @@ def check_prior(prior: CarriedPrior, arm: Arm, readings: Readings) -> None:
     repeated = int(found_among_prints(readings, prior.posterior.prints).sum())
     if repeated:
         raise InputError(
-            f"{_label(prior.posterior)} was learnt from {repeated} of the {len(readings)} "
+            f"{_label(prior.posterior)} is of a fit to {repeated} of the {len(readings)} "
             "readings that are to be fitted; they would count twice; valid: a prior of other "
             "readings"
         )

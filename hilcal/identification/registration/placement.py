@@ -450,9 +450,9 @@ def _starts(data: FrameData, part: FrameData, frames: Frames, free: Bools) -> It
     for f in bases:
         p, observers = part.points(f) @ f.base[:3, :3].T + f.base[:3, 3], []
         for k, o in enumerate(frames.observers):
-            mine = part.observer == k
-            placed = bool(o.free) and bool(np.any(mine))
-            observers.append(_observer_placed(o, p[mine], part.value[mine]) if placed else o)
+            own = part.observer == k
+            placed = bool(o.free) and bool(np.any(own))
+            observers.append(_observer_placed(o, p[own], part.value[own]) if placed else o)
         yield replace(f, observers=tuple(observers))
 
 
