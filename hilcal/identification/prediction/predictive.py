@@ -42,10 +42,10 @@ import numpy as np
 import scipy
 
 from hilcal.effects.protocol import FRAME_ROLES, Effect
-from hilcal.errors import CannotAnswerError, InputError
+from hilcal.errors import CannotAnswerError
 from hilcal.identification.carried.carried_prior import coordinates_of, scales_of
 from hilcal.identification.carried.posterior import Posterior, PosteriorEffect, Source, determined
-from hilcal.identification.fit import Fit
+from hilcal.identification.fit import Fit, require_gc
 from hilcal.identification.folds import distinct_poses, ordinary_magnitudes, random_folds
 from hilcal.identification.gauss_newton import whitened_jacobian
 from hilcal.identification.mixed_fit import INSTRUMENT, mixed_fit_at
@@ -373,8 +373,7 @@ def variance_spread(variances: Variances, fold: Ints) -> float:
 
 def posterior_of(fit: Fit, source: Source | None = None) -> Posterior:
     """Return the posterior of the arm after a fit; arguments and errors as of `Posterior.of`."""
-    if fit.scaling != "gc":
-        raise InputError(f"a prior needs a fit with scaling gc, this one has {fit.scaling}")
+    require_gc(fit, "a prior")
     model, cell = fit.model, fit.model.cell
     effects = [e for e in model.effects if belongs_to_arm(e)]
     if not effects:
