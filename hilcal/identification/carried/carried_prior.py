@@ -201,8 +201,8 @@ def check_arm(prior: CarriedPrior, arm: Arm) -> None:
         )
     if np.abs(p.links - arm.links).max() > SAME_M:
         raise InputError(
-            f"{label} is of the arm {p.arm}, whose nominal links are others than those of "
-            f"{arm.name}; valid: a campaign of the same arm, described alike"
+            f"{label} is of the arm {p.arm}, whose nominal links differ from those of {arm.name}; "
+            "valid: a campaign of the same arm, described alike"
         )
 
 
