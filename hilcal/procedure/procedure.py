@@ -177,8 +177,8 @@ class Procedure:
     ) -> Refinement:
         """Fit, diagnose, and change the model until it is adequate; all revisions are stored.
 
-        `on_step` is called with each revision's number and step as soon as it is diagnosed. A
-        CannotAnswerError where the readings do not determine the baseline.
+        `on_step` is called with each revision's number and step as soon as it is
+        diagnosed. Raises CannotAnswerError where the readings do not determine the baseline.
         """
         with Campaign.open(self.run, self.catalogue) as o:
             mode = usual_mode(o.readings, self.settings.readings)
