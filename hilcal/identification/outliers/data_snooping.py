@@ -360,8 +360,8 @@ def runs_of_equal_shifts(
 ) -> Ints:
     """Return the rows in runs with the same shift; none up to `MOST_ALIKE_SHARE` of the tested.
 
-    Of readings that deviate: `off` (F,) ascending rows, `shift` (F, 3) in sensor axes, and `axes`
-    (F, 3, 3), the rotations of the target.
+    `off` (F,) are the rows of the readings that deviate, ascending; `shift` (F, 3) their shifts in
+    sensor axes; and `axes` (F, 3, 3) the rotations of the target in them.
     """
     order = np.zeros(len(readings), dtype=np.int64)
     alike = np.zeros(len(off), dtype=np.bool_)
@@ -413,10 +413,11 @@ def site_columns(model: Model, theta: Floats, prediction: Prediction, readings: 
 
 
 def along_one_site(shift: Floats, columns: Floats, pose: Ints) -> Bools:
-    """(F,) which deviating readings, at poses of numbers (F,), are ascribed to a law.
+    """Return (F,) which readings that deviate are ascribed to a law, not to gross errors.
 
-    The shifts (F, m), and the columns (F, m, P) of changes by each site, are in units of the noise,
-    equal for all directions, so that random shifts have no preferred one.
+    `shift` (F, m) are their shifts, `columns` (F, m, P) their changes by each site of a law, `pose`
+    (F,) their poses. The unit is the noise, equal in all directions, so that random shifts prefer
+    none.
     """
     count, m, sites = columns.shape
     if not count:

@@ -300,9 +300,10 @@ def predictive(
 def left_out_variances(
     a: Floats, fold: Ints, predicted: Sequence[tuple[Floats, Ints]], root: Floats, noise: float
 ) -> list[float]:
-    """Mean variance of `predicted` rows (R', P) with folds (R',), each without its fold.
+    """Return the mean variance of each set of `predicted` rows, each row without its own fold.
 
-    `a` are the fitted rows (R, P) in units of W, `root` (P, K) is that of C, `noise` σ².
+    A set is rows (R', P) with their folds (R',). `a` (R, P) are the fitted rows in units of W, and
+    `fold` (R,) their folds; `root` (P, K) is the root of C, and `noise` is σ².
     """
     total = np.zeros(len(predicted))
     for f in range(int(fold.max(initial=-1)) + 1):
