@@ -152,8 +152,8 @@ def find_basis(
     held = np.flatnonzero(~flat & (prior > 0))
     columns = np.flatnonzero(flat)
     p = a.shape[1]
-    r = np.asarray(sl.qr(a[:, columns] * scale[columns], mode="r", check_finite=False)[0])
-    r = r[: len(columns)]
+    scaled = a[:, columns] * scale[columns]
+    r = np.asarray(sl.qr(scaled, mode="r", check_finite=False)[0], dtype=float)[: len(columns)]
     _, s, vt = np.linalg.svd(r, full_matrices=True)
     s = np.concatenate([s, np.zeros(len(columns) - len(s))])
     floor = ROUNDING * s.max(initial=0.0)
