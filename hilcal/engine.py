@@ -304,7 +304,7 @@ class Cluster:
             raise worker_deaths(f"cluster {self.address}") from error
         except (FutureCancelledError, OSError) as error:
             raise ClusterError(
-                f"cluster {self.address}: lost in the middle; start it again"
+                f"cluster {self.address}: the connection was lost; start the cluster again"
             ) from error
         finally:
             waiting.clear()

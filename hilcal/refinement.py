@@ -6,7 +6,6 @@ from functools import cache
 
 import numpy as np
 
-from hilcal import limits
 from hilcal.diagnosis.background_evidence import (
     JOINT_LEVEL,
     BackgroundEffect,
@@ -148,7 +147,7 @@ def refine(
 
     Args:
         model: the starting model. Its effects stay, except those of a carried prior that the
-            readings contradict (`carried_evidence`). The prior is in every fit, with the arm's
+            readings contradict (`contradicted_effects`). The prior is in every fit, with the arm's
             scatter if the earlier campaign estimated it.
         readings: all readings.
         mode: "deflection" or "absolute".
@@ -163,7 +162,6 @@ def refine(
     Raises:
         InputError: too many readings.
     """
-    limits.check_fitted(len(readings), readings.m)
     say(f"fitting {' + '.join(model.names) or 'the bare arm'}")
     readings = with_prior_scatter(model, readings.with_serial(None))
     first = with_serial_noise(fit(model, readings, mode))

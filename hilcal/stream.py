@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import ClassVar, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import scipy
@@ -213,8 +213,6 @@ class _StreamPoint(NewtonPoint):
 @dataclass(frozen=True, slots=True, eq=False)
 class _Stream(NewtonProblem[_StreamPoint]):
     """The least-squares problem of a stream; each point takes one pass."""
-
-    same_rows: ClassVar[bool] = False
 
     work: PassTask
     engine: Engine

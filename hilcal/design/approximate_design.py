@@ -72,18 +72,8 @@ def _product(rows: Floats, x: Floats, y: Floats) -> Floats:
                 out += products if i == j else products + products.T
         return out
     # by the matrices T_k = L_xᵀ H_k L_y: the sum of T_k ∘ T_l
-    n, t = len(rows), np.matmul(left.transpose(0, 2, 1), right)
-    if y is x:  # symmetric: half of each is enough
-        up, across = np.triu_indices(t.shape[1])
-        half = np.take(t.reshape(n, -1), up * t.shape[1] + across, axis=1)
-        half *= np.where(up == across, 1.0, np.sqrt(2.0))
-        return _gram(half)
-    return _gram(t.reshape(n, -1))
-
-
-def _gram(t: Floats) -> Floats:
-    upper = np.asarray(sl.blas.dsyrk(1.0, t.T, trans=1))
-    return upper + np.triu(upper, 1).T
+    t = np.matmul(left.transpose(0, 2, 1), right).reshape(len(rows), -1)
+    return np.asarray(t @ t.T)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,12 +122,12 @@ def solve(program: BarrierProgram, start: Floats, tolerance: float, order: float
             smooth = surrogate(m) or smooth
         slope = prices(program.objective.units.rows, smooth.gradient)
         top = program.max_weight - w
-        lean = slope + mu / w - mu / top
-        move = _newton(program, program.curvature(smooth) + np.diag(z / w + y / top), lean, w)
+        rise = slope + mu / w - mu / top
+        move = _newton(program, program.curvature(smooth) + np.diag(z / w + y / top), rise, w)
         if move is None:
             break
         length = min(1.0, _BACK * _room(w, move), _BACK * _room(top, -move))
-        push = float(lean @ move)
+        push = float(rise @ move)
         moved = program.change(move)
         length = _search(program, surrogate, smooth, (w, m), (move, moved), length, mu, push)
         if length == 0.0 and (criterion.kinked or mu <= tolerance / (10 * n)):
@@ -161,8 +151,8 @@ def solve(program: BarrierProgram, start: Floats, tolerance: float, order: float
     return best
 
 
-def _newton(program: BarrierProgram, matrix: Floats, lean: Floats, w: Floats) -> Floats | None:
-    """Return the step that spends the budget: K dw + λ c = lean, c·dw = B − c·w."""
+def _newton(program: BarrierProgram, matrix: Floats, rise: Floats, w: Floats) -> Floats | None:
+    """Return the step that spends the budget: K dw + λ c = rise, c·dw = B − c·w."""
     diagonal = np.diag(matrix).copy()
     for ridge in (1e-14, 1e-10, 1e-6):
         matrix[np.diag_indices_from(matrix)] = diagonal * (1.0 + ridge)
@@ -171,7 +161,7 @@ def _newton(program: BarrierProgram, matrix: Floats, lean: Floats, w: Floats) ->
         except (np.linalg.LinAlgError, ValueError):
             continue
         cost = program.objective.units.cost
-        solved = sl.cho_solve(factor, np.column_stack([lean, cost]), check_finite=False)
+        solved = sl.cho_solve(factor, np.column_stack([rise, cost]), check_finite=False)
         if np.isfinite(solved).all():
             unspent = program.budget - float(cost @ w)
             price = (float(cost @ solved[:, 0]) - unspent) / float(cost @ solved[:, 1])

@@ -377,10 +377,7 @@ class Separate(Criterion):
 
 def _explained(m: Floats, model: Ints, block: Ints) -> Floats:
     """Return (N, R, R) M_rm M_mm⁻ M_mr: the part of the block r that the model m explains."""
-    cross = m[:, model[:, None], block]
-    # one matrix at a time is faster for large blocks
-    both = zip(m[:, model[:, None], model], cross, strict=True)
-    half = np.stack([inverse_root(b) @ c for b, c in both])
+    half = inverse_root(m[:, model[:, None], model]) @ m[:, model[:, None], block]
     return np.asarray(np.swapaxes(half, -1, -2) @ half)
 
 

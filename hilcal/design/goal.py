@@ -207,7 +207,7 @@ class GoalRule:
         self._ended = self._took = -np.inf
 
     def __call__(self, readings: Readings, last: bool) -> GoalStatus:
-        """Return the status of the goal, see `measuring.stopping_rule.StoppingRule`."""
+        """Return the status of the goal after some readings; `last`: the plan ends with them."""
         start = self._now()
         if last or (start - self._ended >= self._took / FIT_TIME_SHARE and self._news(readings)):
             try:

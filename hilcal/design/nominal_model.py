@@ -18,7 +18,7 @@ from hilcal.identification.carried.carried_prior import (
     prior_of,
     scales_of,
 )
-from hilcal.identification.fit import Fit
+from hilcal.identification.fit import Fit, require_gc
 from hilcal.mixed.families import families_of
 from hilcal.model.model import Model
 from hilcal.readings.readings import ObserverKind, ObserverName, States
@@ -152,8 +152,7 @@ def carried_information(model: Model, live: Ints) -> Floats | None:
 
 def model_after(fit: Fit, config: CellConfig) -> NominalModel:
     """Return the nominal model of further readings, from the fit of the readings so far."""
-    if fit.scaling != "gc":
-        raise InputError(f"planning on needs a fit with scaling gc, this one has {fit.scaling}")
+    require_gc(fit, "a plan of further readings")
     cell, prior = replace(fit.model.cell, registration_known=True), fit.solution.prior
     _, station = _registered(cell, config, nominal_tracker_place(cell, config)[0])
     # the fit scales its priors by the noise factor β

@@ -369,7 +369,7 @@ def kept_by_step(p: Linearisation, family: EffectColumns, score: FamilyScore) ->
     model = replace(fit.model, effects=(*fit.model.effects, family.effect))
     theta = np.concatenate([s.theta + s.transform @ z, family.scale * score.step])
     try:
-        prediction = model.predict(s.prediction.situation.states, theta, near=s.prediction)
+        prediction = model.predict(s.prediction.situation.states, theta)
     except CannotAnswerError:
         return 0.0
     w, readings = fit.whitening, fit.readings[~fit.outlier]

@@ -55,9 +55,8 @@ from hilcal.diagnosis.residual_regression import Dependence, Regressions, Residu
 from hilcal.diagnosis.stepwise import trial
 from hilcal.diagnosis.wrong_figures import WrongFigure, wrong_figures
 from hilcal.effects.protocol import Effect
-from hilcal.errors import InputError
 from hilcal.identification.carried.drift import carried_effects, evidence_of_carried
-from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit import Fit, fit, require_gc
 from hilcal.identification.linearisation import (
     Linearisation,
     effect_columns,
@@ -234,8 +233,7 @@ class Evidence:
         background: tuple[BackgroundEffect, ...] | None = None,  # if tested already
     ) -> None:
         """Take a fit; raises InputError for one whose residual is not whitened."""
-        if fit.scaling != "gc":
-            raise InputError(f"diagnosis needs scaling gc, this fit has {fit.scaling}")
+        require_gc(fit, "diagnosis")
         self.fit, self._refit, self._say = fit, refit, say
         self._regressions = regressions or Regressions()
         self._background = background

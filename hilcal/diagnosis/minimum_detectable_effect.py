@@ -26,7 +26,6 @@ from hilcal.identification.linearisation import (
 )
 from hilcal.regression.evidence import (
     LARGE_FAMILY,
-    FamilyScore,
     Spectrum,
     noncentrality_of_power,
     score_family,
@@ -141,7 +140,7 @@ def _least(tests: "SuspectTests", full: EffectColumns, start: float) -> Strength
     units = tuple(q.unit for q in full.effect.parameters)
     for displacement in (GRID * start).tolist():
         t = displacement / float(moved)
-        if np.mean(tests.passed(t * signal + error, POWER)) >= POWER:
+        if np.mean(tests.passed(t * signal + error)) >= POWER:
             return _strength(displacement, t, full.scale, units)
     return _never(units)
 
@@ -162,21 +161,16 @@ class SuspectTests:
         p, x = self.p, self.family.white
         return FamilyFolds(p.folds, p.projection), FamilyFolds(p.folds, p.projection, x)
 
-    def passed(self, y: Floats, enough: float = 0.0) -> list[bool]:
+    def passed(self, y: Floats) -> list[bool]:
         """Whether each of K simulated residuals y (R, K) would reveal the family."""
-        # Once a share of `enough` is out of reach, the remaining residuals count as failed.
         p = self.p
         r = p.project_out(y)
         g, rss = self.family.white.T @ r, np.sum(r * y, axis=0)
-        scores: list[FamilyScore] = []
-        able = [False] * y.shape[1]
-        for k in range(len(able)):
-            c = score_family(self.s, g[:, k], float(rss[k]), p.fit.dof, largest=self.largest)
-            scores.append(c)
-            able[k] = c.p_value < self.level and c.log_evidence > 0
-            failed = len(scores) - sum(able)
-            if 1.0 - failed / len(able) < enough:
-                return able
+        scores = [
+            score_family(self.s, g[:, k], float(rss[k]), p.fit.dof, largest=self.largest)
+            for k in range(y.shape[1])
+        ]
+        able = [c.p_value < self.level and c.log_evidence > 0 for c in scores]
         if np.mean(able) < POWER:
             return able
         ridge = float(np.median([c.ridge for c in scores]))

@@ -53,7 +53,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from hilcal import limits
 from hilcal.diagnosis.background_evidence import (
     JOINT_LEVEL,
     BackgroundEffect,
@@ -89,9 +88,8 @@ def diagnose(
     """Judge a fit, reached by the changes of `history`; `say` takes progress, one line each.
 
     Raises:
-        InputError: for a fit whose residual is not whitened, or of too many readings.
+        InputError: a fit whose residual is not whitened.
     """
-    limits.check_fitted(len(fit.readings), fit.readings.m)
     return judge(Evidence(fit, say=say), history)
 
 

@@ -19,7 +19,6 @@ from hilcal.errors import CannotAnswerError
 from hilcal.identification.fit import Fit, fit, with_outliers
 from hilcal.identification.linearisation import LEAST_MISFIT, linearise
 from hilcal.identification.residual import residual
-from hilcal.model.model import Prediction
 from hilcal.types import Floats
 
 FigureKind = Literal["load", "tool_mass", "tool_com"]
@@ -79,14 +78,14 @@ class _Figure:
             readings = replace(readings, states=replace(readings.states, wrench=wrench))
         return replace(stated, model=replace(stated.model, cell=cell), readings=readings)
 
-    def columns(self, stated: Fit, near: Prediction) -> Floats:
-        """(R, k) whitened derivatives of the measurements by the figure, near a prediction."""
+    def columns(self, stated: Fit) -> Floats:
+        """(R, k) whitened derivatives of the measurements by the figure."""
         fitted, w, h = ~stated.outlier, stated.whitening, DERIVATIVE_STEP[self.kind]
         readings = stated.readings[fitted]
         out = []
         for change in h * np.eye(self.size):
             changed = self.applied(stated, change)
-            ahead = changed.model.predict(changed.readings[fitted].states, stated.theta, near)
+            ahead = changed.model.predict(changed.readings[fitted].states, stated.theta)
             raw = (stated.raw - residual(readings, ahead, w)) / h
             out.append(w.whiten(raw).reshape(-1))
         return np.stack(out, axis=1)
@@ -94,7 +93,7 @@ class _Figure:
     def step(self, stated: Fit) -> tuple[Floats, float]:
         """Gauss-Newton step (k,) beside the model, and the share of χ² that it explains."""
         p = linearise(stated)
-        x = self.columns(stated, stated.solution.prediction)
+        x = self.columns(stated)
         g = x.T @ p.residual
         step = np.linalg.pinv(p.information(x), rcond=1e-9, hermitian=True) @ g
         return step, float(step @ g) / p.rss
@@ -106,9 +105,8 @@ class _Figure:
         if self.kind != "load" or 2 * outliers <= np.count_nonzero(of_load):
             return self.step(stated)
         raw, w = with_outliers(stated)
-        prediction = stated.model.predict(stated.readings.states, stated.theta)
         everything = replace(stated, outlier=np.zeros_like(stated.outlier), raw=raw, whitening=w)
-        x, r = self.columns(everything, prediction)[:, 0], w.whiten(raw).reshape(-1)
+        x, r = self.columns(everything)[:, 0], w.whiten(raw).reshape(-1)
         size = float(x @ r) / max(float(x @ x), 1e-300)
         return np.array([size]), size * float(x @ r) / max(float(r @ r), 1e-300)
 

@@ -1,9 +1,10 @@
 """The amplitude of a law: a product of functions of recorded quantities.
 
 The complexity of a product is the sum of those of its shapes; a sum of joint angles as quantity
-adds 1. A function of a composed quantity u = Σ w_i φ_i is no sum of products: a hose that pulls
-beyond some length, which depends on two joints, is max(u − u0, 0) with u = cos q_5·cos q_6. f(u)
-depends on the transmitted wrenches W by the chain rule, ∂f/∂W = f'(u) Σ w_i ∂φ_i/∂W.
+adds 1. A function f(u) of a composed quantity u = Σ w_i φ_i is no sum of products: the pull of
+a hose that is taut beyond a length u0 is max(u − u0, 0), where u depends on two joints, for example
+as cos q_5·cos q_6. Its derivative with respect to the transmitted wrenches W follows from the chain
+rule, ∂f/∂W = f'(u) Σ w_i ∂φ_i/∂W.
 """
 
 from collections.abc import Callable, Iterator

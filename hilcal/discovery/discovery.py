@@ -36,7 +36,7 @@ from hilcal.discovery.search import LEAST_LOG_ODDS, Selection, search
 from hilcal.discovery.structures import Structure, averaged, pareto, structure_of, structures
 from hilcal.effects.catalogue import effects_of
 from hilcal.errors import CannotAnswerError, HilcalError, InputError, expect
-from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit import Fit, fit, require_gc
 from hilcal.identification.folds import random_folds
 from hilcal.identification.linearisation import by_pose, left_out_by_pose, linearise
 from hilcal.readings.readings import Readings
@@ -128,8 +128,7 @@ def discover(
         InputError: the scaling of the fit is not gc.
     """
     expect(fit, Fit, "fit", "a Fit, as of hc.fit(model, readings)")
-    if fit.scaling != "gc":
-        raise InputError(f"scaling {fit.scaling!r}: laws are searched in a fit scaled by gc")
+    require_gc(fit, "a search for laws")
     linear = linearise(fit)
     noise = float(scipy.stats.chi2.sf(fit.chi2, fit.dof)) >= MISFIT_ALARM
     # A background takes up a part of what a law would explain.

@@ -318,9 +318,10 @@ def grammar(quantities: list[Variable], s: Situation, poses: int = 0) -> Grammar
 
 
 def _products(value: Floats, pairs: Ints) -> tuple[Floats, Floats, Ints]:
-    """Products (F', N) of pairs (F, 2) of rows, scaled to root mean square 1, single precision.
+    """Multiply pairs (F, 2) of rows, and leave out the products that are zero.
 
-    Also (F',) root mean squares before scaling, and indices of the pairs: those that are not zero.
+    Returns the other products (F', N), scaled to root mean square 1, in single precision; (F',)
+    their root mean squares before; and (F',) the indices of their pairs.
     """
     size = np.empty(len(pairs))
     for part in (slice(a, a + PRODUCTS_AT_ONCE) for a in range(0, len(pairs), PRODUCTS_AT_ONCE)):

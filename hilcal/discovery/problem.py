@@ -121,10 +121,10 @@ class CandidateTerms:
         yield from zip(along.tolist(), units, strict=True)
 
     def _screened(self) -> tuple[Floats, Floats, Floats, Floats]:
-        """Products of all candidates beside the model and the chosen terms, as in `Screen`.
+        """Inner products of all candidates, projected off the chosen terms as well as the model.
 
-        (S, F) each: xᵀ r; xᵀ M x, zero for dependent columns; xᵀ M x' with the partner, and with a
-        constant at the site.
+        Four arrays (S, F), as in `Screen`: xᵀ r; xᵀ M x, zero where x depends on the chosen terms;
+        xᵀ M x' with x' the partner; and xᵀ M x' with x' constant at the site.
         """
         p = self.problem
         slope, square, across, across_one = p.slope, p.square, p.across, p.across_one
@@ -359,10 +359,10 @@ def orthonormal(model: Projection, x: Floats) -> Floats:
 def pair_gain(
     square: Floats, slope: Floats, across: Floats, visible: Bools, which: Ints, partner: Ints
 ) -> Floats:
-    """(H,) gain of candidates `which` (H,), each with a partner; zero where the two are dependent.
+    """Return (H,) the gain of candidates `which` with their partners; 0 where both are dependent.
 
-    Of all candidates (F,) at a site are xᵀ M x, xᵀ r, xᵀ M x', whether they are independent of the
-    model, and the partner.
+    The other arguments (F,) are of all candidates of one site: xᵀ M x, xᵀ r, xᵀ M x' with the
+    partner x', whether x is independent of the model, and the index of the partner.
     """
     a, b, h = square[which], square[partner[which]], across[which]
     g, k = slope[which], slope[partner[which]]

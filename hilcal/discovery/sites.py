@@ -26,7 +26,7 @@ _AXES = "xyz"
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """A unit motion."""
+    """The unit motion of one part, or a unit error of the force sensor."""
 
     field: Place  # of `Deviation`; "sensor" for the recorded wrench, flange axes
     element: int  # joint or slot; 0 if the field has none
@@ -54,9 +54,9 @@ class Site:
     def takes(self, elastic: bool, sensed: bool = False) -> bool:
         """Whether a law may act here, by its causes.
 
-        Transmitted wrenches (`elastic`) move only parts of the arm; they move the base as the frame
-        of joint 1, other causes move it as the frame of the base. Readings of the force sensor
-        (`sensed`) cause only the sensor's own errors.
+        Transmitted wrenches (`elastic`) move only parts of the arm. They move the base by the twist
+        of the frame before joint 1; other causes move it by the base's own frame. Readings of the
+        force sensor (`sensed`) cause only the sensor's own errors.
         """
         if self.field == "sensor" or sensed:
             return self.field == "sensor" and not elastic

@@ -30,7 +30,7 @@ class WrenchGain(ForceSensorEffect):
         """Return g/(1 + g) w per axis."""
         if np.any(theta <= -1):
             raise CannotAnswerError(
-                f"{self.name}: a gain error of {100 * theta.min():.0f} % turns the wrench round; "
+                f"{self.name}: a gain error of {100 * theta.min():.0f} % reverses the wrench; "
                 "measure loads in more directions, or leave the effect out"
             )
         return np.asarray(recorded * (theta / (1 + theta)))

@@ -308,6 +308,12 @@ class Residuals(Sequence[Floats]):
         return f"Residuals({len(self)} of {self._fit.mode} readings: {rms:.1f} µm rms)"
 
 
+def require_gc(fit: Fit, task: str) -> None:
+    """Refuse a fit whose residual is not whitened by the full covariance."""
+    if fit.scaling != "gc":
+        raise InputError(f"{task} needs a fit with scaling gc, this one has {fit.scaling}")
+
+
 def mahalanobis2(raw: Floats, covariance: Floats) -> Floats:
     """Squared Mahalanobis distances (D,) of residuals (D, m) with covariances (D, m, m)."""
     white = np.einsum("dij,dj->di", inverse_root(covariance), raw)

@@ -42,13 +42,13 @@ def random_folds(pose: Ints, count: int = FOLDS) -> Ints:
     return np.asarray(deal[pose])
 
 
-def block_folds(pose: Ints, count: int = FOLDS) -> Ints:
+def block_folds(pose: Ints) -> Ints:
     """Fold of each measurement (D,): consecutive poses are in one fold."""
     total = int(pose.max()) + 1
-    return np.asarray(np.arange(total) * min(count, total) // total)[pose]
+    return np.asarray(np.arange(total) * min(FOLDS, total) // total)[pose]
 
 
-def region_folds(angle: Floats, pose: Ints, count: int = FOLDS) -> Ints:
+def region_folds(angle: Floats, pose: Ints) -> Ints:
     """Fold of each measurement (D,): poses close to each other in joint space are in one fold.
 
     The largest group of poses is halved, repeatedly, across the first principal component of its
@@ -58,7 +58,7 @@ def region_folds(angle: Floats, pose: Ints, count: int = FOLDS) -> Ints:
     q = np.zeros((total, angle.shape[1]))
     q[pose] = angle
     regions = [np.arange(total)]
-    while len(regions) < min(count, total):
+    while len(regions) < min(FOLDS, total):
         regions.sort(key=len)
         rows = regions.pop()
         spread = q[rows] - q[rows].mean(axis=0)

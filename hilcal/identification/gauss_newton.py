@@ -2,19 +2,19 @@
 
     minimise ‖w(θ)‖² + β ‖y/σ‖²,    θ = m + U y
 
-with w (R,) the whitened residual; y coordinates in which the prior is independent and about zero,
-θ itself without a carried prior (`carried.Coordinates`); σ their prior standard deviations. The
-noise factor β is the variance of the residual in units of the stated noise, at least 1. Priors of
-shrunk families maximise the evidence (`regression.empirical_bayes`). The rank is the number of flat
-directions that the data determine better than the residual's scatter.
+with w (R,) the whitened residual. In the coordinates y the prior is independent and about zero
+(`carried_prior.Coordinates`); without a carried prior they are θ itself. σ are their prior standard
+deviations. The noise factor β is the variance of the residual in units of the stated noise, at
+least 1. Priors of shrunk families maximise the evidence (`regression.empirical_bayes`). The rank is
+the number of flat directions that the data determine better than the residual's scatter.
 
 A `NewtonProblem` states the objective at a point and the linear problem there, whose rows may be
 replaced by any rows with the same products.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import ClassVar, Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -31,7 +31,6 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening
 from hilcal.regression.empirical_bayes import maximise_evidence, spent_by_groups
 from hilcal.regression.normal_equations import (
-    TALL,
     Basis,
     NormalEquations,
     find_basis,
@@ -42,11 +41,12 @@ from hilcal.regression.schur import Projection, projection
 from hilcal.types import Bools, Floats, Ints
 
 # All of these are choices.
+TALL = 10_000  # rows from which a step reduces them to their triangle first: its rank analysis and
+# normal equations of 150,000 rows of 30 then take a tenth of the time
 MAX_ITERATIONS = 20  # steps; the tests of convergence allow 8
 CONVERGED = 1e-5  # motion of the whitened readings by the last step, in units of the noise
 SETTLED = 0.02  # priors and rank are chosen anew until the residual changes by less than this share
 # in a step, or is within the noise
-ACCELERATION_DEPTH = 3  # previous steps that a step is combined with: weak directions are as few
 HALVINGS = 8  # most step lengths of a line search
 NOISE_STEPS, NOISE_TOLERANCE = 50, 1e-9  # iterations of the noise factor, and relative change
 
@@ -227,9 +227,6 @@ class Minimum(NamedTuple, Generic[P]):
 class NewtonProblem(Generic[P]):
     """A model, its coordinates, and the readings of the fit."""
 
-    same_rows: ClassVar[bool] = True
-    """Whether row i belongs to the same element of the readings in every linearisation."""
-
     model: Model
     coordinates: Coordinates
     whitened: bool  # whether rows are in units of the stated noise
@@ -278,7 +275,6 @@ def minimum(problem: NewtonProblem[P], start: Floats | None, prior: Floats | Non
     point = problem.at(np.where(sigma > 0, y, 0.0))
     by: Regularisation  # set in the first step
     square, settled = np.inf, False
-    path: list[tuple[Floats, Floats]] = []
     for iterations in range(1, MAX_ITERATIONS + 1):
         linear = problem.linearise(point, sigma)
         if not settled:
@@ -291,11 +287,7 @@ def minimum(problem: NewtonProblem[P], start: Floats | None, prior: Floats | Non
         aim = linear.origin.copy()
         aim[linear.live] += by.basis.transform @ equations.solve(by.beta)
         moved = linear.rows @ (aim - point.y)[linear.live]
-        shortcut = None
-        if settled and problem.same_rows:
-            path = [*path[-ACCELERATION_DEPTH:], (aim, moved)]
-            shortcut = accelerated(path) if len(path) > 1 else None
-        start_point, point = point, _line_search(problem, point, aim, by, shortcut)
+        start_point, point = point, _line_search(problem, point, aim, by)
         previous, square = square, point.mean_square(len(by.basis.singular))
         noise = max(square, by.beta) * linear.rank
         if settled and float(moved @ moved) <= CONVERGED**2 * noise:
@@ -305,21 +297,6 @@ def minimum(problem: NewtonProblem[P], start: Floats | None, prior: Floats | Non
         del linear  # frees memory for the next one
         settled = (problem.whitened and square < 1) or abs(square / previous - 1) <= SETTLED
     return Minimum(point, by, iterations, False, None)
-
-
-def accelerated(path: Sequence[tuple[Floats, Floats]]) -> Floats:
-    """Anderson's acceleration of the steps after priors and rank have settled: the aim (P,).
-
-    Where a residual remains, steps in a weakly determined direction shrink only by a constant
-    factor. Step i of the `path` leads to g_i (P,) and moves the whitened readings by f_i (R,). With
-    α_i, Σ α_i = 1, that minimise ‖Σ α_i f_i‖, the accelerated step leads to Σ α_i g_i.
-
-    Source: Walker and Ni, *Anderson acceleration for fixed-point iterations*, SIAM J. Numer. Anal.
-    49 (2011) 1715-1735.
-    """
-    (aim, moved), parts = path[-1], zip(*path, strict=True)
-    aims, moves = (np.diff(part, axis=0) for part in parts)
-    return np.asarray(aim - np.linalg.lstsq(moves.T, moved, rcond=None)[0] @ aims)
 
 
 def shortened(
@@ -343,22 +320,16 @@ def shortened(
     return None
 
 
-def _line_search(
-    problem: NewtonProblem[P], point: P, aim: Floats, by: Regularisation, shortcut: Floats | None
-) -> P:
-    """Go to the `shortcut` (P,) if the objective does not grow; else towards `aim` (P,).
+def _line_search(problem: NewtonProblem[P], point: P, aim: Floats, by: Regularisation) -> P:
+    """Go towards `aim` (P,).
 
-    That step is halved while the objective grows, as the chain may be strongly nonlinear.
+    The step is halved while the objective grows, as the chain may be strongly nonlinear.
     """
-
-    def cost(trial: P) -> float:
-        return trial.objective(by)
-
-    current, y = cost(point), np.where(by.prior > 0, point.y, 0.0)
-    reached = None if shortcut is None else shortened(problem.at, shortcut, 1, cost, current)
-    if reached is None:
-        limit = current * (1 + 1e-9) + 1e-12
-        reached = shortened(lambda step: problem.at(y + step), aim - y, HALVINGS, cost, limit)
+    y = np.where(by.prior > 0, point.y, 0.0)
+    limit = point.objective(by) * (1 + 1e-9) + 1e-12
+    reached = shortened(
+        lambda step: problem.at(y + step), aim - y, HALVINGS, lambda p: p.objective(by), limit
+    )
     return problem.at(y) if reached is None else reached
 
 

@@ -138,10 +138,10 @@ def _means(x: Floats, group: Ints) -> Floats:
 def _fitted(
     y: Floats, causes: Mapping[str, Floats], side: Mapping[str, Floats], lost: int
 ) -> tuple[dict[str, _Factor], Floats]:
-    """Factors of causes (N, n), as far as they are determined, and the drives' noise (n,).
+    """Return the factors of the causes that are determined, and the drives' noise (n,).
 
-    Sides of the approach (N, n) are causes of no factor; centring took `lost` degrees of freedom
-    from each drive, which has an offset where that is zero.
+    The sides of the approach (N, n) are fitted with them, but have no factor. Centring `y` took
+    `lost` degrees of freedom from each drive; where it took none, a drive has an offset.
     """
     count, n = y.shape
     largest = max([float(np.abs(x).max()) for x in causes.values()], default=0.0)

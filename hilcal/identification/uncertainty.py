@@ -45,6 +45,7 @@ LARGEST_STD = 10.0  # standard uncertainty, in ordinary magnitudes, from which n
 MISFIT_LEVEL = 0.01  # p-value of χ² below which the residual is a misfit; a choice
 GRID = np.logspace(-2.0, 3.0, 101)  # values of τ in units of the half-Cauchy's scale
 ROUNDING = 1e-9
+MOST_NAMED = 3  # parameters by which an unidentifiable direction is named
 DROPPED_VARIANCE = 2.0  # variance that a dropped group may have, in units of that by noise alone:
 # the mean over τ of a group at the limit of being dropped
 
@@ -124,7 +125,7 @@ def identifiable_parameters(
     return np.where(basis.flat | carried, flat, narrowed & (prior > 0))
 
 
-def name_directions(model: Model, null: Floats, most: int = 3) -> tuple[str, ...]:
+def name_directions(model: Model, null: Floats) -> tuple[str, ...]:
     """Name unidentifiable directions by the parameters that move together in them.
 
     Each is pivoted on its largest element, so that it involves few parameters. Factors are in
@@ -134,12 +135,13 @@ def name_directions(model: Model, null: Floats, most: int = 3) -> tuple[str, ...
     for row in echelon(null.T, (range(len(null)),)):
         order = np.argsort(-np.abs(row), kind="stable")
         strong = [k for k in order if abs(row[k]) > 0.05]
-        factors = [f"{abs(row[k]):.2g}" for k in strong[:most]]
+        factors = [f"{abs(row[k]):.2g}" for k in strong[:MOST_NAMED]]
         text = " ".join(
             f"{'+' if row[k] > 0 else '−'} {'' if f == '1' else f'{f}·'}{names[k]}"
             for k, f in zip(strong, factors, strict=False)
         )
-        suffix = f" … ({len(strong) - most} more)" if len(strong) > most else ""
+        more = len(strong) - MOST_NAMED
+        suffix = f" … ({more} more)" if more > 0 else ""
         out.append(text.removeprefix("+ ") + suffix)
     return tuple(out)
 

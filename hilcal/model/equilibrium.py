@@ -205,9 +205,6 @@ def _pruned(b: SlotResponse) -> SlotResponse | None:
     )
 
 
-WIDE = 64  # Successive parameters of one joint from which on they are written at once; by timing
-
-
 class ReadingColumns:
     """The derivative (N, m, L) of a chunk of readings by L parameters, sensor axes.
 
@@ -226,8 +223,6 @@ class ReadingColumns:
         self._moves, self._blocks, self._load, self._out = moves, blocks, load, out
         self._scale = np.ones(out.shape[2]) if scale is None else scale
         self._sums = zeros(*out.shape)
-        # which columns were added to, and which of them are written already
-        self._used, self._written = np.zeros((2, out.shape[2]), dtype=np.bool_)
         self._motions: dict[str | int, Floats] = {}
 
     def add(self, c: Columns, places: Ints) -> None:
@@ -237,7 +232,7 @@ class ReadingColumns:
         if c.field == "dq":
             for joint, run in c.runs():
                 moved = self._moves.drives[:, :, joint, None]
-                self._add_joint(moved, c.values[:, run], place[run])
+                self._add(moved * along_states(c.values[:, run])[:, None], place[run])
         elif c.field == "twist":
             for slot, run in c.runs():
                 moved = self._motion(slot, partial(self._moves.by_slot, slot))
@@ -262,10 +257,7 @@ class ReadingColumns:
 
     def write(self) -> None:
         """Write the derivative by all that was added."""
-        ends = np.flatnonzero(np.diff(np.concatenate([[True], self._written, [True]])))
-        for start, stop in ends.reshape(-1, 2).tolist():
-            part = (slice(None), slice(None), slice(start, stop))
-            np.multiply(self._sums[part], self._scale[start:stop], out=self._out[part])
+        np.multiply(self._sums, self._scale, out=self._out)
 
     @cached_property
     def _form(self) -> dict[tuple[int, bool], Floats]:
@@ -276,23 +268,10 @@ class ReadingColumns:
             self._motions[key] = find()
         return self._motions[key]
 
-    def _add_joint(self, moved: Floats, values: Floats, column: Ints) -> None:
-        """Add the motion (N, m, 1) by a joint, times (N or 1, P); many are written at once."""
-        place = slice(int(column[0]), int(column[0]) + len(column))
-        if len(column) >= WIDE and np.all(np.diff(column) == 1) and not self._used[place].any():
-            np.multiply(moved, (values * self._scale[place])[:, None], out=self._out[:, :, place])
-            self._used[place] = self._written[place] = True
-        else:
-            self._add(moved * along_states(values)[:, None], column)
-
     def _add(self, block: Floats, places: Ints) -> None:
         """Add columns (N, m, P) at their places (P,), which may be the same."""
-        self._used[places] = True
         for k, place in enumerate(places.tolist()):
-            if self._written[place]:
-                self._out[:, :, place] += self._scale[place] * block[:, :, k]
-            else:
-                self._sums[:, :, place] += block[:, :, k]
+            self._sums[:, :, place] += block[:, :, k]
 
 
 def _times(moved: Floats, values: Floats) -> Floats:

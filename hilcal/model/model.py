@@ -138,31 +138,26 @@ class Model(Brief):
         made = catalogue.make(spec.name, self.cell, states, spec.options, m)
         return replace(self, effects=(*self.effects, made), catalogue=catalogue)
 
-    def predict(self, states: States, theta: Floats, near: Prediction | None = None) -> Prediction:
+    def predict(self, states: States, theta: Floats) -> Prediction:
         """Equilibrium of N states: elastic deviations at the deflected configuration.
 
         The elastic deviations depend on the wrenches, those on the configuration, and the
         configuration on the deviations: a fixed point, which the iteration approaches by a
-        factor of about deflection/reach (1e-3) per step. It begins undeflected, or with a
-        prediction `near` of the same states, which saves a step or two.
+        factor of about deflection/reach (1e-3) per step.
 
         Raises:
             CannotAnswerError: the deviations grow instead of settling.
         """
-        parts = [
-            self._equilibrium(states[rows], theta, near[rows] if near else None)
-            for rows in chunks(len(states))
-        ]
+        parts = [self._equilibrium(states[rows], theta) for rows in chunks(len(states))]
         return parts[0] if len(parts) == 1 else Prediction.joined(states, parts)
 
-    def _equilibrium(self, states: States, theta: Floats, near: Prediction | None) -> Prediction:
+    def _equilibrium(self, states: States, theta: Floats) -> Prediction:
         cell = self.cell
         angle = states.q if states.q_actual is None else states.q_actual
         angle = along_states(angle)
         parts = self._parts(theta)
         turns = chains.joint_motions(cell.arm, angle)
-        chain = near.situation.chain if near else None
-        chain = chain or chains.evaluate(cell.arm, angle, nominal=turns)
+        chain = chains.evaluate(cell.arm, angle, nominal=turns)
         nothing = zeros(len(states), cell.arm.n + 1, 6)
         recorded = self._load(states, theta)
         turned = along_states(cell.arm.phases(angle))

@@ -173,12 +173,12 @@ class Procedure:
     def refine(
         self,
         say: Say = lambda text: None,
-        seen: Callable[[int, RefinementStep], None] = lambda number, step: None,
+        on_step: Callable[[int, RefinementStep], None] = lambda number, step: None,
     ) -> Refinement:
         """Fit, diagnose, and change the model until it is adequate; all revisions are stored.
 
-        `seen` takes each step as soon as it is diagnosed, after the number of its revision. A
-        CannotAnswerError where the readings do not determine the baseline.
+        `on_step` is called with each revision's number and step as soon as it is
+        diagnosed. Raises CannotAnswerError where the readings do not determine the baseline.
         """
         with Campaign.open(self.run, self.catalogue) as o:
             mode = usual_mode(o.readings, self.settings.readings)
@@ -186,7 +186,7 @@ class Procedure:
             model = baseline(o.cell, o.readings, mode, o.catalogue, self.prior)
             numbers = itertools.count(len(o.file.revisions()) + 1)
             refinement = refine(
-                model, o.readings, mode, say, on_step=lambda step: seen(next(numbers), step)
+                model, o.readings, mode, say, on_step=lambda step: on_step(next(numbers), step)
             )
             say("computing standard uncertainties")
             self.keep(o, refinement)

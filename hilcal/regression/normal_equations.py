@@ -1,6 +1,6 @@
 """The whitened linear problem: rank analysis, parameter scaling, priors, solution; QR in parts.
 
-    minimise ‖r − A δ‖² + β ‖(θ + δ − 0)/σ‖²  over δ
+    minimise ‖r − A δ‖² + β ‖(θ + δ)/σ‖²  over δ
 
 A (R, P) whitened Jacobian, r (R,) whitened residual, σ (P,) prior standard deviations
 (infinite for flat parameters), β the noise variance factor that multiplies the prior precision.
@@ -33,15 +33,10 @@ from hilcal.regression.schur import inverse_root, positive_solve
 from hilcal.types import Bools, Floats, Ints
 
 INFORMATION = 0.2  # least singular value s of an identifiable direction, in residuals' spreads
-NULL_SHARE = (
-    0.1  # share of its standard uncertainty by which an identifiable parameter may move for
-)
-# an ordinary magnitude along an unidentifiable direction; a choice, no study set it
+NULL_SHARE = 0.1
+"""Share of its standard uncertainty by which an identifiable parameter may move for an ordinary
+magnitude along an unidentifiable direction; a choice, no study set it."""
 ROUNDING = 1e-10
-TALL = (
-    10_000  # rows from which the QR is done in parts that fit into the processor's cache: a third
-)
-# of the time for 300,000 rows of 30; a choice by timing
 _ROWS = 4096  # rows multiplied at a time; a choice by memory
 ROWS = 3072  # rows reduced at a time, which fit into the processor's cache; a choice by timing
 BLOCK = 8  # columns whose reflections are applied together; a choice by timing
@@ -144,7 +139,6 @@ def find_basis(
     scale: Floats,  # (P,) ordinary magnitudes
     prior: Floats,
     spread: float | None = 1.0,
-    triangle: Floats | None = None,  # of `flat_triangle`, where it was computed before
 ) -> Basis:
     """Find the identifiable directions of the flat parameters of A (R, P).
 
@@ -158,7 +152,8 @@ def find_basis(
     held = np.flatnonzero(~flat & (prior > 0))
     columns = np.flatnonzero(flat)
     p = a.shape[1]
-    r = flat_triangle(a, columns, scale) if triangle is None else triangle
+    scaled = a[:, columns] * scale[columns]
+    r = np.asarray(sl.qr(scaled, mode="r", check_finite=False)[0], dtype=float)[: len(columns)]
     _, s, vt = np.linalg.svd(r, full_matrices=True)
     s = np.concatenate([s, np.zeros(len(columns) - len(s))])
     floor = ROUNDING * s.max(initial=0.0)
@@ -195,16 +190,6 @@ def echelon(rows: Floats, blocks: Sequence[Sequence[int]], least: float = 0.0) -
             rows[remaining] -= rows[remaining, pivot][:, None] * rows[done]
             done += 1
     return rows
-
-
-def flat_triangle(a: Floats, columns: Ints, scale: Floats) -> Floats:
-    """Return R of the QR of some columns of A (R, P), multiplied by their magnitudes (P,)."""
-    if len(a) > TALL and len(columns):
-        triangle = Triangle(len(columns))
-        triangle.add(a if len(columns) == a.shape[1] else a[:, columns])
-        return np.asarray(triangle.r * scale[columns])
-    scaled = a[:, columns] * scale[columns]
-    return np.asarray(sl.qr(scaled, mode="r", check_finite=False)[0], dtype=float)[: len(columns)]
 
 
 def _conditions(r: Floats, scale: Floats, rank: int) -> tuple[float, float]:

@@ -30,7 +30,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as sl
 
-from hilcal.types import Bools, Floats, Ints
+from hilcal.types import Floats, Ints
 
 # Least eigenvalue of an information matrix of unit diagonal that counts as information. Rounding of
 # double precision turns a zero into about 1e-16 times the number of rows; at 1e-12 a parameter's
@@ -51,48 +51,23 @@ def inverse_root(block: Floats) -> Floats:
     root = np.sqrt(np.maximum(np.diagonal(flat, axis1=1, axis2=2), 0.0))
     root[root == 0.0] = 1.0
     scaled = flat / (root[:, :, None] * root[:, None, :])
-    out, sound = _triangular(scaled)
-    for k in np.flatnonzero(~sound):
-        values, vectors = np.linalg.eigh(scaled[k])
-        determined = values > DETERMINED
-        inverse = np.where(determined, 1.0 / np.sqrt(np.where(determined, values, 1.0)), 0.0)
-        out[k] = inverse[:, None] * vectors.T
+    out = np.zeros_like(scaled)
+    for k, m in enumerate(scaled):
+        low, failed = sl.lapack.dpotrf(m.T, lower=1, clean=1)
+        if not failed:
+            out[k] = sl.lapack.dtrtri(low, lower=1)[0]
+            # The trace of an inverse is at least the inverse of the least eigenvalue.
+            failed = float(np.sum(out[k] ** 2)) >= _SOUND / DETERMINED
+        if failed:
+            values, vectors = np.linalg.eigh(m)
+            determined = values > DETERMINED
+            inverse = np.where(determined, 1.0 / np.sqrt(np.where(determined, values, 1.0)), 0.0)
+            out[k] = inverse[:, None] * vectors.T
     return np.asarray((out / root[:, None, :]).reshape(block.shape))
 
 
-def _triangular(scaled: Floats) -> tuple[Floats, Bools]:
-    """Inverse Cholesky factors of blocks (N, F, F), and which of them are accurate (N,)."""
-    if len(scaled) == 1:
-        low, failed = sl.lapack.dpotrf(scaled[0].T, lower=1, clean=1)
-        out = (np.zeros_like(low) if failed else sl.lapack.dtrtri(low, lower=1)[0])[None]
-    else:
-        try:
-            out = np.linalg.inv(np.linalg.cholesky(scaled))
-        except np.linalg.LinAlgError:  # one is singular: use eigenvalues for all
-            return np.zeros_like(scaled), np.zeros(len(scaled), dtype=np.bool_)
-        failed = False
-    # The trace of an inverse is at least the inverse of the least eigenvalue.
-    trace = np.einsum("nij,nij->n", out, out)
-    return out, np.asarray((trace < _SOUND / DETERMINED) & (not failed))
-
-
 def positive_solve(m: Floats, rhs: Floats) -> Floats:
-    """Return M⁻ times (P,) or (P, K), M (P, P) positive semidefinite.
-
-    Cholesky's factor is used where LAPACK's estimate of the condition shows that no direction is
-    near the limit: the trace of an inverse (F, F) is at most F times its 1-norm.
-    """
-    scale = np.sqrt(np.maximum(np.diagonal(m), 0.0))
-    if len(m) and scale.all():
-        scaled = m / scale
-        scaled /= scale[:, None]
-        norm = float(np.abs(scaled).sum(axis=0).max())
-        low, failed = sl.lapack.dpotrf(scaled.T, lower=1)
-        if not failed:
-            condition, _ = sl.lapack.dpocon(low, norm, uplo="L")
-            if condition * norm > len(m) * DETERMINED / _SOUND:
-                divisor = scale if rhs.ndim == 1 else scale[:, None]
-                return np.asarray(sl.lapack.dpotrs(low, rhs / divisor, lower=1)[0] / divisor)
+    """Return M⁻ times (P,) or (P, K), M (P, P) positive semidefinite, by the rule above."""
     root = inverse_root(m)
     return np.asarray(root.T @ (root @ rhs))
 

@@ -203,6 +203,6 @@ def _of_yaml(text: str, source: str) -> FactoryKinematics:
     for k, name in enumerate(_BODIES):
         place = np.array([places[name][key] for key in _PLACE])
         if not np.abs(place).max() < _LARGEST:
-            raise ValueError(f"{name} is nowhere")
+            raise ValueError(f"the place of {name} is not finite, or too far away")
         links[k] = se3.matrix(se3.of_rpy(place[3:]), place[:3])
     return FactoryKinematics(links, None, LINEARISED_STATUS, (), source)

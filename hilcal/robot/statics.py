@@ -55,29 +55,21 @@ def slot_wrenches(arm: Arm, chain: Chain, load: Load) -> Floats:
     f = force + weight
     t = load.wrench[:, 3:] + se3.cross(chain.point(load.point) - flange, force)
     if weight.any():
-        _add_moment(t, chain.point(load.tool_com) - flange, weight)
+        t += se3.cross(chain.point(load.tool_com) - flange, weight)
     out = empty(count, n + 1, 6)
     for k in range(n, -1, -1):
         if k < n:
             weight = arm.masses[k] * load.gravity
             t += se3.cross(chain.position[k + 1] - chain.position[k], f)
             if weight.any():
-                _add_moment(t, chain.com[k] - chain.position[k], weight)
+                t += se3.cross(chain.com[k] - chain.position[k], weight)
                 f += weight
             if load.first_moment is not None:
                 moment = se3.apply(body_axes(arm, chain, k), load.first_moment[k])
-                _add_moment(t, moment, load.gravity)
+                t += se3.cross(moment, load.gravity)
         np.einsum("nji,nj->ni", chain.rotation[k], f, out=out[:, k, :3])
         np.einsum("nji,nj->ni", chain.rotation[k], t, out=out[:, k, 3:])
     return out
-
-
-def _add_moment(t: Floats, lever: Floats, force: Floats) -> None:
-    """Add l × f of a force f (3,) that is the same in all states, mostly along one axis."""
-    for axis in np.flatnonzero(force):
-        j, k = (axis + 1) % 3, (axis + 2) % 3
-        t[:, j] += lever[:, k] * force[axis]
-        t[:, k] -= lever[:, j] * force[axis]
 
 
 def slot_wrench_change(chain: Chain, force: Floats, moment: Floats) -> Floats:
@@ -210,15 +202,15 @@ def geometric_stiffness(
     point, weight = chain.point(load.point), load.tool_mass * load.gravity
     force = load.wrench[:, :3] + weight
     dyad = _outer(point - p[n], load.wrench[:, :3])
-    _add_weight(dyad, chain.point(load.tool_com) - p[n], weight)
+    dyad += _outer(chain.point(load.tool_com) - p[n], weight)
     forces, dyads = [force], [dyad]
     for k in range(n - 1, -1, -1):
         dyad = dyad + _outer(p[k + 1] - p[k], force)
         weight = arm.masses[k] * load.gravity
-        _add_weight(dyad, chain.com[k] - p[k], weight)
+        dyad += _outer(chain.com[k] - p[k], weight)
         if load.first_moment is not None:
             moment = se3.apply(body_axes(arm, chain, k), load.first_moment[k])
-            _add_weight(dyad, moment, load.gravity)
+            dyad += _outer(moment, load.gravity)
         force = force + weight
         forces.insert(0, force)
         dyads.insert(0, dyad)
@@ -256,10 +248,5 @@ def _rows_dot(rows: Floats, vector: Floats) -> Floats:
 
 
 def _outer(a: Floats, b: Floats) -> Floats:
-    return np.einsum("ni,nj->nij", a, b, out=empty(len(a), 3, 3))
-
-
-def _add_weight(dyad: Floats, lever: Floats, weight: Floats) -> None:
-    """Add l wᵀ of a weight w (3,) that is the same in all states."""
-    for axis in np.flatnonzero(weight):
-        dyad[:, :, axis] += lever * weight[axis]
+    """Return a bᵀ (N, 3, 3) of a (N, 3) and b (N, 3) or (3,)."""
+    return np.multiply(a[:, :, None], b[..., None, :], out=empty(len(a), 3, 3))

@@ -185,7 +185,7 @@ def check_prior(prior: CarriedPrior, arm: Arm, readings: Readings) -> None:
     repeated = int(found_among_prints(readings, prior.posterior.prints).sum())
     if repeated:
         raise InputError(
-            f"{_label(prior.posterior)} was learnt from {repeated} of the {len(readings)} "
+            f"{_label(prior.posterior)} is of a fit to {repeated} of the {len(readings)} "
             "readings that are to be fitted; they would count twice; valid: a prior of other "
             "readings"
         )
@@ -201,8 +201,8 @@ def check_arm(prior: CarriedPrior, arm: Arm) -> None:
         )
     if np.abs(p.links - arm.links).max() > SAME_M:
         raise InputError(
-            f"{label} is of the arm {p.arm}, whose nominal links are others than those of "
-            f"{arm.name}; valid: a campaign of the same arm, described alike"
+            f"{label} is of the arm {p.arm}, whose nominal links differ from those of {arm.name}; "
+            "valid: a campaign of the same arm, described alike"
         )
 
 
@@ -325,7 +325,7 @@ def prior_of(model: Model) -> tuple[Floats, Ints]:
     """Starting prior (P,) of a model, and the shrinkage group (P,) of each parameter or −1.
 
     Random effects have the standard deviations stated in the model. Parameters with a carried prior
-    are flat here, see `carried.Coordinates`.
+    are flat here, see `Coordinates`.
     """
     prior, groups, used = [np.zeros(0)], [np.zeros(0, dtype=np.int64)], 0
     for e in model.effects:

@@ -27,10 +27,10 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.config.cell import Tool
 from hilcal.effects.protocol import Effect, Role
-from hilcal.errors import CannotAnswerError, InputError
+from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import LEVER_M
 from hilcal.identification.carried.carried_prior import scales_of
-from hilcal.identification.fit import Fit
+from hilcal.identification.fit import Fit, require_gc
 from hilcal.identification.gauss_newton import shortened
 from hilcal.identification.noise.arm_scatter import with_arm_scatter
 from hilcal.identification.prediction.predictive import Predictive, predictive_of
@@ -67,11 +67,7 @@ class EarlierFit:
 
 def earlier_fit(fit: Fit) -> EarlierFit:
     """Return a fit, which must be gc-scaled, with its predictive distribution."""
-    if fit.scaling != "gc":
-        raise InputError(
-            f"the earlier fit has scaling {fit.scaling}; a comparison needs gc: run hilcal "
-            "identify again"
-        )
+    require_gc(fit, "a comparison with later readings")
     knows = predictive_of(fit)
     beyond = max(knows.factor * knows.scatter - 1.0, 0.0)
     shared = beyond * _share_by_pose(fit, knows, fit.readings[~fit.outlier])

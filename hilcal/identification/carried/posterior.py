@@ -199,7 +199,7 @@ def _read(content: Mapping[str, Any]) -> Posterior:
     if not all(np.isfinite(a).all() for a in numbers):
         raise ValueError("numbers that are not finite")
     if np.any(p.scale <= 0) or np.any(p.own_precision < 0):
-        raise ValueError("a magnitude or precision that cannot be")
+        raise ValueError("a magnitude that is not positive, or a negative precision")
     return p
 
 

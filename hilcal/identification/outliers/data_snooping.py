@@ -12,12 +12,14 @@ Readings that deviate by one common cause are no gross errors: readings in a row
 in the axes of the sensor or of the target, as by another reflector, a target that was moved on the
 tool, or a bumped tracker (`runs_of_equal_shifts`); and readings with shifts along the directions of
 one site of the arm (`along_one_site`), as a law of a joint, of a link that bends, or of the force
-sensor moves each reading along one direction, whatever it depends on. For a random error in m
-dimensions the share of its square normal to a direction is sin² ~ Beta((m − 1)/2, 1/2), so that its
-distribution function p is uniform. With p_(n) ascending, n of F gross errors are as near to the
-directions of a site as p_(n) with the probability P(B(F, p_(n)) ≥ n). Its minimum over n and the
-sites is multiplied by F and the number of sites; where the product is too small, the readings near
-these directions, if of at least two poses, are ascribed to a law.
+sensor moves each reading along one direction, whatever it depends on.
+
+The shift of a gross error has no preferred direction: in m dimensions the share of its square that
+is normal to a given direction is sin² ~ Beta((m − 1)/2, 1/2), whose distribution function p is
+uniform. Of F gross errors, with p_(n) ascending, at least n are as near to the directions of a site
+as p_(n) with the probability P(B ≥ n), B binomial with F and p_(n). The least of these, over n and
+the sites, is multiplied by F and the number of sites. Where the product is too small for chance,
+the readings near these directions, if of at least two poses, are ascribed to a law.
 """
 
 from dataclasses import dataclass, replace
@@ -358,8 +360,8 @@ def runs_of_equal_shifts(
 ) -> Ints:
     """Return the rows in runs with the same shift; none up to `MOST_ALIKE_SHARE` of the tested.
 
-    Of readings that deviate: `off` (F,) ascending rows, `shift` (F, 3) in sensor axes, and `axes`
-    (F, 3, 3), the rotations of the target.
+    `off` (F,) are the rows of the readings that deviate, ascending; `shift` (F, 3) their shifts in
+    sensor axes; and `axes` (F, 3, 3) the rotations of the target in them.
     """
     order = np.zeros(len(readings), dtype=np.int64)
     alike = np.zeros(len(off), dtype=np.bool_)
@@ -401,7 +403,7 @@ def site_columns(model: Model, theta: Floats, prediction: Prediction, readings: 
             wrench = states.wrench.copy()
             wrench[:, part] += axis
             try:
-                o = model.predict(replace(states, wrench=wrench), theta, p).observation
+                o = model.predict(replace(states, wrench=wrench), theta).observation
             except CannotAnswerError:  # parameters so large that there is no equilibrium
                 continue
             turn = se3.rotation_vector(o.rotation @ observation.rotation.swapaxes(1, 2))
@@ -411,10 +413,11 @@ def site_columns(model: Model, theta: Floats, prediction: Prediction, readings: 
 
 
 def along_one_site(shift: Floats, columns: Floats, pose: Ints) -> Bools:
-    """(F,) which deviating readings, at poses of numbers (F,), are ascribed to a law.
+    """Return (F,) which readings that deviate are ascribed to a law, not to gross errors.
 
-    The shifts (F, m), and the columns (F, m, P) of changes by each site, are in units of the noise,
-    equal for all directions, so that random shifts have no preferred one.
+    `shift` (F, m) are their shifts, `columns` (F, m, P) their changes by each site of a law, `pose`
+    (F,) their poses. The unit is the noise, equal in all directions, so that random shifts prefer
+    none.
     """
     count, m, sites = columns.shape
     if not count:

@@ -8,18 +8,18 @@ A (R, P) of the fitted readings, whitened by W, σ² their noise factor, Λ the 
 
     C = (AᵀA/σ² + Λ)⁻¹,    Cov(measured − predicted) = κ (σ² W + J C Jᵀ)
 
-W is the stated covariance V, with more for positions or attitudes where their residual asks for it:
-a misfit has not the shape of an instrument's noise, which is small along the beam. W, C and the
-residual of parameters with this W and Λ are computed in turns. Where the model has a background, σ
-is the factor of the instrument's noise in the mixed model; otherwise σ² is from the residual, at
-least 1.
+W is the stated covariance V plus the excess of the residual over it (see below): a misfit does not
+have the shape of an instrument's noise, which is small along the beam. W depends on the residual of
+the parameters, these on W and Λ, so that both are computed in turn until W settles. Where the model
+has a background, σ is the factor of the instrument's noise in the mixed model; otherwise σ² is the
+variance of the whitened residual, at least 1.
 
-κ, at least 1, makes the mean variance on poses left out, in units of V, equal to the mean square
-error there. Of the folds as they are left out, F of rows Y, with X the same whitened by W and
-multiplied by the root of C, it is the mean of Y (1 − XᵀX/σ²)⁻¹ Yᵀ.
+κ, at least 1, makes the mean predicted variance of poses left out, in units of V, equal to their
+mean square error. With Y the rows of a fold times the root of C, and X the same rows whitened by W,
+the variance of its prediction from the other folds is the mean of Y (1 − XᵀX/σ²)⁻¹ Yᵀ.
 
 The uncertainty of the variances of a background makes C larger by how far it moves the parameters
-(`mixed.prediction`), and κ is at least its mean effect on predictions (Kackar and Harville, JASA 79
+(`mixed.variances`), and κ is at least its mean effect on predictions (Kackar and Harville, JASA 79
 (1984) 853). At given variances rows predicted without their fold are off by e with the variance v.
 With x = (log s, η) drawn from its posterior, by weights from the normal approximation at its
 maximum x̂, the mean square is E[Σ v] + E|e − E e|²; its ratio to Σ v at x̂ is that least κ. With
@@ -42,10 +42,10 @@ import numpy as np
 import scipy
 
 from hilcal.effects.protocol import FRAME_ROLES, Effect
-from hilcal.errors import CannotAnswerError, InputError
+from hilcal.errors import CannotAnswerError
 from hilcal.identification.carried.carried_prior import coordinates_of, scales_of
 from hilcal.identification.carried.posterior import Posterior, PosteriorEffect, Source, determined
-from hilcal.identification.fit import Fit
+from hilcal.identification.fit import Fit, require_gc
 from hilcal.identification.folds import distinct_poses, ordinary_magnitudes, random_folds
 from hilcal.identification.gauss_newton import whitened_jacobian
 from hilcal.identification.mixed_fit import INSTRUMENT, mixed_fit_at
@@ -72,7 +72,7 @@ DRAWS, SEED = 30, 0  # of the posterior; a choice: 20 poses of that UR10 give 1.
 # log of the largest weight of a draw over the median: tails are not normal; a choice
 LARGEST_LOG_WEIGHT = 2.0
 EXCESS_LEVEL = 0.0005
-"""P-value of χ² below which there is an excess: that of `diagnosis.noise_verdict`."""
+"""P-value of χ² below which there is an excess: that of `diagnosis.noise.MISFIT_ALARM`."""
 LEVERAGE_SAMPLE = 400  # measurements, evenly spaced, for a mean leverage, for speed; a choice
 NEGLIGIBLE_CHANGE = 0.05  # relative change of s² and of the factor that is negligible; a choice
 
@@ -300,9 +300,10 @@ def predictive(
 def left_out_variances(
     a: Floats, fold: Ints, predicted: Sequence[tuple[Floats, Ints]], root: Floats, noise: float
 ) -> list[float]:
-    """Mean variance of `predicted` rows (R', P) with folds (R',), each without its fold.
+    """Return the mean variance of each set of `predicted` rows, each row without its own fold.
 
-    `a` are the fitted rows (R, P) in units of W, `root` (P, K) is that of C, `noise` σ².
+    A set is rows (R', P) with their folds (R',). `a` (R, P) are the fitted rows in units of W, and
+    `fold` (R,) their folds; `root` (P, K) is the root of C, and `noise` is σ².
     """
     total = np.zeros(len(predicted))
     for f in range(int(fold.max(initial=-1)) + 1):
@@ -373,8 +374,7 @@ def variance_spread(variances: Variances, fold: Ints) -> float:
 
 def posterior_of(fit: Fit, source: Source | None = None) -> Posterior:
     """Return the posterior of the arm after a fit; arguments and errors as of `Posterior.of`."""
-    if fit.scaling != "gc":
-        raise InputError(f"a prior needs a fit with scaling gc, this one has {fit.scaling}")
+    require_gc(fit, "a prior")
     model, cell = fit.model, fit.model.cell
     effects = [e for e in model.effects if belongs_to_arm(e)]
     if not effects:

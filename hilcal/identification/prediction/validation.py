@@ -120,7 +120,7 @@ def _register(
         if float(np.linalg.norm(columns @ step)) < CONVERGED * len(white):
             return moved, values
     raise CannotAnswerError(
-        "registration: does not settle on these readings; measure poses spread in space"
+        "registration: does not converge on these readings; measure poses spread in space"
     )
 
 

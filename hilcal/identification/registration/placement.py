@@ -43,7 +43,7 @@ def angles(readings: Readings) -> Floats:
 def inverse_roots(covariance: Floats, partial: bool = False) -> Floats:
     """(N, m, m) W with W V Wᵀ = I, V the covariance with the roughness added.
 
-    With `partial` elements without a variance were not read: they get no roughness either.
+    With `partial`, elements of variance 0 were not read, and get no roughness either.
     """
     m = covariance.shape[-1]
     rough = np.repeat(np.square(ROUGHNESS), 3)[:m] * np.eye(m)
@@ -53,9 +53,10 @@ def inverse_roots(covariance: Floats, partial: bool = False) -> Floats:
 
 
 def free_parameters(base: bool, targets: Bools, attitudes: bool) -> Bools:
-    """(6 + 6 T,) which parameters are estimated; of base and targets (T,), which are unknown.
+    """Return (6 + 6 T,) which parameters of base and targets are estimated.
 
-    A target's axes show in attitudes alone, and are estimated from them even at a known offset.
+    `base` and `targets` (T,) state which of the frames have unknown places. A target's axes show in
+    attitudes alone, and are estimated from them even at a known offset.
     """
     return np.concatenate(
         [np.full(6, base), *(np.repeat([bool(t), attitudes], 3) for t in targets)]
@@ -304,8 +305,8 @@ def best_placement(
 ) -> Placement:
     """Return the best placement from several starts: closed forms, then rotations of a cube.
 
-    Of these the best `rotated` are tried. The search ends at a whitened rms misfit per reading of
-    `good`; each start takes at most `steps`.
+    The search ends where a closed form leaves at most the whitened rms misfit `good` per reading;
+    otherwise the best `rotated` rotations are followed as well. A start takes at most `steps`.
     """
     placements: list[Placement] = []
     for start in _closed_forms(data, frames, free):
@@ -430,9 +431,10 @@ def _with_translations(data: FrameData, frames: Frames, rotation: Floats, free: 
 
 
 def _starts(data: FrameData, part: FrameData, frames: Frames, free: Bools) -> Iterator[Frames]:
-    """Yield starts for several observers, which are placed by a part of the readings.
+    """Yield starts for several observers, which are placed by `part` of the readings.
 
-    Base and targets are by stations of known place, else by rotations of a cube.
+    Base and targets are placed by stations of known place where there are enough readings of them,
+    else by rotations of a cube.
     """
     known = [k for k, o in enumerate(frames.observers) if o.name.kind == "station" and not o.free]
     rows, bases = np.isin(np.asarray(data.observer), known), [frames]
@@ -450,9 +452,9 @@ def _starts(data: FrameData, part: FrameData, frames: Frames, free: Bools) -> It
     for f in bases:
         p, observers = part.points(f) @ f.base[:3, :3].T + f.base[:3, 3], []
         for k, o in enumerate(frames.observers):
-            mine = part.observer == k
-            placed = bool(o.free) and bool(np.any(mine))
-            observers.append(_observer_placed(o, p[mine], part.value[mine]) if placed else o)
+            own = part.observer == k
+            placed = bool(o.free) and bool(np.any(own))
+            observers.append(_observer_placed(o, p[own], part.value[own]) if placed else o)
         yield replace(f, observers=tuple(observers))
 
 

@@ -300,8 +300,8 @@ def rank_conventions(
 ) -> tuple[Agreement, ...]:
     """Rank the conventions of orientations by their agreement with the nominal arm, best first.
 
-    Of the numbers (N, k), in a unit of angles, at joint angles (N, n) and positions (N, 3), sensor
-    axes; none where there are too few readings.
+    `values` (N, k) are the numbers of the orientations, with angles in `unit`, read at joint angles
+    `q` (N, n) and positions (N, 3), sensor axes. Returns none where there are too few readings.
     """
     step = max(1, len(q) // MOST_READINGS)
     q, y, values = q[::step], position[::step], values[::step]

@@ -73,8 +73,9 @@ def test_with_all_directions_the_mean_variance_is_that_of_all_parameters(monkeyp
     of, work = scene(mode, fitted=fitted)
     asked = mixed_design(of, config(mode), work)
     # what no unit moves is as uncertain by every plan, and left out
-    least = mean_variance_of_all(of, work, mode, np.full(len(of.units), 1e9))
-    least -= variance_of(asked, np.full(len(of.units), 1e9))
+    # (more than 1e7 of each lose digits to rounding)
+    many = np.full(len(of.units), 1e7)
+    least = mean_variance_of_all(of, work, mode, many) - variance_of(asked, many)
     for seed in range(3):
         counts = np.random.default_rng(seed).integers(1, 3, len(of.units)).astype(float)
         every = mean_variance_of_all(of, work, mode, counts) - least

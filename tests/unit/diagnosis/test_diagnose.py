@@ -158,7 +158,7 @@ def test_where_names_each_variable_once_and_in_order():
 def test_a_diagnosis_needs_whitened_residuals():
     c = campaign(plan_seed=0)
     found = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute", "none")
-    refusal("needs scaling gc, this fit has none", diagnose, found)
+    refusal("diagnosis needs a fit with scaling gc, this one has none", diagnose, found)
 
 
 def test_effects_that_need_missing_columns_are_no_suspects():

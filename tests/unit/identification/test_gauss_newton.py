@@ -10,8 +10,8 @@ from hilcal.errors import CannotAnswerError
 from hilcal.identification.carried.carried_prior import scales_of
 from hilcal.identification.fit import fit
 from hilcal.identification.gauss_newton import (
+    TALL,
     NewtonPoint,
-    accelerated,
     linear_problem,
     regularise,
     shortened,
@@ -20,7 +20,6 @@ from hilcal.identification.residual import residual
 from hilcal.model.model import Model
 from hilcal.readings.readings import States
 from hilcal.readings.whitening import whitening
-from hilcal.regression.normal_equations import TALL
 from tests.support.campaigns import cell_of
 from tests.support.effect_cases import make
 from tests.support.readings_cases import readings_at
@@ -100,18 +99,6 @@ def test_sideways_pulls_separate_the_first_joints_offset_from_the_registration(s
     )
     down = fit(model, replace(readings, states=states, value=readings.value + shift), "absolute")
     assert not down.uncertainty.identifiable[pair].any()
-
-
-def test_steps_that_shrink_by_constant_factors_lead_to_their_limit():
-    """Anderson's combination of steps x → x* + D (x − x*), D diagonal with two factors."""
-    rng = np.random.default_rng(0)
-    limit, factor = rng.normal(size=8), np.where(np.arange(8) < 4, -0.55, 0.6)
-    path, x = [], np.zeros(8)
-    for _ in range(4):
-        aim = limit + factor * (x - limit)
-        path.append((aim, aim - x))
-        x = accelerated(path) if len(path) > 1 else aim
-    np.testing.assert_allclose(x, limit, rtol=0, atol=1e-10)
 
 
 def test_a_step_is_shortened_until_it_can_be_taken():

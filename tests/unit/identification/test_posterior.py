@@ -318,7 +318,7 @@ def test_priors_that_cannot_be_are_refused():
     fewer, ur3e = replace(p, links=p.links[:-1]), replace(c.cell, arm=load_arm("ur3e"))
     for of, cell, readings, words in (
         (p, c.cell, c.readings, "count twice"),
-        (p, ur3e, later, "other"),
+        (p, ur3e, later, "differ"),
         (fewer, c.cell, later, "joints"),
     ):
         refusal(words, baseline, cell, readings, "absolute", prior=carried_prior(of))

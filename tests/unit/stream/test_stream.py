@@ -13,8 +13,7 @@ from hilcal.engine import open_engine
 from hilcal.identification import gauss_newton as gauss_newton_steps
 from hilcal.identification.fit import fit
 from hilcal.readings.readings import Readings
-from hilcal.regression import normal_equations
-from hilcal.regression.normal_equations import Triangle, combined, find_basis
+from hilcal.regression.normal_equations import Triangle, combined
 from hilcal.stream import fit_stream
 from hilcal.tables.parquet_stream import open_stream
 from tests.support.cli_cases import ok, refused
@@ -124,19 +123,6 @@ def test_nearly_dependent_columns_lose_no_digits():
     assert by_triangle < 10 * max(by_lapack, 1e9 * np.finfo(float).eps)
     by_products = np.linalg.lstsq(a.T @ a, a.T @ b)[0]
     assert off(by_products) > 1e4 * by_triangle
-
-
-def test_a_tall_problem_has_the_rank_of_its_qr(monkeypatch):
-    rng = np.random.default_rng(2)
-    a = rng.normal(size=(12_000, 5)) @ np.diag([1, 1e3, 1e-3, 1, 1])
-    a[:, 4] = a[:, 0] - a[:, 3]
-    scale, flat = np.array([1, 1e-3, 1e3, 2, 1.0]), np.full(5, np.inf)
-    tall = find_basis(a, scale, flat)
-    monkeypatch.setattr(normal_equations, "TALL", 10**9)
-    whole = find_basis(a, scale, flat)
-    assert tall.structural == whole.structural == 4
-    assert tall.singular == pytest.approx(whole.singular, rel=1e-12)
-    assert np.abs(tall.null) == pytest.approx(np.abs(whole.null), abs=1e-12)
 
 
 @pytest.mark.long
