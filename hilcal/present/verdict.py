@@ -227,8 +227,8 @@ def _no_suspect(d: Diagnosis) -> list[str]:
     if d.fit.model.background:
         return [
             "All effects of the catalogue together explain the fitted poses (residuals are "
-            f"{_spread(d)}), but not poses left out: {predicted} of the misfit there is predicted "
-            f"by what the catalogue lacks{follows}.",
+            f"{_spread(d)}), but not poses left out: {predicted} of the misfit there is "
+            f"predictable, and no effect of the catalogue explains it{follows}.",
             "All of them take part in predictions; each may only resemble the missing effect.",
         ]
     return [
