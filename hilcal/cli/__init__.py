@@ -252,6 +252,12 @@ def _run(
             print(error, file=sys.stderr)
             return _USAGE
         return failures.report(error, *_explained(error, name))
+    except SystemExit as error:
+        from hilcal.effects.protocol import failure_of
+
+        if (failed := failure_of(error)) is None:
+            raise
+        return failures.report(error, str(failed), failed.exit_code)
     if result == _INTERRUPTED:
         return failures.report(None, "interrupted", _INTERRUPTED)
     return result if isinstance(result, int) else 0
