@@ -28,7 +28,7 @@ from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.effects.written import read_effects_text, write_effect
 from hilcal.errors import CannotAnswerError, HilcalError, InputError, LimitError
 from hilcal.identification.background import background_of
-from hilcal.identification.baseline import masses_note
+from hilcal.identification.baseline import loads_note
 from hilcal.identification.fit import all_left_out, fit
 from hilcal.identification.fit_document import frames_to_json, prior_to_json
 from hilcal.identification.linearisation import linearise
@@ -253,7 +253,7 @@ def refine(
         other_arm = other_arm_of(o.cell, o.readings) if latest is None else None
         if other_arm is not None:
             t.show(other_arm_line(other_arm))
-        if note := masses_note(refinement.fit):
+        if note := loads_note(refinement.fit):
             t.show(numbers.sentence(note))
         if names := ", ".join(refinement.rejected):
             t.show(f"Tried and left out, since the error on poses left out did not fall: {names}.")
