@@ -104,6 +104,7 @@ def run(
             if append and plan is None:
                 raise InputError("--append needs the further plan: give it with --plan PLAN")
             campaign = stack.enter_context(CampaignFile.open(output, check_revisions=False))
+            campaign.measure_alone()
             check_same_cell(campaign, config, base_dir)
             campaign_plan = RunLog(campaign).plans[0]
             if plan is not None:
@@ -212,6 +213,7 @@ def measure(
     viewer: LiveViewer | None = None,
 ) -> int:
     """Measure what a campaign lacks, until a goal is met; `epoch` is the wall time at zero, s."""
+    campaign.measure_alone()
     log = RunLog(campaign)
     stored = log.readings()
     if goal is not None and stored is not None and goal(stored, last=True).met:

@@ -417,6 +417,21 @@ def test_an_append_that_was_stopped_is_resumed(site, capsys):
     assert d["readings"] == d["planned"] == len(site.plan.steps) + 15
 
 
+@pytest.mark.long
+def test_nobody_measures_beside_a_run(site, capsys):
+    ok(capsys, *site.command(*site.fresh))
+    further, path = str(further_plan(site)), site.directory / "run.hilcal"
+    before = path.read_bytes()
+    with CampaignFile.open(path) as campaign:
+        campaign.measure_alone()
+        for words in (("--resume",), ("--append", "--plan", further)):
+            line = refused(capsys, 2, *site.command(*words))
+            assert "another hilcal is measuring this campaign" in line
+        assert path.read_bytes() == before
+        ok(capsys, "info", path)
+    assert ok(capsys, *site.command("--resume", "--json")).document["readings"]
+
+
 def test_wrong_ways_to_append(site, capsys):
     further = str(further_plan(site))
     line = refused(capsys, 2, *site.command("--append", "--plan", further))
