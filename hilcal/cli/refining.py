@@ -2,7 +2,6 @@
 
 import itertools
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -58,7 +57,7 @@ from hilcal.store.revision import change
 from hilcal.tables.units import parse_length
 from hilcal.transfer.compare import compare as compare_campaigns
 from hilcal.transfer.compare import validate as validate_campaign
-from hilcal.whole_file import replace_file
+from hilcal.whole_file import replace_file, spare_other
 
 
 def chapters_of(numbers: Iterable[int], steps: Iterable[RefinementStep]) -> list[Chapter]:
@@ -299,6 +298,9 @@ def revisions_json(chapters: Iterable[Chapter], stored: str = "") -> list[dict[s
     ]
 
 
+LAW = "a law of hilcal discover"
+
+
 @command("""
     output | -o --output F.py | The effect, to be edited.
     against | --against MODEL | Beside this model instead of the revision in use: effects A,B;
@@ -322,9 +324,7 @@ def discover(
     if effects is not None and revision is not None:
         raise InputError("--against and --revision: give one of them")
     check_folder(output, f"-o {output}")
-    with suppress(OSError):  # said when it is written
-        if output.is_file() and PROPOSED.encode() not in output.read_bytes():
-            raise InputError(f"{output}: exists and is no law of hilcal discover; it is kept")
+    spare_other(output, LAW, PROPOSED)
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         number: int | None = None
         if effects is None:
@@ -342,6 +342,8 @@ def discover(
     rivals = rival_sources(d) if alternatives else {}
     written = {name: d.source, **rivals}
     places = {effect: output.with_name(f"{effect}.py") for effect in written}
+    for place in places.values():
+        spare_other(place, LAW, PROPOSED)
     for effect, source in written.items():
         replace_file(places[effect], source)
     t.show(

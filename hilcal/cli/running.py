@@ -67,7 +67,7 @@ from hilcal.store.plan import Plan, load_plan, with_new_names
 from hilcal.store.procedure_log import ProcedureLog
 from hilcal.store.run_log import RunLog, check_same_cell, create_run
 from hilcal.transfer.compare import check_factory
-from hilcal.whole_file import replace_file
+from hilcal.whole_file import replace_file, spare_other
 
 
 @command("""
@@ -454,6 +454,7 @@ def lasting_cell(p: Procedure) -> Iterator[CellConfig]:
         yield simulated.config
 
 
+SIMULATED = "# Written by hilcal simulate: the devices are simulated.\n"
 MAX_CLOCK = 200.0  # Largest clock rate of a simulated world, as in `[simulation] clock`
 
 
@@ -477,7 +478,8 @@ def simulate(
         if not 1.0 <= clock <= MAX_CLOCK:
             raise InputError(f"--clock {clock:g}; valid: a number from 1 to {MAX_CLOCK:g}")
         config = config.with_keys("simulation", clock=clock)
-    base_dir = cell.absolute().parent
+    base_dir, target = cell.absolute().parent, output / "cell.toml"
+    spare_other(target, "a cell of hilcal simulate", SIMULATED)
     choice = hide or config.simulation.hide or NO_EFFECT
     program_config(
         config, choice, catalogue
@@ -503,9 +505,8 @@ def simulate(
         with working(t.progress) as say:
             say("starting the devices")
             simulated = stack.enter_context(simulated_cell(secret, number, base_dir, output))
-        target = output / "cell.toml"
         written = with_person(simulated.config) if person else simulated.config
-        replace_file(target, to_toml(_placed(written, base_dir)))
+        replace_file(target, SIMULATED + to_toml(_placed(written, base_dir)))
         t.show(f"The devices run. Their cell is {target}; go on in another terminal with:")
         t.command(shlex.join(("hilcal", "check", str(target))))
         plan_option = () if plan is None else ("--plan", str(plan))
