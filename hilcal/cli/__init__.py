@@ -253,9 +253,9 @@ def _run(
             return _USAGE
         return failures.report(error, *_explained(error, name))
     except SystemExit as error:
-        from hilcal.effects.protocol import failure_of
-
-        if (failed := failure_of(error)) is None:
+        effects = sys.modules.get("hilcal.effects.protocol")  # without it no effect has run
+        failed = None if effects is None else effects.failure_of(error)
+        if failed is None:
             raise
         return failures.report(error, str(failed), failed.exit_code)
     if result == _INTERRUPTED:
