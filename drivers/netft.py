@@ -37,9 +37,9 @@ RENEW_S = 0.3
 _PAGE_S = 2.0
 _LARGEST = 1 << 16
 _BUFFER = 1 << 22
-ERROR, LATCHED, SATURATED = 1 << 31, 1 << 16, (1 << 17, 1 << 27 | 1 << 30)
+ERROR, LATCHED, SATURATED = 1 << 31, 1 << 16, 1 << 17 | 1 << 27 | 1 << 30
 """Bits of the status: any error; a threshold was once exceeded (no error); gauges over their range,
-of a Net F/T and of an Axia."""
+of a Net F/T (17) and of an Axia (27, 30). A sensor need not set bit 31 with them."""
 _LBF, _KGF, _INCH = 4.4482216152605, 9.80665, 0.0254
 _FORCE = {
     **{"1": _LBF, "2": 1.0, "3": 1e3 * _LBF, "4": 1e3, "5": _KGF},
@@ -130,10 +130,9 @@ class Datagrams:
 
 def _overload(wrench: Floats, status: int) -> str:
     """The error that the status reports; that a threshold was exceeded (bit 16) is no error."""
-    if status in (0, LATCHED, ERROR | LATCHED) or not status & (ERROR | SATURATED[0]):
+    if status == ERROR | LATCHED or not status & (ERROR | SATURATED):
         return ""  # other bits of an Axia report a change of settings
-    over = any(status & bits for bits in SATURATED)
-    hint = "is it loaded over its range?" if over else "see the status on its page"
+    hint = "is it loaded over its range?" if status & SATURATED else "see the status on its page"
     return f"the sensor reports an error (status {status:#010x}); {hint}"
 
 

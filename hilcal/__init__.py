@@ -97,7 +97,8 @@ if TYPE_CHECKING:
 def __getattr__(name: str) -> object:
     """Import a name of the library when it is first used."""
     if name not in _PLACES:
-        raise AttributeError(f"module 'hilcal' has no attribute {name!r}")
+        valid = ", ".join(sorted(_PLACES))
+        raise AttributeError(f"module 'hilcal' has no attribute {name!r}; valid: {valid}")
     value = getattr(import_module(_PLACES[name]), name)
     globals()[name] = value
     return value

@@ -264,7 +264,7 @@ def _carried(
 
 def fit(
     model: Model,
-    data: Readings | Campaign,
+    data: Readings | Campaign | None = None,
     readings: str | None = None,
     scaling: str = "gc",
     prior: Posterior | CarriedPrior | Floats | None = None,
@@ -295,6 +295,8 @@ def fit(
             reading.
         CannotAnswerError: fewer measured elements than identifiable parameters.
     """
+    if data is None:
+        raise InputError("a model without readings; valid: fit(model, readings), fit(model, run)")
     expect(model, Model, "model", A_MODEL)
     data, readings = _readings(data), _either(readings, mode)
     std: Floats | None = None

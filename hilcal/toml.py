@@ -21,6 +21,7 @@ from hilcal.names import check_names
 Number = Annotated[float, Strict()]
 NonNegative = Annotated[float, Strict(), Field(ge=0)]
 Positive = Annotated[float, Strict(), Field(gt=0)]
+STORED = "stored"  # key of the context of a validation
 _WHOLE = 1 << 63
 _SHORT = 100
 Vector3 = tuple[Number, Number, Number]
@@ -104,18 +105,21 @@ def _check_whole(data: dict[str, Any], where: str) -> None:
         )
 
 
-def check_section(data: object, section: type[S], where: str) -> S:
-    """Check a dictionary against `section`; `where` names its origin in InputErrors of one line."""
+def check_section(data: object, section: type[S], where: str, stored: bool = False) -> S:
+    """Check a dictionary against `section`; `where` names its origin in InputErrors of one line.
+
+    What is `stored` was checked when it was new: it is valid where checks were added since.
+    """
     check_names(data, where)
     try:
-        return section.model_validate(data)
+        return section.model_validate(data, context={STORED: stored})
     except ValidationError as error:
         raise InputError(f"{where}: {_message(error, section)}") from None
 
 
 def check_json(text: str, section: type[S], where: str) -> S:
-    """Check a JSON document against `section`; InputErrors as of `read_json`, and of its keys."""
-    return check_section(read_json(text, where), section, where)
+    """Check a stored JSON document; InputErrors as of `read_json`, and of its keys."""
+    return check_section(read_json(text, where), section, where, stored=True)
 
 
 def read_json(text: str, where: str) -> Any:

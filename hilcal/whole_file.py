@@ -11,6 +11,8 @@ from pathlib import Path
 from hilcal.errors import InputError
 
 SQLITE = b"SQLite format 3\x00"  # first bytes of a campaign
+RECORDING, PAGE = "RRF", "<!DOCTYPE html>"  # first bytes of a recording, and of a page
+_HEAD = 10_000  # bytes
 
 
 def replace_file(path: str | Path, content: str | bytes, *, must_be_new: bool = False) -> None:
@@ -21,9 +23,30 @@ def replace_file(path: str | Path, content: str | bytes, *, must_be_new: bool = 
 
 def spare_campaign(path: str | Path) -> None:
     """Refuse the path of a campaign for anything else: its readings cannot be made again."""
-    with suppress(OSError), Path(path).open("rb") as stream:
-        if stat.S_ISREG(os.fstat(stream.fileno()).st_mode) and stream.read(len(SQLITE)) == SQLITE:
-            raise InputError(f"{path}: a campaign is there, which is kept; choose another name")
+    if _head(path).startswith(SQLITE):
+        raise InputError(f"{path}: a campaign is there, which is kept; choose another name")
+
+
+def spare_other(path: str | Path, kind: str, mark: str) -> None:
+    """Refuse the path of a file that is neither empty nor of a kind, as a cell's or a program's.
+
+    Args:
+        path: the file that is to be written; any name is valid for a new one.
+        kind: the kind, such as "a plan".
+        mark: a text near the beginning of every file of this kind.
+    """
+    spare_campaign(path)
+    if (head := _head(path)) and mark.encode() not in head:
+        raise InputError(f"{path}: exists and is not {kind}; it is not overwritten")
+
+
+def _head(path: str | Path) -> bytes:
+    """Return the beginning of a file; nothing of what is no file, or cannot be read."""
+    with suppress(OSError):  # said when it is written
+        if Path(path).is_file():
+            with Path(path).open("rb") as stream:
+                return stream.read(_HEAD)
+    return b""
 
 
 @contextmanager

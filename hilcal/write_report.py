@@ -22,7 +22,7 @@ from hilcal.store.revision import utc_now
 from hilcal.store.run_log import PLAN, RunLog
 from hilcal.transfer.compare import validate
 from hilcal.transfer.fleet import Fleet
-from hilcal.whole_file import replace_file
+from hilcal.whole_file import PAGE, replace_file, spare_other
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +88,7 @@ def write_report(
     later, validation = options.later, options.validation
     if path.resolve() in {c.path.resolve() for c in (run, later, validation) if c is not None}:
         raise InputError(f"{path}: this is the campaign itself; name another file for the page")
+    spare_other(path, "a page", PAGE)
     if not path.absolute().parent.is_dir():  # before minutes of work
         raise InputError(f"{path}: cannot be written, there is no folder {path.absolute().parent}")
     if later is not None:
@@ -162,6 +163,7 @@ def write_fleet_report(fleet: Fleet, directory: Path, path: Path) -> None:
     """Write the results of a fleet as one HTML page."""
     from hilcal.present.html.other_pages import fleet_page
 
+    spare_other(path, "a page", PAGE)
     replace_file(path, fleet_page(fleet, directory.resolve().name, utc_now(), hilcal.__version__))
 
 

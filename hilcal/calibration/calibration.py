@@ -433,4 +433,5 @@ def _numbers(values: object, name: str) -> Any:
     try:
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError):
-        raise InputError(f"{name} = {values!r:.60} is not an array of numbers") from None
+        valid = "; valid: six, as Calibration.loads['5kg']" if name == "wrench" else ""
+        raise InputError(f"{name} = {values!r:.60} is not an array of numbers{valid}") from None

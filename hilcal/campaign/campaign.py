@@ -260,6 +260,11 @@ class Campaign(Brief):
         """Close the file."""
         self.close()
 
+    @property
+    def revisions(self) -> tuple[RevisionRecord, ...]:
+        """All revisions, oldest first; `fit(n)` restores the one of number n."""
+        return self.file.revisions()
+
     def latest(self) -> RevisionRecord | None:
         """Return the latest revision; None without revisions."""
         return next(reversed(self.file.revisions()), None)

@@ -252,6 +252,12 @@ def _run(
             print(error, file=sys.stderr)
             return _USAGE
         return failures.report(error, *_explained(error, name))
+    except SystemExit as error:
+        effects = sys.modules.get("hilcal.effects.protocol")  # without it no effect has run
+        failed = None if effects is None else effects.failure_of(error)
+        if failed is None:
+            raise
+        return failures.report(error, str(failed), failed.exit_code)
     if result == _INTERRUPTED:
         return failures.report(None, "interrupted", _INTERRUPTED)
     return result if isinstance(result, int) else 0

@@ -225,6 +225,7 @@ def _procedure(
     _refuse_goal(p.settings.readings, stated, path)
     p = replace(p, settings=replace(p.settings, **stated))
     with CampaignFile.open(output) as campaign:
+        campaign.measure_alone()  # nobody else measures
         p.resume(campaign)
     go_on.t.notice(f"{output}: a calibration, {words.state_clause(p.next())}")
     return p

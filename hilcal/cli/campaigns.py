@@ -32,7 +32,7 @@ from hilcal.store.overview import overview, to_json
 from hilcal.store.repair import put_robot
 from hilcal.store.repair import repair as repaired
 from hilcal.store.revision import RevisionRecord
-from hilcal.whole_file import replace_file
+from hilcal.whole_file import PAGE, replace_file, spare_other
 
 
 @command("""
@@ -234,6 +234,9 @@ def _named(record: RevisionRecord) -> str:
     return f"revision {record.number} ({model_name(record.effects)})"
 
 
+PRIOR = "the result of hilcal fleet"
+
+
 @command("""
     directory | DIR | With campaign files, in folders below as well.
     out | -o PRIOR.json | What to expect of another arm.
@@ -248,6 +251,7 @@ def fleet(
     from hilcal.cli.fitting import check_record
     from hilcal.cli.showing import open_command
     from hilcal.engine import open_engine
+    from hilcal.identification.carried.posterior import FORMAT
     from hilcal.present.comparison import fleet_report
     from hilcal.store.codec import write_document
     from hilcal.transfer.fleet import fleet as pool_fleet
@@ -256,6 +260,9 @@ def fleet(
     from hilcal.write_report import write_fleet_report
 
     check_record(record)
+    spare_other(out, PRIOR, FORMAT)
+    if report is not None:
+        spare_other(report, "a page", PAGE)
     entries(directory)  # refuses a directory before workers are started
     with open_engine(workers, scheduler) as engine:
         pooled = pool_fleet(directory, engine, partial(counting, t.progress))
@@ -263,6 +270,7 @@ def fleet(
     written = {}
     for arm_type in pooled.types:
         path = out if len(pooled.types) == 1 else out.with_stem(f"{out.stem}-{arm_type.type}")
+        spare_other(path, PRIOR, FORMAT)
         write_document(path, arm_type.prior.to_json())
         written[arm_type.type] = str(path)
         t.show(f"\n{path}: what to expect of another {arm_type.type}, for --prior {quoted(path)}")

@@ -1,5 +1,6 @@
 """The list of commands: module and summary of each; none of them is imported."""
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
@@ -100,6 +101,7 @@ def _read() -> tuple[dict[str, Command], dict[str, tuple[str, ...]]]:
 
 COMMANDS, SECTIONS = _read()
 
+MOST_SUGGESTED = 3
 EXIT_CODES = (
     "Exit codes: 0 done; 2 wrong input; 3 a device failed; 4 the data cannot answer the question; "
     "5 a limit is not kept; 130 interrupted with Ctrl-C."
@@ -140,3 +142,16 @@ class InOrderOfWork(CommandGroup):
     """The group of all commands of hilcal."""
 
     sections = SECTIONS
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return the command; of an unknown one, suggest those whose summary has its word."""
+        try:
+            return super().resolve_command(ctx, args)
+        except Exception as error:
+            text = str(getattr(error, "message", ""))
+            word = rf"\b{re.escape(args[0])}\b"
+            near = [n for n, c in COMMANDS.items() if re.search(word, c.summary, re.IGNORECASE)]
+            if near and text.startswith("No such command") and not text.endswith("?"):
+                named = ", ".join(map(repr, near[:MOST_SUGGESTED]))
+                error.message = f"{text.rstrip('.')}. Did you mean {named}?"  # type: ignore[attr-defined]
+            raise

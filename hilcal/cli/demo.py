@@ -42,7 +42,7 @@ from hilcal.drivers.simulated.rehearsal import (
     simulate_plan,
 )
 from hilcal.effects.catalogue import Catalogue
-from hilcal.errors import CannotAnswerError
+from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
@@ -67,7 +67,8 @@ from hilcal.procedure.state import Files, Settings
 from hilcal.refinement import Refinement
 from hilcal.refinement import refine as refine_model
 from hilcal.robot.catalogue import configs_dir
-from hilcal.store.campaign_file import may_write
+from hilcal.store.campaign_file import CampaignFile, may_write
+from hilcal.store.kept_texts import COMMAND
 from hilcal.store.plan import REFERENCE, Plan
 from hilcal.store.revision import RevisionRecord
 from hilcal.store.rows import content_hash
@@ -207,10 +208,10 @@ def demo(
     hidden = hide or config.simulation.hide
     world = invented_law(catalogue) if hidden == INVENTED else catalogue
     check_choice(hidden or RANDOM, world)
-    may_write(output, True)  # before the planning, which takes a while
+    _spare_measured(output)  # before the planning, which takes a while
     files = Files(output)
     for path in (files.validation, files.corrected):
-        may_write(path, True)
+        _spare_measured(path)
     case = running.RehearsalSettings(
         config, hidden or RANDOM, number, output, configs_dir() / "cells", catalogue, world
     )
@@ -292,6 +293,17 @@ def demo(
         },
         diagnoses=[s.diagnosis.to_dict() for s in refinement.steps],
     )
+
+
+def _spare_measured(path: Path) -> None:
+    """Refuse to replace anything but a campaign of `demo`: readings cannot be made again."""
+    may_write(path, True)
+    if path.exists() and path.stat().st_size:
+        with CampaignFile.open(path, read_only=True, check_revisions=False) as campaign:
+            if not (campaign.about(COMMAND) or "").startswith("hilcal demo"):
+                raise InputError(
+                    f"{path}: exists and is no campaign of hilcal demo; it is not overwritten"
+                )
 
 
 @contextmanager

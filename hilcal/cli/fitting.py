@@ -41,7 +41,7 @@ from hilcal.stream import fit_stream
 from hilcal.stream import to_json as stream_json
 from hilcal.tables.files import is_parquet
 from hilcal.tables.parquet_stream import open_stream
-from hilcal.whole_file import spare_campaign
+from hilcal.whole_file import RECORDING, spare_other
 
 
 def fit_of(t: Terminal, run: Campaign, say: Say, revision: int | None) -> tuple[int | None, Fit]:
@@ -161,7 +161,7 @@ def check_record(path: Path | None) -> None:
     """Refuse a recording that cannot be written, before any work is done."""
     if path is not None:
         check_folder(path, f"--record {path}")
-        spare_campaign(path)
+        spare_other(path, "a recording", RECORDING)
 
 
 def record_story(t: Terminal, chapters: list[Chapter], path: Path | None) -> None:

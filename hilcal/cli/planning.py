@@ -1,6 +1,5 @@
 """`plan`, `next`: choose poses, loads and their order; `check`: examine devices and a plan."""
 
-from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Literal
@@ -11,7 +10,7 @@ from hilcal import numbers as words_of
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli import fitting
-from hilcal.cli.options import POSES, check_seed, command
+from hilcal.cli.options import POSES, check_folder, check_seed, command
 from hilcal.cli.terminal import Terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.design.choice import CRITERIA, criterion_name
@@ -35,8 +34,8 @@ from hilcal.procedure.next_plan import Doubt, doubt_to_settle, fit_without, next
 from hilcal.procedure.procedure import with_origin
 from hilcal.procedure.state import reference_in
 from hilcal.store.plan import FORMAT, Plan, load_plan
-from hilcal.tables.write import plan_csv
-from hilcal.whole_file import replace_file, spare_campaign
+from hilcal.tables.write import ORDER, plan_csv
+from hilcal.whole_file import replace_file, spare_other
 
 
 def write(
@@ -62,12 +61,13 @@ def write(
             record_plan(cell, config, checked_plan.plan, checked_plan.summary, record, powers)
 
 
-def _check_plan_place(output: Path) -> None:
-    """Refuse to replace anything but a plan, before planning, which takes a while."""
-    spare_campaign(output)
-    with suppress(OSError):  # said when it is written
-        if output.is_file() and FORMAT.encode() not in output.read_bytes()[:10_000]:
-            raise InputError(f"{output}: exists and is not a plan; it is not overwritten")
+def _check_places(output: Path, csv: Path | None = None) -> None:
+    """Refuse files of other kinds and missing folders, before planning, which takes a while."""
+    check_folder(output, f"-o {output}")
+    spare_other(output, "a plan", FORMAT)
+    if csv is not None:
+        check_folder(csv, f"--csv {csv}")
+        spare_other(csv, "the table of a plan", ORDER)
 
 
 @command(f"""
@@ -87,7 +87,7 @@ def plan(
 ) -> None:  # fmt: skip
     """Choose poses, loads and their order, with a proof of how near to the best they are."""
     fitting.check_record(record)
-    _check_plan_place(output)
+    _check_places(output, csv)
     if revision is not None and after is None:
         raise InputError("--revision is one of a campaign; give the campaign with --after")
     if prior.prior is not None and after is not None:
@@ -245,7 +245,7 @@ def next_(
 ) -> None:  # fmt: skip
     """Plan the measurements that separate the leading suspects; exit 4 where none are in doubt."""
     fitting.check_record(record)
-    _check_plan_place(output)
+    _check_places(output, csv)
     carried = prior.load(catalogue)
     rng = np.random.default_rng(check_seed(seed))
     if poses is not None and poses < 1:

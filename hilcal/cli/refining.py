@@ -2,7 +2,6 @@
 
 import itertools
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -28,7 +27,7 @@ from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.effects.written import read_effects_text, write_effect
 from hilcal.errors import CannotAnswerError, HilcalError, InputError, LimitError
 from hilcal.identification.background import background_of
-from hilcal.identification.baseline import masses_note
+from hilcal.identification.baseline import loads_note
 from hilcal.identification.fit import all_left_out, fit
 from hilcal.identification.fit_document import frames_to_json, prior_to_json
 from hilcal.identification.linearisation import linearise
@@ -58,7 +57,7 @@ from hilcal.store.revision import change
 from hilcal.tables.units import parse_length
 from hilcal.transfer.compare import compare as compare_campaigns
 from hilcal.transfer.compare import validate as validate_campaign
-from hilcal.whole_file import replace_file
+from hilcal.whole_file import replace_file, spare_other
 
 
 def chapters_of(numbers: Iterable[int], steps: Iterable[RefinementStep]) -> list[Chapter]:
@@ -245,7 +244,7 @@ def refine(
         other_arm = other_arm_of(o.cell, o.readings) if latest is None else None
         if other_arm is not None:
             t.show(other_arm_line(other_arm))
-        if note := masses_note(refinement.fit):
+        if note := loads_note(refinement.fit):
             t.show(numbers.sentence(note))
         if names := ", ".join(refinement.rejected):
             t.show(f"Tried and left out, since the error on poses left out did not fall: {names}.")
@@ -291,6 +290,9 @@ def revisions_json(chapters: Iterable[Chapter], stored: str = "") -> list[dict[s
     ]
 
 
+LAW = "a law of hilcal discover"
+
+
 @command("""
     output | -o --output F.py | The effect, to be edited.
     against | --against MODEL | Beside this model instead of the revision in use: effects A,B;
@@ -313,9 +315,7 @@ def discover(
     if effects is not None and revision is not None:
         raise InputError("--against and --revision: give one of them")
     check_folder(output, f"-o {output}")
-    with suppress(OSError):  # said when it is written
-        if output.is_file() and PROPOSED.encode() not in output.read_bytes():
-            raise InputError(f"{output}: exists and is no law of hilcal discover; it is kept")
+    spare_other(output, LAW, PROPOSED)
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         number: int | None = None
         if effects is None:
@@ -333,6 +333,8 @@ def discover(
     rivals = rival_sources(d) if alternatives else {}
     written = {name: d.source, **rivals}
     places = {effect: output.with_name(f"{effect}.py") for effect in written}
+    for place in places.values():
+        spare_other(place, LAW, PROPOSED)
     for effect, source in written.items():
         replace_file(places[effect], source)
     t.show(

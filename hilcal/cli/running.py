@@ -67,7 +67,7 @@ from hilcal.store.plan import Plan, load_plan, with_new_names
 from hilcal.store.procedure_log import ProcedureLog
 from hilcal.store.run_log import RunLog, check_same_cell, create_run
 from hilcal.transfer.compare import check_factory
-from hilcal.whole_file import replace_file
+from hilcal.whole_file import replace_file, spare_other
 
 
 @command("""
@@ -107,6 +107,7 @@ def run(
             if append and plan is None:
                 raise InputError("--append needs the further plan: give it with --plan PLAN")
             campaign = stack.enter_context(CampaignFile.open(output, check_revisions=False))
+            campaign.measure_alone()
             check_same_cell(campaign, config, base_dir)
             campaign_plan = RunLog(campaign).plans[0]
             if plan is not None:
@@ -217,6 +218,7 @@ def measure(
     viewer: LiveViewer | None = None,
 ) -> int:
     """Measure what a campaign lacks, until a goal is met; `epoch` is the wall time at zero, s."""
+    campaign.measure_alone()
     log = RunLog(campaign)
     stored = log.readings()
     if goal is not None and stored is not None and goal(stored, last=True).met:
@@ -467,6 +469,7 @@ def lasting_cell(p: Procedure) -> Iterator[CellConfig]:
         yield simulated.config
 
 
+SIMULATED = "# Written by hilcal simulate: the devices are simulated.\n"
 MAX_CLOCK = 200.0  # Largest clock rate of a simulated world, as in `[simulation] clock`
 
 
@@ -490,7 +493,8 @@ def simulate(
         if not 1.0 <= clock <= MAX_CLOCK:
             raise InputError(f"--clock {clock:g}; valid: a number from 1 to {MAX_CLOCK:g}")
         config = config.with_keys("simulation", clock=clock)
-    base_dir = cell.absolute().parent
+    base_dir, target = cell.absolute().parent, output / "cell.toml"
+    spare_other(target, "a cell of hilcal simulate", SIMULATED)
     choice = hide or config.simulation.hide or NO_EFFECT
     program_config(
         config, choice, catalogue
@@ -516,9 +520,8 @@ def simulate(
         with working(t.progress) as say:
             say("starting the devices")
             simulated = stack.enter_context(simulated_cell(secret, number, base_dir, output))
-        target = output / "cell.toml"
         written = with_person(simulated.config) if person else simulated.config
-        replace_file(target, to_toml(_placed(written, base_dir)))
+        replace_file(target, SIMULATED + to_toml(_placed(written, base_dir)))
         t.show(f"The devices run. Their cell is {target}; go on in another terminal with:")
         t.command(shlex.join(("hilcal", "check", str(target))))
         plan_option = () if plan is None else ("--plan", str(plan))

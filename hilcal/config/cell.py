@@ -91,7 +91,7 @@ class Target(sections.CellSection):
 
     name: str = Field(min_length=1)
     target_m: Vector3 | None = None
-    target_rotvec_rad: Vector3 | None = None
+    target_rotvec_rad: sections.RotationVector | None = None
     estimate: bool = False
 
     @model_validator(mode="after")
@@ -123,7 +123,7 @@ class Tool(sections.CellSection):
     """
 
     target_m: Vector3 | None = None
-    target_rotvec_rad: Vector3 | None = None
+    target_rotvec_rad: sections.RotationVector | None = None
     targets: tuple[Target, ...] = ()
     load_point_m: Vector3 = (0.0, 0.0, 0.0)
     mass_kg: NonNegative = 0.0
@@ -181,9 +181,9 @@ class Tracker(sections.CellSection):
     options: dict[str, Any] = Field(default_factory=dict)
     frame: Literal["tracker", "base"] = "tracker"
     observes: Literal["position", "distance", "height"] = "position"
-    base_xyz_m: Vector3 | None = None
-    base_rotvec_rad: Vector3 | None = None
-    station_m: Vector3 | None = None
+    base_xyz_m: sections.Place | None = None
+    base_rotvec_rad: sections.RotationVector | None = None
+    station_m: sections.Place | None = None
     range_std_m: Positive = 5e-6
     range_std_per_m: NonNegative = 0.15e-6
     transverse_std_m: Positive = 7.5e-6

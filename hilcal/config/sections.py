@@ -4,15 +4,42 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, Strict, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, Strict, ValidationInfo, model_validator
 
-from hilcal.toml import NonNegative, Number, Positive, Section, Vector3
+from hilcal.toml import STORED, NonNegative, Number, Positive, Section, Vector3
 from hilcal.types import Floats
 
 Whole = Annotated[int, Strict(), Field(ge=1)]
 HOST = 'the address in the network, e.g. "192.168.0.1"; another port as "192.168.0.1:7000"'
 """Description of the key `host` of an instrument that is connected by Ethernet."""
 PORT = 'the serial port, e.g. "/dev/serial/by-id/usb-FTDI_..."'
+
+
+def _within_a_turn(vector: tuple[float, ...], about: ValidationInfo) -> tuple[float, ...]:
+    """Refuse a rotation vector in degrees."""
+    if np.linalg.norm(vector) > 2 * np.pi + 1e-6 and not (about.context or {}).get(STORED):
+        raise ValueError(f"{about.field_name} = {list(vector)} is over a turn; is it in rad?")
+    return vector
+
+
+def _within(most_m: float) -> AfterValidator:
+    """Refuse a length, or a place, in millimetres."""
+
+    def check(value: Any, about: ValidationInfo) -> Any:
+        if np.max(np.abs(value)) > most_m and not (about.context or {}).get(STORED):
+            shown = value if isinstance(value, float) else list(value)
+            raise ValueError(f"{about.field_name} = {shown} is over {most_m:g} m; is it in m?")
+        return value
+
+    return AfterValidator(check)
+
+
+RotationVector = Annotated[Vector3, AfterValidator(_within_a_turn)]
+Place = Annotated[Vector3, _within(50.0)]
+"""A place in base or tracker axes. In millimetres, an obstacle or a limit would be far away."""
+OnFlange = Annotated[Vector3, _within(5.0)]
+Accuracy = Annotated[Positive, _within(0.02)]
+"""An allowed error: arms are off by less before any calibration."""
 
 
 class CellSection(Section):
@@ -82,8 +109,8 @@ class ForceSensor(CellSection):
     port: str | None = Field(None, min_length=1)
     host: str | None = Field(None, min_length=1)
     baud: Whole | None = None
-    origin_m: Vector3 = (0.0, 0.0, 0.0)
-    rotvec_rad: Vector3 = (0.0, 0.0, 0.0)
+    origin_m: OnFlange = (0.0, 0.0, 0.0)
+    rotvec_rad: RotationVector = (0.0, 0.0, 0.0)
     max_force_N: Positive = 250.0
     max_moment_Nm: Positive = 25.0
     use: Literal["pulls", "all", "verify"] = "pulls"
@@ -246,10 +273,10 @@ class Limits(CellSection):
 
     joint_margin_rad: NonNegative = 0.05
     torque_share: Annotated[float, Strict(), Field(gt=0, le=1)] = 0.9
-    workspace_min_m: Vector3 | None = None
-    workspace_max_m: Vector3 | None = None
+    workspace_min_m: Place | None = None
+    workspace_max_m: Place | None = None
     joint_speed_rad_s: Positive = 2.0
-    accuracy_m: Positive | None = None
+    accuracy_m: Accuracy | None = None
 
     @model_validator(mode="after")
     def _box(self) -> "Limits":
@@ -270,7 +297,7 @@ class Point(CellSection):
         cov_d_d | 1e-05
     """
 
-    position_m: Vector3 | None = None
+    position_m: Place | None = None
     offset_m: Number = 0.0
     estimate_offset: bool = False
     std_m: Positive | None = None
@@ -289,7 +316,7 @@ class Gauge(CellSection):
     """
 
     direction: Vector3 | None = None
-    origin_m: Vector3 | None = None
+    origin_m: Place | None = None
     std_m: Positive | None = None
 
     @model_validator(mode="after")
@@ -339,8 +366,8 @@ class Planning(CellSection):
         BeforeValidator(lambda name: "I" if name == "test" else name),  # its name before 1.0
     ] = None
     work_q_rad: tuple[_Joints, ...] = ()
-    work_min_m: Vector3 | None = None
-    work_max_m: Vector3 | None = None
+    work_min_m: Place | None = None
+    work_max_m: Place | None = None
     work_load: _Name = "none"
     reading_s: Positive | None = None
     load_change_s: Positive = 60.0
@@ -373,9 +400,9 @@ class Obstacle(CellSection):
     """
 
     name: str = Field(min_length=1)
-    center_m: Vector3 | None = None
+    center_m: Place | None = None
     size_m: tuple[Positive, Positive, Positive] | None = None
-    bottom_m: Vector3 | None = None
+    bottom_m: Place | None = None
     radius_m: Positive | None = None
     height_m: Positive | None = None
 
@@ -407,7 +434,7 @@ class Sight(CellSection):
     clearance_m: the distance between the beam and the arm in m, 0 or more
     """
 
-    tracker_m: Vector3 | None = None
+    tracker_m: Place | None = None
     target_normal: Vector3 | None = None
     incidence_max_rad: Annotated[float, Strict(), Field(gt=0, le=np.pi / 2)] = 0.5
     clearance_m: NonNegative = 0.03

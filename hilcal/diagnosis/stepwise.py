@@ -57,13 +57,8 @@ def remove(before: Fit, effect: str) -> Fit:
 
 def _reduced(model: Model, theta: Floats, effect: str) -> tuple[Model, Floats]:
     """Return the model without an effect, and its parameters."""
-    if effect not in model.names:
-        raise InputError(f"effect {effect} is not in the model: {', '.join(model.names)}")
-    columns = model.slices()[model.names.index(effect)]
-    effects = tuple(e for e in model.effects if e.name != effect)
-    random = {name: std for name, std in model.random.items() if name != effect}
-    model = replace(model, effects=effects, random=random, background=model.background - {effect})
-    return model, np.delete(theta, columns)
+    reduced = model - effect
+    return reduced, np.delete(theta, model.slices()[model.names.index(effect)])
 
 
 def _grown(

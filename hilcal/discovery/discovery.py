@@ -28,7 +28,15 @@ from hilcal.discovery.known_effects import (
     known_effects,
     resembling,
 )
-from hilcal.discovery.law import Coefficient, Form, Law, SelectionFrequency, form_of, source_of_form
+from hilcal.discovery.law import (
+    PROPOSED,
+    Coefficient,
+    Form,
+    Law,
+    SelectionFrequency,
+    form_of,
+    source_of_form,
+)
 from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.refit import refine, refit_exactly
 from hilcal.discovery.screen import LawTerm, Screen, screen
@@ -44,7 +52,7 @@ from hilcal.regression.evidence import score_family
 from hilcal.regression.leave_out import improves
 from hilcal.shown import Shown
 from hilcal.types import Bools, Floats
-from hilcal.whole_file import replace_file
+from hilcal.whole_file import replace_file, spare_other
 
 Reason = Literal["law", "adequate", "catalogue", "no_law", "unpredictable"]
 """Why there are laws, or none:
@@ -439,8 +447,11 @@ class LawSearch:
     def __init__(self, folder: Path, name: str = LAW_NAME, replacing: bool = False) -> None:
         """Laws are named after their future files; `replacing` deletes old files."""
         if replacing:
-            for k in range(1, MOST_SEARCHES + 1):
-                (folder / f"{_numbered(name, k)}.py").unlink(missing_ok=True)
+            old = [folder / f"{_numbered(name, k)}.py" for k in range(1, MOST_SEARCHES + 1)]
+            for path in old:
+                spare_other(path, "a law of hilcal discover", PROPOSED)
+            for path in old:
+                path.unlink(missing_ok=True)
         self.discoveries: list[Discovery] = []  # the searches, in order
         self.files: dict[str, Path] = {}  # of laws that were written, by name; see `write`
         self._folder, self._name = folder, name

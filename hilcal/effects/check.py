@@ -124,7 +124,7 @@ def check_effect(kind: type[Effect], cell: Cell | None = None) -> None:
             _try(kind, example)
         except HilcalError as error:
             problems.append(InputError(f"{where}: effect {kind.name}: {error}"))
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raised = f"{where}: effect {kind.name}: {type(error).__name__}: {error}"
             problems.append(failure_of(error) or InputError(raised))
         else:

@@ -483,9 +483,12 @@ def effect(kind: str | type[Effect], **options: object) -> EffectSpec:
     return EffectSpec(kind, options)
 
 
-def failure_of(error: Exception) -> InputError | None:
+def failure_of(error: BaseException) -> InputError | None:
     """Return an error raised in a user's effect as one line, by its traceback; None for others."""
-    for frame, _ in traceback.walk_tb(error.__traceback__):
+    frames = list(traceback.walk_tb(error.__traceback__))
+    if isinstance(error, SystemExit) and frames[-1][0].f_globals["__name__"].startswith("hilcal."):
+        return None  # by a signal
+    for frame, _ in frames:
         effect = frame.f_locals.get("self", frame.f_locals.get("cls"))
         kind = effect if isinstance(effect, type) else type(effect)
         file = frame.f_code.co_filename

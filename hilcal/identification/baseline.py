@@ -31,6 +31,7 @@ from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
 
+SURE_SIGMA = 3.0  # value, in standard uncertainties, from which a sign is determined
 LEVER_M = 0.5  # m, length over angle of a registration's prior: half of a reach; a guess
 
 
@@ -115,11 +116,31 @@ def loads_differ(readings: Readings) -> bool:
     return len(np.unique(states, axis=0)) > len(np.unique(readings.pose))
 
 
-def masses_note(fit: Fit) -> str | None:
-    """Return in a sentence how missing masses affect the compliances of a fit; None if they do not.
+def loads_note(fit: Fit) -> str | None:
+    """Return in a sentence why the compliances of a fit are in doubt; None if they are not.
 
     Without the initial capital and the full stop.
     """
+    return _turned_forces(fit) or _missing_masses(fit)
+
+
+def _turned_forces(fit: Fit) -> str | None:
+    """Describe forces of the wrong sign: a load does positive work on what it deforms."""
+    std, of_load = fit.uncertainty.std, np.zeros(len(fit.theta), dtype=bool)
+    for effect, columns in zip(fit.model.effects, fit.model.slices(), strict=True):
+        of_load[columns] = effect.role == "baseline"
+    sure = of_load & (np.abs(fit.theta) > SURE_SIGMA * std)
+    if np.count_nonzero(sure) < 2 or np.any(fit.theta[sure] > 0):
+        return None
+    return (
+        "every compliance that is determined is negative: the arm moves against its loads. Are the "
+        "forces those on the sensor, of the opposite sign? Valid are those that the load exerts on "
+        "the tool, in base axes: of a weight, downwards"
+    )
+
+
+def _missing_masses(fit: Fit) -> str | None:
+    """Describe how missing masses affect the compliances."""
     model, readings = fit.model, fit.readings[~fit.outlier]
     if not masses_missing(model.cell, fit.mode) or not any(e.elastic for e in model.effects):
         return None

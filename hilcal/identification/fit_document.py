@@ -6,7 +6,7 @@ from dataclasses import asdict
 import numpy as np
 
 from hilcal.identification.background import background_of
-from hilcal.identification.baseline import masses_note
+from hilcal.identification.baseline import loads_note
 from hilcal.identification.fit import Fit
 from hilcal.identification.prediction.full_prediction import (
     disagreement_words,
@@ -108,9 +108,9 @@ def notes(fit: Fit) -> tuple[str, ...]:
         )
     if fit.disagreement is not None:
         out.append(disagreement_words(fit))
-    weight = masses_note(fit)
-    if weight is not None:
-        out.append(weight)
+    loads = loads_note(fit)
+    if loads is not None:
+        out.append(loads)
     return tuple(out)
 
 

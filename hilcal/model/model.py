@@ -138,6 +138,14 @@ class Model(Brief):
         made = catalogue.make(spec.name, self.cell, states, spec.options, m)
         return replace(self, effects=(*self.effects, made), catalogue=catalogue)
 
+    def __sub__(self, effect: str) -> "Model":
+        """Return the model without an effect."""
+        if effect not in self.names:
+            raise InputError(f"effect {effect} is not in the model: {', '.join(self.names)}")
+        effects = tuple(e for e in self.effects if e.name != effect)
+        random = {name: std for name, std in self.random.items() if name != effect}
+        return replace(self, effects=effects, random=random, background=self.background - {effect})
+
     def predict(self, states: States, theta: Floats) -> Prediction:
         """Equilibrium of N states: elastic deviations at the deflected configuration.
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from hilcal import numbers
 from hilcal.config.cell import Changes, write_value
-from hilcal.config.reference import NOT_SET, REQUIRED, KeyTable
+from hilcal.config.reference import REQUIRED, KeyTable
 from hilcal.doctor import Finding
 from hilcal.identification.fit import Fit
 from hilcal.measuring.session_state import RepeatabilityEstimate
@@ -25,13 +25,6 @@ if TYPE_CHECKING:
     from hilcal.measuring.route import DryRun
     from hilcal.transfer.compare import FactoryCheck
 
-_HEAD = """\
-# Keys of CELL.toml
-
-Written by the program (`hilcal config SECTION` shows the same in the terminal); a test holds this
-page to the code. Every key that is not "required" may be left out. `hilcal init` writes a file to
-begin with.
-"""
 MARKS = {"ok": "✓", "warning": "!", "problem": "✗"}
 WIDEST, LISTED = 34, 12  # most characters of a table cell; most unused columns that are listed
 LISTED_EVENTS = ("start", "load", "moved", "doubted", "goal", "interrupted", "failed", "finished")
@@ -56,20 +49,6 @@ def section_report(t: KeyTable) -> Iterator[Block]:
         yield from ("", Words(key.name, "strong", indent=2))
         for line in (key.valid, unit + default, f"example: {key.example}"):
             yield Words(line, indent=6)
-
-
-def reference_page(tables: Sequence[KeyTable]) -> str:
-    """Return the reference page of all keys, in Markdown."""
-    lines = [_HEAD]
-    for t in tables:
-        lines += [f"## `{t.header}`", "", t.about, ""]
-        lines += ["| key | unit | default | what it must be | example |", "|---|---|---|---|---|"]
-        for key in t.keys:
-            default = key.default if key.default in (REQUIRED, NOT_SET) else f"`{key.default}`"
-            cells = (f"`{key.name}`", key.unit or "–", default, key.valid, f"`{key.example}`")
-            lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
-        lines.append("")
-    return "\n".join(lines)
 
 
 def doctor_report(findings: Sequence[Finding]) -> Iterator[Block]:

@@ -10,7 +10,7 @@ from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE
 from hilcal.diagnosis.misfit_breakdown import Group, MisfitShare
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.identification.background import background_of
-from hilcal.identification.baseline import masses_note
+from hilcal.identification.baseline import loads_note
 from hilcal.identification.fit import Fit
 from hilcal.identification.fit_document import notes
 from hilcal.identification.prediction.full_prediction import (
@@ -74,8 +74,8 @@ def fit_report(fit: Fit, details: bool = True) -> Iterator[Block]:
         several = f"{len(null)} directions" if len(null) > 1 else "1 direction"
         yield f"{several} cannot be seen in these readings: {numbers.few(null, 1)}."
     yield from gross_error_lines(fit, details=False)
-    if (masses := masses_note(fit)) is not None:
-        yield numbers.sentence(masses)
+    if (loads := loads_note(fit)) is not None:
+        yield numbers.sentence(loads)
     yield from list(fitted_lines(fit))[:1]
 
 

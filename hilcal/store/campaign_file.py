@@ -61,6 +61,7 @@ class CampaignFile:
         self.path, self.connection = path, connection
         self._identity = identity(path)
         self._new_place: Path | None = None
+        self._measuring: int | None = None
         self._written = False
         self._meta = self.texts()
         self.config_json, self.base_dir = self._meta["config"], self._meta["base_dir"]
@@ -124,9 +125,20 @@ class CampaignFile:
                 connection.close()
                 raise
 
+    def measure_alone(self) -> None:
+        """Refuse a campaign that is being measured; until `close`, let nobody else measure it.
+
+        Fits may read it, and append revisions, meanwhile.
+        """
+        if self._measuring is None:
+            self._measuring = schema.lock(self.path)
+
     def close(self) -> None:
         """Close the file."""
         self.connection.close()
+        if self._measuring is not None:
+            os.close(self._measuring)
+            self._measuring = None
 
     def __enter__(self) -> Self:
         return self

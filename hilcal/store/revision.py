@@ -10,6 +10,7 @@ from typing import Any
 from hilcal.config.cell import Changes
 from hilcal.errors import InputError
 from hilcal.names import check_names
+from hilcal.shown import Brief
 from hilcal.store.stored_schema import REVISION, check
 from hilcal.toml import parse_json
 
@@ -38,7 +39,7 @@ def seconds_of(date: str, where: str = "date") -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class RevisionRecord:
+class RevisionRecord(Brief):
     """A fit as a campaign file stores it; all mappings are JSON."""
 
     effects: tuple[str, ...]  # canonical names of the model's effects, in order
@@ -54,6 +55,18 @@ class RevisionRecord:
     removed: str | None = None  # the effect removed from the parent's model
     parent: int | None = None
     """Number of the revision that it was made from; None for the previous one, or a first model."""
+
+    def _brief(self) -> dict[str, str]:
+        judged = self.result_json.get("diagnose", {})
+        return {
+            "number": str(self.number),
+            "model": " + ".join(self.effects),
+            "added": str(self.added),
+            "removed": str(self.removed),
+            "verdict": str(judged.get("verdict")),
+            "created": f"{self.created} by hilcal {self.program_version}",
+            "more": "Campaign.fit(number)",
+        }
 
     @property
     def cell(self) -> Changes:

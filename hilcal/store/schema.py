@@ -6,10 +6,12 @@ transaction; the next opening removes it. Source: SQLite documentation, "Atomic 
 and "PRAGMA synchronous".
 """
 
+import fcntl
 import os
 import re
 import sqlite3
 import stat
+import struct
 import sys
 import time
 from collections.abc import Iterator
@@ -32,6 +34,8 @@ HEADER = SQLITE
 _JOURNAL = bytes.fromhex("d9d505f920a163d7")
 """Magic number of a journal; it ends a journal that ends in a name, too."""
 
+_MEASURING = struct.pack("hhqqi4x", fcntl.F_WRLCK, os.SEEK_SET, 1 << 40, 1, 0)
+"""The lock of one who measures, see `lock`: a `struct flock` of one byte."""
 _TABLES = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, crc INTEGER NOT NULL) WITHOUT ROWID;
 CREATE TABLE poses (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE);
@@ -180,6 +184,28 @@ def _refuse_write_ahead_log(path: Path) -> None:
                 f"{path}: another program has put its changes into a write-ahead log beside it, "
                 "which no hilcal does; valid: the file as hilcal wrote it"
             )
+
+
+def lock(path: Path) -> int | None:
+    """Return a descriptor by which this process alone measures; refuse if another one does.
+
+    The lock is of a byte far from those that SQLite locks, and ends when the descriptor is closed,
+    or with the process. Where a file cannot be written, or has no locks, there is none. Source:
+    fcntl(2), open file description locks; over NFS, flock(2) would lock SQLite out.
+    """
+    with suppress(OSError):
+        handle = os.open(path, os.O_RDWR)
+        with suppress(OSError):
+            try:
+                fcntl.fcntl(handle, fcntl.F_OFD_SETLK, _MEASURING)
+            except BlockingIOError:
+                os.close(handle)
+                raise InputError(
+                    f"{path}: another hilcal is measuring this campaign; wait until it ends, or "
+                    "choose another name"
+                ) from None
+        return handle
+    return None
 
 
 @contextmanager

@@ -42,6 +42,7 @@ from hilcal.transfer.members import (
     entries,
     member_of,
     prints_of,
+    sizes_of_arms,
     type_sizes,
 )
 from hilcal.types import Floats
@@ -203,7 +204,7 @@ def pool(members: Sequence[Member], diagnosed: Sequence[DiagnosedEffect]) -> Poo
         prior=_prior(members, effects, names, scale, units, h, len(arms)),
         off=(h.arm_mean - h.mu) * scale,
         off_std=np.where(h.arm_variance < UNDETERMINED**2, np.sqrt(h.arm_variance) * scale, np.inf),
-        sizes=type_sizes([m.sizes for m in members if m.sizes is not None]),
+        sizes=type_sizes(sizes_of_arms(members)),
     )
 
 

@@ -109,7 +109,7 @@ def evidence_of(variances: Variances, ordinary: dict[str, float]) -> SizeEvidenc
 
 
 def type_sizes(evidence: Sequence[SizeEvidence]) -> tuple[TypeSize, ...]:
-    """Return sizes from the joint evidence of a type's campaigns, by names of effects."""
+    """Return sizes from the joint evidence of a type's arms, by names of effects."""
     effects = sorted({e for x in evidence for e in x.effects})
     if not effects:
         return ()
@@ -164,6 +164,19 @@ class Failure:
 
     name: str  # its path within the directory
     reason: str  # why, in a line
+
+
+def sizes_of_arms(members: Sequence[Member]) -> list[SizeEvidence]:
+    """Return the evidence of each arm: that of its campaign which tells most.
+
+    All campaigns of an arm have the same d_i; each would count as an arm of its own.
+    """
+    told: dict[str, SizeEvidence] = {}
+    for m in members:
+        if m.sizes is not None:
+            pair = told.get(m.arm, m.sizes), m.sizes
+            told[m.arm] = max(pair, key=lambda x: float(np.trace(x.information)))
+    return list(told.values())
 
 
 def entries(directory: Path) -> tuple[Entry, ...]:

@@ -423,7 +423,7 @@ class Work:
             answer = Answer(result) if isinstance(result, str) and result else None
         except HilcalError as error:
             answer = Answer(str(error), done=False)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             text = f"{type(error).__name__}: {' '.join(str(error).split())}"
             why = failure_of(error) or f"unexpected {text}; please report it"
             answer = Answer(str(why), done=False)

@@ -6,6 +6,7 @@ import socket
 import sys
 import time
 import warnings
+from pathlib import Path
 
 import pytest
 
@@ -103,8 +104,43 @@ def test_a_plan_and_a_law_replace_no_file_of_another_kind(campaign, tmp_path, ca
     ok(capsys, "identify", campaign)
     for command in (("plan", cell), ("next", campaign)):
         assert "exists and is not a plan" in refused(capsys, 2, *command, "-o", cell)
-    assert "is no law of hilcal discover" in refused(capsys, 2, "discover", campaign, "-o", law)
+    assert "is not a law of hilcal discover" in refused(capsys, 2, "discover", campaign, "-o", law)
     assert (cell.read_bytes(), law.read_text("utf-8")) == (CELL.read_bytes(), "of my own")
+
+
+@pytest.mark.parametrize("arguments", [
+    ("report", "RUN", "-o", "CELL"),
+    ("report", "RUN", "-o", "LAW"),
+    ("view", "RUN", "--record", "CELL"),
+    ("refine", "RUN", "--record", "LAW"),
+    ("demo", "--record", "CELL"),
+    ("demo", "-o", "RUN"),
+    ("plan", "CELL", "-o", "p.json", "--csv", "CELL"),
+    ("plan", "CELL", "-o", "p.json", "--csv", "LAW"),
+    ("next", "RUN", "-o", "p.json", "--csv", "CELL"),
+    ("fleet", ".", "-o", "CELL"),
+    ("fleet", ".", "-o", "prior.json", "--report", "LAW"),
+    ("simulate", "CELL", "-o", ".")])  # fmt: skip
+def test_no_output_replaces_a_file_of_another_kind(arguments, campaign, capsys, monkeypatch):
+    monkeypatch.chdir(campaign.parent)
+    ok(capsys, "identify", campaign)
+    names = {"RUN": campaign, "CELL": Path("cell.toml"), "LAW": Path("mine.py")}
+    names["CELL"].write_bytes(CELL.read_bytes())
+    names["LAW"].write_text("of my own", encoding="utf-8")
+    kept = {path: path.read_bytes() for path in names.values()}
+    line = refused(capsys, 2, *(names.get(a, a) for a in arguments))
+    assert re.search("exists and is (not|no) .*; it is not overwritten", line)
+    assert {path: path.read_bytes() for path in names.values()} == kept
+
+
+def test_an_output_replaces_the_one_before(campaign, capsys, monkeypatch):
+    monkeypatch.chdir(campaign.parent)
+    ok(capsys, "identify", campaign)
+    Path("page").touch()  # empty
+    for _ in range(2):
+        ok(capsys, "report", campaign, "-o", "page")
+        ok(capsys, "view", campaign, "--record", "r")
+        ok(capsys, "plan", CELL, "-o", "p", "--csv", "c", "--poses", "6", "--quick")
 
 
 def test_unknown_names_list_the_valid_ones(campaign, good, tmp_path, capsys):

@@ -433,6 +433,21 @@ def test_a_pose_is_left_out_of_what_is_resumed(site, capsys):
     assert "nothing is missing" in refused(capsys, 2, *site.command("--resume", "--skip", pose))
 
 
+@pytest.mark.long
+def test_nobody_measures_beside_a_run(site, capsys):
+    ok(capsys, *site.command(*site.fresh))
+    further, path = str(further_plan(site)), site.directory / "run.hilcal"
+    before = path.read_bytes()
+    with CampaignFile.open(path) as campaign:
+        campaign.measure_alone()
+        for words in (("--resume",), ("--append", "--plan", further)):
+            line = refused(capsys, 2, *site.command(*words))
+            assert "another hilcal is measuring this campaign" in line
+        assert path.read_bytes() == before
+        ok(capsys, "info", path)
+    assert ok(capsys, *site.command("--resume", "--json")).document["readings"]
+
+
 def test_wrong_ways_to_append(site, capsys):
     further = str(further_plan(site))
     line = refused(capsys, 2, *site.command("--append", "--plan", further))

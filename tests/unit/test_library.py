@@ -129,7 +129,7 @@ def test_a_diagnosis_as_a_dictionary_is_what_the_command_prints(site):
 
 
 def test_an_unknown_name_is_an_attribute_error_and_none_is_a_package_too():
-    with pytest.raises(AttributeError, match="no attribute 'fitt'"):
+    with pytest.raises(AttributeError, match=r"no attribute 'fitt'; valid: .*, fit, "):
         hc.fitt  # noqa: B018
     assert set(names()) <= set(dir(hc))
     places = {path.stem for path in (ROOT / "hilcal").iterdir()}
@@ -174,6 +174,8 @@ def test_wrong_words_are_refused_with_the_valid_ones(site):
     (lambda s: hc.plan(s.loaded, poses="ten"), "poses is of class str; valid: a whole number"),
     (lambda s: hc.simulate(s.loaded, None), "plan is None; valid: a plan"),
     (lambda s: hc.check_effect("creep"), "'creep' is no class of an effect"),
+    (lambda s: hc.fit(s.model), r"without readings; valid: fit\(model, readings\)"),
+    (lambda s: s.model - "creep", "effect creep is not in the model: base_frame, joint_compliance"),
     (lambda s: s.model + 2, "effect is of class int; valid: a name of an effect")])  # fmt: skip
 def test_an_argument_of_another_class_is_refused_with_what_is_valid(guess, said, site):
     cell = hc.Cell.load(site.cell)
@@ -186,7 +188,7 @@ def test_an_argument_of_another_class_is_refused_with_what_is_valid(guess, said,
 @pytest.mark.parametrize(("q", "wrench", "said"), [
     ([10, -90, 90, -90, -90, 0], None, "q has joints at 90 rad; valid: rad, as np.radians"),
     ("home", None, "q = 'home' is not an array of numbers"),
-    ([0.1] * 6, "5kg", "wrench = '5kg' is not an array of numbers")])  # fmt: skip
+    ([0.1] * 6, "5kg", "is not an array of numbers; valid: six, as Calibration")])  # fmt: skip
 def test_points_in_degrees_and_names_are_refused(q, wrench, said, site):
     with hc.Campaign(site.run) as run:
         calibration = hc.Calibration.of(hc.fit(hc.baseline(run), run))
@@ -213,7 +215,11 @@ def test_what_a_stranger_guesses_works(site, refined, tmp_path):
         refusal("no revision yet", hc.diagnose, run)
         found = hc.refine(run)
         assert found.fit.model.names == refined.fit.model.names
+        assert run.revisions == ()
         run.append(found)
+        assert [r.number for r in run.revisions] == list(range(1, 1 + len(found.steps)))
+        assert run.fit(1).model.names == model.names
+        assert (model + "creep" - "creep").names == model.names
         assert hc.diagnose(run).verdict == found.verdict
     assert hc.validate(path, site.later).judged.unseen
     assert hc.report(path) == tmp_path / "run.html"
@@ -235,6 +241,7 @@ def test_what_a_console_prints_of_a_value_is_at_most_fifteen_lines(site, refined
         calibration, q = hc.Calibration.of(fit), run.readings.states.q
         values += [fit.residuals, planned, hc.validate(run, run), calibration]
         values += [calibration.predict(q), calibration.compensate(q)]
+        values += run.revisions
         for value in (*values, found, found.steps[0]):
             text = repr(value)
             assert text.count("\n") < 15, text

@@ -130,7 +130,16 @@ def test_a_sensor_that_restarts_is_asked_again(there: There) -> None:
 
 @pytest.mark.parametrize(
     ("status", "said"),
-    [(0x80020000, "loaded over its range"), (0x80000008, "see the status"), (0x80010000, "")],
+    [
+        (0x80020000, "loaded over its range"),
+        (0x00020000, "loaded over its range"),
+        (0x88000000, "loaded over its range"),  # an Axia: gauges, force and moment
+        (0xC0000000, "loaded over its range"),
+        (0x48010000, "loaded over its range"),
+        (0x80000008, "see the status"),
+        (0x80010000, ""),
+        (0x10000008, ""),  # an Axia: simulated, and busy
+    ],
 )
 def test_status_of_the_sensor(there: There, status: int, said: str) -> None:
     with opened(there[1]) as sensor:
@@ -138,6 +147,7 @@ def test_status_of_the_sensor(there: There, status: int, said: str) -> None:
         time.sleep(0.2)
         if said:
             fails(sensor.latest, said)
+            fails(lambda: sensor.average(0.1), said)
         else:  # a threshold was passed once: no error
             assert steady(sensor, 0.1).frames > 0
 

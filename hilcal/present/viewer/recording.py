@@ -15,7 +15,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from hilcal.errors import HilcalError, InputError
-from hilcal.whole_file import replace_file
+from hilcal.whole_file import RECORDING, replace_file, spare_other
 
 APPLICATION, LOOPBACK = "hilcal", "127.0.0.1"
 _FLUSH_TIMEOUT = 10.0
@@ -80,6 +80,7 @@ def write(
     """
     if not path.parent.is_dir():
         raise InputError(f"recording {path}: no folder {path.parent}; make it first")
+    spare_other(path, "a recording", RECORDING)
     memory = rec.memory_recording()
     rec.send_blueprint(blueprint, make_active=True, make_default=True)
     log()

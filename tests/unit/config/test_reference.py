@@ -9,9 +9,9 @@ from pydantic import TypeAdapter
 from hilcal.cli.looking_up import DRIVERS_OWN
 from hilcal.config import CellConfig
 from hilcal.config.reference import NOT_SET, REQUIRED, tables
-from hilcal.present.campaign import reference_page
 from hilcal.toml import section_of
 from tests.support.cli_cases import ok, refused
+from tests.support.hooks import hook
 from tests.support.paths import ROOT
 
 TABLES = {t.name: t for t in tables(DRIVERS_OWN)}
@@ -96,9 +96,8 @@ def test_no_key_is_invented():
 
 def test_the_page_of_the_reference_is_what_the_program_writes():
     path = ROOT / "docs" / "reference" / "cell-configuration.md"
-    assert path.read_text(encoding="utf-8") == reference_page(list(TABLES.values())), (
-        "write it anew: `reference_page` makes it"
-    )
+    written = hook("cell_page").page(list(TABLES.values()))
+    assert path.read_text(encoding="utf-8") == written, "docs/hooks/cell_page.py makes it"
 
 
 def test_config_in_the_terminal(capsys):

@@ -2,6 +2,9 @@
 
 import gc
 import sqlite3
+import subprocess
+import sys
+from subprocess import PIPE
 
 import numpy as np
 import pytest
@@ -14,6 +17,7 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, Step, load_plan, read_plan
 from hilcal.store.run_log import PLAN, RunLog
 from hilcal.store.schema import transaction
+from tests.support.paths import ROOT
 from tests.support.readings_cases import readings_at
 from tests.support.refusals import refusal, refusal_of, refusals, refuses, with_edits
 
@@ -79,6 +83,38 @@ def test_what_is_missing_goes_on_without_a_pose_that_is_skipped(tmp_path):
         log.skip(["p3"])  # nothing is left to be measured: the arm goes home and reads
         assert log.plan.without(log.done()).steps == (Step("p1", "none", 1),)
         assert [x["point"] for x in log.plan.about["left_out"]] == ["p2", "p3"]
+
+
+MEASURES = """
+import sys
+from hilcal.store.campaign_file import CampaignFile
+campaign = CampaignFile.open(sys.argv[1])
+campaign.measure_alone()
+print("measures", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_one_process_measures_and_a_killed_one_holds_nobody_off(tmp_path):
+    path = tmp_path / "run.hilcal"
+    with _campaign(path) as campaign:
+        command = [sys.executable, "-c", MEASURES, str(path)]
+        with subprocess.Popen(command, stdin=PIPE, stdout=PIPE, cwd=ROOT) as other:
+            assert other.stdout is not None
+            assert other.stdout.readline() == b"measures\n"
+            refusal("another hilcal is measuring this campaign", campaign.measure_alone)
+            RunLog(campaign).record(_reading(STEPS[0]), STEPS[0], {})  # as fits may store
+            path.read_bytes()
+            refusal("another hilcal is measuring this campaign", campaign.measure_alone)
+            other.kill()
+            other.wait()
+            campaign.measure_alone()
+        campaign.measure_alone()
+        with CampaignFile.open(path) as second:
+            refusal("another hilcal is measuring", second.measure_alone)
+        refusal("another hilcal is measuring", CampaignFile.open(path).measure_alone)
+    with CampaignFile.open(path) as campaign:
+        campaign.measure_alone()
 
 
 def test_a_table_cannot_be_resumed(tmp_path):

@@ -258,8 +258,12 @@ def test_every_command_with_models_reads_it_first(command, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("law", "said"),
     first(
-        1,
+        2,
         [
+            (
+                "exit(3) if len(s.angle) > 40 else s.angle[:, :1]",
+                ", line 13: effect mine: columns raises SystemExit: 3",
+            ),
             (
                 "[1.0][len(s.angle) > 40] * s.angle[:, :1]",
                 ", line 13: effect mine: columns raises Ind",

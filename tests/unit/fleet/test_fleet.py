@@ -15,7 +15,14 @@ from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.codec import write_document
 from hilcal.transfer.fleet import Fleet, diagnosed_effects, pool
-from hilcal.transfer.members import Failure, Member, entries, member_of
+from hilcal.transfer.members import (
+    Failure,
+    Member,
+    SizeEvidence,
+    entries,
+    member_of,
+    type_sizes,
+)
 from tests.support.calibrate_process import CELL
 from tests.support.campaigns import cell_of, configuration, noiseless, plan, with_noise, world_of
 from tests.support.cli_cases import ok, refused
@@ -74,6 +81,17 @@ def members(one, seed, odd=0.0):
 def with_odd(one):
     fleet = members(one, 3, odd=1.5)
     return fleet, pool(fleet, diagnosed_effects(fleet))
+
+
+def test_a_campaign_more_of_an_arm_is_no_arm_more(with_odd):
+    found, _ = with_odd
+    more = SizeEvidence(("creep",), np.array([[0.5]]), np.array([0.4]))
+    less = SizeEvidence(("creep",), np.array([[0.2]]), np.array([0.1]))
+    twice = [replace(m, sizes=(more, less)[k % 2]) for k, m in enumerate(found)]
+    assert len({m.arm for m in twice[:6]}) == 3
+    told = pool(twice[:6], []).sizes
+    assert told == type_sizes([more] * 3)
+    assert told[0].high < type_sizes([more])[0].high
 
 
 def test_the_spread_of_arms_is_recovered_and_the_odd_one_named(one, with_odd):

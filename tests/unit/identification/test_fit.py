@@ -8,7 +8,7 @@ import pytest
 
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.baseline import baseline, loads_differ, masses_note, with_effects
+from hilcal.identification.baseline import baseline, loads_differ, loads_note, with_effects
 from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import notes, to_json
 from hilcal.model.model import Model
@@ -386,7 +386,7 @@ def test_where_loads_differ_the_compliances_are_right(mode):
     assert ("link_mass" in f.model.names) == absolute
     assert ratios(f) == pytest.approx(1.0, abs=0.03)
     assert f.variance_factor == pytest.approx(1.0, abs=0.3)
-    note = masses_note(f)
+    note = loads_note(f)
     assert (note is None) == (not absolute)
     if absolute:
         assert "link_mass estimates what its weight does" in note
@@ -398,9 +398,22 @@ def test_without_the_weight_they_are_too_soft_and_that_is_said():
         fitted_model(cell, C.readings, "absolute", ("joint_compliance",)) for cell in (BARE, C.cell)
     )
     assert ratios(bare).max() > 1.3
-    assert "hilcal add RUN link_mass" in masses_note(bare)
+    assert "hilcal add RUN link_mass" in loads_note(bare)
     assert ratios(told) == pytest.approx(1.0, abs=0.03)
-    assert masses_note(told) is None
+    assert loads_note(told) is None
+
+
+def test_forces_of_the_wrong_sign_are_said():
+    """Deflections are the same under opposite forces and compliances; no arm has such."""
+    f = fitted_model(C.cell, C.readings, "deflection")
+    assert loads_note(f) is None
+    turned = replace(
+        C.readings, states=replace(C.readings.states, wrench=-C.readings.states.wrench)
+    )
+    f = fitted_model(C.cell, turned, "deflection")
+    assert f.variance_factor == pytest.approx(1.0, abs=0.3)
+    assert "of the opposite sign" in loads_note(f)
+    assert any("of the opposite sign" in n for n in notes(f))
 
 
 def test_under_one_load_nothing_tells_them_apart_and_that_is_said():
@@ -408,5 +421,5 @@ def test_under_one_load_nothing_tells_them_apart_and_that_is_said():
     f = fitted_model(BARE, light, "absolute")
     assert "link_mass" not in f.model.names
     assert ratios(f)[0] > 2.0
-    assert "no pose was read under two loads" in masses_note(f)
+    assert "no pose was read under two loads" in loads_note(f)
     assert [loads_differ(r) for r in (light, under("none", "5kg"))] == [False, True]
