@@ -250,7 +250,7 @@ def check_joints(table: ColumnTable, names: tuple[str, ...], q: Floats, arm: Arm
     for i, j in first_true((q < arm.q_min - _LIMIT_MARGIN) | (q > arm.q_max + _LIMIT_MARGIN)):
         if arm.slides[j]:
             seems = " (looks like millimetres)" if abs(q[i, j]) > 10 * most[j] else ""
-        elif arm.q_min[j] <= q[i, j] - 2 * np.pi <= min(arm.q_max[j], 0.0):
+        elif q[:, j].min() >= 0 and arm.q_min[j] <= q[i, j] - 2 * np.pi <= min(arm.q_max[j], 0):
             seems = "; it is within them a whole turn on: were the angles counted from 0 to 360°?"
         unit, limits = arm.unit(j), f"{arm.q_min[j]:g} to {arm.q_max[j]:g}"
         raise InputError(
