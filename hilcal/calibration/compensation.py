@@ -12,6 +12,11 @@ Newton's method on T(q) = T_wanted starts from the commanded joint values and st
 
 Each residual e is of the full model at equilibrium, so the solution is exact. J lacks the effects,
 which costs a step or two more; each step reduces e about 10³ times.
+
+An arm with fewer than six joints of independent values cannot correct all of a pose. There the
+position is met, and the orientation is as near as the joints that are left allow:
+
+    q ← q + J_p⁺ e_p + (J_r N)⁺ (e_r − J_r J_p⁺ e_p),   N = I − J_p⁺ J_p
 """
 
 from collections.abc import Callable, Sequence
@@ -41,6 +46,9 @@ TOLERANCE = 1e-10
 """Residual at which a point is solved, m and rad."""
 MAX_STEPS = 30
 """Newton steps at most; four are usual."""
+MOST_TURNED = 0.02
+"""Largest angle, rad, from a target orientation that an arm with few joints cannot have: several
+times the errors of arms. A choice."""
 MAX_JOINT_STEP = 0.2
 """Largest step of a joint, rad; longer ones are shortened, so that the branch stays the same."""
 MIN_SINGULAR_RATIO = 1e-3
@@ -138,36 +146,60 @@ class Inverse(Brief):
     q: Floats  # (N, n) joint values
     residual_m: Floats  # (N,) distance from the target position
     residual_rad: Floats  # (N,) angle from the target orientation
+    most_rad: float = TOLERANCE  # angle at which a point is solved
 
     @property
     def solved(self) -> Bools:
         """(N,) points at which the tool reaches its target pose, within `TOLERANCE`."""
-        return np.asarray(np.maximum(self.residual_m, self.residual_rad) <= TOLERANCE)
+        reached = self.residual_m <= TOLERANCE
+        return np.asarray(reached & (self.residual_rad <= self.most_rad))
 
 
 def invert(
     arm: Arm, poses: Callable[[Floats, Ints], Pose], q: Floats, rotation: Floats, position: Floats
 ) -> Inverse:
     """Find joint values for target orientations (N, 3, 3) and positions (N, 3), from q (N, n)."""
-    q, count = q.copy(), len(q)
+    q, count = arm.complete(q).copy(), len(q)
     residual = np.full((count, 2), np.inf)
     active = np.arange(count)
     scale = np.array([arm.reach] * 3 + [1.0] * 3)
+    few = int(arm.independent.sum()) < 6
     for _ in range(MAX_STEPS):
         r, p, chain = poses(q[active], active)
         rotvec = se3.rotation_vector(se3.product(rotation[active], np.swapaxes(r, 1, 2)))
         e = np.concatenate([position[active] - p, rotvec], axis=1)  # base axes
         residual[active] = np.linalg.norm(e.reshape(-1, 2, 3), axis=2)
-        u, s, vt = np.linalg.svd(_jacobian(arm, chain, p), full_matrices=False)
-        step = np.einsum("nji,nj,nkj,nk->ni", vt, 1.0 / np.maximum(s, 1e-6), u, e / scale)
-        moving = residual[active].max(axis=1) > TOLERANCE
+        jacobian, e = _jacobian(arm, chain, p), e / scale
+        if few:
+            step = _position_first(jacobian, e)
+            moving = (residual[active, 0] > TOLERANCE) | (np.abs(step).max(axis=1) > TOLERANCE)
+        else:
+            step = np.einsum("nij,nj->ni", _inverse(jacobian), e)
+            moving = residual[active].max(axis=1) > TOLERANCE
         if not moving.any():
             break
         longest = np.abs(step).max(axis=1, keepdims=True)
         step *= np.minimum(1.0, MAX_JOINT_STEP / np.maximum(longest, 1e-300))
-        q[active[moving]] += step[moving]
+        q[active[moving]] = arm.complete(q[active[moving]] + step[moving])
         active = active[moving]
-    return Inverse(q, residual[:, 0], residual[:, 1])
+    return Inverse(q, residual[:, 0], residual[:, 1], MOST_TURNED if few else TOLERANCE)
+
+
+def _inverse(jacobian: Floats) -> Floats:
+    """(N, n, k) pseudo-inverse, with singular values of at least 1e-6."""
+    u, s, vt = np.linalg.svd(jacobian, full_matrices=False)
+    return np.asarray(np.einsum("nji,nj,nkj->nik", vt, 1.0 / np.maximum(s, 1e-6), u))
+
+
+def _position_first(jacobian: Floats, e: Floats) -> Floats:
+    """(N, n) steps that meet positions, and orientations as far as that leaves joints free."""
+    of_position, of_turn = jacobian[:, :3], jacobian[:, 3:]
+    inverse = _inverse(of_position)
+    step = np.einsum("nij,nj->ni", inverse, e[:, :3])
+    free = np.eye(jacobian.shape[2]) - inverse @ of_position
+    turn = np.linalg.pinv(of_turn @ free, rcond=MIN_SINGULAR_RATIO)
+    left = e[:, 3:] - np.einsum("nij,nj->ni", of_turn, step)
+    return np.asarray(step + np.einsum("nij,nj->ni", turn, left))
 
 
 def nominal_pose(arm: Arm, tool: Floats, q: Floats) -> Pose:
@@ -330,7 +362,7 @@ class Compensation(Brief):
         """(N,) whether the pose is singular."""
         arm = self._tool.model.cell.arm
         jacobian = _jacobian(arm, evaluate(arm, self.q), self.after.position)
-        s = np.linalg.svd(jacobian, compute_uv=False)
+        s = np.linalg.svd(jacobian[..., arm.independent], compute_uv=False)
         return np.asarray(s[:, -1] < MIN_SINGULAR_RATIO * s[:, 0])
 
     @property

@@ -38,6 +38,7 @@ from hilcal.tables.columns import (
     WRENCH,
     approach_columns,
     check_rotations,
+    independent_columns,
     joint_columns,
     known_columns,
     temperature_columns,
@@ -93,9 +94,14 @@ def read_points(
         if mapping is None:
             mapping, guess = _guessed(path, arm)
         table = _mapped(path, arm, mapping)
-    present = [group for group in groups if group[1][0] in table.number]
-    columns = {quantity: table.matrix(names) * factor for quantity, names, factor in present}
+    nothing = np.full(len(table.rows), np.nan)  # of mimic joints, which need no column
+    columns = {
+        quantity: factor * np.stack([table.number.get(name, nothing) for name in names], axis=1)
+        for quantity, names, factor in groups
+        if names[0] in table.number
+    }
     q = columns.pop("q", None)
+    q = None if q is None else arm.complete(q)
     if q is not None and np.any(large := (np.abs(q) > LARGEST_RAD) & ~arm.slides):
         k = int(np.argmax(np.any(large, axis=1)))
         raise InputError(
@@ -129,7 +135,8 @@ def _plain(path: Path, arm: Arm, groups: "_Groups") -> ColumnTable | None:
         chosen.extend(_checked(path, header, groups, arm))
 
     try:
-        return ColumnTable.of(open_grid(path, _form(path), check), *chosen)
+        table = ColumnTable.of(open_grid(path, _form(path), check), *chosen)
+        return with_following(table, arm)
     except _OtherNamesError:
         return None
 
@@ -223,7 +230,7 @@ def _form(path: Path) -> FileFormat:
 
 def _guessed(path: Path, arm: Arm) -> tuple[PointMapping, str]:
     """Return the guessed mapping of a table, and its description for people."""
-    proposed = propose(path, joints=arm.n)
+    proposed = propose(path, joints=arm.n, joint_names=arm.joint_names)
     proposal = proposed.proposal
     understood = [
         f"{u.section} = {', '.join(u.columns)}" + f" ({u.meaning})" * bool(u.meaning)
@@ -316,9 +323,11 @@ def _checked(
     first: dict[str, list[str]] = {"hung": ["load"] * ("load" in header)}
     for quantity, names, _ in groups:
         missing = [name for name in names if name not in header]
-        if missing and len(missing) < len(names):
-            raise InputError(f"{path}: column '{missing[0]}' is missing beside its group")
-        if not missing:
+        needed = names if quantity != "q" else independent_columns(names, 0, arm)
+        lacks = [name for name in missing if name in needed]
+        if lacks and len(missing) < len(names):
+            raise InputError(f"{path}: column '{lacks[0]}' is missing beside its group")
+        if not lacks:
             key = "hung" if quantity in ("wrench", "sensed") else quantity
             first.setdefault(key, []).append(names[0])
     for options in first.values():

@@ -185,7 +185,8 @@ def _check_arm(arm: Arm) -> None:
     frames("links", arm.links, several=True)
     numbers("masses", arm.masses, (n,), minimum=0.0)
     numbers("coms", arm.coms, (n, 3))
-    numbers("payload", arm.payload, minimum=0.0)
+    if not arm.payload >= 0.0:  # infinite where it is not known
+        raise ValueError("payload has a number that cannot be")
     for name, shape in (("coupling", (n, n)), ("drive", (n, n)), ("mimic", (n, n + 1))):
         if getattr(arm, name) is not None:
             numbers(name, getattr(arm, name), shape)

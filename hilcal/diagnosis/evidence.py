@@ -53,7 +53,7 @@ from hilcal.diagnosis.noise import (
 from hilcal.diagnosis.pose_alone import PoseAlone, pose_alone
 from hilcal.diagnosis.residual_regression import Dependence, Regressions, ResidualRegression
 from hilcal.diagnosis.stepwise import trial
-from hilcal.diagnosis.wrong_figures import WrongFigure, wrong_figures
+from hilcal.diagnosis.wrong_figures import WrongFigure, loads_reversed, wrong_figures
 from hilcal.effects.protocol import Effect
 from hilcal.identification.carried.drift import carried_effects, evidence_of_carried
 from hilcal.identification.fit import Fit, fit, require_gc
@@ -257,7 +257,8 @@ class Evidence:
     @cached_property
     def wrong_figures(self) -> tuple[WrongFigure, ...]:
         """Figures of the cell that seem to be wrong."""
-        if self.misfit or self.fit.outlier.any() or not self.fit.readings.noise_stated:
+        stated = self.fit.readings.noise_stated
+        if self.misfit or self.fit.outlier.any() or not stated or loads_reversed(self.fit):
             return wrong_figures(self.fit, self.suspects)
         return ()
 

@@ -1,10 +1,15 @@
-"""Wrong figures of the cell: a load's mass, the tool's mass or its centre of mass.
+"""Wrong figures of the cell: a load's mass, the tool's mass or its centre of mass, gravity.
 
 They are tried before any effect is named: a factor of all wrenches of one load, a factor of the
 tool's mass, and a shift of its centre of mass. Gauss-Newton estimates the figure beside the model,
 which is refitted in every step. A figure is named if it explains nearly all of the misfit, is
 better than any effect of the catalogue by the Bayesian information criterion, and differs from the
 stated figure by more than rounding.
+
+Where no effect of the catalogue explains the misfit, the direction of gravity in base axes is
+tried, too: the axes of the base as starts, the best of them refined; and whether the forces of a
+table are those in flange axes, or of the other sign. Loads that act the other way leave no misfit:
+they turn the sign of all compliances, and no joint gives way against its torque.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,12 +24,17 @@ from hilcal.errors import CannotAnswerError
 from hilcal.identification.fit import Fit, fit, with_outliers
 from hilcal.identification.linearisation import LEAST_MISFIT, linearise
 from hilcal.identification.residual import residual
-from hilcal.types import Floats
+from hilcal.model.model import Prediction
+from hilcal.robot import se3
+from hilcal.robot.chain import evaluate
+from hilcal.types import Bools, Floats
 
-FigureKind = Literal["load", "tool_mass", "tool_com"]
+FigureKind = Literal["load", "tool_mass", "tool_com", "gravity", "forces", "force_axes"]
 LEAST_SHARE = 0.8
 """Share of the misfit that a wrong figure must explain; a choice: ordinary effects may explain the
 remainder."""
+LEAST_SHARE_OF_GRAVITY = 0.5
+"""The same where no effect explains the misfit, which may have been taken for noise. A choice."""
 MOST_REMAINING = 0.7
 """Share of χ² that may remain where the noise was estimated, so that χ² shows no misfit."""
 BIC_MARGIN = 10.0
@@ -39,17 +49,23 @@ MISTAKE_FACTOR = {"load": 1.2, "tool_mass": 1.3}
 LARGEST_STEP = 0.5  # most of a mass that one step removes, as a share; a step trebles it at most
 WEIGHT_COSINE = 0.999  # cosine to gravity from which a force is a weight
 MISTAKE_M = 0.02  # shift from which a centre of mass is a mistake, m; a choice
-DERIVATIVE_STEP: dict[FigureKind, float] = {"load": 1e-2, "tool_mass": 1e-1, "tool_com": 1e-2}
-"""Steps of the derivatives: relative for wrench and mass, m for the centre of mass."""
+MISTAKE_COSINE = 0.985  # of the angle from which gravity's direction is a mistake, 10°; a choice
+DERIVATIVE_STEP: dict[FigureKind, float] = {
+    "load": 1e-2, "tool_mass": 1e-1, "tool_com": 1e-2, "gravity": 1e-2,
+}  # fmt: skip
+"""Steps of the derivatives: relative for wrench and mass, m for the centre of mass, rad."""
+TOLD = 5.0  # standard uncertainties from which the sign of a compliance is beyond doubt; a choice
 
 
 @dataclass(frozen=True, slots=True)
 class WrongFigure:
     """A figure that seems to be wrong."""
 
-    kind: FigureKind  # a load's mass or pull, the tool's mass, or its centre of mass
-    load: str  # name of the load; "" for the tool
-    stated: tuple[float, ...]  # as it was entered: kg, N for a pull, or the centre, flange axes, m
+    kind: FigureKind  # a load's mass or pull, the tool's mass or centre of mass, gravity, all pulls
+    load: str  # name of the load; "" for the others
+    # as it was entered: kg, N for a pull, the centre in flange axes, m, gravity in base axes, m/s²,
+    # or the sign of all forces (of `force_axes` those that are found in flange axes)
+    stated: tuple[float, ...]
     found: tuple[float, ...]  # as estimated from the readings
     unit: str  # of both
     rms_m: float  # position error of the fit, m
@@ -60,10 +76,13 @@ class WrongFigure:
 class _Figure:
     kind: FigureKind
     load: int = -1
+    axis: tuple[float, ...] = ()  # (3,) of the base, the direction of gravity to start from
+    sign: float = 1.0  # of all forces
 
     @property
     def size(self) -> int:
-        return 3 if self.kind == "tool_com" else 1
+        sizes = {"tool_com": 3, "gravity": 2, "forces": 0, "force_axes": 0}
+        return sizes.get(self.kind, 1)
 
     def applied(self, stated: Fit, change: Floats) -> Fit:
         """Return a fit with the figure changed in its cell or readings; nothing is refitted."""
@@ -74,7 +93,20 @@ class _Figure:
             cell = replace(cell, tool_com=cell.tool_com + change)
         else:
             wrench = readings.states.wrench.copy()
-            wrench[readings.load == self.load] *= 1.0 + change[0]
+            if self.kind == "gravity":
+                g, weights = float(np.linalg.norm(cell.gravity)), _weights(stated)
+                across = np.linalg.svd(np.array([self.axis]))[2][1:]
+                direction = self.axis + change @ across
+                cell = replace(cell, gravity=g * direction / np.linalg.norm(direction))
+                size = np.linalg.norm(wrench[weights, :3], axis=1, keepdims=True)
+                wrench[weights, :3] = size * cell.gravity / g
+            elif self.kind in ("forces", "force_axes"):
+                wrench *= self.sign
+                if self.kind == "force_axes":
+                    flange = evaluate(cell.arm, readings.states.q).rotation[-1]
+                    wrench = se3.apply(flange[:, None], wrench.reshape(-1, 2, 3)).reshape(-1, 6)
+            else:
+                wrench[readings.load == self.load] *= 1.0 + change[0]
             readings = replace(readings, states=replace(readings.states, wrench=wrench))
         return replace(stated, model=replace(stated.model, cell=cell), readings=readings)
 
@@ -110,20 +142,22 @@ class _Figure:
         size = float(x @ r) / max(float(x @ x), 1e-300)
         return np.array([size]), size * float(x @ r) / max(float(r @ r), 1e-300)
 
-    def refitted(self, stated: Fit, step: Floats) -> tuple[Floats, Fit]:
+    def refitted(self, stated: Fit, step: Floats, steps: int = MOST_STEPS) -> tuple[Floats, Fit]:
         """Return the best change (k,) of the figure, from a first step on, and its fit.
 
         Raises:
             CannotAnswerError: no equilibrium with the changed figure.
         """
         change, refit = np.zeros(self.size), stated
-        for _ in range(MOST_STEPS):
-            if self.kind == "tool_com":
+        for _ in range(steps):
+            if self.kind in ("tool_com", "gravity"):
                 change = change + step
             else:  # no mass changes its sign
                 change = (1.0 + change) * (1.0 + np.clip(step, -LARGEST_STEP, 2.0)) - 1.0
             changed = self.applied(stated, change)
             refit = fit(changed.model, changed.readings, stated.mode, start=refit.theta)
+            if not self.size:
+                break
             step, _ = self.step(refit)
             if np.abs(step).max() < SMALL_STEP * DERIVATIVE_STEP[self.kind]:
                 break
@@ -139,7 +173,11 @@ class _Figure:
     def named(self, stated: Fit, change: Floats, refit: Fit) -> WrongFigure:
         """Return the figure as stated and as changed by (k,), with the errors of both fits."""
         cell, readings, load = stated.model.cell, stated.readings, ""
-        if self.kind == "tool_com":
+        if self.kind == "gravity":
+            figure, estimate, unit = cell.gravity, refit.model.cell.gravity, "m/s²"
+        elif self.kind in ("forces", "force_axes"):
+            figure, estimate, unit = np.ones(1), self.sign * np.ones(1), "1"
+        elif self.kind == "tool_com":
             figure, estimate, unit = cell.tool_com, cell.tool_com + change, "m"
         else:
             figure, unit = np.array([cell.tool_mass]), "kg"
@@ -177,7 +215,79 @@ def wrong_figures(fit: Fit, suspects: Sequence[Suspect]) -> tuple[WrongFigure, .
         if bic is not None and figure.mistaken(change) and bic < min(best, -BIC_MARGIN):
             named.append((bic, figure.named(fit, change, refit)))
     named.sort(key=lambda pair: pair[0])
-    return tuple(figure for bic, figure in named if bic <= named[0][0] + BIC_MARGIN)
+    found = tuple(figure for bic, figure in named if bic <= named[0][0] + BIC_MARGIN)
+    passing = [s for s in suspects if s.passes]
+    if found or any(s.share > LEAST_SHARE for s in passing):
+        return found
+    best = min((s.score.delta_bic for s in passing), default=0.0)
+    return _wrong_direction(fit, LEAST_SHARE if passing else LEAST_SHARE_OF_GRAVITY, best)
+
+
+def loads_reversed(fit: Fit) -> bool:
+    """Whether all compliances of joints whose sign the readings tell are negative."""
+    z = _compliances(fit)
+    told = z[np.abs(z) > TOLD]
+    return len(told) > 0 and bool(np.all(told < 0.0))
+
+
+def _compliances(fit: Fit) -> Floats:
+    """Compliances of the joints in their standard uncertainties; none without loads."""
+    if "joint_compliance" not in fit.model.names or not fit.readings.states.wrench.any():
+        return np.zeros(0)
+    rows = fit.model.slices()[fit.model.names.index("joint_compliance")]
+    std = fit.uncertainty.std[rows]
+    return np.divide(fit.theta[rows], std, out=np.zeros(len(std)), where=std > 0.0)
+
+
+def _weights(fit: Fit) -> Bools:
+    """(N,) readings under a load that pulls along gravity as stated."""
+    force, g = fit.readings.states.wrench[:, :3], fit.model.cell.gravity
+    size = np.linalg.norm(force, axis=1) * np.linalg.norm(g)
+    return np.asarray((size > 0.0) & (force @ g > WEIGHT_COSINE * size))
+
+
+def _wrong_direction(fit: Fit, least_share: float, best: float) -> tuple[WrongFigure, ...]:
+    """Gravity elsewhere, forces reversed or in flange axes, if it explains the misfit or the signs.
+
+    `best` is the least criterion of the suspects that pass all tests.
+    """
+    g = fit.model.cell.gravity
+    if not _compliances(fit).any():
+        return ()
+    figures = []
+    loaded = np.any(fit.readings.states.wrench != 0.0, axis=1)
+    if 2 * np.count_nonzero(_weights(fit)) < np.count_nonzero(loaded):  # most are pulls
+        figures = [_Figure("forces", sign=-1.0)]
+        figures += [_Figure("force_axes", sign=sign) for sign in (1.0, -1.0)]
+    axes = (*np.eye(3), *-np.eye(3)) if g.any() else ()
+    figures += [_Figure("gravity", axis=tuple(a.tolist())) for a in axes if _elsewhere(a, g)]
+    refits: list[tuple[Fit, _Figure]] = []
+    for figure in figures:
+        with suppress(CannotAnswerError):
+            refit = figure.refitted(fit, np.zeros(figure.size), 1)[1]
+            z = _compliances(refit)
+            if np.sum(z * np.abs(z)) > 0.0:  # else gravity is the opposite one
+                refits.append((refit, figure))
+    if not refits:
+        return ()
+    refit, figure = min(refits, key=lambda pair: pair[0].chi2)
+    if figure.kind == "gravity":
+        with suppress(CannotAnswerError):
+            refined = figure.refitted(fit, np.zeros(2))[1]
+            refit = min(refit, refined, key=lambda f: f.chi2 + BIC_MARGIN * (f is refined))
+    if loads_reversed(fit):
+        explained = refit.chi2 < fit.chi2 + BIC_MARGIN
+    else:
+        bic = _criterion(fit, refit, figure.size, least_share)
+        wrong = figure.kind != "gravity" or _elsewhere(refit.model.cell.gravity, g)
+        explained = wrong and bic is not None and bic < min(best, -BIC_MARGIN)
+    return (figure.named(fit, np.zeros(figure.size), refit),) if explained else ()
+
+
+def _elsewhere(gravity: Floats, stated: Floats) -> bool:
+    """Whether gravity has another direction than stated, by more than ways to mount a base."""
+    size = float(np.linalg.norm(gravity) * np.linalg.norm(stated))
+    return float(gravity @ stated) < MISTAKE_COSINE * size
 
 
 def _figures(fit: Fit) -> Iterator[_Figure]:
@@ -190,7 +300,9 @@ def _figures(fit: Fit) -> Iterator[_Figure]:
         yield from (_Figure("tool_mass"), _Figure("tool_com"))
 
 
-def _criterion(stated: Fit, refit: Fit, size: int) -> float | None:
+def _criterion(
+    stated: Fit, refit: Fit, size: int, least_share: float = LEAST_SHARE
+) -> float | None:
     """Change of the Bayesian information criterion by a figure; None where it explains too little.
 
     Only inliers of the refit count: with the stated figure they may look like gross errors.
@@ -198,7 +310,7 @@ def _criterion(stated: Fit, refit: Fit, size: int) -> float | None:
     readings, w = stated.readings[~refit.outlier], refit.whitening
     prediction = stated.model.predict(readings.states, stated.theta)
     chi2, dof = float(np.sum(w.whiten(residual(readings, prediction, w)) ** 2)), refit.dof
-    most = chi2 - LEAST_SHARE * max(chi2 - dof, LEAST_MISFIT * np.sqrt(2 * dof))
+    most = chi2 - least_share * max(chi2 - dof, LEAST_MISFIT * np.sqrt(2 * dof))
     if not stated.readings.noise_stated:
         most = min(most, MOST_REMAINING * chi2)
     if refit.chi2 > most:

@@ -254,6 +254,10 @@ def compensation_report(
         f"{length(float(bands.max()))}; expected {expected} rms"
     )
     yield f"  the latter includes {', '.join(_contributions(calibration, c.unstated))}"
+    joints = int(np.sum(calibration.model.cell.arm.independent))
+    if joints < 6:
+        turned = np.degrees(float(c.after.error_rad.max()))
+        yield f"  {joints} joints correct the position alone; orientations are off by {turned:.2g}°"
     yield f"  {base_line(calibration.model.cell, calibration.frames, calibration.mode)}"
     rows = table("point", "before", "after, 95 %", "largest correction")
     for k in sorted(np.argsort(-errors, kind="stable")[:LISTED]):

@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from hilcal import numbers
 from hilcal.calibration.scatter import ScatterSource
 from hilcal.diagnosis.background_evidence import POSSIBLE_LEVEL
@@ -92,6 +94,22 @@ def _wrong_figure(f: WrongFigure) -> str:
         return (
             f"the tool's centre of mass seems to be at ({estimated}) mm, not ({stated}) mm "
             f"{change}: measure it, correct [tool] com_m, and import or measure again"
+        )
+    if f.kind == "gravity":
+        opposite = float(np.dot(f.found, f.stated)) < -0.999 * float(np.dot(f.stated, f.stated))
+        why = "no joint gives way against its torque" if opposite else change.strip("()")
+        estimated, stated = (", ".join(f"{x + 0.0:.2f}" for x in v) for v in (f.found, f.stated))
+        return (
+            f"gravity seems to be ({estimated}) m/s² in base axes, not ({stated}) ({why}): see "
+            "how the base is mounted, correct [robot] gravity_m_s2, and import or measure again"
+        )
+    if f.kind in ("forces", "force_axes"):
+        axes = ["in flange axes, not base axes"] * (f.kind == "force_axes")
+        are = " and ".join([*axes, *["of the other sign"] * (f.found[0] < 0.0)])
+        why = change if f.rms_with_m < 0.9 * f.rms_m else "(no joint gives way against its torque)"
+        return (
+            f"the forces seem to be {are} {why}: a table states what a load exerts on the tool, in "
+            'base axes (a mapping may say [wrench] of = "reaction"); correct it, and import again'
         )
     estimated, stated = (f"{x[0]:.3g} {f.unit}" for x in (f.found, f.stated))
     if f.kind == "tool_mass":

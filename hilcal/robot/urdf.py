@@ -19,6 +19,7 @@ import numpy as np
 import pinocchio as pin
 
 from hilcal import limits
+from hilcal.config import STANDARD_GRAVITY_M_S2
 from hilcal.errors import InputError
 from hilcal.names import check_name
 from hilcal.robot import se3
@@ -27,6 +28,7 @@ from hilcal.toml import suggest
 from hilcal.types import Bools, Floats
 
 _WHOLE_TURN = 2.0 * math.pi
+MOST_LEVEL = 0.9999  # cosine of the tilt from which a base is not level, 0.8°; a choice
 
 
 def arm_from_urdf(path: Path, base_link: str | None = None, tip_link: str | None = None) -> Arm:
@@ -53,7 +55,21 @@ def arm_from_urdf(path: Path, base_link: str | None = None, tip_link: str | None
     outside = [joint for joint in range(1, model.njoints) if joint not in chain]
     reduced = pin.buildReducedModel(model, outside, pin.neutral(model))
     arm = _arm(reduced, _link(reduced, base).placement, _link(reduced, tip).placement, path)
+    arm = replace(arm, notes=(*arm.notes, *_tilt(model, base, names[0], path.name)))
     return with_mimics(arm, mimics, path.name)
+
+
+def _tilt(model: pin.Model, base: str, root: str, where: str) -> Iterator[str]:
+    """Say what gravity is in the base link's axes, where fixed joints tilt it."""
+    frame = _link(model, base)
+    up = frame.placement.rotation.T @ np.array([0.0, 0.0, 1.0])
+    if frame.parentJoint == 0 and up[2] < MOST_LEVEL:
+        gravity = ", ".join(f"{x + 0.0:.4f}" for x in -STANDARD_GRAVITY_M_S2 * up)
+        angle = math.degrees(math.acos(max(float(up[2]), -1.0)))
+        yield (
+            f'{where} tilts link "{base}" by {angle:.3g}°: where z of its link "{root}" is up, '
+            f"[robot] gravity_m_s2 = [{gravity}]"
+        )
 
 
 def _arm(model: pin.Model, base: pin.SE3, tip: pin.SE3, path: Path) -> Arm:

@@ -245,11 +245,13 @@ _G = 9.80665
 def check_joints(table: ColumnTable, names: tuple[str, ...], q: Floats, arm: Arm) -> None:
     """Refuse commanded joints beyond the arm's limits; (N, n), rad."""
     most = np.maximum(np.abs(arm.q_min), np.abs(arm.q_max))
-    large, turns = np.abs(q[:, ~arm.slides]), most[~arm.slides]
-    seems = " (looks like degrees)" if large.max(initial=0.0) > turns.max(initial=0.0) + 1 else ""
+    large, turns = np.abs(q[:, ~arm.slides]).max(initial=0.0), most[~arm.slides].max(initial=0.0)
+    seems = " (looks like degrees)" if large > max(turns + 1, 2 * np.pi) else ""
     for i, j in first_true((q < arm.q_min - _LIMIT_MARGIN) | (q > arm.q_max + _LIMIT_MARGIN)):
         if arm.slides[j]:
             seems = " (looks like millimetres)" if abs(q[i, j]) > 10 * most[j] else ""
+        elif q[:, j].min() >= 0 and arm.q_min[j] <= q[i, j] - 2 * np.pi <= min(arm.q_max[j], 0):
+            seems = "; it is within them a whole turn on: were the angles counted from 0 to 360°?"
         unit, limits = arm.unit(j), f"{arm.q_min[j]:g} to {arm.q_max[j]:g}"
         raise InputError(
             f"{table.at(i, names[j])}: {q[i, j]:g} {unit} is beyond the limits of "

@@ -25,6 +25,7 @@ from hilcal.tables.grid import Cell, Check, Grid, joined, text_of, unique
 from hilcal.tables.mapping import FileFormat, PointMapping
 from hilcal.toml import suggest
 
+NUMPY = 'a NumPy file; save it as CSV: numpy.savetxt("t.csv", array, delimiter=",")'
 MAGIC = {
     b"PK\x03\x04": "XLSX",
     b"PAR1": "Parquet",
@@ -33,7 +34,7 @@ MAGIC = {
     b"\x89HDF": "an HDF5 file (MATLAB's -v7.3); save it with -v7, or as CSV",
     b"\xd0\xcf\x11\xe0": "an old Excel file (XLS); save it as XLSX or CSV",
     b"\x1f\x8b": "a gzip file; unpack it first",
-    b"\x93NUMPY": "a NumPy file; save it as CSV",
+    b"\x93NUMPY": NUMPY,
     **dict.fromkeys(
         [b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05"],
         "a Python pickle, which is never loaded; save it as CSV",
@@ -156,7 +157,10 @@ def workbook(path: str, content: bytes) -> Any:
     with undamaged(path, "damaged, or not an XLSX file"):
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             members = archive.infolist()
-            if "xl/workbook.xml" not in [m.filename for m in members]:
+            names = [m.filename for m in members]
+            if any(name.endswith(".npy") for name in names):
+                raise InputError(f"{path}: {NUMPY}")
+            if "xl/workbook.xml" not in names:
                 raise InputError(
                     f"{path}: a zip archive that is no XLSX; unpack it, or save as XLSX"
                 )

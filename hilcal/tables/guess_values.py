@@ -29,6 +29,7 @@ FORMATS = (
 """Forms of dates that are tried, in this order."""
 RIVAL = 0.5  # Difference of the score within which another choice of columns is as good; a choice
 BY_VALUES = "found by their values: check the columns"
+BY_ROWS = "found by their values; row by row, or column by column?"
 RIVALS = "as good by their values:"
 _EXCEL = (30000.0, 60000.0)
 
@@ -144,19 +145,30 @@ def _orientation_by_values(g: words.Guesser, free: list[str]) -> None:
     """Find quaternions by their length, rotation matrices by their orthogonality."""
     if "orientation" in g.proposal.sections:
         return
-    for k in range(len(free) - 8):
-        names = free[k : k + 9]
+    for width, k in product((3, 4), range(len(free) - 8)):  # 4: a position ends each row
+        rows = [free[k + i * width : k + i * width + width] for i in range(3)]
+        names = [name for row in rows for name in row[:3]]
+        if len(names) < 9:
+            continue
         m = g.block(names).reshape(-1, 3, 3)
         m = m[np.isfinite(m).all(axis=(1, 2))]
         if len(m) and np.abs(m @ np.swapaxes(m, 1, 2) - np.eye(3)).max() < NORM:
-            g.assign("orientation", names, "rotation matrix", convention="matrix")
-            g.doubt("orientation", "found by their values; row by row, or column by column?")
+            _take_matrix(g, names, [name for row in rows for name in row[3:]])
+            g.doubt("orientation", BY_ROWS)
             return
     for k in range(len(free) - 3):
         names = free[k : k + 4]
         if is_quaternion(g.block(names)):
             _take_quaternion(g, names)
             return
+
+
+def _take_matrix(g: words.Guesser, names: list[str], position: list[str]) -> None:
+    """Take nine numbers for a rotation matrix, and three more for the position beside it."""
+    g.assign("orientation", names, "rotation matrix", convention="matrix")
+    if len(position) == 3 and "position" not in g.proposal.sections:
+        unit = words.length_unit(g, "position", position)
+        g.assign("position", position, unit, unit=unit)
 
 
 def _take_quaternion(g: words.Guesser, names: list[str]) -> None:
@@ -204,6 +216,7 @@ def guess_axes(g: words.Guesser) -> None:
     }
     positions = complete.get("position", {})
     if not positions:
+        _matrix(g)
         return
     ranked = sorted(positions, key=_rank)
     stem = ranked[0]
@@ -346,7 +359,12 @@ def _matrix(g: words.Guesser) -> bool:
             places = [(i + base, j + base) for i in range(3) for j in range(3)]
             if all(place in by_place for place in places):
                 names = [by_place[place] for place in places]
-                g.assign("orientation", names, "rotation matrix", convention="matrix")
+                beside = [
+                    by_place[i + base, 3 + base]
+                    for i in range(3)
+                    if (i + base, 3 + base) in by_place
+                ]
+                _take_matrix(g, names, beside)
                 return True
     return False
 

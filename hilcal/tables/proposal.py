@@ -155,6 +155,11 @@ def parse(name: str, unit_cell: str = "") -> ColumnName:
     return ColumnName(name, tuple(words), axis, tuple(numbers), stated or unit)
 
 
+def without_unit(name: str) -> str:
+    """Return the name of a column in small letters, without its unit."""
+    return _unit(name)[0].strip().lower()
+
+
 def _unit(name: str) -> tuple[str, str | None]:
     """Name without its unit, and the unit."""
     plain = name.replace("µ", "u").replace("μ", "u").strip()

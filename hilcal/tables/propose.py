@@ -37,8 +37,16 @@ class GridProposal:
 
 
 @limits.bounded
-def propose(path: Path, second: Path | None = None, joints: int | None = None) -> GridProposal:
-    """Look at a table, or two that hold columns of the same readings, and propose a mapping."""
+def propose(
+    path: Path,
+    second: Path | None = None,
+    joints: int | None = None,
+    joint_names: Sequence[str] = (),
+) -> GridProposal:
+    """Look at a table, or two that hold columns of the same readings, and propose a mapping.
+
+    Columns that have the names of the arm's joints are these joints, in whatever order they stand.
+    """
     first = sniff(path)
     grid, doubts = first.grid, [("file", sentence) for sentence in first.doubts]
     second_file: dict[str, Any] | None = None
@@ -53,7 +61,7 @@ def propose(path: Path, second: Path | None = None, joints: int | None = None) -
             doubts.append(("second_file", f"rows are matched by '{match[0]}' and '{match[1]}'"))
         if lost:
             doubts.append(("second_file", f"{lost} rows of the first file have no partner"))
-    proposal = guess(grid, joints)
+    proposal = guess(grid, joints, joint_names)
     file = {**first.file_keys, **proposal.sections.pop("file", {})}
     head: dict[str, dict[str, Any]] = {"file": file} if file else {}
     if second_file is not None:
@@ -96,10 +104,10 @@ def _is_key(keys: list[str]) -> bool:
     return bool(np.all(numbers == np.rint(numbers)))
 
 
-def guess(grid: Grid, joints: int | None = None) -> words.Proposal:
+def guess(grid: Grid, joints: int | None = None, joint_names: Sequence[str] = ()) -> words.Proposal:
     """Propose a mapping for a table."""
     g = words.Guesser(grid, joints)
-    _joints(g)
+    _joints(g, joint_names)
     guess_axes(g)
     _scalars(g)
     read = {"position", "distance", "gauge"} & set(g.proposal.sections)
@@ -139,8 +147,11 @@ def _why_unused(g: words.Guesser, column: words.ColumnName) -> str:
     return "its name says nothing"
 
 
-def _joints(g: words.Guesser) -> None:
-    """Find joint angles: columns named by a joint's word and a number, or by `ARM_JOINTS`."""
+def _joints(g: words.Guesser, joint_names: Sequence[str]) -> None:
+    """Find joint angles by the names of the arm's joints, a joint's word and number, or UR's names.
+
+    A unit may stand behind the name of a joint.
+    """
     groups: dict[tuple[str, ...], dict[int, str]] = {}
     for c in g.columns:
         torque = c.has(words.TORQUE) or c.unit in MOMENTS
@@ -161,6 +172,10 @@ def _joints(g: words.Guesser) -> None:
             _per_joint(g, first, names)
         else:
             candidates.append((first, names))
+    by_name = {words.without_unit(c.name): c.name for c in g.columns if g.number(c.name)}
+    of_arm = [by_name[name.lower()] for name in joint_names if name.lower() in by_name]
+    if of_arm and len(of_arm) == len(joint_names):
+        candidates.insert(0, (words.parse("joint"), of_arm))
     named = [_with_words(g, w) for w in words.ARM_JOINTS]
     if all(named):
         candidates.append((words.parse("joint"), [str(name) for name in named]))

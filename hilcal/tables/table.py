@@ -328,8 +328,11 @@ def _instrument_covariance(
         )
     origin = np.zeros(3) if station is None else np.asarray(station, dtype=float)
     for (k,) in first_true(np.linalg.norm(value[:, :3] - origin, axis=1) < 1e-3):
+        lost = "a lost reflector, as 0, 0, 0 often is? Leave the row out, or " * (
+            not value[k].any()
+        )
         raise InputError(
-            f"{table.at(k)}: position lies at the tracker's station; set station_m in the "
+            f"{table.at(k)}: position lies at the tracker's station; {lost}set station_m in the "
             f"section [tracker] of the configuration"
         )
     return tracker_covariance(value[:, :3], noise, origin, m)

@@ -7,6 +7,7 @@ import pytest
 
 from hilcal.cell import cell_from_config
 from hilcal.config import load_config
+from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.store.campaign_file import CampaignFile
 from tests.support.cli_cases import ok, refused
 from tests.support.foreign_tables import CELL, campaign, lines, write
@@ -407,3 +408,85 @@ def test_one_coordinate_of_nines_is_no_unit_and_the_way_out_is_one(tmp_path, cap
     assert "millimetres" not in said
     mapping.write_text(own.replace("[file]", "[file]\nmissing = [-9999]"), encoding="utf-8")
     assert ok(capsys, *arguments, "--json").document["n_readings"] == 11
+
+
+def proposed(tmp_path, capsys, header, *columns, robot="ur10e"):
+    """Return the document of --preview for a table of joint values and other columns."""
+    c = campaign(24)
+    write(tmp_path / "t.csv", lines(header, *(f(c) for f in columns), separator=",", digits=8))
+    text = f'[robot]\nmodel = "{robot}"\n[tracker]\nframe = "tracker"\n'
+    cell = write(tmp_path / "CELL.toml", text)
+    return ok(
+        capsys, "import", tmp_path / "t.csv", "--preview", "--config", cell, "--json"
+    ).document
+
+
+def matrices(c, columns=3):
+    """(N, 3, columns) of the rotation and, with 4 columns, the position."""
+    return np.concatenate([c.attitude.as_matrix(), c.position[:, :, None]], axis=2)[:, :, :columns]
+
+
+def test_columns_named_as_the_arms_joints_are_these_joints_in_any_order(tmp_path, capsys):
+    text = (configs_dir() / "robots" / "ur10e.toml").read_text()
+    names = ["yaw", "lift", "elbow", "roll", "tilt", "spin"]
+    for old, new in zip(load_arm("ur10e").joint_names, names, strict=True):
+        text = text.replace(f'"{old}"', f'"{new}"')
+    write(tmp_path / "arm.toml", text)
+    order = [3, 1, 5, 0, 2, 4]
+    header = [*(f"{names[k].title()} [rad]" for k in order), "x", "y", "z"]
+    columns = lambda c: c.q[:, order], lambda c: c.position
+    d = proposed(tmp_path, capsys, header, *columns, robot="arm.toml")
+    assert d["mapping"]["joints"]["columns"] == [f"{name.title()} [rad]" for name in names]
+
+
+@pytest.mark.parametrize("named", [True, False])
+@pytest.mark.parametrize("rows", [3, 4])
+def test_homogeneous_matrices_row_by_row(named, rows, tmp_path, capsys):
+    def cells(c):
+        below = np.broadcast_to([[[0.0, 0.0, 0.0, 1.0]]], (len(c.q), 1, 4))
+        return np.concatenate([matrices(c, 4), below], axis=1)[:, :rows].reshape(len(c.q), -1)
+
+    header = [*(f"q{k}" for k in range(1, 7))]
+    header += [f"T{i}{j}" for i in range(1, rows + 1) for j in range(1, 5)]
+    d = proposed(tmp_path, capsys, header if named else None, lambda c: c.q, cells)
+    mapping = d["mapping"]
+    places = [7, 8, 9, 11, 12, 13, 15, 16, 17]
+    expected = [header[k - 1] for k in places] if named else places
+    assert [str(c) for c in mapping["orientation"]["columns"]] == [str(c) for c in expected]
+    expected = [header[k - 1] for k in (10, 14, 18)] if named else [10, 14, 18]
+    assert [str(c) for c in mapping["position"]["columns"]] == [str(c) for c in expected]
+    assert any("leaves 4" in line or "µm rms" in line for line in d["outcome"]), d["outcome"]
+
+
+def test_the_arm_decides_whether_matrices_stand_column_by_column(tmp_path, capsys):
+    def across(c):
+        return np.swapaxes(matrices(c), 1, 2).reshape(-1, 9)
+
+    d = proposed(tmp_path, capsys, None, lambda c: c.q, lambda c: c.position, across)
+    mapping = d["mapping"]
+    assert [int(c) for c in mapping["orientation"]["columns"]] == [
+        10, 13, 16, 11, 14, 17, 12, 15, 18,
+    ]  # fmt: skip
+    assert not [doubt for doubt in d["unsure"] if "row by row" in str(doubt)]
+
+
+def test_angles_from_0_to_360_beyond_a_limit_are_told_from_degrees(tmp_path, capsys):
+    c = campaign(8)
+    q = c.q % (2 * np.pi)
+    header = ["pose", "load", *(f"q{k}_rad" for k in range(1, 7)), "x_m", "y_m", "z_m"]
+    text = lines(header, [f"P{k}" for k in range(8)], ["none"] * 8, q, c.position, separator=",")
+    write(tmp_path / "t.csv", text)
+    cell = write(tmp_path / "CELL.toml", '[robot]\nmodel = "irb120"\n[tracker]\nframe = "base"\n')
+    line = refused(
+        capsys, 2, "import", tmp_path / "t.csv", "--config", cell, "-o", tmp_path / "x.hilcal"
+    )
+    assert "within them a whole turn on: were the angles counted from 0 to 360°?" in line
+    assert "degrees" not in line
+
+
+def test_a_numpy_archive_is_named(tmp_path, capsys):
+    np.savez(tmp_path / "t.npz", q=np.zeros((3, 6)))
+    line = refused(
+        capsys, 2, "import", tmp_path / "t.npz", "--config", CELL, "-o", tmp_path / "x.hilcal"
+    )
+    assert "a NumPy file; save it as CSV" in line

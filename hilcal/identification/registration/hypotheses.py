@@ -202,7 +202,9 @@ KINDS: dict[str, HypothesisKind] = {
         _mapped("turn", np.degrees), "the attitudes are radians, and were taken for degrees"
     ),
     "mirrored": HypothesisKind(
-        _mirrored, "the axes of the readings are left-handed: one coordinate has the other sign"
+        _mirrored,
+        "the axes of the readings are left-handed: one coordinate has the other sign, or two are "
+        "exchanged",
     ),
     "mirrored_positions": HypothesisKind(
         _mapped("value", lambda p: p * MIRROR), "one coordinate of the positions has the other sign"

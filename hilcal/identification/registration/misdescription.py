@@ -66,6 +66,7 @@ MOST_WRONG_ROWS = 0.2  # largest share of rows that may be wrong by themselves
 SEPARATE_FIRST = ("shift", "columns")
 """Hypotheses that are combined with others only where they help by themselves; for speed."""
 LEAST_ZERO_DEG = 0.2  # zero of a single joint, degrees, that is worth mentioning
+FEWEST_BY_THEMSELVES = 10  # readings that tell a place of the tracker by themselves; a choice
 MOST_NAMED = 8  # rows, or explanations, that are named
 ZERO_STARTS = tuple(np.radians([0.0, 45.0, -45.0, 135.0, -135.0]).tolist())  # where searches begin
 ZERO_WIDTH, ZERO_EXACT = np.pi / 4, 1e-7  # range of a search to both sides, and its tolerance, rad
@@ -97,6 +98,7 @@ class DescriptionFinding:
     explanations: tuple[Explanation, ...]  # best first; several do equally well
     rows: Bools  # (N,) readings that do not fit, while most do
     swapped: tuple[tuple[int, int], ...] = ()  # pairs of them that fit each other's place
+    moved: int = 0  # first reading from another place of the tracker, where that explains them
     tried: int = 0  # number of descriptions that were tried
 
     @property
@@ -111,6 +113,13 @@ class DescriptionFinding:
     def words(self, cell: Cell, readings: Readings) -> str:
         """Return in one line what is wrong, and what to write instead."""
         size, rows = length(self.rms), self._rows_named(readings)
+        if self.moved:
+            last, first = (self._name(readings, self.moved + k) for k in (-1, 0))
+            return (
+                f"the readings up to {last} and those from {first} on fit, but not together "
+                f"({size} rms after registration): was the tracker or the base moved between "
+                "them? In a column 'station' each place of the tracker has a name"
+            )
         note = f"({size} rms after registration)"
         begin = f"the readings do not fit the description of the arm {note}"
         if self.explanations:
@@ -133,21 +142,24 @@ class DescriptionFinding:
 
     def _rows_named(self, readings: Readings) -> str:
         which = np.flatnonzero(self.rows).tolist()
-
-        def name(k: int) -> str:
-            pose = readings.pose_names[readings.pose[k]]
-            label = f"{pose}/{readings.load_names[readings.load[k]]}"
-            several = readings.states.target is not None
-            return f"{label} {readings.target_names[readings.target[k]]}" if several else label
-
         if not which:
             return ""
         if self.swapped:
-            crossed = [f"{name(i)} with {name(j)}" for i, j in self.swapped[:MOST_NAMED]]
+            crossed = [
+                f"{self._name(readings, i)} with {self._name(readings, j)}"
+                for i, j in self.swapped[:MOST_NAMED]
+            ]
             return f"rows are swapped ({', '.join(crossed)})"
         suffix = f" and {len(which) - MOST_NAMED} more" if len(which) > MOST_NAMED else ""
-        named = ", ".join(map(name, which[:MOST_NAMED]))
+        named = ", ".join(self._name(readings, k) for k in which[:MOST_NAMED])
         return f"{len(which)} of {len(readings)} rows do not fit: {named}{suffix}"
+
+    @staticmethod
+    def _name(readings: Readings, k: int) -> str:
+        pose = readings.pose_names[readings.pose[k]]
+        label = f"{pose}/{readings.load_names[readings.load[k]]}"
+        several = readings.states.target is not None
+        return f"{label} {readings.target_names[readings.target[k]]}" if several else label
 
     def to_json(self, cell: Cell, readings: Readings) -> dict[str, object]:
         """Return its JSON."""
@@ -165,6 +177,7 @@ class DescriptionFinding:
             ],
             "rows": np.flatnonzero(self.rows).tolist(),
             "swapped": [list(pair) for pair in self.swapped],
+            "moved": self.moved,
             "tried": self.tried,
         }
 
@@ -190,19 +203,19 @@ def examine(registered: Registration, readings: Readings) -> DescriptionFinding 
         search = _DescriptionSearch(cell, readings, max(3.0 * noise, fitting_rms))
         shifted = search.shifted()
         if shifted:
-            return DescriptionFinding(rms, gate, shifted, none, (), search.tried)
+            return DescriptionFinding(rms, gate, shifted, none, tried=search.tried)
         swapped = search.swapped(far)
-        return DescriptionFinding(rms if swapped else fitting_rms, gate, (), far, swapped, 1)
+        return DescriptionFinding(rms if swapped else fitting_rms, gate, (), far, swapped, tried=1)
     if rms <= min(SEARCH_SHARE * gate, max(GATE_EXTENT * extent, 5.0 * noise)):
         return None
     close = max(0.02 * min(extent, cell.arm.reach), rms / 50.0)
     search = _DescriptionSearch(cell, readings, max(3.0 * noise, min(0.25 * gate, close)))
     near, bad, _ = search.robust(())
     if bad.any() and (shifted := search.shifted()):
-        return DescriptionFinding(rms, gate, shifted, none, (), search.tried)
+        return DescriptionFinding(rms, gate, shifted, none, tried=search.tried)
     few = bool(bad.any() and bad.mean() <= MOST_WRONG_ROWS)
     if few and near <= search.enough:
-        return DescriptionFinding(rms, gate, (), bad, search.swapped(bad), 1)
+        return DescriptionFinding(rms, gate, (), bad, search.swapped(bad), tried=1)
     alone: Combination = (Hypothesis("attitudes"),)
     in_attitudes = readings.m == 6 and search.score(alone) <= search.enough
     explanations = search.explain(gate, DEPTH if rms > gate and not in_attitudes else 1)
@@ -210,11 +223,36 @@ def examine(registered: Registration, readings: Readings) -> DescriptionFinding 
         explanations = search.explain(gate, DEPTH, alone)
     if not explanations and rms <= gate:
         return None
+    if not explanations and (moved := _moved(cell, readings, gate)):
+        return DescriptionFinding(rms, gate, (), none, moved=moved, tried=search.tried)
     if not explanations and few and near <= gate:
-        return DescriptionFinding(rms, gate, (), bad, (), search.tried)
+        return DescriptionFinding(rms, gate, (), bad, tried=search.tried)
     rows = search.robust(explanations[0].changes)[1] if explanations else none
     rows = rows if rows.mean() <= MOST_WRONG_ROWS else none
-    return DescriptionFinding(rms, gate, explanations, rows, (), search.tried)
+    return DescriptionFinding(rms, gate, explanations, rows, tried=search.tried)
+
+
+def _moved(cell: Cell, readings: Readings, gate: float) -> int:
+    """Return the first reading from another place of the tracker, where two explain all; else 0.
+
+    The first and the last third are registered by themselves; all rows before it fit the one, all
+    others the other.
+    """
+    third, m6 = len(readings) // 3, readings.m == 6
+    if cell.registration_known or third < FEWEST_BY_THEMSELVES:
+        return 0
+    try:
+        parts = [register(cell, part) for part in (readings[:third], readings[-third:])]
+    except CannotAnswerError:
+        return 0
+    data, off = FrameData.of(cell.arm, readings), []
+    for part in parts:
+        frames, _ = given_and_free(part.cell, m6)
+        off.append(np.linalg.norm(data.misfit(frames) * _levers(readings.m), axis=1))
+    later = off[1] < off[0]
+    first = int(np.argmax(later))
+    fits = float(np.sqrt(np.mean(np.minimum(*off) ** 2))) <= gate
+    return first if fits and later[first:].all() and first > 0 else 0
 
 
 class _DescriptionSearch:
@@ -268,7 +306,33 @@ class _DescriptionSearch:
             if explanations:
                 return explanations
             beam = sorted(scores, key=lambda w: (scores[w], _cost(w)))[: BEAM[min(depth, 1)]]
+        if most > 1 and min(tried.values()) > self.enough:
+            tried.update(self._all_zeros(begin))
         return _explained(tried, min(gate, base / LEAST_IMPROVEMENT))
+
+    def _all_zeros(self, begin: Combination) -> dict[Combination, float]:
+        """Try constants near zero as the zeros of all joints that turn together.
+
+        An unknown base has that of joint 1, an unknown target that of the last joint.
+        """
+        d, n = self._described(begin), self._cell.arm.n
+        hidden = {h.joint for h in begin}
+        hidden |= {
+            joint for joint, unknown in ((1, d.base_unknown), (n, d.target_unknown)) if unknown
+        }
+        turning = [int(j) for j in np.flatnonzero(~self._cell.arm.slides) + 1 if j not in hidden]
+
+        def zeroed(zeros: Floats, least: float = 0.0) -> Combination:
+            pairs = zip(turning, zeros.tolist(), strict=True)
+            told = [(j, z) for j, z in pairs if abs(np.degrees(z)) >= least]
+            return _sorted((*begin, *(Hypothesis("joint", j, 1, z) for j, z in told)))
+
+        def white(zeros: Floats) -> Floats:
+            return self._best(*self._problem(zeroed(zeros), self._rows)).white.ravel()
+
+        found = scipy.optimize.least_squares(white, np.zeros(len(turning)), diff_step=[1e-5])
+        way = zeroed(found.x, LEAST_ZERO_DEG)
+        return {way: self.score(way)}
 
     def shifted(self) -> tuple[Explanation, ...]:
         """Return the shift of rows that explains the readings, where one does.

@@ -28,7 +28,7 @@ from hilcal.identification.registration.registration import register
 from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
-from hilcal.tables.guess_values import BY_VALUES, RIVALS
+from hilcal.tables.guess_values import BY_ROWS, BY_VALUES, RIVALS
 from hilcal.tables.mapped import import_readings
 from hilcal.tables.mapping import Mapping
 from hilcal.tables.proposal import (
@@ -110,7 +110,9 @@ def preview_table(
     """
     table = Path(path)
     second = None if second is None else Path(second)
-    proposed = propose(table, second, cell.arm.n if cell else None)
+    proposed = propose(
+        table, second, cell.arm.n if cell else None, cell.arm.joint_names if cell else ()
+    )
     if cell is None:
         return Preview(len(proposed.grid.rows), proposed.proposal, None)
     settings = cell.configured()
@@ -175,7 +177,7 @@ def _decide_convention(proposed: GridProposal, arm: Arm) -> list[str]:
     proposal, grid = proposed.proposal, proposed.grid
     sections = [proposal.sections.get(name) for name in ("joints", "position", "orientation")]
     joints, position, section = sections
-    if joints is None or position is None or section is None or section["convention"] == "matrix":
+    if joints is None or position is None or section is None:
         return []
     blocks = [
         np.stack([grid.numbers(name) for name in s["columns"]], axis=1)
@@ -187,6 +189,8 @@ def _decide_convention(proposed: GridProposal, arm: Arm) -> list[str]:
     q, y, values = (block[complete] for block in blocks)
     q, y = ANGLES[joints["unit"]] * q, LENGTHS[position["unit"]] * y
     unit = ANGLES[section.get("unit", "rad")]
+    if section["convention"] == "matrix":
+        return _decide_rows(proposal, arm, q, y, values)
     ranked = rank_conventions(arm, q, y, values, unit)
     if not ranked:
         return []
@@ -214,6 +218,27 @@ def _decide_convention(proposed: GridProposal, arm: Arm) -> list[str]:
         f"orientation: {section['convention']}, since the nominal {arm.name} fits best with it: "
         f"{best.words} are left, with the next convention {second.words}"
     ]
+
+
+def _decide_rows(proposal: Proposal, arm: Arm, q: Floats, y: Floats, values: Floats) -> list[str]:
+    """Decide by the nominal arm whether matrices (N, 9) stand row by row."""
+    doubt = ("orientation", BY_ROWS)
+    if doubt not in proposal.doubts or len(q) < FEWEST_READINGS:
+        return []
+    across = np.arange(9).reshape(3, 3).T.ravel()
+    by_rows, by_columns = (
+        _agreement(arm, "matrix", q, y, rotations("matrix", v, 1.0))
+        for v in (values, values[:, across])
+    )
+    ranked = sorted((by_rows, by_columns), key=lambda a: a.rms)
+    if clearly_best(ranked) is None:
+        return []
+    proposal.doubts.remove(doubt)
+    if ranked[0] is by_columns:
+        columns = proposal.sections["orientation"]["columns"]
+        proposal.sections["orientation"]["columns"] = [columns[k] for k in across]
+    how = "row by row" if ranked[0] is by_rows else "column by column"
+    return [f"orientation: matrices stand {how}, since the nominal {arm.name} fits best so"]
 
 
 def _decide_columns(
@@ -307,20 +332,30 @@ def rank_conventions(
     q, y, values = q[::step], position[::step], values[::step]
     if len(q) < FEWEST_READINGS:
         return ()
+    return tuple(
+        sorted(
+            (
+                _agreement(arm, name, q, y, rotations(name, values, unit))
+                for name, kind in CONVENTIONS.items()
+                if name.startswith(_GENERIC) and NUMBERS.get(kind, 3) == values.shape[1]
+            ),
+            key=lambda a: a.rms,
+        )
+    )
+
+
+def _agreement(arm: Arm, name: str, q: Floats, y: Floats, measured: Floats) -> Agreement:
+    """Return how well orientations (N, 3, 3) at positions y (N, 3) agree with the arm."""
     chain = evaluate(arm, q)
     flange, p = chain.rotation[-1], chain.position[-1]
-    eye, agreements = np.broadcast_to(np.eye(3), (len(p), 3, 3)), []
-    for name, kind in CONVENTIONS.items():
-        if name.startswith(_GENERIC) and NUMBERS.get(kind, 3) == values.shape[1]:
-            base, angle = _fit_attitudes(rotations(name, values, unit), flange)
-            # y_i − A p_i = A R_i τ + t with the best τ and t
-            target = (y - p @ base.T).reshape(-1)
-            design = np.concatenate([base @ flange, eye], axis=2).reshape(-1, 6)
-            residual = target - design @ np.linalg.lstsq(design, target, rcond=1e-9)[0]
-            distance = float(np.sqrt(3 * np.mean(residual**2)))
-            rms = float(np.hypot(angle, distance / arm.reach))
-            agreements.append(Agreement(name, angle, distance, rms))
-    return tuple(sorted(agreements, key=lambda a: a.rms))
+    base, angle = _fit_attitudes(measured, flange)
+    # y_i − A p_i = A R_i τ + t with the best τ and t
+    target = (y - p @ base.T).reshape(-1)
+    eye = np.broadcast_to(np.eye(3), (len(p), 3, 3))
+    design = np.concatenate([base @ flange, eye], axis=2).reshape(-1, 6)
+    residual = target - design @ np.linalg.lstsq(design, target, rcond=1e-9)[0]
+    distance = float(np.sqrt(3 * np.mean(residual**2)))
+    return Agreement(name, angle, distance, float(np.hypot(angle, distance / arm.reach)))
 
 
 def clearly_best(ranked: Sequence[Agreement]) -> str | None:

@@ -159,6 +159,15 @@ def test_a_calibration_comes_back_from_its_file(effect, tmp_path):
     ]
 
 
+def test_a_calibration_of_an_arm_of_unknown_payload_and_torques_comes_back(tmp_path):
+    """Such as most arms that are described by a URDF or by DH rows alone."""
+    c = calibrated("none")
+    arm = replace(c.model.cell.arm, payload=np.inf, torque_max=np.full(6, np.inf))
+    c = replace(c, model=replace(c.model, cell=replace(c.model.cell, arm=arm)))
+    c.save(tmp_path / "c.json")
+    assert Calibration.load(tmp_path / "c.json").model.cell.arm.payload == np.inf
+
+
 def test_a_file_of_another_kind_is_refused_in_words(tmp_path):
     good = to_json(calibrated("none"))
     path = tmp_path / "c.json"

@@ -12,6 +12,7 @@ from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline
 from hilcal.model.model import Model
 from hilcal.present.verdict import message
+from hilcal.robot.chain import evaluate
 from tests.support.campaigns import NO_EFFECT, campaign
 from tests.support.fit_cases import refined
 from tests.support.rows import first
@@ -113,3 +114,61 @@ def test_effects_are_no_wrong_figures(effect):
     c = campaign(effect, mode, 1, poses=16)
     d = judged(c.cell, c.readings, mode)
     assert d.suspects[0].effect == effect, message(d)
+
+
+def mounted(c, gravity):
+    """Describe a campaign under weights as if gravity were another one in base axes."""
+    readings = c.readings[np.isin(c.readings.load, [0, 1, 2])]
+    assert {"5kg", "10kg"} == {readings.load_names[k] for k in (1, 2)}
+    wrench, g = readings.states.wrench.copy(), np.linalg.norm(c.cell.gravity)
+    wrench[:, :3] = np.linalg.norm(wrench[:, :3], axis=1, keepdims=True) * np.array(gravity) / g
+    return replace(c.cell, gravity=np.array(gravity)), replace(
+        readings, states=replace(readings.states, wrench=wrench)
+    )
+
+
+@pytest.mark.parametrize("mode", ["absolute", "deflection"])
+@pytest.mark.parametrize("stated", first(2, [[0, 0, 9.80665], [9.0, 0.0, 3.8], [0, -9.80665, 0]]))
+def test_gravity_elsewhere_than_stated_is_named(mode, stated):
+    """An arm that hangs, or stands on a wall; of one upside down all signs change, no residual."""
+    c = campaign(NO_EFFECT, mode, 1, poses=20)
+    d = judged(*mounted(c, stated), mode)
+    assert [f.kind for f in d.wrong_figures] == ["gravity"], message(d)
+    assert d.wrong_figures[0].stated == pytest.approx(stated)
+    assert d.wrong_figures[0].found == pytest.approx(c.cell.gravity, abs=0.3)
+    assert "[robot] gravity_m_s2" in message(d)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("axes", ["base", "flange"])
+@pytest.mark.parametrize("mode", ["absolute", "deflection"])
+def test_forces_of_the_other_sign_or_in_flange_axes_are_named(mode, axes, sign):
+    """Pulls alone; in absolute readings the arm's own weight tells their sign, too."""
+    c = campaign(NO_EFFECT, mode, 1, poses=20)
+    pulls = [k for k, name in enumerate(c.readings.load_names) if name.startswith("pull")]
+    readings = c.readings[np.isin(c.readings.load, [0, *pulls])]
+    wrench = sign * readings.states.wrench
+    if axes == "flange":
+        flange = evaluate(c.cell.arm, readings.states.q).rotation[-1]
+        wrench = np.einsum("nji,nkj->nki", flange, wrench.reshape(-1, 2, 3)).reshape(-1, 6)
+    readings = replace(readings, states=replace(readings.states, wrench=wrench))
+    d = judged(c.cell, readings, mode)
+    if (axes, sign) == ("base", 1.0):
+        assert not d.wrong_figures
+        return
+    (figure,) = d.wrong_figures
+    assert (figure.kind, figure.found) == (
+        "forces" if axes == "base" else "force_axes",
+        (sign,),
+    ), message(d)
+    assert ("in flange axes" in message(d)) == (axes == "flange")
+    assert ("of the other sign" in message(d)) == (sign < 0)
+
+
+@pytest.mark.parametrize("mode", ["absolute", "deflection"])
+def test_gravity_as_stated_is_no_wrong_figure(mode):
+    """Of a base that tilts by 3°, which effects such as `base_compliance` are alike."""
+    c = campaign(NO_EFFECT, mode, 1, poses=20)
+    tilted = 9.80665 * np.array([np.sin(0.05), 0.0, -np.cos(0.05)])
+    for gravity in (c.cell.gravity, tilted):
+        assert not judged(*mounted(c, gravity), mode).wrong_figures

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
+from hilcal.config.sections import Conventions
 from hilcal.identification.baseline import baseline
 from hilcal.identification.registration.hypotheses import Description, Hypothesis
 from hilcal.identification.registration.misdescription import (
@@ -18,6 +19,7 @@ from hilcal.identification.registration.misdescription import (
 )
 from hilcal.identification.registration.registration import register
 from hilcal.identification.registration.table_preview import clearly_best, rank_conventions
+from hilcal.robot import se3
 from hilcal.robot.arm import with_controller_conventions
 from hilcal.robot.catalogue import load_arm, robot_names
 from studies.random_descriptions import draw, judge, read
@@ -128,6 +130,30 @@ def test_exchanged_columns_of_joints_are_named(order, words):
     finding, said = found_in(off)
     assert finding.refused
     assert words in said
+
+
+def test_a_tracker_that_was_moved_on_the_way_is_asked_for():
+    readings, m = readings_of(), se3.matrix(se3.rotation(np.array([0.0, 0.1, 0.4])), np.ones(3))
+    value = readings.value.copy()
+    value[17:, :3] = value[17:, :3] @ m[:3, :3].T + m[:3, 3]
+    finding, said = found_in(replace(readings, value=value))
+    assert (finding.moved, finding.refused) == (17, True)
+    assert "the readings up to p17/none and those from p18/none on fit, but not together" in said
+    assert "column 'station'" in said
+
+
+def test_zeros_of_all_joints_that_are_a_little_elsewhere_are_named():
+    """But not those of the first and the last, which base and target have."""
+    zeros = np.radians([0.0, 4.5, -6.0, -2.0, 5.0, 0.0])
+    arm = with_controller_conventions(CELL.arm, Conventions(joint_offset_deg=np.degrees(zeros)))
+    q = np.random.default_rng(2).uniform(-2, 2, (40, 6))
+    finding, said = found_in(by_arm(arm, q))
+    (explanation,) = finding.explanations
+    assert [h.joint for h in explanation.changes] == [2, 3, 4, 5]
+    assert explanation.rms < 1e-3
+    found = [h.offset for h in explanation.changes]
+    np.testing.assert_allclose(found, zeros[1:5], rtol=0, atol=2e-3)
+    assert "[robot] joint_offset_deg = [0.0, 4.5" in said
 
 
 @pytest.mark.long

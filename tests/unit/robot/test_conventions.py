@@ -119,6 +119,27 @@ def test_a_urdf_says_what_it_lacks(tmp_path):
     np.testing.assert_allclose(arm.q_max, [2 * np.pi, 1.0])
 
 
+def test_a_urdf_whose_base_link_is_tilted_says_what_gravity_is(tmp_path):
+    """As the one arm of two on a torso; about the vertical it may be turned."""
+    mount = {"type": "fixed", "link": "left_base", "xyz": "0 0.2 1.2"}
+    (tmp_path / "r.urdf").write_text(
+        serial_urdf([{**mount, "rpy": "1.2 0 0.7"}, {"axis": "0 1 0"}, {"axis": "1 0 0"}])
+    )
+    assert not any("gravity" in note for note in arm_from_urdf(tmp_path / "r.urdf").notes)
+    arm = arm_from_urdf(tmp_path / "r.urdf", base_link="left_base")
+    assert arm.notes[-1] == (
+        'r.urdf tilts link "left_base" by 68.8°: where z of its link "l0" is up, [robot] '
+        "gravity_m_s2 = [0.0000, -9.1402, -3.5535]"
+    )
+    up = pin.buildModelFromXML((tmp_path / "r.urdf").read_text()).frames[2].placement.rotation[2]
+    np.testing.assert_allclose(-9.80665 * up, [0.0, -9.1402, -3.5535], atol=1e-4)
+    (tmp_path / "r.urdf").write_text(
+        serial_urdf([{**mount, "rpy": "0 0 0.7"}, {"axis": "0 1 0"}, {"axis": "1 0 0"}])
+    )
+    notes = arm_from_urdf(tmp_path / "r.urdf", base_link="left_base").notes
+    assert not any("gravity" in note for note in notes)
+
+
 def test_a_rail_without_ends_is_refused_by_name(tmp_path):
     refusal(r'prismatic joint "j1" has no <limit', arm_from_urdf, urdf(tmp_path, "prismatic"))
 
