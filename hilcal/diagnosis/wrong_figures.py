@@ -24,7 +24,6 @@ from hilcal.errors import CannotAnswerError
 from hilcal.identification.fit import Fit, fit, with_outliers
 from hilcal.identification.linearisation import LEAST_MISFIT, linearise
 from hilcal.identification.residual import residual
-from hilcal.model.model import Prediction
 from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
 from hilcal.types import Bools, Floats
