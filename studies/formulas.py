@@ -149,7 +149,10 @@ def hilcal(
     whitening = SimpleNamespace(m=1, whiten_readings=lambda v: v.reshape(count, -1) / std)
     constant = projection(ones, np.zeros(1))
     solution = SimpleNamespace(prediction=SimpleNamespace(situation=situation))
-    fit = SimpleNamespace(whitening=whitening, dof=count - 1.0, white=y / std, solution=solution)
+    fit = SimpleNamespace(
+        model=SimpleNamespace(background=()), whitening=whitening, dof=count - 1.0, white=y / std,
+        solution=solution,
+    )  # fmt: skip
     linear = Linearisation(cast(Any, fit), constant, constant.project_out(y / std))
     site = Site("base", 0, 0, "table", "table", "y", "y", "1")
     motion = np.full((count, 1, 1), float(np.std(y)))
