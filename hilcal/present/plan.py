@@ -23,7 +23,7 @@ CRITERIA = {
 BAR = 30
 SCREEN = 4  # remarks on the first screen; the most important come first
 NAMED_FROM = "a diagnosis names what is about ten times as large"
-"""6 to 16 times in simulated campaigns of 20 poses: tests at the level of a whole catalogue."""
+"""6 to 16 times in one simulated campaign of 20 poses: tests at the level of a whole catalogue."""
 UNCERTAIN = 1e-3  # least certified efficiency that is reported: the last printed digit
 SIMILAR_RATIO = 1.1
 """Poses are enough if their predicted uncertainty is at most this multiple of that at the end of
