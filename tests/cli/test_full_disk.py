@@ -15,7 +15,7 @@ from hilcal.tables.table import write_table
 from tests.support.cli_cases import CELL, ok, rehearsal, run, stored_readings
 from tests.support.paths import ROOT
 
-OLD = "what was there"
+OLD = "<!DOCTYPE html>what was there"  # which a page may replace
 POINTS = "pose,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad\n" + "\n".join(
     f"w{k},{0.1 + 0.01 * k},-1.2,1.4,-1.7,-1.5,0.2" for k in range(40)
 )
