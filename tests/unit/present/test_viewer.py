@@ -350,7 +350,7 @@ def test_a_port_in_use_is_refused(told, free_port):
 @pytest.mark.skipif(sys.platform == "win32", reason="no file size limits on Windows")
 def test_a_file_that_cannot_grow_leaves_what_was_there(tmp_path):
     path = tmp_path / "x.rrd"
-    path.write_text("before")
+    path.write_text("RRF2, a recording of before")
     code = (
         "import resource, signal, sys; from pathlib import Path\n"
         "from tests.support.viewer_story import story; from hilcal.present.viewer import save\n"
@@ -362,5 +362,5 @@ def test_a_file_that_cannot_grow_leaves_what_was_there(tmp_path):
     done = subprocess.run(command, env=env, capture_output=True, text=True, check=False, timeout=60)
     assert done.stderr.strip().splitlines()[-1].startswith("hilcal.errors.InputError: ")
     assert "cannot be written" in done.stderr
-    assert path.read_text() == "before"
+    assert path.read_text() == "RRF2, a recording of before"
     assert list(tmp_path.iterdir()) == [path]
