@@ -20,6 +20,7 @@ from typing import Literal
 import numpy as np
 
 from hilcal.diagnosis.effect_ranking import Suspect
+from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.fit import Fit, fit, with_outliers
 from hilcal.identification.linearisation import LEAST_MISFIT, linearise
@@ -231,9 +232,10 @@ def loads_reversed(fit: Fit) -> bool:
 
 def _compliances(fit: Fit) -> Floats:
     """Compliances of the joints in their standard uncertainties; none without loads."""
-    if "joint_compliance" not in fit.model.names or not fit.readings.states.wrench.any():
+    parts = zip(fit.model.effects, fit.model.slices(), strict=True)
+    rows = next((columns for e, columns in parts if isinstance(e, JointCompliance)), None)
+    if rows is None or not fit.readings.states.wrench.any():
         return np.zeros(0)
-    rows = fit.model.slices()[fit.model.names.index("joint_compliance")]
     std = fit.uncertainty.std[rows]
     return np.divide(fit.theta[rows], std, out=np.zeros(len(std)), where=std > 0.0)
 

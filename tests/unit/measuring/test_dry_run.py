@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hilcal.config import CellLoad, ForceSensor, Limits, Tool
 from hilcal.measuring.clearance import Clearance
 from hilcal.measuring.feasibility import BETWEEN_M
-from hilcal.measuring.route import APPROACH_RAD, dry_run, duration, home, route
+from hilcal.measuring.route import APPROACH_RAD, dry_run, duration, route
 from hilcal.robot.catalogue import load_arm
 from hilcal.store.plan import Plan, Step
 from tests.support.fake_bench import POSES, Bench, plan_of, usual_plan
@@ -150,7 +150,7 @@ def test_lacking_unloaded_readings_and_reference_are_remarks():
     assert checked.problems == ()
     assert any("p1, none, cycle 0" in line for line in checked.remarks)
     assert any('"reference"' in line for line in checked.remarks)
-    assert home(plan) == "p1"
+    assert plan.home == "p1"
 
 
 def test_all_problems_at_once_and_each_once():
