@@ -159,7 +159,7 @@ class _Laws:
         self._p, self._fold = p, fold
         self._chosen: dict[int, Floats] = {}
         self.ridge = np.maximum(p.projection.ridge, LEAST_RIDGE)
-        self._y = p.with_prior
+        self._y = p.marginal_residual
         parts = [(p.rows[fold == f], self._y[fold == f]) for f in range(int(fold.max()) + 1)]
         self._grams = [rows.T @ rows for rows, _ in parts]
         self._sides = [rows.T @ white for rows, white in parts]
@@ -205,7 +205,7 @@ class _Laws:
 
 def smooth_laws(p: Linearisation) -> ResidualRegression:
     """Find the laws that predict the misfit of poses left out, and the variables that carry it."""
-    white, w = p.with_prior, p.fit.whitening
+    white, w = p.marginal_residual, p.fit.whitening
     fold = w.rows_of(random_folds(p.fit.pose, FOLDS))
     laws, count = _Laws(p, fold), int(fold.max()) + 1
     # For speed, the laws are selected on every n-th measurement: about `MOST_ROWS` rows per fit.

@@ -310,7 +310,7 @@ def left_out_residual(problem: SearchProblem, selection: Selection | None, out: 
     """Residual of rows that are left out, by model and law refitted to the other rows."""
     screen = problem.screen
     linear = screen.linear
-    rows, white = linear.rows, linear.with_prior
+    rows, white = linear.rows, linear.marginal_residual
     terms = () if selection is None else selection.terms
     x = np.hstack([rows, *map(screen.columns_of, terms)])
     used = problem.rows

@@ -166,8 +166,8 @@ class Linearisation:
         return float(self.residual @ self.residual)
 
     @cached_property
-    def with_prior(self) -> Floats:
-        """(R,) whitened residual of the model with its parameters that have a prior zero."""
+    def marginal_residual(self) -> Floats:
+        """(R,) whitened residual of the model with all parameters zero that have a prior."""
         s, random = self.fit.solution, self.projection.ridge > 0
         return np.asarray(s.white + self.rows @ np.where(random, s.coordinates(), 0.0))
 
@@ -195,7 +195,7 @@ class Linearisation:
         if not self.fit.model.background:
             return float(residual @ residual), max(self.fit.dof - less, 1.0)
         free = float(self.fit.whitening.rank - less - self.flat)
-        return float(self.with_prior[rows] @ residual), max(free, 1.0)
+        return float(self.marginal_residual[rows] @ residual), max(free, 1.0)
 
     @cached_property
     def left_out(self) -> Floats:

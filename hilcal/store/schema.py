@@ -197,7 +197,8 @@ def lock(path: Path) -> int | None:
         handle = os.open(path, os.O_RDWR)
         with suppress(OSError):
             try:
-                fcntl.fcntl(handle, fcntl.F_OFD_SETLK, _MEASURING)
+                if hasattr(fcntl, "F_OFD_SETLK"):  # Linux alone has it
+                    fcntl.fcntl(handle, fcntl.F_OFD_SETLK, _MEASURING)
             except BlockingIOError:
                 os.close(handle)
                 raise InputError(
