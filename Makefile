@@ -50,7 +50,9 @@ demo: $(STAMP)
 	$(BIN)/hilcal demo
 
 # Tests of tests/wire mostly wait: one process more than the two cores that the suite is made for.
-TEST = $(BIN)/python -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder
+# One that hangs shows where and ends its process; none takes a tenth of that long.
+HANGS = -o faulthandler_timeout=300 -o faulthandler_exit_on_timeout=true --max-worker-restart 3
+TEST = $(BIN)/python -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder $(HANGS)
 test: $(STAMP)
 	$(TEST)
 	@echo "Left out: tests marked long (make test-all runs them, too) and slow (make slow)."
