@@ -17,6 +17,7 @@ there. With tls:// both sides need certificates of the same authority; Dask's co
 their files (`distributed.comm.tls`, https://distributed.dask.org/en/stable/tls.html).
 """
 
+import asyncio
 import logging
 import multiprocessing
 import os
@@ -29,6 +30,7 @@ import traceback
 import warnings
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
@@ -319,6 +321,9 @@ def cluster(address: str) -> Iterator[Cluster]:
         if address.startswith("tls://"):
             _check_certificates(address)
         try:
+            # A client that does not reach its scheduler may lock the next one when it is collected.
+            with ThreadPoolExecutor(1) as apart:  # this thread may have a loop, as in a notebook
+                apart.submit(asyncio.run, _reach(address)).result()
             client = Client(address, timeout=ANSWER_TIMEOUT_S, set_as_default=False)
         except ValueError as error:
             raise InputError(
@@ -340,6 +345,16 @@ def cluster(address: str) -> Iterator[Cluster]:
                     f"`dask worker {address}`"
                 ) from error
             yield Cluster(client, address)
+
+
+async def _reach(address: str) -> None:
+    """Connect to a scheduler once; raises ValueError for no address, OSError without an answer."""
+    from distributed.comm.core import connect
+    from distributed.security import Security
+
+    arguments = Security().get_connection_args("client")
+    async with asyncio.timeout(ANSWER_TIMEOUT_S):
+        await (await connect(address, timeout=ANSWER_TIMEOUT_S, **arguments)).close()
 
 
 def _check_certificates(address: str) -> None:

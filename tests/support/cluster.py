@@ -12,15 +12,23 @@ import pytest
 
 from tests.support.paths import ROOT
 
-HERE = {**os.environ, "PYTHONPATH": str(ROOT)}
 WORKER = ("--host", "127.0.0.1", "--no-nanny", "--no-dashboard", "--nthreads", "1")
 """Of `dask worker`, behind the address."""
+
+
+def environment() -> dict[str, str]:
+    """As it is now, with this checkout on the path."""
+    return {**os.environ, "PYTHONPATH": str(ROOT)}
 
 
 @contextmanager
 def running(*command: str) -> "Iterator[subprocess.Popen[str]]":
     process = subprocess.Popen(
-        [sys.executable, "-m", *command], env=HERE, cwd=ROOT, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", *command],
+        env=environment(),
+        cwd=ROOT,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     try:
         yield process
