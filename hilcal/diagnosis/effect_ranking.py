@@ -414,8 +414,7 @@ def beyond_geometry(p: Linearisation, family: EffectColumns, geometry: Floats) -
     # One ridge for both: columns in units of their strength.
     both = np.hstack([geometry / np.sqrt(first.ridge), family.white / np.sqrt(second.ridge)])
     without, with_family = (
-        by_pose(fit, FamilyFolds(p.folds, p.projection, x).left_out(fit.white, 1.0, of_fit=True))
-        for x in (both[:, :q], both)
+        by_pose(fit, FamilyFolds(p.folds, x).left_out(p.alone, 1.0)) for x in (both[:, :q], both)
     )
     return improves(without, with_family, STANDARD_ERRORS)
 

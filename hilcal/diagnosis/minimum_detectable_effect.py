@@ -159,10 +159,9 @@ class SuspectTests:
     largest: float
 
     @cached_property
-    def _folds(self) -> tuple[FamilyFolds, FamilyFolds]:
-        """The model fitted without each fold, without the family and with it."""
-        p, x = self.p, self.family.white
-        return FamilyFolds(p.folds, p.projection), FamilyFolds(p.folds, p.projection, x)
+    def _family_folds(self) -> FamilyFolds:
+        """The model with the family, fitted without each fold."""
+        return FamilyFolds(self.p.folds, self.family.white)
 
     def passed(self, y: Floats, enough: float = 0.0) -> list[bool]:
         """Whether each of K simulated residuals y (R, K) would reveal the family."""
@@ -182,10 +181,11 @@ class SuspectTests:
         if np.mean(able) < POWER:
             return able
         ridge = float(np.median([c.ridge for c in scores]))
-        without, with_family = (folds.left_out(y, ridge) for folds in self._folds)
+        alone = p.folds.left_out(y)
+        with_family = self._family_folds.left_out(alone, ridge)
         out = []
         for k, fit_able in enumerate(able):
-            a, b = by_pose(p.fit, without[:, k]), by_pose(p.fit, with_family[:, k])
+            a, b = by_pose(p.fit, alone.residual[:, k]), by_pose(p.fit, with_family[:, k])
             share = float(a.sum() - b.sum()) / max(float(a.sum()) - p.fit.whitening.rank, 1.0)
             out.append(fit_able and share >= LEAST_SHARE and improves(a, b))
         return out

@@ -17,7 +17,7 @@ from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening
 from hilcal.regression.empirical_bayes import FamilyProblem, solutions
-from hilcal.regression.leave_out import Fold, folds
+from hilcal.regression.leave_out import ModelFolds, folds
 from hilcal.types import Floats, Ints
 
 # All of these are choices.
@@ -71,7 +71,7 @@ def region_folds(angle: Floats, pose: Ints) -> Ints:
     return fold[pose]
 
 
-def folds_of(model: Model, solution: Solution, fold: Ints) -> tuple[Fold, ...]:
+def folds_of(model: Model, solution: Solution, fold: Ints) -> ModelFolds:
     """Return the normal equations of a fit without each fold; `fold` (R,) numbers them by row."""
     s, magnitude = solution, ordinary_magnitudes_of_y(model, solution)
     return folds(s.projection(), s.white, s.equations, s.y, s.prior, magnitude, s.beta, fold)
@@ -92,7 +92,7 @@ def ordinary_magnitudes_of_y(model: Model, solution: Solution) -> Floats:
 
 def parameter_changes(model: Model, solution: Solution, fold: Ints, w: Whitening) -> Floats:
     """Return the parameters without each fold (D,) minus those with it (F, P)."""
-    steps = [f.step() for f in folds_of(model, solution, w.rows_of(fold))]
+    steps = [f.step() for f in folds_of(model, solution, w.rows_of(fold)).folds]
     return np.asarray(np.array(steps) @ solution.transform.T)
 
 

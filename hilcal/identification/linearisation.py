@@ -26,7 +26,7 @@ from hilcal.identification.folds import folds_of, random_folds
 from hilcal.identification.gauss_newton import columns_of
 from hilcal.readings.whitening import Whitening
 from hilcal.regression.evidence import FamilyScore, Spectrum, score_family
-from hilcal.regression.leave_out import FamilyFolds, Fold, improves
+from hilcal.regression.leave_out import FamilyFolds, LeftOut, ModelFolds, improves
 from hilcal.regression.normal_equations import Basis, find_basis, normal_equations
 from hilcal.regression.schur import Projection
 from hilcal.types import Bools, Floats, Ints
@@ -204,11 +204,15 @@ class Linearisation:
         The strengths are those of the fit, as in `held_out`; `Fit.left_out` has strengths chosen
         without the pose.
         """
-        model = FamilyFolds(self.folds, self.projection)
-        return by_pose(self.fit, model.left_out(self.fit.white, of_fit=True))
+        return by_pose(self.fit, self.alone.residual)
 
     @cached_property
-    def folds(self) -> tuple[Fold, ...]:
+    def alone(self) -> LeftOut:
+        """The fit's residual, predicted without each fold of poses."""
+        return self.folds.left_out(self.fit.white, of_fit=True)
+
+    @cached_property
+    def folds(self) -> ModelFolds:
         """The model without each fold of poses."""
         fit = self.fit
         return folds_of(fit.model, fit.solution, fit.whitening.rows_of(random_folds(fit.pose)))
@@ -225,7 +229,7 @@ class Linearisation:
 
     def products(self, families: Iterable[Floats]) -> list[FamilyFolds]:
         """Return the products of families of whitened columns, for `held_out`."""
-        return [FamilyFolds(self.folds, self.projection, x) for x in families]
+        return [FamilyFolds(self.folds, x) for x in families]
 
     def score(
         self, x: Floats, s: Floats | Spectrum | None = None, largest: float = np.inf
@@ -268,7 +272,7 @@ class Linearisation:
             if not score.rank:
                 out.append(HeldOut(0.0, False))
                 continue
-            after = by_pose(self.fit, family.left_out(self.fit.white, score.ridge, of_fit=True))
+            after = by_pose(self.fit, family.left_out(self.alone, score.ridge))
             gain = float(before.sum() - after.sum())
             share = float(np.clip(gain / misfit, -1.0, 1.0))
             out.append(HeldOut(share, improves(before, after)))

@@ -11,6 +11,7 @@ standard deviation is their magnitude in the full fit: a direction that the othe
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy
@@ -56,17 +57,48 @@ class Fold:
     inverse_root: Floats  # (K, K) T with Tᵀ T = H⁻¹ of the other rows
     rhs: Floats  # (K,) right-hand side of the other rows, for a step from the fit
 
-    def rows(self, p: Projection) -> Floats:
-        """Return the model's columns in the rows of the fold."""
-        return np.asarray(p.rows[self.left_out_rows])
-
-    def solve(self, rhs: Floats) -> Floats:
-        """Return H⁻¹ times (K, ...)."""
-        return np.asarray(self.inverse_root.T @ (self.inverse_root @ rhs))
-
     def step(self) -> Floats:
         """Return (K,) coordinates without the fold minus those with it."""
-        return self.solve(self.rhs)
+        return np.asarray(self.inverse_root.T @ (self.inverse_root @ self.rhs))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LeftOut:
+    """Residuals of each row, predicted by the model without the row's fold."""
+
+    y: Floats  # (R, ...) residuals of the model with the parameters of all rows, or zero
+    solved: tuple[Floats, ...]  # (K, ...) change of the parameters without each fold, by T⁻ᵀ
+    residual: Floats  # (R, ...)
+
+
+@dataclass(frozen=True, eq=False)
+class ModelFolds:
+    """A model without each of several folds."""
+
+    projection: Projection  # of the model's columns B
+    folds: tuple[Fold, ...]
+
+    @cached_property
+    def lifted(self) -> tuple[Floats, ...]:
+        """B Tᵀ (R_f, K) in the rows of each fold."""
+        rows = self.projection.rows
+        return tuple(rows[f.left_out_rows] @ f.inverse_root.T for f in self.folds)
+
+    def left_out(self, y: Floats, of_fit: bool = False) -> LeftOut:
+        """Predict each row without its fold.
+
+        y (R, ...) are residuals of a model with the parameters zero, or the residual `of_fit`.
+        """
+        total, residual = self.projection.rows.T @ y, y.copy()
+        solved = []
+        for fold, lifted in zip(self.folds, self.lifted, strict=True):
+            out = fold.left_out_rows
+            if of_fit:
+                solved.append(fold.inverse_root @ fold.rhs)
+            else:
+                solved.append(fold.inverse_root @ total - lifted.T @ y[out])
+            residual[out] -= lifted @ solved[-1]
+        return LeftOut(y, tuple(solved), residual)
 
 
 def folds(
@@ -78,7 +110,7 @@ def folds(
     magnitude: Floats,  # (P,) prior standard deviations of flat parameters without a fold
     beta: float,  # noise variance factor that multiplies the prior precisions
     fold: Ints,  # (R,) fold of each row, from 0
-) -> tuple[Fold, ...]:
+) -> ModelFolds:
     """Return for each fold the normal equations of a step from the fit without it."""
     basis = equations.basis
     flat, held = slice(0, len(basis.singular)), basis.with_prior
@@ -96,39 +128,35 @@ def folds(
         root = inverse_root(h - rows.T @ rows)
         return Fold(out, root, rhs - rows.T @ white[out])
 
-    return tuple(without(f) for f in range(int(fold.max()) + 1))
+    return ModelFolds(p, tuple(without(f) for f in range(int(fold.max()) + 1)))
 
 
 class FamilyFolds:
     """A model without each fold, and a family X (R, F); products of columns are formed once."""
 
-    def __init__(self, folds: tuple[Fold, ...], p: Projection, x: Floats | None = None) -> None:
-        self._x = x = np.zeros((len(p.rows), 0)) if x is None else x
-        self._folds, self._p = folds, p
-        self.gram, self.cross = x.T @ x, p.rows.T @ x  # XᵀX, BᵀX of all rows
+    def __init__(self, model: ModelFolds, x: Floats) -> None:
+        self._x, self._model = x, model
+        self.gram, self.cross = x.T @ x, model.projection.rows.T @ x  # XᵀX, BᵀX of all rows
         self._rounding = FAMILY_ROUNDING * float(self.gram.max(initial=0.0))
-        self._products = []
-        for fold in folds:
+        self._products = []  # T BᵀX and Xᵀ M X of the other rows
+        for fold, lifted in zip(model.folds, model.lifted, strict=True):
             out = x[fold.left_out_rows]
-            c = self.cross - fold.rows(p).T @ out
-            solved = fold.solve(c)
-            self._products.append((c, solved, self.gram - out.T @ out - c.T @ solved))
+            c = fold.inverse_root @ self.cross - lifted.T @ out
+            self._products.append((c, self.gram - out.T @ out - c.T @ c))
 
-    def left_out(self, y: Floats, ridge: float = 0.0, of_fit: bool = False) -> Floats:
-        """Return the residual (R, ...) of each row, predicted without its fold.
+    def left_out(self, alone: LeftOut, ridge: float = 0.0) -> Floats:
+        """Return the residual (R, ...) of each row, predicted without its fold with the family.
 
-        y (R, ...) are residuals of a model with the parameters zero, or the residual `of_fit`.
+        `alone` is the prediction by the model.
         """
-        x, p = self._x, self._p
-        total, rhs = p.rows.T @ y, x.T @ y
-        left = np.zeros(y.shape)
-        for fold, (c, solved, gram) in zip(self._folds, self._products, strict=True):
-            out, model, r = x[fold.left_out_rows], fold.rows(p), y[fold.left_out_rows]
-            steps = fold.step() if of_fit else fold.solve(total - model.T @ r)
-            left[fold.left_out_rows] = r - model @ steps
-            if x.shape[1]:
-                h, b = gram.copy(), rhs - out.T @ r - c.T @ steps
-                h[np.diag_indices_from(h)] += max(ridge, self._rounding)
-                family = positive_solve(h, b)
-                left[fold.left_out_rows] += model @ (solved @ family) - out @ family
+        x, y, left = self._x, alone.y, alone.residual.copy()
+        rhs = x.T @ y
+        for fold, lifted, steps, (c, gram) in zip(
+            self._model.folds, self._model.lifted, alone.solved, self._products, strict=True
+        ):
+            rows = fold.left_out_rows
+            h, b = gram.copy(), rhs - x[rows].T @ y[rows] - c.T @ steps
+            h[np.diag_indices_from(h)] += max(ridge, self._rounding)
+            family = positive_solve(h, b)
+            left[rows] += lifted @ (c @ family) - x[rows] @ family
         return left

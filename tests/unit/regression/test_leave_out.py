@@ -42,9 +42,9 @@ def model(beta):
 def test_rows_left_out_are_predicted_as_by_a_refit_without_them(beta):
     a, x, y, theta = case(beta)
     each, p, basis, white, _ = model(beta)
-    fold, ridge, family = np.arange(60) % 5, 0.8, FamilyFolds(each, p, x)
-    found = family.left_out(white, ridge, of_fit=True)
-    alone = FamilyFolds(each, p).left_out(white, of_fit=True)
+    fold, ridge, family = np.arange(60) % 5, 0.8, FamilyFolds(each, x)
+    before = each.left_out(white, of_fit=True)
+    found, alone = family.left_out(before, ridge), before.residual
     information = p.schur(family.gram, family.cross)
     np.testing.assert_allclose(information, p.information(x), rtol=1e-11, atol=1e-12)
     # Without a fold the flat parameters have a prior, too.
@@ -56,7 +56,7 @@ def test_rows_left_out_are_predicted_as_by_a_refit_without_them(beta):
         np.testing.assert_allclose(found[out], y[out] - whole[out] @ both, atol=1e-4)
         bare = refit(a[~out], y[~out], std, beta)
         np.testing.assert_allclose(alone[out], y[out] - a[out] @ bare, atol=1e-4)
-        step = basis.transform @ each[f].step()
+        step = basis.transform @ each.folds[f].step()
         np.testing.assert_allclose(theta + step, bare, atol=1e-4)
 
 
@@ -64,11 +64,11 @@ def test_rows_left_out_are_predicted_as_by_a_refit_without_them(beta):
 def test_simulated_residuals_are_predicted_as_by_refits_without_their_fold(ridge):
     each, p, _, _, x = model(1.0)
     y = np.random.default_rng(6).standard_normal((60, 3))
-    found = FamilyFolds(each, p, x)
+    found, before = FamilyFolds(each, x), each.left_out(y)
     for again in (ridge, 2.0, ridge):  # another ridge in between changes nothing
-        left = found.left_out(y, again)
-    alone = FamilyFolds(each, p).left_out(y)
-    for fold in each:
+        left = found.left_out(before, again)
+    alone = before.residual
+    for fold in each.folds:
         rows, stay = p.rows[fold.left_out_rows], ~fold.left_out_rows
         h = np.linalg.inv(fold.inverse_root.T @ fold.inverse_root)
         cross = p.rows[stay].T @ x[stay]
