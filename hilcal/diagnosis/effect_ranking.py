@@ -35,7 +35,12 @@ from functools import cache, partial
 import numpy as np
 
 from hilcal.diagnosis.minimum_detectable_effect import LEAST_SHARE as LEAST_SHARE
-from hilcal.diagnosis.minimum_detectable_effect import Strength, least_of_family, least_strength
+from hilcal.diagnosis.minimum_detectable_effect import (
+    Simulated,
+    Strength,
+    least_of_family,
+    least_strength,
+)
 from hilcal.diagnosis.stepwise import trial
 from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError, InputError
@@ -231,7 +236,8 @@ def rank_suspects(
     refit: Callable[[Fit, str], Fit | None] = trial,  # returns a fit with one more effect
 ) -> tuple[Suspect, ...]:
     """Score all effects; best first, see `ranked`."""
-    suspects = [_suspect(p, s, len(effects)) for s in _scored(p, effects)]
+    noise = cache(partial(Simulated.noise, p))
+    suspects = [_suspect(p, s, len(effects), noise) for s in _scored(p, effects)]
     tested = max(sum(s.score.rank > 0 for s in suspects), 1)
     no_load = p.fit.mode == "absolute" and not p.fit.solution.prediction.situation.load.wrench.any()
     geometry = cache(partial(geometry_columns, p, effects))
@@ -302,7 +308,9 @@ def _scored(p: Linearisation, effects: Sequence[Effect]) -> Iterator[_Scored]:
         yield from (replace(c, held_out=next(held_out)) if c in able else c for c in scored)
 
 
-def _suspect(p: Linearisation, scored: _Scored, count: int) -> Suspect:
+def _suspect(
+    p: Linearisation, scored: _Scored, count: int, simulated_noise: Callable[[], Simulated]
+) -> Suspect:
     """Describe one of `count` effects that are tested together, without keeping its columns."""
     of_s, result, effect = scored.spectrum, scored.score, scored.family.effect
     s, largest, held_out = scored.information, scored.largest, scored.held_out
@@ -317,7 +325,7 @@ def _suspect(p: Linearisation, scored: _Scored, count: int) -> Suspect:
         units = tuple(q.unit for q in effect.parameters)
         noise, level = max(p.fit.variance_factor, 1.0), FALSE_ALARM / count
         start = least_strength(s, x.motion, x.scale, units, p.fit.dof, noise, level, of_s.rank)
-        return least_of_family(p, x, of_s, start, level, largest)
+        return least_of_family(p, x, of_s, start, level, largest, simulated_noise)
 
     return Suspect(
         effect.name, result, p.share(result.gain), left_out, explains=False, detection=least,

@@ -14,8 +14,10 @@ which nine draws in ten pass. If the poses resolve only a part of the family, as
 transmission error, the size for the family at its finest is stated as well.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
@@ -31,7 +33,7 @@ from hilcal.regression.evidence import (
     noncentrality_of_power,
     score_family,
 )
-from hilcal.regression.leave_out import FamilyFolds, improves
+from hilcal.regression.leave_out import FamilyFolds, LeftOut, improves
 from hilcal.types import Floats
 
 POWER = 0.9
@@ -111,6 +113,31 @@ def _strength(moved: float, t: float, scale: Floats, units: tuple[str, ...]) -> 
     return Strength(moved, tuple((u, t * size) for u, size in rms.items()), t)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Simulated:
+    """Simulated residuals of K campaigns, and what the model leaves of them."""
+
+    fitted: Floats  # (R, K) with the model fitted to all rows
+    alone: LeftOut  # ... and without each fold; its y (R, K) are the residuals
+
+    @classmethod
+    def of(cls, p: Linearisation, y: Floats) -> Self:
+        """Fit the model to residuals (R, K)."""
+        return cls(p.project_out(y), p.folds.left_out(y))
+
+    @classmethod
+    def noise(cls, p: Linearisation) -> Self:
+        """Return noise of the size found in a fit, of `DRAWS` campaigns."""
+        shape = (len(p.residual), DRAWS)
+        draws = np.random.default_rng(SEED).standard_normal(shape)
+        return cls.of(p, np.sqrt(max(p.fit.variance_factor, 1.0)) * draws)
+
+    def plus(self, other: "Simulated", factor: float) -> "Simulated":
+        """Add `factor` times other residuals."""
+        fitted = self.fitted + factor * other.fitted
+        return Simulated(fitted, self.alone.plus(other.alone, factor))
+
+
 def least_of_family(
     p: Linearisation,  # of the fit
     family: EffectColumns,  # as it is scored
@@ -118,31 +145,30 @@ def least_of_family(
     start: Strength,  # that the F-test alone would reveal, where the grid begins
     level: float,  # of the test, between 0 and 1
     largest: float,  # largest plausible strength
+    noise: Callable[[], Simulated],  # of the fit
 ) -> Strength:
     """Return the smallest strength that all tests would reveal."""
     if not start.visible:
         return start
     fine = family.effect.fine(p.fit.readings[~p.fit.outlier].states)
     tests = SuspectTests(p, family, s, level, largest)
-    least = _least(tests, family, start.displacement_m)
+    least = _least(tests, family, start.displacement_m, noise())
     if fine is None:
         return least
-    finest = _least(tests, effect_columns(p.fit, fine), start.displacement_m)
+    finest = _least(tests, effect_columns(p.fit, fine), start.displacement_m, noise())
     return replace(least, finest_m=finest.displacement_m)
 
 
-def _least(tests: "SuspectTests", full: EffectColumns, start: float) -> Strength:
+def _least(tests: "SuspectTests", full: EffectColumns, start: float, noise: Simulated) -> Strength:
     """`least_of_family` where the arm has the effect `full` and the tests score their family."""
     rng = np.random.default_rng(SEED_OF_FAMILY)
     beta = rng.standard_normal((len(full.scale), DRAWS))
     motion = np.einsum("dip,pk->dik", full.motion, beta)
     moved = np.sqrt(np.mean(np.sum(motion**2, axis=1), axis=0))
-    signal = full.white @ (beta / moved)  # of a displacement of 1 m
-    noise = max(tests.p.fit.variance_factor, 1.0)
-    error = np.sqrt(noise) * rng.standard_normal(signal.shape)
+    signal = Simulated.of(tests.p, full.white @ (beta / moved))  # of a displacement of 1 m
     units = tuple(q.unit for q in full.effect.parameters)
     for displacement in (GRID * start).tolist():
-        if np.mean(tests.passed(displacement * signal + error, POWER)) >= POWER:
+        if np.mean(tests.passed(noise.plus(signal, displacement), POWER)) >= POWER:
             typical = float(np.median(moved))
             return _strength(displacement, displacement / typical, full.scale, units)
     return _never(units)
@@ -163,11 +189,11 @@ class SuspectTests:
         """The model with the family, fitted without each fold."""
         return FamilyFolds(self.p.folds, self.family.white)
 
-    def passed(self, y: Floats, enough: float = 0.0) -> list[bool]:
-        """Whether each of K simulated residuals y (R, K) would reveal the family."""
-        # Once a share of `enough` is out of reach, the remaining residuals count as failed.
-        p = self.p
-        r = p.project_out(y)
+    def passed(self, campaigns: Simulated, enough: float = 0.0) -> list[bool]:
+        """Whether each of K simulated campaigns would reveal the family."""
+        # Once a share of `enough` is out of reach, the remaining ones count as failed.
+        p, y, alone = self.p, campaigns.alone.y, campaigns.alone
+        r = campaigns.fitted
         g, rss = self.family.white.T @ r, np.sum(r * y, axis=0)
         scores: list[FamilyScore] = []
         able = [False] * y.shape[1]
@@ -181,7 +207,6 @@ class SuspectTests:
         if np.mean(able) < POWER:
             return able
         ridge = float(np.median([c.ridge for c in scores]))
-        alone = p.folds.left_out(y)
         with_family = self._family_folds.left_out(alone, ridge)
         out = []
         for k, fit_able in enumerate(able):

@@ -70,6 +70,15 @@ class LeftOut:
     solved: tuple[Floats, ...]  # (K, ...) change of the parameters without each fold, by T⁻ᵀ
     residual: Floats  # (R, ...)
 
+    def plus(self, other: "LeftOut", factor: float) -> "LeftOut":
+        """Return the same of y and `factor` times another y: all is linear in it."""
+        pairs = zip(self.solved, other.solved, strict=True)
+        return LeftOut(
+            self.y + factor * other.y,
+            tuple(a + factor * b for a, b in pairs),
+            self.residual + factor * other.residual,
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class ModelFolds:
