@@ -55,9 +55,13 @@ class Setup:
 
     rig: Rig
     cell: Cell
-    config: CellConfig
     clock: Clock
     watcher: Watcher
+
+    @property
+    def config(self) -> CellConfig:
+        """The configuration of the cell."""
+        return self.cell.configured()
 
 
 Factory = Callable[[CellConfig], Any]
