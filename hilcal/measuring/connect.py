@@ -58,11 +58,6 @@ class Setup:
     clock: Clock
     watcher: Watcher
 
-    @property
-    def config(self) -> CellConfig:
-        """The configuration of the cell."""
-        return self.cell.configured()
-
 
 Factory = Callable[[CellConfig], Any]
 

@@ -31,8 +31,7 @@ class Guard:
     """The limits of a cell, checked against samples of its devices."""
 
     def __init__(self, cell: Cell) -> None:
-        config = cell.configured()
-        self.cell, self.config = cell, config
+        self.cell, self.config = cell, cell.configured()
         self._limits = Feasibility(cell, SLACK)
 
     def check(
@@ -102,8 +101,7 @@ class LoadWatch:
 
     def __init__(self, meter: ForceMeter, cell: Cell) -> None:
         """Start without comparison, until `expect`."""
-        config = cell.configured()
-        self._meter, self._cell, self._config = meter, cell, config
+        self._meter, self._cell, self._config = meter, cell, cell.configured()
         self._load: CellLoad | None = None
         self._hung = np.zeros(6)  # wrench of the load at the load point, base axes
         self.watching, self.differed = False, 0
@@ -207,7 +205,7 @@ class Mover:
 
     def __init__(self, setup: Setup, meter: ForceMeter | None) -> None:
         """Use an open arm; the watcher gets its position during motions, and must not block."""
-        cell, config = setup.cell, setup.config
+        cell, config = setup.cell, setup.cell.configured()
         self.goal: Floats | None = None
         self.hanging: tuple[str, ...] = (UNLOADED,)
         self.side = np.zeros(cell.arm.n)

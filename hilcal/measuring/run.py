@@ -83,7 +83,7 @@ class Session:
     ) -> None:
         """Read the stored readings of earlier sessions; no device is used yet."""
         self.in_control = False
-        rig, cell, config = setup.rig, setup.cell, setup.config
+        rig, cell, config = setup.rig, setup.cell, setup.cell.configured()
         self._rig, self._cell, self._config = rig, cell, config
         self._clock, self._watcher = setup.clock, setup.watcher
         self._plan, self._store, self._live, self._wall = plan, store, live, wall

@@ -312,16 +312,10 @@ class FurtherMeasuring:
             return replace(decision, reason="floor")
         self.say("planning what would lower the predicted error")
         planning = self.config.planning.model_copy(update={"readings": self.d.fit.mode})
-        config, poses = self.config.model_copy(update={"planning": planning}), self.settings.poses
+        cell = self.cell.with_config(self.config.model_copy(update={"planning": planning}))
         try:
             planned = plan_readings(
-                *(
-                    self.cell.with_config(config),
-                    PlanRequest(poses),
-                    self.rng,
-                    self.d.fit,
-                    self.say,
-                ),
+                *(cell, PlanRequest(self.settings.poses), self.rng, self.d.fit, self.say),
                 reference=self._reference(),
             )
         except (CannotAnswerError, InputError):

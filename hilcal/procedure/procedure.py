@@ -345,7 +345,9 @@ class Procedure:
         all_known = (True,) * len(model.cell.known_targets)
         cell = replace(model.cell, registration_known=True)
         cell = cell.with_targets(cell.all_targets, all_known)
-        readings = full_readings(file.readings(), file.about(COVERS_KEY), cell)
+        readings = full_readings(
+            file.readings(), file.about(COVERS_KEY), cell.with_config(o.config)
+        )
         scatter = record.parameters_json.get("arm_scatter")
         if scatter is None:
             return readings
