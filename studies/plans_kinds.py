@@ -48,12 +48,16 @@ class Scene:
     """
 
     cell: Cell
-    config: CellConfig
     space: FeasibleSpace
     nominal: NominalModel
     exact: DesignProblem
     robust: DesignProblem | None
     work: PredictionPoses
+
+    @property
+    def config(self) -> CellConfig:
+        """The configuration of the cell."""
+        return self.cell.configured()
 
     def with_others(self, chosen: "Chosen") -> float | None:
         """Predicted RMS position error, m, with potential terms estimated, too; else None."""
@@ -91,22 +95,23 @@ class Chosen:
         return len({self.problem.contents[k][0] for k in np.flatnonzero(self.counts)})
 
 
-def scene(cell: Cell, config: CellConfig, candidates: int, rng: np.random.Generator) -> Scene:
+def scene(cell: Cell, candidates: int, rng: np.random.Generator) -> Scene:
     """Draw candidates and test poses of a cell and set up its design problems.
 
     Raises:
         CannotAnswerError: no feasible pose, or no load that any of them bears.
         InputError: from the configuration's `[planning]`.
     """
-    space = FeasibleSpace(cell, config)
+    config = cell.configured()
+    space = FeasibleSpace(cell)
     drawn = draw_poses(space, candidates, rng)
     apart = draw_poses(space, TEST_POSES, rng).q
-    model = nominal_model(cell, config)
+    model = nominal_model(cell)
     alone = without_potential(config)
     exact = problem(model, alone, drawn.q, drawn.allowed)
     robust = problem(model, config, drawn.q, drawn.allowed) if config.planning.against else None
     work = prediction_poses(model, config, apart, space.allowed)
-    return Scene(cell, config, space, model, exact, robust, work)
+    return Scene(cell, space, model, exact, robust, work)
 
 
 def without_potential(config: CellConfig) -> CellConfig:

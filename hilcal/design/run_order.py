@@ -248,7 +248,6 @@ class Ordered:
 
 def order_plan(
     cell: Cell,
-    config: CellConfig,
     names: Sequence[str],  # (P) names of poses
     q: Floats,  # (P, n) their joint angles, rad
     reference: Floats,  # (n,) joint angles of the reference pose, rad
@@ -276,7 +275,7 @@ def order_plan(
     used = [name for name in names if any(c.pose == name for c in chosen)]
     indices = np.array([names.index(name) for name in used])
     poses, stops = np.vstack([reference, q[indices]]), stops_of(used, chosen, ordering.repeats, rng)
-    draws = OrderDraws(cell, config, tuple(used), poses, ordering, rng, stops, passable)
+    draws = OrderDraws(cell, tuple(used), poses, ordering, rng, stops, passable)
     shortest = draws.plan(draws.short_tours, half=False, mixed=False)
     shortest_time, shortest_loss = draws.duration_and_confounding(shortest)
     best = (shortest_loss.correlation, shortest, shortest_time, shortest_loss)
@@ -334,7 +333,6 @@ class OrderDraws:
     """Plans of the same readings in different orders: short ones and random ones."""
 
     cell: Cell
-    config: CellConfig  # its loads, motion and acquisition
     names: tuple[str, ...]  # (P) names of the poses
     q: Floats  # (P + 1, n) joint angles of the reference and of the poses, rad
     ordering: Ordering
@@ -347,6 +345,11 @@ class OrderDraws:
     short_tours: dict[str, list[int]] = field(
         default_factory=dict
     )  # shortest tours of stops, from 1
+
+    @property
+    def config(self) -> CellConfig:
+        """The configuration of the cell."""
+        return self.cell.configured()
 
     def __post_init__(self, passable: Passable) -> None:
         """Find the ways and the shortest tour under each load."""

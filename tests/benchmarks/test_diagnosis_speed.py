@@ -140,7 +140,7 @@ def test_what_separates_four_suspects(mode: Mode, poses: int, benchmark: Any, cl
 
     def planned(found: Fit) -> SeparatingPlan:
         rng = np.random.default_rng(0)
-        return plan_separating(c.cell, config, found, SUSPECTS, PlanRequest(20), rng)
+        return plan_separating(c.cell.with_config(config), found, SUSPECTS, PlanRequest(20), rng)
 
     fitted()  # what is imported late
     start = time.process_time()

@@ -438,8 +438,7 @@ class Bench:
     """Everything that a run needs, in memory."""
 
     def __init__(self, **changes: Any) -> None:
-        self.config = configuration(**changes)
-        self.cell = cell_from_config(self.config)
+        self.cell = cell_from_config(configuration(**changes))
         start = np.array([0.1, -1.3, 1.6, -1.4, -1.4, 0.1])
         self.world = FakeWorld(self.config, self.cell, start)
         self.store = MemoryStore(self.world)
@@ -448,6 +447,15 @@ class Bench:
         force = None if self.config.force_sensor is None else FakeForce(self.world)
         self.rig = Rig(FakeArm(self.world), FakeTracker(self.world), force, self.operator)
         self.clock = FakeClock(world=self.world)
+
+    @property
+    def config(self) -> CellConfig:
+        """The configuration of the cell."""
+        return self.cell.configured()
+
+    @config.setter
+    def config(self, config: CellConfig) -> None:
+        self.cell = self.cell.with_config(config)
 
     @property
     def requested_loads(self) -> list[str]:
@@ -460,7 +468,7 @@ class Bench:
     def measure(self, plan: Plan | None = None, **more: Any) -> Readings:
         """Run a plan (the usual one if None) to its end; returns all readings."""
         plan = plan or usual_plan()
-        run(self.rig, self.cell, self.config, plan, self.store, self.clock, self.notes, **more)
+        run(self.rig, self.cell, plan, self.store, self.clock, self.notes, **more)
         readings = self.store.readings()
         assert readings is not None
         return readings

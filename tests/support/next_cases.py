@@ -49,7 +49,7 @@ def first_plan() -> Plan:
     """As many readings as six poses take under two of the four loads."""
     some = SMALL.model_copy(update={"loads": SMALL.loads[1::2]})
     return plan_readings(
-        cell_from_config(some), some, PlanRequest(readings=18), np.random.default_rng(1)
+        cell_from_config(some), PlanRequest(readings=18), np.random.default_rng(1)
     ).ordered.plan
 
 
@@ -67,7 +67,8 @@ def after_further_plan(first: Doubtful, poses: int = 20) -> tuple[Diagnosis, Sep
     cell = first.rehearsal.cell
     reference = first.plan.joints("reference")
     found = plan_separating(
-        cell, SMALL, first.fit, first.suspects, PlanRequest(poses), np.random.default_rng(1),
+        cell.with_config(SMALL), first.fit, first.suspects, PlanRequest(poses),
+        np.random.default_rng(1),
         reference=reference,
     )  # fmt: skip
     further = with_new_names(found.planned.ordered.plan, first.plan, 2)

@@ -28,9 +28,10 @@ def config_of(
     return changed(configuration(), planning=asked, acquire=acquire)
 
 
-def problem_of(cell: Cell, config: CellConfig, q: Floats, **options: Any) -> DesignProblem:
+def problem_of(cell: Cell, q: Floats, **options: Any) -> DesignProblem:
     """The design problem of poses, before any reading."""
-    return problem(nominal_model(cell, config), config, q, **options)
+    config = cell.configured()
+    return problem(nominal_model(cell), config, q, **options)
 
 
 def poses_of(count: int, seed: int = 0) -> Floats:

@@ -165,7 +165,7 @@ def cell(**sections: Any) -> CellConfig:
 
 
 def space_of(config: CellConfig) -> FeasibleSpace:
-    return FeasibleSpace(cell_from_config(config), config)
+    return FeasibleSpace(cell_from_config(config))
 
 
 def drawn_of(config: CellConfig, count: int = 40, seed: int = 0, **how: Any) -> DrawnPoses:

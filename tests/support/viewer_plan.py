@@ -80,10 +80,10 @@ SUMMARY = PlanSummary(
 BARE = PlanSummary(3, 10, {UNLOADED: 10}, Duration(1.0, 2.0, 0.0), "made by hand", None, (), None)
 
 
-def configured(**sections: object) -> tuple[Cell, CellConfig]:
+def configured(**sections: object) -> Cell:
     told = load_config(CELL).model_dump(mode="json", exclude_none=True)
     config = CellConfig.model_validate(told | sections)
-    return cell_from_config(config), config
+    return cell_from_config(config)
 
 
 def target(cell: Cell, pose: int) -> np.ndarray:
@@ -91,9 +91,9 @@ def target(cell: Cell, pose: int) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def shadowed() -> tuple[Cell, CellConfig]:
+def shadowed() -> Cell:
     """A screen stands between the tracker and the target in pose p1; a pillar stands apart."""
-    cell, _ = configured()
+    cell = configured()
     middle = 0.45 * target(cell, 1) + 0.55 * TRACKER
     return configured(
         obstacles=[
@@ -107,7 +107,7 @@ def shadowed() -> tuple[Cell, CellConfig]:
 @pytest.fixture(scope="module")
 def recording(shadowed, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("plan") / "plan.rrd"
-    record_plan(*shadowed, PLAN, SUMMARY, path)
+    record_plan(shadowed, PLAN, SUMMARY, path)
     return path
 
 

@@ -46,7 +46,7 @@ def small(**planning):
 def planned(config, poses=5, seed=1, **wanted):
     cell = cell_from_config(config)
     request = PlanRequest(poses, **wanted)
-    return plan_readings(cell, config, request, np.random.default_rng(seed))
+    return plan_readings(cell, request, np.random.default_rng(seed))
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def test_the_plan_is_what_the_design_chose(usual):
 def test_the_plan_may_be_run_and_is_the_same_every_time(usual):
     config = small()
     plan = usual.ordered.plan
-    checked = dry_run(cell_from_config(config), config, plan)
+    checked = dry_run(cell_from_config(config), plan)
     assert checked.problems == ()
     assert checked.duration == pytest.approx(usual.ordered.duration.total)
     again = planned(config, readings=25).ordered.plan
@@ -83,9 +83,9 @@ def test_a_plan_to_append_is_made_for_the_reference_of_its_campaign(usual):
     config = small()
     cell, reference = cell_from_config(config), usual.ordered.plan.joints(REFERENCE)
     rng = np.random.default_rng(8)
-    made = plan_readings(cell, config, PlanRequest(5), rng, reference=reference).ordered.plan
+    made = plan_readings(cell, PlanRequest(5), rng, reference=reference).ordered.plan
     np.testing.assert_array_equal(made.joints(REFERENCE), reference)
-    assert dry_run(cell, config, with_new_names(made, usual.ordered.plan, 2)).problems == ()
+    assert dry_run(cell, with_new_names(made, usual.ordered.plan, 2)).problems == ()
 
 
 @pytest.mark.long
@@ -160,7 +160,7 @@ def test_absolute_readings_are_planned_one_by_one():
     assert all(len(loads) == 1 for _, loads in made.problem.contents)
     assert made.counts.sum() == made.budget
     config = small(readings="absolute")
-    assert dry_run(cell_from_config(config), config, made.ordered.plan).problems == ()
+    assert dry_run(cell_from_config(config), made.ordered.plan).problems == ()
 
 
 @pytest.mark.long
@@ -304,7 +304,7 @@ def cell_with(*loads, **planning):
 
 
 def twelve(config):
-    return problem_of(cell_from_config(config), config, poses_of(12))
+    return problem_of(cell_from_config(config), poses_of(12))
 
 
 def test_weights_make_no_torque_about_a_vertical_joint():
@@ -350,7 +350,7 @@ def test_other_parameters_have_plain_words():
 def test_the_plan_goes_on_without_and_states_it():
     config = cell_with(WEIGHT, candidates=40, against=())
     cell, rng = cell_from_config(config), np.random.default_rng(1)
-    planned = plan_readings(cell, config, PlanRequest(5), rng)
+    planned = plan_readings(cell, PlanRequest(5), rng)
     s = summarise(planned, config, rng, compare=False)
     std = {p.name: p.std for p in s.parameters}
     assert std[J1] == np.inf
@@ -367,7 +367,7 @@ def test_options_are_those_of_identify():
     config = cell_with(WEIGHT, model=("joint_compliance(joints=2/3/4-6)", "creep"))
     wanted = planned_effects(config, installed())
     assert wanted == {"joint_compliance": {"joints": "2/3/4-6"}, "creep": {}}
-    model = nominal_model(cell_from_config(config), config).model
+    model = nominal_model(cell_from_config(config)).model
     named = [p.name for e in model.effects if e.name == "joint_compliance" for p in e.parameters]
     assert named == ["j2", "j3", "j4-6"]
 
@@ -375,4 +375,4 @@ def test_options_are_those_of_identify():
 @refusals("planned_models")
 def test_options_that_cannot_be(case, given):
     config = cell_with(WEIGHT, model=tuple(given[:-1].split(", ")))
-    refuses(case, lambda: nominal_model(cell_from_config(config), config))
+    refuses(case, lambda: nominal_model(cell_from_config(config)))

@@ -137,7 +137,7 @@ def run_of(readings, path, tracker="", arm=""):
     plan = Plan(names, readings.states.q, tuple(Step(name, "none") for name in names))
     with create_run(path / "r.hilcal", config, path, plan) as file:
         file.append_readings(readings)
-        estimate_noise(terminal(False), config, hc.Cell.load(path / "CELL.toml"), file)
+        estimate_noise(terminal(False), hc.Cell.load(path / "CELL.toml").with_config(config), file)
     return path / "r.hilcal"
 
 
@@ -176,7 +176,7 @@ def test_an_estimate_does_not_outlive_the_readings_that_it_is_of(tmp_path, capsy
     cell = hc.Cell.load(tmp_path / "CELL.toml")
     monkeypatch.setattr("hilcal.cli.running.measured_noise", lambda *_: None)
     with CampaignFile.open(path) as file:
-        estimate_noise(terminal(False), cell.configured(), cell, file)
+        estimate_noise(terminal(False), cell, file)
         stored = file.readings()
     with hc.Campaign.open(path) as run:
         assert run.readings.noise_stated

@@ -20,12 +20,12 @@ WIDE = Limits(workspace_min_m=(-3, -3, -3), workspace_max_m=(3, 3, 3))
 
 
 def problems(bench, plan):
-    return dry_run(bench.cell, bench.config, plan).problems
+    return dry_run(bench.cell, plan).problems
 
 
 def test_a_good_plan_passes():
     bench = Bench()
-    checked = dry_run(bench.cell, bench.config, usual_plan())
+    checked = dry_run(bench.cell, usual_plan())
     assert checked.problems == ()
     assert checked.remarks == ()
     assert checked.load_changes == 4
@@ -73,7 +73,7 @@ def test_reference_at_a_joint_limit_is_approached_from_within(side):
 
 def box(bench, q):
     """The smallest box around forearm, wrists and tool in all states."""
-    parts = Clearance(bench.cell, bench.config).scene.parts
+    parts = Clearance(bench.cell).scene.parts
     return reached(bench.cell, parts, np.asarray(q))
 
 
@@ -146,7 +146,7 @@ def test_lacking_unloaded_readings_and_reference_are_remarks():
     bench = Bench()
     poses = {name: q for name, q in POSES.items() if name != "reference"}
     plan = plan_of(("p1", "3kg", 0), ("p1", "none", 1), poses=poses)
-    checked = dry_run(bench.cell, bench.config, plan)
+    checked = dry_run(bench.cell, plan)
     assert checked.problems == ()
     assert any("p1, none, cycle 0" in line for line in checked.remarks)
     assert any('"reference"' in line for line in checked.remarks)

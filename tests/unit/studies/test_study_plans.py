@@ -34,7 +34,7 @@ SEED = 5
 
 
 def scene_of(config, candidates=120):
-    return scene(cell_from_config(config), config, candidates, np.random.default_rng(SEED))
+    return scene(cell_from_config(config), candidates, np.random.default_rng(SEED))
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def absolute():
 def small():
     config = configured()
     return plans_study(
-        cell_from_config(config), config, arms(0), readings=60, campaigns=3, candidates=80, seed=3
+        cell_from_config(config), arms(0), readings=60, campaigns=3, candidates=80, seed=3
     )
 
 
@@ -145,7 +145,7 @@ def test_the_readings_of_random_plans_for_an_accuracy_are_found(deflection):
 def test_the_simulated_noise_is_the_planned_one(known):
     of = scene_of(configured(known=known))
     asked = planned_readings(at_random(of, 60, np.random.default_rng(0)))
-    measured = arms(0)(of.cell, of.config, 4).measure(asked, np.random.default_rng(0))
+    measured = arms(0)(of.cell, 4).measure(asked, np.random.default_rng(0))
     model, theta = of.nominal.model, of.nominal.theta
     planned = reading_covariance(of.nominal, of.config, model.predict(asked.states, theta))
     # The tracker is turned at random, and the arm sags by about 1 mm: axes and beams differ.
@@ -160,9 +160,9 @@ def test_the_study_depends_on_its_seed_alone(small):
     cell = cell_from_config(config)
     with open_engine(2) as engine:
         again = plans_study(
-            cell, config, arms(0), readings=60, campaigns=3, candidates=80, seed=3, engine=engine
+            cell, arms(0), readings=60, campaigns=3, candidates=80, seed=3, engine=engine
         )
-    other = plans_study(cell, config, arms(1), readings=60, campaigns=3, candidates=80, seed=4)
+    other = plans_study(cell, arms(1), readings=60, campaigns=3, candidates=80, seed=4)
     assert again == small
     assert other.of(RANDOM).result.position_real != small.of(RANDOM).result.position_real
 
@@ -204,7 +204,7 @@ def test_the_command_gives_one_document(capsys):
 
 def studied(config, campaigns):
     cell = cell_from_config(config)
-    return plans_study(cell, config, arms(0), campaigns=campaigns, candidates=400)
+    return plans_study(cell, arms(0), campaigns=campaigns, candidates=400)
 
 
 def needs_at_most_half(study, kind):

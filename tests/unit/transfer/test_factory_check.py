@@ -25,7 +25,7 @@ def readings(folder, hide, seed):
     """Readings of 20 poses of an arm that the factory had measured, with a later change."""
     write(folder / "arm.toml", "ur15")
     config = CellConfig.model_validate(CELL)
-    plan = make_plan(cell_from_config(config, folder), config, 20, 1, installed())
+    plan = make_plan(cell_from_config(config, folder), 20, 1, installed())
     secret = case_of_plan(config, plan, hide, seed, None, folder)
     return config, simulate_plan(secret, plan, [seed]).readings
 
