@@ -509,8 +509,9 @@ def simulate(
         return rehearsal.simulate_plan(cell, bare_plan, [seed])
     if hide == rehearsal.INVENTED:
         catalogue = rehearsal.invented_law(catalogue or installed())
-    config = cell.configured()
-    case = rehearsal.case_of_plan(config, bare_plan, hide, seed, catalogue, cell.base_dir)
+    case = rehearsal.case_of_plan(
+        cell.configured(), bare_plan, hide, seed, catalogue, cell.base_dir
+    )
     return rehearsal.simulate_plan(case, bare_plan, [seed, 1])
 
 

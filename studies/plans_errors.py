@@ -96,7 +96,7 @@ class Subject:
 
 def subject(scene: Scene, arm: Arm) -> Subject:
     """Compute the truth at the test poses, once for all plans."""
-    candidates, work_load = scene.exact.candidates, scene.config.planning.work_load
+    candidates, work_load = scene.exact.candidates, scene.cell.configured().planning.work_load
     deflection = scene.exact.mode == "deflection"
     if deflection and work_load == UNLOADED:
         loads = np.arange(1, len(candidates.loads))

@@ -54,11 +54,6 @@ class Scene:
     robust: DesignProblem | None
     work: PredictionPoses
 
-    @property
-    def config(self) -> CellConfig:
-        """The configuration of the cell."""
-        return self.cell.configured()
-
     def with_others(self, chosen: "Chosen") -> float | None:
         """Predicted RMS position error, m, with potential terms estimated, too; else None."""
         if self.robust is None or chosen.problem not in (self.exact, self.robust):
@@ -132,9 +127,9 @@ def optimal(
         rng: generator.
         robust: whether the plan keeps power against the potential terms.
     """
-    of_plan, config = s.exact, without_potential(s.config)
+    of_plan, config = s.exact, without_potential(s.cell.configured())
     if robust and s.robust is not None:
-        of_plan, config = s.robust, s.config
+        of_plan, config = s.robust, s.cell.configured()
     objective = compound_objective(of_plan, config, criterion, s.work, float(budget), rng)
     design = best_design(objective, float(budget), rng, effort=EFFORT)
     counts = np.asarray(design.counts, dtype=float)
@@ -173,7 +168,7 @@ def grid(s: Scene, budget: int) -> Chosen:
             break
     if not len(q):
         raise CannotAnswerError("no pose of a regular grid in joint space is feasible")
-    of_grid = problem(s.nominal, without_potential(s.config), q, allowed)
+    of_grid = problem(s.nominal, without_potential(s.cell.configured()), q, allowed)
     poses = next((n for n in range(1, len(q)) if allowed[_even(len(q), n)].sum() >= budget), len(q))
     order = _even(len(q), poses)
     return _of_poses(of_grid, cycle(order.tolist()), budget, s.work)

@@ -94,7 +94,6 @@ def plan(
         raise InputError("--after has the prior of its revision; leave out --prior")
     carried = prior.load(catalogue)
     numbers = Cell.load(cell)
-    config = numbers.configured()
     unloaded: Literal["around", "first"] = "first" if unloaded_first else "around"
     if criterion is not None and criterion_name(criterion) not in CRITERIA:
         raise InputError(f"--criterion {criterion!r} is unknown; valid: {', '.join(CRITERIA)}")
@@ -109,7 +108,9 @@ def plan(
             numbers, request, rng, fitted, say, catalogue, carried, reference=reference
         )
         plan_ = replace(chosen.ordered.plan, about=about(chosen))
-        summary = summarise(chosen, config, rng, say, compare=not quick, curve=not quick)
+        summary = summarise(
+            chosen, numbers.configured(), rng, say, compare=not quick, curve=not quick
+        )
         say("checking every motion in a dry run")
         checked_plan = checked(numbers, plan_, summary)
     write(t, numbers, checked_plan, output, csv, record)
@@ -135,7 +136,6 @@ def check(
     if save_calibration is not None and save_calibration.exists():
         raise InputError(f"{save_calibration}: the file exists; choose another name")
     numbers = Cell.load(cell)
-    config = numbers.configured()
     try:
         check_effects(numbers, catalogue)
     except InputError as error:
@@ -144,7 +144,7 @@ def check(
     if plan is not None:
         dry = dry_checked(t, numbers, load_plan(plan))
     try:
-        answers = with_kinematics(answers_of(t, config), numbers)
+        answers = with_kinematics(answers_of(t, numbers.configured()), numbers)
     except InputError:  # the cell names no device: report the plan alone
         if dry is None or not dry.problems:
             raise

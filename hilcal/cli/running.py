@@ -164,9 +164,8 @@ def run(
 
 def _default_plan(t: Terminal, path: Path, cell: Cell, catalogue: Catalogue, yes: bool) -> Plan:
     """Make a plan and show it; ask whether to measure it, unless `yes` or nobody can answer."""
-    config = cell.configured()
     with working(t.progress) as say:
-        seed = check_seed(config.simulation.seed)
+        seed = check_seed(cell.configured().simulation.seed)
         rng = np.random.default_rng(seed)
         planned = checked_plan(cell, POSES, rng, catalogue, say)
     t.show(plan_facts(planned.summary))

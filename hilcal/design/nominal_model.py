@@ -269,8 +269,7 @@ def nominal_states(q: Floats, wrench: Floats) -> States:
 
 def _registered(cell: Cell, place: Floats) -> tuple[Cell, Floats]:
     """Return the cell with a registration, and the start of the beam (3,), sensor axes, m."""
-    config = cell.configured()
-    if config.tracker.frame == "base":
+    if cell.configured().tracker.frame == "base":
         return cell, place
     if cell.registration_known or cell.observers:
         return cell, np.zeros(3)

@@ -346,15 +346,11 @@ class OrderDraws:
         default_factory=dict
     )  # shortest tours of stops, from 1
 
-    @property
-    def config(self) -> CellConfig:
-        """The configuration of the cell."""
-        return self.cell.configured()
-
     def __post_init__(self, passable: Passable) -> None:
         """Find the ways and the shortest tour under each load."""
-        self.pace = pace(self.config)
-        self.wrenches = {load.name: load.wrench(self.cell.gravity) for load in self.config.loads}
+        config = self.cell.configured()
+        self.pace = pace(config)
+        self.wrenches = {load.name: load.wrench(self.cell.gravity) for load in config.loads}
         for load, load_stops in self.stops.items():
             poses = np.array([pose for pose, _ in load_stops])
             visited = np.unique(poses)
@@ -438,7 +434,7 @@ class OrderDraws:
 
     def duration_and_confounding(self, plan: Plan) -> tuple[Duration, Confounding]:
         """Return duration and confounding of a plan."""
-        margin, how = self.config.limits.joint_margin_rad, self.ordering
+        margin, how = self.cell.configured().limits.joint_margin_rad, self.ordering
         time, times = timeline(plan, self.cell.arm, margin, self.pace)
         return time, confounding(plan, times, self.wrenches, how.drift, how.reading_std)
 

@@ -78,9 +78,8 @@ class LiveModel:
 
     def __init__(self, cell: Cell) -> None:
         """Prepare for a cell."""
-        config = cell.configured()
         self._cell = cell
-        self._scatter = config.repeatability.per_joint(cell.arm.n)
+        self._scatter = cell.configured().repeatability.per_joint(cell.arm.n)
         self._fitted: _FittedModel | None = None
 
     def __call__(self, readings: Readings) -> LiveResidual:

@@ -537,7 +537,6 @@ def run(
         DeviceError: a device failed, a limit was exceeded, a person gave up.
         KeyboardInterrupt: unchanged; the arm stands.
     """
-    config = cell.configured()
     done = store.done()
     missing = plan.without(done)
     if not missing.steps:
@@ -549,7 +548,7 @@ def run(
     setup = Setup(rig, cell, clock, watcher)
     session = Session(setup, plan, store, live, wall, goal, epoch)
     try:
-        session.visit(route(missing, cell.arm, config.limits.joint_margin_rad))
+        session.visit(route(missing, cell.arm, cell.configured().limits.joint_margin_rad))
     except BaseException as error:
         trouble = _stop(rig.arm) if session.in_control else ""
         again = session.pose is not None and _failed_at(store) == session.pose

@@ -252,11 +252,6 @@ class FurtherMeasuring:
     rng: np.random.Generator
     say: Say
 
-    @property
-    def config(self) -> CellConfig:
-        """The configuration of the cell."""
-        return self.cell.configured()
-
     def decide(self) -> Decision:
         """Decide whether to measure a further plan, and which.
 
@@ -264,7 +259,9 @@ class FurtherMeasuring:
         must bring a gain within the time allowed.
         """
         d, settings = self.d, self.settings
-        error = predicted_error(Calibration.of(d.fit), d.fit.readings.states, self.config)
+        error = predicted_error(
+            Calibration.of(d.fit), d.fit.readings.states, self.cell.configured()
+        )
         further = self._separating(error)
         if further is None or not further.measures:
             sharper = self._sharpening(error)
@@ -311,8 +308,9 @@ class FurtherMeasuring:
         if error.floor_m >= goal:
             return replace(decision, reason="floor")
         self.say("planning what would lower the predicted error")
-        planning = self.config.planning.model_copy(update={"readings": self.d.fit.mode})
-        cell = self.cell.with_config(self.config.model_copy(update={"planning": planning}))
+        config = self.cell.configured()
+        planning = config.planning.model_copy(update={"readings": self.d.fit.mode})
+        cell = self.cell.with_config(config.model_copy(update={"planning": planning}))
         try:
             planned = plan_readings(
                 *(cell, PlanRequest(self.settings.poses), self.rng, self.d.fit, self.say),

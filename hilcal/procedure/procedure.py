@@ -382,17 +382,15 @@ def checked_plan(
     say: Say,
 ) -> CheckedPlan:
     """Choose a plan, each pose under every load that it bears; check all motions."""
-    config = cell.configured()
     chosen = plan_readings(cell, PlanRequest(poses), rng, None, say, catalogue)
-    summary = summarise(chosen, config, rng, say, compare=False)
+    summary = summarise(chosen, cell.configured(), rng, say, compare=False)
     say("checking every motion in a dry run")
     return checked(cell, with_origin(chosen), summary)
 
 
 def continued(run: Path, cell: Cell, catalogue: Catalogue) -> Procedure:
     """Return the calibration of a campaign file, with the file's settings."""
-    config = cell.configured()
     with CampaignFile.open(run, read_only=True) as campaign:
         settings, base_dir = state.settings_of(campaign), cell.base_dir.absolute()
-        check_same_cell(campaign, config, base_dir)
+        check_same_cell(campaign, cell.configured(), base_dir)
     return Procedure(run, cell, base_dir, catalogue, settings)

@@ -146,8 +146,7 @@ def _loads(calibration: Calibration, fitted: Readings, under_load: bool) -> tupl
 
 def _within(cell: Cell, q: Floats) -> Cell:
     """Return the cell with joint limits at the range of the measured joint angles (N, n)."""
-    config = cell.configured()
-    margin, arm = config.limits.joint_margin_rad + 2e-6, cell.arm
+    margin, arm = cell.configured().limits.joint_margin_rad + 2e-6, cell.arm
     low, high = q.min(axis=0), q.max(axis=0)
     wider = 0.5 * np.maximum(LEAST_RANGE - (high - low), 0.0)
     q_min = np.maximum(arm.q_min, low - wider - margin)
@@ -217,7 +216,6 @@ def corrected_plan(
     cannot be corrected, or whose corrected joint values the cell does not allow, are left out and
     listed in the plan. The plan begins at the time of the last reading.
     """
-    config = cell.configured()
     say("correcting joint values")
     points, time = points_of(validation, calibration.mode), validation.states.time
     start = 0.0 if time is None else float(time[-1])
@@ -235,7 +233,7 @@ def corrected_plan(
         order = np.array([names.index(s.pose) for s in plan.steps if s.pose != REFERENCE])
         wrenches = {names[k]: validation.states.wrench[points.rows[k]] for k in keep}
         wrench = np.array([wrenches.get(s.pose, np.zeros(6)) for s in plan.steps])
-        states = expected_states(plan, cell.arm, config, wrench, last, start)
+        states = expected_states(plan, cell.arm, cell.configured(), wrench, last, start)
         at_points = states[np.array([s.pose != REFERENCE for s in plan.steps])]
         result = _compensated(calibration, at_points, points, order)
         reasons = refusals(result, allowed_outside=True)

@@ -30,8 +30,7 @@ def config_of(
 
 def problem_of(cell: Cell, q: Floats, **options: Any) -> DesignProblem:
     """The design problem of poses, before any reading."""
-    config = cell.configured()
-    return problem(nominal_model(cell), config, q, **options)
+    return problem(nominal_model(cell), cell.configured(), q, **options)
 
 
 def poses_of(count: int, seed: int = 0) -> Floats:

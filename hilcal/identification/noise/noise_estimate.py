@@ -104,8 +104,7 @@ def with_estimated_noise(
     readings are fewer than `FEWEST_POSES` or show several effects, or where nothing can be fitted
     to them as they are described.
     """
-    config = cell.configured()
-    readings, station = imported.readings, config.tracker.station_m
+    readings, station = imported.readings, cell.configured().tracker.station_m
     components = None if imported.noise_stated else _components(readings, cell)
     if components is None:
         return imported, None
@@ -181,13 +180,12 @@ class _Components:
 
 
 def _components(readings: Readings, cell: Cell) -> _Components | None:
-    config = cell.configured()
     if len(np.unique(readings.pose)) < FEWEST_POSES or readings.scalar.any():
         return None
     mode, share = usual_mode(readings), MOST_ROWS / readings.value.size
     readings = readings[some_poses(readings, share, SEED, FEWEST_POSES)]
     try:
-        return _estimated(baseline(cell, readings, mode), readings, config)
+        return _estimated(baseline(cell, readings, mode), readings, cell.configured())
     except (HilcalError, np.linalg.LinAlgError):  # the fit says why
         return None
 

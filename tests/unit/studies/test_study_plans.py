@@ -147,7 +147,7 @@ def test_the_simulated_noise_is_the_planned_one(known):
     asked = planned_readings(at_random(of, 60, np.random.default_rng(0)))
     measured = arms(0)(of.cell, 4).measure(asked, np.random.default_rng(0))
     model, theta = of.nominal.model, of.nominal.theta
-    planned = reading_covariance(of.nominal, of.config, model.predict(asked.states, theta))
+    planned = reading_covariance(of.nominal, of.cell.config, model.predict(asked.states, theta))
     # The tracker is turned at random, and the arm sags by about 1 mm: axes and beams differ.
     axes = np.linalg.eigvalsh(planned)
     assert np.allclose(np.linalg.eigvalsh(measured.covariance), axes, rtol=5e-3)
