@@ -18,7 +18,7 @@ from hilcal.design.tour import NEVER
 from hilcal.errors import CannotAnswerError
 from hilcal.measuring.route import duration, route, seconds_at_rest
 from hilcal.robot.arm import Arm
-from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
+from hilcal.store.plan import ARM, REFERENCE, UNLOADED, Plan, Step
 from hilcal.types import Bools, Floats
 
 
@@ -292,6 +292,7 @@ def order_plan(
             extra *= _SHRINK
     _, plan, time, loss = best
     about: dict[str, object] = {
+        ARM: cell.arm.name,
         "duration_s": time.about(),
         "order": {
             **loss.about(),

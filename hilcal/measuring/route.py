@@ -11,7 +11,7 @@ from hilcal.config import CellConfig
 from hilcal.measuring.clearance import TRACKER_UNKNOWN
 from hilcal.measuring.feasibility import Feasibility
 from hilcal.robot.arm import Arm
-from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
+from hilcal.store.plan import ARM, REFERENCE, UNLOADED, Plan, Step
 from hilcal.toml import suggest
 from hilcal.types import Floats
 
@@ -117,7 +117,13 @@ def dry_run(cell: Cell, plan: Plan) -> DryRun:
     config = cell.configured()
     limits = Feasibility(cell)
     problems = _cell_problems(config) + _load_problems(limits, plan)
-    width, n = plan.q.shape[1], cell.arm.n
+    width, n, made_for = plan.q.shape[1], cell.arm.n, plan.about.get(ARM, cell.arm.name)
+    if made_for != cell.arm.name:
+        problems.insert(
+            0,
+            f"the plan was made for {made_for}, and the cell's arm is {cell.arm.name}: make one "
+            f'with hilcal plan, or take "{ARM}" out of the file if it is meant for this arm, too',
+        )
     if width != n:
         wrong = f"the plan has {width} joint angles per pose; {cell.arm.name} has {n} joints"
         return DryRun((wrong, *problems), (), 0.0, 0, 0)

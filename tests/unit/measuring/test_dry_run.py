@@ -1,5 +1,6 @@
 """The dry run: finds everything that a plan must not do, and lets the rest pass."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -33,6 +34,13 @@ def test_a_good_plan_passes():
     # a change of the load: 4 poses, then twice: to the reference, 4 poses, to the reference
     assert checked.motions == 1 + 4 + 2 * (1 + 4) + 1
     assert checked.duration > 4 * 60.0
+
+
+def test_a_plan_of_another_arm():
+    bench, plan = Bench(), usual_plan()
+    assert problems(bench, replace(plan, about={"robot": bench.cell.arm.name})) == ()
+    (found,) = problems(bench, replace(plan, about={"robot": "ur3e"}))
+    assert f"made for ur3e, and the cell's arm is {bench.cell.arm.name}" in found
 
 
 def test_number_of_joints_and_names_of_loads_at_once():
