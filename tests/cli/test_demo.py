@@ -6,7 +6,6 @@ import pytest
 from hilcal.cli.running import TRIES, first_plan, retry_after_failures
 from hilcal.cli.terminal import terminal
 from hilcal.config import load_config
-from hilcal.drivers.simulated.rehearsal import choices
 from hilcal.errors import DeviceError, InputError
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan
@@ -94,16 +93,6 @@ def test_the_demo_in_words(tmp_path, capsys, monkeypatch):
     assert "is replaced" in again.err
 
 
-def test_the_demo_does_not_replace_another_file(tmp_path, capsys, monkeypatch):
-    path = tmp_path / "notes.txt"
-    path.write_text("mine", encoding="utf-8")
-    line = refused(capsys, 2, "demo", FAST, "--hide", "nothing", "-o", path)
-    assert "notes.txt" in line
-    assert path.read_text(encoding="utf-8") == "mine"
-    monkeypatch.chdir(tmp_path)
-    assert "is not a campaign" in refused(capsys, 2, "demo", FAST, "--hide", "nothing", "-o", ".")
-
-
 @pytest.mark.slow
 def test_an_effect_of_ones_own_is_hidden_and_found(tmp_path, capsys):
     file = tmp_path / "mine.py"
@@ -138,13 +127,6 @@ def test_an_invented_law_is_discovered(tmp_path, capsys):
     assert f"hilcal view {path} --effects-from {law}" in words
     stored = ok(capsys, "diagnose", path, "--effects-from", law, "--json")
     assert stored.document["verdict"] == "adequate"
-
-
-def test_what_cannot_be_hidden(tmp_path, capsys):
-    line = refused(capsys, 2, "demo", "--hide", "gremlins", "-o", tmp_path / "x.hilcal")
-    assert all(name in line for name in (*choices(), "random", "nothing"))
-    line = refused(capsys, 2, "demo", "--seed", "-1", "-o", tmp_path / "x.hilcal")
-    assert "--seed" in line
 
 
 def test_a_random_choice_gives_nothing_away():
