@@ -127,6 +127,8 @@ def test_joints_that_differ_are_let_differ(campaign, tmp_path, capsys):
     finer = "joint_compliance(joints=each)"
     ok(capsys, "identify", campaign, "--effects", "joint_compliance(joints=common)")
     found = ok(capsys, "diagnose", campaign, "--json").document
+    told = " ".join(ok(capsys, "diagnose", campaign).out.split())
+    assert f'hilcal add RUN "{finer}"' in told
     assert found["suspects"][0]["effect"] == finer
     assert found["suspects"][0]["finer_than"] == "joint_compliance"
     assert found["message"].startswith(f"Let joints differ: {finer} explains")

@@ -145,7 +145,7 @@ def test_deflections_need_a_loaded_reading(site, capsys):
     bare = site.store("bare.hilcal", readings[readings.unloaded])
     line = refused(capsys, 2, "compare", site.earlier, bare, "--revision", "2")
     assert "no loaded reading" in line
-    assert "--readings absolute" in line
+    assert f"hilcal identify {site.earlier} --readings absolute" in line
 
 
 @pytest.fixture(scope="module")
