@@ -161,6 +161,15 @@ def test_fewer_readings_than_parameters(tmp_path, capsys):
     assert "poses" in refused(capsys, 4, "identify", two)
 
 
+def test_a_busy_port_is_refused(campaign, capsys):
+    ok(capsys, "identify", campaign)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        line = refused(capsys, 2, "view", campaign, "--port", str(taken.getsockname()[1]))
+    assert "port" in line
+
+
 def test_numerical_warnings_do_not_reach_the_user(monkeypatch, campaign, capsys):
     def noisy(p):
         warnings.warn("divide by zero", RuntimeWarning, stacklevel=1)

@@ -6,6 +6,7 @@ import pytest
 from hilcal.cli.running import TRIES, first_plan, retry_after_failures
 from hilcal.cli.terminal import terminal
 from hilcal.config import load_config
+from hilcal.drivers.simulated.rehearsal import choices
 from hilcal.errors import DeviceError, InputError
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan
@@ -127,6 +128,13 @@ def test_an_invented_law_is_discovered(tmp_path, capsys):
     assert f"hilcal view {path} --effects-from {law}" in words
     stored = ok(capsys, "diagnose", path, "--effects-from", law, "--json")
     assert stored.document["verdict"] == "adequate"
+
+
+def test_what_cannot_be_hidden(tmp_path, capsys):
+    line = refused(capsys, 2, "demo", "--hide", "gremlins", "-o", tmp_path / "x.hilcal")
+    assert all(name in line for name in (*choices(), "random", "nothing"))
+    line = refused(capsys, 2, "demo", "--seed", "-1", "-o", tmp_path / "x.hilcal")
+    assert "--seed" in line
 
 
 def test_a_random_choice_gives_nothing_away():

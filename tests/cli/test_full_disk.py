@@ -103,6 +103,19 @@ def test_an_import_that_finds_no_room_leaves_the_campaign_that_was_there(
             assert set(Path().iterdir()) == here
 
 
+def test_a_link_stays_and_output_may_be_a_pipe(capsys, fitted, monkeypatch):
+    monkeypatch.chdir(fitted)
+    real, link = Path("real.script"), Path("link.script")
+    real.write_text(OLD)
+    link.symlink_to(real)
+    ok(capsys, "compensate", "run.hilcal", "points.csv", "--load", "10kg", "-o", link, "--force")
+    assert link.is_symlink()
+    assert "movej" in real.read_text()
+    Path("link.csv").symlink_to("none.csv")
+    ok(capsys, "export", "run.hilcal", "--readings", "link.csv", "--force")
+    assert Path("none.csv").read_text().startswith("pose,")
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("redirected", [False, True])
 def test_standard_output_is_written_straight(fitted, redirected):
