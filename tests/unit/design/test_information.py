@@ -1,6 +1,5 @@
 """What a plan predicts is what identification then states, and what the parameters scatter by."""
 
-import json
 from dataclasses import replace
 from functools import cache
 
@@ -10,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilcal.cell import cell_from_config
-from hilcal.config import load_config
 from hilcal.config.cell import Target
 from hilcal.config.sections import Gauge, Point
 from hilcal.design.information import MOST_PARAMETERS, MOST_TIMES, problem, reading_covariance
@@ -41,8 +39,6 @@ from tests.support.campaigns import (
     with_noise,
     world_of,
 )
-from tests.support.cli_cases import CELL as DEMO
-from tests.support.cli_cases import ok
 from tests.support.fit_cases import fitted_model, parameters_by_effect
 from tests.support.fit_cases import predicted as read
 from tests.support.observer_cases import NORMAL, POINTS, STD, observed
@@ -148,21 +144,6 @@ def test_a_deflection_unit_is_a_pose_whose_place_is_unknown(name, seed):
         mine = units.units.rows[k].T @ units.units.rows[k]
         size = np.sqrt(np.outer(np.diag(both), np.diag(both)))
         assert np.all(np.abs(mine - schur) <= 1e-9 * size)
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_what_was_measured_is_known_exactly(mode):
-    c = campaign(mode=mode, poses=12, seed=1, target_known=False)
-    found = fitted_model(c.cell, c.readings, mode)
-    config = config_of(mode)
-    p = problem(model_after(found, config), config, poses_of(3))
-    mine = predicted_uncertainty(p)
-    flat = np.isinf(found.solution.prior)
-    ratio = (mine.std / found.uncertainty.formal)[flat & found.uncertainty.identifiable]
-    assert ratio == pytest.approx(np.ones(len(ratio)), rel=1e-6)
-    assert np.isinf(mine.std[flat & ~found.uncertainty.identifiable]).all()
-    identified = np.isfinite(mine.std)
-    assert np.all(identified == found.uncertainty.identifiable)
 
 
 def test_planning_on_predicts_the_fit_to_all_readings():
@@ -429,18 +410,6 @@ def test_effects_that_only_the_prior_knows_are_planned_for():
     assert "joint_tilt_compliance" in found.nominal.model.names
 
 
-def test_a_prior_that_knows_nothing_changes_no_prediction():
-    p = learnt()
-    nothing = carried_prior(replace(p, information=np.zeros_like(p.information)))
-    alone, known = std(problem_with(None)), std(problem_with(nothing))
-    np.testing.assert_allclose(list(known.values()), list(alone.values()), rtol=1e-9)
-
-
-def test_of_another_arm_is_refused():
-    p = learnt()
-    refusal("nominal links", problem_with, carried_prior(replace(p, links=1.01 * p.links)))
-
-
 CASES = {
     "distance": (["A", "B"], {k: Point(position_m=POINTS[k], std_m=STD) for k in "AB"}, {}),
     "height": (["G"], {}, {"G": Gauge(direction=tuple(NORMAL), std_m=STD)}),
@@ -473,22 +442,6 @@ def test_predicted_uncertainties_are_those_of_a_fit(what):
     for name, planned in zip((names[k] for k in own), std, strict=True):
         if np.isfinite(fitted[name][1]):
             assert planned == pytest.approx(fitted[name][1], rel=0.25), name
-
-
-@pytest.mark.long
-def test_a_cell_of_distances_is_planned(tmp_path, capsys):
-    text = DEMO.read_text().replace("candidates = 250", "candidates = 60\nagainst = []")
-    text = text.replace('frame = "tracker"', 'frame = "base"\nobserves = "distance"')
-    (tmp_path / "cell.toml").write_text(text + "\n[points.A]\nstd_m = 1e-5\n[points.B]\n")
-    out = tmp_path / "plan.json"
-    ok(capsys, "plan", tmp_path / "cell.toml", "--poses", "8", "-o", out)
-    assert len({step["pose"] for step in json.loads(out.read_text())["steps"]}) >= 8
-
-
-def test_devices_read_positions(tmp_path):
-    keys = 'driver = "geocom"\nport = "x"\nobserves = "distance"'
-    (tmp_path / "cell.toml").write_text(DEMO.read_text().replace('frame = "tracker"', keys))
-    refusal(r'observes = "distance" together with driver', load_config, tmp_path / "cell.toml")
 
 
 def test_sight_and_time_of_each_target():

@@ -7,7 +7,6 @@ import pytest
 
 from hilcal.design import mixed_design as condensing
 from hilcal.design.approximate_design import relax
-from hilcal.design.choice import EFFORT, objective_of
 from hilcal.design.criteria import MeanVariance
 from hilcal.design.information import (
     absolute_rows,
@@ -18,7 +17,6 @@ from hilcal.design.information import (
 )
 from hilcal.design.mixed_design import balanced, mixed_design, other_effects
 from hilcal.design.nominal_model import model_after, nominal_model
-from hilcal.design.optimum import best_design
 from hilcal.design.predicted import position_derivative, prediction_poses
 from tests.support.campaigns import campaign, cell_of
 from tests.support.fit_cases import fitted_model
@@ -121,21 +119,3 @@ def test_what_is_known_very_well_does_not_hide_what_a_reading_tells():
     assert told[1] == pytest.approx(told[0], rel=1e-6)
     found = [relax(balanced(d), 20.0).value for d in (plain, uneven)]
     assert found[1] == pytest.approx(found[0], rel=1e-4)
-
-
-@pytest.mark.long
-def test_a_plan_for_predictions_is_better_than_random_poses_and_certified():
-    known = config("absolute").model_copy(update={"loads": []})
-    nominal = nominal_model(cell_of(registration_known=False), known)
-    nominal = replace(nominal, live=nominal.live[:-6])  # no load tells the compliance
-    of = problem(nominal, known, poses_of(80))
-    asked = objective_of(of, known, "I", prediction_poses(of.nominal, known, poses_of(30, 9)))
-    design = best_design(asked, 20.0, np.random.default_rng(0), effort=EFFORT)
-    # the bound splits precise readings over all poses, which no plan can
-    assert 0.1 < design.efficiency <= 1.0
-    rng, others = np.random.default_rng(5), []
-    for _ in range(20):
-        some = rng.permutation(len(of.units))[:20]
-        m = asked.prior + asked.units.information(np.ones(20), some)
-        others.append(float(asked.criterion.value(m)))
-    assert design.value > 1.2 * max(others)

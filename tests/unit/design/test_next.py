@@ -4,26 +4,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import scipy.linalg as sl
 from scipy import stats
 
 from hilcal.cell import cell_from_config
 from hilcal.design.criterion import Pair
 from hilcal.design.discriminated_pairs import (
     LEVEL,
-    SUPPORTED,
     discriminated_pairs,
     not_separable_message,
     pair_of,
     posterior_draws,
     power,
-    supported_parameters,
 )
 from hilcal.design.information import problem
-from hilcal.design.next import DRAWS, plan_poses, plan_separating
+from hilcal.design.next import plan_poses, plan_separating
 from hilcal.design.nominal_model import model_after
 from hilcal.design.planner import PlanRequest
-from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
+from hilcal.diagnosis.effect_ranking import candidates
 from hilcal.diagnosis.pose_alone import pose_powers
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.rehearsal import planned_states, simulate
@@ -107,33 +104,6 @@ def test_the_power_is_the_share_of_rejections_in_the_simulated_world():
         s, g = x.T @ f.project_out(x), x.T @ rival.white
         rejected += bool(g @ np.linalg.solve(s, g) > stats.chi2.isf(LEVEL, len(g)))
     assert share_is(rejected, 100, promised)
-
-
-@pytest.mark.long
-def test_the_powers_of_a_plan_are_shares_of_rejections():
-    """Of what is known and planned for, with the parameters that the readings support."""
-    first = doubtful("base_compliance", 2)
-    rng, trials = np.random.default_rng(3), 2000
-    asked = (first.rehearsal.cell, SMALL, first.fit, first.suspects, PlanRequest(6), rng)
-    found = plan_separating(*asked, reference=first.plan.joints("reference"))
-    of, known = found.planned.problem, discriminated_pairs(found.planned.problem).prior
-    values, vectors = np.linalg.eigh(known)
-    before = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-    planned = np.repeat(of.units.rows, found.planned.counts.astype(int), axis=0)
-    every = np.vstack([before, planned.reshape(-1, of.units.size)])
-    supported = supported_parameters(of, DRAWS)
-    for p in found.powers:
-        where, rival = of.of_effect(p.effect), of.of_effect(p.rival)
-        fitted = np.concatenate([np.arange(of.model_size), rival])
-        beta = supported[p.effect][rng.integers(DRAWS, size=trials)] / of.scale[where]
-        for rows, promised in ((before, p.power_now), (every, p.power_planned)):
-            y = rows[:, where] @ beta.T + rng.standard_normal((len(rows), trials))
-            both = (fitted, np.append(fitted, where))
-            spanned = [sl.orth(rows[:, c], rcond=1e-7) for c in both]  # roots of rounding, 1e-8
-            less, more = (np.sum((basis.T @ y) ** 2, axis=0) for basis in spanned)
-            added = spanned[1].shape[1] - spanned[0].shape[1]
-            rejected = int(np.sum(more - less > stats.chi2.isf(LEVEL, added)))
-            assert share_is(rejected, trials, promised), p
 
 
 # how strong suspects are
@@ -315,15 +285,3 @@ def test_information_beside_the_model_and_power_beside_model_and_rival(mode):
     tested = family_power(with_rival.information(x[TILT]), beta, LEVEL)
     assert promised == pytest.approx(tested, rel=1e-10)
     assert 2 * LEVEL < promised < 0.9
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_evidence_and_estimates_of_suspects(mode):
-    found, of = case(mode)
-    linear = linearise(found)
-    ranked = {s.effect: s.score for s in rank_suspects(linear, candidates(found))}
-    for family in of.families:
-        score, scale = ranked[family.name], np.array([p.scale for p in family.parameters])
-        drawn = posterior_draws(linear, family, 3)  # the diagnosis' evidence supports the effect
-        np.testing.assert_allclose(drawn[0], scale * score.step, rtol=1e-10)
-        assert score.log_evidence > SUPPORTED

@@ -124,15 +124,6 @@ def test_values_of_many_are_the_values_of_each(name):
         assert abs(single[-1]) <= 1e-12 * min(single[:-1])
 
 
-def test_test_poses_give_the_variance_of_their_position():
-    rng = np.random.default_rng(4)
-    m = information(rng)
-    v = rng.normal(size=(7, 3, P))  # Jacobians of the position at 7 poses
-    c = np.mean(np.swapaxes(v, 1, 2) @ v, axis=0)
-    variances = [np.trace(one @ np.linalg.inv(m) @ one.T) for one in v]
-    assert float(MeanVariance(c).value(m)) == pytest.approx(1 / np.mean(variances))
-
-
 @pytest.mark.parametrize("twice", [False, True])
 def test_separation_is_what_a_fit_leaves(twice):
     """The sum of squares that a fit of the nuisance leaves; also where it is not unique."""
@@ -375,14 +366,6 @@ def test_many_units(most):
         assert found.weight.max() <= 1 + 1e-9
         top = np.sort(leverage)[-40:].sum()  # the 40 best once each
         assert found.value * top / 8 <= found.value * (1 + 1e-5)
-
-
-def test_the_plan_depends_on_the_generator_alone():
-    units = random_units(5, 300, 6)
-    one, two = (
-        best_design(asked(units, D()), 9.0, np.random.default_rng(3)).counts for _ in range(2)
-    )
-    np.testing.assert_array_equal(one, two)
 
 
 def test_scale_of_a_parameter_does_not_matter_to_d():

@@ -1,7 +1,6 @@
 """From a cell to a plan: what it promises, what it keeps, and what it refuses."""
 
 import csv
-import sys
 from collections import Counter
 from dataclasses import replace
 from functools import cache
@@ -12,7 +11,7 @@ import pytest
 from hilcal.cell import cell_from_config
 from hilcal.config.reference import to_toml
 from hilcal.config.sections import CellLoad
-from hilcal.design.choice import CRITERIA, costly_loads, objective_of
+from hilcal.design.choice import CRITERIA, costly_loads
 from hilcal.design.nominal_model import nominal_model, planned_effects
 from hilcal.design.planner import (
     PlanRequest,
@@ -20,16 +19,13 @@ from hilcal.design.planner import (
     plan_readings,
     without_undetermined,
 )
-from hilcal.design.predicted import predicted_uncertainty
 from hilcal.design.summary import remarks, summarise
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError
 from hilcal.measuring.route import dry_run
-from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import REFERENCE, UNLOADED, load_plan, read_plan, with_new_names
+from hilcal.store.plan import REFERENCE, UNLOADED, load_plan, read_plan
 from hilcal.store.run_log import PLAN
-from hilcal.tables.table import write_table
 from tests.support.campaigns import configuration
 from tests.support.cli_cases import ok, quickly_planned, refused, rehearsal, run
 from tests.support.plan_cases import changed, config_of, poses_of, problem_of
@@ -78,50 +74,6 @@ def test_the_plan_may_be_run_and_is_the_same_every_time(usual):
     assert read_plan(plan.to_json(), "plan").to_json() == plan.to_json()
 
 
-@pytest.mark.long
-def test_a_plan_to_append_is_made_for_the_reference_of_its_campaign(usual):
-    config = small()
-    cell, reference = cell_from_config(config), usual.ordered.plan.joints(REFERENCE)
-    rng = np.random.default_rng(8)
-    made = plan_readings(cell, config, PlanRequest(5), rng, reference=reference).ordered.plan
-    np.testing.assert_array_equal(made.joints(REFERENCE), reference)
-    assert dry_run(cell, config, with_new_names(made, usual.ordered.plan, 2)).problems == ()
-
-
-@pytest.mark.long
-def test_the_last_round_takes_poses_that_are_reached(monkeypatch):
-    """Half of what each round chooses is not reached: a plan was refused for that."""
-    module = sys.modules["hilcal.design.planner"]
-    reached, rounds = module._unreachable, []
-
-    def lost(space, of, home, units):
-        chosen = {of.contents[k][0] for k in units}
-        odd = {pose for pose in chosen if pose % 2} if rounds else set()
-        rounds.append(chosen)
-        return np.array(sorted(odd | {*reached(space, of, home, units).tolist()}), dtype=np.int64)
-
-    monkeypatch.setattr(module, "_unreachable", lost)
-    monkeypatch.setattr(module, "ROUNDS", 2)
-    made = planned(small(), 12)
-    _, first, last = rounds
-    assert any(pose % 2 for pose in first)
-    assert last <= {pose for pose in first if not pose % 2}
-    assert {s.pose for s in made.ordered.plan.steps if s.load == "10kg"} > {REFERENCE}
-
-
-@pytest.mark.long
-def test_more_readings_promise_more():
-    some, more = planned(small(), 10), planned(small(), 20)
-    before = predicted_uncertainty(some.problem, some.counts, work=some.work)
-    after = predicted_uncertainty(more.problem, more.counts, work=more.work)
-    live = np.isfinite(before.std) & (before.std > 0)
-    ratio = (after.std[live] / before.std[live])[: some.problem.model_size]
-    # As at the continuous optimum, with the root of the readings; whole numbers move single ones.
-    expected = np.sqrt(some.budget / more.budget)
-    assert expected < 0.8
-    assert np.median(ratio) == pytest.approx(expected, rel=0.1)
-
-
 @cache
 def by_criterion(name):
     """Thirty readings; effects are told apart where there are two of them."""
@@ -138,21 +90,6 @@ def test_every_criterion_gives_a_certified_plan(criterion):
     assert made.criterion == criterion
     assert 0.5 < made.design.efficiency <= 1.0
     assert made.ordered.plan.steps
-
-
-@pytest.mark.long
-def test_each_criterion_is_best_at_its_own(usual):
-    of, work = usual.problem, usual.work
-    designs = {name: by_criterion(name) for name in ("D", "A", "E", "I")}
-    for name in designs:
-        asked = objective_of(of, small(), name, work)
-        values = {}
-        for other, made in designs.items():
-            own = objective_of(made.problem, small(), name, made.work)
-            taken = np.flatnonzero(made.counts)
-            m = own.prior + own.units.information(made.counts[taken], taken)
-            values[other] = float(asked.criterion.value(m))
-        assert values[name] >= 0.97 * max(values.values()), (name, values)
 
 
 def test_absolute_readings_are_planned_one_by_one():
@@ -238,26 +175,6 @@ def test_a_run_without_a_plan_keeps_the_same_rule(tmp_path, capsys):
     assert all(f", {name} " in words for name in ("10kg", "pull x", "pull y"))
     assert "5kg " in words
     assert "More would give, predicted for the deflection: 30 poses ±" in words
-
-
-@pytest.mark.long
-def test_planning_on_from_what_is_known(tmp_path, capsys):
-    r = rehearsal("nothing")
-    table, run = tmp_path / "readings.csv", tmp_path / "run.hilcal"
-    write_table(r.readings, table, INSTRUMENT_AND_ARM)
-    cell = cell_file(tmp_path, small())
-    ok(capsys, "import", table, "--config", cell, "-o", run)
-    ok(capsys, "identify", run)
-    arguments = ("plan", cell, "-o", tmp_path / "p.json", "--poses", "3", "--quick", "--json")
-    alone = ok(capsys, *arguments).document
-    on = ok(capsys, *arguments, "--after", run).document
-    stated = ok(capsys, "identify", run, "--json").document["parameters"]
-    std = {p["name"]: p["std"] for p in stated}
-    for k in range(1, 7):
-        name = f"joint_compliance.j{k}"
-        assert on["predicted_std"][name] < alone["predicted_std"][name]
-        assert on["predicted_std"][name] < std[name]
-    assert any("planned on from" in words for words in on["remarks"])
 
 
 @pytest.mark.long

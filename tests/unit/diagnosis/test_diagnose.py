@@ -144,17 +144,6 @@ def test_the_misfit_follows_the_variable_that_drives_it(effect, mode, kind):
     assert strongest.p_value < 1e-10
 
 
-def test_where_names_each_variable_once_and_in_order():
-    places = misfit_breakdown(linearise(fitted_baseline(hidden("hysteresis", "absolute", 0))))
-    names = [v.variable for v in places]
-    assert len(set(names)) == len(names)
-    follows = [v.share for v in places if v.variable != "pose" and "direction" not in v.variable]
-    assert follows == sorted(follows, reverse=True)
-    assert all(0 <= v.share <= 1 and 0 <= v.p_value <= 1 for v in places)
-    assert {f"joint {j} torque" for j in range(2, 7)} <= set(names)
-    assert {"time", "load", "joint 1 approach", "joint 6 angle"} <= set(names)
-
-
 def test_a_diagnosis_needs_whitened_residuals():
     c = campaign(plan_seed=0)
     found = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute", "none")

@@ -5,16 +5,11 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.stats import chi2, multivariate_normal
+from scipy.stats import multivariate_normal
 
 from hilcal.diagnosis.effect_ranking import (
     candidates,
-    largest_plausible,
-    rank_suspects,
-    unloaded_readings,
 )
-from hilcal.diagnosis.evidence import contradicted_effects, whole_catalogue
-from hilcal.diagnosis.noise import MISFIT_ALARM
 from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification import linearisation as columns_module
@@ -24,7 +19,7 @@ from hilcal.identification.carried.drift import carried_effects, evidence_of_car
 from hilcal.identification.carried.posterior import Posterior
 from hilcal.identification.fit import fit
 from hilcal.identification.gauss_newton import whitened_jacobian
-from hilcal.identification.linearisation import columns_of_each, effect_columns, linearise
+from hilcal.identification.linearisation import columns_of_each
 from hilcal.present.verdict import message
 from hilcal.refinement import refine
 from tests.support.campaigns import campaign, measured, plan
@@ -89,29 +84,6 @@ def test_effects_of_the_catalogue_explain_all(mode, effects):
     assert d.insufficiency is None
 
 
-@pytest.mark.long
-def test_noise_that_repeats_show_is_not_an_unknown_effect():
-    found = studied("deflection", "hysteresis", stated=0.5, cycles=2)
-    d = diagnose(found)
-    assert d.suspects[0].effect == "hysteresis"
-    _, square, dof = whole_catalogue(found)
-    assert chi2.sf(square, dof) < MISFIT_ALARM
-    assert d.verdict in ("missing_effect", "ambiguous")
-
-
-def test_a_fit_that_is_not_quite_at_rest_credits_no_effect_with_its_own_step():
-    at_rest = studied("absolute")
-    s = at_rest.solution
-    step = np.random.default_rng(0).standard_normal(s.rows.shape[1])
-    theta = s.theta - s.equations.basis.transform @ step
-    off = replace(at_rest, solution=replace(s, theta=theta, white=s.white + s.rows @ step))
-    one, other = linearise(at_rest), linearise(off)
-    np.testing.assert_allclose(other.residual, one.residual, atol=1e-9)
-    for effect in candidates(at_rest):
-        x = effect_columns(at_rest, effect).white
-        assert other.score(x).log_evidence == pytest.approx(one.score(x).log_evidence, abs=1e-6)
-
-
 @pytest.fixture(scope="module")
 def shared():
     c = campaign("hysteresis", "deflection", poses=12)
@@ -133,23 +105,6 @@ def test_columns_of_several_effects_are_those_of_each(shared, together, monkeypa
         white = w.whiten_readings(jacobian)
         atol = 1e-12 * np.abs(white).max(initial=0.0)
         np.testing.assert_allclose(of.white, white, rtol=1e-9, atol=atol)
-
-
-def test_scores_of_a_catalogue_are_those_of_each_effect_by_itself(shared):
-    p, effects, w = linearise(shared), candidates(shared), shared.whitening
-    ranked = {s.effect: s.score for s in rank_suspects(p, effects)}
-    bare = unloaded_readings(shared)
-    for of in columns_of_each(shared, effects):
-        jacobian = shared.model.jacobian_of(
-            (of.effect,), shared.solution.prediction, shared.theta, 3
-        )
-        x = w.whiten(w.raw(jacobian)) * of.scale
-        score = p.score(x, x.T @ p.project_out(x), largest_plausible(of, bare))
-        together = ranked[of.effect.name]
-        assert (together.rank, together.strength) == (score.rank, score.strength)
-        assert together.log_evidence == pytest.approx(score.log_evidence, rel=1e-9, abs=1e-9)
-        assert together.gain == pytest.approx(score.gain, rel=1e-9, abs=1e-9)
-        assert together.p_value == pytest.approx(score.p_value, rel=1e-6)
 
 
 HIDDEN = "joint_tilt_compliance"
@@ -179,11 +134,6 @@ def with_prior(*, repaired, poses=10):
     c, prior = before()
     r = later(repaired=repaired, poses=poses)
     return fit(baseline(c.cell, r, "absolute", prior=prior), r, "absolute")
-
-
-def test_what_was_repaired_is_spoken_against_and_what_is_there_is_not():
-    assert contradicted_effects(with_prior(repaired=True)) == (HIDDEN,)
-    assert contradicted_effects(with_prior(repaired=False)) == ()
 
 
 def test_the_evidence_is_the_ratio_of_normal_densities_of_the_readings():

@@ -6,16 +6,13 @@ import numpy as np
 import pytest
 
 from hilcal.diagnosis.diagnosis import in_doubt
-from hilcal.diagnosis.effect_ranking import candidates
 from hilcal.diagnosis.misfit_breakdown import pose_constants
-from hilcal.diagnosis.pose_alone import detection_power
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
 from hilcal.present.verdict import message
 from tests.support.campaigns import campaign, measured, plan
-from tests.support.diagnosis_cases import fitted_baseline
 from tests.support.fit_cases import fitted_model
 
 
@@ -74,14 +71,3 @@ def test_a_transmission_error_too_fine_for_thirty_poses_is_ambiguous(seed):
     assert "130 more poses would decide with a chance of" in message(d)
     assert in_doubt(d)[:2] == ("transmission_error", "link_geometry")
     assert d.to_dict()["pose_alone"]["more"] == 130
-
-
-def test_the_chance_grows_with_the_poses():
-    """Thirty poses hardly ever tell, many do."""
-    options = {"plan_seed": 0, "poses": 30, "strength": 2.0, "harmonics": 21}
-    c = campaign("transmission_error", "absolute", 0, **options)
-    p = linearise(fitted_baseline(c))
-    effect = next(e for e in candidates(p.fit) if e.name == "transmission_error")
-    few, many = (detection_power(p, effect, n, 1e-4) for n in (0, 160))
-    assert few < 0.2
-    assert many > 0.9

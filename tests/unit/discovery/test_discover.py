@@ -14,7 +14,7 @@ from hilcal.discovery.discovery import Discovery, LawSearch, discover, discovery
 from hilcal.discovery.law import Form, LawPart, effect_class, source_of_form
 from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.refit import refit_exactly
-from hilcal.discovery.screen import LawTerm, Screen, screen
+from hilcal.discovery.screen import LawTerm, screen
 from hilcal.discovery.search import Selection, search, worth_their_length
 from hilcal.discovery.sites import ORDINARY
 from hilcal.effects.catalogue import installed
@@ -177,18 +177,6 @@ def test_screening_is_what_the_columns_themselves_give():
         slope = float(x[:, 0] @ problem.residual)
         size = float(np.linalg.norm(x) * np.linalg.norm(problem.residual))
         assert problem.slope[site, amplitude] == pytest.approx(slope, abs=1e-4 * size)
-
-
-@pytest.mark.long
-def test_a_screening_of_some_of_the_poses_finds_the_same(monkeypatch):
-    monkeypatch.setattr(sys.modules[Screen.__module__], "MOST_READINGS", 27)
-    thinned = screen(linearise(campaign(LAW)))
-    assert len(thinned.readings) <= 27
-    assert not thinned.rows.all()
-    (first, *_) = search(SearchProblem(thinned))
-    (known, *_) = searched()
-    assert first.terms[0].parts == known.terms[0].parts
-    assert first.total == pytest.approx(known.total, rel=1e-6)
 
 
 def test_columns_of_the_written_effect_are_those_of_the_search():

@@ -146,9 +146,3 @@ def test_a_law_is_seen_on_the_page_and_in_the_viewer(tmp_path):
     save(story, tmp_path / "x.rrd")
     law = rows(tmp_path / "x.rrd", "/law/law", "BarChart:values", "revision")
     assert set(law) == {2}
-
-
-def test_a_model_of_the_catalogue_has_no_laws():
-    made = fitted(DRAWN)
-    plain = replace(made.model, effects=made.model.effects[:-1], catalogue=installed())
-    assert drawn_laws(fit(plain, made.readings, made.mode)) == ()

@@ -9,8 +9,6 @@ import pytest
 from hilcal.discovery import grammar as products
 from hilcal.discovery import shapes
 from hilcal.discovery.amplitudes import Amplitude, Composed, Factor, composed, variables
-from hilcal.discovery.curve import curves
-from hilcal.discovery.discovery import agreement, discover
 from hilcal.discovery.grammar import grammar
 from hilcal.discovery.law import Form, LawPart, effect_class, source_of_form
 from hilcal.discovery.refit import refine, refit_exactly, rss_with_law
@@ -150,32 +148,6 @@ def campaign():
     moved = moved * (SIGMA / np.sqrt(np.mean(w.whiten(w.raw(moved)) ** 2)))
     readings = replace(readings, value=readings.value + moved)
     return fitted_model(cell, readings, "deflection"), moved
-
-
-@cache
-def found():
-    return discover(campaign()[0], name="beyond")
-
-
-@pytest.mark.long
-def test_a_bend_of_a_product_is_found_with_its_site_and_quantities():
-    law = found().laws[0]
-    assert law.acts_on == ("joint 3",)
-    assert set(law.variables) == {"joint 2 torque", "joint 5 angle"}
-    assert "max(cos(q_5)·τ_2 - " in law.formula
-    assert {symbol for symbol, *_ in law.ranges} == {"τ_2", "q_5"}
-
-
-@pytest.mark.long
-def test_the_effect_of_a_bend_does_what_was_hidden():
-    before, moved = campaign()
-    d = found()
-    assert agreement(before, d.after, moved) > 0.99
-    assert d.after.variance_factor < 0.5 * before.variance_factor
-    check_effect(effect_class(d.source, "beyond"))
-    drawn = curves(d.after, d.laws[0].form)[0]
-    assert drawn.quantity == "cos(q_5)·τ_2"
-    assert drawn.line[0, 0] < drawn.line[0, -1]
 
 
 def test_levels_weights_and_exponents_are_refined_together():

@@ -214,30 +214,3 @@ def test_a_gain_that_no_sensor_has_is_said_in_words():
     with pytest.raises(CannotAnswerError, match=r"wrench_gain: a gain error of -120 %") as caught:
         position(model, states, joints(UR10E), np.array([0, 0, -1.2, 0, 0, 0]))
     assert "\n" not in str(caught.value)
-
-
-def test_changes_of_the_load_add():
-    """Load point, weights and sensor together are the load that they make together."""
-    cell = CELLS["odd"]
-    states = some_states(cell)
-    names = ("joint_compliance", "load_point", "link_mass", "wrench_bias", "wrench_gain")
-    model = Model(cell, tuple(make(n, cell, states) for n in names))
-    rng = np.random.default_rng(3)
-    shift, moments = rng.normal(size=3) * 0.02, rng.normal(size=(7, 3)) * 0.05
-    bias, gain = ERRORS["wrench_bias"], ERRORS["wrench_gain"]
-    theta = np.concatenate([joints(cell), shift, moments.ravel(), bias, gain])
-    found = model.predict(states, theta)
-    flange = found.situation.chain.rotation[-1]
-    no_turn = np.zeros(3)
-    parts = [
-        acting(states.wrench, flange, name, ERRORS[name], no_turn) - states.wrench
-        for name in names[3:]
-    ]
-    other = replace(
-        cell,
-        load_point=cell.load_point + shift,
-        arm=replace(cell.arm, coms=cell.arm.coms + moments / cell.arm.masses[:, None]),
-    )
-    plain = Model(other, (make("joint_compliance", other, states),))
-    expected = position(plain, replace(states, wrench=states.wrench + sum(parts)), joints(cell))
-    np.testing.assert_allclose(found.observation.position, expected, rtol=0, atol=1e-12)

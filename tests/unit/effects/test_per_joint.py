@@ -26,10 +26,8 @@ from tests.support.effect_cases import (
     some_states,
 )
 from tests.support.refusals import refusals, refuses
-from tests.unit.effects.test_effect_jacobian import assert_slope
 
 PER_JOINT = tuple(name for name in NAMES if issubclass(effect_class(name), PerJoint))
-CREEPS = ("common", "each", "2-3/5+6")
 GROUPS = ("common", "2/3/4-6", "1+4/2-3", "5")
 
 
@@ -115,34 +113,6 @@ def test_a_shared_parameter_is_the_same_number_at_each_of_its_joints(name, group
     size = np.abs(expected).max(axis=(0, 1)) + 1e-300
     np.testing.assert_allclose(ja / size, expected / size, rtol=0, atol=1e-10)
     assert np.all(np.abs(ja).max(axis=(0, 1)) > 0)
-
-
-@pytest.mark.parametrize("creeps", CREEPS)
-@pytest.mark.parametrize("groups", ["common", "2/3/4-6", "1-3"])
-def test_a_shared_compliance_shows_more_where_the_joints_creep(groups, creeps):
-    """With a creep of the size of the elastic twist, which no neglect could hide."""
-    cell = CELLS["odd"]
-    states = some_states(cell, 4)
-    creep = make("creep", cell, states, {"joints": creeps})
-    some = make("joint_compliance", cell, states, {"joints": groups})
-    every = make("joint_compliance", cell, states)
-    rng = np.random.default_rng(8)
-    k = rng.uniform(0.3, 1.0, len(creep.parameters))
-    c = 1e-4 * rng.uniform(0.5, 1.0, len(some.parameters)) * [p.scale for p in some.parameters]
-    a, b = Model(cell, (creep, some)), Model(cell, (creep, every))
-    m = spread(some, groups)
-    at, bt = np.append(k, c), np.append(k, m @ c)
-    assert_slope(a, states, at, 3)
-    ja = a.jacobian(a.predict(states, at), at, 3)
-    jb = b.jacobian(b.predict(states, bt), bt, 3)
-    expected = np.concatenate([jb[:, :, : len(k)], jb[:, :, len(k) :] @ m], axis=2)
-    size = np.abs(expected).max(axis=(0, 1)) + 1e-300
-    np.testing.assert_allclose(ja / size, expected / size, rtol=0, atol=1e-10)
-    plain = Model(cell, (every,))
-    alone = plain.jacobian(plain.predict(states, m @ c), m @ c, 3)
-    crept = membership(creeps, cell.arm.n) @ k * np.log10(1 + states.load_time)[:, None]
-    law = (alone * (1 + crept)[:, None, :]) @ m
-    np.testing.assert_allclose(ja[:, :, len(k) :], law, rtol=0, atol=1e-3 * np.abs(law).max())
 
 
 @pytest.mark.parametrize("name", PER_JOINT)

@@ -196,18 +196,6 @@ def hilcal(site, *arguments):
 
 
 @pytest.mark.long
-def test_a_plan_is_made_against_it(file, tmp_path, capsys):
-    cell = tmp_path / "cell.toml"
-    text = CELL.read_text(encoding="utf-8")
-    assert "[planning]" in text
-    cell.write_text(text.replace("[planning]", f'[planning]\nagainst = ["{NAME}"]'), "utf-8")
-    arguments = ("plan", cell, "-o", tmp_path / "plan.toml", "--poses", "6", "--quick")
-    assert f"unknown effect '{NAME}'" in refused(capsys, 2, *arguments)
-    d = ok(capsys, *arguments, "--effects-from", file, "--json").document
-    assert {seen["effect"] for seen in d["detectable"]} == {NAME}
-
-
-@pytest.mark.long
 def test_a_revision_says_which_file_it_needs(run_file, file, capsys):
     mine = ("--effects-from", file)
     ok(capsys, "identify", run_file, "--effects", f"joint_compliance,{NAME}", *mine)

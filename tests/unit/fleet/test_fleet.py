@@ -164,19 +164,6 @@ def prior_file(one, path):
     return path
 
 
-@pytest.mark.long
-def test_a_plan_counts_on_what_the_fleet_knows(one, capsys, tmp_path):
-    prior = prior_file(one, tmp_path / "prior.json")
-    command = ("plan", tmp_path / "cell.toml", "-o", tmp_path / "p.json", "--poses", "4", "--quick")
-    alone = ok(capsys, *command, "--json").document["predicted_std"]
-    told = ok(capsys, *command, "--prior", prior, "--json")
-    known = told.document["predicted_std"]
-    assert "60 campaigns of 30 arms of the type ur10e" in " ".join(told.err.split())
-    stiffness = [name for name in alone if name.startswith("joint_compliance.")]
-    assert len(stiffness) == 6
-    assert all(known[name] < alone[name] for name in stiffness)
-
-
 @pytest.mark.slow
 def test_a_calibration_takes_the_prior_of_a_fleet(one, capsys, tmp_path):
     """On simulated devices, from the plan to the corrected targets; asked for once, kept after."""

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from hilcal.calibration.scatter import budget
 from hilcal.campaign.revisions import restore, to_record
 from hilcal.cell import Cell
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
@@ -25,14 +24,13 @@ from hilcal.identification.mixed_fit import mixed_fit
 from hilcal.identification.outliers.gross_errors import find_gross_errors
 from hilcal.identification.prediction.predictive import predictive_of
 from hilcal.library import read_table
-from hilcal.library import refine as search_laws
 from hilcal.mixed.variances import evidence
 from hilcal.readings.whitening import whitening
 from hilcal.refinement import BACKGROUND, refine
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.revision import from_text, to_text
 from hilcal.store.rows import content_hash
-from studies.all_effects_command import AllEffectsCase, campaign_of
+from studies.all_effects_command import AllEffectsCase
 from studies.all_effects_command import refined as all_effects
 from studies.diagnosis import DiagnosisCase
 from studies.diagnosis_command import simulate
@@ -155,55 +153,6 @@ def test_bands_do_not_depend_on_how_large_the_noise_is_stated(series):
     assert sizes[1] == pytest.approx(sizes[0], rel=0.2)
 
 
-HIDDEN = (
-    "link_geometry", "transmission_error", "encoder_offset", "joint_tilt_compliance",
-    "joint_coupling", "hysteresis", "tool_compliance",
-)  # fmt: skip
-
-
-@pytest.mark.long
-def test_an_arm_that_errs_in_many_ways_is_predicted_from_few_poses():
-    config = configuration()
-    case = study_case(config, "ur10e", "absolute", HIDDEN, 20.0, 1, n_poses=25)
-    some = case.readings[case.readings.load == 0]
-    assert len(some) == 25
-    found = refined(case.cell, some, "absolute")
-    added = [step.added for step in found.steps]
-    alone = found.steps[added.index(BACKGROUND) - 1]
-    _, loads = with_study_loads(config, "ur10e")
-    fresh, *_ = rehearsal_states(case.cell, 20, loads, np.random.default_rng(2))
-    true = case.world.ideal_readings(fresh).position
-    error = np.linalg.norm(found.fit.predict(fresh).position - true, axis=1).mean()
-    before = np.linalg.norm(alone.fit.predict(fresh).position - true, axis=1).mean()
-    assert error < 0.6 * before
-    stated = budget(found.fit)  # fitted poses are far nearer than any other is
-    assert stated.combined >= found.fit.holdout.rms_m > 3 * found.fit.error.rms_m
-    unloaded = replace(fresh, wrench=np.zeros_like(fresh.wrench))  # as what was fitted
-    off = found.fit.predict(unloaded).position - case.world.ideal_readings(unloaded).position
-    assert np.mean(np.linalg.norm(off, axis=1) <= stated.expanded) >= 0.9
-    assert found.verdict in ("missing_effect", "ambiguous")
-    assert set(found.fit.model.named) - {"base_frame"} <= set(HIDDEN)
-
-
-@pytest.mark.long
-def test_effects_of_implausible_size_do_not_stand_in_for_an_unknown_law():
-    law = "compliance by another joint"  # link lengths of 14 mm would predict it
-    asked = DiagnosisCase("outside", "ur3e", "deflection", (law,), 3.0, 0)
-    case = simulate(asked)
-    found = refined(case.cell, case.readings, asked.mode)
-    assert found.verdict == "unknown_effect"
-    assert not found.fit.model.background
-
-
-@pytest.mark.long
-def test_noise_that_is_stated_too_small_is_no_background():
-    asked = DiagnosisCase("noise", "ur3e", "absolute", (), 0.0, 0, 0.5, cycles=2)
-    case = simulate(asked)
-    found = refined(case.cell, case.readings, asked.mode)
-    assert found.verdict == "noise_misjudged"
-    assert not found.fit.model.background
-
-
 @pytest.mark.long
 def test_waves_of_gears_in_pools_predict_better_than_line_by_line():
     config, ratios = configuration(), []
@@ -245,20 +194,6 @@ def test_a_law_that_the_catalogue_lacks_is_seen_beside_all_its_effects(seed):
     assert (found.verdict, found.named) == ("unknown_effect", ())
     without = all_effects(AllEffectsCase(60, seed, factor=1.0, without=False))
     assert without.verdict in ("ambiguous", "adequate")
-
-
-@pytest.mark.slow
-def test_a_law_beside_all_effects_is_found_and_the_others_are_named(tmp_path):
-    case = AllEffectsCase(60, 0, factor=1.0, without=False, law_rad=5e-4)
-    cell, some, test = campaign_of(case)
-    path = search_laws(baseline(cell, some, "absolute"), some, "absolute", discover=tmp_path)
-    added = [step.added for step in path.steps]
-    before = path.steps[added.index(BACKGROUND)].fit
-    assert error(path.fit, test) < 0.6 * error(before, test)
-    assert "dq_2 = a·sin(3·q_4)" in (tmp_path / "found.py").read_text()
-    assert added.index("found") < added.index("transmission_error")
-    assert {"found", "link_geometry", "transmission_error"} <= set(path.fit.model.named)
-    assert path.verdict == "ambiguous"
 
 
 def test_a_slip_in_time_that_all_effects_fit_is_unknown():

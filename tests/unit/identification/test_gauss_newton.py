@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import scipy.linalg as sl
 
-from hilcal.errors import CannotAnswerError
 from hilcal.identification.carried.carried_prior import scales_of
 from hilcal.identification.fit import fit
 from hilcal.identification.gauss_newton import (
@@ -14,7 +13,6 @@ from hilcal.identification.gauss_newton import (
     NewtonPoint,
     linear_problem,
     regularise,
-    shortened,
 )
 from hilcal.identification.residual import residual
 from hilcal.model.model import Model
@@ -99,18 +97,6 @@ def test_sideways_pulls_separate_the_first_joints_offset_from_the_registration(s
     )
     down = fit(model, replace(readings, states=states, value=readings.value + shift), "absolute")
     assert not down.uncertainty.identifiable[pair].any()
-
-
-def test_a_step_is_shortened_until_it_can_be_taken():
-    def moved(step):
-        if step[0] > 1.0:
-            raise CannotAnswerError("too far")
-        return float(step[0])
-
-    step = np.array([3.0])
-    assert shortened(moved, step, 3) == 0.75
-    assert shortened(moved, step, 4, cost=lambda x: x, limit=0.5) == 0.375
-    assert shortened(moved, step, 2) is None
 
 
 def nearly_dependent(condition, columns):

@@ -7,15 +7,12 @@ import pytest
 from scipy.stats import binom, poisson
 
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import notes, outliers
 from hilcal.identification.outliers.data_snooping import (
     SITE_LEVEL,
-    DataSnooping,
     along_one_site,
-    linearised,
     site_columns,
 )
 from hilcal.identification.outliers.least_trimmed_squares import (
@@ -27,7 +24,7 @@ from hilcal.identification.outliers.least_trimmed_squares import (
 from hilcal.identification.registration.misdescription import examine
 from hilcal.identification.registration.registration import register
 from hilcal.present.verdict import message
-from hilcal.readings.whitening import MODES, inverse_root, whitening
+from hilcal.readings.whitening import MODES, inverse_root
 from studies.gross_errors import GrossErrorCase, count, spoil
 from studies.study_cases import study_case
 from tests.support.campaigns import campaign, configuration, noiseless, plan, with_noise
@@ -129,14 +126,6 @@ def test_clean_campaigns_keep_all_their_readings(tried):
     start = np.zeros(model.size)
     fits = (fit(model, with_noise(clean, rng), "absolute", start=start) for _ in range(tried))
     assert sum(bool(f.outlier.any()) for f in fits) <= poisson.isf(1e-3, FALSE_ALARMS * tried)
-
-
-def test_the_limit_moves_away_gradually_as_the_bulk_grows_beyond_chance():
-    far = [rejection_limit(3, 150, scale) for scale in (1.0, 1.2, 1.31, 1.4, 1.5, 2.0)]
-    assert far == sorted(far)
-    assert far[2] < 2.1 * far[0]
-    for k, factor in ((1, 1.2), (4, 1.5 * 2.5**2), (5, 2.0 * 2.5**2)):
-        assert far[k] == pytest.approx(factor * far[0])
 
 
 def test_a_true_effect_is_not_mistaken_for_gross_errors():
@@ -280,15 +269,6 @@ def test_a_block_is_not_taken_for_random_errors_among_such():
     assert found.outlier[20:32].sum() <= inside.sum()
 
 
-def test_an_unloaded_reading_that_several_deflections_share():
-    c = twelve("deflection")
-    rows, value = np.flatnonzero(c.readings.unloaded)[::4], c.readings.value.copy()
-    value[rows] += 5e-3 * np.random.default_rng(0).normal(size=(len(rows), 3))
-    found = fitted_model(c.cell, replace(c.readings, value=value), "deflection")
-    expected = np.isin(c.readings.pose, c.readings.pose[rows])
-    np.testing.assert_array_equal(found.outlier, expected)
-
-
 @pytest.mark.parametrize("mode", MODES)
 def test_readings_of_several_targets(mode):
     c = reflectors(poses=10)
@@ -304,13 +284,6 @@ def test_a_registration_does_not_follow_errors_of_centimetres():
     assert found.rms < 1.1 * register(c.cell, c.readings).rms + 1e-4
     finding = examine(found, readings)
     assert not finding.refused
-
-
-@pytest.mark.long
-def test_a_block_off_by_centimetres_is_refused():
-    readings = shifted(twelve().readings, slice(12, 30), np.array([0.05, 0.0, 0.0]))
-    with pytest.raises(InputError, match=r"rows do not fit|Nothing that was tried"):
-        baseline(twelve().cell, readings, "absolute")
 
 
 APART = np.arange(400)
@@ -412,18 +385,3 @@ def test_distances_are_those_of_least_squares_without_the_reading(mode):
         off = of.residual[k] - b[k] @ delta
         exact = off @ np.linalg.solve(np.eye(3) + b[k] @ c @ b[k].T, off)
         assert found[k] == pytest.approx(exact, rel=1e-6)
-
-
-@pytest.mark.parametrize("m", [3, 6])
-@pytest.mark.parametrize("mode", MODES)
-def test_a_step_of_the_linear_model_is_that_of_the_fit(mode, m):
-    """At the minimum of a fit the step is zero, deflections through their offset as well."""
-    c = campaign("none", mode, poses=12, m=m)
-    found = fitted_model(c.cell, c.readings, mode)
-    y = found.solution.y
-    of = linearised(DataSnooping(found.model, c.readings, mode, found.solution, y), y).linear
-    delta, covariance = of.fitted(of.tested)
-    assert np.abs(delta / np.sqrt(np.diagonal(covariance))).max() < 1e-2
-    left = of.residuals(of.tested)
-    assert np.sum(left**2) == pytest.approx(found.chi2, rel=1e-3)
-    assert len(whitening(c.readings, mode)) == np.count_nonzero(of.tested) - len(of.members)

@@ -19,7 +19,6 @@ from hilcal.identification.folds import (
 )
 from hilcal.identification.gauss_newton import solve
 from hilcal.identification.residual import residual
-from hilcal.readings.whitening import MODES
 from studies.study_cases import study_case
 from tests.support.campaigns import campaign, configuration
 from tests.support.fit_cases import fitted_model
@@ -64,24 +63,6 @@ def test_leaving_out_is_refitting_without(mode, m):
     assert np.abs(np.concatenate(moved)).max() > 0.3
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_every_measurement_is_predicted_without_its_own_pose(mode):
-    """Wrong readings of one pose change the prediction of all others, not their own."""
-    found = fitted(mode)
-    readings, w = found.readings, found.whitening
-    fold = random_folds(found.pose)
-    mine = random_folds(distinct_poses(readings)) == 4
-    value = readings.value.copy()
-    value[mine & ~readings.unloaded] += 2e-5
-    other = fit(found.model, replace(readings, value=value), mode, prior=found.solution.prior)
-    assert not other.outlier.any()
-    told = [r.readings.value[w.reading][fold == 4] - r.left_out[fold == 4] for r in (found, other)]
-    # To the share (a few 1e-3) by which a linear step differs from a refit.
-    np.testing.assert_allclose(told[1], told[0], rtol=0, atol=5e-3 * 2e-5)
-    elsewhere = [r.left_out[fold != 4] for r in (found, other)]
-    assert np.abs(elsewhere[1] - elsewhere[0]).max() > 1e-6
-
-
 def test_the_error_on_poses_left_out_exceeds_that_of_the_fit_by_what_parameters_cost():
     """Expected squares: 1 − P/R fitted, about 1 + P/R left out."""
     gain, share = [], []
@@ -117,17 +98,6 @@ def test_repetitions_of_a_pose_stay_together_whatever_their_names():
     assert pose.max() + 1 == len(c.readings.pose_names)
     for fold in (random_folds(pose), block_folds(pose), region_folds(twice.states.q, pose)):
         np.testing.assert_array_equal(fold[:n], fold[n:])
-
-
-def test_poses_are_numbered_by_first_appearance_and_order_does_not_matter():
-    c = campaign(plan_seed=0)
-    pose = distinct_poses(c.readings)
-    np.testing.assert_array_equal(pose, c.readings.pose)
-    shuffle = np.random.default_rng(0).permutation(len(c.readings))
-    mixed = distinct_poses(c.readings[shuffle])
-    assert np.all(np.diff(np.unique(mixed, return_index=True)[1]) > 0)
-    same = pose[shuffle][:, None] == pose[shuffle]
-    np.testing.assert_array_equal(mixed[:, None] == mixed, same)
 
 
 @pytest.mark.parametrize("poses", [2, 9, 10, 37])

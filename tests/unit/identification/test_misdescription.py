@@ -242,14 +242,6 @@ def test_an_arm_before_calibration_is_not_taken_for_another(name, off):
         assert other_arm(registered, readings) is None
 
 
-def test_joints_count_as_the_cell_says():
-    sign = [1, 1, 1, -1, 1, 1]
-    right = measured("ur10", 0, 1.0)
-    counted = replace(right, states=replace(right.states, q=right.states.q * sign))
-    found = other_arm_of(cell("ur10e", joint_sign=sign), counted)
-    assert found.name == "ur10"
-
-
 def test_too_few_poses_say_nothing():
     assert other_arm_of(cell("ur10e"), measured("ur10", 0, 1.0, poses=3)) is None
 

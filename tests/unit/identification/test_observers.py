@@ -1,13 +1,11 @@
 """Stations, distances and heights: derivative, registration, fits, verdicts, tables, refusals."""
 
-import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.cell import Cell
 from hilcal.config.sections import Gauge, Point
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import installed
@@ -23,12 +21,11 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.rows import content_hash
 from hilcal.tables.table import write_table
 from tests.support.campaigns import campaign, cell_of, configuration, true_parameters
-from tests.support.cli_cases import CELL, ok
 from tests.support.effect_cases import numeric_slopes, random_theta, some_states
 from tests.support.fit_cases import fitted_model, parameters_by_effect
 from tests.support.observer_cases import NORMAL, POINTS, base_cell, observed, stated
 from tests.support.readings_cases import read_table
-from tests.support.refusals import refusal, refusals, refuses
+from tests.support.refusals import refusals, refuses
 from tests.support.rows import first
 
 KNOWN = replace(base_cell(stated("ABC")), registration_known=True)
@@ -202,23 +199,6 @@ def test_tables_files_and_calibrations_keep_observers(tmp_path):
     np.testing.assert_allclose(again.predict(q).position, made.predict(q).position, atol=1e-12)
 
 
-@pytest.mark.long
-def test_commands(tmp_path, capsys):
-    c = observed(["S1", "S2", "A", "G"], 5, effect="joint_tilt_compliance", strength=5.0)
-    write_table(c.readings, tmp_path / "t.csv")
-    (tmp_path / "cell.toml").write_text(CELL.read_text())
-    run = tmp_path / "r.hilcal"
-    told = ok(capsys, "import", tmp_path / "t.csv", "--config", tmp_path / "cell.toml", "-o", run)
-    words = " ".join(told.out.split())
-    assert "60 positions by S1, 60 positions by S2, 60 distances from A, 60 heights of G" in words
-    assert re.search(r"point A is at \(1\.\d+, 0\.\d+, -0\.\d+\) m; gauge G has", words)
-    refined = ok(capsys, "refine", run, "--readings", "absolute", "--json").document
-    assert refined["verdict"] == "adequate"
-    assert refined["revisions"][-1]["added"] == "joint_tilt_compliance"
-    assert ok(capsys, "info", run, "--json").document["revisions"]
-    ok(capsys, "report", run, "-o", tmp_path / "r.html")
-
-
 HEADER = "pose,load,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad"
 Q = "p1,none,0,-1,0,0,0,0"
 
@@ -251,10 +231,3 @@ def test_stations_of_poses():
     assert found.dof == one.dof - 6
     assert abs(one.variance_factor - 1.0) < 0.3
     assert abs(found.variance_factor - 1.0) < 0.3
-
-
-def test_a_cell_names_its_gauges(tmp_path):
-    (tmp_path / "cell.toml").write_text(
-        CELL.read_text() + "\n[gauges.G]\norigin_m = [0.0, 0.0, 1.0]\n"
-    )
-    refusal("origin_m without direction", Cell.load, tmp_path / "cell.toml")

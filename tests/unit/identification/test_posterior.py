@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import hilcal as hc
-from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.revisions import restore, to_record
 from hilcal.diagnosis.stepwise import add, remove
 from hilcal.drivers.simulated.world import place_tracker
@@ -174,23 +173,6 @@ def test_a_change_is_seen_with_its_size_in_its_effect_alone(arm):
     assert p["joint_compliance"] > 1e-3
 
 
-def test_effects_that_one_fit_lacks_are_named(arm):
-    one = posterior(arm, 0)
-    rows = one.index("joint_compliance")
-    less = replace(
-        one,
-        names=tuple(one.names[k] for k in rows),
-        units=tuple(one.units[k] for k in rows),
-        scale=one.scale[rows],
-        mean=one.mean[rows],
-        information=one.marginal(rows),
-        own_precision=one.own_precision[rows],
-    )
-    d = parameter_differences(one, less)
-    assert d.apart == ("encoder_offset",)
-    assert {r.name.split(".")[0] for r in d.rows} == {"joint_compliance"}
-
-
 NAMES = ("joint_compliance", "encoder_offset", "joint_tilt_compliance")
 
 
@@ -329,10 +311,3 @@ def test_priors_that_cannot_be_are_refused():
         (foreign, {}, "--effects-from"),
     ):
         refusal(words, carried_prior, of, **given)
-
-
-def test_a_calibration_is_surer_with_a_prior():
-    fits = (of_poses(25, 40, carried_prior(learnt())), of_poses(25, 40))
-    stated = [Calibration.of(f).predict(both().readings.states.q[:20]).covariance for f in fits]
-    spread = [np.trace(c, axis1=1, axis2=2).mean() for c in stated if c is not None]
-    assert spread[0] < spread[1]

@@ -181,14 +181,6 @@ def test_one_axis_registers_to_the_noise_at_ordinary_places(m):
     assert "joints 2 to 6 never turned" in " ".join(registration_lines(found))
 
 
-@EITHER
-def test_poses_that_turn_leave_nothing_undetermined(m):
-    q = np.random.default_rng(1).uniform(-2, 2, (30, 6))
-    found = registered(seen(BASE, target_of(m), m, q, 1e-5))
-    assert found.undetermined == ()
-    np.testing.assert_allclose(found.cell.target[:3, 3], OFFSET, atol=1e-4)
-
-
 def test_positions_count_although_attitudes_of_one_axis_are_blind():
     """Attitudes alone leave the base's turn about the common axis open; positions tell it."""
     q = pointing_down(40)

@@ -178,16 +178,6 @@ def test_a_family_that_others_span_has_no_evidence_of_its_own():
     assert (evidence(again, 1, rng).ratio, evidence(again, 1, rng).rank) == (0.0, 0)
 
 
-def test_the_outcome_does_not_depend_on_the_order_of_families():
-    (one, fresh, _), (two, _, _) = (
-        drawn(np.random.default_rng(8), (1.0, 0.5), 0.3, 15, turned=t) for t in (False, True)
-    )
-    first, second = estimate_variances(one), estimate_variances(two)
-    np.testing.assert_allclose(first.log_std[[1, 0, 2]], second.log_std, atol=0.01)
-    for mean, other in zip(predict(first, fresh), predict(second, fresh), strict=True):
-        np.testing.assert_allclose(mean, other, rtol=0.01, atol=0.01)
-
-
 @pytest.mark.parametrize("over", [0, 60])
 def test_the_likelihood_of_one_size_is_exact(over):
     rng = np.random.default_rng(9)

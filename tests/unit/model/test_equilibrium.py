@@ -12,9 +12,7 @@ from hilcal.model.model import Model
 from hilcal.readings.readings import States
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
-from hilcal.robot.chain import Deviation
-from hilcal.robot.statics import Load, slot_wrenches
-from tests.support.arm_cases import ODD, arm_of, cell_of, displacement
+from tests.support.arm_cases import arm_of, cell_of, displacement
 
 COUNT = 10
 ALL = (
@@ -53,33 +51,6 @@ def case(name="ur10e", count=COUNT):
     states = states_of(arm, count)
     model = model_of(cell_of(arm), states)
     return model, states, ordinary(model)
-
-
-def deviation_at(model, p, states, theta):
-    """The effects evaluated anew at the configuration of a prediction."""
-    cell, s = model.cell, p.situation
-    shift = sum(
-        (c.point for e, at in zip(model.effects, model.slices(), strict=True)
-         if (c := e.load_change(theta[at])) is not None),
-        np.zeros(3),
-    )  # fmt: skip
-    load = Load(states.wrench, cell.load_point + shift, cell.tool_mass, cell.tool_com, cell.gravity)
-    s = replace(s, wrench=slot_wrenches(cell.arm, s.chain, load))
-    parts = zip(model.effects, model.slices(), strict=True)
-    return sum((e.deviation(theta[at], s) for e, at in parts), Deviation())
-
-
-@pytest.mark.parametrize("name", ["ur10e", "ur3", ODD])
-def test_effects_at_the_equilibrium_give_its_deviation(name):
-    model, states, theta = case(name)
-    p = model.predict(states, theta)
-    again = deviation_at(model, p, states, theta)
-    for field in ("dq", "twist", "base", "station", "target"):
-        found, expected = getattr(p.deviation, field), getattr(again, field)
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
-    assert p.deviation.scale is None
-    largest = np.abs(p.deviation.dq).max()
-    assert largest > 1e-3  # the case is worth converging
 
 
 def test_elastic_pendulum_hangs_where_its_torques_balance():

@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy import stats
 from scipy.stats import beta
 
@@ -23,7 +21,7 @@ from hilcal.regression.forward_selection import (
     block_evidence,
     forward_selection,
 )
-from tests.support.regression_cases import KINDS, Problem, problem
+from tests.support.regression_cases import Problem, problem
 
 DOF = 53.0
 
@@ -75,17 +73,6 @@ def test_posterior_mean_and_scale_are_those_of_ridge_regression(kind):
     np.testing.assert_allclose(found.root @ found.root.T, left * np.linalg.inv(h), rtol=1e-9)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_common_factor_of_the_noise_changes_no_evidence(kind):
-    """Columns and data in units of another noise: only the prior's strength is moved."""
-    of = problem(kind)
-    louder = Problem(of.rows, of.ridge, of.x, 3 * of.y)
-    one, other = score(of), score(louder)
-    assert other.p_value == pytest.approx(one.p_value, rel=1e-9)
-    # τ is tried on a grid of steps of a fifth of a decade.
-    assert other.log_evidence == pytest.approx(one.log_evidence, abs=0.02 * of.x.shape[1])
-
-
 def test_directions_that_cannot_be_seen_count_for_nothing():
     of = problem("rank deficient")
     assert of.x.shape[1] == 6
@@ -122,13 +109,6 @@ def test_evidences_of_a_chain_add_up():
 def test_the_noncentrality_is_that_of_the_power(rank, level):
     value = noncentrality_of_power(rank, 60.0, level, 0.9)
     assert power_of_test(value, rank, 60.0, level) == pytest.approx(0.9, abs=1e-4)
-
-
-def test_without_a_family_the_power_is_the_level_and_known_noise_is_the_limit():
-    assert power_of_test(0.0, 3, 50.0, 0.01) == pytest.approx(0.01)
-    few, many, known = (power_of_test(12.0, 3, rest, 0.01) for rest in (20.0, 1e6, np.inf))
-    assert few < many == pytest.approx(known, rel=1e-4)
-    assert family_power(np.zeros((2, 2)), np.ones(2), 0.01) == 0.01
 
 
 def test_the_power_is_the_share_of_rejections():
@@ -174,26 +154,6 @@ def test_unequal_eigenvalues_agree_with_monte_carlo(seed):
         # 4 σ of the Monte-Carlo share, and 3 % of the approximation.
         slack = 4 * np.sqrt(p * (1 - p) / draws) + 0.03 * p
         assert ratio_tail(values, dimension, c) == pytest.approx(p, abs=slack)
-
-
-@pytest.mark.long
-@given(
-    st.lists(st.floats(1e-3, 1e3), min_size=1, max_size=12),
-    st.integers(2, 300),
-    st.floats(1e-6, 1e6),
-)
-def test_it_is_a_probability_that_falls_and_has_no_unit(values, extra, unit):
-    eigenvalues = np.array(values)
-    dimension = len(values) + extra
-    at = np.linspace(0.0, 1.0, 60) * eigenvalues.max()
-    tail = np.array([ratio_tail(eigenvalues, dimension, c) for c in at])
-    assert np.all((tail >= 0) & (tail <= 1))
-    assert tail[0] == 1
-    assert tail[-1] == 0
-    # Monotone but for the approximation's own error near the middle.
-    assert np.all(np.diff(tail) <= 1e-3)
-    scaled = [ratio_tail(unit * eigenvalues, dimension, unit * c) for c in at]
-    np.testing.assert_allclose(scaled, tail, rtol=1e-4, atol=1e-7)
 
 
 def test_the_deep_tail_falls_without_a_step():
@@ -274,14 +234,6 @@ def test_the_same_blocks_in_the_same_order():
             assert selection.without(f, 4, 8.0, TRIED) == expected
             lengths.append(len(expected))
     assert min(lengths) >= 3
-
-
-def test_nothing_is_chosen_of_noise():
-    rng = np.random.default_rng(1)
-    own, x = rng.normal(size=(ROWS, MODEL)), rng.normal(size=(ROWS, BLOCKS, WIDTH))
-    y, fold = rng.normal(size=ROWS), np.arange(ROWS) % FOLDS
-    selection = BlockSelection(own, np.full(MODEL, 1e-6), x, y, fold, MODEL)
-    assert [selection.without(f, 4, 8.0, TRIED) for f in range(FOLDS)] == [[]] * FOLDS
 
 
 def test_a_fold_that_the_sample_has_no_row_of_is_left_out_of_nothing():

@@ -60,27 +60,6 @@ def test_rows_left_out_are_predicted_as_by_a_refit_without_them(beta):
         np.testing.assert_allclose(theta + step, bare, atol=1e-4)
 
 
-@pytest.mark.parametrize("ridge", [0.0, 0.8, 40.0])
-def test_simulated_residuals_are_predicted_as_by_refits_without_their_fold(ridge):
-    each, p, _, _, x = model(1.0)
-    y = np.random.default_rng(6).standard_normal((60, 3))
-    found, before = FamilyFolds(each, x), each.left_out(y)
-    for again in (ridge, 2.0, ridge):  # another ridge in between changes nothing
-        left = found.left_out(before, again)
-    alone = before.residual
-    for fold in each.folds:
-        rows, stay = p.rows[fold.left_out_rows], ~fold.left_out_rows
-        h = np.linalg.inv(fold.inverse_root.T @ fold.inverse_root)
-        cross = p.rows[stay].T @ x[stay]
-        own = x[stay].T @ x[stay] + ridge * np.eye(2)
-        rhs = np.vstack([p.rows[stay].T @ y[stay], x[stay].T @ y[stay]])
-        step = np.linalg.solve(np.block([[h, cross], [cross.T, own]]), rhs)
-        expected = y[fold.left_out_rows] - np.hstack([rows, x[fold.left_out_rows]]) @ step
-        np.testing.assert_allclose(left[fold.left_out_rows], expected, atol=1e-8)
-        plain = y[fold.left_out_rows] - rows @ np.linalg.solve(h, p.rows[stay].T @ y[stay])
-        np.testing.assert_allclose(alone[fold.left_out_rows], plain, atol=1e-8)
-
-
 @pytest.mark.parametrize("out", [[0], [2, 3], [4, 5], [0, 1, 4]])
 def test_a_model_without_columns_is_as_a_refit_without_them(out):
     beta = 1.7

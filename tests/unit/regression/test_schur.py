@@ -57,13 +57,6 @@ def test_units_of_the_parameters_do_not_matter(singular):
     np.testing.assert_allclose(schur_complement(scaled.T @ scaled, INTEREST), expected, rtol=1e-9)
 
 
-def test_many_matrices_at_once():
-    m = np.stack([c.T @ c for c in (columns(singular=False), columns(singular=True))] * 2)
-    found = schur_complement(m.reshape(2, 2, 8, 8), INTEREST)
-    each = [schur_complement(one, INTEREST) for one in m]
-    np.testing.assert_allclose(found.reshape(4, 3, 3), each, rtol=1e-13)
-
-
 @pytest.mark.parametrize("singular", [False, True])
 def test_the_inverse_root_is_one_of_the_pseudoinverse(singular):
     a = columns(singular=singular)

@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
-from scipy.stats import binom
 
 from hilcal.regression.variance_components import (
-    FALSE_ALARM,
     BlockRows,
     FleetEstimates,
     hierarchy,
@@ -138,22 +136,6 @@ def test_spreads_and_means_are_recovered_within_their_sampling_errors():
     assert np.mean(within) == pytest.approx(WITHIN, rel=0.15)
 
 
-def test_an_arm_that_is_unlike_the_others_is_named_and_leaves_the_spread_alone():
-    of, _ = fleet(3, odd=(7, 4, 8.0))
-    h, named = hierarchy(of)
-    assert [(o.unit, o.parameter) for o in named] == [(7, 4)]
-    assert named[0].deviation == pytest.approx(8.0, abs=4 * BETWEEN[4])
-    ordinary, _ = hierarchy(fleet(3)[0])
-    assert np.sqrt(h.between[4]) == pytest.approx(np.sqrt(ordinary.between[4]), rel=0.1)
-
-
-@pytest.mark.long
-def test_in_ordinary_fleets_no_arm_is_named():
-    fleets = 25
-    alarms = sum(bool(hierarchy(fleet(100 + seed)[0])[1]) for seed in range(fleets))
-    assert binom.sf(alarms - 1, fleets, FALSE_ALARM) > 1e-3
-
-
 def test_common_drift_is_found_beside_the_changes_of_single_arms():
     of, _ = fleet(5, slope=0.3)
     h, _ = hierarchy(of)
@@ -161,14 +143,3 @@ def test_common_drift_is_found_beside_the_changes_of_single_arms():
     assert abs(h.slope[2] - 0.3) < 4 * std[2]
     assert h.slope[2] > 5 * std[2]
     assert np.abs(np.delete(h.slope / std, 2)).max() < 4
-
-
-def test_arms_measured_once_have_one_spread():
-    of, _ = fleet(6)
-    once = of.time == 0
-    h, _ = hierarchy(
-        FleetEstimates(of.mean[once], of.information[once], of.arm[once], of.time[once])
-    )
-    assert not h.within.any()
-    assert not h.slope.any()
-    assert h.between[5] > h.between[0]

@@ -20,8 +20,3 @@ def test_few_positions_predict_nearly_as_well_as_can_be():
         assert f.inside > 0.85
         assert f.rms_m < 0.8 * f.without_m
         assert "link_geometry" in f.named
-
-
-@pytest.mark.long
-def test_an_arm_that_is_not_as_described_is_refused():
-    assert refined(AllEffectsCase(30, 1, 10.0, False)) is None

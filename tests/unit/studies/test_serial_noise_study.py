@@ -3,9 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
-from studies.serial_noise import SerialCase, SerialNoiseOutcome, serial_case, serial_readings
+from studies.serial_noise import SerialCase, SerialNoiseOutcome, serial_readings
 from studies.serial_noise_command import _figures
 from studies.study_cases import study_case
 from tests.support.campaigns import configuration
@@ -22,16 +21,6 @@ def test_the_noise_has_the_stated_covariance_and_the_correlation():
     z = np.array(drawn)[..., 0]
     assert abs(float(np.mean(z**2)) - 1.0) < 0.05
     assert abs(float(np.mean(z[:, 1:] * z[:, :-1])) - 0.8) < 0.05
-
-
-@pytest.mark.long
-def test_a_case_counts_what_is_within():
-    c = serial_case((3, 0.9, ""), config=CONFIG, robot="ur10e", poses=6)
-    for o in (c.before, c.after):
-        assert 0 <= o.parameters[0] <= o.parameters[1] <= 6
-        assert o.predictions[1] > 0
-        assert 0 <= o.predictions[0] <= o.predictions[1]
-    assert c.found is not None
 
 
 def test_requirements_are_of_strong_noise_and_of_white():

@@ -5,15 +5,12 @@ import pytest
 
 from hilcal.cell import cell_from_config
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.drivers.simulated.injected_effects import EFFECTS
 from hilcal.errors import InputError
-from hilcal.readings.whitening import whitening
 from studies.diagnosis import intervals
-from studies.study_cases import effects_shown, study_case, with_study_loads
+from studies.study_cases import study_case, with_study_loads
 from studies.study_more import measure_more, suspects
 from studies.unmodelled_laws import LAWS, law_named, shift
 from tests.support.campaigns import configuration
-from tests.support.effect_cases import make
 from tests.support.fit_cases import fitted_model
 from tests.support.refusals import refusal
 from tests.support.rehearsed import dead_weights
@@ -104,21 +101,6 @@ def test_laws_and_effects_that_do_not_fit_are_refused():
         shift(law_named("swaying bench"), c.world, still[none], 3.0, "absolute", none, none)
 
 
-@pytest.mark.long
-def test_true_parameters_have_the_program_s_names():
-    for effect in EFFECTS:
-        if effect == "joint_compliance":
-            continue
-        c = case(effect, poses=30 if effect == "transmission_error" else 4)  # for its harmonics
-        effects = {effect, "joint_compliance"}
-        names = {
-            f"{e}.{p.name}" for e in effects for p in make(e, c.cell, c.readings.states).parameters
-        }
-        assert {n.split(".")[0] for n in c.world.truth} == effects
-        assert set(c.world.truth) <= names, effect
-    assert set(effects_shown("absolute")) == set(EFFECTS) - {"joint_compliance"}
-
-
 def test_intervals_hold_true_parameters_and_no_others():
     c = study_case(configuration(), "ur10e", "absolute", (), 0.0, 1)
     f = fitted_model(c.cell, c.readings, "absolute")
@@ -132,28 +114,6 @@ def test_intervals_hold_true_parameters_and_no_others():
 
 def diagnosed(c):
     return diagnose(fitted_model(c.cell, c.readings, "deflection"))
-
-
-@pytest.mark.long
-def test_a_further_round_adds_readings_of_new_poses_in_the_same_world():
-    c = case("link_compliance", mode="deflection", strength=0.5, poses=10)
-    d = diagnosed(c)
-    assert len(suspects(d)) > 1
-    all_ = measure_more(configuration(), "ur10e", c, d, seed=1, poses=4)
-    n = len(c.readings)
-    assert len(all_) > n + 10
-    np.testing.assert_array_equal(all_.value[:n], c.readings.value)
-    assert all_.pose[n:].min() > all_.pose[:n].max()
-    assert len(all_.pose_names) == all_.pose.max() + 1
-    assert np.all(np.diff(np.asarray(all_.states.time)) > 0)
-    # Every loaded reading has its unloaded one, and noise is what the covariance says.
-    loaded = whitening(all_, "deflection", "gc")
-    assert len(loaded.reading) == np.count_nonzero(~all_.unloaded)
-    clean = c.world.ideal_readings(all_.states).position
-    white = np.einsum(
-        "nij,nj->ni", np.linalg.inv(np.linalg.cholesky(all_.covariance)), all_.value - clean
-    )
-    assert abs(np.mean(white[n:] ** 2) - 1) < 4 * np.sqrt(2 / white[n:].size)
 
 
 def test_nothing_is_measured_where_one_effect_leads_alone():

@@ -3,30 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
-from studies.change import ChangeCase, case, studied_arm
+from studies.change import ChangeCase
 from studies.change_command import figures_of
-from tests.support.campaigns import configuration
-
-CONFIG = configuration()
-
-
-@pytest.mark.long
-def test_a_case_says_how_visible_its_change_was_and_what_was_named():
-    arm = studied_arm(CONFIG, "ur10e", 0, poses=20)
-    found = case(arm, "zero", 3, True, 7)
-    assert found.found
-    assert found.visible
-    assert 0.3e-3 <= abs(found.size_rad) <= 5e-3
-    assert found.moved_m > 1e-4
-    assert len(found.z) == 1
-    turned = case(arm, "zero", 1, True, 7)
-    assert turned.parts == ""
-    assert not turned.visible
-    assert turned.moved_m > 1e-4  # the tracker's new place absorbs it
-    again = case(arm, "zero", 3, True, 7)
-    assert again.z == found.z
 
 
 def test_figures_count_what_was_found_missed_and_claimed():

@@ -1,13 +1,11 @@
 """`study diagnosis`: what it counts and asks, on one process and on several."""
 
 import io
-import json
 
 import pytest
 from rich.console import Console
 
 from hilcal.errors import InputError
-from hilcal.readings.whitening import MODES
 from studies.diagnosis import (
     AddedEffect,
     DiagnosisCase,
@@ -18,9 +16,7 @@ from studies.diagnosis import (
     run_case,
 )
 from studies.diagnosis_claims import claims
-from studies.diagnosis_document import document
 from studies.diagnosis_pool import run_all
-from studies.diagnosis_questions import Extent, questions
 from studies.diagnosis_rates import (
     afterwards,
     both_added,
@@ -32,7 +28,6 @@ from studies.diagnosis_rates import (
     unknown,
 )
 from studies.diagnosis_table import report
-from studies.study_cases import effects_shown, laws_shown
 from tests.support.cli_cases import ok, refused
 from tests.support.refusals import check, refusals
 
@@ -66,17 +61,6 @@ def quick(question):
     if question.seed < 0:
         raise RuntimeError("a seed below 0")
     return DiagnosisOutcome(question, said(f"effect {question.seed}"))
-
-
-def extent(*kinds, **given):
-    usual = {
-        "kinds": kinds,
-        "robots": ("ur3e", "ur10e"),
-        "modes": MODES,
-        "effects": {m: effects_shown(m) for m in MODES},
-        "laws": {m: laws_shown(m) for m in MODES},
-    }
-    return Extent(**usual | given)
 
 
 @pytest.mark.parametrize(
@@ -176,18 +160,6 @@ def test_claims_are_met_or_not_by_what_is_asked():
     assert always.met is False
 
 
-def test_everything_is_asked_of_every_arm():
-    every = questions(extent("hidden", seeds=3))
-    assert len(set(every)) == len(every)
-    shown = sum(len(effects_shown(m)) for m in MODES)
-    assert len(every) == 3 * 2 * 3 * shown
-    assert not any("joint_compliance" in q.hidden for q in every)
-    # A study that is stopped after a third has asked of everything once.
-    first = every[: len(every) // 3]
-    assert {q.seed for q in first} == {0}
-    assert {(q.mode, q.hidden) for q in first} == {(q.mode, q.hidden) for q in every}
-
-
 def raising(error):
     def run(question):
         raise error
@@ -225,27 +197,11 @@ def test_ctrl_c_leaves_what_there_is(jobs):
     assert all(o.case in every for o in outcomes)
 
 
-@pytest.mark.slow
-def test_an_error_of_a_case_ends_the_study_and_its_processes():
-    every = tuple(asked(seed=s) for s in (1, 2, -1, 3))
-    with pytest.raises(RuntimeError, match="below 0"):
-        run_all(every, quick, 2, lambda step: None)
-
-
 def written(outcomes):
     out = Console(file=io.StringIO(), width=100)
     for part in report(outcomes):
         out.print(part)
     return out.file.getvalue()
-
-
-def test_the_document_is_json_and_holds_every_case():
-    cases = [outcome(), DiagnosisOutcome(asked(), failure="InputError: no")]
-    d = document(cases, complete=False)
-    again = json.loads(json.dumps(d))
-    assert again["complete"] is False
-    assert [c["failure"] for c in again["cases"]] == ["", "InputError: no"]
-    assert again["effects"][0]["found"] == {"share": 0.5, "hits": 1, "cases": 2}
 
 
 SMALL = (

@@ -1,21 +1,18 @@
 """`study plans`: what it counts and compares, and what planning buys on simulated arms."""
 
-from collections import Counter
-
 import numpy as np
 import pytest
 
 from hilcal.cell import cell_from_config
 from hilcal.design.information import reading_covariance
 from hilcal.engine import open_engine
-from studies.plans import DOUBLE, GRID, PARAMETERS, RANDOM, TEST, plans_study
+from studies.plans import RANDOM, TEST, plans_study
 from studies.plans_command import arms, with_robot
 from studies.plans_errors import Errors, planned_readings
 from studies.plans_kinds import at_random, grid, matching, optimal, scene
 from studies.plans_statistics import MeanAndStd, summary
 from studies.plans_table import as_predicted, halved
 from tests.support.campaigns import configuration
-from tests.support.cli_cases import run
 
 KNOWN = {"base_xyz_m": (-3.0, 0.5, -0.6), "base_rotvec_rad": (0.0, 0.0, 0.4)}
 
@@ -110,21 +107,6 @@ def test_every_plan_keeps_its_readings_and_the_limits_of_the_cell(mode, request)
             )
 
 
-def test_deflections_have_their_own_unloaded_reading_each_time(deflection):
-    plan = optimal(deflection, PARAMETERS, 60, np.random.default_rng(0))
-    assert plan.counts.max() > 1  # a unit is taken again
-    asked = planned_readings(plan)
-    groups = Counter(zip(asked.pose.tolist(), asked.cycle.tolist(), strict=True))
-    unloaded = Counter(
-        (p, c)
-        for p, c, load in zip(asked.pose, asked.cycle, asked.load, strict=True)
-        if asked.load_names[load] == "none"
-    )
-    assert len(groups) == int(plan.counts.sum())
-    assert set(unloaded) == set(groups)
-    assert set(unloaded.values()) == {1}
-
-
 @pytest.mark.parametrize("mode", ["deflection", "absolute"])
 def test_a_planned_campaign_beats_the_others_where_it_is_asked_to(mode, request):
     of = request.getfixturevalue(mode)
@@ -165,41 +147,6 @@ def test_the_study_depends_on_its_seed_alone(small):
     other = plans_study(cell, config, arms(1), readings=60, campaigns=3, candidates=80, seed=4)
     assert again == small
     assert other.of(RANDOM).result.position_real != small.of(RANDOM).result.position_real
-
-
-@pytest.mark.long
-def test_the_study_compares_equal_numbers_of_readings(small):
-    assert [line.kind for line in small.lines] == [TEST, PARAMETERS, RANDOM, GRID, DOUBLE]
-    for line in small.lines:
-        wanted = 120 if line.kind == DOUBLE else 60
-        assert wanted - 2 <= line.result.readings <= wanted
-    assert [line.kind for line in small.planned] == [TEST, PARAMETERS]
-    for s in small.shrinkage():
-        own, base = small.of(s.kind).result, small.of(RANDOM).result
-        assert s.position == pytest.approx(base.position / own.position)
-        ratio = base.parameter_real.value / own.parameter_real.value
-        assert s.parameter_real.value == pytest.approx(ratio)
-
-
-@pytest.mark.long
-def test_the_command_gives_one_document(capsys):
-    done = run(
-        capsys, "studies", "plans", "--robot", "ur5e", "--campaigns", "2", "--readings", "50",
-        "--candidates", "60", "--json",
-    )  # fmt: skip
-    assert done.code == 0, done.err
-    (robot,) = done.document["robots"]
-    assert robot["robot"] == "ur5e"
-    assert robot["campaigns"] == 2
-    kinds = {line["kind"]: line for line in robot["lines"]}
-    assert set(kinds) == {TEST, PARAMETERS, "test, robust", "D, robust", RANDOM, GRID, DOUBLE}
-    assert 0.9 < kinds[TEST]["efficiency"] <= 1.0
-    assert kinds[RANDOM]["efficiency"] is None
-    # Each plan is the best in what it was made for.
-    assert kinds[TEST]["result"]["position"] < kinds["test, robust"]["result"]["position"]
-    assert kinds["test, robust"]["position_open"] < kinds[TEST]["position_open"]
-    for s in robot["shrinkage"]:
-        assert {s["as_predicted"], s["half"]} <= {"yes", "no", "unclear"}
 
 
 def studied(config, campaigns):

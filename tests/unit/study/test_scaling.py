@@ -9,7 +9,6 @@ import pytest
 from rich.console import Console
 from scipy import stats
 
-from hilcal.engine import open_engine
 from hilcal.errors import CannotAnswerError
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import Deviation, evaluate
@@ -20,9 +19,7 @@ from hilcal.study import (
     TARGET,
     UNITS,
     WRENCHES,
-    cramer_rao_bound,
     make_design,
-    n_experiments,
     scaling_study,
     table,
 )
@@ -151,14 +148,6 @@ def test_observation_matrix_is_the_motion_under_load(design):
         np.testing.assert_allclose(expected, motion, atol=1e-5 * np.abs(motion).max())
 
 
-@pytest.mark.parametrize("shared", [False, True])
-def test_bound_is_the_inverse_of_the_dense_information(design, shared):
-    a, v = dense(design, 0.9, shared)
-    expected = np.linalg.inv(a.T @ np.linalg.solve(v, a))
-    found = cramer_rao_bound(design, design.covariance(0.9), shared)
-    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-10 * expected.max())
-
-
 def test_arm_too_weak_is_said():
     arm = replace(load_arm("ur3e"), torque_max=np.full(6, 1.0))
     with pytest.raises(CannotAnswerError, match=r"ur3e: only 0 feasible poses of 30"):
@@ -174,29 +163,6 @@ def test_arm_too_weak_is_said():
     ({"correlations": (float("nan"),)}, "correlation nan: must be")])  # fmt: skip
 def test_wrong_options_are_named(options, message):
     refusal(message, scaling_study, np.random.default_rng(0), **options)
-
-
-@pytest.mark.long
-def test_the_same_bits_on_several_workers():
-    correlations, done = (0.5, 0.9), []
-
-    def on(engine):
-        rng = np.random.default_rng(3)
-        found = scaling_study(rng, 50, correlations, engine=engine, advance=done.append)
-        assert rng.random() == after
-        return found
-
-    every = np.random.default_rng(3)
-    make_design(every, load_arm("ur10e"), 30)
-    for loaded_and_unloaded in (8, 8, 5, 5):  # as one sequence: of 30 poses, 6 elements, 50 runs
-        every.standard_normal((30 * loaded_and_unloaded, 6, 50))
-    after = every.random()
-    with open_engine(1) as engine:
-        alone = on(engine)
-    with open_engine(2) as engine:
-        assert on(engine) == alone
-    assert len(done) == 2 * n_experiments(correlations)
-    assert n_experiments() == 2 * len(CORRELATIONS)
 
 
 def test_json_holds_every_cell(study):
