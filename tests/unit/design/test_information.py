@@ -239,19 +239,6 @@ def test_problems_that_cannot_be():
         problem_of(cell, config_of(against=("ghost",)), poses_of(3))
 
 
-def test_what_cannot_be_seen_has_no_uncertainty():
-    """One load along one axis: some joints are never turned by it."""
-    config, cell = config_of("deflection"), cell_of(registration_known=True)
-    a = nominal_model(cell, config)
-    p = problem(a, config, poses_of(1))
-    only = np.array([float(loads == ("5kg",)) for _, loads in p.contents])
-    work = prediction_poses(a, config, poses_of(5))
-    mine = predicted_uncertainty(p, only, work=work)
-    assert np.isinf(mine.std).any()  # three numbers measured, six compliances
-    assert np.isinf(mine.position)
-    assert np.isfinite(predicted_uncertainty(p, everything_once(p) * 0 + 1.0).std).any()
-
-
 CELL = cell_of(registration_known=True)
 
 
@@ -347,15 +334,6 @@ def test_derivatives_where_the_robot_works():
             # The Jacobian leaves out what is smaller by deflection over reach.
             near = 2e-2 * np.abs(slope).max() + 1e-12
             assert work.derivative[:, :, k] == pytest.approx(slope, abs=near)
-
-
-def test_unloaded_work_with_deflections_is_under_each_load():
-    config = config_of("deflection")
-    a = nominal_model(CELL, config)
-    work = prediction_poses(a, config, poses_of(3))
-    assert work.description == "deflection under each load at 3 feasible poses"
-    assert len(work.q) == 12
-    assert np.all(np.abs(work.derivative).max(axis=(1, 2)) > 0)
 
 
 def test_named_work_and_a_box():

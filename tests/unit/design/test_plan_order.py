@@ -159,15 +159,14 @@ def test_a_pose_behind_another_one_is_reached_by_it():
 
 
 @cache
-def _large():
+def of_24_poses(seed=0):
     world = World(24, 0.1, 8)
-    return world, [world.ordered(everything(world), seed) for seed in range(5)]
+    return world.ordered(everything(world), seed)
 
 
 @pytest.mark.long
 def test_time_is_far_less_confounded_than_in_the_shortest_order():
-    _, made = _large()
-    for ordered in made:
+    for ordered in map(of_24_poses, range(5)):
         assert ordered.confounding.correlation < 0.5 * ordered.confounding_shortest.correlation
         assert abs(ordered.confounding.bias_m) < 0.2 * ordered.confounding_shortest.bias_m
 
@@ -201,8 +200,7 @@ def test_orders_under_different_loads_are_independent():
 
 
 def test_correlation_is_the_information_that_a_parameter_loses_to_a_drift():
-    _, made = _large()
-    ordered = made[0]
+    ordered = of_24_poses()
     plan, told = ordered.plan, ordered.confounding
     _, times = timeline(plan, CELL.arm, CONFIG.limits.joint_margin_rad, pace(CONFIG))
     when = dict(zip(plan.steps, times, strict=True))
@@ -224,14 +222,14 @@ def test_correlation_is_the_information_that_a_parameter_loses_to_a_drift():
 
 
 def test_the_drift_that_returns_tell_is_that_of_a_fit_to_them():
-    _, made = _large()
-    plan = made[0].plan
+    ordered = of_24_poses()
+    plan = ordered.plan
     _, times = timeline(plan, CELL.arm, CONFIG.limits.joint_margin_rad, pace(CONFIG))
     at = [k for k, s in enumerate(plan.steps) if s.pose == REFERENCE]
     means = np.array([[plan.steps[k].load == load for load in plan.loads] for k in at], float)
     design = np.column_stack([times[at], means])
     std = 15e-6 * np.sqrt(np.linalg.inv(design.T @ design)[0, 0])
-    assert made[0].confounding.drift_std == pytest.approx(std, rel=1e-6)
+    assert ordered.confounding.drift_std == pytest.approx(std, rel=1e-6)
 
 
 def test_the_heaviest_of_three_loads_comes_in_the_middle():

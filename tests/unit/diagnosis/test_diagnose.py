@@ -20,6 +20,7 @@ from hilcal.refinement import add
 from tests.support.campaigns import campaign, noiseless, plan, with_noise
 from tests.support.diagnosis_cases import fitted_baseline
 from tests.support.refusals import refusal
+from tests.support.rows import first
 
 MODES = ("absolute", "deflection")
 NAMES = tuple(
@@ -102,7 +103,7 @@ def test_scores_foretell_what_adding_does(mode):
         assert f_distribution.isf(s.score.p_value, rank, rest) == pytest.approx(ratio, rel=0.03)
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", first(1, MODES))
 @pytest.mark.parametrize("factor", [2.0, 0.5])
 def test_misjudged_noise_is_told_from_a_missing_effect_by_repeats(mode, factor):
     c = campaign("none", mode, plan_seed=0, poses=6, cycles=3)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from hilcal.diagnosis.noise import contrasts, judge_noise, pure_error, repeat_classes
+from hilcal.diagnosis.noise import judge_noise, pure_error
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.model.observe import motion
@@ -59,17 +59,6 @@ def null_p_values(mode, m, seeds):
 def test_the_factor_is_chi_square_and_so_is_what_is_left(mode, m, seeds):
     for p in null_p_values(mode, m, seeds):
         assert kstest(p, "uniform").pvalue > 1e-3 / 8
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_degrees_of_freedom_are_those_of_the_repeats(mode):
-    r = Repeated(mode, 6)
-    c = contrasts(r.fit(with_noise(r.clean, np.random.default_rng(0))))
-    kind = repeat_classes(r.clean)
-    # An unloaded reading that deflections share is no measurement by itself.
-    counted = np.ones(len(kind), dtype=bool) if mode == "absolute" else ~r.clean.unloaded
-    again = np.sum(counted) - len(np.unique(kind[counted]))
-    assert c.dof + c.nuisance.shape[1] == 3 * again
 
 
 @pytest.mark.parametrize("mode", MODES)

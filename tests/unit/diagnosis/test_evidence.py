@@ -32,7 +32,7 @@ from tests.support.fit_cases import fitted_model
     ("mode", "law", "variable"),
     [
         pytest.param("deflection", "relaxing bench", "time under load", marks=pytest.mark.long),
-        ("absolute", "swaying bench", "air temperature"),
+        pytest.param("absolute", "swaying bench", "air temperature", marks=pytest.mark.long),
         ("absolute", "coupled joint", "joint 2 torque"),
     ],
 )
@@ -67,7 +67,8 @@ def check_insufficiency(d):
 @pytest.mark.parametrize(
     ("mode", "effects"),
     [
-        ("deflection", ("creep", "load_point")),  # turns a lever: far from linear
+        # turns a lever: far from linear
+        pytest.param("deflection", ("creep", "load_point"), marks=pytest.mark.long),
         ("absolute", ("link_geometry",)),
         ("absolute", ("encoder_offset", "load_point")),
         pytest.param("deflection", ("link_compliance",), marks=pytest.mark.slow),

@@ -190,23 +190,6 @@ def test_the_stated_error_is_that_of_other_trees(monkeypatch):
     assert spread == pytest.approx(np.mean([f.std for f in found]), rel=0.6)
 
 
-def test_noise_is_not_predicted():
-    shares = [predict_by_trees(*table(100 + seed, 0.0)).share for seed in range(20)]
-    assert max(shares) < 0.05
-    assert np.mean(shares) < 0
-
-
-def test_trees_are_grown_no_further_than_they_matter():
-    x, y, fold = table(2, 0.5)
-    exact, less = (
-        predict_by_trees(x, y, fold, 3.0),
-        predict_by_trees(x, y, fold, 3.0, other_share=0.95),
-    )
-    assert less.trees == module.TREES < exact.trees
-    assert less.share < 0.95
-    assert predict_by_trees(x, y, fold, 3.0) == exact
-
-
 @pytest.mark.parametrize("how", ["one fold", "no residual", "no rows"])
 def test_nothing_to_learn_from(how):
     x, y, fold = table(3, 1.0)

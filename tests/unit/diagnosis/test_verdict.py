@@ -1,7 +1,6 @@
 """The rules of the verdict, of several targets, of a background; probabilities of effects."""
 
 import itertools
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -26,7 +25,6 @@ from studies.study_cases import study_case
 from tests.support.campaigns import campaign, configuration
 from tests.support.diagnosis_cases import fitted_baseline
 from tests.support.fit_cases import fitted_model, refined
-from tests.support.reflector_cases import reflectors
 
 
 def evidence(effect, mode, seed, **options):
@@ -94,30 +92,6 @@ def test_an_adequate_model_is_in_doubt_where_another_effect_could_replace_an_add
     assert in_doubt(chosen) == ("tracker_scale", *others)[:4]
     without = judge(e, History(added=("tracker_scale",), removed=others))
     assert set(others).isdisjoint(in_doubt(without))
-
-
-STD = 2.5e-5
-KNOWN = (True, False, False)
-
-
-def unstated(c):
-    """The readings with the instrument's covariance alone, as a table without the arm's has it."""
-    common = c.readings.common
-    instrument = c.readings.covariance - common @ np.swapaxes(common, 1, 2)
-    return replace(c.readings, covariance=instrument, common=None, scatter_stated=False)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("effect", "mode"), [("base_compliance", "deflection"), ("link_compliance", "absolute")]
-)
-def test_a_hidden_effect_is_found_beside_an_unknown_scatter(effect, mode):
-    c = reflectors(effect, mode=mode, poses=20, known=KNOWN, joint_std=STD)
-    readings = unstated(c)
-    path = refined(c.cell, readings, mode)
-    assert [s.added for s in path.steps] == [None, effect, None]
-    assert path.steps[-1].diagnosis.verdict == "adequate"
-    assert 0.8 < path.fit.variance_factor < 1.25
 
 
 def step(suspects=None, background=None, alternatives=()):

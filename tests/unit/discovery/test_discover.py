@@ -20,7 +20,6 @@ from hilcal.discovery.sites import ORDINARY
 from hilcal.effects.catalogue import installed
 from hilcal.effects.check import check_effect
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import effect_columns, linearise
 from hilcal.present.diagnosis import discovery_report, no_law_sentence, refined_laws
 from hilcal.refinement import refine
@@ -62,19 +61,6 @@ def test_a_law_outside_of_the_catalogue_is_found_with_its_site_and_variables():
     assert law.parameters[0].unit == "rad/(N·m)"
     assert law.p_value < 1e-6
     assert law.holdout_share > 0.8
-
-
-def test_what_is_written_is_an_effect_that_lowers_the_error():
-    d, before = found(), campaign(LAW)
-    kind = effect_class(d.source, "bent")
-    check_effect(kind)
-    model = before.model + kind(before.model.cell, before.readings.states)
-    after = fit(model, before.readings, before.mode)
-    assert after.holdout.rms_m < 0.6 * before.holdout.rms_m
-    assert after.variance_factor == pytest.approx(d.laws[0].variance_factor, rel=1e-3)
-    assert after.parameters["bent.a"].value == pytest.approx(
-        d.laws[0].parameters[0].value, rel=1e-4
-    )
 
 
 def test_a_refinement_adds_the_law_and_its_file_gives_it_back(tmp_path, monkeypatch):

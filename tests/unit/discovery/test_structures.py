@@ -9,7 +9,7 @@ import pytest
 
 from hilcal.discovery import shapes
 from hilcal.discovery.amplitudes import Amplitude, Factor, variables
-from hilcal.discovery.discovery import Discovery, alternatives, discover, discovery_json
+from hilcal.discovery.discovery import Discovery, discover
 from hilcal.discovery.law import Form, LawPart
 from hilcal.discovery.sites import sites
 from hilcal.discovery.structures import Structure, averaged, pareto, posterior
@@ -102,29 +102,6 @@ def test_the_pareto_list_has_what_no_other_one_beats():
             for o in of if o is not x
         )  # fmt: skip
         assert beaten == (x not in pareto(of))
-
-
-@pytest.mark.long
-def test_a_discovery_says_how_likely_its_laws_are():
-    d = found()
-    (law,) = [x for x in d.structures if x.law]
-    assert law.form.text() == d.laws[0].formula == "dq_3 = a·cos(q_4)·τ_3"
-    assert law.probability == d.laws[0].probability > 0.9
-    assert sum(x.probability for x in d.structures) <= 1.0
-    assert [x.probability for x in d.structures] == sorted(
-        (x.probability for x in d.structures), reverse=True
-    )
-    assert alternatives(d, d.laws[0]) == ()
-    assert law in pareto(d.structures)
-    assert law.holdout_share == pytest.approx(d.laws[0].holdout_share, abs=0.02)
-    (coefficient,) = law.parameters
-    assert coefficient.value == pytest.approx(d.laws[0].parameters[0].value, rel=0.02)
-    # Formal; that of a fit is the largest of it and two jackknives.
-    assert 0.5 * d.laws[0].parameters[0].std < coefficient.std <= d.laws[0].parameters[0].std
-    assert "dq_3 = a·cos(q_4)·τ_3" in repr(d)
-    rows = discovery_json(d)["structures"]
-    assert rows[0]["law"] == "bent"
-    assert {"formula", "probability", "complexity", "holdout_share"} <= {*rows[0]}
 
 
 @pytest.mark.long

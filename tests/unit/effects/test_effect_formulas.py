@@ -11,7 +11,6 @@ from hilcal.drivers.simulated import truth
 from hilcal.effects.link_compliance import long_links
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.model.model import Model
-from hilcal.robot import chain as chains
 from hilcal.robot.arm import with_controller_conventions
 from hilcal.robot.catalogue import robot_names
 from hilcal.robot.chain import evaluate
@@ -64,24 +63,6 @@ def test_creep_without_a_compliance_in_the_model_takes_a_typical_one():
     decades = np.log10(1 + states.load_time)[:, None]
     expected = 0.1 * decades * typical * alone.situation.torque
     np.testing.assert_allclose(alone.deviation.dq, expected, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("arm", CELLS)
-@pytest.mark.parametrize("source", ["air", "joints"])
-def test_growth_is_the_same_as_longer_links(arm, source):
-    cell = CELLS[arm]
-    states = some_states(cell)
-    options = {"temperature": source, "reference_degC": 18.0}
-    model = Model(cell, (make("thermal_growth", cell, states, options),))
-    seen = model.predict(states, np.array([23e-6])).situation.chain
-    warm = states.air_temperature if source == "air" else states.joint_temperature.mean(axis=1)
-    for i in range(len(states)):
-        links = cell.arm.links.copy()
-        links[:, :3, 3] *= 1 + 23e-6 * (warm[i] - 18.0)
-        longer = chains.evaluate(replace(cell.arm, links=links), states.q[i : i + 1])
-        np.testing.assert_allclose(
-            seen.position[:, i], longer.position[:, 0], rtol=0, atol=1e-14 * cell.arm.reach
-        )
 
 
 def test_links_that_grow_each_by_their_own_grow_together():

@@ -1,19 +1,14 @@
 """Joints that share a parameter, joints that have none: what it means for each effect."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from hilcal.campaign.revisions import restore_model, to_record
 from hilcal.effects.per_joint import PerJoint, joint_groups
 from hilcal.errors import InputError
 from hilcal.identification.baseline import with_effects
-from hilcal.identification.fit import fit
 from hilcal.model.model import Model
-from hilcal.store.revision import from_text, to_text
-from hilcal.store.rows import content_hash
 from tests.support.campaigns import campaign
 from tests.support.effect_cases import (
     CELLS,
@@ -149,41 +144,6 @@ def test_creep_takes_the_older_name_of_its_groups():
     assert [p.name for p in make("creep", UR10E, states).parameters] == ["k"]
     with pytest.raises(InputError, match="form and joints; valid: joints alone"):
         make("creep", UR10E, states, {"form": "each", "joints": "each"})
-
-
-CHOSEN = {
-    "joint_compliance": {"joints": "1/2/3/4-6"},
-    "hysteresis": {"joints": "1-3"},
-    "transmission_error": {"joints": "2/3", "harmonics": 2},
-}
-
-
-def test_shared_parameters_are_found_and_stored_with_their_groups():
-    c = campaign(plan_seed=0, registration_known=True)
-    model = with_effects(c.cell, c.readings, "absolute", CHOSEN, CHOSEN)
-    rng = np.random.default_rng(2)
-    truth = np.abs(random_theta(model.effects, rng))
-    value = model.predict(c.readings.states, truth).observation.position
-    noise = 2e-6 * rng.normal(size=value.shape)
-    readings = replace(c.readings, value=value + noise)
-    found = fit(model, readings, "absolute")
-    free = found.solution.prior > 0
-    assert free[:5].all()
-    names = [f"{e.name}.{p.name}" for e in model.effects for p in e.parameters]
-    assert names[:5] == [
-        "joint_compliance.j1", "joint_compliance.j2", "joint_compliance.j3",
-        "joint_compliance.j4-6", "hysteresis.j1-3",
-    ]  # fmt: skip
-    seen = found.uncertainty.identifiable[:5]
-    assert seen[1:].all()
-    off = np.abs(found.theta - truth)[:5][seen] / found.uncertainty.std[:5][seen]
-    assert off.max() < 5
-
-    record = from_text(to_text(to_record(found, None, None, content_hash(readings))), 1)
-    again, theta = restore_model(record, c.cell, readings)
-    assert [e.options for e in again.effects] == [e.options for e in model.effects]
-    assert again.effects[0].options == {"joints": "1/2/3/4-6"}
-    np.testing.assert_array_equal(theta, found.theta)
 
 
 def test_frames_take_options_too():

@@ -8,7 +8,7 @@ import pytest
 
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.baseline import baseline, loads_differ, loads_note, with_effects
+from hilcal.identification.baseline import baseline, loads_differ, loads_note
 from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import notes, to_json
 from hilcal.model.model import Model
@@ -75,19 +75,6 @@ def test_geometry_converges_from_large_errors(m, seed):
     assert found.error.max_m < 1e-10
 
 
-def test_the_same_data_give_the_same_numbers_and_a_fit_is_found_again_from_its_own():
-    c = campaign("transmission_error", plan_seed=0)
-    model = with_effects(c.cell, c.readings, "absolute", WAVES)
-    a, b = (fit(model, c.readings, "absolute") for _ in range(2))
-    np.testing.assert_array_equal(a.theta, b.theta)
-    np.testing.assert_array_equal(a.uncertainty.std, b.uncertainty.std)
-    assert to_json(a) == to_json(b)
-    again = fit(model, c.readings, "absolute", start=a.theta, prior=a.solution.prior)
-    # Steps below 1e-5 σ count as none; seen along the least determined direction.
-    assert np.nanmax(np.abs(again.theta - a.theta) / a.uncertainty.std) < 1e-3
-    assert again.chi2 == pytest.approx(a.chi2, rel=1e-6)
-
-
 def test_the_order_of_readings_and_of_effects_does_not_matter():
     c = campaign(plan_seed=0, target_known=False)
     found = fitted_model(c.cell, c.readings, "absolute", ("joint_compliance", "hysteresis"))
@@ -147,16 +134,6 @@ def test_what_cannot_be_seen_is_named_and_has_no_number():
         assert p["identifiable"] == bool(seen)
     assert len(document["unidentifiable"]) == model.size - found.rank
     assert all("link_geometry" in name for name in document["unidentifiable"])
-
-
-def test_an_over_complete_model_predicts_what_the_world_shows_elsewhere():
-    c, other = campaign("link_geometry", plan_seed=0, poses=30), plan(12, 77).states
-    clean = noiseless(c.world, plan(30))
-    told = fitted_model(c.cell, clean, "absolute", GEOMETRY).predict(other).position
-    off = np.linalg.norm(told - c.world.ideal_readings(other).position, axis=1)
-    # Parts of a direction too weak to be estimated stay: 0.05 σ over all data together.
-    sigma = np.sqrt(np.trace(clean.covariance, axis1=1, axis2=2).mean())
-    assert off.max() < 0.05 * sigma
 
 
 @pytest.mark.parametrize("count", [1, 2])

@@ -9,9 +9,7 @@ import pytest
 
 import hilcal as hc
 from hilcal.campaign.revisions import restore, to_record
-from hilcal.diagnosis.stepwise import add, remove
 from hilcal.drivers.simulated.world import place_tracker
-from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.carried.carried_prior import carried_prior
@@ -121,12 +119,6 @@ def test_what_is_no_posterior_is_refused():
     damaged = {"version 9": {**p, "version": 9}, "damaged": {**p, "mean": [1.0]}, "format": {}}
     for words, content in damaged.items():
         refusal(words, Posterior.from_json, content)
-
-
-def test_every_effect_says_whose_it_is():
-    setup = {kind.name for kind in installed().effects if kind.of_setup}
-    assert {"base_frame", "target_offset", "tracker_drift", "wrench_bias", "load_point"} <= setup
-    assert not {"joint_compliance", "link_geometry", "transmission_error"} & setup
 
 
 @pytest.fixture(scope="module")
@@ -249,19 +241,6 @@ def test_the_joint_that_moved_is_found_and_let_go():
     document = to_json(found)["prior"]
     assert document["source"]["n_readings"] == len(both().readings)
     assert document["effects"][0]["joint"] == 3
-
-
-@pytest.mark.filterwarnings("error")
-def test_an_effect_may_be_taken_out_or_added():
-    found = repaired()
-    without = remove(found, "joint_compliance")
-    assert without.model.names == NAMES[1:]
-    assert np.isfinite(without.theta).all()
-    assert without.chi2 > found.chi2
-    more = add(found, "base_compliance")
-    assert more.model.names == (*found.model.names, "base_compliance")
-    # The drift is chosen anew, so that the sum of squares may grow a little.
-    assert more.holdout.rms_sigma < 1.05 * found.holdout.rms_sigma
 
 
 def test_without_a_change_nothing_has_moved():

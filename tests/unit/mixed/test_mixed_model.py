@@ -98,20 +98,6 @@ def test_slopes_are_finite_differences(scatter, over):
     np.testing.assert_allclose(e.sensitivity, moved, rtol=1e-4, atol=1e-6)
 
 
-def test_the_average_information_is_the_mean_of_observed_and_expected():
-    rng = np.random.default_rng(3)
-    p = problem(rng, over=0)
-    x = 0.3 * rng.standard_normal(len(p.priors))
-    left = dense(p, x)[2]
-    z = p.x[:, p.flat :]
-    parts = [np.exp(2 * x[f]) * z[:, p.family == f] @ z[:, p.family == f].T for f in range(2)]
-    y = left @ p.y
-    for i in range(2):
-        for j in range(2):
-            expected = 2.0 * y @ parts[i] @ left @ parts[j] @ y
-            assert equations(p, x).information[i, j] == pytest.approx(expected, rel=1e-8)
-
-
 def drawn(rng, stds, noise, groups, prior=FLAT, *, turned=False):
     """A problem with families of known standard deviations, fresh rows, and what they truly are."""
     rows = rng.standard_normal((3 * groups + 40, 27))

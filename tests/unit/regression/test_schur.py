@@ -7,9 +7,7 @@ from scipy.sparse.csgraph import connected_components
 from hilcal.identification.folds import groups_within
 from hilcal.regression.schur import (
     differentiable_schur_complement,
-    eliminate,
     inverse_root,
-    nuisance_inverse,
     positive_solve,
     projection,
     schur_complement,
@@ -46,64 +44,6 @@ def test_it_is_the_information_of_the_residual_columns(singular):
     np.testing.assert_allclose(single.lift.T @ m @ single.lift, expected, rtol=1e-11)
     some = beyond(a[:, OTHERS[:2]], a[:, INTEREST])
     np.testing.assert_allclose(schur_complement(m, INTEREST, OTHERS[:2]), some, rtol=1e-11)
-
-
-@pytest.mark.parametrize("singular", [False, True])
-def test_units_of_the_parameters_do_not_matter(singular):
-    """Standard units of an arm's parameters differ by 1e9: rad/Nm beside m."""
-    units = np.logspace(-5, 5, 8)[::-1]
-    a, scaled = columns(singular=singular), columns(singular=singular, units=units)
-    expected = schur_complement(a.T @ a, INTEREST) * np.outer(units[INTEREST], units[INTEREST])
-    np.testing.assert_allclose(schur_complement(scaled.T @ scaled, INTEREST), expected, rtol=1e-9)
-
-
-@pytest.mark.parametrize("singular", [False, True])
-def test_the_inverse_root_is_one_of_the_pseudoinverse(singular):
-    a = columns(singular=singular)
-    m = a.T @ a
-    t = inverse_root(m)
-    inverse = t.T @ t
-    np.testing.assert_allclose(m @ inverse @ m, m, atol=1e-11)
-    assert np.linalg.matrix_rank(inverse) == (6 if singular else 8)
-    y = nuisance_inverse(m, OTHERS)
-    assert not y[INTEREST].any()
-    assert not y[:, INTEREST].any()
-
-
-def test_its_derivatives_by_the_information():
-    a = columns(singular=False)
-    m = a.T @ a
-    rng = np.random.default_rng(0)
-    h, k = (c.T @ c for c in rng.standard_normal((2, 3, 8)))
-    g = np.diag([1.0, 2.0, 0.5])
-
-    def value(t, u=0.0):
-        return float(np.trace(g @ schur_complement(m + t * h + u * k, INTEREST)))
-
-    at = differentiable_schur_complement(m, INTEREST)
-    step = 1e-4
-    gradient = at.lift @ g @ at.lift.T
-    slope = (value(step) - value(-step)) / (2 * step)
-    assert float(np.sum(gradient * h)) == pytest.approx(slope, rel=1e-7)
-    bend = (
-        value(step, step) - value(step, -step) - value(-step, step) + value(-step, -step)
-    ) / (4 * step**2)  # fmt: skip
-    expected = -2 * float(np.trace(gradient @ h @ at.inverse @ k))
-    assert bend == pytest.approx(expected, rel=1e-4)
-
-
-@pytest.mark.parametrize("ridge", [0.0, 0.7])
-def test_elimination_gives_the_normal_equations_of_the_residual(ridge):
-    a, y = columns(singular=False), np.random.default_rng(1).standard_normal(40)
-    out, rest = slice(2, 5), np.array([0, 1, 5, 6, 7])
-    x = np.vstack([a[:, out], np.sqrt(ridge) * np.eye(3)])
-    wide, data = np.vstack([a, np.zeros((3, 8))]), np.append(y, np.zeros(3))
-    p = np.eye(43) - x @ np.linalg.inv(x.T @ x) @ x.T
-    g, b, square = eliminate(a.T @ a, a.T @ y, float(y @ y), out, ridge)
-    np.testing.assert_allclose(g[np.ix_(rest, rest)], (wide.T @ p @ wide)[np.ix_(rest, rest)],
-                               rtol=1e-11, atol=1e-11)  # fmt: skip
-    np.testing.assert_allclose(b[rest], (wide.T @ p @ data)[rest], rtol=1e-11, atol=1e-11)
-    assert square == pytest.approx(float(data @ p @ data), rel=1e-12)
 
 
 @pytest.mark.parametrize("least", [1.0, 1e-6, 1e-11, 1e-14])

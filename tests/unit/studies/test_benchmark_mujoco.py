@@ -9,72 +9,8 @@ from hilcal.calibration.handover import urdf
 from studies.benchmark.campaign import campaign
 from studies.benchmark.mujoco_tasks import SHOWN
 from studies.benchmark.world_elastic import bare
-from studies.benchmark.world_mujoco import PIECES, Springs
+from studies.benchmark.world_mujoco import Springs
 from tests.support.rows import first
-
-G, MASS, LENGTH = 9.81, 4.0, 1.2
-
-
-def plain(link, **hidden):
-    """An arm whose joint 1 turns about -y and whose only extent, 1.2 m along x, leads to `link`.
-
-    Behind it hangs a mass of 4 kg; a `link` of 6 is the flange.
-    """
-    names = ["base_link", *(f"link_{k}" for k in range(1, 7)), "tool0"]
-    inertia = '<inertia ixx="1e-9" iyy="1e-9" izz="1e-9" ixy="0" ixz="0" iyz="0"/>'
-    text = "".join(
-        f'<link name="{name}"><inertial><mass value="1e-9"/>{inertia}</inertial></link>'
-        for name in names
-    )
-    for k in range(7):
-        far, turn = LENGTH * (k == link), np.pi / 2 * (k == 0)
-        place = f'<origin xyz="{far} 0 0" rpy="{turn} 0 0"/>'
-        kind = "revolute" if k < 6 else "fixed"
-        text += (
-            f'<joint name="j{k}" type="{kind}">{place}<parent link="{names[k]}"/>'
-            f'<child link="{names[k + 1]}"/><axis xyz="0 0 1"/>'
-            '<limit lower="-7" upper="7" effort="0" velocity="0"/></joint>'
-        )
-    gravity = np.array([0.0, 0.0, -G if link == 6 else 0.0])
-    zero = np.zeros(3)
-    return Springs(
-        f'<robot name="plain">{text}</robot>', MASS, zero, zero, zero, gravity, hidden, np.eye(4)
-    )
-
-
-def only(joint, value, joints=6):
-    return value * np.eye(joints)[joint]
-
-
-@pytest.mark.parametrize("cubic", [0.0, -1e-9])
-def test_a_pendulum_gives_way_by_its_torque_over_its_stiffness(cubic):
-    compliance, n = 1e-5, 7
-    q = np.zeros((n, 6))
-    q[:, 0] = np.linspace(-2.0, 2.0, n)
-    arm = plain(6, joint_compliance=only(0, compliance), joint_stiffening=only(0, cubic))
-    place, _ = arm.flange(q, np.zeros((n, 6)))
-    angle = q[:, 0].copy()
-    for _ in range(30):  # delta = c tau + s tau³ at the deflected angle
-        torque = -MASS * G * LENGTH * np.cos(angle)
-        angle = q[:, 0] + compliance * torque + cubic * torque**3
-    by_hand = LENGTH * np.column_stack([np.cos(angle), np.zeros(n), np.sin(angle)])
-    assert np.abs(angle - q[:, 0]).max() > 3e-4
-    np.testing.assert_allclose(place, by_hand, atol=1e-12)
-
-
-def test_a_beam_gives_way_as_a_cantilever():
-    bend, force = 2e-6, 50.0  # 1/EI, N
-    arm = plain(2, link_compliance=np.array([[bend, 0.0], [0.0, 0.0]]))
-    place, turn = arm.flange(np.zeros((1, 6)), np.array([[0.0, 0.0, force, 0.0, 0.0, 0.0]]))
-    tip = force * LENGTH**3 / 3.0 * bend
-    assert place[0, 2] == pytest.approx(tip * (1.0 - 0.25 / PIECES**2), rel=1e-6)
-    tilt = np.arctan2(turn[0, 2, 0], turn[0, 0, 0])
-    assert tilt == pytest.approx(force * LENGTH**2 / 2.0 * bend, rel=1e-6)
-    # a moment about the beam twists it by L/GJ M
-    arm = plain(2, link_compliance=np.array([[0.0, 3e-6], [0.0, 0.0]]))
-    _, turn = arm.flange(np.zeros((1, 6)), np.array([[0.0, 0.0, 0.0, 20.0, 0.0, 0.0]]))
-    twist = -np.arcsin(turn[0, 1, 1])  # the flange's y pointed upwards
-    assert twist == pytest.approx(20.0 * LENGTH * 3e-6, rel=1e-6)
 
 
 def drawn(softness, rng):

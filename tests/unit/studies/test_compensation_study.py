@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from studies.compensation_command import FINAL, SplitErrors, _figures, _parts, judged
+from studies.compensation_command import FINAL, SplitErrors, _figures, judged
 from tests.support.campaigns import campaign, measured, plan
 from tests.unit.calibration.test_calibration import POSES, calibrated
 
@@ -36,17 +36,6 @@ def test_errors_are_counted_against_what_the_tracker_reads_elsewhere():
     assert 0.85 < inside.mean() < 0.995
     further = replace(others, value=others.value + 1e-3)
     assert not judged(c, p, further)[1].any()
-
-
-def test_parts_are_halves_or_four_fifths():
-    found = dict(_parts(100, 2, 0.5))
-    assert list(found) == ["random half 1", "random half 2", "first half"]
-    assert all(rows.sum() == 50 for rows in found.values())
-    assert found["first half"][:50].all()
-    (name, rows), (other, different) = _parts(100, 2, 0.8)
-    assert (name, other) == ("random 80 % 1", "random 80 % 2")
-    assert rows.sum() == different.sum() == 80
-    assert (rows != different).any()
 
 
 def test_the_worst_split_decides():

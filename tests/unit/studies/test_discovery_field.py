@@ -5,22 +5,10 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
-
-from studies.formulas import FORMULAS, Answer, asked, claims, drawn, hilcal, mark
+from studies.formulas import FORMULAS, Answer, asked, claims, mark
 from studies.odds import OddsCase
 from studies.odds import claims as odds_claims
 from studies.records import resumed
-
-BY_TEXT = {f.text: f for f in FORMULAS}
-
-
-def test_noise_alone_has_no_law():
-    rng = np.random.default_rng(2)
-    x, _ = drawn(BY_TEXT["μ N"], 60, 1.0, rng)
-    text, values = hilcal(x, rng.standard_normal(60), 1.0, reciprocals=False)
-    assert text == ""
-    assert np.ptp(values(x)) == 0.0
 
 
 def test_a_searcher_that_is_not_there_is_said_to_be_missing():

@@ -46,18 +46,6 @@ def test_loads_are_what_the_arm_can_carry(robot):
     assert pulls[0] == pytest.approx(dead_weights([-pulls[0, 2] / 9.81], [0, 0, -9.81])[0][1])
 
 
-def test_equal_arguments_give_equal_campaigns_and_strength_changes_the_effect_alone():
-    a, b = case("hysteresis"), case("hysteresis")
-    assert np.array_equal(a.readings.value, b.readings.value)
-    weak = case("hysteresis", strength=0.5)
-    assert np.array_equal(weak.readings.states.q, a.readings.states.q)
-    assert weak.noise == pytest.approx(a.noise, abs=1e-8)
-    ratio = np.asarray(a.world.physics.hysteresis) / weak.world.physics.hysteresis
-    assert ratio == pytest.approx(4.0, rel=1e-2)
-    other = case("hysteresis", seed=4)
-    assert not np.allclose(other.readings.states.q, a.readings.states.q)
-
-
 def test_the_noise_is_as_large_as_stated_or_as_misjudged():
     for stated in (0.5, 1.0, 2.0):
         many = [case(mode="deflection", seed=s, stated=stated, cycles=2) for s in range(4)]

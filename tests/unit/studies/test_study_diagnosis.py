@@ -28,7 +28,7 @@ from studies.diagnosis_rates import (
     unknown,
 )
 from studies.diagnosis_table import report
-from tests.support.cli_cases import ok, refused
+from tests.support.cli_cases import refused
 from tests.support.refusals import check, refusals
 
 
@@ -202,25 +202,6 @@ def written(outcomes):
     for part in report(outcomes):
         out.print(part)
     return out.file.getvalue()
-
-
-SMALL = (
-    "studies", "diagnosis", "hidden", "nothing", "--robot", "ur10e", "--readings", "deflection",
-    "--effect", "hysteresis", "--strength", "3", "--seeds", "1", "--nothing", "1", "--json",
-)  # fmt: skip
-
-
-@pytest.mark.slow
-def test_the_command_gives_the_same_on_any_number_of_processes(capsys):
-    one = ok(capsys, *SMALL, "--jobs", "1").document
-    two = ok(capsys, *SMALL, "--jobs", "2").document
-    assert one == two
-    assert one["complete"] is True
-    assert [c["failure"] for c in one["cases"]] == ["", ""]
-    strong, _ = one["cases"]
-    assert strong["found"] is True
-    assert strong["refined"]["model"][-1] == "hysteresis"
-    assert {c["kind"] for c in one["claims"]} == {"hidden", "nothing"}
 
 
 @refusals("study_arguments")

@@ -5,8 +5,7 @@ import pytest
 
 from hilcal.cell import cell_from_config
 from hilcal.design.information import reading_covariance
-from hilcal.engine import open_engine
-from studies.plans import RANDOM, TEST, plans_study
+from studies.plans import TEST, plans_study
 from studies.plans_command import arms, with_robot
 from studies.plans_errors import Errors, planned_readings
 from studies.plans_kinds import at_random, grid, matching, optimal, scene
@@ -44,27 +43,8 @@ def absolute():
     return scene_of(configured("absolute"))
 
 
-@pytest.fixture(scope="module")
-def small():
-    config = configured()
-    return plans_study(
-        cell_from_config(config), config, arms(0), readings=60, campaigns=3, candidates=80, seed=3
-    )
-
-
 def errors_of(parameter, std, position=1.0):
     return Errors(parameter, std, np.array([1.0, 10.0]), position, 2.0, 60, 12)
-
-
-def test_errors_are_summarised_over_campaigns():
-    std = np.array([1.0, 2.0])
-    s = summary([errors_of(np.array([3.0, -8.0]), std, 1.0), errors_of(np.zeros(2), std, 7.0)])
-    assert s.parameter == pytest.approx(np.sqrt(1.0 * 0.2))
-    assert s.parameter_real.value == pytest.approx(np.sqrt(3.0 / np.sqrt(2) * 0.8 / np.sqrt(2)))
-    assert s.spread.value == pytest.approx(np.sqrt((9 + 16) / 4))
-    assert s.position_real.value == pytest.approx(5.0)
-    assert s.position_ratio.value == pytest.approx(2.5)
-    assert (s.campaigns, s.readings, s.poses) == (2, 60, 12)
 
 
 def test_the_stated_uncertainty_of_the_simulation_is_that_of_repeated_studies():
@@ -135,20 +115,6 @@ def test_the_simulated_noise_is_the_planned_one(known):
     assert np.allclose(np.linalg.eigvalsh(measured.covariance), axes, rtol=5e-3)
 
 
-@pytest.mark.slow
-def test_the_study_depends_on_its_seed_alone(small):
-    """Not on the number of workers either."""
-    config = configured()
-    cell = cell_from_config(config)
-    with open_engine(2) as engine:
-        again = plans_study(
-            cell, config, arms(0), readings=60, campaigns=3, candidates=80, seed=3, engine=engine
-        )
-    other = plans_study(cell, config, arms(1), readings=60, campaigns=3, candidates=80, seed=4)
-    assert again == small
-    assert other.of(RANDOM).result.position_real != small.of(RANDOM).result.position_real
-
-
 def studied(config, campaigns):
     cell = cell_from_config(config)
     return plans_study(cell, config, arms(0), campaigns=campaigns, candidates=400)
@@ -176,21 +142,3 @@ def test_errors_are_those_predicted_and_shrink_as_predicted(robot):
             assert ratio.std < 0.06
             assert as_predicted(ratio) != "no", s.kind
     assert needs_at_most_half(study, TEST)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("robot", ["ur10e", "ur5e"])
-def test_half_of_the_readings_of_random_plans_do(robot):
-    """50 campaigns each, registration unknown; each plan in the measure that it was made for.
-
-    With all effects as large as arms have them it is two thirds: what is known of arms serves both.
-    """
-    study = studied(with_robot(configured(robust=True), robot), 50)
-    for line in study.lines:
-        assert as_predicted(line.result.spread) != "no", line.kind
-        # The registration is better than a plan takes for granted: errors are hardly larger.
-        assert line.result.position_ratio.value <= 1.1, line.kind
-    assert all(as_predicted(s.agreement) != "no" for s in study.shrinkage())
-    assert needs_at_most_half(study, TEST)
-    needs = study.of("test, robust").random_readings_open
-    assert needs is None or needs >= 1.5 * study.readings

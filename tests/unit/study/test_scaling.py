@@ -120,19 +120,6 @@ def test_gu_loses_and_its_intervals_fail_where_correlation_is_high(study):
     assert study.of("gu", UNITS[0][0], True)[0].error_over_bound > 1.1
 
 
-def test_poses_are_feasible_and_the_arm_repeats_as_said(design):
-    arm = design.arm
-    assert np.all((design.q >= arm.q_min) & (design.q <= arm.q_max))
-    chain = evaluate(arm, design.q)
-    assert chain.position[1:, :, 2].min() > 0
-    jacobian_std = design.std[:, :3].mean()
-    assert 1e-5 < jacobian_std < 1e-4
-    for rho in (0.0, 0.5, 0.99):
-        v = design.covariance(rho)
-        np.testing.assert_allclose(np.diagonal(v, axis1=1, axis2=2), design.std**2, rtol=1e-12)
-        assert np.linalg.eigvalsh(v / (design.std[:, :, None] * design.std[:, None])).min() > 0.005
-
-
 def test_observation_matrix_is_the_motion_under_load(design):
     """Joints turned by c τ, with τ from virtual work, move the target by A c."""
     c = np.array([2, 3, 4, 10, 12, 15]) * 1e-9
