@@ -110,21 +110,6 @@ def test_every_plan_keeps_its_promises(count, blocked, slack, unloaded, every, s
         )
 
 
-def test_absolute_readings_of_a_pose_share_no_more_than_they_must():
-    world = World(3, 0.0, 1)
-    chosen = [
-        PoseReadings("p0", (UNLOADED,), 2),
-        PoseReadings("p0", (LOADS[0],), 2),
-        PoseReadings("p1", (LOADS[1],)),
-    ]
-    plan = world.ordered(chosen, 0, Ordering(repeats=0)).plan
-    taken = {(s.pose, s.load, s.cycle) for s in plan.steps if s.pose != REFERENCE}
-    assert taken == {
-        *(("p0", load, cycle) for load in (UNLOADED, LOADS[0]) for cycle in (0, 1)),
-        ("p1", LOADS[1], 0),
-    }
-
-
 def test_the_pace_is_that_of_the_configuration():
     world = World(4, 0.0, 1)
     slow = {"reading_s": 20.0, "load_change_s": 300.0}

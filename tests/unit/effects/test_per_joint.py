@@ -128,12 +128,6 @@ def test_names_and_magnitudes(name):
     assert {p.unit for p in some} == {p.unit for p in every}
 
 
-def test_harmonics_of_shared_joints_have_one_variance():
-    effect = make("transmission_error", UR10E, some_states(UR10E), options(PER_JOINT[1], "1-3/5"))
-    assert effect.groups().tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
-    assert effect.for_scoring(some_states(UR10E)).options == effect.options
-
-
 def test_creep_takes_the_older_name_of_its_groups():
     states = some_states(UR10E)
     for form in ("common", "each"):

@@ -113,19 +113,6 @@ def test_stated_covariances_that_include_the_scatter():
     assert with_common_scatter(c.cell, one, np.full(6, STD)).common is None
 
 
-def test_a_hidden_reflector_is_a_missing_reading():
-    c = reflectors("base_compliance", strength=5.0, joint_std=1e-5, known=(False, False, True))
-    r = c.readings
-    third = (r.target == 2) & (r.pose == 3)
-    kept = r[~((r.target == 1) & (r.pose % 4 == 0) | third & r.unloaded)]
-    f = fitted_model(c.cell, kept, "deflection", ["joint_compliance", "base_compliance"])
-    off = f.theta[-3:] - c.world.physics.base_compliance
-    assert np.abs(off / f.uncertainty.std[-3:]).max() < 4.0
-    assert chi2.sf(f.chi2, f.dof) > 1e-3
-    orphans = np.count_nonzero(third & ~r.unloaded)
-    assert len(f.whitening) == np.count_nonzero(~kept.unloaded) - orphans
-
-
 def scattering(std=2e-5, m=3, seed=0, noise=1.0, poses=16, loads=3, law=0.0):
     """Each reading is an arrival with joints off by `std` (n,), by the world's own kinematics.
 

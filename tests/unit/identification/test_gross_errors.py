@@ -30,7 +30,6 @@ from studies.gross_errors import GrossErrorCase, count, spoil
 from studies.study_cases import study_case
 from tests.support.campaigns import campaign, configuration, noiseless, plan, with_noise
 from tests.support.fit_cases import fitted_model, refined
-from tests.support.reflector_cases import reflectors
 from tests.support.rows import first
 
 CONFIG = configuration()
@@ -201,13 +200,6 @@ def test_a_block_off_alike_is_said_and_not_set_aside(of_tool):
     assert not found.outlier.any()
     np.testing.assert_array_equal(found.disagreement.rows, np.arange(12, 30))
     assert any("are off by the same shift" in note for note in notes(found))
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_readings_of_several_targets(mode):
-    c = reflectors(poses=10)
-    readings, wrong = spoil(c.readings, 0.3, 5e-3, np.random.default_rng(0))
-    assert fitted_model(c.cell, readings, mode).outlier[wrong].all()
 
 
 def test_a_registration_does_not_follow_errors_of_centimetres():

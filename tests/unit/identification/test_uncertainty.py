@@ -14,7 +14,6 @@ from hilcal.identification.fit import fit
 from hilcal.identification.folds import distinct_poses
 from hilcal.model.model import Model
 from hilcal.present.calibration import bootstrap_remarks
-from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES, whitening
 from tests.support.campaigns import campaign, noiseless, plan, with_noise
 from tests.support.effect_cases import make
@@ -189,14 +188,6 @@ def test_a_draw_has_whole_poses_each_copy_with_its_own_unloaded_reading():
         of = readings.pose == readings.pose_names.index(name)
         np.testing.assert_array_equal(found.value[found.pose == k], readings.value[of])
     assert len(whitening(found, "deflection")) == 12 * (size - 1)
-
-
-def test_two_names_of_one_pose_are_drawn_together():
-    readings = campaign("none", "deflection", poses=12).readings
-    twice = Readings.joined([readings, replace(readings, pose=readings.pose + 12)])
-    twice = replace(twice, pose_names=tuple(f"p{k}" for k in range(24)))
-    names = set(resample(twice, distinct_poses(twice), np.random.default_rng(4)).pose_names)
-    assert {f"p{(int(n[1:]) + 12) % 24}" for n in names} == names
 
 
 def test_what_it_refuses():

@@ -249,14 +249,6 @@ def test_intervals_hold_the_truth_about_as_often_as_stated(truth):
         assert as_chosen < 0.9
 
 
-def test_a_strong_group_is_hardly_widened_and_a_flat_parameter_not_at_all():
-    covariance, theta = np.diag([0.01, 0.01, 1.0]), np.array([30.0, -20.0, 2.0])
-    prior, groups = np.array([25.0, 25.0, np.inf]), np.array([0, 0, -1])
-    factor = hyperparameter_factors(covariance, theta, prior, groups)
-    np.testing.assert_allclose(factor, 1.0, atol=2e-3)
-    assert factor[2] == 1.0
-
-
 def test_what_a_dropped_group_could_do_widens_what_it_is_confused_with():
     rng = np.random.default_rng(2)
     kept = rng.normal(size=(200, 3))

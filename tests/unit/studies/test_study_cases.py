@@ -3,17 +3,14 @@
 import numpy as np
 import pytest
 
-from hilcal.cell import cell_from_config
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
-from studies.diagnosis import intervals
-from studies.study_cases import study_case, with_study_loads
+from studies.study_cases import study_case
 from studies.study_more import measure_more, suspects
 from studies.unmodelled_laws import LAWS, law_named, shift
 from tests.support.campaigns import configuration
 from tests.support.fit_cases import fitted_model
 from tests.support.refusals import refusal
-from tests.support.rehearsed import dead_weights
 
 
 def case(*hidden, mode="absolute", strength=2.0, **given):
@@ -28,22 +25,6 @@ def case(*hidden, mode="absolute", strength=2.0, **given):
 def seen(c):
     """What would be read without noise."""
     return c.readings.value - c.noise
-
-
-@pytest.mark.parametrize("robot", ["ur3e", "ur5e", "ur10e"])
-def test_loads_are_what_the_arm_can_carry(robot):
-    own, loads = with_study_loads(configuration(), robot)
-    arm = cell_from_config(own).arm
-    assert len(loads) == 5
-    carried = [float(np.linalg.norm(w[:3])) / 9.81 + own.tool.mass_kg for _, w in loads]
-    assert max(carried) <= arm.payload
-    assert max(carried) > 0.7 * arm.payload
-    c = study_case(configuration(), robot, "deflection", (), 0.0, 0)
-    assert len(c.readings) == 180
-    assert set(c.readings.load_names) == {"none", *(name for name, _ in loads)}
-    pulls = np.array([w for _, w in loads])
-    assert np.linalg.matrix_rank(pulls) >= 4
-    assert pulls[0] == pytest.approx(dead_weights([-pulls[0, 2] / 9.81], [0, 0, -9.81])[0][1])
 
 
 def test_the_noise_is_as_large_as_stated_or_as_misjudged():
@@ -87,17 +68,6 @@ def test_laws_and_effects_that_do_not_fit_are_refused():
         shift(law, c.world, still[none + 1], 3.0, "deflection", none, none)
     with pytest.raises(InputError, match="changes nothing"):
         shift(law_named("swaying bench"), c.world, still[none], 3.0, "absolute", none, none)
-
-
-def test_intervals_hold_true_parameters_and_no_others():
-    c = study_case(configuration(), "ur10e", "absolute", (), 0.0, 1)
-    f = fitted_model(c.cell, c.readings, "absolute")
-    (told,) = intervals(f, c.world.truth)
-    assert (told.effect, told.parameters) == ("joint_compliance", 6)
-    assert told.inside >= 4
-    doubled = {name: 2 * value for name, value in c.world.truth.items()}
-    assert intervals(f, doubled)[0].inside < told.inside
-    assert intervals(f, {}) == ()
 
 
 def diagnosed(c):

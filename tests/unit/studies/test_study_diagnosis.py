@@ -19,8 +19,6 @@ from studies.diagnosis_claims import claims
 from studies.diagnosis_pool import run_all
 from studies.diagnosis_rates import (
     afterwards,
-    both_added,
-    both_found,
     by_effect,
     coverage_by_effect,
     followed,
@@ -95,19 +93,6 @@ def test_what_came_first_instead_is_counted():
     assert row.instead[0] == ("hysteresis", 2)
 
 
-def test_a_further_round_is_counted_by_itself():
-    again = asked(again=True)
-    cases = [
-        DiagnosisOutcome(again, said("a"), again=said()),
-        DiagnosisOutcome(again, said("a"), again=said("b")),
-    ]
-    (row,) = by_effect(cases)
-    assert (row.found.hits, row.again.hits, row.again.cases) == (0, 1, 2)
-    assert row.size_again == 1.0
-    (claim,) = (c for c in claims(cases) if "further round" in c.words)
-    assert (claim.rate.share, claim.met) == (0.5, False)
-
-
 def test_refinements_count_where_the_effect_was_found_and_named():
     inside = (IntervalCount("creep", 1, 1), IntervalCount("joint_compliance", 4, 6))
     right = DiagnosisOutcome(asked(), said(), refined("creep", inside=inside))
@@ -119,17 +104,6 @@ def test_refinements_count_where_the_effect_was_found_and_named():
     assert (row.intervals.hits, row.intervals.cases) == (5, 7)
     told = dict(coverage_by_effect([right, more, wrong]))
     assert told["joint_compliance"].share == pytest.approx(4 / 6)
-
-
-def test_of_two_effects_a_set_that_was_added_stands_for_its_members():
-    pair = asked(kind="pairs", hidden=("creep", "backlash"))
-    both = DiagnosisOutcome(pair, said(), refined("creep", "backlash"))
-    stand_in = DiagnosisOutcome(
-        pair, said(), refined("creep", "load_point", same_as=("backlash", "x"))
-    )
-    one = DiagnosisOutcome(pair, said(), refined("creep"))
-    assert [both_added(o) for o in (both, stand_in, one)] == [True, False, False]
-    assert [both_found(o) for o in (both, stand_in, one)] == [True, True, False]
 
 
 def test_outside_of_the_catalogue_the_verdict_and_the_variable_count():

@@ -7,9 +7,9 @@ from hilcal.cell import cell_from_config
 from hilcal.design.information import reading_covariance
 from studies.plans import TEST, plans_study
 from studies.plans_command import arms, with_robot
-from studies.plans_errors import Errors, planned_readings
-from studies.plans_kinds import at_random, grid, matching, optimal, scene
-from studies.plans_statistics import MeanAndStd, summary
+from studies.plans_errors import planned_readings
+from studies.plans_kinds import at_random, grid, optimal, scene
+from studies.plans_statistics import MeanAndStd
 from studies.plans_table import as_predicted, halved
 from tests.support.campaigns import configuration
 
@@ -43,25 +43,6 @@ def absolute():
     return scene_of(configured("absolute"))
 
 
-def errors_of(parameter, std, position=1.0):
-    return Errors(parameter, std, np.array([1.0, 10.0]), position, 2.0, 60, 12)
-
-
-def test_the_stated_uncertainty_of_the_simulation_is_that_of_repeated_studies():
-    rng = np.random.default_rng(1)
-    std = np.array([1.0, 2.0])
-
-    def one():
-        return errors_of(std * rng.standard_normal(2), std, float(abs(rng.standard_normal())))
-
-    many = [summary([one() for _ in range(50)]) for _ in range(300)]
-    for figure in ("parameter_real", "spread", "position_real"):
-        found = [getattr(s, figure) for s in many]
-        scatter = np.std([f.value for f in found])
-        assert np.mean([f.std for f in found]) == pytest.approx(scatter, rel=0.15)
-    assert np.mean([s.spread.value for s in many]) == pytest.approx(1.0, abs=0.02)
-
-
 @pytest.mark.parametrize(
     ("value", "std", "verdict"),
     [(1.09, 0.01, "yes"), (0.91, 0.2, "yes"), (1.15, 0.03, "unclear"), (0.8, 0.04, "no")],
@@ -93,14 +74,6 @@ def test_a_planned_campaign_beats_the_others_where_it_is_asked_to(mode, request)
     plan = optimal(of, TEST, 60, np.random.default_rng(0)).predicted.position
     rest = [at_random(of, 60, np.random.default_rng(k)) for k in range(5)] + [grid(of, 60)]
     assert all(r.predicted.position > plan for r in rest if r.predicted.position is not None)
-
-
-def test_the_readings_of_random_plans_for_an_accuracy_are_found(deflection):
-    at_120 = [at_random(deflection, 120, np.random.default_rng(k)) for k in range(20)]
-    wanted = np.sqrt(np.mean([float(p.predicted.position or np.nan) ** 2 for p in at_120]))
-    found = matching(deflection, float(wanted), 60, np.random.default_rng(77))
-    assert found == pytest.approx(120, rel=0.1)
-    assert matching(deflection, 1e-9, 60, np.random.default_rng(77)) is None
 
 
 @pytest.mark.parametrize("known", [False, True])
