@@ -94,15 +94,6 @@ def as_stated(c, config, found, rel, names):
         assert foreseen[name] == pytest.approx(stated[name], rel=rel), name
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_prediction_is_what_identification_states_of_several_targets(mode):
-    config = changed(config_of(mode), repeatability={"joint_std_rad": 5e-5})
-    c = reflectors(poses=14, joint_std=5e-5, known=(True, False, True), registration_known=True)
-    # in deflections a prior of another size holds the offset
-    offset = ("target_offset.R2.x",) if mode == "absolute" else ()
-    as_stated(c, config, fitted_model(c.cell, c.readings, mode), 0.05, (*offset, *JOINTS))
-
-
 @pytest.mark.parametrize("mode", first(1, MODES))
 def test_parameters_and_positions_scatter_as_predicted(mode):
     cell = cell_of(registration_known=True)
@@ -309,15 +300,6 @@ def test_a_load_that_no_pose_bears_is_as_good_as_none():
     np.testing.assert_allclose(*(p.information(np.ones(len(p.contents))) for p in (borne, without)))
 
 
-def test_potential_terms_only_add_uncertainty():
-    problems = made(), made(against=())
-    work = prediction_poses(problems[0].nominal, config_of("deflection"), poses_of(5, 9))
-    mine, bare = (predicted_uncertainty(p, everything_once(p), work=work) for p in problems)
-    assert mine.std == pytest.approx(bare.std, rel=1e-9)
-    assert bare.position_open == pytest.approx(bare.position, rel=1e-9)
-    assert mine.position_open > bare.position
-
-
 def test_asked_for_effects_that_the_order_tells_are_taken_at_random():
     p = made(against=("hysteresis",), poses=10)
     assert len(p.of_effect("hysteresis")) == 6
@@ -347,6 +329,15 @@ def test_derivatives_where_the_robot_works():
             # The Jacobian leaves out what is smaller by deflection over reach.
             near = 2e-2 * np.abs(slope).max() + 1e-12
             assert work.derivative[:, :, k] == pytest.approx(slope, abs=near)
+
+
+def test_unloaded_work_with_deflections_is_under_each_load():
+    config = config_of("deflection")
+    a = nominal_model(CELL, config)
+    work = prediction_poses(a, config, poses_of(3))
+    assert work.description == "deflection under each load at 3 feasible poses"
+    assert len(work.q) == 12
+    assert np.all(np.abs(work.derivative).max(axis=(1, 2)) > 0)
 
 
 def test_named_work_and_a_box():

@@ -20,22 +20,18 @@ from hilcal.design.information import problem
 from hilcal.design.next import plan_separating
 from hilcal.design.nominal_model import model_after
 from hilcal.design.planner import PlanRequest
-from hilcal.diagnosis.effect_ranking import candidates
 from hilcal.diagnosis.pose_alone import pose_powers
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import effect_columns, linearise
-from hilcal.refinement import add
 from hilcal.regression.evidence import family_power
 from hilcal.regression.schur import projection, schur_complement
 from tests.support.campaigns import (
     campaign,
     measured,
-    noiseless,
     plan,
     true_parameters,
-    with_noise,
 )
 from tests.support.fit_cases import fitted_model
 from tests.support.next_cases import SMALL, after_further_plan, doubtful
@@ -70,35 +66,6 @@ def test_the_power_is_the_share_of_rejections_in_linear_problems(size):
         rejected += bool(left[0] - left[1] > stats.chi2.isf(LEVEL, 3))
     assert share_is(rejected, 1500, promised)
     assert promised == pytest.approx(LEVEL) if size == 0 else promised > 0.05
-
-
-@pytest.mark.long
-def test_the_power_is_the_share_of_rejections_in_the_simulated_world():
-    """Tilting joints are there and bending links are fitted; 100 campaigns of the same poses."""
-    c = campaign(TILT, "deflection", 3, poses=8, strength=1.3, plan_seed=21)
-    p = plan(8, 21)
-    clean = noiseless(c.world, p)
-    config = config_of("deflection", against=(TILT, LINK))
-    first = fitted_model(c.cell, c.readings, "deflection")
-    of = problem(model_after(first, config), config, poses_of(8, 21))
-    where = of.of_effect(TILT)
-    nuisance = np.concatenate([np.arange(of.model_size), of.of_effect(LINK)])
-    beta = true_parameters(c.world, TILT) / of.scale[where]
-    prior = of.measured.copy()
-    size = of.model_size
-    prior[:size, :size] = of.prior[:size, :size]
-    promised = power(Pair(where, beta, nuisance), prior)
-    assert 0.2 < promised < 0.9
-    rng = np.random.default_rng(1)
-    rejected = 0
-    start = add(first, LINK)
-    for _ in range(100):
-        rival = fit(start.model, with_noise(clean, rng), "deflection", start=start.theta)
-        f = linearise(rival)
-        x = effect_columns(rival, next(e for e in candidates(rival) if e.name == TILT)).white
-        s, g = x.T @ f.project_out(x), x.T @ rival.white
-        rejected += bool(g @ np.linalg.solve(s, g) > stats.chi2.isf(LEVEL, len(g)))
-    assert share_is(rejected, 100, promised)
 
 
 # how strong suspects are

@@ -260,16 +260,6 @@ def test_the_direction_that_scatters_is_named(mode, what):
         assert e.where.interval[0] < 10 < e.where.interval[1]
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_a_common_factor_has_no_direction(mode):
-    r = Repeated(mode, 10)
-    for seed in range(3):
-        e = found(r, with_noise(r.clean, np.random.default_rng(seed), 2.0))
-        assert e.where is None
-        assert e.interval[0] < 4.5
-        assert e.interval[1] > 3.5
-
-
 def test_repeats_that_scatter_less_blame_the_model():
     r = Repeated("absolute", 10, effect="encoder_offset")
     f = r.fit(with_noise(r.clean, np.random.default_rng(0), 2.0))

@@ -191,17 +191,6 @@ def unit_motion(form):
     return ORDINARY[form.parts[0].site.unit]
 
 
-def test_what_is_told_of_a_law_names_all_that_speaks_for_it():
-    told = "\n".join(str(part) for part in discovery_report(found()))
-    assert "dq_3 = a·cos(q_4)·τ_3" in told
-    assert "acts on      joint 3" in told
-    assert "µrad/(N·m)" in told
-    (law,) = discovery_json(found())["laws"][:1]
-    asked = ("name", "formula", "acts_on", "parameters", "holdout_share", "p_value", "variables")
-    assert {*asked} <= {*law}
-    assert law["latex"] == r"\delta q_3 = a\,\cos(q_4)\,\tau_3"
-
-
 def test_the_curve_of_a_law_lies_where_the_readings_are():
     by_angle, by_torque = found().curves
     assert (by_angle.site, by_angle.quantity, by_angle.of) == ("joint 3", "q_4", "dq_3/τ_3")

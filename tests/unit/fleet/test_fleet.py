@@ -30,7 +30,6 @@ from hilcal.transfer.members import (
 from tests.support.calibrate_process import CELL
 from tests.support.campaigns import cell_of, configuration, noiseless, plan, with_noise, world_of
 from tests.support.cli_cases import ok, refused
-from tests.support.picture import Shot, needs_vulkan, pictures
 from tests.support.recordings import chunks, entities, rows
 from tests.support.refusals import refusal, refusal_of
 from tests.support.viewer_plan import rgb
@@ -347,12 +346,3 @@ def test_an_ordinary_fleet_has_nothing_red(one, tmp_path):
     assert style.RED not in colors
     assert "/arms0/unlike" not in entities(path)
     assert "No arm is unlike" in rows(path, "/words/type0", "TextDocument:text")[0][0]
-
-
-@pytest.mark.slow
-@needs_vulkan
-def test_the_viewer_draws_it_without_a_complaint(one, tmp_path):
-    path = recorded(one, tmp_path / "fleet.rrd", 1.5)
-    told = pictures(path, [Shot(tmp_path / "fleet.png")], (960, 540), 480)
-    assert {v.name: v.problems for v in told if v.problems} == {}
-    assert len(told) >= 4

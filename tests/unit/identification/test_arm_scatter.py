@@ -16,7 +16,7 @@ from hilcal.diagnosis.verdict import diagnose, judge
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import effect_columns, linearise
 from hilcal.identification.noise.arm_scatter import estimate_arm_scatter, factors, with_arm_scatter
-from hilcal.identification.noise.full_covariance import with_common_scatter, with_joint_scatter
+from hilcal.identification.noise.full_covariance import with_common_scatter
 from hilcal.identification.registration.registration import register
 from hilcal.present.verdict import message
 from hilcal.readings.covariance import COVERS_KEY, INSTRUMENT
@@ -89,16 +89,6 @@ def test_p_values_and_standard_errors(mode):
     # 72 standardised errors: rms within 1 ± 0.25 (3 σ); about √3 where rows count as arrivals.
     assert np.sqrt(np.mean(np.square(z))) == pytest.approx(1.0, abs=0.25)
     assert np.sqrt(np.mean(np.square(apart))) > 1.3
-
-
-def test_repeatability_is_common_to_an_arrival():
-    c = reflectors(joint_std=STD, poses=6)
-    bare = replace(c.readings, covariance=c.readings.covariance * 0.0, common=None)
-    made = with_joint_scatter(c.cell, bare, np.full(6, STD))
-    # The world's own mechanics give the same factors but for the arm's elasticity.
-    np.testing.assert_allclose(made.common, c.readings.common, atol=0.02 * STD)
-    square = made.common @ np.swapaxes(made.common, 1, 2)
-    np.testing.assert_allclose(made.covariance, square, atol=1e-18)
 
 
 def test_stated_covariances_that_include_the_scatter():

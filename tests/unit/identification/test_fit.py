@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import scipy.linalg as sl
 
-from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import baseline, loads_differ, loads_note
 from hilcal.identification.carried.carried_prior import scales_of
@@ -278,27 +277,6 @@ def test_scalings_agree_where_they_must_and_differ_where_errors_correlate():
     assert np.all(diagonal["none"] != diagonal["gc"])
     correlated = all_three(c.readings.covariance)
     assert np.all(np.abs(correlated["gu"] / correlated["gc"] - 1) > 1e-6)
-
-
-class Rescaled(JointCompliance):
-    """The same effect with other ordinary magnitudes."""
-
-    @property
-    def parameters(self):
-        factors = zip(super().parameters, [30.0, 0.1, 3.0, 0.3, 10.0, 2.0], strict=True)
-        return tuple(replace(p, scale=f * p.scale) for p, f in factors)
-
-
-def test_scaling_parameters_of_different_units_lowers_the_condition():
-    c = campaign(plan_seed=0, target_known=False)
-    found = fitted_model(c.cell, c.readings, "absolute")
-    basis, cell = found.solution.equations.basis, found.model.cell
-    assert basis.condition_scaled < 0.1 * basis.condition_unscaled
-    # Both are properties of the data, not of the magnitudes that someone thought ordinary.
-    other = Model(cell, found.model.effects[:2]) + Rescaled(cell, c.readings.states)
-    again = fit(other, c.readings, "absolute").solution.equations.basis
-    assert again.condition_scaled == pytest.approx(basis.condition_scaled, rel=1e-3)
-    assert again.condition_unscaled == pytest.approx(basis.condition_unscaled, rel=1e-3)
 
 
 C = campaign("none", "absolute", 0, poses=12)

@@ -18,17 +18,16 @@ from hilcal.identification.outliers.data_snooping import (
 )
 from hilcal.identification.outliers.least_trimmed_squares import (
     FALSE_ALARMS,
-    ReadingModel,
     bulk_scale,
     rejection_limit,
 )
 from hilcal.identification.registration.misdescription import examine
 from hilcal.identification.registration.registration import register
 from hilcal.present.verdict import message
-from hilcal.readings.whitening import MODES, inverse_root, whitening
+from hilcal.readings.whitening import MODES, whitening
 from studies.gross_errors import GrossErrorCase, count, spoil
 from studies.study_cases import study_case
-from tests.support.campaigns import campaign, configuration, noiseless, plan, with_noise
+from tests.support.campaigns import campaign, configuration
 from tests.support.fit_cases import fitted_model, refined
 from tests.support.rows import first
 
@@ -115,17 +114,6 @@ def test_good_readings_are_called_gross_once_in_a_thousand_campaigns(m, factor, 
     expected = FALSE_ALARMS * tried
     assert alarms <= poisson.isf(1e-4, expected)
     assert factor > 1 or alarms >= poisson.ppf(1e-4, expected)
-
-
-@pytest.mark.parametrize(
-    "tried", [pytest.param(50, marks=pytest.mark.long), pytest.param(200, marks=pytest.mark.slow)]
-)
-def test_clean_campaigns_keep_all_their_readings(tried):
-    c, rng = campaign(plan_seed=0, registration_known=True), np.random.default_rng(1)
-    model, clean = baseline(c.cell, c.readings, "absolute"), noiseless(c.world, plan())
-    start = np.zeros(model.size)
-    fits = (fit(model, with_noise(clean, rng), "absolute", start=start) for _ in range(tried))
-    assert sum(bool(f.outlier.any()) for f in fits) <= poisson.isf(1e-3, FALSE_ALARMS * tried)
 
 
 def test_a_true_effect_is_not_mistaken_for_gross_errors():
@@ -272,45 +260,6 @@ def test_gross_errors_beside_such_a_law_are_found():
     assert found.outlier[wrong].mean() >= 0.95
     lost = np.isin(r.pose, r.pose[wrong[r.unloaded[wrong]]])  # with their unloaded reading
     assert not found.outlier[~lost & ~np.isin(np.arange(len(r)), wrong)].any()
-
-
-def random_model(mode, rng):
-    """30 readings; as deflections in groups of an unloaded and four or five loaded ones."""
-    n, m, k = 30, 3, 4
-    covariance = rng.normal(size=(n, m, m))
-    root = inverse_root(covariance @ covariance.swapaxes(1, 2) + 0.1 * np.eye(m))
-    members = np.arange(n).reshape(5, 6)
-    members[2, 5] = -1
-    return ReadingModel(
-        residual=(root @ rng.normal(size=(n, m, 1)))[:, :, 0],
-        columns=root @ rng.normal(size=(n, m, k)),
-        precision=np.array([0.0, 0.0, 0.0, 2.0]),
-        pull=np.array([0.0, 0.0, 0.0, 0.7]),
-        root=root,
-        members=members if mode == "deflection" else np.zeros((0, 0), dtype=np.int64),
-    )
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_distances_are_those_of_least_squares_without_the_reading(mode):
-    rng = np.random.default_rng(1)
-    of = random_model(mode, rng)
-    used = of.tested & (rng.random(len(of)) < 0.7)
-    found, groups = of.distances(used), len(of.members)
-    offsets = np.zeros((len(of), 3, 3 * groups))
-    for k in np.flatnonzero(of.group >= 0):
-        offsets[k, :, 3 * of.group[k] : 3 * of.group[k] + 3] = of.root[k]
-    b = np.concatenate([of.columns, offsets], axis=2)
-    prior, pull = (np.append(x, np.zeros(3 * groups)) for x in (of.precision, of.pull))
-    for k in np.flatnonzero(of.tested):
-        rest = used.copy()
-        rest[k] = False
-        rows = b[rest].reshape(-1, b.shape[2])
-        c = np.linalg.inv(rows.T @ rows + np.diag(prior))
-        delta = c @ (rows.T @ of.residual[rest].reshape(-1) - pull)
-        off = of.residual[k] - b[k] @ delta
-        exact = off @ np.linalg.solve(np.eye(3) + b[k] @ c @ b[k].T, off)
-        assert found[k] == pytest.approx(exact, rel=1e-6)
 
 
 @pytest.mark.parametrize("m", [3, 6])

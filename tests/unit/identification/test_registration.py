@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.baseline import with_effects
 from hilcal.identification.prediction.full_prediction import gross_errors
 from hilcal.identification.registration.registration import register
 from hilcal.present.registration import registration_lines
@@ -225,21 +224,6 @@ def test_base_and_targets_are_registered_together(known, m):
     assert np.all(off[list(known)] == 0.0)
     turn = cell.registration[:3, :3] @ c.world.registration[:3, :3].T
     assert np.linalg.norm(rotation_vector(turn)) < 1e-3
-
-
-@EITHER
-def test_derivatives_agree_with_differences(m):
-    c = reflectors(known=(False, True, False), m=m, poses=4)
-    states = c.readings.states
-    model = with_effects(c.cell, c.readings, "absolute", ("joint_compliance", "encoder_offset"))
-    assert [p.name for p in model.effects[1].parameters][::m] == ["R1.x", "R3.x"]
-    scale = np.array([p.scale for e in model.effects for p in e.parameters])
-    theta = 0.3 * scale * np.random.default_rng(1).standard_normal(model.size)
-    exact = model.jacobian(model.predict(states, theta), theta, 3)
-    for k, step in enumerate(1e-2 * np.diag(scale)):
-        ahead, back = (model.predict(states, theta + s).observation for s in (step, -step))
-        quotient = (ahead.position - back.position) / (2 * step[k])
-        np.testing.assert_allclose(exact[:, :, k], quotient, atol=2e-6 * np.abs(quotient).max())
 
 
 @pytest.mark.parametrize(("mode", "known"), [(MODES[0], OF_THREE[0]), (MODES[1], OF_THREE[-1])])

@@ -123,14 +123,6 @@ def assert_all_close(a, b):
         np.testing.assert_allclose(value, b[key], rtol=0, atol=1e-12, err_msg=key)
 
 
-def test_one_state_at_a_time_gives_the_same_numbers():
-    model, states, theta = case()
-    together = everything(model, states, theta)
-    for i in range(COUNT):
-        alone = everything(model, states[i : i + 1], theta)
-        assert_all_close(alone, {k: v[i : i + 1] for k, v in together.items()})
-
-
 @pytest.mark.parametrize("size", [1, 3, COUNT])
 def test_chunks_give_the_same_numbers(size, monkeypatch):
     model, states, theta = case()

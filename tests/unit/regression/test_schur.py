@@ -15,7 +15,6 @@ from hilcal.regression.schur import (
     projection,
     schur_complement,
 )
-from tests.support.regression_cases import KINDS, problem
 
 INTEREST = np.array([0, 2, 5])
 OTHERS = np.array([1, 3, 4, 6, 7])
@@ -68,15 +67,6 @@ def test_solutions_follow_the_rule_for_singular_blocks(least):
     zero[3] = zero[:, 3] = 0.0
     root = inverse_root(zero)
     np.testing.assert_allclose(positive_solve(zero, rhs), root.T @ (root @ rhs), rtol=1e-12)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_products_are_those_of_the_dense_matrix(kind):
-    of = problem(kind)
-    p, m = of.projection, of.dense
-    np.testing.assert_allclose(p.project_out(of.x), m @ of.x, atol=1e-12)
-    np.testing.assert_allclose(p.project_out(of.y), m @ of.y, atol=1e-12)
-    np.testing.assert_allclose(p.information(of.x), of.x.T @ m @ of.x, rtol=1e-12, atol=1e-11)
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
