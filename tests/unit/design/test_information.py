@@ -510,24 +510,6 @@ def variance_of(asked, counts):
     return float(np.trace(asked.criterion.c @ np.linalg.inv(m)))
 
 
-def test_directions_that_are_left_out_are_noise_and_nothing_is_learnt_of_them(monkeypatch):
-    """Of one unit: what is predicted of the kept directions is as uncertain as by all of them."""
-    monkeypatch.setattr(condensing, "DIRECTIONS", 10_000)
-    monkeypatch.setattr(condensing, "LEAST", 0.0)
-    of, work = scene("absolute", fitted=True)
-    whole = mixed_design(of, config("absolute"), work)
-    monkeypatch.setattr(condensing, "DIRECTIONS", 12)
-    few = mixed_design(of, config("absolute"), work)
-    flat = len(few.prior) - 12
-    kept = np.r_[np.arange(flat), np.arange(len(whole.prior) - 12, len(whole.prior))]
-    for k in range(0, len(of.units), 7):
-        counts = np.zeros(len(of.units))
-        counts[k] = 1.0
-        of_all = np.linalg.inv(whole.prior + whole.units.information(counts))
-        of_few = np.linalg.inv(few.prior + few.units.information(counts))
-        assert of_few == pytest.approx(of_all[np.ix_(kept, kept)], rel=1e-6, abs=1e-9)
-
-
 def test_what_is_known_very_well_does_not_hide_what_a_reading_tells():
     """After many readings: the same mean variance in balanced coordinates, and a plan is found."""
     of, work = scene("absolute", fitted=True)

@@ -29,12 +29,10 @@ from hilcal.regression.evidence import family_power
 from hilcal.regression.schur import projection, schur_complement
 from tests.support.campaigns import (
     campaign,
-    measured,
-    plan,
     true_parameters,
 )
 from tests.support.fit_cases import fitted_model
-from tests.support.next_cases import SMALL, after_further_plan, doubtful
+from tests.support.next_cases import SMALL, after_further_plan, doubtful, many_waves
 from tests.support.plan_cases import config_of, poses_of
 
 TILT, LINK = "joint_tilt_compliance", "link_compliance"
@@ -152,22 +150,8 @@ def test_most_doubts_are_settled(effect):
     assert np.mean(alone) >= 0.75
 
 
-FINE = {"plan_seed": 0, "poses": 30, "strength": 2.0, "harmonics": 21}
-
-
-def fine_error():
-    """Thirty poses with a transmission error of harmonics 3 to 21 at 2 σ."""
-    c = campaign("transmission_error", "absolute", 0, **FINE)
-    waves = c.world.physics.transmission_error.copy()
-    size = np.sum(waves**2)
-    waves[:, :2] = 0.0
-    waves *= np.sqrt(size / np.sum(waves**2))
-    world = replace(c.world, physics=replace(c.world.physics, transmission_error=waves))
-    return replace(c, world=world), measured(world, plan(30, 0), np.random.default_rng(0))
-
-
 def test_the_chance_of_telling_it_from_a_rival_grows():
-    c = campaign("transmission_error", "absolute", 0, **FINE)
+    c = many_waves()
     first = fitted_model(c.cell, c.readings, "absolute")
     (told,) = pose_powers(first, ("transmission_error", "encoder_offset"), 140)
     assert (told.effect, told.rival) == ("transmission_error", "encoder_offset")

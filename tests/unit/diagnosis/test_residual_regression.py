@@ -21,9 +21,10 @@ from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
 from hilcal.present.verdict import message
-from tests.support.campaigns import campaign, measured, plan
+from tests.support.campaigns import campaign, plan
 from tests.support.diagnosis_cases import fitted_baseline
 from tests.support.fit_cases import fitted_model
+from tests.support.next_cases import fine_error
 from tests.support.rows import first
 
 
@@ -238,22 +239,9 @@ def test_equal_to_dense_columns(mode, effects):
     assert found.square(x) == pytest.approx(float(np.sum((u.T @ x) ** 2)), rel=1e-6)
 
 
-def fine_error(seed, first):
-    """Thirty poses; a transmission error of 2 σ with the harmonics from `first` to 21."""
-    options = {"plan_seed": seed, "poses": 30, "strength": 2.0, "harmonics": 21}
-    c = campaign("transmission_error", "absolute", seed, **options)
-    waves = c.world.physics.transmission_error.copy()
-    size = np.sum(waves**2)
-    waves[:, : first - 1] = 0.0
-    waves *= np.sqrt(size / np.sum(waves**2))
-    world = replace(c.world, physics=replace(c.world.physics, transmission_error=waves))
-    r = measured(world, plan(30, seed), np.random.default_rng(seed))
-    return diagnose(fitted_model(c.cell, r, "absolute"))
-
-
 @pytest.mark.parametrize("seed", [2, *(pytest.param(k, marks=pytest.mark.slow) for k in (0, 6))])
 def test_a_transmission_error_too_fine_for_thirty_poses_is_ambiguous(seed):
-    d = fine_error(seed, 3)
+    d = diagnose(fitted_model(*fine_error(seed), "absolute"))
     assert (d.verdict, d.reason) == ("ambiguous", "pose_alone")
     assert d.pose_alone.share > 0.95
     assert d.pose_alone.effects[:2] == ("transmission_error", "link_geometry")

@@ -1,13 +1,10 @@
-"""Schur complements, projections, rows and columns left out, against dense algebra and refits."""
+"""Schur complements, projections and groups of what is connected, against dense algebra."""
 
 import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
 
 from hilcal.identification.folds import groups_within
-from hilcal.identification.linearisation import eliminate_columns
-from hilcal.regression.leave_out import FamilyFolds, folds
-from hilcal.regression.normal_equations import find_basis, normal_equations
 from hilcal.regression.schur import (
     differentiable_schur_complement,
     inverse_root,
@@ -88,70 +85,3 @@ def test_groups_and_their_numbers_are_those_of_a_graph():
         near = np.all(np.abs(points[:, None] - points) <= distance, axis=2)
         expected = connected_components(near, directed=False)[1]
         assert np.array_equal(groups_within(points, distance), expected)
-
-
-PRIOR = np.array([np.inf, np.inf, 0.5, 2.0, np.inf, 1.0])
-MAGNITUDE = np.array([1.0, 2.0, 1.0, 1.0, 0.5, 1.0])
-
-
-def refit(a, y, std, beta):
-    """Parameters of least squares with priors about zero, by rows that are appended."""
-    known = np.isfinite(std)
-    more = np.sqrt(beta) * np.eye(len(std))[known] / std[known][:, None]
-    return np.linalg.lstsq(np.vstack([a, more]), np.append(y, np.zeros(len(more))), rcond=None)[0]
-
-
-def case(beta):
-    """Columns (R, 6), family (R, 2), data, and the parameters of the fit."""
-    rng = np.random.default_rng(2)
-    a, x = rng.standard_normal((60, 6)), rng.standard_normal((60, 2))
-    y = a @ rng.standard_normal(6) + x @ np.array([0.5, -1.0]) + rng.standard_normal(60)
-    return a, x, y, refit(a, y, PRIOR, beta)
-
-
-def model(beta):
-    """Folds and columns of the fit of `case`, its basis and residual, and a family."""
-    a, x, y, theta = case(beta)
-    basis = find_basis(a, np.ones(6), PRIOR)
-    equations = normal_equations(a, y, basis, a.T @ a)
-    p = projection(a @ basis.transform, beta * basis.prior_precision)
-    fold = np.arange(60) % 5
-    each = folds(p, y - a @ theta, equations, theta, PRIOR, MAGNITUDE, beta, fold)
-    return each, p, basis, y - a @ theta, x
-
-
-@pytest.mark.parametrize("beta", [1.0, 2.5])
-def test_rows_left_out_are_predicted_as_by_a_refit_without_them(beta):
-    a, x, y, theta = case(beta)
-    each, p, basis, white, _ = model(beta)
-    fold, ridge, family = np.arange(60) % 5, 0.8, FamilyFolds(each, x)
-    before = each.left_out(white, of_fit=True)
-    found, alone = family.left_out(before, ridge), before.residual
-    information = p.schur(family.gram, family.cross)
-    np.testing.assert_allclose(information, p.information(x), rtol=1e-11, atol=1e-12)
-    # Without a fold the flat parameters have a prior, too.
-    std = np.where(np.isinf(PRIOR), MAGNITUDE, PRIOR)
-    for f in range(5):
-        out = fold == f
-        whole = np.hstack([a, x])
-        both = refit(whole[~out], y[~out], np.append(std, np.full(2, np.sqrt(beta / ridge))), beta)
-        np.testing.assert_allclose(found[out], y[out] - whole[out] @ both, atol=1e-4)
-        bare = refit(a[~out], y[~out], std, beta)
-        np.testing.assert_allclose(alone[out], y[out] - a[out] @ bare, atol=1e-4)
-        step = basis.transform @ each.folds[f].step()
-        np.testing.assert_allclose(theta + step, bare, atol=1e-4)
-
-
-@pytest.mark.parametrize("out", [[0], [2, 3], [4, 5], [0, 1, 4]])
-def test_a_model_without_columns_is_as_a_refit_without_them(out):
-    beta = 1.7
-    a, _, y, theta = case(beta)
-    mine = np.isin(np.arange(6), out)
-    reduced = eliminate_columns(a, a.T @ a, y - a @ theta, theta, PRIOR, mine, beta, 60)
-    again = refit(a[:, ~mine], y, PRIOR[~mine], beta)
-    np.testing.assert_allclose(reduced.residual, y - a[:, ~mine] @ again, atol=1e-11)
-    h = a[:, ~mine].T @ a[:, ~mine] + np.diag(beta / PRIOR[~mine] ** 2)
-    spent = np.trace(np.linalg.solve(h, a[:, ~mine].T @ a[:, ~mine]))
-    assert reduced.dof == pytest.approx(60 - spent, rel=1e-12)
-    s = mine.sum()
-    assert reduced.score().rank == s
