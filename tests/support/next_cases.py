@@ -21,7 +21,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.readings.readings import Readings
 from hilcal.store.plan import Plan, with_new_names
-from tests.support.campaigns import Campaign, campaign, measured, plan
+from tests.support.campaigns import SimulatedCampaign, campaign, measured, plan
 from tests.support.cli_cases import CELL
 from tests.support.plan_cases import changed
 
@@ -85,7 +85,7 @@ def joined_readings(a: Readings, b: Readings) -> Readings:
     return Readings.joined([replace(r, pose=at, pose_names=names) for r, at in parts])
 
 
-def many_waves(seed: int = 0) -> Campaign:
+def many_waves(seed: int = 0) -> SimulatedCampaign:
     """Thirty poses with a transmission error of harmonics 1 to 21 at 2 σ."""
     return campaign(
         "transmission_error", "absolute", seed, poses=30, plan_seed=seed, strength=2.0, harmonics=21
