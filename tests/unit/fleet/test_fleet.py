@@ -305,24 +305,6 @@ def recorded(one, path, odd):
     return path
 
 
-def test_campaigns_are_as_far_from_the_type_as_their_arm(one):
-    whole, of = fleet(one, 1.5)
-    d = DrawnType(of, whole.members)
-    assert np.argwhere(d.odd).tolist() == [[ODD, d.names.index("joint_compliance.j3")]]
-    assert d.joints == tuple(int(name[-1]) for name in d.names)
-    assert (d.pooled.distance.shape, d.campaigns.shape) == (
-        (ARMS, len(d.names)),
-        (2 * ARMS, len(d.names)),
-    )
-    assert [d.owner[k] for k in (0, 1, 2)] == [0, 0, 1]
-    assert d.seconds[1] - d.seconds[0] == 59 * 86400
-    odd = d.campaigns[d.owner == ODD][:, d.names.index("joint_compliance.j3")]
-    assert (odd > 5).all()
-    apart = np.linalg.norm(arm_positions(d)[:, None] - arm_positions(d), axis=2) + 10 * np.eye(ARMS)
-    assert apart.min() > 0.5
-
-
-@pytest.mark.long
 def test_the_odd_joint_alone_is_red_and_its_arm_framed(one, tmp_path):
     path = recorded(one, tmp_path / "fleet.rrd", 1.5)
     d = DrawnType(fleet(one, 1.5)[1], fleet(one, 1.5)[0].members)

@@ -74,20 +74,6 @@ def test_blocks_of_two_sizes_and_columns_with_priors_against_the_dense_likelihoo
     assert found.log_likelihood == pytest.approx(gain, abs=2e-3)
 
 
-def test_two_components_are_told_apart_without_bias_and_their_uncertainty_is_right():
-    rng, truth, z = np.random.default_rng(0), np.array([2.0, 0.5]), []
-    rows = rng.standard_normal((40, 3, 30))
-    components = np.stack([v[:, :, None] * v[:, None, :] for v in rng.standard_normal((2, 40, 3))])
-    vectors = np.sqrt(np.einsum("cgii->cgi", components)) * np.sign(components[:, :, :, 0])
-    for _ in range(60):
-        y = rng.standard_normal((40, 3))
-        y += np.einsum("cgi,c,cg->gi", vectors, np.sqrt(truth), rng.standard_normal((2, 40)))
-        found = variance_components([BlockRows(y, rows, components)], np.zeros(30))
-        z.append(found.variance)
-    mean, error = np.mean(z, axis=0), np.std(z, axis=0) / np.sqrt(60)
-    assert np.all(np.abs(mean - truth) < 4 * error)
-
-
 ARMS, TIMES, SIZE = 30, 2, 6
 BETWEEN = np.linspace(0.2, 1.0, SIZE)
 WITHIN = 0.1
