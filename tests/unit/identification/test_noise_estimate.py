@@ -18,7 +18,7 @@ from hilcal.store.plan import Plan, Step
 from hilcal.store.run_log import create_run
 from tests.support.cli_cases import ok
 from tests.support.rows import first
-from tests.unit.identification.test_misdescription import measured
+from tests.unit.identification.test_registration import measured
 
 OFF = 0.3  # mm and mrad of each link: an ordinary arm
 

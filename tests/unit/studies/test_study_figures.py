@@ -28,7 +28,7 @@ from tests.support.cli_cases import ok
 from tests.support.paths import ROOT
 from tests.support.refusals import refusal
 from tests.unit.calibration.test_calibration import POSES, calibrated
-from tests.unit.studies.test_study_cases import case
+from tests.unit.studies.test_study_diagnosis import case
 
 MEASURED = ROOT / "docs" / "measured"
 
