@@ -526,3 +526,17 @@ def test_what_is_known_very_well_does_not_hide_what_a_reading_tells():
     assert told[1] == pytest.approx(told[0], rel=1e-6)
     found = [relax(balanced(d), 20.0).value for d in (plain, uneven)]
     assert found[1] == pytest.approx(found[0], rel=1e-4)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_prediction_is_what_identification_states_of_several_targets(mode):
+    config = changed(config_of(mode), repeatability={"joint_std_rad": 5e-5})
+    c = reflectors(poses=14, joint_std=5e-5, known=(True, False, True), registration_known=True)
+    # in deflections a prior of another size holds the offset
+    offset = ("target_offset.R2.x",) if mode == "absolute" else ()
+    as_stated(c, config, fitted_model(c.cell, c.readings, mode), 0.05, (*offset, *JOINTS))
+
+
+def test_of_another_arm_is_refused():
+    p = learnt()
+    refusal("nominal links", problem_with, carried_prior(replace(p, links=1.01 * p.links)))

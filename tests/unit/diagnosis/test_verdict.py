@@ -1,6 +1,7 @@
 """The rules of the verdict, of several targets, of a background; probabilities of effects."""
 
 import itertools
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,7 +16,7 @@ from hilcal.diagnosis.diagnosis import (
     in_doubt,
 )
 from hilcal.diagnosis.evidence import Alternative, Evidence
-from hilcal.diagnosis.verdict import judge
+from hilcal.diagnosis.verdict import diagnose, judge
 from hilcal.identification.background import with_background
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
@@ -25,6 +26,8 @@ from studies.study_cases import study_case
 from tests.support.campaigns import campaign, configuration
 from tests.support.diagnosis_cases import fitted_baseline
 from tests.support.fit_cases import fitted_model, refined
+from tests.support.reflector_cases import reflectors
+from tests.support.rows import first
 
 
 def evidence(effect, mode, seed, **options):
@@ -165,3 +168,29 @@ def test_a_model_with_pooled_lines_is_refined_further():
     assert p_value_of_others(found.fit) > 0.01  # nothing else is there
     again = refine(found.fit.model, case.readings, "absolute")
     assert again.verdict == found.verdict == "adequate"
+
+
+KNOWN = (True, False, False)
+
+
+STD = 2.5e-5
+
+
+def unstated(c):
+    """The readings with the instrument's covariance alone, as a table without the arm's has it."""
+    common = c.readings.common
+    instrument = c.readings.covariance - common @ np.swapaxes(common, 1, 2)
+    return replace(c.readings, covariance=instrument, common=None, scatter_stated=False)
+
+
+@pytest.mark.parametrize(("mode", "seed"), first(1, [("absolute", 2), ("deflection", 0)]))
+def test_an_unknown_scatter_is_found_and_not_taken_for_a_cause(mode, seed):
+    """Taken for independent, these readings name a cause: transmission_error in the second."""
+    c = reflectors(seed=seed, poses=20, known=KNOWN, joint_std=STD)
+    readings = unstated(c)
+    found = fitted_model(c.cell, readings, mode)
+    d = diagnose(found)
+    assert found.variance_factor > 4
+    assert (d.verdict, d.reason, d.significant) == ("adequate", "arm_scatter", ())
+    assert d.scatter.kind == "joints"
+    assert d.scatter.std[0] == pytest.approx(STD, abs=4 * d.scatter.std_error[0])

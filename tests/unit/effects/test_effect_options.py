@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hilcal.diagnosis.effect_ranking import candidates
@@ -175,7 +175,6 @@ values = st.one_of(
 )
 
 
-@settings(max_examples=15)
 @given(st.dictionaries(st.from_regex(r"[a-z]\w*", fullmatch=True).filter(str.isascii),
                        st.one_of(values, st.lists(values, max_size=3)), max_size=3))  # fmt: skip
 def test_what_is_written_reads_the_same(options):

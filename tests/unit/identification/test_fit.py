@@ -450,3 +450,10 @@ def test_errors_are_those_of_lapacks_qr(condition):
     if condition == 1e8:
         squared = np.abs(np.linalg.solve(a.T @ a, a.T @ white) - truth).max()
         assert squared > 1e3 * error
+
+
+def test_the_summary_has_every_parameter_and_both_errors(found):
+    text = found.summary()
+    assert all(f"{row.name} " in text for row in found.parameters)
+    for error in (found.error, found.holdout):
+        assert f"{1e6 * error.rms_m:.1f} µm rms" in text

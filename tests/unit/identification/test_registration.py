@@ -11,8 +11,10 @@ from scipy.spatial.transform import Rotation
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
 from hilcal.config.sections import Conventions
+from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline
+from hilcal.identification.linearisation import linearise
 from hilcal.identification.prediction.full_prediction import gross_errors
 from hilcal.identification.registration.hypotheses import Description, Hypothesis
 from hilcal.identification.registration.misdescription import (
@@ -500,3 +502,18 @@ def test_what_is_no_orientation_is_not_decided():
     ranked = rank_conventions(ARM, C.q, C.position, noise, 1.0)
     assert clearly_best(ranked) is None
     assert rank_conventions(ARM, C.q[:4], C.position[:4], noise[:4], 1.0) == ()
+
+
+def test_the_misfit_of_a_displaced_reflector_follows_the_target():
+    c = reflectors(seed=2, joint_std=1e-5)
+    moved, by = c.cell.all_targets.copy(), np.array([2e-4, -1e-4, 1e-4])
+    moved[1, :3, 3] += by
+    cell = c.cell.with_targets(moved)
+    share = misfit_breakdown(linearise(fitted_model(cell, c.readings, "absolute")))[0]
+    assert share.variable == "target"
+    assert share.share > 0.9
+    found = fitted_model(cell, c.readings, "absolute", ["joint_compliance", "target_offset"])
+    rows = found.model.slices()[found.model.names.index("target_offset")]
+    theta = found.theta[rows].reshape(3, 3)
+    # A common displacement of all targets is hardly told from one of the base; a single one is.
+    np.testing.assert_allclose(theta[1] - theta[[0, 2]].mean(axis=0), -by, atol=1.5e-5)

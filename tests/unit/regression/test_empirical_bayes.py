@@ -22,6 +22,7 @@ from hilcal.regression.schur import projection
 from tests.support.campaigns import campaign, measured, plan
 from tests.support.effect_cases import make
 from tests.support.fit_cases import fitted_model
+from tests.support.rows import first
 
 
 def linear(strength, count, rows=1200, flat=3, noise=1.0, seed=0):
@@ -255,3 +256,34 @@ def test_what_a_dropped_group_could_do_widens_what_it_is_confused_with():
     full = np.hstack([kept, dropped])
     joint = np.linalg.inv(full.T @ full + np.diag([0.0, 0.0, 0.0, *prior]))
     np.testing.assert_allclose(factor, np.sqrt(np.diag(joint)[:3] / np.diag(inverse)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("size", first(2, [1, 8, 2, 3]))
+def test_groups_of_noise_spend_what_they_lower_the_sum_of_squares_by(size):
+    x = np.random.default_rng(size).chisquare(size, 200_000)
+    kept = x > size
+    lowered = np.where(kept, x - size**2 / x, 0.0)
+    share = np.where(kept, 1 - size / x, 0.0)
+    spent = np.where(kept, spent_by_groups(share, np.full(len(x), size)), 0.0)
+    assert spent.mean() == pytest.approx(lowered.mean(), abs=5 * lowered.std() / np.sqrt(len(x)))
+    assert spent_by_groups(np.ones(1), np.array([size])) == pytest.approx(size)
+
+
+def test_a_dropped_column_that_others_stand_for_altogether_changes_nothing():
+    kept = np.random.default_rng(3).normal(size=(50, 2))
+    p, copy = projection(kept, np.zeros(2)), kept @ np.array([[1.0], [2.0]])
+    factor = dropped_group_factors(np.eye(2), p, copy, np.array([0]), 1.0)
+    np.testing.assert_allclose(factor, 1.0)
+
+
+def test_without_dropped_groups_and_shrinkage_a_fold_is_least_squares():
+    rng = np.random.default_rng(0)
+    a, truth = rng.normal(size=(200, 8)), rng.normal(size=8)
+    y = a @ truth + 1e-3 * rng.normal(size=200)
+    p = FamilyProblem(
+        a / 1e-3, y / 1e-3, np.zeros((2, 2)), np.zeros(2), np.arange(6) // 3, np.ones(6), 1.0
+    )
+    fold = np.arange(200) % 5
+    for f, u in enumerate(solutions(p, fold)):
+        exact = np.linalg.lstsq(a[fold != f], y[fold != f], rcond=None)[0]
+        np.testing.assert_allclose(u, exact, rtol=0, atol=1e-5)

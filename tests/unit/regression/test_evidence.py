@@ -221,3 +221,10 @@ def test_a_fold_that_the_sample_has_no_row_of_is_left_out_of_nothing():
     first = BlockSelection(own, np.ones(2), x, y, np.arange(60) % 3, 0)
     strengths = np.array([0.1, 1.0])
     assert first.without(3, 2, 3.0, strengths) == first.without(7, 2, 3.0, strengths) == [1]
+
+
+def test_without_a_family_the_power_is_the_level_and_known_noise_is_the_limit():
+    assert power_of_test(0.0, 3, 50.0, 0.01) == pytest.approx(0.01)
+    few, many, known = (power_of_test(12.0, 3, rest, 0.01) for rest in (20.0, 1e6, np.inf))
+    assert few < many == pytest.approx(known, rel=1e-4)
+    assert family_power(np.zeros((2, 2)), np.ones(2), 0.01) == 0.01

@@ -120,3 +120,14 @@ def test_common_drift_is_found_beside_the_changes_of_single_arms():
     assert abs(h.slope[2] - 0.3) < 4 * std[2]
     assert h.slope[2] > 5 * std[2]
     assert np.abs(np.delete(h.slope / std, 2)).max() < 4
+
+
+def test_arms_measured_once_have_one_spread():
+    of, _ = fleet(6)
+    once = of.time == 0
+    h, _ = hierarchy(
+        FleetEstimates(of.mean[once], of.information[once], of.arm[once], of.time[once])
+    )
+    assert not h.within.any()
+    assert not h.slope.any()
+    assert h.between[5] > h.between[0]

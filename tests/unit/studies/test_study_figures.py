@@ -16,6 +16,7 @@ from studies.compensation_command import _figures as _figures_of_compensation
 from studies.discover import DiscoveryCase, DiscoveryOutcome
 from studies.discover_command import claims
 from studies.foreign_laws import KINDS
+from studies.formulas import FORMULAS, drawn, hilcal
 from studies.law_scene import scene
 from studies.odds import OddsCase
 from studies.odds import claims as odds_claims
@@ -253,3 +254,14 @@ def test_frequencies_are_counted_by_what_was_said():
     assert error.measured == f"{0.25 ** (1 / 3):.3f} (geometric mean), smaller in 2 of 3"
     inside = figures["elements of fresh poses inside the 95 % interval of the average"]
     assert inside.measured == "95.0 %"
+
+
+BY_TEXT = {f.text: f for f in FORMULAS}
+
+
+def test_noise_alone_has_no_law():
+    rng = np.random.default_rng(2)
+    x, _ = drawn(BY_TEXT["μ N"], 60, 1.0, rng)
+    text, values = hilcal(x, rng.standard_normal(60), 1.0, reciprocals=False)
+    assert text == ""
+    assert np.ptp(values(x)) == 0.0
