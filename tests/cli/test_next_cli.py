@@ -28,9 +28,8 @@ from hilcal.workbench.session import WorkbenchSession
 from tests.cli.test_until_goal import site
 from tests.support.campaigns import configuration
 from tests.support.cli_cases import CELL, imported, ok, refused, stored_readings
-from tests.support.next_cases import SMALL, doubtful
+from tests.support.next_cases import SMALL, doubtful, fine_error
 from tests.unit.data.test_run_log import MADE, STEPS, _campaign, _reading
-from tests.unit.design.test_next import fine_error
 
 TILT, LINK, BASE = "joint_tilt_compliance", "link_compliance", "base_compliance"
 

@@ -11,7 +11,7 @@ from hilcal.cell import cell_from_config, tracker_place
 from hilcal.design.feasible import REASONS, FeasibleSpace, draw_poses
 from hilcal.errors import CannotAnswerError
 from hilcal.measuring.feasibility import BETWEEN_M, STATE_CHECKS, Feasibility, Margins
-from hilcal.measuring.motion import SLACK, SLACK_M, Guard
+from hilcal.measuring.motion import SLACK_M, Guard
 from hilcal.measuring.route import Stop, dry_run, route_problems
 from hilcal.robot.catalogue import load_arm
 from hilcal.store.plan import UNLOADED, Plan, Step
@@ -154,18 +154,6 @@ def _under_load(config, space, q, name):
         for part in parts:
             if part.body < arm.n:
                 assert gap(placed(part, at), points) > part.radius + radius + 0.02 - 1e-9
-
-
-def test_enough_candidates_under_every_load_the_same_again_from_the_seed():
-    config = cell(obstacles=[TABLE])
-    drawn = drawn_of(config, 300)
-    assert drawn.q.shape == (300, 6)
-    assert drawn.allowed.shape == (300, 3)
-    assert np.all(drawn.allowed.mean(axis=0) > [0.99, 0.2, 0.5])
-    np.testing.assert_array_equal(drawn.q, drawn_of(config, 300).q)
-    assert not np.array_equal(drawn.q, drawn_of(config, 300, seed=1).q)
-    spread = drawn.q.std(axis=0) / (drawn.q.max(axis=0) - drawn.q.min(axis=0))
-    assert np.all(spread > 0.1)
 
 
 def test_reasons_are_told_one_by_one_in_order():
@@ -445,21 +433,6 @@ def test_a_state_is_refused_by_all_or_by_none(c, seed, load):
         assert lines or said is None
         if inside < -SLACK_M - 1e-6 or apart < -1e-9:
             assert said is not None
-
-
-@settings(max_examples=20, deadline=None)
-@given(cells_of_same_feasibility(), SEED, LOAD)
-def test_all_checks_together_find_what_each_finds_alone(c, seed, load):
-    """The checks share one evaluation of the states; it is another for every state."""
-    limits, q = Feasibility(c, SLACK), states(c, seed, 6)
-    together = list(limits.findings(q, load))
-    assert together == [x for kind in STATE_CHECKS for x in limits.findings(q, load, (kind,))]
-    alone = [list(limits.findings(row[None], load)) for row in q]
-    assert {x.key for x in together} == {x.key for found in alone for x in found}
-    allowed = np.array([not found for found in alone])
-    np.testing.assert_array_equal(limits.allowed(q, load, STATE_CHECKS), allowed)
-    fresh = Feasibility(c, SLACK)
-    assert list(fresh.findings(q[-1:], load)) == alone[-1]
 
 
 @pytest.mark.long
