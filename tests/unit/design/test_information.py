@@ -1,5 +1,6 @@
-"""What a plan predicts is what identification then states; plans for predictions, condensed."""
+"""What a plan predicts is what identification then states, and what the parameters scatter by."""
 
+import json
 from dataclasses import replace
 from functools import cache
 
@@ -9,24 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilcal.cell import cell_from_config
+from hilcal.config import load_config
 from hilcal.config.cell import Target
 from hilcal.config.sections import Gauge, Point
-from hilcal.design import mixed_design as condensing
-from hilcal.design.approximate_design import relax
-from hilcal.design.criteria import MeanVariance
-from hilcal.design.information import (
-    MOST_PARAMETERS,
-    MOST_TIMES,
-    absolute_rows,
-    deflection_rows,
-    information_of,
-    problem,
-    reading_covariance,
-    reading_derivatives,
-)
-from hilcal.design.mixed_design import balanced, mixed_design, other_effects
+from hilcal.design.information import MOST_PARAMETERS, MOST_TIMES, problem, reading_covariance
 from hilcal.design.nominal_model import model_after, nominal_model, nominal_states
-from hilcal.design.predicted import position_derivative, predicted_uncertainty, prediction_poses
+from hilcal.design.predicted import predicted_uncertainty, prediction_poses
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import baseline
@@ -52,6 +41,8 @@ from tests.support.campaigns import (
     with_noise,
     world_of,
 )
+from tests.support.cli_cases import CELL as DEMO
+from tests.support.cli_cases import ok
 from tests.support.fit_cases import fitted_model, parameters_by_effect
 from tests.support.fit_cases import predicted as read
 from tests.support.observer_cases import NORMAL, POINTS, STD, observed
@@ -92,6 +83,15 @@ def as_stated(c, config, found, rel, names):
     stated = dict(zip(foreseen, found.uncertainty.formal, strict=True))
     for name in names:
         assert foreseen[name] == pytest.approx(stated[name], rel=rel), name
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_prediction_is_what_identification_states_of_several_targets(mode):
+    config = changed(config_of(mode), repeatability={"joint_std_rad": 5e-5})
+    c = reflectors(poses=14, joint_std=5e-5, known=(True, False, True), registration_known=True)
+    # in deflections a prior of another size holds the offset
+    offset = ("target_offset.R2.x",) if mode == "absolute" else ()
+    as_stated(c, config, fitted_model(c.cell, c.readings, mode), 0.05, (*offset, *JOINTS))
 
 
 @pytest.mark.parametrize("mode", first(1, MODES))
@@ -148,6 +148,21 @@ def test_a_deflection_unit_is_a_pose_whose_place_is_unknown(name, seed):
         mine = units.units.rows[k].T @ units.units.rows[k]
         size = np.sqrt(np.outer(np.diag(both), np.diag(both)))
         assert np.all(np.abs(mine - schur) <= 1e-9 * size)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_what_was_measured_is_known_exactly(mode):
+    c = campaign(mode=mode, poses=12, seed=1, target_known=False)
+    found = fitted_model(c.cell, c.readings, mode)
+    config = config_of(mode)
+    p = problem(model_after(found, config), config, poses_of(3))
+    mine = predicted_uncertainty(p)
+    flat = np.isinf(found.solution.prior)
+    ratio = (mine.std / found.uncertainty.formal)[flat & found.uncertainty.identifiable]
+    assert ratio == pytest.approx(np.ones(len(ratio)), rel=1e-6)
+    assert np.isinf(mine.std[flat & ~found.uncertainty.identifiable]).all()
+    identified = np.isfinite(mine.std)
+    assert np.all(identified == found.uncertainty.identifiable)
 
 
 def test_planning_on_predicts_the_fit_to_all_readings():
@@ -243,6 +258,19 @@ def test_problems_that_cannot_be():
         problem_of(cell.with_config(config_of(against=("ghost",))), poses_of(3))
 
 
+def test_what_cannot_be_seen_has_no_uncertainty():
+    """One load along one axis: some joints are never turned by it."""
+    config, cell = config_of("deflection"), cell_of(registration_known=True)
+    a = nominal_model(cell.with_config(config))
+    p = problem(a, config, poses_of(1))
+    only = np.array([float(loads == ("5kg",)) for _, loads in p.contents])
+    work = prediction_poses(a, config, poses_of(5))
+    mine = predicted_uncertainty(p, only, work=work)
+    assert np.isinf(mine.std).any()  # three numbers measured, six compliances
+    assert np.isinf(mine.position)
+    assert np.isfinite(predicted_uncertainty(p, everything_once(p) * 0 + 1.0).std).any()
+
+
 CELL = cell_of(registration_known=True)
 
 
@@ -302,6 +330,15 @@ def test_a_load_that_no_pose_bears_is_as_good_as_none():
     assert borne.contents == without.contents
     assert borne.terms == without.terms
     np.testing.assert_allclose(*(p.information(np.ones(len(p.contents))) for p in (borne, without)))
+
+
+def test_potential_terms_only_add_uncertainty():
+    problems = made(), made(against=())
+    work = prediction_poses(problems[0].nominal, config_of("deflection"), poses_of(5, 9))
+    mine, bare = (predicted_uncertainty(p, everything_once(p), work=work) for p in problems)
+    assert mine.std == pytest.approx(bare.std, rel=1e-9)
+    assert bare.position_open == pytest.approx(bare.position, rel=1e-9)
+    assert mine.position_open > bare.position
 
 
 def test_asked_for_effects_that_the_order_tells_are_taken_at_random():
@@ -396,6 +433,18 @@ def test_effects_that_only_the_prior_knows_are_planned_for():
     assert "joint_tilt_compliance" in found.nominal.model.names
 
 
+def test_a_prior_that_knows_nothing_changes_no_prediction():
+    p = learnt()
+    nothing = carried_prior(replace(p, information=np.zeros_like(p.information)))
+    alone, known = std(problem_with(None)), std(problem_with(nothing))
+    np.testing.assert_allclose(list(known.values()), list(alone.values()), rtol=1e-9)
+
+
+def test_of_another_arm_is_refused():
+    p = learnt()
+    refusal("nominal links", problem_with, carried_prior(replace(p, links=1.01 * p.links)))
+
+
 CASES = {
     "distance": (["A", "B"], {k: Point(position_m=POINTS[k], std_m=STD) for k in "AB"}, {}),
     "height": (["G"], {}, {"G": Gauge(direction=tuple(NORMAL), std_m=STD)}),
@@ -430,6 +479,22 @@ def test_predicted_uncertainties_are_those_of_a_fit(what):
             assert planned == pytest.approx(fitted[name][1], rel=0.25), name
 
 
+@pytest.mark.long
+def test_a_cell_of_distances_is_planned(tmp_path, capsys):
+    text = DEMO.read_text().replace("candidates = 250", "candidates = 60\nagainst = []")
+    text = text.replace('frame = "tracker"', 'frame = "base"\nobserves = "distance"')
+    (tmp_path / "cell.toml").write_text(text + "\n[points.A]\nstd_m = 1e-5\n[points.B]\n")
+    out = tmp_path / "plan.json"
+    ok(capsys, "plan", tmp_path / "cell.toml", "--poses", "8", "-o", out)
+    assert len({step["pose"] for step in json.loads(out.read_text())["steps"]}) >= 8
+
+
+def test_devices_read_positions(tmp_path):
+    keys = 'driver = "geocom"\nport = "x"\nobserves = "distance"'
+    (tmp_path / "cell.toml").write_text(DEMO.read_text().replace('frame = "tracker"', keys))
+    refusal(r'observes = "distance" together with driver', load_config, tmp_path / "cell.toml")
+
+
 def test_sight_and_time_of_each_target():
     config, named = config_of(), zip(NAMES, OFFSETS.tolist(), strict=True)
     targets = tuple(Target(name=name, target_m=tuple(at)) for name, at in named)
@@ -450,97 +515,3 @@ def test_sight_and_time_of_each_target():
             assert ("between tracker and targets" in problems) == (len(hidden) == 3)
             counts.add(len(hidden))
     assert {0, 3} <= counts
-
-
-AGAINST = ("joint_tilt_compliance", "link_geometry", "transmission_error")
-STD_RAD = 2e-5
-
-
-def config(mode):
-    found = config_of(mode, against=AGAINST, work_load="none" if mode == "absolute" else "10kg")
-    return changed(found, repeatability={"joint_std_rad": STD_RAD})
-
-
-def scene(mode, *, fitted):
-    known = config(mode)
-    if fitted:
-        c = campaign(mode=mode, poses=8, seed=3, registration_known=True)
-        nominal = model_after(fitted_model(c.cell, c.readings, mode), known)
-    else:
-        nominal = nominal_model(cell_of(registration_known=True), known)
-    of = problem(nominal, known, poses_of(6))
-    return of, prediction_poses(of.nominal, known, poses_of(5, 9))
-
-
-def mean_variance_of_all(of, work, mode, counts):
-    """tr(C M⁻¹) by all parameters as they are."""
-    known, nominal = config(mode), of.nominal
-    more, std = other_effects(nominal, known)
-    live = nominal.prior_std[nominal.live]
-    scale = np.concatenate([np.where(np.isinf(live), of.scale[: len(live)], live), std])
-    prior = np.concatenate([~np.isinf(live), np.ones(len(std), dtype=bool)]).astype(float)
-    m = information_of(nominal, more, scale) + np.diag(prior)
-    (part,) = reading_derivatives(nominal, known, of.candidates, more, scale)
-    for (pose, loads), count in zip(of.contents, counts, strict=True):
-        index = tuple(of.candidates.loads.index(name) for name in loads)
-        if mode == "absolute":
-            rows = absolute_rows(part)[pose, index[0]]
-        else:
-            rows = deflection_rows(part, np.array([pose]), index)[0]
-        m += count * rows.T @ rows
-    v = position_derivative(nominal, work, more, scale).reshape(-1, len(scale))
-    return float(np.trace(v @ np.linalg.solve(m, v.T))) / len(work.q)
-
-
-@pytest.mark.parametrize("fitted", first(1, [True, False]))
-@pytest.mark.parametrize("mode", first(1, ["deflection", "absolute"]))
-def test_with_all_directions_the_mean_variance_is_that_of_all_parameters(monkeypatch, mode, fitted):
-    monkeypatch.setattr(condensing, "DIRECTIONS", 10_000)
-    monkeypatch.setattr(condensing, "LEAST", 0.0)
-    of, work = scene(mode, fitted=fitted)
-    asked = mixed_design(of, config(mode), work)
-    # what no unit moves is as uncertain by every plan, and left out
-    # (more than 1e7 of each lose digits to rounding)
-    many = np.full(len(of.units), 1e7)
-    least = mean_variance_of_all(of, work, mode, many) - variance_of(asked, many)
-    for seed in range(3):
-        counts = np.random.default_rng(seed).integers(1, 3, len(of.units)).astype(float)
-        every = mean_variance_of_all(of, work, mode, counts) - least
-        assert variance_of(asked, counts) == pytest.approx(every, rel=1e-5)
-
-
-def variance_of(asked, counts):
-    m = asked.prior + asked.units.information(counts)
-    return float(np.trace(asked.criterion.c @ np.linalg.inv(m)))
-
-
-def test_what_is_known_very_well_does_not_hide_what_a_reading_tells():
-    """After many readings: the same mean variance in balanced coordinates, and a plan is found."""
-    of, work = scene("absolute", fitted=True)
-    plain = mixed_design(of, config("absolute"), work)
-    size = np.logspace(-6, 6, len(plain.prior))  # coordinates that rounding would decide in
-    uneven = replace(
-        plain,
-        units=replace(plain.units, rows=plain.units.rows * size),
-        prior=plain.prior * np.outer(size, size),
-        criterion=MeanVariance(plain.criterion.c * np.outer(size, size)),
-    )
-    counts = np.ones(len(of.units))
-    told = [variance_of(d, counts) for d in (plain, balanced(uneven))]
-    assert told[1] == pytest.approx(told[0], rel=1e-6)
-    found = [relax(balanced(d), 20.0).value for d in (plain, uneven)]
-    assert found[1] == pytest.approx(found[0], rel=1e-4)
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_prediction_is_what_identification_states_of_several_targets(mode):
-    config = changed(config_of(mode), repeatability={"joint_std_rad": 5e-5})
-    c = reflectors(poses=14, joint_std=5e-5, known=(True, False, True), registration_known=True)
-    # in deflections a prior of another size holds the offset
-    offset = ("target_offset.R2.x",) if mode == "absolute" else ()
-    as_stated(c, config, fitted_model(c.cell, c.readings, mode), 0.05, (*offset, *JOINTS))
-
-
-def test_of_another_arm_is_refused():
-    p = learnt()
-    refusal("nominal links", problem_with, carried_prior(replace(p, links=1.01 * p.links)))
