@@ -91,7 +91,7 @@ def gross_error_lines(fit: Fit, details: bool) -> Iterator[str]:
     of_load = fit.readings.load
     for k in np.setdiff1d(of_load, of_load[~fit.outlier]):
         name, count = fit.readings.load_names[k], int(np.sum(of_load == k))
-        yield f"No reading under the load {name} is left of {count}: is its force right?"
+        yield f"All {count} readings under the load {name} are set aside: is its force right?"
 
 
 def _listed(lines: Sequence[str], most: int) -> Iterator[str]:

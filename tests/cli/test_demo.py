@@ -94,6 +94,16 @@ def test_the_demo_in_words(tmp_path, capsys, monkeypatch):
     assert "is replaced" in again.err
 
 
+def test_the_demo_does_not_replace_another_file(tmp_path, capsys, monkeypatch):
+    path = tmp_path / "notes.txt"
+    path.write_text("mine", encoding="utf-8")
+    line = refused(capsys, 2, "demo", FAST, "--hide", "nothing", "-o", path)
+    assert "notes.txt" in line
+    assert path.read_text(encoding="utf-8") == "mine"
+    monkeypatch.chdir(tmp_path)
+    assert "is not a campaign" in refused(capsys, 2, "demo", FAST, "--hide", "nothing", "-o", ".")
+
+
 @pytest.mark.slow
 def test_an_effect_of_ones_own_is_hidden_and_found(tmp_path, capsys):
     file = tmp_path / "mine.py"

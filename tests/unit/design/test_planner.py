@@ -1,6 +1,7 @@
 """From a cell to a plan: what it promises, keeps and refuses; goals and when they are met."""
 
 import csv
+import sys
 from collections import Counter
 from dataclasses import replace
 from functools import cache
@@ -11,7 +12,7 @@ import pytest
 from hilcal.cell import cell_from_config
 from hilcal.config.reference import to_toml
 from hilcal.config.sections import CellLoad
-from hilcal.design.choice import CRITERIA, costly_loads
+from hilcal.design.choice import CRITERIA, costly_loads, objective_of
 from hilcal.design.goal import parse_goal
 from hilcal.design.nominal_model import nominal_model
 from hilcal.design.planner import (
@@ -23,9 +24,11 @@ from hilcal.design.planner import (
 from hilcal.design.summary import remarks, summarise
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.measuring.route import dry_run
+from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import REFERENCE, UNLOADED, load_plan, read_plan
+from hilcal.store.plan import REFERENCE, UNLOADED, load_plan, read_plan, with_new_names
 from hilcal.store.run_log import PLAN
+from hilcal.tables.table import write_table
 from tests.support.campaigns import configuration
 from tests.support.cli_cases import ok, quickly_planned, refused, rehearsal, run
 from tests.support.plan_cases import changed, config_of, poses_of, problem_of
@@ -337,3 +340,69 @@ def test_a_goal_must_fit_the_model():
         parse_goal("j9 std < 1 %").check(UNITS)
     with pytest.raises(InputError, match="work_q_rad"):
         parse_goal("position std < 1 mm").status(STDS, VALUES)
+
+
+@pytest.mark.long
+def test_a_plan_to_append_is_made_for_the_reference_of_its_campaign(usual):
+    config = small()
+    cell, reference = cell_from_config(config), usual.ordered.plan.joints(REFERENCE)
+    rng = np.random.default_rng(8)
+    made = plan_readings(cell, PlanRequest(5), rng, reference=reference).ordered.plan
+    np.testing.assert_array_equal(made.joints(REFERENCE), reference)
+    assert dry_run(cell, with_new_names(made, usual.ordered.plan, 2)).problems == ()
+
+
+@pytest.mark.long
+def test_the_last_round_takes_poses_that_are_reached(monkeypatch):
+    """Half of what each round chooses is not reached: a plan was refused for that."""
+    module = sys.modules["hilcal.design.planner"]
+    reached, rounds = module._unreachable, []
+
+    def lost(space, of, home, units):
+        chosen = {of.contents[k][0] for k in units}
+        odd = {pose for pose in chosen if pose % 2} if rounds else set()
+        rounds.append(chosen)
+        return np.array(sorted(odd | {*reached(space, of, home, units).tolist()}), dtype=np.int64)
+
+    monkeypatch.setattr(module, "_unreachable", lost)
+    monkeypatch.setattr(module, "ROUNDS", 2)
+    made = planned(small(), 12)
+    _, first, last = rounds
+    assert any(pose % 2 for pose in first)
+    assert last <= {pose for pose in first if not pose % 2}
+    assert {s.pose for s in made.ordered.plan.steps if s.load == "10kg"} > {REFERENCE}
+
+
+@pytest.mark.long
+def test_each_criterion_is_best_at_its_own(usual):
+    of, work = usual.problem, usual.work
+    designs = {name: by_criterion(name) for name in ("D", "A", "E", "I")}
+    for name in designs:
+        asked = objective_of(of, small(), name, work)
+        values = {}
+        for other, made in designs.items():
+            own = objective_of(made.problem, small(), name, made.work)
+            taken = np.flatnonzero(made.counts)
+            m = own.prior + own.units.information(made.counts[taken], taken)
+            values[other] = float(asked.criterion.value(m))
+        assert values[name] >= 0.97 * max(values.values()), (name, values)
+
+
+@pytest.mark.long
+def test_planning_on_from_what_is_known(tmp_path, capsys):
+    r = rehearsal("nothing")
+    table, run = tmp_path / "readings.csv", tmp_path / "run.hilcal"
+    write_table(r.readings, table, INSTRUMENT_AND_ARM)
+    cell = cell_file(tmp_path, small())
+    ok(capsys, "import", table, "--config", cell, "-o", run)
+    ok(capsys, "identify", run)
+    arguments = ("plan", cell, "-o", tmp_path / "p.json", "--poses", "3", "--quick", "--json")
+    alone = ok(capsys, *arguments).document
+    on = ok(capsys, *arguments, "--after", run).document
+    stated = ok(capsys, "identify", run, "--json").document["parameters"]
+    std = {p["name"]: p["std"] for p in stated}
+    for k in range(1, 7):
+        name = f"joint_compliance.j{k}"
+        assert on["predicted_std"][name] < alone["predicted_std"][name]
+        assert on["predicted_std"][name] < std[name]
+    assert any("planned on from" in words for words in on["remarks"])

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import binom, poisson
 
+from hilcal.diagnosis.verdict import diagnose
+from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import notes, outliers
@@ -18,17 +20,19 @@ from hilcal.identification.outliers.data_snooping import (
 )
 from hilcal.identification.outliers.least_trimmed_squares import (
     FALSE_ALARMS,
+    ReadingModel,
     bulk_scale,
     rejection_limit,
 )
 from hilcal.identification.registration.misdescription import examine
 from hilcal.identification.registration.registration import register
 from hilcal.present.verdict import message
-from hilcal.readings.whitening import MODES, whitening
+from hilcal.readings.whitening import MODES, inverse_root, whitening
 from studies.gross_errors import GrossErrorCase, count, spoil
 from studies.study_cases import study_case
-from tests.support.campaigns import campaign, configuration
+from tests.support.campaigns import campaign, configuration, noiseless, plan, with_noise
 from tests.support.fit_cases import fitted_model, refined
+from tests.support.reflector_cases import reflectors
 from tests.support.rows import first
 
 CONFIG = configuration()
@@ -116,6 +120,25 @@ def test_good_readings_are_called_gross_once_in_a_thousand_campaigns(m, factor, 
     assert factor > 1 or alarms >= poisson.ppf(1e-4, expected)
 
 
+@pytest.mark.parametrize(
+    "tried", [pytest.param(50, marks=pytest.mark.long), pytest.param(200, marks=pytest.mark.slow)]
+)
+def test_clean_campaigns_keep_all_their_readings(tried):
+    c, rng = campaign(plan_seed=0, registration_known=True), np.random.default_rng(1)
+    model, clean = baseline(c.cell, c.readings, "absolute"), noiseless(c.world, plan())
+    start = np.zeros(model.size)
+    fits = (fit(model, with_noise(clean, rng), "absolute", start=start) for _ in range(tried))
+    assert sum(bool(f.outlier.any()) for f in fits) <= poisson.isf(1e-3, FALSE_ALARMS * tried)
+
+
+def test_the_limit_moves_away_gradually_as_the_bulk_grows_beyond_chance():
+    far = [rejection_limit(3, 150, scale) for scale in (1.0, 1.2, 1.31, 1.4, 1.5, 2.0)]
+    assert far == sorted(far)
+    assert far[2] < 2.1 * far[0]
+    for k, factor in ((1, 1.2), (4, 1.5 * 2.5**2), (5, 2.0 * 2.5**2)):
+        assert far[k] == pytest.approx(factor * far[0])
+
+
 def test_a_true_effect_is_not_mistaken_for_gross_errors():
     """A bias of the force sensor, too, which looks like bad unloaded readings, pose after pose."""
     cases = []
@@ -128,8 +151,63 @@ def test_a_true_effect_is_not_mistaken_for_gross_errors():
     assert not any(fitted_model(*case).outlier.any() for case in cases)
 
 
+def gross(r, rng, share=0.05):
+    """Far off by 10 to 1000 σ, the load not hung, or the reading before once more."""
+    value, what = r.value.copy(), {}
+    for row in np.sort(rng.choice(np.arange(1, len(r)), int(share * len(r)), replace=False)):
+        kind = rng.choice(["far", "far" if r.unloaded[row] else "not hung", "stale"])
+        if kind == "far":
+            direction = rng.normal(size=3)
+            std = np.sqrt(np.trace(r.covariance[row, :3, :3]) / 3)
+            size = std * 10 ** rng.uniform(1, 3)
+            value[row, :3] += size * direction / np.linalg.norm(direction)
+        elif kind == "not hung":
+            same = (r.pose == r.pose[row]) & (r.cycle == r.cycle[row]) & r.unloaded
+            error = np.linalg.cholesky(r.covariance[row]) @ rng.normal(size=r.m)
+            value[row] = r.value[np.flatnonzero(same)[0]] + error
+        else:
+            value[row] = r.value[row - 1]
+        what[int(row)] = str(kind)
+    return replace(r, value=value), what
+
+
+def check_verdict(effect, mode, seed):
+    c = campaign(effect, mode, seed, poses=30)
+    r = c.readings
+
+    def judged(readings):
+        d = diagnose(fitted_model(c.cell, readings, mode))
+        return d.verdict, d.significant[:1]
+
+    wrong, what = gross(r, np.random.default_rng(1000 + seed))
+    verdict = judged(wrong)
+    if verdict != judged(r):
+        # Near a limit, what remains may say less, or more, than all: not because of the errors.
+        lost = np.isin(np.arange(len(r)), list(what))
+        if mode == "deflection":  # they go with their unloaded reading
+            lost |= np.isin(r.pose, r.pose[lost & r.unloaded])
+        assert verdict == judged(r[~lost]), what
+
+
 SPOILT = [(e, m) for m in MODES for e in ("none", "joint_tilt_compliance", "base_compliance")]
 SPOILT += [(e, "absolute") for e in ("hysteresis", "encoder_offset", "link_geometry")]
+FAST = (
+    *(("base_compliance", "absolute"), ("hysteresis", "absolute"), ("link_geometry", "absolute")),
+    *(("none", "deflection"), ("joint_tilt_compliance", "deflection")),
+)
+"""One of each kind every time; all of them over many seeds in the slow suite."""
+
+
+@pytest.mark.parametrize(
+    ("effect", "mode", "seeds"),
+    [
+        *first(2, [(*each, 1) for each in FAST]),
+        *(pytest.param(*each, 15, marks=pytest.mark.slow) for each in SPOILT),
+    ],
+)
+def test_a_twentieth_of_gross_errors_changes_no_verdict(effect, mode, seeds):
+    for seed in range(seeds):
+        check_verdict(effect, mode, seed)
 
 
 @pytest.mark.parametrize("m", first(1, [3, 6]))
@@ -190,6 +268,34 @@ def test_a_block_off_alike_is_said_and_not_set_aside(of_tool):
     assert any("are off by the same shift" in note for note in notes(found))
 
 
+def test_a_block_is_not_taken_for_random_errors_among_such():
+    c = twelve()
+    readings, wrong = spoil(c.readings, 0.1, 5e-3, np.random.default_rng(1))
+    found = fitted_model(
+        c.cell, shifted(readings, slice(20, 32), np.array([0, 0, -8e-3])), "absolute"
+    )
+    inside = (wrong >= 20) & (wrong < 32)
+    assert found.outlier[wrong[~inside]].all()
+    assert found.disagreement is not None
+    assert found.outlier[20:32].sum() <= inside.sum()
+
+
+def test_an_unloaded_reading_that_several_deflections_share():
+    c = twelve("deflection")
+    rows, value = np.flatnonzero(c.readings.unloaded)[::4], c.readings.value.copy()
+    value[rows] += 5e-3 * np.random.default_rng(0).normal(size=(len(rows), 3))
+    found = fitted_model(c.cell, replace(c.readings, value=value), "deflection")
+    expected = np.isin(c.readings.pose, c.readings.pose[rows])
+    np.testing.assert_array_equal(found.outlier, expected)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_readings_of_several_targets(mode):
+    c = reflectors(poses=10)
+    readings, wrong = spoil(c.readings, 0.3, 5e-3, np.random.default_rng(0))
+    assert fitted_model(c.cell, readings, mode).outlier[wrong].all()
+
+
 def test_a_registration_does_not_follow_errors_of_centimetres():
     c = twelve()
     readings, wrong = spoil(c.readings, 0.4, 5e-2, np.random.default_rng(0))
@@ -198,6 +304,13 @@ def test_a_registration_does_not_follow_errors_of_centimetres():
     assert found.rms < 1.1 * register(c.cell, c.readings).rms + 1e-4
     finding = examine(found, readings)
     assert not finding.refused
+
+
+@pytest.mark.long
+def test_a_block_off_by_centimetres_is_refused():
+    readings = shifted(twelve().readings, slice(12, 30), np.array([0.05, 0.0, 0.0]))
+    with pytest.raises(InputError, match=r"rows do not fit|Nothing that was tried"):
+        baseline(twelve().cell, readings, "absolute")
 
 
 APART = np.arange(400)
@@ -260,6 +373,45 @@ def test_gross_errors_beside_such_a_law_are_found():
     assert found.outlier[wrong].mean() >= 0.95
     lost = np.isin(r.pose, r.pose[wrong[r.unloaded[wrong]]])  # with their unloaded reading
     assert not found.outlier[~lost & ~np.isin(np.arange(len(r)), wrong)].any()
+
+
+def random_model(mode, rng):
+    """30 readings; as deflections in groups of an unloaded and four or five loaded ones."""
+    n, m, k = 30, 3, 4
+    covariance = rng.normal(size=(n, m, m))
+    root = inverse_root(covariance @ covariance.swapaxes(1, 2) + 0.1 * np.eye(m))
+    members = np.arange(n).reshape(5, 6)
+    members[2, 5] = -1
+    return ReadingModel(
+        residual=(root @ rng.normal(size=(n, m, 1)))[:, :, 0],
+        columns=root @ rng.normal(size=(n, m, k)),
+        precision=np.array([0.0, 0.0, 0.0, 2.0]),
+        pull=np.array([0.0, 0.0, 0.0, 0.7]),
+        root=root,
+        members=members if mode == "deflection" else np.zeros((0, 0), dtype=np.int64),
+    )
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_distances_are_those_of_least_squares_without_the_reading(mode):
+    rng = np.random.default_rng(1)
+    of = random_model(mode, rng)
+    used = of.tested & (rng.random(len(of)) < 0.7)
+    found, groups = of.distances(used), len(of.members)
+    offsets = np.zeros((len(of), 3, 3 * groups))
+    for k in np.flatnonzero(of.group >= 0):
+        offsets[k, :, 3 * of.group[k] : 3 * of.group[k] + 3] = of.root[k]
+    b = np.concatenate([of.columns, offsets], axis=2)
+    prior, pull = (np.append(x, np.zeros(3 * groups)) for x in (of.precision, of.pull))
+    for k in np.flatnonzero(of.tested):
+        rest = used.copy()
+        rest[k] = False
+        rows = b[rest].reshape(-1, b.shape[2])
+        c = np.linalg.inv(rows.T @ rows + np.diag(prior))
+        delta = c @ (rows.T @ of.residual[rest].reshape(-1) - pull)
+        off = of.residual[k] - b[k] @ delta
+        exact = off @ np.linalg.solve(np.eye(3) + b[k] @ c @ b[k].T, off)
+        assert found[k] == pytest.approx(exact, rel=1e-6)
 
 
 @pytest.mark.parametrize("m", [3, 6])
