@@ -68,8 +68,7 @@ from hilcal.store.schema import is_campaign
 from hilcal.stream import StreamFit
 from hilcal.types import Bools, Floats, Ints
 
-LARGEST_RAD = 4.0 * np.pi
-"""rad; a choice, twice the range of most joints: larger values of joints are degrees."""
+LARGEST_RAD = 4.0 * np.pi  # twice the range of most joints: larger values are degrees; a choice
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +101,6 @@ class Calibration(Brief):
 
     @cached_property
     def _tracked(self) -> ToolPose:
-        """The tracked target, the usual tool."""
         return tool_of(self.model, self.theta, None)
 
     @classmethod
@@ -176,13 +174,11 @@ class Calibration(Brief):
 
         Args:
             q: (n,) or (N, n) joint values, rad.
-            wrench: (6,) or (N, 6) force and moment of the load at the load point, base axes; none
-                where None.
+            wrench: (6,) or (N, 6) force and moment of the load at the load point, base axes.
             tool: (4, 4) T_flange_tool; the tracked target where None.
             std: also state the uncertainty, and whether points lie far from the measured ones.
-            recorded: other columns of `States` by name: `air_temperature`, `load_time`, ...; a
-                missing column that the model needs is replaced by its mean while measuring, see
-                `calibration.measured`.
+            recorded: other columns of `States` by name; one that the model needs is else its mean
+                while measuring, see `calibration.measured`.
 
         Raises:
             InputError: a wrong shape, or the model needs a missing column whose mean the
@@ -429,7 +425,6 @@ def calibration_of_stream(fit: StreamFit, source: Mapping[str, Any]) -> Calibrat
 
 
 def _numbers(values: object, name: str) -> Any:
-    """Return numbers as an array; InputError for anything else."""
     try:
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError):

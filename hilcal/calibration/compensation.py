@@ -42,18 +42,13 @@ from hilcal.types import Bools, Floats, Ints
 if TYPE_CHECKING:
     from hilcal.calibration.calibration import Calibration
 
-TOLERANCE = 1e-10
-"""Residual at which a point is solved, m and rad."""
-MAX_STEPS = 30
-"""Newton steps at most; four are usual."""
-MOST_TURNED = 0.02
-"""Largest angle, rad, from a target orientation that an arm with few joints cannot have: several
-times the errors of arms. A choice."""
-MAX_JOINT_STEP = 0.2
-"""Largest step of a joint, rad; longer ones are shortened, so that the branch stays the same."""
+TOLERANCE = 1e-10  # residual at which a point is solved, m and rad
+MAX_STEPS = 30  # Newton steps at most; four are usual
+MOST_TURNED = 0.02  # rad, from a target orientation that few joints cannot have; a choice
+MAX_JOINT_STEP = 0.2  # rad; longer steps are shortened, so that the branch stays the same
 MIN_SINGULAR_RATIO = 1e-3
-"""Ratio of the smallest to the largest singular value of J, lengths in units of the reach, below
-which a pose is singular: joints may turn a thousand times as far as the tool. A choice."""
+"""Ratio of the singular values of J, lengths over the reach, below which a pose is singular; a
+choice."""
 
 Pose = tuple[Floats, Floats, Chain]
 """Orientation (N, 3, 3) and position (N, 3) of the tool, base axes, with the chain."""
@@ -223,8 +218,7 @@ def _jacobian(arm: Arm, chain: Chain, position: Floats) -> Floats:
     return jacobian if arm.coupling is None else np.asarray(jacobian @ arm.coupling)
 
 
-BAND = 0.95
-"""Share of points whose error lies within the stated band."""
+BAND = 0.95  # share of points whose error lies within the stated band
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,10 +282,7 @@ class ToolPoses(Brief):
 
 
 def band(covariance: Floats) -> Floats:
-    """(N,) radius that holds `BAND` of normal vectors with covariance (N, 3, 3).
-
-    |e|² counts as a scaled χ² of the same mean and variance; 0 for a zero covariance.
-    """
+    """(N,) radius that holds `BAND` of normal vectors with covariance (N, 3, 3), see `band_m`."""
     size = np.trace(covariance, axis1=1, axis2=2)
     shape = covariance / np.where(size > 0, size, 1.0)[:, None, None]
     second = np.einsum("nij,nji->n", shape, shape)
@@ -309,8 +300,7 @@ class Compensation(Brief):
     _states: States
     _wanted: tuple[Floats, Floats] | None
     _std: bool
-    unstated: tuple[str, ...] = ()
-    """Columns of `States` that the model needs and the points lack."""
+    unstated: tuple[str, ...] = ()  # columns of `States` that the model needs and the points lack
 
     def _brief(self) -> dict[str, str]:
         return {

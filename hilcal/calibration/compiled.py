@@ -7,8 +7,7 @@ wrenches is compared with
     ξ_k = b_k + Q_k q + C_k w_k
 
 (tables T, P, G by cubic splines). An effect that needs times, temperatures or sides of approach
-gives a, b and s of each point. A model with an effect of another form is not compiled, but
-evaluated as everywhere else, some hundred times slower.
+gives a, b and s of each point. A model with another effect is evaluated as everywhere else.
 """
 
 from dataclasses import dataclass, replace
@@ -24,16 +23,13 @@ from hilcal.readings.whitening import Mode
 from hilcal.robot.chain import Deviation
 from hilcal.types import Floats
 
-TURN = 2 * np.pi
-"""Angles of the tables reach from −TURN to TURN."""
+TURN = 2 * np.pi  # angles of the tables reach from −TURN to TURN
 NODES = 16385
 """Nodes of a table over angles: 120 waves per turn with amplitudes of 0.1 mrad are met to 1e-11."""
 TORQUE_NODES = 40001
-TORQUES = 3.0
-"""Range of tables over torques, in units of the joint's limit."""
+TORQUES = 3.0  # range of tables over torques, in units of the joint's limit
 TRIALS = 64
-EXACT = 1e-12
-"""Largest difference, rad and m, between an effect and the form that represents it."""
+EXACT = 1e-12  # largest difference, rad and m, between an effect and the form that represents it
 
 
 class CompiledForm:
@@ -116,7 +112,6 @@ class CompiledForm:
         return True
 
     def _by_torque(self, e: Effect, theta: Floats, s: Situation, deviation: Deviation) -> bool:
-        """Add displacements that depend on the joint's own torque alone."""
         n = s.angle.shape[1]
         torque = TORQUES * np.where(np.isfinite(s.cell.arm.torque_max), s.cell.arm.torque_max, 1e3)
         share = np.linspace(-1.0, 1.0, TORQUE_NODES)
@@ -174,7 +169,6 @@ def fixed_columns_suffice(e: Effect, theta: Floats, s: Situation) -> bool:
 
 
 def _unit_torque(s: Situation) -> Floats:
-    """Return wrenches of 1 N·m about the axes alone."""
     unit = np.zeros_like(s.wrench)
     unit[..., 5] = 1.0
     return unit
@@ -228,7 +222,6 @@ def repeated(s: Situation, count: int) -> Situation:
 
 
 def _only(d: Deviation) -> bool:
-    """Whether a deviation moves joints and slots alone."""
     return all(f is None for f in (d.base, d.station, d.target, d.scale, d.observer))
 
 

@@ -1,8 +1,8 @@
 """The measured ranges of a calibration, points outside of them, and means of missing columns.
 
-A table of points or a program seldom states temperatures, times or sides of approach. Where an
-effect of the model needs such a quantity x, its mean x̄ while measuring is used. The motion of the
-tool by x − x̄ at measured states then counts as a variance of each axis of the tool's position p:
+Where an effect needs a quantity x that the points lack (temperature, time, side of approach), its
+mean x̄ while measuring is used, and the motion of the tool by x − x̄ at measured states counts as a
+variance of each axis of the tool's position p:
 
     v = mean over measured states of (|p(x) − p(x̄)|² + |(J(x) − J(x̄)) R|²) / 3
 
@@ -106,8 +106,7 @@ CONDITION_NAMES = {
     "approach": "sides of approach",
 }
 """Columns of `States` whose mean a calibration may know, with their names for people."""
-MAX_STATES = 200
-"""Measured states at which variances are computed, evenly spread; a choice."""
+MAX_STATES = 200  # measured states at which variances are computed, evenly spread; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,10 +1,9 @@
 """Target points for the tool, read from a table.
 
-The table has one row per point and a header; kind of file, separator and decimal mark may be those
-that `import` reads. A table of readings, of the exchange format or by a mapping, is a table of
-points, too: columns that are not listed here (covariances, cycles, actual joints, `x_…`) are
-ignored. Where no column has a name of this list or of the exchange format, a mapping is guessed as
-by `import --preview`, and used if nothing in it is unsure.
+One row per point and a header, in any kind of file that `import` reads. A table of readings, of the
+exchange format or by a mapping, is a table of points, too: its other columns are ignored. Where no
+column has a name of this list or of the exchange format, a mapping is guessed as by
+`import --preview`, and used if nothing in it is unsure.
 
 - `pose`: name of the point; points without names are numbered.
 - `q1_rad` … or `q1_deg` …: joint values, of slides `q1_m` or `q1_mm`. Alone, they state the target
@@ -54,12 +53,9 @@ from hilcal.tables.units import LENGTHS
 from hilcal.types import Floats
 
 NO_LOAD = "none"
-NEAREST_RAD = 0.5
-"""rad; a solution within this distance of the start counts as the nearest. A choice."""
-N_STARTS = 300
-"""Random starts to find all branches from; a choice: an arm of six joints has up to 16."""
-LIMIT_PENALTY = 1e3
-"""rad; added to the distance of a solution beyond the joints' limits."""
+NEAREST_RAD = 0.5  # a solution within this distance of the start counts as the nearest; a choice
+N_STARTS = 300  # random starts to find all branches from, of six joints up to 16; a choice
+LIMIT_PENALTY = 1e3  # rad; added to the distance of a solution beyond the joints' limits
 LEAST_REACH, LONGEST_TOOL = 0.05, 0.5
 """Least distance of the farthest point over the reach, and largest beyond it, m; choices."""
 
@@ -183,7 +179,6 @@ def solutions(arm: Arm, tool: Floats, near: Floats | None, goal: Floats) -> Floa
 
 
 def _everywhere(arm: Arm) -> Floats:
-    """(STARTS, n) random joint values over the whole range of the joints."""
     low, high = arm.usual_range
     spread = np.random.default_rng(0).random((N_STARTS, arm.n))
     return arm.complete(low + spread * (high - low))
@@ -216,7 +211,6 @@ def _nearest(arm: Arm, tool: Floats, name: str, near: Floats, goal: Floats) -> F
 
 
 def _form(path: Path) -> FileFormat:
-    """Return the format of a table: plain CSV, or its separator and decimal mark."""
     try:
         with path.open(encoding="utf-8", errors="replace") as stream:
             header = stream.readline(limits.LINE)
@@ -268,7 +262,6 @@ def _certain_unit(proposed: GridProposal, arm: Arm) -> bool:
 
 
 def _mapped(path: Path, arm: Arm, mapping: PointMapping) -> ColumnTable:
-    """Return a table by its mapping, with the columns listed above."""
     mapped = mapped_table(path, mapping, arm)
     table = with_following(mapped.table, arm)
     text = {"pose": table.text["pose"]}
@@ -305,7 +298,6 @@ def _groups(arm: Arm) -> _Groups:
 def _checked(
     path: Path, header: Sequence[str], groups: _Groups, arm: Arm
 ) -> tuple[Sequence[str], Sequence[str]]:
-    """Check a header; return its text and its number columns."""
     listed = [name for _, names, _ in groups for name in names]
     exchanged = set(known_columns(arm.units))
     ours = {*listed, *exchanged} - {"pose", "load", "target"}

@@ -10,16 +10,14 @@ is solved for σ², one for all joints. Where S − N is below its standard unce
 replaces it. Where C contains the arm's scatter already, all of S counts as scatter. Without repeats
 the scatter is what the arm's maker states.
 
-An uncertainty budget in the sense of the GUM (JCGM 100:2008): the measurand is a position (in
-deflection mode: a deflection) as the instrument measures it at a pose that was not fitted, minus
-the position that the calibration predicts. Its combined standard uncertainty is the root mean
-square over such poses,
+The uncertainty budget (GUM, JCGM 100:2008) of a measured minus a predicted position or deflection,
+root mean square over poses that were not fitted:
 
     u² = κ c² + e² + s² + n²
 
-of the parameters estimated without the pose, c (see `predictive`), of the model's misfit beyond the
-noise, e, of the arm's scatter from one arrival to the next, s, and of the instrument, n. κ makes u
-at least the error at held-out poses. The expanded uncertainty is U = k u with k = 2.
+of the parameters estimated without the pose, c (see `predictive`), the misfit beyond the noise, e,
+the arm's scatter, s, and the instrument, n. κ makes u at least the error at held-out poses. The
+expanded uncertainty is U = k u with k = 2.
 """
 
 from dataclasses import dataclass
@@ -38,15 +36,8 @@ from hilcal.robot.chain import Chain, drive_jacobian, evaluate
 from hilcal.types import Floats
 
 ScatterSource = Literal["estimated", "stated", "repeats", "maker", "industry", "unknown"]
-"""Source of a scatter:
-
-- estimated: the fit, from its residuals;
-- stated: `[repeatability]` of the cell;
-- repeats: scatter of repeated readings beyond the instrument's noise;
-- maker: the pose repeatability that the robot's file states;
-- industry: that of industrial arms, where the robot's file states none;
-- unknown: a calibration file of an older program, which assumed zero.
-"""
+"""From the fit's residuals; `[repeatability]` of the cell; repeated readings; the robot's file;
+industrial arms, where that states none; unknown in a file of an older program."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,8 +100,7 @@ def _shown_by_repeats(fit: Fit) -> float | None:
     return float(std) if std > 0.0 else None
 
 
-COVERAGE = 2.0
-"""Coverage factor k, as is usual (GUM, 6.3.3)."""
+COVERAGE = 2.0  # coverage factor k, as is usual (GUM, 6.3.3)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,9 +1,8 @@
 """A calibration as one JSON file with everything that predicting and compensating needs.
 
-The covariance is stored in the smaller of two forms. One is its factor, as 32-bit floats, each row
-scaled by its parameter's standard deviation. The other (key `learnt`) is the source that it is
-computed from, if that reproduces the standard deviations at fitted states to `STD_TOLERANCE`, which
-is checked before writing. Everything else is decimal numbers, exactly.
+The covariance is stored in the smaller of two forms: its factor, as 32-bit floats, each row scaled
+by its parameter's standard deviation; or (key `learnt`) the source that it is computed from, if
+that reproduces the standard deviations at fitted states to `STD_TOLERANCE`.
 """
 
 import base64
@@ -32,12 +31,9 @@ from hilcal.store.codec import decode, encode, frames, numbers, read_document
 from hilcal.types import Floats
 
 FORMAT, VERSION = "hilcal-calibration", 2
-FACTOR_VERSION = 1
-"""Version of a file with the factor of the covariance, which older programs read."""
-STD_TOLERANCE = 5e-3
-"""Largest relative change of a standard deviation by the source form; a choice."""
-CHECKED_STATES = 40
-"""Fitted states at which that is checked."""
+FACTOR_VERSION = 1  # version of a file with the factor of the covariance, which older programs read
+STD_TOLERANCE = 5e-3  # largest relative change of a standard deviation by the source form; a choice
+CHECKED_STATES = 40  # fitted states at which that is checked
 _CELL = (
     *("target", "load_point", "tool_mass", "tool_com", "gravity", "registration", "targets"),
     *("target_names", "known_targets", "registration_known", "measured_torques"),

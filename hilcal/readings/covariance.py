@@ -8,16 +8,11 @@ the scatter of the joints from one arrival to the next, J the Jacobian of the ta
 (`joint_scatter`).
 
 The third term needs the registration; it is added when the readings are opened
-(`identification.noise.full_covariance`), with σ_q from [repeatability]. The file states what the
-stored covariances cover (`COVERS_KEY`):
-
-- a measured campaign stores the first two terms: `INSTRUMENT`, the third is added;
-- an imported campaign stores what its table states, or `tracker_covariance` where the table states
-  none. Both are taken as the instrument's: `INSTRUMENT`, the third is added. Where the table's
-  covariances include the arm's scatter, its column `covers` says so ("instrument+arm", which
-  `hilcal export` writes), or the cell does ([repeatability] in_tables = true):
-  `INSTRUMENT_AND_ARM`, and nothing is added;
-- to a campaign whose file does not state it, of an older version, nothing is added.
+(`identification.noise.full_covariance`), with σ_q from [repeatability], where the file states that
+the stored covariances cover the instrument alone (`COVERS_KEY`, `INSTRUMENT`): those of a measured
+campaign, of a table, or of `tracker_covariance`. Nothing is added where they include the arm's
+scatter (`INSTRUMENT_AND_ARM`: column `covers`, or [repeatability] in_tables = true), nor to files
+of older versions, which do not state it.
 
 Two readings share the scatter of an arrival, and noise that is correlated along their order; two
 deflections share the error of their unloaded readings (`measurement_covariance`).
@@ -55,15 +50,13 @@ class TrackerNoise:
     orientation_std: float = 0.0  # of a small rotation about any axis, rad; 0 if not read
 
     def __post_init__(self) -> None:
-        """Refuse impossible figures."""
         for f in fields(self):
             value = getattr(self, f.name)
             if not np.isfinite(value) or value < 0:
                 raise InputError(f"tracker noise {f.name} = {value}: must be a number >= 0")
-        if self.range_std + self.range_std_per_m == 0:
-            raise InputError("tracker noise: range_std and range_std_per_m are both 0")
-        if self.transverse_std + self.transverse_std_per_m == 0:
-            raise InputError("tracker noise: transverse_std and transverse_std_per_m are both 0")
+        for name in ("range_std", "transverse_std"):
+            if getattr(self, name) + getattr(self, f"{name}_per_m") == 0:
+                raise InputError(f"tracker noise: {name} and {name}_per_m are both 0")
 
 
 def tracker_noise(section: Tracker) -> TrackerNoise:
@@ -117,9 +110,8 @@ def covariance_of_mean(
 
         R = (ν0 (1 - s) τ Σ̄ + Σ_k r_k r_kᵀ) / (ν0 + K - 1)        Cov = s Σ̄ + R / K
 
-    The share s of Σ̄ is the same in all samples: averaging does not reduce it. R is the posterior
-    mean of the random covariance with the stated one, times τ, as an inverse Wishart prior worth ν0
-    = `PRIOR_REPEATS` repeats (Gelman et al., *Bayesian Data Analysis*, section 3.6).
+    Averaging does not reduce the systematic share s. R is the posterior mean with an inverse
+    Wishart prior worth ν0 repeats (Gelman et al., *Bayesian Data Analysis*, section 3.6).
     """
     count = len(deviations)
     prior = PRIOR_REPEATS * (1 - systematic_share) * factor * stated
@@ -160,19 +152,15 @@ def arrival_factors(
 
 def with_scatter(readings: Readings, factor: Floats) -> Readings:
     """Return the readings with a scatter of the arm, F (N, m, k), added: V + F Fᵀ."""
-    total = readings.covariance + factor @ np.swapaxes(factor, 1, 2)
-    return replace(readings, covariance=total, common=_common_factor(readings, factor))
+    total, s = readings.covariance + factor @ np.swapaxes(factor, 1, 2), readings.states
+    shared = None if s.target is None and s.observer is None else factor
+    return replace(readings, covariance=total, common=shared)
 
 
 def scatter_alone(readings: Readings, factor: Floats) -> Readings:
     """Return the readings with the covariance of a scatter F (N, m, k) of the arm alone."""
-    v = factor @ np.swapaxes(factor, 1, 2)
-    return replace(readings, covariance=v, common=_common_factor(readings, factor), serial=None)
-
-
-def _common_factor(readings: Readings, factor: Floats) -> Floats | None:
-    s = readings.states
-    return None if s.target is None and s.observer is None else factor
+    without = replace(readings, covariance=np.zeros_like(readings.covariance), serial=None)
+    return with_scatter(without, factor)
 
 
 def symmetric_root(covariance: Floats) -> Floats:

@@ -5,12 +5,10 @@ the stated covariance V_i of reading i is not white: with S_i S_iᵀ = V_i,
 
     e_i = √(1 − φ) w_i + √φ S_i z_i,    Cov(z_i, z_j) = exp(−|t_i − t_j| / τ) 1
 
-w_i independent of covariance V_i, each element of z an Ornstein-Uhlenbeck process. So the stated
-covariance holds for each reading. t is the time of a reading, or its number in the order, where
-z is an AR(1) process with ρ = exp(−1/τ). S_i is the symmetric root of V_i's correlation matrix
-times the standard deviations: neighbours with nearly the same V have nearly the same S, in any
-units. V excludes an estimated scatter of the arm and the error that targets share in one arrival:
-the arm draws these anew in each arrival.
+w_i independent of covariance V_i, each element of z an Ornstein-Uhlenbeck process, t the time of a
+reading, or its number in the order (AR(1), ρ = exp(−1/τ)). S_i is the symmetric root of V_i's
+correlation matrix times the standard deviations, nearly the same for nearly the same V, in any
+units. V excludes what the arm draws anew in each arrival: its scatter, estimated or shared.
 
 Source: Gelb (ed.), *Applied Optimal Estimation* (1974), section 3.8 (exponentially correlated
 noise).
@@ -68,11 +66,9 @@ class States(Brief):
     observer: Ints | None = None
 
     def __len__(self) -> int:
-        """Return the number of states N."""
         return len(self.q)
 
     def __getitem__(self, rows: Ints | Bools | slice) -> "States":
-        """Return the chosen states."""
         return by_field([self], lambda fields: fields[0][rows])
 
     @staticmethod
@@ -89,7 +85,6 @@ class ObserverName:
     name: str
 
     def __str__(self) -> str:
-        """Return kind and name."""
         return f"{self.kind} {self.name}"
 
 
@@ -178,7 +173,6 @@ class SerialNoise:
 
 
 def _with_tuples(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return fields that JSON holds, its lists as tuples."""
     return {name: tuple(x) if isinstance(x, list) else x for name, x in content.items()}
 
 
@@ -233,11 +227,9 @@ class Readings(Tabular):
     along: Floats | None = None
 
     def __len__(self) -> int:
-        """Return the number of readings N."""
         return len(self.pose)
 
     def __getitem__(self, rows: Ints | Bools | slice) -> "Readings":
-        """Return the chosen readings; names are kept."""
         chosen = by_field([self], lambda fields: fields[0][rows])
         return replace(chosen, states=self.states[rows])
 
@@ -324,18 +316,25 @@ class Readings(Tabular):
         """(N,) number of the arrival of the arm in which each reading was taken.
 
         Readings of different targets, or by different observers, at one pose, under one load, in
-        one cycle are of one arrival: the arm did not move between them. A target that was read
-        several times there was read in as many arrivals, in the order of the readings.
+        one cycle are of one arrival; a target that was read k times there, of k arrivals, in order.
         """
-        keys = np.stack([self.pose, self.load, self.cycle, self.line], axis=1)
-        _, group = np.unique(keys, axis=0, return_inverse=True)
-        group = group.reshape(-1)
-        order = np.argsort(group, kind="stable")
-        first = np.flatnonzero(np.diff(group[order], prepend=-1))
+        where = self.pose, self.load, self.cycle
+        order, first, sizes = in_groups(numbered(*where, self.line))
         visit = np.empty(len(self), dtype=np.int64)
-        visit[order] = np.arange(len(self)) - np.repeat(first, np.diff(np.append(first, len(self))))
-        keys[:, 3] = visit
-        return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
+        visit[order] = np.arange(len(self)) - np.repeat(first, sizes)
+        return numbered(*where, visit)
+
+
+def numbered(*keys: Ints) -> Ints:
+    """Return (N,) numbers from 0, the same where all keys (N,) are the same."""
+    return np.unique(np.stack(keys, axis=1), axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def in_groups(group: Ints, *first_by: Ints | Bools) -> tuple[Ints, Ints, Ints]:
+    """Order of rows by their group, then by keys, the last first; start and size of each group."""
+    order = np.lexsort((*first_by, group))
+    starts = np.flatnonzero(np.diff(group[order], prepend=-1))
+    return order, starts, np.diff(np.append(starts, len(group)))
 
 
 MARGIN = 0.02  # share of the fitted range by which values may exceed it; a choice

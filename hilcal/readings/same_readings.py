@@ -5,17 +5,15 @@ it was read, and whether a load was on. Names of poses and loads, times, covaria
 of the rows do not count, since a table may be imported again with others; nor does the wrench,
 which changes with the configured mass of a load.
 
-Numbers agree within `LENGTH_M`, `ANGLE_RAD` and `ATTITUDE_RAD`. A tracker's scatter is far
-larger: readings that were taken again at the same pose differ by more in some element, unless the
-instrument's last digit is coarser than its scatter. A digest of rounded numbers would not do: two
-copies on both sides of a rounding boundary have different digests, however fine the rounding is.
+Numbers agree within `LENGTH_M`, `ANGLE_RAD` and `ATTITUDE_RAD`, far below a tracker's scatter. A
+digest of rounded numbers would not do: copies on both sides of a rounding boundary differ.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from hilcal.readings.readings import Readings
+from hilcal.readings.readings import Readings, numbered
 from hilcal.types import Bools, Floats
 
 LENGTH_M = 1e-7  # A table in mm with four decimals is off by half of that; a choice
@@ -85,9 +83,7 @@ def never_fitted(readings: Readings, fitted: Readings, deflections: bool) -> tup
     repeated = found_among(readings, fitted)
     if not deflections:
         return repeated, ~repeated
-    keys = np.stack([readings.pose, readings.cycle, readings.target], axis=1)
-    _, group = np.unique(keys, axis=0, return_inverse=True)
-    group = group.reshape(-1)
+    group = numbered(readings.pose, readings.cycle, readings.target)
     spoilt = np.zeros(group.max(initial=-1) + 1, dtype=np.bool_)
     spoilt[group[repeated & readings.unloaded]] = True
     unseen = ~repeated & ~spoilt[group]

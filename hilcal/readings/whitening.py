@@ -1,14 +1,12 @@
 """Task-variable scaling: the one place where noise enters.
 
 A scaling matrix G multiplies both sides of A c = ΔX so that the errors G ε become
-independent, of unit spread, and pure numbers. G is block diagonal: one block per reading
-(absolute) or per pose group (deflections of one pose share their unloaded reading). Where several
-targets were read in one arrival of the arm, they share its scatter F_i F_jᵀ (`Readings.common`):
-absolute readings have one block per arrival, deflections one per pose and cycle, all targets
-together. The blocks are kept stacked by size; nothing of size (readings)² exists. Noise that is
-correlated along the order of the readings (`Readings.serial`) makes blocks of runs of them, up to
-`RUN` measurements; the correlation across the ends of a run is neglected. Their S is Cholesky's
-factor: the whitened rows of a measurement are its innovation, which earlier ones do not predict.
+independent, of unit spread, and pure numbers. G is block diagonal, stacked by size of the blocks:
+one per reading (absolute) or pose group (deflections share their unloaded reading); where targets
+share the scatter F_i F_jᵀ of an arrival (`Readings.common`), one per arrival, or per pose and
+cycle. Noise that is correlated along the order of the readings (`Readings.serial`) makes blocks of
+up to `RUN` measurements, without the correlation across their ends; their S is Cholesky's factor,
+so that whitened rows are innovations.
 
     none   G = I
     gu     G = diag(1/M_ik), M_ik the standard deviation of element k of measurement i
@@ -26,7 +24,7 @@ from scipy.linalg import block_diag, solve_triangular
 from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.readings.covariance import measurement_covariance, single_covariance
-from hilcal.readings.readings import Readings
+from hilcal.readings.readings import Readings, in_groups, numbered
 from hilcal.robot import se3
 from hilcal.types import Bools, Floats, Ints
 
@@ -37,9 +35,7 @@ def arrival_groups(readings: Readings) -> list[Group]:
     """Group the readings that share the scatter of an arrival; else each is alone."""
     count = len(readings)
     arrival = np.arange(count) if readings.common is None else readings.arrivals
-    order = np.argsort(arrival, kind="stable")
-    starts = np.flatnonzero(np.diff(arrival[order], prepend=-1))
-    sizes = np.diff(np.append(starts, count))
+    order, starts, sizes = in_groups(arrival)
     if len(starts) == count:
         order = np.arange(count)
     groups = []
@@ -71,10 +67,8 @@ def deflection_groups(readings: Readings) -> list[Group]:
     unloaded, target = readings.unloaded[rows], readings.line[rows]
     if readings.common is None:
         keys.append(readings.line)
-    group = _numbered([i[rows] for i in keys])
-    order = np.lexsort((target, ~unloaded, group))
-    starts = np.flatnonzero(np.diff(group[order], prepend=-1))
-    sizes = np.diff(np.append(starts, len(rows)))
+    group = numbered(*(i[rows] for i in keys))
+    order, starts, sizes = in_groups(group, target, ~unloaded)
     count = np.add.reduceat(unloaded[order].astype(np.int64), starts)
     alike = np.zeros_like(starts)
     if readings.common is not None:
@@ -125,16 +119,12 @@ def runs(readings: Readings, groups: Sequence[Group], most: int) -> list[Group]:
     return joined
 
 
-def _numbered(keys: Sequence[Ints]) -> Ints:
-    return np.unique(np.stack(keys, axis=1), axis=0, return_inverse=True)[1].reshape(-1)
-
-
 def has_unloaded(readings: Readings, *also: Ints) -> Bools:
     """Return (N,) which readings have an unloaded one, or are one, in their pose and cycle.
 
     `also` are further numbers (N,) in which the two must agree.
     """
-    group = _numbered([readings.pose, readings.cycle, *also])
+    group = numbered(readings.pose, readings.cycle, *also)
     has = np.zeros(int(group.max()) + 1, dtype=bool)
     has[group[readings.unloaded]] = True
     return np.asarray(has[group])
@@ -153,13 +143,10 @@ def inverse_root(covariance: Floats, scaling: Scaling = "gc") -> Floats:
     """Whitening matrices S⁻¹ (..., k, k) of covariances (..., k, k).
 
     For `gc`, V = D C D with D the standard deviations and C = U Λ Uᵀ the correlation matrix;
-    S = D U Λ^½, so that S Sᵀ = V and S⁻¹ ε does not depend on the units of ε. (The
-    eigenvectors of V itself would turn with the units; every S with S Sᵀ = V gives the same
-    estimate.)
+    S = D U Λ^½, so that S Sᵀ = V and S⁻¹ ε does not depend on the units of ε.
 
-    Rule for rank-deficient V: an element of zero variance, or a direction whose eigenvalue
-    of C is below 1e-10 of the largest, has no stated noise to weigh it by. It is left out:
-    its row of S⁻¹ is zero, and does not count as a degree of freedom.
+    Rule for rank-deficient V: an element of zero variance, or a direction whose eigenvalue of C is
+    below 1e-10 of the largest, is left out: its row of S⁻¹ is zero, and no degree of freedom.
     """
     k = covariance.shape[-1]
     if scaling == "none":
@@ -212,7 +199,6 @@ class Whitening:
     rank: int  # number of whitened rows that carry information
 
     def __len__(self) -> int:
-        """Return the number of measurements D (readings or deflections)."""
         return len(self.reading)
 
     def raw(self, x: Floats) -> Floats:

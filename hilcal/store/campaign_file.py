@@ -36,10 +36,8 @@ from hilcal.store.rows import Layout, content_hash, layout_of, read_layout
 from hilcal.whole_file import replacing
 
 _TARGETS, _OBSERVERS = "targets", "observers"
-ACCEPTED = "accepted {}"
-"""Keys of the acceptances, numbered from 1; the last one is valid."""
-_MEANWHILE = 1000
-"""Most readings appended during a fit; a choice: each takes a second."""
+ACCEPTED = "accepted {}"  # keys of the acceptances, numbered from 1; the last one is valid
+_MEANWHILE = 1000  # most readings appended during a fit; a choice: each takes a second
 _HASHED = 1_000_000
 """Most readings that are hashed to find the number of fitted ones; a choice: it takes seconds."""
 _OTHER_READINGS = (

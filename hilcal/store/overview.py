@@ -139,7 +139,6 @@ def _instruments(events: Sequence[Mapping[str, Any]]) -> tuple[MeasuringDevice, 
 
 
 def _last(events: Sequence[Mapping[str, Any]], kind: str) -> Mapping[str, Any] | None:
-    """Return the content of the last event of a kind, without its times."""
     for event in reversed(events):
         if event["kind"] == kind:
             return {k: v for k, v in event.items() if k not in ("kind", "utc", "wall_s")}

@@ -22,14 +22,10 @@ from hilcal.store.plan import Plan, Step, joined, read_plan, with_new_names
 from hilcal.store.revision import utc_now
 from hilcal.store.stored_schema import DETAIL, check, check_event
 
-PLAN = "plan"
-"""Key of the first plan among the texts of a campaign ..."""
-FURTHER_PLAN = "plan {}"
-"""... and of further ones, numbered from 2."""
-FIXED_SECTIONS = ("robot", "tool", "loads")
-"""Sections of the configuration that must not change during a campaign ..."""
-ADDRESS_KEYS = {"driver", "host", "port", "baud", "options"}
-"""... except these keys."""
+PLAN = "plan"  # key of the first plan among the texts of a campaign
+FURTHER_PLAN = "plan {}"  # keys of further plans, numbered from 2
+FIXED_SECTIONS = ("robot", "tool", "loads")  # of the configuration, during a campaign
+ADDRESS_KEYS = {"driver", "host", "port", "baud", "options"}  # keys of these that may change
 
 
 def create_run(

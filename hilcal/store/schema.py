@@ -80,8 +80,7 @@ _MESSAGES: dict[str, tuple[type[HilcalError], str]] = {
     ),
 }
 """Error and message by a pattern in SQLite's message."""
-_LONGEST_S = 60.0
-"""Longest time to check a file when it is opened; a choice."""
+_LONGEST_S = 60.0  # longest time to check a file when it is opened; a choice
 
 
 def statements() -> list[str]:

@@ -29,9 +29,7 @@ PREVIEW = "hilcal import TABLE --preview proposes a mapping for --format"
 SCALAR = {"point": ("distance_m", "from", "cov_d_d"), "gauge": ("gauge_m", "gauge", "cov_g_g")}
 """Columns of a reading that is one number, by kind of observer: value, observer, variance."""
 USER_PREFIX = "x_"
-JOINT_TOLERANCE = (
-    2e-3  # rad; largest difference from the arm's description: tables round to 0.1°. A choice
-)
+JOINT_TOLERANCE = 2e-3  # rad; of the arm's description: tables round to 0.1°. A choice
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 Units = int | Sequence[str]
@@ -222,9 +220,8 @@ def with_following(table: ColumnTable, arm: Arm) -> ColumnTable:
         nothing = np.full(len(number[stated[0]]), np.nan)
         q = np.stack([number.get(name, nothing) for name in names], axis=1)
         full = arm.complete(q)
-        off = (
-            np.abs(q - full) > JOINT_TOLERANCE
-        ) & ~arm.independent  # False where there is no value
+        # False where there is no value
+        off = (np.abs(q - full) > JOINT_TOLERANCE) & ~arm.independent
         for i, k in first_true(off):
             raise InputError(
                 f"{table.at(i, names[k])}: {q[i, k]:g} {arm.unit(k)}, but by the arm's "

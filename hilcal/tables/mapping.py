@@ -16,7 +16,6 @@ Column = Annotated[str, Field(min_length=1)] | Annotated[int, Strict(), Field(ge
 
 
 def _columns(*valid: int) -> AfterValidator:
-    """Refuse another number of columns than the valid ones."""
     *first, last = map(str, valid)
 
     def counted(columns: tuple[Column, ...]) -> tuple[Column, ...]:

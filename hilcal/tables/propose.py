@@ -206,7 +206,6 @@ def _with_words(g: words.Guesser, parts: tuple[str, ...]) -> str | None:
 
 
 def _per_joint(g: words.Guesser, first: words.ColumnName, names: list[str]) -> None:
-    """Find torques, temperatures and sides of approach of the joints."""
     values = g.block(names)
     if (first.has(words.TORQUE) or first.unit in MOMENTS) and not first.has(words.NOMINAL):
         unit = g.unit(names, MOMENTS)
@@ -439,7 +438,6 @@ def _is_number(cell: Cell, how: FileFormat) -> bool:
 
 
 def _layout(rows: Rows, how: FileFormat) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Header row, row of units and rows that are no readings."""
     length, _ = Counter(len(cells) for _, cells in rows).most_common(1)[0]
     share = []
     for _, cells in rows:
@@ -496,7 +494,6 @@ def _commented_header(text: str, how: dict[str, Any], rows: Rows) -> dict[str, A
 
 
 def _spreadsheet(path: str, content: bytes) -> SniffedFile:
-    """Choose the sheet with most numbers."""
     best: tuple[int, str, Rows] = (0, "", [])
     book = files.workbook(path, content)
     names = book.sheetnames

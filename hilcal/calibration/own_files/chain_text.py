@@ -37,11 +37,9 @@ FRAME_TOLERANCE = 1e-6
 NEAR_M, NEAR_RAD = 5e-3, 1e-2
 """m, rad; a file with axes within these distances is of the same arm: many files are rounded to
 millimetres, others are corrected already. A choice; the corrected file is exact in any case."""
-EDIT_TOLERANCE = 1e-9
-"""m, rad; a transform that changes less keeps its text."""
+EDIT_TOLERANCE = 1e-9  # m, rad; a transform that changes less keeps its text
 Edits = list[tuple[Span, str]]
-LARGEST, SMALLEST = 1e6, 1e-6
-"""Largest number, and least length of a direction; choices."""
+LARGEST, SMALLEST = 1e6, 1e-6  # largest number, and least length of a direction; choices
 _TAG = re.compile(r"<(?:\"[^\"]*\"|'[^']*'|[^<>\"'])*>")
 
 

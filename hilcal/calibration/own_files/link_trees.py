@@ -35,10 +35,8 @@ from hilcal.names import escaped
 from hilcal.robot import se3
 from hilcal.types import Floats
 
-TURNING = ("revolute", "continuous")
-"""Types of a joint that turns."""
-EXPRESSION = re.compile(r"\$\{([^{}]*)\}")
-"""An expression of a xacro."""
+TURNING = ("revolute", "continuous")  # types of a joint that turns
+EXPRESSION = re.compile(r"\$\{([^{}]*)\}")  # an expression of a xacro
 _ARITHMETIC: dict[type[ast.operator], Callable[[float, float], float]] = {
     **{ast.Add: operator.add, ast.Sub: operator.sub},
     **{ast.Mult: operator.mul, ast.Div: operator.truediv},
@@ -66,7 +64,6 @@ class LinkTree:
         return [self.parents[k][1] for k in up], [self.parents[k][1] for k in reversed(down)]
 
     def _up(self, link: str) -> list[str]:
-        """Return a link and its ancestors, the root last."""
         out = [link]
         while out[-1] in self.parents:
             out.append(self.parents[out[-1]][0])
@@ -85,7 +82,6 @@ class LinkTree:
         return matching[0]
 
     def _last(self) -> str:
-        """Return the only link after moving joints that has no children."""
         parents = {parent for parent, _ in self.parents.values()}
 
         def moves(link: str) -> bool:
@@ -168,7 +164,6 @@ def _urdf_step(document: Document, joint: Node, *, turned: bool = False) -> Chai
 
 
 def _values(document: Document, node: Node, text: str) -> Floats:
-    """Return three numbers, which may be expressions of a xacro."""
 
     def computed(m: re.Match[str]) -> str:
         try:
@@ -184,7 +179,6 @@ def _values(document: Document, node: Node, text: str) -> Floats:
 
 
 def _constant(node: ast.expr) -> float:
-    """Value of an expression of numbers, pi and radians()."""
     match node:
         case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
             return float(value)
@@ -199,8 +193,7 @@ def _constant(node: ast.expr) -> float:
     raise ValueError
 
 
-MODEL = "__model__"
-"""The model's own frame."""
+MODEL = "__model__"  # the model's own frame
 
 
 class SdfModel:

@@ -29,15 +29,14 @@ from hilcal.toml import Number, Section, load_section
 from hilcal.types import Floats, Ints
 
 JOINTS = 6
-DECIMAL = r"[-+]?(?:\d+\.?\d*|\.\d+)"
-"""Pattern of a number without exponent."""
-UNSTATED = -99
-"""A flag of a configuration that is not stated."""
+DECIMAL = r"[-+]?(?:\d+\.?\d*|\.\d+)"  # pattern of a number without exponent
+UNSTATED = -99  # a flag of a configuration that is not stated
 SAME_M, SAME_RAD = 2e-9, 2e-9
 """m, rad; a point that moved less keeps its text: above the residual of the inverse, see
 `calibration.compensation.TOLERANCE`, and below the resolution of any controller."""
-GIMBAL = 1e-9
-"""cos B below which A and C turn about one axis."""
+GIMBAL = 1e-9  # cos B below which A and C turn about one axis
+MOVES = "{} moves, and it is not known what that carries"
+"""Why a point with an external axis is not corrected."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +72,10 @@ class ProgramPoint:
     not_corrected: str = ""  # why it is not corrected; empty if it is understood
     blend_m: float = 0.0  # 0, since only URScript states it at the point
 
+    def refused(self, reason: str) -> "ProgramPoint":
+        """Return the point with the reason why it is not corrected."""
+        return replace(self, not_corrected=reason)
+
     def at_joints(
         self, numbers: Sequence[Span], values: Floats, tool: Floats | str
     ) -> "ProgramPoint":
@@ -85,7 +88,7 @@ class ProgramPoint:
     ) -> "ProgramPoint":
         """Return the point with a pose; it is not corrected if tool or frame is a reason (text)."""
         if isinstance(tool, str) or isinstance(frame, str):
-            return replace(self, not_corrected=tool if isinstance(tool, str) else str(frame))
+            return self.refused(tool if isinstance(tool, str) else str(frame))
         return replace(self, numbers=tuple(numbers), values=values, tool=tool, frame=frame)
 
 
@@ -148,7 +151,6 @@ class Program:
     def _edits(
         self, p: ProgramPoint, flange: Floats, old_q: Floats, q: Floats, flags: Ints
     ) -> list[tuple[Span, str]]:
-        """Edits of one point."""
         language = self.language
         if np.abs(q - old_q).max() < SAME_RAD:
             return []
@@ -226,6 +228,13 @@ def arguments_of(text: str) -> list[tuple[int, str]]:
             out.append((begin, text[begin:k]))
             begin = k + 1
     return [*out, (begin, text[begin:])]
+
+
+def numbers_in(text: str, pattern: re.Pattern[str], offset: int) -> tuple[Floats, list[Span]]:
+    """Numbers of a text at an offset of the file, with their places."""
+    matches = list(pattern.finditer(text))
+    values = np.array([float(m[0]) for m in matches])
+    return values, [Span(0, offset + m.start(), offset + m.end()) for m in matches]
 
 
 def line_of(text: str, offset: int) -> int:
@@ -341,8 +350,8 @@ class ProgramReader:
         """Return the program with all recorded points."""
         for name, line in self.otherwise.items():
             if name in self.points and not self.points[name].not_corrected:
-                reason = f"line {line} uses or changes it otherwise"
-                self.points[name] = replace(self.points[name], not_corrected=reason)
+                point = self.points[name]
+                self.points[name] = point.refused(f"line {line} uses or changes it otherwise")
         language, points = self.controller.language, tuple(self.points.values())
         if not points:
             raise InputError(f"{self.path.name}: no motions; valid: {language.motions}")
