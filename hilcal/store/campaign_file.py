@@ -38,8 +38,7 @@ from hilcal.whole_file import replacing
 _TARGETS, _OBSERVERS = "targets", "observers"
 ACCEPTED = "accepted {}"  # keys of the acceptances, numbered from 1; the last one is valid
 _MEANWHILE = 1000  # most readings appended during a fit; a choice: each takes a second
-_HASHED = 1_000_000
-"""Most readings that are hashed to find the number of fitted ones; a choice: it takes seconds."""
+_HASHED = 1_000_000  # most readings that are hashed to find the fitted ones; a choice: seconds
 _OTHER_READINGS = (
     "the readings were changed after revision {} had been fitted to them (their SHA-256 is another)"
 )
@@ -77,10 +76,7 @@ class CampaignFile:
         more_texts: Mapping[str, str] | None = None,
         readings: Readings | None = None,
     ) -> Self:
-        """Make a campaign; the file appears only when it is complete.
-
-        It may `overwrite` an existing campaign, never a file of another kind.
-        """
+        """Make a campaign, which appears when complete; `overwrite` replaces campaigns only."""
         path = Path(path)
         meta = {"config": config_json, "base_dir": base_dir, "source": source}
         meta |= {"created": utc_now(), "program_version": __version__, **running_command()}
@@ -94,10 +90,7 @@ class CampaignFile:
     def open(
         cls, path: str | Path, *, read_only: bool = False, check_revisions: bool = True
     ) -> Self:
-        """Open a campaign and check that it is complete and undamaged.
-
-        Bad revisions (`bad_revision`) are refused with `check_revisions`.
-        """
+        """Open a campaign; refuse a damaged one, and with `check_revisions` a `bad_revision`."""
         path = Path(path)
         if path.exists() and not (path.is_file() or path.is_dir()):
             raise InputError(f"{path}: a device or a pipe; valid: a campaign file")
@@ -234,11 +227,10 @@ class CampaignFile:
 
     def insert_revision(self, record: RevisionRecord) -> int:
         """Append a model revision within the caller's transaction."""
-        number = rows.last_id(self.connection, "revisions") + 1
-        if record.parent == number - 1 and replace(record, parent=None).has_parent:
+        last = rows.last_id(self.connection, "revisions")
+        if record.parent == last and replace(record, parent=None).has_parent:
             record = replace(record, parent=None)
         record, key, posterior = split(record)
-        text = to_text(record)
         if key is not None and key not in self.texts():
             rows.insert_meta(self.connection, key, posterior)
         schema.require(
@@ -247,9 +239,7 @@ class CampaignFile:
             schema.CARRIED_PRIOR * (key is not None),
             schema.CHOSEN_REVISION * (record.parent is not None),
         )
-        row = (number, text, rows.text_crc(str(number), text))
-        rows.insert(self.connection, "revisions", [row])
-        return number
+        return rows.append_text(self.connection, "revisions", to_text(record))
 
     def accepted(self) -> int | None:
         """Return the number of the accepted revision; None where the latest one is used."""
@@ -308,8 +298,7 @@ class CampaignFile:
     def bad_revision(self) -> tuple[int, str] | None:
         """Return number and defect of the first revision that is damaged or of other readings.
 
-        A revision's hash must be that of the first readings: of those that were fitted, or, in
-        files of older programs, of those and the next ones, which were appended during the fit.
+        Its hash is of the fitted readings; in older files also of some appended during the fit.
         """
         records, damaged = self._sound_revisions()
         fitted = [(r.number, *basis) for r in records if (basis := fitted_to(r)) is not None]

@@ -1,8 +1,4 @@
-"""Texts that a campaign stores: the files of its robot, and the command that made it.
-
-With these texts a campaign can be read on any machine, without a file outside of it. The command
-line sets the command as typed while it runs.
-"""
+"""Texts that a campaign stores: the files of its robot, and the command that made it."""
 
 import json
 import shlex

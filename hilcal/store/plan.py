@@ -22,8 +22,7 @@ FORMAT = "hilcal-plan"
 VERSION = 1
 UNLOADED = "none"
 REFERENCE = "reference"  # the pose of drift checks and load changes
-SEEN = "reference_seen_m"
-"""Key of `Plan.about`: where the unloaded target was seen at the reference pose, sensor axes, m."""
+SEEN = "reference_seen_m"  # key of `Plan.about`: the unloaded target there, sensor axes, m
 ARM = "robot"  # key of `Plan.about`: the name of the arm that the plan was made for
 LEFT_OUT = "left_out"  # key of `Plan.about`: points that are not measured, each with the reason
 
@@ -79,8 +78,7 @@ class Plan(Brief):
     def skipping(self, poses: Sequence[str], done: frozenset[Step], cycle: int) -> "Plan":
         """Return what is missing besides `done`, without some poses; `about` lists these.
 
-        Across a gap the arm moves by the pose where loads are changed, and reads it, as the planner
-        has it where a straight motion is not known to be clear. `cycle` is new in the campaign.
+        Across a gap the arm moves by the home pose, and reads it; `cycle` is new in the campaign.
         """
         missing, home = self.without(done).steps, self.home
         valid = list(dict.fromkeys(s.pose for s in missing if s.pose != home))
@@ -191,9 +189,8 @@ def _steps(data: object, names: tuple[str, ...], where: str) -> tuple[Step, ...]
 def with_new_names(plan: Plan, campaign: Plan, number: int) -> Plan:
     """Return plan number `number` of a campaign with names and cycles that are new in it.
 
-    The reference pose becomes that of the campaign, so that the drift refers to it. A pose with a
-    name of the campaign at other joints gets a new name. At the same joints it is the same pose,
-    and its readings get new cycles, with separate unloaded readings.
+    The reference pose becomes that of the campaign. A pose with a name of the campaign at other
+    joints gets a new name; at the same joints its readings get new cycles.
     """
     if plan.q.shape[1] != campaign.q.shape[1]:
         raise InputError(

@@ -15,10 +15,7 @@ from hilcal.store.stored_schema import REVISION, check
 from hilcal.toml import parse_json
 
 STORED_HASH = "stored_sha256"
-"""Key in the options of a revision: hash of the readings as the file stores them.
-
-`data_hash` includes the arm's scatter in the covariance, which is computed, so that its last bits
-depend on the machine."""
+"""Key in the options of a revision: hash of the readings as stored, without computed scatter."""
 
 CELL = "cell"  # key in the options of a revision: the changes of the cell, see `config.cell`
 
@@ -130,8 +127,7 @@ def fitted_to(record: RevisionRecord) -> tuple[int, str] | None:
     return count, stored
 
 
-CARRIED = "carried_prior"
-"""Key in the parameters of a revision: the prior of another campaign in the fit, as JSON."""
+CARRIED = "carried_prior"  # key in the parameters of a revision: another campaign's prior, JSON
 _POSTERIOR, _HASH = "posterior", "posterior_sha256"
 _KEY = "posterior {}"  # key of a posterior in the file, with its hash
 

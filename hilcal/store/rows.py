@@ -23,8 +23,7 @@ from hilcal.types import Floats, Ints
 Layout = tuple[tuple[str, int], ...]
 """Fields of a record in order, with their number of doubles; absent quantities are left out."""
 LARGEST = 1e12  # upper bound of all quantities of a reading, in SI units: times in s are below 1e11
-OPTIONAL_FIELDS = "torque"
-"""Quantity of a state that single readings may lack; all of its numbers are NaN then."""
+OPTIONAL_FIELDS = "torque"  # NaN in single readings without it
 _PER_JOINT = ("q", "joint_temperature", "approach", "q_actual", "torque")
 _STATE = (
     *("q", "wrench", "time", "load_time", "air_temperature", "joint_temperature", "approach"),
@@ -121,9 +120,8 @@ def _unpacked(
 def content_hash(readings: Readings) -> str:
     """Return the SHA-256 (hex) of readings in order.
 
-    The hash depends on every number and on the names of poses, loads and targets. It does not
-    depend on the numbering of names, on names without readings, on how the readings were appended,
-    or on a scatter of the arm that was estimated from them.
+    The hash depends on every number and on the names of poses, loads and targets; not on how these
+    are numbered, or on a scatter of the arm that was estimated from the readings.
     """
     readings = readings.as_stated()
     sha = hashlib.sha256()
@@ -169,6 +167,13 @@ def last_id(connection: sqlite3.Connection, table: str) -> int:
     """Return the number of the last row of a table; 0 where it is empty."""
     (last,) = connection.execute(f"SELECT ifnull(max(id), 0) FROM {table}").fetchone()  # noqa: S608
     return int(last)
+
+
+def append_text(connection: sqlite3.Connection, table: str, text: str) -> int:
+    """Append a text to the revisions or events; return its number."""
+    number = last_id(connection, table) + 1
+    insert(connection, table, [(number, text, text_crc(str(number), text))])
+    return number
 
 
 def insert_meta(connection: sqlite3.Connection, key: str, value: str) -> None:

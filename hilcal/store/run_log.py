@@ -67,10 +67,9 @@ def check_same_cell(campaign: CampaignFile, config: CellConfig, base_dir: Path) 
 
 
 class RunLog:
-    """Plans, readings and events that a run writes into its campaign file.
+    """Plans, readings and events that a run writes into its campaign file, durably.
 
-    All writing is durable before a method returns. A reading, its step and its raw details are
-    stored together or not at all, and no step twice.
+    A reading, its step and its raw details are stored together or not at all, no step twice.
     """
 
     def __init__(self, campaign: CampaignFile) -> None:
@@ -140,9 +139,9 @@ class RunLog:
                 several = reading.states.target is not None
                 target = [reading.target_names[reading.target[k]]] if several else []
                 key = json.dumps([step.pose, step.load, step.cycle, *target])
+                row = (number, key, text, rows.text_crc(f"{number}{key}", text))
                 try:
-                    crc = rows.text_crc(f"{number}{key}", text)
-                    rows.insert(connection, "details", [(number, key, text, crc)])
+                    rows.insert(connection, "details", [row])
                 except sqlite3.IntegrityError:
                     raise InputError(
                         f"{self._campaign.path}: {step} has been measured already"
@@ -152,9 +151,7 @@ class RunLog:
         """Append an event, with the time (UTC)."""
         text = json.dumps({"kind": kind, "utc": utc_now(), **content}, allow_nan=False)
         with self._campaign.transaction() as connection:
-            number = rows.last_id(connection, "events") + 1
-            row = (number, text, rows.text_crc(str(number), text))
-            rows.insert(connection, "events", [row])
+            rows.append_text(connection, "events", text)
 
     def done(self) -> frozenset[Step]:
         """Return the steps that have been measured."""
