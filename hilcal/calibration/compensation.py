@@ -10,11 +10,9 @@ Newton's method on T(q) = T_wanted starts from the commanded joint values and st
 
     q ← q + J⁺ e,   e = (p_wanted − p, Log(R_wanted Rᵀ)),   J = ∂(p, ω)/∂q by the chain alone
 
-Each residual e is of the full model at equilibrium, so the solution is exact. J lacks the effects,
-which costs a step or two more; each step reduces e about 10³ times.
-
-An arm with fewer than six joints of independent values cannot correct all of a pose. There the
-position is met, and the orientation is as near as the joints that are left allow:
+Each residual e is of the full model at equilibrium, so the solution is exact; J lacks the effects,
+so that a step reduces e about 10³ times. With fewer than six independent joints the position is
+met, and the orientation as far as the joints that are left allow:
 
     q ← q + J_p⁺ e_p + (J_r N)⁺ (e_r − J_r J_p⁺ e_p),   N = I − J_p⁺ J_p
 """
@@ -242,12 +240,9 @@ class ToolPoses(Brief):
 
     position: Floats  # (N, 3) m
     rotation: Floats  # (N, 3, 3)
-    nominal_position: Floats
-    """(N, 3) target position: by the nominal arm, or by the unloaded arm for a fit to
-    deflections."""
+    nominal_position: Floats  # (N, 3) target, of a fit to deflections that of the unloaded arm
     nominal_rotation: Floats  # (N, 3, 3)
-    covariance: Floats | None
-    """(N, 3, 3) of the true position about `position`, m²; None if `std` is false."""
+    covariance: Floats | None  # (N, 3, 3) of the true position, m²; None if `std` is false
     outside: tuple[Outside, ...]  # measured ranges that the points leave
 
     @property
@@ -378,11 +373,7 @@ class Compensation(Brief):
         return self._wanted
 
     def to_dict(self, names: Sequence[str]) -> dict[str, object]:
-        """Return the document of `compensate --json`, SI; `names` of the points.
-
-        `expected_error_m` is the root sum square of the inversion's residual and the position's
-        standard deviation.
-        """
+        """Return the document of `compensate --json`, SI; `names` of the points."""
         calibration, before, after = self._calibration, self.before, self.after
         columns: dict[str, Sequence[Any]] = {
             "name": names,

@@ -208,13 +208,7 @@ def _waves(e: Effect, theta: Floats, s: Situation) -> tuple[Floats, Floats]:
 def repeated(s: Situation, count: int) -> Situation:
     """Return the first state, repeated `count` times."""
     rows = np.zeros(count, dtype=np.int64)
-    chain = replace(
-        s.chain,
-        rotation=s.chain.rotation[:, rows],
-        position=s.chain.position[:, rows],
-        com=s.chain.com[:, rows],
-        twist=None if s.chain.twist is None else s.chain.twist[:, rows],
-    )
+    chain = se3.by_field([s.chain], lambda arrays: arrays[0][:, rows])
     load = replace(s.load, wrench=s.load.wrench[rows])
     return replace(
         s, states=s.states[rows], angle=s.angle[rows], chain=chain, wrench=s.wrench[rows], load=load

@@ -53,9 +53,7 @@ class MeasuredRanges:
     """Ranges of the fitted readings."""
 
     ranges: tuple[Range, ...]  # of joint angles, force, moment, temperatures
-    most_std_m: float
-    """Standard deviation of the tracked target's predicted position, by the parameters alone, above
-    which a point is far from all fitted ones."""
+    most_std_m: float  # std of the target, by the parameters alone, of points far from fitted ones
 
     @classmethod
     def of(

@@ -56,8 +56,7 @@ NO_LOAD = "none"
 NEAREST_RAD = 0.5  # a solution within this distance of the start counts as the nearest; a choice
 N_STARTS = 300  # random starts to find all branches from, of six joints up to 16; a choice
 LIMIT_PENALTY = 1e3  # rad; added to the distance of a solution beyond the joints' limits
-LEAST_REACH, LONGEST_TOOL = 0.05, 0.5
-"""Least distance of the farthest point over the reach, and largest beyond it, m; choices."""
+LEAST_REACH, LONGEST_TOOL = 0.05, 0.5  # of the farthest point: over, and beyond the reach, m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,10 +67,8 @@ class Points:
     q: Floats  # (N, n) joint values, rad; rows of NaN where only a pose is stated
     target_poses: Floats | None = None
     """(N, 4, 4) T_base_tool, NaN where joint values state the target; None if they do for all."""
-    wrench: Floats | None = None
-    """(N, 6) force and moment at the load point, base axes; None if not stated."""
-    sensor_wrench: Floats | None = None
-    """(N, 6) change of the force sensor's reading by the load, sensor axes; None if not stated."""
+    wrench: Floats | None = None  # (N, 6) at the load point, base axes; None if not stated
+    sensor_wrench: Floats | None = None  # (N, 6) change of the sensor's reading, sensor axes
     recorded: Mapping[str, Floats] = field(default_factory=dict)  # other columns of `States`
     guess: str = ""  # meaning of guessed columns, for people
 

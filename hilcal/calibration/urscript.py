@@ -93,15 +93,13 @@ class Waypoint:
     line: int  # of the program, from 1
     start: int  # offset of its target in the text
     end: int  # offset of the target's end
-    q: Floats | None = None
-    """(6,) joint values, or those that select the branch of `pose`, rad; None if not stated."""
+    q: Floats | None = None  # (6,) joint values, or those that select the branch of `pose`, rad
     pose: Floats | None = None  # (4, 4) T_base_tool; None where the joint values are the target
     tool: Floats | None = None  # (4, 4) T_flange_tool that was set; None if none
     blend_m: float = 0.0  # radius within which the arm passes without a stop, m
     not_corrected: str = ""  # why it is not corrected; empty if it is understood
     straight: bool = False  # whether the motion to it is a straight line
-    follows_previous: bool = False
-    """Whether the previous waypoint of the text always comes right before it."""
+    follows_previous: bool = False  # whether that of the text before always comes right before it
 
 
 def waypoints(program: str) -> tuple[Waypoint, ...]:

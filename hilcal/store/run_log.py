@@ -2,7 +2,7 @@
 
 import json
 import sqlite3
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial, reduce
 from pathlib import Path
@@ -162,14 +162,10 @@ class RunLog:
         """Return the raw details of all readings, in order, each with its "step"."""
         out = []
         for number, key, text, crc in self._select("SELECT * FROM details ORDER BY id"):
-            if rows.text_crc(f"{number}{key}", text) != crc:
-                raise InputError(
-                    f"{self._campaign.path}: the campaign is damaged at the details of "
-                    f"reading {number}"
-                )
-            pose, load, cycle = self._step(key)
-            content = rows.stored_json(self._campaign.path, text, partial(check, DETAIL))
-            out.append({**content, "step": {"pose": pose, "load": load, "cycle": cycle}})
+            place = f"the details of reading {number}"
+            content = self._content(f"{number}{key}", text, crc, place, partial(check, DETAIL))
+            step = dict(zip(("pose", "load", "cycle"), self._step(key), strict=True))
+            out.append({**content, "step": step})
         return out
 
     def events(self) -> list[dict[str, Any]]:
@@ -182,14 +178,17 @@ class RunLog:
         return next(iter(self._events(statement, f'{{"kind": "{kind}", %')), None)
 
     def _events(self, statement: str, *values: str) -> list[dict[str, Any]]:
-        out = []
-        for number, text, crc in self._select(statement, *values):
-            if rows.text_crc(str(number), text) != crc:
-                raise InputError(
-                    f"{self._campaign.path}: the campaign is damaged at event {number}"
-                )
-            out.append(rows.stored_json(self._campaign.path, text, check_event))
-        return out
+        stored = self._select(statement, *values)
+        return [
+            self._content(str(k), text, crc, f"event {k}", check_event) for k, text, crc in stored
+        ]
+
+    def _content(
+        self, key: str, text: str, crc: int, place: str, fits: Callable[[object], None]
+    ) -> Any:
+        if rows.text_crc(key, text) != crc:
+            raise InputError(f"{self._campaign.path}: the campaign is damaged at {place}")
+        return rows.stored_json(self._campaign.path, text, fits)
 
     def readings(self) -> Readings | None:
         """Return all readings; None without any."""

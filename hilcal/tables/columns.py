@@ -411,7 +411,7 @@ class ObserverRows:
         """Return values (N, m) and covariances (N, m, m) with distances and heights filled in."""
         value, cov = value.copy(), cov.copy()
         for kind in KINDS:
-            column, _, variance_column = SCALAR[kind]
+            column, _, spread = SCALAR[kind]
             rows = np.flatnonzero([self.names[k].kind == kind for k in self.observer])
             if not len(rows):
                 continue
@@ -423,34 +423,22 @@ class ObserverRows:
                     f"expected {low:g} to {MAX_DISTANCE:g} m"
                 )
             value[rows, 0] = read
-            cov[rows, 0, 0] = self._variance(table, rows, variance_column, kind, std)
-        return value, cov
-
-    def _variance(
-        self,
-        table: ColumnTable,
-        rows: Ints,
-        column: str,
-        kind: ObserverKind,
-        std: Mapping[ObserverName, float],
-    ) -> Floats:
-        nothing = np.full(len(table.rows), np.nan)
-        variances = table.number.get(column, nothing)[rows].copy()
-        for k, i in enumerate(rows.tolist()):
-            name = self.names[self.observer[i]]
-            if np.isnan(variances[k]):
-                if name not in std:
+            stated = table.number.get(spread, np.full(len(table.rows), np.nan))
+            for i in rows.tolist():
+                name = self.names[self.observer[i]]
+                variance = std.get(name, np.nan) ** 2 if np.isnan(stated[i]) else stated[i]
+                if np.isnan(variance):
                     raise InputError(
                         f"{table.at(i)}: nothing states the noise of {name}; give column "
-                        f"'{column}', the variance in m², or [{kind}s.{name.name}] std_m"
+                        f"'{spread}', the variance in m², or [{kind}s.{name.name}] std_m"
                     )
-                variances[k] = std[name] ** 2
-            if not MIN_STD[0] ** 2 <= variances[k] <= MAX_STD**2:
-                raise InputError(
-                    f"{table.at(i, column)}: a variance of {variances[k]:g} m² cannot be right; "
-                    f"expected standard deviations of {MIN_STD[0]:g} to {MAX_STD:g} m, squared"
-                )
-        return np.asarray(variances)
+                if not MIN_STD[0] ** 2 <= variance <= MAX_STD**2:
+                    raise InputError(
+                        f"{table.at(i, spread)}: a variance of {variance:g} m² cannot be right; "
+                        f"expected standard deviations of {MIN_STD[0]:g} to {MAX_STD:g} m, squared"
+                    )
+                cov[i, 0, 0] = variance
+        return value, cov
 
 
 def observer_rows(table: ColumnTable) -> ObserverRows | None:

@@ -1,8 +1,4 @@
-"""The table of a file: a `Grid` of cells, and a `ColumnTable` of columns with a meaning.
-
-`hilcal.tables.files` reads a file into a `Grid`. The names of its columns (exchange table) or a
-mapping give them a meaning, which makes a `ColumnTable` of numbers and texts.
-"""
+"""The table of a file: a `Grid` of cells, and a `ColumnTable` of columns with a meaning."""
 
 import itertools
 from collections.abc import Callable, Collection, Sequence

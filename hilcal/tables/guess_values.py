@@ -357,12 +357,8 @@ def _matrix(g: words.Guesser) -> bool:
             places = [(i + base, j + base) for i in range(3) for j in range(3)]
             if all(place in by_place for place in places):
                 names = [by_place[place] for place in places]
-                beside = [
-                    by_place[i + base, 3 + base]
-                    for i in range(3)
-                    if (i + base, 3 + base) in by_place
-                ]
-                _take_matrix(g, names, beside)
+                last = [(i + base, 3 + base) for i in range(3)]
+                _take_matrix(g, names, [by_place[place] for place in last if place in by_place])
                 return True
     return False
 

@@ -461,10 +461,8 @@ def _plausible(
     """Leave out implausible readings; a note on each reason.
 
     A reading is stale where it equals the previous one within the scatter (N, m, m) of both though
-    the joints were sent elsewhere: the arm did not follow, or the tracker did not measure again.
-    Readings that repeat a pose are odd where their positions differ by more than `REPEATS_TO` +
-    lever · Σ|dq|, the most that the difference of their joints moves the target: which of them is
-    wrong cannot be known.
+    the joints were sent elsewhere. Readings that repeat a pose are odd, all of them, where their
+    positions differ by more than `REPEATS_TO` + lever · Σ|dq|, the most that the joints move it.
     """
     from scipy.spatial import cKDTree
 

@@ -8,10 +8,9 @@ along z,
     N_k = H_{k−1}⁻¹ M_k G_k,   G_k = Rz(·) Tz(·),   H_k = Rz(o_k) G_k,   N'_k = H_{k−1}⁻¹ C_k G_k
 
 o_k is the difference between the joint's zeros in the file and in the controller. H_{−1} is from
-the base of the arm to that of the file: the identity, or half a turn about z (as between `base` and
-`base_link` of a UR arm). G_n is from the flange to the tip. G and H do not contain the file's own
-errors, which may be millimetres, so that N' is exact. One transform is changed for each N'_k: that
-of its joint, after the last joint that of the first step.
+the base of the arm to that of the file: the identity, or half a turn about z (as of UR's `base`).
+G_n is from the flange to the tip. G and H do not contain the file's own errors, so that N' is
+exact. One transform is changed for each N'_k: that of its joint, or of the first step after all.
 """
 
 import re
@@ -32,11 +31,8 @@ from hilcal.robot import se3
 from hilcal.robot.arm import Arm, as_drawn
 from hilcal.types import Floats
 
-FRAME_TOLERANCE = 1e-6
-"""m, rad; frames that differ by less count as the same: descriptions have six decimals."""
-NEAR_M, NEAR_RAD = 5e-3, 1e-2
-"""m, rad; a file with axes within these distances is of the same arm: many files are rounded to
-millimetres, others are corrected already. A choice; the corrected file is exact in any case."""
+FRAME_TOLERANCE = 1e-6  # m, rad; of frames that count as the same: files have six decimals
+NEAR_M, NEAR_RAD = 5e-3, 1e-2  # a file with axes this near, rounded or not, is of the arm; a choice
 EDIT_TOLERANCE = 1e-9  # m, rad; a transform that changes less keeps its text
 Edits = list[tuple[Span, str]]
 LARGEST, SMALLEST = 1e6, 1e-6  # largest number, and least length of a direction; choices
@@ -160,10 +156,8 @@ class ChainStep:
     name: str  # of the element, for people
     line: int  # of it, from 1
     transform: Floats  # (4, 4) in the previous frame
-    joint: Floats | None
-    """(4, 4) pose of the joint axis (its z) in the frame of `transform`; None without a joint."""
-    write: Callable[[Floats], Edits]
-    """Edits that write another place; raises `InputError` where the file cannot have one."""
+    joint: Floats | None  # (4, 4) joint axis (its z) in the frame of `transform`; None without
+    write: Callable[[Floats], Edits]  # edits of another place; InputError where there can be none
 
 
 @dataclass(frozen=True, slots=True, eq=False)

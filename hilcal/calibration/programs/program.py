@@ -31,9 +31,7 @@ from hilcal.types import Floats, Ints
 JOINTS = 6
 DECIMAL = r"[-+]?(?:\d+\.?\d*|\.\d+)"  # pattern of a number without exponent
 UNSTATED = -99  # a flag of a configuration that is not stated
-SAME_M, SAME_RAD = 2e-9, 2e-9
-"""m, rad; a point that moved less keeps its text: above the residual of the inverse, see
-`calibration.compensation.TOLERANCE`, and below the resolution of any controller."""
+SAME_M, SAME_RAD = 2e-9, 2e-9  # a point that moved less keeps its text; above `TOLERANCE`
 GIMBAL = 1e-9  # cos B below which A and C turn about one axis
 MOVES = "{} moves, and it is not known what that carries"
 """Why a point with an external axis is not corrected."""
@@ -64,11 +62,10 @@ class ProgramPoint:
     flags: tuple[int, ...] = ()  # the configuration, see `Language.flags`
     config: tuple[Span, ...] = ()  # places of its changeable part; empty if it cannot change
     flags_obeyed: bool = True
-    """Whether the controller obeys the stated configuration; otherwise it stays on the branch of
-    the previous point."""
+    """Whether the controller obeys the configuration, or stays on the branch of the last point."""
     template: str = ""
-    """For a point that the program computes (`Offs(p, …)`), the text that replaces `numbers[0]`,
-    with fields for the numbers and the changeable configuration; else ""."""
+    """Of a point that the program computes (`Offs(p, …)`), the text for `numbers[0]`, with fields
+    for the numbers and the changeable configuration; else ""."""
     not_corrected: str = ""  # why it is not corrected; empty if it is understood
     blend_m: float = 0.0  # 0, since only URScript states it at the point
 
@@ -103,12 +100,10 @@ class Language:
     decimals: tuple[int, int, int]
     """Least number of decimals of a position in mm, of the orientation, of joint values."""
     axes: tuple[tuple[int, int, int], ...]
-    """(6, 3) directions of the joint axes of the maker's arms with spherical wrist at zero joint
-    values, in axes of the controller's base."""
+    """(6, 3) joint axes of the maker's arms with spherical wrist at zero, base axes."""
     flags: Callable[[Floats, Ints], Ints]
     """(K, F) configuration at joint values (K, 6), with `languages.shape` (K, 2) there."""
-    shape_flags: tuple[bool, ...]
-    """(F,) which flags depend on the shape of the arm, not on the joint values alone."""
+    shape_flags: tuple[bool, ...]  # (F,) which flags depend on the shape of the arm, too
     motions: str  # its motions, for people
     config_texts: Callable[[Ints, Sequence[str]], list[str]] = lambda _, texts: list(texts)
     """New texts at `ProgramPoint.config`, from the flags and the old texts."""
