@@ -56,6 +56,11 @@ class Node:
         """Return the first child with a tag."""
         return next((c for c in self.children if c.tag == tag), None)
 
+    def below(self, tag: str, key: str) -> str:
+        """Return an attribute of the first child with a tag; empty without it."""
+        child = self.child(tag)
+        return "" if child is None else child.attributes.get(key, "")
+
     def descendants(self, *tags: str) -> Iterator["Node"]:
         """Yield descendants with some tags, in the order of the text."""
         for child in self.children:

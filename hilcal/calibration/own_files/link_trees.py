@@ -109,11 +109,9 @@ def urdf_steps(document: Document, base: str | None, tip: str | None) -> list[Ch
     """Return the steps from a base link to a tip link."""
     parents: dict[str, tuple[str, Node]] = {}
     for joint in document.root.descendants("joint"):
-        ends = [joint.child(tag) for tag in ("parent", "child")]
-        names = [e.attributes.get("link") for e in ends if e is not None]
-        if len(names) != 2 or None in names:
+        parent, child = (joint.below(tag, "link") for tag in ("parent", "child"))
+        if not parent or not child:
             continue
-        parent, child = (str(n) for n in names)
         if child in parents:
             reason = f"a second joint leads to link '{escaped(child)}'; valid: a tree"
             raise document.error(joint, reason)
@@ -244,9 +242,7 @@ class SdfModel:
     def reference(self, name: str) -> str:
         """Name of the frame that a pose is relative to."""
         node = self.nodes[name]
-        pose = node.child("pose")
-        relative_to = "" if pose is None else pose.attributes.get("relative_to", "")
-        if relative_to:
+        if relative_to := node.below("pose", "relative_to"):
             return relative_to
         if node.tag == "joint":
             return self.parent_and_child(node)[1]
