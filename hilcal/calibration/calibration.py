@@ -25,7 +25,6 @@ import numpy as np
 
 from hilcal.calibration.compensation import (
     Compensation,
-    Inverse,
     Pose,
     ToolPose,
     ToolPoses,
@@ -216,8 +215,7 @@ class Calibration(Brief):
             goal = np.array(pose[:, :3, :3]), np.array(pose[:, :3, 3])
         kernel = self._kernel(tool_pose)
         if isinstance(kernel, Compiled) and kernel.covers(states.q):
-            solution, residual = kernel.compensate(states, goal)
-            inverse = Inverse(solution, residual[:, 0], residual[:, 1])
+            inverse = kernel.compensate(states, goal)
         else:
             model, theta = tool_pose.model, tool_pose.theta
 
@@ -353,10 +351,9 @@ class Calibration(Brief):
         std: bool,
         unstated: tuple[str, ...] = (),
     ) -> ToolPoses:
-        """Return the poses of a tool at N points.
+        """Return the poses of a tool at N points; errors are relative to `nominal`.
 
-        Errors are relative to `nominal`, orientations (N, 3, 3) and positions (N, 3). `unstated`
-        are columns of the states that are filled with means of `conditions`.
+        `unstated` are columns of the states that are filled with means of `conditions`.
         """
         prediction = tool.model.predict(states, tool.theta)
         rotation, position = tool_poses(tool, prediction)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.calibration.compensation import MAX_JOINT_STEP, TOLERANCE, ToolPose, in_chain
+from hilcal.calibration.compensation import MAX_JOINT_STEP, TOLERANCE, Inverse, ToolPose, in_chain
 from hilcal.effects.protocol import FRAME_ROLES, Effect, Situation
 from hilcal.optional import install
 from hilcal.readings.readings import States
@@ -253,10 +253,8 @@ class Compiled:
         _, (by_angle, _, soft) = self.tables
         return not (len(by_angle) or len(soft)) or bool(np.all(np.abs(q) <= TURN))
 
-    def compensate(
-        self, states: States, goal: tuple[Floats, Floats] | None
-    ) -> tuple[Floats, Floats]:
-        """Joint values (N, n) and residuals (N, 2), m and rad.
+    def compensate(self, states: States, goal: tuple[Floats, Floats] | None) -> Inverse:
+        """Joint values and residuals of N points.
 
         `goal` are target orientations (N, 3, 3) and positions (N, 3), m, base axes; if None, those
         of the nominal arm (for deflections: the unloaded arm) at q.
@@ -283,7 +281,7 @@ class Compiled:
             self.reach, MAX_JOINT_STEP, TOLERANCE, q, wrench, packed(rotation), packed(position),
             True, out, residual,
         )  # fmt: skip
-        return out, residual
+        return Inverse(out, residual[:, 0], residual[:, 1])
 
     def _at_points(self, states: States) -> tuple[Floats, Floats, Floats]:
         """Displacements (N, n), twists (N, n + 1, 6) and compliances (N, n) of the points."""

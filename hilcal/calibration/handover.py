@@ -145,8 +145,7 @@ def ur_kinematics(
 ) -> tuple[str, Floats]:
     """Return UR's kinematics file, and (4, 4) from its last frame to the flange.
 
-    `digest` is the driver's name of the connected arm's calibration, "calib_…"; the driver logs an
-    error if the file has another. If None, a hash of the file's content is used.
+    `digest` is the driver's name of the arm's calibration, "calib_…"; else a hash of the content.
     """
     if not nominal.name.startswith("ur") or arm.n != len(UR_JOINTS):
         raise InputError(f"{nominal.name}: UR's kinematics file is for UR arms")

@@ -123,11 +123,9 @@ def improvement(
     goal: States,
     left_out: Sequence[tuple[str, str]] = (),
 ) -> Improvement:
-    """Compare readings of the same points at uncorrected and at corrected joint values.
+    """Compare readings of the same points, in one order, at uncorrected and corrected joints.
 
-    Both have the same poses in the same order, for deflections with the unloaded readings of the
-    points. `goal` are states of `before` at which the nominal arm has the tool at its target; not
-    used for deflections.
+    `goal` are states at which the nominal arm has the tool at its target; not for deflections.
     """
     first, _, _ = _errors(calibration, p, before, goal)
     last, covariance, noise = _errors(calibration, p, after, goal)

@@ -82,8 +82,7 @@ def tracker_covariance(
 
         Cov = J diag(σ_az², σ_el², (a + b d)²) Jᵀ = (c + e d)² (I - u uᵀ) + (a + b d)² u uᵀ
 
-    where the angles' errors are equal across the beam: d σ_el = d cos(el) σ_az = c + e d. The
-    rotation of a pose (m = 6) has the covariance σ_o² I.
+    with d σ_el = d cos(el) σ_az = c + e d. The rotation of a pose (m = 6) has σ_o² I.
     """
     beam = np.asarray(position, dtype=float)
     beam = beam if station is None else beam - np.asarray(station, dtype=float)
@@ -185,9 +184,8 @@ def measurement_covariance(
 ) -> Floats:
     """(G, L·m, L·m) covariance D C Dᵀ of the measurements of each group, D = [I, −weights].
 
-    C, the covariance of all readings of a group, has the blocks V_i, and F_i F_jᵀ for two readings
-    of one arrival; where their noise is correlated, φ S_i C_ij S_jᵀ is added, see
-    `readings.readings`. A group has L loaded and U unloaded rows, (G, L) and (G, U).
+    C has the blocks V_i, F_i F_jᵀ for two readings of one arrival, and φ S_i C_ij S_jᵀ where their
+    noise is correlated, see `readings.readings`. A group has L loaded and U unloaded rows.
     """
     rows = np.concatenate([loaded, reference], axis=1)
     groups, count = rows.shape

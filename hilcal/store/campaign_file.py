@@ -50,8 +50,7 @@ _OPEN = Path("/proc/self/fd")
 class CampaignFile:
     """An open campaign file; use it in a `with` statement.
 
-    Readings and revisions cannot be changed or deleted. They survive a kill of the process and a
-    loss of power once `append_readings` or `append_revision` has returned.
+    Readings and revisions cannot be changed; once appended they survive a loss of power.
     """
 
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:

@@ -33,7 +33,6 @@ from hilcal.calibration.programs.program import (
     ProgramPoint,
     ProgramReader,
     Span,
-    controller_frames,
     line_of,
     numbers_in,
     of_wpr,
@@ -82,7 +81,7 @@ LS = Language(
 
 def read_ls(path: Path, frames_file: Path | None, tool: Floats | None) -> Program:
     """Read a program."""
-    reader = _FanucReader(path, controller_frames(frames_file, LS, tool))
+    reader = _FanucReader(path, LS, frames_file, tool)
     begin = re.search(r"^/POS\b", reader.text, re.M)
     if begin is None or not re.search(r"^/MN\b", reader.text, re.M):
         raise InputError(f"{path.name}: no sections /MN and /POS; valid: a TP program as text")
@@ -205,7 +204,7 @@ INFORM = Language(
 
 def read_jbi(path: Path, frames_file: Path | None, tool: Floats | None) -> Program:
     """Read a job."""
-    reader = _InformReader(path, controller_frames(frames_file, INFORM, tool))
+    reader = _InformReader(path, INFORM, frames_file, tool)
     if "//POS" not in reader.text or "//INST" not in reader.text:
         raise InputError(f"{path.name}: no sections //POS and //INST; valid: a job as text")
     return reader.read()

@@ -25,14 +25,12 @@ from hilcal.calibration.programs.program import (
     JOINTS,
     MOVES,
     UNSTATED,
-    ControllerFrames,
     Language,
     Program,
     ProgramPoint,
     ProgramReader,
     Span,
     arguments_of,
-    controller_frames,
     of_euler,
     read_text,
     to_euler,
@@ -115,9 +113,9 @@ def read_krl(path: Path, frames_file: Path | None, tool: Floats | None) -> Progr
     if len(set(encodings)) > 1:
         texts = tuple(p.read_bytes().decode(encoding) for p in paths)
     config = frames_file is not None and frames_file.suffix.lower() == ".dat"
-    reader = _KrlReader(path, controller_frames(None if config else frames_file, KRL, tool))
+    reader = _KrlReader(path, KRL, None if config else frames_file, tool)
     reader.text, reader.encoding = texts[0], encoding
-    reader.files = [p.name for p in paths]
+    reader.files, reader.data = [p.name for p in paths], {}
     for k, text in enumerate(texts):
         reader.collect(text, k)
     if frames_file is not None and config:
@@ -178,12 +176,10 @@ class _State:
 
 
 class _KrlReader(ProgramReader):
-    def __init__(self, path: Path, controller: ControllerFrames):
-        super().__init__(path, controller)
-        self.files: list[str] = []
-        self.data: dict[str, list[_Value]] = {}
-        self.state = _State()
-        self.form: str | None = None
+    files: list[str]
+    data: dict[str, list[_Value]]
+    form: str | None = None
+    state = _State()
 
     def collect(self, text: str, file: int) -> None:
         """Collect all named aggregates of a file; `file` is −1 for that of --frames."""

@@ -20,6 +20,7 @@ from hilcal.calibration.programs.fanuc_inform import read_jbi, read_ls
 from hilcal.calibration.programs.krl import read_krl
 from hilcal.calibration.programs.program import JOINTS, UNSTATED, Language, Program, ProgramPoint
 from hilcal.calibration.programs.rapid import read_rapid
+from hilcal.calibration.urscript import BRANCH_MARGIN
 from hilcal.errors import InputError
 from hilcal.names import escaped
 from hilcal.robot.arm import Arm
@@ -127,7 +128,6 @@ AXIS_TOLERANCE = 0.02  # of an axis direction; a choice, above that of any calib
 INTERSECTION_M = 1e-3  # m; largest distance of intersecting axes; a choice
 FLAG_BORDER = 1e-4
 """rad; nearer to a flag's border, joint values have both values; a choice, above rounding."""
-BRANCH_MARGIN = 0.05  # rad, see `calibration.urscript.BRANCH_MARGIN`
 
 
 def form_mismatch(arm: Arm, language: Language) -> str:

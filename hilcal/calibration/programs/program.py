@@ -314,8 +314,10 @@ def controller_frames(
 class ProgramReader:
     """Base of the readers of all makers, which collect the points of a program's text."""
 
-    def __init__(self, path: Path, controller: ControllerFrames):
-        self.path, self.controller = path, controller
+    def __init__(
+        self, path: Path, language: Language, frames_file: Path | None, tool: Floats | None
+    ):
+        self.path, self.controller = path, controller_frames(frames_file, language, tool)
         self.text, self.encoding = read_text(path)
         self.points: dict[str, ProgramPoint] = {}
         self.otherwise: dict[str, int] = {}

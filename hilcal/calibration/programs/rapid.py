@@ -30,7 +30,6 @@ from hilcal.calibration.programs.program import (
     ProgramReader,
     Span,
     arguments_of,
-    controller_frames,
     edited,
     line_of,
     numbers_in,
@@ -110,9 +109,9 @@ RAPID = Language(
 def read_rapid(path: Path, frames_file: Path | None, tool: Floats | None) -> Program:
     """Read a module."""
     module = frames_file is not None and frames_file.suffix.lower() != ".toml"
-    controller = controller_frames(None if module else frames_file, RAPID, tool)
+    reader = _RapidReader(path, RAPID, None if module else frames_file, tool)
     frames_text = read_text(frames_file)[0] if frames_file is not None and module else ""
-    return _RapidReader(path, controller).read(frames_text)
+    return reader.read(frames_text)
 
 
 def _statements(text: str) -> list[tuple[int, str]]:
