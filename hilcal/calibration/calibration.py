@@ -255,8 +255,7 @@ class Calibration(Brief):
 
         Args:
             q: (n,) or (N, n) joint values of the reading, rad.
-            reading: (6,) or (N, 6) reading with the load minus reading without, sensor axes, N and
-                N·m.
+            reading: (6,) or (N, 6) with the load minus without, sensor axes, N and N·m.
 
         Raises:
             InputError: the cell has no force sensor, or a wrong shape.

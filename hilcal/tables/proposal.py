@@ -82,14 +82,7 @@ TIME = {"time", "zeit", "timestamp", "date", "datum", "datetime", "zeitstempel",
         "t"}  # fmt: skip
 REFLECTOR = {"target", "reflector", "reflektor", "prism", "prisma", "smr", "nest"}
 AIR = {"air", "luft", "ambient", "umgebung", "room", "raum", "aire"}
-ARM_JOINTS = (
-    ("shoulder", "pan"),
-    ("shoulder", "lift"),
-    ("elbow",),
-    ("wrist", "1"),
-    ("wrist", "2"),
-    ("wrist", "3"),
-)
+ARM_JOINTS = ("shoulder pan", "shoulder lift", "elbow", "wrist 1", "wrist 2", "wrist 3")
 """Joint names of Universal Robots arms under ROS, in order."""
 
 DIFFERENCE = {"dev", "delta", "diff", "difference", "error", "err", "residual", "abweichung"}
