@@ -67,7 +67,8 @@ from hilcal.store.schema import is_campaign
 from hilcal.stream import StreamFit
 from hilcal.types import Bools, Floats, Ints
 
-LARGEST_RAD = 4.0 * np.pi  # twice the range of most joints: larger values are degrees; a choice
+LARGEST_RAD = 4.0 * np.pi
+"""rad; a choice, twice the range of most joints: larger values of joints are degrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +101,7 @@ class Calibration(Brief):
 
     @cached_property
     def _tracked(self) -> ToolPose:
+        """The tracked target, the usual tool."""
         return tool_of(self.model, self.theta, None)
 
     @classmethod
@@ -173,11 +175,13 @@ class Calibration(Brief):
 
         Args:
             q: (n,) or (N, n) joint values, rad.
-            wrench: (6,) or (N, 6) force and moment of the load at the load point, base axes.
+            wrench: (6,) or (N, 6) force and moment of the load at the load point, base axes; none
+                where None.
             tool: (4, 4) T_flange_tool; the tracked target where None.
             std: also state the uncertainty, and whether points lie far from the measured ones.
-            recorded: other columns of `States` by name; one that the model needs is else its mean
-                while measuring, see `calibration.measured`.
+            recorded: other columns of `States` by name: `air_temperature`, `load_time`, ...; a
+                missing column that the model needs is replaced by its mean while measuring, see
+                `calibration.measured`.
 
         Raises:
             InputError: a wrong shape, or the model needs a missing column whose mean the
@@ -255,7 +259,8 @@ class Calibration(Brief):
 
         Args:
             q: (n,) or (N, n) joint values of the reading, rad.
-            reading: (6,) or (N, 6) with the load minus without, sensor axes, N and N·m.
+            reading: (6,) or (N, 6) reading with the load minus reading without, sensor axes, N and
+                N·m.
 
         Raises:
             InputError: the cell has no force sensor, or a wrong shape.
@@ -350,9 +355,10 @@ class Calibration(Brief):
         std: bool,
         unstated: tuple[str, ...] = (),
     ) -> ToolPoses:
-        """Return the poses of a tool at N points; errors are relative to `nominal`.
+        """Return the poses of a tool at N points.
 
-        `unstated` are columns of the states that are filled with means of `conditions`.
+        Errors are relative to `nominal`, orientations (N, 3, 3) and positions (N, 3). `unstated`
+        are columns of the states that are filled with means of `conditions`.
         """
         prediction = tool.model.predict(states, tool.theta)
         rotation, position = tool_poses(tool, prediction)
@@ -421,6 +427,7 @@ def calibration_of_stream(fit: StreamFit, source: Mapping[str, Any]) -> Calibrat
 
 
 def _numbers(values: object, name: str) -> Any:
+    """Return numbers as an array; InputError for anything else."""
     try:
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError):

@@ -10,9 +10,11 @@ Newton's method on T(q) = T_wanted starts from the commanded joint values and st
 
     q ← q + J⁺ e,   e = (p_wanted − p, Log(R_wanted Rᵀ)),   J = ∂(p, ω)/∂q by the chain alone
 
-Each residual e is of the full model at equilibrium, so the solution is exact; J lacks the effects,
-so that a step reduces e about 10³ times. With fewer than six independent joints the position is
-met, and the orientation as far as the joints that are left allow:
+Each residual e is of the full model at equilibrium, so the solution is exact. J lacks the effects,
+which costs a step or two more; each step reduces e about 10³ times.
+
+An arm with fewer than six joints of independent values cannot correct all of a pose. There the
+position is met, and the orientation is as near as the joints that are left allow:
 
     q ← q + J_p⁺ e_p + (J_r N)⁺ (e_r − J_r J_p⁺ e_p),   N = I − J_p⁺ J_p
 """
@@ -40,13 +42,18 @@ from hilcal.types import Bools, Floats, Ints
 if TYPE_CHECKING:
     from hilcal.calibration.calibration import Calibration
 
-TOLERANCE = 1e-10  # residual at which a point is solved, m and rad
-MAX_STEPS = 30  # Newton steps at most; four are usual
-MOST_TURNED = 0.02  # rad, from a target orientation that few joints cannot have; a choice
-MAX_JOINT_STEP = 0.2  # rad; longer steps are shortened, so that the branch stays the same
+TOLERANCE = 1e-10
+"""Residual at which a point is solved, m and rad."""
+MAX_STEPS = 30
+"""Newton steps at most; four are usual."""
+MOST_TURNED = 0.02
+"""Largest angle, rad, from a target orientation that an arm with few joints cannot have: several
+times the errors of arms. A choice."""
+MAX_JOINT_STEP = 0.2
+"""Largest step of a joint, rad; longer ones are shortened, so that the branch stays the same."""
 MIN_SINGULAR_RATIO = 1e-3
-"""Ratio of the singular values of J, lengths over the reach, below which a pose is singular; a
-choice."""
+"""Ratio of the smallest to the largest singular value of J, lengths in units of the reach, below
+which a pose is singular: joints may turn a thousand times as far as the tool. A choice."""
 
 Pose = tuple[Floats, Floats, Chain]
 """Orientation (N, 3, 3) and position (N, 3) of the tool, base axes, with the chain."""
@@ -216,7 +223,8 @@ def _jacobian(arm: Arm, chain: Chain, position: Floats) -> Floats:
     return jacobian if arm.coupling is None else np.asarray(jacobian @ arm.coupling)
 
 
-BAND = 0.95  # share of points whose error lies within the stated band
+BAND = 0.95
+"""Share of points whose error lies within the stated band."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,9 +248,12 @@ class ToolPoses(Brief):
 
     position: Floats  # (N, 3) m
     rotation: Floats  # (N, 3, 3)
-    nominal_position: Floats  # (N, 3) target, of a fit to deflections that of the unloaded arm
+    nominal_position: Floats
+    """(N, 3) target position: by the nominal arm, or by the unloaded arm for a fit to
+    deflections."""
     nominal_rotation: Floats  # (N, 3, 3)
-    covariance: Floats | None  # (N, 3, 3) of the true position, m²; None if `std` is false
+    covariance: Floats | None
+    """(N, 3, 3) of the true position about `position`, m²; None if `std` is false."""
     outside: tuple[Outside, ...]  # measured ranges that the points leave
 
     @property
@@ -277,7 +288,10 @@ class ToolPoses(Brief):
 
 
 def band(covariance: Floats) -> Floats:
-    """(N,) radius that holds `BAND` of normal vectors with covariance (N, 3, 3), see `band_m`."""
+    """(N,) radius that holds `BAND` of normal vectors with covariance (N, 3, 3).
+
+    |e|² counts as a scaled χ² of the same mean and variance; 0 for a zero covariance.
+    """
     size = np.trace(covariance, axis1=1, axis2=2)
     shape = covariance / np.where(size > 0, size, 1.0)[:, None, None]
     second = np.einsum("nij,nji->n", shape, shape)
@@ -295,7 +309,8 @@ class Compensation(Brief):
     _states: States
     _wanted: tuple[Floats, Floats] | None
     _std: bool
-    unstated: tuple[str, ...] = ()  # columns of `States` that the model needs and the points lack
+    unstated: tuple[str, ...] = ()
+    """Columns of `States` that the model needs and the points lack."""
 
     def _brief(self) -> dict[str, str]:
         return {
@@ -373,7 +388,11 @@ class Compensation(Brief):
         return self._wanted
 
     def to_dict(self, names: Sequence[str]) -> dict[str, object]:
-        """Return the document of `compensate --json`, SI; `names` of the points."""
+        """Return the document of `compensate --json`, SI; `names` of the points.
+
+        `expected_error_m` is the root sum square of the inversion's residual and the position's
+        standard deviation.
+        """
         calibration, before, after = self._calibration, self.before, self.after
         columns: dict[str, Sequence[Any]] = {
             "name": names,

@@ -19,8 +19,8 @@ from hilcal.calibration.compensation import MAX_JOINT_STEP, TOLERANCE, Inverse, 
 from hilcal.effects.protocol import FRAME_ROLES, Effect, Situation
 from hilcal.optional import install
 from hilcal.readings.readings import States
-from hilcal.robot import se3
 from hilcal.readings.whitening import Mode
+from hilcal.robot import se3
 from hilcal.robot.chain import Deviation
 from hilcal.types import Floats
 
