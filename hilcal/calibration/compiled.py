@@ -7,7 +7,8 @@ wrenches is compared with
     ξ_k = b_k + Q_k q + C_k w_k
 
 (tables T, P, G by cubic splines). An effect that needs times, temperatures or sides of approach
-gives a, b and s of each point. A model with another effect is evaluated as everywhere else.
+gives a, b and s of each point. A model with an effect of another form is not compiled, but
+evaluated as everywhere else, some hundred times slower.
 """
 
 from dataclasses import dataclass, replace
@@ -255,7 +256,7 @@ class Compiled:
         return not (len(by_angle) or len(soft)) or bool(np.all(np.abs(q) <= TURN))
 
     def compensate(self, states: States, goal: tuple[Floats, Floats] | None) -> Inverse:
-        """Joint values and residuals of N points.
+        """Joint values (N, n) and residuals (N, 2), m and rad.
 
         `goal` are target orientations (N, 3, 3) and positions (N, 3), m, base axes; if None, those
         of the nominal arm (for deflections: the unloaded arm) at q.

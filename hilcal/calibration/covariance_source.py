@@ -1,11 +1,13 @@
 """The covariance of a calibration's parameters, stored as the quantities it is computed from.
 
-The covariance of a thousand parameters has a million numbers, but follows from few:
+A transmission error has over a thousand parameters, most of which the readings do not determine.
+Their covariance has a million numbers of very different sizes, but follows from few:
 
     κ C = κ σ² S V (E + σ²)⁻¹ Vᵀ S,      S AᵀA S = V E Vᵀ
 
 A (R, P) is the whitened Jacobian of the fitted states, S the prior standard deviations, σ² the
-noise factor, κ as in `calibration`. It takes seconds, once, when an uncertainty is first needed.
+noise factor, κ as in `calibration`. States, their noise and S take some hundred kilobytes. A and
+its eigenvectors take seconds to compute, once, when an uncertainty is first needed.
 """
 
 import base64

@@ -4,11 +4,15 @@ Between two joints every transform is, with the common normal of their axes,
 
     L = Rz(φ) Tz(s) Tx(a) Rx(α) Tz(t) Rz(ψ)
 
-and the parts about z add to the joints' offsets and distances: rows represent the relative poses of
-all axes exactly (of nearly parallel ones with large d, which cancel), but neither that of the first
-axis in the base nor that of the flange on the last axis, B and E, stated beside the rows:
+and the parts about z add to the joints' offsets and distances, so that rows represent the relative
+poses of all axes exactly. The common normal of nearly parallel axes is far away: d of both joints
+is then large, and cancels. Rows represent neither the pose of the first axis in the base nor that
+of the flange on the last axis:
 
     T_base_flange = B Π_i row_i(q_i) E
+
+B has no part about z at its end, E none at its beginning. `base_m_rad` and `flange_m_rad` state
+them beside the rows.
 
 Source: Craig, *Introduction to Robotics*, sections 3.3 and 3.4; Hayati, "Robot arm geometric link
 parameter estimation", IEEE CDC 1983, for parallel axes.

@@ -2,14 +2,17 @@
 
 URDF: fixed-axis roll, pitch, yaw and xyz of every joint's origin; every joint turns about its z.
 
-UR's kinematics file (`ur_description`, `config/*/default_kinematics.yaml`; of a single arm by
-`ur_calibration`) has one origin per joint in the frames of that package: those of this program
-moved along the joints' axes, the first relative to `base_link_inertia`, the controller's base. It
-has no origin for the flange: that part of the last transform belongs to the tool, see `frames`.
+UR's kinematics file (`ur_description`, `config/*/default_kinematics.yaml`; written for a single arm
+by `ur_calibration`) has one origin per joint in the frames of that package, which are those of this
+program moved along the joints' axes. The first origin is relative to `base_link_inertia`, which is
+the controller's base (`base`), half a turn about z from `base_link`. The file has no origin for the
+flange; the part of the last transform that cannot move before the last joint belongs to the tool,
+see `frames`.
 
-An effect whose deviation is the same in every state and under every load (an encoder's zero, a
-link's length) goes into the constant transforms, from the declared base to the declared flange, see
-`identification.registration.robot_frames`. All other effects are listed as not included.
+An effect whose deviation is the same in every state and under every load (an encoder's zero, a link
+of another length or angle) goes into the constant transforms, from the declared base to the
+declared flange, see `identification.registration.robot_frames`. All other effects (compliances,
+gear waves, temperature) are listed as not included.
 """
 
 import hashlib
@@ -145,7 +148,8 @@ def ur_kinematics(
 ) -> tuple[str, Floats]:
     """Return UR's kinematics file, and (4, 4) from its last frame to the flange.
 
-    `digest` is the driver's name of the arm's calibration, "calib_…"; else a hash of the content.
+    `digest` is the driver's name of the connected arm's calibration, "calib_…"; the driver logs an
+    error if the file has another. If None, a hash of the file's content is used.
     """
     if not nominal.name.startswith("ur") or arm.n != len(UR_JOINTS):
         raise InputError(f"{nominal.name}: UR's kinematics file is for UR arms")
@@ -177,9 +181,10 @@ def frames(
 ) -> str:
     """Return the frames that a controller asks for, as JSON: x, y, z, rx, ry, rz in m and rad.
 
-    `tool_on_flange` is of the corrected arm. A controller computes with its own arm: its tool
-    centre point includes the constant part of the last link. `beyond_flange` (4, 4) is what
-    `ur_kinematics` returns, or None.
+    `base_in_tracker` is the base of everything that is exported, `base_is` its origin.
+    `tool_on_flange` is of the corrected arm. A controller computes with its own arm: under
+    "controller", its tool centre point includes the constant part of the last link, in m and, as
+    PolyScope shows it, in mm. `beyond_flange` (4, 4) is what `ur_kinematics` returns, or None.
     """
     tool, base = calibration.tool_pose(), calibration.base_in_tracker()
     nominal, arm = calibration.model.cell.arm, corrected_arm.arm

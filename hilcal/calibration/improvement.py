@@ -1,15 +1,20 @@
 """Position errors of the tool before and after the correction, as the tracker measured them.
 
-The error of a point, by a reading y in the recorded state x, tracker's axes:
+The error of a point is the distance of the tool from its target position, by a reading y:
 
     e = (y − ŷ(x)) + p̂(x) − p_wanted
 
-ŷ is the reading and p̂ the tool's position by the fitted model, so that modelled drift and scale of
-the instruments are subtracted. Where deflections were fitted, y is a loaded minus an unloaded
-reading, and p_wanted the position of the unloaded arm.
+x is the recorded state of the reading, ŷ the reading that the fitted model predicts for x, p̂ the
+tool's position by the same model, all in the tracker's axes. For a model whose only part of the
+instruments is the registration T, e = y − T p_wanted; otherwise modelled drift and scale of the
+instruments are subtracted.
 
-At corrected joint values p̂(x) = p_wanted in the expected state, and e is the prediction error of a
-reading that was not fitted, with the tracker's noise and the arm's repeatability.
+Where deflections were fitted, y is a loaded reading minus the unloaded one of the same point, and
+p_wanted is the position of the unloaded arm: e is then relative to the measured unloaded position.
+
+At corrected joint values p̂(x) = p_wanted if x is the expected state, and e is the prediction error
+of a reading that was not fitted: its covariance is that of the prediction, with the tracker's noise
+and the arm's repeatability.
 """
 
 from collections.abc import Sequence
@@ -123,9 +128,11 @@ def improvement(
     goal: States,
     left_out: Sequence[tuple[str, str]] = (),
 ) -> Improvement:
-    """Compare readings of the same points, in one order, at uncorrected and corrected joints.
+    """Compare readings of the same points at uncorrected and at corrected joint values.
 
-    `goal` are states at which the nominal arm has the tool at its target; not for deflections.
+    Both have the same poses in the same order, for deflections with the unloaded readings of the
+    points. `goal` are states of `before` at which the nominal arm has the tool at its target; not
+    used for deflections.
     """
     first, _, _ = _errors(calibration, p, before, goal)
     last, covariance, noise = _errors(calibration, p, after, goal)

@@ -1,8 +1,8 @@
 """The measured ranges of a calibration, points outside of them, and means of missing columns.
 
-Where an effect needs a quantity x that the points lack (temperature, time, side of approach), its
-mean x̄ while measuring is used, and the motion of the tool by x − x̄ at measured states counts as a
-variance of each axis of the tool's position p:
+A table of points or a program seldom states temperatures, times or sides of approach. Where an
+effect of the model needs such a quantity x, its mean x̄ while measuring is used. The motion of the
+tool by x − x̄ at measured states then counts as a variance of each axis of the tool's position p:
 
     v = mean over measured states of (|p(x) − p(x̄)|² + |(J(x) − J(x̄)) R|²) / 3
 

@@ -1,9 +1,10 @@
 """Target points for the tool, read from a table.
 
-One row per point and a header, in any kind of file that `import` reads. A table of readings, of the
-exchange format or by a mapping, is a table of points, too: its other columns are ignored. Where no
-column has a name of this list or of the exchange format, a mapping is guessed as by
-`import --preview`, and used if nothing in it is unsure.
+The table has one row per point and a header; kind of file, separator and decimal mark may be those
+that `import` reads. A table of readings, of the exchange format or by a mapping, is a table of
+points, too: columns that are not listed here (covariances, cycles, actual joints, `x_…`) are
+ignored. Where no column has a name of this list or of the exchange format, a mapping is guessed as
+by `import --preview`, and used if nothing in it is unsure.
 
 - `pose`: name of the point; points without names are numbered.
 - `q1_rad` … or `q1_deg` …: joint values, of slides `q1_m` or `q1_mm`. Alone, they state the target

@@ -10,14 +10,16 @@ is solved for σ², one for all joints. Where S − N is below its standard unce
 replaces it. Where C contains the arm's scatter already, all of S counts as scatter. Without repeats
 the scatter is what the arm's maker states.
 
-The uncertainty budget (GUM, JCGM 100:2008) of a measured minus a predicted position or deflection,
-root mean square over poses that were not fitted:
+An uncertainty budget in the sense of the GUM (JCGM 100:2008): the measurand is a position (in
+deflection mode: a deflection) as the instrument measures it at a pose that was not fitted, minus
+the position that the calibration predicts. Its combined standard uncertainty is the root mean
+square over such poses,
 
     u² = κ c² + e² + s² + n²
 
-of the parameters estimated without the pose, c (see `predictive`), the misfit beyond the noise, e,
-the arm's scatter, s, and the instrument, n. κ makes u at least the error at held-out poses. The
-expanded uncertainty is U = k u with k = 2.
+of the parameters estimated without the pose, c (see `predictive`), of the model's misfit beyond the
+noise, e, of the arm's scatter from one arrival to the next, s, and of the instrument, n. κ makes u
+at least the error at held-out poses. The expanded uncertainty is U = k u with k = 2.
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,9 @@
 """A calibration as one JSON file with everything that predicting and compensating needs.
 
-The covariance is stored in the smaller of two forms: its factor, as 32-bit floats, each row scaled
-by its parameter's standard deviation; or (key `learnt`) the source that it is computed from, if
-that reproduces the standard deviations at fitted states to `STD_TOLERANCE`.
+The covariance is stored in the smaller of two forms. One is its factor, as 32-bit floats, each row
+scaled by its parameter's standard deviation. The other (key `learnt`) is the source that it is
+computed from, if that reproduces the standard deviations at fitted states to `STD_TOLERANCE`, which
+is checked before writing. Everything else is decimal numbers, exactly.
 """
 
 import base64

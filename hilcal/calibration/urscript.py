@@ -1,16 +1,18 @@
 """The waypoints of a URScript program, and the program with other joint values in their place.
 
-A waypoint, the target of `movej`, `movel`, `movep` or `servoj`, is understood if it is the same in
-every run: joint values `[q1, …, q6]`, a pose `p[x, y, z, rx, ry, rz]`, a variable that is assigned
-one of these once, before it and in a block around it, or `get_inverse_kin(pose, qnear=joints)`. A
-list of joint values replaces its text; all else stays. The program is refused if anything in it may
-change the meaning of a corrected waypoint: an unknown function, another tool or payload on the way,
-a value that depends on the arm's position.
+A waypoint is the target of `movej`, `movel`, `movep` or `servoj`. It is understood if it is the
+same in every run: joint values `[q1, …, q6]`, a pose `p[x, y, z, rx, ry, rz]`, a variable that is
+assigned one of these once in the whole program, before the waypoint and in a block around it, or
+`get_inverse_kin(pose, qnear=joints)`. A list of joint values, which all of these functions accept,
+replaces its text; the rest of the program does not change, nor do other waypoints. The program is
+refused if anything in it may change the meaning of a corrected waypoint: an unknown function, a
+change of tool or payload on the way, a value that depends on the arm's position.
 
-A pose is of the tool centre point that `set_tcp(p[…])` set before it. Of its up to eight solutions
-`get_inverse_kin` takes the one nearest to `qnear`, `movej` the one nearest to the arm's position:
-the previous waypoint if this one always follows it. The manual does not state the measure of the
-distance. A straight motion stays on its branch, whatever joint values state its target.
+A pose is of the tool centre point that `set_tcp(p[…])` set before it. It has up to eight solutions.
+`get_inverse_kin(pose, qnear=joints)` takes the solution nearest to `joints`, `movej` to a pose the
+one nearest to the arm's position, which is the previous waypoint if this one always follows it. The
+manual does not state the measure of the distance. A straight motion stays on the branch on which it
+begins, whatever joint values state its target. A correction holds on one branch only.
 
 Source: Universal Robots, *The URScript Programming Language*, e-Series, software 5.11.
 """
@@ -181,7 +183,11 @@ UNCHECKED = (
 
 
 def movej_program(names: Sequence[str], q: Floats) -> str:
-    """Return a program, for a script port (30001 to 30003), that moves to joint values (N, 6)."""
+    """Return a program that moves to joint values (N, 6) one after the other.
+
+    The controller runs it when it is sent to a script port (30001 to 30003). Nobody has checked
+    its motions, which begin wherever the arm stands; its first line says so.
+    """
     rows = zip(names, q, strict=True)
     lines = [f"  movej({urscript_list(row)})  # {escaped(name)}" for name, row in rows]
     return "\n".join([f"def compensated():  {CORRECTED}; {UNCHECKED}", *lines, "end", ""])

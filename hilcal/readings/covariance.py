@@ -8,11 +8,16 @@ the scatter of the joints from one arrival to the next, J the Jacobian of the ta
 (`joint_scatter`).
 
 The third term needs the registration; it is added when the readings are opened
-(`identification.noise.full_covariance`), with σ_q from [repeatability], where the file states that
-the stored covariances cover the instrument alone (`COVERS_KEY`, `INSTRUMENT`): those of a measured
-campaign, of a table, or of `tracker_covariance`. Nothing is added where they include the arm's
-scatter (`INSTRUMENT_AND_ARM`: column `covers`, or [repeatability] in_tables = true), nor to files
-of older versions, which do not state it.
+(`identification.noise.full_covariance`), with σ_q from [repeatability]. The file states what the
+stored covariances cover (`COVERS_KEY`):
+
+- a measured campaign stores the first two terms: `INSTRUMENT`, the third is added;
+- an imported campaign stores what its table states, or `tracker_covariance` where the table states
+  none. Both are taken as the instrument's: `INSTRUMENT`, the third is added. Where the table's
+  covariances include the arm's scatter, its column `covers` says so ("instrument+arm", which
+  `hilcal export` writes), or the cell does ([repeatability] in_tables = true):
+  `INSTRUMENT_AND_ARM`, and nothing is added;
+- to a campaign whose file does not state it, of an older version, nothing is added.
 
 Two readings share the scatter of an arrival, and noise that is correlated along their order; two
 deflections share the error of their unloaded readings (`measurement_covariance`).
@@ -82,7 +87,8 @@ def tracker_covariance(
 
         Cov = J diag(σ_az², σ_el², (a + b d)²) Jᵀ = (c + e d)² (I - u uᵀ) + (a + b d)² u uᵀ
 
-    with d σ_el = d cos(el) σ_az = c + e d. The rotation of a pose (m = 6) has σ_o² I.
+    where the angles' errors are equal across the beam: d σ_el = d cos(el) σ_az = c + e d. The
+    rotation of a pose (m = 6) has the covariance σ_o² I.
     """
     beam = np.asarray(position, dtype=float)
     beam = beam if station is None else beam - np.asarray(station, dtype=float)
@@ -109,8 +115,9 @@ def covariance_of_mean(
 
         R = (ν0 (1 - s) τ Σ̄ + Σ_k r_k r_kᵀ) / (ν0 + K - 1)        Cov = s Σ̄ + R / K
 
-    Averaging does not reduce the systematic share s. R is the posterior mean with an inverse
-    Wishart prior worth ν0 repeats (Gelman et al., *Bayesian Data Analysis*, section 3.6).
+    The share s of Σ̄ is the same in all samples: averaging does not reduce it. R is the posterior
+    mean of the random covariance with the stated one, times τ, as an inverse Wishart prior worth ν0
+    = `PRIOR_REPEATS` repeats (Gelman et al., *Bayesian Data Analysis*, section 3.6).
     """
     count = len(deviations)
     prior = PRIOR_REPEATS * (1 - systematic_share) * factor * stated
@@ -184,8 +191,9 @@ def measurement_covariance(
 ) -> Floats:
     """(G, L·m, L·m) covariance D C Dᵀ of the measurements of each group, D = [I, −weights].
 
-    C has the blocks V_i, F_i F_jᵀ for two readings of one arrival, and φ S_i C_ij S_jᵀ where their
-    noise is correlated, see `readings.readings`. A group has L loaded and U unloaded rows.
+    C, the covariance of all readings of a group, has the blocks V_i, and F_i F_jᵀ for two readings
+    of one arrival; where their noise is correlated, φ S_i C_ij S_jᵀ is added, see
+    `readings.readings`. A group has L loaded and U unloaded rows, (G, L) and (G, U).
     """
     rows = np.concatenate([loaded, reference], axis=1)
     groups, count = rows.shape

@@ -5,10 +5,12 @@ the stated covariance V_i of reading i is not white: with S_i S_iᵀ = V_i,
 
     e_i = √(1 − φ) w_i + √φ S_i z_i,    Cov(z_i, z_j) = exp(−|t_i − t_j| / τ) 1
 
-w_i independent of covariance V_i, each element of z an Ornstein-Uhlenbeck process, t the time of a
-reading, or its number in the order (AR(1), ρ = exp(−1/τ)). S_i is the symmetric root of V_i's
-correlation matrix times the standard deviations, nearly the same for nearly the same V, in any
-units. V excludes what the arm draws anew in each arrival: its scatter, estimated or shared.
+w_i independent of covariance V_i, each element of z an Ornstein-Uhlenbeck process. So the stated
+covariance holds for each reading. t is the time of a reading, or its number in the order, where
+z is an AR(1) process with ρ = exp(−1/τ). S_i is the symmetric root of V_i's correlation matrix
+times the standard deviations: neighbours with nearly the same V have nearly the same S, in any
+units. V excludes an estimated scatter of the arm and the error that targets share in one arrival:
+the arm draws these anew in each arrival.
 
 Source: Gelb (ed.), *Applied Optimal Estimation* (1974), section 3.8 (exponentially correlated
 noise).
@@ -37,7 +39,8 @@ class States(Brief):
 
     Attributes:
         q: (N, n) commanded joint angles, rad.
-        wrench: (N, 6) force and moment by the load at the load point, base axes, N and N·m.
+        wrench: (N, 6) force and moment that the load exerts on the tool at the load point,
+            base axes, N and N·m; zero where unloaded.
         time: (N,) time since the campaign's start, s; None when unknown.
         load_time: (N,) time under the present load, s.
         air_temperature: (N,) °C.
@@ -46,8 +49,10 @@ class States(Brief):
         q_actual: (N, n) joint angles that the encoders reported, rad.
         torque: (N, n) measured static torques of the drives, N·m: the negative of those by load
             and weight about the drives' axes (`Situation.torque`); NaN in readings without them.
-        target: (N,) number of the target, as in `Cell.target_names`; None where there is one.
-        observer: (N,) number of the observer, as in `Readings.observers`; None for one tracker.
+        target: (N,) number of the target that is read, in the order of `Cell.target_names`; None
+            where the tool carries one target.
+        observer: (N,) number of the observer, in the order of `Readings.observers`; None where one
+            tracker reads all.
     """
 
     q: Floats
@@ -90,7 +95,8 @@ class ArmScatter:
     """An estimate of the arm's scatter; see `identification.noise.arm_scatter`.
 
     Attributes:
-        kind: "joints" (one σ for all), "each joint", or "isotropic" (of the target's position).
+        kind: "joints" (one σ for all of them), "each joint" (one σ per joint), or "isotropic" (of
+            the target's position).
         std: σ of each, rad, or m where isotropic.
         std_error: their standard uncertainties.
         size_m: rms over the readings of the 3-D displacement of the target.
@@ -134,7 +140,8 @@ class SerialNoise:
             every effect that the readings could show.
         proved: whether that gain is significant; False where effects explain the readings as well.
         instead: what explains them as well, where it is not proved.
-        wider: least and largest factor on the standard uncertainties of the parameters.
+        wider: least and largest factor by which it changes the standard uncertainties of the
+            parameters.
     """
 
     clock: Clock
@@ -188,15 +195,18 @@ class Readings(Tabular):
         pose_names: names of the poses, as in the table.
         target_names: names of the targets that `states.target` numbers; empty where it is None.
         observers: what `states.observer` numbers; empty where it is None.
-        common: (N, m, n) factors F of the error that readings i, j of one arrival (`arrivals`)
-            share: Cov(i, j) = F_i F_jᵀ, F_i F_iᵀ in `covariance`; None where none is known.
+        common: (N, m, n) factors F of the error that all readings of one arrival have in common:
+            Cov(i, j) = F_i F_jᵀ for two readings i, j of one arrival (see `arrivals`); F_i F_iᵀ
+            is part of `covariance`. None where no such error is known.
         scatter_stated: whether the arm's own scatter is in the covariances, as far as it is known;
             where False, `hilcal.diagnose` may attribute the remaining misfit to it.
         noise_stated: whether the noise is stated; where False, it was estimated from these
             readings, so that χ² does not test the model.
-        stated: (N, m, m) `covariance` without an estimated scatter; None where it has none.
+        stated: (N, m, m) the covariance without a scatter that was estimated; None where
+            `covariance` has none.
         arm_scatter: the estimate that `covariance` includes beside `stated`.
-        serial: how the noise is correlated along the readings, as estimated; None if white.
+        serial: how the noise of the readings is correlated along their order, as estimated; None
+            for noise that is white.
         along: (N,) t of `serial`: time, s, or number in the order of the campaign.
     """
 
@@ -308,7 +318,8 @@ class Readings(Tabular):
         """(N,) number of the arrival of the arm in which each reading was taken.
 
         Readings of different targets, or by different observers, at one pose, under one load, in
-        one cycle are of one arrival; a target that was read k times there, of k arrivals, in order.
+        one cycle are of one arrival: the arm did not move between them. A target that was read
+        several times there was read in as many arrivals, in the order of the readings.
         """
         where = self.pose, self.load, self.cycle
         order, first, sizes = in_groups(numbered(*where, self.line))

@@ -5,8 +5,10 @@ it was read, and whether a load was on. Names of poses and loads, times, covaria
 of the rows do not count, since a table may be imported again with others; nor does the wrench,
 which changes with the configured mass of a load.
 
-Numbers agree within `LENGTH_M`, `ANGLE_RAD` and `ATTITUDE_RAD`, far below a tracker's scatter. A
-digest of rounded numbers would not do: copies on both sides of a rounding boundary differ.
+Numbers agree within `LENGTH_M`, `ANGLE_RAD` and `ATTITUDE_RAD`. A tracker's scatter is far
+larger: readings that were taken again at the same pose differ by more in some element, unless the
+instrument's last digit is coarser than its scatter. A digest of rounded numbers would not do: two
+copies on both sides of a rounding boundary have different digests, however fine the rounding is.
 """
 
 from collections.abc import Sequence

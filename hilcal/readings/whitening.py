@@ -1,12 +1,14 @@
 """Task-variable scaling: the one place where noise enters.
 
 A scaling matrix G multiplies both sides of A c = ΔX so that the errors G ε become
-independent, of unit spread, and pure numbers. G is block diagonal, stacked by size of the blocks:
-one per reading (absolute) or pose group (deflections share their unloaded reading); where targets
-share the scatter F_i F_jᵀ of an arrival (`Readings.common`), one per arrival, or per pose and
-cycle. Noise that is correlated along the order of the readings (`Readings.serial`) makes blocks of
-up to `RUN` measurements, without the correlation across their ends; their S is Cholesky's factor,
-so that whitened rows are innovations.
+independent, of unit spread, and pure numbers. G is block diagonal: one block per reading
+(absolute) or per pose group (deflections of one pose share their unloaded reading). Where several
+targets were read in one arrival of the arm, they share its scatter F_i F_jᵀ (`Readings.common`):
+absolute readings have one block per arrival, deflections one per pose and cycle, all targets
+together. The blocks are kept stacked by size; nothing of size (readings)² exists. Noise that is
+correlated along the order of the readings (`Readings.serial`) makes blocks of runs of them, up to
+`RUN` measurements; the correlation across the ends of a run is neglected. Their S is Cholesky's
+factor: the whitened rows of a measurement are its innovation, which earlier ones do not predict.
 
     none   G = I
     gu     G = diag(1/M_ik), M_ik the standard deviation of element k of measurement i
@@ -143,10 +145,13 @@ def inverse_root(covariance: Floats, scaling: Scaling = "gc") -> Floats:
     """Whitening matrices S⁻¹ (..., k, k) of covariances (..., k, k).
 
     For `gc`, V = D C D with D the standard deviations and C = U Λ Uᵀ the correlation matrix;
-    S = D U Λ^½, so that S Sᵀ = V and S⁻¹ ε does not depend on the units of ε.
+    S = D U Λ^½, so that S Sᵀ = V and S⁻¹ ε does not depend on the units of ε. (The
+    eigenvectors of V itself would turn with the units; every S with S Sᵀ = V gives the same
+    estimate.)
 
-    Rule for rank-deficient V: an element of zero variance, or a direction whose eigenvalue of C is
-    below 1e-10 of the largest, is left out: its row of S⁻¹ is zero, and no degree of freedom.
+    Rule for rank-deficient V: an element of zero variance, or a direction whose eigenvalue
+    of C is below 1e-10 of the largest, has no stated noise to weigh it by. It is left out:
+    its row of S⁻¹ is zero, and does not count as a degree of freedom.
     """
     k = covariance.shape[-1]
     if scaling == "none":

@@ -50,7 +50,8 @@ _OPEN = Path("/proc/self/fd")
 class CampaignFile:
     """An open campaign file; use it in a `with` statement.
 
-    Readings and revisions cannot be changed; once appended they survive a loss of power.
+    Readings and revisions cannot be changed or deleted. They survive a kill of the process and a
+    loss of power once `append_readings` or `append_revision` has returned.
     """
 
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
@@ -75,7 +76,10 @@ class CampaignFile:
         more_texts: Mapping[str, str] | None = None,
         readings: Readings | None = None,
     ) -> Self:
-        """Make a campaign, which appears when complete; `overwrite` replaces campaigns only."""
+        """Make a campaign; the file appears only when it is complete.
+
+        It may `overwrite` an existing campaign, never a file of another kind.
+        """
         path = Path(path)
         meta = {"config": config_json, "base_dir": base_dir, "source": source}
         meta |= {"created": utc_now(), "program_version": __version__, **running_command()}
@@ -89,7 +93,10 @@ class CampaignFile:
     def open(
         cls, path: str | Path, *, read_only: bool = False, check_revisions: bool = True
     ) -> Self:
-        """Open a campaign; refuse a damaged one, and with `check_revisions` a `bad_revision`."""
+        """Open a campaign and check that it is complete and undamaged.
+
+        Bad revisions (`bad_revision`) are refused with `check_revisions`.
+        """
         path = Path(path)
         if path.exists() and not (path.is_file() or path.is_dir()):
             raise InputError(f"{path}: a device or a pipe; valid: a campaign file")
@@ -297,7 +304,8 @@ class CampaignFile:
     def bad_revision(self) -> tuple[int, str] | None:
         """Return number and defect of the first revision that is damaged or of other readings.
 
-        Its hash is of the fitted readings; in older files also of some appended during the fit.
+        A revision's hash must be that of the first readings: of those that were fitted, or, in
+        files of older programs, of those and the next ones, which were appended during the fit.
         """
         records, damaged = self._sound_revisions()
         fitted = [(r.number, *basis) for r in records if (basis := fitted_to(r)) is not None]

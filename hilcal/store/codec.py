@@ -1,7 +1,8 @@
 """The codec of all stored values: to JSON by their fields, and back by their types.
 
-A dataclass becomes an object of its fields; arrays and tuples become lists; infinite numbers the
-texts "inf" and "-inf". A missing field has its default, and unknown ones are ignored: older files.
+A dataclass becomes an object of its fields; arrays and tuples become lists; infinite numbers, which
+JSON lacks, become the texts "inf" and "-inf". When decoding, a missing field has its default, and
+unknown fields are ignored, so that files of older programs can be read.
 """
 
 import base64

@@ -1,4 +1,8 @@
-"""Texts that a campaign stores: the files of its robot, and the command that made it."""
+"""Texts that a campaign stores: the files of its robot, and the command that made it.
+
+With these texts a campaign can be read on any machine, without a file outside of it. The command
+line sets the command as typed while it runs.
+"""
 
 import json
 import shlex

@@ -78,7 +78,8 @@ class Plan(Brief):
     def skipping(self, poses: Sequence[str], done: frozenset[Step], cycle: int) -> "Plan":
         """Return what is missing besides `done`, without some poses; `about` lists these.
 
-        Across a gap the arm moves by the home pose, and reads it; `cycle` is new in the campaign.
+        Across a gap the arm moves by the pose where loads are changed, and reads it, as the planner
+        has it where a straight motion is not known to be clear. `cycle` is new in the campaign.
         """
         missing, home = self.without(done).steps, self.home
         valid = list(dict.fromkeys(s.pose for s in missing if s.pose != home))
@@ -189,8 +190,9 @@ def _steps(data: object, names: tuple[str, ...], where: str) -> tuple[Step, ...]
 def with_new_names(plan: Plan, campaign: Plan, number: int) -> Plan:
     """Return plan number `number` of a campaign with names and cycles that are new in it.
 
-    The reference pose becomes that of the campaign. A pose with a name of the campaign at other
-    joints gets a new name; at the same joints its readings get new cycles.
+    The reference pose becomes that of the campaign, so that the drift refers to it. A pose with a
+    name of the campaign at other joints gets a new name. At the same joints it is the same pose,
+    and its readings get new cycles, with separate unloaded readings.
     """
     if plan.q.shape[1] != campaign.q.shape[1]:
         raise InputError(

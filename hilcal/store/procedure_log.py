@@ -1,8 +1,10 @@
 """The log of a calibration, and the purpose of a campaign.
 
-Entries are only appended; with readings, plans and revisions of the file they are the complete
-state of the procedure (`hilcal.procedure`). A validation campaign's file states its purpose: fits
-refuse it until it is released, which the file records for good.
+Entries are only appended to the campaign file. With the readings, plans and revisions of the file
+they are the complete state of the procedure (`hilcal.procedure`).
+
+The readings of a validation campaign must never have been fitted. Its file states the purpose, and
+fits refuse it until it is released; the release is recorded in the file for good.
 """
 
 import json
@@ -44,7 +46,10 @@ class ProcedureLog:
         plan: Plan | None = None,
         revisions: Sequence[RevisionRecord] = (),
     ) -> tuple[int, ...]:
-        """Append an entry, a further plan and revisions, whose numbers are returned, or nothing."""
+        """Append an entry with a further plan (`RunLog.with_new_names`) and revisions, or nothing.
+
+        Returns the numbers of the revisions, which the entry has as "revisions".
+        """
         log = None if plan is None else RunLog(self._campaign)
         with self._campaign.transaction() as connection:
             number = len(self.entries()) + 1

@@ -25,7 +25,10 @@ class RepairResult:
 
 
 def repair(path: Path) -> RepairResult | None:
-    """Set aside the first bad revision, all later ones, and all entries that name one of them."""
+    """Set aside the first bad revision, all later ones, and all entries that name one of them.
+
+    Later revisions may depend on the bad one. The readings must be undamaged.
+    """
     with CampaignFile.open(path, check_revisions=False) as file:
         if file.n_readings:
             file.readings()

@@ -120,8 +120,9 @@ def _unpacked(
 def content_hash(readings: Readings) -> str:
     """Return the SHA-256 (hex) of readings in order.
 
-    The hash depends on every number and on the names of poses, loads and targets; not on how these
-    are numbered, or on a scatter of the arm that was estimated from the readings.
+    The hash depends on every number and on the names of poses, loads and targets. It does not
+    depend on the numbering of names, on names without readings, on how the readings were appended,
+    or on a scatter of the arm that was estimated from them.
     """
     readings = readings.as_stated()
     sha = hashlib.sha256()

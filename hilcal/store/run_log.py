@@ -67,9 +67,10 @@ def check_same_cell(campaign: CampaignFile, config: CellConfig, base_dir: Path) 
 
 
 class RunLog:
-    """Plans, readings and events that a run writes into its campaign file, durably.
+    """Plans, readings and events that a run writes into its campaign file.
 
-    A reading, its step and its raw details are stored together or not at all, no step twice.
+    All writing is durable before a method returns. A reading, its step and its raw details are
+    stored together or not at all, and no step twice.
     """
 
     def __init__(self, campaign: CampaignFile) -> None:

@@ -126,7 +126,8 @@ def sqlite_errors(path: Path) -> Iterator[None]:
 def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
     """Open an existing file; every commit is durable before it returns.
 
-    With `read_only` nothing is written, unless SQLite has to undo a killed program's transaction.
+    With `read_only` neither the file nor files next to it are written, unless it has the journal of
+    a killed program: SQLite has to undo the unfinished transaction before it can be read.
     """
     _refuse_write_ahead_log(path)
     unfinished = _journal(path)
@@ -184,8 +185,9 @@ def _refuse_write_ahead_log(path: Path) -> None:
 def lock(path: Path) -> int | None:
     """Return a descriptor by which this process alone measures; refuse if another one does.
 
-    The lock is of a byte far from SQLite's, and ends with the descriptor. Where a file cannot be
-    written, or has no locks, there is none. Source: fcntl(2), open file description locks.
+    The lock is of a byte far from those that SQLite locks, and ends when the descriptor is closed,
+    or with the process. Where a file cannot be written, or has no locks, there is none. Source:
+    fcntl(2), open file description locks; over NFS, flock(2) would lock SQLite out.
     """
     with suppress(OSError):
         handle = os.open(path, os.O_RDWR)
@@ -205,7 +207,11 @@ def lock(path: Path) -> int | None:
 
 @contextmanager
 def transaction(connection: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
-    """Commit all changes of the block, or none."""
+    """Commit all changes of the block, or none.
+
+    An interrupt between the statement `with` and its block leaves the transaction open; the next
+    transaction or the end of the connection rolls it back.
+    """
     if connection.in_transaction:  # of an interrupt between `with` and its block
         connection.execute("ROLLBACK")
     connection.execute("BEGIN IMMEDIATE")

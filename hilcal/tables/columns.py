@@ -271,7 +271,11 @@ def check_actual_joints(
 
 
 def check_positions(table: ColumnTable, position: Floats, q: Floats, arm: Arm) -> None:
-    """Refuse positions (N, 3) that cannot be metres: too far, too far apart, or all the same."""
+    """Refuse positions (N, 3) that cannot be metres.
+
+    No reading is further than 100 m from its instrument; all lie within a few reaches of each
+    other; and joints that move by more than 0.1 rad move the target.
+    """
     distance = np.linalg.norm(position, axis=1)
     for (i,) in first_true(distance > MAX_DISTANCE):
         j = int(np.argmax(np.abs(position[i])))
@@ -318,7 +322,8 @@ def check_rotations(table: ColumnTable, rotation: Floats) -> None:
 def check_covariances(table: ColumnTable, covariance: Floats) -> None:
     """Refuse covariances (N, m, m) that no error can have.
 
-    The correlation matrix must be positive semi-definite: eigenvalues >= -1e-9, in any units.
+    A covariance is positive semi-definite; tested on the correlation matrix D V D with
+    D = diag(V)^-1/2, so that the answer does not depend on units: eigenvalues >= -1e-9.
     """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     for i, j in first_true(variance < 0):

@@ -1,4 +1,8 @@
-"""The table of a file: a `Grid` of cells, and a `ColumnTable` of columns with a meaning."""
+"""The table of a file: a `Grid` of cells, and a `ColumnTable` of columns with a meaning.
+
+`hilcal.tables.files` reads a file into a `Grid`. The names of its columns (exchange table) or a
+mapping give them a meaning, which makes a `ColumnTable` of numbers and texts.
+"""
 
 import itertools
 from collections.abc import Callable, Collection, Sequence

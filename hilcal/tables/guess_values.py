@@ -86,8 +86,8 @@ def time_unit(
 def guess_by_values(g: words.Guesser) -> None:
     """Find positions and joints among columns whose names say nothing.
 
-    Neighbouring columns are tried: positions vary by hundreds (mm) or stay small (m), joint angles
-    stay within a turn.
+    Neighbouring columns are tried: positions vary by hundreds (mm) or stay small (m), joint
+    angles stay within one turn. Where several choices are as good, a note says so.
     """
     named = words.NOMINAL | words.STD | words.TIME | words.TEMPERATURE | words.LOAD | words.MASS
     free = []

@@ -1,7 +1,8 @@
 """Matrices of a MAT file, read in a process of their own.
 
-The compiled reader of scipy crashes on some damaged files (`python -m tests.fuzz mat`), or asks for
-any memory that a header states: neither ends the program there.
+The compiled reader of scipy crashes on some damaged files (found by `python -m tests.fuzz mat`) and
+may ask for any amount of memory that a damaged header states. In a process of its own, with limits,
+neither ends the program. It returns matrices of numbers and lists of texts, no objects.
 """
 
 import io

@@ -1,7 +1,8 @@
 """Readings of a moving arm that do not fit into memory: a Parquet file, chunk by chunk.
 
-The columns are those of the exchange table, without `pose`, `load` and `cycle`. A worker reads one
-row group of the file, in chunks of `CHUNK` rows, so that memory does not grow with either.
+The columns are those of the exchange table, without `pose`, `load` and `cycle`: each row is a
+reading that stands alone. A worker reads one row group of the file, in chunks of `CHUNK` rows, so
+that memory does not grow with the file or its row groups.
 """
 
 from collections.abc import Iterator

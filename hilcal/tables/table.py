@@ -360,8 +360,9 @@ def named_loads(readings: Readings, config: CellConfig) -> tuple[Readings, tuple
 def without_copies(readings: Readings) -> tuple[Readings, tuple[str, ...]]:
     """Leave out rows that are copies of another row to the last digit, with a note.
 
-    Equal rows stay in different cycles, or where rows have no times and positions are rounded to
-    more than their noise; copies of another pose's row where their pose has other rows.
+    A repeated measurement scatters, a copy does not. Equal rows may be measurements, and stay, in
+    different cycles, or where rows have no times and positions are rounded to more than their
+    noise. Copies of another pose's row stay where their pose has rows that are no copies.
     """
     s, value = readings.states, readings.value
     rounding = np.sqrt(12.0 * rounding_variance(value[:, :3], 1.0))

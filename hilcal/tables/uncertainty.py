@@ -34,9 +34,10 @@ def mapped_covariance(
 
         V = E D C D Eᵀ + V_tracker
 
-    with D the standard deviations, C their correlation, E the axes about which the angles turn, and
-    the instrument's covariance where the mapping adds it; orientations without a stated uncertainty
-    have the instrument's. None where the table states none; m² and rad².
+    with D the standard deviations (of the position's axes and the orientation's angles), C their
+    correlation, E the axes about which the angles turn, and the instrument's covariance where the
+    mapping adds it. Orientations without a stated uncertainty have the instrument's. None where
+    the table states none; m² and rad².
     """
     m = 3 if angles is None else 6
     if mapping.std is not None:
@@ -179,8 +180,9 @@ def floored(
 ) -> tuple[Floats, tuple[str, ...]]:
     """Raise variances that are zero, or far below the others, to the instrument's.
 
-    A reading without scatter (0.000) would outweigh all others. `instrument` is the covariance of
-    the noise in [tracker]; None if unknown.
+    An instrument that writes 0.000 has some scatter below its last digit; a reading without any
+    would outweigh all others. Adding to a diagonal element of a covariance (N, m, m) keeps it
+    positive. `instrument` is the covariance of the noise in [tracker]; None if unknown.
     """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     m = variance.shape[1]

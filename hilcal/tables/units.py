@@ -1,12 +1,14 @@
 """Units and conventions: their size in SI, lengths and durations, orientations.
 
-Every convention gives the rotation R of the target's axes into the sensor's; "intrinsic" angles
-turn about the axes of the turned frame, "fixed" ones about the sensor's, in order of the columns:
+Every convention gives the rotation R that maps the target's axes into the sensor's. Angles in
+the order of their columns; "intrinsic" turns about the axes of the turned frame, "fixed" about
+those of the sensor:
 
     intrinsic-zyx:  R = R_z(a) R_y(b) R_x(c)        fixed-xyz:  R = R_z(c) R_y(b) R_x(a)
 
-Source: the makers' manuals, as collected in the pose formats of the Basler stereo visard
-documentation; the export formats of the SpatialAnalyzer manual.
+Source of the makers' conventions: their manuals, as collected in the pose formats of the Basler
+stereo visard documentation (KUKA, FANUC, ABB, Yaskawa, Mitsubishi, Universal Robots) and the
+export formats of the SpatialAnalyzer manual.
 """
 
 import math

@@ -8,9 +8,10 @@ along z,
     N_k = H_{k−1}⁻¹ M_k G_k,   G_k = Rz(·) Tz(·),   H_k = Rz(o_k) G_k,   N'_k = H_{k−1}⁻¹ C_k G_k
 
 o_k is the difference between the joint's zeros in the file and in the controller. H_{−1} is from
-the base of the arm to that of the file: the identity, or half a turn about z (as of UR's `base`).
-G_n is from the flange to the tip. G and H do not contain the file's own errors, so that N' is
-exact. One transform is changed for each N'_k: that of its joint, or of the first step after all.
+the base of the arm to that of the file: the identity, or half a turn about z (as between `base` and
+`base_link` of a UR arm). G_n is from the flange to the tip. G and H do not contain the file's own
+errors, which may be millimetres, so that N' is exact. One transform is changed for each N'_k: that
+of its joint, after the last joint that of the first step.
 """
 
 import re

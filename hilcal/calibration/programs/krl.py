@@ -5,9 +5,10 @@ turn T) and `E6AXIS`, `AXIS` (degrees), declared with a value, or written into a
 bit 0 for a wrist centre behind axis 1 and bit 1 for axis 3 beyond the stretched arm, `T` a bit for
 each axis at a negative angle; the controller obeys both in PTP motions and neither on paths.
 
-Tool and base are `$TOOL` and `$BASE`, set earlier in the text by an assignment, `BAS(#TOOL, n)`, an
-inline form (`FDAT`), or in the motion (`WITH`). They are unknown after a branch or a loop that sets
-them, and after the call of a subprogram, which may.
+Tool and base are `$TOOL` and `$BASE`, set earlier in the text by an assignment, `BAS(#TOOL, n)`,
+`BAS(#BASE, n)`, by an inline form (`FDAT`), or in the motion (`WITH`). Values that are set within a
+branch or a loop are unknown after its end, and both after the call of a subprogram, which may set
+them.
 
 Source: KUKA, *KUKA System Software 8.3, Operating and Programming Instructions for System
 Integrators*, chapters 10 to 12; *Expert Programming*, status and turn.
