@@ -25,7 +25,6 @@ import numpy as np
 
 from hilcal.calibration.compensation import (
     Compensation,
-    Inverse,
     Pose,
     ToolPose,
     ToolPoses,
@@ -220,8 +219,7 @@ class Calibration(Brief):
             goal = np.array(pose[:, :3, :3]), np.array(pose[:, :3, 3])
         kernel = self._kernel(tool_pose)
         if isinstance(kernel, Compiled) and kernel.covers(states.q):
-            solution, residual = kernel.compensate(states, goal)
-            inverse = Inverse(solution, residual[:, 0], residual[:, 1])
+            inverse = kernel.compensate(states, goal)
         else:
             model, theta = tool_pose.model, tool_pose.theta
 

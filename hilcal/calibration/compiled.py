@@ -16,24 +16,22 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.calibration.compensation import MAX_JOINT_STEP, TOLERANCE, ToolPose, in_chain
+from hilcal.calibration.compensation import MAX_JOINT_STEP, TOLERANCE, Inverse, ToolPose, in_chain
 from hilcal.effects.protocol import FRAME_ROLES, Effect, Situation
 from hilcal.optional import install
 from hilcal.readings.readings import States
 from hilcal.readings.whitening import Mode
+from hilcal.robot import se3
 from hilcal.robot.chain import Deviation
 from hilcal.types import Floats
 
-TURN = 2 * np.pi
-"""Angles of the tables reach from −TURN to TURN."""
+TURN = 2 * np.pi  # angles of the tables reach from −TURN to TURN
 NODES = 16385
 """Nodes of a table over angles: 120 waves per turn with amplitudes of 0.1 mrad are met to 1e-11."""
 TORQUE_NODES = 40001
-TORQUES = 3.0
-"""Range of tables over torques, in units of the joint's limit."""
+TORQUES = 3.0  # range of tables over torques, in units of the joint's limit
 TRIALS = 64
-EXACT = 1e-12
-"""Largest difference, rad and m, between an effect and the form that represents it."""
+EXACT = 1e-12  # largest difference, rad and m, between an effect and the form that represents it
 
 
 class CompiledForm:
@@ -116,7 +114,6 @@ class CompiledForm:
         return True
 
     def _by_torque(self, e: Effect, theta: Floats, s: Situation, deviation: Deviation) -> bool:
-        """Add displacements that depend on the joint's own torque alone."""
         n = s.angle.shape[1]
         torque = TORQUES * np.where(np.isfinite(s.cell.arm.torque_max), s.cell.arm.torque_max, 1e3)
         share = np.linspace(-1.0, 1.0, TORQUE_NODES)
@@ -174,7 +171,6 @@ def fixed_columns_suffice(e: Effect, theta: Floats, s: Situation) -> bool:
 
 
 def _unit_torque(s: Situation) -> Floats:
-    """Return wrenches of 1 N·m about the axes alone."""
     unit = np.zeros_like(s.wrench)
     unit[..., 5] = 1.0
     return unit
@@ -214,13 +210,7 @@ def _waves(e: Effect, theta: Floats, s: Situation) -> tuple[Floats, Floats]:
 def repeated(s: Situation, count: int) -> Situation:
     """Return the first state, repeated `count` times."""
     rows = np.zeros(count, dtype=np.int64)
-    chain = replace(
-        s.chain,
-        rotation=s.chain.rotation[:, rows],
-        position=s.chain.position[:, rows],
-        com=s.chain.com[:, rows],
-        twist=None if s.chain.twist is None else s.chain.twist[:, rows],
-    )
+    chain = se3.by_field([s.chain], lambda arrays: arrays[0][:, rows])
     load = replace(s.load, wrench=s.load.wrench[rows])
     return replace(
         s, states=s.states[rows], angle=s.angle[rows], chain=chain, wrench=s.wrench[rows], load=load
@@ -228,7 +218,6 @@ def repeated(s: Situation, count: int) -> Situation:
 
 
 def _only(d: Deviation) -> bool:
-    """Whether a deviation moves joints and slots alone."""
     return all(f is None for f in (d.base, d.station, d.target, d.scale, d.observer))
 
 
@@ -266,9 +255,7 @@ class Compiled:
         _, (by_angle, _, soft) = self.tables
         return not (len(by_angle) or len(soft)) or bool(np.all(np.abs(q) <= TURN))
 
-    def compensate(
-        self, states: States, goal: tuple[Floats, Floats] | None
-    ) -> tuple[Floats, Floats]:
+    def compensate(self, states: States, goal: tuple[Floats, Floats] | None) -> Inverse:
         """Joint values (N, n) and residuals (N, 2), m and rad.
 
         `goal` are target orientations (N, 3, 3) and positions (N, 3), m, base axes; if None, those
@@ -296,7 +283,7 @@ class Compiled:
             self.reach, MAX_JOINT_STEP, TOLERANCE, q, wrench, packed(rotation), packed(position),
             True, out, residual,
         )  # fmt: skip
-        return out, residual
+        return Inverse(out, residual[:, 0], residual[:, 1])
 
     def _at_points(self, states: States) -> tuple[Floats, Floats, Floats]:
         """Displacements (N, n), twists (N, n + 1, 6) and compliances (N, n) of the points."""

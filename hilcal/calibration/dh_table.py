@@ -35,12 +35,9 @@ from hilcal.types import Floats
 
 Convention = Literal["standard", "modified"]
 CONVENTIONS: tuple[Convention, ...] = ("standard", "modified")
-PARALLEL = 1e-9
-"""rad; axes at a smaller angle count as parallel, which moves the tool by a nanometre."""
-CROSSED = 0.1
-"""rad; above this tilt the end of a chain is represented by rows, as a link is; a choice."""
-EXACT = 1e-9
-"""m; smaller differences are not reported."""
+PARALLEL = 1e-9  # rad; of axes that count as parallel, which moves the tool by a nanometre
+CROSSED = 0.1  # rad; above this tilt the end of a chain is in rows, as a link is; a choice
+EXACT = 1e-9  # m; smaller differences are not reported
 TRIALS = 200
 
 
@@ -159,7 +156,6 @@ def to_toml(rows: DhRows, arm: Arm, title: str) -> str:
 
 
 def _ranges(arm: Arm, k: int) -> dict[str, object]:
-    """Kind, limits and torque of a joint, as a row states them."""
     low, high, torque = (float(x[k]) for x in (arm.q_min, arm.q_max, arm.torque_max))
     if arm.slides[k]:
         out: dict[str, object] = {"type": "prismatic", "q_min_m": low, "q_max_m": high}

@@ -107,43 +107,40 @@ def matlab(arm: Arm, name: str, note: str = "") -> str:
 
     Bodies base, link_1 …, tool0; each joint turns about z of its fixed transform.
     """
-    out = [f"function robot = {name}()"]
-    out += [f"% {escaped(line)}" for line in note.split("\n")]
-    out += [
-        f"robot = rigidBodyTree('DataFormat', 'row', 'MaxNumBodies', {arm.n + 1});",
-        "robot.Gravity = [0 0 -9.80665];",
-    ]
+    comment = "\n".join(f"% {escaped(line)}" for line in note.split("\n"))
+    out = f"""function robot = {name}()
+{comment}
+robot = rigidBodyTree('DataFormat', 'row', 'MaxNumBodies', {arm.n + 1});
+robot.Gravity = [0 0 -9.80665];
+"""
     for k, transform in enumerate(arm.links):
         moving = k < arm.n
         body, kind = (f"link_{k + 1}", "revolute") if moving else ("tool0", "fixed")
         joint = escaped(arm.joint_names[k]).replace("'", "''") if moving else "flange"
-        out += [
-            "",
-            f"body = rigidBody('{body}');",
-            f"joint = rigidBodyJoint('{joint}', '{kind}');",
-            f"setFixedTransform(joint, [{'; '.join(_numbers(row) for row in transform)}]);",
-        ]
+        out += f"""
+body = rigidBody('{body}');
+joint = rigidBodyJoint('{joint}', '{kind}');
+setFixedTransform(joint, [{"; ".join(map(_numbers, transform))}]);
+"""
         if moving:
             low, high = float(arm.q_min[k]), float(arm.q_max[k])
             limited = np.isfinite(low) and np.isfinite(high)
             limits = (low, high) if limited else (-FULL_TURN, FULL_TURN)
             home = min(max(0.0, limits[0]), limits[1])
-            out += [
-                "joint.JointAxis = [0 0 1];",
-                f"joint.PositionLimits = [{limits[0]:.17g} {limits[1]:.17g}];",
-                f"joint.HomePosition = {home:.17g};",
-            ]
+            out += f"""joint.JointAxis = [0 0 1];
+joint.PositionLimits = [{limits[0]:.17g} {limits[1]:.17g}];
+joint.HomePosition = {home:.17g};
+"""
         mass, com = (arm.masses[k], arm.coms[k]) if moving else (0.0, np.zeros(3))
         square = mass * (com @ com * np.eye(3) - np.outer(com, com)) + 0.4 * mass * 0.01 * np.eye(3)
         inertia = square[[0, 1, 2, 1, 0, 0], [0, 1, 2, 2, 2, 1]]
-        out += [
-            f"body.Mass = {mass:.17g};",
-            f"body.CenterOfMass = [{_numbers(com)}];",
-            f"body.Inertia = [{_numbers(inertia)}];",
-            "body.Joint = joint;",
-            f"addBody(robot, body, '{'base' if k == 0 else f'link_{k}'}');",
-        ]
-    return "\n".join([*out, "end", ""])
+        out += f"""body.Mass = {mass:.17g};
+body.CenterOfMass = [{_numbers(com)}];
+body.Inertia = [{_numbers(inertia)}];
+body.Joint = joint;
+addBody(robot, body, '{"base" if k == 0 else f"link_{k}"}');
+"""
+    return f"{out}end\n"
 
 
 def ur_kinematics(

@@ -21,10 +21,8 @@ from hilcal.types import Floats
 
 Arrays = tuple[Floats, ...]
 
-ROUNDS = 40
-"""Rounds at most; five are usual."""
-SETTLED = 1e-12
-"""Change of the deviations that ends the rounds, m and rad."""
+ROUNDS = 40  # rounds at most; five are usual
+SETTLED = 1e-12  # change of the deviations that ends the rounds, m and rad
 
 
 @njit(cache=True)
@@ -40,7 +38,6 @@ def _interpolate(x: float, low: float, step: float, table: Floats) -> float:
 
 @njit(cache=True)
 def _product(a: Floats, b: Floats, out: Floats) -> None:
-    """Write a b, (3, 3) each; `out` is another array."""
     for i in range(3):
         for j in range(3):
             out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]

@@ -53,9 +53,7 @@ class MeasuredRanges:
     """Ranges of the fitted readings."""
 
     ranges: tuple[Range, ...]  # of joint angles, force, moment, temperatures
-    most_std_m: float
-    """Standard deviation of the tracked target's predicted position, by the parameters alone, above
-    which a point is far from all fitted ones."""
+    most_std_m: float  # std of the target, by the parameters alone, of points far from fitted ones
 
     @classmethod
     def of(
@@ -106,8 +104,7 @@ CONDITION_NAMES = {
     "approach": "sides of approach",
 }
 """Columns of `States` whose mean a calibration may know, with their names for people."""
-MAX_STATES = 200
-"""Measured states at which variances are computed, evenly spread; a choice."""
+MAX_STATES = 200  # measured states at which variances are computed, evenly spread; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -31,19 +31,7 @@ from hilcal.errors import InputError
 from hilcal.names import quoted
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
-from hilcal.tables.columns import (
-    POSITION,
-    ROTATION,
-    USER_PREFIX,
-    WRENCH,
-    approach_columns,
-    check_rotations,
-    independent_columns,
-    joint_columns,
-    known_columns,
-    temperature_columns,
-    with_following,
-)
+from hilcal.tables import columns as exchange
 from hilcal.tables.files import open_grid
 from hilcal.tables.grid import ColumnTable
 from hilcal.tables.mapped import mapped_table
@@ -54,14 +42,10 @@ from hilcal.tables.units import LENGTHS
 from hilcal.types import Floats
 
 NO_LOAD = "none"
-NEAREST_RAD = 0.5
-"""rad; a solution within this distance of the start counts as the nearest. A choice."""
-N_STARTS = 300
-"""Random starts to find all branches from; a choice: an arm of six joints has up to 16."""
-LIMIT_PENALTY = 1e3
-"""rad; added to the distance of a solution beyond the joints' limits."""
-LEAST_REACH, LONGEST_TOOL = 0.05, 0.5
-"""Least distance of the farthest point over the reach, and largest beyond it, m; choices."""
+NEAREST_RAD = 0.5  # a solution within this distance of the start counts as the nearest; a choice
+N_STARTS = 300  # random starts to find all branches from, of six joints up to 16; a choice
+LIMIT_PENALTY = 1e3  # rad; added to the distance of a solution beyond the joints' limits
+LEAST_REACH, LONGEST_TOOL = 0.05, 0.5  # of the farthest point: over, and beyond the reach, m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,10 +56,8 @@ class Points:
     q: Floats  # (N, n) joint values, rad; rows of NaN where only a pose is stated
     target_poses: Floats | None = None
     """(N, 4, 4) T_base_tool, NaN where joint values state the target; None if they do for all."""
-    wrench: Floats | None = None
-    """(N, 6) force and moment at the load point, base axes; None if not stated."""
-    sensor_wrench: Floats | None = None
-    """(N, 6) change of the force sensor's reading by the load, sensor axes; None if not stated."""
+    wrench: Floats | None = None  # (N, 6) at the load point, base axes; None if not stated
+    sensor_wrench: Floats | None = None  # (N, 6) change of the sensor's reading, sensor axes
     recorded: Mapping[str, Floats] = field(default_factory=dict)  # other columns of `States`
     guess: str = ""  # meaning of guessed columns, for people
 
@@ -108,8 +90,8 @@ def read_points(
             f"{table.at(k)}: a joint at {np.abs(q[k]).max():.4g} rad; columns q1_rad … are in rad, "
             "q1_deg … in degrees"
         )
-    if ROTATION[0] in table.number:
-        check_rotations(table, columns["rotation"])
+    if exchange.ROTATION[0] in table.number:
+        exchange.check_rotations(table, columns["rotation"])
     pose_names = table.text.get("pose")
     names = tuple(pose_names) if pose_names else tuple(str(k + 1) for k in range(len(table.rows)))
     wrench, sensed = columns.pop("wrench", None), columns.pop("sensed", None)
@@ -136,7 +118,7 @@ def _plain(path: Path, arm: Arm, groups: "_Groups") -> ColumnTable | None:
 
     try:
         table = ColumnTable.of(open_grid(path, _form(path), check), *chosen)
-        return with_following(table, arm)
+        return exchange.with_following(table, arm)
     except _OtherNamesError:
         return None
 
@@ -183,7 +165,6 @@ def solutions(arm: Arm, tool: Floats, near: Floats | None, goal: Floats) -> Floa
 
 
 def _everywhere(arm: Arm) -> Floats:
-    """(STARTS, n) random joint values over the whole range of the joints."""
     low, high = arm.usual_range
     spread = np.random.default_rng(0).random((N_STARTS, arm.n))
     return arm.complete(low + spread * (high - low))
@@ -216,7 +197,6 @@ def _nearest(arm: Arm, tool: Floats, name: str, near: Floats, goal: Floats) -> F
 
 
 def _form(path: Path) -> FileFormat:
-    """Return the format of a table: plain CSV, or its separator and decimal mark."""
     try:
         with path.open(encoding="utf-8", errors="replace") as stream:
             header = stream.readline(limits.LINE)
@@ -268,9 +248,8 @@ def _certain_unit(proposed: GridProposal, arm: Arm) -> bool:
 
 
 def _mapped(path: Path, arm: Arm, mapping: PointMapping) -> ColumnTable:
-    """Return a table by its mapping, with the columns listed above."""
     mapped = mapped_table(path, mapping, arm)
-    table = with_following(mapped.table, arm)
+    table = exchange.with_following(mapped.table, arm)
     text = {"pose": table.text["pose"]}
     if mapping.load is not None:
         text["load"] = table.text["load"]
@@ -283,34 +262,35 @@ _Groups = list[tuple[str, tuple[str, ...], Floats | float]]
 
 def _groups(arm: Arm) -> _Groups:
     """Groups of columns that come together: their quantity, their names, and the factor to SI."""
-    q, n, degree = joint_columns(arm.units), arm.n, np.pi / 180
+    q, n, degree = exchange.joint_columns(arm.units), arm.n, np.pi / 180
     q_other = tuple(f"{c}m" if c.endswith("_m") else c.replace("_rad", "_deg") for c in q)
     return [
         ("q", q, 1.0),
         ("q", q_other, np.where(arm.slides, 1e-3, degree)),
-        ("position", POSITION, 1.0),
-        ("position", tuple(name.replace("_m", "_mm") for name in POSITION), 1e-3),
-        ("rotation", ROTATION, 1.0),
-        ("rotation", tuple(name.replace("_rad", "_deg") for name in ROTATION), degree),
-        ("wrench", WRENCH, 1.0),
-        ("sensed", tuple(f"sensor_{name}" for name in WRENCH), 1.0),
+        ("position", exchange.POSITION, 1.0),
+        ("position", tuple(name.replace("_m", "_mm") for name in exchange.POSITION), 1e-3),
+        ("rotation", exchange.ROTATION, 1.0),
+        ("rotation", tuple(name.replace("_rad", "_deg") for name in exchange.ROTATION), degree),
+        ("wrench", exchange.WRENCH, 1.0),
+        ("sensed", tuple(f"sensor_{name}" for name in exchange.WRENCH), 1.0),
         ("air_temperature", ("air_degC",), 1.0),
-        ("joint_temperature", temperature_columns(n), 1.0),
+        ("joint_temperature", exchange.temperature_columns(n), 1.0),
         ("load_time", ("load_time_s",), 1.0),
         ("time", ("time_s",), 1.0),
-        ("approach", approach_columns(n), 1.0),
+        ("approach", exchange.approach_columns(n), 1.0),
     ]
 
 
 def _checked(
     path: Path, header: Sequence[str], groups: _Groups, arm: Arm
 ) -> tuple[Sequence[str], Sequence[str]]:
-    """Check a header; return its text and its number columns."""
     listed = [name for _, names, _ in groups for name in names]
-    exchanged = set(known_columns(arm.units))
+    exchanged = set(exchange.known_columns(arm.units))
     ours = {*listed, *exchanged} - {"pose", "load", "target"}
     for name in header:
-        if name not in (*listed, "pose", "load", *exchanged) and not name.startswith(USER_PREFIX):
+        if name not in (*listed, "pose", "load", *exchanged) and not name.startswith(
+            exchange.USER_PREFIX
+        ):
             if not ours & set(header):
                 raise _OtherNamesError(f"{path}: no column of a table of points")
             valid = ", ".join(("pose", "load", *listed))
@@ -323,7 +303,7 @@ def _checked(
     first: dict[str, list[str]] = {"hung": ["load"] * ("load" in header)}
     for quantity, names, _ in groups:
         missing = [name for name in names if name not in header]
-        needed = names if quantity != "q" else independent_columns(names, 0, arm)
+        needed = names if quantity != "q" else exchange.independent_columns(names, 0, arm)
         lacks = [name for name in missing if name in needed]
         if lacks and len(missing) < len(names):
             raise InputError(f"{path}: column '{lacks[0]}' is missing beside its group")

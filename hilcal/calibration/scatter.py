@@ -38,15 +38,8 @@ from hilcal.robot.chain import Chain, drive_jacobian, evaluate
 from hilcal.types import Floats
 
 ScatterSource = Literal["estimated", "stated", "repeats", "maker", "industry", "unknown"]
-"""Source of a scatter:
-
-- estimated: the fit, from its residuals;
-- stated: `[repeatability]` of the cell;
-- repeats: scatter of repeated readings beyond the instrument's noise;
-- maker: the pose repeatability that the robot's file states;
-- industry: that of industrial arms, where the robot's file states none;
-- unknown: a calibration file of an older program, which assumed zero.
-"""
+"""From the fit's residuals; `[repeatability]` of the cell; repeated readings; the robot's file;
+industrial arms, where that states none; unknown in a file of an older program."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,8 +102,7 @@ def _shown_by_repeats(fit: Fit) -> float | None:
     return float(std) if std > 0.0 else None
 
 
-COVERAGE = 2.0
-"""Coverage factor k, as is usual (GUM, 6.3.3)."""
+COVERAGE = 2.0  # coverage factor k, as is usual (GUM, 6.3.3)
 
 
 @dataclass(frozen=True, slots=True)

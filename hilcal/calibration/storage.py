@@ -32,12 +32,9 @@ from hilcal.store.codec import decode, encode, frames, numbers, read_document
 from hilcal.types import Floats
 
 FORMAT, VERSION = "hilcal-calibration", 2
-FACTOR_VERSION = 1
-"""Version of a file with the factor of the covariance, which older programs read."""
-STD_TOLERANCE = 5e-3
-"""Largest relative change of a standard deviation by the source form; a choice."""
-CHECKED_STATES = 40
-"""Fitted states at which that is checked."""
+FACTOR_VERSION = 1  # version of a file with the factor of the covariance, which older programs read
+STD_TOLERANCE = 5e-3  # largest relative change of a standard deviation by the source form; a choice
+CHECKED_STATES = 40  # fitted states at which that is checked
 _CELL = (
     *("target", "load_point", "tool_mass", "tool_com", "gravity", "registration", "targets"),
     *("target_names", "known_targets", "registration_known", "measured_torques"),

@@ -30,6 +30,7 @@ import numpy as np
 from hilcal import limits
 from hilcal.calibration.compensation import invert_nominal, nominal_pose
 from hilcal.calibration.points import Points
+from hilcal.calibration.programs.program import Span, edited
 from hilcal.calibration.urscript_statements import Statement, statements
 from hilcal.errors import InputError
 from hilcal.names import escaped
@@ -41,8 +42,7 @@ JOINTS = 6
 STRAIGHT = ("movel", "movep")
 MOVE_FUNCTIONS = {"movej": 4, "movel": 4, "movep": 3, "servoj": None}
 """Functions that move to a waypoint, with the index of the argument that is the blend radius."""
-MAX_NAMED = 5
-"""Most lines that an error names."""
+MAX_NAMED = 5  # most lines that an error names
 _OTHER_MOVES = ("movec", "servoc", "speedj", "speedl")
 """Functions of other motions, which are not corrected."""
 _STOPS = ("stopj", "stopl")
@@ -83,11 +83,9 @@ _ARITHMETIC: dict[type[ast.operator], Callable[[float, float], float]] = {
 }
 """Without division: whether URScript divides integers to integers is not known."""
 
-_LARGEST = 2.0**31
-"""Integers of a controller overflow here."""
+_LARGEST = 2.0**31  # integers of a controller overflow here
 
-Value = float | tuple[str, tuple[float, ...]]
-"""A number, or a list ("") or pose ("p") of numbers."""
+Value = float | tuple[str, tuple[float, ...]]  # a number, or a list ("") or pose ("p") of numbers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,15 +95,13 @@ class Waypoint:
     line: int  # of the program, from 1
     start: int  # offset of its target in the text
     end: int  # offset of the target's end
-    q: Floats | None = None
-    """(6,) joint values, or those that select the branch of `pose`, rad; None if not stated."""
+    q: Floats | None = None  # (6,) joint values, or those that select the branch of `pose`, rad
     pose: Floats | None = None  # (4, 4) T_base_tool; None where the joint values are the target
     tool: Floats | None = None  # (4, 4) T_flange_tool that was set; None if none
     blend_m: float = 0.0  # radius within which the arm passes without a stop, m
     not_corrected: str = ""  # why it is not corrected; empty if it is understood
     straight: bool = False  # whether the motion to it is a straight line
-    follows_previous: bool = False
-    """Whether the previous waypoint of the text always comes right before it."""
+    follows_previous: bool = False  # whether that of the text before always comes right before it
 
 
 def waypoints(program: str) -> tuple[Waypoint, ...]:
@@ -168,14 +164,11 @@ def with_joints(program: str, corrected: Sequence[Waypoint], q: Floats) -> str:
     mark = re.compile(r"\r?$", re.MULTILINE).search(
         program, corrected[0].end if first is None else first.end()
     )
-    edits = [(w.start, w.end, urscript_list(v)) for w, v in zip(corrected, q, strict=True)]
+    pairs = zip(corrected, q, strict=True)
+    edits = [(Span(0, w.start, w.end), urscript_list(row)) for w, row in pairs]
     if mark is not None:
-        edits.append((mark.start(), mark.start(), f"  {CORRECTED}"))
-    parts, end = [], 0
-    for start, stop, text in sorted(edits):
-        parts += [program[end:start], text]
-        end = stop
-    return "".join([*parts, program[end:]])
+        edits.append((Span(0, mark.start(), mark.start()), f"  {CORRECTED}"))
+    return edited(program, edits)
 
 
 def urscript_list(values: Floats) -> str:
@@ -202,8 +195,6 @@ def movej_program(names: Sequence[str], q: Floats) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Program:
-    """Statements, and the values of their variables."""
-
     statements: tuple[Statement, ...]  # in the order of the text
     functions: frozenset[str]  # names of functions that it defines
     bound: dict[str, list[tuple[int, ast.expr | None]]]
@@ -214,7 +205,6 @@ class _Program:
 
     @classmethod
     def of(cls, program: tuple[Statement, ...]) -> "_Program":
-        """Collect names."""
         bound: dict[str, list[tuple[int, ast.expr | None]]] = {}
         functions, elements = set(), set()
         for k, s in enumerate(program):
@@ -282,7 +272,6 @@ class _Program:
         return self.computed[assignment]
 
     def contains(self, outer: int, k: int) -> bool:
-        """Whether the block of statement `outer` contains statement k."""
         blocks = self.statements[outer].blocks
         return self.statements[k].blocks[: len(blocks)] == blocks
 
@@ -303,7 +292,6 @@ class _Program:
         return None if q is goal is None else (q, goal)
 
     def why_not(self, node: ast.expr, s: Statement) -> str:
-        """Say why a target is not understood."""
         reason = f"the waypoint '{s.text_of(node)[:40]}' is computed while the program runs"
         if isinstance(node, ast.Name) and node.id in self.bound:
             bound = self.bound[node.id]  # a line with several, of parameters, is named once
@@ -315,7 +303,6 @@ class _Program:
 
 
 def _waypoints(p: _Program) -> tuple[Waypoint, ...]:
-    """Return the motions of all statements, in the order of the text."""
     out: list[Waypoint] = []
     last_blocks: tuple[int, ...] | None = None  # of the waypoint that the arm is at, if known
     at_start = True  # the arm has not moved yet
@@ -393,7 +380,6 @@ def _waypoint(p: _Program, k: int, setup: Mapping[str, tuple[int, list[Value | N
 def _set_up(
     p: _Program, k: int, setup: dict[str, tuple[int, list[Value | None]]], *, moved: bool
 ) -> None:
-    """Record a tool centre point, a payload or gravity in `setup`."""
     s = p.statements[k]
     assert s.call is not None  # noqa: S101 - see `_check_calls`
     name = s.calls[s.call]
@@ -454,19 +440,13 @@ def _pose(value: Value | None) -> Floats | None:
     return None if six is None else se3.matrix(se3.rotation(six[3:]), six[:3])
 
 
-STEPS = 40
-"""Poses between two waypoints of a straight motion; a choice."""
-LARGEST_STEP = 0.5
-"""Turn of a joint between two of these poses above which the motion passes a singularity, rad; a
-choice."""
-SAME_SOLUTION = 1e-6
-"""Largest difference of joint values of the same solution, rad: far above the residual of one, far
-below the distance of two."""
+STEPS = 40  # poses between two waypoints of a straight motion; a choice
+LARGEST_STEP = 0.5  # rad; a larger turn between two of these poses is a singularity; a choice
+SAME_SOLUTION = 1e-6  # rad; largest difference of joint values of the same solution
 BRANCH_MARGIN = 0.05
-"""Margin by which any other solution must be farther for this one to count as the nearest, rad. A
-controller has its own calibrated arm: of 1,024 motions of ur3e, ur5e and ur10e the branch is wrong
-in 1 at 0.02 and in none from 0.05 on, if each joint of each solution is up to 10 mrad off; 17
-remain uncertain at 0.05, 33 at 0.1, 62 at 0.2."""
+"""Margin by which any other solution must be farther for this one to count as the nearest, rad: of
+1,024 motions of ur3e, ur5e and ur10e with joints up to 10 mrad off (a controller has its own
+calibrated arm) the branch is wrong in 1 at 0.02, in none from 0.05 on."""
 NEAREST = "another branch of the arm is as near; joint values in place of the pose say which"
 NOT_STRAIGHT = (
     "a straight motion from the waypoint before ends on another branch of the arm; use movej"
@@ -550,5 +530,4 @@ def _straight(arm: Arm, tool: Floats, begin: Floats, q: Floats) -> Bools:
 
 
 def _turn(angle: Floats) -> Floats:
-    """Angles from -π to π."""
     return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)

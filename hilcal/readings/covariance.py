@@ -55,15 +55,13 @@ class TrackerNoise:
     orientation_std: float = 0.0  # of a small rotation about any axis, rad; 0 if not read
 
     def __post_init__(self) -> None:
-        """Refuse impossible figures."""
         for f in fields(self):
             value = getattr(self, f.name)
             if not np.isfinite(value) or value < 0:
                 raise InputError(f"tracker noise {f.name} = {value}: must be a number >= 0")
-        if self.range_std + self.range_std_per_m == 0:
-            raise InputError("tracker noise: range_std and range_std_per_m are both 0")
-        if self.transverse_std + self.transverse_std_per_m == 0:
-            raise InputError("tracker noise: transverse_std and transverse_std_per_m are both 0")
+        for name in ("range_std", "transverse_std"):
+            if getattr(self, name) + getattr(self, f"{name}_per_m") == 0:
+                raise InputError(f"tracker noise: {name} and {name}_per_m are both 0")
 
 
 def tracker_noise(section: Tracker) -> TrackerNoise:
@@ -160,19 +158,15 @@ def arrival_factors(
 
 def with_scatter(readings: Readings, factor: Floats) -> Readings:
     """Return the readings with a scatter of the arm, F (N, m, k), added: V + F Fᵀ."""
-    total = readings.covariance + factor @ np.swapaxes(factor, 1, 2)
-    return replace(readings, covariance=total, common=_common_factor(readings, factor))
+    total, s = readings.covariance + factor @ np.swapaxes(factor, 1, 2), readings.states
+    shared = None if s.target is None and s.observer is None else factor
+    return replace(readings, covariance=total, common=shared)
 
 
 def scatter_alone(readings: Readings, factor: Floats) -> Readings:
     """Return the readings with the covariance of a scatter F (N, m, k) of the arm alone."""
-    v = factor @ np.swapaxes(factor, 1, 2)
-    return replace(readings, covariance=v, common=_common_factor(readings, factor), serial=None)
-
-
-def _common_factor(readings: Readings, factor: Floats) -> Floats | None:
-    s = readings.states
-    return None if s.target is None and s.observer is None else factor
+    without = replace(readings, covariance=np.zeros_like(readings.covariance), serial=None)
+    return with_scatter(without, factor)
 
 
 def symmetric_root(covariance: Floats) -> Floats:

@@ -68,11 +68,9 @@ class States(Brief):
     observer: Ints | None = None
 
     def __len__(self) -> int:
-        """Return the number of states N."""
         return len(self.q)
 
     def __getitem__(self, rows: Ints | Bools | slice) -> "States":
-        """Return the chosen states."""
         return by_field([self], lambda fields: fields[0][rows])
 
     @staticmethod
@@ -89,7 +87,6 @@ class ObserverName:
     name: str
 
     def __str__(self) -> str:
-        """Return kind and name."""
         return f"{self.kind} {self.name}"
 
 
@@ -178,7 +175,6 @@ class SerialNoise:
 
 
 def _with_tuples(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return fields that JSON holds, its lists as tuples."""
     return {name: tuple(x) if isinstance(x, list) else x for name, x in content.items()}
 
 
@@ -233,11 +229,9 @@ class Readings(Tabular):
     along: Floats | None = None
 
     def __len__(self) -> int:
-        """Return the number of readings N."""
         return len(self.pose)
 
     def __getitem__(self, rows: Ints | Bools | slice) -> "Readings":
-        """Return the chosen readings; names are kept."""
         chosen = by_field([self], lambda fields: fields[0][rows])
         return replace(chosen, states=self.states[rows])
 
@@ -327,15 +321,23 @@ class Readings(Tabular):
         one cycle are of one arrival: the arm did not move between them. A target that was read
         several times there was read in as many arrivals, in the order of the readings.
         """
-        keys = np.stack([self.pose, self.load, self.cycle, self.line], axis=1)
-        _, group = np.unique(keys, axis=0, return_inverse=True)
-        group = group.reshape(-1)
-        order = np.argsort(group, kind="stable")
-        first = np.flatnonzero(np.diff(group[order], prepend=-1))
+        where = self.pose, self.load, self.cycle
+        order, first, sizes = in_groups(numbered(*where, self.line))
         visit = np.empty(len(self), dtype=np.int64)
-        visit[order] = np.arange(len(self)) - np.repeat(first, np.diff(np.append(first, len(self))))
-        keys[:, 3] = visit
-        return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
+        visit[order] = np.arange(len(self)) - np.repeat(first, sizes)
+        return numbered(*where, visit)
+
+
+def numbered(*keys: Ints) -> Ints:
+    """Return (N,) numbers from 0, the same where all keys (N,) are the same."""
+    return np.unique(np.stack(keys, axis=1), axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def in_groups(group: Ints, *first_by: Ints | Bools) -> tuple[Ints, Ints, Ints]:
+    """Order of rows by their group, then by keys, the last first; start and size of each group."""
+    order = np.lexsort((*first_by, group))
+    starts = np.flatnonzero(np.diff(group[order], prepend=-1))
+    return order, starts, np.diff(np.append(starts, len(group)))
 
 
 MARGIN = 0.02  # share of the fitted range by which values may exceed it; a choice

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hilcal.readings.readings import Readings
+from hilcal.readings.readings import Readings, numbered
 from hilcal.types import Bools, Floats
 
 LENGTH_M = 1e-7  # A table in mm with four decimals is off by half of that; a choice
@@ -85,9 +85,7 @@ def never_fitted(readings: Readings, fitted: Readings, deflections: bool) -> tup
     repeated = found_among(readings, fitted)
     if not deflections:
         return repeated, ~repeated
-    keys = np.stack([readings.pose, readings.cycle, readings.target], axis=1)
-    _, group = np.unique(keys, axis=0, return_inverse=True)
-    group = group.reshape(-1)
+    group = numbered(readings.pose, readings.cycle, readings.target)
     spoilt = np.zeros(group.max(initial=-1) + 1, dtype=np.bool_)
     spoilt[group[repeated & readings.unloaded]] = True
     unseen = ~repeated & ~spoilt[group]

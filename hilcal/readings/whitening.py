@@ -26,7 +26,7 @@ from scipy.linalg import block_diag, solve_triangular
 from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.readings.covariance import measurement_covariance, single_covariance
-from hilcal.readings.readings import Readings
+from hilcal.readings.readings import Readings, in_groups, numbered
 from hilcal.robot import se3
 from hilcal.types import Bools, Floats, Ints
 
@@ -37,9 +37,7 @@ def arrival_groups(readings: Readings) -> list[Group]:
     """Group the readings that share the scatter of an arrival; else each is alone."""
     count = len(readings)
     arrival = np.arange(count) if readings.common is None else readings.arrivals
-    order = np.argsort(arrival, kind="stable")
-    starts = np.flatnonzero(np.diff(arrival[order], prepend=-1))
-    sizes = np.diff(np.append(starts, count))
+    order, starts, sizes = in_groups(arrival)
     if len(starts) == count:
         order = np.arange(count)
     groups = []
@@ -71,10 +69,8 @@ def deflection_groups(readings: Readings) -> list[Group]:
     unloaded, target = readings.unloaded[rows], readings.line[rows]
     if readings.common is None:
         keys.append(readings.line)
-    group = _numbered([i[rows] for i in keys])
-    order = np.lexsort((target, ~unloaded, group))
-    starts = np.flatnonzero(np.diff(group[order], prepend=-1))
-    sizes = np.diff(np.append(starts, len(rows)))
+    group = numbered(*(i[rows] for i in keys))
+    order, starts, sizes = in_groups(group, target, ~unloaded)
     count = np.add.reduceat(unloaded[order].astype(np.int64), starts)
     alike = np.zeros_like(starts)
     if readings.common is not None:
@@ -125,16 +121,12 @@ def runs(readings: Readings, groups: Sequence[Group], most: int) -> list[Group]:
     return joined
 
 
-def _numbered(keys: Sequence[Ints]) -> Ints:
-    return np.unique(np.stack(keys, axis=1), axis=0, return_inverse=True)[1].reshape(-1)
-
-
 def has_unloaded(readings: Readings, *also: Ints) -> Bools:
     """Return (N,) which readings have an unloaded one, or are one, in their pose and cycle.
 
     `also` are further numbers (N,) in which the two must agree.
     """
-    group = _numbered([readings.pose, readings.cycle, *also])
+    group = numbered(readings.pose, readings.cycle, *also)
     has = np.zeros(int(group.max()) + 1, dtype=bool)
     has[group[readings.unloaded]] = True
     return np.asarray(has[group])
@@ -212,7 +204,6 @@ class Whitening:
     rank: int  # number of whitened rows that carry information
 
     def __len__(self) -> int:
-        """Return the number of measurements D (readings or deflections)."""
         return len(self.reading)
 
     def raw(self, x: Floats) -> Floats:

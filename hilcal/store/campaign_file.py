@@ -36,12 +36,9 @@ from hilcal.store.rows import Layout, content_hash, layout_of, read_layout
 from hilcal.whole_file import replacing
 
 _TARGETS, _OBSERVERS = "targets", "observers"
-ACCEPTED = "accepted {}"
-"""Keys of the acceptances, numbered from 1; the last one is valid."""
-_MEANWHILE = 1000
-"""Most readings appended during a fit; a choice: each takes a second."""
-_HASHED = 1_000_000
-"""Most readings that are hashed to find the number of fitted ones; a choice: it takes seconds."""
+ACCEPTED = "accepted {}"  # keys of the acceptances, numbered from 1; the last one is valid
+_MEANWHILE = 1000  # most readings appended during a fit; a choice: each takes a second
+_HASHED = 1_000_000  # most readings that are hashed to find the fitted ones; a choice: seconds
 _OTHER_READINGS = (
     "the readings were changed after revision {} had been fitted to them (their SHA-256 is another)"
 )
@@ -236,11 +233,10 @@ class CampaignFile:
 
     def insert_revision(self, record: RevisionRecord) -> int:
         """Append a model revision within the caller's transaction."""
-        number = rows.last_id(self.connection, "revisions") + 1
-        if record.parent == number - 1 and replace(record, parent=None).has_parent:
+        last = rows.last_id(self.connection, "revisions")
+        if record.parent == last and replace(record, parent=None).has_parent:
             record = replace(record, parent=None)
         record, key, posterior = split(record)
-        text = to_text(record)
         if key is not None and key not in self.texts():
             rows.insert_meta(self.connection, key, posterior)
         schema.require(
@@ -249,9 +245,7 @@ class CampaignFile:
             schema.CARRIED_PRIOR * (key is not None),
             schema.CHOSEN_REVISION * (record.parent is not None),
         )
-        row = (number, text, rows.text_crc(str(number), text))
-        rows.insert(self.connection, "revisions", [row])
-        return number
+        return rows.append_text(self.connection, "revisions", to_text(record))
 
     def accepted(self) -> int | None:
         """Return the number of the accepted revision; None where the latest one is used."""

@@ -25,8 +25,7 @@ from hilcal.whole_file import replace_file
 
 T = TypeVar("T")
 _hints = cache(get_type_hints)
-LARGEST = 1e9
-"""Upper bound of all lengths, angles, masses, forces and parameters, in SI units."""
+LARGEST = 1e9  # upper bound of all lengths, angles, masses, forces and parameters, in SI units
 
 
 def encode(value: Any) -> Any:

@@ -15,10 +15,8 @@ from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.names import quoted
 
-ROBOT_FILE = "robot_file"
-"""Key of the file of a robot that is not in the catalogue."""
-CALIBRATION_FILE = "calibration_file"
-"""Key of the file of [robot] calibration."""
+ROBOT_FILE = "robot_file"  # key of the file of a robot that is not in the catalogue
+CALIBRATION_FILE = "calibration_file"  # key of the file of [robot] calibration
 KEYS = {ROBOT_FILE: "model", CALIBRATION_FILE: "calibration"}
 _KINDS = (".urdf", ".toml")
 
@@ -66,8 +64,7 @@ def _robot_value(config_json: str, key: str) -> str:
     return str(robot.get(key) or "") if isinstance(robot, dict) else ""
 
 
-COMMAND = "command"
-"""Key of the command, in the texts of a file and in the options of a revision."""
+COMMAND = "command"  # key of the command, in the texts of a file and in the options of a revision
 _command: ContextVar[str | None] = ContextVar("typed", default=None)
 
 

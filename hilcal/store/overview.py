@@ -89,6 +89,10 @@ def overview(file: CampaignFile) -> Overview:
     events = () if log is None else tuple(log.events())
     r = file.readings() if file.n_readings else None
     revisions, accepted = file.revisions(), file.accepted()
+
+    def of_kind(kind: str) -> list[dict[str, Any]]:
+        return [e for e in events if e["kind"] == kind]
+
     return Overview(
         created=file.created,
         program_version=file.about("program_version") or "",
@@ -101,19 +105,16 @@ def overview(file: CampaignFile) -> Overview:
         planned=None if log is None else len(log.plan.steps),
         measured=0 if log is None else len(log.done()),
         plans=0 if log is None else len(log.plans),
-        instruments=_instruments(events),
+        instruments=_instruments(of_kind("devices")),
         tares=tuple(
-            Tare(e["utc"], np.array(e["force"]["wrench"], dtype=float))
-            for e in events
-            if e["kind"] == "tare"
+            Tare(e["utc"], np.array(e["force"]["wrench"], dtype=float)) for e in of_kind("tare")
         ),
         returns=tuple(
             ReferenceReturn(e["utc"], np.array(e["shift_m"]), float(e["sigma"]), bool(e["over"]))
-            for e in events
-            if e["kind"] == "drift"
+            for e in of_kind("drift")
         ),
-        tool=_last(events, "tool"),
-        repeatability=_last(events, "repeatability"),
+        tool=_content(of_kind("tool")),
+        repeatability=_content(of_kind("repeatability")),
         events=events,
         revisions=revisions,
         accepted=accepted,
@@ -129,7 +130,7 @@ def _count(index: Sequence[int], names: Sequence[str]) -> dict[str, int]:
 def _instruments(events: Sequence[Mapping[str, Any]]) -> tuple[MeasuringDevice, ...]:
     devices: dict[tuple[str, str], MeasuringDevice] = {}
     for event in events:
-        for a in event["answers"] if event["kind"] == "devices" else ():
+        for a in event["answers"]:
             facts, name = dict(a["facts"]), str(a["name"])
             m = _SERIAL.search(name)
             serial = facts.get("serial number") or (m and m[1].rstrip(",;"))
@@ -138,12 +139,9 @@ def _instruments(events: Sequence[Mapping[str, Any]]) -> tuple[MeasuringDevice, 
     return tuple(devices.values())
 
 
-def _last(events: Sequence[Mapping[str, Any]], kind: str) -> Mapping[str, Any] | None:
-    """Return the content of the last event of a kind, without its times."""
-    for event in reversed(events):
-        if event["kind"] == kind:
-            return {k: v for k, v in event.items() if k not in ("kind", "utc", "wall_s")}
-    return None
+def _content(events: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+    last = next(reversed(events), None)
+    return last and {k: v for k, v in last.items() if k not in ("kind", "utc", "wall_s")}
 
 
 def to_json(o: Overview, path: str, covariance: str) -> dict[str, object]:

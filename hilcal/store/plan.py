@@ -17,19 +17,14 @@ from hilcal.shown import Brief
 from hilcal.toml import read_json, suggest
 from hilcal.types import Floats
 
-LARGEST = 1e3
-"""Upper bound of joint angles, rad; a choice: larger numbers are damage."""
+LARGEST = 1e3  # upper bound of joint angles, rad; a choice: larger numbers are damage
 FORMAT = "hilcal-plan"
 VERSION = 1
 UNLOADED = "none"
-REFERENCE = "reference"
-"""The pose of drift checks and load changes."""
-SEEN = "reference_seen_m"
-"""Key of `Plan.about`: where the unloaded target was seen at the reference pose, sensor axes, m."""
-ARM = "robot"
-"""Key of `Plan.about`: the name of the arm that the plan was made for."""
-LEFT_OUT = "left_out"
-"""Key of `Plan.about`: points that are not measured, each with the reason."""
+REFERENCE = "reference"  # the pose of drift checks and load changes
+SEEN = "reference_seen_m"  # key of `Plan.about`: the unloaded target there, sensor axes, m
+ARM = "robot"  # key of `Plan.about`: the name of the arm that the plan was made for
+LEFT_OUT = "left_out"  # key of `Plan.about`: points that are not measured, each with the reason
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +36,6 @@ class Step:
     cycle: int = 0  # readings of one pose and one cycle share their unloaded reading
 
     def __str__(self) -> str:
-        """Return the step for people."""
         return f"{self.pose}, {self.load}, cycle {self.cycle}"
 
 
@@ -143,7 +137,6 @@ def read_plan(text: str, where: str) -> Plan:
 
 
 def _entries(data: object, kind: str, where: str) -> list[Any]:
-    """Return a list of poses or steps; refuse an empty or a long one."""
     if not isinstance(data, list) or not data:
         raise InputError(f'{where}: "{kind}s" must be a list of at least one {kind}')
     limits.check_planned(where, f"{kind}s", len(data))
@@ -151,7 +144,6 @@ def _entries(data: object, kind: str, where: str) -> list[Any]:
 
 
 def _poses(data: object, where: str) -> tuple[tuple[str, ...], Floats]:
-    """Return names (P) and joint angles (P, n) of the poses."""
     rows: dict[str, list[float]] = {}
     for k, pose in enumerate(_entries(data, "pose", where), start=1):
         if not isinstance(pose, dict) or set(pose) != {"name", "q_rad"}:

@@ -20,8 +20,7 @@ from hilcal.store.revision import RevisionRecord, utc_now
 from hilcal.store.run_log import RunLog
 from hilcal.store.stored_schema import check_entry
 
-ENTRY = "calibrate {}"
-"""Keys of the entries, numbered from 1."""
+ENTRY = "calibrate {}"  # keys of the entries, numbered from 1
 
 
 class ProcedureLog:
@@ -69,12 +68,9 @@ def entry(kind: str, content: dict[str, Any]) -> str:
 
 PURPOSE = "purpose"
 """Key of the purpose in the texts of a campaign; a campaign without it may be fitted."""
-VALIDATION = "validation"
-"""Purpose: to test a model."""
-CORRECTED = "corrected"
-"""Purpose: to test the corrected joint targets of a validation campaign."""
-CALIBRATION = "calibration"
-"""Key of the identity of the campaign whose model is tested."""
+VALIDATION = "validation"  # purpose: to test a model
+CORRECTED = "corrected"  # purpose: to test the corrected joint targets of a validation campaign
+CALIBRATION = "calibration"  # key of the identity of the campaign whose model is tested
 RELEASED = "released for fitting"
 
 

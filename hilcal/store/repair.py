@@ -80,7 +80,6 @@ def _naming(file: CampaignFile, first: int) -> tuple[str, ...]:
 def _delete(
     connection: sqlite3.Connection, table: str, key: str, values: tuple[int | str, ...]
 ) -> None:
-    """Delete rows of an immutable table."""
     guard = f"{table}_no_delete"
     (trigger,) = (s for s in schema.statements() if s.startswith(f"CREATE TRIGGER {guard} "))
     connection.execute(f"DROP TRIGGER {guard}")

@@ -15,13 +15,9 @@ from hilcal.store.stored_schema import REVISION, check
 from hilcal.toml import parse_json
 
 STORED_HASH = "stored_sha256"
-"""Key in the options of a revision: hash of the readings as the file stores them.
+"""Key in the options of a revision: hash of the readings as stored, without computed scatter."""
 
-`data_hash` includes the arm's scatter in the covariance, which is computed, so that its last bits
-depend on the machine."""
-
-CELL = "cell"
-"""Key in the options of a revision: the changes of the cell, see `config.cell`."""
+CELL = "cell"  # key in the options of a revision: the changes of the cell, see `config.cell`
 
 
 def utc_now() -> str:
@@ -43,8 +39,7 @@ class RevisionRecord(Brief):
     """A fit as a campaign file stores it; all mappings are JSON."""
 
     effects: tuple[str, ...]  # canonical names of the model's effects, in order
-    added: str | None
-    """The effect added to the parent's model; None for a first model."""
+    added: str | None  # the effect added to the parent's model; None for a first model
     options: Mapping[str, Any]  # scaling, kind of readings, options of the effects
     data_hash: str  # `content_hash` of the fitted readings
     program_version: str  # version of the program that fitted
@@ -132,11 +127,9 @@ def fitted_to(record: RevisionRecord) -> tuple[int, str] | None:
     return count, stored
 
 
-CARRIED = "carried_prior"
-"""Key in the parameters of a revision: the prior of another campaign in the fit, as JSON."""
+CARRIED = "carried_prior"  # key in the parameters of a revision: another campaign's prior, JSON
 _POSTERIOR, _HASH = "posterior", "posterior_sha256"
-_KEY = "posterior {}"
-"""Key of a posterior in the file, with its hash."""
+_KEY = "posterior {}"  # key of a posterior in the file, with its hash
 
 
 def split(record: RevisionRecord) -> tuple[RevisionRecord, str | None, str]:

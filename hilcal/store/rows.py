@@ -22,10 +22,8 @@ from hilcal.types import Floats, Ints
 
 Layout = tuple[tuple[str, int], ...]
 """Fields of a record in order, with their number of doubles; absent quantities are left out."""
-LARGEST = 1e12
-"""Upper bound of all quantities of a reading, in SI units: times in s are below 1e11."""
-OPTIONAL_FIELDS = "torque"
-"""Quantity of a state that single readings may lack; all of its numbers are NaN then."""
+LARGEST = 1e12  # upper bound of all quantities of a reading, in SI units: times in s are below 1e11
+OPTIONAL_FIELDS = "torque"  # NaN in single readings without it
 _PER_JOINT = ("q", "joint_temperature", "approach", "q_actual", "torque")
 _STATE = (
     *("q", "wrench", "time", "load_time", "air_temperature", "joint_temperature", "approach"),
@@ -82,7 +80,6 @@ def pack(readings: Readings) -> Floats:
 
 
 def _columns(layout: Layout) -> dict[str, slice]:
-    """Return the columns of each field in the records."""
     ends = accumulate(width for _, width in layout)
     return {name: slice(end - width, end) for (name, width), end in zip(layout, ends, strict=True)}
 
@@ -173,6 +170,13 @@ def last_id(connection: sqlite3.Connection, table: str) -> int:
     return int(last)
 
 
+def append_text(connection: sqlite3.Connection, table: str, text: str) -> int:
+    """Append a text to the revisions or events; return its number."""
+    number = last_id(connection, table) + 1
+    insert(connection, table, [(number, text, text_crc(str(number), text))])
+    return number
+
+
 def insert_meta(connection: sqlite3.Connection, key: str, value: str) -> None:
     """Store a text about the campaign; it cannot be changed later."""
     insert(connection, "meta", [(key, value, text_crc(key, value))])
@@ -189,13 +193,11 @@ def fetch_meta(connection: sqlite3.Connection, path: Path) -> dict[str, str]:
 
 
 def _fetch_names(connection: sqlite3.Connection, table: str) -> tuple[str, ...]:
-    """Return the names of the poses or loads by number."""
     rows = connection.execute(f"SELECT name FROM {table} ORDER BY id")  # noqa: S608
     return tuple(str(name) for (name,) in rows)
 
 
 def _insert_names(connection: sqlite3.Connection, table: str, names: Sequence[str]) -> Ints:
-    """Return the numbers of names; new names are appended in order."""
     if len(set(names)) != len(names):
         raise InputError(f"readings: two {table} have the same name")
     numbers = {name: k for k, name in enumerate(_fetch_names(connection, table))}

@@ -2,7 +2,7 @@
 
 import json
 import sqlite3
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial, reduce
 from pathlib import Path
@@ -22,14 +22,10 @@ from hilcal.store.plan import Plan, Step, joined, read_plan, with_new_names
 from hilcal.store.revision import utc_now
 from hilcal.store.stored_schema import DETAIL, check, check_event
 
-PLAN = "plan"
-"""Key of the first plan among the texts of a campaign ..."""
-FURTHER_PLAN = "plan {}"
-"""... and of further ones, numbered from 2."""
-FIXED_SECTIONS = ("robot", "tool", "loads")
-"""Sections of the configuration that must not change during a campaign ..."""
-ADDRESS_KEYS = {"driver", "host", "port", "baud", "options"}
-"""... except these keys."""
+PLAN = "plan"  # key of the first plan among the texts of a campaign
+FURTHER_PLAN = "plan {}"  # keys of further plans, numbered from 2
+FIXED_SECTIONS = ("robot", "tool", "loads")  # of the configuration, during a campaign
+ADDRESS_KEYS = {"driver", "host", "port", "baud", "options"}  # keys of these that may change
 
 
 def create_run(
@@ -144,9 +140,9 @@ class RunLog:
                 several = reading.states.target is not None
                 target = [reading.target_names[reading.target[k]]] if several else []
                 key = json.dumps([step.pose, step.load, step.cycle, *target])
+                row = (number, key, text, rows.text_crc(f"{number}{key}", text))
                 try:
-                    crc = rows.text_crc(f"{number}{key}", text)
-                    rows.insert(connection, "details", [(number, key, text, crc)])
+                    rows.insert(connection, "details", [row])
                 except sqlite3.IntegrityError:
                     raise InputError(
                         f"{self._campaign.path}: {step} has been measured already"
@@ -156,9 +152,7 @@ class RunLog:
         """Append an event, with the time (UTC)."""
         text = json.dumps({"kind": kind, "utc": utc_now(), **content}, allow_nan=False)
         with self._campaign.transaction() as connection:
-            number = rows.last_id(connection, "events") + 1
-            row = (number, text, rows.text_crc(str(number), text))
-            rows.insert(connection, "events", [row])
+            rows.append_text(connection, "events", text)
 
     def done(self) -> frozenset[Step]:
         """Return the steps that have been measured."""
@@ -169,14 +163,10 @@ class RunLog:
         """Return the raw details of all readings, in order, each with its "step"."""
         out = []
         for number, key, text, crc in self._select("SELECT * FROM details ORDER BY id"):
-            if rows.text_crc(f"{number}{key}", text) != crc:
-                raise InputError(
-                    f"{self._campaign.path}: the campaign is damaged at the details of "
-                    f"reading {number}"
-                )
-            pose, load, cycle = self._step(key)
-            content = rows.stored_json(self._campaign.path, text, partial(check, DETAIL))
-            out.append({**content, "step": {"pose": pose, "load": load, "cycle": cycle}})
+            place = f"the details of reading {number}"
+            content = self._content(f"{number}{key}", text, crc, place, partial(check, DETAIL))
+            step = dict(zip(("pose", "load", "cycle"), self._step(key), strict=True))
+            out.append({**content, "step": step})
         return out
 
     def events(self) -> list[dict[str, Any]]:
@@ -189,14 +179,17 @@ class RunLog:
         return next(iter(self._events(statement, f'{{"kind": "{kind}", %')), None)
 
     def _events(self, statement: str, *values: str) -> list[dict[str, Any]]:
-        out = []
-        for number, text, crc in self._select(statement, *values):
-            if rows.text_crc(str(number), text) != crc:
-                raise InputError(
-                    f"{self._campaign.path}: the campaign is damaged at event {number}"
-                )
-            out.append(rows.stored_json(self._campaign.path, text, check_event))
-        return out
+        stored = self._select(statement, *values)
+        return [
+            self._content(str(k), text, crc, f"event {k}", check_event) for k, text, crc in stored
+        ]
+
+    def _content(
+        self, key: str, text: str, crc: int, place: str, fits: Callable[[object], None]
+    ) -> Any:
+        if rows.text_crc(key, text) != crc:
+            raise InputError(f"{self._campaign.path}: the campaign is damaged at {place}")
+        return rows.stored_json(self._campaign.path, text, fits)
 
     def readings(self) -> Readings | None:
         """Return all readings; None without any."""

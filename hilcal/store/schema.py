@@ -31,8 +31,7 @@ from the previous one; a revision with a prior of another campaign, or in a chan
 with joint torques, or of several observers. Older programs would misread a file of a newer one."""
 VERSION = MORE_COLUMNS
 HEADER = SQLITE
-_JOURNAL = bytes.fromhex("d9d505f920a163d7")
-"""Magic number of a journal; it ends a journal that ends in a name, too."""
+_JOURNAL = bytes.fromhex("d9d505f920a163d7")  # also at the end of a journal that ends in a name
 
 _MEASURING = struct.pack("hhqqi4x", fcntl.F_WRLCK, os.SEEK_SET, 1 << 40, 1, 0)
 """The lock of one who measures, see `lock`: a `struct flock` of one byte."""
@@ -80,8 +79,7 @@ _MESSAGES: dict[str, tuple[type[HilcalError], str]] = {
     ),
 }
 """Error and message by a pattern in SQLite's message."""
-_LONGEST_S = 60.0
-"""Longest time to check a file when it is opened; a choice."""
+_LONGEST_S = 60.0  # longest time to check a file when it is opened; a choice
 
 
 def statements() -> list[str]:
@@ -98,8 +96,8 @@ def statements() -> list[str]:
                 ("replace", "INSERT", exists),
             )
         ]
-    versions = f"PRAGMA application_id = {APPLICATION_ID}", f"PRAGMA user_version = {ONE_TARGET}"
-    return [*created, *versions]
+    created += [f"PRAGMA application_id = {APPLICATION_ID}", f"PRAGMA user_version = {ONE_TARGET}"]
+    return created
 
 
 def is_campaign(path: Path) -> bool:
@@ -154,10 +152,8 @@ def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
 def _journal(path: Path) -> bool:
     """Whether a file has a journal; refuse one by which SQLite would change other files.
 
-    SQLite replays any journal. A journal that ends in a name belongs to a transaction over several
-    files, and SQLite deletes the file of that name. Through a link it would write elsewhere.
-    Source: SQLite documentation, "Database File Format", section 3, "The Rollback Journal", and
-    pager.c, `pager_delsuper`.
+    Where a journal ends in a name, SQLite deletes that file; through a link it writes elsewhere.
+    Source: SQLite documentation, "Database File Format", section 3; pager.c, `pager_delsuper`.
     """
     journal = Path(f"{os.path.realpath(path)}-journal")  # next to the file that a link points to
     try:
@@ -216,7 +212,7 @@ def transaction(connection: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
     An interrupt between the statement `with` and its block leaves the transaction open; the next
     transaction or the end of the connection rolls it back.
     """
-    if connection.in_transaction:
+    if connection.in_transaction:  # of an interrupt between `with` and its block
         connection.execute("ROLLBACK")
     connection.execute("BEGIN IMMEDIATE")
     try:
@@ -261,20 +257,15 @@ def check_file(connection: sqlite3.Connection, path: Path) -> None:
 
 
 def _check_schema(connection: sqlite3.Connection, path: Path, version: int) -> None:
-    """Refuse tables, views, triggers and indexes that are not exactly those of a campaign.
-
-    In a received file they could drop what is stored, show other readings, or never end.
-    """
+    """Refuse tables, views, triggers and indexes, which could do harm, other than a campaign's."""
     actual, expected = _schema(connection), _own_schema()
     expected = {entry for entry in expected if version >= _SINCE.get(entry[2], 1)}
-    if extra := sorted(actual - expected):
-        kind, name, *_ = extra[0]
+    for kind, name, *_ in sorted(actual - expected)[:1]:
         raise InputError(
             f"{path}: has the {kind} {name[:60]!r}, which no hilcal made; a campaign that another "
             "program has changed is not opened; valid: the file as hilcal wrote it"
         )
-    if missing := sorted(expected - actual):
-        kind, name, *_ = missing[0]
+    for kind, name, *_ in sorted(expected - actual)[:1]:
         raise InputError(f"{path}: the campaign file is damaged (no {kind} '{name}')")
 
 

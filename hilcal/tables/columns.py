@@ -29,9 +29,7 @@ PREVIEW = "hilcal import TABLE --preview proposes a mapping for --format"
 SCALAR = {"point": ("distance_m", "from", "cov_d_d"), "gauge": ("gauge_m", "gauge", "cov_g_g")}
 """Columns of a reading that is one number, by kind of observer: value, observer, variance."""
 USER_PREFIX = "x_"
-JOINT_TOLERANCE = (
-    2e-3  # rad; largest difference from the arm's description: tables round to 0.1°. A choice
-)
+JOINT_TOLERANCE = 2e-3  # rad; of the arm's description: tables round to 0.1°. A choice
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 Units = int | Sequence[str]
@@ -222,9 +220,8 @@ def with_following(table: ColumnTable, arm: Arm) -> ColumnTable:
         nothing = np.full(len(number[stated[0]]), np.nan)
         q = np.stack([number.get(name, nothing) for name in names], axis=1)
         full = arm.complete(q)
-        off = (
-            np.abs(q - full) > JOINT_TOLERANCE
-        ) & ~arm.independent  # False where there is no value
+        # False where there is no value
+        off = (np.abs(q - full) > JOINT_TOLERANCE) & ~arm.independent
         for i, k in first_true(off):
             raise InputError(
                 f"{table.at(i, names[k])}: {q[i, k]:g} {arm.unit(k)}, but by the arm's "
@@ -414,7 +411,7 @@ class ObserverRows:
         """Return values (N, m) and covariances (N, m, m) with distances and heights filled in."""
         value, cov = value.copy(), cov.copy()
         for kind in KINDS:
-            column, _, variance_column = SCALAR[kind]
+            column, _, spread = SCALAR[kind]
             rows = np.flatnonzero([self.names[k].kind == kind for k in self.observer])
             if not len(rows):
                 continue
@@ -426,34 +423,22 @@ class ObserverRows:
                     f"expected {low:g} to {MAX_DISTANCE:g} m"
                 )
             value[rows, 0] = read
-            cov[rows, 0, 0] = self._variance(table, rows, variance_column, kind, std)
-        return value, cov
-
-    def _variance(
-        self,
-        table: ColumnTable,
-        rows: Ints,
-        column: str,
-        kind: ObserverKind,
-        std: Mapping[ObserverName, float],
-    ) -> Floats:
-        nothing = np.full(len(table.rows), np.nan)
-        variances = table.number.get(column, nothing)[rows].copy()
-        for k, i in enumerate(rows.tolist()):
-            name = self.names[self.observer[i]]
-            if np.isnan(variances[k]):
-                if name not in std:
+            stated = table.number.get(spread, np.full(len(table.rows), np.nan))
+            for i in rows.tolist():
+                name = self.names[self.observer[i]]
+                variance = std.get(name, np.nan) ** 2 if np.isnan(stated[i]) else stated[i]
+                if np.isnan(variance):
                     raise InputError(
                         f"{table.at(i)}: nothing states the noise of {name}; give column "
-                        f"'{column}', the variance in m², or [{kind}s.{name.name}] std_m"
+                        f"'{spread}', the variance in m², or [{kind}s.{name.name}] std_m"
                     )
-                variances[k] = std[name] ** 2
-            if not MIN_STD[0] ** 2 <= variances[k] <= MAX_STD**2:
-                raise InputError(
-                    f"{table.at(i, column)}: a variance of {variances[k]:g} m² cannot be right; "
-                    f"expected standard deviations of {MIN_STD[0]:g} to {MAX_STD:g} m, squared"
-                )
-        return np.asarray(variances)
+                if not MIN_STD[0] ** 2 <= variance <= MAX_STD**2:
+                    raise InputError(
+                        f"{table.at(i, spread)}: a variance of {variance:g} m² cannot be right; "
+                        f"expected standard deviations of {MIN_STD[0]:g} to {MAX_STD:g} m, squared"
+                    )
+                cov[i, 0, 0] = variance
+        return value, cov
 
 
 def observer_rows(table: ColumnTable) -> ObserverRows | None:

@@ -77,13 +77,12 @@ def open_grid(path: str | Path, file_format: FileFormat, check: Check | None = N
     name, content = str(path), content_of(path)
     kind = kind_of(name, content)
     with undamaged(name, "damaged, or not what its first bytes say"):
-        match kind:
-            case "XLSX":
-                return _xlsx(name, content, file_format, check)
-            case "Parquet":
-                return _parquet(name, content, file_format, check)
-            case "MAT":
-                return _mat(name, file_format, check)
+        if kind == "XLSX":
+            return _xlsx(name, content, file_format, check)
+        if kind == "Parquet":
+            return _parquet(name, content, file_format, check)
+        if kind == "MAT":
+            return _mat(name, file_format, check)
     if file_format.sheet or file_format.variable:
         key = "sheet" if file_format.sheet else "variable"
         raise InputError(f"{name}: text has no {key}; remove [file] {key}")
@@ -195,14 +194,10 @@ def _check_xml(path: str, name: str, stream: IO[bytes]) -> None:
             limits.check_rows(where, rows)
         cells += sheet and tag == "c"
         if depth > limits.XML_DEPTH or elements > most:
-            excess = (
-                f"{depth} elements in each other"
-                if depth > limits.XML_DEPTH
-                else f"{elements} elements"
-            )
-            raise InputError(
-                f"{where}: {excess}{' in a row' if sheet else ''}; valid: a workbook of readings"
-            )
+            deep = depth > limits.XML_DEPTH
+            excess = f"{depth} elements in each other" if deep else f"{elements} elements"
+            excess += " in a row" * sheet
+            raise InputError(f"{where}: {excess}; valid: a workbook of readings")
 
     def end(_: str) -> None:
         nonlocal depth
@@ -402,15 +397,12 @@ def records(path: str, text: str, file_format: FileFormat) -> Iterator[tuple[int
     separator = SEPARATORS.get(file_format.separator or ",", file_format.separator or ",")
     blanks = file_format.separator == "blanks"
     text = text.replace("\t", " ") if blanks else text
-    if (
-        file_format.comment is not None and file_format.header_row
-    ):  # a header as numpy.savetxt writes it
+    comment, k = file_format.comment, file_format.header_row - 1
+    if comment is not None and k >= 0:  # a header as numpy.savetxt writes it
         split = text.splitlines(keepends=True)
-        for line in split[file_format.header_row - 1 : file_format.header_row]:
-            if line.lstrip().startswith(file_format.comment):
-                split[file_format.header_row - 1] = (
-                    line.lstrip().removeprefix(file_format.comment).lstrip()
-                )
+        for line in split[k : k + 1]:
+            if (head := line.lstrip()).startswith(comment):
+                split[k] = head.removeprefix(comment).lstrip()
         text = "".join(split)
     lines = limits.Lines(path, io.StringIO(text, newline=None))
     reader = csv.reader(lines, delimiter=separator, skipinitialspace=blanks, strict=True)
@@ -421,9 +413,7 @@ def records(path: str, text: str, file_format: FileFormat) -> Iterator[tuple[int
             lines.row(len(cells))
             plain = [c.strip() for c in cells]
             plain = plain[: length_of(plain)] if blanks else plain
-            if any(plain) and not (
-                file_format.comment and plain[0].startswith(file_format.comment)
-            ):
+            if any(plain) and not (comment and plain[0].startswith(comment)):
                 yield row, plain
     except csv.Error as e:
         raise InputError(f"{path}: row {reader.line_num}: not delimited text ({e})") from e

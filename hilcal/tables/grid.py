@@ -42,7 +42,6 @@ class Grid:
     units: dict[str, str] = field(default_factory=dict)  # cells of the row of units, by column
 
     def __post_init__(self) -> None:
-        """Refuse too many cells, and invalid names of columns."""
         limits.check_cells(self.path, len(self.rows), len(self.names))
         check_names(self.names, f"{self.path}: column")
 

@@ -142,7 +142,6 @@ def guess_by_values(g: words.Guesser) -> None:
 
 
 def _orientation_by_values(g: words.Guesser, free: list[str]) -> None:
-    """Find quaternions by their length, rotation matrices by their orthogonality."""
     if "orientation" in g.proposal.sections:
         return
     for width, k in product((3, 4), range(len(free) - 8)):  # 4: a position ends each row
@@ -172,7 +171,6 @@ def _take_matrix(g: words.Guesser, names: list[str], position: list[str]) -> Non
 
 
 def _take_quaternion(g: words.Guesser, names: list[str]) -> None:
-    """Take four numbers for a quaternion; which of them is w is a guess."""
     g.assign("orientation", names, "quaternion, w first", convention="quaternion-wxyz")
     g.proposal.open_convention = True
 
@@ -359,12 +357,8 @@ def _matrix(g: words.Guesser) -> bool:
             places = [(i + base, j + base) for i in range(3) for j in range(3)]
             if all(place in by_place for place in places):
                 names = [by_place[place] for place in places]
-                beside = [
-                    by_place[i + base, 3 + base]
-                    for i in range(3)
-                    if (i + base, 3 + base) in by_place
-                ]
-                _take_matrix(g, names, beside)
+                last = [(i + base, 3 + base) for i in range(3)]
+                _take_matrix(g, names, [by_place[place] for place in last if place in by_place])
                 return True
     return False
 

@@ -36,9 +36,7 @@ MAX_LOST_SHARE = 0.5  # Share of rows without a value beyond which the mapping i
 UNIT_LENGTH = 0.01  # Of a quaternion from 1, of a matrix from orthogonal; three digits stay below
 MOST_TURN = 2 * np.pi + 1e-3  # rad; a larger angle of an orientation is in another unit
 MOVED_RAD = 0.01  # rad; a joint commanded by more is sent to another pose; a choice
-STILL_RAD = (
-    1e-4  # rad; a joint commanded by less did not move far enough to arrive from another side
-)
+STILL_RAD = 1e-4  # rad; a joint commanded by less does not arrive from another side
 SIGMAS = 4.0  # Standard deviations within which two readings are the same; a choice
 REPEATED = 2e-4  # rad; rows whose joints differ by less repeat a pose; a choice
 REPEATS_TO = 4e-4  # m; ten times an arm's repeatability: of positions further apart some are wrong
@@ -358,7 +356,6 @@ def _rotations(
 
 
 def _wrench(grid: Grid, mapping: forms.PointMapping, gravity: Floats, table: ColumnTable) -> Floats:
-    """(N, 6) wrench, N and N·m; zero where the table has none."""
     wrench = np.zeros((len(grid.rows), 6))
     if (w := mapping.wrench) is not None:
         scale = [units.FORCES[w.unit]] * 3 + [units.MOMENTS[w.moment_unit]] * 3
@@ -464,10 +461,8 @@ def _plausible(
     """Leave out implausible readings; a note on each reason.
 
     A reading is stale where it equals the previous one within the scatter (N, m, m) of both though
-    the joints were sent elsewhere: the arm did not follow, or the tracker did not measure again.
-    Readings that repeat a pose are odd where their positions differ by more than `REPEATS_TO` +
-    lever · Σ|dq|, the most that the difference of their joints moves the target: which of them is
-    wrong cannot be known.
+    the joints were sent elsewhere. Readings that repeat a pose are odd, all of them, where their
+    positions differ by more than `REPEATS_TO` + lever · Σ|dq|, the most that the joints move it.
     """
     from scipy.spatial import cKDTree
 
@@ -537,7 +532,6 @@ def import_readings(
 
 
 def _std(config: CellConfig) -> dict[ObserverName, float]:
-    """Return the standard deviations of distances and heights that the cell states."""
     points = {ObserverName("point", k): p.std_m for k, p in config.points.items()}
     gauges = {ObserverName("gauge", k): g.std_m for k, g in config.gauges.items()}
     return {name: std for name, std in (points | gauges).items() if std is not None}

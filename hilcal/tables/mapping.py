@@ -16,7 +16,6 @@ Column = Annotated[str, Field(min_length=1)] | Annotated[int, Strict(), Field(ge
 
 
 def _columns(*valid: int) -> AfterValidator:
-    """Refuse another number of columns than the valid ones."""
     *first, last = map(str, valid)
 
     def counted(columns: tuple[Column, ...]) -> tuple[Column, ...]:
@@ -501,16 +500,11 @@ def load_mapping(path: Path, kind: type[M]) -> M:
     mapping = load_section(path, kind)
     if (second := mapping.second_file) is None or second.path is None:
         return mapping
-    second = second.model_copy(update={"path": str(_second_path(path, str(second.path)))})
-    return mapping.model_copy(update={"second_file": second})
-
-
-def _second_path(path: Path, name: str) -> Path:
-    """Return the path of a file that a mapping names; it must not leave the mapping's folder."""
     folder = path.absolute().parent
-    if not (folder / name).resolve().is_relative_to(folder.resolve()):
+    if not (folder / second.path).resolve().is_relative_to(folder.resolve()):
         raise InputError(
-            f"{path}: [second_file] path = {name!r} leaves the folder of the mapping; a mapping "
-            "names files beside or below it, others are given by --second"
+            f"{path}: [second_file] path = {second.path!r} leaves the folder of the mapping; a "
+            "mapping names files beside or below it, others are given by --second"
         )
-    return folder / name
+    second = second.model_copy(update={"path": str(folder / second.path)})
+    return mapping.model_copy(update={"second_file": second})

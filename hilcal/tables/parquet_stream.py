@@ -42,7 +42,6 @@ class ReadingStream:
     rounding: Floats = field(default_factory=lambda: np.zeros(3))  # (3,) variance that it adds, m²
 
     def __len__(self) -> int:
-        """Return the number of readings."""
         return sum(self.rows)
 
     def first_row(self, group: int) -> int:
@@ -136,7 +135,6 @@ def _covers(path: Path, group: int) -> str:
 
 
 def _numbers(path: Path, name: str, column: Any, row: int) -> Floats:
-    """Return a column (N,); refuses what is no finite number, by its row."""
     try:
         values = np.asarray(column.to_numpy(zero_copy_only=False), dtype=float)
     except (TypeError, ValueError) as e:

@@ -82,14 +82,7 @@ TIME = {"time", "zeit", "timestamp", "date", "datum", "datetime", "zeitstempel",
         "t"}  # fmt: skip
 REFLECTOR = {"target", "reflector", "reflektor", "prism", "prisma", "smr", "nest"}
 AIR = {"air", "luft", "ambient", "umgebung", "room", "raum", "aire"}
-ARM_JOINTS = (
-    ("shoulder", "pan"),
-    ("shoulder", "lift"),
-    ("elbow",),
-    ("wrist", "1"),
-    ("wrist", "2"),
-    ("wrist", "3"),
-)
+ARM_JOINTS = ("shoulder pan", "shoulder lift", "elbow", "wrist 1", "wrist 2", "wrist 3")
 """Joint names of Universal Robots arms under ROS, in order."""
 
 DIFFERENCE = {"dev", "delta", "diff", "difference", "error", "err", "residual", "abweichung"}
@@ -161,7 +154,6 @@ def without_unit(name: str) -> str:
 
 
 def _unit(name: str) -> tuple[str, str | None]:
-    """Name without its unit, and the unit."""
     plain = name.replace("µ", "u").replace("μ", "u").strip()
     for bracketed in re.finditer(r"[\[({<]\s*([^\])}>]+?)\s*[\])}>]", plain):
         if unit := UNITS.get(bracketed[1].lower()):
@@ -175,9 +167,7 @@ def _unit(name: str) -> tuple[str, str | None]:
 
 
 MAX_ANGLE_RAD = 2 * np.pi + 0.1  # rad; a larger angle is in degrees
-MAX_POSITION_M = (
-    50.0  # A position beyond this number is in millimetres: no arm is measured from 50 m
-)
+MAX_POSITION_M = 50.0  # A larger position is in millimetres: no arm is measured from 50 m
 GUESSED = "the convention is a guess; --config CELL.toml lets the arm decide"
 SIDE_BY_SIDE = "several targets: name them as in the cell's [[tool.targets]]"
 REPORTED = 5e-3  # rad; encoders at rest in one pose differ by less, commanded poses by more
@@ -243,7 +233,6 @@ class Guesser:
     """The columns that are still unused, and the mapping that is being built."""
 
     def __init__(self, grid: Grid, joints: int | None) -> None:
-        """Parse the names of the columns, and read their numbers."""
         self.grid = grid
         self.joints = joints
         self.columns = [parse(name, grid.units.get(name, "")) for name in grid.names]

@@ -148,10 +148,7 @@ def _why_unused(g: words.Guesser, column: words.ColumnName) -> str:
 
 
 def _joints(g: words.Guesser, joint_names: Sequence[str]) -> None:
-    """Find joint angles by the names of the arm's joints, a joint's word and number, or UR's names.
-
-    A unit may stand behind the name of a joint.
-    """
+    """Find joint angles by the arm's names of joints, a joint's word and number, or UR's names."""
     groups: dict[tuple[str, ...], dict[int, str]] = {}
     for c in g.columns:
         torque = c.has(words.TORQUE) or c.unit in MOMENTS
@@ -176,7 +173,7 @@ def _joints(g: words.Guesser, joint_names: Sequence[str]) -> None:
     of_arm = [by_name[name.lower()] for name in joint_names if name.lower() in by_name]
     if of_arm and len(of_arm) == len(joint_names):
         candidates.insert(0, (words.parse("joint"), of_arm))
-    named = [_with_words(g, w) for w in words.ARM_JOINTS]
+    named = [_with_words(g, joint.split()) for joint in words.ARM_JOINTS]
     if all(named):
         candidates.append((words.parse("joint"), [str(name) for name in named]))
     if not candidates:
@@ -197,7 +194,7 @@ def _joints(g: words.Guesser, joint_names: Sequence[str]) -> None:
                 break
 
 
-def _with_words(g: words.Guesser, parts: tuple[str, ...]) -> str | None:
+def _with_words(g: words.Guesser, parts: Sequence[str]) -> str | None:
     for c in g.columns:
         digits = {str(k) for k in c.numbers}
         if set(parts) <= set(c.words) | digits and g.number(c.name) and not c.has(words.NO_ANGLE):
@@ -206,7 +203,6 @@ def _with_words(g: words.Guesser, parts: tuple[str, ...]) -> str | None:
 
 
 def _per_joint(g: words.Guesser, first: words.ColumnName, names: list[str]) -> None:
-    """Find torques, temperatures and sides of approach of the joints."""
     values = g.block(names)
     if (first.has(words.TORQUE) or first.unit in MOMENTS) and not first.has(words.NOMINAL):
         unit = g.unit(names, MOMENTS)
@@ -439,7 +435,6 @@ def _is_number(cell: Cell, how: FileFormat) -> bool:
 
 
 def _layout(rows: Rows, how: FileFormat) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Header row, row of units and rows that are no readings."""
     length, _ = Counter(len(cells) for _, cells in rows).most_common(1)[0]
     share = []
     for _, cells in rows:
@@ -496,7 +491,6 @@ def _commented_header(text: str, how: dict[str, Any], rows: Rows) -> dict[str, A
 
 
 def _spreadsheet(path: str, content: bytes) -> SniffedFile:
-    """Choose the sheet with most numbers."""
     best: tuple[int, str, Rows] = (0, "", [])
     book = files.workbook(path, content)
     names = book.sheetnames

@@ -302,7 +302,6 @@ def _cycles(table: ColumnTable) -> Ints:
 
 
 def _stated_covariance(table: ColumnTable, m: int) -> Floats | None:
-    """Covariances (N, m, m) that the table states, None where it states none."""
     names = columns.covariance_columns(m)
     if names[0] not in table.number:
         return None
@@ -318,7 +317,6 @@ def _instrument_covariance(
     noise: TrackerNoise | None,
     station: Floats | Sequence[float] | None,
 ) -> Floats:
-    """Covariances (N, m, m) of the instrument in [tracker]."""
     m = value.shape[1]
     if noise is None:
         names = columns.covariance_columns(m)

@@ -12,12 +12,8 @@ from hilcal.tables.mapping import Column, CovarianceColumns, Mapping, Std
 from hilcal.tables.units import angle_axes
 from hilcal.types import Bools, Floats
 
-FAR_RATIO = (
-    5.0  # Ratio of stated and instrument's standard deviation that is worth a note; a choice
-)
-NEAR_RATIO = (
-    3.0  # Ratio within which another interpretation of the figures fits the instrument; a choice
-)
+FAR_RATIO = 5.0  # Of stated and instrument's standard deviation, worth a note; a choice
+NEAR_RATIO = 3.0  # Within which the figures, read otherwise, fit the instrument; a choice
 MIN_STD = (1e-7, 1e-7)  # m, rad; no instrument in air is better than 0.1 µm and 0.02": a choice
 DISTINCT = 10  # Values needed to recognise rounding: ten end in zero by chance once in 10^10
 ROUNDING_SHARE = 0.01  # Rounding is added where its variance is more than this share; a choice
@@ -135,7 +131,6 @@ def _of_std(grid: Grid, mapping: Mapping, std: Std, count: int) -> tuple[Floats,
 
 
 def _scale(section: Std | CovarianceColumns, m: int) -> Floats:
-    """(m,) m and rad in the units of a section."""
     return np.repeat([units.LENGTHS[section.unit], units.ANGLES[section.angle_unit]], 3)[:m]
 
 

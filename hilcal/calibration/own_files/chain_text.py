@@ -32,16 +32,11 @@ from hilcal.robot import se3
 from hilcal.robot.arm import Arm, as_drawn
 from hilcal.types import Floats
 
-FRAME_TOLERANCE = 1e-6
-"""m, rad; frames that differ by less count as the same: descriptions have six decimals."""
-NEAR_M, NEAR_RAD = 5e-3, 1e-2
-"""m, rad; a file with axes within these distances is of the same arm: many files are rounded to
-millimetres, others are corrected already. A choice; the corrected file is exact in any case."""
-EDIT_TOLERANCE = 1e-9
-"""m, rad; a transform that changes less keeps its text."""
+FRAME_TOLERANCE = 1e-6  # m, rad; of frames that count as the same: files have six decimals
+NEAR_M, NEAR_RAD = 5e-3, 1e-2  # a file with axes this near, rounded or not, is of the arm; a choice
+EDIT_TOLERANCE = 1e-9  # m, rad; a transform that changes less keeps its text
 Edits = list[tuple[Span, str]]
-LARGEST, SMALLEST = 1e6, 1e-6
-"""Largest number, and least length of a direction; choices."""
+LARGEST, SMALLEST = 1e6, 1e-6  # largest number, and least length of a direction; choices
 _TAG = re.compile(r"<(?:\"[^\"]*\"|'[^']*'|[^<>\"'])*>")
 
 
@@ -61,6 +56,11 @@ class Node:
     def child(self, tag: str) -> "Node | None":
         """Return the first child with a tag."""
         return next((c for c in self.children if c.tag == tag), None)
+
+    def below(self, tag: str, key: str) -> str:
+        """Return an attribute of the first child with a tag; empty without it."""
+        child = self.child(tag)
+        return "" if child is None else child.attributes.get(key, "")
 
     def descendants(self, *tags: str) -> Iterator["Node"]:
         """Yield descendants with some tags, in the order of the text."""
@@ -162,10 +162,8 @@ class ChainStep:
     name: str  # of the element, for people
     line: int  # of it, from 1
     transform: Floats  # (4, 4) in the previous frame
-    joint: Floats | None
-    """(4, 4) pose of the joint axis (its z) in the frame of `transform`; None without a joint."""
-    write: Callable[[Floats], Edits]
-    """Edits that write another place; raises `InputError` where the file cannot have one."""
+    joint: Floats | None  # (4, 4) joint axis (its z) in the frame of `transform`; None without
+    write: Callable[[Floats], Edits]  # edits of another place; InputError where there can be none
 
 
 @dataclass(frozen=True, slots=True, eq=False)

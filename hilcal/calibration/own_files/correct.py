@@ -77,11 +77,7 @@ def correct_file(
 
 
 def _ur_conf(path: Path, nominal: Arm, arm: Arm) -> CorrectedFile:
-    """Return UR's `calibration.conf` with the differences between the arm's and nominal DH rows.
-
-    The controller adds `delta_theta`, `delta_a`, `delta_d`, `delta_alpha` to the classic rows of
-    its model.
-    """
+    """Return UR's `calibration.conf`: differences between the arm's and nominal classic DH rows."""
     try:
         text = limits.read_bytes(path, limits.SETTINGS).decode("latin-1")
     except OSError as error:

@@ -35,10 +35,8 @@ from hilcal.names import escaped
 from hilcal.robot import se3
 from hilcal.types import Floats
 
-TURNING = ("revolute", "continuous")
-"""Types of a joint that turns."""
-EXPRESSION = re.compile(r"\$\{([^{}]*)\}")
-"""An expression of a xacro."""
+TURNING = ("revolute", "continuous")  # types of a joint that turns
+EXPRESSION = re.compile(r"\$\{([^{}]*)\}")  # an expression of a xacro
 _ARITHMETIC: dict[type[ast.operator], Callable[[float, float], float]] = {
     **{ast.Add: operator.add, ast.Sub: operator.sub},
     **{ast.Mult: operator.mul, ast.Div: operator.truediv},
@@ -66,7 +64,6 @@ class LinkTree:
         return [self.parents[k][1] for k in up], [self.parents[k][1] for k in reversed(down)]
 
     def _up(self, link: str) -> list[str]:
-        """Return a link and its ancestors, the root last."""
         out = [link]
         while out[-1] in self.parents:
             out.append(self.parents[out[-1]][0])
@@ -85,7 +82,6 @@ class LinkTree:
         return matching[0]
 
     def _last(self) -> str:
-        """Return the only link after moving joints that has no children."""
         parents = {parent for parent, _ in self.parents.values()}
 
         def moves(link: str) -> bool:
@@ -113,11 +109,9 @@ def urdf_steps(document: Document, base: str | None, tip: str | None) -> list[Ch
     """Return the steps from a base link to a tip link."""
     parents: dict[str, tuple[str, Node]] = {}
     for joint in document.root.descendants("joint"):
-        ends = [joint.child(tag) for tag in ("parent", "child")]
-        names = [e.attributes.get("link") for e in ends if e is not None]
-        if len(names) != 2 or None in names:
+        parent, child = (joint.below(tag, "link") for tag in ("parent", "child"))
+        if not parent or not child:
             continue
-        parent, child = (str(n) for n in names)
         if child in parents:
             reason = f"a second joint leads to link '{escaped(child)}'; valid: a tree"
             raise document.error(joint, reason)
@@ -168,7 +162,6 @@ def _urdf_step(document: Document, joint: Node, *, turned: bool = False) -> Chai
 
 
 def _values(document: Document, node: Node, text: str) -> Floats:
-    """Return three numbers, which may be expressions of a xacro."""
 
     def computed(m: re.Match[str]) -> str:
         try:
@@ -184,7 +177,6 @@ def _values(document: Document, node: Node, text: str) -> Floats:
 
 
 def _constant(node: ast.expr) -> float:
-    """Value of an expression of numbers, pi and radians()."""
     match node:
         case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
             return float(value)
@@ -199,8 +191,7 @@ def _constant(node: ast.expr) -> float:
     raise ValueError
 
 
-MODEL = "__model__"
-"""The model's own frame."""
+MODEL = "__model__"  # the model's own frame
 
 
 class SdfModel:
@@ -251,9 +242,7 @@ class SdfModel:
     def reference(self, name: str) -> str:
         """Name of the frame that a pose is relative to."""
         node = self.nodes[name]
-        pose = node.child("pose")
-        relative_to = "" if pose is None else pose.attributes.get("relative_to", "")
-        if relative_to:
+        if relative_to := node.below("pose", "relative_to"):
             return relative_to
         if node.tag == "joint":
             return self.parent_and_child(node)[1]

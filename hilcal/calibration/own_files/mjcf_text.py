@@ -47,7 +47,6 @@ def mjcf_steps(document: Document, base: str | None, tip: str | None) -> list[Ch
 
 
 def _up(node: Node) -> list[Node]:
-    """An element and its ancestors."""
     out = [node]
     while out[-1].parent is not None:
         out.append(out[-1].parent)
@@ -106,7 +105,6 @@ def _step(document: Document, node: Node) -> ChainStep:
 
 
 def _rotation(document: Document, node: Node) -> Floats:
-    """(3, 3) orientation of an element."""
     keys = [k for k in _TURNS if k in node.attributes]
     if not keys:
         return np.eye(3)

@@ -26,14 +26,15 @@ import numpy as np
 from hilcal.calibration.programs.program import (
     DECIMAL,
     JOINTS,
+    MOVES,
     UNSTATED,
     Language,
     Program,
     ProgramPoint,
     ProgramReader,
     Span,
-    controller_frames,
     line_of,
+    numbers_in,
     of_wpr,
     to_wpr,
 )
@@ -62,14 +63,8 @@ def config_flags(q: Floats, shape: Ints) -> Ints:
     return np.column_stack([q[:, 4] > 0, shape[:, 1], shape[:, 0], turns])
 
 
-AXES = (
-    (0, 0, 1),
-    (0, 1, 0),
-    (0, -1, 0),
-    (-1, 0, 0),
-    (0, -1, 0),
-    (-1, 0, 0),
-)  # of both makers' joints
+AXES = ((0, 0, 1), (0, 1, 0), (0, -1, 0), (-1, 0, 0), (0, -1, 0), (-1, 0, 0))
+"""Of both makers' joints."""
 
 LS = Language(
     name="FANUC",
@@ -86,7 +81,7 @@ LS = Language(
 
 def read_ls(path: Path, frames_file: Path | None, tool: Floats | None) -> Program:
     """Read a program."""
-    reader = _FanucReader(path, controller_frames(frames_file, LS, tool))
+    reader = _FanucReader(path, LS, frames_file, tool)
     begin = re.search(r"^/POS\b", reader.text, re.M)
     if begin is None or not re.search(r"^/MN\b", reader.text, re.M):
         raise InputError(f"{path.name}: no sections /MN and /POS; valid: a TP program as text")
@@ -95,7 +90,6 @@ def read_ls(path: Path, frames_file: Path | None, tool: Floats | None) -> Progra
 
 class _FanucReader(ProgramReader):
     def read(self, offset: int) -> Program:
-        """Read the program; its positions begin at an offset."""
         positions = {m[1]: (m, offset + m.start(2)) for m in _POSITION.finditer(self.text[offset:])}
         for line, code in self._instructions(self.text[:offset]):
             m = _MOTION.match(code)
@@ -115,10 +109,8 @@ class _FanucReader(ProgramReader):
                         line, f"the point P[{index[:20]}] is chosen while the program runs"
                     )
                 elif name not in positions:
-                    reason = f"P[{name}] is not in /POS"
-                    self.points.setdefault(
-                        name, ProgramPoint(line, f"P[{name}]", not_corrected=reason)
-                    )
+                    missing = ProgramPoint(line, f"P[{name}]").refused(f"P[{name}] is not in /POS")
+                    self.points.setdefault(name, missing)
                 elif name not in self.points:
                     position, place = positions[name]
                     at_line = line_of(self.text, place)
@@ -127,7 +119,6 @@ class _FanucReader(ProgramReader):
         return self.program()
 
     def _instructions(self, text: str) -> Iterator[tuple[int, str]]:
-        """Yield line and text of each instruction, without comments."""
         start = re.search(r"^/MN\b[^\n]*\n", text, re.M)
         begin = start.end() if start else len(text)
         for m in re.finditer(r"[^;]*;", text[begin:]):
@@ -144,18 +135,16 @@ class _FanucReader(ProgramReader):
         """Return a position of `/POS`; its text begins at `offset`."""
         group = _GROUP.search(text)
         if group is None:
-            return replace(bare, not_corrected="no group GP1")
+            return bare.refused("no group GP1")
         body, begin = group[1], offset + group.start(1)
         fields = {m[1]: m for m in _FIELD.finditer(body)}
         if moving := [k for k, m in fields.items() if k.startswith("E") and float(m[2]) != 0]:
-            return replace(
-                bare, not_corrected=f"{moving[0]} moves, and it is not known what that carries"
-            )
+            return bare.refused(MOVES.format(moving[0]))
         keys = J if all(k in fields for k in J) else XYZWPR
         frame, tool, config = (x.search(body) for x in (_FRAME, _TOOL, _CONFIG))
         complete = all(k in fields for k in keys)
         if keys is XYZWPR and not (complete and config and frame and tool):
-            return replace(bare, not_corrected="not a position of numbers with UF, UT and CONFIG")
+            return bare.refused("not a position of numbers with UF, UT and CONFIG")
         numbers = [Span(0, begin + fields[k].start(2), begin + fields[k].end(2)) for k in keys]
         values = np.array([float(fields[k][2]) for k in keys])
         tool_pose = self.controller.pose(
@@ -165,12 +154,11 @@ class _FanucReader(ProgramReader):
             return bare.at_joints(numbers, values, tool_pose)
         stated = self._flags(config)
         if isinstance(stated, str):
-            return replace(bare, not_corrected=stated)
+            return bare.refused(stated)
         base = self.controller.pose("bases", frame[1], f"frame {frame[1]}")
         return replace(bare, flags=stated).at_pose(numbers, values, tool_pose, base)
 
     def _flags(self, config: re.Match[str]) -> tuple[int, ...] | str:
-        """Flags of a CONFIG, or why they are unknown."""
         letters, turns = config[1].split(), [int(t) for t in re.findall(r"-?\d+", config[2])]
         out = [
             next((k for k, sign in enumerate(pair) if sign in letters), UNSTATED)
@@ -216,7 +204,7 @@ INFORM = Language(
 
 def read_jbi(path: Path, frames_file: Path | None, tool: Floats | None) -> Program:
     """Read a job."""
-    reader = _InformReader(path, controller_frames(frames_file, INFORM, tool))
+    reader = _InformReader(path, INFORM, frames_file, tool)
     if "//POS" not in reader.text or "//INST" not in reader.text:
         raise InputError(f"{path.name}: no sections //POS and //INST; valid: a job as text")
     return reader.read()
@@ -228,7 +216,6 @@ def _key(kind: str, number: str) -> str:
 
 class _InformReader(ProgramReader):
     def read(self) -> Program:
-        """Read the job line by line."""
         self.positions: dict[str, ProgramPoint] = {}
         head: dict[str, str] = {}
         base_line, section, offset = 0, "", 0
@@ -274,12 +261,9 @@ class _InformReader(ProgramReader):
     ) -> ProgramPoint:
         """Return a position; its line begins at `offset`."""
         bare = ProgramPoint(line, f"{m[1]}{m[2]} (line {line})")
-        numbers = list(_NUMBER.finditer(m[3]))
-        if len(numbers) != JOINTS or not re.fullmatch(r"[-+\d.,\s]+", m[3]):
-            return replace(bare, not_corrected=f"not {JOINTS} numbers")
-        start = offset + m.start(3)
-        spans = [Span(0, start + n.start(), start + n.end()) for n in numbers]
-        values = np.array([float(n[0]) for n in numbers])
+        values, spans = numbers_in(m[3], _NUMBER, offset + m.start(3))
+        if len(values) != JOINTS or not re.fullmatch(r"[-+\d.,\s]+", m[3]):
+            return bare.refused(f"not {JOINTS} numbers")
         kind, number = head.get("POSTYPE", "").upper(), head.get("TOOL", "0").split(",")[0].strip()
         tool = self.controller.pose("tools", number, f"tool {number}")
         if kind == "ANGLE":
@@ -287,10 +271,10 @@ class _InformReader(ProgramReader):
         if kind == "PULSE":
             if self.controller.pulses is None:
                 reason = "in pulses; give pulses_per_degree = [S, L, U, R, B, T] by --frames F.toml"
-                return replace(bare, not_corrected=reason)
+                return bare.refused(reason)
             return replace(bare.at_joints(spans, values, tool), scale=self.controller.pulses)
         if kind not in ("BASE", "ROBOT", "USER"):
-            return replace(bare, not_corrected=f"POSTYPE {kind} is not corrected")
+            return bare.refused(f"POSTYPE {kind} is not corrected")
         user = head.get("USER", "0") if kind == "USER" else "0"
         frame = self.controller.pose("bases", user, f"frame {user}")
         if kind == "USER" and user == "0":

@@ -24,15 +24,14 @@ import numpy as np
 from hilcal.calibration.programs.program import (
     DECIMAL,
     JOINTS,
+    MOVES,
     UNSTATED,
-    ControllerFrames,
     Language,
     Program,
     ProgramPoint,
     ProgramReader,
     Span,
     arguments_of,
-    controller_frames,
     of_euler,
     read_text,
     to_euler,
@@ -41,8 +40,7 @@ from hilcal.types import Floats, Ints
 
 KINDS = ("TOOL", "BASE")
 POSE, AXES, TURN = ("X", "Y", "Z", "A", "B", "C"), tuple(f"A{k}" for k in range(1, 7)), "T"
-OVERHEAD, ELBOW = 1, 2
-"""Bits of S."""
+OVERHEAD, ELBOW = 1, 2  # bits of S
 _FIELD = re.compile(
     rf"\b([A-Za-z]\w*)\s+({DECIMAL}(?:[eE][-+]?\d+)?|'[BbHh][0-9A-Fa-f]+'|#\w+|\"[^\"]*\"|TRUE|FALSE)"
 )
@@ -78,6 +76,7 @@ _FORBIDDEN = re.compile(
 )
 _INERT = re.compile(r"^\s*(\$H_POS|\$POS_RET)\s*=\s*\w+\s*$", re.IGNORECASE)
 """Statements that read a point without a motion."""
+_APPROXIMATION = re.compile(r"\s*(CA|C_\w+)\b", re.IGNORECASE)
 _BEFORE = "before it in the same subprogram"
 
 
@@ -87,7 +86,6 @@ def flags(q: Floats, shape: Ints) -> Ints:
 
 
 def _written(new: Ints, texts: Sequence[str]) -> list[str]:
-    """Return T with the bits of the flags."""
     (text,) = texts
     turn = int(_value(text)) & ~0b111111
     return [str(turn | sum(1 << k for k, bit in enumerate(new[2:]) if bit == 1))]
@@ -116,9 +114,9 @@ def read_krl(path: Path, frames_file: Path | None, tool: Floats | None) -> Progr
     if len(set(encodings)) > 1:
         texts = tuple(p.read_bytes().decode(encoding) for p in paths)
     config = frames_file is not None and frames_file.suffix.lower() == ".dat"
-    reader = _KrlReader(path, controller_frames(None if config else frames_file, KRL, tool))
+    reader = _KrlReader(path, KRL, None if config else frames_file, tool)
     reader.text, reader.encoding = texts[0], encoding
-    reader.files = [p.name for p in paths]
+    reader.files, reader.data = [p.name for p in paths], {}
     for k, text in enumerate(texts):
         reader.collect(text, k)
     if frames_file is not None and config:
@@ -144,14 +142,12 @@ class _Value:
         return cls(file, line, kind.upper(), fields)
 
     def numbers(self, keys: Sequence[str]) -> Floats | None:
-        """Values of some fields; None if one is missing."""
         try:
             return np.array([_value(self.fields[k][0]) for k in keys])
         except (KeyError, ValueError):
             return None
 
     def spans(self, keys: Sequence[str]) -> tuple[Span, ...]:
-        """Places of the numbers of some fields."""
         return tuple(Span(self.file, *self.fields[k][1:]) for k in keys)
 
 
@@ -171,8 +167,6 @@ def _key(name: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _State:
-    """Tool and base that are set: a pose, or why it is unknown."""
-
     tool: Floats | str = f"the program does not set $TOOL {_BEFORE}"
     base: Floats | str = f"the program does not set $BASE {_BEFORE}"
 
@@ -183,14 +177,10 @@ class _State:
 
 
 class _KrlReader(ProgramReader):
-    """Reader of the statements of a `.src` file, in the order of its text."""
-
-    def __init__(self, path: Path, controller: ControllerFrames):
-        super().__init__(path, controller)
-        self.files: list[str] = []
-        self.data: dict[str, list[_Value]] = {}
-        self.state = _State()
-        self.form: str | None = None
+    files: list[str]
+    data: dict[str, list[_Value]]
+    form: str | None = None
+    state = _State()
 
     def collect(self, text: str, file: int) -> None:
         """Collect all named aggregates of a file; `file` is −1 for that of --frames."""
@@ -200,7 +190,6 @@ class _KrlReader(ProgramReader):
                 self.data.setdefault(_key(m[2]), []).append(value)
 
     def read(self, texts: Sequence[str], suffixes: Sequence[str]) -> Program:
-        """Read the statements of the first text."""
         lines = list(_code(texts[0]))
         self.used = self._used_otherwise(lines)
         blocks: list[list[_State]] = []  # states at the beginning and after branches of open blocks
@@ -250,7 +239,6 @@ class _KrlReader(ProgramReader):
             self._forget(f"{m[1][:40]} of line {line} may set them")
 
     def _of_form(self, name: str | None, line: int, kinds: Sequence[str] = KINDS) -> None:
-        """Set tool and base of an inline form."""
         values = self.data.get(_key(name or ""), [])
         if len(values) != 1 or "TOOL_NO" not in values[0].fields:
             reason = f"the FDAT of line {line} is not in the .dat file"
@@ -267,12 +255,10 @@ class _KrlReader(ProgramReader):
         self.state = replace(self.state, **{kind.lower(): self._frame(kind, value, line)})
 
     def _numbers(self, name: str) -> Floats | None:
-        """Numbers of the pose of a name; None if it has none, or several."""
         values = self.data.get(_key(name), [])
         return values[0].numbers(POSE) if len(values) == 1 else None
 
     def _frame(self, kind: str, value: str, line: int) -> Floats | str:
-        """Pose of a value, or why it is unknown."""
         if value.upper() == "$NULLFRAME":
             return np.eye(4)
         if value.startswith("{"):
@@ -306,8 +292,7 @@ class _KrlReader(ProgramReader):
             reason = f"{word} is not corrected"
         elif "CIRC" in word and re.search(r"\bCA\b", head, re.I):
             reason = "a circle with CA does not end at the point that is stated"
-        approximation = re.compile(r"\s*(CA|C_\w+)\b", re.IGNORECASE)
-        targets = [(b, t) for b, t in arguments_of(head) if not approximation.match(t)]
+        targets = [(b, t) for b, t in arguments_of(head) if not _APPROXIMATION.match(t)]
         for begin, target in targets[: 2 if "CIRC" in word else 1]:
             self._target(line, offset + m.end() + begin, target, word in ("PTP", "SPTP"), reason)
         self.state = previous
@@ -337,14 +322,12 @@ class _KrlReader(ProgramReader):
         axes = (k for k in value.fields if re.fullmatch(r"E[1-6]", k))
         moving = [k for k in axes if value.numbers([k]) is None or value.numbers([k]) != 0]
         if moving:
-            return replace(
-                bare, not_corrected=f"{moving[0]} moves, and it is not known what that carries"
-            )
+            return bare.refused(MOVES.format(moving[0]))
         keys = AXES if AXES[0] in value.fields else POSE
         numbers = value.numbers(keys)
         if numbers is None:
             names = "A1 to A6" if keys is AXES else "X, Y, Z, A, B, C"
-            return replace(bare, not_corrected=f"not all of {names} are written")
+            return bare.refused(f"not all of {names} are written")
         tool, spans = self.state.tool, value.spans(keys)
         if keys is AXES:
             return bare.at_joints(spans, numbers, tool)
@@ -356,7 +339,6 @@ class _KrlReader(ProgramReader):
         return bare.at_pose(spans, numbers, tool, self.state.base)
 
     def _used_otherwise(self, lines: Sequence[tuple[int, int, str]]) -> dict[str, int]:
-        """Names of points that statements other than motions use, with their lines."""
         out: dict[str, int] = {}
         keys: dict[str, list[str]] = {}
         for key in self.data:
@@ -383,7 +365,6 @@ def _value(text: str) -> float:
 
 
 def _word(code: str) -> str:
-    """First word of a statement, in capital letters."""
     m = _NAME.match(code.strip())
     return m[0].upper() if m else ""
 

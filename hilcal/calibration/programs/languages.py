@@ -20,14 +20,14 @@ from hilcal.calibration.programs.fanuc_inform import read_jbi, read_ls
 from hilcal.calibration.programs.krl import read_krl
 from hilcal.calibration.programs.program import JOINTS, UNSTATED, Language, Program, ProgramPoint
 from hilcal.calibration.programs.rapid import read_rapid
+from hilcal.calibration.urscript import BRANCH_MARGIN
 from hilcal.errors import InputError
 from hilcal.names import escaped
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
 from hilcal.types import Bools, Floats, Ints
 
-LARGEST_NUMBER = 1e7
-"""Largest number of a point: mm, degrees or pulses; a choice."""
+LARGEST_NUMBER = 1e7  # largest number of a point: mm, degrees or pulses; a choice
 READERS: Mapping[str, Callable[[Path, Path | None, Floats | None], Program]] = {
     ".src": read_krl,
     ".mod": read_rapid,
@@ -59,8 +59,7 @@ class ResolvedProgram:
         """Return the program without refused points; `refused` has "" for the others."""
         reasons = iter(refused)
         points = tuple(
-            p if p.not_corrected else replace(p, not_corrected=next(reasons))
-            for p in self.program.points
+            p if p.not_corrected else p.refused(next(reasons)) for p in self.program.points
         )
         retained = [k for k, reason in enumerate(refused) if not reason]
         return replace(self, program=replace(self.program, points=points), q=self.q[retained])
@@ -102,7 +101,7 @@ def read_program(
         numbers = np.concatenate([p.values, p.frame.ravel(), p.tool.ravel()])
         usable = (np.abs(numbers) < LARGEST_NUMBER).all()
         wrong = "a number of it, its tool or its base is not finite or too large"
-        points.append(p if usable else replace(p, not_corrected=wrong))
+        points.append(p if usable else p.refused(wrong))
     program = replace(program, points=tuple(points))
     _refuse(path, program.points, leave)
     q, doubts, remarks = resolve(program, arm, near)
@@ -116,7 +115,6 @@ def read_program(
 
 
 def _refuse(path: Path, points: tuple[ProgramPoint, ...], leave: bool) -> None:
-    """Refuse points that cannot be corrected; raises as `read_program` does."""
     left = [p for p in points if p.not_corrected]
     if left and not (leave and len(left) < len(points)):
         p = left[0]
@@ -126,16 +124,10 @@ def _refuse(path: Path, points: tuple[ProgramPoint, ...], leave: bool) -> None:
         raise InputError(f"{path}: {reason}; --leave keeps such points as they are")
 
 
-AXIS_TOLERANCE = 0.02
-"""Largest difference of an axis direction from that of the maker's arms; a choice, above that of
-any calibrated arm."""
-INTERSECTION_M = 1e-3
-"""m; largest distance of intersecting axes; a choice."""
+AXIS_TOLERANCE = 0.02  # of an axis direction; a choice, above that of any calibrated arm
+INTERSECTION_M = 1e-3  # m; largest distance of intersecting axes; a choice
 FLAG_BORDER = 1e-4
-"""rad; joint values within this distance of a flag's border have both values; a choice, above the
-rounding of numbers with four decimals."""
-BRANCH_MARGIN = 0.05
-"""rad, see `calibration.urscript.BRANCH_MARGIN`."""
+"""rad; nearer to a flag's border, joint values have both values; a choice, above rounding."""
 
 
 def form_mismatch(arm: Arm, language: Language) -> str:
@@ -235,7 +227,6 @@ def _solve(
     stated: Ints,
     required: Bools,
 ) -> tuple[Floats, str]:
-    """Joint values of a pose, and why they are not certain; raises as `resolve` does."""
     goal = p.frame @ language.pose(p.values)
     unknown = np.full(JOINTS, np.nan)
     if previous is None and not required.any():

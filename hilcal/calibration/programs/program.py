@@ -29,15 +29,12 @@ from hilcal.toml import Number, Section, load_section
 from hilcal.types import Floats, Ints
 
 JOINTS = 6
-DECIMAL = r"[-+]?(?:\d+\.?\d*|\.\d+)"
-"""Pattern of a number without exponent."""
-UNSTATED = -99
-"""A flag of a configuration that is not stated."""
-SAME_M, SAME_RAD = 2e-9, 2e-9
-"""m, rad; a point that moved less keeps its text: above the residual of the inverse, see
-`calibration.compensation.TOLERANCE`, and below the resolution of any controller."""
-GIMBAL = 1e-9
-"""cos B below which A and C turn about one axis."""
+DECIMAL = r"[-+]?(?:\d+\.?\d*|\.\d+)"  # pattern of a number without exponent
+UNSTATED = -99  # a flag of a configuration that is not stated
+SAME_M, SAME_RAD = 2e-9, 2e-9  # a point that moved less keeps its text; above `TOLERANCE`
+GIMBAL = 1e-9  # cos B below which A and C turn about one axis
+MOVES = "{} moves, and it is not known what that carries"
+"""Why a point with an external axis is not corrected."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,13 +62,16 @@ class ProgramPoint:
     flags: tuple[int, ...] = ()  # the configuration, see `Language.flags`
     config: tuple[Span, ...] = ()  # places of its changeable part; empty if it cannot change
     flags_obeyed: bool = True
-    """Whether the controller obeys the stated configuration; otherwise it stays on the branch of
-    the previous point."""
+    """Whether the controller obeys the configuration, or stays on the branch of the last point."""
     template: str = ""
-    """For a point that the program computes (`Offs(p, …)`), the text that replaces `numbers[0]`,
-    with fields for the numbers and the changeable configuration; else ""."""
+    """Of a point that the program computes (`Offs(p, …)`), the text for `numbers[0]`, with fields
+    for the numbers and the changeable configuration; else ""."""
     not_corrected: str = ""  # why it is not corrected; empty if it is understood
     blend_m: float = 0.0  # 0, since only URScript states it at the point
+
+    def refused(self, reason: str) -> "ProgramPoint":
+        """Return the point with the reason why it is not corrected."""
+        return replace(self, not_corrected=reason)
 
     def at_joints(
         self, numbers: Sequence[Span], values: Floats, tool: Floats | str
@@ -85,7 +85,7 @@ class ProgramPoint:
     ) -> "ProgramPoint":
         """Return the point with a pose; it is not corrected if tool or frame is a reason (text)."""
         if isinstance(tool, str) or isinstance(frame, str):
-            return replace(self, not_corrected=tool if isinstance(tool, str) else str(frame))
+            return self.refused(tool if isinstance(tool, str) else str(frame))
         return replace(self, numbers=tuple(numbers), values=values, tool=tool, frame=frame)
 
 
@@ -100,12 +100,10 @@ class Language:
     decimals: tuple[int, int, int]
     """Least number of decimals of a position in mm, of the orientation, of joint values."""
     axes: tuple[tuple[int, int, int], ...]
-    """(6, 3) directions of the joint axes of the maker's arms with spherical wrist at zero joint
-    values, in axes of the controller's base."""
+    """(6, 3) joint axes of the maker's arms with spherical wrist at zero, base axes."""
     flags: Callable[[Floats, Ints], Ints]
     """(K, F) configuration at joint values (K, 6), with `languages.shape` (K, 2) there."""
-    shape_flags: tuple[bool, ...]
-    """(F,) which flags depend on the shape of the arm, not on the joint values alone."""
+    shape_flags: tuple[bool, ...]  # (F,) which flags depend on the shape of the arm, too
     motions: str  # its motions, for people
     config_texts: Callable[[Ints, Sequence[str]], list[str]] = lambda _, texts: list(texts)
     """New texts at `ProgramPoint.config`, from the flags and the old texts."""
@@ -148,7 +146,6 @@ class Program:
     def _edits(
         self, p: ProgramPoint, flange: Floats, old_q: Floats, q: Floats, flags: Ints
     ) -> list[tuple[Span, str]]:
-        """Edits of one point."""
         language = self.language
         if np.abs(q - old_q).max() < SAME_RAD:
             return []
@@ -226,6 +223,13 @@ def arguments_of(text: str) -> list[tuple[int, str]]:
             out.append((begin, text[begin:k]))
             begin = k + 1
     return [*out, (begin, text[begin:])]
+
+
+def numbers_in(text: str, pattern: re.Pattern[str], offset: int) -> tuple[Floats, list[Span]]:
+    """Numbers of a text at an offset of the file, with their places."""
+    matches = list(pattern.finditer(text))
+    values = np.array([float(m[0]) for m in matches])
+    return values, [Span(0, offset + m.start(), offset + m.end()) for m in matches]
 
 
 def line_of(text: str, offset: int) -> int:
@@ -310,8 +314,10 @@ def controller_frames(
 class ProgramReader:
     """Base of the readers of all makers, which collect the points of a program's text."""
 
-    def __init__(self, path: Path, controller: ControllerFrames):
-        self.path, self.controller = path, controller
+    def __init__(
+        self, path: Path, language: Language, frames_file: Path | None, tool: Floats | None
+    ):
+        self.path, self.controller = path, controller_frames(frames_file, language, tool)
         self.text, self.encoding = read_text(path)
         self.points: dict[str, ProgramPoint] = {}
         self.otherwise: dict[str, int] = {}
@@ -341,8 +347,8 @@ class ProgramReader:
         """Return the program with all recorded points."""
         for name, line in self.otherwise.items():
             if name in self.points and not self.points[name].not_corrected:
-                reason = f"line {line} uses or changes it otherwise"
-                self.points[name] = replace(self.points[name], not_corrected=reason)
+                point = self.points[name]
+                self.points[name] = point.refused(f"line {line} uses or changes it otherwise")
         language, points = self.controller.language, tuple(self.points.values())
         if not points:
             raise InputError(f"{self.path.name}: no motions; valid: {language.motions}")

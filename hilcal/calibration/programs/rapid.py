@@ -30,21 +30,18 @@ from hilcal.calibration.programs.program import (
     ProgramReader,
     Span,
     arguments_of,
-    controller_frames,
     edited,
     line_of,
+    numbers_in,
     of_euler,
     read_text,
 )
 from hilcal.robot import se3
 from hilcal.types import Floats, Ints
 
-POSE = 7
-"""Numbers of a pose."""
-LEAST = 4
-"""Least number of arguments of a motion: point, speed, zone, tool."""
-UNUSED = 8e8
-"""Numbers of external axes above this mean no axis: 9E9."""
+POSE = 7  # numbers of a pose
+LEAST = 4  # least number of arguments of a motion: point, speed, zone, tool
+UNUSED = 8e8  # numbers of external axes above this mean no axis: 9E9
 _STATEMENT = re.compile(r"[^;]*;")
 _BLANK = re.compile(r'"[^"]*"|!.*')
 _DATA = re.compile(
@@ -112,9 +109,9 @@ RAPID = Language(
 def read_rapid(path: Path, frames_file: Path | None, tool: Floats | None) -> Program:
     """Read a module."""
     module = frames_file is not None and frames_file.suffix.lower() != ".toml"
-    controller = controller_frames(None if module else frames_file, RAPID, tool)
+    reader = _RapidReader(path, RAPID, None if module else frames_file, tool)
     frames_text = read_text(frames_file)[0] if frames_file is not None and module else ""
-    return _RapidReader(path, controller).read(frames_text)
+    return reader.read(frames_text)
 
 
 def _statements(text: str) -> list[tuple[int, str]]:
@@ -123,15 +120,7 @@ def _statements(text: str) -> list[tuple[int, str]]:
     return [(m.start(), m[0]) for m in _STATEMENT.finditer(code)]
 
 
-def _numbers(text: str, offset: int = 0) -> tuple[Floats, list[Span]]:
-    """All numbers of an aggregate at an offset of the file, with their places."""
-    matches = list(_NUMBER.finditer(text))
-    values = np.array([float(m[0]) for m in matches])
-    return values, [Span(0, offset + m.start(), offset + m.end()) for m in matches]
-
-
 def _form(text: str) -> str:
-    """Return an aggregate with its numbers as 0, to compare its form."""
     return re.sub(r"\s", "", _NUMBER.sub("0", text))
 
 
@@ -143,8 +132,6 @@ _Data = dict[str, list[tuple[str, str, int]]]
 
 
 class _RapidReader(ProgramReader):
-    """Reader of the statements of a module, in the order of its text."""
-
     def read(self, frames_text: str) -> Program:
         """Read the module; `frames_text` is the text of one with tools and work objects."""
         self.statements = _statements(self.text)
@@ -203,15 +190,16 @@ class _RapidReader(ProgramReader):
             self.mark_not_corrected(line, f"{m[1]} without its arguments")
             return
         work_object = re.search(r"\\\s*WObj\s*:=\s*(\w+)", options, re.I)
-        frames = (
-            self._frame("tooldata", tool),
-            self._frame("wobjdata", work_object[1] if work_object else "wobj0"),
-        )
+        tool_pose = self._frame("tooldata", tool)
+        frame = self._frame("wobjdata", work_object[1] if work_object else "wobj0")
+        joints = m[1].upper() == "MOVEABSJ"
         for place, text in targets:
-            self._target(line, offset + place, text, m[1].upper() == "MOVEABSJ", frames, obeyed)
+            key, p = self._target(line, offset + place, text, joints)
+            if not p.not_corrected and not joints:
+                p = replace(p, flags_obeyed=obeyed).at_pose(p.numbers, p.values, tool_pose, frame)
+            self.record(key, p, line)
 
     def _frame(self, kind: str, name: str) -> Floats | str:
-        """Pose of a tool or of an object frame, or why it is unknown."""
         key, is_tool = name.upper(), kind == "tooldata"
         group, label = "tools" if is_tool else "bases", f"the {_FRAMES[kind]} '{name[:40]}'"
         values = self.data.get(key) or self.frames.get(key) or []
@@ -221,7 +209,10 @@ class _RapidReader(ProgramReader):
             return f"{label} is not one {kind} of the program"
         if key in self.assigned:
             return f"line {self.assigned[key]} changes {label}"
-        numbers, start = _numbers(values[0][1])[0], re.sub(r"\s", "", values[0][1]).upper()
+        numbers, start = (
+            numbers_in(values[0][1], _NUMBER, 0)[0],
+            re.sub(r"\s", "", values[0][1]).upper(),
+        )
         if is_tool:
             if not start.startswith("[TRUE,[[") or len(numbers) < POSE:
                 return f"{label} is not one on the flange with numbers"
@@ -230,16 +221,8 @@ class _RapidReader(ProgramReader):
             return f"{label} is not fixed, or not of numbers"
         return of_quaternion(numbers[:POSE]) @ of_quaternion(numbers[POSE:])
 
-    def _target(
-        self,
-        line: int,
-        offset: int,
-        text: str,
-        joints: bool,
-        frames: tuple[Floats | str, Floats | str],
-        obeyed: bool,
-    ) -> None:
-        """Record one target; `frames` are its tool and its reference frame."""
+    def _target(self, line: int, offset: int, text: str, joints: bool) -> tuple[str, ProgramPoint]:
+        """Return key and point of one target, without tool and reference frame."""
         call, key, label = _MADE.match(text), f"line {line}, {offset}", f"line {line}"
         if text.startswith("["):
             new = self._value(text, offset, label, joints)
@@ -249,37 +232,32 @@ class _RapidReader(ProgramReader):
             key, new = text.upper(), ProgramPoint(line, label)
             values = self.data.get(key, [])
             if not _NAME.fullmatch(text):
-                new = replace(new, not_corrected=_COMPUTED.format(text[:40]))
+                new = new.refused(_COMPUTED.format(text[:40]))
             elif len(values) != 1 or not values[0][1]:
                 reason = "has several values" if values else "is not in this module"
-                new = replace(new, not_corrected=f"the point '{text[:40]}' {reason}")
+                new = new.refused(f"the point '{text[:40]}' {reason}")
             elif key in self.used:
-                reason = f"line {self.used[key]} uses or changes '{text[:40]}' otherwise"
-                new = replace(new, not_corrected=reason)
+                new = new.refused(f"line {self.used[key]} uses or changes '{text[:40]}' otherwise")
             else:
                 kind, value, place = values[0]
                 name = f"{text} (line {line_of(self.text, place)})"
                 new = self._value(value, place, name, kind == "jointtarget")
-        if not new.not_corrected and not joints:
-            new = replace(new, flags_obeyed=obeyed).at_pose(new.numbers, new.values, *frames)
-        self.record(key, new, line)
+        return key, new
 
     def _value(self, text: str, offset: int, name: str, joints: bool) -> ProgramPoint:
         """Return the point of an aggregate at an offset of the file."""
-        values, spans = _numbers(text, offset)
+        values, spans = numbers_in(text, _NUMBER, offset)
         bare = ProgramPoint(line_of(self.text, offset), name)
         if _form(text) != (_JOINTTARGET if joints else _ROBTARGET):
             kind = "jointtarget" if joints else "robtarget"
-            return replace(bare, not_corrected=f"it is no {kind} of numbers")
+            return bare.refused(f"it is no {kind} of numbers")
         external = values[-JOINTS:]
         if np.any((external < UNUSED) & (external != 0)):
-            return replace(
-                bare, not_corrected="an external axis moves, and it is not known what it carries"
-            )
+            return bare.refused("an external axis moves, and it is not known what it carries")
         if joints:
             return bare.at_joints(spans[:JOINTS], values[:JOINTS], np.eye(4))
         if not np.isclose(np.linalg.norm(values[3:POSE]), 1.0, atol=1e-3):
-            return replace(bare, not_corrected="its quaternion is not of length 1")
+            return bare.refused("its quaternion is not of length 1")
         return replace(
             bare,
             numbers=tuple(spans[:POSE]),
@@ -298,11 +276,11 @@ class _RapidReader(ProgramReader):
         turns = [m for m in moves if m and m not in shift]
         plain = len(shift) == 3 and all(re.fullmatch(turn, m, re.I) for m in turns)
         if len(values) != 1 or not values[0][1] or not plain or base.upper() in self.assigned:
-            return replace(bare, not_corrected=_COMPUTED.format(text[:40]))
+            return bare.refused(_COMPUTED.format(text[:40]))
         _, value, begin = values[0]
         point = self._value(value, begin, bare.name, False)
         if point.not_corrected:
-            return replace(bare, not_corrected=point.not_corrected)
+            return bare.refused(point.not_corrected)
         places = [Span(0, s.start - begin, s.end - begin) for s in (*point.numbers, *point.config)]
         t, displacement = of_quaternion(point.values), np.array([float(m) for m in shift])
         if relative:
@@ -324,7 +302,6 @@ class _RapidReader(ProgramReader):
         )
 
     def _used_otherwise(self) -> dict[str, int]:
-        """Names of points that statements other than motions use, with their lines."""
         out: dict[str, int] = {}
         points = {k for k, v in self.data.items() if v[0][0] in ("robtarget", "jointtarget")}
         for offset, code in self.statements:
