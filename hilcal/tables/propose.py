@@ -20,7 +20,7 @@ from hilcal.tables.columns import required_columns
 from hilcal.tables.grid import Cell, Grid, joined, number
 from hilcal.tables.guess_values import guess_axes, guess_by_values, is_quaternion, time_unit
 from hilcal.tables.mapping import UNLOADED, FileFormat
-from hilcal.tables.units import ANGLES, LENGTHS, MOMENTS
+from hilcal.tables.units import ANGLES, FORCES, LENGTHS, MASSES, MOMENTS
 
 EXCHANGE_NAMES = (
     "its columns are named as an exchange table's, which (commas, header in row 1, SI units, "
@@ -142,6 +142,8 @@ def _why_unused(g: words.Guesser, column: words.ColumnName) -> str:
         return "a difference"
     if column.has(words.NOMINAL):
         return "a commanded or nominal value"
+    if column.unit in FORCES or (column.has(words.FORCE) and column.axis):
+        return "a force; [wrench] takes fx, fy, fz or fz alone, [hung_mass] a weight"
     if values is None:
         return "no numbers" if any(g.grid.text(column.name)) else "empty"
     return "its name says nothing"
@@ -256,11 +258,13 @@ def guess_names(g: words.Guesser) -> None:
     _pick(g, "pose", words.POSE, lambda n: q is None or _names_poses(g, n, q))
     for c in list(g.free.values()):
         if c.has(words.MASS | words.LOAD) and g.number(c.name) and "load" not in g.free:
-            mass = c.unit in ("kg", "g", "lb") or c.has(words.MASS)
-            if mass and "hung_mass" not in g.proposal.sections:
-                unit = c.unit if c.unit in ("kg", "g", "lb") else "kg"
+            stated = c.unit if c.unit in MASSES | FORCES else None
+            if (stated or c.has(words.MASS)) and "hung_mass" not in g.proposal.sections:
+                unit = stated or "kg"
                 if "wrench" in g.proposal.sections:
                     continue
+                if unit in FORCES:
+                    g.doubt("hung_mass", "taken as a weight, which pulls down")
                 g.assign("hung_mass", [c.name], unit, column=c.name, unit=unit)
     if "hung_mass" not in g.proposal.sections:
         _pick(g, "load", words.LOAD, lambda n: True)
@@ -325,11 +329,15 @@ def _names_poses(g: words.Guesser, name: str, joints: dict[str, Any]) -> bool:
 
 def guess_scalars(g: words.Guesser) -> None:
     """Find times and the temperature of the air."""
+    read = np.ones(len(g.grid.rows), dtype=bool)  # rows that have what a reading needs
+    for section in ("joints", "position"):
+        if section in g.proposal.sections:
+            read &= np.isfinite(g.block(g.proposal.sections[section]["columns"])).any(axis=1)
     for c in list(g.free.values()):
         dated = all(isinstance(cell, datetime) for cell in g.grid.cells(c.name))
         timed = dated or (c.has(words.TIME) and not c.axis)
         if "time" not in g.proposal.sections and timed:
-            guessed = time_unit(g.grid, c.name, c.unit, g.values[c.name])
+            guessed = time_unit(g.grid.rows_with(read), c.name, c.unit, g.values[c.name])
             if guessed is not None:
                 section, doubt = guessed
                 if doubt:
@@ -473,7 +481,8 @@ def _layout(rows: Rows, how: FileFormat) -> tuple[dict[str, Any], tuple[str, ...
         late = [row for row in odd if row > rows[first][0]]
         if late:
             listed = ", ".join(map(str, late[:5])) + ", ..." * (len(late) > 5)
-            doubts.append(f"rows {listed} are left out: they are not of the table's length")
+            why = "they repeat the header or are not of the table's length"
+            doubts.append(f"rows {listed} are left out: {why}")
     return out, tuple(doubts)
 
 
