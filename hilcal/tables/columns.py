@@ -249,7 +249,10 @@ def check_joints(table: ColumnTable, names: tuple[str, ...], q: Floats, arm: Arm
         if arm.slides[j]:
             seems = " (looks like millimetres)" if abs(q[i, j]) > 10 * most[j] else ""
         elif q[:, j].min() >= 0 and arm.q_min[j] <= q[i, j] - 2 * np.pi <= min(arm.q_max[j], 0):
-            seems = "; it is within them a whole turn on: were the angles counted from 0 to 360°?"
+            seems = (
+                "; it is within them a whole turn on: were the angles counted from 0 to 360°? "
+                "[joints] from_zero = true of a mapping reads such angles"
+            )
         unit, limits = arm.unit(j), f"{arm.q_min[j]:g} to {arm.q_max[j]:g}"
         raise InputError(
             f"{table.at(i, names[j])}: {q[i, j]:g} {unit} is beyond the limits of "

@@ -1,5 +1,6 @@
 """Readings from a table of any kind: the exchange table, or one that a mapping explains."""
 
+import math
 import re
 from collections.abc import Mapping as Mapped
 from collections.abc import Sequence
@@ -275,7 +276,20 @@ def _raw(grid: Grid, mapping: forms.PointMapping, arm: Arm) -> dict[str, Floats]
         needed += section.columns
     needed += [s.column for s in (mapping.air, mapping.cycle) if s is not None]
     needed += [s.column for s in mapping.scalars.values()]
-    return {grid.name(column): grid.numbers(column) for column in needed}
+    raw = {grid.name(column): grid.numbers(column) for column in needed}
+    for section in (mapping.joints, mapping.actual_joints):
+        if section is not None and section.from_zero:
+            half = math.pi / units.ANGLES[section.unit]
+            for name in _turning(grid, section, arm):
+                raw[name] = np.where(raw[name] > half, raw[name] - 2 * half, raw[name])
+    return raw
+
+
+def _turning(grid: Grid, section: forms.Joints, arm: Arm) -> list[str]:
+    """Names of the columns of a section whose joints turn."""
+    names = independent_columns(columns.joint_columns(arm.units), len(section.columns), arm)
+    of_joints = zip(names, section.columns, strict=True)
+    return [grid.name(column) for name, column in of_joints if name.endswith("_rad")]
 
 
 def _missing_positions(

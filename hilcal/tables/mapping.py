@@ -155,6 +155,11 @@ class Joints(Section):
     columns: PerJoint
     slide_unit: Length = Field("m", description=_LENGTH + ", of joints that slide")
     unit: Angle = Field(description=_ANGLE)
+    from_zero: bool = Field(
+        False,
+        description="true where angles are counted from 0 to 360°: those over 180° then count as "
+        "negative ones; else false",
+    )
 
 
 class CommandedJoints(Joints):

@@ -21,6 +21,7 @@ from hilcal.tables.grid import Cell, Grid, joined, number
 from hilcal.tables.guess_values import guess_axes, guess_by_values, is_quaternion, time_unit
 from hilcal.tables.mapping import UNLOADED, FileFormat
 from hilcal.tables.units import ANGLES, FORCES, LENGTHS, MASSES, MOMENTS
+from hilcal.types import Floats
 
 EXCHANGE_NAMES = (
     "its columns are named as an exchange table's, which (commas, header in row 1, SI units, "
@@ -185,7 +186,10 @@ def _joints(g: words.Guesser, joint_names: Sequence[str]) -> None:
     if first.has(words.MEASURED | {"qa"}):
         g.doubt("joints", f"'{names[0]}' ... are reported angles, used as the commanded ones")
     unit = words.angle_unit(g, "joints", names)
-    g.assign("joints", names, unit, unit=unit)
+    from_zero = {"from_zero": True} if _from_zero(g.block(names) * ANGLES[unit]) else {}
+    if from_zero:
+        g.doubt("joints", "counted from 0 to 360°, by their values: those over 180° are negative")
+    g.assign("joints", names, unit, unit=unit, **from_zero)
     if g.joints is not None and len(names) != g.joints:
         g.doubt("joints", f"{len(names)} columns, the arm has {g.joints} joints")
     for parsed, reported in candidates[1:]:
@@ -194,6 +198,16 @@ def _joints(g: words.Guesser, joint_names: Sequence[str]) -> None:
             if same < (0.1 if unit == "rad" else 5.7):
                 g.assign("actual_joints", reported, unit, unit=unit)
                 break
+
+
+def _from_zero(q: Floats) -> bool:
+    """Whether angles (N, k), rad, are counted from 0 to a turn: several go round, none is below 0.
+
+    A joint goes round whose values lie in the first quarter of the turn and in the last.
+    """
+    least, most = np.nanmin(q, axis=0), np.nanmax(q, axis=0)
+    within = bool(np.all(least >= 0.0) and np.all(most <= 2 * np.pi))
+    return within and int(np.sum((least < np.pi / 2) & (most > 1.5 * np.pi))) > 1
 
 
 def _with_words(g: words.Guesser, parts: Sequence[str]) -> str | None:
@@ -356,6 +370,7 @@ def guess_scalars(g: words.Guesser) -> None:
 
 
 HEAD = 400  # Lines that the dialect is guessed from
+MANY_NUMBERS = 0.5  # of those of the sheet that is read: other readings; a choice
 COMMENTS = ("//", "#", "%", "!")
 _UNIT = re.compile(
     r"[\[(<]?\s*(|-|1|m|mm|[uµμ]m|in(ch)?|\"|deg|degrees?|°|rad|mrad|n|kn|nm|n[*·]m|kg|g|s|sec|ms|"
@@ -501,11 +516,12 @@ def _commented_header(text: str, how: dict[str, Any], rows: Rows) -> dict[str, A
 
 def _spreadsheet(path: str, content: bytes) -> SniffedFile:
     best: tuple[int, str, Rows] = (0, "", [])
+    counts: dict[str, int] = {}
     book = files.workbook(path, content)
     names = book.sheetnames
     for sheet in names:
         rows = files.sheet_rows(path, book, sheet, None)
-        count = sum(isinstance(c, float) for _, cells in rows for c in cells)
+        count = counts[sheet] = sum(isinstance(c, float) for _, cells in rows for c in cells)
         if count > best[0]:
             best = count, sheet, rows
     if not best[0]:
@@ -513,6 +529,8 @@ def _spreadsheet(path: str, content: bytes) -> SniffedFile:
     how, doubts = _layout(best[2], FileFormat(header_row=0))
     if len(names) > 1:
         how["sheet"] = best[1]
+    if others := [s for s in names if s != best[1] and counts[s] > MANY_NUMBERS * best[0]]:
+        doubts = (*doubts, f"only this sheet is read, and not {', '.join(others)}")
     if how["header_row"] == 1:
         del how["header_row"]
     form = FileFormat(**how)

@@ -91,6 +91,12 @@ def test_hung_masses_pull_along_gravity(tmp_path):
     assert [x.load_names[k] for k in x.load] == ["none", "2500g", "none", "2500g", "1000g"]
 
 
+def test_angles_from_zero_to_a_turn(tmp_path):
+    cells = {f"B{k}": np.rad2deg(Q[:, k]) % 360 for k in range(6)}
+    x = read(tmp_path, cells, joints={"columns": list(cells), "unit": "deg", "from_zero": True})
+    np.testing.assert_allclose(x.states.q, Q, atol=1e-12)
+
+
 @pytest.mark.parametrize("sign", [1, -1])
 def test_weights_pull_as_the_masses_they_are_of(sign, tmp_path):
     pounds = sign * np.array([0.0, 5.0, 10.0, 5.0, 0.0])

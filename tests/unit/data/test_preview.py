@@ -201,6 +201,13 @@ def test_a_load_in_one_column_is_read_in_its_unit(name, section, tmp_path):
     assert {k: v for k, v in sections.items() if k in ("hung_mass", "wrench", "load")} == section
 
 
+@pytest.mark.parametrize(("angles", "from_zero"), [(DEG % 360, True), (DEG, False)])
+def test_angles_counted_from_zero_are_noticed(angles, from_zero, tmp_path):
+    text = lines([*six("A{}"), "X", "Y", "Z"], angles, MM)
+    found = propose(write(tmp_path / "t.csv", text)).proposal.mapping(Mapping)
+    assert found.joints.from_zero is from_zero
+
+
 def test_a_force_of_unknown_direction_is_not_called_nameless(tmp_path):
     text = lines([*six("A{}"), "X", "Y", "Z", "Fx [N]"], DEG, MM, np.arange(N) * 1.5)
     unused = dict(propose(write(tmp_path / "t.csv", text)).proposal.unused)
