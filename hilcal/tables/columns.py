@@ -13,7 +13,7 @@ from difflib import get_close_matches
 import numpy as np
 
 from hilcal.errors import InputError
-from hilcal.readings.covariance import smallest_correlation
+from hilcal.readings.covariance import SINGULAR, smallest_correlation
 from hilcal.readings.readings import SAME_POSE, ObserverKind, ObserverName, Readings
 from hilcal.robot.arm import Arm
 from hilcal.tables.grid import ColumnTable, first_true
@@ -326,7 +326,7 @@ def check_covariances(table: ColumnTable, covariance: Floats) -> None:
     """Refuse covariances (N, m, m) that no error can have.
 
     A covariance is positive semi-definite; tested on the correlation matrix D V D with
-    D = diag(V)^-1/2, so that the answer does not depend on units: eigenvalues >= -1e-9.
+    D = diag(V)^-1/2, so that the answer does not depend on units: eigenvalues >= -SINGULAR.
     """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     for i, j in first_true(variance < 0):
@@ -340,7 +340,7 @@ def check_covariances(table: ColumnTable, covariance: Floats) -> None:
             f"leave out all covariance columns to use the tracker's specification"
         )
     smallest = smallest_correlation(covariance)
-    for (i,) in first_true(smallest < -1e-9):
+    for (i,) in first_true(smallest < -SINGULAR):
         why = f"smallest eigenvalue of the correlation matrix {smallest[i]:.3g}"
         if np.isinf(smallest[i]):
             why = "a covariance is larger than its two variances allow"
