@@ -257,7 +257,7 @@ class Guesser:
         values = (self.values[name] for name in names)
         return np.stack([nothing if v is None else v for v in values], axis=1)
 
-    def assign(self, name: str, columns: Sequence[str], meaning: str, **section: object) -> None:
+    def assign(self, name: str, columns: Sequence[str], meaning: str, /, **section: object) -> None:
         """Give columns a meaning."""
         key = "column" if "column" in section else "columns"
         section = {key: columns[0] if key == "column" else list(columns)} | section

@@ -208,6 +208,12 @@ def test_angles_counted_from_zero_are_noticed(angles, from_zero, tmp_path):
     assert found.joints.from_zero is from_zero
 
 
+def test_distances_without_a_name_are_from_one_point(tmp_path):
+    text = lines([*six("A{}"), "Bar length [mm]"], DEG, np.linalg.norm(MM, axis=1))
+    distance = propose(write(tmp_path / "t.csv", text)).proposal.mapping(Mapping).distance
+    assert (distance.column, distance.name, distance.unit) == ("Bar length [mm]", "A", "mm")
+
+
 def test_a_force_of_unknown_direction_is_not_called_nameless(tmp_path):
     text = lines([*six("A{}"), "X", "Y", "Z", "Fx [N]"], DEG, MM, np.arange(N) * 1.5)
     unused = dict(propose(write(tmp_path / "t.csv", text)).proposal.unused)
