@@ -344,9 +344,9 @@ def _names_poses(g: words.Guesser, name: str, joints: dict[str, Any]) -> bool:
 def guess_scalars(g: words.Guesser) -> None:
     """Find times and the temperature of the air."""
     read = np.ones(len(g.grid.rows), dtype=bool)  # rows that have what a reading needs
-    for section in ("joints", "position"):
-        if section in g.proposal.sections:
-            read &= np.isfinite(g.block(g.proposal.sections[section]["columns"])).any(axis=1)
+    for needed in ("joints", "position"):
+        if needed in g.proposal.sections:
+            read &= np.isfinite(g.block(g.proposal.sections[needed]["columns"])).any(axis=1)
     for c in list(g.free.values()):
         dated = all(isinstance(cell, datetime) for cell in g.grid.cells(c.name))
         timed = dated or (c.has(words.TIME) and not c.axis)
