@@ -14,7 +14,7 @@ import pytest
 from hilcal.errors import HilcalError
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.run_log import RunLog
-from tests.support.cluster import HERE, WORKER, running, scheduler
+from tests.support.cluster import WORKER, environment, running, scheduler
 from tests.support.paths import ROOT
 
 ARMS, EFFECT = ("ur3e", "ur10e"), "encoder_offset"
@@ -28,7 +28,7 @@ def study(folder: Path, *options: str, temporary: Path | None = None) -> "subpro
     more = {} if temporary is None else {"TMPDIR": str(temporary)}
     return subprocess.Popen(
         [sys.executable, "-m", "studies", "corrected", str(folder), *SIZE, *options],
-        env=HERE | {"OMP_NUM_THREADS": "1"} | more,
+        env=environment() | {"OMP_NUM_THREADS": "1"} | more,
         cwd=ROOT,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -18,7 +18,6 @@ pytestmark = [pytest.mark.long, pytest.mark.usefixtures("nothing_goes_on")]
 SCRIPT_PORT = 30003
 HAND = [20.0, 35.0, -44.0, 0.0, 0.0, 0.0]
 NOBODY = [0.0] * 6
-MORE_READINGS = 8
 
 
 def somebody_jogs(s: cases.Site) -> None:
@@ -95,18 +94,6 @@ def test_a_load_that_falls_off_is_asked_for_again_and_no_reading_is_without_it(
     run.interrupt()
     cases.failed(run, 130)
     cases.check_readings(cell, path)
-
-
-@pytest.mark.slow
-def test_an_arm_jogged_before_a_campaign_goes_on_is_asked_for(cell: cases.Site, path: Path) -> None:
-    run, _ = cases.start_run(cell, path, cases.Run.measuring)
-    run.kill()
-    run.end()
-    somebody_jogs(cell)
-    again = cases.Run(cell, path)
-    again.wait_until(lambda: "does not stand where it was left" in again.output, "a question")
-    again.interrupt()
-    again.end()
 
 
 @pytest.mark.slow

@@ -97,7 +97,6 @@ OVERCOME = {
     ),
 }
 """Faults that a run goes on from, by the line that they are on."""
-MORE_READINGS = len(OVERCOME["tracker"])
 START = {
     what: [fault for fault in (*TRACKER, *FORCE) if fault.name.endswith(what)]
     for what in ("unplugged", "mute", "at another rate")
@@ -170,34 +169,6 @@ def test_instruments_that_are_not_ready_are_named_at_once(
             fault.mend(cell)
     assert "tracker" in line
     assert "force sensor" in line
-
-
-@pytest.mark.slow
-def test_the_operator_hangs_the_wrong_load_and_is_told(cell: cases.Site, tmp_path: Path) -> None:
-    path = tmp_path / "loads.hilcal"
-    short = cell.shorter(tmp_path, poses=1)
-    cell.ask("world", "mistake", name="10kg")  # instead of nothing, at the start
-    run = cases.Run(short, path)
-    code, words = run.end()
-    assert code == 0, words
-    assert "asked to take everything off: the force sensor feels" in words
-    cases.check_readings(short, path)
-
-
-@pytest.mark.slow
-def test_an_operator_who_keeps_hanging_the_wrong_load_ends_the_run(
-    cell: cases.Site, tmp_path: Path
-) -> None:
-    path = tmp_path / "loads.hilcal"
-    short = cell.shorter(tmp_path, poses=1)
-    run, _ = cases.start_run(short, path, cases.Run.measuring)
-    for _ in range(3):
-        cell.ask("world", "mistake", name="10kg")
-    line = cases.failed(run)
-    assert "asked 3 times to hang 5kg" in line
-    assert "10.0 kg" in line
-    cases.check_readings(short, path)
-    cases.finish(short, path)
 
 
 @pytest.mark.slow

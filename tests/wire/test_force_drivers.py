@@ -21,11 +21,8 @@ from hilcal.drivers.links import close_port, open_port
 from hilcal.drivers.simulated.force_server import DRIFT_STD, ROOM
 from hilcal.errors import DeviceError, InputError
 from tests.support import force_cases as cases
-from tests.support.force_cases import instruments, simulated
 from tests.support.instruments import WRENCH, force_sensor
 from tests.support.timing import wait_until
-
-__all__ = ["instruments", "simulated"]  # fixtures
 
 
 @cases.ALL
@@ -98,13 +95,6 @@ def test_close_leaves_nothing_behind_and_never_fails(kind, simulated):
     assert len(os.listdir("/proc/self/fd")) <= files + 1
 
 
-def test_an_ft300_is_silent_after_close(instruments):
-    simulated = instruments("ft300")
-    with cases.opened("ft300", simulated.port):
-        assert simulated.admin("state")["streaming"]
-    wait_until(lambda: not simulated.admin("state")["streaming"], "silent")
-
-
 def test_an_ft300_that_streams_for_a_dead_program_is_taken_over(instruments):
     simulated = instruments("ft300")
     port = open_port("force sensor", str(simulated.port), ft300.BAUD)
@@ -164,15 +154,6 @@ def test_unplugged_while_streaming_and_replugged(kind, simulated):
     simulated.admin("replug")
     with cases.opened(kind, simulated.port) as sensor:
         assert cases.steady(sensor, 0.2).frames > 10
-
-
-@cases.BOTH
-def test_unplugged_in_the_middle_of_a_mean(kind, simulated):
-    with cases.opened(kind, simulated.port) as sensor:
-        timer = threading.Timer(0.3, lambda: simulated.admin("unplug"))
-        timer.start()
-        cases.fails(lambda: sensor.average(30.0), "unplugged")
-        timer.join()
 
 
 @cases.BOTH
@@ -385,14 +366,6 @@ def test_ft300_serves_a_modbus_library_that_no_driver_uses() -> None:
             assert ft300.admin("state")["streaming"]
         finally:
             client.close()
-
-
-def test_each_sensor_has_a_zero_of_its_own() -> None:
-    biases = []
-    for seed in (1, 1, 2):
-        with force_sensor("ft300", seed=seed) as sensor:
-            biases.append(sensor.admin("state")["bias"])
-    assert biases[0] == biases[1] != biases[2]
 
 
 def test_the_zero_drifts_as_the_sensor_warms_up() -> None:

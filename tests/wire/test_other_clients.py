@@ -111,12 +111,6 @@ def test_ur_rtde_records_and_writes_inputs(arm: SimulatedUr, tmp_path: Path) -> 
     np.testing.assert_allclose(joints[-1], arm.admin()["q"], atol=1e-3)
 
 
-def test_an_unknown_protocol_is_not_spoken(arm: SimulatedUr) -> None:
-    with Wire(arm.host) as wire:
-        assert wire.ask("V", struct.pack(">H", 3)) == b"\x00"
-        assert wire.ask("V", struct.pack(">H", 2)) == b"\x01"
-
-
 # --- Modbus RTU: MODBUS over Serial Line V1.02, and Application Protocol V1.1b3 ------------------
 
 

@@ -129,22 +129,3 @@ def test_a_line_is_drained_until_quiet(line):
     finally:
         thread.join()
         close_port(port)
-
-
-def test_a_line_that_never_is_quiet_is_told_of(line):
-    port = open_port("tracker", str(line.path), 19200)
-    stop = threading.Event()
-
-    def talk() -> None:
-        while not stop.is_set():
-            os.write(line.master, b"x")
-            time.sleep(0.002)
-
-    thread = threading.Thread(target=talk)
-    try:
-        thread.start()
-        assert not drain(port, quiet=0.5, limit=1.0)
-    finally:
-        stop.set()
-        thread.join()
-        close_port(port)

@@ -2,7 +2,6 @@
 
 import contextlib
 import itertools
-import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,9 +12,7 @@ import serial
 from geocompy.communication import SerialConnection
 from geocompy.geo import GeoCom
 from geocompy.geo.gctypes import GeoComCode
-from scipy import stats
 
-from hilcal.drivers.simulated.admin import Operations
 from hilcal.drivers.simulated.geocom_server import PolarPoint
 from hilcal.drivers.simulated.pty_port import PtyPort
 from hilcal.drivers.simulated.world import SimulatedNoise
@@ -44,25 +41,6 @@ def received(port: PtyPort, line: serial.Serial, count: int) -> bytes:
         port.pump()
         data += line.read(min(count - len(data), 64))
     return data
-
-
-def take(port: PtyPort, count: int) -> bytes:
-    data = b""
-    for _ in range(200):
-        data += port.read(0.02)
-        if len(data) >= count:
-            break
-    return data
-
-
-def test_carries_every_byte_value_both_ways(port: PtyPort) -> None:
-    every = bytes(range(256))
-    with client(port) as line:
-        port.send(every)
-        port.drain()
-        assert line.read(256) == every
-        line.write(every)
-        assert take(port, 256) == every
 
 
 def test_bytes_take_ten_bits_each(port: PtyPort) -> None:
@@ -109,29 +87,6 @@ def test_old_bytes_are_gone_when_a_client_opens(port: PtyPort) -> None:
         port.send(b"new")
         port.drain()
         assert line.read(100) == b"new"
-
-
-def test_plugged_in_again_it_works_under_the_same_name(port: PtyPort) -> None:
-    before = os.readlink(port.link)
-    port.unplug()
-    other = os.openpty()  # takes the freed number: the name has to lead to the new one
-    try:
-        port.faults()["replug"]()
-        assert os.readlink(port.link) != before
-        with client(port) as line:
-            port.send(b"back")
-            port.drain()
-            assert line.read(4) == b"back"
-    finally:
-        for end in other:
-            os.close(end)
-
-
-def test_refuses_what_it_does_not_know(port: PtyPort) -> None:
-    with pytest.raises(ValueError, match="unknown op 'explode'; valid: flip, cut"):
-        Operations(port.faults())("explode", {})
-    with pytest.raises(ValueError, match="valid"):
-        Operations(port.faults())("baud", {"baud": 12345})
 
 
 TARGET = (0.5, 2.8, 0.4)
@@ -251,32 +206,6 @@ def test_refuses_what_it_cannot_do(station: Instrument) -> None:
         assert line.tell("hello\r\n\r\n%R1Q,0,3:") == "%R1P,0,3:0"
 
 
-@pytest.mark.parametrize(
-    ("target", "scale"), [((0.4, 0.6, 1.3), 200.0), ((-8.0, 9.0, -6.0), 200.0)]
-)
-def test_noise_is_as_specified_and_fresh(target: tuple[float, float, float], scale: float) -> None:
-    """The whitened errors of 250 measurements have unit variance in each direction."""
-    count = 250
-    d = float(np.linalg.norm(target))
-    along, across = 20e-6 + 10e-6 * d, 50e-6 + 30e-6 * d
-    options = ("--range-std", "20e-6", "10e-6", "--transverse-std", "50e-6", "30e-6")
-    options += ("--baud", "1000000")
-    with tracker(target, *options, scale=scale) as station, Line(station, 1_000_000) as line:
-        seen = np.array([line.point()[1] for _ in range(count)])
-    sight = np.array(target) / d
-    left = np.array([-sight[1], sight[0], 0.0]) / np.hypot(sight[0], sight[1])
-    axes = np.array([sight, left, np.cross(sight, left)])
-    error = (seen - np.array(target)) @ axes.T / np.array([along, across, across])
-    low, high = stats.chi2.ppf([1e-6, 1 - 1e-6], count)
-    assert np.all((low < (error**2).sum(axis=0)) & ((error**2).sum(axis=0) < high))
-    assert np.all(np.abs(error.mean(axis=0)) < 5 / np.sqrt(count))
-    together = [
-        *np.mean(error[1:] * error[:-1], axis=0),  # one after the other
-        *(np.mean(error[:, i] * error[:, j]) for i, j in ((0, 1), (0, 2), (1, 2))),
-    ]
-    assert np.all(np.abs(together) < 5 / np.sqrt(count))
-
-
 @pytest.mark.parametrize("point", [(0.0, 0.0, 2.0), (0.0, 0.0, -2.0), (1e-9, 0.0, 2.0)])
 def test_straight_above_and_below(point: tuple[float, float, float]) -> None:
     noise, rng = SimulatedNoise((0.0, 0.0), (1e-4, 0.0)), np.random.default_rng(1)
@@ -302,28 +231,3 @@ def test_reads_the_target_of_the_moment_when_it_has_measured(station: Instrument
         code, _, v, distance = line.ask(2108, "60000", "1")
         assert (code, float(distance)) == ("0", float(values[2]))
         assert float(v) == pytest.approx(PolarPoint.of(np.array([-0.1, -0.1, 0.9])).v, abs=1e-3)
-
-
-def test_does_not_wait_longer_than_asked(station: Instrument) -> None:
-    station.admin("meas_s", seconds=1e6)
-    with Line(station) as line:
-        line.ask(2008, "1", "1")
-        code, *_, distance = line.ask(2108, "100", "1")
-        assert (code, float(distance)) == ("1285", 0.0)
-
-
-@pytest.mark.parametrize(
-    "find", [("9013",), ("17020", "0"), ("9037", "0.05", "0.05", "0"), ("9027", "1", "1", "0", "1")]
-)
-def test_a_lost_lock_stays_lost_until_found(station: Instrument, find: tuple[str, ...]) -> None:
-    with Line(station) as line:
-        station.admin("lock_lost")
-        assert line.ask(17017, "2") == ["8710"]
-        assert line.ask(9021) == ["0", "0"]
-        assert line.ask(6021) == ["0", "0"]
-        line.ask(2008, "1", "1")
-        code, *_, distance = line.ask(2108, "5000", "1")
-        assert (code, float(distance)) == ("1285", 0.0)
-        assert line.ask(int(find[0]), *find[1:]) == ["0"]
-        assert line.ask(9021) == ["0", "1"]
-        assert line.point()[0] == 0

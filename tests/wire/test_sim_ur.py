@@ -1,6 +1,5 @@
 """The simulated UR controller, by clients of its protocols; its motions."""
 
-import socket
 import struct
 import time
 from collections.abc import Callable, Iterator
@@ -11,17 +10,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as some
-from scipy.spatial.transform import Rotation
 
 from hilcal.calibration.urscript import movej_program, waypoints, with_joints
-from hilcal.drivers.simulated.blackboard import Blackboard
-from hilcal.drivers.simulated.cell_processes import free_host
 from hilcal.drivers.simulated.ur_programs import ScriptStream
-from hilcal.drivers.simulated.ur_state import GRAVITY, Kinematics, Trajectory, line
-from hilcal.errors import DeviceError
-from hilcal.robot.catalogue import load_arm
-from hilcal.robot.chain import evaluate
-from tests.support.rows import first
+from hilcal.drivers.simulated.ur_state import line
 from tests.support.sim_ur_cases import (
     Client,
     Lines,
@@ -29,7 +21,6 @@ from tests.support.sim_ur_cases import (
     Wire,
     client,
     send_script,
-    server,
     start,
 )
 from tests.support.timing import wait_until
@@ -97,17 +88,6 @@ def learns(run: Client, part: str, call: str, good: Callable[[Any], bool] = bool
     return answer
 
 
-def test_stopj_decelerates_as_told(sim):
-    with client(sim.host, "control") as run:
-        under_way(run, sim)
-        run("control", "stopJ", 1.0)
-        state = sim.admin()
-        assert not state["moving"]  # it blocked until the arm stood
-        assert state["script_running"]
-    (began,) = [ns for ns, what in sim.admin("log") if what == "stop command, 1"]
-    assert state["rest_ns"] - began == pytest.approx(SPEED / 1.0 * 1e9, rel=0.05)
-
-
 @pytest.mark.parametrize("how", ["dashboard", "line", "program", "killed"])
 def test_ways_to_stop(sim, how):
     with client(sim.host, "control", "dashboard") as run:
@@ -128,10 +108,6 @@ def test_ways_to_stop(sim, how):
         sim.wait("script_running", False)
         learns(run, "control", "isProgramRunning", lambda running: running is False)
         assert run("control", "moveJ", goal, SPEED, ACCELERATION) is False
-
-
-def turned(vector):
-    return Rotation.from_rotvec(vector).as_matrix()
 
 
 def test_asynchronous_move_reaches_its_goal(sim):
@@ -166,34 +142,6 @@ def test_payload_keeps_its_centre_when_told_zeros(sim):
     arm = sim.board.read("arm")
     assert arm["payload"] == 3.5
     np.testing.assert_array_equal(arm["payload_com"], [0.01, 0.02, 0.03])
-
-
-def test_forward_kinematics_is_that_of_the_nominal_arm(sim):
-    tool = [0.1, -0.05, 0.2, 0.3, -0.4, 0.5]
-    with client(sim.host, "control", "receive") as run:
-        assert run("control", "setTcp", tool)
-        told = run("control", "getForwardKinematics")
-        learns(run, "receive", "getActualTCPPose", lambda p: np.allclose(p, told, atol=1e-4))
-        assert run("control", "setTcp", [0.0] * 6)
-    place = np.eye(4)
-    links = load_arm("ur10e").links
-    for link, angle in zip(links, [*sim.admin()["q"], 0.0], strict=True):
-        turn = np.eye(4)
-        turn[:3, :3] = turned([0.0, 0.0, angle])
-        place = place @ link @ turn
-    offset = np.eye(4)
-    offset[:3, :3], offset[:3, 3] = turned(tool[3:]), tool[:3]
-    expected = place @ offset
-    np.testing.assert_allclose(told[:3], expected[:3, 3], atol=1e-9)
-    np.testing.assert_allclose(turned(told[3:]), expected[:3, :3], atol=1e-9)
-
-
-def test_goal_beyond_the_joints_is_a_protective_stop(sim):
-    with client(sim.host, "control") as run:
-        goal = sim.admin()["q"]
-        goal[5] = 7.0
-        assert run("control", "moveJ", goal, SPEED, ACCELERATION) is False
-    assert sim.admin()["safety"] & 1 << 2
 
 
 Q = np.array([[0.1, -1.2, 1.5, -1.0, -1.4, 0.3], [0.3, -1.1, 1.4, -0.9, -1.5, 0.4]])
@@ -288,15 +236,6 @@ def test_dashboard_connections_of_local_mode_stay_without_rights(sim):
         assert dashboard.ask("stop") == "Stopped"
 
 
-def test_unknown_operations_and_settings_are_refused(sim):
-    with pytest.raises(DeviceError, match=r"'explode'; valid: protective_stop"):
-        sim.admin("explode")
-    with pytest.raises(DeviceError, match=r"speed_scaling = 2; valid: 0 to 1"):
-        sim.admin("set", speed_scaling=2)
-    with pytest.raises(DeviceError, match="four numbers"):
-        sim.admin("set", version="5.11")
-
-
 def test_the_truth_is_what_the_sensors_tell(tmp_path):
     rng = np.random.default_rng(4)
     truth = {
@@ -332,23 +271,6 @@ def test_the_truth_is_what_the_sensors_tell(tmp_path):
         sim.close()
 
 
-@pytest.mark.parametrize("port", first(1, [30004, 29999, 30003]))
-def test_an_address_in_use_is_refused(tmp_path, port):
-    Blackboard.create(tmp_path / "world.bin", 1.0)
-    host = free_host()
-    with socket.socket() as taken:
-        taken.bind((host, port))
-        taken.listen()
-        process = server(tmp_path, host)
-        process.start()
-        wait_until(lambda: process.has_ended, "ended")
-        with pytest.raises(DeviceError, match=rf"exit code 3: .*{host}:{port} is in use"):
-            process.check()
-        process.end()
-    assert process.log.read_text().count("\n") == 1
-    assert not (tmp_path / "arm.sock").exists()
-
-
 @pytest.mark.long
 def test_a_restarted_controller_finds_its_arm_where_it_was(tmp_path):
     sim = start(tmp_path)
@@ -364,12 +286,7 @@ def test_a_restarted_controller_finds_its_arm_where_it_was(tmp_path):
         assert sim.board.read("arm")["arrivals"] == 42
 
 
-GOAL = np.array([1.0, -0.5, 0.0, 0.2, 0.0, -1.5])
 vectors = some.lists(some.floats(-3.0, 3.0), min_size=6, max_size=6).map(np.array)
-
-
-def trajectory():
-    return Trajectory(np.zeros(6), np.ones(6), 5, 100.0)
 
 
 @given(vectors, some.floats(0.01, 2.0), some.floats(0.01, 10.0))
@@ -390,47 +307,6 @@ def test_speed_is_the_derivative_and_limits_hold(goal, speed, acceleration):
         np.diff(way), 0.5 * step * (rate[1:] + rate[:-1]), rtol=0.0, atol=corner
     )
     assert np.max(np.abs(np.diff(rate))) <= acceleration * step * (1 + 1e-6) + 1e-12
-
-
-@pytest.mark.parametrize("when", [0.2, 1.5, 3.1, 3.45])
-def test_stop_is_smooth_and_stays_on_the_line(when):
-    path = trajectory()
-    path.start(GOAL, 0.5, 1.0, 100.0)
-    path.advance(100.0 + when)
-    speed, q = np.max(np.abs(path.qd)), path.q.copy()
-    path.stop(2.0, 100.0 + when)
-    assert path.moving
-    path.advance(100.0 + when + 1e-6)
-    assert np.max(np.abs(path.qd)) == pytest.approx(speed, rel=1e-3)
-    path.advance(104.0)
-    assert not path.moving
-    assert path.arrivals == 6
-    rest = path.rest_time - 100.0 - when
-    assert rest <= speed / 2.0 + 1e-9
-    np.testing.assert_allclose(path.q - q, GOAL / 1.5 * 0.5 * speed * rest, atol=1e-9)
-    assert np.all(np.abs(path.q) <= np.abs(GOAL) + 1e-12)
-
-
-def test_jacobian_and_weight_are_derivatives():
-    kinematics = Kinematics(load_arm("ur10e"))
-    arm = kinematics.arm
-    rng = np.random.default_rng(2)
-    q, com, mass, h = rng.uniform(-2, 2, 6), np.array([0.05, -0.1, 0.2]), 4.0, 1e-6
-
-    def tip(q):
-        place = kinematics.flange(q)
-        return place[:3, 3] + place[:3, :3] @ com
-
-    def energy(q):
-        """Work of gravity, J."""
-        centres = evaluate(arm, q[None]).com[:, 0]
-        return arm.masses @ centres @ GRAVITY + mass * GRAVITY @ tip(q)
-
-    steps = h * np.eye(6)
-    numeric = np.array([(tip(q + s) - tip(q - s)) / (2 * h) for s in steps]).T
-    np.testing.assert_allclose(kinematics.jacobian(q, tip(q))[:3], numeric, atol=1e-8)
-    work = [(energy(q + s) - energy(q - s)) / (2 * h) for s in steps]
-    np.testing.assert_allclose(kinematics.weight_torque(q, mass, com), work, atol=1e-6)
 
 
 def test_script_port_cuts_programs_and_lines():

@@ -128,56 +128,6 @@ def test_a_full_disk_stops_the_arm_and_loses_nothing(cell: cases.Site, tmp_path:
 
 
 @pytest.mark.slow
-def test_a_pose_out_of_the_trackers_sight_is_left_out(cell: cases.Site, tmp_path: Path) -> None:
-    short = cell.shorter(tmp_path, poses=2)
-    path = tmp_path / "hidden.hilcal"
-    hiding = short.plan.joints("p2")
-
-    def check_ends(says: str, code: int, *more: str) -> None:
-        """Run with a beam that is broken wherever the arm is near p2."""
-        for left in reversed(range(cases.TRIES)):
-            run = cases.Run(short, path, *more)
-            while run.process.poll() is None:
-                near = np.abs(np.array(cell.ask("arm", "state")["q"]) - hiding).max() < 0.02
-                cell.ask("tracker", "beam", on=bool(near))
-                time.sleep(0.01)
-            cell.ask("tracker", "beam", on=False)
-            got, words = run.end()
-            if (got, says in words) == (code, True):
-                return
-            assert left, words
-            assert cases.STARVED.search(words), words
-            more = ()  # it is stored before the arm moves
-
-    def jog_home() -> None:
-        cell.ask("arm", "jog", q=short.plan.joints("reference").tolist())
-
-    check_ends("line of sight", 3)
-    check_ends("drive it by hand to where the tracker sees it", 3)
-    jog_home()
-    check_ends("--skip p2 goes on without that pose", 3)
-    jog_home()
-    check_ends("readings are in", 0, "--skip", "p2")
-    with CampaignFile.open(path) as campaign:
-        done = RunLog(campaign).done()
-    assert {s for s in short.plan.steps if s.pose != "p2"} <= done
-    assert "p2" not in {s.pose for s in done}
-    cases.check_readings(short, path)
-
-
-@pytest.mark.slow
-def test_two_programs_at_one_cell(cell: cases.Site, tmp_path: Path) -> None:
-    short = cell.shorter(tmp_path, poses=2)
-    first, _ = cases.start_run(short, tmp_path / "first.hilcal", cases.Run.measuring)
-    second = cases.Run(short, tmp_path / "second.hilcal")
-    line = cases.failed(second)
-    assert line.count("in use by another program") == 2  # both serial ports
-    code, words = first.end()
-    assert code == 0, words
-    cases.check_complete(short, tmp_path / "first.hilcal")
-
-
-@pytest.mark.slow
 def test_two_programs_at_one_campaign_file(cell: cases.Site, tmp_path: Path) -> None:
     short = cell.shorter(tmp_path, poses=1)
     path = tmp_path / "locked.hilcal"

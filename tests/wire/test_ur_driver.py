@@ -12,9 +12,6 @@ from hilcal.drivers.ur_link.control import Control
 from hilcal.drivers.ur_link.worker import WorkerError
 from hilcal.errors import DeviceError, InputError
 from tests.support import ur_driver_cases as cases
-from tests.support.ur_driver_cases import arm, sim
-
-__all__ = ["arm", "sim"]  # fixtures
 
 
 def test_opening_and_report_move_nothing_and_upload_nothing(sim):
@@ -194,17 +191,6 @@ def test_second_program_is_refused_and_disturbs_nothing(arm, sim):
     assert sim.admin()["payload"] == cases.MASS
 
 
-def test_motion_in_a_world_that_goes_faster(tmp_path):
-    with (
-        closing(cases.start(tmp_path, scale=20.0)) as running,
-        closing(cases.controlled(running, clock=20.0)) as arm,
-    ):
-        goal = cases.displaced_joints(arm, by=2.0)
-        arm.start_move(goal, cases.SPEED, cases.ACCELERATION)
-        cases.finish(arm)
-        np.testing.assert_allclose(running.admin()["q"], goal, atol=2e-5)
-
-
 def test_controller_that_does_not_tell_its_payload(tmp_path):
     with (
         closing(cases.start(tmp_path, "--version", "5.4.0.0")) as running,
@@ -250,15 +236,6 @@ def test_versions_of_polyscope_x(tmp_path, version, says):
 
 
 CONNECT_S = 8.0  # deadline of opening (the requirement)
-
-
-@pytest.mark.usefixtures("put_right")
-def test_local_mode_is_refused_before_anything_is_uploaded(sim):
-    scripts = sim.admin("local_mode")["scripts"]
-    with closing(open_arm(cases.config(sim.host))) as arm:
-        with pytest.raises(DeviceError, match="local mode"):
-            arm.take_control(1.0, np.zeros(3))
-        assert sim.admin()["scripts"] == scripts
 
 
 def fails_to_open(host):

@@ -20,9 +20,6 @@ from tests.support import ur_driver_cases as cases
 from tests.support.paths import ROOT
 from tests.support.rows import first
 from tests.support.timing import runs, wait_until
-from tests.support.ur_driver_cases import arm, sim
-
-__all__ = ["arm", "sim"]  # fixtures
 
 FAULTS = {
     "emergency_stop": ("emergency stop", "release"),
@@ -67,13 +64,6 @@ def test_motion_that_is_refused_is_told(arm, sim):
     text = cases.error_of(lambda: arm.start_move(goal, cases.SPEED, cases.ACCELERATION))
     assert "did not take the motion" in text
     assert not sim.admin()["moving"]
-
-
-def test_sample_in_motion_stops_the_arm_when_the_link_is_lost(arm, sim):
-    cases.under_way(arm, sim)
-    since = sim.admin("rtde_drop")["fault_ns"]
-    assert "the link is lost" in cases.error_of(arm.sample)
-    cases.check_resting(sim, since)
 
 
 def test_protective_stop_names_its_cause_and_is_recovered_from(tmp_path):
@@ -146,14 +136,6 @@ def test_motion_scaled_to_nothing_is_given_up(arm, sim):
     sim.admin("set", speed_scaling=1.0)
     time.sleep(0.2)
     assert abs(sim.admin()["q"][0] - goal[0]) > 0.05  # it does not go on later
-
-
-def test_slow_speed_slider_is_waited_for(arm, sim):
-    sim.admin("set", slider=0.2)
-    goal = cases.displaced_joints(arm, by=0.05)
-    arm.start_move(goal, cases.SPEED, cases.ACCELERATION)
-    cases.finish(arm)
-    np.testing.assert_allclose(sim.admin()["q"], goal, atol=2e-5)
 
 
 @pytest.mark.parametrize("fault", first(1, ["rtde_drop", "rtde_stall", "rtde_half_frame"]))

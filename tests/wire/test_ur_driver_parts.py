@@ -16,7 +16,6 @@ from hilcal.config.reference import to_toml
 from hilcal.drivers.simulated.cell_processes import SimulatedCell, free_host
 from hilcal.drivers.simulated.ur_rtde import outputs_since
 from hilcal.drivers.simulated.ur_server import API
-from hilcal.drivers.simulated.ur_state import line
 from hilcal.drivers.ur import open_arm
 from hilcal.drivers.ur_link import states
 from hilcal.drivers.ur_link.control import MARGIN_S, MotionInProgress, deceleration, program_ended
@@ -32,11 +31,7 @@ from hilcal.drivers.ur_link.reading import (
     settled_rate,
 )
 from hilcal.drivers.ur_link.supervision import RobotApi
-from hilcal.drivers.ur_link.worker import Worker, WorkerError
 from hilcal.identification.torques import check_torques
-from hilcal.measuring.route import duration
-from hilcal.robot.catalogue import load_arm
-from hilcal.robot.factory import nominal_rows
 from hilcal.store.campaign_file import CampaignFile
 from tests.support import ur_driver_cases as cases
 from tests.support.cli_cases import ok
@@ -52,18 +47,6 @@ FIELDS = {
 }
 
 
-@given(
-    distance=st.floats(1e-4, 6.0), speed=st.floats(0.01, 3.0), acceleration=st.floats(0.01, 40.0)
-)
-def test_time_of_a_motion_is_that_of_the_simulated_controller(distance, speed, acceleration):
-    goal = np.zeros(N)
-    goal[3] = -distance
-    segment = line(np.zeros(N), goal, speed, acceleration)
-    assert duration(np.zeros(N), goal, speed, acceleration) == pytest.approx(
-        segment.duration, rel=1e-9
-    )
-
-
 @given(speed=st.floats(0.01, 2.0))
 def test_every_speed_is_braked_in_time(speed):
     assert speed / deceleration(speed) <= 0.2
@@ -71,10 +54,6 @@ def test_every_speed_is_braked_in_time(speed):
 
 def reading(**changes):
     return read({"host_ns": 1, "fields": {**FIELDS, **changes}})
-
-
-def test_slider_and_scaling_multiply():
-    assert reading().sample.speed_scaling == 0.25
 
 
 @pytest.mark.parametrize(
@@ -126,11 +105,6 @@ def test_a_pause_that_the_watchdog_bears_does_not_hide_another_program():
         assert "another program" in program_ended(stopped, late)
     assert "too busy for 0.09 s" in program_ended(stopped, 0.09)
     assert "another program" not in program_ended(stopped, 0.2)
-
-
-def test_worker_that_cannot_start_says_so():
-    with pytest.raises(WorkerError, match="exit code 1"):
-        Worker("no such kind", (), 10.0)
 
 
 def test_a_moment_without_packets_is_no_slow_line() -> None:
@@ -346,10 +320,3 @@ def test_a_controller_tells_the_kinematics_of_its_factory(tmp_path, version: str
         np.testing.assert_allclose(report.kinematics.rows, made.rows, rtol=1e-9, atol=1e-9)
         assert report.kinematics.status == 2
         assert dict(report.fields)["kinematics"] == report.kinematics.to_dict()
-
-
-def test_a_controller_without_a_calibration_tells_the_nominal_ones(tmp_path) -> None:
-    with closing(cases.start(tmp_path)) as running:
-        found = read_kinematics(running.host, 2.0)
-    np.testing.assert_allclose(found.rows, nominal_rows(load_arm("ur10e")), rtol=0, atol=1e-12)
-    assert found.status == 0

@@ -10,7 +10,6 @@ import pytest
 import hilcal as hc
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensation import band, tool_poses
-from hilcal.calibration.covariance_source import CovarianceSource
 from hilcal.calibration.measured import MeasuredRanges
 from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.storage import from_json, to_json
@@ -18,7 +17,6 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.registration.robot_frames import state_with_every_column
 from hilcal.model.model import Model
-from hilcal.robot import se3
 from hilcal.robot.arm import with_conventions
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
@@ -72,31 +70,6 @@ def test_the_world_is_where_it_was_asked_to_be(effect):
     assert np.sqrt(np.mean(np.sum(after**2, axis=1) / k.after.std_m[good] ** 2)) < 1.2
 
 
-@pytest.mark.parametrize("effect", ["link_geometry", "encoder_offset"])
-def test_the_base_does_not_move_along_with_the_first_link(effect):
-    """Moving the base along with the first link changes no reading, and no correction either."""
-    c, r = calibrated(effect), campaign(effect, "absolute", 0, poses=POSES).readings
-    base = c.base_in_tracker()
-    seen = (r.value[:, :3] - base[:3, 3]) @ base[:3, :3]
-    p = c.predict(r.states.q, r.states.wrench)
-    np.testing.assert_allclose(p.position, seen, atol=2e-4)
-    shifted = replace(c, theta=c.theta + moved_along(c))
-    again = shifted.predict(r.states.q, r.states.wrench)
-    np.testing.assert_allclose(again.position, p.position, atol=5e-6)  # loads pull elsewhere
-    np.testing.assert_array_equal(again.nominal_position, p.nominal_position)
-    np.testing.assert_allclose(shifted.base_in_tracker(), base, atol=1e-5)
-
-
-def moved_along(c):
-    """Parameters that turn the base one way and the first link, or joint, the other."""
-    names = [f"{e.name}.{p.name}" for e in c.model.effects for p in e.parameters]
-    out = np.zeros(len(names))
-    out[names.index("base_frame.rz")] = 2e-3
-    other = "link_geometry.link0.rz" if "link_geometry.link0.rz" in names else "encoder_offset.j1"
-    out[names.index(other)] = -2e-3
-    return out
-
-
 def test_deflections_are_compensated_to_the_unloaded_arm():
     c, states = calibrated("joint_tilt_compliance", "deflection"), fresh()
     k = c.compensate(states.q, states.wrench)
@@ -113,19 +86,6 @@ def test_deflections_are_compensated_to_the_unloaded_arm():
     nothing = c.compensate(states.q)
     np.testing.assert_allclose(nothing.q, states.q, atol=1e-9)
     assert nothing.before.error_m.max() < 1e-12
-
-
-def test_a_wanted_pose_is_reached_from_joint_values_nearby():
-    c, q = calibrated("none"), fresh().q[:5]
-    wanted = se3.matrix(*(x[:5] for x in nominal(c, q)))
-    k = c.compensate(q + 0.05, wanted=wanted, std=False)
-    np.testing.assert_allclose(k.q, c.compensate(q, std=False).q, atol=1e-8)
-
-
-def nominal(c, q):
-    chain = evaluate(c.model.cell.arm, q)
-    pose = c.tool_pose()
-    return se3.product(chain.rotation[-1], pose[:3, :3]), chain.point(pose[:3, 3])
 
 
 @pytest.mark.parametrize("effect", ["target_offset", "thermal_growth", "creep", "backlash"])
@@ -157,15 +117,6 @@ def test_a_calibration_comes_back_from_its_file(effect, tmp_path):
     assert [(o.range, o.points.tolist()) for o in a.after.outside] == [
         (o.range, o.points.tolist()) for o in b.after.outside
     ]
-
-
-def test_a_calibration_of_an_arm_of_unknown_payload_and_torques_comes_back(tmp_path):
-    """Such as most arms that are described by a URDF or by DH rows alone."""
-    c = calibrated("none")
-    arm = replace(c.model.cell.arm, payload=np.inf, torque_max=np.full(6, np.inf))
-    c = replace(c, model=replace(c.model, cell=replace(c.model.cell, arm=arm)))
-    c.save(tmp_path / "c.json")
-    assert Calibration.load(tmp_path / "c.json").model.cell.arm.payload == np.inf
 
 
 def test_a_file_of_another_kind_is_refused_in_words(tmp_path):
@@ -271,35 +222,3 @@ def test_coupled_joints_are_compensated_by_the_controllers_values():
     wanted = evaluate(arm, q).point(cell.target[:3, 3])
     np.testing.assert_allclose(c.predict(k.q, [0, 0, -80, 0, 0, 0]).position, wanted, atol=1e-9)
     assert k.before.error_m.mean() > 1e-3
-
-
-@pytest.mark.parametrize(
-    ("effect", "mode"),
-    [("transmission_error", "absolute"), ("joint_tilt_compliance", "deflection")],
-)
-def test_the_covariance_follows_from_the_fitted_states(effect, mode):
-    c = calibrated(effect, mode)
-    small = json.loads(json.dumps(c.covariance_source.to_json()))
-    again = replace(c, root=None, covariance_source=CovarianceSource.from_json(small))
-    states = fresh(3)
-    a, b = (x.predict(states.q, states.wrench) for x in (c, again))
-    np.testing.assert_allclose(a.std_m, b.std_m, rtol=1e-5)
-
-
-@pytest.mark.slow
-def test_a_thousand_parameters_are_a_small_file(tmp_path):
-    made = campaign("transmission_error", "absolute", 0, poses=POSES, harmonics=20)
-    model = baseline(made.cell, made.readings, "absolute")
-    options = {"harmonics": 100}
-    effect = model.catalogue.make("transmission_error", made.cell, made.readings.states, options)
-    c = Calibration.of(fit(model + effect, made.readings, "absolute"))
-    assert len(c.theta) > 1000
-    path = tmp_path / "c.json"
-    c.save(path)
-    assert path.stat().st_size < 0.5e6
-    again, states = Calibration.load(path), fresh(2)
-    a, b = (x.predict(states.q, states.wrench) for x in (c, again))
-    np.testing.assert_array_equal(a.position, b.position)
-    np.testing.assert_allclose(a.std_m, b.std_m, rtol=5e-3)
-    again.save(tmp_path / "again.json")
-    assert (tmp_path / "again.json").stat().st_size == pytest.approx(path.stat().st_size, rel=0.01)

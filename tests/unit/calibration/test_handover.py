@@ -9,28 +9,9 @@ import pytest
 from hilcal.calibration.handover import corrected_arm, ur_kinematics
 from hilcal.errors import CannotAnswerError
 from hilcal.robot.catalogue import load_arm, robot_names
-from hilcal.robot.chain import Deviation
 from tests.support.refusals import refusal, refusal_of
-from tests.unit.calibration.other_eyes import flanges, ur_origins
-from tests.unit.calibration.test_calibration import calibrated, fresh
-
-
-@pytest.mark.parametrize("effect", ["link_geometry", "encoder_offset"])
-def test_constant_effects_are_in_the_transforms_exactly(effect):
-    c = calibrated(effect)
-    found = corrected_arm(c)
-    assert found.included == (effect,)
-    assert found.not_included == ("joint_compliance",)
-    states = fresh()
-    situation = c.model.predict(states, c.theta).situation
-    deviation = Deviation()
-    for e, mine in zip(c.model.effects, c.model.slices(), strict=True):
-        if e.name == effect:
-            deviation = e.deviation(c.theta[mine], situation)
-    base, behind = c.frames.chain, c.frames.flange
-    expected = base @ flanges(c.model.cell.arm, states.q, deviation) @ behind
-    np.testing.assert_allclose(flanges(found.arm, states.q), expected, atol=1e-12)
-    assert np.abs(expected - flanges(c.model.cell.arm, states.q)).max() > 1e-5
+from tests.unit.calibration.other_eyes import ur_origins
+from tests.unit.calibration.test_calibration import calibrated
 
 
 @pytest.mark.parametrize("effect", ["joint_tilt_compliance", "transmission_error"])

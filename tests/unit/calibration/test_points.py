@@ -7,7 +7,6 @@ import pandas as pd
 import pytest
 
 from hilcal.calibration.points import on_branch, read_points
-from hilcal.calibration.urscript import movej_program, program_points, waypoints
 from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.robot.catalogue import load_arm
@@ -137,15 +136,6 @@ def test_a_unit_is_taken_where_the_arm_tells_it(tmp_path, far):
     np.testing.assert_allclose(found.target_poses[:, :3, 3], points[:, :3, 3], atol=1e-9)
 
 
-def test_joint_values_alone_under_other_names(tmp_path):
-    rows = "".join(";".join(f"{v:.9f}" for v in np.degrees(q)) + "\n" for q in Q)
-    path = written(tmp_path, "A1;A2;A3;A4;A5;A6\n" + rows.replace(".", ","))
-    found = read_points(path, ARM, LOADS)
-    np.testing.assert_allclose(found.q, Q, atol=1e-9)
-    assert found.target_poses is None
-    assert found.wrench is None
-
-
 @pytest.mark.parametrize("kind", ["csv", "xlsx", "parquet"])
 def test_poses_without_joint_values_by_a_mapping(tmp_path, kind):
     """As the message on the missing convention says: --preview writes the mapping to correct."""
@@ -177,11 +167,3 @@ def test_a_pose_out_of_reach_is_named(tmp_path):
 def test_tables_that_cannot_be_used_are_refused(case, given, tmp_path):
     path = written(tmp_path, given)
     refuses(case, lambda: read_points(path, ARM, LOADS), path)
-
-
-def test_a_program_of_moves_has_them_as_waypoints():
-    np.testing.assert_allclose([w.q for w in waypoints(movej_program(["a", "b"], Q))], Q, atol=1e-9)
-
-
-def test_a_program_without_waypoints_is_refused(tmp_path):
-    refusal(r"p\.script: no waypoints", program_points, written(tmp_path, "x = 1\n", "p.script"))

@@ -84,9 +84,3 @@ def test_repeats_below_the_noise_say_how_much_it_can_be():
     scatter = Calibration.of(fitted(c, "absolute", noisy)).scatter
     assert scatter.source == "repeats"
     assert TRUE < scatter.joint_std[0] < 10 * TRUE
-
-
-def test_what_the_fit_or_the_cell_states_goes_first():
-    c = campaign(poses=16, cycles=3)
-    found = fitted_model(c.cell, c.readings, "absolute")
-    assert Calibration.of(found).scatter.source == "stated"

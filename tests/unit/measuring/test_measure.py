@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.errors import DeviceError
 from hilcal.measuring.devices import TrackerSample
-from hilcal.measuring.measure import SettleWindow, average, deviations
+from hilcal.measuring.measure import SettleWindow, average
 from tests.support.refusals import refusal_of
 from tests.support.rows import first
 
@@ -81,17 +81,6 @@ def test_noise_far_above_what_is_stated_is_not_believed_away(worse):
     assert got > 0.85
 
 
-def test_scatter_is_how_much_worse_it_is_with_uniform_p_values():
-    rng = np.random.default_rng(11)
-    p = [average(samples_of(drawn(rng, 6))).scatter_p for _ in range(800)]
-    assert stats.kstest(p, "uniform").pvalue > 1e-3
-    rng = np.random.default_rng(12)
-    result = average(samples_of(drawn(rng, 400, 9 * V)))
-    assert result.scatter == pytest.approx(9, rel=0.15)
-    assert result.scatter_p < 1e-12
-    assert "3.0 times" in result.warnings[0]
-
-
 def test_rotations_average_on_the_sphere_also_across_the_half_turn():
     rng = np.random.default_rng(5)
     middle = Rotation.from_rotvec([0.0, 0.0, np.pi - 1e-5])  # rotation vectors flip about here
@@ -102,19 +91,6 @@ def test_rotations_average_on_the_sphere_also_across_the_half_turn():
     off = (Rotation.from_rotvec(mean.value[3:]) * middle.inv()).as_rotvec()
     assert np.linalg.norm(off) < 4 * 8e-5 / np.sqrt(50) * np.sqrt(3)
     assert np.trace(mean.covariance[3:, 3:]) == pytest.approx(3 * 8e-5**2 / 50, rel=0.3)
-
-
-def test_deviations_of_poses_turn_with_the_sensor_axes():
-    rng = np.random.default_rng(6)
-    turns = Rotation.from_rotvec(0.3 * rng.standard_normal((8, 3)))
-    values = np.hstack([np.zeros((8, 3)), turns.as_rotvec()])
-    frame = Rotation.from_rotvec([0.5, 1.1, -0.4])
-    seen = np.hstack([np.zeros((8, 3)), (frame * turns).as_rotvec()])
-    (mean, residuals), (mean_seen, residuals_seen) = deviations(values), deviations(seen)
-    assert residuals.sum(axis=0) == pytest.approx(np.zeros(6), abs=1e-12)
-    assert residuals_seen[:, 3:] == pytest.approx(frame.apply(residuals[:, 3:]), abs=1e-10)
-    there = frame * Rotation.from_rotvec(mean[3:])
-    assert Rotation.from_rotvec(mean_seen[3:]).as_matrix() == pytest.approx(there.as_matrix())
 
 
 def test_gross_outlier_is_left_out_and_named():
@@ -139,18 +115,6 @@ def test_one_in_five_may_be_left_out_and_more_is_no_reading(count, bad):
         assert average(samples_of(values)).left_out == tuple(range(bad))
         return
     refusal_of(DeviceError, f"readings scatter: {bad} of {count}", average, samples_of(values))
-
-
-def test_good_samples_are_never_left_out():
-    rng = np.random.default_rng(8)
-    for count in (3, 5, 10, 50):
-        for _ in range(300):
-            assert average(samples_of(drawn(rng, count))).left_out == ()
-
-
-def test_remarks_of_the_instrument_come_once():
-    result = average(samples_of([PLACE] * 3, warnings=["tilted", "", "tilted"]))
-    assert result.warnings == ("tilted",)
 
 
 STD = np.array([5.0, 12.0, 12.0]) * 1e-6

@@ -1,6 +1,5 @@
 """A campaign that ends as soon as its goal is met: home, nothing hangs, and the rest waits."""
 
-from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -82,13 +81,6 @@ def test_a_goal_that_is_met_elsewhere(count, more):
     assert b.store.kinds()[-1] == "finished"
 
 
-def test_a_plan_without_returns_ends_at_the_reference_too(b):
-    plan = plan_of(("p1", "none", 0), ("p1", "3kg", 0), ("p2", "3kg", 0), ("p2", "none", 0))
-    b.measure(plan, goal=Enough(2))
-    assert steps(b) == list(plan.steps[:2])
-    assert is_home(b)
-
-
 def test_the_way_home_is_clear(b):
     """A post stands between p2 and the reference pose: the arm goes back by where it came."""
     q = {"reference": HOME, "via": np.add(POSES["p2"], [0.0, -0.5, 0.3, 0.0, 0.0, 0.0]),
@@ -108,16 +100,6 @@ def test_the_way_home_is_clear(b):
     assert route_problems(Feasibility(b.cell, config), (p2, *way)) == []
     free = way_home(b.cell, b.config, plan, [home, via, p2], frozenset())
     assert [s.name for s in free] == ["reference"]
-
-
-@pytest.mark.long
-def test_what_was_left_out_is_measured_on_resuming():
-    b, plan = Bench(), usual_plan()
-    b.measure(goal=Enough(7))
-    b.world.restart()
-    b.measure()
-    assert Counter(steps(b)) == Counter(plan.steps)
-    assert steps(b)[-1] == plan.steps[-1]  # the campaign still ends with a look at the drift
 
 
 def test_resuming_towards_a_farther_goal():

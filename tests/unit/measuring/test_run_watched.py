@@ -77,20 +77,6 @@ def test_an_arm_jogged_to_a_free_place_is_asked_for_and_the_way_checked_from_the
     assert b.world.calls.index("operator.confirm") < b.world.calls.index("arm.take_control")
 
 
-@pytest.mark.long
-def test_an_arm_that_is_moved_while_it_is_asked_for_is_asked_for_again(b):
-    jogged(b, "none", FREE)
-    places = [FREE + 0.1, FREE + 0.1]
-
-    def again(question):
-        if places:
-            b.world.q = places.pop()
-
-    call_before(b.operator, "confirm", again)
-    b.measure()
-    assert len(confirmed(b)) == 2
-
-
 def test_an_arm_jogged_while_control_is_taken_is_not_moved(b):
     call_before(b.rig.arm, "take_control", lambda *_: setattr(b.world, "q", FREE.copy()))
     refusal_of(DeviceError, r"has commanded it since.*0\.5 rad", b.measure)
@@ -124,17 +110,6 @@ def test_an_operator_who_cannot_be_asked_is_not_taken_to_agree(b):
     b.rig = replace(b.rig, operator=Silent(b.operator))
     refusal_of(DeviceError, "does not stand where it was left", b.measure)
     assert "arm.start_move" not in b.world.calls
-
-
-@pytest.mark.long
-def test_a_campaign_that_goes_on_says_that_the_arm_stands_elsewhere_and_asks():
-    for moved, questions in ((False, 0), (True, 1)):
-        b = Bench()
-        b.interrupt(1, SHORT)
-        if moved:
-            b.world.q = FREE.copy()
-        b.measure(SHORT)
-        assert len(confirmed(b)) == questions
 
 
 @pytest.mark.parametrize("elsewhere", [False, True])
@@ -439,13 +414,6 @@ def test_who_bears_a_part_of_a_heavy_load_in_motion_is_noticed_though_it_may_swi
     assert "6kg" in [name for name, why in b.operator.requests if "where 6kg should hang" in why]
 
 
-@pytest.mark.long
-def test_a_load_that_stays_wrong_ends_the_run(b):
-    falls_in_motion(b, "none", "none", "none")
-    refusal_of(DeviceError, r"asked 3 times to hang 3kg.*--resume$", b.measure)
-    assert len(b.store.rows) == 7
-
-
 def test_a_tracker_whose_target_does_not_move_with_the_arm_is_named_before_any_reading(b):
     still = b.world.position()
     b.world.position = lambda: still
@@ -483,18 +451,6 @@ def test_a_tracker_that_keeps_to_the_place_of_the_last_pose_is_named(b, good):
     assert "why" in b.store.last("doubted")
     doubted = [content["reading"] for _, content in b.store.events if content.get("stored")]
     assert doubted == ([asdict(b.store.rows[1][0])] if good == 2 else [])
-
-
-@pytest.mark.long
-def test_stored_readings_of_a_stuck_tracker_do_not_keep_a_campaign_from_going_on(b):
-    """As older versions stored them: four right ones, then three at one and the same place."""
-    plan = usual_plan()
-    b.interrupt(7, plan)
-    step, reading, _ = b.store.rows[3]
-    for k in (4, 5, 6):
-        step, other, text = b.store.rows[k]
-        b.store.rows[k] = (step, replace(other, value=reading.value), text)
-    assert len(b.measure(plan)) == len(plan.steps)
 
 
 def test_a_force_sensor_that_repeats_itself_is_named(b):

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 import hilcal.drivers.simulated
@@ -14,9 +13,7 @@ from hilcal.drivers.simulated.injected_effects import (
     DEFLECTION_EFFECTS,
     EFFECTS,
     hide_effect,
-    world_without_effect,
 )
-from hilcal.drivers.simulated.truth import Truth
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from studies.random_campaigns import rehearsal_states
@@ -57,77 +54,6 @@ def test_strength_is_the_one_asked_for(effect, mode, m):
     assert all(name.split(".")[0] in (effect, "joint_compliance") for name in world.truth)
 
 
-def rigid_world(**effects):
-    world = world_without_effect(CELL, np.random.default_rng(2))
-    truth = replace(Truth.rigid(CELL.arm), **effects)
-    return replace(world, physics=truth)
-
-
-def by_hand(world, states, dq=0.0, links=CELL.arm.links, base=None, offset=0.0):
-    """Target positions of a rigid arm, by matrix products, sensor axes."""
-    out = []
-    for q in states.q + dq:
-        place = world.registration @ (np.eye(4) if base is None else base) @ links[0]
-        for angle, link in zip(q, links[1:], strict=True):
-            step = np.eye(4)
-            step[:3, :3] = Rotation.from_euler("z", angle).as_matrix()
-            place = place @ step @ link
-        out.append(place[:3, :3] @ (CELL.target[:3, 3] + offset) + place[:3, 3])
-    return np.array(out)
-
-
-def exp(twist):
-    v, (x, y, z) = twist[:3], twist[3:]
-    return expm(np.array([[0, -z, y, v[0]], [z, 0, -x, v[1]], [-y, x, 0, v[2]], [0, 0, 0, 0]]))
-
-
-def test_effects_without_load_follow_their_laws():
-    rng = np.random.default_rng(3)
-    q = STATES.q
-
-    def same(world, expected):
-        np.testing.assert_allclose(world.ideal_readings(STATES).position, expected, atol=1e-12)
-
-    o = 1e-3 * rng.standard_normal(6)
-    world = rigid_world(encoder_offset=o)
-    same(world, by_hand(world, STATES, o))
-    world = rigid_world(hysteresis=o)
-    same(world, by_hand(world, STATES, o * STATES.approach))
-    ab = 1e-3 * rng.standard_normal((6, 2, 2))
-    dq = sum(ab[:, k - 1, 0] * np.cos(k * q) + ab[:, k - 1, 1] * np.sin(k * q) for k in (1, 2))
-    world = rigid_world(transmission_error=ab)
-    same(world, by_hand(world, STATES, dq))
-    k = 1e-3 * rng.standard_normal((6, 6))
-    world = rigid_world(joint_coupling=k)
-    same(world, by_hand(world, STATES, np.array([[row @ at for row in k] for at in q])))
-    twist = 1e-2 * rng.standard_normal((7, 6))
-    world = rigid_world(link_geometry=twist)
-    links = [link @ exp(t) for link, t in zip(CELL.arm.links, twist, strict=True)]
-    same(world, by_hand(world, STATES, links=links))
-    offset = rng.standard_normal(3)
-    world = rigid_world(target_offset=offset)
-    same(world, by_hand(world, STATES, offset=offset))
-    base = 1e-2 * rng.standard_normal(6)
-    world = rigid_world(base_frame=base)
-    same(world, by_hand(world, STATES, base=exp(base)))
-    rate = 1e-6 * rng.standard_normal(6)
-    world = rigid_world(tracker_drift=rate)
-    still = by_hand(world, STATES)
-    moved = [(exp(rate * t) @ [*p, 1.0])[:3] for t, p in zip(STATES.time, still, strict=True)]
-    same(world, np.array(moved))
-
-
-def test_load_point_adds_the_moment_of_the_load():
-    shift = np.array([0.02, -0.03, 0.05])
-    compliance = np.full(6, 1e-5)
-    moved = rigid_world(joint_compliance=compliance, load_point=shift)
-    cell = replace(CELL, load_point=CELL.load_point + shift)
-    told = replace(rigid_world(joint_compliance=compliance), cell=cell)
-    np.testing.assert_allclose(
-        moved.ideal_readings(STATES).position, told.ideal_readings(STATES).position, atol=1e-14
-    )
-
-
 FIRST = np.array([np.flatnonzero((p == POSE) & (LOAD == 0))[0] for p in POSE])
 ABSOLUTE_ONLY = tuple(e for e in EFFECTS if e not in DEFLECTION_EFFECTS)
 
@@ -159,17 +85,6 @@ def test_truth_is_named_in_si():
     assert world.truth["joint_stiffening.j2"] < 0.0
 
 
-def test_unknown_registration_and_target_are_the_worlds_own():
-    cell = replace(CELL, target_known=False)
-    world = world_without_effect(cell, np.random.default_rng(1))
-    assert np.hypot(*world.registration[:2, 3]) == pytest.approx(3.0)
-    np.testing.assert_allclose(world.registration[2, :3], [0, 0, 1], atol=1e-15)
-    assert np.any(world.physics.target_offset != 0.0)
-    told = world_without_effect(ur10e_cell(registration_known=True), np.random.default_rng(1))
-    np.testing.assert_array_equal(told.registration, np.eye(4))
-    assert np.hypot(*told.station[:2, 3]) == pytest.approx(3.0)
-
-
 @refusals("hidden")
 def test_what_cannot_be_hidden_is_refused(case, given):
     effect, strength, mode = given.split()
@@ -191,14 +106,6 @@ def test_states_without_what_the_effect_needs_are_refused(effect, column):
     bare = States(q=STATES.q, wrench=STATES.wrench)
     with pytest.raises(InputError, match=f"^{column}: {effect} is hidden"):
         hide_effect(effect, CELL, bare, 3.0, "absolute", np.random.default_rng(0))
-
-
-@pytest.mark.parametrize("effect", ["wrench_bias", "wrench_gain", "sensor_misalignment"])
-def test_a_sensor_cannot_misread_what_is_not_there(effect):
-    unloaded = replace(STATES, wrench=np.zeros_like(STATES.wrench))
-    with pytest.raises(InputError, match="no state has a load; valid: ") as caught:
-        hide_effect(effect, CELL, unloaded, 3.0, "absolute", np.random.default_rng(0))
-    assert "\n" not in str(caught.value)
 
 
 def test_a_pose_without_an_unloaded_reading_is_refused():

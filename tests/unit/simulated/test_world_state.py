@@ -8,12 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilcal.drivers.simulated.blackboard import Blackboard
-from hilcal.drivers.simulated.truth import Truth
-from hilcal.drivers.simulated.world import World
-from hilcal.drivers.simulated.world_server import WorldState, read_world, write_world
-from hilcal.errors import InputError
-from tests.support.arm_cases import ODD, arm_of
+from hilcal.drivers.simulated.world_server import read_world, write_world
 from tests.support.refusals import refusal
 from tests.support.running_world import (
     PULL,
@@ -35,47 +30,6 @@ def cell(tmp_path):
     return running_world(tmp_path)
 
 
-@pytest.mark.parametrize(("load", "wrench"), [(None, np.zeros(6)), ("5kg", WEIGHT), ("pull", PULL)])
-def test_the_truth_is_the_equilibrium_of_the_state(tmp_path, load, wrench):
-    rng = np.random.default_rng(11)
-    cell = running_world(tmp_path, joint_std=1e-4, **every_effect(rng))
-    cell.living.hang(load)
-    for _ in range(3):
-        q = rng.uniform(-2.0, 2.0, 6)
-        truth = cell.rest_at(q)
-        state = states(q, wrench, float(truth["time"]))
-        slip = cell.living.slip(cell.arrivals)[None]
-        sight, rest = cell.world.ideal_readings(state, slip), cell.world.equilibrium(state, slip)
-        assert truth["arrivals"] == cell.arrivals
-        assert same_bytes(truth["target"], sight.position[0])
-        assert same_bytes(truth["target_rotation"], sight.rotation[0])
-        assert same_bytes(truth["flange"], rest.flange[0])
-
-
-def test_the_drive_torque_is_that_of_weight_and_load(tmp_path):
-    cell = running_world(tmp_path, joint_std=0.0, **every_effect(np.random.default_rng(2)))
-    cell.living.hang("pull")
-    torque = cell.rest_at(Q)["drive_torque"]
-    assert same_bytes(torque, cell.world.drive_torque(states(Q, PULL, 0.0))[0])
-
-
-def test_the_encoders_see_neither_slip_nor_elasticity(tmp_path):
-    cell = running_world(tmp_path, joint_std=1e-2)
-    cell.living.hang("5kg")
-    read = np.array([cell.rest_at(Q)["encoder"] for _ in range(200)]) - Q
-    spread = np.sqrt(np.mean(read**2))
-    # 1200 draws of 2e-6 rad: the rms is within 5 of its standard errors, 2 %
-    assert abs(spread / 2e-6 - 1.0) < 5.0 / np.sqrt(2 * read.size)
-
-
-def test_a_resting_arm_is_not_computed_anew_but_its_encoders_are_read(cell, tmp_path):
-    first = cell.rest_at(Q)
-    second = cell.truth_after()
-    assert same_bytes(first["target"], second["target"])
-    assert not same_bytes(first["encoder"], second["encoder"])
-    assert second["time"] > first["time"]
-
-
 def slip_of(cell):
     return cell.living.slip(cell.arrivals)[None]
 
@@ -91,20 +45,6 @@ def test_the_slip_stays_until_the_next_arrival_and_comes_new_with_it(cell, tmp_p
     cell.board.write("arm", q=Q, moving=1.0)
     assert same_bytes(cell.truth_after()["flange"], first)
     assert not same_bytes(cell.rest_at(Q)["flange"], first)
-
-
-def test_the_published_scatter_of_arrivals_is_that_of_the_joints(tmp_path):
-    cell = running_world(tmp_path, joint_std=3e-5)
-    count = 400
-    seen = np.array([cell.rest_at(Q)["target"] for _ in range(count)])
-    sight = cell.world.ideal_readings(states(Q, np.zeros(6), 0.0))
-    jac = sight.jacobian[0, :3] * cell.world.joint_std
-    white = np.linalg.solve(np.linalg.cholesky(jac @ jac.T), (seen - sight.position).T)
-    # |white|² is chi-square of 3 degrees: mean 3, variance 6
-    assert abs(np.mean(np.sum(white**2, axis=0)) - 3.0) < 5.0 * np.sqrt(6.0 / count)
-    assert np.abs(white.mean(axis=1)).max() < 5.0 / np.sqrt(count)
-    neighbours = np.mean(np.sum(white[:, 1:] * white[:, :-1], axis=0))
-    assert abs(neighbours) < 5.0 * np.sqrt(3.0 / count)
 
 
 def test_the_slip_of_an_arrival_does_not_depend_on_who_looked(tmp_path):
@@ -172,18 +112,6 @@ def test_a_mistake_is_made_once_and_told(cell, tmp_path):
     ]
 
 
-def test_pushing_adds_to_the_load(cell, tmp_path):
-    cell.living.hang("5kg")
-    lean = np.array([5.0, -7.0, 9.0, 1.0, 2.0, -1.0])
-    cell.living.push(lean.tolist())
-    truth = cell.rest_at(Q)
-    want = cell.world.equilibrium(states(Q, WEIGHT + lean, 0.0), slip_of(cell))
-    assert same_bytes(truth["flange"], want.flange[0])
-    cell.living.push([0.0] * 6)
-    want = cell.world.equilibrium(states(Q, WEIGHT, 0.0), slip_of(cell))
-    assert same_bytes(cell.board.read("truth")["flange"], want.flange[0])
-
-
 def yielding(tmp_path, *places):
     """A cell whose joint 2 bears the torque of the first state, but not that of the second."""
     made = config()
@@ -247,16 +175,6 @@ def test_a_load_swings_for_a_while_and_rests_where_it_should(cell, tmp_path):
     assert same_bytes(cell.truth_after()["flange"], still)
 
 
-def test_an_arm_of_seven_joints_is_refused(tmp_path):
-    made = config()
-    usual = world_of(made)
-    arm = arm_of(ODD)
-    cell, places = replace(usual.cell, arm=arm), (np.eye(4), np.eye(4))
-    odd = World(cell, Truth.rigid(arm), *places, usual.noise, np.zeros(7))
-    board = Blackboard.create(tmp_path / "world.bin", 1.0)
-    refusal("arm odd has 7 joints, the shared world one of 6", WorldState, odd, made, board, 1)
-
-
 def state_of(cell, truth, wrench):
     """The state that a truth belongs to."""
     state = states(Q, wrench, float(truth["time"]))
@@ -305,26 +223,6 @@ def test_what_goes_on_with_time_or_warmth_moves_a_resting_arm(tmp_path, effect):
     assert not same_bytes(second["target"], first["target"])
 
 
-def test_a_sensor_that_misreads_says_what_hangs_while_the_arm_bears_another_load(tmp_path):
-    bias = np.array([5.0, -4.0, 6.0, 0.5, 0.3, -0.2])
-    wrong = running_world(tmp_path, sections=SENSOR, wrench_bias=bias)
-    (tmp_path / "right").mkdir()
-    right = running_world(tmp_path / "right", sections=SENSOR)
-    for cell in (wrong, right):
-        cell.rest_at(Q)
-        cell.living.hang("5kg")
-    a, b = (cell.board.read("truth") for cell in (wrong, right))
-    turned = a["flange"][:3, :3]
-    seen = Rotation.from_matrix(turned.T @ b["flange"][:3, :3]).magnitude()
-    assert 1e-6 < seen < 1e-3
-    np.testing.assert_allclose(a["sensor_wrench"], b["sensor_wrench"], atol=60.0 * seen)
-    lean = np.abs(a["drive_torque"] - b["drive_torque"])
-    assert lean[1] > 1.0
-    assert wrong.living.hang(None) is None
-    right.living.hang(None)
-    assert same_bytes(wrong.board.read("truth")["flange"], right.board.read("truth")["flange"])
-
-
 def test_world_comes_back_from_its_file_to_the_last_bit(tmp_path):
     made = config(force_sensor={"driver": "ft300", "port": "x", "origin_m": [0, 0, 0.1]})
     world = world_of(made, **every_effect(np.random.default_rng(3)), **remaining_effects(4))
@@ -339,14 +237,6 @@ def test_world_comes_back_from_its_file_to_the_last_bit(tmp_path):
     assert back.joint_reference == 23.4
     state = replace(states(Q, WEIGHT, 12.3), joint_temperature=np.full((1, 6), 25.0))
     assert same_bytes(back.ideal_readings(state).position, world.ideal_readings(state).position)
-
-
-def test_a_configuration_of_another_cell_is_refused(tmp_path):
-    world = world_of(config())
-    other = config(tool={"mass_kg": 0.9, "load_point_m": [0.1, -0.03, 0.15]})
-    with pytest.raises(InputError, match="differ in targets, tool_mass, tool_com;"):
-        write_world(tmp_path / "world.json", world, other)
-    assert not (tmp_path / "world.json").exists()
 
 
 @pytest.mark.parametrize("text", ["", "[1]", '{"format": "hilcal-plan"}', "{"])
