@@ -14,12 +14,11 @@ import pytest
 from pymodbus.client import ModbusSerialClient
 from pymodbus.exceptions import ModbusIOException
 
-from hilcal.config import CellConfig
-from hilcal.drivers import bota, ft300, onrobot_hex
+from hilcal.drivers import bota, ft300
 from hilcal.drivers.ft300 import STREAM, start_stream
 from hilcal.drivers.links import close_port, open_port
 from hilcal.drivers.simulated.force_server import DRIFT_STD, ROOM
-from hilcal.errors import DeviceError, InputError
+from hilcal.errors import DeviceError
 from tests.support import force_cases as cases
 from tests.support.instruments import WRENCH, force_sensor
 from tests.support.timing import wait_until
@@ -104,24 +103,6 @@ def test_an_ft300_that_streams_for_a_dead_program_is_taken_over(instruments):
     with cases.opened("ft300", simulated.port) as sensor:
         assert "serial number F3004242" in sensor.report().name
         assert cases.steady(sensor, 0.3).frames > 20
-
-
-@pytest.mark.parametrize(
-    "start", [ft300.open_force_sensor, bota.open_force_sensor], ids=["ft300", "bota"]
-)
-def test_a_cell_without_force_sensor_or_with_a_strange_option(start):
-    with pytest.raises(InputError, match=r"\[force_sensor\] is missing"):
-        start(CellConfig.model_validate({"robot": {"model": "ur10e"}}))
-    with pytest.raises(InputError, match='driver "x" has no option "colour"'):
-        start(cases.config("x", "/dev/null", options={"colour": "red"}))
-
-
-@pytest.mark.parametrize(
-    "options", [{}, {"counts_per_N": 50.0}, {**cases.OPTIONS["hex"], "rate_hz": 0}]
-)
-def test_a_hex_needs_its_scale(options):
-    with pytest.raises(InputError, match=r"it must be .*over 0"):
-        onrobot_hex.open_force_sensor(cases.config("hex", "/dev/null", options=options))
 
 
 @pytest.mark.parametrize("bit", [1, 2, 3, 9])

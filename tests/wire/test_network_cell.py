@@ -17,7 +17,7 @@ from hilcal.drivers.simulated.arm import open_arm
 from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.drivers.simulated.cell_processes import SimulatedCell
 from hilcal.drivers.simulated.rehearsal import SimulationCase, case_of_plan, simulated_cell
-from hilcal.errors import DeviceError, InputError
+from hilcal.errors import DeviceError
 from hilcal.measuring.connect import connect
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.factory import flange_difference, of_dict, read_factory, with_factory
@@ -169,13 +169,6 @@ def test_the_simulated_arm_keeps_the_rules_of_a_real_one(fr3) -> None:
     fr3.restart("arm")
     np.testing.assert_allclose(arm.sample().q, stood, atol=1e-3)
     arm.close()
-
-
-def test_a_simulated_arm_outside_of_its_cell_is_refused() -> None:
-    config = config_of("fr3")
-    robot = config.robot.model_copy(update={"driver": "hilcal.drivers.simulated.arm:open_arm"})
-    with pytest.raises(InputError, match=r"lacks socket.*a real arm needs the driver of its maker"):
-        open_arm(config.model_copy(update={"robot": robot}))
 
 
 ROBOT = {"model": "ur15", "kinematics": "factory", "calibration": "cal.toml"}

@@ -13,8 +13,7 @@ from hilcal.cli.running import with_person
 from hilcal.config.reference import to_toml
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.operator import open_operator as open_simulated
-from hilcal.drivers.terminal_operator import open_operator as open_terminal
-from hilcal.errors import DeviceError, InputError
+from hilcal.errors import DeviceError
 from hilcal.measuring import devices
 from hilcal.store.campaign_file import CampaignFile
 from tests.support.campaign_cases import STARVED, TRIES, Site
@@ -83,23 +82,6 @@ def test_a_simulated_person_without_a_world_reports_it(world, tmp_path):
     assert "none.sock" in report.problems[0]
     with pytest.raises(DeviceError, match=r"none\.sock"):
         lost.hang(None, "")
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({}, 'lacks "socket": .* where the simulated operator lives'),
-        ({"socket": 3}, "socket = 3 is not valid"),
-        ({"socket": "x", "hand_s": -1}, "hand_s = -1 is not valid: .*0 to 3600"),
-        ({"socket": "x", "hand_s": True}, "hand_s = .rue is not valid"),
-        ({"socket": "x", "hands": 2}, 'no .*key "hands"'),
-        ({"socket": "x", "person": "me"}, "person = .me. is not valid: .*true"),
-    ],
-)
-def test_wrong_options_of_the_simulated_person_are_refused(options, message):
-    made = config(operator={"driver": "simulated", "options": options})
-    with pytest.raises(InputError, match=message):
-        open_simulated(made)
 
 
 # the person at the terminal, in a process whose terminal the test holds
@@ -181,11 +163,6 @@ def test_without_a_terminal_nobody_is_asked():
     problems, *lines = done.stdout.splitlines()
     assert problems.startswith(f"problems: {want}")
     assert [line[: len(want) + 7] for line in lines] == [f"error: {want}"] * 2
-
-
-def test_the_terminal_has_no_options():
-    with pytest.raises(InputError, match="has socket"):
-        open_terminal(config(operator={"options": {"socket": "x"}}))
 
 
 @pytest.fixture

@@ -1,20 +1,26 @@
 """The simulated devices as programs of others meet them: clients written here from the protocols'
-documents alone, libraries of others (ur_rtde, pymodbus), and byte transcripts of the makers'
+documents alone, libraries of others (ur_rtde, geocompy), and byte transcripts of the makers'
 manuals. UR's own library for Python is in no package registry; its recipes are asked for here.
 """
 
 import csv
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
+import serial
+from geocompy.communication import SerialConnection
+from geocompy.geo import GeoCom
+from geocompy.geo.gctypes import GeoComCode
 
 from hilcal.drivers.links import crc16 as crc16_of
 from hilcal.drivers.links import crc_modbus, crc_x25
 from hilcal.drivers.simulated.force_server import Ft300
 from tests.support.geocom_cases import crc16
+from tests.support.instruments import TARGET, Instrument, tracker
 from tests.support.sim_ur_cases import ClientError, SimulatedUr, Wire, client, start
 from tests.support.timing import wait_until
 
@@ -121,6 +127,70 @@ def test_a_request_that_the_line_has_damaged_is_not_answered() -> None:
         damaged = bytearray(whole)
         damaged[bit // 8] ^= 1 << bit % 8
         assert Ft300().receive(bytes(damaged), np.zeros(6)) == b""
+
+
+# --- GeoCOM: geocompy -----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def station() -> Iterator[Instrument]:
+    with tracker(TARGET) as running:
+        yield running
+
+
+def cartesian(hz: float, v: float, distance: float) -> np.ndarray:
+    return distance * np.array([np.sin(v) * np.sin(hz), np.sin(v) * np.cos(hz), np.cos(v)])
+
+
+@contextmanager
+def geocom(station: Instrument) -> Iterator[GeoCom]:
+    port = serial.Serial(str(station.port), 115200, timeout=5.0, exclusive=True)
+    with SerialConnection(port) as connection:
+        yield GeoCom(connection, checksum=True)
+
+
+def test_geocompy_reads_who_it_is(station: Instrument) -> None:
+    with geocom(station) as device:
+        assert device.csv.get_instrument_name().params == "SIM LASER STATION"
+        assert device.csv.get_serial_number().params == 123456
+        assert device.csv.get_firmware_version().params == (6, 20, 0)
+        assert device.com.get_geocom_version().params == (1, 50, 0)
+        assert device.csv.get_datetime().params is not None
+        assert 0 < device.csv.get_internal_temperature().params < 60
+        assert device.aut.get_lock_status().params is True
+        assert device.aut.switch_atr(True).error == GeoComCode.OK
+        assert device.tmc.get_atmospheric_corrections().params == pytest.approx(
+            (658e-9, 1013.25, 20.0, 20.0), abs=1e-12
+        )
+        assert device.tmc.set_atmospheric_corrections(1e-6, 950.0, 31.0, 21.0).error == 0
+        assert device.tmc.get_atmospheric_corrections().params == (1e-6, 950.0, 31.0, 21.0)
+        assert device.com.set_double_precision(4).error == 0
+        assert device.com.get_double_precision().params == 4
+        assert device.com.set_double_precision(15).error == 0
+        assert device.abort().error == 0
+
+
+def test_geocompy_reads_where_the_target_is(station: Instrument) -> None:
+    with geocom(station) as device:
+        answer = device.bap.measure_distance_angle()
+        assert answer.error == GeoComCode.OK
+        hz, v, distance, _ = answer.params
+        np.testing.assert_allclose(cartesian(float(hz), float(v), distance), TARGET, atol=1e-3)
+        assert device.tmc.do_measurement().error == GeoComCode.OK
+        full = device.tmc.get_complete_measurement()
+        assert full.error == GeoComCode.OK
+        hz, v, accuracy, cross, length, _, distance, at_ms = full.params
+        np.testing.assert_allclose(cartesian(float(hz), float(v), distance), TARGET, atol=1e-3)
+        assert float(accuracy) == pytest.approx(
+            (7.5e-6 + 3e-6 * float(np.linalg.norm(TARGET))) / float(np.linalg.norm(TARGET)),
+            rel=1e-3,
+        )
+        assert abs(float(cross)) + abs(float(length)) < 1e-4
+        assert 0 < at_ms <= station.board.time * 1e3
+        simple = device.tmc.get_simple_measurement()
+        assert simple.params[2] == distance  # of the same distance measurement
+        angles = device.tmc.get_angle().params
+        assert float(angles[0]) == pytest.approx(float(hz), abs=1e-4)
 
 
 # --- transcripts ---------------------------------------------------------------------------------

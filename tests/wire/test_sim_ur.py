@@ -236,41 +236,6 @@ def test_dashboard_connections_of_local_mode_stay_without_rights(sim):
         assert dashboard.ask("stop") == "Stopped"
 
 
-def test_the_truth_is_what_the_sensors_tell(tmp_path):
-    rng = np.random.default_rng(4)
-    truth = {
-        "encoder": rng.normal(size=6),
-        "joint_temperature": 30.0 + rng.normal(size=6),
-        "drive_torque": 20.0 * rng.normal(size=6),
-        "sensor_wrench": np.array([1.0, 2.0, -60.0, 0.5, 0.25, 0.0]),
-    }
-    sim = start(tmp_path, 1.0, {**truth, "arrivals": 0})
-    names = (
-        "actual_q,joint_temperatures,target_moment,ft_raw_wrench,actual_TCP_force,target_current"
-    )
-
-    def values():
-        with Wire(sim.host) as wire:
-            wire.outputs(names)
-            wire.ask("S")
-            return np.array(struct.unpack(">B36d", wire.receive()[1])[1:]).reshape(6, 6)
-
-    try:
-        q, temperature, moment, wrench, force, current = values()
-        np.testing.assert_array_equal(q, truth["encoder"])
-        np.testing.assert_array_equal(temperature, truth["joint_temperature"])
-        np.testing.assert_array_equal(moment, truth["drive_torque"])
-        assert np.all(np.sign(current) == np.sign(moment))
-        offset = wrench - truth["sensor_wrench"]
-        assert 2.0 < np.linalg.norm(offset[:3]) < 10.0
-        # no payload was told: what the controller calls contact is all of the load
-        assert np.linalg.norm(force[:3]) == pytest.approx(np.linalg.norm(wrench[:3]), rel=1e-9)
-        sim.board.write("truth", arrivals=7)  # not that of this arm's rest
-        np.testing.assert_allclose(values()[0], sim.admin()["q"], atol=5e-5)
-    finally:
-        sim.close()
-
-
 @pytest.mark.long
 def test_a_restarted_controller_finds_its_arm_where_it_was(tmp_path):
     sim = start(tmp_path)

@@ -63,15 +63,6 @@ def test_report_names_everything_that_hinders_a_run(sim):
             arm.take_control(1.0, np.zeros(3))
 
 
-def test_host_and_options_are_checked():
-    with pytest.raises(InputError, match=r"\[robot\] host"):
-        open_arm(cases.config(None))
-    with pytest.raises(InputError, match=r"\[robot.options\].*receive_hz"):
-        open_arm(cases.config("127.0.0.1", receive_hz=0.5))
-    with pytest.raises(InputError, match="recieve_hz"):
-        open_arm(cases.config("127.0.0.1", recieve_hz=125.0))
-
-
 def test_bad_goals_are_refused_before_anything_moves(arm, sim):
     q = arm.sample().q
     for goal in (q[:5], np.append(q, 0.0), np.where(np.arange(6) == 2, np.nan, q), q + 10.0):

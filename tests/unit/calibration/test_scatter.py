@@ -75,12 +75,3 @@ def test_identical_rows_are_no_repeats():
     one = once(instrument(c))
     twice = Readings.joined([one, one])
     assert Calibration.of(fitted(c, "absolute", twice)).scatter.source == "maker"
-
-
-def test_repeats_below_the_noise_say_how_much_it_can_be():
-    c = campaign(poses=16, cycles=3)
-    own = instrument(c)
-    noisy = replace(own, covariance=100.0 * own.covariance)
-    scatter = Calibration.of(fitted(c, "absolute", noisy)).scatter
-    assert scatter.source == "repeats"
-    assert TRUE < scatter.joint_std[0] < 10 * TRUE

@@ -17,7 +17,6 @@ from hilcal.drivers.simulated.rehearsal import (
 )
 from hilcal.drivers.simulated.world_server import read_world, write_world
 from hilcal.effects.catalogue import installed
-from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from tests.support.campaigns import cell_of, configuration, plan
@@ -93,13 +92,6 @@ def test_a_law_that_has_changed_since_is_refused(law, file, tmp_path):
     write_world(tmp_path / "world.json", world, configuration())
     file.write_text(CLASS.replace(COLUMNS, "values = np.sin(s.angle[:, :1])"), encoding="utf-8")
     refusal(r"mine\.py: changed since", read_world, tmp_path / "world.json")
-
-
-def test_what_the_simulated_cell_does_not_measure_is_named(file):
-    file.write_text(CLASS.replace("summary", 'needs = ("air_temperature",)\n    summary'))
-    catalogue = installed().with_file(file)
-    with pytest.raises(InputError, match="mine needs air_temperature"):
-        own_law(catalogue, "mine", cell_of(), replace(plan(6).states, air_temperature=None))
 
 
 def test_only_effects_of_ones_own_are_added_to_the_choices(law):

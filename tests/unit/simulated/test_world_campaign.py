@@ -32,39 +32,6 @@ def test_every_pose_is_seen_unloaded_first_and_then_under_each_load():
     assert np.diff(states.time).min() >= 20.0
 
 
-def test_loads_hang_for_seconds_or_minutes_and_never_since_before_the_last_reading():
-    states, _, load, _ = rehearse(n=60)
-    hung = states.load_time
-    assert hung.min() >= 4.999
-    assert hung.max() <= 300.001
-    assert np.all(hung[1:] < np.diff(states.time))
-    decades = np.log(hung / 5.0) / np.log(60.0)  # uniform from 0 to 1, whatever hangs
-    for which in range(3):
-        mine = decades[load == which]
-        assert mine.mean() == pytest.approx(0.5, abs=4.0 * np.sqrt(1 / 12 / len(mine)))
-        assert mine.std() == pytest.approx(np.sqrt(1 / 12), rel=0.25)
-
-
-def test_joints_warm_up_each_by_its_own_and_the_air_drifts():
-    states, _, _, _ = rehearse(n=40)
-    warm, hall = states.joint_temperature, states.air_temperature
-    assert warm.shape == states.q.shape
-    assert np.abs(warm[0] - 22.0).max() < 1.5
-    risen = warm[-5:].mean(axis=0) - 22.0
-    assert risen.min() > 4.0
-    assert risen.max() < 20.5
-    assert np.ptp(risen) > 1.0
-    assert np.corrcoef(warm.T).min() > 0.5
-    lasted = np.diff(states.time)
-    # at most 20 °C with a time constant of 1500 s, and six of the sensor's sigmas
-    assert np.all(np.abs(np.diff(warm, axis=0)) < lasted[:, None] * 20 / 1500 + 6 * 0.07)
-    assert len(np.unique(hall)) == len(hall)
-    assert 0.3 < np.ptp(hall) < 6.0
-    assert np.abs(hall - 22.0).max() < 6.0
-    # the quickest is the air conditioning, 0.25 °C in a period of 1200 s
-    assert np.all(np.abs(np.diff(hall)) < lasted * 0.0022 + 6 * 0.03)
-
-
 @pytest.mark.parametrize(
     ("poses", "wrenches", "message"),
     [

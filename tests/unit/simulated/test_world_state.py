@@ -47,20 +47,6 @@ def test_the_slip_stays_until_the_next_arrival_and_comes_new_with_it(cell, tmp_p
     assert not same_bytes(cell.rest_at(Q)["flange"], first)
 
 
-def test_the_slip_of_an_arrival_does_not_depend_on_who_looked(tmp_path):
-    made = config()
-    world = world_of(made)
-    (tmp_path / "other").mkdir()
-    a, b = RunningWorld(world, made, tmp_path), RunningWorld(world, made, tmp_path / "other")
-    for _ in range(4):
-        first = a.rest_at(Q)
-    b.arrivals = 3
-    assert same_bytes(first["flange"], b.rest_at(Q)["flange"])
-    other = RunningWorld(world, made, tmp_path / "other", seed=6)
-    other.arrivals = 3
-    assert not same_bytes(first["flange"], other.rest_at(Q)["flange"])
-
-
 # the wrench on the sensor
 
 MOUNT = {"origin_m": [0.01, -0.02, 0.045], "rotvec_rad": [0.3, -0.9, 2.1]}
@@ -83,18 +69,6 @@ def test_the_sensor_feels_the_weight_of_tool_and_load_in_its_own_axes(tmp_path):
 
 
 # what the people in the cell do
-
-
-def test_hanging_is_true_at_once_and_dated(cell, tmp_path):
-    up = cell.rest_at(Q)["flange"][2, 3]
-    assert cell.living.hang("5kg") == "5kg"
-    truth = cell.board.read("truth")
-    assert truth["load"] == 1
-    assert 0.0 < truth["load_since"] <= truth["time"]
-    assert truth["flange"][2, 3] < up - 1e-4
-    assert cell.living.hang(None) is None
-    assert cell.board.read("truth")["load"] == 0
-    assert cell.board.read("truth")["flange"][2, 3] == up
 
 
 def test_a_mistake_is_made_once_and_told(cell, tmp_path):
@@ -147,32 +121,6 @@ def test_a_pose_without_equilibrium_is_logged_and_the_world_lives_on(tmp_path):
     cell.truth_after()
     assert len(cell.living.log()) == 1
     assert cell.rest_at(upright)["arrivals"] == 3
-
-
-@pytest.mark.parametrize(
-    "wrong", [[1.0], [np.nan] * 6, [0.0, 0.0, 1e9, 0.0, 0.0, 0.0], [[0.0] * 6]]
-)
-def test_what_nobody_can_push_is_refused(cell, tmp_path, wrong):
-    refusal("valid: six numbers", cell.living.push, wrong)
-    refusal("valid: six numbers", cell.living.swing, wrong, period=1.0, decay=1.0)
-    refusal("valid: over 0", cell.living.swing, [1.0] * 6, period=1.0, decay=0.0)
-
-
-def test_an_unknown_load_is_refused_with_the_known_ones(cell, tmp_path):
-    for refused in (cell.living.hang, cell.living.mistake):
-        refusal(r'no load \'5 kg\' \(did you mean "5kg"\?\); valid: ', refused, "5 kg")
-
-
-def test_a_load_swings_for_a_while_and_rests_where_it_should(cell, tmp_path):
-    cell.rest_at(Q)
-    cell.living.swing([0.0, 0.0, 20.0, 0.0, 0.0, 0.0], period=1e-3, decay=0.2)  # world s
-    cell.living.hang("5kg")
-    still = cell.world.equilibrium(states(Q, WEIGHT, 0.0), slip_of(cell)).flange[0]
-    seen = [cell.truth_after()["flange"] for _ in range(2)]
-    assert not same_bytes(seen[0], still)
-    assert not same_bytes(seen[0], seen[1])
-    time.sleep(0.2)  # 4 s of the world, 20 decays
-    assert same_bytes(cell.truth_after()["flange"], still)
 
 
 def state_of(cell, truth, wrench):
