@@ -128,23 +128,6 @@ def test_a_step_against_qr(benchmark: Any, claim: Claim) -> None:
     assert np.isfinite(solution).all()
 
 
-def test_time_is_linear_in_the_readings(benchmark: Any, claim: Claim) -> None:
-    """Microseconds per reading at growing numbers of readings."""
-    per_reading: dict[str, dict[int, float]] = {"step": {}, "predicting": {}}
-    for count in SIZES:
-        works = works_of(problem_of(count))
-        found = shortest({name: works[name] for name in per_reading}, ROUNDS)
-        for name, seconds in found.items():
-            per_reading[name][count] = 1e6 * seconds / count
-    benchmark.extra_info["us_per_reading"] = per_reading
-    for name, costs in per_reading.items():
-        growth = costs[SIZES[-1]] / costs[SIZES[0]]
-        what = f"{name}: time per reading at {SIZES[-1]} over that at {SIZES[0]} readings"
-        claim(what, f"{growth:.2f}", "1 where time is linear")
-    p = problem_of(SIZES[0])
-    benchmark.pedantic(p.model.predict, args=(p.readings.states, p.theta), rounds=ROUNDS)
-
-
 def peak_memory(count: int) -> float:
     """Peak memory of a prediction and a step, bytes."""
     p = problem_of(count)

@@ -5,13 +5,11 @@ meets a fault. Whatever it is, the arm stands within half a second, the program 
 with one line, and leaves no process; the resumed campaign has every reading exactly once.
 """
 
-import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from hilcal.types import Floats
 from tests.support import campaign_cases as cases
 from tests.support.timing import wait_until
 
@@ -103,15 +101,6 @@ REST = (
         fast=True,
     ),
 )
-START = {
-    "mute": (arm("rtde_mute"), off("rtde_mute"), ("RTDE", "does not answer")),
-    "negotiated, then no data": (arm("rtde_stall"), off("rtde_stall"), ("data",)),
-    "refused": (arm("refuse"), off("refuse"), ("refuses the connection",)),
-    "dashboard mute": (arm("dashboard_mute"), off("dashboard_mute"), ("dashboard",)),
-    "local mode": (arm("local_mode"), arm("remote_mode"), ("local mode", "remote control")),
-    "protective stop": (arm("protective_stop"), unlock, ("protective stop", "unlock")),
-    "emergency stop": (arm("emergency_stop"), release, ("emergency stop",)),
-}
 
 
 @cases.parametrize_faults(MOTION)
@@ -122,60 +111,6 @@ def test_a_fault_in_motion(fault: cases.Fault, cell: cases.Site, path: Path) -> 
 @cases.parametrize_faults(REST)
 def test_a_fault_at_rest(fault: cases.Fault, cell: cases.Site, path: Path) -> None:
     cases.check_fault(fault, cell, path, moving=False)
-
-
-@pytest.mark.slow
-def test_the_controller_loses_power_in_motion(cell: cases.Site, path: Path) -> None:
-    run, _ = cases.start_run(cell, path, cases.Run.moving)
-    cell.simulated.kill("arm")
-    try:
-        assert "link" in cases.failed(run)
-        cases.check_readings(cell, path)
-        line = cases.failed(cases.Run(cell, path))  # nobody answers
-    finally:
-        cell.simulated.restart("arm")
-    assert cell.config.robot.host is not None
-    assert cell.config.robot.host in line
-
-
-@pytest.mark.slow
-def test_a_dashboard_that_is_dropped_or_mute_costs_nothing_and_the_arm_is_stopped_without_it(
-    cell: cases.Site, path: Path
-) -> None:
-    def without(run: cases.Run) -> Floats:
-        cell.ask("arm", "dashboard_drop")
-        run.next_reading("a dropped dashboard")
-        cell.ask("arm", "dashboard_mute", on=True)
-        run.next_reading("a mute dashboard")
-        return run.moving()
-
-    try:
-        run, goal = cases.start_run(cell, path, without)
-        since = time.monotonic()
-        run.interrupt()
-        assert "interrupted" in cases.failed(run, 130)
-        cases.check_stopped_on_its_way(cell, since, goal)
-    finally:
-        cell.ask("arm", "dashboard_mute", on=False)
-    cases.check_readings(cell, path)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", START)
-def test_an_arm_that_is_not_ready_is_named_and_not_waited_for(
-    name: str, cell: cases.Site, path: Path
-) -> None:
-    do, undo, says = START[name]
-    arrivals = cell.ask("arm", "state")["arrivals"]
-    do(cell)
-    try:
-        line = cases.failed(cases.Run(cell, path))
-        assert cell.ask("arm", "state")["arrivals"] == arrivals
-    finally:
-        undo(cell)
-    assert "arm" in line
-    for words in says:
-        assert words in line
 
 
 def test_the_campaign_has_every_reading_exactly_once(cell: cases.Site, path: Path) -> None:

@@ -4,8 +4,6 @@ As for the arm: one campaign on one simulated cell, and every run meets a fault.
 overcome without help: then the run goes on, and says what happened.
 """
 
-import re
-import time
 from itertools import zip_longest
 from pathlib import Path
 
@@ -97,10 +95,6 @@ OVERCOME = {
     ),
 }
 """Faults that a run goes on from, by the line that they are on."""
-START = {
-    what: [fault for fault in (*TRACKER, *FORCE) if fault.name.endswith(what)]
-    for what in ("unplugged", "mute", "at another rate")
-}
 
 
 @cases.parametrize_faults(TRACKER)
@@ -123,20 +117,6 @@ def test_a_fault_of_the_force_sensor_at_rest(
     cases.check_fault(fault, cell, path, moving=False)
 
 
-@pytest.mark.slow
-def test_a_hit_stops_the_arm(cell: cases.Site, path: Path) -> None:
-    """A collision is over after a moment, for the arm bounces off."""
-    run, goal = cases.start_run(cell, path, cases.Run.moving)
-    since = time.monotonic()
-    cell.ask("force", "overload", force=HIT)
-    time.sleep(0.1)
-    cell.ask("force", "overload", force=NO_FORCE)
-    line = cases.failed(run)
-    cases.check_stopped_on_its_way(cell, since, goal)
-    assert re.search(TOO_MUCH, line), line
-    cases.check_readings(cell, path)
-
-
 def test_faults_that_are_overcome_cost_nothing(cell: cases.Site, path: Path) -> None:
     """All of them in one run, each for a whole reading, at both lines at a time."""
     run, _ = cases.start_run(cell, path, cases.Run.measuring)
@@ -151,24 +131,6 @@ def test_faults_that_are_overcome_cost_nothing(cell: cases.Site, path: Path) -> 
     run.interrupt()
     cases.failed(run, 130)
     cases.check_readings(cell, path)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("what", START)
-def test_instruments_that_are_not_ready_are_named_at_once(
-    what: str, cell: cases.Site, path: Path
-) -> None:
-    arrivals = cell.ask("arm", "state")["arrivals"]
-    for fault in START[what]:
-        fault.cause(cell)
-    try:
-        line = cases.failed(cases.Run(cell, path))
-        assert cell.ask("arm", "state")["arrivals"] == arrivals
-    finally:
-        for fault in START[what]:
-            fault.mend(cell)
-    assert "tracker" in line
-    assert "force sensor" in line
 
 
 @pytest.mark.slow

@@ -8,12 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as some
 
 from hilcal.calibration.urscript import movej_program, waypoints, with_joints
 from hilcal.drivers.simulated.ur_programs import ScriptStream
-from hilcal.drivers.simulated.ur_state import line
 from tests.support.sim_ur_cases import (
     Client,
     Lines,
@@ -249,29 +246,6 @@ def test_a_restarted_controller_finds_its_arm_where_it_was(tmp_path):
         assert state["q"] == q
         assert state["arrivals"] == 42
         assert sim.board.read("arm")["arrivals"] == 42
-
-
-vectors = some.lists(some.floats(-3.0, 3.0), min_size=6, max_size=6).map(np.array)
-
-
-@given(vectors, some.floats(0.01, 2.0), some.floats(0.01, 10.0))
-def test_speed_is_the_derivative_and_limits_hold(goal, speed, acceleration):
-    segment = line(np.zeros(6), goal, speed, acceleration)
-    if segment is None:
-        assert np.max(np.abs(goal)) < 1e-9
-        return
-    assert segment.length == pytest.approx(np.max(np.abs(goal)), rel=1e-9)
-    times = np.linspace(0.0, segment.duration, 2001)
-    way, rate = np.array([segment.at(t) for t in times]).T
-    assert rate.max() <= speed * (1 + 1e-9)
-    assert rate[0] == 0.0
-    assert rate[-1] == pytest.approx(0.0, abs=1e-9 * (1 + rate.max()))
-    step = times[1] - times[0]
-    corner = 0.25 * acceleration * step**2 + 1e-12  # what a trapezium misses where ramps end
-    np.testing.assert_allclose(
-        np.diff(way), 0.5 * step * (rate[1:] + rate[:-1]), rtol=0.0, atol=corner
-    )
-    assert np.max(np.abs(np.diff(rate))) <= acceleration * step * (1 + 1e-6) + 1e-12
 
 
 def test_script_port_cuts_programs_and_lines():

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -12,7 +11,6 @@ import numpy as np
 import psutil
 import pytest
 
-from hilcal.drivers.simulated.cell_processes import free_host
 from hilcal.drivers.ur_link import supervision
 from hilcal.drivers.ur_link.worker import environment
 from hilcal.errors import DeviceError
@@ -265,29 +263,3 @@ def test_kill_9_while_control_is_taken_leaves_no_program_behind(sim):
             cases.controlled(sim).close()  # and the next program takes over
     finally:
         cases.supervision(sim).stop(2.0)
-
-
-HANGING = """
-import sys, threading
-from hilcal.drivers.ur_link.worker import Worker
-arguments = (sys.argv[1], "125.0", "timestamp")
-start = lambda: Worker("receive", arguments, 60.0)
-thread = threading.Thread(target=start)
-thread.start()
-thread.join()
-"""
-
-
-@pytest.mark.long
-def test_child_that_hangs_in_the_client_library_ends_with_the_program():
-    host = free_host()
-    with socket.socket() as server:
-        server.bind((host, 30004))
-        server.listen(4)
-        with program(HANGING, host) as parent:
-            line, _ = server.accept()  # the library is in its constructor, and stays there
-            with line:
-                (child,) = psutil.Process(parent.pid).children()
-                parent.kill()
-                parent.wait()
-                wait_until(lambda: not runs(child.pid), "ended: the child", 5.0)

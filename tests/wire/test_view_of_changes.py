@@ -12,7 +12,6 @@ import pytest
 from rerun.chunk import RrdReader
 
 from hilcal.present.viewer.recording import executable
-from hilcal.store.campaign_file import CampaignFile
 from tests.support.bench_cases import BASE, store_campaign
 from tests.support.timing import wait_until
 
@@ -73,18 +72,6 @@ def test_added_and_removed_a_viewer_sees_both_revisions(tmp_path: Path) -> None:
         recording = run.with_name("run.live.rrd")
         assert revisions(recording) == seen
         assert RrdReader(recording).store() is not None  # it has its footer: whole
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:RRD file has no footer")
-def test_a_refinement_is_shown_to_its_last_revision(tmp_path: Path) -> None:
-    run = store_campaign(tmp_path / "run.hilcal")
-    process, told = begun(tmp_path, "refine", run)
-    assert process.wait(LONG) == 0, told.read_text()
-    with CampaignFile.open(run, read_only=True) as file:
-        made = {record.number for record in file.revisions()}
-    assert len(made) > 1
-    assert revisions(run.with_name("run.live.rrd")) == made
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")

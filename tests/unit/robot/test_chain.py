@@ -5,20 +5,16 @@ import pinocchio as pin
 import pytest
 
 from hilcal.robot import se3
-from hilcal.robot.chain import Deviation, evaluate, joint_jacobian, twist_jacobian
+from hilcal.robot.chain import Deviation, evaluate
 from hilcal.robot.scene import FLANGE, body_poses, pinocchio_model
 from hilcal.robot.statics import Load, slot_wrenches
 from tests.support.arm_cases import (
     ARMS,
-    ODD,
-    RAILS,
     arm_of,
     displacement,
     flange_at,
-    slope,
     twisted,
 )
-from tests.support.rows import first
 
 COUNT = 12
 
@@ -51,57 +47,6 @@ def test_flange_is_where_pinocchio_has_it(name, size):
     for i in range(COUNT):
         flange = pinocchio_flange(twisted(arm, d.twist[i]), q[i] + d.dq[i])
         flange_at(chain, i, flange.homogeneous)
-
-
-def motion_by(arm, q, d, change, offset):
-    """Motion (N, 6) of a flange-fixed point per change along a deviation, by differences."""
-    r0 = evaluate(arm, q, d).rotation[-1]
-
-    def moved(t):
-        scaled = Deviation(
-            dq=None if change.dq is None else t * change.dq,
-            twist=None if change.twist is None else t * change.twist,
-        )
-        chain = evaluate(arm, q, d + scaled)
-        turn = chain.rotation[-1] @ np.swapaxes(r0, 1, 2)
-        spin = [turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]]
-        return np.column_stack([chain.point(offset), *spin])
-
-    return slope(moved, 1e-3)
-
-
-OFFSET = np.array([0.05, -0.1, 0.2])
-
-
-@pytest.mark.parametrize(
-    "name", first(3, ["ur10e", ODD, RAILS, *sorted({*ARMS} - {"ur10e", ODD, RAILS})])
-)
-@pytest.mark.parametrize("size", [0.0, pytest.param(1e-3, marks=pytest.mark.slow), 0.3])
-def test_jacobians_are_slopes(name, size):
-    arm = arm_of(name)
-    count = 3
-    q, d = angles(arm, count), random_deviation(arm, size, count)
-    chain = evaluate(arm, q, d)
-    x = chain.point(OFFSET)
-    by_joint = joint_jacobian(chain, x)
-    for j in range(arm.n):
-        change = np.zeros((count, arm.n))
-        change[:, j] = 1.0
-        expected = motion_by(arm, q, d, Deviation(dq=change), OFFSET)
-        assert_close_relative(by_joint[:, :, j], expected)
-    for k in range(arm.n + 1):
-        own = None if chain.twist is None else chain.twist[k]
-        by_slot = twist_jacobian(chain.rotation[k], x - chain.position[k], own)
-        for axis in range(6):
-            twist = np.zeros((count, arm.n + 1, 6))
-            twist[:, k, axis] = 1.0
-            expected = motion_by(arm, q, d, Deviation(twist=twist), OFFSET)
-            assert_close_relative(by_slot[:, :, axis], expected)
-
-
-def assert_close_relative(found, expected):
-    """Within 1e-7 of the longest motion."""
-    assert np.abs(found - expected).max() <= 1e-7 * np.abs(expected).max()
 
 
 @pytest.mark.parametrize("name", ARMS)
