@@ -74,13 +74,6 @@ def test_stated_ellipsoid_covers_the_truth_as_often_as_it_says(count, share):
     assert 0.925 < got < 0.965
 
 
-@pytest.mark.parametrize("worse", first(2, [2.0, 10.0, 4.0]))
-def test_noise_far_above_what_is_stated_is_not_believed_away(worse):
-    """From the scatter of 10 alone a covariance would cover 81 %; the stated one far less."""
-    got = covered(np.random.default_rng(9), 10, 600, worse=worse)
-    assert got > 0.85
-
-
 def test_rotations_average_on_the_sphere_also_across_the_half_turn():
     rng = np.random.default_rng(5)
     middle = Rotation.from_rotvec([0.0, 0.0, np.pi - 1e-5])  # rotation vectors flip about here
@@ -93,28 +86,21 @@ def test_rotations_average_on_the_sphere_also_across_the_half_turn():
     assert np.trace(mean.covariance[3:, 3:]) == pytest.approx(3 * 8e-5**2 / 50, rel=0.3)
 
 
-def test_gross_outlier_is_left_out_and_named():
-    rng = np.random.default_rng(7)
-    values = drawn(rng, 10)
-    clean = average(samples_of(np.delete(values, 3, axis=0)))
-    values[3] += [0.0, 2e-3, 0.0]
-    result = average(samples_of(values))
-    assert result.left_out == (3,)
-    assert "reading 4 of 10" in result.warnings[0]
-    assert result.value == pytest.approx(clean.value, abs=1e-15)
-    assert result.covariance == pytest.approx(clean.covariance, rel=1e-12)
-
-
 @pytest.mark.parametrize(
     ("count", "bad"), [(3, 1), (5, 1), (5, 2), (10, 2), (10, 3), (20, 4), (20, 5)]
 )
-def test_one_in_five_may_be_left_out_and_more_is_no_reading(count, bad):
+def test_one_in_five_may_be_left_out_and_named_and_more_is_no_reading(count, bad):
     values = drawn(np.random.default_rng(count), count)
+    clean = average(samples_of(values[bad:]))
     values[:bad] += [[1e-3, 0, 0]] * np.arange(1, bad + 1)[:, None]
-    if bad <= max(1, count // 5):
-        assert average(samples_of(values)).left_out == tuple(range(bad))
+    if bad > max(1, count // 5):
+        refusal_of(DeviceError, f"readings scatter: {bad} of {count}", average, samples_of(values))
         return
-    refusal_of(DeviceError, f"readings scatter: {bad} of {count}", average, samples_of(values))
+    result = average(samples_of(values))
+    assert result.left_out == tuple(range(bad))
+    assert f"reading 1 of {count}" in result.warnings[0]
+    assert result.value == pytest.approx(clean.value, abs=1e-15)
+    assert result.covariance == pytest.approx(clean.covariance, rel=1e-12)
 
 
 STD = np.array([5.0, 12.0, 12.0]) * 1e-6
@@ -161,21 +147,6 @@ def test_decay_is_waited_for_until_its_rest_is_below_the_noise(count, tau):
         left.append(START_SIGMA * np.exp(-t / tau))
     assert np.quantile(left, 0.95) < 0.4
     assert max(left) < 1.0
-
-
-@pytest.mark.parametrize("tau", first(1, [1.0, 5.0]))
-def test_vibration_is_waited_for_until_its_rest_is_below_the_noise(tau):
-    """An amplitude of less than one sigma is left in 95 %; it hardly moves the mean then."""
-    rng = np.random.default_rng(round(tau))
-    left = []
-    for _ in range(60):
-        phase = rng.uniform(0, 2 * np.pi)
-        _, t = wait(
-            rng, 5, lambda t, p=phase: 1e-3 * ALONG * np.exp(-t / tau) * np.cos(7.3 * t + p)
-        )
-        left.append(START_SIGMA * np.exp(-t / tau))
-    assert np.quantile(left, 0.95) < 1.0
-    assert max(left) < 2.0
 
 
 def test_drift_that_matters_never_settles():

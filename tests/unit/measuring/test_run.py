@@ -245,22 +245,6 @@ def test_a_load_that_is_not_taken_off_is_noticed(b):
     assert "3.0 kg still hangs" in b.operator.requests[3][1]
 
 
-@pytest.mark.long
-def test_a_swinging_load_is_weighed_twice(b):
-    times = []
-
-    def swinging(seconds):
-        times.append(b.world.time)
-        b.world.extra = np.zeros(6)
-        if b.world.load == "3kg" and len(b.operator.requests) == 2 and len(b.store.rows) == 5:
-            swings = len([t for t in times if t > b.world.time - 10.0]) == 1
-            b.world.extra[0] = 8.0 if swings else 0.0
-
-    call_before(b.rig.force, "average", swinging)
-    b.measure()
-    assert b.requested_loads == ["none", "3kg", "none", "pull", "none"]
-
-
 def test_the_tool_is_identified_and_compared_with_the_configuration(b):
     b.world.tool_mass = 1.4
     b.measure()
@@ -308,21 +292,6 @@ def test_a_clock_set_back_since_the_epoch_makes_no_time_before_it(b):
     plan = plan_of(("reference", "none", 0), ("p1", "none", 0))
     readings = b.measure(plan, wall=lambda: 1000.0 + b.world.time, epoch=5000.0)
     assert np.all(readings.states.time > 0)
-
-
-@pytest.mark.long
-def test_a_load_that_still_hangs_at_a_resume_is_noticed(b):
-    b.interrupt(7)
-    assert b.world.load == "3kg"
-    b.world.wrong_loads = ["3kg"]  # the first answer is wrong
-    # the sensor was off meanwhile
-    b.world.offset = b.world.offset + np.array([2.0, 2.0, -2.0, 0, 0, 0])
-    seen = len(b.operator.requests)
-    b.measure()
-    asked = b.operator.requests[seen:]
-    assert [name for name, _ in asked[:3]] == ["none", "none", "3kg"]
-    assert "3kg seems to hang still" in asked[1][1]
-    assert [s for s, _, _ in b.store.rows] == list(usual_plan().steps)
 
 
 def test_a_load_left_on_at_the_very_beginning_is_asked_about_said_and_found_in_motion(b):

@@ -12,7 +12,6 @@ from hilcal.cell import Cell
 from hilcal.config import Acquire, ForceSensor, Limits
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.arrival import RoughRegistration
-from hilcal.measuring.progress import ReadingStored
 from hilcal.measuring.run import HOW_ON
 from hilcal.robot import chain as chains
 from hilcal.robot.catalogue import configs_dir
@@ -20,7 +19,6 @@ from hilcal.store.plan import Step
 from tests.support.fake_bench import (
     FEW_POSES,
     POSES,
-    STD,
     Bench,
     FakeClock,
     Killed,
@@ -426,27 +424,6 @@ def test_readings_that_drift_are_waited_for_and_given_up():
     refusal_of(DeviceError, "not settled within 20 s: the readings drift", b.measure)
     assert b.store.rows == []
     assert b.world.time - begun < 120.0
-
-
-@pytest.mark.long
-def test_drift_that_ends_is_waited_for():
-    b, few = Bench(), plan_of(("p1", "none", 0), ("p2", "none", 0), ("p2", "3kg", 0))
-    arrived = {}
-
-    def settles(place):
-        """The target comes to rest with a time constant of 0.5 s after each arrival."""
-        since = arrived.setdefault((*b.world.joints(), len(b.world.at_start)), b.world.time)
-        return place + 1e-3 * np.exp(-(b.world.time - since) / 0.5)
-
-    change_result(b.world, "position", settles)
-    b.measure(few)
-    taken = b.notes.of_kind(ReadingStored)
-    assert min(t.settling for t in taken) > 1.0
-    quiet = Bench()
-    quiet.measure(few)
-    assert max(t.settling for t in quiet.notes.of_kind(ReadingStored)) < 1.0
-    away = b.store.readings().value - quiet.store.readings().value
-    assert np.abs(away).max() < 6 * STD
 
 
 def test_an_arm_that_trembles_is_measured_again_and_given_up(b):
