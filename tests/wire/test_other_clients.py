@@ -16,12 +16,21 @@ from geocompy.communication import SerialConnection
 from geocompy.geo import GeoCom
 from geocompy.geo.gctypes import GeoComCode
 
+from hilcal.calibration.urscript import movej_program, waypoints, with_joints
 from hilcal.drivers.links import crc16 as crc16_of
 from hilcal.drivers.links import crc_modbus, crc_x25
 from hilcal.drivers.simulated.force_server import Ft300
 from tests.support.geocom_cases import crc16
 from tests.support.instruments import TARGET, Instrument, tracker
-from tests.support.sim_ur_cases import ClientError, SimulatedUr, Wire, client, start
+from tests.support.sim_ur_cases import (
+    ClientError,
+    Lines,
+    SimulatedUr,
+    Wire,
+    client,
+    send_script,
+    start,
+)
 from tests.support.timing import wait_until
 
 
@@ -115,6 +124,92 @@ def test_ur_rtde_records_and_writes_inputs(arm: SimulatedUr, tmp_path: Path) -> 
     assert np.all(np.diff(stamps) >= 0.0)  # the library may write a package twice
     joints = [[float(row[f"actual_q_{j}"]) for j in range(6)] for row in rows]
     np.testing.assert_allclose(joints[-1], arm.admin()["q"], atol=1e-3)
+
+
+# --- payload, dashboard and script port, as ur_rtde and the makers' pages use them ---------------
+
+
+def test_payload_keeps_its_centre_when_told_zeros(arm: SimulatedUr) -> None:
+    with client(arm.host, "control", "receive") as run:
+        assert run("control", "setPayload", 2.5, [0.01, 0.02, 0.03])
+        assert run("control", "setPayload", 3.5, [0.0, 0.0, 0.0])
+        wait_until(lambda: run("receive", "getPayload") == 3.5, "told")
+        assert run("receive", "getPayloadCog") == [0.01, 0.02, 0.03]
+
+
+LOCAL = "Command is not allowed due to safety reasons, please switch robot to Remote Control mode"
+
+
+def test_dashboard_answers(arm: SimulatedUr) -> None:
+    with Lines(arm.host) as dashboard:
+        assert dashboard.read() == "Connected: Universal Robots Dashboard Server"
+        assert dashboard.ask("stop") == "Stopped"  # the program of the client before
+        arm.wait("script_running", False)
+        assert dashboard.ask("PolyscopeVersion").startswith("URSoftware 5.11.6.1010327 ")
+        assert dashboard.ask("get robot model") == "UR10e"
+        assert dashboard.ask("get serial number").isdigit()
+        assert dashboard.ask("robotmode") == "Robotmode: RUNNING"
+        assert dashboard.ask("safetystatus") == "Safetystatus: NORMAL"
+        assert dashboard.ask("running") == "Program running: false"
+        assert dashboard.ask("programState").split()[0] == "STOPPED"
+        assert dashboard.ask("play") == "Failed to execute: play"
+        assert dashboard.ask("close safety popup") == "closing safety popup"
+        assert dashboard.ask("dance") == "could not understand: 'dance'"
+        assert dashboard.ask("quit") == "Disconnected"
+        assert dashboard.read() == ""
+
+
+def test_dashboard_connections_of_local_mode_stay_without_rights(arm: SimulatedUr) -> None:
+    arm.admin("local_mode")
+    with Lines(arm.host) as dashboard:
+        dashboard.read()
+        assert dashboard.ask("is in remote control") == "false"
+        assert dashboard.ask("stop").startswith(LOCAL)
+        arm.admin("remote_mode")
+        assert dashboard.ask("is in remote control") == "true"
+        assert dashboard.ask("stop").startswith(LOCAL)
+    with Lines(arm.host) as dashboard:
+        dashboard.read()
+        assert dashboard.ask("stop") == "Stopped"
+
+
+Q = np.array([[0.1, -1.2, 1.5, -1.0, -1.4, 0.3], [0.3, -1.1, 1.4, -0.9, -1.5, 0.4]])
+PROGRAM = """def prog():
+  set_tcp(p[0,0,0.1,0,0,0])
+  movej([0,-1.57,1.57,0,1.57,0], a=20, v=30) # first
+  sleep(0.01)
+  movel([0.1,-1.5,1.5,0,1.5,0], a=20, v=30, r=0.01)
+end
+"""
+
+
+def reached(arm: SimulatedUr, text: str, goals: np.ndarray) -> None:
+    send_script(arm.host, text)
+    moves = [f"move to {np.round(goal, 6).tolist()}" for goal in goals]
+    wait_until(
+        lambda: [line for _, line in arm.admin("log") if line in moves] == moves, f"moved {moves}"
+    )
+    arm.wait("script_running", False)
+    state = arm.admin()
+    np.testing.assert_allclose(state["q"], goals[-1], atol=1e-8)
+    assert not state["moving"]
+
+
+def test_a_program_of_compensated_points_is_carried_out(arm: SimulatedUr) -> None:
+    reached(arm, movej_program(["a", "b"], Q).replace("])", "], a=20, v=30)"), Q)
+
+
+def test_a_rewritten_program_goes_to_its_new_waypoints(arm: SimulatedUr) -> None:
+    reached(arm, with_joints(PROGRAM, waypoints(PROGRAM), Q), Q)
+
+
+def test_programs_with_other_statements_are_foreign_and_move_nothing(arm: SimulatedUr) -> None:
+    before = arm.admin()["q"]
+    send_script(arm.host, "def p():\n  movej([0,0,0,0,0,0])\n  while (True):\n  end\nend\n")
+    wait_until(
+        lambda: any("foreign program" in line for _, line in arm.admin("log")), "a foreign program"
+    )
+    assert arm.admin()["q"] == before
 
 
 # --- Modbus RTU: MODBUS over Serial Line V1.02, and Application Protocol V1.1b3 ------------------

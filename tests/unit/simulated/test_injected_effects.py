@@ -23,7 +23,7 @@ from tests.support.rehearsed import dead_weights
 
 CELL = ur10e_cell()
 WEIGHTS = dead_weights([4.0, 8.0, 12.0], CELL.gravity)
-STATES, POSE, LOAD, CYCLE = rehearsal_states(CELL, 10, WEIGHTS, np.random.default_rng(0))
+STATES, POSE, LOAD, _ = rehearsal_states(CELL, 10, WEIGHTS, np.random.default_rng(0))
 VISIBLE = [(e, "absolute") for e in EFFECTS] + [(e, "deflection") for e in DEFLECTION_EFFECTS]
 
 
