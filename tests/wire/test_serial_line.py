@@ -3,8 +3,6 @@
 import os
 import subprocess
 import sys
-import threading
-import time
 import tty
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from hilcal.drivers.links import close_port, drain, line_failures, open_port
+from hilcal.drivers.links import close_port, open_port
 from hilcal.errors import DeviceError, InputError
 
 HOLD = """
@@ -86,46 +84,3 @@ def test_a_rate_that_no_port_has(line, baud):
     with pytest.raises(InputError, match=f"{baud} is no rate"):
         open_port("tracker", str(line.path), baud)
     close_port(open_port("tracker", str(line.path), 19200))  # nothing is left locked
-
-
-@pytest.mark.parametrize("action", ["read", "write", "waiting", "reset", "drain"])
-def test_an_unplugged_adapter_is_one_line_whatever_was_tried(line, action):
-    port = open_port("tracker", str(line.path), 19200, timeout=0.2)
-    try:
-        line.unplug()
-        assert port.is_open
-        actions = {
-            "read": lambda: port.read(1),
-            "write": lambda: port.write(b"x"),
-            "waiting": lambda: port.in_waiting,
-            "reset": port.reset_input_buffer,
-            "drain": lambda: drain(port, 0.05, 1.0),
-        }
-        with (
-            pytest.raises(DeviceError, match=r"^tracker: port .* is gone; was its adapter unp"),
-            line_failures("tracker", str(line.path)),
-        ):
-            actions[action]()
-    finally:
-        close_port(port)
-
-
-def test_a_line_is_drained_until_quiet(line):
-    port = open_port("tracker", str(line.path), 19200)
-    sent = threading.Event()
-
-    def talk() -> None:
-        for _ in range(10):
-            os.write(line.master, b"late answer\r\n")
-            time.sleep(0.01)
-        sent.set()
-
-    thread = threading.Thread(target=talk)
-    try:
-        thread.start()
-        assert drain(port, quiet=0.3, limit=20.0)
-        assert sent.is_set()
-        assert port.in_waiting == 0
-    finally:
-        thread.join()
-        close_port(port)

@@ -210,18 +210,6 @@ def test_a_device_that_ends_early_is_named_with_its_last_words(tmp_path, monkeyp
     assert children() == before
 
 
-@pytest.mark.long
-def test_a_device_that_never_gets_ready_is_named_at_the_deadline(tmp_path, monkeypatch):
-    before = children()
-    (tmp_path / "asleep.py").write_text("import time\ntime.sleep(600)\n")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
-    broken(monkeypatch, "asleep")
-    monkeypatch.setattr(cell_processes, "START_TIMEOUT", 2.0)
-    with pytest.raises(DeviceError, match=r"tracker: not ready within 2 s; see .*\.log"):
-        start(tmp_path, config())
-    assert children() == before
-
-
 def test_what_cannot_be_simulated_is_refused_before_anything_starts(tmp_path):
     made = whole()
     world = world_of(made)

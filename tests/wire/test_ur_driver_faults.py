@@ -125,17 +125,6 @@ def test_controller_dies_in_motion(tmp_path):
     assert cases.children() == []
 
 
-@pytest.mark.slow
-def test_motion_scaled_to_nothing_is_given_up(arm, sim):
-    goal = cases.under_way(arm, sim)
-    sim.admin("set", speed_scaling=0.0)
-    assert "scaled to 0" in cases.error_of(arm.moving)
-    assert not sim.admin()["moving"]
-    sim.admin("set", speed_scaling=1.0)
-    time.sleep(0.2)
-    assert abs(sim.admin()["q"][0] - goal[0]) > 0.05  # it does not go on later
-
-
 @pytest.mark.parametrize("fault", first(1, ["rtde_drop", "rtde_stall", "rtde_half_frame"]))
 def test_link_lost_at_rest_gives_no_old_values(arm, sim, fault):
     sim.admin(fault)

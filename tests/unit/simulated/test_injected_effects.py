@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.spatial.transform import Rotation
 
 import hilcal.drivers.simulated
@@ -13,6 +14,7 @@ from hilcal.drivers.simulated.injected_effects import (
     DEFLECTION_EFFECTS,
     EFFECTS,
     hide_effect,
+    world_without_effect,
 )
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
@@ -133,3 +135,26 @@ def test_the_world_shares_no_physics_with_the_program():
             for module in names:
                 own = not module.startswith("hilcal") or module.startswith("hilcal.drivers.")
                 assert own or module in allowed, (name, module)
+
+
+DRAWS = 4000
+
+
+@pytest.mark.parametrize(("m", "known"), [(3, False), (6, False), (6, True)])
+def test_sample_covariance_is_the_reported_one(m, known):
+    world = world_without_effect(ur10e_cell(registration_known=known), np.random.default_rng(4))
+    q = np.array([0.4, -1.2, 1.3, -0.4, 0.9, 0.3])
+    states = States(np.tile(q, (DRAWS, 1)), np.tile([0.0, 0, -90, 0, 0, 0], (DRAWS, 1)))
+    sight = world.ideal_readings(states[:1])
+    cov = world.covariance(sight, m)[0]
+    value = world.observe(states, np.random.default_rng(5), m)
+    off = value[:, :3] - sight.position
+    if m == 6:
+        seen = Rotation.from_rotvec(value[:, 3:]) * Rotation.from_matrix(sight.rotation[0]).inv()
+        off = np.hstack([off, seen.as_rotvec()])
+    white = np.linalg.solve(np.linalg.cholesky(cov), off.T)
+    low, high = stats.chi2.ppf([0.001, 0.999], DRAWS * m)
+    assert low < np.sum(white**2) < high
+    # each element of the whitened sample covariance has a deviation of 1 or √2 over √DRAWS
+    np.testing.assert_allclose(white @ white.T / DRAWS, np.eye(m), atol=4.5 * np.sqrt(2 / DRAWS))
+    np.testing.assert_allclose(white.mean(axis=1), 0.0, atol=4.5 / np.sqrt(DRAWS))
