@@ -1,4 +1,4 @@
-"""A calibration against the world's own mechanics; and the scatter of an arm is never taken for zero."""
+"""A calibration against the world's own mechanics; and an arm's scatter is never zero."""
 
 import json
 from dataclasses import replace

@@ -299,8 +299,8 @@ ARM_AXES = [f"A{k}" for k in range(1, 7)]
 ALL_AXES = [f"J{k}" for k in range(1, 8)]
 
 
-def their_table(folder, r, header, loads=("none",), mirrored=False):
-    """Positions and travel in mm, perhaps counted backwards; joints in degrees; weights, if any."""
+def their_table(folder, r, header, loads=("none",)):
+    """Positions and travel in mm, joints in degrees, weights, if any."""
     s, weight = r.readings, ["weight"] * (len(loads) > 1)
     with (folder / "theirs.csv").open("w", newline="") as file:
         out = csv.writer(file)
@@ -309,16 +309,15 @@ def their_table(folder, r, header, loads=("none",), mirrored=False):
             if load not in loads:
                 continue
             q, kg = s.states.q[k], [10.0 * (load != "none") for _ in weight]
-            travel = 3.0 - q[0] if mirrored else q[0]
-            figures = [1e3 * travel, *np.degrees(q[1:]), *(1e3 * s.value[k]), *kg]
+            figures = [1e3 * q[0], *np.degrees(q[1:]), *(1e3 * s.value[k]), *kg]
             out.writerow([s.pose_names[s.pose[k]], *(f"{x:.6f}" for x in figures)])
     return folder / "theirs.csv"
 
 
-def plain_table(folder, header, mirrored=False):
+def plain_table(folder, header):
     cell = '[robot]\nmodel = "track.toml"\n[tool]\ntarget_m = [0.06, 0.02, 0.12]\n'
     (folder / "cell.toml").write_text(cell)
-    return their_table(folder, campaign(folder, "nothing", 2, 24)[0], header, mirrored=mirrored)
+    return their_table(folder, campaign(folder, "nothing", 2, 24)[0], header)
 
 
 @pytest.mark.parametrize("header", [["E1", *ARM_AXES], ALL_AXES])
