@@ -20,7 +20,6 @@ from hilcal.calibration.urscript import movej_program, waypoints, with_joints
 from hilcal.drivers.links import crc16 as crc16_of
 from hilcal.drivers.links import crc_modbus, crc_x25
 from hilcal.drivers.simulated.force_server import Ft300
-from tests.support.geocom_cases import crc16
 from tests.support.instruments import TARGET, Instrument, tracker
 from tests.support.sim_ur_cases import (
     ClientError,
@@ -213,15 +212,6 @@ def test_programs_with_other_statements_are_foreign_and_move_nothing(arm: Simula
 
 
 # --- Modbus RTU: MODBUS over Serial Line V1.02, and Application Protocol V1.1b3 ------------------
-
-
-def test_a_request_that_the_line_has_damaged_is_not_answered() -> None:
-    request = b"\x09\x03" + struct.pack(">HH", 500, 1)
-    whole = request + crc16(request, 0xFFFF).to_bytes(2, "little")
-    for bit in range(8 * len(whole)):
-        damaged = bytearray(whole)
-        damaged[bit // 8] ^= 1 << bit % 8
-        assert Ft300().receive(bytes(damaged), np.zeros(6)) == b""
 
 
 # --- GeoCOM: geocompy -----------------------------------------------------------------------------
