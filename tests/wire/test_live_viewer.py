@@ -1,10 +1,13 @@
-"""A campaign on simulated devices while a live viewer follows it: nothing waits for the viewer."""
+"""Commands that a live viewer, a real client, follows: nothing waits for it, and it sees all."""
 
 import os
 import re
 import signal
 import subprocess
+import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
@@ -12,6 +15,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from hilcal.present.viewer.recording import executable
+from tests.support.bench_cases import BASE, store_campaign
 from tests.support.campaign_cases import (
     STARVED,
     TRIES,
@@ -21,11 +25,37 @@ from tests.support.campaign_cases import (
     check_complete,
     check_readings,
 )
+from tests.support.timing import wait_until
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("nothing_goes_on")]
+pytestmark = pytest.mark.slow
 
 MORE_READINGS = 12
 URL = re.compile(r"rerun\+http://127\.0\.0\.1:\d+/proxy")
+LONG = 120.0
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Settings of the viewer go here."""
+    for name in ("HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME"):
+        monkeypatch.setenv(name, str(tmp_path))
+
+
+@contextmanager
+def follower(told: str, saved: Path) -> "Iterator[subprocess.Popen[bytes]]":
+    """A viewer of its own that follows what a command serves."""
+    url = URL.search(told)
+    assert url is not None
+    viewer = subprocess.Popen(
+        [executable(), "--port", "auto", "--save", str(saved), url.group()],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        yield viewer
+    finally:
+        viewer.kill()
+        viewer.wait()
 
 
 def live_process(run: Run) -> psutil.Process:
@@ -43,11 +73,10 @@ def drawn(recording: Path) -> int:
     return found
 
 
+@pytest.mark.usefixtures("nothing_goes_on")
 def test_whatever_happens_to_the_viewer_the_campaign_is_whole(
-    cell: Site, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cell: Site, path: Path, tmp_path: Path
 ) -> None:
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     recording = path.with_name("run.live.rrd")
 
     # Ctrl-C: the recording is complete, and no process is left
@@ -66,14 +95,7 @@ def test_whatever_happens_to_the_viewer_the_campaign_is_whole(
     # a viewer that is frozen all the time, and then the process that is killed
     run = Run(cell, path, "--view")
     run.wait_until(lambda: URL.search(run.output) is not None, "viewer")
-    found = URL.search(run.output)
-    assert found is not None
-    viewer = subprocess.Popen(
-        [executable(), "--port", "auto", "--save", str(tmp_path / "frozen.rrd"), found.group()],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    try:
+    with follower(run.output, tmp_path / "frozen.rrd") as viewer:
         time.sleep(0.5)
         viewer.send_signal(signal.SIGSTOP)
         run.some_readings()
@@ -83,9 +105,6 @@ def test_whatever_happens_to_the_viewer_the_campaign_is_whole(
         assert "the live viewer has ended; everything else goes on" in run.output
         run.interrupt()
         run.end()
-    finally:
-        viewer.kill()
-        viewer.wait()
     check_readings(cell, path)
 
     # to the end; what earlier sessions measured is in the recording as well
@@ -98,3 +117,32 @@ def test_whatever_happens_to_the_viewer_the_campaign_is_whole(
             raise EndedError(words)
     check_complete(cell, path)
     assert drawn(recording) == len(cell.plan.steps)
+
+
+def revisions(recording: Path) -> set[int]:
+    """The revisions whose verdicts a recording has."""
+    try:
+        chunks = RrdReader(recording).stream().filter(content="/words/verdict").to_chunks()
+        batches = [c.to_record_batch() for c in chunks]
+    except (ValueError, RuntimeError):  # nothing in it yet; a part of a message
+        return set()
+    found = [b["revision"].to_pylist() for b in batches if "revision" in b.schema.names]
+    return {k for one in found for k in one}
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_added_and_removed_a_viewer_sees_both_revisions(tmp_path: Path) -> None:
+    run, told = store_campaign(tmp_path / "run.hilcal"), tmp_path / "told.txt"
+    for word, seen in (("add", {1, 2}), ("remove", {1, 2, 3})):
+        late = tmp_path / f"{word}.rrd"
+        line = [sys.executable, "-m", "hilcal", word, str(run), BASE, "--view"]
+        with told.open("w") as out:
+            process = subprocess.Popen(line, stdout=out, stderr=out)
+        wait_until(lambda: URL.search(told.read_text()) is not None, "served", LONG)
+        with follower(told.read_text(), late):
+            assert process.wait(LONG) == 0, told.read_text()
+            # what it had sent when it ended
+            wait_until(lambda late=late: revisions(late), "seen", LONG)
+        recording = run.with_name("run.live.rrd")
+        assert revisions(recording) == seen
+        assert RrdReader(recording).store() is not None  # it has its footer: whole
