@@ -2,7 +2,6 @@
 
 import os
 import re
-import resource
 import signal
 import socket
 import subprocess
@@ -149,7 +148,6 @@ class Run:
         site: Site,
         path: Path,
         *more: str,
-        limit: int | None = None,
         how: tuple[str, ...] = (),
     ) -> None:
         """Start it; unless `how` says otherwise, `--resume` where the campaign is there already."""
@@ -166,7 +164,6 @@ class Run:
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
                 env=environment,
-                preexec_fn=None if limit is None else lambda: _limited(limit),
             )
         self._family: set[int] = {self.process.pid}
         self._looked = 0.0
@@ -263,10 +260,6 @@ def still_running(processes: set[int], seconds: float) -> list[str]:
         if not names or time.monotonic() > end:
             return names
         time.sleep(0.02)
-
-
-def _limited(size: int) -> None:
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 
 
 def _alive(pid: int) -> str:

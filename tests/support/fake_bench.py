@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -209,11 +209,22 @@ TORQUE = np.array([3.0, -40.0, 20.0, 5.0, 1.0, -0.5])  # N·m, of every pose
 
 
 @dataclass
-class FakeArm:
+class FakeDevice:
+    """What all devices answer alike."""
+
     world: FakeWorld
+    name: ClassVar[str]
 
     def report(self) -> Report:
-        return Report("arm", "fake")
+        return Report(self.name, "fake")
+
+    def close(self) -> None:
+        return
+
+
+@dataclass
+class FakeArm(FakeDevice):
+    name = "arm"
 
     def sample(self) -> ArmSample:
         w = self.world
@@ -279,13 +290,10 @@ class FakeArm:
 
 
 @dataclass
-class FakeTracker:
+class FakeTracker(FakeDevice):
     """A tracker with white noise."""
 
-    world: FakeWorld
-
-    def report(self) -> Report:
-        return Report("tracker", "fake")
+    name = "tracker"
 
     def measure(self) -> TrackerSample:
         w = self.world
@@ -306,18 +314,12 @@ class FakeTracker:
             w.not_found -= 1
             raise TargetLostError("tracker: no target found")
 
-    def close(self) -> None:
-        return
-
 
 @dataclass
-class FakeForce:
+class FakeForce(FakeDevice):
     """A force sensor of 100 Hz."""
 
-    world: FakeWorld
-
-    def report(self) -> Report:
-        return Report("force sensor", "fake")
+    name = "force sensor"
 
     def latest(self) -> WrenchSample:
         self.world.call("force.latest")
@@ -335,19 +337,13 @@ class FakeForce:
     def losses(self) -> Losses:
         return Losses(1000, 0, 0, 0)
 
-    def close(self) -> None:
-        return
-
 
 @dataclass
-class FakeOperator:
+class FakeOperator(FakeDevice):
     """Hangs what it is asked for, or what `FakeWorld.wrong_loads` says."""
 
-    world: FakeWorld
+    name = "operator"
     requests: list[tuple[str, str]] = field(default_factory=list)
-
-    def report(self) -> Report:
-        return Report("operator", "fake")
 
     def hang(self, load: CellLoad | None, why: str) -> None:
         w = self.world
@@ -362,9 +358,6 @@ class FakeOperator:
         self.world.call("operator.confirm")
         assert not self.world.is_moving, "a person asked to look at a moving arm"
         self.requests.append(("confirm", question))
-
-    def close(self) -> None:
-        return
 
 
 @dataclass(frozen=True)

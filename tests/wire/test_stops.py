@@ -117,17 +117,6 @@ def test_kill_minus_nine_at_random_moments(
 
 
 @pytest.mark.slow
-def test_a_full_disk_stops_the_arm_and_loses_nothing(cell: cases.Site, tmp_path: Path) -> None:
-    short = cell.shorter(tmp_path, poses=1)
-    path = tmp_path / "full.hilcal"
-    run = cases.Run(short, path, limit=56 << 10)
-    line = cases.failed(run)
-    assert "make room on the disk" in line
-    assert not cell.ask("arm", "state")["moving"]
-    cases.finish(short, path)
-
-
-@pytest.mark.slow
 def test_two_programs_at_one_campaign_file(cell: cases.Site, tmp_path: Path) -> None:
     short = cell.shorter(tmp_path, poses=1)
     path = tmp_path / "locked.hilcal"
@@ -139,41 +128,6 @@ def test_two_programs_at_one_campaign_file(cell: cases.Site, tmp_path: Path) -> 
     other.close()
     assert "another program" in line
     assert not cell.ask("arm", "state")["moving"]
-    cases.finish(short, path)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("how", "interrupted"),
-    [("deleted", False), ("deleted", True), ("moved", False), ("replaced", False)],
-)
-def test_a_campaign_that_is_gone_is_said_and_found(
-    cell: cases.Site, tmp_path: Path, how: str, interrupted: bool
-) -> None:
-    """Deleted, moved or replaced by another program: the arm stops, and nothing is lost."""
-    short = cell.shorter(tmp_path, poses=2)
-    path = tmp_path / "gone.hilcal"
-    run, _ = cases.start_run(short, path, cases.Run.measuring)
-    with CampaignFile.open(path, read_only=True) as campaign:
-        measured = campaign.n_readings
-    if how == "moved":
-        path.rename(tmp_path / "there.hilcal")
-    elif how == "deleted":
-        path.unlink()
-    else:
-        path.with_name("other").write_text("another")
-        path.with_name("other").replace(path)
-    if interrupted:
-        run.interrupt()
-    line = cases.failed(run)
-    assert "gone.hilcal: deleted, replaced or moved while it was open; all" in line
-    assert "then go on with: hilcal run" in line
-    assert not cell.ask("arm", "state")["moving"]
-    place = Path(line.partition(" are in ")[2].partition(": move that back")[0])
-    assert place.name == ("there.hilcal" if how == "moved" else "gone.rescued.hilcal")
-    with CampaignFile.open(place) as campaign:
-        assert campaign.n_readings >= measured > 0
-    place.replace(path)  # as the line says
     cases.finish(short, path)
 
 
