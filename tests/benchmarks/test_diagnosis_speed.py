@@ -6,19 +6,15 @@ times; `make bench` prints the ratios at its end and stores them in `extra_info`
 """
 
 from dataclasses import replace
-from typing import Any
 
 import pytest
 
-from hilcal.diagnosis.effect_ranking import Suspect, candidates, rank_suspects
+from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
-from hilcal.model.model import Model
-from hilcal.readings.whitening import Mode
-from tests.benchmarks.conftest import Claim
-from tests.support.campaigns import SimulatedCampaign, campaign
+from tests.support.campaigns import campaign
 from tests.support.effect_cases import make
 from tests.support.timing import shortest
 
@@ -28,11 +24,11 @@ LOADS = 5  # readings of a pose
 ROUNDS = 3
 
 
-def based(c: SimulatedCampaign) -> Fit:
+def based(c):
     return fit(baseline(c.cell, c.readings, c.mode), c.readings, c.mode)
 
 
-def largest(found: Fit) -> Model:
+def largest(found):
     """The baseline and the suspect with most parameters."""
     names = {e.name: len(e.parameters) for e in candidates(found)}
     name = max(names, key=lambda n: names[n])
@@ -40,15 +36,13 @@ def largest(found: Fit) -> Model:
     return found.model + make(name, found.model.cell, states, m=found.readings.m)
 
 
-def score(found: Fit) -> tuple[Suspect, ...]:
+def score(found):
     return rank_suspects(linearise(found), candidates(found))
 
 
 @pytest.mark.parametrize("mode", ["absolute", "deflection"])
 @pytest.mark.parametrize("readings", [180, 1000])
-def test_scoring_against_a_fit_of_the_largest_model(
-    readings: int, mode: Mode, benchmark: Any, claim: Claim
-) -> None:
+def test_scoring_against_a_fit_of_the_largest_model(readings, mode, benchmark, claim):
     """`ratio`: scoring the catalogue over one fit of the largest model; `diagnose_s`: all of it."""
     found = based(campaign("hysteresis", mode, poses=readings // LOADS, strength=2.0))
     assert len(found.readings) == readings
@@ -77,7 +71,7 @@ def test_scoring_against_a_fit_of_the_largest_model(
 
 
 @pytest.mark.parametrize("mode", ["absolute", "deflection"])
-def test_diagnosing_what_nothing_explains(mode: Mode, benchmark: Any, claim: Claim) -> None:
+def test_diagnosing_what_nothing_explains(mode, benchmark, claim):
     """`diagnose_s`: with smooth laws and trees on the residual, which a good suspect spares."""
     c = campaign("none", mode, poses=1000 // LOADS)
     found = based(replace(c, readings=replace(c.readings, covariance=c.readings.covariance / 4)))

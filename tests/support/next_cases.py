@@ -7,7 +7,7 @@ import numpy as np
 
 from hilcal.cell import cell_from_config
 from hilcal.config import load_config
-from hilcal.design.next import SeparatingPlan, plan_separating
+from hilcal.design.next import plan_separating
 from hilcal.design.planner import PlanRequest, plan_readings
 from hilcal.diagnosis.diagnosis import Diagnosis, in_doubt
 from hilcal.diagnosis.verdict import diagnose
@@ -39,13 +39,13 @@ class Doubtful:
     diagnosis: Diagnosis
 
     @property
-    def suspects(self) -> tuple[str, ...]:
+    def suspects(self):
         """The first one that passes all tests, and those that are inseparable from it."""
         return in_doubt(self.diagnosis) or self.diagnosis.significant[:1]
 
 
 @cache
-def first_plan() -> Plan:
+def first_plan():
     """As many readings as six poses take under two of the four loads."""
     some = SMALL.model_copy(update={"loads": SMALL.loads[1::2]})
     return plan_readings(
@@ -54,7 +54,7 @@ def first_plan() -> Plan:
 
 
 @cache
-def doubtful(effect: str, seed: int) -> Doubtful:
+def doubtful(effect, seed):
     """A small campaign with a weak hidden effect."""
     secret = case_of_plan(SMALL, first_plan(), effect, seed)
     r = simulate_plan(secret, first_plan(), [seed, 1])
@@ -62,7 +62,7 @@ def doubtful(effect: str, seed: int) -> Doubtful:
     return Doubtful(secret, first_plan(), r, found, diagnose(found))
 
 
-def after_further_plan(first: Doubtful, poses: int = 20) -> tuple[Diagnosis, SeparatingPlan]:
+def after_further_plan(first, poses=20):
     """Plan what separates the suspects, measure it in the same world, and diagnose all."""
     cell = first.rehearsal.cell
     reference = first.plan.joints("reference")
@@ -77,7 +77,7 @@ def after_further_plan(first: Doubtful, poses: int = 20) -> tuple[Diagnosis, Sep
     return diagnose(fit(baseline(cell, readings, mode), readings, mode)), found
 
 
-def joined_readings(a: Readings, b: Readings) -> Readings:
+def joined_readings(a, b):
     names = tuple(dict.fromkeys((*a.pose_names, *b.pose_names)))
     place = [np.array([names.index(n) for n in r.pose_names])[r.pose] for r in (a, b)]
     parts = zip((a, b), place, strict=True)

@@ -7,20 +7,17 @@ import numpy as np
 from hilcal.identification.residual import ErrorBlock
 from hilcal.present.document import table
 from hilcal.present.story import DependenceCurve, Story, StoryRevision
-from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.scene import body_poses
 
 EFFECTS = ("joint_compliance", "base_compliance", "joint_tilt_compliance", "hysteresis")
 
 
-def ur10e() -> Arm:
+def ur10e():
     return load_arm("ur10e")
 
 
-def story(
-    poses: int = 30, loads: int = 3, seed: int = 1, mode: str = "deflection", names: str = ""
-) -> Story:
+def story(poses=30, loads=3, seed=1, mode="deflection", names=""):
     """Build a story of `poses` x `loads` readings and 4 revisions with falling residuals."""
     rng = np.random.default_rng(seed)
     arm = ur10e()
@@ -94,7 +91,7 @@ LOAD = DependenceCurve(
 )
 
 
-def doubtful(names: str = "") -> Story:
+def doubtful(names=""):
     """A story with doubts: a missing effect, an ambiguous one, an unknown one, and none left."""
     told = story(poses=12, names=names)
     first, second, third, last = told.revisions

@@ -10,7 +10,6 @@ what the person is asked to put right, ends no run.
 import socket
 from dataclasses import replace
 from itertools import zip_longest
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,27 +20,27 @@ from tests.support.timing import wait_until
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("nothing_goes_on")]
 
 
-def arm(op: str, **arguments: object) -> cases.Act:
+def arm(op, **arguments):
     return cases.act("arm", op, **arguments)
 
 
-def off(*ops: str) -> cases.Act:
+def off(*ops):
     """Switch faults off."""
 
-    def undo(s: cases.Site) -> None:
+    def undo(s):
         for op in ops:
             s.ask("arm", op, on=False)
 
     return undo
 
 
-def unlock(s: cases.Site) -> None:
+def unlock(s):
     """As on the pendant: acknowledge, and stop the paused program."""
     s.ask("arm", "set", unlock_s=0.0)
     s.dashboard("unlock protective stop", "stop")
 
 
-def release(s: cases.Site) -> None:
+def release(s):
     """As on the pendant; the dashboard powers an arm on in remote mode only."""
     s.ask("arm", "remote_mode")
     s.ask("arm", "release_emergency_stop")
@@ -49,10 +48,10 @@ def release(s: cases.Site) -> None:
     wait_until(lambda: s.ask("arm", "state")["robot_mode"] == 7, "running")
 
 
-def alone(op: str, **arguments: object) -> cases.Act:
+def alone(op, **arguments):
     """The same while the dashboard, the second way to stop, does not answer."""
 
-    def do(s: cases.Site) -> None:
+    def do(s):
         s.ask("arm", "dashboard_mute", on=True)
         s.ask("arm", op, **arguments)
 
@@ -113,13 +112,13 @@ HIT = [0.0, 0.0, -280.0, 0.0, 0.0, 0.0]
 TOO_MUCH = "max_force_N|over its range"  # with a load on the hook it may be beyond the range
 
 
-def unplugged(device: str) -> cases.Fault:
+def unplugged(device):
     name = f"{device} unplugged"
     says = (device, "unplugged")
     return cases.Fault(name, cases.act(device, "unplug"), cases.act(device, "replug"), says)
 
 
-def rate(device: str, wrong: int, good: int, says: str) -> cases.Fault:
+def rate(device, wrong, good, says):
     on, off = cases.act(device, "baud", baud=wrong), cases.act(device, "baud", baud=good)
     return cases.Fault(f"{device} at another rate", on, off, (device, says))
 
@@ -157,13 +156,13 @@ FORCE = (
 )
 
 
-def damage(device: str, op: str) -> cases.Fault:
+def damage(device, op):
     """The line flips or cuts for a while."""
     on, off = cases.act(device, op, probability=0.02), cases.act(device, op, probability=0.0)
     return cases.Fault(f"{device} {op}", on, off, ())
 
 
-def once(device: str, op: str, **arguments: object) -> cases.Fault:
+def once(device, op, **arguments):
     """What is over after once."""
     return cases.Fault(f"{device} {op}", cases.act(device, op, **arguments), cases.no_action, ())
 
@@ -197,17 +196,16 @@ HAND = [20.0, 35.0, -44.0, 0.0, 0.0, 0.0]
 NOBODY = [0.0] * 6
 
 
-def somebody_jogs(s: cases.Site) -> None:
+def somebody_jogs(s):
     """Move the arm by hand, a little, from where it is."""
     q = s.ask("arm", "state")["q"]
     s.ask("arm", "jog", q=[q[0] + 0.1, *q[1:5], q[5] + 0.2])
 
 
-def another_program(s: cases.Site) -> None:
+def another_program(s):
     """Send the arm elsewhere by the script port, as any program of the network may."""
     q = np.array(s.ask("arm", "state")["q"]) + np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.5])
     text = f"def other():\n  movej([{', '.join(map(str, q))}], a=1.4, v=1.0)\nend\n"
-    assert s.config.robot.host is not None
     with socket.create_connection((s.config.robot.host, SCRIPT_PORT), timeout=5.0) as line:
         line.sendall(text.encode())
 
@@ -241,16 +239,16 @@ NOT_FAST = tuple(replace(fault, fast=False) for fault in FORCE)
 
 
 @cases.parametrize_faults((*ARM_MOTION, *FORCE, *PERSON_MOTION))
-def test_a_fault_in_motion(fault: cases.Fault, cell: cases.Site, path: Path) -> None:
+def test_a_fault_in_motion(fault, cell, path):
     cases.check_fault(fault, cell, path, moving=True)
 
 
 @cases.parametrize_faults((*ARM_REST, *TRACKER, *NOT_FAST, *PERSON_REST))
-def test_a_fault_at_rest(fault: cases.Fault, cell: cases.Site, path: Path) -> None:
+def test_a_fault_at_rest(fault, cell, path):
     cases.check_fault(fault, cell, path, moving=False)
 
 
-def test_faults_that_are_overcome_cost_nothing(cell: cases.Site, path: Path) -> None:
+def test_faults_that_are_overcome_cost_nothing(cell, path):
     """All of them in one run, each for a whole reading, at both lines at a time."""
     run, _ = cases.start_run(cell, path, cases.Run.measuring)
     for row in zip_longest(*OVERCOME.values()):
@@ -266,11 +264,11 @@ def test_faults_that_are_overcome_cost_nothing(cell: cases.Site, path: Path) -> 
     cases.check_readings(cell, path)
 
 
-def loaded(run: cases.Run) -> str:
+def loaded(run):
     """Wait for a reading under a load; returns its name."""
-    found: list[str] = []
+    found = []
 
-    def under_load() -> bool:
+    def under_load():
         name = run.site.ask("world", "state")["load"]
         found[:] = [] if name is None else [name]
         now = run.output.rstrip().rpartition("\n")[2]
@@ -280,9 +278,7 @@ def loaded(run: cases.Run) -> str:
     return found[0]
 
 
-def test_a_load_that_falls_off_is_asked_for_again_and_no_reading_is_without_it(
-    cell: cases.Site, path: Path
-) -> None:
+def test_a_load_that_falls_off_is_asked_for_again_and_no_reading_is_without_it(cell, path):
     run, name = cases.start_run(cell, path, loaded)
     cell.ask("world", "hang", name=None)
     run.wait_until(lambda: "touch the tool" in run.output, "words about the load")
@@ -293,6 +289,6 @@ def test_a_load_that_falls_off_is_asked_for_again_and_no_reading_is_without_it(
     cases.check_readings(cell, path)
 
 
-def test_the_campaign_has_every_reading_exactly_once(cell: cases.Site, path: Path) -> None:
+def test_the_campaign_has_every_reading_exactly_once(cell, path):
     cases.finish(cell, path)
     assert b"doubted" in path.read_bytes()

@@ -277,7 +277,7 @@ def talker(tmp_path, frame):
     path.symlink_to(os.ttyname(slave))
     stop = threading.Event()
 
-    def talk() -> None:
+    def talk():
         start, number = time.monotonic(), 0
         while not stop.wait(0.002):
             while number < (time.monotonic() - start) * 1000:
@@ -315,13 +315,13 @@ def test_values_that_cannot_be_never_pass(tmp_path, bad):
         )
 
 
-def test_ft300_serves_a_modbus_library_that_no_driver_uses() -> None:
+def test_ft300_serves_a_modbus_library_that_no_driver_uses():
     """The FT 300's driver uses minimalmodbus; this is pymodbus."""
     with force_sensor("ft300") as ft300:
         client = ModbusSerialClient(str(ft300.port), baudrate=19200, timeout=0.5, retries=0)
         assert client.connect()
 
-        def held(address: int, count: int, kind: object) -> object:
+        def held(address, count, kind):
             found = client.read_holding_registers(address, count=count, device_id=9)
             return client.convert_from_registers(found.registers, kind)
 

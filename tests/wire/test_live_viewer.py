@@ -6,9 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import psutil
 import pytest
@@ -21,7 +19,6 @@ from tests.support.campaign_cases import (
     TRIES,
     EndedError,
     Run,
-    Site,
     check_complete,
     check_readings,
 )
@@ -35,17 +32,16 @@ LONG = 120.0
 
 
 @pytest.fixture(autouse=True)
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def home(tmp_path, monkeypatch):
     """Settings of the viewer go here."""
     for name in ("HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME"):
         monkeypatch.setenv(name, str(tmp_path))
 
 
 @contextmanager
-def follower(told: str, saved: Path) -> "Iterator[subprocess.Popen[bytes]]":
+def follower(told, saved):
     """A viewer of its own that follows what a command serves."""
     url = URL.search(told)
-    assert url is not None
     viewer = subprocess.Popen(
         [executable(), "--port", "auto", "--save", str(saved), url.group()],
         stdout=subprocess.DEVNULL,
@@ -58,13 +54,13 @@ def follower(told: str, saved: Path) -> "Iterator[subprocess.Popen[bytes]]":
         viewer.wait()
 
 
-def live_process(run: Run) -> psutil.Process:
+def live_process(run):
     """The process that serves and records."""
     children = psutil.Process(run.process.pid).children(recursive=True)
     return next(p for p in children if "hilcal.present.live_viewer" in p.cmdline())
 
 
-def drawn(recording: Path) -> int:
+def drawn(recording):
     """Readings that a recording of one session shows, with those of earlier sessions."""
     found = 0
     for kind in ("arrows", "dots"):
@@ -74,16 +70,13 @@ def drawn(recording: Path) -> int:
 
 
 @pytest.mark.usefixtures("nothing_goes_on")
-def test_whatever_happens_to_the_viewer_the_campaign_is_whole(
-    cell: Site, path: Path, tmp_path: Path
-) -> None:
+def test_whatever_happens_to_the_viewer_the_campaign_is_whole(cell, path, tmp_path):
     recording = path.with_name("run.live.rrd")
 
     # Ctrl-C: the recording is complete, and no process is left
     run = Run(cell, path, "--view")
     run.some_readings()
-    served = URL.search(run.output)
-    assert served is not None
+    assert URL.search(run.output)
     run.interrupt()
     code, words = run.end()
     assert code == 130, words
@@ -119,7 +112,7 @@ def test_whatever_happens_to_the_viewer_the_campaign_is_whole(
     assert drawn(recording) == len(cell.plan.steps)
 
 
-def revisions(recording: Path) -> set[int]:
+def revisions(recording):
     """The revisions whose verdicts a recording has."""
     try:
         chunks = RrdReader(recording).stream().filter(content="/words/verdict").to_chunks()
@@ -131,7 +124,7 @@ def revisions(recording: Path) -> set[int]:
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
-def test_added_and_removed_a_viewer_sees_both_revisions(tmp_path: Path) -> None:
+def test_added_and_removed_a_viewer_sees_both_revisions(tmp_path):
     run, told = store_campaign(tmp_path / "run.hilcal"), tmp_path / "told.txt"
     for word, seen in (("add", {1, 2}), ("remove", {1, 2, 3})):
         late = tmp_path / f"{word}.rrd"

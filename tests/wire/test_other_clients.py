@@ -5,9 +5,7 @@ manuals. UR's own library for Python is in no package registry; its recipes are 
 
 import csv
 import struct
-from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,11 +18,10 @@ from hilcal.calibration.urscript import movej_program, waypoints, with_joints
 from hilcal.drivers.links import crc16 as crc16_of
 from hilcal.drivers.links import crc_modbus, crc_x25
 from hilcal.drivers.simulated.force_server import Ft300
-from tests.support.instruments import TARGET, Instrument, tracker
+from tests.support.instruments import TARGET, tracker
 from tests.support.sim_ur_cases import (
     ClientError,
     Lines,
-    SimulatedUr,
     Wire,
     client,
     send_script,
@@ -34,7 +31,7 @@ from tests.support.timing import wait_until
 
 
 @pytest.fixture(scope="module")
-def arm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimulatedUr]:
+def arm(tmp_path_factory):
     running = start(tmp_path_factory.mktemp("ur"))
     yield running
     running.close()
@@ -61,7 +58,7 @@ FORMAT = {"DOUBLE": "d", "VECTOR6D": "6d", "VECTOR3D": "3d", "UINT64": "Q", "UIN
           "INT32": "i", "VECTOR6INT32": "6i"}  # fmt: skip
 
 
-def test_a_recorder_gets_every_output_that_it_asks_for(arm: SimulatedUr) -> None:
+def test_a_recorder_gets_every_output_that_it_asks_for(arm):
     layout = struct.Struct(">B" + "".join(FORMAT[kind] for kind in RECORD.values()))
     with Wire(arm.host) as wire:
         assert wire.ask("V", struct.pack(">H", 2)) == b"\x01"
@@ -83,7 +80,7 @@ def test_a_recorder_gets_every_output_that_it_asks_for(arm: SimulatedUr) -> None
         assert came == ("P", b"\x01")
 
 
-def test_a_control_loop_writes_and_two_cannot_hold_one_register(arm: SimulatedUr) -> None:
+def test_a_control_loop_writes_and_two_cannot_hold_one_register(arm):
     setp = ",".join(f"input_double_register_{k}" for k in range(6)).encode()
     with Wire(arm.host) as wire, Wire(arm.host) as other:
         wire.outputs("target_q,target_qd,output_int_register_0")
@@ -104,7 +101,7 @@ def test_a_control_loop_writes_and_two_cannot_hold_one_register(arm: SimulatedUr
         wait_until(lambda: third.ask("I", setp)[0], "free: the registers")
 
 
-def test_ur_rtde_records_and_writes_inputs(arm: SimulatedUr, tmp_path: Path) -> None:
+def test_ur_rtde_records_and_writes_inputs(arm, tmp_path):
     """Its own record and control of inputs, by a library of the University of Southern Denmark."""
     path = tmp_path / "record.csv"
     with client(arm.host, "receive", "io") as run, client(arm.host) as other:
@@ -128,7 +125,7 @@ def test_ur_rtde_records_and_writes_inputs(arm: SimulatedUr, tmp_path: Path) -> 
 # --- payload, dashboard and script port, as ur_rtde and the makers' pages use them ---------------
 
 
-def test_payload_keeps_its_centre_when_told_zeros(arm: SimulatedUr) -> None:
+def test_payload_keeps_its_centre_when_told_zeros(arm):
     with client(arm.host, "control", "receive") as run:
         assert run("control", "setPayload", 2.5, [0.01, 0.02, 0.03])
         assert run("control", "setPayload", 3.5, [0.0, 0.0, 0.0])
@@ -139,7 +136,7 @@ def test_payload_keeps_its_centre_when_told_zeros(arm: SimulatedUr) -> None:
 LOCAL = "Command is not allowed due to safety reasons, please switch robot to Remote Control mode"
 
 
-def test_dashboard_answers(arm: SimulatedUr) -> None:
+def test_dashboard_answers(arm):
     with Lines(arm.host) as dashboard:
         assert dashboard.read() == "Connected: Universal Robots Dashboard Server"
         assert dashboard.ask("stop") == "Stopped"  # the program of the client before
@@ -158,7 +155,7 @@ def test_dashboard_answers(arm: SimulatedUr) -> None:
         assert dashboard.read() == ""
 
 
-def test_dashboard_connections_of_local_mode_stay_without_rights(arm: SimulatedUr) -> None:
+def test_dashboard_connections_of_local_mode_stay_without_rights(arm):
     arm.admin("local_mode")
     with Lines(arm.host) as dashboard:
         dashboard.read()
@@ -182,7 +179,7 @@ end
 """
 
 
-def reached(arm: SimulatedUr, text: str, goals: np.ndarray) -> None:
+def reached(arm, text, goals):
     send_script(arm.host, text)
     moves = [f"move to {np.round(goal, 6).tolist()}" for goal in goals]
     wait_until(
@@ -194,15 +191,15 @@ def reached(arm: SimulatedUr, text: str, goals: np.ndarray) -> None:
     assert not state["moving"]
 
 
-def test_a_program_of_compensated_points_is_carried_out(arm: SimulatedUr) -> None:
+def test_a_program_of_compensated_points_is_carried_out(arm):
     reached(arm, movej_program(["a", "b"], Q).replace("])", "], a=20, v=30)"), Q)
 
 
-def test_a_rewritten_program_goes_to_its_new_waypoints(arm: SimulatedUr) -> None:
+def test_a_rewritten_program_goes_to_its_new_waypoints(arm):
     reached(arm, with_joints(PROGRAM, waypoints(PROGRAM), Q), Q)
 
 
-def test_programs_with_other_statements_are_foreign_and_move_nothing(arm: SimulatedUr) -> None:
+def test_programs_with_other_statements_are_foreign_and_move_nothing(arm):
     before = arm.admin()["q"]
     send_script(arm.host, "def p():\n  movej([0,0,0,0,0,0])\n  while (True):\n  end\nend\n")
     wait_until(
@@ -218,23 +215,23 @@ def test_programs_with_other_statements_are_foreign_and_move_nothing(arm: Simula
 
 
 @pytest.fixture(scope="module")
-def station() -> Iterator[Instrument]:
+def station():
     with tracker(TARGET) as running:
         yield running
 
 
-def cartesian(hz: float, v: float, distance: float) -> np.ndarray:
+def cartesian(hz, v, distance):
     return distance * np.array([np.sin(v) * np.sin(hz), np.sin(v) * np.cos(hz), np.cos(v)])
 
 
 @contextmanager
-def geocom(station: Instrument) -> Iterator[GeoCom]:
+def geocom(station):
     port = serial.Serial(str(station.port), 115200, timeout=5.0, exclusive=True)
     with SerialConnection(port) as connection:
         yield GeoCom(connection, checksum=True)
 
 
-def test_geocompy_reads_who_it_is(station: Instrument) -> None:
+def test_geocompy_reads_who_it_is(station):
     with geocom(station) as device:
         assert device.csv.get_instrument_name().params == "SIM LASER STATION"
         assert device.csv.get_serial_number().params == 123456
@@ -255,7 +252,7 @@ def test_geocompy_reads_who_it_is(station: Instrument) -> None:
         assert device.abort().error == 0
 
 
-def test_geocompy_reads_where_the_target_is(station: Instrument) -> None:
+def test_geocompy_reads_where_the_target_is(station):
     with geocom(station) as device:
         answer = device.bap.measure_distance_angle()
         assert answer.error == GeoComCode.OK
@@ -291,12 +288,12 @@ def test_geocompy_reads_where_the_target_is(station: Instrument) -> None:
         "09 03 06 39 00 00 FF 0E 0A F7 8B",  # ... its response
     ],
 )
-def test_checksums_of_the_makers_transcripts(frame: str) -> None:
+def test_checksums_of_the_makers_transcripts(frame):
     data = bytes.fromhex(frame)
     assert crc_modbus(data[:-2]) == data[-2:]
 
 
-def test_the_makers_start_of_the_stream_starts_it() -> None:
+def test_the_makers_start_of_the_stream_starts_it():
     sensor = Ft300()
     answer = sensor.receive(bytes.fromhex("0910019A0001020200CDCA"), np.zeros(6))
     assert sensor.streaming
@@ -305,7 +302,7 @@ def test_the_makers_start_of_the_stream_starts_it() -> None:
     assert not sensor.streaming
 
 
-def test_check_values_of_the_checksums() -> None:
+def test_check_values_of_the_checksums():
     """Of "123456789", as the catalogue of parametrised CRC algorithms (reveng) gives them."""
     assert crc_modbus(b"123456789") == bytes.fromhex("374B")
     assert crc_x25(b"123456789") == bytes.fromhex("6E90")

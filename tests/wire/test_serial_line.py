@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 import tty
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,7 +29,7 @@ class Line:
     master: int
     slave: int
 
-    def unplug(self) -> None:
+    def unplug(self):
         self.path.unlink(missing_ok=True)
         for end in (self.master, self.slave):
             os.close(end)
@@ -38,7 +37,7 @@ class Line:
 
 
 @pytest.fixture
-def line(tmp_path: Path) -> Iterator[Line]:
+def line(tmp_path):
     master, slave = os.openpty()
     tty.setraw(slave)
     path = tmp_path / "adapter"
@@ -54,7 +53,6 @@ def test_a_port_that_another_program_uses_is_refused_and_named(line):
         [sys.executable, "-c", HOLD, str(line.path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
     with other:
-        assert other.stdout is not None
         assert other.stdout.readline() == b"held\n"
         with pytest.raises(DeviceError, match="in use by another program") as caught:
             open_port("force sensor", str(line.path), 19200)

@@ -2,7 +2,6 @@
 
 import time
 from contextlib import closing
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,9 +30,7 @@ def made(driver):
 
 
 @pytest.mark.parametrize("driver", first(1, [*OPEN]))
-def test_the_station_measures_the_reflector_that_it_is_pointed_to(
-    driver: str, tmp_path: Path
-) -> None:
+def test_the_station_measures_the_reflector_that_it_is_pointed_to(driver, tmp_path):
     with (
         SimulatedCell.start(world_of(made(driver)), made(driver), tmp_path, 3) as cell,
         closing(OPEN[driver](cell.config)) as tracker,

@@ -7,7 +7,6 @@ reading exactly once.
 import signal
 import sqlite3
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,9 +29,7 @@ SLOW = 0.3  # position of the speed slider meanwhile: the arm moves for about ha
         pytest.param(signal.SIGHUP, marks=pytest.mark.slow),
     ],
 )
-def test_a_plea_to_end_stops_the_arm_first(
-    kind: signal.Signals, cell: cases.Site, path: Path
-) -> None:
+def test_a_plea_to_end_stops_the_arm_first(kind, cell, path):
     run, goal = cases.start_run(cell, path, cases.Run.moving)
     since = time.monotonic()
     if kind == signal.SIGINT:
@@ -47,7 +44,7 @@ def test_a_plea_to_end_stops_the_arm_first(
 
 
 @pytest.mark.slow
-def test_ctrl_c_twice_in_a_row_stops_it_too(cell: cases.Site, path: Path) -> None:
+def test_ctrl_c_twice_in_a_row_stops_it_too(cell, path):
     run, goal = cases.start_run(cell, path, cases.Run.moving)
     since = time.monotonic()
     run.interrupt()
@@ -63,7 +60,7 @@ def test_ctrl_c_twice_in_a_row_stops_it_too(cell: cases.Site, path: Path) -> Non
     cases.check_readings(cell, path)
 
 
-def _kill_at_random(cell: cases.Site, path: Path, kills: int, seed: int) -> int:
+def _kill_at_random(cell, path, kills, seed):
     """Kill one run after the other; returns in how many of them the arm moved."""
     rng = np.random.default_rng(seed)
     killed = moved = starved = 0
@@ -97,7 +94,7 @@ def _kill_at_random(cell: cases.Site, path: Path, kills: int, seed: int) -> int:
     return moved
 
 
-def _sound(path: Path) -> None:
+def _sound(path):
     with CampaignFile.open(path) as campaign:
         log = RunLog(campaign)
         assert campaign.n_readings == len(log.done()) == len(log.details())
@@ -107,9 +104,7 @@ def _sound(path: Path) -> None:
     ("kills", "poses"),
     [pytest.param(2, 2, marks=pytest.mark.long), pytest.param(100, 25, marks=pytest.mark.slow)],
 )
-def test_kill_minus_nine_at_random_moments(
-    cell: cases.Site, tmp_path: Path, kills: int, poses: int
-) -> None:
+def test_kill_minus_nine_at_random_moments(cell, tmp_path, kills, poses):
     long = cell.shorter(tmp_path, poses=poses)
     path = tmp_path / "killed.hilcal"
     assert _kill_at_random(long, path, kills, seed=poses) > (10 if kills > 10 else -1)
@@ -117,7 +112,7 @@ def test_kill_minus_nine_at_random_moments(
 
 
 @pytest.mark.slow
-def test_two_programs_at_one_campaign_file(cell: cases.Site, tmp_path: Path) -> None:
+def test_two_programs_at_one_campaign_file(cell, tmp_path):
     short = cell.shorter(tmp_path, poses=1)
     path = tmp_path / "locked.hilcal"
     run, _ = cases.start_run(short, path, cases.Run.measuring)
@@ -132,5 +127,5 @@ def test_two_programs_at_one_campaign_file(cell: cases.Site, tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_the_stopped_campaign_has_every_reading_exactly_once(cell: cases.Site, path: Path) -> None:
+def test_the_stopped_campaign_has_every_reading_exactly_once(cell, path):
     cases.finish(cell, path)

@@ -101,11 +101,11 @@ def test_a_pause_that_the_watchdog_bears_does_not_hide_another_program():
     assert "another program" not in program_ended(stopped, 0.2)
 
 
-def test_a_moment_without_packets_is_no_slow_line() -> None:
+def test_a_moment_without_packets_is_no_slow_line():
     """A busy computer loses some tenths of a second; a slow network stays slow."""
-    counted: list[float] = []
+    counted = []
 
-    def count(seconds: float, *rates: float) -> float:
+    def count(seconds, *rates):
         counted.append(seconds)
         return rates[len(counted) - 1]
 
@@ -124,7 +124,7 @@ NOISE = 5 * 0.02 * np.array([13.0, 13.0, 11.0, 9.0, 9.0, 9.0])
 """N·m; five standard deviations of one packet."""
 
 
-def test_an_older_controller_is_read_without(tmp_path) -> None:
+def test_an_older_controller_is_read_without(tmp_path):
     with closing(cases.start(tmp_path)) as sim:
         assert controller(sim.host, ("timestamp", TORQUE), 2.0)[1] == ("timestamp",)
         arm = open_arm(cases.config(sim.host))
@@ -133,7 +133,7 @@ def test_an_older_controller_is_read_without(tmp_path) -> None:
         arm.close()
 
 
-def test_torques_hold_the_arm_and_the_friction_of_the_arrival(tmp_path) -> None:
+def test_torques_hold_the_arm_and_the_friction_of_the_arrival(tmp_path):
     with closing(cases.start(tmp_path, "--version", NEW)) as sim:
         with closing(cases.controlled(sim)) as arm:
             for sign in (1.0, -1.0):
@@ -155,7 +155,7 @@ def test_torques_hold_the_arm_and_the_friction_of_the_arrival(tmp_path) -> None:
         assert cases.children() == []
 
 
-def test_a_stalled_link_ends_the_torques_not_the_arm(tmp_path) -> None:
+def test_a_stalled_link_ends_the_torques_not_the_arm(tmp_path):
     with (
         closing(cases.start(tmp_path, "--version", NEW)) as sim,
         closing(open_arm(cases.config(sim.host))) as arm,
@@ -172,11 +172,11 @@ def test_a_stalled_link_ends_the_torques_not_the_arm(tmp_path) -> None:
 JSON = b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\nContent-Length: %d\r\n\r\n%s"
 
 
-def answer(body: bytes) -> bytes:
+def answer(body):
     return JSON % (len(body), body)
 
 
-def test_what_is_asked_goes_over_the_wire_as_the_maker_says() -> None:
+def test_what_is_asked_goes_over_the_wire_as_the_maker_says():
     with server(API, lambda asked: answer(b'{"state": "STOPPED"}')) as (host, asked):
         RobotApi(host, API).stop(2.0)
         RobotApi(host, API).order("/robotstate/v1/state", "POWER_ON", 2.0)
@@ -187,8 +187,8 @@ def test_what_is_asked_goes_over_the_wire_as_the_maker_says() -> None:
     assert asked[1].endswith(b'{"action": "POWER_ON"}')
 
 
-def test_a_path_that_has_moved_is_followed() -> None:
-    def says(asked: bytes) -> bytes:
+def test_a_path_that_has_moved_is_followed():
+    def says(asked):
         if b"/moved" in asked:
             return answer(b'{"mode": "LOCAL"}')
         return b"HTTP/1.1 308 Permanent Redirect\r\nLocation: /moved\r\nContent-Length: 0\r\n\r\n"
@@ -208,7 +208,7 @@ def test_a_path_that_has_moved_is_followed() -> None:
         (b"HTTP/1.1 307 Go\r\nLocation: /again\r\nContent-Length: 0\r\n\r\n", "307"),
     ],
 )  # fmt: skip
-def test_other_answers_are_one_line(says: bytes, words: str) -> None:
+def test_other_answers_are_one_line(says, words):
     with (
         server(API, lambda asked: says) as (host, _),
         pytest.raises(LinkError, match=words) as refused,
@@ -217,7 +217,7 @@ def test_other_answers_are_one_line(says: bytes, words: str) -> None:
     assert "\n" not in str(refused.value)
 
 
-def test_a_mute_one_costs_its_deadline_and_no_more() -> None:
+def test_a_mute_one_costs_its_deadline_and_no_more():
     with socket.socket() as door:
         host = free_host()
         door.bind((host, API))
@@ -230,11 +230,11 @@ def test_a_mute_one_costs_its_deadline_and_no_more() -> None:
         RobotApi(host, API).check(0.3)
 
 
-def package(kind: int, body: bytes) -> bytes:
+def package(kind, body):
     return struct.pack(">iB", 5 + len(body), kind) + body
 
 
-def test_kinematics_are_found_among_other_packages() -> None:
+def test_kinematics_are_found_among_other_packages():
     rows = np.arange(24.0)
     part = package(5, struct.pack(">6I24dI", *range(6), *rows, 2) + b"later fields")
     state = package(16, package(0, b"modes") + part + package(6, b"configuration"))
@@ -256,7 +256,7 @@ def test_kinematics_are_found_among_other_packages() -> None:
         package(20, b"") * 60,
     ],
 )
-def test_something_else_on_the_primary_port_is_one_line(says: bytes) -> None:
+def test_something_else_on_the_primary_port_is_one_line(says):
     with (
         server(PRIMARY_PORT, lambda asked: says) as (host, _),
         pytest.raises(LinkError, match="primary port") as refused,
@@ -266,7 +266,7 @@ def test_something_else_on_the_primary_port_is_one_line(says: bytes) -> None:
 
 
 @pytest.mark.parametrize("version", cases.GENERATIONS)
-def test_a_controller_tells_the_kinematics_of_its_factory(tmp_path, version: str) -> None:
+def test_a_controller_tells_the_kinematics_of_its_factory(tmp_path, version):
     made = write(tmp_path / "cal.toml", "ur10e")
     options = ("--version", version, "--calibration", str(tmp_path / "cal.toml"))
     with (
