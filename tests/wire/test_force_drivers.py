@@ -20,8 +20,11 @@ from hilcal.drivers.links import close_port, open_port
 from hilcal.drivers.simulated.force_server import DRIFT_STD
 from hilcal.errors import DeviceError
 from tests.support import force_cases as cases
+from tests.support.force_cases import instruments, simulated
 from tests.support.instruments import WRENCH, force_sensor
 from tests.support.timing import wait_until
+
+__all__ = ["instruments", "simulated"]  # fixtures
 
 
 @cases.ALL

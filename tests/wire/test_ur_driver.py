@@ -12,6 +12,9 @@ from hilcal.drivers.ur_link.control import Control
 from hilcal.drivers.ur_link.worker import WorkerError
 from hilcal.errors import DeviceError, InputError
 from tests.support import ur_driver_cases as cases
+from tests.support.ur_driver_cases import arm, sim
+
+__all__ = ["arm", "sim"]  # fixtures
 
 
 def test_opening_and_report_move_nothing_and_upload_nothing(sim):

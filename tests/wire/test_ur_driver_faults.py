@@ -18,6 +18,9 @@ from tests.support import ur_driver_cases as cases
 from tests.support.paths import ROOT
 from tests.support.rows import first
 from tests.support.timing import runs, wait_until
+from tests.support.ur_driver_cases import arm, sim
+
+__all__ = ["arm", "sim"]  # fixtures
 
 FAULTS = {
     "emergency_stop": ("emergency stop", "release"),
