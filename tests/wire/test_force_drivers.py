@@ -97,6 +97,13 @@ def test_close_leaves_nothing_behind_and_never_fails(kind, simulated):
     assert len(os.listdir("/proc/self/fd")) <= files + 1
 
 
+def test_an_ft300_is_silent_after_close(instruments):
+    simulated = instruments("ft300")
+    with cases.opened("ft300", simulated.port):
+        assert simulated.admin("state")["streaming"]
+    wait_until(lambda: not simulated.admin("state")["streaming"], "silent")
+
+
 def test_an_ft300_that_streams_for_a_dead_program_is_taken_over(instruments):
     simulated = instruments("ft300")
     port = open_port("force sensor", str(simulated.port), ft300.BAUD)
