@@ -197,26 +197,6 @@ def test_a_path_that_has_moved_is_followed():
         assert RobotApi(host, API).in_remote_control(2.0) is False
 
 
-@pytest.mark.parametrize(
-    ("says", "words"),
-    [
-        (b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\n\r\n", "403"),
-        (b"HTTP/1.1 500 Oh\r\nContent-Length: 17\r\n\r\n{\"message\": \"no\"}", '500 "no"'),
-        (answer(b"<html>"), "JSON"),
-        (b"SSH-2.0-OpenSSH_9\r\n", "Robot API"),
-        (b"", "Robot API"),
-        (b"HTTP/1.1 307 Go\r\nLocation: /again\r\nContent-Length: 0\r\n\r\n", "307"),
-    ],
-)  # fmt: skip
-def test_other_answers_are_one_line(says, words):
-    with (
-        server(API, lambda asked: says) as (host, _),
-        pytest.raises(LinkError, match=words) as refused,
-    ):
-        RobotApi(host, API).stop(2.0)
-    assert "\n" not in str(refused.value)
-
-
 def test_a_mute_one_costs_its_deadline_and_no_more():
     with socket.socket() as door:
         host = free_host()
@@ -245,23 +225,33 @@ def test_kinematics_are_found_among_other_packages():
     assert (found.status, found.checksum) == (2, (0, 1, 2, 3, 4, 5))
 
 
+ASK = {
+    API: lambda host: RobotApi(host, API).stop(2.0),
+    PRIMARY_PORT: lambda host: read_kinematics(host, 1.0),
+}
+NAN = package(16, package(5, struct.pack(">6I24dI", *range(6), *[float("nan")] * 24, 2)))
+
+
 @pytest.mark.parametrize(
-    "says",
+    ("port", "says", "words"),
     [
-        b"",
-        b"HTTP/1.1 400 Bad Request\r\n\r\n",
-        struct.pack(">iB", 2, 16),
-        package(16, struct.pack(">iB", 0, 5) + b"x"),
-        package(16, package(5, struct.pack(">6I24dI", *range(6), *[float("nan")] * 24, 2))),
-        package(20, b"") * 60,
+        (API, b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\n\r\n", "403"),
+        (API, b'HTTP/1.1 500 Oh\r\nContent-Length: 17\r\n\r\n{"message": "no"}', '500 "no"'),
+        (API, answer(b"<html>"), "JSON"),
+        (API, b"HTTP/1.1 307 Go\r\nLocation: /again\r\nContent-Length: 0\r\n\r\n", "307"),
+        *((API, says, "Robot API") for says in (b"", b"SSH-2.0-OpenSSH_9\r\n")),
+        *((PRIMARY_PORT, says, "primary port") for says in (
+            b"", b"HTTP/1.1 400 Bad Request\r\n\r\n", struct.pack(">iB", 2, 16),
+            package(16, struct.pack(">iB", 0, 5) + b"x"), NAN, package(20, b"") * 60,
+        )),
     ],
-)
-def test_something_else_on_the_primary_port_is_one_line(says):
+)  # fmt: skip
+def test_something_else_on_a_port_is_one_line(port, says, words):
     with (
-        server(PRIMARY_PORT, lambda asked: says) as (host, _),
-        pytest.raises(LinkError, match="primary port") as refused,
+        server(port, lambda asked: says) as (host, _),
+        pytest.raises(LinkError, match=words) as refused,
     ):
-        read_kinematics(host, 1.0)
+        ASK[port](host)
     assert "\n" not in str(refused.value)
 
 

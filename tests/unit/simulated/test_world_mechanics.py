@@ -29,7 +29,7 @@ from tests.support.running_world import (
     world_of,
 )
 from tests.support.running_world import (
-    Q as Q_state,
+    Q as AT_REST,
 )
 
 CELL = ur10e_cell()
@@ -162,13 +162,13 @@ def slip_of(cell):
 
 
 def test_the_slip_stays_until_the_next_arrival_and_comes_new_with_it(cell, tmp_path):
-    first = cell.rest_at(Q_state)["flange"].copy()
-    cell.board.write("arm", moving=1.0, q=Q_state + 0.1)
+    first = cell.rest_at(AT_REST)["flange"].copy()
+    cell.board.write("arm", moving=1.0, q=AT_REST + 0.1)
     on_the_way = cell.truth_after()["flange"]
     assert np.abs(on_the_way - first).max() > 1e-2
-    cell.board.write("arm", q=Q_state, moving=1.0)
+    cell.board.write("arm", q=AT_REST, moving=1.0)
     assert same_bytes(cell.truth_after()["flange"], first)
-    assert not same_bytes(cell.rest_at(Q_state)["flange"], first)
+    assert not same_bytes(cell.rest_at(AT_REST)["flange"], first)
 
 
 # the wrench on the sensor
@@ -180,7 +180,7 @@ SENSOR = {"force_sensor": {"driver": "ft300", "port": "x", **MOUNT}}
 def test_the_sensor_feels_the_weight_of_tool_and_load_in_its_own_axes(tmp_path):
     cell = running_world(tmp_path, sections=SENSOR, load_point=np.array([0.004, 0.0, -0.003]))
     cell.living.hang("5kg")
-    for q in (Q_state, -Q_state, Q_state + 0.8):
+    for q in (AT_REST, -AT_REST, AT_REST + 0.8):
         truth = cell.rest_at(q)
         flange = Rotation.from_matrix(truth["flange"][:3, :3])
         in_base = flange * Rotation.from_rotvec(MOUNT["rotvec_rad"])
@@ -223,23 +223,23 @@ def yielding(tmp_path, *places):
 
 
 def test_what_the_arm_does_not_bear_is_refused_and_changes_nothing(tmp_path):
-    cell = yielding(tmp_path, (Q_state, np.zeros(6)), (Q_state, WEIGHT))
-    before = cell.rest_at(Q_state)
+    cell = yielding(tmp_path, (AT_REST, np.zeros(6)), (AT_REST, WEIGHT))
+    before = cell.rest_at(AT_REST)
     refusal("spring back", cell.living.hang, "5kg")
     refusal("spring back", cell.living.push, WEIGHT.tolist())
     after = cell.truth_after()
     assert (after["load"], after["load_since"]) == (0, 0.0)
     assert same_bytes(before["flange"], after["flange"])
-    again = cell.rest_at(Q_state)
+    again = cell.rest_at(AT_REST)
     assert again["arrivals"] == before["arrivals"] + 1
     np.testing.assert_allclose(again["flange"], before["flange"], atol=1e-3)
 
 
 def test_a_pose_without_equilibrium_is_logged_and_the_world_lives_on(tmp_path):
     upright = np.array([0.0, -np.pi / 2, 0.0, 0.0, 0.0, 0.0])
-    cell = yielding(tmp_path, (upright, np.zeros(6)), (0 * Q_state, np.zeros(6)))
+    cell = yielding(tmp_path, (upright, np.zeros(6)), (0 * AT_REST, np.zeros(6)))
     before = cell.rest_at(upright)
-    stretched = cell.rest_at(0 * Q_state)
+    stretched = cell.rest_at(0 * AT_REST)
     assert same_bytes(stretched["flange"], before["flange"])
     assert "spring back" in cell.living.log()[0]["event"]
     cell.truth_after()
@@ -249,7 +249,7 @@ def test_a_pose_without_equilibrium_is_logged_and_the_world_lives_on(tmp_path):
 
 def state_of(cell, truth, wrench):
     """The state that a truth belongs to."""
-    state = states(Q_state, wrench, float(truth["time"]))
+    state = states(AT_REST, wrench, float(truth["time"]))
     return replace(
         state,
         load_time=truth["time"][None] - truth["load_since"],
@@ -262,7 +262,7 @@ def test_every_effect_shows_in_the_truth(tmp_path):
         tmp_path, sections=SENSOR, **every_effect(np.random.default_rng(2)), **remaining_effects(3)
     )
     cell.living.hang("pull")
-    truth = cell.rest_at(Q_state)
+    truth = cell.rest_at(AT_REST)
     want = cell.world.ideal_readings(state_of(cell, truth, PULL), slip_of(cell))
     assert same_bytes(truth["target"], want.position[0])
     for effect in remaining_effects(3):
@@ -286,7 +286,7 @@ SLOW = {
 def test_what_goes_on_with_time_or_warmth_moves_a_resting_arm(tmp_path, effect):
     cell = running_world(tmp_path, **{effect: SLOW[effect]})
     cell.living.hang("5kg")
-    first = cell.rest_at(Q_state)
+    first = cell.rest_at(AT_REST)
     time.sleep(0.02)
     second = cell.truth_after()
     assert second["time"] - first["time"] >= 0.02 * 20.0
@@ -307,7 +307,7 @@ def test_world_comes_back_from_its_file_to_the_last_bit(tmp_path):
     for name in ("registration", "station", "joint_std"):
         assert same_bytes(getattr(back, name), getattr(world, name))
     assert back.joint_reference == 23.4
-    state = replace(states(Q_state, WEIGHT, 12.3), joint_temperature=np.full((1, 6), 25.0))
+    state = replace(states(AT_REST, WEIGHT, 12.3), joint_temperature=np.full((1, 6), 25.0))
     assert same_bytes(back.ideal_readings(state).position, world.ideal_readings(state).position)
 
 
