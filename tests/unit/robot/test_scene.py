@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilcal.config import Obstacle
+from hilcal.measuring.clearance import segment_distance
 from hilcal.robot.catalogue import load_arm, robot_names
 from hilcal.robot.chain import evaluate
 from hilcal.robot.scene import Scene, Segment, capsules, is_known
@@ -18,6 +19,18 @@ from tests.support.space_cases import frames, gap_to, placed, self_gap
 POINT = st.tuples(*[st.floats(-2.0, 2.0, width=32)] * 3)
 UPRIGHT = np.array([0.0, -np.pi / 2, 0.0, -np.pi / 2, 0.0, 0.0])
 TABLE = Obstacle(name="table", center_m=(0.0, 0.0, -0.1), size_m=(3.0, 3.0, 0.1))
+
+
+@given(POINT, POINT, POINT, POINT)
+def test_distance_of_segments(a, b, c, d):
+    ends = [np.array(p) for p in (a, b, c, d)]
+    share = np.linspace(0.0, 1.0, 81)[:, None]
+    first = ends[0] + share * (ends[1] - ends[0])
+    second = ends[2] + share * (ends[3] - ends[2])
+    nearest = np.linalg.norm(first[:, None] - second[None], axis=2).min()
+    coarse = (np.linalg.norm(ends[1] - ends[0]) + np.linalg.norm(ends[3] - ends[2])) / 160
+    found = float(segment_distance(*ends))
+    assert nearest - coarse - 1e-9 <= found <= nearest + 1e-9
 
 
 @pytest.mark.parametrize("name", [n for n in robot_names() if n.startswith("ur")])
