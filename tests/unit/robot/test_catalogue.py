@@ -145,6 +145,21 @@ def test_a_dh_table_of_ones_own(tmp_path):
     assert arm.name == "mine"
 
 
+def test_dh_rows_alone_are_an_arm(tmp_path):
+    """Masses, limits, torques, payload, title and source may be left out, as in a URDF."""
+    needed = ("[[joints]]", "name", "a_m", "d_m", "alpha_deg")
+    lines = (configs_dir() / "robots" / "ur5e.toml").read_text().splitlines()
+    rows = [x for x in lines[lines.index("[[joints]]") :] if x.startswith(needed)]
+    (tmp_path / "mine.toml").write_text("\n".join(rows))
+    arm, q = load_arm("mine.toml", tmp_path), np.array([0.3, -1.0, 1.2, 0.1, 0.5, 2.0])
+    np.testing.assert_allclose(flange(arm, q), flange(load_arm("ur5e"), q), rtol=0, atol=1e-12)
+    assert not arm.masses.any()
+    assert np.all(np.isinf(arm.torque_max))
+    assert [note.split(" ", 2)[:2] for note in arm.notes] == [
+        ["mine.toml", "has"], ["no", "limits"], ["no", "torque"]
+    ]  # fmt: skip
+
+
 @refusals("dh_tables")
 def test_a_wrong_dh_table_is_refused(case, given, tmp_path):
     text = (configs_dir() / "robots" / "ur5e.toml").read_text()
@@ -265,6 +280,15 @@ def test_mass_of_a_gripper_beyond_the_tip_is_kept(tmp_path):
         np.linalg.inv(whole.links[6]) @ [*com, 1.0],
         atol=1e-12,
     )
+
+
+def test_continuous_joint_turns_freely(tmp_path):
+    path = write(tmp_path)
+    text = path.read_text().replace('type="revolute"', 'type="continuous"')
+    path.write_text(text)
+    arm, q = arm_from_urdf(path, tip_link="tool0"), np.array([0.3, -1.0, 1.2, 0.1, 0.5, 2.0])
+    np.testing.assert_allclose(arm.q_max, 2 * np.pi)
+    np.testing.assert_allclose(flange(arm, q), published_flange("ur5e", q), rtol=0, atol=1e-12)
 
 
 PLANAR = FINGER.replace('type="prismatic"', 'type="planar"')

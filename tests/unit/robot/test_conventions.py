@@ -22,6 +22,7 @@ from hilcal.robot.factory import (
     flange_difference,
     nominal_rows,
     of_dict,
+    of_rows,
     read_factory,
     with_factory,
 )
@@ -319,6 +320,12 @@ def test_other_files_are_refused_in_one_line(case, given, tmp_path):
     name, _, text = given.partition("\n")
     (tmp_path / name).write_text(with_edits(text, UR5E_YAML=UR5E_YAML))
     refuses(case, lambda: read_factory(tmp_path / name, load_arm("ur5e")), tmp_path / name)
+
+
+def test_the_kinematics_of_another_arm_are_refused(tmp_path):
+    (tmp_path / "x.yaml").write_text(UR5E_YAML)
+    refusal("another arm than ur10e", read_factory, tmp_path / "x.yaml", load_arm("ur10e"))
+    refusal("four times 6", of_rows, np.zeros((4, 7)), "rows")
 
 
 def test_a_cell_counts_from_what_the_configuration_says(tmp_path):

@@ -148,6 +148,16 @@ def test_an_effect_of_slides_needs_one():
         installed().make("guide_error", cell, states)
 
 
+def test_joints_that_turn_and_slide_share_no_compliance(tmp_path):
+    track(tmp_path)
+    cell = cell_from_config(track_config(), tmp_path)
+    states = hc.States(q=np.zeros((2, 7)), wrench=np.zeros((2, 6)))
+    units = [p.unit for p in installed().make("joint_compliance", cell, states).parameters]
+    assert units == ["m/N", *("rad/(N·m)",) * 6]
+    with pytest.raises(InputError, match="joints 1-2 turn and slide, and share a parameter in rad"):
+        _ = installed().make("joint_compliance", cell, states, {"joints": "1-2"}).parameters
+
+
 # --- campaigns ------------------------------------------------------------------------------
 
 
@@ -299,8 +309,8 @@ ARM_AXES = [f"A{k}" for k in range(1, 7)]
 ALL_AXES = [f"J{k}" for k in range(1, 8)]
 
 
-def their_table(folder, r, header, loads=("none",)):
-    """Positions and travel in mm, joints in degrees, weights, if any."""
+def their_table(folder, r, header, loads=("none",), mirrored=False):
+    """Positions and travel in mm, perhaps counted backwards; joints in degrees; weights, if any."""
     s, weight = r.readings, ["weight"] * (len(loads) > 1)
     with (folder / "theirs.csv").open("w", newline="") as file:
         out = csv.writer(file)
@@ -309,15 +319,16 @@ def their_table(folder, r, header, loads=("none",)):
             if load not in loads:
                 continue
             q, kg = s.states.q[k], [10.0 * (load != "none") for _ in weight]
-            figures = [1e3 * q[0], *np.degrees(q[1:]), *(1e3 * s.value[k]), *kg]
+            travel = 3.0 - q[0] if mirrored else q[0]
+            figures = [1e3 * travel, *np.degrees(q[1:]), *(1e3 * s.value[k]), *kg]
             out.writerow([s.pose_names[s.pose[k]], *(f"{x:.6f}" for x in figures)])
     return folder / "theirs.csv"
 
 
-def plain_table(folder, header):
+def plain_table(folder, header, mirrored=False):
     cell = '[robot]\nmodel = "track.toml"\n[tool]\ntarget_m = [0.06, 0.02, 0.12]\n'
     (folder / "cell.toml").write_text(cell)
-    return their_table(folder, campaign(folder, "nothing", 2, 24)[0], header)
+    return their_table(folder, campaign(folder, "nothing", 2, 24)[0], header, mirrored=mirrored)
 
 
 @pytest.mark.parametrize("header", [["E1", *ARM_AXES], ALL_AXES])
@@ -333,3 +344,13 @@ def test_a_preview_sees_the_travel_in_mm(tmp_path, capsys, header):
         q = campaign_.readings.states.q
     assert 2.9 < np.ptp(q[:, 0]) <= 3.0
     assert np.abs(q[:, 1:]).max() < 2 * np.pi
+
+
+def test_a_travel_that_is_counted_backwards_is_named(tmp_path, capsys):
+    table = plain_table(tmp_path, ALL_AXES, mirrored=True)
+    cell, run = tmp_path / "cell.toml", tmp_path / "run.hilcal"
+    mapping = tmp_path / "m.toml"
+    ok(capsys, "import", table, "--config", cell, "--preview", "-o", mapping)
+    said = ok(capsys, "import", table, "--config", cell, "--format", mapping, "-o", run)
+    words = " ".join((said.out + said.err).split())
+    assert "joint_sign = [-1, 1, 1, 1, 1, 1, 1]" in words
