@@ -453,6 +453,18 @@ def test_a_tracker_that_keeps_to_the_place_of_the_last_pose_is_named(b, good):
     assert doubted == ([asdict(b.store.rows[1][0])] if good == 2 else [])
 
 
+@pytest.mark.long
+def test_stored_readings_of_a_stuck_tracker_do_not_keep_a_campaign_from_going_on(b):
+    """As older versions stored them: four right ones, then three at one and the same place."""
+    plan = usual_plan()
+    b.interrupt(7, plan)
+    step, reading, _ = b.store.rows[3]
+    for k in (4, 5, 6):
+        step, other, text = b.store.rows[k]
+        b.store.rows[k] = (step, replace(other, value=reading.value), text)
+    assert len(b.measure(plan)) == len(plan.steps)
+
+
 def test_a_force_sensor_that_repeats_itself_is_named(b):
     change_result(b.rig.force, "average", lambda one: replace(one, covariance=np.zeros((6, 6))))
     refusal_of(DeviceError, "frames are the same to the last digit", b.measure)

@@ -126,6 +126,14 @@ def test_states_without_what_the_effect_needs_are_refused(effect, column):
         hide_effect(effect, CELL, bare, 3.0, "absolute", np.random.default_rng(0))
 
 
+@pytest.mark.parametrize("effect", ["wrench_bias", "wrench_gain", "sensor_misalignment"])
+def test_a_sensor_cannot_misread_what_is_not_there(effect):
+    unloaded = replace(STATES, wrench=np.zeros_like(STATES.wrench))
+    with pytest.raises(InputError, match="no state has a load; valid: ") as caught:
+        hide_effect(effect, CELL, unloaded, 3.0, "absolute", np.random.default_rng(0))
+    assert "\n" not in str(caught.value)
+
+
 def test_a_pose_without_an_unloaded_reading_is_refused():
     keep = ~((POSE == 3) & (LOAD == 0))
     with pytest.raises(InputError, match="pose 3 has no unloaded reading"):
@@ -244,6 +252,13 @@ def test_a_law_that_has_changed_since_is_refused(law, file, tmp_path):
     write_world(tmp_path / "world.json", world, configuration())
     file.write_text(CLASS.replace(COLUMNS, "values = np.sin(s.angle[:, :1])"), encoding="utf-8")
     refusal(r"mine\.py: changed since", read_world, tmp_path / "world.json")
+
+
+def test_what_the_simulated_cell_does_not_measure_is_named(file):
+    file.write_text(CLASS.replace("summary", 'needs = ("air_temperature",)\n    summary'))
+    catalogue = installed().with_file(file)
+    with pytest.raises(InputError, match="mine needs air_temperature"):
+        own_law(catalogue, "mine", cell_of(), replace(plan(6).states, air_temperature=None))
 
 
 def test_only_effects_of_ones_own_are_added_to_the_choices(law):

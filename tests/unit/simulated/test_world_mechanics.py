@@ -257,6 +257,20 @@ def state_of(cell, truth, wrench):
     )
 
 
+def test_a_load_swings_for_a_while_and_rests_where_it_should(cell, tmp_path):
+    cell.rest_at(AT_REST)
+    cell.living.swing([0.0, 0.0, 20.0, 0.0, 0.0, 0.0], period=1e-3, decay=0.2)  # world s
+    cell.living.hang("5kg")
+    still = cell.world.equilibrium(
+        states(AT_REST, WEIGHT, 0.0), cell.living.slip(cell.arrivals)[None]
+    ).flange[0]
+    seen = [cell.truth_after()["flange"] for _ in range(2)]
+    assert not same_bytes(seen[0], still)
+    assert not same_bytes(seen[0], seen[1])
+    time.sleep(0.2)  # 4 s of the world, 20 decays
+    assert same_bytes(cell.truth_after()["flange"], still)
+
+
 def test_every_effect_shows_in_the_truth(tmp_path):
     cell = running_world(
         tmp_path, sections=SENSOR, **every_effect(np.random.default_rng(2)), **remaining_effects(3)

@@ -236,6 +236,23 @@ def test_flags_tell_every_branch_and_turn(maker, arms):
     np.testing.assert_allclose(found, q, atol=1e-6)
 
 
+def test_a_joint_that_passes_zero_changes_its_turn(examples):
+    found = examples["krl"]
+    q = found.q.copy()
+    q[0, 3], q[2, 0] = -0.01, -0.02  # joint 4 of XP1, joint 1 of XP3
+    dat = found.corrected(q)[".dat"].decode("latin-1")
+    assert re.search(r"XP1=.*,S 2,T 26,E1", dat)  # 18 + 8
+    assert re.search(r"XP3=.*,S 'B010',T 11\}", dat)  # 10 + 1
+    rapid = examples["rapid"]
+    q = rapid.q.copy()
+    q[1, 5] = np.radians(-89.9)  # from quadrant -2 to -1
+    assert re.search(r"p10:=.*\],\[0,0,-1,0\],\[9E9", rapid.corrected(q)[".mod"].decode())
+    inform = examples["inform"]
+    q = inform.q.copy()
+    q[3, 3] = np.radians(89.0)  # no flip becomes flip
+    refusal(r"C00003 \(line 17\): .* another configuration", inform.corrected, q)
+
+
 @refusals("makers")
 def test_what_is_not_understood_is_refused_by_line(case, given, arms, tmp_path):
     """A maker, what stands in its example, and what is written in its place."""
