@@ -10,6 +10,7 @@ import pytest
 import hilcal as hc
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensation import band, tool_poses
+from hilcal.calibration.covariance_source import CovarianceSource
 from hilcal.calibration.measured import MeasuredRanges
 from hilcal.calibration.scatter import Scatter, budget
 from hilcal.calibration.storage import from_json, to_json
@@ -124,6 +125,15 @@ def test_a_calibration_comes_back_from_its_file(effect, tmp_path):
     ]
 
 
+def test_a_calibration_of_an_arm_of_unknown_payload_and_torques_comes_back(tmp_path):
+    """Such as most arms that are described by a URDF or by DH rows alone."""
+    c = calibrated("none")
+    arm = replace(c.model.cell.arm, payload=np.inf, torque_max=np.full(6, np.inf))
+    c = replace(c, model=replace(c.model, cell=replace(c.model.cell, arm=arm)))
+    c.save(tmp_path / "c.json")
+    assert Calibration.load(tmp_path / "c.json").model.cell.arm.payload == np.inf
+
+
 def test_a_file_of_another_kind_is_refused_in_words(tmp_path):
     good = to_json(calibrated("none"))
     path = tmp_path / "c.json"
@@ -200,6 +210,19 @@ def test_the_band_holds_its_share():
         c = (root.T @ root)[None]
         drawn = np.linalg.norm(rng.standard_normal((20000, 3)) @ root, axis=1)
         assert np.mean(drawn <= band(c)[0]) == pytest.approx(0.95, abs=0.012)
+
+
+@pytest.mark.parametrize(
+    ("effect", "mode"),
+    [("transmission_error", "absolute"), ("joint_tilt_compliance", "deflection")],
+)
+def test_the_covariance_follows_from_the_fitted_states(effect, mode):
+    c = calibrated(effect, mode)
+    small = json.loads(json.dumps(c.covariance_source.to_json()))
+    again = replace(c, root=None, covariance_source=CovarianceSource.from_json(small))
+    states = fresh(3)
+    a, b = (x.predict(states.q, states.wrench) for x in (c, again))
+    np.testing.assert_allclose(a.std_m, b.std_m, rtol=1e-5)
 
 
 def test_coupled_joints_are_compensated_by_the_controllers_values():

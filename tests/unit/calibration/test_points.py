@@ -139,6 +139,15 @@ def test_a_unit_is_taken_where_the_arm_tells_it(tmp_path, far):
     np.testing.assert_allclose(found.target_poses[:, :3, 3], points[:, :3, 3], atol=1e-9)
 
 
+def test_joint_values_alone_under_other_names(tmp_path):
+    rows = "".join(";".join(f"{v:.9f}" for v in np.degrees(q)) + "\n" for q in Q)
+    path = written(tmp_path, "A1;A2;A3;A4;A5;A6\n" + rows.replace(".", ","))
+    found = read_points(path, ARM, LOADS)
+    np.testing.assert_allclose(found.q, Q, atol=1e-9)
+    assert found.target_poses is None
+    assert found.wrench is None
+
+
 @pytest.mark.parametrize("kind", ["csv", "xlsx", "parquet"])
 def test_poses_without_joint_values_by_a_mapping(tmp_path, kind):
     """As the message on the missing convention says: --preview writes the mapping to correct."""
