@@ -218,6 +218,15 @@ def test_versions_of_polyscope_x(tmp_path, version, says):
 CONNECT_S = 8.0  # deadline of opening (the requirement)
 
 
+@pytest.mark.usefixtures("put_right")
+def test_local_mode_is_refused_before_anything_is_uploaded(sim):
+    scripts = sim.admin("local_mode")["scripts"]
+    with closing(open_arm(cases.config(sim.host))) as arm:
+        with pytest.raises(DeviceError, match="local mode"):
+            arm.take_control(1.0, np.zeros(3))
+        assert sim.admin()["scripts"] == scripts
+
+
 def fails_to_open(host):
     """The error of opening, which has to come before its deadline and leave nothing behind."""
     begun = time.monotonic()
