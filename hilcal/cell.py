@@ -151,6 +151,10 @@ class Cell(Brief):
             raise InputError("the cell has no configuration; make it with Cell.load(CELL.toml)")
         return self.config
 
+    def with_config(self, config: CellConfig) -> "Cell":
+        """Return the cell with another configuration; its numbers stay as they are."""
+        return replace(self, config=config)
+
 
 STANDARD_GRAVITY = np.array([0.0, 0.0, -STANDARD_GRAVITY_M_S2])
 
@@ -206,12 +210,13 @@ def cell_from_config(
     )
 
 
-def tracker_place(cell: Cell, config: CellConfig) -> Floats | None:
+def tracker_place(cell: Cell) -> Floats | None:
     """Return the tracker's position (3,), base axes, m; None where it is unknown.
 
     It is −Rᵀ p of a known registration T_sensor_base; else `[tracker] station_m` (positions in base
     axes), else `[sight] tracker_m`.
     """
+    config = cell.configured()
     if config.tracker.frame == "tracker" and cell.registration_known:
         return np.asarray(-cell.registration[:3, :3].T @ cell.registration[:3, 3])
     position = config.tracker.station_m or config.sight.tracker_m

@@ -17,7 +17,6 @@ there. With tls:// both sides need certificates of the same authority; Dask's co
 their files (`distributed.comm.tls`, https://distributed.dask.org/en/stable/tls.html).
 """
 
-import asyncio
 import logging
 import multiprocessing
 import os
@@ -30,7 +29,6 @@ import traceback
 import warnings
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
@@ -316,6 +314,9 @@ class Cluster:
 def cluster(address: str) -> Iterator[Cluster]:
     """Yield a connection to a cluster."""
     with _quiet():
+        import asyncio
+        from concurrent.futures import ThreadPoolExecutor
+
         from distributed import Client
 
         if address.startswith("tls://"):
@@ -349,6 +350,8 @@ def cluster(address: str) -> Iterator[Cluster]:
 
 async def _reach(address: str) -> None:
     """Connect to a scheduler once; raises ValueError for no address, OSError without an answer."""
+    import asyncio
+
     from distributed.comm.core import connect
     from distributed.security import Security
 

@@ -91,8 +91,8 @@ def read_table(path: str | Path, cell: Cell, mapping: str | Path | None = None) 
     expect(cell, Cell, "cell", A_CELL)
     form, config = "table" if mapping is None else mapping, cell.configured()
     imported = import_readings(Path(path), form, config, cell.arm)
-    estimated, noise = with_estimated_noise(imported, cell, config)
-    readings = full_readings(estimated.readings, estimated.covers, cell, config)
+    estimated, noise = with_estimated_noise(imported, cell)
+    readings = full_readings(estimated.readings, estimated.covers, cell)
     return replace(readings, noise_stated=noise is None)
 
 
@@ -100,12 +100,16 @@ def read_table(path: str | Path, cell: Cell, mapping: str | Path | None = None) 
 class Imported:
     """The result of an import."""
 
-    config: CellConfig
     cell: Cell
     readings: Readings  # as stored
     noise: NoiseEstimate | None  # None where the noise is stated, or cannot be estimated
     parts: CovarianceParts  # components of the covariances
     notes: tuple[str, ...]  # one sentence for each decision
+
+    @property
+    def config(self) -> CellConfig:
+        """The configuration of the cell."""
+        return self.cell.configured()
 
 
 def import_campaign(
@@ -126,7 +130,7 @@ def import_campaign(
     imported = import_readings(table, kind, settings, cell.arm, second)
     if not imported.noise_stated:
         say("estimating the noise, which nothing states")
-    imported, noise = with_estimated_noise(imported, cell, settings)
+    imported, noise = with_estimated_noise(imported, cell)
     texts = {COVERS_KEY: imported.covers}
     texts |= {FROM_KEY: TRACKER} if imported.from_tracker else {}
     texts |= {} if noise is None else {NOISE_KEY: noise.to_json()}
@@ -137,7 +141,7 @@ def import_campaign(
         output, *about, overwrite=overwrite, more_texts=texts, readings=readings
     ).close()
     parts = covariance_parts(imported.covers, settings)
-    return Imported(settings, cell, readings, noise, parts, imported.notes)
+    return Imported(cell, readings, noise, parts, imported.notes)
 
 
 def fit_stream(
@@ -455,9 +459,9 @@ def plan(
     if given is not None and prior is not None:
         raise InputError("a plan after a fit has the prior of that fit; leave out one of both")
     request = PlanRequest(poses, criterion=criterion)
-    planned = plan_readings(cell, config, request, rng, given, prior=_carried(prior, None))
+    planned = plan_readings(cell, request, rng, given, prior=_carried(prior, None))
     file = replace(planned.ordered.plan, about=about(planned))
-    return checked(cell, config, file, summarise(planned, config, rng, compare=False))
+    return checked(cell, file, summarise(planned, config, rng, compare=False))
 
 
 def simulate(
@@ -505,8 +509,9 @@ def simulate(
         return rehearsal.simulate_plan(cell, bare_plan, [seed])
     if hide == rehearsal.INVENTED:
         catalogue = rehearsal.invented_law(catalogue or installed())
-    config = cell.configured()
-    case = rehearsal.case_of_plan(config, bare_plan, hide, seed, catalogue, cell.base_dir)
+    case = rehearsal.case_of_plan(
+        cell.configured(), bare_plan, hide, seed, catalogue, cell.base_dir
+    )
     return rehearsal.simulate_plan(case, bare_plan, [seed, 1])
 
 

@@ -29,7 +29,7 @@ from hilcal.identification.background import (
     with_pooled_lines,
 )
 from hilcal.identification.carried.drift import carried_effects
-from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit import Fit, fit, fit_again
 from hilcal.identification.mixed_fit import MOST_NOISE_ROWS
 from hilcal.identification.noise.arm_scatter import with_arm_scatter, with_prior_scatter
 from hilcal.model.model import Model
@@ -173,7 +173,7 @@ def refine(
     white = last
     if last.readings.serial is not None:
         plain = last.readings.with_serial(None)
-        white = fit(last.model, plain, mode, start=last.theta, outlier=last.kept_outlier)
+        white = fit_again(last, readings=plain)
     noise = serial_noise(white)
     if (noise is None) == (last.readings.serial is None):
         return refinement
@@ -382,10 +382,7 @@ class Path:
         named = last.fit
         if np.any(fitted.outlier & ~named.outlier):  # compared without the same gross errors
             try:
-                named = fit(
-                    named.model, named.readings, named.mode,
-                    start=named.theta, outlier=fitted.outlier | named.outlier,
-                )  # fmt: skip
+                named = fit_again(named, outlier=fitted.outlier | named.outlier)
             except CannotAnswerError:  # as many parameters as measured elements
                 return False
         if not background_is_better(named, fitted):
@@ -433,7 +430,7 @@ class Path:
         if fitted.readings.arm_scatter is not None:
             stated = fitted.readings.as_stated()
             try:
-                fitted = fit(fitted.model, stated, fitted.mode, start=fitted.theta)
+                fitted = fit_again(fitted, readings=stated)
             except CannotAnswerError:  # as many parameters as measured elements
                 return False
             evidence = Evidence(fitted, self._trial, regressions=self._regressions)
@@ -442,7 +439,7 @@ class Path:
             return False
         self._scattered.append(names)
         readings = with_arm_scatter(fitted.model.cell, fitted.readings, judged.scatter)
-        fitted = fit(fitted.model, readings, fitted.mode, start=fitted.theta)
+        fitted = fit_again(fitted, readings=readings)
         self.append(fitted, None, message="the arm's scatter enters the covariance")
         return True
 

@@ -169,11 +169,12 @@ def write_fleet_report(fleet: Fleet, directory: Path, path: Path) -> None:
 
 def _scalings(last: Fit, say: Say) -> dict[Scaling, Fit]:
     out: dict[Scaling, Fit] = {}
+    outlier = last.outlier if last.model.background else None
     for s in SCALINGS if last.scaling == "gc" else ():
         say(f"fitting with scaling {s}")
         try:
             args = last.model, last.readings, last.mode, s
-            out[s] = last if s == "gc" else fit(*args, outlier=last.kept_outlier)
+            out[s] = last if s == "gc" else fit(*args, outlier=outlier)
         except CannotAnswerError:
             continue
     return out

@@ -172,9 +172,9 @@ def _calibrated(t: Terminal, run: Path, config: CellConfig, settings: Settings) 
     cell, catalogue = cell_from_config(config), installed()
     for starts_left in reversed(range(STARTS)):
         if run.exists():
-            p = continued(run, cell, config, catalogue)
+            p = continued(run, cell, catalogue)
         else:
-            p = Procedure(run, cell, config, run.parent, catalogue, settings)
+            p = Procedure(run, cell, run.parent, catalogue, settings)
         with ExitStack() as stack:
             try:
                 CalibrationOperator(t, p, stack, rehearse=True, yes=True).to_the_end()

@@ -192,7 +192,9 @@ def _planned(cell: Cell, readings: Readings, case: FewPosesCase) -> Ints:
     planning = config.planning.model_copy(update={"readings": "absolute"})
     config = config.model_copy(update={"loads": [], "planning": planning})
     q, m = readings.states.q, readings.value.shape[1]
-    design_problem, _ = without_undetermined(problem(nominal_model(cell, config, m), config, q))
+    design_problem, _ = without_undetermined(
+        problem(nominal_model(cell.with_config(config), m), config, q)
+    )
     work = prediction_poses(design_problem.nominal, config, q)
     objective = objective_of(design_problem, config, "I", work)
     design = best_design(

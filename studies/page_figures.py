@@ -69,9 +69,7 @@ def figures(measured: Path) -> dict[str, go.Figure]:
         InputError: a file that is no record.
     """
     cell = _cell()
-    planned = plan_readings(
-        cell, cell.configured(), PlanRequest(POSES), np.random.default_rng(SEED)
-    )
+    planned = plan_readings(cell, PlanRequest(POSES), np.random.default_rng(SEED))
     readings = _readings(cell, planned)
     records = [measured / f"1-few-poses{suffix}.json" for suffix in ("", "-250")]
     return dict(

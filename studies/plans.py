@@ -27,7 +27,7 @@ ROBUST = ", robust"
 TOLERANCE = 0.1
 """Largest accepted relative deviation of true from predicted errors."""
 
-MakeArm = Callable[[Cell, CellConfig, int], Arm]
+MakeArm = Callable[[Cell, int], Arm]
 """Make a simulated arm by its number: equal numbers give equal arms."""
 
 
@@ -136,7 +136,6 @@ class PlansStudy:
 
 def plans_study(
     cell: Cell,
-    config: CellConfig,
     make_arm: MakeArm,
     *,
     readings: int = 100,
@@ -165,8 +164,9 @@ def plans_study(
         CannotAnswerError: from the cell, where it leaves no pose, or from a fit.
         InputError: from the configuration.
     """
+    config = cell.configured()
     rng = np.random.default_rng(seed)
-    s = scene(cell, config, candidates or config.planning.candidates, rng)
+    s = scene(cell, candidates or config.planning.candidates, rng)
     fixed: dict[str, Chosen] = {GRID: grid(s, readings)}
     for robust in (False, True)[: 1 if s.robust is None else 2]:
         for criterion in (TEST, PARAMETERS):
@@ -176,12 +176,12 @@ def plans_study(
     kinds = kinds_of(config)
     asked: list[_Campaign] = []
     for number in range(campaigns):
-        arm = subject(s, make_arm(cell, config, number))
+        arm = subject(s, make_arm(cell, number))
         for index, kind in enumerate(kinds):
             noise = np.random.default_rng([seed, number, index])
             chosen = fixed[kind] if kind in fixed else at_random(s, many[kind], noise)
             asked.append(_Campaign(prepared(chosen), arm, noise))
-    done = engine.map(partial(_run, cell=cell, config=config), asked, advance=advance)
+    done = engine.map(partial(_run, cell=cell), asked, advance=advance)
     errors = {kind: done[index :: len(kinds)] for index, kind in enumerate(kinds)}
     opened = {k: s.with_others(fixed[k]) if k in fixed else None for k in kinds}
     lines = tuple(
@@ -209,8 +209,8 @@ class _Campaign:
     noise: np.random.Generator
 
 
-def _run(asked: _Campaign, cell: Cell, config: CellConfig) -> Errors:
-    return run_campaign(cell, config, asked.plan, asked.arm, asked.noise)
+def _run(asked: _Campaign, cell: Cell) -> Errors:
+    return run_campaign(cell, asked.plan, asked.arm, asked.noise)
 
 
 def kinds_of(config: CellConfig) -> tuple[str, ...]:

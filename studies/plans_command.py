@@ -78,7 +78,7 @@ def plans(
         for config in settings:
             studies.append(
                 plans_study(
-                    cell_from_config(config, base), config, arms(seed),
+                    cell_from_config(config, base), arms(seed),
                     readings=readings, campaigns=campaigns, candidates=candidates,
                     seed=seed, engine=engine, advance=advance,
                 )
@@ -143,8 +143,8 @@ def with_robot(config: CellConfig, model: str, base_dir: Path | None = None) -> 
 def arms(seed: int) -> MakeArm:
     """Return a function that makes arms by number."""
 
-    def make(cell: Cell, config: CellConfig, number: int) -> SimulatedArm:
-        return SimulatedArm(world(cell, config, np.random.default_rng([seed, number, 99])))
+    def make(cell: Cell, number: int) -> SimulatedArm:
+        return SimulatedArm(world(cell, np.random.default_rng([seed, number, 99])))
 
     return make
 
@@ -173,17 +173,18 @@ class SimulatedArm:
         return self.world.ideal_readings(states).position
 
 
-def world(cell: Cell, config: CellConfig, rng: np.random.Generator) -> World:
+def world(cell: Cell, rng: np.random.Generator) -> World:
     """Return an arm without hidden effects, measured as configured.
 
     The tracker has the position that the plan assumes, and a random rotation about the vertical.
     A reading is the mean of the configured number of samples, with the noise that a plan assumes.
     """
+    config = cell.configured()
     noise = measurement_noise(config, config.acquire.samples)
     drawn = world_without_effect(
         cell, rng, noise=noise, joint_std=config.repeatability.per_joint(cell.arm.n)
     )
-    place, _ = nominal_tracker_place(cell, config)
+    place, _ = nominal_tracker_place(cell)
     turn = se3.rotation(np.array([0.0, 0.0, rng.uniform(0.0, 2.0 * np.pi)]))
     frame = se3.matrix(turn, -turn @ place)
     if not cell.registration_known:

@@ -7,7 +7,6 @@ from typing import Protocol
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.config import CellConfig
 from hilcal.design.information import DesignProblem, readings_of
 from hilcal.design.nominal_model import nominal_states, planned_effects
 from hilcal.design.predicted import rms
@@ -97,7 +96,7 @@ class Subject:
 
 def subject(scene: Scene, arm: Arm) -> Subject:
     """Compute the truth at the test poses, once for all plans."""
-    candidates, work_load = scene.exact.candidates, scene.config.planning.work_load
+    candidates, work_load = scene.exact.candidates, scene.cell.configured().planning.work_load
     deflection = scene.exact.mode == "deflection"
     if deflection and work_load == UNLOADED:
         loads = np.arange(1, len(candidates.loads))
@@ -157,7 +156,7 @@ def prepared(chosen: Chosen) -> PreparedPlan:
 
 
 def run_campaign(
-    cell: Cell, config: CellConfig, plan: PreparedPlan, subject: Subject, rng: np.random.Generator
+    cell: Cell, plan: PreparedPlan, subject: Subject, rng: np.random.Generator
 ) -> Errors:
     """Simulate a campaign of a plan, identify, and compare with the truth.
 
@@ -167,6 +166,7 @@ def run_campaign(
     Raises:
         CannotAnswerError: the readings do not determine the parameters.
     """
+    config = cell.configured()
     mode, names = config.planning.readings, planned_effects(config, installed())
     readings = subject.arm.measure(plan.readings_planned, rng)
     f = fit(with_effects(cell, readings, mode, names, names), readings, mode)

@@ -48,7 +48,6 @@ class Scene:
     """
 
     cell: Cell
-    config: CellConfig
     space: FeasibleSpace
     nominal: NominalModel
     exact: DesignProblem
@@ -91,22 +90,23 @@ class Chosen:
         return len({self.problem.contents[k][0] for k in np.flatnonzero(self.counts)})
 
 
-def scene(cell: Cell, config: CellConfig, candidates: int, rng: np.random.Generator) -> Scene:
+def scene(cell: Cell, candidates: int, rng: np.random.Generator) -> Scene:
     """Draw candidates and test poses of a cell and set up its design problems.
 
     Raises:
         CannotAnswerError: no feasible pose, or no load that any of them bears.
         InputError: from the configuration's `[planning]`.
     """
-    space = FeasibleSpace(cell, config)
+    config = cell.configured()
+    space = FeasibleSpace(cell)
     drawn = draw_poses(space, candidates, rng)
     apart = draw_poses(space, TEST_POSES, rng).q
-    model = nominal_model(cell, config)
+    model = nominal_model(cell)
     alone = without_potential(config)
     exact = problem(model, alone, drawn.q, drawn.allowed)
     robust = problem(model, config, drawn.q, drawn.allowed) if config.planning.against else None
     work = prediction_poses(model, config, apart, space.allowed)
-    return Scene(cell, config, space, model, exact, robust, work)
+    return Scene(cell, space, model, exact, robust, work)
 
 
 def without_potential(config: CellConfig) -> CellConfig:
@@ -127,9 +127,9 @@ def optimal(
         rng: generator.
         robust: whether the plan keeps power against the potential terms.
     """
-    of_plan, config = s.exact, without_potential(s.config)
+    of_plan, config = s.exact, without_potential(s.cell.configured())
     if robust and s.robust is not None:
-        of_plan, config = s.robust, s.config
+        of_plan, config = s.robust, s.cell.configured()
     objective = compound_objective(of_plan, config, criterion, s.work, float(budget), rng)
     design = best_design(objective, float(budget), rng, effort=EFFORT)
     counts = np.asarray(design.counts, dtype=float)
@@ -168,7 +168,7 @@ def grid(s: Scene, budget: int) -> Chosen:
             break
     if not len(q):
         raise CannotAnswerError("no pose of a regular grid in joint space is feasible")
-    of_grid = problem(s.nominal, without_potential(s.config), q, allowed)
+    of_grid = problem(s.nominal, without_potential(s.cell.configured()), q, allowed)
     poses = next((n for n in range(1, len(q)) if allowed[_even(len(q), n)].sum() >= budget), len(q))
     order = _even(len(q), poses)
     return _of_poses(of_grid, cycle(order.tolist()), budget, s.work)

@@ -245,4 +245,4 @@ def rehearse(config: CellConfig, choice: str, seed: int, n_poses: int = POSES) -
     names = ("none", *(load.name for load in config.loads))
     v = visits[0]
     readings = simulate(s.world, v.states, v.pose, v.load, v.cycle, names, rng)
-    return Rehearsal(s.config, s.cell, s.mode, s.world, s.hidden, s.strength_sigma, readings)
+    return Rehearsal(s.cell, s.mode, s.world, s.hidden, s.strength_sigma, readings)

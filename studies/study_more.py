@@ -63,12 +63,14 @@ def measure_more(
     # A limit on readings is faster than leaving out loads one by one.
     request = PlanRequest(poses, readings=poses * (1 + len(loads)))
     try:
-        separating = plan_separating(case.cell, robot_config, diagnosis.fit, names, request, rng)
+        separating = plan_separating(
+            case.cell.with_config(robot_config), diagnosis.fit, names, request, rng
+        )
     except CannotAnswerError:
         return None
     before, plan = case.readings, separating.planned.ordered.plan
     start = float(np.asarray(before.states.time).max()) + _PAUSE
-    visit = planned_states(case.cell, robot_config, plan, start)
+    visit = planned_states(case.cell.with_config(robot_config), plan, start)
     since = np.asarray(visit.states.time) - start
     states = replace(
         visit.states,

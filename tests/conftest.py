@@ -60,7 +60,7 @@ FIRST = (
     "test_run_watched", "test_ur_driver_faults", "test_ur_driver", "test_devices",
     "test_gross_errors", "test_diagnose", "test_planner", "test_geocom_driver", "test_next_cli",
     "test_simulated_cell", "test_workbench_page", "test_arm_scatter", "test_background",
-    "test_stepwise", "test_natnet_driver", "test_misdescription", "test_network_cell",
+    "test_natnet_driver", "test_registration", "test_network_cell",
     "test_ur_driver_parts", "test_user_effects", "test_evidence", "test_cli", "test_report_page",
     "test_procedure", "test_demo", "test_p_values", "test_study_plans", "test_docs",
     "test_verdict", "test_operator",

@@ -330,12 +330,10 @@ class Soak:
     def _further(self) -> Path:
         s = self.site
         rngs = (np.random.default_rng([self.rng.randrange(1000), k]) for k in range(20))
-        plans = (spread_plan(s.cell, s.config, 2, rng, repeats=0) for rng in rngs)
+        plans = (spread_plan(s.cell, 2, rng, repeats=0) for rng in rngs)
         with CampaignFile.open(self.path, read_only=True) as campaign:
             log = RunLog(campaign)  # whose reference pose is another one than a plan's own
-            plan = next(
-                p for p in plans if not dry_run(s.cell, s.config, log.with_new_names(p)).problems
-            )
+            plan = next(p for p in plans if not dry_run(s.cell, log.with_new_names(p)).problems)
         path = s.directory / f"further{self.counts['appends']}.json"
         path.write_text(plan.to_json(), encoding="utf-8")
         return path

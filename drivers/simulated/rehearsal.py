@@ -60,7 +60,6 @@ def check_choice(choice: str, catalogue: Catalogue | None = None) -> None:
 class SimulationCase:
     """A simulated cell with a hidden effect."""
 
-    config: CellConfig
     cell: Cell
     mode: Mode  # the kind of readings that shows the hidden effect
     world: World
@@ -69,10 +68,16 @@ class SimulationCase:
     home: Floats | None = field(default=None, kw_only=True)
     """(n,) joint values at the start; None without a plan."""
 
+    @property
+    def config(self) -> CellConfig:
+        """The configuration of the cell."""
+        return self.cell.configured()
+
     def measured(self, readings: Readings, config: CellConfig | None = None) -> "Rehearsal":
         """Return the campaign with these readings; `config`: None for that of the case."""
         case = {f.name: getattr(self, f.name) for f in fields(SimulationCase)}
-        return Rehearsal(**{**case, "config": config or self.config}, readings=readings)
+        case["cell"] = self.cell.with_config(config or self.config)
+        return Rehearsal(**case, readings=readings)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,7 +179,7 @@ def simulation_case(
         world = injected.hide_effect(
             effect, cell, v.states, strength, mode, rng, world=world, pose=v.pose, cycle=v.cycle
         )
-    return SimulationCase(config, cell, mode, world, hidden, strength)
+    return SimulationCase(cell, mode, world, hidden, strength)
 
 
 def _paired(v: CampaignStates) -> bool:
@@ -223,14 +228,13 @@ _LOADING = 60.0  # s, to change a load
 _MEASURING = 5.0  # s, to settle and to measure
 
 
-def planned_states(
-    cell: Cell, config: CellConfig, plan: Plan, start: float = 0.0
-) -> CampaignStates:
+def planned_states(cell: Cell, plan: Plan, start: float = 0.0) -> CampaignStates:
     """Return the N states of a plan's steps in order, with their times from `start` on, s.
 
     All targets are read at every step. The arm takes the route of a session; its joints warm up as
     with simulated devices.
     """
+    config = cell.configured()
     names = [UNLOADED, *(load.name for load in config.loads)]
     wrenches = {load.name: load.wrench(cell.gravity) for load in config.loads}
     q = np.array([plan.joints(step.pose) for step in plan.steps])
@@ -281,7 +285,7 @@ def case_of_plan(
         config,
         choice,
         rng,
-        lambda cell: planned_states(cell, config, plan),
+        lambda cell: planned_states(cell.with_config(config), plan),
         mean,
         catalogue,
         base_dir,
@@ -296,7 +300,7 @@ def simulate_plan(
     """Draw the readings of a plan, each a mean, from the time `start` of the campaign on, s."""
     config = s.config
     world = replace(s.world, noise=measurement_noise(config, config.acquire.samples))
-    v = planned_states(s.cell, config, plan, start)
+    v = planned_states(s.cell, plan, start)
     names = (UNLOADED, *(load.name for load in config.loads))
     rng = np.random.default_rng(seed)
     readings = simulate(world, v.states, v.pose, v.load, v.cycle, names, rng)

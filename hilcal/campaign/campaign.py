@@ -73,7 +73,6 @@ class Campaign(Brief):
     """
 
     file: CampaignFile
-    config: CellConfig
     cell: Cell
     readings: Readings
     catalogue: Catalogue
@@ -100,6 +99,11 @@ class Campaign(Brief):
         except BaseException:
             file.close()
             raise
+
+    @property
+    def config(self) -> CellConfig:
+        """The configuration of the cell."""
+        return self.cell.configured()
 
     @classmethod
     def open(
@@ -143,9 +147,9 @@ class Campaign(Brief):
         cell, restated = cell_from_config(config, None, *robot_texts), _restates(file, changes)
         noise = None if restated else estimated_noise(file)
         readings = _with_instrument(file.readings(), config, restated, noise)
-        readings = full_readings(readings, _covers(file, changes), cell, config)
+        readings = full_readings(readings, _covers(file, changes), cell)
         readings = replace(readings, noise_stated=noise is None)
-        values = (file, config, cell, readings, catalogue, changes, noise)
+        values = (file, cell, readings, catalogue, changes, noise)
         for field, value in zip(fields(self), values, strict=True):
             object.__setattr__(self, field.name, value)
 

@@ -10,7 +10,7 @@ from typing import Any
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.fitting import PriorOptions
 from hilcal.cli.options import POSES, command
-from hilcal.cli.planning import answers_of, read_cell, refuse_unready
+from hilcal.cli.planning import answers_of, refuse_unready
 from hilcal.cli.refining import chapters_of, errors_by_revision
 from hilcal.cli.running import lasting_cell, measure, retry_after_failures
 from hilcal.cli.showing import live_viewer
@@ -105,7 +105,8 @@ def calibrate(
     effects_from: list[Path] | None = None,
 ) -> None:  # fmt: skip
     """Plan, measure, fit, measure what is in doubt, validate, correct, and measure the gain."""
-    config, numbers = read_cell(cell)
+    numbers = Cell.load(cell)
+    config = numbers.configured()
     settings = options.settings()
     if config.limits.accuracy_m is not None and not resume:
         settings.setdefault("limit_m", config.limits.accuracy_m)
@@ -114,7 +115,7 @@ def calibrate(
     flags += [] if options.prior is None else ["--prior", str(options.prior)]
     flags += [word for path in effects_from or () for word in ("--effects-from", str(path))]
     go_on = _Continuation(t, shlex.join([*line, "--resume", *flags]), shlex.join([*line, *flags]))
-    p = _procedure(cell, output, resume, rehearse, config, numbers, catalogue, settings, go_on)
+    p = _procedure(cell, output, resume, rehearse, numbers, catalogue, settings, go_on)
     prior = p.settings.prior
     if prior is not None:
         if options.prior is None and Path(prior).parent != output.absolute().parent:
@@ -192,12 +193,12 @@ def _procedure(
     output: Path,
     resume: bool,
     rehearse: bool,
-    config: CellConfig,
     cell: Cell,
     catalogue: Catalogue,
     stated: dict[str, Any],
     go_on: _Continuation,
 ) -> Procedure:
+    config = cell.configured()
     hide = (config.simulation.hide or NO_EFFECT) if rehearse else None
     base_dir = path.absolute().parent
     if rehearse:
@@ -205,17 +206,17 @@ def _procedure(
         cell = cell_from_config(config, base_dir)
     if not output.exists():
         may_write(output, False)
-        check_effects(cell, config, catalogue)
+        check_effects(cell, catalogue)
         if resume:
             go_on.t.notice(f"{output} is not there yet: the calibration begins")
         _refuse_goal(config.readings_mode, stated, path)
         max_time_s, seed = parse_duration(DEFAULT_MAX_TIME, "--max-time"), config.simulation.seed
         defaults = Settings(POSES, VALIDATION, max_time_s, seed=seed)
         settings = replace(defaults, readings=config.readings_mode, hide=hide, **stated)
-        p = Procedure(output, cell, config, base_dir, catalogue, settings)
+        p = Procedure(output, cell, base_dir, catalogue, settings)
         p.check_files()
         return p
-    p = continued(output, cell, config, catalogue)
+    p = continued(output, cell, catalogue)
     if (p.settings.hide is not None) != rehearse:
         kind = "no rehearsal; leave --rehearse out" if rehearse else "a rehearsal; give --rehearse"
         raise InputError(f"{output}: its calibration is {kind}")
@@ -303,7 +304,9 @@ class CalibrationOperator:
         config = self._config()
 
         def work(campaign: CampaignFile, epoch: float | None) -> None:
-            measure(self.t, config, self.p.cell, campaign, epoch=epoch, viewer=self.viewer)
+            measure(
+                self.t, self.p.cell.with_config(config), campaign, epoch=epoch, viewer=self.viewer
+            )
 
         if self.rehearse:
             retry_after_failures(

@@ -170,9 +170,9 @@ def diagnose_first(
         place = first_plan.joints(REFERENCE) if REFERENCE in first_plan.pose_names else None
         rng = np.random.default_rng(seed)
         request = PlanRequest(max(round(SECOND_SHARE * poses), 1))
-        chosen = plan_separating(r.cell, r.config, fitted, suspects, request, rng, say, place)
+        chosen = plan_separating(r.cell, fitted, suspects, request, rng, say, place)
         plan = plan_of(chosen, suspects)
-        refuse(dry_run(r.cell, r.config, plan), "the plan")
+        refuse(dry_run(r.cell, plan), "the plan")
     visited = len({s.pose for s in plan.steps} - {REFERENCE})
     t.show(next_report(chosen, visited, len(plan.steps)))
     document |= {"suspects": list(suspects), **separates(chosen)}
@@ -230,7 +230,7 @@ def demo(
             for step in refinement.steps:
                 compute_errors(step.fit, say)
         settings = Settings(poses, validation, seed=number, readings=r.mode, hide=case.choice)
-        p = Procedure(output, r.cell, r.config, case.base_dir, catalogue, settings)
+        p = Procedure(output, r.cell, case.base_dir, catalogue, settings)
         with Campaign.open(output, catalogue) as o:
             if doubt is not None and doubt.record is not None:
                 o.file.append_revision(doubt.record)

@@ -8,11 +8,11 @@ import numpy as np
 
 from hilcal import numbers as words_of
 from hilcal.campaign.campaign import Campaign
-from hilcal.cell import Cell, cell_from_config
+from hilcal.cell import Cell
 from hilcal.cli import fitting
 from hilcal.cli.options import POSES, check_folder, check_seed, command
 from hilcal.cli.terminal import Terminal
-from hilcal.config import CellConfig, load_config
+from hilcal.config import CellConfig
 from hilcal.design.choice import CRITERIA, criterion_name
 from hilcal.design.next import PairPower, SeparatingPlan
 from hilcal.design.nominal_model import check_effects
@@ -41,7 +41,6 @@ from hilcal.whole_file import replace_file, spare_other
 def write(
     t: Terminal,
     cell: Cell,
-    config: CellConfig,
     checked_plan: CheckedPlan,
     output: Path,
     csv: Path | None,
@@ -49,6 +48,7 @@ def write(
     powers: tuple[PairPower, ...] = (),
 ) -> None:
     """Write a plan: as a file, and optionally as a table and as a recording."""
+    config = cell.configured()
     checked_plan.save(output)
     if csv is not None:
         pulls = {load.name: load.wrench(cell.gravity) for load in config.loads}
@@ -58,7 +58,7 @@ def write(
 
         with working(t.progress) as say:
             say(f"recording {record}")
-            record_plan(cell, config, checked_plan.plan, checked_plan.summary, record, powers)
+            record_plan(cell, checked_plan.plan, checked_plan.summary, record, powers)
 
 
 def _check_places(output: Path, csv: Path | None = None) -> None:
@@ -93,7 +93,7 @@ def plan(
     if prior.prior is not None and after is not None:
         raise InputError("--after has the prior of its revision; leave out --prior")
     carried = prior.load(catalogue)
-    config, numbers = read_cell(cell)
+    numbers = Cell.load(cell)
     unloaded: Literal["around", "first"] = "first" if unloaded_first else "around"
     if criterion is not None and criterion_name(criterion) not in CRITERIA:
         raise InputError(f"--criterion {criterion!r} is unknown; valid: {', '.join(CRITERIA)}")
@@ -105,13 +105,15 @@ def plan(
                 fitted, reference = fitting.fit_of(t, run, say, revision)[1], reference_in(run.file)
         rng = np.random.default_rng(check_seed(seed))
         chosen = plan_readings(
-            numbers, config, request, rng, fitted, say, catalogue, carried, reference=reference
+            numbers, request, rng, fitted, say, catalogue, carried, reference=reference
         )
         plan_ = replace(chosen.ordered.plan, about=about(chosen))
-        summary = summarise(chosen, config, rng, say, compare=not quick, curve=not quick)
+        summary = summarise(
+            chosen, numbers.configured(), rng, say, compare=not quick, curve=not quick
+        )
         say("checking every motion in a dry run")
-        checked_plan = checked(numbers, config, plan_, summary)
-    write(t, numbers, config, checked_plan, output, csv, record)
+        checked_plan = checked(numbers, plan_, summary)
+    write(t, numbers, checked_plan, output, csv, record)
     t.show(plan_report(checked_plan.summary) if details else plan_screen(checked_plan.summary))
     t.show(f"The plan is in {output}: a file that you may edit. Every limit was checked.")
     t.document({**checked_plan.to_dict(), "plan": str(output)})
@@ -133,16 +135,16 @@ def check(
         raise InputError(f"--save-calibration {save_calibration}; valid: a name that ends in .toml")
     if save_calibration is not None and save_calibration.exists():
         raise InputError(f"{save_calibration}: the file exists; choose another name")
-    config, numbers = read_cell(cell)
+    numbers = Cell.load(cell)
     try:
-        check_effects(numbers, config, catalogue)
+        check_effects(numbers, catalogue)
     except InputError as error:
         raise InputError(f"{cell.name}: {error}") from None
     dry = None
     if plan is not None:
-        dry = dry_checked(t, numbers, config, load_plan(plan))
+        dry = dry_checked(t, numbers, load_plan(plan))
     try:
-        answers = with_kinematics(answers_of(t, config), numbers)
+        answers = with_kinematics(answers_of(t, numbers.configured()), numbers)
     except InputError:  # the cell names no device: report the plan alone
         if dry is None or not dry.problems:
             raise
@@ -159,7 +161,7 @@ def check(
     if factory is not None and (factory.exists() or not any(a.problems for a in answers)):
         from hilcal.cli.running import factory_check  # imports this module
 
-        factory_result = factory_check(t, config, numbers, catalogue, answers, factory, yes)
+        factory_result = factory_check(t, numbers, catalogue, answers, factory, yes)
     if names := ", ".join(a.device for a in answers if a.problems):
         failed = DeviceError(f"not ready: {names}; see above")
     elif dry is not None:
@@ -184,22 +186,15 @@ def answers_of(t: Terminal, config: CellConfig) -> tuple[ConnectionResult, ...]:
     return answers
 
 
-def dry_checked(t: Terminal, cell: Cell, config: CellConfig, plan: Plan) -> DryRun:
+def dry_checked(t: Terminal, cell: Cell, plan: Plan) -> DryRun:
     """Return the dry run of a plan; shows progress, since a long plan takes seconds."""
     with working(t.progress) as say:
         say("checking every motion in a dry run")
-        return dry_run(cell, config, plan)
-
-
-def read_cell(path: Path) -> tuple[CellConfig, Cell]:
-    """Return the configuration in a file, and its cell."""
-    config = load_config(path)
-    return config, cell_from_config(config, path.absolute().parent)
+        return dry_run(cell, plan)
 
 
 def make_plan(
     cell: Cell,
-    config: CellConfig,
     poses: int,
     seed: int,
     catalogue: Catalogue,
@@ -207,7 +202,7 @@ def make_plan(
 ) -> Plan:
     """Return a plan whose poses are each read unloaded and under every load that they bear."""
     rng = np.random.default_rng(check_seed(seed))
-    return with_origin(plan_readings(cell, config, PlanRequest(poses), rng, None, say, catalogue))
+    return with_origin(plan_readings(cell, PlanRequest(poses), rng, None, say, catalogue))
 
 
 def answer_json(answer: ConnectionResult) -> dict[str, object]:
@@ -251,13 +246,13 @@ def next_(
     if poses is not None and poses < 1:
         raise InputError(f"--poses {poses}; valid: a whole number from 1")
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
-        changed = None if cell is None else read_cell(cell)
+        changed = None if cell is None else Cell.load(cell)
         doubt = _without_suspects(t, o, revision, _named(suspects, catalogue), say, carried)
         compare = (details or t.json) and not quick
         planned = next_plan(o, doubt, poses, rng, say, cell=changed, compare=compare)
-        config, numbers = (o.config, o.cell) if changed is None else changed
+        numbers = o.cell if changed is None else changed
     chosen, checked_plan, effects = planned.separating, planned.checked, doubt.suspects
-    write(t, numbers, config, checked_plan, output, csv, record, chosen.powers)
+    write(t, numbers, checked_plan, output, csv, record, chosen.powers)
     t.show(f"In doubt: {words_of.names(effects, 'or')}.\n")
     report = next_report if doubt.pose_alone is None else poses_report
     t.show(report(chosen, checked_plan.summary.poses, checked_plan.summary.readings, details))

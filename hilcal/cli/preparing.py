@@ -329,7 +329,7 @@ def _complete(draft: Draft) -> None:
         draft.set("planning", model=[*GEOMETRY, *loaded])
     draft.set("simulation", clock=CLOCK)
     config = check_section(draft.data, CellConfig, "the cell")
-    check_effects(cell_from_config(config, draft.base_dir), config, installed())
+    check_effects(cell_from_config(config, draft.base_dir), installed())
 
 
 @command("""

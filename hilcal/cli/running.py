@@ -16,7 +16,7 @@ import numpy as np
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.options import POSES, check_seed, command
-from hilcal.cli.planning import answer_json, dry_checked, make_plan, read_cell, refuse_unready
+from hilcal.cli.planning import answer_json, dry_checked, make_plan, refuse_unready
 from hilcal.cli.showing import live_viewer
 from hilcal.cli.terminal import Terminal, confirmed, end_signals, handled, person_present, terminal
 from hilcal.config import CellConfig
@@ -88,8 +88,9 @@ def run(
     effects_from: list[Path] | None = None,
 ) -> None:  # fmt: skip
     """Measure a campaign: every step of the plan, each reading stored before the next motion."""
-    config, numbers = read_cell(cell)
-    goal = None if until is None else GoalRule(until, numbers, config, catalogue)
+    numbers = Cell.load(cell)
+    config = numbers.configured()
+    goal = None if until is None else GoalRule(until, numbers, catalogue)
     base_dir = cell.absolute().parent
     if skip and not resume:
         raise InputError("--skip leaves out what is missing of a campaign; give it with --resume")
@@ -112,7 +113,7 @@ def run(
             campaign_plan = RunLog(campaign).plans[0]
             if plan is not None:
                 further = RunLog(campaign).with_new_names(load_plan(plan))
-                refuse(dry_checked(t, numbers, config, further), str(plan))
+                refuse(dry_checked(t, numbers, further), str(plan))
         else:
             if output.exists():
                 raise InputError(
@@ -120,15 +121,16 @@ def run(
                     "--append, or choose another name"
                 )
             campaign_plan = (
-                load_plan(plan) if plan else _default_plan(t, cell, config, numbers, catalogue, yes)
+                load_plan(plan) if plan else _default_plan(t, cell, numbers, catalogue, yes)
             )
-            refuse(dry_checked(t, numbers, config, campaign_plan), str(plan or "the plan"))
+            refuse(dry_checked(t, numbers, campaign_plan), str(plan or "the plan"))
         if rehearse:
             with working(t.progress) as say:
                 say("starting the simulated devices")
                 choice, seed = config.simulation.hide or NO_EFFECT, config.simulation.seed
                 secret = case_of_plan(config, campaign_plan, choice, seed, catalogue, base_dir)
                 config = stack.enter_context(simulated_cell(secret, seed, base_dir)).config
+                numbers = numbers.with_config(config)
         else:
             connect.drivers_of(config)  # before a campaign is begun
         if skip:
@@ -144,7 +146,7 @@ def run(
         line = shlex.join(("hilcal", "run", str(cell), "-o", str(output), "--resume", *options))
         live = stack.enter_context(live_viewer(t, view, output))
         with _resumable(campaign, planned, line):
-            measured = measure(t, config, numbers, campaign, goal, viewer=live)
+            measured = measure(t, numbers, campaign, goal, viewer=live)
     document: dict[str, object] = {"campaign": str(output), "readings": measured}
     document["planned"] = planned
     if goal is not None:
@@ -160,14 +162,12 @@ def run(
     t.document(document, missed)
 
 
-def _default_plan(
-    t: Terminal, path: Path, config: CellConfig, cell: Cell, catalogue: Catalogue, yes: bool
-) -> Plan:
+def _default_plan(t: Terminal, path: Path, cell: Cell, catalogue: Catalogue, yes: bool) -> Plan:
     """Make a plan and show it; ask whether to measure it, unless `yes` or nobody can answer."""
     with working(t.progress) as say:
-        seed = check_seed(config.simulation.seed)
+        seed = check_seed(cell.configured().simulation.seed)
         rng = np.random.default_rng(seed)
-        planned = checked_plan(cell, config, POSES, rng, catalogue, say)
+        planned = checked_plan(cell, POSES, rng, catalogue, say)
     t.show(plan_facts(planned.summary))
     options = ("--seed", str(seed)) if seed else ()
     line = shlex.join(("hilcal", "plan", str(path), "-o", "plan.json", *options))
@@ -210,7 +210,6 @@ def _resumable(campaign: CampaignFile, planned: int, line: str) -> Iterator[None
 
 def measure(
     t: Terminal,
-    config: CellConfig,
     cell: Cell,
     campaign: CampaignFile,
     goal: GoalRule | None = None,
@@ -218,6 +217,7 @@ def measure(
     viewer: LiveViewer | None = None,
 ) -> int:
     """Measure what a campaign lacks, until a goal is met; `epoch` is the wall time at zero, s."""
+    config = cell.configured()
     campaign.measure_alone()
     log = RunLog(campaign)
     stored = log.readings()
@@ -240,16 +240,16 @@ def measure(
         watcher = stack.enter_context(watching(t.progress, len(log.plan.steps), viewer))
         log.event("devices", {"answers": [answer_json(answer) for answer in answers]})
         clock = Clock(config.simulation.clock)
-        live = LiveModel(cell, config)
-        run_plan(rig, cell, config, log.plan, log, clock, watcher, live, goal=goal, epoch=epoch)
-    estimate_noise(t, config, cell, campaign)
+        live = LiveModel(cell)
+        run_plan(rig, cell, log.plan, log, clock, watcher, live, goal=goal, epoch=epoch)
+    estimate_noise(t, cell, campaign)
     return campaign.n_readings
 
 
-def estimate_noise(t: Terminal, config: CellConfig, cell: Cell, campaign: CampaignFile) -> None:
+def estimate_noise(t: Terminal, cell: Cell, campaign: CampaignFile) -> None:
     """Estimate, store and print the noise of the readings, where no source states it."""
     log = RunLog(campaign)
-    noise = measured_noise(campaign.readings(), cell, config)
+    noise = measured_noise(campaign.readings(), cell)
     if noise is not None:
         log.event(NOISE_KEY, asdict(noise))
         t.notice(sentence(covariance_words("instrument", noise)))
@@ -338,8 +338,8 @@ def first_plan(settings: RehearsalSettings, config: CellConfig, poses: int, say:
     """Plan a campaign without knowledge of the hidden effect, in a cell that may lack loads."""
     config = program_config(config, settings.choice, settings.world)
     cell = cell_from_config(config, settings.base_dir)
-    plan = make_plan(cell, config, poses, settings.seed, settings.catalogue, say)
-    refuse(dry_run(cell, config, plan), "the plan")
+    plan = make_plan(cell, poses, settings.seed, settings.catalogue, say)
+    refuse(dry_run(cell, plan), "the plan")
     return plan
 
 
@@ -358,14 +358,14 @@ def on_devices(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator
 
         def missing(file: CampaignFile, epoch: float | None = None) -> None:
             def work() -> None:
-                measure(t, world.config, secret.cell, file, epoch=epoch)
+                measure(t, secret.cell.with_config(world.config), file, epoch=epoch)
 
             retry_after_failures(t, work, lambda: file.n_readings)
 
         def measured() -> Rehearsal:
             missing(campaign)
             stored = campaign.readings(), campaign.about(COVERS_KEY)
-            readings = full_readings(*stored, secret.cell, world.config)
+            readings = full_readings(*stored, secret.cell.with_config(world.config))
             return secret.measured(readings, world.config)
 
         def further(next_plan: Plan) -> Rehearsal:
@@ -487,12 +487,14 @@ def simulate(
 ) -> None:  # fmt: skip
     """Run simulated devices for a cell until Ctrl-C, for `check` and `run` to talk to."""
     t = terminal(False)
-    config, numbers = read_cell(cell)
+    numbers = Cell.load(cell)
+    config = numbers.configured()
     number = check_seed(config.simulation.seed if seed is None else seed)
     if clock is not None:
         if not 1.0 <= clock <= MAX_CLOCK:
             raise InputError(f"--clock {clock:g}; valid: a number from 1 to {MAX_CLOCK:g}")
         config = config.with_keys("simulation", clock=clock)
+        numbers = numbers.with_config(config)
     base_dir, target = cell.absolute().parent, output / "cell.toml"
     spare_other(target, "a cell of hilcal simulate", SIMULATED)
     choice = hide or config.simulation.hide or NO_EFFECT
@@ -502,7 +504,7 @@ def simulate(
     with working(t.progress) as say:
         if plan is None:
             say("planning a campaign, to know how strong an effect has to be")
-            campaign_plan = make_plan(numbers, config, POSES, number, catalogue, say)
+            campaign_plan = make_plan(numbers, POSES, number, catalogue, say)
         else:
             campaign_plan = load_plan(plan)
         say("preparing the simulated cell")
@@ -547,7 +549,6 @@ FACTORY_POSES = 20  # Without a load; a choice: with 12, an encoder offset of 1 
 
 def factory_check(
     t: Terminal,
-    config: CellConfig,
     cell: Cell,
     catalogue: Catalogue,
     answers: tuple[connect.ConnectionResult, ...],
@@ -561,7 +562,7 @@ def factory_check(
             "--factory: the arm's controller does not tell its kinematics; give [robot] calibration"
         )
     if not output.exists():
-        _measure_without_loads(t, config, cell, catalogue, output, yes)
+        _measure_without_loads(t, cell, catalogue, output, yes)
     with Campaign.open(output, catalogue, read_only=True) as run, working(t.progress) as say:
         say("fitting all effects from the factory's kinematics")
         checked = check_factory(
@@ -572,14 +573,15 @@ def factory_check(
 
 
 def _measure_without_loads(
-    t: Terminal, config: CellConfig, cell: Cell, catalogue: Catalogue, output: Path, yes: bool
+    t: Terminal, cell: Cell, catalogue: Catalogue, output: Path, yes: bool
 ) -> None:
+    config = cell.configured()
     bare = config.with_keys("planning", readings="absolute")
     bare = bare.model_copy(update={"loads": (), "force_sensor": None})
     numbers = cell_from_config(bare, cell.base_dir)
     with working(t.progress) as say:
-        plan = make_plan(numbers, bare, FACTORY_POSES, config.simulation.seed, catalogue, say)
-    refuse(dry_checked(t, numbers, bare, plan), "the plan")
+        plan = make_plan(numbers, FACTORY_POSES, config.simulation.seed, catalogue, say)
+    refuse(dry_checked(t, numbers, plan), "the plan")
     steps = len(plan.steps)
     if not yes:
         if not person_present(t):
@@ -589,4 +591,4 @@ def _measure_without_loads(
         if not confirmed(t, f"Measure {steps} readings without a load? The arm will move."):
             raise StoppedError("not measured, nothing has moved")
     with create_run(output, bare, cell.base_dir, plan) as campaign:
-        measure(t, bare, numbers, campaign)
+        measure(t, numbers, campaign)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.config import CellConfig
 from hilcal.errors import CannotAnswerError
 from hilcal.measuring.clearance import TRACKER_UNKNOWN
 from hilcal.measuring.feasibility import STATE_CHECKS, Feasibility, Margins
@@ -43,9 +42,10 @@ the states that pass, and the keys of the configuration that decide."""
 class FeasibleSpace(Feasibility):
     """Feasible states of a plan: `Feasibility` with margins, at most half a turn per joint."""
 
-    def __init__(self, cell: Cell, config: CellConfig, margins: Margins = PLANNING_MARGINS) -> None:
+    def __init__(self, cell: Cell, margins: Margins = PLANNING_MARGINS) -> None:
         """Build the shapes once."""
-        super().__init__(cell, config, margins)
+        config = cell.configured()
+        super().__init__(cell, margins)
         low, high = cell.arm.usual_range
         margin = config.limits.joint_margin_rad + margins.joint
         self.low, self.high = low + margin, high - margin  # (n,) usable joint values, rad or m

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.config import CellConfig
 from hilcal.design.feasible import FeasibleSpace
 from hilcal.design.nominal_model import model_after, nominal_model, planned_effects
 from hilcal.design.predicted import positions_of, prediction_poses, rms
@@ -174,16 +173,16 @@ class GoalRule:
         self,
         text: str,  # the goal, e.g. "joint std < 2 %"
         cell: Cell,
-        config: CellConfig,  # `[planning]`, loads, repeatability
         catalogue: Catalogue | None = None,  # the installed effects by default
         now: Callable[[], float] = time.monotonic,  # clock of the people, s
     ) -> None:
         """Parse a goal, and check it against the cell's model."""
+        config = cell.configured()
         self.goal, self.status = parse_goal(text), GoalStatus(text)
         self._cell, self._config, self._now = cell, config, now
         self._catalogue = catalogue or installed()
         self._scatter = config.repeatability.per_joint(cell.arm.n)
-        model = nominal_model(cell, config, 3, catalogue)
+        model = nominal_model(cell, 3, catalogue)
         effects = model.model.effects
         self.goal.check({f"{e.name}.{p.name}": p.unit for e in effects for p in e.parameters})
         self._work_q: tuple[tuple[float, ...], ...] = ()
@@ -199,7 +198,7 @@ class GoalRule:
             if not planning.work_q_rad and planning.work_min_m is None:
                 self.goal.status({}, {})  # raises: names the missing keys
             work = prediction_poses(
-                model, config, np.zeros((0, cell.arm.n)), FeasibleSpace(cell, config).collision_free
+                model, config, np.zeros((0, cell.arm.n)), FeasibleSpace(cell).collision_free
             )
             self._work_q = tuple(dict.fromkeys(tuple(q) for q in work.q.tolist()))
             self._predicted = work.description

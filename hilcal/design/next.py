@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.config import CellConfig
 from hilcal.design.criterion import DiscriminatedPairs, Pair
 from hilcal.design.discriminated_pairs import (
     LEAST_POWER,
@@ -60,7 +59,6 @@ class SeparatingPlan:
 
 def plan_separating(
     cell: Cell,
-    config: CellConfig,
     fit: Fit,  # of the readings so far, with scaling gc and without the suspects
     suspects: Sequence[str],  # two effects or more
     request: PlanRequest,  # readings, or poses under every load
@@ -72,24 +70,25 @@ def plan_separating(
 
     The criterion is the least non-centrality over all their pairs; see `discriminated_pairs`.
     """
+    config = cell.configured()
     names = tuple(dict.fromkeys(suspects))
     if len(names) < 2:
         raise InputError(f"{len(names)} suspects; two or more are needed to separate them")
     count = min(config.planning.candidates, CANDIDATES)
     update = {"readings": fit.mode, "against": names, "candidates": count}
     planning = config.planning.model_copy(update=update)
-    config = config.model_copy(update={"planning": planning})
+    cell = cell.with_config(config.model_copy(update={"planning": planning}))
     readings = request.readings or request.poses * (1 + len(config.loads))
     asked = replace(request, criterion="separate", readings=readings)
     try:
-        planned = plan_readings(cell, config, asked, rng, fit, say)
+        planned = plan_readings(cell, asked, rng, fit, say)
     except InputError as error:
         if "effects to tell apart" not in str(error):
             raise
         lines = f"at most one of {', '.join(names)} changes what can be measured in this cell"
         raise CannotAnswerError(f"{lines}: no measurement separates them") from None
     if reference is not None and not np.array_equal(reference, planned.ordered.plan.q[0]):
-        planned = _from_reference(cell, config, planned, reference, rng, request)
+        planned = _from_reference(cell, planned, reference, rng, request)
     say("predicting the powers")
     pairs = planned.objective.discriminated_pairs
     assert pairs is not None  # noqa: S101  (by the criterion)
@@ -139,11 +138,11 @@ def _pair_powers(
 
 
 def _from_reference(
-    cell: Cell, config: CellConfig, planned: Planned, reference: Floats, rng: np.random.Generator,
+    cell: Cell, planned: Planned, reference: Floats, rng: np.random.Generator,
     request: PlanRequest,
 ) -> Planned:  # fmt: skip
     """Return the plan ordered from another reference pose, without poses unreachable from it."""
-    space, problem = FeasibleSpace(cell, config), planned.problem
+    space, problem = FeasibleSpace(cell), planned.problem
     counts = planned.counts.astype(np.int64)
     for load in problem.candidates.loads:
         units = [
@@ -218,7 +217,6 @@ REPEATED = 10  # one pose in so many is visited twice, for the arm's repeatabili
 
 def plan_poses(
     cell: Cell,
-    config: CellConfig,
     fit: Fit,  # of the absolute readings so far
     poses: int,
     rng: np.random.Generator,
@@ -231,13 +229,14 @@ def plan_poses(
     from pose to pose, on a finer scale than the poses so far resolve, need new poses. The
     candidates follow a Sobol sequence; the first reachable ones are taken.
     """
+    config = cell.configured()
     count = max(SPARE * poses, LEAST)
     planning = config.planning.model_copy(update={"readings": fit.mode, "candidates": count})
-    config = config.model_copy(update={"loads": [], "planning": planning})
+    cell = cell.with_config(config.model_copy(update={"loads": [], "planning": planning}))
     request = PlanRequest(poses, readings=poses, criterion=CRITERION, effort=0)
-    planned = plan_readings(cell, config, request, rng, fit, say)
+    planned = plan_readings(cell, request, rng, fit, say)
     say("spreading the poses")
-    problem, space = planned.problem, FeasibleSpace(cell, config)
+    problem, space = planned.problem, FeasibleSpace(cell)
     home = planned.ordered.plan.q[0] if reference is None else reference
     usable = np.flatnonzero(planned.usable)
     q = problem.candidates.q[[problem.contents[k][0] for k in usable]]

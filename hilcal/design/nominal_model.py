@@ -77,7 +77,6 @@ class NominalModel:
 
 def nominal_model(
     cell: Cell,
-    config: CellConfig,
     m: int = 3,  # 3 for positions, 6 for poses
     catalogue: Catalogue | None = None,  # the installed effects by default
     # of another campaign. Its effects enter the model, except families with a shared prior, which
@@ -88,17 +87,18 @@ def nominal_model(
 
     A plan hardly depends on the values: deflections are linear in them to about 1e-3.
     """
+    config = cell.configured()
     catalogue = catalogue or installed()
-    place, configured = nominal_tracker_place(cell, config)
+    place, configured = nominal_tracker_place(cell)
     notes = []
-    cell = _observed(cell, config, place)
+    cell = _observed(cell, place)
     if not configured and not (cell.observers and all(o.tied for o in cell.observers)):
         shown = ", ".join(f"{v:.2g}" for v in place)
         notes.append(
             f"the tracker's place is not configured: taken to be [{shown}] m in base axes "
             "(give [sight] tracker_m)"
         )
-    registered, station = _registered(cell, config, place)
+    registered, station = _registered(cell, place)
     frames = catalogue.unknown_frames(registered)
     chosen = {name: dict[str, object]() for name in frames} | planned_effects(config, catalogue)
     of_prior = {} if prior is None else _effects_of_prior(prior, registered, catalogue, m)
@@ -154,7 +154,8 @@ def model_after(fit: Fit, config: CellConfig) -> NominalModel:
     """Return the nominal model of further readings, from the fit of the readings so far."""
     require_gc(fit, "a plan of further readings")
     cell, prior = replace(fit.model.cell, registration_known=True), fit.solution.prior
-    _, station = _registered(cell, config, nominal_tracker_place(cell, config)[0])
+    configured = cell.with_config(config)
+    _, station = _registered(configured, nominal_tracker_place(configured)[0])
     # the fit scales its priors by the noise factor β
     std = np.where(np.isinf(prior), np.inf, prior / np.sqrt(fit.solution.beta))
     std[fit.solution.space.index] = np.inf
@@ -210,10 +211,11 @@ def known_effects(names: tuple[str, ...], key: str, catalogue: Catalogue) -> tup
     return tuple(dict.fromkeys(names))
 
 
-def check_effects(cell: Cell, config: CellConfig, catalogue: Catalogue) -> None:
+def check_effects(cell: Cell, catalogue: Catalogue) -> None:
     """Refuse effects of a configuration that a plan cannot include."""
+    config = cell.configured()
     try:
-        model = nominal_model(cell, config, catalogue=catalogue).model
+        model = nominal_model(cell, catalogue=catalogue).model
     except InputError as error:
         message = str(error)
         prefix = "" if message.startswith("[planning]") else "[planning] model: "
@@ -249,9 +251,9 @@ def expected_std(model: Model, effects: tuple[Effect, ...]) -> Floats:
     return std
 
 
-def nominal_tracker_place(cell: Cell, config: CellConfig) -> tuple[Floats, bool]:
+def nominal_tracker_place(cell: Cell) -> tuple[Floats, bool]:
     """Return the tracker's place (3,), base axes, m, and whether it is configured."""
-    place, reach = tracker_place(cell, config), cell.arm.reach
+    place, reach = tracker_place(cell), cell.arm.reach
     if place is not None:
         return place, True
     return np.array([DISTANCE * reach, 0.0, 0.5 * reach]), False
@@ -265,9 +267,9 @@ def nominal_states(q: Floats, wrench: Floats) -> States:
     return States(q, wrench, time, load_time, joint_temperature=warm, approach=approach)
 
 
-def _registered(cell: Cell, config: CellConfig, place: Floats) -> tuple[Cell, Floats]:
+def _registered(cell: Cell, place: Floats) -> tuple[Cell, Floats]:
     """Return the cell with a registration, and the start of the beam (3,), sensor axes, m."""
-    if config.tracker.frame == "base":
+    if cell.configured().tracker.frame == "base":
         return cell, place
     if cell.registration_known or cell.observers:
         return cell, np.zeros(3)
@@ -276,8 +278,9 @@ def _registered(cell: Cell, config: CellConfig, place: Floats) -> tuple[Cell, Fl
     return replace(cell, registration=registration), np.zeros(3)
 
 
-def _observed(cell: Cell, config: CellConfig, place: Floats) -> Cell:
+def _observed(cell: Cell, place: Floats) -> Cell:
     """Return the cell with the observers of `[tracker]`; a plane of unknown place is level."""
+    config = cell.configured()
     kind: ObserverKind = "point" if config.tracker.observes == "distance" else "gauge"
     if config.tracker.observes == "position":
         return cell

@@ -8,7 +8,6 @@ from typing import Literal
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.config import CellConfig
 from hilcal.design import choice
 from hilcal.design.approximate_design import ApproximateDesign
 from hilcal.design.criterion import CandidateSet, Objective
@@ -170,7 +169,6 @@ class Planned:
 
 def plan_readings(
     cell: Cell,
-    config: CellConfig,  # limits, loads, noise and `[planning]`
     request: PlanRequest,
     rng: np.random.Generator,
     fit: Fit | None = None,  # of the readings so far
@@ -180,19 +178,17 @@ def plan_readings(
     reference: Floats | None = None,  # (n,) reference pose of the campaign, rad; else a new one
 ) -> Planned:
     """Return a plan of a cell."""
+    config = cell.configured()
     usual = "I" if config.planning.readings == "absolute" else "D"
     criterion = choice.criterion_name(request.criterion or config.planning.criterion or usual)
     say("drawing candidate poses")
-    space, home = FeasibleSpace(cell, config), reference
+    space, home = FeasibleSpace(cell), reference
     drawn = draw_poses(space, config.planning.candidates, rng, min_poses=2)
     if home is None:
         home, poses = _reference(space, drawn, rng)
         drawn = replace(drawn, q=drawn.q[poses], allowed=drawn.allowed[poses])
     say("computing the information of each pose")
-    if fit is None:
-        model = nominal_model(cell, config, 3, catalogue, prior)
-    else:
-        model = model_after(fit, config)
+    model = nominal_model(cell, 3, catalogue, prior) if fit is None else model_after(fit, config)
     reduced, undetermined = without_undetermined(problem(model, config, drawn.q, drawn.allowed))
     work = prediction_poses(reduced.nominal, config, drawn.q, space.collision_free)
     by_poses = request.readings is None
@@ -316,5 +312,5 @@ def order_readings(
     poses = sorted({pose for (pose, _), _ in units})
     names = {pose: f"p{k}" for k, pose in enumerate(poses, start=1)}
     chosen = [PoseReadings(names[u[0]], readings_of(u, problem.mode), count) for u, count in units]
-    q, site = problem.candidates.q[poses], (space.cell, space.config)
-    return order_plan(*site, list(names.values()), q, home, chosen, space.passable, rng, ordering)
+    q, listed = problem.candidates.q[poses], list(names.values())
+    return order_plan(space.cell, listed, q, home, chosen, space.passable, rng, ordering)

@@ -18,7 +18,7 @@ from hilcal.design.tour import NEVER
 from hilcal.errors import CannotAnswerError
 from hilcal.measuring.route import duration, route, seconds_at_rest
 from hilcal.robot.arm import Arm
-from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
+from hilcal.store.plan import ARM, REFERENCE, UNLOADED, Plan, Step
 from hilcal.types import Bools, Floats
 
 
@@ -248,7 +248,6 @@ class Ordered:
 
 def order_plan(
     cell: Cell,
-    config: CellConfig,
     names: Sequence[str],  # (P) names of poses
     q: Floats,  # (P, n) their joint angles, rad
     reference: Floats,  # (n,) joint angles of the reference pose, rad
@@ -276,7 +275,7 @@ def order_plan(
     used = [name for name in names if any(c.pose == name for c in chosen)]
     indices = np.array([names.index(name) for name in used])
     poses, stops = np.vstack([reference, q[indices]]), stops_of(used, chosen, ordering.repeats, rng)
-    draws = OrderDraws(cell, config, tuple(used), poses, ordering, rng, stops, passable)
+    draws = OrderDraws(cell, tuple(used), poses, ordering, rng, stops, passable)
     shortest = draws.plan(draws.short_tours, half=False, mixed=False)
     shortest_time, shortest_loss = draws.duration_and_confounding(shortest)
     best = (shortest_loss.correlation, shortest, shortest_time, shortest_loss)
@@ -293,6 +292,7 @@ def order_plan(
             extra *= _SHRINK
     _, plan, time, loss = best
     about: dict[str, object] = {
+        ARM: cell.arm.name,
         "duration_s": time.about(),
         "order": {
             **loss.about(),
@@ -334,7 +334,6 @@ class OrderDraws:
     """Plans of the same readings in different orders: short ones and random ones."""
 
     cell: Cell
-    config: CellConfig  # its loads, motion and acquisition
     names: tuple[str, ...]  # (P) names of the poses
     q: Floats  # (P + 1, n) joint angles of the reference and of the poses, rad
     ordering: Ordering
@@ -350,8 +349,9 @@ class OrderDraws:
 
     def __post_init__(self, passable: Passable) -> None:
         """Find the ways and the shortest tour under each load."""
-        self.pace = pace(self.config)
-        self.wrenches = {load.name: load.wrench(self.cell.gravity) for load in self.config.loads}
+        config = self.cell.configured()
+        self.pace = pace(config)
+        self.wrenches = {load.name: load.wrench(self.cell.gravity) for load in config.loads}
         for load, load_stops in self.stops.items():
             poses = np.array([pose for pose, _ in load_stops])
             visited = np.unique(poses)
@@ -435,7 +435,7 @@ class OrderDraws:
 
     def duration_and_confounding(self, plan: Plan) -> tuple[Duration, Confounding]:
         """Return duration and confounding of a plan."""
-        margin, how = self.config.limits.joint_margin_rad, self.ordering
+        margin, how = self.cell.configured().limits.joint_margin_rad, self.ordering
         time, times = timeline(plan, self.cell.arm, margin, self.pace)
         return time, confounding(plan, times, self.wrenches, how.drift, how.reading_std)
 

@@ -426,9 +426,9 @@ class CheckedPlan(Shown, Tabular):
         }
 
 
-def checked(cell: Cell, config: CellConfig, plan: Plan, summary: PlanSummary) -> CheckedPlan:
+def checked(cell: Cell, plan: Plan, summary: PlanSummary) -> CheckedPlan:
     """Check a plan in a dry run, whose remarks come first in the summary."""
-    dry = dry_run(cell, config, plan)
+    dry = dry_run(cell, plan)
     refuse(dry, "the plan")
     remarks = tuple(dict.fromkeys((*dry.remarks, *summary.remarks)))
     return CheckedPlan(plan, dry, replace(summary, remarks=remarks))

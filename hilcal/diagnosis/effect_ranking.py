@@ -36,7 +36,7 @@ import numpy as np
 
 from hilcal.diagnosis.minimum_detectable_effect import LEAST_SHARE as LEAST_SHARE
 from hilcal.diagnosis.minimum_detectable_effect import (
-    Simulated,
+    SimulatedCampaigns,
     Strength,
     least_of_family,
     least_strength,
@@ -236,7 +236,7 @@ def rank_suspects(
     refit: Callable[[Fit, str], Fit | None] = trial,  # returns a fit with one more effect
 ) -> tuple[Suspect, ...]:
     """Score all effects; best first, see `ranked`."""
-    noise = cache(partial(Simulated.noise, p))
+    noise = cache(partial(SimulatedCampaigns.noise, p))
     suspects = [_suspect(p, s, len(effects), noise) for s in _scored(p, effects)]
     tested = max(sum(s.score.rank > 0 for s in suspects), 1)
     no_load = p.fit.mode == "absolute" and not p.fit.solution.prediction.situation.load.wrench.any()
@@ -309,7 +309,7 @@ def _scored(p: Linearisation, effects: Sequence[Effect]) -> Iterator[_Scored]:
 
 
 def _suspect(
-    p: Linearisation, scored: _Scored, count: int, simulated_noise: Callable[[], Simulated]
+    p: Linearisation, scored: _Scored, count: int, simulated_noise: Callable[[], SimulatedCampaigns]
 ) -> Suspect:
     """Describe one of `count` effects that are tested together, without keeping its columns."""
     of_s, result, effect = scored.spectrum, scored.score, scored.family.effect
@@ -422,7 +422,8 @@ def beyond_geometry(p: Linearisation, family: EffectColumns, geometry: Floats) -
     # One ridge for both: columns in units of their strength.
     both = np.hstack([geometry / np.sqrt(first.ridge), family.white / np.sqrt(second.ridge)])
     without, with_family = (
-        by_pose(fit, FamilyFolds(p.folds, x).left_out(p.alone, 1.0)) for x in (both[:, :q], both)
+        by_pose(fit, FamilyFolds(p.folds, x).left_out(p.left_out_residual, 1.0))
+        for x in (both[:, :q], both)
     )
     return improves(without, with_family, STANDARD_ERRORS)
 

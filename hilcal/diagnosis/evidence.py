@@ -56,7 +56,7 @@ from hilcal.diagnosis.stepwise import trial
 from hilcal.diagnosis.wrong_figures import WrongFigure, loads_reversed, wrong_figures
 from hilcal.effects.protocol import Effect
 from hilcal.identification.carried.drift import carried_effects, evidence_of_carried
-from hilcal.identification.fit import Fit, fit, require_gc
+from hilcal.identification.fit import Fit, fit_again, require_gc
 from hilcal.identification.linearisation import (
     Linearisation,
     effect_columns,
@@ -312,8 +312,7 @@ class Evidence:
         if self.arm_scatter is None or prefers_instrument(self.arm_scatter):
             return None
         scattered = with_arm_scatter(model.cell, readings, self.arm_scatter)
-        outlier = self.fit.kept_outlier
-        fitted = fit(model, scattered, self.fit.mode, start=self.fit.theta, outlier=outlier)
+        fitted = fit_again(self.fit, readings=scattered)
         return Evidence(fitted, self._refit, self._say, self._regressions)
 
     @cached_property

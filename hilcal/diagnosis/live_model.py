@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.config import CellConfig
 from hilcal.effects.catalogue import installed
 from hilcal.errors import HilcalError
 from hilcal.identification.baseline import with_effects
@@ -77,10 +76,10 @@ class LiveModel:
     model is fitted again only when the readings have grown by `GROWTH`.
     """
 
-    def __init__(self, cell: Cell, config: CellConfig) -> None:
+    def __init__(self, cell: Cell) -> None:
         """Prepare for a cell."""
         self._cell = cell
-        self._scatter = config.repeatability.per_joint(cell.arm.n)
+        self._scatter = cell.configured().repeatability.per_joint(cell.arm.n)
         self._fitted: _FittedModel | None = None
 
     def __call__(self, readings: Readings) -> LiveResidual:

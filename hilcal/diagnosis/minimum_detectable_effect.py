@@ -33,7 +33,7 @@ from hilcal.regression.evidence import (
     noncentrality_of_power,
     score_family,
 )
-from hilcal.regression.leave_out import FamilyFolds, LeftOut, improves
+from hilcal.regression.leave_out import FamilyFolds, LeftOutResidual, improves
 from hilcal.types import Floats
 
 POWER = 0.9
@@ -114,11 +114,11 @@ def _strength(moved: float, t: float, scale: Floats, units: tuple[str, ...]) -> 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Simulated:
-    """Simulated residuals of K campaigns, and what the model leaves of them."""
+class SimulatedCampaigns:
+    """Whitened residuals of K simulated campaigns, with the model fitted to each of them."""
 
     fitted: Floats  # (R, K) with the model fitted to all rows
-    alone: LeftOut  # ... and without each fold; its y (R, K) are the residuals
+    left_out: LeftOutResidual  # ... and without each fold; its y (R, K) are the simulated ones
 
     @classmethod
     def of(cls, p: Linearisation, y: Floats) -> Self:
@@ -132,10 +132,10 @@ class Simulated:
         draws = np.random.default_rng(SEED).standard_normal(shape)
         return cls.of(p, np.sqrt(max(p.fit.variance_factor, 1.0)) * draws)
 
-    def plus(self, other: "Simulated", factor: float) -> "Simulated":
+    def plus(self, other: "SimulatedCampaigns", factor: float) -> "SimulatedCampaigns":
         """Add `factor` times other residuals."""
         fitted = self.fitted + factor * other.fitted
-        return Simulated(fitted, self.alone.plus(other.alone, factor))
+        return SimulatedCampaigns(fitted, self.left_out.plus(other.left_out, factor))
 
 
 def least_of_family(
@@ -145,7 +145,7 @@ def least_of_family(
     start: Strength,  # that the F-test alone would reveal, where the grid begins
     level: float,  # of the test, between 0 and 1
     largest: float,  # largest plausible strength
-    noise: Callable[[], Simulated],  # of the fit
+    noise: Callable[[], SimulatedCampaigns],  # campaigns with the noise of the fit alone
 ) -> Strength:
     """Return the smallest strength that all tests would reveal."""
     if not start.visible:
@@ -159,13 +159,15 @@ def least_of_family(
     return replace(least, finest_m=finest.displacement_m)
 
 
-def _least(tests: "SuspectTests", full: EffectColumns, start: float, noise: Simulated) -> Strength:
+def _least(
+    tests: "SuspectTests", full: EffectColumns, start: float, noise: SimulatedCampaigns
+) -> Strength:
     """`least_of_family` where the arm has the effect `full` and the tests score their family."""
     rng = np.random.default_rng(SEED_OF_FAMILY)
     beta = rng.standard_normal((len(full.scale), DRAWS))
     motion = np.einsum("dip,pk->dik", full.motion, beta)
     moved = np.sqrt(np.mean(np.sum(motion**2, axis=1), axis=0))
-    signal = Simulated.of(tests.p, full.white @ (beta / moved))  # of a displacement of 1 m
+    signal = SimulatedCampaigns.of(tests.p, full.white @ (beta / moved))  # of a displacement of 1 m
     units = tuple(q.unit for q in full.effect.parameters)
     for displacement in (GRID * start).tolist():
         if np.mean(tests.passed(noise.plus(signal, displacement), POWER)) >= POWER:
@@ -189,14 +191,14 @@ class SuspectTests:
         """The model with the family, fitted without each fold."""
         return FamilyFolds(self.p.folds, self.family.white)
 
-    def passed(self, campaigns: Simulated, enough: float = 0.0) -> list[bool]:
+    def passed(self, campaigns: SimulatedCampaigns, enough: float = 0.0) -> list[bool]:
         """Whether each of K simulated campaigns would reveal the family."""
         # Once a share of `enough` is out of reach, the remaining ones count as failed.
-        p, y, alone = self.p, campaigns.alone.y, campaigns.alone
+        p, by_model = self.p, campaigns.left_out
         r = campaigns.fitted
-        g, rss = self.family.white.T @ r, np.sum(r * y, axis=0)
+        g, rss = self.family.white.T @ r, np.sum(r * by_model.y, axis=0)
         scores: list[FamilyScore] = []
-        able = [False] * y.shape[1]
+        able = [False] * by_model.y.shape[1]
         for k in range(len(able)):
             c = score_family(self.s, g[:, k], float(rss[k]), p.fit.dof, largest=self.largest)
             scores.append(c)
@@ -207,10 +209,10 @@ class SuspectTests:
         if np.mean(able) < POWER:
             return able
         ridge = float(np.median([c.ridge for c in scores]))
-        with_family = self._family_folds.left_out(alone, ridge)
+        with_family = self._family_folds.left_out(by_model, ridge)
         out = []
         for k, fit_able in enumerate(able):
-            a, b = by_pose(p.fit, alone.residual[:, k]), by_pose(p.fit, with_family[:, k])
+            a, b = by_pose(p.fit, by_model.residual[:, k]), by_pose(p.fit, with_family[:, k])
             share = float(a.sum() - b.sum()) / max(float(a.sum()) - p.fit.whitening.rank, 1.0)
             out.append(fit_able and share >= LEAST_SHARE and improves(a, b))
         return out

@@ -20,7 +20,7 @@ import numpy as np
 import scipy
 
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM, largest_plausible, unloaded_readings
-from hilcal.diagnosis.minimum_detectable_effect import Simulated, SuspectTests
+from hilcal.diagnosis.minimum_detectable_effect import SimulatedCampaigns, SuspectTests
 from hilcal.diagnosis.misfit_breakdown import pose_constants
 from hilcal.diagnosis.noise import MISFIT_ALARM
 from hilcal.diagnosis.stepwise import add
@@ -155,7 +155,9 @@ def detection_power(
     y = signal + rng.standard_normal(signal.shape)
     s = spectrum(q.information(scored.white))
     largest = largest_plausible(scored, unloaded_readings(extended))
-    return float(np.mean(SuspectTests(q, scored, s, level, largest).passed(Simulated.of(q, y))))
+    return float(
+        np.mean(SuspectTests(q, scored, s, level, largest).passed(SimulatedCampaigns.of(q, y)))
+    )
 
 
 def _with_poses(first: Fit, count: int, rng: np.random.Generator) -> Fit:

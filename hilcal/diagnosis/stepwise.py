@@ -7,7 +7,7 @@ import numpy as np
 from hilcal.effects.options import Options
 from hilcal.effects.written import read_effects_text
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit import Fit, fit_again
 from hilcal.identification.linearisation import left_out_by_pose
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
@@ -30,9 +30,7 @@ def add(before: Fit, effect: str, options: Options | None = None) -> Fit:
             cannot show; an unknown option, or a bad value.
     """
     model, start = _grown(before.model, before.theta, effect, before.readings, options)
-    return fit(
-        model, before.readings, before.mode, before.scaling, start, outlier=before.kept_outlier
-    )
+    return fit_again(before, model, start=start)
 
 
 def trial(before: Fit, effect: str) -> Fit | None:
@@ -50,9 +48,7 @@ def remove(before: Fit, effect: str) -> Fit:
         InputError: an effect that the model lacks.
     """
     model, start = _reduced(before.model, before.theta, effect)
-    return fit(
-        model, before.readings, before.mode, before.scaling, start, outlier=before.kept_outlier
-    )
+    return fit_again(before, model, start=start)
 
 
 def _reduced(model: Model, theta: Floats, effect: str) -> tuple[Model, Floats]:
@@ -92,9 +88,7 @@ def exchange(before: Fit, effect: str, replacement: str) -> Fit:
     if replacement in names:
         raise InputError(f"effect {replacement} is in the model already: {', '.join(names)}")
     model, start = _grown(model, start, replacement, before.readings)
-    return fit(
-        model, before.readings, before.mode, before.scaling, start, outlier=before.kept_outlier
-    )
+    return fit_again(before, model, start=start)
 
 
 def predicts_better(before: Fit, after: Fit) -> bool:

@@ -44,7 +44,7 @@ from hilcal.discovery.search import LEAST_LOG_ODDS, Selection, search
 from hilcal.discovery.structures import Structure, averaged, pareto, structure_of, structures
 from hilcal.effects.catalogue import effects_of
 from hilcal.errors import CannotAnswerError, HilcalError, InputError, expect
-from hilcal.identification.fit import Fit, fit, require_gc
+from hilcal.identification.fit import Fit, fit_again, require_gc
 from hilcal.identification.folds import random_folds
 from hilcal.identification.linearisation import by_pose, left_out_by_pose, linearise
 from hilcal.readings.readings import Readings
@@ -474,8 +474,7 @@ class LawSearch:
         effect = catalogue.make(name, model.cell, fitted.readings.states, m=fitted.readings.m)
         grown = replace(model, effects=(*model.effects, effect), catalogue=catalogue)
         self._sources[name] = d.source
-        of = fitted.readings, fitted.mode, fitted.scaling, after.theta
-        return fit(grown, *of, outlier=fitted.kept_outlier), name
+        return fit_again(fitted, grown, start=after.theta), name
 
     def path(self, name: str) -> Path:
         """Return the file of a law."""

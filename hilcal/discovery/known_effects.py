@@ -131,11 +131,11 @@ def resembling(
     law = np.hstack([problem.columns(t) for t in s.terms])
     free = problem.model.project_out(law)
     y = (law @ np.linalg.lstsq(free, problem.residual, rcond=1e-8)[0])[:, None]
-    alone = linear.folds.left_out(y)
-    total = float(np.sum(alone.residual**2))
+    by_model = linear.folds.left_out(y)
+    total = float(np.sum(by_model.residual**2))
     out = []
     for effect, part in columns.items():
-        residual = FamilyFolds(linear.folds, x[:, part]).left_out(alone)
+        residual = FamilyFolds(linear.folds, x[:, part]).left_out(by_model)
         share = 1.0 - float(np.sum(residual**2)) / max(total, 1e-300)
         out.append(Resemblance(effect, float(np.sqrt(max(share, 0.0)))))
     return tuple(sorted(out, key=lambda r: -r.cosine))

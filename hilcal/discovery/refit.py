@@ -25,7 +25,7 @@ from hilcal.discovery.screen import Screen
 from hilcal.effects.check import check_effect
 from hilcal.effects.protocol import Effect, Situation
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit import Fit, fit_again
 from hilcal.identification.linearisation import Linearisation
 from hilcal.types import Floats
 
@@ -104,8 +104,7 @@ def refit_exactly(
         effect = kind(before.model.cell, s.states)
         model = replace(before.model, effects=(*before.model.effects, effect))
         start = np.concatenate([before.theta, np.zeros(form.count)])
-        outlier = before.kept_outlier
-        after = fit(model, before.readings, before.mode, before.scaling, start, outlier=outlier)
+        after = fit_again(before, model, start=start)
         rows = model.slices()[-1]
         theta, std = after.theta[rows], after.uncertainty.std[rows]
         determined = np.isfinite(std)

@@ -205,14 +205,6 @@ class Fit(WithVarianceFactor, Tabular):
         return self.solution.theta
 
     @property
-    def kept_outlier(self) -> Bools | None:
-        """`outlier` of a fit with a background, which its refits keep; None without one.
-
-        They were sought beside all effects, with the sizes of these estimated anew.
-        """
-        return self.outlier if self.model.background else None
-
-    @property
     def rank(self) -> int:
         """Number of directions of the parameters that the data determine."""
         return int(self.solution.equations.basis.transform.shape[1])
@@ -378,6 +370,33 @@ def fit(
         dof=max(w.rank - solution.effective, 1.0),
         error=error_block(solution.raw, w),
         disagreement=disagreement,
+    )
+
+
+def fit_again(
+    before: Fit,
+    model: Model | None = None,
+    readings: Readings | None = None,
+    start: Floats | None = None,
+    outlier: Bools | None = None,
+) -> Fit:
+    """Repeat a fit with what is changed, from its parameters unless `start` is given.
+
+    Without `outlier`, gross errors are sought anew; only those of a fit with a background stay set
+    aside, as they were sought beside all effects, with the sizes of these estimated anew.
+
+    Raises:
+        CannotAnswerError, InputError: as `fit` does.
+    """
+    if outlier is None and before.model.background:
+        outlier = before.outlier
+    return fit(
+        before.model if model is None else model,
+        before.readings if readings is None else readings,
+        before.mode,
+        before.scaling,
+        before.theta if start is None else start,
+        outlier=outlier,
     )
 
 

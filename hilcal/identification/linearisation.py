@@ -26,7 +26,7 @@ from hilcal.identification.folds import folds_of, random_folds
 from hilcal.identification.gauss_newton import columns_of
 from hilcal.readings.whitening import Whitening
 from hilcal.regression.evidence import FamilyScore, Spectrum, score_family
-from hilcal.regression.leave_out import FamilyFolds, LeftOut, ModelFolds, improves
+from hilcal.regression.leave_out import FamilyFolds, LeftOutResidual, ModelFolds, improves
 from hilcal.regression.normal_equations import Basis, find_basis, normal_equations
 from hilcal.regression.schur import Projection
 from hilcal.types import Bools, Floats, Ints
@@ -204,10 +204,10 @@ class Linearisation:
         The strengths are those of the fit, as in `held_out`; `Fit.left_out` has strengths chosen
         without the pose.
         """
-        return by_pose(self.fit, self.alone.residual)
+        return by_pose(self.fit, self.left_out_residual.residual)
 
     @cached_property
-    def alone(self) -> LeftOut:
+    def left_out_residual(self) -> LeftOutResidual:
         """The fit's residual, predicted without each fold of poses."""
         return self.folds.left_out(self.fit.white, of_fit=True)
 
@@ -272,7 +272,7 @@ class Linearisation:
             if not score.rank:
                 out.append(HeldOut(0.0, False))
                 continue
-            after = by_pose(self.fit, family.left_out(self.alone, score.ridge))
+            after = by_pose(self.fit, family.left_out(self.left_out_residual, score.ridge))
             gain = float(before.sum() - after.sum())
             share = float(np.clip(gain / misfit, -1.0, 1.0))
             out.append(HeldOut(share, improves(before, after)))

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from hilcal.cell import Cell, tracker_place
-from hilcal.config import CellConfig, CellLoad, Obstacle
+from hilcal.config import CellLoad, Obstacle
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
 from hilcal.robot.scene import Capsule, Scene, Segment, flange_capsule, on_flange
@@ -23,8 +23,9 @@ _TINY = 1e-18  # m², below which a segment is a point
 class Clearance:
     """The cell's shapes, base axes, m."""
 
-    def __init__(self, cell: Cell, config: CellConfig) -> None:
+    def __init__(self, cell: Cell) -> None:
         """Build the shapes once."""
+        config = cell.configured()
         self.cell, self.config = cell, config
         self.scene = Scene(cell.arm, _tool(cell), config.obstacles)
         # names of the shapes that touch the load point, by the radius of the load or cable, m
@@ -34,7 +35,7 @@ class Clearance:
     @cached_property
     def sight(self) -> "LineOfSight | None":
         """The tracker's view; None where its place is unknown."""
-        place = tracker_place(self.cell, self.config)
+        place = tracker_place(self.cell)
         return None if place is None else LineOfSight(self, place)
 
     def load(self, name: str) -> CellLoad | None:

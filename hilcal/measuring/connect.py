@@ -55,7 +55,6 @@ class Setup:
 
     rig: Rig
     cell: Cell
-    config: CellConfig
     clock: Clock
     watcher: Watcher
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.config import CellConfig, ForceSensor
+from hilcal.config import ForceSensor
 from hilcal.measuring.clearance import Clearance
 from hilcal.robot import se3
 from hilcal.robot.chain import Chain, evaluate
@@ -77,11 +77,12 @@ class Feasibility:
     at most. Torques and moments are checked in the same way by their rates.
     """
 
-    def __init__(self, cell: Cell, config: CellConfig, margins: Margins | None = None) -> None:
+    def __init__(self, cell: Cell, margins: Margins | None = None) -> None:
         """Build the shapes once."""
+        config = cell.configured()
         self.cell, self.config = cell, config
         self.margins = Margins() if margins is None else margins
-        self.shapes = Clearance(cell, config)
+        self.shapes = Clearance(cell)
         self.sight = self.shapes.sight
         guess = f"the shape of {cell.arm.name} is not known: its links are guessed"
         self._guessed = "" if is_known(cell.arm) else guess

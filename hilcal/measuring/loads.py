@@ -36,9 +36,9 @@ class Hook:
         """Start with an unknown load, until `take_all_off`."""
         self.hanging, self.since, self._doubted = UNLOADED, setup.clock.now(), False
         self._arm, self._operator, self._meter = setup.rig.arm, setup.rig.operator, meter
-        self._cell, self._config, self._mover = setup.cell, setup.config, mover
+        self._cell, self._config, self._mover = setup.cell, setup.cell.configured(), mover
         self._clock, self._watcher = setup.clock, setup.watcher
-        self._loads = {load.name: load for load in setup.config.loads}
+        self._loads = {load.name: load for load in self._config.loads}
 
     def load(self, name: str) -> CellLoad | None:
         """Return a load by name; None for the unloaded state."""

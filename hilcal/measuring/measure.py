@@ -244,7 +244,8 @@ class Measurer:
 
     def __init__(self, setup: Setup, meter: ForceMeter | None, mover: Mover) -> None:
         self._mover, self._tracker, self._meter = mover, setup.rig.tracker, meter
-        self._config, self._clock, self._watcher = setup.config, setup.clock, setup.watcher
+        self._config = setup.cell.configured()
+        self._clock, self._watcher = setup.clock, setup.watcher
 
     def measure(
         self,

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.config import CellConfig, CellLoad
+from hilcal.config import CellLoad
 from hilcal.errors import DeviceError
 from hilcal.measuring.connect import Setup
 from hilcal.measuring.devices import ArmSample, LoadChangedError
@@ -30,9 +30,9 @@ at samples. Nothing may touch."""
 class Guard:
     """The limits of a cell, checked against samples of its devices."""
 
-    def __init__(self, cell: Cell, config: CellConfig) -> None:
-        self.cell, self.config = cell, config
-        self._limits = Feasibility(cell, config, SLACK)
+    def __init__(self, cell: Cell) -> None:
+        self.cell, self.config = cell, cell.configured()
+        self._limits = Feasibility(cell, SLACK)
 
     def check(
         self, sample: ArmSample, wrench: Floats | None = None, hanging: str = UNLOADED
@@ -99,9 +99,9 @@ class LoadWatch:
     pose, so the limit grows with the rotation of the sensor against gravity since then.
     """
 
-    def __init__(self, meter: ForceMeter, cell: Cell, config: CellConfig) -> None:
+    def __init__(self, meter: ForceMeter, cell: Cell) -> None:
         """Start without comparison, until `expect`."""
-        self._meter, self._cell, self._config = meter, cell, config
+        self._meter, self._cell, self._config = meter, cell, cell.configured()
         self._load: CellLoad | None = None
         self._hung = np.zeros(6)  # wrench of the load at the load point, base axes
         self.watching, self.differed = False, 0
@@ -205,13 +205,13 @@ class Mover:
 
     def __init__(self, setup: Setup, meter: ForceMeter | None) -> None:
         """Use an open arm; the watcher gets its position during motions, and must not block."""
-        cell, config = setup.cell, setup.config
+        cell, config = setup.cell, setup.cell.configured()
         self.goal: Floats | None = None
         self.hanging: tuple[str, ...] = (UNLOADED,)
         self.side = np.zeros(cell.arm.n)
-        self.watch = None if meter is None else LoadWatch(meter, cell, config)
-        self._arm, self._meter, self.guard = setup.rig.arm, meter, Guard(cell, config)
-        self._limits = Feasibility(cell, config)
+        self.watch = None if meter is None else LoadWatch(meter, cell)
+        self._arm, self._meter, self.guard = setup.rig.arm, meter, Guard(cell)
+        self._limits = Feasibility(cell)
         self._motion, self._clock, self._watcher = config.motion, setup.clock, setup.watcher
         self._under_way = False
         self._ticked: tuple[float, int] = (-1.0, 0)

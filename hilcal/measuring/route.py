@@ -11,7 +11,7 @@ from hilcal.config import CellConfig
 from hilcal.measuring.clearance import TRACKER_UNKNOWN
 from hilcal.measuring.feasibility import Feasibility
 from hilcal.robot.arm import Arm
-from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
+from hilcal.store.plan import ARM, REFERENCE, UNLOADED, Plan, Step
 from hilcal.toml import suggest
 from hilcal.types import Floats
 
@@ -108,15 +108,22 @@ class DryRun:
         return f"{self.problems[0]}{suffix}"
 
 
-def dry_run(cell: Cell, config: CellConfig, plan: Plan) -> DryRun:
+def dry_run(cell: Cell, plan: Plan) -> DryRun:
     """Check a plan against every limit of the cell; all problems at once.
 
     `Feasibility` checks all stops of the route and the straight paths in joint space between them.
     The tracker's sight of the target at each reading, the speed and the loads are checked, too.
     """
-    limits = Feasibility(cell, config)
+    config = cell.configured()
+    limits = Feasibility(cell)
     problems = _cell_problems(config) + _load_problems(limits, plan)
-    width, n = plan.q.shape[1], cell.arm.n
+    width, n, made_for = plan.q.shape[1], cell.arm.n, plan.about.get(ARM, cell.arm.name)
+    if made_for != cell.arm.name:
+        problems.insert(
+            0,
+            f"the plan was made for {made_for}, and the cell's arm is {cell.arm.name}: make one "
+            f'with hilcal plan, or take "{ARM}" out of the file if it is meant for this arm, too',
+        )
     if width != n:
         wrong = f"the plan has {width} joint angles per pose; {cell.arm.name} has {n} joints"
         return DryRun((wrong, *problems), (), 0.0, 0, 0)
@@ -211,7 +218,7 @@ def seconds_at_rest(config: CellConfig) -> float:
 
 
 def way_home(
-    cell: Cell, config: CellConfig, plan: Plan, visited: Sequence[Stop], done: frozenset[Step]
+    cell: Cell, plan: Plan, visited: Sequence[Stop], done: frozenset[Step]
 ) -> tuple[Stop, ...]:
     """Return the route to the reference pose, where the load is taken off and the drift is read.
 
@@ -224,7 +231,7 @@ def way_home(
     hanging = last.hanging if last.change_to is None else last.change_to
     destination = Stop(base, q_home, hanging, change_to=None if hanging == UNLOADED else UNLOADED)
     way: list[Stop] = []
-    limits = Feasibility(cell, config)
+    limits = Feasibility(cell)
     for stop in reversed(visited):
         candidate = Stop(stop.name, stop.q, hanging)
         way.append(candidate)

@@ -16,7 +16,6 @@ from typing import Any, TypeVar
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.config import CellConfig
 from hilcal.errors import DeviceError, HilcalError, InputError
 from hilcal.measuring.arrival import ArrivalReader, RoughRegistration
 from hilcal.measuring.connect import Rig, Setup
@@ -84,7 +83,7 @@ class Session:
     ) -> None:
         """Read the stored readings of earlier sessions; no device is used yet."""
         self.in_control = False
-        rig, cell, config = setup.rig, setup.cell, setup.config
+        rig, cell, config = setup.rig, setup.cell, setup.cell.configured()
         self._rig, self._cell, self._config = rig, cell, config
         self._clock, self._watcher = setup.clock, setup.watcher
         self._plan, self._store, self._live, self._wall = plan, store, live, wall
@@ -140,7 +139,7 @@ class Session:
         pace = self._pace = Eta(self._clock)
         behind, ahead = list(stops[:2]), stops[2:]
         if self._goal_newly_met(last=False):  # the last session was stopped on its way home
-            ahead = way_home(self._cell, self._config, self._plan, behind, self._store.done())
+            ahead = way_home(self._cell, self._plan, behind, self._store.done())
         while ahead:
             stop, ahead = ahead[0], ahead[1:]
             behind.append(stop)
@@ -149,7 +148,7 @@ class Session:
                 pace.note_reading()
                 if self._goal_newly_met(last=all(s.step is None for s in ahead)):
                     done = self._store.done()
-                    ahead = way_home(self._cell, self._config, self._plan, behind, done)
+                    ahead = way_home(self._cell, self._plan, behind, done)
                 readings_left = sum(s.step is not None for s in ahead)
                 remaining = pace.remaining(
                     readings_left, sum(s.change_to is not None for s in ahead)
@@ -515,7 +514,6 @@ class Session:
 def run(
     rig: Rig,
     cell: Cell,
-    config: CellConfig,
     plan: Plan,
     store: RunLog,
     clock: Clock,
@@ -544,13 +542,13 @@ def run(
     if not missing.steps:
         watcher.notify(Phase("nothing is missing"))
         return
-    _refuse_unsafe(dry_run(cell, config, missing), bool(done))
-    for text in dry_run(cell, config, plan).remarks:
+    _refuse_unsafe(dry_run(cell, missing), bool(done))
+    for text in dry_run(cell, plan).remarks:
         watcher.notify(Remark(text))
-    setup = Setup(rig, cell, config, clock, watcher)
+    setup = Setup(rig, cell, clock, watcher)
     session = Session(setup, plan, store, live, wall, goal, epoch)
     try:
-        session.visit(route(missing, cell.arm, config.limits.joint_margin_rad))
+        session.visit(route(missing, cell.arm, cell.configured().limits.joint_margin_rad))
     except BaseException as error:
         trouble = _stop(rig.arm) if session.in_control else ""
         again = session.pose is not None and _failed_at(store) == session.pose

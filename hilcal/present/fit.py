@@ -88,6 +88,10 @@ def gross_error_lines(fit: Fit, details: bool) -> Iterator[str]:
     yield f"{total} (pose/load):" if details else f"{total}; --details lists them."
     if details:
         yield from _listed([f"  {g.pose}/{g.load}: {g.reason}" for g in gross], GROSS)
+    of_load = fit.readings.load
+    for k in np.setdiff1d(of_load, of_load[~fit.outlier]):
+        name, count = fit.readings.load_names[k], int(np.sum(of_load == k))
+        yield f"All {count} readings under the load {name} are set aside: is its force right?"
 
 
 def _listed(lines: Sequence[str], most: int) -> Iterator[str]:

@@ -63,7 +63,6 @@ def fit_without(fitted: Fit, suspects: tuple[str, ...], say: Say = lambda text: 
 
 def separating_plan(
     cell: Cell,
-    config: CellConfig,
     doubt: Doubt,
     poses: int | None,  # whose readings the plan has; None: as many as the doubt needs
     rng: np.random.Generator,
@@ -75,9 +74,9 @@ def separating_plan(
     fitted, effects = doubt.fit, doubt.suspects
     if doubt.pose_alone is None:
         request = PlanRequest(default_poses if poses is None else poses)
-        return plan_separating(cell, config, fitted, effects, request, rng, say, reference)
+        return plan_separating(cell, fitted, effects, request, rng, say, reference)
     count = doubt.pose_alone.more if poses is None else poses
-    planned = plan_poses(cell, config, fitted, count, rng, say, reference)
+    planned = plan_poses(cell, fitted, count, rng, say, reference)
     say("predicting the powers")
     powers = tuple(PairPower(*row, False) for row in pose_powers(fitted, effects, count))
     return SeparatingPlan(planned, powers, {}, 1.0, ())
@@ -105,7 +104,7 @@ def next_plan(
     rng: np.random.Generator,
     say: Say,
     *,
-    cell: tuple[CellConfig, Cell] | None = None,
+    cell: Cell | None = None,
     compare: bool = False,
 ) -> NextPlan:
     """Plan the measurements that settle a doubt, and check every motion in a dry run.
@@ -113,12 +112,14 @@ def next_plan(
     `poses` is as in `separating_plan`. `cell` replaces the campaign's where it has changed. To
     `compare` criteria and numbers of poses takes longer. Raises as `separating_plan` does.
     """
-    config, numbers = (o.config, o.cell) if cell is None else cell
-    chosen = separating_plan(numbers, config, doubt, poses, rng, say, reference_in(o.file))
+    numbers = o.cell if cell is None else cell
+    chosen = separating_plan(numbers, doubt, poses, rng, say, reference_in(o.file))
     compare = compare and not doubt.pose_alone
-    summary = summarise(chosen.planned, config, rng, say, compare=compare, curve=compare)
+    summary = summarise(
+        chosen.planned, numbers.configured(), rng, say, compare=compare, curve=compare
+    )
     say("checking every motion in a dry run")
-    checked_plan = checked(numbers, config, plan_of(chosen, doubt.suspects), summary)
+    checked_plan = checked(numbers, plan_of(chosen, doubt.suspects), summary)
     return NextPlan(chosen, checked_plan)
 
 
@@ -245,7 +246,6 @@ class FurtherMeasuring:
     """The decision whether to measure more, after a refinement."""
 
     cell: Cell
-    config: CellConfig
     settings: Settings
     d: Diagnosis  # of the last fit
     plans: tuple[Plan, ...]  # all plans so far
@@ -259,7 +259,9 @@ class FurtherMeasuring:
         must bring a gain within the time allowed.
         """
         d, settings = self.d, self.settings
-        error = predicted_error(Calibration.of(d.fit), d.fit.readings.states, self.config)
+        error = predicted_error(
+            Calibration.of(d.fit), d.fit.readings.states, self.cell.configured()
+        )
         further = self._separating(error)
         if further is None or not further.measures:
             sharper = self._sharpening(error)
@@ -283,10 +285,10 @@ class FurtherMeasuring:
         if doubt is None:
             return None
         nothing = Decision("inseparable", self.d.verdict, error, suspects=doubt.suspects)
-        poses, site = self.settings.poses, (self.cell, self.config)
+        poses = self.settings.poses
         try:
             chosen = separating_plan(
-                *site, doubt, None, self.rng, self.say, self._reference(), poses
+                self.cell, doubt, None, self.rng, self.say, self._reference(), poses
             )
         except (CannotAnswerError, InputError):
             return nothing
@@ -306,11 +308,12 @@ class FurtherMeasuring:
         if error.floor_m >= goal:
             return replace(decision, reason="floor")
         self.say("planning what would lower the predicted error")
-        planning = self.config.planning.model_copy(update={"readings": self.d.fit.mode})
-        config, poses = self.config.model_copy(update={"planning": planning}), self.settings.poses
+        config = self.cell.configured()
+        planning = config.planning.model_copy(update={"readings": self.d.fit.mode})
+        cell = self.cell.with_config(config.model_copy(update={"planning": planning}))
         try:
             planned = plan_readings(
-                *(self.cell, config, PlanRequest(poses), self.rng, self.d.fit, self.say),
+                *(cell, PlanRequest(self.settings.poses), self.rng, self.d.fit, self.say),
                 reference=self._reference(),
             )
         except (CannotAnswerError, InputError):

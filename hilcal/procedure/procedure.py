@@ -81,12 +81,16 @@ class Procedure:
 
     run: Path  # the campaign file that is fitted; the others are in the same directory
     cell: Cell  # as configured
-    config: CellConfig
     base_dir: Path  # that paths in the configuration are relative to
     catalogue: Catalogue  # the effects that a model can have
     settings: state.Settings  # goals, sizes and seed
     prior: CarriedPrior | None = None  # the prior of every fit, from `settings.prior`
     _refinements: list[Refinement] = field(default_factory=list, repr=False)  # the latest, if any
+
+    @property
+    def config(self) -> CellConfig:
+        """The configuration of the cell."""
+        return self.cell.configured()
 
     @classmethod
     def at(
@@ -98,13 +102,11 @@ class Procedure:
         """
         path, config, effects = Path(run), cell.configured(), catalogue or installed()
         if path.exists():
-            stored = continued(path, cell, config, effects)
+            stored = continued(path, cell, effects)
             return replace(stored, settings=replace(stored.settings, **options))
         readings = config.planning.readings if config.loads else "absolute"
         default = state.Settings(seed=config.simulation.seed, readings=readings)
-        return cls(
-            path, cell, config, cell.base_dir.absolute(), effects, replace(default, **options)
-        )
+        return cls(path, cell, cell.base_dir.absolute(), effects, replace(default, **options))
 
     @property
     def files(self) -> state.Files:
@@ -122,8 +124,8 @@ class Procedure:
 
     def plan(self, say: Say = lambda text: None) -> CheckedPlan:
         """Choose the first plan, unstored; a CannotAnswerError for a cell with too few poses."""
-        rng, config = self._rng(_FIRST), self._planned()
-        return checked_plan(self.cell, config, self.settings.poses, rng, self.catalogue, say)
+        rng, cell = self._rng(_FIRST), self._planned()
+        return checked_plan(cell, self.settings.poses, rng, self.catalogue, say)
 
     def begin(self, plan: Plan, config: CellConfig, *, covers: str = INSTRUMENT) -> None:
         """Make the campaign file with its first plan.
@@ -210,8 +212,8 @@ class Procedure:
                 say(f"diagnosing revision {record.number}")
                 d = diagnose(o.restore(record), o.history(record.number), say)
             rng = self._rng(_FURTHER, len(run.plans))
-            site = (self.cell, self._planned(), self.settings)
-            decision = FurtherMeasuring(*site, d, run.plans, rng, say).decide()
+            cell, settings = self._planned(), self.settings
+            decision = FurtherMeasuring(cell, settings, d, run.plans, rng, say).decide()
             plan = decision.plan if decision.measures else None
             if plan is not None:
                 plan = run.with_new_names(plan)  # `run` checks every motion of it
@@ -243,7 +245,7 @@ class Procedure:
             fitted, rng = o.fitted_readings(record), self._rng(_VALIDATING)
             reference = state.reference_in(o.file)
             plan = validation_plan(
-                self.cell, self.config, calibration, fitted, reference, self.settings, rng, say
+                self.cell, calibration, fitted, reference, self.settings, rng, say
             )
             self._create(self.files.validation, VALIDATION, plan, o)
         return plan
@@ -298,9 +300,7 @@ class Procedure:
             readings = self._readings(o, record, unseen)
             measured_plan = read_plan(unseen.about(PLAN) or "", f"{unseen.path}, its plan")
             reference, rng = state.reference_of(measured_plan), self._rng(_CORRECTING)
-            plan = corrected_plan(
-                self.cell, self.config, calibration, readings, reference, rng, say
-            )
+            plan = corrected_plan(self.cell, calibration, readings, reference, rng, say)
             self._create(self.files.corrected, CORRECTED, plan, o)
         return plan
 
@@ -324,10 +324,10 @@ class Procedure:
     def _rng(self, *stream: int) -> np.random.Generator:
         return np.random.default_rng([self.settings.seed, *stream])
 
-    def _planned(self) -> CellConfig:
-        """Return the configuration for planning, with the kind of readings that is fitted."""
+    def _planned(self) -> Cell:
+        """Return the cell for planning, with the kind of readings that is fitted."""
         planning = self.config.planning.model_copy(update={"readings": self.settings.readings})
-        return self.config.model_copy(update={"planning": planning})
+        return self.cell.with_config(self.config.model_copy(update={"planning": planning}))
 
     def _record(self, o: Campaign) -> RevisionRecord:
         refined = ProcedureLog(o.file).last(state.REFINED)
@@ -345,7 +345,9 @@ class Procedure:
         all_known = (True,) * len(model.cell.known_targets)
         cell = replace(model.cell, registration_known=True)
         cell = cell.with_targets(cell.all_targets, all_known)
-        readings = full_readings(file.readings(), file.about(COVERS_KEY), cell, o.config)
+        readings = full_readings(
+            file.readings(), file.about(COVERS_KEY), cell.with_config(o.config)
+        )
         scatter = record.parameters_json.get("arm_scatter")
         if scatter is None:
             return readings
@@ -374,22 +376,21 @@ def with_origin(chosen: Planned) -> Plan:
 
 def checked_plan(
     cell: Cell,
-    config: CellConfig,
     poses: int,
     rng: np.random.Generator,
     catalogue: Catalogue,
     say: Say,
 ) -> CheckedPlan:
     """Choose a plan, each pose under every load that it bears; check all motions."""
-    chosen = plan_readings(cell, config, PlanRequest(poses), rng, None, say, catalogue)
-    summary = summarise(chosen, config, rng, say, compare=False)
+    chosen = plan_readings(cell, PlanRequest(poses), rng, None, say, catalogue)
+    summary = summarise(chosen, cell.configured(), rng, say, compare=False)
     say("checking every motion in a dry run")
-    return checked(cell, config, with_origin(chosen), summary)
+    return checked(cell, with_origin(chosen), summary)
 
 
-def continued(run: Path, cell: Cell, config: CellConfig, catalogue: Catalogue) -> Procedure:
+def continued(run: Path, cell: Cell, catalogue: Catalogue) -> Procedure:
     """Return the calibration of a campaign file, with the file's settings."""
     with CampaignFile.open(run, read_only=True) as campaign:
         settings, base_dir = state.settings_of(campaign), cell.base_dir.absolute()
-        check_same_cell(campaign, config, base_dir)
-    return Procedure(run, cell, config, base_dir, catalogue, settings)
+        check_same_cell(campaign, cell.configured(), base_dir)
+    return Procedure(run, cell, base_dir, catalogue, settings)

@@ -46,7 +46,6 @@ def recorded_columns(states: States) -> dict[str, Floats]:
 
 def validation_plan(
     cell: Cell,
-    config: CellConfig,
     calibration: Calibration,
     fitted: Readings,
     reference: Floats | None,  # (n,) where loads are changed, rad; None: at the first reading
@@ -63,11 +62,12 @@ def validation_plan(
     load, for deflections also unloaded; for positions "unloaded" is one of the loads, unless
     `settings.under_load` excludes it.
     """
+    config = cell.configured()
     say("drawing poses within what was measured")
     loads, count = _loads(calibration, fitted, settings.under_load), settings.validation
     hung = [load for load in config.loads if load.name in loads]
     tested_config = config.model_copy(update={"loads": tuple(hung)})
-    space = FeasibleSpace(_within(cell, config, fitted.states.q), tested_config)
+    space = FeasibleSpace(_within(cell, fitted.states.q).with_config(tested_config))
     base = fitted.states.q[0] if reference is None else reference
     drawn = draw_poses(space, DRAWS_PER_POSE * count, rng)
     usable = {
@@ -97,7 +97,7 @@ def validation_plan(
         PoseReadings(f"v{i}", (*unloaded, name)) for i, (_, name) in enumerate(selected, start=1)
     ]
     plan = _ordered(space, chosen, drawn.q[[k for k, _ in selected]], base, rng)
-    refuse(dry_run(cell, config, plan), "the validation plan")
+    refuse(dry_run(cell, plan), "the validation plan")
     return replace(plan, about={**plan.about, "purpose": "validation"})
 
 
@@ -110,8 +110,7 @@ def _ordered(
 ) -> Plan:
     """Order the chosen poses with joint values (P, n), from the reference pose (n,)."""
     names, order = [c.pose for c in chosen], Ordering(repeats=0, draws=ORDER_DRAWS)
-    site = (space.cell, space.config)
-    best = order_plan(*site, names, q, reference, chosen, space.passable, rng, order)
+    best = order_plan(space.cell, names, q, reference, chosen, space.passable, rng, order)
     return fewer_returns(best.plan, space)
 
 
@@ -145,9 +144,9 @@ def _loads(calibration: Calibration, fitted: Readings, under_load: bool) -> tupl
     return (UNLOADED, *hung)
 
 
-def _within(cell: Cell, config: CellConfig, q: Floats) -> Cell:
+def _within(cell: Cell, q: Floats) -> Cell:
     """Return the cell with joint limits at the range of the measured joint angles (N, n)."""
-    margin, arm = config.limits.joint_margin_rad + 2e-6, cell.arm
+    margin, arm = cell.configured().limits.joint_margin_rad + 2e-6, cell.arm
     low, high = q.min(axis=0), q.max(axis=0)
     wider = 0.5 * np.maximum(LEAST_RANGE - (high - low), 0.0)
     q_min = np.maximum(arm.q_min, low - wider - margin)
@@ -204,7 +203,6 @@ def points_of(readings: Readings, mode: str) -> CorrectedPoints:
 
 def corrected_plan(
     cell: Cell,
-    config: CellConfig,
     calibration: Calibration,
     validation: Readings,
     reference: Floats | None,  # (n,) reference pose of the validation, rad; else its first reading
@@ -222,7 +220,7 @@ def corrected_plan(
     points, time = points_of(validation, calibration.mode), validation.states.time
     start = 0.0 if time is None else float(time[-1])
     reference = validation.states.q[0] if reference is None else reference
-    space, last = FeasibleSpace(cell, config), validation.states[slice(len(validation) - 1, None)]
+    space, last = FeasibleSpace(cell), validation.states[slice(len(validation) - 1, None)]
     names, q = points.names, validation.states.q[points.rows]
     blocked = _blocked(space, q, reference, points.loads)
     left_out = {names[k]: why for k, why in blocked.items()}
@@ -235,7 +233,7 @@ def corrected_plan(
         order = np.array([names.index(s.pose) for s in plan.steps if s.pose != REFERENCE])
         wrenches = {names[k]: validation.states.wrench[points.rows[k]] for k in keep}
         wrench = np.array([wrenches.get(s.pose, np.zeros(6)) for s in plan.steps])
-        states = expected_states(plan, cell.arm, config, wrench, last, start)
+        states = expected_states(plan, cell.arm, cell.configured(), wrench, last, start)
         at_points = states[np.array([s.pose != REFERENCE for s in plan.steps])]
         result = _compensated(calibration, at_points, points, order)
         reasons = refusals(result, allowed_outside=True)
@@ -244,7 +242,7 @@ def corrected_plan(
         if not refused:
             say("checking every motion in a dry run")
             corrected = _with_targets(plan, points, order, result, left_out)
-            refuse(dry_run(cell, config, corrected), "the run at corrected targets")
+            refuse(dry_run(cell, corrected), "the run at corrected targets")
             return corrected
         left_out |= {names[order[k]]: why for k, why in refused.items()}
     causes = "; ".join(f"{name}: {why}" for name, why in list(left_out.items())[:3])

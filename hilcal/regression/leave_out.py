@@ -63,17 +63,17 @@ class Fold:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LeftOut:
-    """Residuals of each row, predicted by the model without the row's fold."""
+class LeftOutResidual:
+    """Residual of each row, predicted by the model that is fitted without the row's fold."""
 
-    y: Floats  # (R, ...) residuals of the model with the parameters of all rows, or zero
-    solved: tuple[Floats, ...]  # (K, ...) change of the parameters without each fold, by T⁻ᵀ
-    residual: Floats  # (R, ...)
+    y: Floats  # (R, ...) residual before the change of the parameters without each fold
+    solved: tuple[Floats, ...]  # (K, ...) T b of each fold: Tᵀ T b is that change
+    residual: Floats  # (R, ...) residual after it
 
-    def plus(self, other: "LeftOut", factor: float) -> "LeftOut":
-        """Return the same of y and `factor` times another y: all is linear in it."""
+    def plus(self, other: "LeftOutResidual", factor: float) -> "LeftOutResidual":
+        """Return that of y plus `factor` times the other y: all is linear in y."""
         pairs = zip(self.solved, other.solved, strict=True)
-        return LeftOut(
+        return LeftOutResidual(
             self.y + factor * other.y,
             tuple(a + factor * b for a, b in pairs),
             self.residual + factor * other.residual,
@@ -93,7 +93,7 @@ class ModelFolds:
         rows = self.projection.rows
         return tuple(rows[f.left_out_rows] @ f.inverse_root.T for f in self.folds)
 
-    def left_out(self, y: Floats, of_fit: bool = False) -> LeftOut:
+    def left_out(self, y: Floats, of_fit: bool = False) -> LeftOutResidual:
         """Predict each row without its fold.
 
         y (R, ...) are residuals of a model with the parameters zero, or the residual `of_fit`.
@@ -107,7 +107,7 @@ class ModelFolds:
             else:
                 solved.append(fold.inverse_root @ total - lifted.T @ y[out])
             residual[out] -= lifted @ solved[-1]
-        return LeftOut(y, tuple(solved), residual)
+        return LeftOutResidual(y, tuple(solved), residual)
 
 
 def folds(
@@ -153,15 +153,16 @@ class FamilyFolds:
             c = fold.inverse_root @ self.cross - lifted.T @ out
             self._products.append((c, self.gram - out.T @ out - c.T @ c))
 
-    def left_out(self, alone: LeftOut, ridge: float = 0.0) -> Floats:
-        """Return the residual (R, ...) of each row, predicted without its fold with the family.
+    def left_out(self, by_model: LeftOutResidual, ridge: float = 0.0) -> Floats:
+        """Return the residual (R, ...) of each row, predicted without its fold.
 
-        `alone` is the prediction by the model.
+        The family is fitted in addition to the model, whose residual is `by_model`; its parameters
+        have the prior precision `ridge`, in units of the noise.
         """
-        x, y, left = self._x, alone.y, alone.residual.copy()
+        x, y, left = self._x, by_model.y, by_model.residual.copy()
         rhs = x.T @ y
         for fold, lifted, steps, (c, gram) in zip(
-            self._model.folds, self._model.lifted, alone.solved, self._products, strict=True
+            self._model.folds, self._model.lifted, by_model.solved, self._products, strict=True
         ):
             rows = fold.left_out_rows
             h, b = gram.copy(), rhs - x[rows].T @ y[rows] - c.T @ steps

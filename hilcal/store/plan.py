@@ -26,6 +26,8 @@ REFERENCE = "reference"
 """The pose of drift checks and load changes."""
 SEEN = "reference_seen_m"
 """Key of `Plan.about`: where the unloaded target was seen at the reference pose, sensor axes, m."""
+ARM = "robot"
+"""Key of `Plan.about`: the name of the arm that the plan was made for."""
 LEFT_OUT = "left_out"
 """Key of `Plan.about`: points that are not measured, each with the reason."""
 

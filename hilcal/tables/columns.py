@@ -115,7 +115,8 @@ def check_header(
     """Refuse a header that does not fit an arm; `spare` columns may be missing."""
     for k, name in enumerate(header, start=1):
         if not 0 < len(name) <= 80:
-            raise InputError(f"{path}: column {k} has no name, or a long one, in row 1")
+            index = "; an index? pandas leaves it out by to_csv(..., index=False)" * (not name)
+            raise InputError(f"{path}: column {k} has no name, or a long one, in row 1{index}")
         if (count := header.count(name)) > 1:
             raise InputError(f"{path}: column '{name}' appears {count} times; keep one")
     valid, needed = known_columns(units), required_columns(units)

@@ -339,19 +339,17 @@ def _instrument_covariance(
 
 
 def named_loads(readings: Readings, config: CellConfig) -> tuple[Readings, tuple[str, ...]]:
-    """Give the loads of a table without forces the wrench of the cell's `[[loads]]`, by name."""
+    """Give loads without force in a table the wrench of the cell's `[[loads]]`, by name."""
 
     def plain(name: str) -> str:
         return "".join(name.split()).casefold()
 
     s, gravity = readings.states, np.asarray(config.robot.gravity_m_s2)
-    if s.wrench.any():
-        return readings, ()
     wrenches = {plain(load.name): load.wrench(gravity) for load in config.loads}
     wrench, notes = s.wrench.copy(), []
     for k in np.unique(readings.load):
         name = readings.load_names[k]
-        if name == UNLOADED:
+        if name == UNLOADED or s.wrench[readings.load == k].any():
             continue
         where = "is not stated by the table, nor by [[loads]] of the cell: it is taken as none"
         if plain(name) in wrenches:

@@ -18,7 +18,7 @@ MOST_S = 0.25 * POLL_S
 def test_a_sample_with_a_load_and_obstacles(benchmark, claim):
     bench = Bench()
     config = bench.config.model_copy(update={"obstacles": (Obstacle(**TABLE),)})
-    guard = Guard(bench.cell, config)
+    guard = Guard(bench.cell.with_config(config))
     sample = replace(bench.rig.arm.sample(), q=np.array(POSES["p1"]))
     found = benchmark(guard.check, sample, np.zeros(6), "3kg")
     assert found is None

@@ -101,19 +101,6 @@ def test_units_are_read_as_people_write_them(words, tmp_path, capsys):
     assert [(x.mass_kg, x.force_N[0]) for x in c.loads] == [(0.0, 80.0), (0.5, 0.0)]
 
 
-@pytest.mark.slow
-def test_the_steps_that_it_names(tmp_path, capsys):
-    path, plan, out = (tmp_path / n for n in ("CELL.toml", "plan.json", "rehearsal.hilcal"))
-    said = " ".join(ok(capsys, "init", path, "--robot", "ur3").out.split())
-    assert f"hilcal plan {path} -o plan.json" in said
-    ok(capsys, "plan", path, "-o", plan, "--quick", "--poses", "5")
-    assert f"hilcal run {path} --plan plan.json --rehearse -o rehearsal.hilcal" in said
-    ok(capsys, "run", path, "--plan", plan, "--rehearse", "-o", out)
-    assert "once it has [robot] driver and [robot] host and [tracker] driver" in said
-    assert f"[tracker] port: hilcal check {path} --plan plan.json" in said
-    assert "[robot] driver is missing" in run(capsys, "check", path, "--plan", plan).err
-
-
 def test_nothing_is_overwritten_unasked(tmp_path, capsys):
     path = tmp_path / "CELL.toml"
     path.write_text("mine", encoding="utf-8")

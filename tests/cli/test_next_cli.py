@@ -1,10 +1,7 @@
 """`next`, a further plan in the same campaign, and `demo --ambiguous`."""
 
-import os
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -31,9 +28,8 @@ from hilcal.workbench.session import WorkbenchSession
 from tests.cli.test_until_goal import site
 from tests.support.campaigns import configuration
 from tests.support.cli_cases import CELL, imported, ok, refused, stored_readings
-from tests.support.next_cases import SMALL, doubtful
+from tests.support.next_cases import SMALL, doubtful, fine_error
 from tests.unit.data.test_run_log import MADE, STEPS, _campaign, _reading
-from tests.unit.design.test_next import fine_error
 
 TILT, LINK, BASE = "joint_tilt_compliance", "link_compliance", "base_compliance"
 
@@ -215,12 +211,6 @@ def in_doubt_at_first(seed, path):
     return d.verdict == "ambiguous" and case.choice in in_doubt(d)
 
 
-@pytest.mark.long
-def test_an_ambiguous_demo_is_in_doubt(tmp_path, monkeypatch):
-    monkeypatch.setattr(demo, "NOISE_DRAWS", 2)
-    assert in_doubt_at_first(2, tmp_path / "x")
-
-
 @pytest.mark.slow
 def test_every_ambiguous_demo_is_in_doubt(tmp_path):
     assert all(in_doubt_at_first(seed, tmp_path / "x") for seed in range(10))
@@ -237,7 +227,6 @@ def test_a_case_without_a_doubt_is_told(tmp_path, monkeypatch):
 
 
 __all__ = ["site"]
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def made(*names, shift=0.0):
@@ -314,35 +303,6 @@ def test_what_was_not_measured_before_is_given_up(tmp_path):
         assert log.plan.steps == (*STEPS[:3], *fitted.steps)
         assert log.plan.without(log.done()).steps == fitted.steps
         assert log.plan.pose_names == ("p1-2", "p7", "p1", "p2")
-
-
-_KILLED = """
-import os, sys
-from pathlib import Path
-from tests.cli.test_next_cli import made
-from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.run_log import RunLog
-with CampaignFile.open(Path(sys.argv[1])) as campaign:
-    log = RunLog(campaign)
-    log.append(log.with_new_names(made("p8", "p9")))
-    os._exit(9)
-"""
-
-
-@pytest.mark.long
-def test_an_appended_plan_survives_a_kill(tmp_path):
-    path = tmp_path / "run.hilcal"
-    _campaign(path).close()
-    search = str(ROOT)
-    child = subprocess.run(
-        [sys.executable, "-c", _KILLED, path],
-        env={**os.environ, "PYTHONPATH": search},
-        timeout=60,
-        check=False,
-    )
-    assert child.returncode == 9
-    with CampaignFile.open(path) as campaign:
-        assert RunLog(campaign).plans[1].pose_names == ("p8", "p9")
 
 
 # the command

@@ -123,30 +123,6 @@ def test_nothing_to_carry_over(run, tmp_path, capsys):
 
 
 @pytest.mark.long
-def test_what_a_diagnosis_says(run, tmp_path, capsys):
-    ok(capsys, "add", run, "hysteresis")
-    ok(capsys, "add", run, "tool_compliance")
-    said = ok(capsys, "diagnose", run).out
-    follow(capsys, said, "hilcal remove RUN tool_compliance", RUN=run)
-    assert "hilcal remove" not in ok(capsys, "diagnose", run).out
-
-
-@pytest.mark.long
-def test_what_next_says(tmp_path, capsys):
-    cell, plan = tmp_path / "cell.toml", tmp_path / "PLAN.json"
-    cell.write_text(re.sub(r"candidates = \d+", "candidates = 60\nagainst = []", CELL.read_text()))
-    run = imported(tmp_path / "run.hilcal", "nothing")
-    ok(capsys, "identify", run)
-    said = refused(capsys, 4, "next", run, "-o", plan)
-    places = {"CELL.toml": cell, "PLAN.json": plan}
-    follow(capsys, said, f"hilcal plan CELL.toml -o PLAN.json --after {run}", **places)
-    run = imported(tmp_path / "one.hilcal")
-    ok(capsys, "identify", run)
-    said = refused(capsys, 4, "next", run, "-o", tmp_path / "n.json")
-    follow(capsys, said, f"hilcal add {run} hysteresis")
-
-
-@pytest.mark.long
 def test_what_a_comparison_says(run, tmp_path, capsys):
     later = imported(tmp_path / "later.hilcal", "creep", poses=9)
     ok(capsys, "identify", run)

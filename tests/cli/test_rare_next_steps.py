@@ -1,7 +1,6 @@
 """Next steps that messages name in states that are reached less often; see test_next_steps."""
 
 import html
-import inspect
 import re
 from dataclasses import replace
 
@@ -16,10 +15,7 @@ from hilcal.discovery.discovery import Discovery
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.present.diagnosis import addition_lines, no_law_sentence
 from hilcal.present.story import build_story
-from hilcal.present.viewer import live
-from hilcal.present.viewer.live import GUIDE
 from hilcal.procedure.next_plan import doubt_to_settle
-from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.parquet_stream import open_stream
@@ -119,18 +115,6 @@ def test_an_addition_that_breaks_its_promise(run, capsys):
     follow(capsys, said, "hilcal remove RUN hysteresis", RUN=run)
 
 
-@pytest.mark.long
-def test_joints_that_differ(tmp_path, capsys):
-    path = imported(tmp_path / "run.hilcal", "nothing")
-    common = ("--effects", "base_frame,joint_compliance(joints=common)")
-    ok(capsys, "identify", path, *common)
-    each, plan = "joint_compliance(joints=each)", tmp_path / "n.json"
-    follow(capsys, refused(capsys, 4, "next", path, "-o", plan), f"hilcal add {path} '{each}'")
-    ok(capsys, "identify", path, *common)
-    follow(capsys, ok(capsys, "diagnose", path).out, f'hilcal add RUN "{each}"', RUN=path)
-    assert "Let joints differ" not in ok(capsys, "diagnose", path).out
-
-
 PLAN_AFTER = "hilcal plan CELL.toml -o PLAN.json --after {run}"
 
 
@@ -174,10 +158,6 @@ def test_a_law_that_effects_explain_as_well(run, capsys):
 
 @pytest.mark.long
 def test_what_a_recording_names(run, tmp_path, capsys):
-    assert "`hilcal refine` does, afterwards" in GUIDE
-    assert "hilcal refine says what" in inspect.getsource(live)
-    with pytest.raises(InputError, match="run hilcal identify first"):
-        build_story([])
     ok(capsys, "identify", run, "--scaling", "gu")
     with Campaign.open(run) as o:
         assert (
@@ -202,17 +182,6 @@ def test_a_stream_of_several_targets(run, tmp_path, capsys):
     cell.write_text(re.sub(r"(?m)^target_m = (.*)$", one, CELL.read_text()))
     frame.to_parquet(path)
     ok(capsys, "import", path, "--config", cell, "-o", tmp_path / "t.hilcal")
-
-
-@pytest.mark.long
-def test_deflections_are_compared_after_a_fit_of_absolute_readings(run, tmp_path, capsys):
-    ok(capsys, "identify", run, "--readings", "deflection")
-    readings = rehearsal("hysteresis", 2, 8).readings
-    write_table(readings[readings.unloaded], csv := tmp_path / "bare.csv", INSTRUMENT_AND_ARM)
-    ok(capsys, "import", csv, "--config", CELL, "-o", bare := tmp_path / "bare.hilcal")
-    said = refused(capsys, 2, "compare", run, bare)
-    follow(capsys, said, f"hilcal identify '{run}' --readings absolute")
-    ok(capsys, "compare", run, bare)
 
 
 def test_sections_of_a_cell(tmp_path, capsys):

@@ -167,7 +167,7 @@ def others(config, directory):
     """Somebody else's tables: one in the exchange format, one as a spreadsheet in their units."""
 
     plan = plan_readings(
-        cell_from_config(config), config, PlanRequest(8), np.random.default_rng(2)
+        cell_from_config(config), PlanRequest(8), np.random.default_rng(2)
     ).ordered.plan
     r = readings(config, plan, 5)
     write_table(r, directory / "readings.csv", INSTRUMENT_AND_ARM)

@@ -39,7 +39,7 @@ def config_of(**planning):
 
 def rule(text, c, **planning):
     """A rule for which fits take no time."""
-    return GoalRule(text, c.cell, config_of(**planning), now=lambda: 0.0)
+    return GoalRule(text, c.cell.with_config(config_of(**planning)), now=lambda: 0.0)
 
 
 # what is judged
@@ -164,7 +164,7 @@ def test_fits_take_a_tenth_of_the_time(monkeypatch):
         return real(*arguments)
 
     monkeypatch.setattr(goal_rule, "fit", slow)
-    told = GoalRule("joint std < 1 %", c.cell, config_of(), now=lambda: at[0])
+    told = GoalRule("joint std < 1 %", c.cell.with_config(config_of()), now=lambda: at[0])
     order = np.argsort(~c.readings.unloaded, kind="stable")
     readings = c.readings[order]
     for count in range(9, len(readings) + 1):
@@ -302,7 +302,7 @@ def test_a_worker_of_many_measures_in_a_thread(site):
 
     def measured():
         with create_run(path, bench.config, site.directory, site.plan) as campaign:
-            return running.measure(terminal(True), bench.config, bench.cell, campaign)
+            return running.measure(terminal(True), bench.cell, campaign)
 
     with ThreadPoolExecutor(1) as pool:
         assert pool.submit(measured).result() == len(site.plan.steps)

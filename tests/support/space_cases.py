@@ -160,7 +160,7 @@ def cell(**sections):
 
 
 def space_of(config):
-    return FeasibleSpace(cell_from_config(config), config)
+    return FeasibleSpace(cell_from_config(config))
 
 
 def drawn_of(config, count=40, seed=0, **how):

@@ -6,9 +6,9 @@ from hilcal.design.feasible import FeasibleSpace, draw_poses
 from hilcal.design.run_order import Ordering, PoseReadings, order_plan
 
 
-def spread_plan(cell, config, count, rng, repeats=2):
+def spread_plan(cell, count, rng, repeats=2):
     """Return a plan of `count` poses in the shortest order; every pose bears every load."""
-    space = FeasibleSpace(cell, config)
+    space = FeasibleSpace(cell)
     drawn = draw_poses(space, 30 * (count + 1), rng, min_poses=count + 1)
     q = drawn.q[drawn.allowed.all(axis=1)]
 
@@ -25,4 +25,4 @@ def spread_plan(cell, config, count, rng, repeats=2):
     names = [f"p{k + 1}" for k in range(count)]
     chosen = [PoseReadings(name, space.loads) for name in names]
     how = Ordering(slack=0.0, unloaded="first", repeats=repeats)
-    return order_plan(cell, config, names, poses, q[home], chosen, space.passable, rng, how).plan
+    return order_plan(cell, names, poses, q[home], chosen, space.passable, rng, how).plan

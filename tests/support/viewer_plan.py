@@ -83,7 +83,7 @@ BARE = PlanSummary(3, 10, {UNLOADED: 10}, Duration(1.0, 2.0, 0.0), "made by hand
 def configured(**sections):
     told = load_config(CELL).model_dump(mode="json", exclude_none=True)
     config = CellConfig.model_validate(told | sections)
-    return cell_from_config(config), config
+    return cell_from_config(config)
 
 
 def target(cell, pose):
@@ -93,7 +93,7 @@ def target(cell, pose):
 @pytest.fixture(scope="module")
 def shadowed():
     """A screen stands between the tracker and the target in pose p1; a pillar stands apart."""
-    cell, _ = configured()
+    cell = configured()
     middle = 0.45 * target(cell, 1) + 0.55 * TRACKER
     return configured(
         obstacles=[
@@ -107,7 +107,7 @@ def shadowed():
 @pytest.fixture(scope="module")
 def recording(shadowed, tmp_path_factory):
     path = tmp_path_factory.mktemp("plan") / "plan.rrd"
-    record_plan(*shadowed, PLAN, SUMMARY, path)
+    record_plan(shadowed, PLAN, SUMMARY, path)
     return path
 
 

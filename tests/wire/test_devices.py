@@ -50,7 +50,7 @@ def there(request, tmp_path_factory):
     limits = config.limits.model_copy(update={"workspace_min_m": (-3.0, -3.0, 0.05)})
     config = config.model_copy(update={"simulation": simulation, "robot": robot, "limits": limits})
     cell = cell_from_config(config, base_dir)
-    plan = spread_plan(cell, config, 4, np.random.default_rng(0))
+    plan = spread_plan(cell, 4, np.random.default_rng(0))
     secret = case_of_plan(config, plan, "nothing", 3, base_dir=base_dir)
     with simulated_cell(secret, 3, base_dir, tmp_path_factory.mktemp("cell")) as running:
         yield running.config, secret.cell

@@ -95,7 +95,7 @@ class NoiseEstimate:
 
 
 def with_estimated_noise(
-    imported: ImportResult, cell: Cell, config: CellConfig
+    imported: ImportResult, cell: Cell
 ) -> tuple[ImportResult, NoiseEstimate | None]:
     """Return an import with estimated noise where nobody states it, and the estimate.
 
@@ -104,8 +104,8 @@ def with_estimated_noise(
     readings are fewer than `FEWEST_POSES` or show several effects, or where nothing can be fitted
     to them as they are described.
     """
-    readings, station = imported.readings, config.tracker.station_m
-    components = None if imported.noise_stated else _components(readings, cell, config)
+    readings, station = imported.readings, cell.configured().tracker.station_m
+    components = None if imported.noise_stated else _components(readings, cell)
     if components is None:
         return imported, None
     factors, estimate = components.factors, components.estimate(readings, station)
@@ -117,11 +117,12 @@ def with_estimated_noise(
     return replace(imported, readings=estimated, covers=covers, notes=notes), estimate
 
 
-def measured_noise(readings: Readings, cell: Cell, config: CellConfig) -> NoiseEstimate | None:
+def measured_noise(readings: Readings, cell: Cell) -> NoiseEstimate | None:
     """Return the noise of measured readings that contradict their samples, with its factors.
 
     None where the cell states it, where samples show it, or as of `with_estimated_noise`.
     """
+    config = cell.configured()
     if config.tracker.states_noise:
         return None
     station = config.tracker.station_m
@@ -129,7 +130,7 @@ def measured_noise(readings: Readings, cell: Cell, config: CellConfig) -> NoiseE
         default = with_noise_of(config.tracker, readings)
     except InputError:  # a reading at the station
         return None
-    components = _components(default, cell, config)
+    components = _components(default, cell)
     if components is None:
         return None
     factors = {k: f for k, f in components.factors.items() if k not in (SCATTER, ARM_AS_STATED)}
@@ -178,13 +179,13 @@ class _Components:
         )
 
 
-def _components(readings: Readings, cell: Cell, config: CellConfig) -> _Components | None:
+def _components(readings: Readings, cell: Cell) -> _Components | None:
     if len(np.unique(readings.pose)) < FEWEST_POSES or readings.scalar.any():
         return None
     mode, share = usual_mode(readings), MOST_ROWS / readings.value.size
     readings = readings[some_poses(readings, share, SEED, FEWEST_POSES)]
     try:
-        return _estimated(baseline(cell, readings, mode), readings, config)
+        return _estimated(baseline(cell, readings, mode), readings, cell.configured())
     except (HilcalError, np.linalg.LinAlgError):  # the fit says why
         return None
 

@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 
 from hilcal import numbers
 from hilcal.cell import Cell
-from hilcal.config import CellConfig, Obstacle
+from hilcal.config import Obstacle
 from hilcal.design.next import PairPower
 from hilcal.design.run_order import pace, timeline
 from hilcal.design.summary import PlanSummary
@@ -85,11 +85,11 @@ class PlanView:
     def __init__(
         self,
         cell: Cell,
-        config: CellConfig,
         plan: Plan,
         summary: PlanSummary,
         powers: tuple[PairPower, ...] = (),
     ) -> None:
+        config = cell.configured()
         arm, loads, steps = cell.arm, plan.loads, plan.steps
         if (has := plan.q.shape[1]) != arm.n:
             why = f"{has} joint angles per pose; {arm.name} has {arm.n} joints"
@@ -97,7 +97,7 @@ class PlanView:
         self.cell, self.config, self.plan = cell, config, plan
         self.summary, self.powers = summary, powers
         self.reach = max(arm.reach, 0.1)  # m, scale of drawn sizes
-        self.shapes = Clearance(cell, config)  # the shapes of the collision check
+        self.shapes = Clearance(cell)  # the shapes of the collision check
         self.view = self.shapes.sight
         # (3,) position of the tracker; None: unknown
         self.tracker = None if self.view is None else self.view.tracker
@@ -318,7 +318,6 @@ def _loads(rec: rr.RecordingStream, d: PlanView) -> None:
 
 def record_plan(
     cell: Cell,
-    config: CellConfig,
     plan: Plan,
     summary: PlanSummary,
     path: Path,
@@ -331,7 +330,7 @@ def record_plan(
     recordings. `powers` of the pairs of suspects that the plan separates are shown first. Raises as
     `PlanView` and `recording.write`.
     """
-    d = PlanView(cell, config, plan, summary, powers)
+    d = PlanView(cell, plan, summary, powers)
     rec = recording.content_stream(d.config.to_json(), d.plan.to_json(), d.summary, d.powers)
     recording.write(rec, blueprint(d), lambda: _log(rec, d), Path(path))
 

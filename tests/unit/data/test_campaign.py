@@ -277,14 +277,6 @@ def test_damaged_bytes_never_give_wrong_data(tmp_path):
     assert noticed > 20
 
 
-def test_a_second_writer_waits_or_is_told(tmp_path):
-    path = make(tmp_path / "run.hilcal", simple_readings(2))
-    with CampaignFile.open(path) as one, CampaignFile.open(path) as two:
-        one.append_readings(replace(simple_readings(1), pose_names=("a",)))
-        two.append_readings(replace(simple_readings(1), pose_names=("b",)))
-        assert one.readings().pose_names == ("p0", "p1", "a", "b")
-
-
 @pytest.mark.parametrize(
     "words", ["attempt to write a readonly database", "unable to open database file"]
 )

@@ -166,10 +166,6 @@ def test_what_is_not_a_plan_is_refused_in_one_line(case, given, tmp_path):
     refuses(case, lambda: load_plan(path), path)
 
 
-def test_a_missing_plan_names_the_command(tmp_path):
-    refusal("hilcal plan", load_plan, tmp_path / "no.json")
-
-
 def test_an_interrupt_between_a_transaction_s_begin_and_its_block_leaves_nothing(
     tmp_path, monkeypatch
 ):

@@ -78,7 +78,7 @@ JOINTS = tuple(f"joint_compliance.j{k}" for k in range(1, 7))
 
 def as_stated(c, config, found, rel, names):
     """What a plan predicts for the readings of a campaign is what the fit to them states."""
-    p = problem_of(c.cell, config, poses_in(c.readings))
+    p = problem_of(c.cell.with_config(config), poses_in(c.readings))
     foreseen = predicted_uncertainty(p, everything_once(p)).by_name()
     stated = dict(zip(foreseen, found.uncertainty.formal, strict=True))
     for name in names:
@@ -99,7 +99,7 @@ def test_parameters_and_positions_scatter_as_predicted(mode):
     cell = cell_of(registration_known=True)
     config = config_of(mode, work_load="10kg")
     q = poses_of(10, 5)
-    a = nominal_model(cell, config)
+    a = nominal_model(cell.with_config(config))
     p = problem(a, config, q)
     work = prediction_poses(a, config, poses_of(12, 6))
     expected = predicted_uncertainty(p, everything_once(p), work=work)
@@ -129,8 +129,8 @@ def test_a_deflection_unit_is_a_pose_whose_place_is_unknown(name, seed):
     cell = odd_cell(arm_of(name))
     q = rng.uniform(-2, 2, (2, cell.arm.n))
     d = config_of("deflection", against=("joint_tilt_compliance", "base_compliance"))
-    units = problem_of(cell, d, q)
-    a = nominal_model(cell, d)
+    units = problem_of(cell.with_config(d), q)
+    a = nominal_model(cell.with_config(d))
     # The same readings as positions, in the deflections' scales.
     ab = config_of("absolute")
     states = nominal_states(np.repeat(q, 5, axis=0), np.tile(units.candidates.wrench, (2, 1)))
@@ -199,7 +199,7 @@ def test_averaging_leaves_the_systematic_share(m):
     rng = np.random.default_rng(2)
     acquire, still = {"systematic_share": 0.3, "samples": 5}, {"joint_std_rad": 0.0}
     config = changed(config_of(noise="averaged"), acquire=acquire, repeatability=still)
-    a = nominal_model(cell_of(registration_known=True), config, m)
+    a = nominal_model(cell_of(registration_known=True).with_config(config), m)
     states = nominal_states(poses_of(1), np.zeros((1, 6)))
     prediction = a.model.predict(states, a.theta)
     one = changed(config, acquire={"systematic_share": 1.0})
@@ -217,7 +217,7 @@ def test_averaging_leaves_the_systematic_share(m):
 
 def test_units_are_what_may_be_taken():
     config, cell = config_of("deflection"), cell_of(registration_known=True)
-    a = nominal_model(cell, config)
+    a = nominal_model(cell.with_config(config))
     names = [load.name for load in config.loads]
     allowed = np.ones((4, 5), dtype=bool)
     allowed[1, 2] = False  # not the 10 kg
@@ -237,7 +237,7 @@ def test_units_are_what_may_be_taken():
             other = free.units.rows[free.contents.index(what)]
             assert np.any(other)
             assert p.units.rows[k] == pytest.approx(other, abs=1e-12)
-    single = problem_of(cell, config_of("absolute"), poses_of(4), allowed=allowed)
+    single = problem_of(cell.with_config(config_of("absolute")), poses_of(4), allowed=allowed)
     assert sum(1 for _ in single.contents) == allowed.sum()
     assert single.units.cost == pytest.approx(np.ones(len(single.units)))
     assert (2, ("none",)) not in single.contents
@@ -245,7 +245,7 @@ def test_units_are_what_may_be_taken():
 
 def test_problems_that_cannot_be():
     config, cell = config_of("deflection"), cell_of(registration_known=True)
-    a = nominal_model(cell, config)
+    a = nominal_model(cell.with_config(config))
     with pytest.raises(CannotAnswerError, match="both unloaded and under a load"):
         problem(a, config, poses_of(3), np.zeros((3, 5), dtype=bool))
     with pytest.raises(CannotAnswerError, match="no candidate pose may be taken"):
@@ -253,15 +253,15 @@ def test_problems_that_cannot_be():
     bare = config.model_copy(update={"loads": ()})
     refusal(r"needs \[\[loads\]\]", problem, a, bare, poses_of(3))
     with pytest.raises(InputError, match=r"model: unknown effect 'joint_complience'.*valid:"):
-        nominal_model(cell, config_of(model=("joint_complience",)))
+        nominal_model(cell.with_config(config_of(model=("joint_complience",))))
     with pytest.raises(InputError, match="against: unknown effect 'ghost'"):
-        problem_of(cell, config_of(against=("ghost",)), poses_of(3))
+        problem_of(cell.with_config(config_of(against=("ghost",))), poses_of(3))
 
 
 def test_what_cannot_be_seen_has_no_uncertainty():
     """One load along one axis: some joints are never turned by it."""
     config, cell = config_of("deflection"), cell_of(registration_known=True)
-    a = nominal_model(cell, config)
+    a = nominal_model(cell.with_config(config))
     p = problem(a, config, poses_of(1))
     only = np.array([float(loads == ("5kg",)) for _, loads in p.contents])
     work = prediction_poses(a, config, poses_of(5))
@@ -275,7 +275,9 @@ CELL = cell_of(registration_known=True)
 
 
 def made(mode="deflection", against="catalogue", poses=40, **planning):
-    return problem_of(CELL, config_of(mode, against=against, **planning), poses_of(poses))
+    return problem_of(
+        CELL.with_config(config_of(mode, against=against, **planning)), poses_of(poses)
+    )
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -321,8 +323,10 @@ def test_a_load_that_no_pose_bears_is_as_good_as_none():
     q, loads = poses_of(30), len(config.loads)
     allowed = np.ones((30, 1 + loads), dtype=bool)
     allowed[:, -1] = False
-    borne = problem_of(CELL, config, q, allowed=allowed)
-    without = problem_of(CELL, config.model_copy(update={"loads": config.loads[:-1]}), q)
+    borne = problem_of(CELL.with_config(config), q, allowed=allowed)
+    without = problem_of(
+        CELL.with_config(config.model_copy(update={"loads": config.loads[:-1]})), q
+    )
     assert borne.contents == without.contents
     assert borne.terms == without.terms
     np.testing.assert_allclose(*(p.information(np.ones(len(p.contents))) for p in (borne, without)))
@@ -346,7 +350,7 @@ def test_asked_for_effects_that_the_order_tells_are_taken_at_random():
 def test_derivatives_where_the_robot_works():
     for mode, load in (("absolute", "none"), ("absolute", "10kg"), ("deflection", "10kg")):
         config = config_of(mode, work_load=load)
-        a = nominal_model(CELL, config)
+        a = nominal_model(CELL.with_config(config))
         q = poses_of(3)
         work = prediction_poses(a, config, q)
         wrench = next((x.wrench(CELL.gravity) for x in config.loads if x.name == load), np.zeros(6))
@@ -370,7 +374,7 @@ def test_derivatives_where_the_robot_works():
 
 def test_unloaded_work_with_deflections_is_under_each_load():
     config = config_of("deflection")
-    a = nominal_model(CELL, config)
+    a = nominal_model(CELL.with_config(config))
     work = prediction_poses(a, config, poses_of(3))
     assert work.description == "deflection under each load at 3 feasible poses"
     assert len(work.q) == 12
@@ -380,7 +384,7 @@ def test_unloaded_work_with_deflections_is_under_each_load():
 def test_named_work_and_a_box():
     q = poses_of(2)
     named = config_of("absolute", work_q_rad=tuple(tuple(x) for x in q))
-    a = nominal_model(CELL, named)
+    a = nominal_model(CELL.with_config(named))
     assert prediction_poses(a, named, poses_of(9, 3)).q == pytest.approx(q)
     short = config_of("absolute", work_q_rad=((0.0, 1.0),))
     refusal("2 values; ur10e has 6 joints", prediction_poses, a, short, q)
@@ -408,7 +412,7 @@ def learnt():
 
 def problem_with(prior, names=CARRIED):
     config = changed(configuration(), planning={"model": names, "against": ()})
-    nominal = nominal_model(cell_from_config(config), config, 3, prior=prior)
+    nominal = nominal_model(cell_from_config(config), 3, prior=prior)
     return problem(nominal, config, np.unique(plan(4, 5).states.q, axis=0))
 
 
@@ -460,7 +464,7 @@ def test_predicted_uncertainties_are_those_of_a_fit(what):
     f = fitted_model(cell, readings, "absolute")
 
     _, first = np.unique(readings.pose, return_index=True)
-    of = problem_of(cell, config, readings.states.q[first])
+    of = problem_of(cell.with_config(config), readings.states.q[first])
     assert len(of.contents) == len(first) * 5
     information = of.information(np.ones(len(of.contents))) - of.prior + of.measured
     names = [t.name for t in of.terms]
@@ -501,7 +505,7 @@ def test_sight_and_time_of_each_target():
     q = poses_in(c.readings)
     counts = set()
     for tracker in ([3.0, 0.5, 0.4], [-2.0, 0.0, 0.5], [0.0, 0.0, 2.5]):
-        view = LineOfSight(Clearance(cell, several), np.array(tracker))
+        view = LineOfSight(Clearance(cell.with_config(several)), np.array(tracker))
         seen = np.array([view.target_visible(q, "none", k) for k in range(3)])
         np.testing.assert_array_equal(view.unobstructed(q, "none"), seen.all(axis=0))
         for k in range(len(q)):

@@ -40,7 +40,7 @@ def scene(mode, *, fitted):
         c = campaign(mode=mode, poses=8, seed=3, registration_known=True)
         nominal = model_after(fitted_model(c.cell, c.readings, mode), known)
     else:
-        nominal = nominal_model(cell_of(registration_known=True), known)
+        nominal = nominal_model(cell_of(registration_known=True).with_config(known))
     of = problem(nominal, known, poses_of(6))
     return of, prediction_poses(of.nominal, known, poses_of(5, 9))
 
@@ -126,7 +126,7 @@ def test_what_is_known_very_well_does_not_hide_what_a_reading_tells():
 @pytest.mark.long
 def test_a_plan_for_predictions_is_better_than_random_poses_and_certified():
     known = config("absolute").model_copy(update={"loads": []})
-    nominal = nominal_model(cell_of(registration_known=False), known)
+    nominal = nominal_model(cell_of(registration_known=False).with_config(known))
     nominal = replace(nominal, live=nominal.live[:-6])  # no load tells the compliance
     of = problem(nominal, known, poses_of(80))
     asked = objective_of(of, known, "I", prediction_poses(of.nominal, known, poses_of(30, 9)))

@@ -114,7 +114,13 @@ def test_the_powers_of_a_plan_are_shares_of_rejections():
     """Of what is known and planned for, with the parameters that the readings support."""
     first = doubtful("base_compliance", 2)
     rng, trials = np.random.default_rng(3), 2000
-    asked = (first.rehearsal.cell, SMALL, first.fit, first.suspects, PlanRequest(6), rng)
+    asked = (
+        first.rehearsal.cell.with_config(SMALL),
+        first.fit,
+        first.suspects,
+        PlanRequest(6),
+        rng,
+    )
     found = plan_separating(*asked, reference=first.plan.joints("reference"))
     of, known = found.planned.problem, discriminated_pairs(found.planned.problem).prior
     values, vectors = np.linalg.eigh(known)
@@ -177,7 +183,7 @@ def test_readings_that_do_not_speak_for_an_effect_tell_no_strength():
 def test_pairs_that_no_measurement_separates_are_said_so():
     """In deflections a scale of the tracker is a common factor on all compliances."""
     first = doubtful(TILT, 1)
-    asked = (SMALL, first.fit, ("tracker_scale", LINK), PlanRequest(4), np.random.default_rng(0))
+    asked = (first.fit, ("tracker_scale", LINK), PlanRequest(4), np.random.default_rng(0))
     with pytest.raises(CannotAnswerError, match="no measurement separates them"):
         plan_separating(cell_from_config(SMALL), *asked)
     assert not_separable_message([("a", "b"), ("a", "c"), ("b", "a"), ("c", "d")]) == (
@@ -188,9 +194,9 @@ def test_pairs_that_no_measurement_separates_are_said_so():
 @pytest.mark.parametrize("suspects", [(TILT,), (TILT, TILT)])
 def test_one_suspect_is_refused(suspects):
     first = doubtful(TILT, 1)
-    asked = (SMALL, first.fit, suspects, PlanRequest(4), np.random.default_rng(0))
+    asked = (first.fit, suspects, PlanRequest(4), np.random.default_rng(0))
     with pytest.raises(InputError, match="two or more"):
-        plan_separating(first.rehearsal.cell, *asked)
+        plan_separating(first.rehearsal.cell.with_config(SMALL), *asked)
 
 
 def test_what_was_ambiguous_is_decided():
@@ -242,8 +248,10 @@ def test_the_poses_that_are_planned_end_in_the_effect_that_is_there():
     alone = diagnose(first).pose_alone
     assert alone.effects[0] == "transmission_error"
     config = configuration()
-    made = plan_poses(c.cell, config, first, alone.more, np.random.default_rng(1)).ordered.plan
-    states = planned_states(c.cell, config, made, 5000.0)
+    made = plan_poses(
+        c.cell.with_config(config), first, alone.more, np.random.default_rng(1)
+    ).ordered.plan
+    states = planned_states(c.cell.with_config(config), made, 5000.0)
     number = states.pose + len(before.pose_names)
     after = simulate(c.world, states.states, number, states.load, states.cycle, before.load_names,
                      np.random.default_rng(7))  # fmt: skip
@@ -258,12 +266,14 @@ def test_the_poses_that_are_planned_end_in_the_effect_that_is_there():
 def test_each_pose_is_a_new_one_and_read_unloaded():
     c, before = fine_error()
     first = fitted_model(c.cell, before, "absolute")
-    made = plan_poses(c.cell, configuration(), first, 12, np.random.default_rng(1)).ordered.plan
+    made = plan_poses(
+        c.cell.with_config(configuration()), first, 12, np.random.default_rng(1)
+    ).ordered.plan
     assert len({s.pose for s in made.steps} - {REFERENCE}) == 12
     assert {s.load for s in made.steps} == {UNLOADED}
     assert len(np.unique(np.round(np.concatenate([made.q, before.states.q]), 6), axis=0)) == 13 + 30
     home = made.joints(REFERENCE) + 0.0
-    again = plan_poses(c.cell, configuration(), first, 12, np.random.default_rng(2),
+    again = plan_poses(c.cell.with_config(configuration()), first, 12, np.random.default_rng(2),
                           reference=home).ordered.plan  # fmt: skip
     np.testing.assert_array_equal(again.joints(REFERENCE), home)
 

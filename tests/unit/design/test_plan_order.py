@@ -44,7 +44,9 @@ class World:
 
     def ordered(self, chosen, seed, how=None):
         rng = np.random.default_rng(seed)
-        return order_plan(CELL, CONFIG, self.names, self.q, MIDDLE, chosen, self.passable, rng, how)
+        return order_plan(
+            CELL.with_config(CONFIG), self.names, self.q, MIDDLE, chosen, self.passable, rng, how
+        )
 
 
 def everything(world):
@@ -98,7 +100,7 @@ def test_every_plan_keeps_its_promises(count, blocked, slack, unloaded, every, s
 
     limit = (1.0 + slack) * made.shortest.total
     assert made.duration.total <= limit + 1e-6
-    dry = dry_run(CELL, CONFIG, plan)
+    dry = dry_run(CELL.with_config(CONFIG), plan)
     assert dry.duration == pytest.approx(made.duration.total, rel=1e-9)
     assert dry.remarks == ()
 
@@ -136,7 +138,7 @@ def test_the_pace_is_that_of_the_configuration():
     slow = {"reading_s": 20.0, "load_change_s": 300.0}
     config = CellConfig.model_validate({**CONFIG.model_dump(), "planning": slow})
     poses = (world.names, world.q, MIDDLE, everything(world))
-    made = order_plan(CELL, config, *poses, world.passable, np.random.default_rng(0))
+    made = order_plan(CELL.with_config(config), *poses, world.passable, np.random.default_rng(0))
     assert made.duration.readings == pytest.approx(20.0 * len(made.plan.steps))
     assert made.duration.load_changes == pytest.approx(300.0 * (len(LOADS) + 1))
     split = made.plan.about["duration_s"]
@@ -254,7 +256,7 @@ def test_the_heaviest_of_three_loads_comes_in_the_middle():
 
     poses, how = (world.names, world.q, MIDDLE, chosen), Ordering(slack=0.1)
     for seed in range(3):
-        made = order_plan(CELL, config, *poses, free, np.random.default_rng(seed), how)
+        made = order_plan(CELL.with_config(config), *poses, free, np.random.default_rng(seed), how)
         assert made.plan.loads[2] == "heavy"
 
 

@@ -1,4 +1,4 @@
-"""Suspects: of plausible size, keep their promise, told by gravity, finer than one effect."""
+"""Suspects: plausible, keep their promise, finer than one effect; what could have been seen."""
 
 from dataclasses import replace
 
@@ -10,24 +10,23 @@ from hilcal.diagnosis.effect_ranking import (
     beyond_geometry,
     candidates,
     geometry_columns,
-    kept_by_refit,
-    kept_by_step,
     largest_plausible,
     rank_suspects,
     unloaded_readings,
 )
 from hilcal.diagnosis.evidence import StepwiseAlternatives
+from hilcal.diagnosis.minimum_detectable_effect import least_strength
 from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.effects.catalogue import BUILT_IN
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.errors import InputError
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import effect_columns, linearise
-from hilcal.present.diagnosis import diagnosis_report
+from hilcal.present.diagnosis import detectable_sizes, diagnosis_report
 from hilcal.present.verdict import message
 from hilcal.refinement import refine
+from hilcal.regression.evidence import spectrum
 from tests.support.campaigns import NO_EFFECT, campaign, configuration, measured, plan
 from tests.support.diagnosis_cases import fitted_baseline, studied
 from tests.support.fit_cases import fitted_model
@@ -39,7 +38,7 @@ SECOND_ORDER = {"link_geometry", "encoder_offset", "joint_coupling", "link_mass"
 
 @pytest.mark.parametrize(
     ("law", "robot"),
-    first(1, [("crosswise compliance", "ur5e"), ("compliance by another joint", "ur10e")]),
+    first(0, [("crosswise compliance", "ur5e"), ("compliance by another joint", "ur10e")]),
 )
 def test_no_error_of_second_order_is_named_for_deflections(law, robot):
     d = diagnose(studied("deflection", law, robot=robot, seed=0))
@@ -49,10 +48,6 @@ def test_no_error_of_second_order_is_named_for_deflections(law, robot):
     needed = {unit: rms for unit, rms, _ in geometry.needs}
     assert needed["m"] > 0.01 or needed["rad"] > 0.01
     assert "plausible" in message(d) or d.suspects[0].effect != "link_geometry"
-
-
-def test_every_effect_that_ships_states_what_is_plausible():
-    assert all(1.0 <= kind.plausible < np.inf for kind in BUILT_IN)
 
 
 def test_the_cell_may_allow_more():
@@ -81,20 +76,6 @@ def test_unloaded_readings_bound_what_geometry_may_do_to_deflections():
     true = float(np.sqrt(np.mean((1e3 * off) ** 2)))
     assert true < allowed < 10 * true
     assert largest_plausible(effect_columns(found, e), None) == pytest.approx(e.most())
-
-
-@pytest.mark.parametrize("effect", ["link_geometry", "joint_tilt_compliance"])
-def test_true_effects_keep_their_promise(effect):
-    mode = "absolute" if effect == "link_geometry" else "deflection"
-    c = campaign(effect, mode, 1)
-    found = fitted_baseline(c)
-    p = linearise(found)
-    (s,) = rank_suspects(p, [e for e in candidates(found) if e.name == effect])
-    (e,) = (e for e in candidates(found) if e.name == effect)
-    assert s.passes
-    assert s.plausible
-    assert kept_by_step(p, effect_columns(found, e), s.score) == pytest.approx(1.0, abs=0.1)
-    assert kept_by_refit(found, add(found, effect), s.score) == pytest.approx(1.0, abs=0.15)
 
 
 POSES = 30
@@ -135,19 +116,10 @@ def test_gravity_tells_of_a_compliant_arm():
     assert "joint_compliance" in {s.effect for s in rank_suspects(p, effects) if s.passes}
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_it_is_named_in_absolute_readings(seed):
-    c = campaign("joint_coupling", "absolute", seed, poses=30, strength=2.0)
-    d = diagnose(fitted_baseline(c))
-    assert d.verdict == "missing_effect"
-    assert d.suspects[0].effect == "joint_coupling"
-    assert d.suspects[0].same_as == ()
-
-
 EACH = "joint_compliance(joints=each)"
 
 
-@pytest.fixture(scope="module", params=[1, 2])
+@pytest.fixture(scope="module", params=first(1, [1, 2]))
 def arm(request):
     """An arm whose joints differ, as simulated, and nothing hidden."""
     return campaign(NO_EFFECT, "deflection", request.param, poses=12, registration_known=True)
@@ -187,11 +159,6 @@ def test_refine_lets_them_differ_and_names_no_other_effect(arm):
     assert found.fit.chi2 == pytest.approx(again.chi2, rel=1e-8)
 
 
-def test_a_model_whose_joints_differ_has_no_finer_suspect(arm):
-    found = with_joints(arm, "each")
-    assert not any(e.coarse for e in candidates(found))
-
-
 def test_a_finer_form_is_no_alternative_to_the_effect(arm):
     c = campaign("creep", "deflection", 1, poses=12, strength=3.0)
     found = add(with_joints(c, "each"), "creep")
@@ -224,3 +191,67 @@ def test_finer_is_what_splits_groups_and_keeps_joints(arm, groups):
     if refined is not None:
         assert refined.refines(two)
         assert refined.refined(states) is None
+
+
+ERROR = "transmission_error"
+
+
+def found(poses):
+    c = campaign("none", "absolute", 0, poses=poses, plan_seed=0)
+    return fitted_baseline(c)
+
+
+def test_a_family_is_seen_from_where_poses_left_out_show_it_and_not_finer_than_poses_resolve():
+    f = found(16)  # with 12 it depends on the draw whether any size would be seen
+    p = linearise(f)
+    (e,) = (e for e in candidates(f) if e.name == ERROR)
+    (s,) = rank_suspects(p, [e])
+    of = effect_columns(f, e)
+    units = tuple(q.unit for q in e.parameters)
+    known = p.information(of.white)
+    rank = spectrum(known).rank
+    alone = least_strength(known, of.motion, of.scale, units, f.dof, 1.0, 1e-3, rank)
+    assert s.least.visible
+    assert s.least.displacement_m > alone.displacement_m
+    assert s.least.finest_m == np.inf
+    assert s.least.to_dict()["finer_than_poses"] == {"visible": False, "displacement_m": None}
+    said = [line for line in detectable_sizes(diagnose(f)) if isinstance(line, str)]
+    assert f"A {ERROR} finer than these poses resolve would be seen at no size.\n" in said
+
+
+@pytest.mark.long
+def test_an_effect_of_that_size_is_named_as_often_as_said():
+    """In campaigns of the simulated world; by the F-test alone it was 7 of 24 times."""
+    effect, named = "joint_tilt_compliance", []
+    for seed in range(10):
+        empty = campaign("none", "deflection", seed, poses=20, plan_seed=0)
+        suspects = diagnose(fitted_baseline(empty)).suspects
+        (least,) = (s.least.displacement_m for s in suspects if s.effect == effect)
+        sigma = 1.0
+        for _ in range(3):  # until its rms displacement is the stated one
+            there = campaign(effect, "deflection", seed, poses=20, plan_seed=0, strength=sigma)
+            sigma *= least / displacement(there, empty)
+        there = campaign(effect, "deflection", seed, poses=20, plan_seed=0, strength=sigma)
+        found = diagnose(fitted_baseline(there)).suspects
+        named.append(any(s.effect == effect and s.passes for s in found))
+    assert np.count_nonzero(named) >= 7
+
+
+def displacement(there, empty):
+    """Rms displacement of the deflections by what is hidden, m."""
+    p = plan(20, 0)
+    ideal, bare = (c.world.ideal_readings(p.states).position for c in (there, empty))
+    moved, loaded = ideal - bare, p.load > 0
+    (unloaded,) = np.nonzero(~loaded)
+    first = dict(zip(p.pose[unloaded].tolist(), unloaded.tolist(), strict=True))
+    moved = moved[loaded] - moved[[first[k] for k in p.pose[loaded].tolist()]]
+    return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
+
+
+def test_more_poses_show_smaller_ones():
+    sizes = []
+    for poses in (12, 30):
+        f = found(poses)
+        (e,) = (e for e in candidates(f) if e.name == ERROR)
+        sizes.append(rank_suspects(linearise(f), [e])[0].least.displacement_m)
+    assert sizes[1] < 0.6 * sizes[0]

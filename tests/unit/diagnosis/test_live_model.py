@@ -31,7 +31,7 @@ def told(seed):
     late = c.readings.unloaded & (c.readings.pose % 2 == 1)
     order = np.lexsort((c.readings.pose, c.readings.load, late))
     readings = c.readings[order]
-    live = LiveModel(cell_of(), quiet())
+    live = LiveModel(cell_of().with_config(quiet()))
     out = []
     for k in range(len(readings)):
         same = (readings.pose == readings.pose[k]) & readings.unloaded

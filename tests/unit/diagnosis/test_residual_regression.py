@@ -1,4 +1,4 @@
-"""An effect outside of the catalogue: how much is predictable, by what, and how; by trees."""
+"""An effect outside of the catalogue: how much is predictable, by what; a misfit of poses alone."""
 
 from dataclasses import replace
 
@@ -7,6 +7,8 @@ import pytest
 from sklearn.ensemble import ExtraTreesRegressor
 
 from hilcal.diagnosis import residual_regression as module
+from hilcal.diagnosis.diagnosis import in_doubt
+from hilcal.diagnosis.misfit_breakdown import pose_constants
 from hilcal.diagnosis.residual_regression import (
     LEAF_SIZE,
     PRECISION,
@@ -14,9 +16,15 @@ from hilcal.diagnosis.residual_regression import (
     predict_by_trees,
     residual_regression,
 )
+from hilcal.diagnosis.verdict import diagnose
+from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
+from hilcal.present.verdict import message
 from tests.support.campaigns import campaign, plan
 from tests.support.diagnosis_cases import fitted_baseline
+from tests.support.fit_cases import fitted_model
+from tests.support.next_cases import fine_error
 from tests.support.rows import first
 
 
@@ -106,12 +114,6 @@ def test_its_variable_is_among_the_first_two(name, mode, seeds):
         assert all(each.share > 0.5 for each in found)
 
 
-def test_shares_of_the_variables_add_up_to_the_whole():
-    found = told(hidden("dq2 = F sin q1", "absolute", 3))
-    assert {v.variable for v in found.dependences} == {"joint 1 angle", "load"}
-    assert sum(v.share for v in found.dependences) == pytest.approx(found.share, rel=0.05)
-
-
 @pytest.mark.parametrize("mode", ["absolute", "deflection"])
 def test_noise_is_not_predictable(mode):
     for seed in range(4):
@@ -196,23 +198,6 @@ def test_the_stated_error_is_that_of_other_trees(monkeypatch):
     assert spread == pytest.approx(np.mean([f.std for f in found]), rel=0.6)
 
 
-def test_noise_is_not_predicted():
-    shares = [predict_by_trees(*table(100 + seed, 0.0)).share for seed in range(20)]
-    assert max(shares) < 0.05
-    assert np.mean(shares) < 0
-
-
-def test_trees_are_grown_no_further_than_they_matter():
-    x, y, fold = table(2, 0.5)
-    exact, less = (
-        predict_by_trees(x, y, fold, 3.0),
-        predict_by_trees(x, y, fold, 3.0, other_share=0.95),
-    )
-    assert less.trees == module.TREES < exact.trees
-    assert less.share < 0.95
-    assert predict_by_trees(x, y, fold, 3.0) == exact
-
-
 @pytest.mark.parametrize("how", ["one fold", "no residual", "no rows"])
 def test_nothing_to_learn_from(how):
     x, y, fold = table(3, 1.0)
@@ -223,3 +208,47 @@ def test_nothing_to_learn_from(how):
     else:
         x, y, fold = x[:0], y[:0], fold[:0]
     assert predict_by_trees(x, y, fold) == TreePrediction(0.0, 0.0, 0)
+
+
+def dense(p):
+    """Orthonormal basis (R, K) of the constants beside the model."""
+    f, w = p.fit, p.fit.whitening
+    poses = int(f.pose.max()) + 1
+    raw = np.zeros((len(f.pose), w.m, poses, 3))
+    axes = f.solution.prediction.observation.axes[w.reading]
+    for k, pose in enumerate(f.pose):
+        raw[k, :3, pose] = axes[k]
+    free = p.project_out(w.whiten(raw.reshape(len(raw), w.m, -1)))
+    u, s, _ = np.linalg.svd(free, full_matrices=False)
+    return np.asarray(u[:, s > 1e-6 * s.max()])
+
+
+@pytest.mark.parametrize("mode", ["absolute", "deflection"])
+@pytest.mark.parametrize("effects", [None, ("transmission_error", "joint_compliance")])
+def test_equal_to_dense_columns(mode, effects):
+    c = campaign("creep", mode, 0, poses=12)
+    some = baseline(c.cell, c.readings, mode)
+    model = some if effects is None else with_effects(c.cell, c.readings, mode, effects)
+    p = linearise(fit(model, c.readings, mode))
+    found, u = pose_constants(p), dense(p)
+    assert found.rank == u.shape[1]
+    if mode == "absolute" and effects is None:  # a shift of the base is one of all poses
+        assert found.rank < 36
+    assert found.gain == pytest.approx(float(np.sum((u.T @ p.residual) ** 2)), rel=1e-6)
+    x = np.random.default_rng(0).standard_normal((len(p.residual), 4))
+    assert found.square(x) == pytest.approx(float(np.sum((u.T @ x) ** 2)), rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", [2, *(pytest.param(k, marks=pytest.mark.slow) for k in (0, 6))])
+def test_a_transmission_error_too_fine_for_thirty_poses_is_ambiguous(seed):
+    d = diagnose(fitted_model(*fine_error(seed), "absolute"))
+    assert (d.verdict, d.reason) == ("ambiguous", "pose_alone")
+    assert d.pose_alone.share > 0.95
+    assert d.pose_alone.effects[:2] == ("transmission_error", "link_geometry")
+    # 2 · 40 harmonics of six joints, three elements per pose.
+    assert (d.pose_alone.poses, d.pose_alone.more) == (30, 130)
+    assert "the same under every load of a pose" in message(d)
+    assert d.pose_alone.chance > 0.9
+    assert "130 more poses would decide with a chance of" in message(d)
+    assert in_doubt(d)[:2] == ("transmission_error", "link_geometry")
+    assert d.to_dict()["pose_alone"]["more"] == 130

@@ -70,23 +70,6 @@ def test_intervals_of_a_frame_are_wider_and_of_differences_narrower():
     assert after > 1.5 * before
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("rho", [0.0, 0.5])
-def test_a_drift_is_named_as_one(rho):
-    cell, readings = campaign(rho, hidden="tracker_drift", seed=1, poses=20)
-    found = refined(cell, readings, "absolute")
-    assert found.fit.model.names[2:] == ("tracker_drift",)
-    assert (found.fit.readings.serial is None) == (rho == 0.0)
-
-
-@pytest.mark.long
-def test_an_effect_is_named_beside_it():
-    cell, readings = campaign(0.9, hidden="link_geometry", seed=2, poses=12)
-    found = refined(cell, readings, "absolute")
-    assert "link_geometry" in found.fit.model.names
-    assert found.fit.readings.serial is not None
-
-
 def test_a_fit_with_it_is_found_again():
     cell, readings = campaign(0.9, "deflection")
     found = with_serial_noise(fitted_model(cell, readings, "deflection"))

@@ -106,7 +106,7 @@ def test_a_tool_elsewhere_than_stated_is_named():
 
 
 @pytest.mark.parametrize(
-    "effect", first(2, ["wrench_gain", "link_mass", "load_point", "joint_stiffening"])
+    "effect", first(1, ["link_mass", "wrench_gain", "load_point", "joint_stiffening"])
 )
 def test_effects_are_no_wrong_figures(effect):
     """Of 63 campaigns with 19 effects of 3 and 6 σ, none was one, nor on the way to the model."""
@@ -127,7 +127,7 @@ def mounted(c, gravity):
     )
 
 
-@pytest.mark.parametrize("mode", ["absolute", "deflection"])
+@pytest.mark.parametrize("mode", first(1, ["absolute", "deflection"]))
 @pytest.mark.parametrize("stated", first(2, [[0, 0, 9.80665], [9.0, 0.0, 3.8], [0, -9.80665, 0]]))
 def test_gravity_elsewhere_than_stated_is_named(mode, stated):
     """An arm that hangs, or stands on a wall; of one upside down all signs change, no residual."""
@@ -141,7 +141,7 @@ def test_gravity_elsewhere_than_stated_is_named(mode, stated):
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("axes", ["base", "flange"])
-@pytest.mark.parametrize("mode", ["absolute", "deflection"])
+@pytest.mark.parametrize("mode", first(1, ["absolute", "deflection"]))
 def test_forces_of_the_other_sign_or_in_flange_axes_are_named(mode, axes, sign):
     """Pulls alone; in absolute readings the arm's own weight tells their sign, too."""
     c = campaign(NO_EFFECT, mode, 1, poses=20)

@@ -9,22 +9,17 @@ import pytest
 
 from hilcal.discovery import shapes
 from hilcal.discovery.amplitudes import Amplitude, Factor, variables
-from hilcal.discovery.curve import curves
-from hilcal.discovery.discovery import Discovery, alternatives, discover, discovery_json
-from hilcal.discovery.law import Form, LawPart, effect_class
-from hilcal.discovery.problem import CandidateTerms, SearchProblem
-from hilcal.discovery.screen import LawTerm
-from hilcal.discovery.search import search
+from hilcal.discovery.discovery import Discovery, discover
+from hilcal.discovery.law import Form, LawPart
 from hilcal.discovery.sites import sites
 from hilcal.discovery.structures import Structure, averaged, pareto, posterior
-from hilcal.effects.check import check_effect
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.residual import residual
 from hilcal.readings.whitening import whitening
 from hilcal.regression.evidence import STRENGTHS, score_family
 from hilcal.robot import se3
 from tests.support.fit_cases import fitted_model
-from tests.unit.discovery.test_discover import LAW, campaign, found, screened
+from tests.unit.discovery.test_discover import LAW, campaign, found
 
 
 def test_probabilities_sum_to_one_with_that_of_no_law():
@@ -110,29 +105,6 @@ def test_the_pareto_list_has_what_no_other_one_beats():
 
 
 @pytest.mark.long
-def test_a_discovery_says_how_likely_its_laws_are():
-    d = found()
-    (law,) = [x for x in d.structures if x.law]
-    assert law.form.text() == d.laws[0].formula == "dq_3 = a·cos(q_4)·τ_3"
-    assert law.probability == d.laws[0].probability > 0.9
-    assert sum(x.probability for x in d.structures) <= 1.0
-    assert [x.probability for x in d.structures] == sorted(
-        (x.probability for x in d.structures), reverse=True
-    )
-    assert alternatives(d, d.laws[0]) == ()
-    assert law in pareto(d.structures)
-    assert law.holdout_share == pytest.approx(d.laws[0].holdout_share, abs=0.02)
-    (coefficient,) = law.parameters
-    assert coefficient.value == pytest.approx(d.laws[0].parameters[0].value, rel=0.02)
-    # Formal; that of a fit is the largest of it and two jackknives.
-    assert 0.5 * d.laws[0].parameters[0].std < coefficient.std <= d.laws[0].parameters[0].std
-    assert "dq_3 = a·cos(q_4)·τ_3" in repr(d)
-    rows = discovery_json(d)["structures"]
-    assert rows[0]["law"] == "bent"
-    assert {"formula", "probability", "complexity", "holdout_share"} <= {*rows[0]}
-
-
-@pytest.mark.long
 def test_the_average_of_one_law_is_its_fit_and_more_laws_spread_it():
     d = found()
     readings = d.fit.readings
@@ -175,38 +147,6 @@ def products(s, count):
     raise AssertionError("too few products")
 
 
-@pytest.mark.long
-def test_a_pair_is_found_of_which_neither_part_explains_anything_alone():
-    """As where a temperature is far from its zero all the time: T d and d are nearly the same."""
-    s = screened()
-    place, f, less, direction = _nearly_alike(s)
-    p = SearchProblem(s)
-    noise = 0.3 * np.random.default_rng(5).standard_normal(len(p.residual))
-    p.residual = p._thin_residual = 40.0 * direction + p.model.project_out(noise)
-    p.rss = float(p.residual @ p.residual)
-    alone = CandidateTerms(p, ()).score([LawTerm(((place, k),), 0.0) for k in (f, less)])
-    assert all(c.score.gain < 0.05 * p.rss for c in alone)
-    best = search(p, most=1)[0].terms[0]
-    x = np.hstack([p.columns(best)])
-    free = p.model.project_out(x)
-    told = free @ np.linalg.lstsq(free, p.residual, rcond=None)[0]
-    assert told @ told > 0.95 * p.rss
-    assert {at for at, _ in best.parts} == {place}
-
-
-def _nearly_alike(s):
-    """A product of a site, a factor of it alone, and the unit direction between their columns."""
-    for place, f in products(s, 1000):
-        for less in s.grammar.without_factor[:, f].tolist():
-            free = s.linear.project_out(s.columns([(place, f), (place, less)]))
-            unit = free / np.linalg.norm(free, axis=0)
-            cosine = float(unit[:, 0] @ unit[:, 1])
-            if 0.8 < abs(cosine) < 0.97 and s.alias[place] == place:
-                between = unit[:, 0] - np.sign(cosine) * unit[:, 1]
-                return place, f, less, between / np.linalg.norm(between)
-    raise AssertionError("no such pair")
-
-
 SHARE = 0.3
 """Share of what the sensor reads along +z that is not there; it reads the other way rightly."""
 
@@ -247,23 +187,6 @@ def test_a_one_sided_force_sensor_is_found_with_its_size():
     assert a.unit == "1"
     assert abs(a.value - SHARE) < 4 * a.std < 0.5 * SHARE
     assert d.after.chi2 < 0.5 * misread().chi2
-
-
-@pytest.mark.long
-def test_what_is_written_is_an_effect_of_the_setup_with_its_derivative():
-    d = sensor_law()
-    kind = effect_class(d.source, d.laws[0].name)
-    assert kind.of_setup
-    check_effect(kind)
-
-
-@pytest.mark.long
-def test_the_curve_of_the_law_is_drawn_beside_the_readings():
-    d = sensor_law()
-    curve = curves(d.after, d.laws[0].form)[0]
-    assert (curve.of, curve.unit, curve.quantity) == ("sensor_fz", "N", "fS_z")
-    away = (curve.y - SHARE * np.maximum(curve.x, 0.0)) / curve.std
-    assert abs(float(np.mean(away[curve.x > 0]))) < 0.5
 
 
 @pytest.mark.parametrize(

@@ -1,22 +1,35 @@
-"""The laws of the effects, against the simulated world, which shares no code with them."""
+"""The laws of the effects: against the simulated world, and small formulas and limiting cases."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from hilcal.config.sections import Conventions, Coupling
+from hilcal.drivers.simulated import truth
 from hilcal.drivers.simulated.truth import Truth
 from hilcal.drivers.simulated.world import SimulatedNoise, World
+from hilcal.effects.link_compliance import long_links
+from hilcal.errors import CannotAnswerError, InputError
 from hilcal.model.model import Model
+from hilcal.robot.arm import with_controller_conventions
+from hilcal.robot.catalogue import robot_names
+from hilcal.robot.chain import evaluate
+from tests.support.arm_cases import arm_of
 from tests.support.campaigns import distal_factors, true_parameters
 from tests.support.effect_cases import (
     ALL_NAMES,
     CELLS,
     NAMES,
+    TURN,
     UR10E,
+    joints,
     make,
     options_of,
+    position,
     situation,
+    soft,
     some_states,
 )
 
@@ -128,3 +141,172 @@ def test_drift_starts_at_its_reference_time():
         effect = make("tracker_drift", UR10E, states, given)
         station = effect.deviation(rate, situation(UR10E)).station
         np.testing.assert_allclose(station, (states.time - start)[:, None] * rate, rtol=1e-13)
+
+
+@pytest.mark.parametrize("name", [*robot_names(), "odd"])
+def test_long_links_are_those_of_the_simulated_world(name):
+    arm = arm_of(name)
+    np.testing.assert_array_equal(long_links(arm), truth.long_links(arm))
+
+
+def test_an_arm_without_long_links_has_one_to_the_flange():
+    arm = CELLS["ur10e"].arm
+    links = arm.links.copy()
+    links[1:-1, :3, 3] = 0.0
+    assert long_links(replace(arm, links=links)).tolist() == [6]
+
+
+def test_compliance_that_changes_with_the_angle_repeats_as_often_as_it_says():
+    s = situation(UR10E)
+    effect = make("periodic_joint_compliance", UR10E, s.states, {"orders": [3, 1]})
+    theta = np.random.default_rng(0).normal(size=24)
+    named = {p.name: t for p, t in zip(effect.parameters, theta, strict=True)}
+    dq = effect.deviation(theta, s).dq
+    for j in range(6):
+        q = s.angle[:, j]
+        wave = sum(
+            named[f"j{j + 1}.cos{k}"] * np.cos(k * q) + named[f"j{j + 1}.sin{k}"] * np.sin(k * q)
+            for k in (1, 3)
+        )
+        np.testing.assert_allclose(dq[:, j], s.torque[:, j] * wave, rtol=1e-12)
+
+
+def test_creep_without_a_compliance_in_the_model_takes_a_typical_one():
+    states = some_states(UR10E)
+    alone = Model(UR10E, (make("creep", UR10E, states),)).predict(states, np.array([0.1]))
+    typical = 2e-3 / UR10E.arm.torque_max
+    decades = np.log10(1 + states.load_time)[:, None]
+    expected = 0.1 * decades * typical * alone.situation.torque
+    np.testing.assert_allclose(alone.deviation.dq, expected, rtol=0, atol=1e-12)
+
+
+def test_links_that_grow_each_by_their_own_grow_together():
+    cell = CELLS["odd"]
+    states = some_states(cell)
+    one = Model(cell, (make("thermal_growth", cell, states),))
+    each = Model(cell, (make("thermal_growth", cell, states, {"links": "each"}),))
+    a, b = position(one, states, np.array([1e-5])), position(each, states, np.full(8, 1e-5))
+    np.testing.assert_allclose(a, b, rtol=0, atol=1e-15)
+    assert [p.name for p in each.effects[0].parameters] == [f"link{k}" for k in range(8)]
+
+
+ODD = CELLS["odd"]
+
+
+def coupled(arm, **factors):
+    """An arm whose joints follow others: j3q2=-1.0 is joint 3 by joint 2."""
+    entries = tuple(
+        Coupling(joint=int(name[1]), follows=int(name[3]), factor=k) for name, k in factors.items()
+    )
+    return with_controller_conventions(arm, Conventions(joint_coupling=entries))
+
+
+@pytest.mark.parametrize("given", [{}, {"j3q2": -1.0, "j7q6": 0.5}])
+def test_it_is_what_the_factors_of_the_description_are_off_by(given):
+    """An arm described with other factors stands where the effect says, whatever it is coupled by.
+
+    The factors are those of the controller's values, also where these turn other joints too.
+    """
+    believed = coupled(ODD.arm, **given)
+    k = {"j2q1": 3e-3, "j3q2": -2e-3, "j7q5": 1e-3, "j7q6": -1e-3}
+    true = coupled(ODD.arm, **{p: given.get(p, 0.0) + k.get(p, 0.0) for p in {*k, *given}})
+    cell = replace(ODD, arm=believed)
+    states = some_states(cell)
+    effect = make("joint_coupling", cell, states)
+    theta = np.array([k.get(p.name.replace(".", ""), 0.0) for p in effect.parameters])
+    assert np.count_nonzero(theta) == len(k)
+    chain = Model(cell, (effect,)).predict(states, theta).situation.chain
+    expected = evaluate(true, states.q)
+    np.testing.assert_allclose(chain.position[-1], expected.position[-1], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(chain.rotation[-1], expected.rotation[-1], rtol=0, atol=1e-14)
+
+
+def test_pairs_are_those_of_arms_with_couplings_or_those_that_are_named():
+    states = some_states(ODD)
+    assert make("joint_coupling", ODD, states).options == {"pairs": "2:1/3:2/4:3/5:4/6:5/7:5/7:6"}
+    some = make("joint_coupling", ODD, states, {"pairs": "4:4/ 3:2"})
+    assert some.options == {"pairs": "3:2/4:4"}
+    assert [p.name for p in some.parameters] == ["j3.q2", "j4.q4"]
+    assert some.parameters[1].meaning == "own ratio of joint 4"
+    s = Model(ODD, ()).predict(states, np.zeros(0)).situation
+    twist = some.deviation(np.array([0.1, 0.01]), s).twist
+    expected = np.zeros_like(twist)
+    expected[:, 2, 5], expected[:, 3, 5] = 0.1 * states.q[:, 1], 0.01 * states.q[:, 3]
+    np.testing.assert_allclose(twist, expected, rtol=1e-15)
+
+
+@pytest.mark.parametrize("given", ["", "3", "3:2/3:2", "8:1", "0:1", "3-2", 3.2, None, ["3:2"]])
+def test_other_pairs_are_refused_with_what_would_be_valid(given):
+    with pytest.raises(InputError, match=r"pairs = .*; valid: pairs of joints 1 to 7") as caught:
+        make("joint_coupling", ODD, some_states(ODD), {"pairs": given})
+    assert "\n" not in str(caught.value)
+
+
+def acting(wrench, flange, name, theta, turn):
+    """What acts where a sensor says `wrench`, state by state: said = error(true) in its axes."""
+    out = np.zeros_like(wrench)
+    for i, w in enumerate(wrench):
+        if not np.any(w):
+            continue
+        r = flange[i] @ Rotation.from_rotvec(turn).as_matrix()
+        said = np.concatenate([r.T @ w[:3], r.T @ w[3:]])
+        if name == "wrench_bias":
+            true = said - theta
+        elif name == "wrench_gain":
+            true = said / (1 + theta)
+        else:
+            mounted = Rotation.from_rotvec(theta).as_matrix()
+            true = np.concatenate([mounted @ said[:3], mounted @ said[3:]])
+        out[i] = np.concatenate([r @ true[:3], r @ true[3:]])
+    return out
+
+
+ERRORS = {
+    "wrench_bias": np.array([2.0, -1.0, 3.0, 0.3, -0.2, 0.1]),
+    "wrench_gain": np.array([0.03, -0.02, 0.01, 0.02, -0.04, 0.01]),
+    "sensor_misalignment": np.array([0.03, -0.02, 0.04]),
+}
+
+
+@pytest.mark.parametrize("options", [{}, {"rotvec_rad": TURN}], ids=["flange", "turned"])
+@pytest.mark.parametrize("name", ERRORS)
+def test_a_sensor_that_misreads_is_the_same_as_another_load(name, options):
+    cell = CELLS["odd"]
+    states = some_states(cell)
+    model = soft(cell, states, name, options)
+    theta = ERRORS[name]
+    found = model.predict(states, np.concatenate([joints(cell), theta]))
+    turn = np.array(options.get("rotvec_rad", [0.0, 0.0, 0.0]))
+    other = acting(states.wrench, found.situation.chain.rotation[-1], name, theta, turn)
+    plain = Model(cell, model.effects[:1])
+    expected = plain.predict(replace(states, wrench=other), joints(cell))
+    np.testing.assert_allclose(
+        found.observation.position, expected.observation.position, rtol=0, atol=1e-12
+    )
+    np.testing.assert_allclose(found.situation.load.wrench, other, rtol=0, atol=1e-10)
+    believed = plain.predict(states, joints(cell)).observation.position
+    away = np.linalg.norm(found.observation.position - believed, axis=1)
+    loaded = np.any(states.wrench != 0, axis=1)
+    assert away[loaded].min() > 1e-6
+    assert away[~loaded].max() == 0.0
+
+
+def test_a_load_that_only_turns_is_a_load_too():
+    """A state counts as unloaded only where force and moment are exactly zero."""
+    cell = CELLS["odd"]
+    states = some_states(cell)
+    states = replace(states, wrench=np.tile([0.0, 0, 0, 0, 0, 1e-9], (len(states), 1)))
+    model = soft(cell, states, "wrench_bias")
+    bias = np.array([5.0, 0, 0, 0, 0, 0])
+    moved = position(model, states, joints(cell), bias) - position(
+        model, states, joints(cell), 0 * bias
+    )
+    assert np.linalg.norm(moved, axis=1).min() > 1e-6
+
+
+def test_a_gain_that_no_sensor_has_is_said_in_words():
+    states = some_states(UR10E)
+    model = soft(UR10E, states, "wrench_gain")
+    with pytest.raises(CannotAnswerError, match=r"wrench_gain: a gain error of -120 %") as caught:
+        position(model, states, joints(UR10E), np.array([0, 0, -1.2, 0, 0, 0]))
+    assert "\n" not in str(caught.value)

@@ -1,4 +1,4 @@
-"""What is refused of effects and their options, in one line; and what options choose."""
+"""What options choose and what is refused of them; joints that share; the catalogue as a value."""
 
 import json
 from dataclasses import replace
@@ -8,10 +8,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hilcal.diagnosis.effect_ranking import candidates
 from hilcal.effects.catalogue import BUILT_IN, installed
+from hilcal.effects.per_joint import PerJoint, joint_groups
+from hilcal.effects.protocol import Columns, Effect, Parameter, Role, effect, failure_of
 from hilcal.effects.written import chosen_options, option_defaults, read_effects_text, write_effect
 from hilcal.errors import InputError
+from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.fit import fit
 from hilcal.model.model import Model
+from tests.support.campaigns import campaign
 from tests.support.effect_cases import (
     CELLS,
     NAMES,
@@ -113,33 +119,20 @@ def test_an_effect_is_made_again_from_its_options(name):
     ("text", "expected"),
     [
         ("", {}),
-        ("hysteresis", {"hysteresis": {}}),
         (" creep , hysteresis,,", {"creep": {}, "hysteresis": {}}),
         ("creep()", {"creep": {}}),
-        (
-            "link_mass, transmission_error(harmonics=20), backlash(joints=each)",
-            {
-                "link_mass": {},
-                "transmission_error": {"harmonics": 20},
-                "backlash": {"joints": "each"},
-            },
-        ),
         (
             "backlash ( joints = 2/3/4-6 ; crossing = .5e-1, )",
             {"backlash": {"joints": "2/3/4-6", "crossing": 0.05}},
         ),
         ("creep(joints=1+2)", {"creep": {"joints": "1+2"}}),
-        ("creep(joints=3)", {"creep": {"joints": 3}}),
         ("creep(joints='a, (b)]; \"c')", {"creep": {"joints": 'a, (b)]; "c'}}),
-        ('creep(joints="20")', {"creep": {"joints": "20"}}),
-        ("target_offset(rotation=true)", {"target_offset": {"rotation": True}}),
         ("creep(joints=nan)", {"creep": {"joints": "nan"}}),
         (
             "periodic_joint_compliance(orders=[1, 2;4],joints=each),creep",
             {"periodic_joint_compliance": {"orders": [1, 2, 4], "joints": "each"}, "creep": {}},
         ),
         ("wrench_bias(rotvec_rad=[-1, +2., 3e-1])", {"wrench_bias": {"rotvec_rad": [-1, 2, 0.3]}}),
-        ("periodic_joint_compliance(orders=[])", {"periodic_joint_compliance": {"orders": []}}),
     ],
 )
 def test_what_is_typed_is_what_is_read(text, expected):
@@ -224,3 +217,209 @@ def test_a_default_that_follows_from_the_readings_is_not_told():
     assert drift == {"joints": "each", "reference_degC": None}
     assert option_defaults(installed()["transmission_error"], UR10E, states)["harmonics"] is None
     assert option_defaults(installed()["creep"], UR10E, states) == {"joints": "common"}
+
+
+class Sag(Effect):
+    """dq_1 = a cos(q_2)."""
+
+    name = "sag"
+    summary = "dq_1 = a cos(q_2)"
+    role: Role = "baseline"
+
+    @property
+    def parameters(self):
+        return (Parameter("a", "rad", 1e-5),)
+
+    def columns(self, s):
+        return (Columns("dq", np.array([0]), np.array([0]), np.cos(s.angle[:, 1:2])),)
+
+
+def test_an_effect_is_added_by_name_and_options():
+    c = campaign()
+    model = baseline(c.cell, c.readings, "absolute") + effect("hysteresis", joints="1-3")
+    assert model.names[-1] == "hysteresis"
+    assert model.effects[-1].options == {"joints": "1-3"}
+    with pytest.raises(InputError, match=r"unknown effect 'hysteresys' \(did you mean"):
+        model + effect("hysteresys")
+    with pytest.raises(InputError, match="hysteresis is in the model already"):
+        model + effect("hysteresis")
+    with pytest.raises(InputError, match="unknown option 'joint'; valid: joints"):
+        model + effect("encoder_offset", joint=1)
+
+
+def test_an_effect_is_added_by_its_class_and_is_in_the_catalogue_then():
+    c = campaign()
+    model = baseline(c.cell, c.readings, "absolute") + effect(Sag)
+    assert model.names[-1] == "sag"
+    assert model.catalogue.names[-1] == "sag"
+    assert "sag" not in installed().names
+
+
+def test_a_model_without_readings_takes_effects_that_are_built_only():
+    with pytest.raises(InputError, match="creep: this model was made without readings"):
+        Model(campaign().cell, ()) + effect("creep")
+
+
+def test_what_a_model_could_have_is_what_its_catalogue_holds():
+    c = campaign()
+    mine = installed().with_effects(Sag)
+    assert "sag" in baseline(c.cell, c.readings, "absolute", mine).names  # by its role
+    bare = Model(c.cell, (), mine, c.readings) + effect("joint_compliance") + effect("base_frame")
+    found = fit(bare, c.readings, "absolute")
+    assert "sag" in {e.name for e in candidates(found)}
+    refusal("class Sag: effect sag is in the catalogue already", mine.with_effects, Sag)
+
+
+class Fails(Sag):
+    """Raises where there are many states."""
+
+    name = "fails"
+
+    def columns(self, s):
+        return super().columns([s][len(s.angle) > 40])
+
+
+def test_what_an_effect_raises_in_use_is_traced_to_its_line():
+    c = campaign()
+    model = baseline(c.cell, c.readings, "absolute") + effect(Fails)
+    with pytest.raises(IndexError) as caught:
+        model.predict(c.readings.states, np.zeros(model.size))
+    line = Fails.columns.__code__.co_firstlineno + 1
+    start = f"{__file__}, line {line}: effect fails: columns raises IndexError: list index out of"
+    assert str(failure_of(caught.value)).startswith(start)
+
+
+def test_what_hilcal_raises_is_no_failure_of_a_users_effect():
+    c = campaign()
+    model = baseline(c.cell, c.readings, "absolute")
+    with pytest.raises(IndexError) as caught:
+        model.predict(c.readings.states, np.zeros(0))  # no parameters
+    assert failure_of(caught.value) is None
+
+
+PER_JOINT = tuple(name for name in NAMES if issubclass(effect_class(name), PerJoint))
+GROUPS = ("common", "2/3/4-6", "1+4/2-3", "5")
+
+
+def membership(groups, count):
+    """(n, G) 1 where a joint belongs to a group; written out by hand, not read."""
+    known = {
+        "common": [range(count)],
+        "each": [[j] for j in range(count)],
+        "2/3/4-6": [[1], [2], [3, 4, 5]],
+        "1+4/2-3": [[0, 3], [1, 2]],
+        "2-3/5+6": [[1, 2], [4, 5]],
+        "5": [[4]],
+        "1-3": [[0, 1, 2]],
+    }[groups]
+    out = np.zeros((count, len(known)))
+    for k, group in enumerate(known):
+        out[list(group), k] = 1.0
+    return out
+
+
+def options(name, groups):
+    few = {"harmonics": 2} if name == "transmission_error" else options_of(name)
+    return {**few, "joints": groups}
+
+
+def spread(effect, groups):
+    """(P each, P groups) parameters of every joint by those of the groups."""
+    member = membership(groups, effect.cell.arm.n)
+    return np.kron(member, np.eye(len(effect.parameters) // member.shape[1]))
+
+
+@pytest.mark.parametrize(
+    ("given", "text", "labels", "joint", "group"),
+    [
+        ("each", "each", "1 2 3 4 5 6", [0, 1, 2, 3, 4, 5], [0, 1, 2, 3, 4, 5]),
+        ("common", "common", "1-6", [0, 1, 2, 3, 4, 5], [0] * 6),
+        ("2/3/4-6", "2/3/4-6", "2 3 4-6", [1, 2, 3, 4, 5], [0, 1, 2, 2, 2]),
+        ("4-6/3/2", "2/3/4-6", "2 3 4-6", [1, 2, 3, 4, 5], [0, 1, 2, 2, 2]),
+        ("1+4+5/ 2", "1+4-5/2", "1+4-5 2", [0, 1, 3, 4], [0, 1, 0, 0]),
+        ("1+2+3", "1-3", "1-3", [0, 1, 2], [0, 0, 0]),
+        (3, "3", "3", [2], [0]),
+        ("6/5/4/3/2/1", "each", "1 2 3 4 5 6", [0, 1, 2, 3, 4, 5], [0, 1, 2, 3, 4, 5]),
+        ("1-6", "common", "1-6", [0, 1, 2, 3, 4, 5], [0] * 6),
+        ("1-5/6", "1-5/6", "1-5 6", [0, 1, 2, 3, 4, 5], [0, 0, 0, 0, 0, 1]),
+    ],
+)
+def test_groups_are_read_and_written_in_one_way(given, text, labels, joint, group):
+    g = joint_groups("hysteresis", {"joints": given}, 6)
+    assert (g.text, " ".join(g.labels)) == (text, labels)
+    assert (g.joint.tolist(), g.group.tolist()) == (joint, group)
+    again = joint_groups("hysteresis", {"joints": g.text}, 6)
+    assert (again.text, again.labels) == (g.text, g.labels)
+    assert (again.joint.tolist(), again.group.tolist()) == (joint, group)
+
+
+@refusals("joints")
+def test_other_groups_are_refused_with_what_would_be_valid(case, given):
+    refuses(case, lambda: joint_groups("hysteresis", {"joints": json.loads(given)}, 6))
+
+
+@pytest.mark.parametrize("groups", GROUPS)
+@pytest.mark.parametrize("name", PER_JOINT)
+def test_a_shared_parameter_is_the_same_number_at_each_of_its_joints(name, groups):
+    """Same readings; and the derivative is the sum of theirs, also of another effect's by it."""
+    cell = CELLS["odd"]
+    states = some_states(cell, 5)
+    others = [n for n in ("load_point", "joint_compliance") if n != name]
+    rest = [make(n, cell, states) for n in others]
+    one = make(name, cell, states, options(name, groups))
+    every = make(name, cell, states, options(name, "each"))
+    m = spread(one, groups)
+    assert m.shape == (len(every.parameters), len(one.parameters))
+    rng = np.random.default_rng(1)
+    theta = random_theta((one,), rng)
+    fixed = random_theta(rest, rng)
+    a, b = Model(cell, (*rest, one)), Model(cell, (*rest, every))
+    at, bt = np.concatenate([fixed, theta]), np.concatenate([fixed, m @ theta])
+    pa, pb = a.predict(states, at), b.predict(states, bt)
+    np.testing.assert_allclose(pa.observation.position, pb.observation.position, rtol=0, atol=1e-12)
+    ja, jb = a.jacobian(pa, at, 6), b.jacobian(pb, bt, 6)
+    k = len(fixed)
+    expected = np.concatenate([jb[:, :, :k], jb[:, :, k:] @ m], axis=2)
+    size = np.abs(expected).max(axis=(0, 1)) + 1e-300
+    np.testing.assert_allclose(ja / size, expected / size, rtol=0, atol=1e-10)
+    assert np.all(np.abs(ja).max(axis=(0, 1)) > 0)
+
+
+@pytest.mark.parametrize("name", PER_JOINT)
+def test_names_and_magnitudes(name):
+    states = some_states(UR10E)
+    every = make(name, UR10E, states, options(name, "each")).parameters
+    some = make(name, UR10E, states, options(name, "1+4-5/2/3")).parameters
+    kinds = len(every) // 6
+    assert len(some) == 3 * kinds
+    heads = [p.name.split(".")[0] for p in some[::kinds]]
+    assert heads == ["j1+4-5", "j2", "j3"]
+    tails = [p.name.partition(".")[2] for p in some]
+    assert tails == [p.name.partition(".")[2] for p in every][: len(some)]
+    first = [every[kinds * j].scale for j in (0, 3, 4)]
+    assert some[0].scale == pytest.approx(np.exp(np.mean(np.log(first))), rel=1e-12)
+    assert some[kinds].scale == every[kinds].scale
+    assert some[0].meaning == every[0].meaning.replace("joint 1", "joints 1+4-5")
+    assert {p.unit for p in some} == {p.unit for p in every}
+
+
+def test_creep_takes_the_older_name_of_its_groups():
+    states = some_states(UR10E)
+    for form in ("common", "each"):
+        old = make("creep", UR10E, states, {"form": form})
+        new = make("creep", UR10E, states, {"joints": form})
+        assert old.parameters == new.parameters
+        assert old.options == new.options == {"joints": form}
+    assert [p.name for p in make("creep", UR10E, states).parameters] == ["k"]
+    with pytest.raises(InputError, match="form and joints; valid: joints alone"):
+        make("creep", UR10E, states, {"form": "each", "joints": "each"})
+
+
+def test_frames_take_options_too():
+    c = campaign(plan_seed=0)
+    usual = with_effects(c.cell, c.readings, "absolute", ("hysteresis",))
+    given = {"base_frame": {"prior_m": 2e-3, "prior_rad": 4e-3}}
+    known = with_effects(c.cell, c.readings, "absolute", ("base_frame", "hysteresis"), given)
+    assert known.names == usual.names == ("base_frame", "hysteresis")
+    assert usual.effects[0].prior_std() is None
+    assert known.effects[0].prior_std().tolist() == [2e-3] * 3 + [4e-3] * 3

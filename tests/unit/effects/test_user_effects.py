@@ -1,4 +1,4 @@
-"""An effect of a user's own: from a file or an installed package it takes part in everything."""
+"""An effect of a user's own: its file, one clear line for a bad one, and all it takes part in."""
 
 import json
 import os
@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilcal.effects.catalogue import installed
+from hilcal.effects.catalogue import BUILT_IN, installed
+from hilcal.effects.check import check_effect
 from hilcal.model.model import Model
 from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.store.campaign_file import CampaignFile
@@ -19,6 +20,7 @@ from hilcal.types import Floats
 from tests.support.campaigns import campaign as simulated
 from tests.support.campaigns import plan
 from tests.support.cli_cases import CELL, ok, refused
+from tests.support.refusals import check, refusals, with_edits
 from tests.support.rows import first
 from tests.support.user_effect_cases import CLASS, COLUMNS
 
@@ -196,18 +198,6 @@ def hilcal(site, *arguments):
 
 
 @pytest.mark.long
-def test_a_plan_is_made_against_it(file, tmp_path, capsys):
-    cell = tmp_path / "cell.toml"
-    text = CELL.read_text(encoding="utf-8")
-    assert "[planning]" in text
-    cell.write_text(text.replace("[planning]", f'[planning]\nagainst = ["{NAME}"]'), "utf-8")
-    arguments = ("plan", cell, "-o", tmp_path / "plan.toml", "--poses", "6", "--quick")
-    assert f"unknown effect '{NAME}'" in refused(capsys, 2, *arguments)
-    d = ok(capsys, *arguments, "--effects-from", file, "--json").document
-    assert {seen["effect"] for seen in d["detectable"]} == {NAME}
-
-
-@pytest.mark.long
 def test_a_revision_says_which_file_it_needs(run_file, file, capsys):
     mine = ("--effects-from", file)
     ok(capsys, "identify", run_file, "--effects", f"joint_compliance,{NAME}", *mine)
@@ -255,31 +245,101 @@ def test_every_command_with_models_reads_it_first(command, tmp_path, capsys):
     assert said == f"error: {missing}: no such file; expected a Python file of effects"
 
 
-@pytest.mark.parametrize(
-    ("law", "said"),
-    first(
-        2,
-        [
-            (
-                "exit(3) if len(s.angle) > 40 else s.angle[:, :1]",
-                ", line 13: effect mine: columns raises SystemExit: 3",
-            ),
-            (
-                "[1.0][len(s.angle) > 40] * s.angle[:, :1]",
-                ", line 13: effect mine: columns raises Ind",
-            ),
-            (
-                "s.angle[:, :1] / (len(s.angle) <= 40)",
-                ": effect mine: columns has dq values of which",
-            ),
-            ("s.angle[:40, :1]", ": effect mine: columns has dq values of 40 states; expected 1"),
-        ],
-    ),
-)
+FAILING = {
+    "exit(3) if len(s.angle) > 40 else s.angle[:, :1]": "columns raises SystemExit: 3",
+    "[1.0][len(s.angle) > 40] * s.angle[:, :1]": "columns raises Ind",
+    "s.angle[:, :1] / (len(s.angle) <= 40)": "columns has dq values of which",
+    "s.angle[:40, :1]": "columns has dq values of 40 states; expected 1",
+}
+
+
+@pytest.mark.parametrize(("law", "said"), first(2, list(FAILING.items())))
 def test_a_law_that_fails_on_the_readings_is_one_clear_line(law, said, run_file, tmp_path, capsys):
     path = tmp_path / "mine.py"
     path.write_text(CLASS.replace(COLUMNS, f"values = {law}"), encoding="utf-8")
     ok(capsys, "effects", "--effects-from", path)  # 30 states
     ok(capsys, "identify", run_file, "--effects-from", path)
     line = refused(capsys, 2, "diagnose", run_file, "--effects-from", path)
-    assert line.startswith(f"error: {path}{said}")
+    place = ", line 13" if "raises" in said else ""
+    assert line.startswith(f"error: {path}{place}: effect mine: {said}")
+
+
+ELASTIC = CLASS.replace(COLUMNS, "values = s.torque[:, :1] ** 3").replace(
+    "    @property",
+    """\
+    elastic = True
+
+    def response(self, theta, s, change):
+        dq = np.zeros((*change.shape[:2], s.angle.shape[1]))
+        dq[:, :, 1] = 3 * theta[0] * s.torque[:, :1] ** 2 * change[:, :, 0, 5]
+        return Response(dq=dq)
+
+    @property""",
+)
+
+
+@refusals("user_effects")
+def test_a_bad_file_is_one_clear_line(case, given, tmp_path, capsys):
+    path = tmp_path / "mine.py"
+    path.write_text(with_edits(given, CLASS=CLASS, ELASTIC=ELASTIC), encoding="utf-8")
+    line = refused(capsys, 2, "effects", "--effects-from", path)
+    check(case, line.removeprefix("error: ").replace(str(path), path.name))
+
+
+@pytest.mark.parametrize("content", [CLASS, ELASTIC], ids=["rigid", "elastic"])
+def test_what_the_bad_files_were_made_from_is_good(content, tmp_path, capsys):
+    path = tmp_path / "mine.py"
+    path.write_text(content, encoding="utf-8")
+    ok(capsys, "effects", "--effects-from", path)
+
+
+def test_what_a_file_prints_is_not_in_the_document(tmp_path, capsys):
+    path = tmp_path / "mine.py"
+    law = f"print('here')\n        {COLUMNS}"
+    path.write_text("print('there')\n" + CLASS.replace(COLUMNS, law), encoding="utf-8")
+    result = ok(capsys, "effects", "--effects-from", path, "--json")
+    assert result.document["effects"][-1]["name"] == "mine"
+    assert "there" in result.err
+    assert "here" in result.err
+
+
+@pytest.mark.parametrize("kind", BUILT_IN, ids=lambda kind: kind.name)
+def test_what_is_built_in_passes_the_check(kind):
+    check_effect(kind)
+
+
+def test_new_writes_an_effect_that_works(tmp_path, capsys):
+    path = tmp_path / "response.py"
+    d = ok(capsys, "effects", "new", "response", "-o", path, "--json").document
+    assert d == {"written": str(path), "effect": "response"}
+    listed = ok(capsys, "effects", "--effects-from", path, "--json").document["effects"]
+    assert listed[-1]["name"] == "response"
+    assert listed[-1]["source"] == str(path)
+    content = path.read_text(encoding="utf-8")
+    assert "emplate" not in content
+    for word in ("hilcal.effects", "needs", "elastic", "scale", "--effects-from response.py"):
+        assert word in content
+
+
+def test_new_goes_into_the_folder_one_is_in(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert "soft_side.py" in ok(capsys, "effects", "new", NAME).out
+    there = Path("soft_side.py").read_bytes()
+    assert "the file exists" in refused(capsys, 2, "effects", "new", NAME)
+    assert Path("soft_side.py").read_bytes() == there
+
+
+@pytest.mark.parametrize("name", ["2x", "My", "a-b", "", "class", "é", "a/b"])
+def test_new_refuses_a_bad_name(name, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert "valid: lower-case letters" in refused(capsys, 2, "effects", "new", name)
+    assert not list(tmp_path.iterdir())
+
+
+def test_new_refuses_what_is_there_already(tmp_path, capsys):
+    out = tmp_path / "mine.py"
+    said = refused(capsys, 2, "effects", "new", "hysteresis", "-o", out)
+    assert "in the catalogue already" in said
+    assert ".py" in refused(capsys, 2, "effects", "new", NAME, "-o", tmp_path / "mine.txt")
+    assert "written" in refused(capsys, 2, "effects", "new", NAME, "-o", out / "mine.py")
+    assert not out.exists()

@@ -1,9 +1,10 @@
-"""Fleets of simulated arms: from campaign files to a prior that helps another arm."""
+"""Fleets of simulated arms: from files to a prior that helps another arm; their picture."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import rerun as rr
 
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline
@@ -11,7 +12,10 @@ from hilcal.identification.carried.carried_prior import carried_prior
 from hilcal.identification.carried.posterior import Posterior
 from hilcal.identification.fit import fit
 from hilcal.present.html.other_pages import arms_chart, fleet_page
+from hilcal.present.viewer import style
+from hilcal.present.viewer.fleet import DrawnType, arm_positions, record_fleet
 from hilcal.robot.catalogue import configs_dir
+from hilcal.robot.scene import capsules
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.codec import write_document
 from hilcal.transfer.fleet import Fleet, diagnosed_effects, pool
@@ -26,7 +30,9 @@ from hilcal.transfer.members import (
 from tests.support.calibrate_process import CELL
 from tests.support.campaigns import cell_of, configuration, noiseless, plan, with_noise, world_of
 from tests.support.cli_cases import ok, refused
+from tests.support.recordings import chunks, entities, rows
 from tests.support.refusals import refusal, refusal_of
+from tests.support.viewer_plan import rgb
 
 SPREAD = 0.15
 """Standard deviation of the arms' joint compliances, relative."""
@@ -164,19 +170,6 @@ def prior_file(one, path):
     return path
 
 
-@pytest.mark.long
-def test_a_plan_counts_on_what_the_fleet_knows(one, capsys, tmp_path):
-    prior = prior_file(one, tmp_path / "prior.json")
-    command = ("plan", tmp_path / "cell.toml", "-o", tmp_path / "p.json", "--poses", "4", "--quick")
-    alone = ok(capsys, *command, "--json").document["predicted_std"]
-    told = ok(capsys, *command, "--prior", prior, "--json")
-    known = told.document["predicted_std"]
-    assert "60 campaigns of 30 arms of the type ur10e" in " ".join(told.err.split())
-    stiffness = [name for name in alone if name.startswith("joint_compliance.")]
-    assert len(stiffness) == 6
-    assert all(known[name] < alone[name] for name in stiffness)
-
-
 @pytest.mark.slow
 def test_a_calibration_takes_the_prior_of_a_fleet(one, capsys, tmp_path):
     """On simulated devices, from the plan to the corrected targets; asked for once, kept after."""
@@ -294,3 +287,44 @@ def test_campaigns_of_the_same_readings_are_refused(how, capsys, tmp_path):
     first = "d.hilcal" if how == "two extensions" else "b.hilcal"
     assert first in told or how == "many copies"
     assert not (tmp_path / "p.json").exists()
+
+
+def fleet(one, odd):
+    """30 arms in January and March, of which one may have a soft joint 3."""
+    mine = members(one, 3, odd=odd)
+    of = pool(mine, ())
+    return Fleet((of,), tuple(mine), ()), of
+
+
+def recorded(one, path, odd):
+    rr.set_strict_mode(True)
+    try:
+        record_fleet(fleet(one, odd)[0], path)
+    finally:
+        rr.set_strict_mode(False)
+    return path
+
+
+def test_the_odd_joint_alone_is_red_and_its_arm_framed(one, tmp_path):
+    path = recorded(one, tmp_path / "fleet.rrd", 1.5)
+    d = DrawnType(fleet(one, 1.5)[1], fleet(one, 1.5)[0].members)
+    shapes = capsules(d.arm)
+    colors = [rgb(c) for c in rows(path, "/arms0/arms", "Capsules3D:colors")[0]]
+    red = [k for k, c in enumerate(colors) if c == style.RED]
+    assert red == [ODD * len(shapes) + k for k, s in enumerate(shapes) if s.body == 3]
+    (centre,) = rows(path, "/arms0/unlike", "Boxes3D:centers")[0]
+    np.testing.assert_allclose(centre[:2], arm_positions(d)[ODD, :2], atol=1e-6)
+    words = rows(path, "/words/type0", "TextDocument:text")[0][0]
+    assert f"arm{ODD} is unlike the others" in words
+    drifts = {e for e in entities(path) if e.startswith("/date0/")}
+    assert [e for e in drifts if "unlike" in e] == [f"/date0/2/zunlike/{ODD}"]
+    told = [c.to_record_batch() for c in chunks(path, f"/date0/2/zunlike/{ODD}")]
+    assert sum(b.num_rows for b in told if "date" in b.schema.names) == 2
+
+
+def test_an_ordinary_fleet_has_nothing_red(one, tmp_path):
+    path = recorded(one, tmp_path / "fleet.rrd", 0.0)
+    colors = [rgb(c) for c in rows(path, "/arms0/arms", "Capsules3D:colors")[0]]
+    assert style.RED not in colors
+    assert "/arms0/unlike" not in entities(path)
+    assert "No arm is unlike" in rows(path, "/words/type0", "TextDocument:text")[0][0]

@@ -18,7 +18,7 @@ from hilcal.store.plan import Plan, Step
 from hilcal.store.run_log import create_run
 from tests.support.cli_cases import ok
 from tests.support.rows import first
-from tests.unit.identification.test_misdescription import measured
+from tests.unit.identification.test_registration import measured
 
 OFF = 0.3  # mm and mrad of each link: an ordinary arm
 
@@ -55,14 +55,6 @@ def test_white_noise_of_any_size_is_noise(tmp_path, sigma):
     assert not readings.noise_stated
     assert size(readings) == pytest.approx(sigma, rel=0.3)
     assert judged(cell, readings).verdict == "adequate"
-
-
-@pytest.mark.long
-def test_gross_errors_are_not_noise(tmp_path):
-    of = measured("ur5", 1, OFF, 60, 2e-5)
-    of.value[[5, 17], 0] += 3e-3
-    of.value[30, 1] += 8e-4
-    assert size(read(of, tmp_path)[1]) == pytest.approx(2e-5, rel=0.3)
 
 
 def test_effects_are_not_noise(tmp_path):
@@ -137,7 +129,7 @@ def run_of(readings, path, tracker="", arm=""):
     plan = Plan(names, readings.states.q, tuple(Step(name, "none") for name in names))
     with create_run(path / "r.hilcal", config, path, plan) as file:
         file.append_readings(readings)
-        estimate_noise(terminal(False), config, hc.Cell.load(path / "CELL.toml"), file)
+        estimate_noise(terminal(False), hc.Cell.load(path / "CELL.toml").with_config(config), file)
     return path / "r.hilcal"
 
 
@@ -176,7 +168,7 @@ def test_an_estimate_does_not_outlive_the_readings_that_it_is_of(tmp_path, capsy
     cell = hc.Cell.load(tmp_path / "CELL.toml")
     monkeypatch.setattr("hilcal.cli.running.measured_noise", lambda *_: None)
     with CampaignFile.open(path) as file:
-        estimate_noise(terminal(False), cell.configured(), cell, file)
+        estimate_noise(terminal(False), cell, file)
         stored = file.readings()
     with hc.Campaign.open(path) as run:
         assert run.readings.noise_stated

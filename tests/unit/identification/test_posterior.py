@@ -8,11 +8,8 @@ import numpy as np
 import pytest
 
 import hilcal as hc
-from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.revisions import restore, to_record
-from hilcal.diagnosis.stepwise import add, remove
 from hilcal.drivers.simulated.world import place_tracker
-from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.carried.carried_prior import carried_prior
@@ -124,12 +121,6 @@ def test_what_is_no_posterior_is_refused():
         refusal(words, Posterior.from_json, content)
 
 
-def test_every_effect_says_whose_it_is():
-    setup = {kind.name for kind in installed().effects if kind.of_setup}
-    assert {"base_frame", "target_offset", "tracker_drift", "wrench_bias", "load_point"} <= setup
-    assert not {"joint_compliance", "link_geometry", "transmission_error"} & setup
-
-
 @pytest.fixture(scope="module")
 def arm():
     """An arm without errors of its links, so that two small models hold all there is."""
@@ -172,23 +163,6 @@ def test_a_change_is_seen_with_its_size_in_its_effect_alone(arm):
     p = {e.effect: e.p_value for e in d.effects}
     assert p["encoder_offset"] < 1e-10
     assert p["joint_compliance"] > 1e-3
-
-
-def test_effects_that_one_fit_lacks_are_named(arm):
-    one = posterior(arm, 0)
-    rows = one.index("joint_compliance")
-    less = replace(
-        one,
-        names=tuple(one.names[k] for k in rows),
-        units=tuple(one.units[k] for k in rows),
-        scale=one.scale[rows],
-        mean=one.mean[rows],
-        information=one.marginal(rows),
-        own_precision=one.own_precision[rows],
-    )
-    d = parameter_differences(one, less)
-    assert d.apart == ("encoder_offset",)
-    assert {r.name.split(".")[0] for r in d.rows} == {"joint_compliance"}
 
 
 NAMES = ("joint_compliance", "encoder_offset", "joint_tilt_compliance")
@@ -269,19 +243,6 @@ def test_the_joint_that_moved_is_found_and_let_go():
     assert document["effects"][0]["joint"] == 3
 
 
-@pytest.mark.filterwarnings("error")
-def test_an_effect_may_be_taken_out_or_added():
-    found = repaired()
-    without = remove(found, "joint_compliance")
-    assert without.model.names == NAMES[1:]
-    assert np.isfinite(without.theta).all()
-    assert without.chi2 > found.chi2
-    more = add(found, "base_compliance")
-    assert more.model.names == (*found.model.names, "base_compliance")
-    # The drift is chosen anew, so that the sum of squares may grow a little.
-    assert more.holdout.rms_sigma < 1.05 * found.holdout.rms_sigma
-
-
 def test_without_a_change_nothing_has_moved():
     clean, prior = noiseless(both().world, plan(15, 78)), carried_prior(learnt(40))
     fits = [with_prior(with_noise(clean, np.random.default_rng(s)), prior) for s in range(4)]
@@ -329,10 +290,3 @@ def test_priors_that_cannot_be_are_refused():
         (foreign, {}, "--effects-from"),
     ):
         refusal(words, carried_prior, of, **given)
-
-
-def test_a_calibration_is_surer_with_a_prior():
-    fits = (of_poses(25, 40, carried_prior(learnt())), of_poses(25, 40))
-    stated = [Calibration.of(f).predict(both().readings.states.q[:20]).covariance for f in fits]
-    spread = [np.trace(c, axis1=1, axis2=2).mean() for c in stated if c is not None]
-    assert spread[0] < spread[1]

@@ -42,7 +42,7 @@ def sample(bench, **changes):
 
 
 def test_all_is_well_with_and_without_a_force_sensor_but_for_an_arm_that_is_not_ready(bench):
-    guard = Guard(bench.cell, bench.config)
+    guard = Guard(bench.cell)
     assert guard.check(sample(bench), np.zeros(6)) is None
     assert guard.check(sample(bench)) is None
     assert "protective stop" in str(guard.check(sample(bench, safety="protective stop")))
@@ -52,7 +52,7 @@ def test_all_is_well_with_and_without_a_force_sensor_but_for_an_arm_that_is_not_
 @pytest.mark.parametrize("joint", range(6))
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_speed_of_every_joint(bench, joint, sign):
-    guard, one = Guard(bench.cell, bench.config), sign * np.eye(6)[joint]
+    guard, one = Guard(bench.cell), sign * np.eye(6)[joint]
     assert guard.check(sample(bench, qd=0.999 * one)) is None
     assert bench.cell.arm.joint_names[joint] in str(guard.check(sample(bench, qd=1.001 * one)))
 
@@ -61,7 +61,7 @@ def test_speed_of_every_joint(bench, joint, sign):
     "way", [*np.eye(6), np.repeat([3**-0.5, 0.0], 3), np.repeat([0.0, 3**-0.5], 3)]
 )
 def test_force_and_moment_are_limited_by_the_lengths_of_their_vectors(bench, way):
-    guard = Guard(bench.cell, bench.config)
+    guard = Guard(bench.cell)
     limit, key = (100.0, "max_force_N") if way[:3].any() else (10.0, "max_moment_Nm")
     assert guard.check(sample(bench), -0.999 * limit * way) is None
     assert key in str(guard.check(sample(bench), -1.001 * limit * way))
@@ -69,7 +69,7 @@ def test_force_and_moment_are_limited_by_the_lengths_of_their_vectors(bench, way
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_what_is_not_a_number_is_never_well(bench, bad):
-    guard = Guard(bench.cell, bench.config)
+    guard = Guard(bench.cell)
     q = np.array(POSES["p1"])
     q[2] = bad
     assert guard.check(sample(bench, q=q)) is not None
@@ -82,7 +82,7 @@ def test_what_is_not_a_number_is_never_well(bench, bad):
 @pytest.mark.parametrize("axis", range(3))
 def test_workspace_of_the_actual_pose(bench, side, axis):
     """A box that ends where forearm, wrists and tool do, less and more than the slack."""
-    parts = Clearance(bench.cell, bench.config).scene.parts
+    parts = Clearance(bench.cell).scene.parts
     low, high = reached(bench.cell, parts, np.array([POSES["p1"]]))
     edge = (low if side == "min" else high)[axis]
     inwards = 1.0 if side == "min" else -1.0
@@ -91,7 +91,7 @@ def test_workspace_of_the_actual_pose(bench, side, axis):
         box[side][axis] = edge + inwards * over
         limits = Limits(workspace_min_m=tuple(box["min"]), workspace_max_m=tuple(box["max"]))
         config = bench.config.model_copy(update={"limits": limits})
-        said = Guard(bench.cell, config).check(sample(bench))
+        said = Guard(bench.cell.with_config(config)).check(sample(bench))
         assert (said is not None) is wrong
         if said is not None:
             assert f"is {2 * SLACK_M:.3g} m outside the workspace, whose {'xyz'[axis]}" in said
@@ -101,11 +101,18 @@ def test_what_hangs_stops_the_arm_when_it_is_told():
     """At 0.45 m a weight that hangs 0.5 m low is through the floor, and nothing else is."""
     load = CellLoad(name="long", mass_kg=2.0, hang_m=0.5)
     bench = Bench(loads=(load,), limits=Limits(), force_sensor=None)
-    guard, here = Guard(bench.cell, bench.config), sample(bench, q=np.array(POSES["reference"]))
+    guard, here = Guard(bench.cell), sample(bench, q=np.array(POSES["reference"]))
     assert guard.check(here) is None
     said = str(guard.check(here, hanging="long"))
     assert "what hangs (long)" in said
     assert "mounting plane" in said
+
+
+def test_arm_and_obstacles_that_touch_stop_the_arm():
+    folded = (0.0, -1.5, 3.0, -1.5, -1.5, 0.0)
+    bench = Bench(limits=Limits(workspace_min_m=(-2, -2, -2)))
+    said = Guard(bench.cell).check(sample(bench, q=np.array(folded)))
+    assert "shoulder and forearm collide" in str(said)
 
 
 HOME = (0.0, -1.2, 1.5, -1.5, -1.5, 0.0)
@@ -115,17 +122,17 @@ BELOW = (0.0, 0.5, 0.9, -1.5, -1.5, 0.0)
 def refused_lines(config, *states, load=UNLOADED):
     names = ("reference", *(f"p{k}" for k in range(1, len(states))))
     plan = Plan(names, np.array(states, dtype=float), (Step(names[-1], load),))
-    return dry_run(cell_from_config(config), config, plan).problems
+    return dry_run(cell_from_config(config), plan).problems
 
 
 def stopped(config, q):
     joints = np.array(q, dtype=float)
     here = replace(Bench().rig.arm.sample(), q=joints, qd=np.zeros(len(joints)))
-    return Guard(cell_from_config(config), config).check(here)
+    return Guard(cell_from_config(config)).check(here)
 
 
 def planned(config, q):
-    space = FeasibleSpace(cell_from_config(config), config)
+    space = FeasibleSpace(cell_from_config(config))
     return bool(space.allowed(np.array([q], dtype=float), UNLOADED, GEOMETRY).all())
 
 
@@ -166,22 +173,24 @@ def test_the_shape_of_an_unknown_arm_is_said_to_be_guessed():
     config = cell()
     unknown = replace(cell_from_config(config), arm=arm_of(ODD))
     q = np.zeros((1, unknown.arm.n))
-    checked = dry_run(unknown, config, Plan(("reference",), q, (Step("reference", UNLOADED),)))
+    checked = dry_run(
+        unknown.with_config(config), Plan(("reference",), q, (Step("reference", UNLOADED),))
+    )
     said = "the shape of odd is not known: its links are guessed"
     assert said in checked.remarks
-    assert said in FeasibleSpace(unknown, config).remarks
+    assert said in FeasibleSpace(unknown.with_config(config)).remarks
 
 
 WIDE = Limits(workspace_min_m=(-3, -3, -3), workspace_max_m=(3, 3, 3))
 
 
 def problems(bench, plan):
-    return dry_run(bench.cell, bench.config, plan).problems
+    return dry_run(bench.cell, plan).problems
 
 
 def test_a_good_plan_passes():
     bench = Bench()
-    checked = dry_run(bench.cell, bench.config, usual_plan())
+    checked = dry_run(bench.cell, usual_plan())
     assert checked.problems == ()
     assert checked.remarks == ()
     assert checked.load_changes == 4
@@ -189,6 +198,13 @@ def test_a_good_plan_passes():
     # a change of the load: 4 poses, then twice: to the reference, 4 poses, to the reference
     assert checked.motions == 1 + 4 + 2 * (1 + 4) + 1
     assert checked.duration > 4 * 60.0
+
+
+def test_a_plan_of_another_arm():
+    bench, plan = Bench(), usual_plan()
+    assert problems(bench, replace(plan, about={"robot": bench.cell.arm.name})) == ()
+    (found,) = problems(bench, replace(plan, about={"robot": "ur3e"}))
+    assert f"made for ur3e, and the cell's arm is {bench.cell.arm.name}" in found
 
 
 def test_number_of_joints_and_names_of_loads_at_once():
@@ -229,7 +245,7 @@ def test_reference_at_a_joint_limit_is_approached_from_within(side):
 
 def box(bench, q):
     """The smallest box around forearm, wrists and tool in all states."""
-    parts = Clearance(bench.cell, bench.config).scene.parts
+    parts = Clearance(bench.cell).scene.parts
     return reached(bench.cell, parts, np.asarray(q))
 
 
@@ -283,7 +299,7 @@ def test_lacking_unloaded_readings_and_reference_are_remarks():
     bench = Bench()
     poses = {name: q for name, q in POSES.items() if name != "reference"}
     plan = plan_of(("p1", "3kg", 0), ("p1", "none", 1), poses=poses)
-    checked = dry_run(bench.cell, bench.config, plan)
+    checked = dry_run(bench.cell, plan)
     assert checked.problems == ()
     assert any("p1, none, cycle 0" in line for line in checked.remarks)
     assert any('"reference"' in line for line in checked.remarks)

@@ -440,15 +440,15 @@ def test_the_way_home_is_clear(b):
     post = Obstacle(name="post", center_m=tuple(place), size_m=(0.04, 0.04, 0.04))
     config = b.config.model_copy(update={"obstacles": (post,)})
     home, via, p2 = (Stop(name, np.array(q[name]), "3kg") for name in q)
-    assert "post" in route_problems(Feasibility(b.cell, config), (p2, home))[0]
-    assert route_problems(Feasibility(b.cell, config), (home, via, p2)) == []
+    assert "post" in route_problems(Feasibility(b.cell.with_config(config)), (p2, home))[0]
+    assert route_problems(Feasibility(b.cell.with_config(config)), (home, via, p2)) == []
     plan = plan_of(("p2", "none", 0), ("p2", "3kg", 0), poses=q)
-    way = way_home(b.cell, config, plan, [home, via, p2], frozenset())
+    way = way_home(b.cell.with_config(config), plan, [home, via, p2], frozenset())
     assert [(s.name, s.hanging, s.change_to) for s in way] == [
         ("via", "3kg", None), ("reference", "3kg", "none"),
     ]  # fmt: skip
-    assert route_problems(Feasibility(b.cell, config), (p2, *way)) == []
-    free = way_home(b.cell, b.config, plan, [home, via, p2], frozenset())
+    assert route_problems(Feasibility(b.cell.with_config(config)), (p2, *way)) == []
+    free = way_home(b.cell, plan, [home, via, p2], frozenset())
     assert [s.name for s in free] == ["reference"]
 
 

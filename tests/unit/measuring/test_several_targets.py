@@ -93,7 +93,7 @@ def measure(b, path):
     plan = usual_plan()
     made = CampaignFile.open(path) if path.exists() else create_run(path, b.config, Path(), plan)
     with made as file:
-        run(b.rig, b.cell, b.config, plan, RunLog(file), b.clock, b.notes)
+        run(b.rig, b.cell, plan, RunLog(file), b.clock, b.notes)
         return file.readings()
 
 

@@ -42,7 +42,7 @@ STEPS = list(enumerate(PLAN.steps, start=1))
 
 @pytest.fixture(scope="module")
 def d(shadowed):
-    return PlanView(*shadowed, PLAN, SUMMARY)
+    return PlanView(shadowed, PLAN, SUMMARY)
 
 
 def words(path, of="plan"):
@@ -75,7 +75,7 @@ def test_the_arm_is_drawn_as_what_is_checked_for_collisions(d, recording):
 
 
 def test_arm_and_target_are_in_the_pose_of_every_step(shadowed, recording):
-    arm, link = shadowed[0].arm, shadowed[0].arm.links[6]
+    arm, link = shadowed.arm, shadowed.arm.links[6]
     moves = rows(recording, "/world/arm/body6", "Transform3D:translation")
     now = rows(recording, "/world/target/now", "Points3D:positions")
     assert sorted(moves) == sorted(now) == list(range(1, 11))
@@ -83,7 +83,7 @@ def test_arm_and_target_are_in_the_pose_of_every_step(shadowed, recording):
         chain = evaluate(arm, PLAN.joints(step.pose)[None])
         flange = chain.rotation[-1][0] @ (link[:3, :3].T @ np.array(link[:3, 3]))
         np.testing.assert_allclose(moves[k][0], chain.point(np.zeros(3))[0] - flange, atol=1e-6)
-        np.testing.assert_allclose(now[k][0], chain.point(shadowed[0].target[:3, 3])[0], atol=1e-6)
+        np.testing.assert_allclose(now[k][0], chain.point(shadowed.target[:3, 3])[0], atol=1e-6)
 
 
 def test_the_beam_is_red_where_a_screen_stands_and_green_elsewhere(shadowed, recording):
@@ -91,7 +91,7 @@ def test_the_beam_is_red_where_a_screen_stands_and_green_elsewhere(shadowed, rec
     colors = rows(recording, "/world/beam", "LineStrips3D:colors")
     labels = rows(recording, "/world/label", "Points3D:labels")
     for k, step in STEPS:
-        ends = [TRACKER, target(shadowed[0], PLAN.pose_names.index(step.pose))]
+        ends = [TRACKER, target(shadowed, PLAN.pose_names.index(step.pose))]
         np.testing.assert_allclose(strips[k][0], ends, atol=1e-6)
         hidden = step.pose == "p1"
         assert rgb(colors[k][0]) == (style.RED if hidden else style.NOISE)
@@ -103,11 +103,11 @@ def test_the_beam_is_red_where_a_screen_stands_and_green_elsewhere(shadowed, rec
 
 
 def test_a_reflector_that_looks_away_is_told_from_a_hidden_one(shadowed):
-    cell, config = shadowed
+    cell, config = shadowed, shadowed.config
     normal = evaluate(cell.arm, Q[2:3]).rotation[-1][0].T @ (TRACKER - target(cell, 2))
     more = {"target_normal": tuple(normal), "incidence_max_rad": 0.02}
     sight = config.sight.model_copy(update=more)
-    d = PlanView(cell, config.model_copy(update={"sight": sight}), PLAN, SUMMARY)
+    d = PlanView(cell.with_config(config.model_copy(update={"sight": sight})), PLAN, SUMMARY)
     status = dict(zip((s.pose for s in PLAN.steps), d.sight.tolist(), strict=True))
     assert status == {REFERENCE: TURNED, "p1": HIDDEN, "p2": SEEN, "p3": TURNED}
     assert "incidence" in plan.step_card(d, 0)
@@ -116,11 +116,11 @@ def test_a_reflector_that_looks_away_is_told_from_a_hidden_one(shadowed):
 
 
 def test_without_a_tracker_nothing_is_claimed(tmp_path):
-    cell, config = configured()
+    cell = configured()
     path = tmp_path / "x.rrd"
-    record_plan(cell, config, PLAN, SUMMARY, path)
+    record_plan(cell, PLAN, SUMMARY, path)
     assert not {"/world/beam", "/world/tracker", "/world/target/unseen"} & entities(path)
-    d = PlanView(cell, config, PLAN, SUMMARY)
+    d = PlanView(cell, PLAN, SUMMARY)
     assert set(d.sight.tolist()) == {UNKNOWN}
     assert not d.unseen.any()
     assert "not known" in plan.overview(d)
@@ -129,7 +129,7 @@ def test_without_a_tracker_nothing_is_claimed(tmp_path):
 
 
 def test_a_weight_hangs_below_the_load_point_and_a_pull_is_an_arrow(shadowed, recording):
-    cell = shadowed[0]
+    cell = shadowed
     radii = rows(recording, "/world/load/capsules", "Capsules3D:radii")
     starts = rows(recording, "/world/load/capsules", "Capsules3D:translations")
     cleared = rows(recording, "/world/load/capsules", "Clear:is_recursive")
@@ -152,7 +152,7 @@ def test_one_bead_per_pose_and_load_in_the_loads_colour(d, shadowed, recording):
     by_load = {n: tuple(c) for n, c in zip(PLAN.loads, d.colors.tolist(), strict=True)}
     assert colors == [by_load[load] for _, load in pairs]
     assert (len(places), len(set(by_load.values()))) == (8, 3)
-    off = places - [target(shadowed[0], PLAN.pose_names.index(pose)) for pose, _ in pairs]
+    off = places - [target(shadowed, PLAN.pose_names.index(pose)) for pose, _ in pairs]
     np.testing.assert_allclose(off[:, :2], 0.0, atol=1e-6)
     assert (off[:, 2] > -1e-6).all()
     assert [z < 1e-6 for z in off[:, 2]] == [load == UNLOADED for _, load in pairs]
@@ -165,7 +165,7 @@ def test_ways_are_one_path_of_straight_joint_motions(d, shadowed):
         np.testing.assert_allclose(way[-1], d.target[k], atol=1e-12)
         if k:
             np.testing.assert_allclose(way[0], d.target[k - 1], atol=1e-12)
-    half = evaluate(shadowed[0].arm, 0.5 * (Q[1:2] + Q[2:3])).point(shadowed[0].target[:3, 3])
+    half = evaluate(shadowed.arm, 0.5 * (Q[1:2] + Q[2:3])).point(shadowed.target[:3, 3])
     near = np.linalg.norm(d.paths[2] - half, axis=1).min()
     assert near <= np.linalg.norm(np.diff(d.paths[2], axis=0), axis=1).max()
     # a weight is hung at the reference pose on the way
@@ -177,14 +177,14 @@ def test_only_sides_of_the_workspace_that_are_given_are_drawn(recording, tmp_pat
     assert sides.shape == (3, 5, 3)
     for axis, low in enumerate((-1.6, -1.6, 0.05)):
         np.testing.assert_allclose(sides[axis][:, axis], low, atol=1e-6)
-    cell, config = configured(limits={"workspace_max_m": [1.2, 1.0, 1.5]})
-    record_plan(cell, config, PLAN, BARE, tmp_path / "x.rrd")
+    cell = configured(limits={"workspace_max_m": [1.2, 1.0, 1.5]})
+    record_plan(cell, PLAN, BARE, tmp_path / "x.rrd")
     sides = np.array(rows(tmp_path / "x.rrd", "/world/workspace", "LineStrips3D:strips")[0])
     np.testing.assert_allclose(sides.max(axis=(0, 1)), [1.2, 1.0, 1.5], atol=1e-6)
 
 
 def test_obstacles_stand_where_they_are_and_are_named(shadowed, recording):
-    where = [shadowed[1].obstacles[0].center_m]
+    where = [shadowed.config.obstacles[0].center_m]
     for entity, name, expected in (
         ("box/body", "Boxes3D:half_sizes", [[0.05, 0.05, 0.15]]),
         ("box/body", "Boxes3D:centers", where),
@@ -240,7 +240,7 @@ def test_words_are_what_the_terminal_prints(recording):
 
 
 def test_the_suspects_and_their_powers_come_before_the_plan(tmp_path):
-    record_plan(*configured(), PLAN, SUMMARY, tmp_path / "next.rrd", POWERS)
+    record_plan(configured(), PLAN, SUMMARY, tmp_path / "next.rrd", POWERS)
     lines = words(tmp_path / "next.rrd").splitlines()
     assert lines[0] == "### Which is it: joint_tilt_compliance or link_compliance?"
     assert "| joint_tilt_compliance | link_compliance | 74 % | 98 % |" in lines[1:6]
@@ -250,15 +250,15 @@ def test_the_suspects_and_their_powers_come_before_the_plan(tmp_path):
 
 def test_equal_plans_give_equal_recordings(shadowed, recording, tmp_path):
     again, other = tmp_path / "again.rrd", tmp_path / "other.rrd"
-    record_plan(*shadowed, PLAN, SUMMARY, again)
-    record_plan(*shadowed, replace(PLAN, steps=PLAN.steps[:-1]), SUMMARY, other)
+    record_plan(shadowed, PLAN, SUMMARY, again)
+    record_plan(shadowed, replace(PLAN, steps=PLAN.steps[:-1]), SUMMARY, other)
     assert same(recording, again)
     assert not same(recording, other)
 
 
 def test_no_character_without_a_glyph_reaches_the_viewer(tmp_path):
     bad = "█ |漢⟂ *x*"
-    cell, config = configured(
+    cell = configured(
         loads=[{"name": bad, "mass_kg": 2.0}],
         obstacles=[{"name": bad, "center_m": [2.0, 2.0, 0.0], "size_m": [0.1, 0.1, 0.1]}],
         sight={"tracker_m": TRACKER.tolist()},
@@ -273,7 +273,7 @@ def test_no_character_without_a_glyph_reaches_the_viewer(tmp_path):
         criteria=(replace(SUMMARY.criteria[0], criterion=bad),),
     )
     made = Plan((bad,), Q[:1], (Step(bad, UNLOADED), Step(bad, bad)))
-    record_plan(cell, config, made, summary, tmp_path / "x.rrd")
+    record_plan(cell, made, summary, tmp_path / "x.rrd")
     found = texts(tmp_path / "x.rrd")
     assert len(found) > 10
     assert [t for t in found if style.storable(t) != t] == []
@@ -281,8 +281,8 @@ def test_no_character_without_a_glyph_reaches_the_viewer(tmp_path):
 
 def test_what_does_not_fit_is_refused(shadowed, tmp_path):
     with pytest.raises(InputError, match="5 joint angles per pose; ur10e has 6"):
-        record_plan(*shadowed, replace(PLAN, q=Q[:, :5]), SUMMARY, tmp_path / "x.rrd")
-    refusal("no folder", record_plan, *shadowed, PLAN, SUMMARY, tmp_path / "none" / "x.rrd")
+        record_plan(shadowed, replace(PLAN, q=Q[:, :5]), SUMMARY, tmp_path / "x.rrd")
+    refusal("no folder", record_plan, shadowed, PLAN, SUMMARY, tmp_path / "none" / "x.rrd")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -301,15 +301,15 @@ def eye_place(path):
 
 def test_a_tripod_before_the_arm_makes_the_eye_go_elsewhere(tmp_path):
     free, path = tmp_path / "free.rrd", tmp_path / "tripod.rrd"
-    record_plan(*configured(), PLAN, SUMMARY, free)
+    record_plan(configured(), PLAN, SUMMARY, free)
     preferred = eye_place(free)
     at = [*(0.9 * preferred[:2] / np.linalg.norm(preferred[:2])).tolist(), 0.0]
     tripod = {"name": "tripod", "bottom_m": at, "radius_m": 0.3, "height_m": 1.2}
-    cell, config = configured(obstacles=[tripod])
-    record_plan(cell, config, PLAN, SUMMARY, path)
-    arm = PlanView(cell, config, PLAN, SUMMARY).bodies[:, 1:, :3, 3].reshape(-1, 3)
-    assert style.hidden_points(preferred, arm, config.obstacles).mean() > 0.3
-    assert style.hidden_points(eye_place(path), arm, config.obstacles).mean() < 0.02
+    cell = configured(obstacles=[tripod])
+    record_plan(cell, PLAN, SUMMARY, path)
+    arm = PlanView(cell, PLAN, SUMMARY).bodies[:, 1:, :3, 3].reshape(-1, 3)
+    assert style.hidden_points(preferred, arm, cell.config.obstacles).mean() > 0.3
+    assert style.hidden_points(eye_place(path), arm, cell.config.obstacles).mean() < 0.02
 
 
 @pytest.mark.parametrize(

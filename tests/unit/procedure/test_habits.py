@@ -64,7 +64,7 @@ def test_points_in_the_way_of_something_are_left_out_by_name(tmp_path):
     x, y, z = r.value[first].tolist()
     crate = Obstacle(name="crate", center_m=(x, y, z), size_m=(0.1, 0.1, 0.1))
     config = d.procedure.config.model_copy(update={"obstacles": (crate,)})
-    d = replace(d, procedure=replace(d.procedure, config=config))
+    d = replace(d, procedure=replace(d.procedure, cell=d.procedure.cell.with_config(config)))
     found = d.to_the_end()
     left = dict(found.left_out)
     assert "v1" in {name.split(" ")[0] for name in left}

@@ -16,7 +16,7 @@ from tests.support.procedure_cases import small_config
 @pytest.fixture(scope="module")
 def space():
     config = small_config()
-    return FeasibleSpace(cell_from_config(config, configs_dir() / "cells"), config)
+    return FeasibleSpace(cell_from_config(config, configs_dir() / "cells"))
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -50,6 +50,6 @@ def test_a_load_is_changed_at_the_reference_also_where_nothing_is_read(space):
     q[1:, 0] = 0.3, 0.6
     steps = (Step("a", UNLOADED), Step("b", load), Step("a", load), Step("a", load, 1))
     plan = Plan((REFERENCE, "b", "a"), q, steps)
-    side = planned_states(space.cell, space.config, plan).states.approach
+    side = planned_states(space.cell, plan).states.approach
     assert side[:, 0].tolist() == [1.0, 1.0, 1.0, 1.0]
     assert (side[:, 1:] == 1.0).all()  # as the reference was reached

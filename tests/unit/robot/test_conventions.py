@@ -241,7 +241,7 @@ def test_planned_poses_are_poses_of_the_arm(tmp_path):
     urdf_of_mimic(tmp_path)
     config = CellConfig.model_validate({"robot": {"model": "arm.urdf"}})
     cell = cell_from_config(config, tmp_path)
-    drawn = draw_poses(FeasibleSpace(cell, config), 20, np.random.default_rng(0))
+    drawn = draw_poses(FeasibleSpace(cell), 20, np.random.default_rng(0))
     np.testing.assert_allclose(cell.arm.complete(drawn.q), drawn.q, atol=1e-12)
 
 

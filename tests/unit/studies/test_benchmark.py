@@ -15,7 +15,7 @@ from studies.benchmark.formula import Comparison, Formula, FormulaError
 from studies.benchmark.generate import PUBLIC, main, make, specs
 from studies.benchmark.score import main as score_main
 from studies.benchmark.score import score_all
-from studies.benchmark.task import BenchmarkError, for_entrants, read_result, read_task, read_truth
+from studies.benchmark.task import BenchmarkError, read_result, read_task, read_truth
 from tests.support.rows import first
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -339,13 +339,6 @@ def test_real_tracks_are_made_of_the_public_readings(track, tmp_path, monkeypatc
         assert np.ptp(everywhere, axis=0).max() < 3.0  # within an arm's reach
         q = np.vstack([t.of([f"q{j}_rad" for j in range(1, 7)]) for t in (task.train, task.test)])
         assert len(np.unique(q, axis=0)) == len(q)  # nothing that is predicted was trained on
-
-
-def test_an_entrant_sees_no_truth(tmp_path):
-    for_entrants(TASKS / "elastic-001", tmp_path / "task")
-    assert sorted(path.name for path in (tmp_path / "task").iterdir()) == [
-        "robot.urdf", "task.json", "test.csv", "train.csv",
-    ]  # fmt: skip
 
 
 ALONE = """

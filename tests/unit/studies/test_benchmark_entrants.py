@@ -1,9 +1,7 @@
 """The benchmark's entrants: their arm, their size, and a runner that survives all of them."""
 
-import ast
 import json
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +10,7 @@ import pytest
 from hilcal.robot.chain import evaluate
 from hilcal.robot.urdf import arm_from_urdf
 from studies.benchmark.entrants.common import (
-    COMPLIANCE,
-    FormulaSearch,
     TaskInput,
-    chosen,
-    families,
-    left_out,
     rotation,
 )
 from studies.benchmark.entrants.run import HERE, main, scores
@@ -26,8 +19,6 @@ from studies.benchmark.task import read_task, read_truth
 
 ROOT = Path(__file__).resolve().parents[3]
 TASKS = ROOT / "studies" / "benchmark" / "tasks" / "public"
-MOST_LINES = 60
-"""Of an adapter, with its imports, docstrings and blank lines."""
 KEPT = ROOT / "docs" / "measured" / "benchmark" / "scores.json"
 PAGE = ROOT / "docs" / "reference" / "benchmark.md"
 FAKES = {
@@ -50,23 +41,6 @@ def first_task(track, poses=30):
     raise LookupError(track)
 
 
-@pytest.mark.parametrize("path", sorted(HERE.glob("*/entrant.py")), ids=lambda p: p.parent.name)
-def test_an_adapter_is_small_and_pinned(path):
-    assert len(path.read_text().splitlines()) <= MOST_LINES
-    needs = path.with_name("requirements.txt").read_text().split()
-    assert path.parent.name == "hilcal" or all("==" in line for line in needs)
-
-
-@pytest.mark.parametrize("name", ["common.py", "run.py", "tables.py", "frames/entrant.py"])
-def test_what_others_need_imports_numpy_alone(name):
-    tree = ast.parse((HERE / name).read_text())
-    nodes = list(ast.walk(tree))
-    plain = [a.name for n in nodes if isinstance(n, ast.Import) for a in n.names]
-    plain += [n.module or "" for n in nodes if isinstance(n, ast.ImportFrom) and not n.level]
-    known = {*sys.stdlib_module_names, "numpy", "benchmark"}
-    assert {n.split(".")[0] for n in plain} <= known
-
-
 @pytest.fixture(scope="module")
 def asked():
     """The smallest task of the elastic track."""
@@ -83,67 +57,6 @@ def test_positions_and_torques_are_those_of_another_mechanics(asked):
     law = TaskInput.read(first_task("law"))
     stated = np.stack([law.train.columns[f"x_tau{j}_Nm"] for j in range(1, 7)], axis=1)
     np.testing.assert_allclose(law.train.torque, stated, atol=6e-4)  # they are rounded to 1e-3
-
-
-def test_derivatives_are_exact(asked):
-    rng = np.random.default_rng(1)
-    theta = asked.arm.registered(asked.train)
-    theta[COMPLIANCE] = 1e-5
-    by, joints = asked.arm.jacobian(theta, asked.train)
-    for k in range(51):
-        step = (1e-4 if k < COMPLIANCE.start else 1e-7) * np.eye(51)[k]
-        ends = [asked.arm.predict(theta + s * step, asked.train) for s in (1, -1)]
-        slope = (ends[0] - ends[1]) / (2 * step[k])
-        np.testing.assert_allclose(by[:, :, k], slope, atol=2e-7 * np.abs(slope).max())
-    turn = 1e-4 * rng.standard_normal((len(asked.train.q), 6))
-    ends = [asked.arm.predict(theta, asked.train, s * turn) for s in (1, -1)]
-    moved = np.einsum("nij,nj->ni", joints, turn)
-    np.testing.assert_allclose(moved, (ends[0] - ends[1]) / 2, atol=1e-10)
-
-
-def test_families_are_what_their_parameters_move(asked):
-    theta = asked.arm.registered(asked.train)
-    frames, z = families(asked, theta, asked.train, waves=3)
-    assert list(z) == ["length", "angle", "give", "octave 0", "octave 1", "octave 2"]
-    assert [c.shape[1] for c in (frames, *z.values())] == [9, 18, 18, 6, 12, 12, 12]
-    at = np.r_[9 + 6 * 2 + 1, 9 + 6 * 2 + 3, COMPLIANCE.start + 2]  # y, turn about x, give of q3
-    step, moved = np.zeros(51), np.zeros(3 * len(asked.train.q))
-    for k, (name, column) in zip(at, [("length", 7), ("angle", 6), ("give", 2)], strict=True):
-        step[k] = {"length": 5e-4, "angle": 5e-4, "give": 1e-5}[name]
-        moved += z[name][:, column]
-    waves = np.zeros((len(asked.train.q), 6))
-    waves[:, 3] = 1e-4 * np.cos(2 * asked.train.q[:, 3])
-    moved += z["octave 1"][:, 6 + 3]
-    ends = [asked.arm.predict(theta + s * step, asked.train, s * waves) for s in (1, -1)]
-    np.testing.assert_allclose(moved, (ends[0] - ends[1]).ravel() / 2, atol=1e-8)
-
-
-def test_what_poses_left_out_ask_for_is_chosen(asked):
-    truth = asked.train.y.mean(axis=0)
-
-    def predict(far, rows, other):
-        assert not {*rows.pose} & {*other.pose}
-        return truth + far + 0.0 * other.y
-
-    best, off = chosen(asked, (1.0, -0.1, 0.3), predict)
-    assert best == -0.1
-    np.testing.assert_allclose(off, asked.train.y - truth + 0.1)
-
-
-def test_a_sought_law_is_a_formula_of_its_terms(asked):
-    theta = asked.arm.registered(asked.train)
-    sought = replace(FormulaSearch.of(asked, theta, asked.train), size=2.0)
-    found = sought.law(np.array([0.5, 0.0, -0.25]), ["sin(2*q1)", "q2", "q3 (tau2/8.1)"])
-    assert found == {"formula": "1*sin(2*q1) + -0.5*q3*(tau2/8.1)"}
-    assert sought.law(np.zeros(1), ["q1"]) is None
-
-
-def test_poses_are_left_out_whole(asked):
-    def predict(rows, other):
-        assert not {*rows.pose} & {*other.pose}
-        return other.y
-
-    assert not left_out(asked.train, predict).any()
 
 
 def run(tmp_path, *more, home=HERE):
@@ -226,30 +139,6 @@ def test_what_was_run_is_not_run_again(tmp_path, fakes):
     failed = {r["entrant"]: r["failed"] for r in rows}
     assert failed == {"good": None, "cannot": "not run: needs Julia"}
     assert told.read_text() == page(date, rows, fakes)
-
-
-@pytest.mark.long
-def test_a_row_that_is_reproduced_stands_beside_the_published_ones(tmp_path, capsys):
-    words = (str(TASKS), "--entrants", "frames", "--tasks", "elastic-00[123]")
-    assert run(tmp_path, *words, "--beside", str(KEPT)) == 0
-    table = capsys.readouterr().out
-    rows = [r for r in kept(KEPT)[1] if r["task"] in ("elastic-001", "elastic-002", "elastic-003")]
-    published = next(line for line in block(rows).splitlines() if line.startswith("| frames |"))
-    without_seconds = published.rsplit("|", 2)[0]
-    assert [line for line in table.splitlines() if line.startswith("| frames |")] == [
-        next(line for line in table.splitlines() if line.startswith(without_seconds))
-    ]
-    assert table.splitlines()[2].startswith("| hilcal | 1.00 |")
-
-
-@pytest.mark.long
-def test_an_environment_that_cannot_be_made_is_a_reason(tmp_path, fakes):
-    (fakes / "good" / "requirements.txt").write_text("./no-such-folder\n")
-    folders = ["-o", str(tmp_path / "out"), "--home", str(fakes), "--envs", str(tmp_path / "envs")]
-    words = [str(TASKS), "--entrants", "good", "--tasks", first_task("elastic").name]
-    assert main([*words, *folders]) == 0
-    failed = scores(TASKS, tmp_path / "out")[0]["failed"]
-    assert failed.startswith("its environment cannot be made: ERROR:")
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,13 @@
-"""`study diagnosis`: what it counts and asks, on one process and on several."""
+"""`study diagnosis`: its campaigns, what it counts and asks, on one process and on several."""
 
 import io
-import json
 
+import numpy as np
 import pytest
 from rich.console import Console
 
+from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
-from hilcal.readings.whitening import MODES
 from studies.diagnosis import (
     AddedEffect,
     DiagnosisCase,
@@ -18,13 +18,9 @@ from studies.diagnosis import (
     run_case,
 )
 from studies.diagnosis_claims import claims
-from studies.diagnosis_document import document
 from studies.diagnosis_pool import run_all
-from studies.diagnosis_questions import Extent, questions
 from studies.diagnosis_rates import (
     afterwards,
-    both_added,
-    both_found,
     by_effect,
     coverage_by_effect,
     followed,
@@ -32,9 +28,13 @@ from studies.diagnosis_rates import (
     unknown,
 )
 from studies.diagnosis_table import report
-from studies.study_cases import effects_shown, laws_shown
-from tests.support.cli_cases import ok, refused
-from tests.support.refusals import check, refusals
+from studies.study_cases import study_case
+from studies.study_more import measure_more, suspects
+from studies.unmodelled_laws import LAWS, law_named, shift
+from tests.support.campaigns import configuration
+from tests.support.cli_cases import refused
+from tests.support.fit_cases import fitted_model
+from tests.support.refusals import check, refusal, refusals
 
 
 def asked(**given):
@@ -66,17 +66,6 @@ def quick(question):
     if question.seed < 0:
         raise RuntimeError("a seed below 0")
     return DiagnosisOutcome(question, said(f"effect {question.seed}"))
-
-
-def extent(*kinds, **given):
-    usual = {
-        "kinds": kinds,
-        "robots": ("ur3e", "ur10e"),
-        "modes": MODES,
-        "effects": {m: effects_shown(m) for m in MODES},
-        "laws": {m: laws_shown(m) for m in MODES},
-    }
-    return Extent(**usual | given)
 
 
 @pytest.mark.parametrize(
@@ -111,19 +100,6 @@ def test_what_came_first_instead_is_counted():
     assert row.instead[0] == ("hysteresis", 2)
 
 
-def test_a_further_round_is_counted_by_itself():
-    again = asked(again=True)
-    cases = [
-        DiagnosisOutcome(again, said("a"), again=said()),
-        DiagnosisOutcome(again, said("a"), again=said("b")),
-    ]
-    (row,) = by_effect(cases)
-    assert (row.found.hits, row.again.hits, row.again.cases) == (0, 1, 2)
-    assert row.size_again == 1.0
-    (claim,) = (c for c in claims(cases) if "further round" in c.words)
-    assert (claim.rate.share, claim.met) == (0.5, False)
-
-
 def test_refinements_count_where_the_effect_was_found_and_named():
     inside = (IntervalCount("creep", 1, 1), IntervalCount("joint_compliance", 4, 6))
     right = DiagnosisOutcome(asked(), said(), refined("creep", inside=inside))
@@ -135,17 +111,6 @@ def test_refinements_count_where_the_effect_was_found_and_named():
     assert (row.intervals.hits, row.intervals.cases) == (5, 7)
     told = dict(coverage_by_effect([right, more, wrong]))
     assert told["joint_compliance"].share == pytest.approx(4 / 6)
-
-
-def test_of_two_effects_a_set_that_was_added_stands_for_its_members():
-    pair = asked(kind="pairs", hidden=("creep", "backlash"))
-    both = DiagnosisOutcome(pair, said(), refined("creep", "backlash"))
-    stand_in = DiagnosisOutcome(
-        pair, said(), refined("creep", "load_point", same_as=("backlash", "x"))
-    )
-    one = DiagnosisOutcome(pair, said(), refined("creep"))
-    assert [both_added(o) for o in (both, stand_in, one)] == [True, False, False]
-    assert [both_found(o) for o in (both, stand_in, one)] == [True, True, False]
 
 
 def test_outside_of_the_catalogue_the_verdict_and_the_variable_count():
@@ -174,18 +139,6 @@ def test_claims_are_met_or_not_by_what_is_asked():
     )
     (always,) = (c for c in claims([often]) if "intervals" in c.words)
     assert always.met is False
-
-
-def test_everything_is_asked_of_every_arm():
-    every = questions(extent("hidden", seeds=3))
-    assert len(set(every)) == len(every)
-    shown = sum(len(effects_shown(m)) for m in MODES)
-    assert len(every) == 3 * 2 * 3 * shown
-    assert not any("joint_compliance" in q.hidden for q in every)
-    # A study that is stopped after a third has asked of everything once.
-    first = every[: len(every) // 3]
-    assert {q.seed for q in first} == {0}
-    assert {(q.mode, q.hidden) for q in first} == {(q.mode, q.hidden) for q in every}
 
 
 def raising(error):
@@ -225,13 +178,6 @@ def test_ctrl_c_leaves_what_there_is(jobs):
     assert all(o.case in every for o in outcomes)
 
 
-@pytest.mark.slow
-def test_an_error_of_a_case_ends_the_study_and_its_processes():
-    every = tuple(asked(seed=s) for s in (1, 2, -1, 3))
-    with pytest.raises(RuntimeError, match="below 0"):
-        run_all(every, quick, 2, lambda step: None)
-
-
 def written(outcomes):
     out = Console(file=io.StringIO(), width=100)
     for part in report(outcomes):
@@ -239,34 +185,74 @@ def written(outcomes):
     return out.file.getvalue()
 
 
-def test_the_document_is_json_and_holds_every_case():
-    cases = [outcome(), DiagnosisOutcome(asked(), failure="InputError: no")]
-    d = document(cases, complete=False)
-    again = json.loads(json.dumps(d))
-    assert again["complete"] is False
-    assert [c["failure"] for c in again["cases"]] == ["", "InputError: no"]
-    assert again["effects"][0]["found"] == {"share": 0.5, "hits": 1, "cases": 2}
-
-
-SMALL = (
-    "studies", "diagnosis", "hidden", "nothing", "--robot", "ur10e", "--readings", "deflection",
-    "--effect", "hysteresis", "--strength", "3", "--seeds", "1", "--nothing", "1", "--json",
-)  # fmt: skip
-
-
-@pytest.mark.slow
-def test_the_command_gives_the_same_on_any_number_of_processes(capsys):
-    one = ok(capsys, *SMALL, "--jobs", "1").document
-    two = ok(capsys, *SMALL, "--jobs", "2").document
-    assert one == two
-    assert one["complete"] is True
-    assert [c["failure"] for c in one["cases"]] == ["", ""]
-    strong, _ = one["cases"]
-    assert strong["found"] is True
-    assert strong["refined"]["model"][-1] == "hysteresis"
-    assert {c["kind"] for c in one["claims"]} == {"hidden", "nothing"}
-
-
 @refusals("study_arguments")
 def test_wrong_input_of_a_study_is_refused_in_one_line(case, given, capsys):
     check(case, refused(capsys, 2, "studies", *given.split()))
+
+
+def case(*hidden, mode="absolute", strength=2.0, **given):
+    return study_case(
+        configuration(), "ur10e", mode, hidden, strength, int(given.get("seed", 3)),
+        cycles=int(given.get("cycles", 1)),
+        stated=given.get("stated", 1.0),
+        n_poses=int(given.get("poses", 8)),
+    )  # fmt: skip
+
+
+def seen(c):
+    """What would be read without noise."""
+    return c.readings.value - c.noise
+
+
+def test_the_noise_is_as_large_as_stated_or_as_misjudged():
+    for stated in (0.5, 1.0, 2.0):
+        many = [case(mode="deflection", seed=s, stated=stated, cycles=2) for s in range(4)]
+        white = [
+            np.linalg.solve(np.linalg.cholesky(c.readings.covariance), c.noise[:, :, None])
+            for c in many
+        ]
+        # 4 · 96 readings of three elements: 2 % of a standard deviation
+        assert np.std(np.concatenate(white)) == pytest.approx(1 / stated, rel=0.08)
+
+
+@pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
+def test_a_law_outside_of_the_catalogue_acts_at_the_strength_asked(law):
+    for mode in law.readings:
+        c = case(law.name, mode=mode, strength=3.0)
+        assert c.variables == law.variables
+        clean = c.world.ideal_readings(c.readings.states)
+        change = seen(c) - clean.position
+        covariance = c.world.covariance(clean)
+        if mode == "deflection":
+            first = np.repeat(np.arange(0, 48, 6), 6)
+            change = change - change[first]
+            covariance = covariance + covariance[first]
+            loaded = c.readings.load > 0
+            change, covariance = change[loaded], covariance[loaded]
+        white = np.linalg.solve(np.linalg.cholesky(covariance), change[:, :, None])
+        assert np.sqrt(np.mean(white**2)) == pytest.approx(3.0, rel=1e-6)
+
+
+def test_laws_and_effects_that_do_not_fit_are_refused():
+    refusal("crossed gear", law_named, "crossed gears")
+    refusal("absolute", case, "crossed gear", mode="deflection")
+    refusal("cancels in deflections", case, "encoder_offset", mode="deflection")
+    c = case()
+    still = c.readings.states
+    law, none = law_named("base that turns"), np.zeros(3, dtype=np.int64)
+    refusal("no loaded reading", shift, law, c.world, still[none], 3.0, "deflection", none, none)
+    with pytest.raises(InputError, match="no unloaded reading"):
+        shift(law, c.world, still[none + 1], 3.0, "deflection", none, none)
+    with pytest.raises(InputError, match="changes nothing"):
+        shift(law_named("swaying bench"), c.world, still[none], 3.0, "absolute", none, none)
+
+
+def diagnosed(c):
+    return diagnose(fitted_model(c.cell, c.readings, "deflection"))
+
+
+def test_nothing_is_measured_where_one_effect_leads_alone():
+    c = case("hysteresis", mode="deflection", strength=3.0, poses=20)
+    d = diagnosed(c)
+    assert suspects(d) == ("hysteresis",)
+    assert measure_more(configuration(), "ur10e", c, d, seed=1) is None

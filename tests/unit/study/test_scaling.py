@@ -9,7 +9,6 @@ import pytest
 from rich.console import Console
 from scipy import stats
 
-from hilcal.engine import open_engine
 from hilcal.errors import CannotAnswerError
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import Deviation, evaluate
@@ -20,9 +19,7 @@ from hilcal.study import (
     TARGET,
     UNITS,
     WRENCHES,
-    cramer_rao_bound,
     make_design,
-    n_experiments,
     scaling_study,
     table,
 )
@@ -123,19 +120,6 @@ def test_gu_loses_and_its_intervals_fail_where_correlation_is_high(study):
     assert study.of("gu", UNITS[0][0], True)[0].error_over_bound > 1.1
 
 
-def test_poses_are_feasible_and_the_arm_repeats_as_said(design):
-    arm = design.arm
-    assert np.all((design.q >= arm.q_min) & (design.q <= arm.q_max))
-    chain = evaluate(arm, design.q)
-    assert chain.position[1:, :, 2].min() > 0
-    jacobian_std = design.std[:, :3].mean()
-    assert 1e-5 < jacobian_std < 1e-4
-    for rho in (0.0, 0.5, 0.99):
-        v = design.covariance(rho)
-        np.testing.assert_allclose(np.diagonal(v, axis1=1, axis2=2), design.std**2, rtol=1e-12)
-        assert np.linalg.eigvalsh(v / (design.std[:, :, None] * design.std[:, None])).min() > 0.005
-
-
 def test_observation_matrix_is_the_motion_under_load(design):
     """Joints turned by c τ, with τ from virtual work, move the target by A c."""
     c = np.array([2, 3, 4, 10, 12, 15]) * 1e-9
@@ -149,14 +133,6 @@ def test_observation_matrix_is_the_motion_under_load(design):
         motion = np.concatenate([moved.point(TARGET) - start, turned], axis=1)
         expected = design.observation[:, k] @ c
         np.testing.assert_allclose(expected, motion, atol=1e-5 * np.abs(motion).max())
-
-
-@pytest.mark.parametrize("shared", [False, True])
-def test_bound_is_the_inverse_of_the_dense_information(design, shared):
-    a, v = dense(design, 0.9, shared)
-    expected = np.linalg.inv(a.T @ np.linalg.solve(v, a))
-    found = cramer_rao_bound(design, design.covariance(0.9), shared)
-    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-10 * expected.max())
 
 
 def test_arm_too_weak_is_said():
@@ -174,29 +150,6 @@ def test_arm_too_weak_is_said():
     ({"correlations": (float("nan"),)}, "correlation nan: must be")])  # fmt: skip
 def test_wrong_options_are_named(options, message):
     refusal(message, scaling_study, np.random.default_rng(0), **options)
-
-
-@pytest.mark.long
-def test_the_same_bits_on_several_workers():
-    correlations, done = (0.5, 0.9), []
-
-    def on(engine):
-        rng = np.random.default_rng(3)
-        found = scaling_study(rng, 50, correlations, engine=engine, advance=done.append)
-        assert rng.random() == after
-        return found
-
-    every = np.random.default_rng(3)
-    make_design(every, load_arm("ur10e"), 30)
-    for loaded_and_unloaded in (8, 8, 5, 5):  # as one sequence: of 30 poses, 6 elements, 50 runs
-        every.standard_normal((30 * loaded_and_unloaded, 6, 50))
-    after = every.random()
-    with open_engine(1) as engine:
-        alone = on(engine)
-    with open_engine(2) as engine:
-        assert on(engine) == alone
-    assert len(done) == 2 * n_experiments(correlations)
-    assert n_experiments() == 2 * len(CORRELATIONS)
 
 
 def test_json_holds_every_cell(study):

@@ -7,7 +7,6 @@ from hilcal.cli.planning import make_plan
 from hilcal.config import CellConfig
 from hilcal.drivers.simulated.rehearsal import case_of_plan, simulate_plan
 from hilcal.effects.catalogue import installed
-from hilcal.errors import CannotAnswerError
 from hilcal.robot.catalogue import load_arm
 from hilcal.transfer.compare import check_factory
 from tests.support.factory_cases import factory_of, write
@@ -25,7 +24,7 @@ def readings(folder, hide, seed):
     """Readings of 20 poses of an arm that the factory had measured, with a later change."""
     write(folder / "arm.toml", "ur15")
     config = CellConfig.model_validate(CELL)
-    plan = make_plan(cell_from_config(config, folder), config, 20, 1, installed())
+    plan = make_plan(cell_from_config(config, folder), 20, 1, installed())
     secret = case_of_plan(config, plan, hide, seed, None, folder)
     return config, simulate_plan(secret, plan, [seed]).readings
 
@@ -52,11 +51,3 @@ def test_a_change_since_the_factory_is_found_and_none_is_invented(tmp_path, hide
         assert other.factory_m > found.factory_m
     else:
         assert found.moved_m > 3.0 * found.moved_std_m
-
-
-@pytest.mark.long
-def test_too_few_readings_cannot_answer(tmp_path):
-    config, measured = readings(tmp_path, "nothing", 3)
-    cell = cell_from_config(config, tmp_path)
-    with pytest.raises(CannotAnswerError, match="7 readings; 8"):
-        check_factory(cell, load_arm("ur15"), cell.factory, measured[:7])
