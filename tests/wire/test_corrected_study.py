@@ -1,6 +1,7 @@
 """`studies corrected` on several workers: every cell once, and no device outlives its worker."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -58,6 +59,26 @@ def devices(*of):
 
 def gone(family):
     return not psutil.wait_procs(family, timeout=END_S)[1]
+
+
+@pytest.mark.slow
+def test_ctrl_c(tmp_path):
+    (temporary := tmp_path / "tmp").mkdir()
+    process = study(tmp_path / "d", "--jobs", "2", temporary=temporary)
+    try:
+        until_both_measure(tmp_path / "d", process)
+        family = psutil.Process(process.pid).children(recursive=True)
+        assert len(devices(process.pid)) >= 2 * DEVICES
+        os.killpg(process.pid, signal.SIGINT)
+        told = process.communicate(timeout=60)[1]
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert told.rstrip().endswith("interrupted")
+    assert gone(family)
+    assert not list(temporary.glob("hilcal-*"))
+    for arm in ARMS:
+        assert readings(tmp_path / "d", arm) >= 2
 
 
 @pytest.mark.slow

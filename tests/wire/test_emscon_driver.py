@@ -38,6 +38,19 @@ def opened(there, **options):
         device.close()
 
 
+def test_readings_scatter_as_the_tracker_states(there):
+    with opened(there, measuring_s=0.1) as device:
+        samples = [device.measure() for _ in range(40)]
+    assert isinstance(device, PointingTracker)
+    off = np.array([sample.value for sample in samples]) - TARGET
+    squares = np.einsum("ki,ij,kj->k", off, np.linalg.inv(samples[0].covariance), off)
+    low, high = stats.chi2.ppf((1e-6, 1.0 - 1e-6), 120)
+    assert low < squares.sum() < high
+    beam = np.array(TARGET) / np.linalg.norm(TARGET)
+    std = np.sqrt(beam @ samples[0].covariance @ beam)
+    assert std == pytest.approx(5e-6 + 0.15e-6 * np.linalg.norm(TARGET), rel=1e-3)
+
+
 # readings
 
 

@@ -17,7 +17,7 @@ from pymodbus.exceptions import ModbusIOException
 from hilcal.drivers import bota, ft300
 from hilcal.drivers.ft300 import STREAM, start_stream
 from hilcal.drivers.links import close_port, open_port
-from hilcal.drivers.simulated.force_server import DRIFT_STD
+from hilcal.drivers.simulated.force_server import DRIFT_STD, ROOM
 from hilcal.errors import DeviceError
 from tests.support import force_cases as cases
 from tests.support.force_cases import instruments, simulated
@@ -145,6 +145,15 @@ def test_unplugged_while_streaming_and_replugged(kind, simulated):
     simulated.admin("replug")
     with cases.opened(kind, simulated.port) as sensor:
         assert cases.steady(sensor, 0.2).frames > 10
+
+
+@cases.BOTH
+def test_unplugged_in_the_middle_of_a_mean(kind, simulated):
+    with cases.opened(kind, simulated.port) as sensor:
+        timer = threading.Timer(0.3, lambda: simulated.admin("unplug"))
+        timer.start()
+        cases.fails(lambda: sensor.average(30.0), "unplugged")
+        timer.join()
 
 
 @cases.BOTH
@@ -357,3 +366,48 @@ def test_ft300_serves_a_modbus_library_that_no_driver_uses():
             assert ft300.admin("state")["streaming"]
         finally:
             client.close()
+
+
+def test_each_sensor_has_a_zero_of_its_own():
+    biases = []
+    for seed in (1, 1, 2):
+        with force_sensor("ft300", seed=seed) as sensor:
+            biases.append(sensor.admin("state")["bias"])
+    assert biases[0] == biases[1] != biases[2]
+
+
+def test_the_zero_drifts_as_the_sensor_warms_up():
+    with (
+        force_sensor("bota", "--on", "0", scale=2000.0) as sensor,
+        cases.opened("bota", sensor.port) as device,
+    ):
+        cold = device.latest().temperature
+        time.sleep(1.5)  # 3000 s of the world
+        warm = cases.steady(device, 0.2)
+        state = sensor.admin("state")
+        assert device.latest().temperature > cold
+    assert state["temperature"] - ROOM > 6.0
+    drift = np.abs(warm.wrench - WRENCH - np.array(state["bias"]))
+    assert np.all(drift < 5 * DRIFT_STD * 7.0 + 0.03)
+    noise = np.array(state["noise"]) / np.sqrt(warm.frames)
+    assert np.any(drift > 0.1 * DRIFT_STD * 7.0 + 5 * noise)
+
+
+@pytest.mark.parametrize("kind", ["bota"])
+def test_a_saturated_gauge_is_no_reading_and_a_clock_that_wraps_loses_nothing(kind, simulated):
+    with cases.opened(kind, simulated.port) as sensor:
+        cases.steady(sensor, 0.1)
+        simulated.admin("saturate", on=True)
+        cases.fails(sensor.latest, OVERLOADED)
+        simulated.admin("saturate", on=False)
+        cases.steady(sensor, 0.1)
+        number = simulated.admin("state")["frames"]
+        simulated.admin("clock", us=2**32 - 1000 * number - 500_000)
+        time.sleep(0.2)
+        lost = sensor.losses().lost
+        wait_until(  # it wraps after half a second
+            lambda: simulated.admin("state")["frames"] > number + 700, "wrapped"
+        )
+        cases.steady(sensor, 0.1)
+        assert sensor.losses().lost == lost
+        simulated.admin("clock", us=0)

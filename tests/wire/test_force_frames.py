@@ -1,5 +1,6 @@
 """Frames of force sensors out of damaged streams, and the count of what was lost."""
 
+import binascii
 import struct
 
 import numpy as np
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 
 from hilcal.drivers import bota, ft300, onrobot_hex
 from hilcal.drivers.force_stream import ByArrival, ByDeviceClock, Deframer
+from hilcal.drivers.links import crc_x25
 
 FORMATS = {
     "ft300": ft300.SENSOR.frame,
@@ -42,6 +44,18 @@ def damaged(frames, rng, most_bits):
     return out, np.array(whole)
 
 
+@given(data=st.binary(max_size=60))
+def test_x25_is_the_mirror_image_of_the_standard_library_s_ccitt(data):
+    def mirror(value, bits):
+        return int(f"{value:0{bits}b}"[::-1], 2)
+
+    mirrored = bytes(mirror(byte, 8) for byte in data)
+    assert (
+        int.from_bytes(crc_x25(data), "little")
+        == mirror(binascii.crc_hqx(mirrored, 0xFFFF), 16) ^ 0xFFFF
+    )
+
+
 @ALL
 @given(data=st.data())
 def test_frames_come_whole_however_the_stream_is_cut_into_pieces(kind, data):
@@ -57,6 +71,15 @@ def test_frames_come_whole_however_the_stream_is_cut_into_pieces(kind, data):
     )  # a sum waits for the next header
     assert found == kept
     assert (deframer.frames, deframer.corrupt, deframer.skipped) == (len(kept), 0, 0)
+
+
+@ALL
+def test_a_stream_entered_in_the_middle_of_a_frame_has_lost_nothing(kind):
+    bodies, frames = frames_of(kind, 20, np.random.default_rng(4))
+    deframer = Deframer(FORMATS[kind])
+    found = deframer.push(FORMATS[kind].header + b"".join(frames)[5:])
+    assert found[0] == bodies[1]
+    assert (deframer.corrupt, deframer.skipped) == (0, 0)
 
 
 @ALL
@@ -80,6 +103,15 @@ def test_no_wrong_frame_is_accepted_from_a_damaged_stream(kind, seed):
     bad = int(np.sum(~whole))
     assert len(found) >= len(frames) - (2.2 if weak else 1.2) * bad
     assert 0.8 * bad <= deframer.corrupt <= 1.3 * bad
+
+
+@ALL
+def test_noise_alone_gives_no_frame(kind):
+    deframer = Deframer(FORMATS[kind])
+    rng = np.random.default_rng(8)
+    spec = FORMATS[kind]
+    for _ in range(2000):  # headers among noise
+        assert deframer.push(spec.header + rng.bytes(int(rng.integers(0, 60)))) == []
 
 
 def test_a_frame_inside_a_frame_is_not_taken():
@@ -157,6 +189,19 @@ def test_by_arrival_missing_frames_are_counted(rate):
     counter = ByArrival(100.0)
     arrivals(counter, times[~missing])
     assert counter.lost == pytest.approx(missing.sum(), abs=6)
+
+
+def test_by_arrival_a_held_up_line_that_catches_up_slowly_has_lost_nothing():
+    """100 ms of garbage at 19200 Bd; then each frame takes 8.3 ms on the wire."""
+    rng = np.random.default_rng(9)
+    born = np.arange(3000) / 100.0
+    times, free = np.empty(3000), 0.0
+    for k, start in enumerate(born):
+        free = max(free, start + 0.104 * (k % 500 == 400)) + 16 * 10 / 19200
+        times[k] = free
+    counter = ByArrival(100.0)
+    arrivals(counter, np.maximum.accumulate(times + rng.uniform(0.0, 0.002, 3000)))
+    assert counter.lost == 0
 
 
 def test_by_arrival_frames_that_were_held_up_are_not_lost():

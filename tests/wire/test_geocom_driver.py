@@ -75,6 +75,16 @@ def test_reading_is_the_target_with_the_covariance_it_has(device):
     assert across == pytest.approx(2 * (7.5e-6 + 3e-6 * distance) ** 2, rel=1e-3)
 
 
+def test_instrument_that_states_larger_errors_of_its_angles_is_believed():
+    with simulated.tracker(TARGET, "--transverse-std", "60e-6", "3e-6") as station:
+        device = open_tracker(cell(station.port))
+        covariance = device.measure().covariance
+        device.close()
+    distance = np.linalg.norm(TARGET)
+    across = np.linalg.eigvalsh(covariance)[-1]
+    assert across == pytest.approx((60e-6 + 3e-6 * distance) ** 2, rel=1e-2)
+
+
 @pytest.mark.parametrize("code", [1283, 1284])
 def test_reading_with_a_remark_is_used_and_says_so(device, station, code):
     station.admin("warn", code=code)
@@ -145,6 +155,13 @@ def test_report_names_every_problem_at_once(device, station):
     assert "no distance" in problems
 
 
+def test_report_turns_nothing(device, station):
+    before = len(station.admin("log"))
+    device.report()
+    asked = {int(request[0]) for request in station.admin("log")[before:]}
+    assert not asked & {9013, 9027, 9037, 17020}
+
+
 # the line
 
 
@@ -172,6 +189,11 @@ def test_busy_instrument_is_asked_again_and_given_up_in_time(device, station):
     assert seconds < MUTE_S
     station.admin("busy", on=False)
     device.measure()
+
+
+def test_half_a_reply_is_not_a_reading(device, station):
+    station.admin("half_frame")
+    assert device.measure().value == pytest.approx(TARGET, abs=1e-3)
 
 
 @pytest.mark.long
@@ -231,6 +253,10 @@ def refused(error, config):
     assert time.monotonic() - begin < OPEN_S
     assert "\n" not in str(caught.value)
     return str(caught.value)
+
+
+def test_port_that_is_not_there(tmp_path):
+    assert "no port" in refused(DeviceError, cell(tmp_path / "absent"))
 
 
 # configuration

@@ -56,6 +56,21 @@ def test_the_simulated_person_hangs_what_is_asked_for_and_takes_it_off(world):
     ]
 
 
+def test_the_simulated_person_takes_time_of_the_cell(world):
+    socket, asked = world
+    made = simulated(socket)  # 20 s, 50 times as fast
+    begun = time.monotonic()
+    open_simulated(made).hang(made.loads[0], "")
+    assert asked[0][2] - begun >= 0.4
+
+
+def test_what_the_simulated_world_refuses_is_told(world):
+    socket, _ = world
+    made = simulated(socket, hand_s=0)
+    with pytest.raises(DeviceError, match="the hook is bent"):
+        open_simulated(made).hang(made.loads[1], "")
+
+
 def test_a_simulated_person_without_a_world_reports_it(world, tmp_path):
     assert open_simulated(simulated(world[0])).report().problems == ()
     lost = open_simulated(simulated(tmp_path / "none.sock", hand_s=0))

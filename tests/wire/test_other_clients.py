@@ -1,32 +1,19 @@
 """The simulated devices as programs of others meet them: clients written here from the protocols'
-documents alone, libraries of others (ur_rtde, geocompy), and byte transcripts of the makers'
+documents alone, libraries of others (ur_rtde, pymodbus), and byte transcripts of the makers'
 manuals. UR's own library for Python is in no package registry; its recipes are asked for here.
 """
 
 import csv
 import struct
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
-import serial
-from geocompy.communication import SerialConnection
-from geocompy.geo import GeoCom
-from geocompy.geo.gctypes import GeoComCode
 
-from hilcal.calibration.urscript import movej_program, waypoints, with_joints
 from hilcal.drivers.links import crc16 as crc16_of
 from hilcal.drivers.links import crc_modbus, crc_x25
 from hilcal.drivers.simulated.force_server import Ft300
-from tests.support.instruments import TARGET, tracker
-from tests.support.sim_ur_cases import (
-    ClientError,
-    Lines,
-    Wire,
-    client,
-    send_script,
-    start,
-)
+from tests.support.geocom_cases import crc16
+from tests.support.sim_ur_cases import ClientError, Wire, client, start
 from tests.support.timing import wait_until
 
 
@@ -122,157 +109,22 @@ def test_ur_rtde_records_and_writes_inputs(arm, tmp_path):
     np.testing.assert_allclose(joints[-1], arm.admin()["q"], atol=1e-3)
 
 
-# --- payload, dashboard and script port, as ur_rtde and the makers' pages use them ---------------
-
-
-def test_payload_keeps_its_centre_when_told_zeros(arm):
-    with client(arm.host, "control", "receive") as run:
-        assert run("control", "setPayload", 2.5, [0.01, 0.02, 0.03])
-        assert run("control", "setPayload", 3.5, [0.0, 0.0, 0.0])
-        wait_until(lambda: run("receive", "getPayload") == 3.5, "told")
-        assert run("receive", "getPayloadCog") == [0.01, 0.02, 0.03]
-
-
-LOCAL = "Command is not allowed due to safety reasons, please switch robot to Remote Control mode"
-
-
-def test_dashboard_answers(arm):
-    with Lines(arm.host) as dashboard:
-        assert dashboard.read() == "Connected: Universal Robots Dashboard Server"
-        assert dashboard.ask("stop") == "Stopped"  # the program of the client before
-        arm.wait("script_running", False)
-        assert dashboard.ask("PolyscopeVersion").startswith("URSoftware 5.11.6.1010327 ")
-        assert dashboard.ask("get robot model") == "UR10e"
-        assert dashboard.ask("get serial number").isdigit()
-        assert dashboard.ask("robotmode") == "Robotmode: RUNNING"
-        assert dashboard.ask("safetystatus") == "Safetystatus: NORMAL"
-        assert dashboard.ask("running") == "Program running: false"
-        assert dashboard.ask("programState").split()[0] == "STOPPED"
-        assert dashboard.ask("play") == "Failed to execute: play"
-        assert dashboard.ask("close safety popup") == "closing safety popup"
-        assert dashboard.ask("dance") == "could not understand: 'dance'"
-        assert dashboard.ask("quit") == "Disconnected"
-        assert dashboard.read() == ""
-
-
-def test_dashboard_connections_of_local_mode_stay_without_rights(arm):
-    arm.admin("local_mode")
-    with Lines(arm.host) as dashboard:
-        dashboard.read()
-        assert dashboard.ask("is in remote control") == "false"
-        assert dashboard.ask("stop").startswith(LOCAL)
-        arm.admin("remote_mode")
-        assert dashboard.ask("is in remote control") == "true"
-        assert dashboard.ask("stop").startswith(LOCAL)
-    with Lines(arm.host) as dashboard:
-        dashboard.read()
-        assert dashboard.ask("stop") == "Stopped"
-
-
-Q = np.array([[0.1, -1.2, 1.5, -1.0, -1.4, 0.3], [0.3, -1.1, 1.4, -0.9, -1.5, 0.4]])
-PROGRAM = """def prog():
-  set_tcp(p[0,0,0.1,0,0,0])
-  movej([0,-1.57,1.57,0,1.57,0], a=20, v=30) # first
-  sleep(0.01)
-  movel([0.1,-1.5,1.5,0,1.5,0], a=20, v=30, r=0.01)
-end
-"""
-
-
-def reached(arm, text, goals):
-    send_script(arm.host, text)
-    moves = [f"move to {np.round(goal, 6).tolist()}" for goal in goals]
-    wait_until(
-        lambda: [line for _, line in arm.admin("log") if line in moves] == moves, f"moved {moves}"
-    )
-    arm.wait("script_running", False)
-    state = arm.admin()
-    np.testing.assert_allclose(state["q"], goals[-1], atol=1e-8)
-    assert not state["moving"]
-
-
-def test_a_program_of_compensated_points_is_carried_out(arm):
-    reached(arm, movej_program(["a", "b"], Q).replace("])", "], a=20, v=30)"), Q)
-
-
-def test_a_rewritten_program_goes_to_its_new_waypoints(arm):
-    reached(arm, with_joints(PROGRAM, waypoints(PROGRAM), Q), Q)
-
-
-def test_programs_with_other_statements_are_foreign_and_move_nothing(arm):
-    before = arm.admin()["q"]
-    send_script(arm.host, "def p():\n  movej([0,0,0,0,0,0])\n  while (True):\n  end\nend\n")
-    wait_until(
-        lambda: any("foreign program" in line for _, line in arm.admin("log")), "a foreign program"
-    )
-    assert arm.admin()["q"] == before
+def test_an_unknown_protocol_is_not_spoken(arm):
+    with Wire(arm.host) as wire:
+        assert wire.ask("V", struct.pack(">H", 3)) == b"\x00"
+        assert wire.ask("V", struct.pack(">H", 2)) == b"\x01"
 
 
 # --- Modbus RTU: MODBUS over Serial Line V1.02, and Application Protocol V1.1b3 ------------------
 
 
-# --- GeoCOM: geocompy -----------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def station():
-    with tracker(TARGET) as running:
-        yield running
-
-
-def cartesian(hz, v, distance):
-    return distance * np.array([np.sin(v) * np.sin(hz), np.sin(v) * np.cos(hz), np.cos(v)])
-
-
-@contextmanager
-def geocom(station):
-    port = serial.Serial(str(station.port), 115200, timeout=5.0, exclusive=True)
-    with SerialConnection(port) as connection:
-        yield GeoCom(connection, checksum=True)
-
-
-def test_geocompy_reads_who_it_is(station):
-    with geocom(station) as device:
-        assert device.csv.get_instrument_name().params == "SIM LASER STATION"
-        assert device.csv.get_serial_number().params == 123456
-        assert device.csv.get_firmware_version().params == (6, 20, 0)
-        assert device.com.get_geocom_version().params == (1, 50, 0)
-        assert device.csv.get_datetime().params is not None
-        assert 0 < device.csv.get_internal_temperature().params < 60
-        assert device.aut.get_lock_status().params is True
-        assert device.aut.switch_atr(True).error == GeoComCode.OK
-        assert device.tmc.get_atmospheric_corrections().params == pytest.approx(
-            (658e-9, 1013.25, 20.0, 20.0), abs=1e-12
-        )
-        assert device.tmc.set_atmospheric_corrections(1e-6, 950.0, 31.0, 21.0).error == 0
-        assert device.tmc.get_atmospheric_corrections().params == (1e-6, 950.0, 31.0, 21.0)
-        assert device.com.set_double_precision(4).error == 0
-        assert device.com.get_double_precision().params == 4
-        assert device.com.set_double_precision(15).error == 0
-        assert device.abort().error == 0
-
-
-def test_geocompy_reads_where_the_target_is(station):
-    with geocom(station) as device:
-        answer = device.bap.measure_distance_angle()
-        assert answer.error == GeoComCode.OK
-        hz, v, distance, _ = answer.params
-        np.testing.assert_allclose(cartesian(float(hz), float(v), distance), TARGET, atol=1e-3)
-        assert device.tmc.do_measurement().error == GeoComCode.OK
-        full = device.tmc.get_complete_measurement()
-        assert full.error == GeoComCode.OK
-        hz, v, accuracy, cross, length, _, distance, at_ms = full.params
-        np.testing.assert_allclose(cartesian(float(hz), float(v), distance), TARGET, atol=1e-3)
-        assert float(accuracy) == pytest.approx(
-            (7.5e-6 + 3e-6 * float(np.linalg.norm(TARGET))) / float(np.linalg.norm(TARGET)),
-            rel=1e-3,
-        )
-        assert abs(float(cross)) + abs(float(length)) < 1e-4
-        assert 0 < at_ms <= station.board.time * 1e3
-        simple = device.tmc.get_simple_measurement()
-        assert simple.params[2] == distance  # of the same distance measurement
-        angles = device.tmc.get_angle().params
-        assert float(angles[0]) == pytest.approx(float(hz), abs=1e-4)
+def test_a_request_that_the_line_has_damaged_is_not_answered():
+    request = b"\x09\x03" + struct.pack(">HH", 500, 1)
+    whole = request + crc16(request, 0xFFFF).to_bytes(2, "little")
+    for bit in range(8 * len(whole)):
+        damaged = bytearray(whole)
+        damaged[bit // 8] ^= 1 << bit % 8
+        assert Ft300().receive(bytes(damaged), np.zeros(6)) == b""
 
 
 # --- transcripts ---------------------------------------------------------------------------------

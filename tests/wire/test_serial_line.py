@@ -3,13 +3,15 @@
 import os
 import subprocess
 import sys
+import threading
+import time
 import tty
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from hilcal.drivers.links import close_port, open_port
+from hilcal.drivers.links import close_port, drain, line_failures, open_port
 from hilcal.errors import DeviceError, InputError
 
 HOLD = """
@@ -53,6 +55,7 @@ def test_a_port_that_another_program_uses_is_refused_and_named(line):
         [sys.executable, "-c", HOLD, str(line.path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
     with other:
+        assert other.stdout is not None
         assert other.stdout.readline() == b"held\n"
         with pytest.raises(DeviceError, match="in use by another program") as caught:
             open_port("force sensor", str(line.path), 19200)
@@ -82,3 +85,65 @@ def test_a_rate_that_no_port_has(line, baud):
     with pytest.raises(InputError, match=f"{baud} is no rate"):
         open_port("tracker", str(line.path), baud)
     close_port(open_port("tracker", str(line.path), 19200))  # nothing is left locked
+
+
+@pytest.mark.parametrize("action", ["read", "write", "waiting", "reset", "drain"])
+def test_an_unplugged_adapter_is_one_line_whatever_was_tried(line, action):
+    port = open_port("tracker", str(line.path), 19200, timeout=0.2)
+    try:
+        line.unplug()
+        assert port.is_open
+        actions = {
+            "read": lambda: port.read(1),
+            "write": lambda: port.write(b"x"),
+            "waiting": lambda: port.in_waiting,
+            "reset": port.reset_input_buffer,
+            "drain": lambda: drain(port, 0.05, 1.0),
+        }
+        with (
+            pytest.raises(DeviceError, match=r"^tracker: port .* is gone; was its adapter unp"),
+            line_failures("tracker", str(line.path)),
+        ):
+            actions[action]()
+    finally:
+        close_port(port)
+
+
+def test_a_line_is_drained_until_quiet(line):
+    port = open_port("tracker", str(line.path), 19200)
+    sent = threading.Event()
+
+    def talk():
+        for _ in range(10):
+            os.write(line.master, b"late answer\r\n")
+            time.sleep(0.01)
+        sent.set()
+
+    thread = threading.Thread(target=talk)
+    try:
+        thread.start()
+        assert drain(port, quiet=0.3, limit=20.0)
+        assert sent.is_set()
+        assert port.in_waiting == 0
+    finally:
+        thread.join()
+        close_port(port)
+
+
+def test_a_line_that_never_is_quiet_is_told_of(line):
+    port = open_port("tracker", str(line.path), 19200)
+    stop = threading.Event()
+
+    def talk():
+        while not stop.is_set():
+            os.write(line.master, b"x")
+            time.sleep(0.002)
+
+    thread = threading.Thread(target=talk)
+    try:
+        thread.start()
+        assert not drain(port, quiet=0.5, limit=1.0)
+    finally:
+        stop.set()
+        thread.join()
+        close_port(port)

@@ -6,6 +6,7 @@ import socket
 import stat
 import subprocess
 import sys
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import psutil
 import pytest
 
 from hilcal.drivers.simulated import cell_processes
+from hilcal.drivers.simulated.admin import ask
 from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.drivers.simulated.cell_processes import (
     UR_PORTS,
@@ -23,6 +25,7 @@ from hilcal.drivers.simulated.cell_processes import (
 )
 from hilcal.drivers.simulated.truth import Truth
 from hilcal.drivers.simulated.world import World
+from hilcal.drivers.simulated.world_server import write_world
 from hilcal.errors import DeviceError, InputError
 from tests.support.arm_cases import ODD, arm_of
 from tests.support.paths import ROOT
@@ -91,6 +94,18 @@ def test_the_configuration_leads_to_the_devices_and_keeps_the_rest(cell):
     }
     assert filled.model_copy(update=untouched) == given
     assert filled == type(filled).from_json(filled.to_json())
+
+
+@pytest.mark.long
+def test_two_cells_have_arms_of_their_own(cell, tmp_path):
+    with start(tmp_path, config()) as other:
+        assert tuple(other.processes()) == DEVICES[:3]  # no force sensor was configured
+        assert other.config.robot.host != cell.config.robot.host
+        other.ask("world", "hang", name="5kg")
+        assert cell.ask("world", "state")["load"] is None
+        pids = other.processes().values()
+    assert not any(map(runs, pids))
+    assert all(map(runs, cell.processes().values()))
 
 
 def test_a_directory_in_use_is_refused(cell):
@@ -210,6 +225,18 @@ def test_a_device_that_ends_early_is_named_with_its_last_words(tmp_path, monkeyp
     assert children() == before
 
 
+@pytest.mark.long
+def test_a_device_that_never_gets_ready_is_named_at_the_deadline(tmp_path, monkeypatch):
+    before = children()
+    (tmp_path / "asleep.py").write_text("import time\ntime.sleep(600)\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    broken(monkeypatch, "asleep")
+    monkeypatch.setattr(cell_processes, "START_TIMEOUT", 2.0)
+    with pytest.raises(DeviceError, match=r"tracker: not ready within 2 s; see .*\.log"):
+        start(tmp_path, config())
+    assert children() == before
+
+
 def test_what_cannot_be_simulated_is_refused_before_anything_starts(tmp_path):
     made = whole()
     world = world_of(made)
@@ -241,6 +268,35 @@ def test_what_cannot_be_simulated_is_refused_before_anything_starts(tmp_path):
     assert not list(tmp_path.glob("*.log"))
 
 
+def test_a_world_that_died_goes_on_where_it_was(tmp_path):
+    made = config()
+    write_world(tmp_path / "world.json", world_of(made), made)
+    arguments = ("--seed", "5")
+    process = DeviceProcess("world", "hilcal.drivers.simulated.world_server", tmp_path, arguments)
+
+    def begin():
+        process.start()
+        wait_until(lambda: process.socket.exists() or process.has_ended, "started")
+        process.check()
+
+    with ExitStack() as ending:
+        ending.callback(process.end)
+        begin()
+        board = Blackboard(tmp_path / "world.bin")
+        ask(process.socket, "hang", name="pull")
+        since, begun = board.read("truth")["load_since"], board.time
+        ask(process.socket, "die")
+        wait_until(lambda: process.has_ended, "ended")
+        with pytest.raises(DeviceError, match="ended with exit code 70"):
+            process.check()
+        with pytest.raises(DeviceError, match=r"simulated device at world\.sock"):
+            ask(process.socket, "state")
+        begin()
+        state = ask(process.socket, "state")
+        assert (state["load"], state["load_since"]) == ("pull", since)
+        assert state["time"] > begun
+
+
 def test_requests_that_cannot_be_are_answered_with_what_is_valid(cell):
     before = cell.ask("world", "log")
     with pytest.raises(DeviceError, match=r"no load '7kg'.*valid: none, 5kg, pull"):
@@ -251,6 +307,18 @@ def test_requests_that_cannot_be_are_answered_with_what_is_valid(cell):
         cell.ask("world", "push", wrench=[1.0])
     cell.ask("world", "swing", wrench=[1.0] * 6, period=1.0, decay=1.0)
     assert cell.ask("world", "log") == before
+
+
+def test_a_process_without_a_world_says_so_in_one_line(tmp_path):
+    process = DeviceProcess(
+        "world", "hilcal.drivers.simulated.world_server", tmp_path, ("--seed", "5")
+    )
+    process.start()
+    wait_until(lambda: process.has_ended, "ended")
+    with pytest.raises(DeviceError, match=r"world: ended with exit code 2: .*world\.json"):
+        process.check()
+    process.end()
+    assert len((tmp_path / "world.log").read_text().splitlines()) == 1
 
 
 def listening(pid):

@@ -113,6 +113,20 @@ def test_payload_that_the_controller_does_not_take_is_told_by_its_cause(
     assert sim.admin()["payload"] == cases.MASS
 
 
+def test_a_program_that_ends_while_a_payload_is_set_is_named(arm, sim, monkeypatch):
+    set_payload = Control.set_payload
+
+    def ended(control, mass, com):
+        sim.admin("kill_script")
+        return set_payload(control, mass, com)
+
+    monkeypatch.setattr(Control, "set_payload", ended)
+    with pytest.raises(DeviceError, match="did not take the payload: its program is stopped"):
+        arm.set_payload(4.0, cases.COM)
+    with pytest.raises(DeviceError, match=r"not under control.*its program is stopped"):
+        arm.start_move(arm.sample().q, 0.5, 0.5)
+
+
 @pytest.mark.parametrize("lost", [False, True])
 def test_a_command_that_fails_since_the_program_has_ended_says_so(lost, arm, sim, monkeypatch):
     def ended(*_):
@@ -169,6 +183,17 @@ def test_second_program_is_refused_and_disturbs_nothing(arm, sim):
         cases.finish(arm)
     np.testing.assert_allclose(sim.admin()["q"], goal, atol=2e-5)
     assert sim.admin()["payload"] == cases.MASS
+
+
+def test_motion_in_a_world_that_goes_faster(tmp_path):
+    with (
+        closing(cases.start(tmp_path, scale=20.0)) as running,
+        closing(cases.controlled(running, clock=20.0)) as arm,
+    ):
+        goal = cases.displaced_joints(arm, by=2.0)
+        arm.start_move(goal, cases.SPEED, cases.ACCELERATION)
+        cases.finish(arm)
+        np.testing.assert_allclose(running.admin()["q"], goal, atol=2e-5)
 
 
 def test_controller_that_does_not_tell_its_payload(tmp_path):

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -11,6 +12,7 @@ import numpy as np
 import psutil
 import pytest
 
+from hilcal.drivers.simulated.cell_processes import free_host
 from hilcal.drivers.ur_link import supervision
 from hilcal.drivers.ur_link.worker import environment
 from hilcal.errors import DeviceError
@@ -65,6 +67,13 @@ def test_motion_that_is_refused_is_told(arm, sim):
     text = cases.error_of(lambda: arm.start_move(goal, cases.SPEED, cases.ACCELERATION))
     assert "did not take the motion" in text
     assert not sim.admin()["moving"]
+
+
+def test_sample_in_motion_stops_the_arm_when_the_link_is_lost(arm, sim):
+    cases.under_way(arm, sim)
+    since = sim.admin("rtde_drop")["fault_ns"]
+    assert "the link is lost" in cases.error_of(arm.sample)
+    cases.check_resting(sim, since)
 
 
 def test_protective_stop_names_its_cause_and_is_recovered_from(tmp_path):
@@ -126,6 +135,25 @@ def test_controller_dies_in_motion(tmp_path):
         with pytest.raises(DeviceError, match="refuses the connection"):
             arm.take_control(1.0, np.zeros(3))
     assert cases.children() == []
+
+
+@pytest.mark.slow
+def test_motion_scaled_to_nothing_is_given_up(arm, sim):
+    goal = cases.under_way(arm, sim)
+    sim.admin("set", speed_scaling=0.0)
+    assert "scaled to 0" in cases.error_of(arm.moving)
+    assert not sim.admin()["moving"]
+    sim.admin("set", speed_scaling=1.0)
+    time.sleep(0.2)
+    assert abs(sim.admin()["q"][0] - goal[0]) > 0.05  # it does not go on later
+
+
+def test_slow_speed_slider_is_waited_for(arm, sim):
+    sim.admin("set", slider=0.2)
+    goal = cases.displaced_joints(arm, by=0.05)
+    arm.start_move(goal, cases.SPEED, cases.ACCELERATION)
+    cases.finish(arm)
+    np.testing.assert_allclose(sim.admin()["q"], goal, atol=2e-5)
 
 
 @pytest.mark.parametrize("fault", first(1, ["rtde_drop", "rtde_stall", "rtde_half_frame"]))
@@ -255,3 +283,29 @@ def test_kill_9_while_control_is_taken_leaves_no_program_behind(sim):
             cases.controlled(sim).close()  # and the next program takes over
     finally:
         cases.supervision(sim).stop(2.0)
+
+
+HANGING = """
+import sys, threading
+from hilcal.drivers.ur_link.worker import Worker
+arguments = (sys.argv[1], "125.0", "timestamp")
+start = lambda: Worker("receive", arguments, 60.0)
+thread = threading.Thread(target=start)
+thread.start()
+thread.join()
+"""
+
+
+@pytest.mark.long
+def test_child_that_hangs_in_the_client_library_ends_with_the_program():
+    host = free_host()
+    with socket.socket() as server:
+        server.bind((host, 30004))
+        server.listen(4)
+        with program(HANGING, host) as parent:
+            line, _ = server.accept()  # the library is in its constructor, and stays there
+            with line:
+                (child,) = psutil.Process(parent.pid).children()
+                parent.kill()
+                parent.wait()
+                wait_until(lambda: not runs(child.pid), "ended: the child", 5.0)

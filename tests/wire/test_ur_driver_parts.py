@@ -12,8 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilcal.drivers.simulated.cell_processes import free_host
+from hilcal.config.reference import to_toml
+from hilcal.drivers.simulated.cell_processes import SimulatedCell, free_host
+from hilcal.drivers.simulated.ur_rtde import outputs_since
 from hilcal.drivers.simulated.ur_server import API
+from hilcal.drivers.simulated.ur_state import line
 from hilcal.drivers.ur import open_arm
 from hilcal.drivers.ur_link import states
 from hilcal.drivers.ur_link.control import MARGIN_S, MotionInProgress, deceleration, program_ended
@@ -29,8 +32,16 @@ from hilcal.drivers.ur_link.reading import (
     settled_rate,
 )
 from hilcal.drivers.ur_link.supervision import RobotApi
+from hilcal.drivers.ur_link.worker import Worker, WorkerError
+from hilcal.identification.torques import check_torques
+from hilcal.measuring.route import duration
+from hilcal.robot.catalogue import load_arm
+from hilcal.robot.factory import nominal_rows
+from hilcal.store.campaign_file import CampaignFile
 from tests.support import ur_driver_cases as cases
+from tests.support.cli_cases import ok
 from tests.support.factory_cases import write
+from tests.support.running_world import config, world_of
 from tests.support.ur_driver_cases import server
 
 FIELDS = {
@@ -41,6 +52,18 @@ FIELDS = {
 }
 
 
+@given(
+    distance=st.floats(1e-4, 6.0), speed=st.floats(0.01, 3.0), acceleration=st.floats(0.01, 40.0)
+)
+def test_time_of_a_motion_is_that_of_the_simulated_controller(distance, speed, acceleration):
+    goal = np.zeros(N)
+    goal[3] = -distance
+    segment = line(np.zeros(N), goal, speed, acceleration)
+    assert duration(np.zeros(N), goal, speed, acceleration) == pytest.approx(
+        segment.duration, rel=1e-9
+    )
+
+
 @given(speed=st.floats(0.01, 2.0))
 def test_every_speed_is_braked_in_time(speed):
     assert speed / deceleration(speed) <= 0.2
@@ -48,6 +71,10 @@ def test_every_speed_is_braked_in_time(speed):
 
 def reading(**changes):
     return read({"host_ns": 1, "fields": {**FIELDS, **changes}})
+
+
+def test_slider_and_scaling_multiply():
+    assert reading().sample.speed_scaling == 0.25
 
 
 @pytest.mark.parametrize(
@@ -101,6 +128,11 @@ def test_a_pause_that_the_watchdog_bears_does_not_hide_another_program():
     assert "another program" not in program_ended(stopped, 0.2)
 
 
+def test_worker_that_cannot_start_says_so():
+    with pytest.raises(WorkerError, match="exit code 1"):
+        Worker("no such kind", (), 10.0)
+
+
 def test_a_moment_without_packets_is_no_slow_line():
     """A busy computer loses some tenths of a second; a slow network stays slow."""
     counted = []
@@ -122,6 +154,14 @@ NEW = "5.23.0.0"
 FRICTION = np.array([6.0, 6.0, 4.0, 1.2, 1.2, 1.2])
 NOISE = 5 * 0.02 * np.array([13.0, 13.0, 11.0, 9.0, 9.0, 9.0])
 """N·m; five standard deviations of one packet."""
+
+
+@pytest.mark.parametrize(
+    ("version", "told"),
+    [((5, 22, 9, 0), False), ((5, 23, 0, 0), True), ((10, 7, 0, 0), False), ((10, 11, 0, 0), True)],
+)
+def test_versions_that_tell_torques(version, told):
+    assert (TORQUE in outputs_since(version)) == told
 
 
 def test_an_older_controller_is_read_without(tmp_path):
@@ -167,6 +207,35 @@ def test_a_stalled_link_ends_the_torques_not_the_arm(tmp_path):
         assert time.monotonic() - begun < 5.0
         assert arm.sample().torque is None
         assert len(arm.workers) == 1
+
+
+@pytest.mark.long
+def test_a_run_stores_torques_and_says_what_the_load_weighs(tmp_path, capsys):
+    """The weights are half as heavy as the cell says; friction is taken by the side of arrival."""
+    simulation = {"clock": 40.0, "controller_version": "10.11.0.0", "seed": 4}
+    load = [{"name": "10kg", "mass_kg": 10.0}]
+    parts = config(simulation=simulation, planning={"candidates": 150}, loads=load)
+    true = config(simulation=simulation, loads=[{"name": "10kg", "mass_kg": 5.0}])
+    toml, plan, run = (tmp_path / n for n in ("cell.toml", "plan.json", "run.hilcal"))
+    with SimulatedCell.start(world_of(true), true, tmp_path / "cell", 3) as cell:
+        told = cell.config.model_copy(update={"loads": parts.loads, "planning": parts.planning})
+        toml.write_text(to_toml(told))
+        ok(capsys, "plan", toml, "-o", plan, "--poses", "6")
+        ok(capsys, "run", toml, "--plan", plan, "-o", run)
+    with CampaignFile.open(run, read_only=True) as campaign:
+        readings = campaign.readings()
+    assert readings.states.torque is not None
+    assert np.isfinite(readings.states.torque).all()
+    made = world_of(true).cell
+    found = check_torques(made, readings)
+    assert found is not None
+    (weight,) = (f for f in found.factors if f.of == "10kg")
+    # the interval holds neither friction that is left nor the sag of the arm: a per cent
+    assert weight.factor == pytest.approx(0.5, rel=0.01)
+    assert weight.differs
+    words = " ".join(ok(capsys, "info", run).out.split())
+    assert "load 10kg is" in words
+    assert "kg, not 10 (95 %" in words
 
 
 JSON = b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\nContent-Length: %d\r\n\r\n%s"
@@ -267,3 +336,10 @@ def test_a_controller_tells_the_kinematics_of_its_factory(tmp_path, version):
         np.testing.assert_allclose(report.kinematics.rows, made.rows, rtol=1e-9, atol=1e-9)
         assert report.kinematics.status == 2
         assert dict(report.fields)["kinematics"] == report.kinematics.to_dict()
+
+
+def test_a_controller_without_a_calibration_tells_the_nominal_ones(tmp_path):
+    with closing(cases.start(tmp_path)) as running:
+        found = read_kinematics(running.host, 2.0)
+    np.testing.assert_allclose(found.rows, nominal_rows(load_arm("ur10e")), rtol=0, atol=1e-12)
+    assert found.status == 0

@@ -102,6 +102,15 @@ def test_the_base_is_the_worlds_where_no_geometry_is_wrong(target):
     np.testing.assert_allclose(corrected_arm(c).arm.links, c.model.cell.arm.links, atol=1e-12)
 
 
+def test_a_stated_base_is_the_base():
+    c = fitted("link_geometry", True, True)
+    told = document(c)
+    np.testing.assert_allclose(pose(told["base_in_tracker"]), c.model.cell.registration, atol=1e-9)
+    assert told["base_is"] == "stated"
+    first = corrected_arm(c).arm.links[0]
+    assert np.abs(first - c.model.cell.arm.links[0]).max() > 1e-5  # joint 1 is elsewhere on it
+
+
 @pytest.mark.parametrize(("registration", "target"), [(r, t) for _, r, t in CASES[4:]])
 def test_every_export_puts_the_tool_where_the_tracker_finds_it(registration, target, tmp_path):
     """An arm that does not yield: constant transforms are all of it."""

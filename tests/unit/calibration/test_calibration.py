@@ -22,6 +22,7 @@ from hilcal.identification.noise.full_covariance import joint_factors
 from hilcal.identification.registration.robot_frames import state_with_every_column
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
+from hilcal.robot import se3
 from hilcal.robot.arm import with_conventions
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
@@ -76,6 +77,31 @@ def test_the_world_is_where_it_was_asked_to_be(effect):
     assert np.sqrt(np.mean(np.sum(after**2, axis=1) / k.after.std_m[good] ** 2)) < 1.2
 
 
+@pytest.mark.parametrize("effect", ["link_geometry", "encoder_offset"])
+def test_the_base_does_not_move_along_with_the_first_link(effect):
+    """Moving the base along with the first link changes no reading, and no correction either."""
+    c, r = calibrated(effect), campaign(effect, "absolute", 0, poses=POSES).readings
+    base = c.base_in_tracker()
+    seen = (r.value[:, :3] - base[:3, 3]) @ base[:3, :3]
+    p = c.predict(r.states.q, r.states.wrench)
+    np.testing.assert_allclose(p.position, seen, atol=2e-4)
+    shifted = replace(c, theta=c.theta + moved_along(c))
+    again = shifted.predict(r.states.q, r.states.wrench)
+    np.testing.assert_allclose(again.position, p.position, atol=5e-6)  # loads pull elsewhere
+    np.testing.assert_array_equal(again.nominal_position, p.nominal_position)
+    np.testing.assert_allclose(shifted.base_in_tracker(), base, atol=1e-5)
+
+
+def moved_along(c):
+    """Parameters that turn the base one way and the first link, or joint, the other."""
+    names = [f"{e.name}.{p.name}" for e in c.model.effects for p in e.parameters]
+    out = np.zeros(len(names))
+    out[names.index("base_frame.rz")] = 2e-3
+    other = "link_geometry.link0.rz" if "link_geometry.link0.rz" in names else "encoder_offset.j1"
+    out[names.index(other)] = -2e-3
+    return out
+
+
 def test_deflections_are_compensated_to_the_unloaded_arm():
     c, states = calibrated("joint_tilt_compliance", "deflection"), fresh()
     k = c.compensate(states.q, states.wrench)
@@ -92,6 +118,19 @@ def test_deflections_are_compensated_to_the_unloaded_arm():
     nothing = c.compensate(states.q)
     np.testing.assert_allclose(nothing.q, states.q, atol=1e-9)
     assert nothing.before.error_m.max() < 1e-12
+
+
+def test_a_wanted_pose_is_reached_from_joint_values_nearby():
+    c, q = calibrated("none"), fresh().q[:5]
+    wanted = se3.matrix(*(x[:5] for x in nominal(c, q)))
+    k = c.compensate(q + 0.05, wanted=wanted, std=False)
+    np.testing.assert_allclose(k.q, c.compensate(q, std=False).q, atol=1e-8)
+
+
+def nominal(c, q):
+    chain = evaluate(c.model.cell.arm, q)
+    pose = c.tool_pose()
+    return se3.product(chain.rotation[-1], pose[:3, :3]), chain.point(pose[:3, 3])
 
 
 @pytest.mark.parametrize("effect", ["target_offset", "thermal_growth", "creep", "backlash"])
@@ -225,6 +264,25 @@ def test_the_covariance_follows_from_the_fitted_states(effect, mode):
     np.testing.assert_allclose(a.std_m, b.std_m, rtol=1e-5)
 
 
+@pytest.mark.slow
+def test_a_thousand_parameters_are_a_small_file(tmp_path):
+    made = campaign("transmission_error", "absolute", 0, poses=POSES, harmonics=20)
+    model = baseline(made.cell, made.readings, "absolute")
+    options = {"harmonics": 100}
+    effect = model.catalogue.make("transmission_error", made.cell, made.readings.states, options)
+    c = Calibration.of(fit(model + effect, made.readings, "absolute"))
+    assert len(c.theta) > 1000
+    path = tmp_path / "c.json"
+    c.save(path)
+    assert path.stat().st_size < 0.5e6
+    again, states = Calibration.load(path), fresh(2)
+    a, b = (x.predict(states.q, states.wrench) for x in (c, again))
+    np.testing.assert_array_equal(a.position, b.position)
+    np.testing.assert_allclose(a.std_m, b.std_m, rtol=5e-3)
+    again.save(tmp_path / "again.json")
+    assert (tmp_path / "again.json").stat().st_size == pytest.approx(path.stat().st_size, rel=0.01)
+
+
 def test_coupled_joints_are_compensated_by_the_controllers_values():
     follows = np.zeros((6, 6))
     follows[2, 1], follows[5, 4] = -1.0, 0.5
@@ -313,3 +371,18 @@ def test_identical_rows_are_no_repeats():
     one = once(instrument(c))
     twice = Readings.joined([one, one])
     assert Calibration.of(fitted(c, "absolute", twice)).scatter.source == "maker"
+
+
+def test_repeats_below_the_noise_say_how_much_it_can_be():
+    c = campaign(poses=16, cycles=3)
+    own = instrument(c)
+    noisy = replace(own, covariance=100.0 * own.covariance)
+    scatter = Calibration.of(fitted(c, "absolute", noisy)).scatter
+    assert scatter.source == "repeats"
+    assert TRUE < scatter.joint_std[0] < 10 * TRUE
+
+
+def test_what_the_fit_or_the_cell_states_goes_first():
+    c = campaign(poses=16, cycles=3)
+    found = fitted_model(c.cell, c.readings, "absolute")
+    assert Calibration.of(found).scatter.source == "stated"

@@ -8,7 +8,15 @@ import pytest
 
 from hilcal.calibration.compensation import invert
 from hilcal.calibration.points import Points, on_branch, read_points
-from hilcal.calibration.urscript import NEAREST, NOT_STRAIGHT, UNKNOWN, doubts, waypoints
+from hilcal.calibration.urscript import (
+    NEAREST,
+    NOT_STRAIGHT,
+    UNKNOWN,
+    doubts,
+    movej_program,
+    program_points,
+    waypoints,
+)
 from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.robot.catalogue import load_arm
@@ -179,6 +187,14 @@ def test_a_pose_out_of_reach_is_named(tmp_path):
 def test_tables_that_cannot_be_used_are_refused(case, given, tmp_path):
     path = written(tmp_path, given)
     refuses(case, lambda: read_points(path, ARM, LOADS), path)
+
+
+def test_a_program_of_moves_has_them_as_waypoints():
+    np.testing.assert_allclose([w.q for w in waypoints(movej_program(["a", "b"], Q))], Q, atol=1e-9)
+
+
+def test_a_program_without_waypoints_is_refused(tmp_path):
+    refusal(r"p\.script: no waypoints", program_points, written(tmp_path, "x = 1\n", "p.script"))
 
 
 FLANGE = np.eye(4)

@@ -169,6 +169,19 @@ def test_predicting_what_was_inverted_is_the_target_to_a_nanometre(effect):
     assert np.abs(k.q - q).max() < 0.5  # the branch is that of the given joints
 
 
+@pytest.mark.parametrize("effect", ["transmission_error", "periodic_joint_compliance"])
+def test_a_wrist_that_has_turned_more_than_once_is_inverted_as_exactly(effect):
+    c, rng = (
+        random_calibration(("base_frame", "joint_compliance", effect), 1),
+        np.random.default_rng(1),
+    )
+    q = regular(c, rng.uniform(-2.8, 2.8, (40, 6)))
+    wrench = np.hstack([rng.uniform(-80, 80, (len(q), 3)), rng.uniform(-5, 5, (len(q), 3))])
+    turns = 4 * np.pi * np.eye(6)[5]  # two turns of the last joint
+    near, far = (c.compensate(x, wrench, std=False).q for x in (q, q + turns))
+    np.testing.assert_allclose(far - turns, near, atol=NM)
+
+
 @ROUND
 @given(SEEDS, st.lists(st.sampled_from(EFFECTS), min_size=1, max_size=4, unique=True))
 def test_a_calibration_file_says_the_same_in_every_bit(seed, names):

@@ -256,6 +256,25 @@ def all_of(plan, bench, points_per_leg):
     return np.vstack([a.q + share * (b.q - a.q) for a, b in pairwise(stops)])
 
 
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("side", ["min", "max"])
+def test_workspace_is_checked_along_the_whole_path(axis, side):
+    """A box that is just wide enough passes; one narrower by 5 mm does not."""
+    bench, plan = Bench(), plan_of(*((p, "none", 0) for p in ("p1", "p2", "p3", "p4")))
+    low, high = box(bench, all_of(plan, bench, 60))
+    for narrower, wrong in ((-1e-6, False), (5e-3, True)):
+        a, b = [-3.0] * 3, [3.0] * 3
+        if side == "min":
+            a[axis] = float(low[axis]) + narrower
+        else:
+            b[axis] = float(high[axis]) - narrower
+        limits = Limits(workspace_min_m=tuple(a), workspace_max_m=tuple(b))
+        bench.config = bench.config.model_copy(update={"limits": limits})
+        found = problems(bench, plan)
+        assert bool(found) is wrong
+        assert all(f"whose {'xyz'[axis]} ends" in line for line in found)
+
+
 def test_torque_under_load_names_pose_load_joint_and_limit():
     bench = Bench(
         limits=WIDE,

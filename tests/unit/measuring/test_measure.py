@@ -6,11 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2 as chi2_law
 
 from hilcal.errors import CannotAnswerError, DeviceError
 from hilcal.measuring.devices import TrackerSample
 from hilcal.measuring.force import compare, identify_tool_load, tare
-from hilcal.measuring.measure import SettleWindow, average
+from hilcal.measuring.measure import SettleWindow, average, deviations
 from tests.support.refusals import refusal, refusal_of
 from tests.support.rows import first
 
@@ -77,6 +78,24 @@ def test_stated_ellipsoid_covers_the_truth_as_often_as_it_says(count, share):
     assert 0.925 < got < 0.965
 
 
+@pytest.mark.parametrize("worse", first(2, [2.0, 10.0, 4.0]))
+def test_noise_far_above_what_is_stated_is_not_believed_away(worse):
+    """From the scatter of 10 alone a covariance would cover 81 %; the stated one far less."""
+    got = covered(np.random.default_rng(9), 10, 600, worse=worse)
+    assert got > 0.85
+
+
+def test_scatter_is_how_much_worse_it_is_with_uniform_p_values():
+    rng = np.random.default_rng(11)
+    p = [average(samples_of(drawn(rng, 6))).scatter_p for _ in range(800)]
+    assert stats.kstest(p, "uniform").pvalue > 1e-3
+    rng = np.random.default_rng(12)
+    result = average(samples_of(drawn(rng, 400, 9 * V)))
+    assert result.scatter == pytest.approx(9, rel=0.15)
+    assert result.scatter_p < 1e-12
+    assert "3.0 times" in result.warnings[0]
+
+
 def test_rotations_average_on_the_sphere_also_across_the_half_turn():
     rng = np.random.default_rng(5)
     middle = Rotation.from_rotvec([0.0, 0.0, np.pi - 1e-5])  # rotation vectors flip about here
@@ -87,6 +106,31 @@ def test_rotations_average_on_the_sphere_also_across_the_half_turn():
     off = (Rotation.from_rotvec(mean.value[3:]) * middle.inv()).as_rotvec()
     assert np.linalg.norm(off) < 4 * 8e-5 / np.sqrt(50) * np.sqrt(3)
     assert np.trace(mean.covariance[3:, 3:]) == pytest.approx(3 * 8e-5**2 / 50, rel=0.3)
+
+
+def test_deviations_of_poses_turn_with_the_sensor_axes():
+    rng = np.random.default_rng(6)
+    turns = Rotation.from_rotvec(0.3 * rng.standard_normal((8, 3)))
+    values = np.hstack([np.zeros((8, 3)), turns.as_rotvec()])
+    frame = Rotation.from_rotvec([0.5, 1.1, -0.4])
+    seen = np.hstack([np.zeros((8, 3)), (frame * turns).as_rotvec()])
+    (mean, residuals), (mean_seen, residuals_seen) = deviations(values), deviations(seen)
+    assert residuals.sum(axis=0) == pytest.approx(np.zeros(6), abs=1e-12)
+    assert residuals_seen[:, 3:] == pytest.approx(frame.apply(residuals[:, 3:]), abs=1e-10)
+    there = frame * Rotation.from_rotvec(mean[3:])
+    assert Rotation.from_rotvec(mean_seen[3:]).as_matrix() == pytest.approx(there.as_matrix())
+
+
+def test_good_samples_are_never_left_out():
+    rng = np.random.default_rng(8)
+    for count in (3, 5, 10, 50):
+        for _ in range(300):
+            assert average(samples_of(drawn(rng, count))).left_out == ()
+
+
+def test_remarks_of_the_instrument_come_once():
+    result = average(samples_of([PLACE] * 3, warnings=["tilted", "", "tilted"]))
+    assert result.warnings == ("tilted",)
 
 
 @pytest.mark.parametrize(
@@ -150,6 +194,21 @@ def test_decay_is_waited_for_until_its_rest_is_below_the_noise(count, tau):
         left.append(START_SIGMA * np.exp(-t / tau))
     assert np.quantile(left, 0.95) < 0.4
     assert max(left) < 1.0
+
+
+@pytest.mark.parametrize("tau", first(1, [1.0, 5.0]))
+def test_vibration_is_waited_for_until_its_rest_is_below_the_noise(tau):
+    """An amplitude of less than one sigma is left in 95 %; it hardly moves the mean then."""
+    rng = np.random.default_rng(round(tau))
+    left = []
+    for _ in range(60):
+        phase = rng.uniform(0, 2 * np.pi)
+        _, t = wait(
+            rng, 5, lambda t, p=phase: 1e-3 * ALONG * np.exp(-t / tau) * np.cos(7.3 * t + p)
+        )
+        left.append(START_SIGMA * np.exp(-t / tau))
+    assert np.quantile(left, 0.95) < 1.0
+    assert max(left) < 2.0
 
 
 def test_drift_that_matters_never_settles():
@@ -247,6 +306,28 @@ def test_without_noise_everything_is_recovered(seed, mass, com, poses):
     assert found.load_wrench(wrench, R) == pytest.approx(np.zeros((poses, 6)), abs=1e-6)
 
 
+def test_estimates_scatter_as_their_covariance_says(rng):
+    K, N = 8, 1500
+    R, cov = rotations(K, rng), covariances(K, rng)
+    truth = np.concatenate([BIAS, [MASS], MASS * COM])
+    found = [identify_tool_load(reading(R) + noise(cov, rng), cov, R, GRAVITY) for _ in range(N)]
+    x = np.array([np.concatenate([f.bias, [f.mass], f.moment]) for f in found])
+    inverse = np.linalg.inv(found[0].covariance)
+    error = x - truth
+    # squared Mahalanobis distances are chi² of 10; their mean has the variance 20 / N
+    distance = np.einsum("ki,ij,kj->k", error, inverse, error)
+    assert distance.mean() == pytest.approx(10.0, abs=4 * np.sqrt(20 / N))
+    # each direction by itself: whitened scatter is the unit matrix
+    L = np.linalg.cholesky(found[0].covariance)
+    white = np.linalg.solve(L, error.T)
+    assert white @ white.T / N == pytest.approx(np.eye(10), abs=5 * np.sqrt(2 / N))
+    chi2 = np.array([f.chi2 for f in found])
+    assert chi2.mean() == pytest.approx(6 * K - 10, abs=4 * np.sqrt(2 * (6 * K - 10) / N))
+    assert np.mean(chi2 > chi2_law.ppf(0.95, 6 * K - 10)) == pytest.approx(0.05, abs=0.023)
+    com = np.array([f.com for f in found])
+    assert com.std(axis=0) == pytest.approx(found[0].com_std, rel=0.1)
+
+
 def test_a_wrong_model_shows_in_the_variance_factor(rng):
     R, cov = rotations(10, rng), covariances(10, rng)
     turned = R @ Rotation.from_rotvec([0.0, 0.1, 0.0]).as_matrix()  # the sensor sits askew
@@ -281,6 +362,13 @@ def test_a_sensor_mounted_the_other_way_round_and_values_that_are_no_numbers_are
         wrong = given | {name: values.copy()}
         wrong[name][2, ..., 0] = np.nan
         refusal("values that are no finite numbers", identify_tool_load, **wrong, gravity=GRAVITY)
+
+
+def test_a_massless_tool_has_its_centre_of_mass_nowhere(rng):
+    R, cov = rotations(8, rng), covariances(8, rng)
+    found = identify_tool_load(reading(R, mass=0.0) + noise(cov, rng), cov, R, GRAVITY)
+    assert np.all(np.isfinite(found.com))
+    assert abs(found.mass) < 5 * np.sqrt(found.covariance[6, 6])
 
 
 @given(seed=st.integers(0, 2**32 - 1))

@@ -1,12 +1,14 @@
 """A campaign is measured: readings, loads, torques, to its end or until its goal is met."""
 
 import json
+from collections import Counter
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from hilcal.config import CellLoad, ForceSensor, Limits, Obstacle, Tool
+from hilcal.config import CellLoad, ForceSensor, Limits, Obstacle, Repeatability, Tool
 from hilcal.errors import CannotAnswerError, DeviceError, InputError
 from hilcal.identification.torques import check_torques, require_torques
 from hilcal.measuring.feasibility import Feasibility
@@ -27,6 +29,7 @@ from tests.support.fake_bench import (
     REGISTRATION,
     SAG,
     STD,
+    TORQUE,
     Bench,
     Killed,
     call_before,
@@ -133,6 +136,16 @@ def test_times_and_temperatures(ran):
     assert np.allclose(s.q_actual, s.q)
 
 
+def test_nothing_moves_between_measuring_and_storing(ran):
+    b = ran
+    calls = b.world.calls
+    stored = [k for k, name in enumerate(calls) if name == "store.record"]
+    assert len(stored) == len(b.store.rows) > 1
+    for a, z in pairwise([0, *stored]):
+        last = max(k for k in range(a, z) if calls[k] == "tracker.measure")
+        assert "arm.start_move" not in calls[last:z]
+
+
 def test_progress(ran):
     """What is as configured is not remarked."""
     b, plan = ran, usual_plan()
@@ -182,6 +195,33 @@ def test_drift_of_the_reference_pose_is_told(b):
     said = b.remarks("reference pose has moved")
     assert len(said) == 2
     assert any(word in said[0] for word in ("by 39", "by 40", "by 41"))
+
+
+@pytest.mark.long
+def test_repeatability_is_estimated_at_the_end():
+    """The joints miss by 5e-5 rad from arrival to arrival; the estimate finds that."""
+    b = Bench(repeatability=Repeatability(joint_std_rad=5e-5))
+    arrived = {}
+    rng = np.random.default_rng(3)
+
+    def position():
+        key = len(b.world.at_start)
+        slip = arrived.setdefault(key, 5e-5 * rng.standard_normal(6))
+        q = b.world.joints() + slip
+        chain = chains.evaluate(b.cell.arm, q[None])
+        at = chain.point(b.cell.target[:3, 3])[0] + SAG * b.world.pull()[:3]
+        return REGISTRATION[:3, :3] @ at + REGISTRATION[:3, 3]
+
+    b.world.position = position
+    plan = plan_of(*((p, "none", c) for c in range(12) for p in ("p1", "p2", "p3")))
+    b.measure(plan)
+    found = b.store.last("repeatability")
+    assert found["poses"] == 3
+    assert found["dof"] == 33
+    assert found["joint_std"] == pytest.approx(5e-5, rel=0.35)
+    assert found["scatter"] > 3 * found["instrument"]
+    (said,) = b.remarks("33 returns to 3 poses")
+    assert f"joint_std_rad is about {found['joint_std']:.1g}" in said
 
 
 def test_repeatability_law():
@@ -251,6 +291,22 @@ def test_a_load_that_is_not_taken_off_is_noticed(b):
     assert "3.0 kg still hangs" in b.operator.requests[3][1]
 
 
+@pytest.mark.long
+def test_a_swinging_load_is_weighed_twice(b):
+    times = []
+
+    def swinging(seconds):
+        times.append(b.world.time)
+        b.world.extra = np.zeros(6)
+        if b.world.load == "3kg" and len(b.operator.requests) == 2 and len(b.store.rows) == 5:
+            swings = len([t for t in times if t > b.world.time - 10.0]) == 1
+            b.world.extra[0] = 8.0 if swings else 0.0
+
+    call_before(b.rig.force, "average", swinging)
+    b.measure()
+    assert b.requested_loads == ["none", "3kg", "none", "pull", "none"]
+
+
 def test_the_tool_is_identified_and_compared_with_the_configuration(b):
     b.world.tool_mass = 1.4
     b.measure()
@@ -294,10 +350,32 @@ def test_resume_measures_exactly_what_is_missing_and_time_goes_on(b):
     assert asked[1] == plan.steps[done].load == "3kg"
 
 
+@pytest.mark.long
+def test_time_never_goes_back_whatever_the_clock_on_the_wall_does(b):
+    b.interrupt(4, wall=lambda: 5000.0 + b.world.time)
+    readings = b.measure(wall=lambda: 1000.0 + b.world.time)
+    assert np.all(np.diff(readings.states.time) > 0)
+
+
 def test_a_clock_set_back_since_the_epoch_makes_no_time_before_it(b):
     plan = plan_of(("reference", "none", 0), ("p1", "none", 0))
     readings = b.measure(plan, wall=lambda: 1000.0 + b.world.time, epoch=5000.0)
     assert np.all(readings.states.time > 0)
+
+
+@pytest.mark.long
+def test_a_load_that_still_hangs_at_a_resume_is_noticed(b):
+    b.interrupt(7)
+    assert b.world.load == "3kg"
+    b.world.wrong_loads = ["3kg"]  # the first answer is wrong
+    # the sensor was off meanwhile
+    b.world.offset = b.world.offset + np.array([2.0, 2.0, -2.0, 0, 0, 0])
+    seen = len(b.operator.requests)
+    b.measure()
+    asked = b.operator.requests[seen:]
+    assert [name for name, _ in asked[:3]] == ["none", "none", "3kg"]
+    assert "3kg seems to hang still" in asked[1][1]
+    assert [s for s, _, _ in b.store.rows] == list(usual_plan().steps)
 
 
 def test_a_load_left_on_at_the_very_beginning_is_asked_about_said_and_found_in_motion(b):
@@ -316,7 +394,27 @@ def test_a_finished_campaign_touches_nothing(b):
     assert b.notes.of_kind(Phase)[-1].text == "nothing is missing"
 
 
+@pytest.mark.long
+def test_the_tool_is_known_from_an_earlier_session_after_the_sensor_was_off(b):
+    """Another bias in the second session: the pulls are measured right nevertheless."""
+    b.world.tool_mass = 1.4
+    b.interrupt(7)
+    b.world.offset = -b.world.offset
+    readings = b.measure()
+    felt = readings.states.wrench[rows(readings, "pull")]
+    assert np.allclose(felt, [40.0, 0, 0, 0, 0, 0], atol=1e-6)
+
+
 LOST = "no longer reports the torques"
+
+
+def test_torques_are_averaged_over_the_reading(b):
+    b.world.torques = np.inf
+    torque = b.measure(FEW_POSES).states.torque
+    # means of at least three samples that scatter by 0.1 N·m
+    assert np.abs(torque - TORQUE).max() < 5 * 0.1 / np.sqrt(3)
+    assert not b.remarks(LOST)
+    assert b.store.details()[0]["torque"] == torque[0].tolist()
 
 
 def test_a_lost_link_is_said_once_and_readings_go_on(b, tmp_path):
@@ -431,6 +529,13 @@ def test_a_goal_that_is_met_elsewhere(count, more):
     assert b.store.kinds()[-1] == "finished"
 
 
+def test_a_plan_without_returns_ends_at_the_reference_too(b):
+    plan = plan_of(("p1", "none", 0), ("p1", "3kg", 0), ("p2", "3kg", 0), ("p2", "none", 0))
+    b.measure(plan, goal=Enough(2))
+    assert steps(b) == list(plan.steps[:2])
+    assert is_home(b)
+
+
 def test_the_way_home_is_clear(b):
     """A post stands between p2 and the reference pose: the arm goes back by where it came."""
     q = {"reference": HOME, "via": np.add(POSES["p2"], [0.0, -0.5, 0.3, 0.0, 0.0, 0.0]),
@@ -450,6 +555,16 @@ def test_the_way_home_is_clear(b):
     assert route_problems(Feasibility(b.cell.with_config(config)), (p2, *way)) == []
     free = way_home(b.cell, plan, [home, via, p2], frozenset())
     assert [s.name for s in free] == ["reference"]
+
+
+@pytest.mark.long
+def test_what_was_left_out_is_measured_on_resuming():
+    b, plan = Bench(), usual_plan()
+    b.measure(goal=Enough(7))
+    b.world.restart()
+    b.measure()
+    assert Counter(steps(b)) == Counter(plan.steps)
+    assert steps(b)[-1] == plan.steps[-1]  # the campaign still ends with a look at the drift
 
 
 def test_resuming_towards_a_farther_goal():

@@ -12,6 +12,7 @@ from hilcal.cell import Cell
 from hilcal.config import Acquire, ForceSensor, Limits
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.arrival import RoughRegistration
+from hilcal.measuring.progress import ReadingStored
 from hilcal.measuring.run import HOW_ON
 from hilcal.robot import chain as chains
 from hilcal.robot.catalogue import configs_dir
@@ -19,6 +20,7 @@ from hilcal.store.plan import Step
 from tests.support.fake_bench import (
     FEW_POSES,
     POSES,
+    STD,
     Bench,
     FakeClock,
     Killed,
@@ -293,6 +295,16 @@ def test_payload_is_set_before_a_weight_is_hung_and_after_it_is_off(b):
     ]
 
 
+def test_loads_change_only_at_the_reference_and_motions_carry_them(b):
+    where = []
+    call_before(b.operator, "hang", lambda *_: where.append(b.world.q.copy()))
+    b.measure(FEW_POSES)
+    assert b.requested_loads == ["none", "3kg", "none", "pull", "none"]
+    for q in where[1:]:
+        assert np.allclose(q, POSES["reference"])
+    assert {load for _, load in b.world.at_start} == {"none", "3kg", "pull"}
+
+
 def test_an_unsafe_plan_is_refused_before_any_device_is_asked():
     b = Bench(limits=Limits(workspace_min_m=(-3, -3, 0.9)))
     plan = plan_of(("p1", "none", 0), ("p1", "brick", 0))
@@ -301,6 +313,14 @@ def test_an_unsafe_plan_is_refused_before_any_device_is_asked():
     assert "more: hilcal check --plan" in words
     assert b.world.calls == []
     assert b.store.events == []
+
+
+def test_an_arm_that_stands_outside_its_workspace_is_not_moved():
+    b = Bench(limits=Limits(workspace_min_m=(-1.2, -0.5, 0.05), workspace_max_m=(1.2, 1.2, 1.5)))
+    b.world.q = np.array([1.5, -1.3, 1.6, -1.4, -1.4, 0.1])  # beyond y = -0.5
+    plan = plan_of(("reference", "none", 0), poses={"reference": POSES["reference"]})
+    refusal_of(DeviceError, r"outside the workspace.*drive it by hand", b.measure, plan)
+    assert not {"arm.start_move", "arm.take_control"} & set(b.world.calls)
 
 
 @pytest.mark.parametrize(
@@ -417,6 +437,16 @@ def test_limits_that_were_narrowed_meanwhile_do_not_lock_a_campaign(b):
     assert {s for s in plan.steps if s.pose != "p2"} < b.store.done()
 
 
+def test_another_reflector_is_not_believed(b):
+    def other(*_):
+        if len(b.store.rows) == 5:
+            b.world.shift = np.array([0.0, 0.3, 0.0])
+
+    call_before(b.store, "event", other)
+    refusal_of(DeviceError, "another reflector", b.measure)
+    assert len(b.store.rows) == 5
+
+
 def test_readings_that_drift_are_waited_for_and_given_up():
     b = Bench(acquire=Acquire(samples=3, settle_s=0.2, settle_timeout_s=20.0))
     b.world.creep = 1e-3
@@ -426,10 +456,46 @@ def test_readings_that_drift_are_waited_for_and_given_up():
     assert b.world.time - begun < 120.0
 
 
+@pytest.mark.long
+def test_drift_that_ends_is_waited_for():
+    b, few = Bench(), plan_of(("p1", "none", 0), ("p2", "none", 0), ("p2", "3kg", 0))
+    arrived = {}
+
+    def settles(place):
+        """The target comes to rest with a time constant of 0.5 s after each arrival."""
+        since = arrived.setdefault((*b.world.joints(), len(b.world.at_start)), b.world.time)
+        return place + 1e-3 * np.exp(-(b.world.time - since) / 0.5)
+
+    change_result(b.world, "position", settles)
+    b.measure(few)
+    taken = b.notes.of_kind(ReadingStored)
+    assert min(t.settling for t in taken) > 1.0
+    quiet = Bench()
+    quiet.measure(few)
+    assert max(t.settling for t in quiet.notes.of_kind(ReadingStored)) < 1.0
+    away = b.store.readings().value - quiet.store.readings().value
+    assert np.abs(away).max() < 6 * STD
+
+
 def test_an_arm_that_trembles_is_measured_again_and_given_up(b):
     b.world.jitter = 1e-4
     refusal_of(DeviceError, r"measured 3 times without success: arm: it moved by", b.measure)
     assert b.store.rows == []
+
+
+@pytest.mark.long
+def test_somebody_who_jogs_the_arm_meanwhile_spoils_the_reading(b):
+    jogged = []
+
+    def jog(seconds):
+        if len(b.world.at_start) == 3 and not jogged:
+            jogged.append(1)
+            b.world.q = b.world.q + 3e-4
+
+    call_before(b.rig.force, "average", jog)
+    b.measure()
+    assert "measured again: arm: it moved by 0.0003" in b.store.rows[1][2]
+    assert len(b.store.rows) == len(usual_plan().steps)
 
 
 def test_at_least_twenty_frames_whatever_the_clock():

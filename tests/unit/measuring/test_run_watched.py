@@ -77,6 +77,20 @@ def test_an_arm_jogged_to_a_free_place_is_asked_for_and_the_way_checked_from_the
     assert b.world.calls.index("operator.confirm") < b.world.calls.index("arm.take_control")
 
 
+@pytest.mark.long
+def test_an_arm_that_is_moved_while_it_is_asked_for_is_asked_for_again(b):
+    jogged(b, "none", FREE)
+    places = [FREE + 0.1, FREE + 0.1]
+
+    def again(question):
+        if places:
+            b.world.q = places.pop()
+
+    call_before(b.operator, "confirm", again)
+    b.measure()
+    assert len(confirmed(b)) == 2
+
+
 def test_an_arm_jogged_while_control_is_taken_is_not_moved(b):
     call_before(b.rig.arm, "take_control", lambda *_: setattr(b.world, "q", FREE.copy()))
     refusal_of(DeviceError, r"has commanded it since.*0\.5 rad", b.measure)
@@ -110,6 +124,17 @@ def test_an_operator_who_cannot_be_asked_is_not_taken_to_agree(b):
     b.rig = replace(b.rig, operator=Silent(b.operator))
     refusal_of(DeviceError, "does not stand where it was left", b.measure)
     assert "arm.start_move" not in b.world.calls
+
+
+@pytest.mark.long
+def test_a_campaign_that_goes_on_says_that_the_arm_stands_elsewhere_and_asks():
+    for moved, questions in ((False, 0), (True, 1)):
+        b = Bench()
+        b.interrupt(1, SHORT)
+        if moved:
+            b.world.q = FREE.copy()
+        b.measure(SHORT)
+        assert len(confirmed(b)) == questions
 
 
 @pytest.mark.parametrize("elsewhere", [False, True])
@@ -412,6 +437,13 @@ def test_who_bears_a_part_of_a_heavy_load_in_motion_is_noticed_though_it_may_swi
     assert borne
     assert borne[-1] - borne[0] < 1.0
     assert "6kg" in [name for name, why in b.operator.requests if "where 6kg should hang" in why]
+
+
+@pytest.mark.long
+def test_a_load_that_stays_wrong_ends_the_run(b):
+    falls_in_motion(b, "none", "none", "none")
+    refusal_of(DeviceError, r"asked 3 times to hang 3kg.*--resume$", b.measure)
+    assert len(b.store.rows) == 7
 
 
 def test_a_tracker_whose_target_does_not_move_with_the_arm_is_named_before_any_reading(b):

@@ -291,6 +291,12 @@ def test_continuous_joint_turns_freely(tmp_path):
     np.testing.assert_allclose(flange(arm, q), published_flange("ur5e", q), rtol=0, atol=1e-12)
 
 
+def test_prismatic_joint_in_the_arm_slides(tmp_path):
+    arm = arm_from_urdf(write(tmp_path, FINGER), tip_link="finger")
+    assert arm.slides.tolist() == [False] * 6 + [True]
+    assert (arm.q_min[-1], arm.q_max[-1]) == (0.0, 0.1)
+
+
 PLANAR = FINGER.replace('type="prismatic"', 'type="planar"')
 ENDLESS = FINGER.replace('lower="0" upper="0.1"', 'lower="0" upper="0"')
 

@@ -17,7 +17,7 @@ from hilcal.readings.covariance import TrackerNoise
 from hilcal.readings.readings import States
 from hilcal.robot.arm import with_controller_conventions
 from hilcal.robot.catalogue import load_arm
-from hilcal.robot.chain import evaluate
+from hilcal.robot.chain import drive_jacobian, evaluate
 from hilcal.robot.factory import (
     flange_difference,
     nominal_rows,
@@ -28,6 +28,7 @@ from hilcal.robot.factory import (
 )
 from hilcal.robot.urdf import arm_from_urdf
 from tests.support.arm_cases import classic_flange, flange_at, same_flange
+from tests.support.effect_cases import make
 from tests.support.factory_cases import UR5E_YAML, factory_of, measured_arm
 from tests.support.readings_cases import read_table
 from tests.support.refusals import refusal, refusals, refuses, with_edits
@@ -57,6 +58,15 @@ def test_flange_and_masses_are_those_of_the_drawn_arm_at_the_turned_angles():
     a, b = evaluate(drawn, turned(q)), evaluate(counted, q)
     same_flange(b, a)
     np.testing.assert_allclose(b.com, a.com, atol=1e-12)
+
+
+def test_jacobian_by_the_controllers_values_agrees_with_differences():
+    arm, q, step = described(**KEYS), np.random.default_rng(1).uniform(-2, 2, (3, 6)), 1e-6
+    chain = evaluate(arm, q)
+    found = drive_jacobian(arm, chain, chain.position[-1])[:, :3]
+    for j in range(6):
+        ahead, back = (evaluate(arm, q + s * np.eye(6)[j]).position[-1] for s in (step, -step))
+        np.testing.assert_allclose(found[:, :, j], (ahead - back) / (2 * step), atol=1e-8)
 
 
 @refusals("conventions")
@@ -140,6 +150,10 @@ def test_a_urdf_whose_base_link_is_tilted_says_what_gravity_is(tmp_path):
     assert not any("gravity" in note for note in notes)
 
 
+def test_a_rail_without_ends_is_refused_by_name(tmp_path):
+    refusal(r'prismatic joint "j1" has no <limit', arm_from_urdf, urdf(tmp_path, "prismatic"))
+
+
 NOISE = TrackerNoise(10e-6, 0.3e-6, 15e-6, 6e-6)
 FIGURES = (
     ("0 0 0.3", "0 0 0", "0 0 1"),
@@ -189,6 +203,20 @@ def test_it_stands_and_is_pulled_as_pinocchio_says(tmp_path):
         held = pin.computeGeneralizedGravity(model, data, at) * 9.80665 / 9.81
         np.testing.assert_allclose(-s.torque[k, [0, 1, 4]], held, atol=1e-9)
         assert not s.torque[k, [2, 3]].any()
+
+
+def test_a_compliance_has_one_parameter_less_for_each(tmp_path):
+    """What gives way is the motors: a joint without one cannot be told, nor does it move."""
+    arm, q = arm_from_urdf(urdf_of_mimic(tmp_path)), own_states()
+    cell = cell_from_config(CellConfig.model_validate({"robot": {"model": "ur10e"}}))
+    cell = replace(cell, arm=arm)
+    states = States(q=arm.complete(q), wrench=np.tile([0.0, 0, -50, 0, 0, 0], (len(q), 1)))
+    model = Model(cell, (make("joint_compliance", cell, states),))
+    soft = model.predict(states, np.full(5, 1e-5))
+    jacobian = model.jacobian(soft, np.full(5, 1e-5), 3)
+    moved = np.abs(jacobian).max(axis=(0, 1))
+    assert not moved[[2, 3]].any()
+    assert moved[[0, 1, 4]].min() > 0
 
 
 def test_signs_and_zeros_of_the_controller_go_with_it(tmp_path):

@@ -69,6 +69,37 @@ def test_the_controllers_kinematics_and_torques_are_those_of_virtual_work():
     np.testing.assert_allclose(jacobian[3:], turn.T / (2 * step), atol=1e-8)
 
 
+@pytest.mark.parametrize("mechanical", [True, False])
+def test_the_torque_of_a_law_is_that_of_the_drive(mechanical):
+    """dU = −τ · dq of the controller's values where motors are coupled, of the axes where not."""
+    cell = coupled_cell(mechanical)
+    states = some_states(cell, 4)
+    s = Model(cell, ()).predict(states, np.zeros(0)).situation
+    load, weight, step = cell.load_point, cell.tool_mass, 1e-6
+
+    def energy(chain):
+        points = np.einsum("nij,j->ni", chain.rotation[-1], load) + chain.position[-1]
+        held = np.einsum("knj,k->nj", chain.com, cell.arm.masses)
+        held += weight * chain.point(cell.tool_com)
+        return np.sum(points * states.wrench[:, :3], axis=1) + held @ cell.gravity
+
+    for j in range(6):
+        one = step * np.eye(6)[j]
+        if mechanical:
+            ahead, back = (evaluate(cell.arm, states.q + d) for d in (one, -one))
+        else:  # the joint alone: of the drawn arm, in the sense in which it counts
+            drawn, theta = load_arm("ur10e"), drawn_angles(states.q)
+            ahead, back = (evaluate(drawn, theta + d * SIGN) for d in (one, -one))
+        work = (energy(ahead) - energy(back)) / (2 * step)
+        axis = (ahead.rotation[-1] @ np.swapaxes(back.rotation[-1], 1, 2)) / (2 * step)
+        turn = 0.5 * np.stack(
+            [axis[:, 2, 1] - axis[:, 1, 2], axis[:, 0, 2] - axis[:, 2, 0],
+             axis[:, 1, 0] - axis[:, 0, 1]], axis=1,
+        )  # fmt: skip
+        work += np.sum(turn * states.wrench[:, 3:], axis=1)
+        np.testing.assert_allclose(s.torque[:, j], work, rtol=1e-6, atol=1e-5)
+
+
 LAWS = ("joint_compliance", "joint_stiffening", "backlash", "periodic_joint_compliance",
         "creep", "encoder_offset", "hysteresis", "transmission_error", "joint_coupling",
         "joint_tilt_compliance")  # fmt: skip
@@ -123,6 +154,16 @@ def test_shapes_of_turned_and_coupled_joints_are_those_of_the_drawn_arm():
     here, there = Scene(arm), Scene(drawn)
     for one, two in zip(q, theta, strict=True):
         assert here.itself.distance(one) == pytest.approx(there.itself.distance(two), abs=1e-9)
+
+
+def test_the_situation_says_whose_angles_they_are():
+    for mechanical in (True, False):
+        cell = coupled_cell(mechanical)
+        states = some_states(cell, 3)
+        s = Model(cell, ()).predict(states, np.zeros(0)).situation
+        expected = states.q if mechanical else drawn_angles(states.q) * SIGN
+        np.testing.assert_allclose(s.angle, expected, atol=1e-12)
+        np.testing.assert_array_equal(s.values, states.q)
 
 
 @pytest.mark.parametrize("mechanical", [True, False])

@@ -219,6 +219,29 @@ def test_a_hidden_error_of_the_rail_is_found_and_measured(tmp_path, seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS[:2])
+def test_errors_of_three_guides_of_a_gantry_are_found_and_measured(tmp_path, seed):
+    arm = from_urdf(tmp_path, GANTRY)
+    config = track_config(
+        robot={"model": "arm.urdf"},
+        simulation={"strength_sigma": 3.0},
+        loads=[{"name": "10kg", "mass_kg": 10.0}, {"name": "pull", "force_N": [300.0, 200.0, 0.0]}],
+    )
+    plan = spread_plan(arm, 60)
+    case = case_of_plan(config, plan, "guide_error", seed, installed(), tmp_path)
+    r, cell = simulate_plan(case, plan, [seed, 1]), cell_from_config(config, tmp_path)
+    path = hc.refine(hc.baseline(cell, r.readings), r.readings, readings="absolute")
+    assert path.verdict == "adequate"
+    assert path.fit.model.named == ("base_frame", "joint_compliance", "guide_error")
+    told = [p for p in path.fit.parameters if p.name.startswith("guide_error") and p.identifiable]
+    assert len(told) > 20
+    off = np.array([(p.value - r.world.truth[p.name]) / p.std for p in told])
+    # shrunk estimates of one family lie in their bands as often as normal numbers do
+    assert np.sqrt(np.mean(off**2)) < 1.6
+    assert np.abs(off).max() < 4.2
+    assert path.fit.holdout.rms_sigma < 1.3
+
+
+@pytest.mark.parametrize("seed", SEEDS[:2])
 def test_of_a_good_rail_nothing_is_named(tmp_path, seed):
     r, cell = campaign(tmp_path, "nothing", seed)
     path = hc.refine(hc.baseline(cell, r.readings), r.readings, readings="absolute")

@@ -14,7 +14,7 @@ from hilcal.robot.chain import evaluate
 from hilcal.robot.scene import Scene, Segment, capsules, is_known
 from tests.support.arm_cases import ODD, arm_of
 from tests.support.fake_bench import POSES
-from tests.support.space_cases import frames, gap_to, placed, self_gap
+from tests.support.space_cases import frames, gap, gap_to, placed, self_gap
 
 POINT = st.tuples(*[st.floats(-2.0, 2.0, width=32)] * 3)
 UPRIGHT = np.array([0.0, -np.pi / 2, 0.0, -np.pi / 2, 0.0, 0.0])
@@ -47,6 +47,22 @@ def test_usual_poses_are_free_and_folded_ones_are_not(name):
     down = np.array([[0.0, 0.4, 0.3, -1.5, -1.5, 0.0]])  # through the table
     assert ("forearm", "table") in scene.around.close_pairs(down)
     assert scene.around.touching(down).all()
+
+
+FOOT = {"ur3": 128, "ur3e": 128, "ur5": 149, "ur5e": 149, "ur20": 245, "ur30": 245}
+
+
+@pytest.mark.parametrize("name", robot_names())
+def test_shapes_hold_the_crossings_of_axes_and_are_no_wider_than_the_foot(name):
+    """Feet: data sheets, mm; the tool's flange of a UR3e measures 63 mm."""
+    arm = load_arm(name)
+    assert all(0.03 <= part.radius <= FOOT.get(name, 190) / 2000 for part in capsules(arm))
+    for q in np.random.default_rng(1).uniform(-np.pi, np.pi, (5, 6)):
+        at = frames(arm, q)
+        for k in (2, 5, 6, 7):  # shoulder, wrists and flange; elsewhere the axes do not cross
+            centre = at[k][:3, 3][None]
+            near = [p.body for p in capsules(arm) if gap(placed(p, at), centre) <= p.radius]
+            assert {k - 1, k} & set(near)
 
 
 def test_known_distances_to_a_ball_a_box_and_a_cylinder():

@@ -1,4 +1,4 @@
-"""Hidden effects and laws of one's own: strength, names, and nothing shared with hilcal's."""
+"""Hidden effects: their laws, their strength, their names, and nothing shared with hilcal's."""
 
 import ast
 from dataclasses import replace
@@ -6,42 +6,27 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 import hilcal.drivers.simulated
-from hilcal.diagnosis.stepwise import add
-from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.injected_effects import (
     DEFLECTION_EFFECTS,
     EFFECTS,
     hide_effect,
     world_without_effect,
 )
-from hilcal.drivers.simulated.own_law import own_law
-from hilcal.drivers.simulated.rehearsal import (
-    case_of_plan,
-    check_choice,
-    own_choices,
-    simulate_plan,
-)
-from hilcal.drivers.simulated.world_server import read_world, write_world
-from hilcal.effects.catalogue import installed
+from hilcal.drivers.simulated.truth import Truth
 from hilcal.errors import InputError
-from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import fit
 from hilcal.readings.readings import States
 from studies.random_campaigns import rehearsal_states
-from tests.support.campaigns import cell_of, configuration, plan
 from tests.support.example_cell import ur10e_cell
-from tests.support.next_cases import SMALL, first_plan
-from tests.support.refusals import refusal, refusals, refuses
+from tests.support.refusals import refusals, refuses
 from tests.support.rehearsed import dead_weights
-from tests.support.user_effect_cases import CLASS, COLUMNS
 
 CELL = ur10e_cell()
 WEIGHTS = dead_weights([4.0, 8.0, 12.0], CELL.gravity)
-STATES, POSE, LOAD, _ = rehearsal_states(CELL, 10, WEIGHTS, np.random.default_rng(0))
+STATES, POSE, LOAD, CYCLE = rehearsal_states(CELL, 10, WEIGHTS, np.random.default_rng(0))
 VISIBLE = [(e, "absolute") for e in EFFECTS] + [(e, "deflection") for e in DEFLECTION_EFFECTS]
 
 
@@ -70,6 +55,77 @@ def test_strength_is_the_one_asked_for(effect, mode, m):
     assert np.sqrt(squares.sum() / change.size) == pytest.approx(wanted, rel=0.01)
     assert any(name.startswith(f"{effect}.") for name in world.truth)
     assert all(name.split(".")[0] in (effect, "joint_compliance") for name in world.truth)
+
+
+def rigid_world(**effects):
+    world = world_without_effect(CELL, np.random.default_rng(2))
+    truth = replace(Truth.rigid(CELL.arm), **effects)
+    return replace(world, physics=truth)
+
+
+def by_hand(world, states, dq=0.0, links=CELL.arm.links, base=None, offset=0.0):
+    """Target positions of a rigid arm, by matrix products, sensor axes."""
+    out = []
+    for q in states.q + dq:
+        place = world.registration @ (np.eye(4) if base is None else base) @ links[0]
+        for angle, link in zip(q, links[1:], strict=True):
+            step = np.eye(4)
+            step[:3, :3] = Rotation.from_euler("z", angle).as_matrix()
+            place = place @ step @ link
+        out.append(place[:3, :3] @ (CELL.target[:3, 3] + offset) + place[:3, 3])
+    return np.array(out)
+
+
+def exp(twist):
+    v, (x, y, z) = twist[:3], twist[3:]
+    return expm(np.array([[0, -z, y, v[0]], [z, 0, -x, v[1]], [-y, x, 0, v[2]], [0, 0, 0, 0]]))
+
+
+def test_effects_without_load_follow_their_laws():
+    rng = np.random.default_rng(3)
+    q = STATES.q
+
+    def same(world, expected):
+        np.testing.assert_allclose(world.ideal_readings(STATES).position, expected, atol=1e-12)
+
+    o = 1e-3 * rng.standard_normal(6)
+    world = rigid_world(encoder_offset=o)
+    same(world, by_hand(world, STATES, o))
+    world = rigid_world(hysteresis=o)
+    same(world, by_hand(world, STATES, o * STATES.approach))
+    ab = 1e-3 * rng.standard_normal((6, 2, 2))
+    dq = sum(ab[:, k - 1, 0] * np.cos(k * q) + ab[:, k - 1, 1] * np.sin(k * q) for k in (1, 2))
+    world = rigid_world(transmission_error=ab)
+    same(world, by_hand(world, STATES, dq))
+    k = 1e-3 * rng.standard_normal((6, 6))
+    world = rigid_world(joint_coupling=k)
+    same(world, by_hand(world, STATES, np.array([[row @ at for row in k] for at in q])))
+    twist = 1e-2 * rng.standard_normal((7, 6))
+    world = rigid_world(link_geometry=twist)
+    links = [link @ exp(t) for link, t in zip(CELL.arm.links, twist, strict=True)]
+    same(world, by_hand(world, STATES, links=links))
+    offset = rng.standard_normal(3)
+    world = rigid_world(target_offset=offset)
+    same(world, by_hand(world, STATES, offset=offset))
+    base = 1e-2 * rng.standard_normal(6)
+    world = rigid_world(base_frame=base)
+    same(world, by_hand(world, STATES, base=exp(base)))
+    rate = 1e-6 * rng.standard_normal(6)
+    world = rigid_world(tracker_drift=rate)
+    still = by_hand(world, STATES)
+    moved = [(exp(rate * t) @ [*p, 1.0])[:3] for t, p in zip(STATES.time, still, strict=True)]
+    same(world, np.array(moved))
+
+
+def test_load_point_adds_the_moment_of_the_load():
+    shift = np.array([0.02, -0.03, 0.05])
+    compliance = np.full(6, 1e-5)
+    moved = rigid_world(joint_compliance=compliance, load_point=shift)
+    cell = replace(CELL, load_point=CELL.load_point + shift)
+    told = replace(rigid_world(joint_compliance=compliance), cell=cell)
+    np.testing.assert_allclose(
+        moved.ideal_readings(STATES).position, told.ideal_readings(STATES).position, atol=1e-14
+    )
 
 
 FIRST = np.array([np.flatnonzero((p == POSE) & (LOAD == 0))[0] for p in POSE])
@@ -101,6 +157,17 @@ def test_truth_is_named_in_si():
     assert 4e-6 < world.truth["joint_compliance.j1"] < 8e-6
     world = hide_effect("joint_stiffening", CELL, STATES, 1.0, "absolute", np.random.default_rng(1))
     assert world.truth["joint_stiffening.j2"] < 0.0
+
+
+def test_unknown_registration_and_target_are_the_worlds_own():
+    cell = replace(CELL, target_known=False)
+    world = world_without_effect(cell, np.random.default_rng(1))
+    assert np.hypot(*world.registration[:2, 3]) == pytest.approx(3.0)
+    np.testing.assert_allclose(world.registration[2, :3], [0, 0, 1], atol=1e-15)
+    assert np.any(world.physics.target_offset != 0.0)
+    told = world_without_effect(ur10e_cell(registration_known=True), np.random.default_rng(1))
+    np.testing.assert_array_equal(told.registration, np.eye(4))
+    assert np.hypot(*told.station[:2, 3]) == pytest.approx(3.0)
 
 
 @refusals("hidden")
@@ -159,111 +226,3 @@ def test_the_world_shares_no_physics_with_the_program():
             for module in names:
                 own = not module.startswith("hilcal") or module.startswith("hilcal.drivers.")
                 assert own or module in allowed, (name, module)
-
-
-DRAWS = 4000
-
-
-@pytest.mark.parametrize(("m", "known"), [(3, False), (6, False), (6, True)])
-def test_sample_covariance_is_the_reported_one(m, known):
-    world = world_without_effect(ur10e_cell(registration_known=known), np.random.default_rng(4))
-    q = np.array([0.4, -1.2, 1.3, -0.4, 0.9, 0.3])
-    states = States(np.tile(q, (DRAWS, 1)), np.tile([0.0, 0, -90, 0, 0, 0], (DRAWS, 1)))
-    sight = world.ideal_readings(states[:1])
-    cov = world.covariance(sight, m)[0]
-    value = world.observe(states, np.random.default_rng(5), m)
-    off = value[:, :3] - sight.position
-    if m == 6:
-        seen = Rotation.from_rotvec(value[:, 3:]) * Rotation.from_matrix(sight.rotation[0]).inv()
-        off = np.hstack([off, seen.as_rotvec()])
-    white = np.linalg.solve(np.linalg.cholesky(cov), off.T)
-    low, high = stats.chi2.ppf([0.001, 0.999], DRAWS * m)
-    assert low < np.sum(white**2) < high
-    # each element of the whitened sample covariance has a deviation of 1 or √2 over √DRAWS
-    np.testing.assert_allclose(white @ white.T / DRAWS, np.eye(m), atol=4.5 * np.sqrt(2 / DRAWS))
-    np.testing.assert_allclose(white.mean(axis=1), 0.0, atol=4.5 / np.sqrt(DRAWS))
-
-
-TURN = 3e-4
-
-
-@pytest.fixture
-def file(tmp_path):
-    path = tmp_path / "mine.py"
-    path.write_text(CLASS, encoding="utf-8")
-    return path
-
-
-@pytest.fixture
-def law(file):
-    return own_law(installed().with_file(file), "mine", cell_of(), plan(6).states)
-
-
-def world_with(law, theta):
-    world = world_without_effect(cell_of(), np.random.default_rng(1))
-    return world, replace(world, own_law=replace(law, theta=np.array([theta])))
-
-
-def test_the_target_moves_as_the_world_moves_it_when_the_joint_turns(law):
-    """dq_2 = a sin(2 q_1) is a turn of joint 2: the world's own mechanics make the same."""
-    bare, within = world_with(law, TURN)
-    states = plan(6).states
-    turned = np.zeros_like(states.q)
-    turned[:, 1] = TURN * np.sin(2 * states.q[:, 0])
-    before, after = bare.ideal_readings(states), within.ideal_readings(states)
-    true = bare.ideal_readings(states, turned)
-    shift = true.position - before.position
-    assert np.linalg.norm(shift, axis=1).max() > 1e-4
-    error = after.position - before.position - shift
-    # The world sags under its load as it turns, the law is added to where it rests: 1 %.
-    assert np.linalg.norm(error, axis=1).max() < 0.01 * np.linalg.norm(shift, axis=1).max()
-    np.testing.assert_allclose(after.rotation, true.rotation, atol=0.01 * TURN)
-    assert within.drifts
-    assert within.truth["mine.a"] == TURN
-
-
-def test_a_campaign_in_such_a_cell_reveals_it(law):
-    strong = SMALL.simulation.model_copy(update={"strength_sigma": 4.0})
-    config, catalogue = SMALL.model_copy(update={"simulation": strong}), law.catalogue
-    secret = case_of_plan(config, first_plan(), "mine", 1, catalogue)
-    assert (secret.hidden, secret.mode) == ("mine", "absolute")
-    r = simulate_plan(secret, first_plan(), [1, 1])
-    model = baseline(r.cell, r.readings, r.mode, catalogue)
-    d = diagnose(fit(model, r.readings, r.mode))
-    assert "mine" in (d.suspects[0].effect, *d.suspects[0].same_as)
-    found = add(d.fit, "mine")
-    true, std = secret.world.truth["mine.a"], found.uncertainty.std[-1]
-    assert abs(found.theta[-1] - true) < 4 * std < abs(true)
-
-
-def test_a_world_with_it_comes_back_from_its_file(law, tmp_path):
-    _, world = world_with(law, TURN)
-    write_world(tmp_path / "world.json", world, configuration())
-    back, _ = read_world(tmp_path / "world.json")
-    states = plan(6).states
-    np.testing.assert_array_equal(
-        back.ideal_readings(states).position, world.ideal_readings(states).position
-    )
-    assert back.truth == world.truth
-
-
-def test_a_law_that_has_changed_since_is_refused(law, file, tmp_path):
-    _, world = world_with(law, TURN)
-    write_world(tmp_path / "world.json", world, configuration())
-    file.write_text(CLASS.replace(COLUMNS, "values = np.sin(s.angle[:, :1])"), encoding="utf-8")
-    refusal(r"mine\.py: changed since", read_world, tmp_path / "world.json")
-
-
-def test_what_the_simulated_cell_does_not_measure_is_named(file):
-    file.write_text(CLASS.replace("summary", 'needs = ("air_temperature",)\n    summary'))
-    catalogue = installed().with_file(file)
-    with pytest.raises(InputError, match="mine needs air_temperature"):
-        own_law(catalogue, "mine", cell_of(), replace(plan(6).states, air_temperature=None))
-
-
-def test_only_effects_of_ones_own_are_added_to_the_choices(law):
-    assert own_choices(law.catalogue) == ("mine",)
-    assert own_choices(installed()) == ()  # all that ship have mechanics of their own
-    check_choice("mine", law.catalogue)
-    refusal("hide 'mine'", check_choice, "mine", installed())
-    refusal(r"hide 'mime' \(did you mean \"mine\"\?\)", check_choice, "mime", law.catalogue)

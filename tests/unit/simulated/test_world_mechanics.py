@@ -1,7 +1,5 @@
-"""The elastic arm against mechanics written out by hand; the world as time goes by; its file."""
+"""The elastic arm against mechanics written out by hand: energy, torques, laws, cantilever."""
 
-import json
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -10,27 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.drivers.simulated.mechanics import build, elasticity, equilibrium, long_links
 from hilcal.drivers.simulated.truth import Truth
-from hilcal.drivers.simulated.world_server import read_world, write_world
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
 from tests.support.example_cell import ur10e_cell
 from tests.support.refusals import refusal
-from tests.support.running_world import (
-    PULL,
-    WEIGHT,
-    RunningWorld,
-    config,
-    every_effect,
-    frames,
-    remaining_effects,
-    running_world,
-    same_bytes,
-    states,
-    world_of,
-)
-from tests.support.running_world import (
-    Q as AT_REST,
-)
+from tests.support.running_world import frames, moment_beyond
 
 CELL = ur10e_cell()
 ARM = CELL.arm
@@ -105,6 +87,19 @@ def test_energy_is_stationary_and_virtual_work_of_the_moment_balances():
         np.testing.assert_allclose(delta, spring, atol=1e-16, rtol=1e-12)
 
 
+def test_the_linear_law_is_the_limit():
+    errors = []
+    for small in (1.0, 0.1, 0.01):
+        tree, _, rest = solve(Q[0], WRENCH[0], joint_compliance=small * JOINT)
+        linear = [
+            small * JOINT[j] * np.dot(*moment_beyond(CELL, Q[0], WRENCH[0], j)[:2])
+            for j in range(6)
+        ]
+        errors.append(np.abs(rest.deflection[0, tree.drive] - linear).max() / small)
+    assert errors[0] / errors[1] == pytest.approx(10.0, rel=0.1)
+    assert errors[1] / errors[2] == pytest.approx(10.0, rel=0.1)
+
+
 def cantilever():
     """One joint, and a massless level link of 0.8 m to a second one that carries the flange."""
     links = np.tile(np.eye(4), (3, 1, 1))
@@ -140,6 +135,19 @@ def test_a_long_link_bends_as_a_cantilever(force):
     np.testing.assert_allclose(seen, about, rtol=1e-4)
 
 
+def test_jacobian_is_the_derivative_of_the_flange():
+    tree, _, rest = solve(Q, WRENCH)
+    h = 1e-6
+    for j in range(6):
+        ahead, behind = (solve(Q + s * h * np.eye(6)[j], WRENCH)[2].flange for s in (1, -1))
+        move = (ahead[:, :3, 3] - behind[:, :3, 3]) / (2 * h)
+        spin = ((ahead - behind) / (2 * h))[:, :3, :3] @ np.swapaxes(rest.flange, 1, 2)[:, :3, :3]
+        omega = np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
+        np.testing.assert_allclose(rest.jacobian[:, :3, j], move, atol=1e-8)
+        np.testing.assert_allclose(rest.jacobian[:, 3:, j], omega, atol=1e-8)
+    assert len(tree.drive) == 6
+
+
 def test_a_gear_that_would_spring_back_is_refused():
     with pytest.raises(InputError, match=r"state 0: joint_stiffening is too strong"):
         solve(Q, WRENCH, joint_compliance=JOINT, joint_stiffening=-JOINT / 50.0**2)
@@ -147,195 +155,3 @@ def test_a_gear_that_would_spring_back_is_refused():
 
 def test_an_arm_that_collapses_is_refused():
     refusal(r"state \d: .*equilibrium", solve, Q, WRENCH, joint_compliance=np.full(6, 0.3))
-
-
-@pytest.fixture
-def cell(tmp_path):
-    return running_world(tmp_path)
-
-
-def slip_of(cell):
-    return cell.living.slip(cell.arrivals)[None]
-
-
-# repeatability
-
-
-def test_the_slip_stays_until_the_next_arrival_and_comes_new_with_it(cell, tmp_path):
-    first = cell.rest_at(AT_REST)["flange"].copy()
-    cell.board.write("arm", moving=1.0, q=AT_REST + 0.1)
-    on_the_way = cell.truth_after()["flange"]
-    assert np.abs(on_the_way - first).max() > 1e-2
-    cell.board.write("arm", q=AT_REST, moving=1.0)
-    assert same_bytes(cell.truth_after()["flange"], first)
-    assert not same_bytes(cell.rest_at(AT_REST)["flange"], first)
-
-
-# the wrench on the sensor
-
-MOUNT = {"origin_m": [0.01, -0.02, 0.045], "rotvec_rad": [0.3, -0.9, 2.1]}
-SENSOR = {"force_sensor": {"driver": "ft300", "port": "x", **MOUNT}}
-
-
-def test_the_sensor_feels_the_weight_of_tool_and_load_in_its_own_axes(tmp_path):
-    cell = running_world(tmp_path, sections=SENSOR, load_point=np.array([0.004, 0.0, -0.003]))
-    cell.living.hang("5kg")
-    for q in (AT_REST, -AT_REST, AT_REST + 0.8):
-        truth = cell.rest_at(q)
-        flange = Rotation.from_matrix(truth["flange"][:3, :3])
-        in_base = flange * Rotation.from_rotvec(MOUNT["rotvec_rad"])
-        force, moment = in_base.apply(truth["sensor_wrench"].reshape(2, 3))
-        np.testing.assert_allclose(force, [0.0, 0.0, -5.8 * 9.80665], atol=1e-9)
-        # a weight has no moment about its own centre
-        tool, load = np.array([0.01, 0.02, 0.06]), np.array([0.104, -0.03, 0.147])
-        centre = flange.apply((0.8 * tool + 5.0 * load) / 5.8 - MOUNT["origin_m"])
-        np.testing.assert_allclose(moment, np.cross(centre, force), atol=1e-9)
-
-
-# what the people in the cell do
-
-
-def test_a_mistake_is_made_once_and_told(cell, tmp_path):
-    cell.living.mistake("pull")
-    assert cell.living.hang("5kg") == "pull"
-    assert cell.board.read("truth")["load"] == 2
-    assert cell.living.hang("5kg") == "5kg"
-    cell.living.mistake(None)
-    assert cell.living.hang("5kg") is None
-    events = [entry["event"] for entry in cell.living.log()]
-    assert events == [
-        "asked for 5kg, hung pull",
-        "asked for 5kg, hung 5kg",
-        "asked for 5kg, hung none",
-    ]
-
-
-def yielding(tmp_path, *places):
-    """A cell whose joint 2 bears the torque of the first state, but not that of the second."""
-    made = config()
-    world = world_of(made)
-    lift = [abs(world.drive_torque(states(*place, 0.0))[0, 1]) for place in places]
-    assert lift[0] < 0.9 * lift[1]
-    # c + 3 s tau² is 0 between the two torques: the gear has no equilibrium beyond
-    hidden = np.zeros(6)
-    hidden[1] = -world.physics.joint_compliance[1] / 3.0 / np.mean(lift) ** 2
-    return RunningWorld(world_of(made, joint_stiffening=hidden), made, tmp_path)
-
-
-def test_what_the_arm_does_not_bear_is_refused_and_changes_nothing(tmp_path):
-    cell = yielding(tmp_path, (AT_REST, np.zeros(6)), (AT_REST, WEIGHT))
-    before = cell.rest_at(AT_REST)
-    refusal("spring back", cell.living.hang, "5kg")
-    refusal("spring back", cell.living.push, WEIGHT.tolist())
-    after = cell.truth_after()
-    assert (after["load"], after["load_since"]) == (0, 0.0)
-    assert same_bytes(before["flange"], after["flange"])
-    again = cell.rest_at(AT_REST)
-    assert again["arrivals"] == before["arrivals"] + 1
-    np.testing.assert_allclose(again["flange"], before["flange"], atol=1e-3)
-
-
-def test_a_pose_without_equilibrium_is_logged_and_the_world_lives_on(tmp_path):
-    upright = np.array([0.0, -np.pi / 2, 0.0, 0.0, 0.0, 0.0])
-    cell = yielding(tmp_path, (upright, np.zeros(6)), (0 * AT_REST, np.zeros(6)))
-    before = cell.rest_at(upright)
-    stretched = cell.rest_at(0 * AT_REST)
-    assert same_bytes(stretched["flange"], before["flange"])
-    assert "spring back" in cell.living.log()[0]["event"]
-    cell.truth_after()
-    assert len(cell.living.log()) == 1
-    assert cell.rest_at(upright)["arrivals"] == 3
-
-
-def state_of(cell, truth, wrench):
-    """The state that a truth belongs to."""
-    state = states(AT_REST, wrench, float(truth["time"]))
-    return replace(
-        state,
-        load_time=truth["time"][None] - truth["load_since"],
-        joint_temperature=truth["joint_temperature"][None],
-    )
-
-
-def test_a_load_swings_for_a_while_and_rests_where_it_should(cell, tmp_path):
-    cell.rest_at(AT_REST)
-    cell.living.swing([0.0, 0.0, 20.0, 0.0, 0.0, 0.0], period=1e-3, decay=0.2)  # world s
-    cell.living.hang("5kg")
-    still = cell.world.equilibrium(
-        states(AT_REST, WEIGHT, 0.0), cell.living.slip(cell.arrivals)[None]
-    ).flange[0]
-    seen = [cell.truth_after()["flange"] for _ in range(2)]
-    assert not same_bytes(seen[0], still)
-    assert not same_bytes(seen[0], seen[1])
-    time.sleep(0.2)  # 4 s of the world, 20 decays
-    assert same_bytes(cell.truth_after()["flange"], still)
-
-
-def test_every_effect_shows_in_the_truth(tmp_path):
-    cell = running_world(
-        tmp_path, sections=SENSOR, **every_effect(np.random.default_rng(2)), **remaining_effects(3)
-    )
-    cell.living.hang("pull")
-    truth = cell.rest_at(AT_REST)
-    want = cell.world.ideal_readings(state_of(cell, truth, PULL), slip_of(cell))
-    assert same_bytes(truth["target"], want.position[0])
-    for effect in remaining_effects(3):
-        gone = np.zeros_like(getattr(cell.world.physics, effect))
-        less = replace(cell.world, physics=cell.world.physics.with_effect(effect, gone))
-        seen = less.ideal_readings(state_of(cell, truth, PULL), slip_of(cell)).position[0]
-        # Creep has only begun; equilibria are exact to 1e-12 rad.
-        assert np.linalg.norm(seen - truth["target"]) > 1e-9, effect
-
-
-SLOW = {
-    "tracker_drift": np.array([1e-3, -2e-3, 3e-3, 1e-3, 0.0, 0.0]),
-    **{
-        e: 100.0 * remaining_effects(3)[e]
-        for e in ("creep", "thermal_growth", "thermal_joint_drift")
-    },
-}
-
-
-@pytest.mark.parametrize("effect", SLOW)
-def test_what_goes_on_with_time_or_warmth_moves_a_resting_arm(tmp_path, effect):
-    cell = running_world(tmp_path, **{effect: SLOW[effect]})
-    cell.living.hang("5kg")
-    first = cell.rest_at(AT_REST)
-    time.sleep(0.02)
-    second = cell.truth_after()
-    assert second["time"] - first["time"] >= 0.02 * 20.0
-    want = cell.world.ideal_readings(state_of(cell, second, WEIGHT), slip_of(cell))
-    assert same_bytes(second["target"], want.position[0])
-    assert not same_bytes(second["target"], first["target"])
-
-
-def test_world_comes_back_from_its_file_to_the_last_bit(tmp_path):
-    made = config(force_sensor={"driver": "ft300", "port": "x", "origin_m": [0, 0, 0.1]})
-    world = world_of(made, **every_effect(np.random.default_rng(3)), **remaining_effects(4))
-    world = replace(world, joint_reference=23.4)
-    write_world(tmp_path / "world.json", world, made)
-    back, told = read_world(tmp_path / "world.json")
-    assert told == made
-    assert back.truth == world.truth
-    assert back.noise == world.noise
-    for name in ("registration", "station", "joint_std"):
-        assert same_bytes(getattr(back, name), getattr(world, name))
-    assert back.joint_reference == 23.4
-    state = replace(states(AT_REST, WEIGHT, 12.3), joint_temperature=np.full((1, 6), 25.0))
-    assert same_bytes(back.ideal_readings(state).position, world.ideal_readings(state).position)
-
-
-@pytest.mark.parametrize("text", ["", "[1]", '{"format": "hilcal-plan"}', "{"])
-def test_another_file_is_no_world(tmp_path, text):
-    (tmp_path / "world.json").write_text(text)
-    refusal("no world", read_world, tmp_path / "world.json")
-
-
-def test_a_damaged_world_says_so(tmp_path):
-    path = tmp_path / "world.json"
-    write_world(path, world_of(config()), config())
-    content = json.loads(path.read_text())
-    del content["physics"]["base_frame"]
-    path.write_text(json.dumps(content))
-    refusal(r"no world: TypeError .*'base_frame'", read_world, path)
-    refusal("cannot be read", read_world, tmp_path / "none.json")

@@ -217,6 +217,19 @@ def test_a_corrected_program_means_the_corrected_joint_values(maker, arms, examp
     np.testing.assert_allclose(again.q, wanted, atol=3e-5 if maker in ("fanuc", "inform") else 1e-7)
 
 
+def test_offs_and_reltool_move_as_abb_defines_them():
+    """Offs in the object frame; RelTool in the tool's: about x, the new y, the new z."""
+    e = EXAMPLE["rapid"]
+    offs, p30, relative = (
+        se3.inverse(e.frame) @ flange("rapid", tuple(np.radians(e.q[k]).tolist())) @ e.tool
+        for k in (3, 4, 5)
+    )
+    np.testing.assert_allclose(offs[:3, 3] - p30[:3, 3], [0, 0, 0.04], atol=1e-7)
+    np.testing.assert_allclose(offs[:3, :3], p30[:3, :3], atol=1e-7)
+    step = place("XYZ", [5, 0, -30, 4, 0, -15])
+    np.testing.assert_allclose(relative, p30 @ step, atol=1e-7)
+
+
 @pytest.mark.parametrize("maker", first(1, list(EXAMPLE)))
 def test_flags_tell_every_branch_and_turn(maker, arms):
     arm, language = arms[maker], EXAMPLE[maker].language

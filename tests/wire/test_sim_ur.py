@@ -1,0 +1,438 @@
+"""The simulated UR controller, by clients of its protocols; its motions."""
+
+import socket
+import struct
+import time
+from contextlib import closing
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as some
+from scipy.spatial.transform import Rotation
+
+from hilcal.calibration.urscript import movej_program, waypoints, with_joints
+from hilcal.drivers.simulated.blackboard import Blackboard
+from hilcal.drivers.simulated.cell_processes import free_host
+from hilcal.drivers.simulated.ur_programs import ScriptStream
+from hilcal.drivers.simulated.ur_state import GRAVITY, Kinematics, Trajectory, line
+from hilcal.errors import DeviceError
+from hilcal.robot.catalogue import load_arm
+from hilcal.robot.chain import evaluate
+from tests.support.rows import first
+from tests.support.sim_ur_cases import (
+    Lines,
+    Wire,
+    client,
+    send_script,
+    server,
+    start,
+)
+from tests.support.timing import wait_until
+
+SPEED, ACCELERATION = 0.5, 1.0
+STOP_NS = 500_000_000  # the arm has to stand so soon after a fault
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory):
+    """One controller for a file; a protective stop can be unlocked soon."""
+    running = start(tmp_path_factory.mktemp("u"))
+    running.admin("set", unlock_s=0.3)
+    yield running
+    running.close()
+
+
+@pytest.fixture
+def sim(shared):
+    """A controller without faults; it has none after the test either."""
+    yield shared
+    shared.admin("set", unlock_s=0.3)
+    shared.admin("remote_mode")
+    shared.admin("release_emergency_stop")
+    with Lines(shared.host) as dashboard:
+        dashboard.read()
+        while dashboard.ask("unlock protective stop").startswith("Cannot"):
+            time.sleep(0.05)
+        assert dashboard.ask("brake release") == "Brake releasing"
+        shared.wait("robot_mode", 7)
+        assert dashboard.ask("stop") == "Stopped"
+    shared.wait("moving", False)
+    shared.wait("rtde_clients", 0)
+
+
+def goal_of(sim, by):
+    q = sim.admin()["q"]
+    q[0] += by if q[0] < 0 else -by
+    q[3] += 0.1 * by
+    return q
+
+
+def under_way(run, sim):
+    """Start a long motion and wait until it has its full speed."""
+    goal = goal_of(sim, 1.5)
+    assert run("control", "moveJ", goal, SPEED, ACCELERATION, True)
+    while abs(sim.admin()["qd"][0]) < 0.999 * SPEED:
+        time.sleep(0.01)
+    return goal
+
+
+def rest_after(sim, fault_ns):
+    """The state once the arm stands; it came to rest within the time after the fault."""
+    state = sim.wait("moving", False)
+    assert 0 < state["rest_ns"] - fault_ns < STOP_NS
+    return state
+
+
+def learns(run, part, call, good=bool):
+    """Wait until the client knows: what it says is as old as the last package that it has read."""
+    deadline = time.monotonic() + 5.0
+    while not good(answer := run(part, call)):
+        assert time.monotonic() < deadline, f"{call} stays {answer!r}"
+        time.sleep(0.005)
+    return answer
+
+
+def test_stopj_decelerates_as_told(sim):
+    with client(sim.host, "control") as run:
+        under_way(run, sim)
+        run("control", "stopJ", 1.0)
+        state = sim.admin()
+        assert not state["moving"]  # it blocked until the arm stood
+        assert state["script_running"]
+    (began,) = [ns for ns, what in sim.admin("log") if what == "stop command, 1"]
+    assert state["rest_ns"] - began == pytest.approx(SPEED / 1.0 * 1e9, rel=0.05)
+
+
+@pytest.mark.parametrize("how", ["dashboard", "line", "program", "killed"])
+def test_ways_to_stop(sim, how):
+    with client(sim.host, "control", "dashboard") as run:
+        goal = under_way(run, sim)
+        before = sim.admin()["arrivals"]
+        at = time.monotonic_ns()
+        if how == "dashboard":
+            run("dashboard", "stop")
+        elif how == "line":
+            send_script(sim.host, "stopj(4.0)\n")
+        elif how == "program":
+            send_script(sim.host, "def halt():\n  stopj(4.0)\nend\n")
+        else:
+            sim.admin("kill_script")
+        state = rest_after(sim, at)
+        assert state["arrivals"] == before + 1
+        assert abs(state["q"][0] - goal[0]) > 0.1
+        sim.wait("script_running", False)
+        learns(run, "control", "isProgramRunning", lambda running: running is False)
+        assert run("control", "moveJ", goal, SPEED, ACCELERATION) is False
+
+
+def turned(vector):
+    return Rotation.from_rotvec(vector).as_matrix()
+
+
+def test_asynchronous_move_reaches_its_goal(sim):
+    before = sim.board.read("arm")
+    with client(sim.host, "control", "receive") as run:
+        goal = goal_of(sim, 0.2)
+        assert run("control", "moveJ", goal, SPEED, ACCELERATION, True)
+        assert sim.board.read("arm")["moving"] == 1.0
+        assert run("control", "getAsyncOperationProgress") >= 0
+        state = sim.wait("moving", False)
+        # d / v + v / a = 0.9 s: neither sooner nor much later
+        begun = [ns for ns, what in sim.admin("log") if what.startswith("move to ")][-1]
+        assert 0.85e9 < state["rest_ns"] - begun < 1.5e9
+        np.testing.assert_allclose(state["q"], goal, atol=1e-12)
+        learns(run, "control", "getAsyncOperationProgress", lambda progress: progress < 0)
+        learns(run, "receive", "getTargetQ", lambda q: np.allclose(q, goal, rtol=0.0, atol=1e-12))
+        np.testing.assert_allclose(run("receive", "getActualQ"), goal, atol=5e-5)
+    after = sim.board.read("arm")
+    assert after["arrivals"] == before["arrivals"] + 1
+    moved = np.array(goal) - before["q"]
+    np.testing.assert_array_equal(after["side"][[0, 3]], np.sign(moved[[0, 3]]))
+    np.testing.assert_array_equal(after["side"][[1, 2, 4, 5]], before["side"][[1, 2, 4, 5]])
+    np.testing.assert_allclose(after["q"], goal, atol=1e-12)
+
+
+def test_payload_keeps_its_centre_when_told_zeros(sim):
+    with client(sim.host, "control", "receive") as run:
+        assert run("control", "setPayload", 2.5, [0.01, 0.02, 0.03])
+        assert run("control", "setPayload", 3.5, [0.0, 0.0, 0.0])
+        learns(run, "receive", "getPayload", lambda mass: mass == 3.5)
+        assert run("receive", "getPayloadCog") == [0.01, 0.02, 0.03]
+    arm = sim.board.read("arm")
+    assert arm["payload"] == 3.5
+    np.testing.assert_array_equal(arm["payload_com"], [0.01, 0.02, 0.03])
+
+
+def test_forward_kinematics_is_that_of_the_nominal_arm(sim):
+    tool = [0.1, -0.05, 0.2, 0.3, -0.4, 0.5]
+    with client(sim.host, "control", "receive") as run:
+        assert run("control", "setTcp", tool)
+        told = run("control", "getForwardKinematics")
+        learns(run, "receive", "getActualTCPPose", lambda p: np.allclose(p, told, atol=1e-4))
+        assert run("control", "setTcp", [0.0] * 6)
+    place = np.eye(4)
+    links = load_arm("ur10e").links
+    for link, angle in zip(links, [*sim.admin()["q"], 0.0], strict=True):
+        turn = np.eye(4)
+        turn[:3, :3] = turned([0.0, 0.0, angle])
+        place = place @ link @ turn
+    offset = np.eye(4)
+    offset[:3, :3], offset[:3, 3] = turned(tool[3:]), tool[:3]
+    expected = place @ offset
+    np.testing.assert_allclose(told[:3], expected[:3, 3], atol=1e-9)
+    np.testing.assert_allclose(turned(told[3:]), expected[:3, :3], atol=1e-9)
+
+
+def test_goal_beyond_the_joints_is_a_protective_stop(sim):
+    with client(sim.host, "control") as run:
+        goal = sim.admin()["q"]
+        goal[5] = 7.0
+        assert run("control", "moveJ", goal, SPEED, ACCELERATION) is False
+    assert sim.admin()["safety"] & 1 << 2
+
+
+Q = np.array([[0.1, -1.2, 1.5, -1.0, -1.4, 0.3], [0.3, -1.1, 1.4, -0.9, -1.5, 0.4]])
+PROGRAM = """def prog():
+  set_tcp(p[0,0,0.1,0,0,0])
+  movej([0,-1.57,1.57,0,1.57,0], a=20, v=30) # first
+  sleep(0.01)
+  movel([0.1,-1.5,1.5,0,1.5,0], a=20, v=30, r=0.01)
+end
+"""
+
+
+def reached(sim, text, goals):
+    send_script(sim.host, text)
+    moves = [f"move to {np.round(goal, 6).tolist()}" for goal in goals]
+    wait_until(
+        lambda: [line for _, line in sim.admin("log") if line in moves] == moves, f"moved {moves}"
+    )
+    sim.wait("script_running", False)
+    state = sim.admin()
+    np.testing.assert_allclose(state["q"], goals[-1], atol=1e-8)
+    assert not state["moving"]
+
+
+def test_a_program_of_compensated_points_is_carried_out(sim):
+    reached(sim, movej_program(["a", "b"], Q).replace("])", "], a=20, v=30)"), Q)
+
+
+def test_a_rewritten_program_goes_to_its_new_waypoints(sim):
+    reached(sim, with_joints(PROGRAM, waypoints(PROGRAM), Q), Q)
+
+
+def test_programs_with_other_statements_are_foreign_and_move_nothing(sim):
+    before = sim.admin()["q"]
+    send_script(sim.host, "def p():\n  movej([0,0,0,0,0,0])\n  while (True):\n  end\nend\n")
+    wait_until(
+        lambda: any("foreign program" in line for _, line in sim.admin("log")), "a foreign program"
+    )
+    assert sim.admin()["q"] == before
+
+
+LOCAL = "Command is not allowed due to safety reasons, please switch robot to Remote Control mode"
+
+
+def test_clients_get_the_rate_that_they_asked_for(sim):
+    with Wire(sim.host) as fast, Wire(sim.host) as slow:
+        for wire, hz in ((fast, 250.0), (slow, 25.0)):
+            wire.outputs("timestamp", hz)
+            wire.ask("S")
+            times = [struct.unpack(">Bd", wire.receive()[1])[1] for _ in range(int(hz))]
+            assert times[-1] - times[0] == pytest.approx((hz - 1) / hz, abs=0.1)
+
+
+def test_nonsense_ends_the_connection_and_nothing_else(sim):
+    for data in (b"\x00\x04U\x09", b"\x00\x03U", b"\x00\x04V\x01", b"\x00\x0bO" + b"\xff" * 8):
+        with Wire(sim.host) as wire:
+            wire.socket.sendall(data)
+            with pytest.raises(ConnectionError):
+                wire.exactly(1)
+    with Wire(sim.host) as wire:
+        assert wire.ask("V", struct.pack(">H", 2)) == b"\x01"
+
+
+def test_dashboard_answers(sim):
+    with Lines(sim.host) as dashboard:
+        assert dashboard.read() == "Connected: Universal Robots Dashboard Server"
+        assert dashboard.ask("PolyscopeVersion").startswith("URSoftware 5.11.6.1010327 ")
+        assert dashboard.ask("get robot model") == "UR10e"
+        assert dashboard.ask("get serial number").isdigit()
+        assert dashboard.ask("robotmode") == "Robotmode: RUNNING"
+        assert dashboard.ask("safetystatus") == "Safetystatus: NORMAL"
+        assert dashboard.ask("running") == "Program running: false"
+        assert dashboard.ask("programState").split()[0] == "STOPPED"
+        assert dashboard.ask("play") == "Failed to execute: play"
+        assert dashboard.ask("close safety popup") == "closing safety popup"
+        assert dashboard.ask("dance") == "could not understand: 'dance'"
+        assert dashboard.ask("quit") == "Disconnected"
+        assert dashboard.read() == ""
+
+
+def test_dashboard_connections_of_local_mode_stay_without_rights(sim):
+    sim.admin("local_mode")
+    with Lines(sim.host) as dashboard:
+        dashboard.read()
+        assert dashboard.ask("is in remote control") == "false"
+        assert dashboard.ask("stop").startswith(LOCAL)
+        sim.admin("remote_mode")
+        assert dashboard.ask("is in remote control") == "true"
+        assert dashboard.ask("stop").startswith(LOCAL)
+    with Lines(sim.host) as dashboard:
+        dashboard.read()
+        assert dashboard.ask("stop") == "Stopped"
+
+
+def test_unknown_operations_and_settings_are_refused(sim):
+    with pytest.raises(DeviceError, match=r"'explode'; valid: protective_stop"):
+        sim.admin("explode")
+    with pytest.raises(DeviceError, match=r"speed_scaling = 2; valid: 0 to 1"):
+        sim.admin("set", speed_scaling=2)
+    with pytest.raises(DeviceError, match="four numbers"):
+        sim.admin("set", version="5.11")
+
+
+def test_the_truth_is_what_the_sensors_tell(tmp_path):
+    rng = np.random.default_rng(4)
+    truth = {
+        "encoder": rng.normal(size=6),
+        "joint_temperature": 30.0 + rng.normal(size=6),
+        "drive_torque": 20.0 * rng.normal(size=6),
+        "sensor_wrench": np.array([1.0, 2.0, -60.0, 0.5, 0.25, 0.0]),
+    }
+    sim = start(tmp_path, 1.0, {**truth, "arrivals": 0})
+    names = (
+        "actual_q,joint_temperatures,target_moment,ft_raw_wrench,actual_TCP_force,target_current"
+    )
+
+    def values():
+        with Wire(sim.host) as wire:
+            wire.outputs(names)
+            wire.ask("S")
+            return np.array(struct.unpack(">B36d", wire.receive()[1])[1:]).reshape(6, 6)
+
+    try:
+        q, temperature, moment, wrench, force, current = values()
+        np.testing.assert_array_equal(q, truth["encoder"])
+        np.testing.assert_array_equal(temperature, truth["joint_temperature"])
+        np.testing.assert_array_equal(moment, truth["drive_torque"])
+        assert np.all(np.sign(current) == np.sign(moment))
+        offset = wrench - truth["sensor_wrench"]
+        assert 2.0 < np.linalg.norm(offset[:3]) < 10.0
+        # no payload was told: what the controller calls contact is all of the load
+        assert np.linalg.norm(force[:3]) == pytest.approx(np.linalg.norm(wrench[:3]), rel=1e-9)
+        sim.board.write("truth", arrivals=7)  # not that of this arm's rest
+        np.testing.assert_allclose(values()[0], sim.admin()["q"], atol=5e-5)
+    finally:
+        sim.close()
+
+
+@pytest.mark.parametrize("port", first(1, [30004, 29999, 30003]))
+def test_an_address_in_use_is_refused(tmp_path, port):
+    Blackboard.create(tmp_path / "world.bin", 1.0)
+    host = free_host()
+    with socket.socket() as taken:
+        taken.bind((host, port))
+        taken.listen()
+        process = server(tmp_path, host)
+        process.start()
+        wait_until(lambda: process.has_ended, "ended")
+        with pytest.raises(DeviceError, match=rf"exit code 3: .*{host}:{port} is in use"):
+            process.check()
+        process.end()
+    assert process.log.read_text().count("\n") == 1
+    assert not (tmp_path / "arm.sock").exists()
+
+
+@pytest.mark.long
+def test_a_restarted_controller_finds_its_arm_where_it_was(tmp_path):
+    sim = start(tmp_path)
+    q = sim.admin()["q"]
+    sim.close()
+    q[2] += 0.5
+    sim.board.write("arm", q=q, moving=1.0, arrivals=41)
+    with closing(sim):
+        sim.start()
+        state = sim.admin()
+        assert state["q"] == q
+        assert state["arrivals"] == 42
+        assert sim.board.read("arm")["arrivals"] == 42
+
+
+GOAL = np.array([1.0, -0.5, 0.0, 0.2, 0.0, -1.5])
+vectors = some.lists(some.floats(-3.0, 3.0), min_size=6, max_size=6).map(np.array)
+
+
+def trajectory():
+    return Trajectory(np.zeros(6), np.ones(6), 5, 100.0)
+
+
+@given(vectors, some.floats(0.01, 2.0), some.floats(0.01, 10.0))
+def test_speed_is_the_derivative_and_limits_hold(goal, speed, acceleration):
+    segment = line(np.zeros(6), goal, speed, acceleration)
+    if segment is None:
+        assert np.max(np.abs(goal)) < 1e-9
+        return
+    assert segment.length == pytest.approx(np.max(np.abs(goal)), rel=1e-9)
+    times = np.linspace(0.0, segment.duration, 2001)
+    way, rate = np.array([segment.at(t) for t in times]).T
+    assert rate.max() <= speed * (1 + 1e-9)
+    assert rate[0] == 0.0
+    assert rate[-1] == pytest.approx(0.0, abs=1e-9 * (1 + rate.max()))
+    step = times[1] - times[0]
+    corner = 0.25 * acceleration * step**2 + 1e-12  # what a trapezium misses where ramps end
+    np.testing.assert_allclose(
+        np.diff(way), 0.5 * step * (rate[1:] + rate[:-1]), rtol=0.0, atol=corner
+    )
+    assert np.max(np.abs(np.diff(rate))) <= acceleration * step * (1 + 1e-6) + 1e-12
+
+
+@pytest.mark.parametrize("when", [0.2, 1.5, 3.1, 3.45])
+def test_stop_is_smooth_and_stays_on_the_line(when):
+    path = trajectory()
+    path.start(GOAL, 0.5, 1.0, 100.0)
+    path.advance(100.0 + when)
+    speed, q = np.max(np.abs(path.qd)), path.q.copy()
+    path.stop(2.0, 100.0 + when)
+    assert path.moving
+    path.advance(100.0 + when + 1e-6)
+    assert np.max(np.abs(path.qd)) == pytest.approx(speed, rel=1e-3)
+    path.advance(104.0)
+    assert not path.moving
+    assert path.arrivals == 6
+    rest = path.rest_time - 100.0 - when
+    assert rest <= speed / 2.0 + 1e-9
+    np.testing.assert_allclose(path.q - q, GOAL / 1.5 * 0.5 * speed * rest, atol=1e-9)
+    assert np.all(np.abs(path.q) <= np.abs(GOAL) + 1e-12)
+
+
+def test_jacobian_and_weight_are_derivatives():
+    kinematics = Kinematics(load_arm("ur10e"))
+    arm = kinematics.arm
+    rng = np.random.default_rng(2)
+    q, com, mass, h = rng.uniform(-2, 2, 6), np.array([0.05, -0.1, 0.2]), 4.0, 1e-6
+
+    def tip(q):
+        place = kinematics.flange(q)
+        return place[:3, 3] + place[:3, :3] @ com
+
+    def energy(q):
+        """Work of gravity, J."""
+        centres = evaluate(arm, q[None]).com[:, 0]
+        return arm.masses @ centres @ GRAVITY + mass * GRAVITY @ tip(q)
+
+    steps = h * np.eye(6)
+    numeric = np.array([(tip(q + s) - tip(q - s)) / (2 * h) for s in steps]).T
+    np.testing.assert_allclose(kinematics.jacobian(q, tip(q))[:3], numeric, atol=1e-8)
+    work = [(energy(q + s) - energy(q - s)) / (2 * h) for s in steps]
+    np.testing.assert_allclose(kinematics.weight_torque(q, mass, com), work, atol=1e-6)
+
+
+def test_script_port_cuts_programs_and_lines():
+    text = "stopj(2.0)\ndef a():\n  def b():\n    x = 1\n  end\nend\n\nsec c():\n  y = 2\nend\nd()"
+    stream = ScriptStream()
+    programs = [p for k in range(0, len(text), 3) for p in stream.feed(text[k : k + 3].encode())]
+    assert [p.split("\n")[0] for p in programs] == ["stopj(2.0)", "def a():", "sec c():"]
+    assert programs[1].endswith("  end\nend")
+    assert list(stream.feed(b"\r\n")) == ["d()"]
