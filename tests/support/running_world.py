@@ -56,6 +56,21 @@ def bent(link, give):
     return tip @ axes @ shift @ rotate @ np.linalg.inv(axes) @ rest
 
 
+def moment_beyond(cell, q, wrench, j):
+    """The moment at joint j of weight and load beyond it, and its axis; undeflected arm."""
+    bodies, slots, flange = frames(cell.arm, q)
+    point = slots[j][:3, 3]
+    total = wrench[3:].copy()
+    where = flange[:3, :3] @ cell.load_point + flange[:3, 3]
+    total += np.cross(where - point, wrench[:3])
+    tool = flange[:3, :3] @ cell.tool_com + flange[:3, 3]
+    total += np.cross(tool - point, cell.tool_mass * cell.gravity)
+    for i in range(j, cell.arm.n):
+        com = bodies[i][:3, :3] @ cell.arm.coms[i] + bodies[i][:3, 3]
+        total += np.cross(com - point, cell.arm.masses[i] * cell.gravity)
+    return total, slots[j][:3, 2], point, where
+
+
 def remaining_effects(seed):
     """A bit of the effects that `every_effect` has not, all numbers odd."""
     rng, rigid = np.random.default_rng(seed), Truth.rigid(ur10e_arm())
