@@ -63,7 +63,7 @@ FIRST = (
     "test_natnet_driver", "test_registration", "test_network_cell",
     "test_ur_driver_parts", "test_user_effects", "test_evidence", "test_cli", "test_report_page",
     "test_procedure", "test_demo", "test_p_values", "test_study_plans", "test_docs",
-    "test_verdict", "test_operator",
+    "test_run_until", "test_verdict", "test_operator",
 )  # fmt: skip
 """Files that take longest: they begin first, so that none of them is left over at the end."""
 

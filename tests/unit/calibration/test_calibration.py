@@ -1,4 +1,4 @@
-"""A calibration against the world's own mechanics; and an arm's scatter is never zero."""
+"""A calibration: predicted and compensated poses against the world's own mechanics."""
 
 import json
 from dataclasses import replace
@@ -12,22 +12,17 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensation import band, tool_poses
 from hilcal.calibration.covariance_source import CovarianceSource
 from hilcal.calibration.measured import MeasuredRanges
-from hilcal.calibration.scatter import Scatter, budget
+from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.storage import from_json, to_json
-from hilcal.config import Repeatability
-from hilcal.diagnosis.noise import RP_PER_RMS
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
-from hilcal.identification.noise.full_covariance import joint_factors
 from hilcal.identification.registration.robot_frames import state_with_every_column
 from hilcal.model.model import Model
-from hilcal.readings.readings import Readings
 from hilcal.robot import se3
 from hilcal.robot.arm import with_conventions
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
 from tests.support.campaigns import campaign, cell_of, plan
-from tests.support.fit_cases import fitted_model
 from tests.support.refusals import refusal
 
 POSES = 24
@@ -251,6 +246,33 @@ def test_the_band_holds_its_share():
         assert np.mean(drawn <= band(c)[0]) == pytest.approx(0.95, abs=0.012)
 
 
+def test_coupled_joints_are_compensated_by_the_controllers_values():
+    follows = np.zeros((6, 6))
+    follows[2, 1], follows[5, 4] = -1.0, 0.5
+    sign = np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0])
+    arm = with_conventions(load_arm("ur10e"), sign, np.zeros(6), follows)
+    cell, known = replace(cell_of(registration_known=True), arm=arm), hc.installed()
+    names = ("encoder_offset", "joint_compliance")
+    effects = tuple(known.make(name, cell, state_with_every_column(cell)) for name in names)
+    c = Calibration(
+        model=Model(cell, effects, known),
+        theta=np.repeat([1e-3, 1e-5], 6),
+        mode="absolute",
+        root=np.zeros((12, 1)),
+        misfit=0.0,
+        scatter=Scatter(np.zeros(6), 0.0, "unknown"),
+        measured=MeasuredRanges((), 1.0),
+        loads={},
+        source={},
+    )
+    q = np.random.default_rng(0).uniform(-1.5, 1.5, (30, 6))
+    k = c.compensate(q, np.array([0.0, 0.0, -80.0, 0.0, 0.0, 0.0]))
+    assert k.inverse.solved.all()
+    wanted = evaluate(arm, q).point(cell.target[:3, 3])
+    np.testing.assert_allclose(c.predict(k.q, [0, 0, -80, 0, 0, 0]).position, wanted, atol=1e-9)
+    assert k.before.error_m.mean() > 1e-3
+
+
 @pytest.mark.parametrize(
     ("effect", "mode"),
     [("transmission_error", "absolute"), ("joint_tilt_compliance", "deflection")],
@@ -281,108 +303,3 @@ def test_a_thousand_parameters_are_a_small_file(tmp_path):
     np.testing.assert_allclose(a.std_m, b.std_m, rtol=5e-3)
     again.save(tmp_path / "again.json")
     assert (tmp_path / "again.json").stat().st_size == pytest.approx(path.stat().st_size, rel=0.01)
-
-
-def test_coupled_joints_are_compensated_by_the_controllers_values():
-    follows = np.zeros((6, 6))
-    follows[2, 1], follows[5, 4] = -1.0, 0.5
-    sign = np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0])
-    arm = with_conventions(load_arm("ur10e"), sign, np.zeros(6), follows)
-    cell, known = replace(cell_of(registration_known=True), arm=arm), hc.installed()
-    names = ("encoder_offset", "joint_compliance")
-    effects = tuple(known.make(name, cell, state_with_every_column(cell)) for name in names)
-    c = Calibration(
-        model=Model(cell, effects, known),
-        theta=np.repeat([1e-3, 1e-5], 6),
-        mode="absolute",
-        root=np.zeros((12, 1)),
-        misfit=0.0,
-        scatter=Scatter(np.zeros(6), 0.0, "unknown"),
-        measured=MeasuredRanges((), 1.0),
-        loads={},
-        source={},
-    )
-    q = np.random.default_rng(0).uniform(-1.5, 1.5, (30, 6))
-    k = c.compensate(q, np.array([0.0, 0.0, -80.0, 0.0, 0.0, 0.0]))
-    assert k.inverse.solved.all()
-    wanted = evaluate(arm, q).point(cell.target[:3, 3])
-    np.testing.assert_allclose(c.predict(k.q, [0, 0, -80, 0, 0, 0]).position, wanted, atol=1e-9)
-    assert k.before.error_m.mean() > 1e-3
-
-
-TRUE = 1e-5
-"""rad; what the simulated arm scatters by."""
-
-
-def instrument(c):
-    """Readings with the covariance of the instrument alone."""
-    true = replace(c.cell, registration=c.world.registration)
-    f = joint_factors(true, c.readings, np.full(6, TRUE))
-    alone = c.readings.covariance - f @ np.swapaxes(f, 1, 2)
-    return replace(c.readings, covariance=alone, scatter_stated=False)
-
-
-def fitted(c, mode, readings, rp=5e-5):
-    """Fit a cell that says nothing of its repeatability."""
-    config = c.cell.configured().model_copy(update={"repeatability": Repeatability()})
-    cell = replace(c.cell, config=config, arm=replace(c.cell.arm, repeatability=rp))
-    return fitted_model(cell, readings, mode)
-
-
-def once(readings):
-    """The first reading of each state."""
-    _, first = np.unique(np.stack([readings.pose, readings.load]), axis=1, return_index=True)
-    return readings[np.sort(first)]
-
-
-@pytest.mark.parametrize("mode", ["absolute", "deflection"])
-def test_repeats_show_the_scatter(mode):
-    c = campaign(poses=16, cycles=3)
-    found = Calibration.of(fitted(c, mode, instrument(c)))
-    assert found.scatter.source == "repeats"
-    np.testing.assert_allclose(found.scatter.joint_std, TRUE, rtol=0.25)
-
-
-@pytest.mark.parametrize("mode", ["absolute", "deflection"])
-@pytest.mark.parametrize(("rp", "source"), [(5e-5, "maker"), (None, "industry")])
-def test_without_repeats_it_is_the_makers(mode, rp, source):
-    c = campaign(poses=16)
-    found = fitted(c, mode, once(instrument(c)), rp)
-    b = budget(found)
-    assert b.scatter_source == source
-    arrivals = 2 if mode == "deflection" else 1
-    np.testing.assert_allclose(b.scatter, np.sqrt(arrivals) * (rp or 1e-4) / RP_PER_RMS)
-    assert b.expanded >= 2 * b.scatter
-
-
-@pytest.mark.parametrize("poses", [8, 12, 24])
-@pytest.mark.parametrize("mode", ["absolute", "deflection"])
-def test_the_budget_is_never_below_what_poses_left_out_show(mode, poses):
-    """An effect that the model lacks, and few poses: fitted ones are nearer than new ones are."""
-    c = campaign("joint_tilt_compliance", mode, poses=poses, strength=8.0)
-    found = fitted(c, mode, c.readings)
-    assert budget(found).combined >= found.holdout.rms_m * (1 - 1e-9)
-    assert found.holdout.rms_m > found.error.rms_m
-
-
-def test_identical_rows_are_no_repeats():
-    """Rows that were copied say that the arm does not scatter at all."""
-    c = campaign(poses=16)
-    one = once(instrument(c))
-    twice = Readings.joined([one, one])
-    assert Calibration.of(fitted(c, "absolute", twice)).scatter.source == "maker"
-
-
-def test_repeats_below_the_noise_say_how_much_it_can_be():
-    c = campaign(poses=16, cycles=3)
-    own = instrument(c)
-    noisy = replace(own, covariance=100.0 * own.covariance)
-    scatter = Calibration.of(fitted(c, "absolute", noisy)).scatter
-    assert scatter.source == "repeats"
-    assert TRUE < scatter.joint_std[0] < 10 * TRUE
-
-
-def test_what_the_fit_or_the_cell_states_goes_first():
-    c = campaign(poses=16, cycles=3)
-    found = fitted_model(c.cell, c.readings, "absolute")
-    assert Calibration.of(found).scatter.source == "stated"

@@ -1,7 +1,6 @@
 """What is handed over says the same at the other end: random arms, models, loads and branches."""
 
 import json
-import re
 import warnings
 from dataclasses import replace
 from functools import cache
@@ -16,21 +15,18 @@ import hilcal as hc
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compiled import Compiled, compiled
 from hilcal.calibration.dh_table import CONVENTIONS, dh_rows, flange_poses, to_toml
-from hilcal.calibration.handover import corrected_arm, ur_kinematics, urdf
+from hilcal.calibration.handover import ur_kinematics, urdf
 from hilcal.calibration.measured import MeasuredRanges
 from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.storage import from_json, to_json
 from hilcal.effects.protocol import Columns, Parameter
-from hilcal.errors import CannotAnswerError
 from hilcal.identification.registration.robot_frames import state_with_every_column
 from hilcal.model.model import Model
 from hilcal.robot import se3
 from hilcal.robot.catalogue import load_arm, robot_names
 from hilcal.robot.chain import evaluate, joint_jacobian
 from tests.support.campaigns import cell_of
-from tests.support.refusals import refusal, refusal_of
-from tests.unit.calibration.other_eyes import by_pinocchio, by_ur, flanges, ur_origins, urdf_model
-from tests.unit.calibration.test_calibration import calibrated
+from tests.unit.calibration.other_eyes import by_pinocchio, by_ur, flanges, urdf_model
 
 ROUND = settings(max_examples=10, deadline=None, derandomize=True)
 SEEDS = st.integers(0, 2**32 - 1)
@@ -228,34 +224,3 @@ def test_an_effect_without_a_compiled_form_is_named_and_inverted_all_the_same():
     k = mine.compensate(q, std=False)
     wanted = evaluate(c.model.cell.arm, q).point(c.tool_pose()[:3, 3])
     np.testing.assert_allclose(mine.predict(k.q, std=False).position, wanted, atol=NM)
-
-
-@pytest.mark.parametrize("effect", ["joint_tilt_compliance", "transmission_error"])
-def test_what_is_not_constant_is_named_and_left_out(effect):
-    c = calibrated(effect)
-    found = corrected_arm(c)
-    assert effect in found.not_included
-    assert found.included == ()
-    np.testing.assert_allclose(found.arm.links, c.model.cell.arm.links, atol=1e-12)
-
-
-@pytest.mark.parametrize("name", [n for n in robot_names() if n.startswith("ur")])
-def test_the_nominal_arms_have_the_origins_of_ur_description(name):
-    arm = load_arm(name)
-    text, rest = ur_kinematics(arm, arm)
-    np.testing.assert_allclose(rest, np.eye(4), atol=1e-12)
-    d = np.linalg.norm(arm.links[:, :3, 3], axis=1)
-    # shoulder up, forearm and wrist 1 along −x, wrist 2 along −y, wrist 3 along +y
-    first, last = [[0, 0, d[1]], [0, 0, 0], [-d[2], 0, 0]], [[0, -d[5], 0], [0, d[6], 0]]
-    expected = [*first, [-d[3], 0, d[4]], *last]
-    np.testing.assert_allclose(ur_origins(text)[:, :3, 3], expected, atol=1e-9)
-    assert re.search(r"hash: calib_\d+", text)
-
-
-def test_deflections_and_foreign_arms_are_refused_in_words():
-    refusal_of(
-        CannotAnswerError, "--readings absolute", corrected_arm, calibrated("none", "deflection")
-    )
-    arm = load_arm("ur10e")
-    foreign = replace(arm, name="kr6")
-    refusal("kr6: UR's kinematics file is for UR arms", ur_kinematics, foreign, foreign)

@@ -1,0 +1,92 @@
+"""The arm's scatter is never taken for zero: repeats show it, else the maker states it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.scatter import budget
+from hilcal.config import Repeatability
+from hilcal.diagnosis.noise import RP_PER_RMS
+from hilcal.identification.noise.full_covariance import joint_factors
+from hilcal.readings.readings import Readings
+from tests.support.campaigns import campaign
+from tests.support.fit_cases import fitted_model
+
+TRUE = 1e-5
+"""rad; what the simulated arm scatters by."""
+
+
+def instrument(c):
+    """Readings with the covariance of the instrument alone."""
+    true = replace(c.cell, registration=c.world.registration)
+    f = joint_factors(true, c.readings, np.full(6, TRUE))
+    alone = c.readings.covariance - f @ np.swapaxes(f, 1, 2)
+    return replace(c.readings, covariance=alone, scatter_stated=False)
+
+
+def fitted(c, mode, readings, rp=5e-5):
+    """Fit a cell that says nothing of its repeatability."""
+    config = c.cell.configured().model_copy(update={"repeatability": Repeatability()})
+    cell = replace(c.cell, config=config, arm=replace(c.cell.arm, repeatability=rp))
+    return fitted_model(cell, readings, mode)
+
+
+def once(readings):
+    """The first reading of each state."""
+    _, first = np.unique(np.stack([readings.pose, readings.load]), axis=1, return_index=True)
+    return readings[np.sort(first)]
+
+
+@pytest.mark.parametrize("mode", ["absolute", "deflection"])
+def test_repeats_show_the_scatter(mode):
+    c = campaign(poses=16, cycles=3)
+    found = Calibration.of(fitted(c, mode, instrument(c)))
+    assert found.scatter.source == "repeats"
+    np.testing.assert_allclose(found.scatter.joint_std, TRUE, rtol=0.25)
+
+
+@pytest.mark.parametrize("mode", ["absolute", "deflection"])
+@pytest.mark.parametrize(("rp", "source"), [(5e-5, "maker"), (None, "industry")])
+def test_without_repeats_it_is_the_makers(mode, rp, source):
+    c = campaign(poses=16)
+    found = fitted(c, mode, once(instrument(c)), rp)
+    b = budget(found)
+    assert b.scatter_source == source
+    arrivals = 2 if mode == "deflection" else 1
+    np.testing.assert_allclose(b.scatter, np.sqrt(arrivals) * (rp or 1e-4) / RP_PER_RMS)
+    assert b.expanded >= 2 * b.scatter
+
+
+@pytest.mark.parametrize("poses", [8, 12, 24])
+@pytest.mark.parametrize("mode", ["absolute", "deflection"])
+def test_the_budget_is_never_below_what_poses_left_out_show(mode, poses):
+    """An effect that the model lacks, and few poses: fitted ones are nearer than new ones are."""
+    c = campaign("joint_tilt_compliance", mode, poses=poses, strength=8.0)
+    found = fitted(c, mode, c.readings)
+    assert budget(found).combined >= found.holdout.rms_m * (1 - 1e-9)
+    assert found.holdout.rms_m > found.error.rms_m
+
+
+def test_identical_rows_are_no_repeats():
+    """Rows that were copied say that the arm does not scatter at all."""
+    c = campaign(poses=16)
+    one = once(instrument(c))
+    twice = Readings.joined([one, one])
+    assert Calibration.of(fitted(c, "absolute", twice)).scatter.source == "maker"
+
+
+def test_repeats_below_the_noise_say_how_much_it_can_be():
+    c = campaign(poses=16, cycles=3)
+    own = instrument(c)
+    noisy = replace(own, covariance=100.0 * own.covariance)
+    scatter = Calibration.of(fitted(c, "absolute", noisy)).scatter
+    assert scatter.source == "repeats"
+    assert TRUE < scatter.joint_std[0] < 10 * TRUE
+
+
+def test_what_the_fit_or_the_cell_states_goes_first():
+    c = campaign(poses=16, cycles=3)
+    found = fitted_model(c.cell, c.readings, "absolute")
+    assert Calibration.of(found).scatter.source == "stated"
