@@ -150,7 +150,6 @@ def test_added_and_removed_a_viewer_sees_both_revisions(tmp_path):
         assert RrdReader(recording).store() is not None  # it has its footer: whole
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
 def test_a_refinement_is_shown_to_its_last_revision(tmp_path):
     run = store_campaign(tmp_path / "run.hilcal")
