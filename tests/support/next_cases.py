@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from hilcal.cell import Cell, cell_from_config
+from hilcal.cell import cell_from_config
 from hilcal.config import load_config
 from hilcal.design.next import plan_separating
 from hilcal.design.planner import PlanRequest, plan_readings
@@ -21,7 +21,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.readings.readings import Readings
 from hilcal.store.plan import Plan, with_new_names
-from tests.support.campaigns import SimulatedCampaign, campaign, measured, plan
+from tests.support.campaigns import campaign, measured, plan
 from tests.support.cli_cases import CELL
 from tests.support.plan_cases import changed
 
@@ -86,14 +86,14 @@ def joined_readings(a, b):
     return Readings.joined([replace(r, pose=at, pose_names=names) for r, at in parts])
 
 
-def many_waves(seed: int = 0) -> SimulatedCampaign:
+def many_waves(seed=0):
     """Thirty poses with a transmission error of harmonics 1 to 21 at 2 σ."""
     return campaign(
         "transmission_error", "absolute", seed, poses=30, plan_seed=seed, strength=2.0, harmonics=21
     )
 
 
-def fine_error(seed: int = 0) -> tuple[Cell, Readings]:
+def fine_error(seed=0):
     """The same without the first two harmonics: a cell and readings."""
     c = many_waves(seed)
     waves = c.world.physics.transmission_error.copy()
