@@ -130,6 +130,12 @@ def program_points(
         program = limits.read_bytes(path, limits.SCRIPT).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read as a program: {error}") from None
+    if CORRECTED in program:
+        raise InputError(
+            f"{path}: it is corrected already (line "
+            f"{program[: program.index(CORRECTED)].count(chr(10)) + 1} says so), and a second "
+            "correction would double the first; valid: the original program"
+        )
     try:
         every = waypoints(program)
     except InputError as error:
@@ -145,12 +151,30 @@ def program_points(
     return program, every, Points(names, q, poses), understood[0].tool
 
 
+CORRECTED = "# corrected by hilcal"
+"""Comment of a program whose waypoints are corrected; such a program is not corrected again."""
+_DEFINITION = re.compile(r"^[ \t]*def\b", re.MULTILINE)
+
+
 def with_joints(program: str, corrected: Sequence[Waypoint], q: Floats) -> str:
-    """Return the program with joint values (N, 6) in place of its waypoints."""
+    """Return the program with joint values (N, 6) in place of its waypoints.
+
+    The comment `CORRECTED` ends the line of the first function, or else of the first waypoint: a
+    line outside of functions is a program of its own for the controller.
+    """
+    if not corrected:
+        return program
+    first = _DEFINITION.search(program)
+    mark = re.compile(r"\r?$", re.MULTILINE).search(
+        program, corrected[0].end if first is None else first.end()
+    )
+    edits = [(w.start, w.end, urscript_list(v)) for w, v in zip(corrected, q, strict=True)]
+    if mark is not None:
+        edits.append((mark.start(), mark.start(), f"  {CORRECTED}"))
     parts, end = [], 0
-    for waypoint, values in zip(corrected, q, strict=True):
-        parts += [program[end : waypoint.start], urscript_list(values)]
-        end = waypoint.end
+    for start, stop, text in sorted(edits):
+        parts += [program[end:start], text]
+        end = stop
     return "".join([*parts, program[end:]])
 
 
@@ -173,7 +197,7 @@ def movej_program(names: Sequence[str], q: Floats) -> str:
     """
     rows = zip(names, q, strict=True)
     lines = [f"  movej({urscript_list(row)})  # {escaped(name)}" for name, row in rows]
-    return "\n".join([f"def compensated():  # {UNCHECKED}", *lines, "end", ""])
+    return "\n".join([f"def compensated():  {CORRECTED}; {UNCHECKED}", *lines, "end", ""])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,6 +6,7 @@ read; macros, links and pickles are not.
 
 import csv
 import io
+import re
 import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -350,19 +351,39 @@ SEPARATORS = {"tab": "\t", "blanks": " "}  # Separators that have a name in a ma
 BYTE_ORDER_MARKS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 
 
+def guessed_encoding(content: bytes) -> str:
+    """Guess the encoding of text without a byte order mark.
+
+    UTF-8 if it is that. A Chinese character of GB 18030 has two bytes above 127; such bytes are
+    hardly ever in pairs everywhere in Western text, as "Größe". Latin-1 has no bytes 128 to 159;
+    Shift JIS has them beside others above 127, Windows-1252 mostly alone, as dashes and quotes.
+    """
+    runs = re.findall(rb"[\x80-\xff]+", content)
+    candidates = ["utf-8"]
+    if all(len(run) % 2 == 0 for run in runs):
+        candidates.append("gb18030")
+    if re.search(rb"[\x80-\x9f]", content):
+        candidates += ["cp932"] * any(len(run) > 1 for run in runs) + ["cp1252"]
+    for name in candidates:
+        try:
+            content.decode(name)
+        except UnicodeDecodeError:
+            continue
+        return name
+    return "latin-1"
+
+
 def decoded(path: str, content: bytes, encoding: str | None) -> str:
-    """Text of a file: by its byte order mark, else as stated, else UTF-8, else Latin-1."""
+    """Text of a file: by its byte order mark, else as stated, else as `guessed_encoding` says."""
     marks = (name for mark, name in BYTE_ORDER_MARKS.items() if content.startswith(mark))
     stated = next(marks, encoding)
     try:
-        text = content.decode(stated or "utf-8")
+        text = content.decode(stated or guessed_encoding(content))
     except UnicodeError as e:
-        if stated is not None:
-            raise InputError(
-                f"{path}: not {stated.upper()} text; a mapping states another in [file] encoding "
-                "(--preview proposes one): utf-8, latin-1, utf-16"
-            ) from e
-        text = content.decode("latin-1")
+        raise InputError(
+            f"{path}: not {str(stated).upper()} text; a mapping states another in [file] encoding "
+            "(--preview proposes one): utf-8, latin-1, utf-16, gb18030, shift_jis, euc_kr ..."
+        ) from e
     if "\x00" in text:
         raise InputError(f"{path}: binary data; expected text, XLSX, MAT or Parquet")
     return text

@@ -28,6 +28,17 @@ def _columns(*valid: int) -> AfterValidator:
     return AfterValidator(counted)
 
 
+_ENCODINGS = '"utf-8", "latin-1", "utf-16", "gb18030", "shift_jis", "euc_kr" ...'
+
+
+def _text_encoding(name: str) -> str:
+    try:
+        "a".encode(name)
+    except LookupError:
+        raise ValueError(f'encoding "{name}" is unknown; valid: {_ENCODINGS}') from None
+    return name
+
+
 PerJoint = Annotated[tuple[Column, ...], Field(min_length=1, description="one column per joint")]
 Row = Annotated[int, Strict(), Field(ge=1)]
 _UNLOADED = (
@@ -57,8 +68,8 @@ class FileFormat(Section):
     thousands: Literal[",", ".", "'", " "] | None = Field(
         None, description='the mark between thousands: ",", ".", "\'" or " "'
     )
-    encoding: Literal["utf-8", "latin-1", "utf-16"] | None = Field(
-        None, description='"utf-8", "latin-1" or "utf-16"'
+    encoding: Annotated[str, AfterValidator(_text_encoding)] | None = Field(
+        None, description=_ENCODINGS
     )
     header_row: Annotated[int, Strict(), Field(ge=0)] = Field(
         1, description="the row of the column names, a whole number from 1; 0 where there is none"

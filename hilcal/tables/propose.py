@@ -383,10 +383,8 @@ def sniff(path: str | Path) -> SniffedFile:
     how: dict[str, Any] = {}
     text = files.decoded(name, content, None)
     if not content.startswith(tuple(files.BYTE_ORDER_MARKS)):
-        try:
-            content.decode("utf-8")
-        except UnicodeDecodeError:
-            how["encoding"] = "latin-1"
+        guessed = files.guessed_encoding(content)
+        how |= {"encoding": guessed} if guessed != "utf-8" else {}
     lines = [line for line in text.splitlines() if line.strip()][:HEAD]
     for mark in COMMENTS:
         count = sum(line.lstrip().startswith(mark) for line in lines)

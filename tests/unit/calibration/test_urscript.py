@@ -189,6 +189,29 @@ def test_values_that_double_and_chains_of_variables_take_no_time():
     refusal("nested too deeply", waypoints, f"x0 = 0\n{chain}movej([x3000, 0, 0, 0, 0, 0])\n")
 
 
+@pytest.mark.parametrize(
+    ("program", "marked"),
+    [
+        (f"# f\ndef f():  # of Monday\r\n  movej({SIX})\nend", "def f():  # of Monday"),
+        (f"sleep(1)\nmovej({SIX}, a=1)\nsleep(1)\n", "movej([0"),
+        (f"movej({SIX})", "movej([0"),
+    ],
+)
+def test_a_corrected_program_is_not_corrected_again(program, marked, tmp_path):
+    path, found = tmp_path / "p.script", waypoints(program)
+    again = with_joints(program, found, np.zeros((1, 6)))
+    lines = again.splitlines()
+    assert [line for line in lines if line.endswith("  # corrected by hilcal")] == [
+        line for line in lines if line.startswith(marked)
+    ]
+    assert len(lines) == len(program.splitlines())
+    assert len(waypoints(again)) == 1
+    for text in (again, movej_program(["a"], np.zeros((1, 6)))):
+        path.write_text(text, "utf-8", newline="")
+        with pytest.raises(InputError, match="it is corrected already"):
+            program_points(path)
+
+
 def test_a_name_of_a_point_is_no_line_of_the_program():
     name = "P1\n movej([0,0,0,0,0,0], a=10, v=3)\n #\r\x85\u2028\x0b\x0c\x1e"
     text = movej_program([name, "b"], np.zeros((2, 6)))

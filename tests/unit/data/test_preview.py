@@ -5,6 +5,7 @@ from datetime import datetime, timedelta
 import numpy as np
 import pytest
 
+from hilcal.tables.files import decoded, guessed_encoding, open_grid
 from hilcal.tables.mapping import Mapping, load_mapping
 from hilcal.tables.propose import propose
 from hilcal.toml import check_section, read_toml
@@ -106,6 +107,38 @@ def test_the_guess_is_the_mapping(case, tmp_path):
     assert found.mapping(Mapping).model_dump() == expected.model_dump()
     (tmp_path / "m.toml").write_text(found.to_toml("t.csv"))
     assert load_mapping(tmp_path / "m.toml", Mapping) == found.mapping(Mapping)
+
+
+@pytest.mark.parametrize(
+    ("text", "encoding", "guessed"),
+    [
+        ("位姿 关节1(度) x(毫米)", "gbk", "gb18030"),
+        ("位姿 关节1(度) x(毫米)", "utf-8", "utf-8"),
+        ("Größe in µm, 20 °C, Mañana déjà", "latin-1", "latin-1"),
+        ("Größe – “Achse” in °, it’s 5–10 …", "cp1252", "cp1252"),
+        ("測定点 関節1 座標x ﾌﾟﾗｽ", "cp932", "cp932"),
+        ("x_mm", "ascii", "utf-8"),
+    ],
+)
+def test_the_encoding_is_guessed(text, encoding, guessed):
+    content = text.encode(encoding)
+    assert guessed_encoding(content) == guessed
+    assert decoded("t.csv", content, None) == text
+
+
+def test_an_encoding_can_be_any_that_is_one(tmp_path):
+    table = write(tmp_path / "t.csv", CASES["fanuc"].replace("point", "측정점"), "johab")
+    mapping = {
+        "file": {"encoding": "johab"},
+        "pose": {"column": "측정점"},
+        "joints": {"columns": six("J{}"), "unit": "deg"},
+        "position": {"columns": [*"xyz"], "unit": "mm"},
+    }
+    stated = check_section(mapping, Mapping, "wanted")
+    assert open_grid(table, stated.file).names[0] == "측정점"
+    for name in ("gb99", "base64"):
+        mapping["file"]["encoding"] = name
+        refusal(f'encoding "{name}" is unknown', check_section, mapping, Mapping, "wanted")
 
 
 def test_a_file_for_the_positions_and_one_for_the_joints(tmp_path):
