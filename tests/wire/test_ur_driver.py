@@ -113,6 +113,13 @@ def test_payload_that_the_controller_does_not_take_is_told_by_its_cause(
     assert sim.admin()["payload"] == cases.MASS
 
 
+def test_another_centre_of_mass_than_was_set_is_told(arm, monkeypatch):
+    told = Control.set_payload
+    monkeypatch.setattr(Control, "set_payload", lambda c, mass, com: told(c, mass, com + 0.01))
+    with pytest.raises(DeviceError, match=r"it says 4 kg at .* after a payload of 4 kg at"):
+        arm.set_payload(4.0, cases.COM)
+
+
 def test_a_program_that_ends_while_a_payload_is_set_is_named(arm, sim, monkeypatch):
     set_payload = Control.set_payload
 
