@@ -87,7 +87,9 @@ def read_table(path: str | Path, cell: Cell, mapping: str | Path | None = None) 
     Raises:
         InputError: an invalid value, with row and column.
     """
-    expect(path, PATHS, "path", "the path of a table")
+    expect(
+        path, PATHS, "path", "the path of a table; write a data frame by to_csv(path, index=False)"
+    )
     expect(cell, Cell, "cell", A_CELL)
     form, config = "table" if mapping is None else mapping, cell.configured()
     imported = import_readings(Path(path), form, config, cell.arm)

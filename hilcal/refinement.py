@@ -68,7 +68,7 @@ class RefinementStep(Brief):
 
     def __repr__(self) -> str:
         """Return the step in a line."""
-        title = change(self.added, self.removed) or " + ".join(self.fit.model.names)
+        title = change(self.added, self.removed) or self.fit.model.title
         error = f"{1e6 * self.fit.holdout.rms_m:.1f} µm rms on poses left out"
         return f"RefinementStep({title}: {error}, {self.diagnosis.verdict})"
 
@@ -83,7 +83,7 @@ class Refinement(Shown):
         last = self.steps[-8:]
         first = len(self.steps) - len(last)
         return {
-            "model": " + ".join(self.fit.model.names),
+            "model": self.fit.model.title,
             "verdict": self.verdict,
             **{f"steps[{k}]": repr(s) for k, s in enumerate(last, start=first)},
         }

@@ -11,7 +11,7 @@ import textwrap
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from typing import Annotated, Any, TextIO
 
@@ -25,7 +25,6 @@ from hilcal.store.kept_texts import recording_command
 
 DEBUG = "HILCAL_DEBUG"
 _COMPLETE = "_HILCAL_COMPLETE"
-_BROKEN_PIPE = 141
 _INTERRUPTED = errors.StoppedError.exit_code
 _USAGE = 2
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -53,17 +52,34 @@ def error_document(message: object, code: int) -> dict[str, object]:
 
 
 class WatchedStream:
-    """A stream that knows whether anything was written to it."""
+    """A stream that knows whether anything was written to it, and whose reader may leave.
+
+    Without its reader, as `head`, the command goes on, since it may write files or move an arm.
+    """
 
     def __init__(self, stream: TextIO) -> None:
-        """Wrap a stream; all attributes but `write` are those of the stream."""
+        """Wrap a stream; all attributes but `write` and `flush` are those of the stream."""
         self.written = False
         self._stream = stream
 
     def write(self, text: str) -> int:
         """Write a text; an empty one does not count."""
         self.written = self.written or bool(text)
-        return self._stream.write(text)
+        with self._without_reader():
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush the stream."""
+        with self._without_reader():
+            self._stream.flush()
+
+    @contextmanager
+    def _without_reader(self) -> Iterator[None]:
+        try:
+            yield
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
 
     def __getattr__(self, name: str) -> Any:
         """Return an attribute of the stream."""
@@ -211,7 +227,8 @@ def execute(make: Callable[[], typer.Typer], name: str, arguments: Sequence[str]
     debug = os.environ.get(DEBUG, "") not in ("", "0")
     argv = list(arguments)
     out = WatchedStream(sys.stdout)
-    with warnings.catch_warnings(), redirect_stdout(out):
+    shown = WatchedStream(sys.stderr)
+    with warnings.catch_warnings(), redirect_stdout(out), redirect_stderr(shown):
         if not debug:
             warnings.simplefilter("ignore")
         failed = Failures("--json" in argv, out, debug)
@@ -241,10 +258,6 @@ def _run(
         out.flush()
     except errors.HilcalError as error:
         return failures.report(error, str(error), error.exit_code)
-    except BrokenPipeError:
-        # The reader is gone; flushing the buffer at exit must not raise again.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), out.fileno())
-        return _BROKEN_PIPE
     except KeyboardInterrupt:
         return failures.report(None, "interrupted", _INTERRUPTED)
     except Exception as error:

@@ -159,8 +159,8 @@ def model_after(fit: Fit, config: CellConfig) -> NominalModel:
     # the fit scales its priors by the noise factor β
     std = np.where(np.isinf(prior), np.inf, prior / np.sqrt(fit.solution.beta))
     std[fit.solution.space.index] = np.inf
-    count, names = len(fit.readings) - int(fit.outlier.sum()), " + ".join(fit.model.names)
-    begun = f"planned on from {count} readings, fitted with {names}"
+    count = len(fit.readings) - int(fit.outlier.sum())
+    begun = f"planned on from {count} readings, fitted with {fit.model.title}"
     notes = (begun, *random_columns(fit.model.effects))
     live, m = np.flatnonzero(fit.solution.estimated), fit.readings.m
     carried = carried_information(fit.model, live)

@@ -131,7 +131,7 @@ class Diagnosis(Shown, Tabular):
     def _brief(self) -> dict[str, str]:
         first = self.suspects[:5]
         return {
-            "model": " + ".join(self.fit.model.names),
+            "model": self.fit.model.title,
             "verdict": f"{self.verdict} ({self.reason})",
             "message": presenter().message(self),
             **{f"suspects[{k}]": repr(s) for k, s in enumerate(first)},

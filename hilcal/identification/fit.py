@@ -162,7 +162,7 @@ class Fit(WithVarianceFactor, Tabular):
 
     def _brief(self) -> dict[str, str]:
         return {
-            "model": " + ".join(self.model.names),
+            "model": self.model.title,
             "fitted": f"{len(self.raw)} measurements ({self.mode}, scaling {self.scaling})",
             "set aside": f"{np.count_nonzero(self.outlier)} readings",
             "parameters": f"{len(self.theta)}",
@@ -227,8 +227,8 @@ class Fit(WithVarianceFactor, Tabular):
 
     def summary(self) -> str:
         """Return the model, its errors and its parameters as plain text."""
-        model = " + ".join(self.model.named) or "nominal arm"
-        lines = [f"{model}, fitted to {len(self.raw)} {self.mode} readings, scaling {self.scaling}"]
+        fitted = f"fitted to {len(self.raw)} {self.mode} readings, scaling {self.scaling}"
+        lines = [f"{self.model.title}, {fitted}"]
         for poses, e in (("fitted poses", self.error), ("poses left out", self.holdout)):
             lines.append(
                 f"  error on {poses}: {1e6 * e.rms_m:.1f} µm rms, {1e6 * e.max_m:.1f} µm largest, "

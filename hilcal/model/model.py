@@ -110,6 +110,12 @@ class Model(Brief):
         return tuple(n for n in self.names if n not in self.background)
 
     @property
+    def title(self) -> str:
+        """The effects in a line, those of the background by their number."""
+        parts = [*self.named, *[f"background of {len(self.background)}"] * bool(self.background)]
+        return " + ".join(parts) or "nominal arm"
+
+    @property
     def size(self) -> int:
         """Number of parameters."""
         return sum(len(e.magnitudes) for e in self.effects)

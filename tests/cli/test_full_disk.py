@@ -153,3 +153,19 @@ def test_output_that_finds_no_room_is_one_line(fitted):
     assert ended.returncode == 3
     assert "cannot be written (No space left on device): make room" in ended.stderr
     assert "Traceback" not in ended.stderr
+
+
+@pytest.mark.parametrize("missing", [False, True])
+def test_a_command_whose_reader_has_left_goes_on_to_its_end(fitted, tmp_path, missing):
+    """As in `hilcal ... | head -1`: the file is written, and the exit code is the command's own."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    points = fitted / ("none.csv" if missing else "points.csv")
+    words = ["compensate", str(fitted / "run.hilcal"), str(points), "-o", str(tmp_path / "o.csv")]
+    with os.fdopen(writer, "wb") as nobody:
+        ended = subprocess.run(
+            [sys.executable, "-m", "hilcal", *words],
+            cwd=ROOT, stdout=nobody, stderr=nobody, check=False, timeout=120,
+        )  # fmt: skip
+    assert ended.returncode == (2 if missing else 0)
+    assert (tmp_path / "o.csv").exists() is not missing

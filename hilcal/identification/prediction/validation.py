@@ -325,7 +325,7 @@ class CampaignValidation(Shown):
     def _brief(self) -> dict[str, str]:
         error, noise = self.prediction.error, self.prediction.noise_floor
         return {
-            "model": " + ".join(self.model.named),
+            "model": self.model.title,
             "readings": f"{len(self.prediction.raw)} predicted",
             "error": f"{1e6 * error.rms_m:.1f} µm rms, noise alone {1e6 * noise:.1f} µm",
             "variance factor": f"{self.prediction.variance_factor:.3g}",

@@ -116,6 +116,9 @@ def test_what_it_moves_is_told_by_effect(found):
     assert set(of.effects) == set(found.fit.model.background)
     listed = {p.name for p in found.fit.parameters}
     assert not any(name.split(".")[0] in found.fit.model.background for name in listed)
+    shown = f"{' + '.join(found.fit.model.named)} + background of {len(of.effects)}"
+    for result in (found.fit, found, found.diagnosis):
+        assert f"model: {shown}\n" in repr(result)
 
 
 def test_the_sizes_of_its_families_are_told_with_intervals(found):
