@@ -55,7 +55,7 @@ def pytest_configure() -> None:
 
 
 FIRST = (
-    "test_stops", "test_fault_matrix_serial", "test_fault_matrix_arm", "test_fault_matrix_person",
+    "test_stops", "test_fault_matrix",
     "test_run", "test_force_drivers", "test_library", "test_effect_jacobian", "test_run_faults",
     "test_run_watched", "test_ur_driver_faults", "test_ur_driver", "test_devices",
     "test_gross_errors", "test_diagnose", "test_planner", "test_geocom_driver", "test_next_cli",

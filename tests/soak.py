@@ -44,9 +44,16 @@ from tests.support.campaign_cases import (
 )
 from tests.support.spread_plan import spread_plan
 from tests.support.timing import wait_until
-from tests.wire import test_fault_matrix_person as person
-from tests.wire.test_fault_matrix_arm import MOTION, REST
-from tests.wire.test_fault_matrix_serial import FORCE, OVERCOME, TRACKER
+from tests.wire.test_fault_matrix import (
+    ARM_MOTION,
+    ARM_REST,
+    FORCE,
+    OVERCOME,
+    PERSON_MOTION,
+    PERSON_REST,
+    TRACKER,
+    loaded,
+)
 
 PATIENCE = 25.0  # so long a program may go on with a fault before it counts as overcome, s
 STANDS = 1.0
@@ -55,9 +62,9 @@ IN_MOTION = 1.0  # so long an arm in motion may go on after what it has to be st
 NOTICED = re.compile(r"touch the tool|does not stand|asked \d times")
 """What is said of a load that fell."""
 DONE = "readings are in"  # what a run says at its end
-STOP_MOVING = (*MOTION, *person.MOTION)
+STOP_MOVING = (*ARM_MOTION, *PERSON_MOTION)
 """Faults for which an arm in motion has to be stopped and the run ended."""
-STOP_MEASURING = (*REST, *TRACKER, *FORCE, *person.REST)
+STOP_MEASURING = (*ARM_REST, *TRACKER, *FORCE, *PERSON_REST)
 """Faults that have to end a run whose arm stands and measures."""
 BESIDE = (
     ("identify",),
@@ -190,7 +197,7 @@ class Soak:
         """A load falls off in motion or while it is measured, and is hung again."""
         run, moment = self._begun()
         try:
-            person.loaded(run)
+            loaded(run)
             if moment == "moving":
                 run.wait_until(lambda: self.site.ask("arm", "state")["moving"], "motion")
             since = len(run.output)
@@ -349,11 +356,11 @@ class Soak:
     def _drawn(self, moment: str) -> Fault:
         """A fault; a person's and a device's that repeats itself come after the tare only."""
         kinds: list[tuple[Fault, ...]] = [
-            MOTION if moment == "moving" else REST,
+            ARM_MOTION if moment == "moving" else ARM_REST,
             (*TRACKER, *FORCE, *OVERCOME["tracker"], *OVERCOME["force"]),
         ]
         if moment != "any":
-            kinds.append(person.MOTION if moment == "moving" else person.REST)
+            kinds.append(PERSON_MOTION if moment == "moving" else PERSON_REST)
         return self.rng.choice(self.rng.choice(kinds))
 
     def _count(self, fault: Fault) -> None:
@@ -377,7 +384,7 @@ class Soak:
             for fault in in_motion:
                 self._stands(fault, since)
             ended = self._ends(run, faults, exact=exact)
-            if ended and any(f in MOTION for f in in_motion):
+            if ended and any(f in ARM_MOTION for f in in_motion):
                 check_stopped_on_its_way(self.site, since, goal)  # type: ignore[arg-type]
             for fault in alone:
                 assert ended or run.process.returncode == 0, f"{fault.name}: not noticed"

@@ -45,7 +45,7 @@ TRIALS = 200
 class DhRows:
     """A table of n joints."""
 
-    convention: Convention  # of the rows, see `robot.dh.arm_from_dh`
+    convention: Convention  # of the rows, see `robot.catalogue.arm_from_dh`
     a: Floats  # (n,) m
     d: Floats  # (n,) m
     alpha: Floats  # (n,) rad

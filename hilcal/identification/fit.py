@@ -21,7 +21,7 @@ from hilcal.model.model import Model
 from hilcal.model.observe import Observation
 from hilcal.optional import needed_by
 from hilcal.readings.readings import Readings, States
-from hilcal.readings.whitening import Mode, Scaling, Whitening, inverse_root, whitening
+from hilcal.readings.whitening import Mode, Scaling, Whitening, whitening, whitening_matrix
 from hilcal.shown import Tabular
 from hilcal.toml import suggest
 from hilcal.types import Bools, Floats, Ints
@@ -308,7 +308,7 @@ def require_gc(fit: Fit, task: str) -> None:
 
 def mahalanobis2(raw: Floats, covariance: Floats) -> Floats:
     """Squared Mahalanobis distances (D,) of residuals (D, m) with covariances (D, m, m)."""
-    white = np.einsum("dij,dj->di", inverse_root(covariance), raw)
+    white = np.einsum("dij,dj->di", whitening_matrix(covariance), raw)
     return np.asarray(np.sum(white**2, axis=1))
 
 

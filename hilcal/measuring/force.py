@@ -19,7 +19,7 @@ from hilcal.config import CellLoad, Operator
 from hilcal.config import ForceSensor as Settings
 from hilcal.errors import CannotAnswerError, DeviceError, InputError
 from hilcal.measuring.devices import ForceSensorDevice, WrenchSample
-from hilcal.readings.whitening import inverse_root
+from hilcal.readings.whitening import whitening_matrix
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
 from hilcal.types import Floats
@@ -104,7 +104,7 @@ def identify_tool_load(
     """
     _check_finite(wrench, covariance, rotation)
     _check_orientations(rotation, gravity)
-    white = inverse_root(covariance)
+    white = whitening_matrix(covariance)
     A = (white @ design(rotation, gravity)).reshape(-1, PARAMETERS)
     y = (white @ wrench[..., None]).reshape(-1)
     scale = np.linalg.norm(A, axis=0)

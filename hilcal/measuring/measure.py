@@ -35,7 +35,7 @@ from hilcal.measuring.force import ForceMeter
 from hilcal.measuring.motion import POLL_S, Mover
 from hilcal.measuring.progress import Remark
 from hilcal.readings.covariance import covariance_of_mean
-from hilcal.readings.whitening import inverse_root
+from hilcal.readings.whitening import whitening_matrix
 from hilcal.robot import se3
 from hilcal.types import Bools, Floats
 
@@ -78,7 +78,7 @@ def average(samples: Sequence[TrackerSample], systematic_share: float = 0.0) -> 
         )
     prior = stated[retained].mean(axis=0)
     mean, residuals = deviations(values[retained])
-    total = float(np.sum((residuals @ inverse_root(prior).T) ** 2))  # Σ_k r_kᵀ Σ̄⁻¹ r_k
+    total = float(np.sum((residuals @ whitening_matrix(prior).T) ** 2))  # Σ_k r_kᵀ Σ̄⁻¹ r_k
     dof = residuals.shape[1] * (len(residuals) - 1)
     ratio, p = total / dof, float(scipy.stats.chi2.sf(total, dof))
     factor = 1.0 if p >= UNEXPLAINED else ratio
@@ -119,7 +119,7 @@ def deviations(values: Floats) -> tuple[Floats, Floats]:
 def _not_gross(values: Floats, stated: Floats) -> Bools:
     """Return which samples (K,) are no gross outliers."""
     m = values.shape[1]
-    white = deviations(values)[1] @ inverse_root(stated).T
+    white = deviations(values)[1] @ whitening_matrix(stated).T
     square = np.sum((white - np.median(white, axis=0)) ** 2, axis=1)
     usual = max(1.0, float(np.median(square) / scipy.stats.chi2.median(m)))
     return np.asarray(scipy.stats.chi2.logsf(square / usual, m) > _LOG_GROSS)
@@ -207,7 +207,7 @@ def _trend(samples: Sequence[TrackerSample]) -> _Trend:
     time -= time.mean()
     moment = float(time @ time)
     residuals = deviations(np.array([s.value for s in samples]))[1]
-    root = inverse_root(np.mean([s.covariance for s in samples], axis=0))
+    root = whitening_matrix(np.mean([s.covariance for s in samples], axis=0))
     slope = time @ residuals / moment if moment > 0 else np.zeros(residuals.shape[1])
     about = (residuals - np.outer(time, slope)) @ root.T
     dof = residuals.shape[1] * (len(samples) - 2)

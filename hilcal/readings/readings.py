@@ -183,7 +183,7 @@ class Readings(Tabular):
     """N readings of the target's position (m = 3) or pose (m = 6), one per state.
 
     A distance or a height is one number: the first element of a reading of m = 3, whose others are
-    0 and have no variance, so that whitening drops them (`whitening.inverse_root`).
+    0 and have no variance, so that whitening drops them (`whitening.whitening_matrix`).
 
     Attributes:
         pose: (N,) index of the commanded pose; equal numbers mean the same pose.

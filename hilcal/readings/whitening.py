@@ -141,7 +141,7 @@ TOGETHER = 1_000_000  # Numbers that are whitened at a time; a choice by memory
 RUN = 200  # measurements in a run of correlated noise; a choice: of fewer all is exact
 
 
-def inverse_root(covariance: Floats, scaling: Scaling = "gc") -> Floats:
+def whitening_matrix(covariance: Floats, scaling: Scaling = "gc") -> Floats:
     """Whitening matrices S⁻¹ (..., k, k) of covariances (..., k, k).
 
     For `gc`, V = D C D with D the standard deviations and C = U Λ Uᵀ the correlation matrix;
@@ -250,7 +250,7 @@ def whitening(readings: Readings, mode: Mode, scaling: Scaling = "gc") -> Whiten
     for loaded, reference, weights in runs(readings, groups, RUN) if serial else groups:
         limits.check_shared(loaded.shape[1], m, len(loaded))
         covariance = measurement_covariance(readings, loaded, reference, weights)
-        factor = _innovations(covariance) if serial else inverse_root(covariance, scaling)
+        factor = _innovations(covariance) if serial else whitening_matrix(covariance, scaling)
         if scaling == "none" and readings.scalar.any():  # leaves out elements that are not read
             read = np.diagonal(covariance, axis1=1, axis2=2) > 0
             factor = factor * read[:, :, None]

@@ -1,20 +1,17 @@
 """What the benchmarks measured, against what is claimed: printed at the end of `make bench`."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 _CLAIMS = pytest.StashKey[list[str]]()
 
-Claim = Callable[[str, str, str], None]
-
 
 @pytest.fixture
-def claim(request: pytest.FixtureRequest) -> Claim:
+def claim(request):
     """Function that notes a claim, what was measured of it, and the limit, all in words."""
 
-    def note(what: str, measured: str, limit: str) -> None:
+    def note(what, measured, limit):
         claims = request.config.stash.setdefault(_CLAIMS, [])
         claims.append(f"{what}: {measured} ({limit})")
 
@@ -22,7 +19,7 @@ def claim(request: pytest.FixtureRequest) -> Claim:
 
 
 @pytest.hookimpl(trylast=True)
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+def pytest_terminal_summary(terminalreporter):
     """Print the claims below the tables of times."""
     claims = terminalreporter.config.stash.get(_CLAIMS, [])
     if claims:
@@ -31,7 +28,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
             terminalreporter.write_line(line)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items):
     """Refuse what `make bench` would skip silently."""
     for item in items:
         mine = item.path.parent == Path(__file__).parent

@@ -9,14 +9,12 @@ import json
 import sys
 import textwrap
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 from hilcal.whole_file import replace_file
-from tests.benchmarks.conftest import Claim
 
 ROOT = Path(__file__).parents[2]
 KEPT = ROOT / "docs" / "measured" / "peers" / "peers.json"
@@ -42,7 +40,7 @@ class Row:
     figures: Mapping[str, float]
 
 
-def record(benchmark: Any, claim: Claim, kind: str, what: str, rows: Sequence[Row]) -> None:
+def record(benchmark, claim, kind, what, rows):
     """Keep a table with the benchmark, and print it at the end of `make bench`."""
     table = {"kind": kind, "what": what, "rows": [asdict(row) for row in rows]}
     benchmark.extra_info.setdefault("tables", []).append(table)
@@ -52,11 +50,11 @@ def record(benchmark: Any, claim: Claim, kind: str, what: str, rows: Sequence[Ro
         claim(f"{kind}, {what}: {row.program}", figures, times)
 
 
-def _number(value: float) -> str:
+def _number(value):
     return f"{value:.0f}" if float(value).is_integer() or abs(value) >= 100 else f"{value:.3g}"
 
 
-def kept(bench: Mapping[str, Any]) -> dict[str, Any]:
+def kept(bench):
     """Return what is kept of the JSON of pytest-benchmark: the machine, versions and tables.
 
     Raises:
@@ -75,7 +73,7 @@ def kept(bench: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def page(content: Mapping[str, Any]) -> str:
+def page(content):
     """Return the page of the peers, Markdown."""
     versions = ", ".join(f"{name} {number}" for name, number in content["versions"].items())
     out = [
@@ -105,7 +103,7 @@ def page(content: Mapping[str, Any]) -> str:
     return "\n".join(out) + "\n"
 
 
-def _line(*cells: str) -> str:
+def _line(*cells):
     return f"| {' | '.join(cells)} |"
 
 

@@ -1,8 +1,6 @@
 """Cost of compensation against evaluating the nominal chain once for the same points."""
 
-from collections.abc import Callable
 from timeit import repeat
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +9,6 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.robot.chain import evaluate
-from tests.benchmarks.conftest import Claim
 from tests.support.campaigns import campaign, plan
 
 pytestmark = pytest.mark.slow
@@ -20,7 +17,7 @@ POINTS = 10_000
 ROUNDS = 5
 
 
-def shortest(work: Callable[[], object], times: int = 1) -> float:
+def shortest(work, times=1):
     """Return the median of some calls, least of all rounds, s."""
     timed = [repeat(work, number=1, repeat=times) for _ in range(ROUNDS)]
     return float(np.median(timed, axis=1).min())
@@ -33,7 +30,7 @@ EFFECTS = [
 
 
 @pytest.mark.parametrize("effect", EFFECTS)
-def test_compensation(effect: str, benchmark: Any, claim: Claim) -> None:
+def test_compensation(effect, benchmark, claim):
     c = campaign(effect, "absolute", 0, poses=24)
     model = baseline(c.cell, c.readings, "absolute")
     model = model + model.catalogue.make(effect, c.cell, c.readings.states)

@@ -6,8 +6,7 @@ end, each with the limit that README states, and stores them in `extra_info`.
 """
 
 import tracemalloc
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -27,11 +26,10 @@ from hilcal.identification.gauss_newton import (
     whitened_jacobian,
 )
 from hilcal.identification.residual import residual
-from hilcal.model.model import Model, Prediction
+from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import Whitening, whitening
+from hilcal.readings.whitening import whitening
 from hilcal.types import Floats
-from tests.benchmarks.conftest import Claim
 from tests.support.arm_cases import arm_of, cell_of
 from tests.support.readings_cases import readings_at
 from tests.support.timing import shortest
@@ -57,7 +55,7 @@ class Problem(NamedTuple):
     theta: Floats
 
 
-def problem_of(count: int) -> Problem:
+def problem_of(count):
     """Readings of a UR10e of which every fourth is unloaded, and a model of 30 parameters."""
     rng = np.random.default_rng(20)
     cell = cell_of(arm_of("ur10e"))
@@ -74,12 +72,12 @@ def problem_of(count: int) -> Problem:
     return Problem(model, readings, scales_of(model) * np.abs(rng.normal(size=model.size)))
 
 
-def assemble(p: Problem, prediction: Prediction, w: Whitening) -> Floats:
+def assemble(p, prediction, w):
     """Whitened Jacobian (3 N, 30)."""
     return whitened_jacobian(p.model, prediction, p.theta, w, np.arange(p.model.size))
 
 
-def solve(p: Problem, prediction: Prediction, w: Whitening, a: Floats) -> Floats:
+def solve(p, prediction, w, a):
     """A step of `gauss_newton_steps`: rank analysis, normal equations and solution."""
     white = w.whiten(residual(p.readings, prediction, w)).reshape(-1)
     prior, scale = prior_of(p.model)[0], scales_of(p.model)
@@ -89,13 +87,13 @@ def solve(p: Problem, prediction: Prediction, w: Whitening, a: Floats) -> Floats
     return np.asarray(by.basis.transform @ linear.equations(by.basis).solve(by.beta))
 
 
-def step(p: Problem, prediction: Prediction) -> Floats:
+def step(p, prediction):
     """What is measured: whitening, assembling and solving."""
     w = whitening(p.readings, "absolute")
     return solve(p, prediction, w, assemble(p, prediction, w))
 
 
-def works_of(p: Problem) -> dict[str, Callable[[], object]]:
+def works_of(p):
     prediction = p.model.predict(p.readings.states, p.theta)
     w = whitening(p.readings, "absolute")
     a = assemble(p, prediction, w)
@@ -110,7 +108,7 @@ def works_of(p: Problem) -> dict[str, Callable[[], object]]:
     }
 
 
-def test_a_step_against_qr(benchmark: Any, claim: Claim) -> None:
+def test_a_step_against_qr(benchmark, claim):
     """`ratio`: whitening, assembling and solving over LAPACK's QR."""
     p = problem_of(READINGS)
     prediction = p.model.predict(p.readings.states, p.theta)
@@ -128,24 +126,7 @@ def test_a_step_against_qr(benchmark: Any, claim: Claim) -> None:
     assert np.isfinite(solution).all()
 
 
-def test_time_is_linear_in_the_readings(benchmark: Any, claim: Claim) -> None:
-    """Microseconds per reading at growing numbers of readings."""
-    per_reading: dict[str, dict[int, float]] = {"step": {}, "predicting": {}}
-    for count in SIZES:
-        works = works_of(problem_of(count))
-        found = shortest({name: works[name] for name in per_reading}, ROUNDS)
-        for name, seconds in found.items():
-            per_reading[name][count] = 1e6 * seconds / count
-    benchmark.extra_info["us_per_reading"] = per_reading
-    for name, costs in per_reading.items():
-        growth = costs[SIZES[-1]] / costs[SIZES[0]]
-        what = f"{name}: time per reading at {SIZES[-1]} over that at {SIZES[0]} readings"
-        claim(what, f"{growth:.2f}", "1 where time is linear")
-    p = problem_of(SIZES[0])
-    benchmark.pedantic(p.model.predict, args=(p.readings.states, p.theta), rounds=ROUNDS)
-
-
-def peak_memory(count: int) -> float:
+def peak_memory(count):
     """Peak memory of a prediction and a step, bytes."""
     p = problem_of(count)
     tracemalloc.start()
@@ -156,7 +137,7 @@ def peak_memory(count: int) -> float:
         tracemalloc.stop()
 
 
-def test_memory_is_linear_in_the_readings(benchmark: Any, claim: Claim) -> None:
+def test_memory_is_linear_in_the_readings(benchmark, claim):
     small, large = SIZES[:2]
     per_reading = {count: peak_memory(count) / count for count in (small, large)}
     benchmark.extra_info["bytes_per_reading"] = per_reading

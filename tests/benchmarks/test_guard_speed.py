@@ -2,14 +2,12 @@
 
 from dataclasses import replace
 from time import process_time
-from typing import Any
 
 import numpy as np
 import pytest
 
 from hilcal.config import Obstacle
 from hilcal.measuring.motion import POLL_S, Guard
-from tests.benchmarks.conftest import Claim
 from tests.support.fake_bench import POSES, Bench
 from tests.support.space_cases import TABLE
 
@@ -17,7 +15,7 @@ MOST_S = 0.25 * POLL_S
 
 
 @pytest.mark.benchmark(timer=process_time)  # others may be at work
-def test_a_sample_with_a_load_and_obstacles(benchmark: Any, claim: Claim) -> None:
+def test_a_sample_with_a_load_and_obstacles(benchmark, claim):
     bench = Bench()
     config = bench.config.model_copy(update={"obstacles": (Obstacle(**TABLE),)})
     guard = Guard(bench.cell.with_config(config))

@@ -2,19 +2,14 @@
 
 import time
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
-from playwright.sync_api import CDPSession
 from rerun.chunk import RrdReader
 
 from hilcal.present.charts import MAX_POINTS
-from hilcal.present.html.report import ReportContent
 from hilcal.present.html.report import page as page_of
 from hilcal.present.live_viewer import LiveViewer
 from hilcal.present.viewer import save
-from tests.benchmarks.conftest import Claim
 from tests.support.browser import DESKTOP, needs_chromium, open_browser
 from tests.support.live_story import events, measuring, plan
 from tests.support.report_pages import opened, small_content
@@ -26,16 +21,14 @@ LOADED = "performance.timing.loadEventEnd - performance.timing.navigationStart"
 
 
 @pytest.fixture(scope="module")
-def content(tmp_path_factory: pytest.TempPathFactory) -> ReportContent:
+def content(tmp_path_factory):
     """10,002 readings and four revisions; what a fit alone says is of a small one."""
     small = small_content(tmp_path_factory.mktemp("report"))
     large = story(poses=3334, loads=3)
     return replace(small, story=large, left_out=large.revisions[-1])
 
 
-def test_a_page_of_ten_thousand_readings_is_at_most_8_mb(
-    content: ReportContent, benchmark: Any, claim: Claim
-) -> None:
+def test_a_page_of_ten_thousand_readings_is_at_most_8_mb(content, benchmark, claim):
     html = benchmark.pedantic(page_of, args=(content,), rounds=1)
     size = len(html.encode())
     claim("report of 10,000 readings, size", f"{size / 1e6:.1f} MB", "8 MB")
@@ -44,13 +37,11 @@ def test_a_page_of_ten_thousand_readings_is_at_most_8_mb(
 
 
 @needs_chromium
-def test_until_the_page_can_be_used(
-    content: ReportContent, tmp_path: Path, benchmark: Any, claim: Claim
-) -> None:
+def test_until_the_page_can_be_used(content, tmp_path, benchmark, claim):
     path = tmp_path / "large.html"
     path.write_text(page_of(content), encoding="utf-8")
 
-    def shown() -> tuple[float, float, float, float]:
+    def shown():
         with open_browser() as browser, opened(browser, path, viewport=DESKTOP) as (page, bad):
             client = page.context.new_cdp_session(page)
             client.send("Performance.enable", {"timeDomain": "threadTicks"})
@@ -67,17 +58,17 @@ def test_until_the_page_can_be_used(
     claim("report of 10,000 readings, shown", told.format(*times), "1.5 s on a quiet machine")
 
 
-def work_of(client: CDPSession) -> float:
+def work_of(client):
     """Processor time of the page's main thread, ms."""
     found = client.send("Performance.getMetrics")["metrics"]
     return next(1e3 * m["value"] for m in found if m["name"] == "TaskDuration")
 
 
-def test_recording_of_ten_thousand_readings(tmp_path: Path, benchmark: Any, claim: Claim) -> None:
+def test_recording_of_ten_thousand_readings(tmp_path, benchmark, claim):
     told, path = story(poses=2500, loads=4), tmp_path / "x.rrd"
     walls, works = [], []
 
-    def written() -> None:
+    def written():
         begun, work = time.perf_counter(), time.process_time()
         save(told, path)
         walls.append(time.perf_counter() - begun)
@@ -94,12 +85,12 @@ def test_recording_of_ten_thousand_readings(tmp_path: Path, benchmark: Any, clai
     )
 
 
-def test_telling_a_live_viewer(tmp_path: Path, benchmark: Any, claim: Claim) -> None:
+def test_telling_a_live_viewer(tmp_path, benchmark, claim):
     live = LiveViewer(tmp_path / "x.live.rrd", print)
     live.start()
     each = []
 
-    def tell() -> None:
+    def tell():
         for wall, what in events(measuring(plan(100))):
             begun = time.perf_counter()
             live._send(wall, what)

@@ -9,11 +9,9 @@ import json
 import os
 import subprocess
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -28,25 +26,17 @@ from hilcal.design.optimum import best_design
 from hilcal.drivers.simulated.injected_effects import Draw
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.carried.carried_prior import scales_of
-from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit import fit
 from hilcal.identification.gauss_newton import solve, whitened_jacobian
 from hilcal.identification.residual import residual
 from hilcal.library import read_table
-from hilcal.model.model import Model
-from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import whitening
 from hilcal.refinement import refine
-from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import configs_dir, load_arm
-from hilcal.types import Floats
-from tests.benchmarks.conftest import Claim
 from tests.benchmarks.peers import Row, record
 from tests.support import campaigns
 
 pytestmark = pytest.mark.slow
-
-Case = tuple[Cell, Readings, States, Floats]
-"""A cell, the readings that are fitted, and other states with what a reading there would be."""
 
 PEER = Path(__file__).with_name("figaroh_peer.py")
 POSES = 24
@@ -61,14 +51,14 @@ ARMS = {
 GEOMETRY = ("link_geometry", "joint_compliance")
 
 
-def timed(work: Callable[[], Any]) -> tuple[Any, float]:
+def timed(work):
     """Return what some work gives, and its processor time, s."""
     start = time.process_time()
     found = work()
     return found, time.process_time() - start
 
 
-def by_figaroh(benchmark: Any, folder: Path, arm: Arm, task: dict[str, Any]) -> dict[str, Any]:
+def by_figaroh(benchmark, folder, arm, task):
     """Return what figaroh made of a task."""
     python = os.environ.get("HILCAL_PEERS")
     if not python:
@@ -79,12 +69,12 @@ def by_figaroh(benchmark: Any, folder: Path, arm: Arm, task: dict[str, Any]) -> 
     command = [python, "-W", "ignore", str(PEER), str(folder)]
     ran = subprocess.run(command, env=alone, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr
-    done: dict[str, Any] = json.loads((folder / "done.json").read_text(encoding="utf-8"))
+    done = json.loads((folder / "done.json").read_text(encoding="utf-8"))
     benchmark.extra_info["figaroh"] = done.pop("version")
     return done
 
 
-def with_tool(cell: Cell) -> Arm:
+def with_tool(cell):
     """Return the arm with the mass of its tool as part of its last body."""
     arm, mass = cell.arm, cell.arm.masses.copy()
     mass[-1] += cell.tool_mass
@@ -95,7 +85,7 @@ def with_tool(cell: Cell) -> Arm:
 
 
 @pytest.mark.parametrize("count", [300, 1000])
-def test_plan(benchmark: Any, claim: Claim, tmp_path: Path, count: int) -> None:
+def test_plan(benchmark, claim, tmp_path, count):
     """Poses for the geometry of a UR10, D-optimal, out of the same candidates.
 
     Both programs have figaroh's own regressor, and are judged by det(M)^(1/p) over that of
@@ -111,7 +101,7 @@ def test_plan(benchmark: Any, claim: Claim, tmp_path: Path, count: int) -> None:
     chosen, seconds = timed(lambda: best_design(objective, float(POSES)))
     benchmark.pedantic(relax, args=(objective, 1.0), rounds=1)
 
-    def root(information: Floats) -> float:
+    def root(information):
         return float(np.exp(np.linalg.slogdet(information)[1] / units.size))
 
     optimum = root(units.information(weights / weights.sum()))
@@ -137,8 +127,11 @@ def test_plan(benchmark: Any, claim: Claim, tmp_path: Path, count: int) -> None:
     assert root(chosen.information) <= optimum * POSES * (1 + 1e-6)
 
 
-def simulated(*, elastic: bool) -> Case:
-    """A UR10e with errors of links and encoders, rigid, or giving way under its own weight."""
+def simulated(*, elastic):
+    """A UR10e with errors of links and encoders, rigid, or giving way under its own weight.
+
+    Its cell, the readings that are fitted, and other states with what a reading there would be.
+    """
     rng = np.random.default_rng(5)
     cell = campaigns.cell_of(target_known=False)
     world, n = campaigns.world_of(cell, rng), cell.arm.n
@@ -154,7 +147,7 @@ def simulated(*, elastic: bool) -> Case:
     return cell, bare, states, world.ideal_readings(states).value(3)
 
 
-def real(data: Path) -> Case:
+def real(data):
     """Series B of IPA's UR10, positions alone."""
     cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
     path = data / "Series_B" / "measurements_joint_configurations.csv"
@@ -166,9 +159,7 @@ def real(data: Path) -> Case:
 
 
 @pytest.mark.parametrize("kind", ARMS)
-def test_calibration(
-    benchmark: Any, claim: Claim, tmp_path: Path, kind: str, request: pytest.FixtureRequest
-) -> None:
+def test_calibration(benchmark, claim, tmp_path, kind, request):
     """The geometry of an arm from the same positions, judged by others that were not fitted."""
     if kind == "real":
         case = real(request.getfixturevalue("ipa_ur10"))
@@ -189,10 +180,10 @@ def test_calibration(
     }
     done = by_figaroh(benchmark, tmp_path, with_tool(cell), task)
 
-    def begun() -> Model:
+    def begun():
         return baseline(cell, readings, "absolute")
 
-    def geometry() -> Fit:
+    def geometry():
         return fit(with_effects(cell, readings, "absolute", GEOMETRY), readings, "absolute")
 
     works = {
@@ -211,13 +202,13 @@ def test_calibration(
     record(benchmark, claim, "calibration", what, table)
 
 
-def _judged(who: str, seconds: float, size: int, predicted: object, truth: Floats) -> Row:
+def _judged(who, seconds, size, predicted, truth):
     """Return a program's row: its parameters and its mean error."""
     error = np.linalg.norm(np.asarray(predicted) - truth, axis=1)
     return Row(who, seconds, {"parameters": size, ERROR: 1e6 * float(error.mean())})
 
 
-def test_least_squares(benchmark: Any, claim: Claim) -> None:
+def test_least_squares(benchmark, claim):
     """The same residual minimised by SciPy, over the same identifiable coordinates.
 
     Frames, links and elastic joints. `all` is over all parameters, also of those directions that
@@ -227,7 +218,7 @@ def test_least_squares(benchmark: Any, claim: Claim) -> None:
     model = with_effects(cell, readings, "absolute", GEOMETRY)
     flat, w = np.full(model.size, np.inf), whitening(readings, "absolute")
 
-    def error(theta: Floats) -> float:
+    def error(theta):
         off = model.predict(states, theta).observation.position - truth
         return 1e6 * float(np.linalg.norm(off, axis=1).mean())
 
@@ -246,11 +237,11 @@ def test_least_squares(benchmark: Any, claim: Claim) -> None:
     ]
     for name, method, exact, basis in cases:
 
-        def off(z: Floats, basis: Floats = basis) -> Floats:
+        def off(z, basis=basis):
             prediction = model.predict(readings.states, basis @ z)
             return w.whiten(residual(readings, prediction, w)).reshape(-1)
 
-        def slope(z: Floats, basis: Floats = basis) -> Floats:
+        def slope(z, basis=basis):
             theta = basis @ z
             prediction = model.predict(readings.states, theta)
             everywhere = np.arange(model.size)
@@ -268,13 +259,13 @@ def test_least_squares(benchmark: Any, claim: Claim) -> None:
     record(benchmark, claim, "least squares", what, table)
 
 
-def test_cross_validation(benchmark: Any, claim: Claim) -> None:
+def test_cross_validation(benchmark, claim):
     """mrcal's test of a model beside hilcal's errors on poses left out, of the same campaigns.
 
     mrcal fits two halves apart and compares their predictions with what their covariances, from
     the readings' noise alone, let them differ by.
     """
-    rows: dict[str, dict[str, list[float]]] = {"hilcal": {}, "mrcal": {}}
+    rows = {"hilcal": {}, "mrcal": {}}
     seconds = {"hilcal": 0.0, "mrcal": 0.0}
     for effect in (campaigns.NO_EFFECT, "transmission_error"):
         for seed in range(CAMPAIGNS):
@@ -303,13 +294,13 @@ def test_cross_validation(benchmark: Any, claim: Claim) -> None:
     assert all(row.figures["smallest over largest"] > 1 for row in table)
 
 
-def _left_out(model: Model, readings: Readings, states: States) -> float:
+def _left_out(model, readings, states):
     """Return the rms error of poses left out, in units of the noise."""
     del states
     return fit(model, readings, "absolute").holdout.rms_sigma
 
 
-def _halves(model: Model, readings: Readings, states: States) -> float:
+def _halves(model, readings, states):
     """Return the rms difference of two halves' predictions, in units of its standard deviation."""
     predictions, spread = [], np.zeros((len(states), 3, 3))
     for half in (0, 1):

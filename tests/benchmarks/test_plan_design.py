@@ -6,8 +6,6 @@ machine.
 """
 
 import time
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,8 +20,6 @@ from hilcal.effects.link_geometry import LinkGeometry
 from hilcal.identification.carried.carried_prior import scales_of
 from hilcal.model.model import Model
 from hilcal.readings.readings import States
-from hilcal.types import Floats
-from tests.benchmarks.conftest import Claim
 from tests.support.arm_cases import arm_of, cell_of
 from tests.support.timing import shortest
 
@@ -35,7 +31,7 @@ WRENCHES = np.array([[0, 0, 0], [0, 0, -98], [80, 0, 0], [0, 80, 0]])  # none, h
 SIGMA = 2e-5  # m
 
 
-def arm_units(count: int, size: int) -> CandidateSet:
+def arm_units(count, size):
     """Readings of a UR10e: six joint compliances and those geometric errors that are separate."""
     rng = np.random.default_rng(2)
     cell = cell_of(arm_of("ur10e"))
@@ -53,31 +49,31 @@ def arm_units(count: int, size: int) -> CandidateSet:
     return CandidateSet(np.ascontiguousarray(jacobian[:, :, chosen]), np.ones(count))
 
 
-def gauss_units(count: int, size: int) -> CandidateSet:
+def gauss_units(count, size):
     """Rows without any structure: the hardest for whole numbers."""
     return CandidateSet(np.random.default_rng(1).normal(size=(count, 3, size)), np.ones(count))
 
 
-KINDS: dict[str, Callable[[int, int], CandidateSet]] = {"arm": arm_units, "gauss": gauss_units}
+KINDS = {"arm": arm_units, "gauss": gauss_units}
 
 
-def by_volume(units: CandidateSet) -> Objective:
+def by_volume(units):
     return Objective(units, D(), np.zeros((units.size, units.size)))
 
 
-def leverage(units: CandidateSet) -> Floats:
+def leverage(units):
     """One scan of all candidates."""
     root = np.linalg.cholesky(np.linalg.inv(units.information(np.ones(len(units)))))
     return np.asarray(np.sum((units.rows @ root) ** 2, axis=(1, 2)))
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_states_out_of_many(benchmark: Any, claim: Claim, kind: str) -> None:
+def test_states_out_of_many(benchmark, claim, kind):
     """100,000 candidates, 30 parameters, 40 states: certified efficiency and time."""
     units = KINDS[kind](CANDIDATES, 30)
     scan = shortest({"scan": lambda: leverage(units)}, 3)["scan"]
 
-    def plan() -> float:
+    def plan():
         return best_design(by_volume(units), float(STATES), np.random.default_rng(1)).efficiency
 
     start = time.process_time()
@@ -93,7 +89,7 @@ def test_states_out_of_many(benchmark: Any, claim: Claim, kind: str) -> None:
     assert efficiency > least
 
 
-def multiplicative(units: CandidateSet, rounds: int) -> float:
+def multiplicative(units, rounds):
     """Log det of the D-optimal shares by the multiplicative algorithm."""
     w = np.full(len(units), 1 / len(units))
     for _ in range(rounds):
@@ -103,7 +99,7 @@ def multiplicative(units: CandidateSet, rounds: int) -> float:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_peer_problem(benchmark: Any, claim: Claim, kind: str) -> None:
+def test_peer_problem(benchmark, claim, kind):
     """300 poses, 24 parameters: the continuous optimum to 1e-6, against another algorithm."""
     units = KINDS[kind](2000, 24)
     units = CandidateSet(units.rows[:300], units.cost[:300])

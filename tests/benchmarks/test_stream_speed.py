@@ -8,9 +8,6 @@ against the same with AᵀA, and against the reading and multiplying of given ro
 
 import resource
 import time
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -18,13 +15,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from hilcal import stream as passes
-from hilcal.effects.protocol import Effect
 from hilcal.identification.carried.carried_prior import scales_of
 from hilcal.model.model import Model
 from hilcal.regression.normal_equations import Triangle
-from hilcal.tables.parquet_stream import ReadingStream, open_stream
-from hilcal.types import Floats
-from tests.benchmarks.conftest import Claim
+from hilcal.tables.parquet_stream import open_stream
 from tests.benchmarks.test_cost import EFFECTS
 from tests.support.stream_cases import cell, write
 
@@ -39,10 +33,10 @@ ROUNDS = 3
 class Product:
     """AᵀA of rows as they come, in place of a triangle."""
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size):
         self.r = np.zeros((size, size))
 
-    def add(self, rows: Floats, right: Floats | None = None) -> None:
+    def add(self, rows, right=None):
         count = rows.shape[1]
         self.r[:count, :count] += rows.T @ rows
         if right is not None:
@@ -50,7 +44,7 @@ class Product:
             self.r[count, count] += right @ right
 
 
-def rows_file(path: Path) -> None:
+def rows_file(path):
     """Whitened rows and right-hand side of `READINGS` 3-D readings, a column each."""
     rng = np.random.default_rng(0)
     names = [f"a{k}" for k in range(PARAMETERS + 1)]
@@ -61,40 +55,38 @@ def rows_file(path: Path) -> None:
             out.write_table(pa.table(part, schema=schema))
 
 
-def given_rows(path: Path, kind: type[Product] | type[Triangle]) -> Floats:
+def given_rows(path, kind):
     total = kind(PARAMETERS + 1)
     for batch in pq.ParquetFile(path).iter_batches(CHUNK):
         total.add(np.stack([c.to_numpy() for c in batch.columns]).T)
     return total.r
 
 
-def the_whole(work: passes.PassTask, theta: Floats) -> list[passes.Reduced]:
+def the_whole(work, theta):
     return [passes.reduce_group(k, work, theta) for k in range(len(work.stream.rows))]
 
 
-def seconds(work: Callable[[], object]) -> float:
+def seconds(work):
     begun = time.process_time()
     work()
     return time.process_time() - begun
 
 
-def work_of(stream: ReadingStream) -> tuple[passes.PassTask, Floats]:
+def work_of(stream):
     of = cell()
     states = next(stream.chunks(0)).states
-    effects: tuple[Effect, ...] = tuple(effect(of, states) for effect in EFFECTS)
+    effects = tuple(effect(of, states) for effect in EFFECTS)
     model = Model(of, effects)
     assert model.size == PARAMETERS
     return passes.PassTask(stream, model, np.zeros(6), {}), 1e-3 * scales_of(model)
 
 
-def test_a_stream_against_reading_and_multiplying(
-    benchmark: Any, claim: Claim, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stream_against_reading_and_multiplying(benchmark, claim, tmp_path, monkeypatch):
     rows, path = tmp_path / "rows.parquet", tmp_path / "moving.parquet"
     rows_file(rows)
     write(path, READINGS, group=100_000)
     work, theta = work_of(open_stream(path, cell().arm, None, None))
-    times: dict[str, list[float]] = {}
+    times = {}
     for _ in range(ROUNDS):
         times.setdefault("multiply", []).append(seconds(lambda: given_rows(rows, Product)))
         times.setdefault("reduce", []).append(seconds(lambda: given_rows(rows, Triangle)))

@@ -6,15 +6,12 @@ takes but how much longer than that of a small recording, in processor time of t
 
 import math
 import os
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import pytest
 
 from hilcal.present.viewer import live, save
-from tests.benchmarks.conftest import Claim
 from tests.support.live_story import events, measuring, plan
 from tests.support.picture import opened, vulkan_available
 from tests.support.viewer_story import story
@@ -32,12 +29,12 @@ MOST = 1.5
 TICKS = os.sysconf("SC_CLK_TCK")
 
 
-def finished(readings: int, path: Path) -> None:
+def finished(readings, path):
     """Write the recording of a campaign with four revisions."""
     save(story(poses=readings // 3, loads=3), path)
 
 
-def followed(readings: int, path: Path) -> None:
+def followed(readings, path):
     """Write what a live viewer was told of a campaign, as `--view` does."""
     outlet = live._Outlet("speed", print, file=path)
     for wall, event in events(measuring(plan(readings // 2))):
@@ -45,13 +42,13 @@ def followed(readings: int, path: Path) -> None:
     outlet.end()
 
 
-def spent(process: int) -> float:
+def spent(process):
     """Processor time of a process until now, ms."""
     fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
     return 1e3 * (int(fields[11]) + int(fields[12])) / TICKS
 
 
-def turned(viewer: Any) -> Iterator[None]:
+def turned(viewer):
     """Turn every 3-D view a little, again and again."""
     cos, sin = math.cos(0.1), math.sin(0.1)
     while True:
@@ -66,7 +63,7 @@ def turned(viewer: Any) -> Iterator[None]:
         yield
 
 
-def dragged(viewer: Any, timeline: str) -> Iterator[None]:
+def dragged(viewer, timeline):
     """Drag the time along the second half of a recording, again and again."""
     found = [t for r in viewer.get_state().recordings for t in r.timelines if t.name == timeline]
     start, end = float(found[0].start), float(found[0].end)
@@ -80,9 +77,9 @@ def dragged(viewer: Any, timeline: str) -> Iterator[None]:
 
 @pytest.mark.parametrize(("make", "timeline"), [(finished, "pose"), (followed, "time")])
 def test_ten_thousand_readings_are_shown_as_fluently_as_a_hundred(
-    make: Callable[[int, Path], None], timeline: str, tmp_path: Path, benchmark: Any, claim: Claim
-) -> None:
-    def cost(readings: int) -> tuple[float, float]:
+    make, timeline, tmp_path, benchmark, claim
+):
+    def cost(readings):
         """Processor time of a picture while the view is turned, and while time is dragged, ms."""
         path = tmp_path / f"{readings}.rrd"
         if not path.exists():
@@ -100,7 +97,7 @@ def test_ten_thousand_readings_are_shown_as_fluently_as_a_hundred(
                 out.append((spent(process) - begun) / PICTURES)
         return out[0], out[1]
 
-    def measured() -> tuple[list[float], list[float]]:
+    def measured():
         rounds = [(cost(SMALL), cost(LARGE)) for _ in range(ROUNDS)]
         few, many = ([r[k] for r in rounds] for k in (0, 1))
         return [median(c) for c in zip(*few, strict=True)], [

@@ -374,6 +374,7 @@ def test_an_append_that_was_stopped_is_resumed(site, capsys):
     assert d["readings"] == d["planned"] == len(site.plan.steps) + 15
 
 
+@pytest.mark.long
 def test_a_pose_is_left_out_of_what_is_resumed(site, capsys):
     ok(capsys, *site.command(*site.fresh))
     site.bench.world.restart()

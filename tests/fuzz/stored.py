@@ -14,7 +14,7 @@ from rich.console import Console
 
 import hilcal as hc
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.urscript import program_points, with_joints
+from hilcal.calibration.urscript import CORRECTED, program_points, with_joints
 from hilcal.effects import template
 from hilcal.effects.catalogue import installed
 from hilcal.identification.carried.carried_prior import carried_prior, check_arm
@@ -174,7 +174,8 @@ def _program(path: Path) -> None:
     if not np.all(np.isfinite(points.q[~np.isnan(points.q).all(axis=1)])):
         raise Accepted("a program: joints that are not finite")
     kept = [w for w in every if not w.not_corrected]
-    path.write_text(with_joints(program, kept, np.ones((len(kept), 6))), "utf-8", newline="")
+    corrected = with_joints(program, kept, np.ones((len(kept), 6)))
+    path.write_text(corrected.replace(CORRECTED, "#"), "utf-8", newline="")
     _, again, points, _ = program_points(path, leave)
     if [(w.line, w.not_corrected) for w in again] != [(w.line, w.not_corrected) for w in every]:
         raise Accepted("a program: other waypoints than before")

@@ -6,7 +6,6 @@ until it is killed, and prints how many readings there are.
 
 import sys
 import time
-from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -14,12 +13,11 @@ from subprocess import PIPE, Popen
 
 import numpy as np
 
-from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
 from tests.support.paths import ROOT
 
 
-def repeated_deflection(x: Readings, rng: np.random.Generator, cycle: int) -> Readings:
+def repeated_deflection(x, rng, cycle):
     """One deflection of those that are there, measured again."""
     of = np.flatnonzero((x.pose == rng.choice(x.pose)) & (x.cycle == 0))
     one = x[np.append(of[x.unloaded[of]][:1], rng.choice(of[~x.unloaded[of]]))]
@@ -28,7 +26,7 @@ def repeated_deflection(x: Readings, rng: np.random.Generator, cycle: int) -> Re
     return replace(one, value=value, cycle=np.full(len(one), cycle))
 
 
-def append(path: Path, seed: int, pause: float) -> None:
+def append(path, seed, pause):
     rng = np.random.default_rng(seed)
     with CampaignFile.open(path, read_only=True) as file:
         x = file.readings()
@@ -40,12 +38,11 @@ def append(path: Path, seed: int, pause: float) -> None:
 
 
 @contextmanager
-def appending(path: Path, seed: int, pause: float) -> Iterator["Popen[str]"]:
+def appending(path, seed, pause):
     """A process that has begun to append, and is killed at the end."""
     command = [sys.executable, "-m", "tests.support.appending", str(path), str(seed), str(pause)]
     process = Popen(command, stdout=PIPE, stderr=PIPE, cwd=ROOT, text=True)
     try:
-        assert process.stdout is not None
         assert int(process.stdout.readline()) > 0
         yield process
         assert process.poll() is None, process.stderr and process.stderr.read()

@@ -1,6 +1,5 @@
 """Arms, states and an independent arithmetic of rigid displacements for the tests of the arm."""
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,14 +9,12 @@ import scipy.linalg as sl
 from hilcal.cell import STANDARD_GRAVITY, Cell
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm, robot_names
-from hilcal.robot.chain import Chain
-from hilcal.types import Floats
 
 ODD, RAILS = "odd", "rails"
 ARMS = (*robot_names(), ODD, RAILS)
 
 
-def arm_of(name: str) -> Arm:
+def arm_of(name):
     """An arm of the catalogue, drawn; or one of seven joints with axes in odd directions."""
     if name not in (ODD, RAILS):
         return replace(load_arm(name), coupling=None, drive=None)
@@ -40,7 +37,7 @@ def arm_of(name: str) -> Arm:
     )
 
 
-def cell_of(arm: Arm, gravity: Sequence[float] | Floats = STANDARD_GRAVITY) -> Cell:
+def cell_of(arm, gravity=STANDARD_GRAVITY):
     """A cell in which nothing is at the origin or aligned."""
     return Cell(
         arm=arm,
@@ -55,7 +52,7 @@ def cell_of(arm: Arm, gravity: Sequence[float] | Floats = STANDARD_GRAVITY) -> C
     )
 
 
-def displacement(twist: Sequence[float] | Floats) -> Floats:
+def displacement(twist):
     """(4, 4) exponential of a twist (v, ω), by the matrix exponential of SciPy."""
     v, w = np.asarray(twist, dtype=float)[:3], np.asarray(twist, dtype=float)[3:]
     hat = np.zeros((4, 4))
@@ -64,13 +61,13 @@ def displacement(twist: Sequence[float] | Floats) -> Floats:
     return np.asarray(sl.expm(hat))
 
 
-def twisted(arm: Arm, twist: Floats) -> Arm:
+def twisted(arm, twist):
     """The arm whose links end in the twists (n + 1, 6) of one state."""
     ends = [pin.exp6(pin.Motion(t)).homogeneous for t in twist]
     return replace(arm, links=arm.links @ np.array(ends))
 
 
-def slots_of(arm: Arm, q: Floats) -> Floats:
+def slots_of(arm, q):
     """(n + 1, 4, 4) slots of one state, by products of homogeneous matrices."""
     pose, out = arm.links[0], [arm.links[0]]
     for value, slides, link in zip(q, arm.slides, arm.links[1:], strict=True):
@@ -80,20 +77,20 @@ def slots_of(arm: Arm, q: Floats) -> Floats:
     return np.array(out)
 
 
-def flange_at(chain: Chain, state: int, pose: Floats, atol: float = 1e-12) -> None:
+def flange_at(chain, state, pose, atol=1e-12):
     """Assert where the flange is in a state: a pose (4, 4)."""
     found = chain.rotation[-1, state], chain.position[-1, state]
     np.testing.assert_allclose(np.column_stack(found), pose[:3], rtol=0, atol=atol)
 
 
-def same_flange(one: Chain, other: Chain) -> None:
+def same_flange(one, other):
     """Assert that the flange is at the same poses."""
     for of in ("position", "rotation"):
         ends = (getattr(chain, of)[-1] for chain in (one, other))
         np.testing.assert_allclose(*ends, rtol=0, atol=1e-12)
 
 
-def classic_flange(rows: Floats, q: Floats) -> Floats:
+def classic_flange(rows, q):
     """Flange (4, 4) of θ, a, d, α (4, n) at angles (n,), by the closed form of a classic row."""
     pose = np.eye(4)
     for (theta, a, d, alpha), angle in zip(rows.T, q, strict=True):
@@ -103,6 +100,6 @@ def classic_flange(rows: Floats, q: Floats) -> Floats:
     return pose
 
 
-def slope(f: Callable[[float], Floats], h: float) -> Floats:
+def slope(f, h):
     """Central difference of f at 0, of fourth order."""
     return (8 * (f(h) - f(-h)) - (f(2 * h) - f(-2 * h))) / (12 * h)

@@ -1,11 +1,10 @@
 """Debian's chromium, headless, for the tests of pages."""
 
 import shutil
-from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
-from playwright.sync_api import Browser, sync_playwright
+from playwright.sync_api import sync_playwright
 
 CHROMIUM = shutil.which("chromium")
 
@@ -19,7 +18,7 @@ PHONE = {"width": 390, "height": 844}
 
 
 @contextmanager
-def open_browser() -> Iterator[Browser]:
+def open_browser():
     """A headless browser that talks to nobody unasked."""
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(

@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import psutil
 
@@ -26,13 +25,13 @@ STARTING = 15.0
 class CalibrationProcess:
     """Starts `calibrate` in a session of its own, as often as it takes."""
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory):
         self.toml, self.run = directory / "cell.toml", directory / "run.hilcal"
         self.log = directory / "calibrate.log"
         self.toml.write_text(CELL, encoding="utf-8")
-        self._family: set[int] = set()
+        self._family = set()
 
-    def start(self) -> "subprocess.Popen[bytes]":
+    def start(self):
         """Start it, with --resume in any case: without a campaign it begins."""
         command = [sys.executable, "-m", "hilcal", "calibrate", self.toml, "-o", self.run]
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
@@ -46,7 +45,7 @@ class CalibrationProcess:
                 env=environment,
             )
 
-    def killed_after(self, seconds: float) -> bool:
+    def killed_after(self, seconds):
         """Start it, and kill its process group so long after; False where it ended before."""
         process = self.start()
         end = time.monotonic() + seconds
@@ -64,19 +63,19 @@ class CalibrationProcess:
         assert not left, left
         return not ended
 
-    def finish(self) -> None:
+    def finish(self):
         process = self.start()
         assert process.wait(LONGEST) == 0, self.output
 
     @property
-    def output(self) -> str:
+    def output(self):
         return self.log.read_text(encoding="utf-8", errors="replace")[-4000:]
 
-    def orphans(self) -> list[str]:
+    def orphans(self):
         """Return its processes that still run, after a moment: one may be starting just then."""
         return still_running(self._family, STARTING)
 
-    def check_each_reading_once(self) -> int:
+    def check_each_reading_once(self):
         """Check that each step of each plan was measured once; returns the number of readings."""
         count = 0
         for path in self._files():
@@ -87,21 +86,21 @@ class CalibrationProcess:
                 assert len(log.plan.steps) == campaign.n_readings
         return count
 
-    def n_stored(self) -> int:
+    def n_stored(self):
         return self._once(self.run) if self.run.exists() else 0
 
-    def check_readable(self) -> None:
+    def check_readable(self):
         """Check that what is there can be read."""
         for path in self._files():
             if path.exists():
                 with CampaignFile.open(path, read_only=True) as campaign:
                     assert self._once(path) == campaign.n_readings
 
-    def _files(self) -> tuple[Path, ...]:
+    def _files(self):
         files = Files(self.run)
         return files.run, files.validation, files.corrected
 
-    def _once(self, path: Path) -> int:
+    def _once(self, path):
         """Return how many readings a campaign holds, each with its details once."""
         with CampaignFile.open(path, read_only=True) as campaign:
             steps = [tuple(d["step"].values()) for d in RunLog(campaign).details()]
@@ -109,7 +108,7 @@ class CalibrationProcess:
             assert len(steps) <= campaign.n_readings  # read later: the run may go on meanwhile
         return len(steps)
 
-    def look(self, pid: int) -> None:
+    def look(self, pid):
         try:
             children = psutil.Process(pid).children(recursive=True)
         except psutil.Error:

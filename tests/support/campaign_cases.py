@@ -8,11 +8,10 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
 
 import numpy as np
 import psutil
@@ -30,7 +29,6 @@ from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, Step
 from hilcal.store.run_log import RunLog
-from hilcal.types import Floats
 from tests.support.paths import ROOT
 from tests.support.spread_plan import spread_plan
 from tests.support.timing import wait_until
@@ -54,7 +52,7 @@ class Site:
     directory: Path
     runs: list["Run"]
 
-    def end_runs(self) -> None:
+    def end_runs(self):
         """End what a test that failed has left running."""
         for run in self.runs:
             if run.process.poll() is None:
@@ -62,22 +60,21 @@ class Site:
                 run.process.wait()
         self.runs.clear()
 
-    def ask(self, device: str, op: str, **arguments: Any) -> Any:
+    def ask(self, device, op, **arguments):
         return self.simulated.ask(device, op, **arguments)
 
-    def slider(self, share: float) -> None:
+    def slider(self, share):
         """Set the speed slider on the pendant; what runs goes on at that share of its speed."""
         self.ask("arm", "set", slider=share)
 
-    def shorter(self, directory: Path, poses: int) -> "Site":
+    def shorter(self, directory, poses):
         plan = spread_plan(self.cell, poses, np.random.default_rng(7), repeats=0)
         plan_file = directory / "plan.json"
         plan_file.write_text(plan.to_json(), encoding="utf-8")
         return replace(self, plan=plan, plan_file=plan_file, directory=directory)
 
-    def dashboard(self, *commands: str) -> list[str]:
+    def dashboard(self, *commands):
         """Say something to the controller's dashboard, as the pendant's buttons do."""
-        assert self.config.robot.host is not None
         with (
             socket.create_connection((self.config.robot.host, 29999), timeout=5.0) as line,
             line.makefile("rw") as stream,
@@ -92,14 +89,7 @@ class Site:
 
 
 @contextmanager
-def site(
-    directory: Path,
-    *,
-    poses: int,
-    seed: int = 5,
-    tracker: dict[str, Any] | None = None,
-    force_sensor: dict[str, Any] | None = None,
-) -> Iterator[Site]:
+def site(directory, *, poses, seed=5, tracker=None, force_sensor=None):
     """Run a simulated cell with two loads and a plan of few poses; other instruments as given."""
     base_dir = configs_dir() / "cells"
     config = load_config(base_dir / "demo_ur10e.toml")
@@ -144,14 +134,7 @@ class EndedError(AssertionError):
 class Run:
     """One `hilcal run`, in a session of its own."""
 
-    def __init__(
-        self,
-        site: Site,
-        path: Path,
-        *more: str,
-        limit: int | None = None,
-        how: tuple[str, ...] = (),
-    ) -> None:
+    def __init__(self, site, path, *more, limit=None, how=()):
         """Start it; unless `how` says otherwise, `--resume` where the campaign is there already."""
         self.site, self.path = site, path
         self.log = path.with_suffix(f".{time.monotonic_ns()}.log")
@@ -168,15 +151,15 @@ class Run:
                 env=environment,
                 preexec_fn=None if limit is None else lambda: _limited(limit),
             )
-        self._family: set[int] = {self.process.pid}
+        self._family = {self.process.pid}
         self._looked = 0.0
         site.runs.append(self)
 
     @property
-    def output(self) -> str:
+    def output(self):
         return self.log.read_text(encoding="utf-8", errors="replace")
 
-    def wait_until(self, what: Callable[[], bool], words: str) -> None:
+    def wait_until(self, what, words):
         end = time.monotonic() + DEADLINE
         while not what():
             self._look()
@@ -185,16 +168,16 @@ class Run:
             assert time.monotonic() < end, f"no {words} in {DEADLINE} s:\n{self.output}"
             time.sleep(0.02)
 
-    def some_readings(self) -> None:
+    def some_readings(self):
         self.wait_until(lambda: bool(READING_COUNT.search(self.output)), "a reading")
 
-    def moving(self) -> Floats:
+    def moving(self):
         """Wait until the arm moves, so slowly and so far that it will not arrive soon."""
         self.site.slider(SLOW_SLIDER)
         plan = self.site.plan
         goal = np.zeros(6)
 
-        def far() -> bool:
+        def far():
             name = self.output.splitlines()[-1].partition("moving to ")[2]
             state = self.site.ask("arm", "state")
             if name not in plan.pose_names or not state["moving"]:
@@ -205,19 +188,19 @@ class Run:
         self.wait_until(far, "motion")
         return goal
 
-    def measuring(self) -> None:
+    def measuring(self):
         count = len(self.output.splitlines())
         self.wait_until(
             lambda: "measuring" in "".join(self.output.splitlines()[count:]), "measurement"
         )
 
-    def next_reading(self, words: str) -> None:
+    def next_reading(self, words):
         count = len(READING_COUNT.findall(self.output))
         self.wait_until(
             lambda: len(READING_COUNT.findall(self.output)) > count, f"a reading with {words}"
         )
 
-    def family(self) -> set[int]:
+    def family(self):
         """Process numbers of it and of all that it has started."""
         try:
             children = psutil.Process(self.process.pid).children(recursive=True)
@@ -226,22 +209,22 @@ class Run:
             pass
         return self._family
 
-    def _look(self) -> None:
+    def _look(self):
         """Note what it has started meanwhile, now and then."""
         if time.monotonic() - self._looked > LOOK_S:
             self.family()
             self._looked = time.monotonic()
 
-    def interrupt(self) -> None:
+    def interrupt(self):
         """Ctrl-C at the terminal: the whole group gets it."""
         self.family()
         os.killpg(self.process.pid, signal.SIGINT)
 
-    def kill(self) -> None:
+    def kill(self):
         self.family()
         self.process.kill()
 
-    def end(self, longest: float = DEADLINE) -> tuple[int, str]:
+    def end(self, longest=DEADLINE):
         """Wait for its end; returns the exit code and what it said."""
         end = time.monotonic() + longest
         while self.process.poll() is None:
@@ -250,12 +233,12 @@ class Run:
             time.sleep(0.02)
         return self.process.wait(), self.output
 
-    def orphans(self) -> list[str]:
+    def orphans(self):
         """Processes that it has left behind, after a moment."""
         return still_running(self._family, 3.0)
 
 
-def still_running(processes: set[int], seconds: float) -> list[str]:
+def still_running(processes, seconds):
     """Commands of those of some processes that have not ended after so long."""
     end = time.monotonic() + seconds
     while True:
@@ -265,11 +248,11 @@ def still_running(processes: set[int], seconds: float) -> list[str]:
         time.sleep(0.02)
 
 
-def _limited(size: int) -> None:
+def _limited(size):
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 
 
-def _alive(pid: int) -> str:
+def _alive(pid):
     try:
         process = psutil.Process(pid)
         if process.status() == psutil.STATUS_ZOMBIE:
@@ -287,7 +270,6 @@ STARVED = re.compile(
 """What a run says, too, where this computer has given one of the processes no turn for long."""
 TRIES = 3
 
-Then = TypeVar("Then")
 Act = Callable[[Site], object]
 
 
@@ -303,25 +285,25 @@ class Fault:
     fast: bool = False  # whether it is one of the few that are long, not slow
 
 
-def act(device: str, op: str, **arguments: object) -> Act:
+def act(device, op, **arguments):
     return lambda cell: cell.ask(device, op, **arguments)
 
 
-def no_action(cell: Site) -> None:
+def no_action(cell):
     """Nothing has to be put right."""
 
 
-def switch(name: str, device: str, op: str, *says: str, fast: bool = False) -> Fault:
+def switch(name, device, op, *says, fast=False):
     return Fault(name, act(device, op, on=True), act(device, op, on=False), says, fast=fast)
 
 
-def parametrize_faults(faults: tuple[Fault, ...]) -> pytest.MarkDecorator:
+def parametrize_faults(faults):
     mark = {True: pytest.mark.long, False: pytest.mark.slow}
     rows = [pytest.param(one, id=one.name, marks=mark[one.fast]) for one in faults]
     return pytest.mark.parametrize("fault", rows)
 
 
-def start_run(cell: Site, path: Path, then: Callable[[Run], Then]) -> tuple[Run, Then]:
+def start_run(cell, path, then):
     """Start a run, wait for its first reading and for what comes then; returns both."""
     for left in reversed(range(TRIES)):
         run = Run(cell, path)
@@ -335,7 +317,7 @@ def start_run(cell: Site, path: Path, then: Callable[[Run], Then]) -> tuple[Run,
     raise AssertionError("unreachable")
 
 
-def check_fault(fault: Fault, cell: Site, path: Path, *, moving: bool) -> None:
+def check_fault(fault, cell, path, *, moving):
     """Let a run meet a fault after its first reading, and check what the operator sees."""
     for left in reversed(range(TRIES)):
         run, goal = start_run(cell, path, Run.moving if moving else Run.measuring)
@@ -358,7 +340,7 @@ def check_fault(fault: Fault, cell: Site, path: Path, *, moving: bool) -> None:
         cell.slider(1.0)
 
 
-def failed(run: Run, code: int = 3) -> str:
+def failed(run, code=3):
     """Check that a run ended as it should when something fails; returns the line that says why."""
     got, words = run.end()
     assert got == code, words
@@ -369,7 +351,7 @@ def failed(run: Run, code: int = 3) -> str:
     return lines[0]
 
 
-def finish(site: Site, path: Path) -> None:
+def finish(site, path):
     """Resume until it is done, and check the campaign; see `start_run` for more than one try."""
     for left in reversed(range(TRIES)):
         run = Run(site, path)
@@ -382,7 +364,7 @@ def finish(site: Site, path: Path) -> None:
     check_complete(site, path)
 
 
-def check_complete(site: Site, path: Path) -> None:
+def check_complete(site, path):
     """Check that every step of the plan is there once, and that every reading is right."""
     with CampaignFile.open(path) as campaign:
         log = RunLog(campaign)
@@ -392,7 +374,7 @@ def check_complete(site: Site, path: Path) -> None:
     check_readings(site, path)
 
 
-def check_readings(site: Site, path: Path) -> None:
+def check_readings(site, path):
     """Check that every stored reading is what a tracker may read of the state it is stored with."""
     with CampaignFile.open(path) as campaign:
         log = RunLog(campaign)
@@ -423,13 +405,13 @@ def check_readings(site: Site, path: Path) -> None:
     )
 
 
-def check_stopped_within(cell: Site, since: float) -> None:
+def check_stopped_within(cell, since):
     """Check that the arm stands since at most half a second after `since` (monotonic, s)."""
     wait_until(lambda: not cell.ask("arm", "state")["moving"], "at rest", DEADLINE)
     assert cell.ask("arm", "state")["rest_ns"] * 1e-9 - since <= 0.5
 
 
-def check_stopped_on_its_way(cell: Site, since: float, goal: Floats) -> None:
+def check_stopped_on_its_way(cell, since, goal):
     """Check that the arm came to rest in time after `since`, far from where it was to go (6,)."""
     check_stopped_within(cell, since)
     assert np.abs(goal - cell.ask("arm", "state")["q"]).max() > 0.1

@@ -6,22 +6,21 @@ from functools import cache
 import numpy as np
 
 from hilcal.cell import Cell, cell_from_config
-from hilcal.config import CellConfig, load_config
+from hilcal.config import load_config
 from hilcal.drivers.simulated.injected_effects import hide_effect, world_without_effect
 from hilcal.drivers.simulated.rehearsal import simulate
 from hilcal.drivers.simulated.world import SimulatedNoise, World
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import Mode
 from hilcal.robot import se3
-from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import configs_dir
-from hilcal.types import Floats, Ints
+from hilcal.types import Ints
 from studies.random_campaigns import rehearsal_states
 
 NO_EFFECT = "none"
 
 
-def configuration() -> CellConfig:
+def configuration():
     """The cell of `hilcal demo`: a UR10e, two weights and two pulls."""
     return load_config(configs_dir() / "cells" / "demo_ur10e.toml")
 
@@ -47,7 +46,7 @@ class SimulatedCampaign:
     mode: Mode
 
 
-def cell_of(*, registration_known: bool = False, target_known: bool = True) -> Cell:
+def cell_of(*, registration_known=False, target_known=True):
     """The demo's cell; a known registration is some way off the origin and turned."""
     cell = cell_from_config(configuration())
     cell = replace(cell, registration_known=registration_known, target_known=target_known)
@@ -58,7 +57,7 @@ def cell_of(*, registration_known: bool = False, target_known: bool = True) -> C
 
 
 @cache
-def plan(poses: int = 12, seed: int = 0, cycles: int = 1) -> CampaignPlan:
+def plan(poses=12, seed=0, cycles=1):
     """Feasible spread poses under all loads of the configuration; the same for equal arguments."""
     config, cell = configuration(), cell_of()
     pulls = [(load.name, load.wrench(cell.gravity)) for load in config.loads]
@@ -67,7 +66,7 @@ def plan(poses: int = 12, seed: int = 0, cycles: int = 1) -> CampaignPlan:
     return CampaignPlan(states, pose, load, cycle, ("none", *(name for name, _ in pulls)))
 
 
-def world_of(cell: Cell, rng: np.random.Generator) -> World:
+def world_of(cell, rng):
     """A world with joint compliance alone, tracker and repeatability as configured."""
     config = configuration()
     t, joint_std = config.tracker, config.repeatability.per_joint(cell.arm.n)
@@ -78,19 +77,19 @@ def world_of(cell: Cell, rng: np.random.Generator) -> World:
 
 @cache
 def campaign(
-    effect: str = NO_EFFECT,
-    mode: Mode = "absolute",
-    seed: int = 0,
+    effect=NO_EFFECT,
+    mode="absolute",
+    seed=0,
     *,
-    poses: int = 12,
-    strength: float = 3.0,
-    registration_known: bool = False,
-    target_known: bool = True,
-    m: int = 3,
-    cycles: int = 1,
-    plan_seed: int | None = None,
-    harmonics: int = 6,
-) -> SimulatedCampaign:
+    poses=12,
+    strength=3.0,
+    registration_known=False,
+    target_known=True,
+    m=3,
+    cycles=1,
+    plan_seed=None,
+    harmonics=6,
+):
     """Measure a campaign in a world that hides one effect at `strength` σ."""
     cell = cell_of(registration_known=registration_known, target_known=target_known)
     p = plan(poses, 1000 + seed if plan_seed is None else plan_seed, cycles)
@@ -110,18 +109,18 @@ def campaign(
     return SimulatedCampaign(cell, world, readings, mode)
 
 
-def measured(world: World, p: CampaignPlan, rng: np.random.Generator, m: int = 3) -> Readings:
+def measured(world, p, rng, m=3):
     """What the tracker reads of a plan."""
     return simulate(world, p.states, p.pose, p.load, p.cycle, p.load_names, rng, m)
 
 
-def noiseless(world: World, p: CampaignPlan, m: int = 3) -> Readings:
+def noiseless(world, p, m=3):
     """The same without any noise; the covariance stays."""
     readings = measured(world, p, np.random.default_rng(0), m)
     return replace(readings, value=world.ideal_readings(p.states).value(m))
 
 
-def with_noise(clean: Readings, rng: np.random.Generator, factor: float = 1.0) -> Readings:
+def with_noise(clean, rng, factor=1.0):
     """Readings about noiseless ones, normal with `factor`² times the stated covariance."""
     root = factor * np.linalg.cholesky(clean.covariance)
     error = np.einsum("nij,nj->ni", root, rng.standard_normal(clean.value.shape))
@@ -132,7 +131,7 @@ def with_noise(clean: Readings, rng: np.random.Generator, factor: float = 1.0) -
     return replace(clean, value=value)
 
 
-def true_parameters(world: World, effect: str, *, m: int = 3) -> Floats:
+def true_parameters(world, effect, *, m=3):
     """Parameters of one effect of the program that describe the world, in its order."""
     truth = np.asarray(getattr(world.physics, effect)).reshape(-1)
     if effect == "target_offset" and m == 6:
@@ -142,7 +141,7 @@ def true_parameters(world: World, effect: str, *, m: int = 3) -> Floats:
     return truth
 
 
-def distal_factors(arm: Arm) -> Ints:
+def distal_factors(arm):
     """Where among n x n factors, row by row, those of joints behind one another are."""
     n = arm.n
     pairs = np.eye(n, k=-1)

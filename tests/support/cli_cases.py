@@ -9,19 +9,15 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from hilcal.cli import main
-from hilcal.config import CellConfig, load_config
-from hilcal.drivers.simulated.rehearsal import Rehearsal
+from hilcal.config import load_config
 from hilcal.readings.covariance import COVERS_KEY, INSTRUMENT_AND_ARM
-from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.table import write_table
@@ -33,7 +29,7 @@ CELL = configs_dir() / "cells" / "demo_ur10e.toml"
 POSES = 14
 
 
-def quickly_planned(config: CellConfig) -> CellConfig:
+def quickly_planned(config):
     """The same cell, whose plans take a second: few candidates, no effect to look out for."""
     return config.with_keys("planning", candidates=60, against=())
 
@@ -45,12 +41,12 @@ class Outcome:
     err: str
 
     @property
-    def document(self) -> dict[str, Any]:
+    def document(self):
         """What stdout holds: one JSON document and nothing else."""
         return dict(json.loads(self.out))
 
 
-def run(capsys: Capsys, *arguments: str | Path) -> Outcome:
+def run(capsys, *arguments):
     """Run a command in this process; one of `python -m studies` where it begins with "studies"."""
     capsys.readouterr()
     command, given = (
@@ -63,13 +59,13 @@ def run(capsys: Capsys, *arguments: str | Path) -> Outcome:
     return Outcome(ended.value.code, told.out, told.err)
 
 
-def ok(capsys: Capsys, *arguments: str | Path) -> Outcome:
+def ok(capsys, *arguments):
     result = run(capsys, *arguments)
     assert result.code == 0, result.err
     return result
 
 
-def done(*arguments: str | Path) -> None:
+def done(*arguments):
     """Run a command that must succeed, where a fixture makes something once for many tests."""
     with (
         contextlib.redirect_stdout(io.StringIO()),
@@ -80,7 +76,7 @@ def done(*arguments: str | Path) -> None:
     assert ended.value.code == 0, said.getvalue()
 
 
-def refused(capsys: Capsys, code: int, *arguments: str | Path) -> str:
+def refused(capsys, code, *arguments):
     """Run a command that must be refused; returns the one line on stderr that says why."""
     result = run(capsys, *arguments)
     assert result.code == code, result
@@ -92,7 +88,7 @@ def refused(capsys: Capsys, code: int, *arguments: str | Path) -> str:
     return lines[0]
 
 
-def start(*arguments: str | Path, **options: Any) -> "subprocess.Popen[str]":
+def start(*arguments, **options):
     """Start the program as a process of its own."""
     root = str(Path(__file__).resolve().parents[2])
     return subprocess.Popen(
@@ -105,13 +101,11 @@ def start(*arguments: str | Path, **options: Any) -> "subprocess.Popen[str]":
     )
 
 
-def rehearsal(hidden: str, seed: int = 1, poses: int = POSES) -> Rehearsal:
+def rehearsal(hidden, seed=1, poses=POSES):
     return rehearse(load_config(CELL), hidden, seed, poses)
 
 
-def stored_readings(
-    path: Path, readings: Readings, config: CellConfig | None = None, covers: str | None = None
-) -> Path:
+def stored_readings(path, readings, config=None, covers=None):
     """Write a campaign file that holds readings alone; in the cell of the demo unless given."""
     content, base_dir = (config or load_config(CELL)).to_json(), str(CELL.parent)
     more = {} if covers is None else {COVERS_KEY: covers}
@@ -121,13 +115,13 @@ def stored_readings(
     return path
 
 
-def table(path: Path, hidden: str, seed: int = 1, poses: int = POSES) -> Path:
+def table(path, hidden, seed=1, poses=POSES):
     write_table(rehearsal(hidden, seed, poses).readings, path, INSTRUMENT_AND_ARM)
     return path
 
 
 @cache
-def _imported(hidden: str, seed: int, poses: int, then: tuple[str, ...]) -> Path:
+def _imported(hidden, seed, poses, then):
     """A campaign as a command has left it; made once in a process."""
     folder = Path(tempfile.mkdtemp(prefix="hilcal-tests-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
@@ -141,9 +135,7 @@ def _imported(hidden: str, seed: int, poses: int, then: tuple[str, ...]) -> Path
     return run
 
 
-def imported(
-    path: Path, hidden: str = "hysteresis", seed: int = 1, poses: int = 8, then: Sequence[str] = ()
-) -> Path:
+def imported(path, hidden="hysteresis", seed=1, poses=8, then=()):
     """A campaign imported from a table into the cell of the demo, and what one command adds.
 
     The table lies beside the campaign.

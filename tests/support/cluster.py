@@ -4,9 +4,7 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
 
@@ -16,13 +14,13 @@ WORKER = ("--host", "127.0.0.1", "--no-nanny", "--no-dashboard", "--nthreads", "
 """Of `dask worker`, behind the address."""
 
 
-def environment() -> dict[str, str]:
+def environment():
     """As it is now, with this checkout on the path."""
     return {**os.environ, "PYTHONPATH": str(ROOT)}
 
 
 @contextmanager
-def running(*command: str) -> "Iterator[subprocess.Popen[str]]":
+def running(*command):
     process = subprocess.Popen(
         [sys.executable, "-m", *command],
         env=environment(),
@@ -38,12 +36,11 @@ def running(*command: str) -> "Iterator[subprocess.Popen[str]]":
 
 
 @contextmanager
-def scheduler(protocol: str = "tcp") -> Iterator[str]:
+def scheduler(protocol="tcp"):
     """A real scheduler on loopback; its address."""
     host = ("--host", "127.0.0.1", "--protocol", protocol)
     command = ("dask", "scheduler", *host, "--port", "0", "--no-dashboard")
     with running(*command, "--dashboard-address", "127.0.0.1:0") as process:
-        assert process.stderr is not None
         for line in process.stderr:
             if found := re.search(r"Scheduler at:\s*(\w+://127\S+)", line):
                 yield found[1]
@@ -51,7 +48,7 @@ def scheduler(protocol: str = "tcp") -> Iterator[str]:
     pytest.fail("no scheduler")
 
 
-def certificates(folder: Path, names: tuple[str, ...]) -> None:
+def certificates(folder, names):
     """Make an authority of each name, and a certificate `NAME-own` of it."""
     for name in names:
         key = ("-newkey", "rsa:2048", "-nodes", "-keyout")
@@ -63,11 +60,11 @@ def certificates(folder: Path, names: tuple[str, ...]) -> None:
                 "-CAkey", f"{name}.key", "-CAcreateserial", "-out", f"{name}-own.pem")  # fmt: skip
 
 
-def openssl(folder: Path, *arguments: str) -> None:
+def openssl(folder, *arguments):
     subprocess.run(["openssl", *arguments], cwd=folder, check=True, capture_output=True)
 
 
-def tls(folder: Path, name: str) -> dict[str, str]:
+def tls(folder, name):
     """Dask's configuration of an authority's certificate, for scheduler, worker and client."""
     at = "distributed.comm.tls"
     own = {"cert": f"{folder}/{name}-own.pem", "key": f"{folder}/{name}-own.key"}
@@ -76,7 +73,7 @@ def tls(folder: Path, name: str) -> dict[str, str]:
     return {f"{at}.ca-file": f"{folder}/{name}.pem", **roles}
 
 
-def in_environment(settings: dict[str, str]) -> dict[str, str]:
+def in_environment(settings):
     """Dask's configuration as environment variables."""
     return {f"DASK_{k}".replace(".", "__").replace("-", "_").upper(): v
             for k, v in settings.items()}  # fmt: skip

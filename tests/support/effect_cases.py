@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from hilcal.cell import Cell
 from hilcal.effects.catalogue import BUILT_IN, installed
 from hilcal.effects.options import typical_compliances
 from hilcal.effects.protocol import Situation
@@ -11,7 +10,6 @@ from hilcal.readings.readings import States
 from hilcal.robot import chain as chains
 from hilcal.robot.chain import Deviation
 from hilcal.robot.statics import Load, slot_wrenches
-from hilcal.types import Floats
 from tests.support.arm_cases import RAILS, arm_of
 from tests.support.arm_cases import cell_of as odd_cell
 from tests.support.campaigns import cell_of
@@ -23,7 +21,7 @@ NAMES = tuple(e.name for e in BUILT_IN if e.applies(cell_of()) and e.role != "ob
 """Those that an arm without slides can have."""
 
 
-def some_states(cell: Cell, count: int = 9, seed: int = 1) -> States:
+def some_states(cell, count=9, seed=1):
     rng = np.random.default_rng(seed)
     n = cell.arm.n
     wrench = rng.normal(size=(count, 6)) * [40, 40, 40, 6, 6, 6]
@@ -39,10 +37,10 @@ def some_states(cell: Cell, count: int = 9, seed: int = 1) -> States:
     )
 
 
-def options_of(name: str, m: int = 3) -> dict[str, object]:
+def options_of(name, m=3):
     if name == "target_offset":
         return {"rotation": m == 6}
-    known: dict[str, dict[str, object]] = {
+    known = {
         "tracker_drift": {"reference_s": 0.0},
         "transmission_error": {"harmonics": 3},
         "thermal_joint_drift": {"reference_degC": 22.0},
@@ -51,7 +49,7 @@ def options_of(name: str, m: int = 3) -> dict[str, object]:
 
 
 TURN = [0.3, -0.5, 1.1]
-VARIANTS: tuple[tuple[str, dict[str, object]], ...] = (
+VARIANTS = (
     ("periodic_joint_compliance", {"orders": [1, 4, 2]}),
     ("backlash", {"crossing": 0.3}),
     ("creep", {"form": "each"}),
@@ -64,7 +62,7 @@ VARIANTS: tuple[tuple[str, dict[str, object]], ...] = (
 """Effects with options other than the usual ones."""
 
 
-def situation(cell: Cell, seed: int = 2) -> Situation:
+def situation(cell, seed=2):
     """A configuration that is visibly deflected, under wrenches and weight."""
     states = some_states(cell, seed=seed)
     rng = np.random.default_rng(seed)
@@ -119,14 +117,14 @@ def numeric_jacobian(model, states, theta, scale, m):
 SOFT = 2e-5  # compliance of every joint in what follows, rad/(N·m)
 
 
-def soft(cell: Cell, states: States, name: str, options=None) -> Model:
+def soft(cell, states, name, options=None):
     names = ("joint_compliance", name)
     return Model(cell, tuple(make(n, cell, states, options if n == name else {}) for n in names))
 
 
-def position(model: Model, states: States, *theta: Floats) -> Floats:
+def position(model, states, *theta):
     return model.predict(states, np.concatenate(theta)).observation.position
 
 
-def joints(cell: Cell) -> Floats:
+def joints(cell):
     return np.full(cell.arm.n, SOFT)

@@ -3,7 +3,6 @@
 import os
 import signal
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,29 +13,29 @@ from hilcal.engine import open_engine
 Ints = NDArray[np.integer[Any]]
 
 
-def singular_value(item: int, rng: np.random.Generator) -> float:
+def singular_value(item, rng):
     """Takes BLAS, whose threads could change the last bits, and a while."""
     a = rng.normal(size=(120, 120))
     time.sleep(0.02)
     return float(np.linalg.svd(a @ a.T, compute_uv=False)[item % 7])
 
 
-def wait(item: int) -> int:
+def wait(item):
     """The first is done at once."""
     os.write(2, b"computing\n")  # whole, whatever another worker writes at the same moment
     time.sleep(60 if item else 0)
     return item
 
 
-def negative(item: Ints) -> Ints:
+def negative(item):
     return -item
 
 
-def strides(item: Any) -> tuple[int, ...]:
+def strides(item):
     return item.strides
 
 
-def die_once(item: int, folder: Path) -> int:
+def die_once(item, folder):
     """Items 1 and 4 kill their worker where the folder has no note that they did so before."""
     note = folder / str(item)
     if item in (1, 4) and not note.exists():
@@ -46,7 +45,7 @@ def die_once(item: int, folder: Path) -> int:
     return item
 
 
-def refuse(item: int) -> int:
+def refuse(item):
     if item == 3:
         raise ValueError("item 3 is odd")
     return item

@@ -4,17 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from hilcal.cell import Cell, cell_from_config
+from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, Robot, Tool
-from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
 
 
-def ur10e_arm() -> Arm:
+def ur10e_arm():
     return load_arm("ur10e")
 
 
-def ur10e_cell(*, registration_known: bool = False, target_known: bool = True) -> Cell:
+def ur10e_cell(*, registration_known=False, target_known=True):
     """A UR10e with a load adapter of 1.5 kg and a target beside the load point."""
     config = CellConfig(
         robot=Robot(model="ur10e"),

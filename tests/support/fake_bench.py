@@ -1,9 +1,8 @@
 """A bench in memory: devices that share one small world, cell, plans, and a store."""
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 
@@ -37,7 +36,7 @@ from hilcal.robot import chain as chains
 from hilcal.robot import se3
 from hilcal.store.plan import Plan, Step
 from hilcal.store.stored_schema import DETAIL, check, check_event
-from hilcal.types import Bools, Floats
+from hilcal.types import Floats
 
 REGISTRATION = se3.matrix(se3.rotation(np.array([0.02, -0.03, 2.1])), np.array([2.4, -1.6, -0.5]))
 SAG = 2e-5  # m/N, how far the target gives way along the force
@@ -85,14 +84,14 @@ class FakeWorld:
     at_start: list[tuple[Floats, str]] = field(default_factory=list)  # load at each motion
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(5))
 
-    def call(self, name: str) -> None:
+    def call(self, name):
         """Count a call; fail where that is wanted."""
         if self.killed:
             raise Killed
         self.calls.append(name)
         k = len(self.calls)
         last = self.kill_after is not None and self.kill_after[0] == name
-        if last and self.calls.count(name) == self.kill_after[1]:  # type: ignore[index]
+        if last and self.calls.count(name) == self.kill_after[1]:
             self.kill_at = k
         if self.kill_at == k:
             self.killed = True
@@ -100,7 +99,7 @@ class FakeWorld:
         if k in self.fail:
             raise self.fail[k]
 
-    def restart(self) -> None:
+    def restart(self):
         """Start the program anew: the arm has stopped where it was, the load still hangs."""
         self.joints()
         self.is_moving = self.control = self.killed = False
@@ -108,27 +107,27 @@ class FakeWorld:
         self.fail = {}
         self.calls.clear()
 
-    def joints(self) -> Floats:
+    def joints(self):
         if self.is_moving:
             share = min(1.0, (self.time - self.motion_start) / self.motion_duration)
             self.q = self.start + share * (self.goal - self.start)
             self.is_moving = share < 1.0
         return self.q
 
-    def pull(self) -> Floats:
+    def pull(self):
         """(6,) wrench of the load at the load point, base axes."""
         for load in self.config.loads:
             if load.name == self.load:
                 return load.wrench(self.cell.gravity)
         return np.zeros(6)
 
-    def position(self) -> Floats:
+    def position(self):
         """(3,) target in sensor axes."""
         chain = chains.evaluate(self.cell.arm, self.joints()[None])
         at = chain.point(self.cell.target[:3, 3])[0] + SAG * self.pull()[:3] + self.shift
         return REGISTRATION[:3, :3] @ at + REGISTRATION[:3, 3] + self.creep * self.time
 
-    def wrench(self) -> Floats:
+    def wrench(self):
         """(6,) what the sensor reads, sensor axes (those of the flange)."""
         rotation = chains.evaluate(self.cell.arm, self.joints()[None]).rotation[-1][0]
         force = rotation.T @ (self.tool_mass * self.cell.gravity)
@@ -142,13 +141,13 @@ class FakeWorld:
 class MemoryStore:
     """Keeps what it is given, as JSON where a file would; may be full."""
 
-    def __init__(self, world: FakeWorld) -> None:
+    def __init__(self, world):
         self.world = world
-        self.refuses: dict[int, Exception] = {}  # by the number of rows that are there
-        self.rows: list[tuple[Step, Readings, str]] = []
-        self.events: list[tuple[str, dict[str, Any]]] = []
+        self.refuses = {}  # by the number of rows that are there
+        self.rows = []
+        self.events = []
 
-    def record(self, reading: Readings, step: Step, detail: dict[str, Any]) -> None:
+    def record(self, reading, step, detail):
         self.world.call("store.record")
         if len(self.rows) in self.refuses:
             raise self.refuses[len(self.rows)]
@@ -159,18 +158,18 @@ class MemoryStore:
         self.rows.append((step, reading, text))
         self.world.call("store.recorded")
 
-    def event(self, kind: str, content: dict[str, Any]) -> None:
+    def event(self, kind, content):
         self.world.call("store.event")
         check_event(json.loads(json.dumps({"kind": kind, "utc": "now", **content})))
         self.events.append((kind, content))
 
-    def done(self) -> frozenset[Step]:
+    def done(self):
         return frozenset(step for step, _, _ in self.rows)
 
-    def details(self) -> list[dict[str, Any]]:
+    def details(self):
         return [json.loads(text) for _, _, text in self.rows]
 
-    def readings(self) -> Readings | None:
+    def readings(self):
         if not self.rows:
             return None
         rows = [reading for _, reading, _ in self.rows]
@@ -184,10 +183,10 @@ class MemoryStore:
             pose_names=poses,
         )
 
-    def kinds(self) -> list[str]:
+    def kinds(self):
         return [kind for kind, _ in self.events]
 
-    def last(self, kind: str) -> Any:
+    def last(self, kind):
         return next((content for k, content in reversed(self.events) if k == kind), None)
 
 
@@ -197,10 +196,10 @@ class EventLog:
 
     events: list[object] = field(default_factory=list)
 
-    def notify(self, event: object) -> None:
+    def notify(self, event):
         self.events.append(event)
 
-    def of_kind(self, kind: type) -> list[Any]:
+    def of_kind(self, kind):
         return [event for event in self.events if isinstance(event, kind)]
 
 
@@ -209,13 +208,24 @@ TORQUE = np.array([3.0, -40.0, 20.0, 5.0, 1.0, -0.5])  # N·m, of every pose
 
 
 @dataclass
-class FakeArm:
+class FakeDevice:
+    """What all devices answer alike."""
+
     world: FakeWorld
+    name: ClassVar[str]
 
-    def report(self) -> Report:
-        return Report("arm", "fake")
+    def report(self):
+        return Report(self.name, "fake")
 
-    def sample(self) -> ArmSample:
+    def close(self):
+        return
+
+
+@dataclass
+class FakeArm(FakeDevice):
+    name = "arm"
+
+    def sample(self):
         w = self.world
         w.call("arm.sample")
         q = w.joints()
@@ -243,17 +253,17 @@ class FakeArm:
             torque=TORQUE + 0.1 * w.rng.standard_normal(6) if w.torques >= 0 else None,
         )
 
-    def take_control(self, mass: float, com: Floats) -> None:
+    def take_control(self, mass, com):
         self.world.call("arm.take_control")
         self.world.control, self.world.payload = True, (mass, com)
 
-    def set_payload(self, mass: float, com: Floats) -> None:
+    def set_payload(self, mass, com):
         self.world.call("arm.set_payload")
         assert self.world.control
         assert not self.world.is_moving
         self.world.payload = (mass, com)
 
-    def start_move(self, q: Floats, speed: float, acceleration: float) -> None:
+    def start_move(self, q, speed, acceleration):
         w = self.world
         w.call("arm.start_move")
         assert w.control, "a motion without control"
@@ -264,30 +274,27 @@ class FakeArm:
         w.is_moving = True
         w.at_start.append((q.copy(), w.load))
 
-    def moving(self) -> bool:
+    def moving(self):
         self.world.call("arm.moving")
         self.world.joints()
         return self.world.is_moving
 
-    def stop(self) -> None:
+    def stop(self):
         self.world.call("arm.stop")
         self.world.joints()
         self.world.is_moving = False
 
-    def close(self) -> None:
+    def close(self):
         self.world.is_moving = self.world.control = False
 
 
 @dataclass
-class FakeTracker:
+class FakeTracker(FakeDevice):
     """A tracker with white noise."""
 
-    world: FakeWorld
+    name = "tracker"
 
-    def report(self) -> Report:
-        return Report("tracker", "fake")
-
-    def measure(self) -> TrackerSample:
+    def measure(self):
         w = self.world
         w.call("tracker.measure")
         w.time += 0.1
@@ -298,7 +305,7 @@ class FakeTracker:
         value = w.position() + STD * w.rng.standard_normal(3)
         return TrackerSample(int(w.time * 1e9), value, STD**2 * np.eye(3))
 
-    def find_target(self) -> None:
+    def find_target(self):
         w = self.world
         w.call("tracker.find_target")
         w.time += 1.0
@@ -306,50 +313,38 @@ class FakeTracker:
             w.not_found -= 1
             raise TargetLostError("tracker: no target found")
 
-    def close(self) -> None:
-        return
-
 
 @dataclass
-class FakeForce:
+class FakeForce(FakeDevice):
     """A force sensor of 100 Hz."""
 
-    world: FakeWorld
+    name = "force sensor"
 
-    def report(self) -> Report:
-        return Report("force sensor", "fake")
-
-    def latest(self) -> WrenchSample:
+    def latest(self):
         self.world.call("force.latest")
         return self._sample(1)
 
-    def average(self, seconds: float) -> WrenchSample:
+    def average(self, seconds):
         self.world.call("force.average")
         self.world.time += seconds
         return self._sample(int(100 * seconds))
 
-    def _sample(self, frames: int) -> WrenchSample:
+    def _sample(self, frames):
         covariance = np.diag([0.01] * 3 + [1e-4] * 3) if frames > 1 else np.zeros((6, 6))
         return WrenchSample(int(self.world.time * 1e9), self.world.wrench(), covariance, frames)
 
-    def losses(self) -> Losses:
+    def losses(self):
         return Losses(1000, 0, 0, 0)
-
-    def close(self) -> None:
-        return
 
 
 @dataclass
-class FakeOperator:
+class FakeOperator(FakeDevice):
     """Hangs what it is asked for, or what `FakeWorld.wrong_loads` says."""
 
-    world: FakeWorld
+    name = "operator"
     requests: list[tuple[str, str]] = field(default_factory=list)
 
-    def report(self) -> Report:
-        return Report("operator", "fake")
-
-    def hang(self, load: CellLoad | None, why: str) -> None:
+    def hang(self, load, why):
         w = self.world
         w.call("operator.hang")
         assert not w.is_moving, "a person asked to work at a moving arm"
@@ -358,13 +353,10 @@ class FakeOperator:
         w.time += 20.0
         w.load = w.wrong_loads.pop(0) if w.wrong_loads else name
 
-    def confirm(self, question: str) -> None:
+    def confirm(self, question):
         self.world.call("operator.confirm")
         assert not self.world.is_moving, "a person asked to look at a moving arm"
         self.requests.append(("confirm", question))
-
-    def close(self) -> None:
-        return
 
 
 @dataclass(frozen=True)
@@ -373,18 +365,16 @@ class FakeClock(Clock):
 
     world: FakeWorld | None = None
 
-    def now(self) -> float:
-        assert self.world is not None
+    def now(self):
         return self.world.time
 
-    def sleep(self, seconds: float) -> None:
-        assert self.world is not None
+    def sleep(self, seconds):
         self.world.time += max(0.0, seconds)
 
 
-def configuration(**changes: Any) -> CellConfig:
+def configuration(**changes):
     """A UR10e with a force sensor, two weights and a pull."""
-    sections: dict[str, Any] = {
+    sections = {
         "robot": Robot(model="ur10e"),
         "tool": Tool(
             target_m=(0.06, 0.02, 0.12),
@@ -416,12 +406,12 @@ POSES = {
 }
 
 
-def plan_of(*steps: tuple[str, str, int], poses: dict[str, Any] | None = None) -> Plan:
+def plan_of(*steps, poses=None):
     poses = POSES if poses is None else poses
     return Plan(tuple(poses), np.array(list(poses.values())), tuple(Step(*step) for step in steps))
 
 
-def usual_plan(names: tuple[str, ...] = ("p1", "p2", "p3", "p4")) -> Plan:
+def usual_plan(names=("p1", "p2", "p3", "p4")):
     """Four poses unloaded and under each load, with returns to the reference pose."""
     steps = [("reference", "none", 0), *((p, "none", 0) for p in names)]
     for cycle, load in enumerate(("3kg", "pull"), start=1):
@@ -437,7 +427,7 @@ FEW_POSES = usual_plan(("p1", "p3"))
 class Bench:
     """Everything that a run needs, in memory."""
 
-    def __init__(self, **changes: Any) -> None:
+    def __init__(self, **changes):
         self.cell = cell_from_config(configuration(**changes))
         start = np.array([0.1, -1.3, 1.6, -1.4, -1.4, 0.1])
         self.world = FakeWorld(self.config, self.cell, start)
@@ -449,31 +439,30 @@ class Bench:
         self.clock = FakeClock(world=self.world)
 
     @property
-    def config(self) -> CellConfig:
+    def config(self):
         """The configuration of the cell."""
         return self.cell.configured()
 
     @config.setter
-    def config(self, config: CellConfig) -> None:
+    def config(self, config):
         self.cell = self.cell.with_config(config)
 
     @property
-    def requested_loads(self) -> list[str]:
+    def requested_loads(self):
         """Names of the loads that were asked for, in order."""
         return [name for name, _ in self.operator.requests]
 
-    def remarks(self, words: str = "") -> list[str]:
+    def remarks(self, words=""):
         return [note.text for note in self.notes.of_kind(Remark) if words in note.text]
 
-    def measure(self, plan: Plan | None = None, **more: Any) -> Readings:
+    def measure(self, plan=None, **more):
         """Run a plan (the usual one if None) to its end; returns all readings."""
         plan = plan or usual_plan()
         run(self.rig, self.cell, plan, self.store, self.clock, self.notes, **more)
         readings = self.store.readings()
-        assert readings is not None
         return readings
 
-    def interrupt(self, stored: int, plan: Plan | None = None, **more: Any) -> None:
+    def interrupt(self, stored, plan=None, **more):
         """Kill a run when so many readings are stored, and start the program anew."""
         self.world.kill_after = ("store.recorded", stored)
         try:
@@ -484,22 +473,22 @@ class Bench:
             raise AssertionError("the run came to its end")
 
 
-def call_before(device: Any, call: str, action: Callable[..., None]) -> None:
+def call_before(device, call, action):
     """Have something done before each call of a device, with what the call is given."""
     real = getattr(device, call)
 
-    def first(*given: Any) -> Any:
+    def first(*given):
         action(*given)
         return real(*given)
 
     setattr(device, call, first)
 
 
-def change_result(device: Any, call: str, by: Callable[[Any], Any]) -> None:
+def change_result(device, call, by):
     """Have something else returned by each call of a device, made of what it returns."""
     real = getattr(device, call)
     setattr(device, call, lambda *given: by(real(*given)))
 
 
-def rows(readings: Readings, load: str) -> Bools:
+def rows(readings, load):
     return readings.load == readings.load_names.index(load)

@@ -3,7 +3,6 @@
 import re
 import threading
 import time
-from collections.abc import Callable
 from contextlib import ExitStack, closing, suppress
 
 import numpy as np
@@ -14,7 +13,7 @@ from hilcal.drivers import bota, ft300, onrobot_hex
 from hilcal.errors import DeviceError
 from tests.support.instruments import WARM, WRENCH, force_sensor
 
-OPEN: dict[str, Callable] = {
+OPEN = {
     "ft300": ft300.open_force_sensor,
     "bota": bota.open_force_sensor,
     "hex": onrobot_hex.open_force_sensor,
@@ -45,7 +44,7 @@ def fails(action, match):
     """Do it again and again until it fails, with one line, in time."""
     start = time.monotonic()
 
-    def again() -> None:
+    def again():
         while time.monotonic() < start + DEADLINE_S + SLACK_S:
             try:
                 action()

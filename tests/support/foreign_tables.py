@@ -1,7 +1,6 @@
 """Tables as other people write them, of readings of the nominal demo arm."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -25,12 +24,12 @@ class Campaign:
     position: np.ndarray
     attitude: Rotation
 
-    def angles(self, convention: str) -> np.ndarray:
+    def angles(self, convention):
         """(N, 3) deg, as scipy names conventions."""
         return np.rad2deg(self.attitude.as_euler(convention))
 
 
-def campaign(poses: int = 24, seed: int = 4) -> Campaign:
+def campaign(poses=24, seed=4):
     rng = np.random.default_rng(seed)
     arm = load_arm(load_config(CELL).robot.model)
     q = rng.uniform(-1.0, 1.0, (poses, 6)) * [2.4, 0.6, 1.0, 2.0, 1.8, 2.6] + [
@@ -48,10 +47,10 @@ def campaign(poses: int = 24, seed: int = 4) -> Campaign:
     return Campaign(q, position, BASE * r * MOUNT)
 
 
-def lines(header: list[str] | None, *columns: object, separator: str = ";", comma: bool = False,
-          digits: int = 6) -> str:  # fmt: skip
+def lines(header, *columns, separator = ";", comma = False,
+          digits = 6):  # fmt: skip
     """Text of columns, each (N,), (N, k) or a list of names."""
-    cells: list[list[str]] = []
+    cells = []
     for column in columns:
         array = np.asarray(column)
         if array.dtype.kind in "US":
@@ -64,6 +63,6 @@ def lines(header: list[str] | None, *columns: object, separator: str = ";", comm
     return "\n".join([*([separator.join(header)] if header else []), *rows]) + "\n"
 
 
-def write(path: Path, text: str, encoding: str = "utf-8") -> Path:
+def write(path, text, encoding="utf-8"):
     path.write_bytes(text.encode(encoding))
     return path

@@ -4,13 +4,12 @@ import os
 import select
 import threading
 import tty
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from hilcal.config import CellConfig
 
 
-def crc16(data: bytes, crc: int = 0) -> int:
+def crc16(data, crc=0):
     """CRC-16/ARC, bit by bit; of Modbus (over Serial Line V1.02, 6.2.2) where it begins at FFFF."""
     for byte in data:
         crc ^= byte
@@ -19,14 +18,12 @@ def crc16(data: bytes, crc: int = 0) -> int:
     return crc
 
 
-def line(head: str, body: str) -> bytes:
+def line(head, body):
     """A reply with its checksum; `head` is %R1P,com,transaction."""
     return f"{head},{crc16(f'{head}:{body}'.encode())}:{body}\r\n".encode()
 
 
-Table = dict[int, str | Callable[[str, str], bytes]]
-
-GREETING: Table = {
+GREETING = {
     0: "0",
     108: "0,15",
     110: "0,1,50,0",
@@ -40,16 +37,16 @@ UNKNOWN = "3081"
 
 
 @contextmanager
-def table_instrument(table: Table) -> Iterator[tuple[str, list[int]]]:
+def table_instrument(table):
     """Serve a table: request number -> body of the reply, or a function(transaction, arguments) of
     its bytes; requests that are not in it are unknown. The table may change meanwhile; yields
     the port and the numbers of the requests."""
-    asked: list[int] = []
+    asked = []
     master, slave = os.openpty()
     tty.setraw(slave)
     stop, woken = os.pipe()[::-1]
 
-    def reply(text: str) -> bytes:
+    def reply(text):
         head, _, rest = text.partition(":")
         _, number, transaction = head.split(",")[:3]
         asked.append(int(number))
@@ -60,7 +57,7 @@ def table_instrument(table: Table) -> Iterator[tuple[str, list[int]]]:
             return line(f"%R1P,{UNKNOWN},{transaction}", "0")
         return line(f"%R1P,0,{transaction}", answer)
 
-    def serve() -> None:
+    def serve():
         buffer = b""
         while True:
             ready, _, _ = select.select([master, woken], [], [])
@@ -83,7 +80,7 @@ def table_instrument(table: Table) -> Iterator[tuple[str, list[int]]]:
             os.close(end)
 
 
-def cell(port: object, scale: float = 20.0, **tracker: object) -> CellConfig:
+def cell(port, scale=20.0, **tracker):
     return CellConfig.model_validate(
         {
             "robot": {"model": "ur10e"},

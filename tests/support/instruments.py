@@ -1,11 +1,9 @@
 """Simulated instruments for tests: a process each, in a world that the test writes."""
 
 import tempfile
-from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -36,33 +34,31 @@ class Instrument:
     board: Blackboard  # the shared world; the test is its writer
 
     @property
-    def port(self) -> Path:
+    def port(self):
         """The serial port to open."""
         return self.process.socket.with_suffix("")
 
-    def admin(self, op: str = "state", **arguments: Any) -> Any:
+    def admin(self, op="state", **arguments):
         """Switch a fault, or ask for the state."""
         return ask(self.process.socket, op, **arguments)
 
-    def truth(self, **fields: Any) -> None:
+    def truth(self, **fields):
         """Write what is true in the world, e.g. `target` or `sensor_wrench`."""
         self.board.write("truth", time=self.board.time, **fields)
 
-    def start(self) -> None:
+    def start(self):
         """Start the server, and wait until it answers."""
         self.process.start()
         wait_until(lambda: self.process.socket.exists() or self.process.has_ended, "started")
         self.process.check()
 
-    def close(self) -> None:
+    def close(self):
         """End the server as the end of its parent would."""
         self.process.end()
 
 
 @contextmanager
-def running(
-    module: str, name: str, *options: str, scale: float = 1.0, seed: int = 1, **truth: Any
-) -> Iterator[Instrument]:
+def running(module, name, *options, scale=1.0, seed=1, **truth):
     """Run `hilcal.drivers.simulated.<module>` in a world that says `truth` from the beginning."""
     with tempfile.TemporaryDirectory() as directory:
         arguments = ("--seed", str(seed), *options)
@@ -78,9 +74,7 @@ def running(
 
 
 @contextmanager
-def tracker(
-    target: tuple[float, float, float] = TARGET, *options: str, scale: float = 20.0
-) -> Iterator[Instrument]:
+def tracker(target=TARGET, *options, scale=20.0):
     """Run a GeoCOM station that sees `target` (its own axes, m)."""
     at = np.array(target)
     with running(
@@ -90,9 +84,7 @@ def tracker(
 
 
 @contextmanager
-def force_sensor(
-    kind: str, *options: str, scale: float = 1.0, seed: int = 1
-) -> Iterator[Instrument]:
+def force_sensor(kind, *options, scale=1.0, seed=1):
     """Run a force sensor ("ft300", "bota", "hex") that feels `WRENCH` (its axes, N and N·m)."""
     with running(
         "force_server", "force", "--kind", kind, *options,
@@ -105,7 +97,7 @@ def force_sensor(
 
 
 @contextmanager
-def emscon() -> Iterator[tuple[Instrument, str]]:
+def emscon():
     """Run a laser tracker that sees `TARGET`, turned by `TURNED`; yields its address, too."""
     host = free_host()
     place = ("--host", host, "--port", str(EMSCON_PORT))
@@ -117,7 +109,7 @@ def emscon() -> Iterator[tuple[Instrument, str]]:
 
 
 @contextmanager
-def natnet(*options: str) -> Iterator[tuple[Instrument, str]]:
+def natnet(*options):
     """Run cameras that see `TARGET`, turned by `TURNED`; yields their address, too."""
     host = free_host()
     with running(
@@ -128,7 +120,7 @@ def natnet(*options: str) -> Iterator[tuple[Instrument, str]]:
 
 
 @contextmanager
-def netft() -> Iterator[tuple[Instrument, str]]:
+def netft():
     """Run a Net F/T that feels `WRENCH`, warm; yields its address without a port, too."""
     host = free_host()
     place = ("--kind", "netft", "--host", host)
@@ -136,7 +128,7 @@ def netft() -> Iterator[tuple[Instrument, str]]:
         yield sensor, host
 
 
-def cell(address: str, driver: str, **options: Any) -> CellConfig:
+def cell(address, driver, **options):
     """A cell whose tracker is in the network."""
     return CellConfig.model_validate(
         {
@@ -147,7 +139,7 @@ def cell(address: str, driver: str, **options: Any) -> CellConfig:
     )
 
 
-def force_cell(host: str, **options: Any) -> CellConfig:
+def force_cell(host, **options):
     """A cell whose force sensor is a Net F/T."""
     section = {"driver": "netft", "host": host, "options": {"web_port": WEB_PORT, **options}}
     return CellConfig.model_validate({"robot": {"model": "ur10e"}, "force_sensor": section})

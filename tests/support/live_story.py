@@ -1,7 +1,5 @@
 """What a command tells its live viewer while it measures: a UR10e whose model fails under load."""
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from hilcal.measuring.progress import ArmPosition, LiveResidual, Phase, ReadingStored, Remark
@@ -13,7 +11,7 @@ START_S = 1_800_000_000.0  # the time of day at which it begins, s
 READINGS_BEFORE_MODEL = 8  # readings before there is a model
 
 
-def plan(poses: int = 24, loads: tuple[str, ...] = ("none", "10kg"), seed: int = 3) -> Plan:
+def plan(poses=24, loads=("none", "10kg"), seed=3):
     rng = np.random.default_rng(seed)
     low, high = np.array([-1.6, -2.3, 0.3, -2.4, -2.0, -1.0]), np.array([1.6, -0.5, 2.0, 0, -1, 1])
     names = tuple(f"p{k + 1}" for k in range(poses))
@@ -21,15 +19,13 @@ def plan(poses: int = 24, loads: tuple[str, ...] = ("none", "10kg"), seed: int =
     return Plan(names, rng.uniform(low, high, (poses, 6)), steps)
 
 
-def measuring(
-    made: Plan | None = None, earlier: tuple[tuple[float, Step], ...] = ()
-) -> MeasuringStart:
+def measuring(made=None, earlier=()):
     return MeasuringStart(
         "RUN.hilcal", ur10e(), np.array([[0.03, 0.0, 0.12]]), made or plan(), earlier
     )
 
 
-def residual(rng: np.random.Generator, wrong: float) -> LiveResidual:
+def residual(rng, wrong):
     """A residual of noise (30 µm), and `wrong` σ downwards that the model does not know."""
     sigma = 3e-5
     r = sigma * (rng.standard_normal(3) + np.array([0.0, 0.0, -wrong]))
@@ -38,9 +34,7 @@ def residual(rng: np.random.Generator, wrong: float) -> LiveResidual:
     return LiveResidual(distance, distance / sigma / 3**0.5, False, None, 0.0, tuple(r), covariance)
 
 
-def events(
-    told: MeasuringStart, wrong: float = 6.0, seed: int = 5
-) -> Iterator[tuple[float, object]]:
+def events(told, wrong=6.0, seed=5):
     """Everything that a run tells, with its time of day; half of the loaded readings are off."""
     rng, plan_, wall = np.random.default_rng(seed), told.plan, START_S
     yield wall, told

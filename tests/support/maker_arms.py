@@ -2,11 +2,10 @@
 
 from pathlib import Path
 
-from hilcal.robot.arm import Arm
 from hilcal.robot.urdf import arm_from_urdf
 
 EXAMPLES = Path(__file__).parents[1] / "unit" / "calibration" / "programs" / "examples"
-ARMS: dict[str, tuple[list[str], list[str], str]] = {
+ARMS = {
     # KR 10 R1420, as ROS-Industrial's kuka_experimental has it
     "krl": (
         ["0 0 0.45", "0.15 0 0", "0.61 0 0", "0 0 0.02", "0.66 0 0", "0 0 0"],
@@ -30,7 +29,7 @@ ARMS: dict[str, tuple[list[str], list[str], str]] = {
 ARMS["inform"] = ARMS["fanuc"]
 
 
-def urdf_of(maker: str, limit: float = 2.9, wrist: float = 5.9) -> str:
+def urdf_of(maker, limit=2.9, wrist=5.9):
     """A URDF of the maker's arm; axes 4 and 6 turn farther."""
     places, axes, tip = ARMS[maker]
     links = ["base_link", *(f"link_{k}" for k in range(1, 7)), "tool0"]
@@ -49,7 +48,7 @@ def urdf_of(maker: str, limit: float = 2.9, wrist: float = 5.9) -> str:
     return "\n".join([*out, "</robot>"])
 
 
-def maker_arm(maker: str, folder: Path) -> Arm:
+def maker_arm(maker, folder):
     path = folder / f"{maker}.urdf"
     path.write_text(urdf_of(maker), encoding="utf-8")
     return arm_from_urdf(path)

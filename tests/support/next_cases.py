@@ -5,9 +5,9 @@ from functools import cache
 
 import numpy as np
 
-from hilcal.cell import Cell, cell_from_config
+from hilcal.cell import cell_from_config
 from hilcal.config import load_config
-from hilcal.design.next import SeparatingPlan, plan_separating
+from hilcal.design.next import plan_separating
 from hilcal.design.planner import PlanRequest, plan_readings
 from hilcal.diagnosis.diagnosis import Diagnosis, in_doubt
 from hilcal.diagnosis.verdict import diagnose
@@ -21,7 +21,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.readings.readings import Readings
 from hilcal.store.plan import Plan, with_new_names
-from tests.support.campaigns import SimulatedCampaign, campaign, measured, plan
+from tests.support.campaigns import campaign, measured, plan
 from tests.support.cli_cases import CELL
 from tests.support.plan_cases import changed
 
@@ -40,13 +40,13 @@ class Doubtful:
     diagnosis: Diagnosis
 
     @property
-    def suspects(self) -> tuple[str, ...]:
+    def suspects(self):
         """The first one that passes all tests, and those that are inseparable from it."""
         return in_doubt(self.diagnosis) or self.diagnosis.significant[:1]
 
 
 @cache
-def first_plan() -> Plan:
+def first_plan():
     """As many readings as six poses take under two of the four loads."""
     some = SMALL.model_copy(update={"loads": SMALL.loads[1::2]})
     return plan_readings(
@@ -55,7 +55,7 @@ def first_plan() -> Plan:
 
 
 @cache
-def doubtful(effect: str, seed: int) -> Doubtful:
+def doubtful(effect, seed):
     """A small campaign with a weak hidden effect."""
     secret = case_of_plan(SMALL, first_plan(), effect, seed)
     r = simulate_plan(secret, first_plan(), [seed, 1])
@@ -63,7 +63,7 @@ def doubtful(effect: str, seed: int) -> Doubtful:
     return Doubtful(secret, first_plan(), r, found, diagnose(found))
 
 
-def after_further_plan(first: Doubtful, poses: int = 20) -> tuple[Diagnosis, SeparatingPlan]:
+def after_further_plan(first, poses=20):
     """Plan what separates the suspects, measure it in the same world, and diagnose all."""
     cell = first.rehearsal.cell
     reference = first.plan.joints("reference")
@@ -79,21 +79,21 @@ def after_further_plan(first: Doubtful, poses: int = 20) -> tuple[Diagnosis, Sep
     return diagnose(fit(baseline(cell, readings, mode), readings, mode)), found
 
 
-def joined_readings(a: Readings, b: Readings) -> Readings:
+def joined_readings(a, b):
     names = tuple(dict.fromkeys((*a.pose_names, *b.pose_names)))
     place = [np.array([names.index(n) for n in r.pose_names])[r.pose] for r in (a, b)]
     parts = zip((a, b), place, strict=True)
     return Readings.joined([replace(r, pose=at, pose_names=names) for r, at in parts])
 
 
-def many_waves(seed: int = 0) -> SimulatedCampaign:
+def many_waves(seed=0):
     """Thirty poses with a transmission error of harmonics 1 to 21 at 2 σ."""
     return campaign(
         "transmission_error", "absolute", seed, poses=30, plan_seed=seed, strength=2.0, harmonics=21
     )
 
 
-def fine_error(seed: int = 0) -> tuple[Cell, Readings]:
+def fine_error(seed=0):
     """The same without the first two harmonics: a cell and readings."""
     c = many_waves(seed)
     waves = c.world.physics.transmission_error.copy()

@@ -1,19 +1,16 @@
 """Campaigns of several observers, measured on the mechanics' own arm."""
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.config import CellConfig
-from hilcal.config.sections import Gauge, Point
+from hilcal.config.sections import Point
 from hilcal.drivers.simulated.injected_effects import hide_effect
 from hilcal.drivers.simulated.world import World
 from hilcal.readings.covariance import INSTRUMENT_AND_ARM  # noqa: F401 - for the tests
 from hilcal.readings.readings import ObserverName, Readings
 from hilcal.robot import se3
-from hilcal.types import Floats
 from tests.support.campaigns import cell_of, configuration, plan, world_of
 
 STD = 1e-5
@@ -35,24 +32,14 @@ class Observed:
     readings: Readings
 
 
-def configured(
-    points: Mapping[str, Point] | None = None, gauges: Mapping[str, Gauge] | None = None
-) -> CellConfig:
+def configured(points=None, gauges=None):
     update = {"points": dict(points or {}), "gauges": dict(gauges or {})}
     return configuration().model_copy(update=update)
 
 
 def observed(
-    who: Sequence[str],
-    seed: int,
-    *,
-    poses: int = 12,
-    cell: Cell | None = None,
-    effect: str | None = None,
-    strength: float = 3.0,
-    base: bool = False,
-    alternate: bool = False,
-) -> Observed:
+    who, seed, *, poses=12, cell=None, effect=None, strength=3.0, base=False, alternate=False
+):
     """Measure every state of a plan by observers: "S1", "S2" stations, "A" to "D" points, "G"."""
     cell, rng, p = cell or cell_of(), np.random.default_rng(seed), plan(poses, seed)
     world = world_of(cell, rng)
@@ -64,7 +51,7 @@ def observed(
     slip = world.joint_std * rng.standard_normal(p.states.q.shape)
     at = world.ideal_readings(p.states, slip).position
     parts, count = [], len(p.pose)
-    names: list[ObserverName] = []
+    names = []
     for k, name in enumerate(who):
         rows = np.flatnonzero(p.pose % len(who) == k) if alternate else np.arange(count)
         value, cov = np.zeros((len(rows), 3)), np.zeros((len(rows), 3, 3))
@@ -105,17 +92,15 @@ def observed(
     return Observed(cell, world, readings)
 
 
-def base_cell(
-    points: Mapping[str, Point] | None = None, gauges: Mapping[str, Gauge] | None = None
-) -> Cell:
+def base_cell(points=None, gauges=None):
     """The demo's cell with descriptions of points and gauges."""
     return replace(cell_of(), config=configured(points, gauges))
 
 
-def stated(names: Sequence[str]) -> dict[str, Point]:
+def stated(names):
     """Points whose place is stated."""
     return {name: Point(position_m=POINTS[name]) for name in names}
 
 
-def moved(frame: Floats, by: Floats) -> Floats:
+def moved(frame, by):
     return np.asarray(se3.matrix(*se3.exp(by)) @ frame)

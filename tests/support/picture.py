@@ -9,19 +9,14 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from hilcal.present.viewer.recording import executable
-
-if TYPE_CHECKING:
-    from rerun.experimental import ViewerClient
 
 _ICD_DIRS = ("/usr/share/vulkan/icd.d", "/usr/local/share/vulkan/icd.d", "/etc/vulkan/icd.d")
 _START_TIMEOUT = 60.0
@@ -47,7 +42,7 @@ class ViewReport:
     problems: tuple[str, ...]
 
 
-def vulkan_available() -> bool:
+def vulkan_available():
     """Return whether the Vulkan loader and at least one driver description are installed."""
     named = os.environ.get("VK_DRIVER_FILES") or os.environ.get("VK_ICD_FILENAMES") or ""
     files = [Path(p) for p in named.split(os.pathsep) if p]
@@ -64,14 +59,9 @@ def vulkan_available() -> bool:
 needs_vulkan = pytest.mark.skipif(not vulkan_available(), reason="no Vulkan driver installed")
 
 
-def pictures(
-    rrd: Path,
-    shots: Sequence[Shot],
-    size: tuple[int, int] = (1920, 1080),
-    longest: int | None = None,
-) -> tuple[ViewReport, ...]:
+def pictures(rrd, shots, size=(1920, 1080), longest=None):
     """Draw a recording into PNG files, one per shot, with one start of the viewer."""
-    problems: dict[str, set[str]] = {}
+    problems = {}
     with opened(rrd, size) as (viewer, _):
         for shot in shots:
             _take(viewer, shot, longest)
@@ -82,7 +72,7 @@ def pictures(
 
 
 @contextlib.contextmanager
-def opened(rrd: Path, size: tuple[int, int]) -> Iterator[tuple["ViewerClient", int]]:
+def opened(rrd, size):
     """A headless viewer that has shown a recording, and the number of its process."""
     with _headless(size) as (viewer, process):
         viewer.open([str(Path(rrd).resolve())])
@@ -101,9 +91,9 @@ def opened(rrd: Path, size: tuple[int, int]) -> Iterator[tuple["ViewerClient", i
         yield viewer, process
 
 
-def _take(viewer: "ViewerClient", shot: Shot, longest: int | None) -> None:
+def _take(viewer, shot, longest):
     if shot.timeline is not None:
-        when: dict[str, Any] = {} if shot.at is None else {"sequence": shot.at}
+        when = {} if shot.at is None else {"sequence": shot.at}
         viewer.set_time(shot.timeline, play_state="paused", **when)
         time.sleep(_SETTLE)
     view_id = None
@@ -113,7 +103,7 @@ def _take(viewer: "ViewerClient", shot: Shot, longest: int | None) -> None:
     Path(shot.png).write_bytes(viewer.take_screenshot(view_id, max_size=longest))
 
 
-def _bring_forward(viewer: "ViewerClient", view_id: str) -> None:
+def _bring_forward(viewer, view_id):
     """Make a view the active one of its tabs: only what is on the window is drawn."""
     parts = viewer.get_blueprint().blueprint
     path = f"/view/{view_id}"
@@ -127,7 +117,7 @@ def _bring_forward(viewer: "ViewerClient", view_id: str) -> None:
 
 
 @contextlib.contextmanager
-def _headless(size: tuple[int, int]) -> Iterator[tuple["ViewerClient", int]]:
+def _headless(size):
     """Run a viewer of our own in a home of its own, with analytics off; end it afterwards."""
     with tempfile.TemporaryDirectory(prefix="hilcal-picture-") as home, socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -152,7 +142,7 @@ def _headless(size: tuple[int, int]) -> Iterator[tuple["ViewerClient", int]]:
                 process.wait()
 
 
-def _connect(process: subprocess.Popen[bytes], port: int) -> "ViewerClient":
+def _connect(process, port):
     from rerun.experimental import ViewerClient
 
     end = time.monotonic() + _START_TIMEOUT
@@ -172,7 +162,7 @@ def _connect(process: subprocess.Popen[bytes], port: int) -> "ViewerClient":
             return client
 
 
-def _environment(home: Path) -> dict[str, str]:
+def _environment(home):
     config, run = home / "config", home / "run"
     for folder in (config / "rerun", run):
         folder.mkdir(parents=True, mode=0o700)
@@ -190,13 +180,13 @@ def _environment(home: Path) -> dict[str, str]:
     }
 
 
-def pixels(png: Path) -> np.ndarray:
+def pixels(png):
     """(height, width, channels) of a PNG."""
     with Image.open(png) as image:
         return np.asarray(image)
 
 
-def contrast(a: Sequence[int], b: Sequence[int]) -> float:
+def contrast(a, b):
     """Ratio of relative luminances of two colours (0 to 255), as WCAG 2 defines it."""
     c = np.array([a, b]) / 255.0
     linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)

@@ -10,7 +10,6 @@ in order (a journaling file system). What SQLite assumes of a disk: sqlite.org/a
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,14 +18,14 @@ from random import Random
 SECTOR = 512
 
 
-def compiled(folder: Path) -> Path:
+def compiled(folder):
     library, source = folder / "record.so", Path(__file__).with_suffix(".c")
     command = ["gcc", "-shared", "-fPIC", "-O1", "-w", "-o", str(library), str(source), "-ldl"]
     subprocess.run(command, check=True)
     return library
 
 
-def recorded(code: str, folder: Path, recorder: Path, root: Path) -> list["Op"]:
+def recorded(code, folder, recorder, root):
     """Run a Python program and return what it did in `folder`."""
     log = recorder.with_suffix(".log")
     log.unlink(missing_ok=True)
@@ -51,7 +50,7 @@ class Op:
     data: bytes
 
 
-def _read(log: bytes) -> Iterator[Op]:
+def _read(log):
     at = 0
     while at < len(log):
         end = log.index(b"\n", at)
@@ -62,7 +61,7 @@ def _read(log: bytes) -> Iterator[Op]:
         at += int(size) if has else 0
 
 
-def _done(content: bytes, op: Op) -> bytes:
+def _done(content, op):
     if op.kind == "truncate":
         return content[: op.at].ljust(op.at, b"\0")
     return content[: op.at].ljust(op.at, b"\0") + op.data + content[op.at + len(op.data) :]
@@ -84,7 +83,7 @@ class Disk:
     durable: dict[str, int] = field(default_factory=dict)
     moves: list[Op] = field(default_factory=list)
 
-    def do(self, op: Op) -> None:
+    def do(self, op):
         match op.kind:
             case "sync" if op.path.rstrip("/") == self.folder:
                 self.durable, self.moves = dict(self.names), []
@@ -103,7 +102,7 @@ class Disk:
                 self._move(op, self.names)
                 self.moves.append(op)
 
-    def _move(self, op: Op, names: dict[str, int], number: int | None = None) -> None:
+    def _move(self, op, names, number=None):
         if op.kind == "create":
             names[op.path] = len(self.files) - 1 if number is None else number
         elif op.kind == "unlink":
@@ -111,7 +110,7 @@ class Disk:
         elif op.path in names:
             names[op.data.decode()] = names.pop(op.path)
 
-    def states(self, rng: Random, tries: int) -> Iterator[dict[str, bytes]]:
+    def states(self, rng, tries):
         """What may be on the disk after a power loss now: contents by path."""
         for k in range(tries):
             names = dict(self.durable)
@@ -122,7 +121,7 @@ class Disk:
                 created += op.kind == "create"
             yield {path: self._content(number, rng, k) for path, number in names.items()}
 
-    def _content(self, number: int, rng: Random, k: int) -> bytes:
+    def _content(self, number, rng, k):
         file = self.files[number]
         content = file.synced
         for op in file.later:
@@ -135,9 +134,7 @@ class Disk:
         return content
 
 
-def crashes(
-    ops: list[Op], folder: Path, ack: str, seed: int, tries: int = 4
-) -> Iterator[tuple[int, dict[str, bytes]]]:
+def crashes(ops, folder, ack, seed, tries=4):
     """Every moment: how many acknowledgements the program had given, and a state of the disk."""
     disk, rng, acknowledged = Disk(str(folder)), Random(seed), 0
     for op in ops:

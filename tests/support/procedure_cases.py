@@ -1,16 +1,14 @@
 """A calibration in the simulated world without devices: its readings are drawn."""
 
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 from hilcal.cell import cell_from_config
-from hilcal.config import CellConfig, load_config
-from hilcal.drivers.simulated.rehearsal import SimulationCase, case_of_plan, simulate_plan
+from hilcal.config import load_config
+from hilcal.drivers.simulated.rehearsal import case_of_plan, simulate_plan
 from hilcal.effects.catalogue import installed
 from hilcal.procedure.procedure import Procedure
-from hilcal.procedure.state import ProcedureStep, Settings
+from hilcal.procedure.state import Settings
 from hilcal.readings.covariance import INSTRUMENT_AND_ARM
-from hilcal.readings.whitening import Mode
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.run_log import RunLog
@@ -23,7 +21,7 @@ class KilledError(BaseException):
     """The program was killed."""
 
 
-def small_config(loads: int = 2, **planning: object) -> CellConfig:
+def small_config(loads=2, **planning):
     """The cell of the demo with few candidates, so that planning takes a second."""
     config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
     quick = changed(config, planning={"candidates": 60, "against": (), **planning})
@@ -39,14 +37,14 @@ class DrawnCalibration:
     dies_after: int | None = None  # readings after which measuring is killed; None for never
     kinds: list[str] = field(default_factory=list)  # of the steps that were done
 
-    def case(self) -> SimulationCase:
+    def case(self):
         """The world, made again from the first plan."""
         p = self.procedure
         with CampaignFile.open(p.run, read_only=True) as campaign:
             plan = RunLog(campaign).plans[0]
         return case_of_plan(p.config, plan, self.hidden, p.settings.seed, p.catalogue)
 
-    def measure(self, campaign: CampaignFile, epoch: float | None) -> None:
+    def measure(self, campaign, epoch):
         """Draw what is missing of a campaign, one reading after the other."""
         log, case = RunLog(campaign), self.case()
         number = len(campaign.path.name)
@@ -65,7 +63,7 @@ class DrawnCalibration:
             rows = drawn[slice(k * each, (k + 1) * each)]
             log.record(rows, step, *({"epoch_wall_s": 0.0} for _ in range(each)))
 
-    def do(self, step: ProcedureStep) -> object:
+    def do(self, step):
         self.kinds.append(step.kind)
         p = self.procedure
         if step.kind == "plan":
@@ -73,10 +71,10 @@ class DrawnCalibration:
             return None
         if step.moves:
             return p.measure(step, self.measure)
-        result: object = getattr(p, step.kind)()
+        result = getattr(p, step.kind)()
         return result
 
-    def to_the_end(self) -> object:
+    def to_the_end(self):
         result = None
         while (step := self.procedure.next()).kind != "done":
             result = self.do(step)
@@ -84,16 +82,16 @@ class DrawnCalibration:
 
 
 def drawn_calibration(
-    path: Path,
-    hidden: str = "nothing",
+    path,
+    hidden="nothing",
     *,
-    config: CellConfig | None = None,
-    seed: int = 1,
-    poses: int = 5,
-    validation: int = 5,
-    readings: Mode = "deflection",
-    goal_m: float | None = None,
-) -> DrawnCalibration:
+    config=None,
+    seed=1,
+    poses=5,
+    validation=5,
+    readings="deflection",
+    goal_m=None,
+):
     """A small calibration in a file that need not be there yet."""
     config = small_config() if config is None else config
     settings = Settings(
@@ -103,7 +101,7 @@ def drawn_calibration(
     return DrawnCalibration(Procedure(path, cell, path.parent, installed(), settings), hidden)
 
 
-def reopened(d: DrawnCalibration) -> DrawnCalibration:
+def reopened(d):
     """The same calibration as another process finds it: nothing but its files."""
     p = d.procedure
     return replace(d, procedure=replace(p, _refinements=[]), dies_after=None)

@@ -1,10 +1,6 @@
 """Random cells, every optional section absent or present, as a lab's first CELL.toml may be."""
 
-from typing import Any
-
-import numpy as np
-
-LOADS: tuple[dict[str, Any], ...] = (
+LOADS = (
     {"name": "5kg", "mass_kg": 5.0},
     {"name": "3 kg", "mass_kg": 3.0},
     {"name": "pull x", "force_N": [80.0, 0.0, 0.0], "moment_Nm": [0.0, 6.0, 6.0]},
@@ -14,16 +10,16 @@ HIDDEN = ("nothing", "joint_stiffening", "base_compliance", "transmission_error"
 LENGTHS = ("1 um", "30 um", "0.1 mm", "1 mm", "1 m")
 
 
-def random_cell(rng: np.random.Generator) -> dict[str, Any]:
+def random_cell(rng):
     """Return the sections of a cell as TOML has them; plans of it take a second."""
 
-    def some(p: float = 0.5) -> bool:
+    def some(p=0.5):
         return bool(rng.random() < p)
 
-    def one_of(values: tuple[Any, ...]) -> Any:
+    def one_of(values):
         return values[int(rng.integers(len(values)))]
 
-    out: dict[str, Any] = {"robot": {"model": one_of(("ur10e", "ur10e", "ur5e"))}}
+    out = {"robot": {"model": one_of(("ur10e", "ur10e", "ur5e"))}}
     if some(0.8):
         tool = {
             "target_m": [0.06, 0.02, 0.12],
@@ -74,9 +70,9 @@ def random_cell(rng: np.random.Generator) -> dict[str, Any]:
     return out
 
 
-def random_options(rng: np.random.Generator) -> list[str]:
+def random_options(rng):
     """Return options of `calibrate`: a goal, a limit, or none."""
-    out: list[str] = []
+    out = []
     for option in ("--goal", "--limit"):
         if rng.random() < 0.7:
             out += [option, LENGTHS[int(rng.integers(len(LENGTHS)))]]

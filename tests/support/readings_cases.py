@@ -1,7 +1,5 @@
 """An arm and readings for the tests of what goes in and out."""
 
-from typing import Any
-
 import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -9,15 +7,14 @@ from hypothesis.extra.numpy import arrays
 from hilcal.readings.readings import Readings, States
 from hilcal.robot.arm import Arm
 from hilcal.tables.table import import_table
-from hilcal.types import Floats
 
 
-def read_table(*given: Any, **more: Any) -> Readings:
+def read_table(*given, **more):
     """The readings of an exchange table, without the decisions of their import."""
     return import_table(*given, **more).readings
 
 
-def make_arm(n: int = 6) -> Arm:
+def make_arm(n=6):
     """An arm of n joints with a reach of n times 0.25 m and limits of ±2π."""
     links = np.tile(np.eye(4), (n + 1, 1, 1))
     links[1:, 0, 3] = 0.25
@@ -35,7 +32,7 @@ def make_arm(n: int = 6) -> Arm:
     )
 
 
-def floats(shape: tuple[int, ...], size: float) -> st.SearchStrategy[Floats]:
+def floats(shape, size):
     return arrays(np.float64, shape, elements=st.floats(-size, size, allow_nan=False))
 
 
@@ -45,7 +42,7 @@ names = st.text(st.characters(codec="utf-8"), min_size=1, max_size=8).filter(
 
 
 @st.composite
-def readings(draw: st.DrawFn, n: int = 6) -> Readings:
+def readings(draw, n=6):
     """Readings that a table and a campaign can hold, numbered in order of first appearance."""
     count = draw(st.integers(1, 5))
     m = draw(st.sampled_from([3, 6]))
@@ -61,7 +58,7 @@ def readings(draw: st.DrawFn, n: int = 6) -> Readings:
     cov = 1e-8 * (root @ np.swapaxes(root, 1, 2) + np.eye(m))
     cov = np.triu(cov) + np.swapaxes(np.triu(cov, 1), 1, 2)
 
-    def maybe(values: st.SearchStrategy[Floats]) -> Floats | None:
+    def maybe(values):
         return draw(st.none() | values)
 
     return Readings(
@@ -85,22 +82,22 @@ def readings(draw: st.DrawFn, n: int = 6) -> Readings:
     )
 
 
-def first_seen(numbers: list[int]) -> np.ndarray:
+def first_seen(numbers):
     order = {k: i for i, k in enumerate(dict.fromkeys(numbers))}
     return np.array([order[k] for k in numbers], dtype=np.int64)
 
 
-def readings_at(q: Floats, value: Floats, **more: Any) -> Readings:
+def readings_at(q, value, **more):
     """Readings of joint values (N, n), each of a pose of its own and unloaded unless more is said.
 
     `more` are fields of readings and of states, or `std` of every element for a covariance.
     """
     count, m = value.shape
-    told: dict[str, Any] = {"wrench": np.zeros((count, 6))} | more
+    told = {"wrench": np.zeros((count, 6))} | more
     states = {name: told.pop(name) for name in States.__dataclass_fields__ if name in told}
     pose = told.pop("pose", np.arange(count))
     load = np.broadcast_to(told.pop("load", 0), count).astype(np.int64)
-    usual: dict[str, Any] = {
+    usual = {
         "cycle": np.zeros(count, dtype=np.int64),
         "covariance": np.tile(told.pop("std", 1e-5) ** 2 * np.eye(m), (count, 1, 1)),
         "load_names": ("none", *(f"load {k}" for k in range(1, load.max(initial=0) + 1))),
@@ -109,13 +106,13 @@ def readings_at(q: Floats, value: Floats, **more: Any) -> Readings:
     return Readings(States(q, **states), pose=pose, load=load, value=value, **usual | told)
 
 
-def simple_readings(count: int, m: int = 3, seed: int = 0) -> Readings:
+def simple_readings(count, m=3, seed=0):
     rng = np.random.default_rng(seed)
     q, time = rng.uniform(-3, 3, (count, 6)), np.arange(count, dtype=float)
     return readings_at(q, rng.uniform(-1, 1, (count, m)), time=time, std=1e-9**0.5)
 
 
-def assert_same(a: Readings, b: Readings) -> None:
+def assert_same(a, b):
     """Every array equal to the last bit, every name equal."""
     for name in States.__dataclass_fields__:
         left, right = getattr(a.states, name), getattr(b.states, name)

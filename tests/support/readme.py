@@ -11,12 +11,12 @@ _INLINE = re.compile(r"`(hilcal [^`]*)`")
 _OPTIONAL = re.compile(r"\[(--[^\]]*)\]")
 
 
-def campaign() -> str:
+def campaign():
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     return CAMPAIGN + text.split(CAMPAIGN, 1)[1].split("\n## ", 1)[0]
 
 
-def cell() -> str:
+def cell():
     """CELL.toml: every TOML block of the section, pasted one after the other."""
     lines = []
     for block in _blocks(campaign()):
@@ -25,7 +25,7 @@ def cell() -> str:
     return "\n".join(lines) + "\n"
 
 
-def commands(*, options: bool = False) -> list[list[str]]:
+def commands(*, options=False):
     """Commands of the section as words without "hilcal": of the blocks, then of the sentences."""
     typed, mentioned = [], []
     for line in campaign().splitlines():
@@ -39,9 +39,9 @@ def commands(*, options: bool = False) -> list[list[str]]:
     return [words for words in each if words[0][0].islower()]
 
 
-def _blocks(text: str) -> list[list[str]]:
+def _blocks(text):
     """Indented blocks of code, without their indentation."""
-    out: list[list[str]] = [[]]
+    out = [[]]
     for line in text.splitlines():
         code = _CODE.match(line)
         if code is not None:

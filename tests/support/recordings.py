@@ -1,30 +1,27 @@
 """Recordings read back: what is in them, by entity, component and time."""
 
 import subprocess
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 from rerun.chunk import RrdReader
 
 from hilcal.present.viewer.recording import executable
 
 
-def chunks(path: Path, entity: str = "") -> Iterator[Any]:
+def chunks(path, entity=""):
     stream = RrdReader(path).stream()
     return iter((stream.filter(content=entity) if entity else stream).to_chunks())
 
 
-def values(path: Path, entity: str, component: str) -> list[Any]:
+def values(path, entity, component):
     """Every value of a component, row after row."""
     batches = (chunk.to_record_batch() for chunk in chunks(path, entity))
     found = [batch.column(component) for batch in batches if component in batch.schema.names]
     return [value for column in found for value in column.to_pylist() if value is not None]
 
 
-def rows(path: Path, entity: str, component: str, timeline: str = "step") -> dict[int, Any]:
+def rows(path, entity, component, timeline="step"):
     """The values of a component by time, under 0 what is static."""
-    out: dict[int, Any] = {}
+    out = {}
     for chunk in chunks(path, entity):
         batch = chunk.to_record_batch()
         if component not in batch.schema.names:
@@ -40,7 +37,7 @@ def rows(path: Path, entity: str, component: str, timeline: str = "step") -> dic
     return out
 
 
-def texts(path: Path) -> list[str]:
+def texts(path):
     """Every string that a viewer would have to draw."""
     kinds = (":text", ":labels", ":names", ":name")
     return [
@@ -54,11 +51,11 @@ def texts(path: Path) -> list[str]:
     ]
 
 
-def entities(path: Path) -> set[str]:
+def entities(path):
     return {str(chunk.entity_path) for chunk in chunks(path)}
 
 
-def same(a: Path, b: Path) -> bool:
+def same(a, b):
     """Whether two recordings hold the same, as rerun itself compares them."""
     command = [executable(), "rrd", "compare", str(a), str(b)]
     return subprocess.run(command, capture_output=True, check=False).returncode == 0

@@ -4,10 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hilcal.cell import Cell
 from hilcal.drivers.simulated.injected_effects import hide_effect
-from hilcal.readings.readings import States
-from hilcal.types import Floats, Ints
 from tests.support.campaigns import (
     NO_EFFECT,
     CampaignPlan,
@@ -22,7 +19,7 @@ NAMES = ("R1", "R2", "R3")
 OFFSETS = np.array([[0.06, 0.02, 0.12], [-0.09, 0.05, 0.10], [0.02, -0.11, 0.15]])
 
 
-def plate(*, known: tuple[bool, ...] = (True, True, True), **told: bool) -> Cell:
+def plate(*, known=(True, True, True), **told):
     """The demo's cell with three reflectors on a plate; unknown ones are told near the flange."""
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, :3, 3] = OFFSETS
@@ -30,26 +27,26 @@ def plate(*, known: tuple[bool, ...] = (True, True, True), **told: bool) -> Cell
     return cell.with_targets(poses, known)
 
 
-def each_target(p: CampaignPlan, count: int = 3) -> CampaignPlan:
+def each_target(p, count=3):
     """The plan with every state read once per target, one after the other."""
-    rows: Ints = np.repeat(np.arange(len(p.states)), count)
-    states: States = replace(p.states[rows], target=np.tile(np.arange(count), len(p.states)))
+    rows = np.repeat(np.arange(len(p.states)), count)
+    states = replace(p.states[rows], target=np.tile(np.arange(count), len(p.states)))
     return CampaignPlan(states, p.pose[rows], p.load[rows], p.cycle[rows], p.load_names)
 
 
 def reflectors(
-    effect: str = NO_EFFECT,
-    seed: int = 0,
+    effect=NO_EFFECT,
+    seed=0,
     *,
-    mode: str = "absolute",
-    poses: int = 12,
-    strength: float = 3.0,
-    cycles: int = 1,
-    joint_std: Floats | float | None = None,
-    known: tuple[bool, ...] = (True, True, True),
-    m: int = 3,
-    **told: bool,
-) -> SimulatedCampaign:
+    mode="absolute",
+    poses=12,
+    strength=3.0,
+    cycles=1,
+    joint_std=None,
+    known=(True, True, True),
+    m=3,
+    **told,
+):
     """Measure a campaign of three reflectors in a world that hides one effect."""
     cell = plate(known=known, **told)
     p = each_target(plan(poses, 3, cycles))
@@ -60,4 +57,4 @@ def reflectors(
         world = replace(world, joint_std=spread)
     if effect != NO_EFFECT:
         world = hide_effect(effect, cell, p.states, strength, mode, rng, world=world, m=m)
-    return SimulatedCampaign(cell, world, measured(world, p, rng, m), mode)  # type: ignore[arg-type]
+    return SimulatedCampaign(cell, world, measured(world, p, rng, m), mode)

@@ -12,20 +12,18 @@ After a wanted change of words `HILCAL_REFUSALS=write pytest ...` writes the lin
 
 import os
 import re
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from hilcal.errors import HilcalError, InputError
+from hilcal.errors import InputError
 
 FOLDER = Path(__file__).resolve().parents[1] / "data" / "refusals"
 BLOCK = re.compile(r"^== (.*)\n((?:(?!== |-> ).*\n)*)-> (.*)\n", re.MULTILINE)
 EDIT = re.compile(r"((?:^-.*\n)+)((?:^\+.*\n)*)", re.MULTILINE)
 
 
-def refusals(name: str) -> pytest.MarkDecorator:
+def refusals(name):
     """Run a test with `case`, the name of a file's case, and `given`, its text."""
     blocks = BLOCK.findall((FOLDER / f"{name}.txt").read_text(encoding="utf-8"))
     rows = [pytest.param((name, case), given, id=case) for case, given, _ in blocks]
@@ -33,7 +31,7 @@ def refusals(name: str) -> pytest.MarkDecorator:
     return pytest.mark.parametrize(("case", "given"), rows)
 
 
-def with_edits(source: str, **texts: str) -> str:
+def with_edits(source, **texts):
     """What a case gives: itself, or one of the texts with its edits."""
     if not source.startswith("in "):
         return source
@@ -46,7 +44,7 @@ def with_edits(source: str, **texts: str) -> str:
     return text
 
 
-def refuses(case: tuple[str, str], call: Callable[[], object], path: Path | None = None) -> str:
+def refuses(case, call, path=None):
     """Compare the line that a call is refused with; a path in it is known by its name alone."""
     line = refusal(".", call)
     line = line if path is None else line.replace(str(path), path.name)
@@ -54,14 +52,12 @@ def refuses(case: tuple[str, str], call: Callable[[], object], path: Path | None
     return line
 
 
-def refusal(words: str, call: Callable[..., object], /, *given: Any, **more: Any) -> str:
+def refusal(words, call, /, *given, **more):
     """Call with what is given, which is wrong input: the line that says so, with these words."""
     return refusal_of(InputError, words, call, *given, **more)
 
 
-def refusal_of(
-    kind: type[HilcalError], words: str, call: Callable[..., object], /, *given: Any, **more: Any
-) -> str:
+def refusal_of(kind, words, call, /, *given, **more):
     """The same where another kind of error is to be raised."""
     with pytest.raises(kind, match=words) as raised:
         call(*given, **more)
@@ -71,7 +67,7 @@ def refusal_of(
     return line
 
 
-def check(case: tuple[str, str], line: str) -> None:
+def check(case, line):
     """Compare the line that a case was refused with to the one that is kept, or keep it."""
     path = FOLDER / f"{case[0]}.txt"
     text = path.read_text(encoding="utf-8")

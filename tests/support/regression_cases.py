@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.regression.schur import Projection, projection
+from hilcal.regression.schur import projection
 from hilcal.types import Floats
 
 
@@ -18,24 +18,22 @@ class Problem:
     y: Floats  # (R,) the data
 
     @property
-    def projection(self) -> Projection:
+    def projection(self):
         return projection(self.rows, self.ridge)
 
     @property
-    def dense(self) -> Floats:
+    def dense(self):
         """M (R, R)."""
         h = self.rows.T @ self.rows + np.diag(self.ridge)
         return np.eye(len(self.y)) - self.rows @ np.linalg.inv(h) @ self.rows.T
 
     @property
-    def estimate(self) -> Floats:
+    def estimate(self):
         h = self.rows.T @ self.rows + np.diag(self.ridge)
         return np.linalg.solve(h, self.rows.T @ self.y)
 
 
-def problem(
-    kind: str = "priors", rows: int = 60, family: int = 4, noise: float = 1.0, seed: int = 0
-) -> Problem:
+def problem(kind="priors", rows=60, family=4, noise=1.0, seed=0):
     """Return a random problem; kinds: "flat", "priors", "no columns", "rank deficient"."""
     rng = np.random.default_rng(seed)
     size = 0 if kind == "no columns" else 7

@@ -1,6 +1,5 @@
 """Deflections of a simulated UR10e that hides nothing, under two weights, from seeded draws."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +11,7 @@ from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.drivers.simulated.world import World
 from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import configs_dir
-from hilcal.types import Floats, Ints
+from hilcal.types import Ints
 from studies.random_campaigns import rehearsal_states
 
 
@@ -25,7 +24,7 @@ class Rehearsed:
     cycle: Ints  # (D,) number of its load cycle
 
 
-def dead_weights(masses: Sequence[float], gravity: Floats) -> list[tuple[str, Floats]]:
+def dead_weights(masses, gravity):
     """Return the wrenches of masses that hang at the load point, kg and m/s², by name."""
     return [
         (f"{mass:g}kg", np.concatenate([mass * np.asarray(gravity), np.zeros(3)]))
@@ -33,7 +32,7 @@ def dead_weights(masses: Sequence[float], gravity: Floats) -> list[tuple[str, Fl
     ]
 
 
-def rehearsed(poses: int, seed: int) -> Rehearsed:
+def rehearsed(poses, seed):
     """Simulate some poses, without temperatures, approach directions or times under load."""
     config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
     cell = cell_from_config(config)

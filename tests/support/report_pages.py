@@ -1,15 +1,10 @@
 """What the tests of report pages share: a small campaign, what its page says, a browser."""
 
-from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
-
-from playwright.sync_api import Browser, Page, Route
 
 from hilcal.campaign.campaign import Campaign
-from hilcal.present.html.report import ReportContent
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.write_report import ReportOptions, content_of
@@ -19,7 +14,7 @@ EVIL = "<script>window.harmed = 1</script>"
 ALLOWED = ("file:", "data:", "blob:")
 
 
-def write_campaign(path: Path, poses: int = 6) -> None:
+def write_campaign(path, poses=6):
     """A campaign in which joints tilt; one pose and one load have names that look like markup."""
     found = campaign("joint_tilt_compliance", "deflection", poses=poses, strength=8.0).readings
     names = (f"{EVIL}1", *found.pose_names[1:])
@@ -30,7 +25,7 @@ def write_campaign(path: Path, poses: int = 6) -> None:
 
 
 @cache
-def small_content(folder: Path) -> ReportContent:
+def small_content(folder):
     """The content of a page on that campaign, without a revision, with limit and appendix."""
     path = folder / "a&<b>.hilcal"
     write_campaign(path)
@@ -39,11 +34,11 @@ def small_content(folder: Path) -> ReportContent:
 
 
 @contextmanager
-def opened(browser: Browser, file: Path, **context: object) -> Iterator[tuple[Page, list[str]]]:
+def opened(browser, file, **context):
     """A page whose console errors, and requests to anywhere else, are listed; none is answered."""
-    bad: list[str] = []
+    bad = []
 
-    def answer(route: Route) -> None:
+    def answer(route):
         url = route.request.url
         if url.startswith(ALLOWED):
             route.continue_()
@@ -51,7 +46,7 @@ def opened(browser: Browser, file: Path, **context: object) -> Iterator[tuple[Pa
             bad.append(f"request to {url}")
             route.abort()
 
-    site = browser.new_context(offline=True, **context)  # type: ignore[arg-type]
+    site = browser.new_context(offline=True, **context)
     page = site.new_page()
     page.route("**/*", answer)
     page.on("console", lambda m: bad.append(m.text) if m.type == "error" else None)

@@ -1,9 +1,6 @@
 """A small simulated cell for what lives in it, and the elastic arm by plain matrix products."""
 
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,10 +10,8 @@ from hilcal.config import CellConfig
 from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.drivers.simulated.injected_effects import world_without_effect
 from hilcal.drivers.simulated.truth import Truth
-from hilcal.drivers.simulated.world import World
 from hilcal.drivers.simulated.world_server import WorldState
 from hilcal.readings.readings import States
-from hilcal.types import Floats
 from tests.support.arm_cases import arm_of
 from tests.support.example_cell import ur10e_arm
 
@@ -100,7 +95,7 @@ SIDE = np.array([1.0, -1.0, 1.0, 1.0, -1.0, -1.0])
 CLOCK = 20.0
 
 
-def config(**sections: Any) -> CellConfig:
+def config(**sections):
     """A UR10e with two loads; further sections as given."""
     content = {
         "robot": {"model": "ur10e"},
@@ -119,7 +114,7 @@ def config(**sections: Any) -> CellConfig:
     return CellConfig.model_validate({**content, **sections})
 
 
-def world_of(made: CellConfig, seed: int = 1, joint_std: float = 1e-5, **hidden: Any) -> World:
+def world_of(made, seed=1, joint_std=1e-5, **hidden):
     """The world of a configuration with the given parts of its truth."""
     rng = np.random.default_rng(seed)
     world = world_without_effect(cell_from_config(made), rng, joint_std=joint_std)
@@ -129,28 +124,28 @@ def world_of(made: CellConfig, seed: int = 1, joint_std: float = 1e-5, **hidden:
 class RunningWorld:
     """A living world in this process, with a controller that does what the test says."""
 
-    def __init__(self, world: World, made: CellConfig, path: Path, seed: int = 5) -> None:
+    def __init__(self, world, made, path, seed=5):
         self.world = world
         self.board = Blackboard.create(path / "world.bin", made.simulation.clock)
         self.living = WorldState(world, made, self.board, seed)
         self.arrivals = 0
         self.now_ns = 0
 
-    def rest_at(self, q: Floats) -> Any:
+    def rest_at(self, q):
         """Let the arm arrive, and return the truth."""
         self.arrivals += 1
         fields = {"q": q, "side": SIDE, "arrivals": self.arrivals, "moving": 0.0, "alive": 1.0}
         self.board.write("arm", **fields)
         return self.truth_after()
 
-    def truth_after(self, seconds: float = 1.0) -> Any:
+    def truth_after(self, seconds=1.0):
         """Let the world look once, so many real seconds later, and return the truth."""
         self.now_ns += round(seconds * 1e9)
         self.living.step(self.now_ns)
         return self.board.read("truth")
 
 
-def states(q: Floats, wrench: Sequence[float] | Floats, time: float) -> States:
+def states(q, wrench, time):
     return States(
         q=np.asarray(q)[None],
         wrench=np.asarray(wrench, dtype=float)[None],

@@ -10,9 +10,6 @@ import subprocess
 import sys
 import termios
 import time
-from collections.abc import Callable
-from pathlib import Path
-from typing import Self
 
 import pyte
 
@@ -28,19 +25,13 @@ class AtTerminal:
     """One command of hilcal in a pseudo-terminal of its own, and what stands on its screen."""
 
     def __init__(
-        self,
-        *arguments: str | Path,
-        columns: int = 80,
-        lines: int = 30,
-        home: Path | None = None,
-        paper: int | None = None,
-        command: tuple[str, ...] = ("-m", "hilcal"),
-    ) -> None:
+        self, *arguments, columns=80, lines=30, home=None, paper=None, command=("-m", "hilcal")
+    ):
         """Start it, in the directory `home`; on wider paper, lines that are too long show."""
         self.columns = paper or columns
         self._screen = pyte.HistoryScreen(self.columns, lines, history=HISTORY, ratio=1.0)
         self._stream = pyte.ByteStream(self._screen)
-        self._silences: list[tuple[float, str]] = []
+        self._silences = []
         self._heard = time.monotonic()
         self._open = True
         self._master, slave = pty.openpty()
@@ -62,12 +53,12 @@ class AtTerminal:
     # what stands there
 
     @property
-    def page(self) -> list[str]:
+    def page(self):
         """The lines of the screen as it is now, without blanks at their ends."""
         return [line.rstrip() for line in self._screen.display]
 
     @property
-    def lines(self) -> list[str]:
+    def lines(self):
         """Everything that still stands, from the first line: scrolled off, and on the screen."""
         above = [
             "".join(row[k].data for k in range(self.columns)).rstrip()
@@ -79,22 +70,22 @@ class AtTerminal:
         return above + below
 
     @property
-    def text(self) -> str:
+    def text(self):
         """All lines as one text; words that a line's end divides are joined by a blank."""
         return " ".join(" ".join(self.lines).split())
 
-    def page_with(self, words: str) -> str:
+    def page_with(self, words):
         """The first line of the screen that has some words; empty where there is none."""
         return next((line for line in self.page if words in line), "")
 
     @property
-    def gaps(self) -> list[tuple[float, str]]:
+    def gaps(self):
         """Silences, the longest first."""
         return sorted(self._silences, reverse=True)
 
     # what happens
 
-    def read_screen(self, seconds: float = 0.05) -> bool:
+    def read_screen(self, seconds=0.05):
         """Let the screen change for a while; False where the program's end has been read."""
         end = time.monotonic() + seconds
         while self._open and (left := end - time.monotonic()) > 0:
@@ -113,11 +104,11 @@ class AtTerminal:
             self._stream.feed(found)
         return self._open
 
-    def wait_for_words(self, words: str, times: int = 1) -> None:
+    def wait_for_words(self, words, times=1):
         """Wait until words stand there, so many times; line ends count as blanks."""
         self.wait(lambda: self.text.count(words) >= times, f"{words!r} for the {times}. time")
 
-    def check_words_stay(self, words: str, times: int = 1) -> None:
+    def check_words_stay(self, words, times=1):
         """Wait for words, and see that they still stand after a while."""
         self.wait_for_words(words, times)
         end = time.monotonic() + STANDING_S
@@ -125,7 +116,7 @@ class AtTerminal:
             self.read_screen()
         assert self.text.count(words) >= times, f"wiped away: {words!r}\n" + "\n".join(self.lines)
 
-    def wait(self, holds: Callable[[], bool], what: str) -> None:
+    def wait(self, holds, what):
         end = time.monotonic() + DEADLINE
         while not holds():
             there = self.read_screen()
@@ -134,19 +125,19 @@ class AtTerminal:
             assert there, f"ended before {what}:\n" + "\n".join(self.lines)
             assert time.monotonic() < end, f"never {what}:\n" + "\n".join(self.lines)
 
-    def type_keys(self, keys: str) -> None:
+    def type_keys(self, keys):
         os.write(self._master, keys.encode())
 
-    def wait_for_end(self, within: float = DEADLINE) -> int:
+    def wait_for_end(self, within=DEADLINE):
         end = time.monotonic() + within
         while self.read_screen(0.2):
             assert time.monotonic() < end, "it does not end:\n" + "\n".join(self.lines)
         return self.process.wait(10.0)
 
-    def __enter__(self) -> Self:
+    def __enter__(self):
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         if self.process.poll() is None:
             os.killpg(self.process.pid, signal.SIGKILL)
             self.process.wait()

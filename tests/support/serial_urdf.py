@@ -1,14 +1,12 @@
 """URDFs of serial arms, a row for each joint."""
 
-from collections.abc import Mapping, Sequence
-
 USUAL = {
     "type": "revolute", "xyz": "0 0 0", "rpy": "0 0 0", "axis": "0 0 1",
     "lower": -3.1, "upper": 3.1, "effort": 100, "mimic": "", "com": "0 0 0.1",
 }  # fmt: skip
 
 
-def serial_urdf(rows: Sequence[Mapping[str, object]]) -> str:
+def serial_urdf(rows):
     """Joints j1, j2, ... to links l1, l2, ..., unless named; masses where given, kg."""
     out, parent = ['<robot name="arm"><link name="l0"/>'], "l0"
     for k, row in enumerate(rows, start=1):

@@ -6,11 +6,8 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -28,7 +25,7 @@ class SimulatedUr(Instrument):
     host: str
     is_x: bool
 
-    def wait(self, what: str, value: Any, timeout: float = 5.0) -> dict[str, Any]:
+    def wait(self, what, value, timeout=5.0):
         """Wait until a field of the state has a value; returns the state."""
         deadline = time.monotonic() + timeout
         while (state := self.admin())[what] != value:
@@ -37,18 +34,13 @@ class SimulatedUr(Instrument):
         return state
 
 
-def server(directory: Path, host: str, *arguments: str) -> DeviceProcess:
+def server(directory, host, *arguments):
     """The process of a controller, to be started."""
     arguments = ("--host", host, "--robot", "ur10e", *arguments)
     return DeviceProcess("arm", "hilcal.drivers.simulated.ur_server", directory, arguments)
 
 
-def start(
-    directory: Path,
-    scale: float = 1.0,
-    truth: dict[str, Any] | None = None,
-    *arguments: str,
-) -> SimulatedUr:
+def start(directory, scale=1.0, truth=None, *arguments):
     """Start a controller in a world of its own; `truth` are fields of the blackboard's section."""
     board = Blackboard.create(directory / "world.bin", scale)
     if truth is not None:
@@ -71,7 +63,7 @@ class ClientError(Exception):
 class Client:
     """The real client library in a process of its own: its constructors hold the GIL."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.process = subprocess.Popen(
             [sys.executable, str(ROOT / "tests" / "support" / "sim_ur_client.py")],
             stdin=subprocess.PIPE,
@@ -80,7 +72,7 @@ class Client:
             env={**environment(), "OMP_NUM_THREADS": "1"},
         )
 
-    def __call__(self, part: str, call: str, *arguments: Any) -> Any:
+    def __call__(self, part, call, *arguments):
         """Call `part` ("control", "receive", "dashboard"); the call "open" constructs it."""
         self.process.stdin.write(json.dumps([part, call, arguments]).encode() + b"\n")
         self.process.stdin.flush()
@@ -92,7 +84,7 @@ class Client:
             raise ClientError(result["error"])
         return result["result"]
 
-    def close(self) -> None:
+    def close(self):
         self.process.kill()
         self.process.wait()
         self.process.stdin.close()
@@ -100,7 +92,7 @@ class Client:
 
 
 @contextmanager
-def client(host: str, *parts: str) -> Iterator[Client]:
+def client(host, *parts):
     """A client with these parts opened."""
     made = Client()
     try:
@@ -114,35 +106,35 @@ def client(host: str, *parts: str) -> Iterator[Client]:
 class Wire:
     """A plain socket that speaks RTDE frames."""
 
-    def __init__(self, host: str, port: int = 30004) -> None:
+    def __init__(self, host, port=30004):
         self.socket = socket.create_connection((host, port), timeout=5.0)
 
-    def __enter__(self) -> "Wire":
+    def __enter__(self):
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, *error):
         self.socket.close()
 
-    def send(self, kind: str, payload: bytes = b"") -> None:
+    def send(self, kind, payload=b""):
         self.socket.sendall(struct.pack(">HB", 3 + len(payload), ord(kind)) + payload)
 
-    def receive(self) -> tuple[str, bytes]:
+    def receive(self):
         size, kind = struct.unpack(">HB", self.exactly(3))
         return chr(kind), self.exactly(size - 3)
 
-    def ask(self, kind: str, payload: bytes = b"") -> bytes:
+    def ask(self, kind, payload=b""):
         """Send a frame and return the payload of the next one, which has the same type."""
         self.send(kind, payload)
         came, body = self.receive()
         assert came == kind
         return body
 
-    def outputs(self, names: str, hz: float = 125.0) -> str:
+    def outputs(self, names, hz=125.0):
         """Agree on outputs; returns their types."""
         assert self.ask("V", struct.pack(">H", 2)) == b"\x01"
         return self.ask("O", struct.pack(">d", hz) + names.encode())[1:].decode()
 
-    def exactly(self, count: int) -> bytes:
+    def exactly(self, count):
         data = b""
         while len(data) < count:
             more = self.socket.recv(count - len(data))
@@ -155,25 +147,25 @@ class Wire:
 class Lines:
     """A plain socket that speaks lines: the dashboard."""
 
-    def __init__(self, host: str, port: int = 29999) -> None:
+    def __init__(self, host, port=29999):
         self.socket = socket.create_connection((host, port), timeout=5.0)
         self.stream = self.socket.makefile("rb")
 
-    def __enter__(self) -> "Lines":
+    def __enter__(self):
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, *error):
         self.stream.close()
         self.socket.close()
 
-    def read(self) -> str:
+    def read(self):
         return self.stream.readline().decode().rstrip("\n")
 
-    def ask(self, words: str) -> str:
+    def ask(self, words):
         self.socket.sendall(words.encode() + b"\n")
         return self.read()
 
 
-def send_script(host: str, text: str) -> None:
+def send_script(host, text):
     with socket.create_connection((host, 30003), timeout=5.0) as line:
         line.sendall(text.encode())

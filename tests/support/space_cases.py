@@ -1,25 +1,20 @@
 """Another way to tell what a state touches: own kinematics, and points along every capsule."""
 
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from hypothesis import strategies as st
 
-from hilcal.cell import Cell, cell_from_config
-from hilcal.config import CellConfig, Obstacle
-from hilcal.design.feasible import DrawnPoses, FeasibleSpace, draw_poses
-from hilcal.measuring.clearance import Clearance
-from hilcal.robot.arm import Arm
-from hilcal.robot.scene import Capsule
-from hilcal.types import Floats
+from hilcal.cell import cell_from_config
+from hilcal.config import CellConfig
+from hilcal.design.feasible import FeasibleSpace, draw_poses
 
 POINTS = 41
 ALWAYS = ({"wrist 1", "wrist 3"}, {"base", "upper arm"})
 """Parts whose crude shapes nearly touch in every state; they cannot meet on the real arm."""
 
 
-def frames(arm: Arm, q: Floats) -> list[Floats]:
+def frames(arm, q):
     """(4, 4) frames of base and bodies, then of the flange."""
     out, pose = [np.eye(4)], np.eye(4)
     for link, angle in zip(arm.links, q, strict=False):
@@ -30,18 +25,18 @@ def frames(arm: Arm, q: Floats) -> list[Floats]:
     return [*out, pose @ arm.links[-1]]
 
 
-def along(a: Floats, b: Floats) -> Floats:
+def along(a, b):
     """(POINTS, 3) points of a segment."""
     return a + np.linspace(0.0, 1.0, POINTS)[:, None] * (b - a)
 
 
-def placed(part: Capsule, at: list[Floats]) -> Floats:
+def placed(part, at):
     """(POINTS, 3) points of a capsule's segment, base axes."""
     frame = at[part.body]
     return along(part.start, part.end) @ frame[:3, :3].T + frame[:3, 3]
 
 
-def reached(cell: Cell, parts: tuple[Capsule, ...], q: Floats) -> tuple[Floats, Floats]:
+def reached(cell, parts, q):
     """(3,) what all that is held to a workspace reaches in states (N, n): lowest and highest, m."""
     turns = np.zeros((25, cell.arm.n))
     turns[:, 0] = np.linspace(-np.pi, np.pi, 25)
@@ -52,7 +47,7 @@ def reached(cell: Cell, parts: tuple[Capsule, ...], q: Floats) -> tuple[Floats, 
     return low, np.where(rises < high, np.maximum(high, upper[1]), high)
 
 
-def extent(parts: list[Capsule], cell: Cell, q: Floats) -> tuple[Floats, Floats]:
+def extent(parts, cell, q):
     """(3,) lowest and highest of capsules in states (N, n) along each axis, m."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for state in q:
@@ -65,12 +60,12 @@ def extent(parts: list[Capsule], cell: Cell, q: Floats) -> tuple[Floats, Floats]
     return low, high
 
 
-def gap(a: Floats, b: Floats) -> float:
+def gap(a, b):
     """The least distance of the points of two segments."""
     return float(np.linalg.norm(a[:, None] - b[None], axis=2).min())
 
 
-def gap_to(thing: Obstacle, points: Floats) -> float:
+def gap_to(thing, points):
     """The least distance of points to an obstacle; 0 inside."""
     if thing.center_m is not None:
         off = np.abs(points - thing.center_m) - 0.5 * np.array(thing.size_m)
@@ -81,7 +76,7 @@ def gap_to(thing: Obstacle, points: Floats) -> float:
     return float(np.linalg.norm(np.maximum(off, 0.0), axis=1).min())
 
 
-def self_gap(parts: tuple[Capsule, ...], at: list[Floats]) -> float:
+def self_gap(parts, at):
     """The least gap between parts of bodies that are not neighbours."""
     out = np.inf
     for a, b in combinations(parts, 2):
@@ -90,7 +85,7 @@ def self_gap(parts: tuple[Capsule, ...], at: list[Floats]) -> float:
     return out
 
 
-def hung(cell: Cell, shapes: Clearance, q: Floats, load: str) -> list[tuple[Floats, float]]:
+def hung(cell, shapes, q, load):
     """Points and radius of what hangs, and of the cable."""
     flange = frames(cell.arm, q)[-1]
     at = flange[:3, :3] @ cell.load_point + flange[:3, 3]
@@ -107,7 +102,7 @@ def hung(cell: Cell, shapes: Clearance, q: Floats, load: str) -> list[tuple[Floa
     return out
 
 
-def energy(cell: Cell, q: Floats, force: Floats) -> float:
+def energy(cell, q, force):
     """Potential energy of arm and tool, and of a constant force at the load point, J."""
     arm, at = cell.arm, frames(cell.arm, q)
     flange = at[-1]
@@ -120,7 +115,7 @@ def energy(cell: Cell, q: Floats, force: Floats) -> float:
     return out - float(force @ (flange[:3, :3] @ cell.load_point + flange[:3, 3]))
 
 
-def torques(cell: Cell, q: Floats, force: Floats) -> Floats:
+def torques(cell, q, force):
     """(n,) what weights and a force at the load point exert about the joints, N·m."""
     h = 1e-4
     steps = h * np.eye(cell.arm.n)
@@ -128,7 +123,7 @@ def torques(cell: Cell, q: Floats, force: Floats) -> Floats:
                      for s in steps])  # fmt: skip
 
 
-def conditioning(arm: Arm, q: Floats) -> float:
+def conditioning(arm, q):
     """σ_min/σ_max of the flange's Jacobian by differences, lengths in units of the reach."""
     h, columns = 1e-6, []
     flange = frames(arm, q)[-1]
@@ -145,9 +140,9 @@ def conditioning(arm: Arm, q: Floats) -> float:
 TABLE = {"name": "table", "center_m": [0.0, 0.0, -0.06], "size_m": [2.0, 2.0, 0.1]}
 
 
-def cell(**sections: Any) -> CellConfig:
+def cell(**sections):
     """A UR10e with a weight and a pull; sections are replaced."""
-    usual: dict[str, Any] = {
+    usual = {
         "robot": {"model": "ur10e"},
         "tool": {
             "target_m": [0.06, 0.02, 0.12],
@@ -164,11 +159,11 @@ def cell(**sections: Any) -> CellConfig:
     return CellConfig.model_validate(usual | sections)
 
 
-def space_of(config: CellConfig) -> FeasibleSpace:
+def space_of(config):
     return FeasibleSpace(cell_from_config(config))
 
 
-def drawn_of(config: CellConfig, count: int = 40, seed: int = 0, **how: Any) -> DrawnPoses:
+def drawn_of(config, count=40, seed=0, **how):
     return draw_poses(space_of(config), count, np.random.default_rng(seed), **how)
 
 

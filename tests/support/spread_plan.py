@@ -2,20 +2,17 @@
 
 import numpy as np
 
-from hilcal.cell import Cell
 from hilcal.design.feasible import FeasibleSpace, draw_poses
 from hilcal.design.run_order import Ordering, PoseReadings, order_plan
-from hilcal.store.plan import Plan
-from hilcal.types import Bools, Floats
 
 
-def spread_plan(cell: Cell, count: int, rng: np.random.Generator, repeats: int = 2) -> Plan:
+def spread_plan(cell, count, rng, repeats=2):
     """Return a plan of `count` poses in the shortest order; every pose bears every load."""
     space = FeasibleSpace(cell)
     drawn = draw_poses(space, 30 * (count + 1), rng, min_poses=count + 1)
     q = drawn.q[drawn.allowed.all(axis=1)]
 
-    def reaches(start: Floats, ends: Floats) -> Bools:
+    def reaches(start, ends):
         """To which of `ends` a motion is clear under every load."""
         return np.all([space.passable(start, ends, load) for load in space.loads], axis=0)
 

@@ -1,8 +1,6 @@
 """Streams of readings of a moving arm, as Parquet files."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -14,7 +12,6 @@ from hilcal.model.model import Model
 from hilcal.readings.readings import States
 from hilcal.robot import se3
 from hilcal.robot.catalogue import configs_dir
-from hilcal.types import Floats
 
 CELL = configs_dir() / "cells" / "demo_ur10e.toml"
 NOISE = 2e-5
@@ -22,11 +19,11 @@ WRENCH = ("fx_N", "fy_N", "fz_N", "mx_Nm", "my_Nm", "mz_Nm")
 EFFECTS = ("encoder_offset", "joint_compliance", "target_offset")
 
 
-def cell() -> Cell:
+def cell():
     return Cell.load(CELL)
 
 
-def motion(count: int, rng: np.random.Generator) -> Floats:
+def motion(count, rng):
     """(N, 6) joint angles of an arm that moves on, at 1,000 readings a second."""
     t = np.arange(count)[:, None] / max(count, 2)
     speed, phase = rng.uniform(3, 9, 6), rng.uniform(0, 6, 6)
@@ -34,7 +31,7 @@ def motion(count: int, rng: np.random.Generator) -> Floats:
     return middle + [2.5, 0.7, 0.9, 1.2, 1.5, 2.8] * np.sin(speed * t * 6 + phase)
 
 
-def truth(of: Cell, rng: np.random.Generator) -> tuple[Model, Floats]:
+def truth(of, rng):
     """An arm that differs from the nominal one, in a tracker's frame."""
     turned = np.eye(4)
     turned[:3, :3] = se3.rotation(np.array([0.1, -0.05, 2.0]))
@@ -49,15 +46,7 @@ def truth(of: Cell, rng: np.random.Generator) -> tuple[Model, Floats]:
     return model, scales_of(model) * rng.normal(size=model.size)
 
 
-def write(
-    path: Path,
-    count: int,
-    *,
-    group: int = 20_000,
-    seed: int = 1,
-    gross: int = 0,
-    damage: Callable[[pa.Table], pa.Table] = lambda table: table,
-) -> Floats:
+def write(path, count, *, group=20_000, seed=1, gross=0, damage=lambda table: table):
     """Write a stream; the true parameters of `EFFECTS`."""
     rng = np.random.default_rng(seed)
     model, theta = truth(cell(), rng)
@@ -79,11 +68,11 @@ def write(
     return theta
 
 
-def _variances() -> tuple[float, ...]:
+def _variances():
     return NOISE**2, 0.0, 0.0, NOISE**2, 0.0, NOISE**2
 
 
-def _schema() -> pa.Schema:
+def _schema():
     names = [*(f"q{k}_rad" for k in range(1, 7)), "x_m", "y_m", "z_m", *WRENCH, "time_s"]
     names += [f"cov_{a}" for a in ("x_x", "x_y", "x_z", "y_y", "y_z", "z_z")]
     return pa.schema([*((name, pa.float64()) for name in names), ("covers", pa.string())])

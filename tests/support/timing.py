@@ -1,14 +1,13 @@
 """How long work takes, and waiting, where a machine has other work too."""
 
 import time
-from collections.abc import Callable
 
 import psutil
 
 
-def shortest(works: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
+def shortest(works, rounds):
     """Return the shortest processor time of each piece of work, s; they are done in turn."""
-    times: dict[str, list[float]] = {name: [] for name in works}
+    times = {name: [] for name in works}
     for _ in range(rounds):
         for name, work in works.items():
             start = time.process_time()
@@ -17,7 +16,7 @@ def shortest(works: dict[str, Callable[[], object]], rounds: int) -> dict[str, f
     return {name: min(seconds) for name, seconds in times.items()}
 
 
-def runs(pid: int) -> bool:
+def runs(pid):
     """Whether a process is there, and no zombie."""
     try:
         return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
@@ -25,7 +24,7 @@ def runs(pid: int) -> bool:
         return False
 
 
-def wait_until(holds: Callable[[], object], what: str, seconds: float = 30.0) -> None:
+def wait_until(holds, what, seconds=30.0):
     """Wait until something holds; the limit is far above what a busy machine takes."""
     end = time.monotonic() + seconds
     while not holds():

@@ -1,12 +1,10 @@
 """A campaign changed as somebody would who knows SQLite: its guards are back afterwards."""
 
-import sqlite3
-from collections.abc import Iterator
 from contextlib import contextmanager
 
 
 @contextmanager
-def unguarded(db: sqlite3.Connection) -> Iterator[None]:
+def unguarded(db):
     """Let rows be changed that no program of ours changes."""
     kept = db.execute("SELECT name, sql FROM sqlite_master WHERE type = 'trigger'").fetchall()
     for name, _ in kept:

@@ -3,10 +3,7 @@
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import psutil
@@ -15,7 +12,7 @@ import pytest
 from hilcal.config import CellConfig
 from hilcal.drivers.simulated.cell_processes import free_host
 from hilcal.drivers.simulated.ur_server import API
-from hilcal.drivers.ur import UrArm, open_arm
+from hilcal.drivers.ur import open_arm
 from hilcal.drivers.ur_link.supervision import Dashboard, RobotApi, ask
 from hilcal.errors import DeviceError
 from tests.support import sim_ur_cases
@@ -24,22 +21,18 @@ MASS, COM = 2.5, np.array([0.01, -0.02, 0.08])
 SPEED, ACCELERATION = 0.5, 4.0
 STOP_NS = 500_000_000  # in this time the arm has to stand after a fault (the requirement)
 
-Sim = sim_ur_cases.SimulatedUr
 
-
-def config(
-    host: str | None, model: str = "ur10e", clock: float = 1.0, **options: Any
-) -> CellConfig:
+def config(host, model="ur10e", clock=1.0, **options):
     options = {"robot_api_port": API, **options}
     robot = {"model": model, "driver": "ur", "host": host, "options": options}
     return CellConfig.model_validate({"robot": robot, "simulation": {"clock": clock}})
 
 
-def start(directory: Path, *arguments: str, scale: float = 1.0) -> Sim:
+def start(directory, *arguments, scale=1.0):
     return sim_ur_cases.start(directory, scale, None, *arguments)
 
 
-def controlled(sim: Sim, clock: float = 1.0) -> UrArm:
+def controlled(sim, clock=1.0):
     arm = open_arm(config(sim.host, clock=clock))
     try:
         arm.take_control(MASS, COM)
@@ -49,19 +42,19 @@ def controlled(sim: Sim, clock: float = 1.0) -> UrArm:
     return arm
 
 
-def displaced_joints(arm: UrArm, by: float = 0.8) -> np.ndarray:
+def displaced_joints(arm, by=0.8):
     """A goal that takes a while, and stays within the joint limits."""
     q = arm.sample().q.copy()
     q[0] += by if q[0] < 0 else -by
     return q
 
 
-def finish(arm: UrArm) -> None:
+def finish(arm):
     while arm.moving():
         time.sleep(0.01)
 
 
-def under_way(arm: UrArm, sim: Sim) -> np.ndarray:
+def under_way(arm, sim):
     """Start a motion and watch it until it has its full speed; returns the goal."""
     goal = displaced_joints(arm)
     arm.start_move(goal, SPEED, ACCELERATION)
@@ -71,7 +64,7 @@ def under_way(arm: UrArm, sim: Sim) -> np.ndarray:
     return goal
 
 
-def error_of(call: Callable[[], Any], seconds: float = 20.0) -> str:
+def error_of(call, seconds=20.0):
     """Call until a DeviceError comes; returns its text, which has to be one line."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
@@ -87,15 +80,15 @@ def error_of(call: Callable[[], Any], seconds: float = 20.0) -> str:
     return text
 
 
-def supervision(sim: Sim) -> Dashboard | RobotApi:
+def supervision(sim):
     return RobotApi(sim.host, API) if sim.is_x else Dashboard(sim.host)
 
 
-def api(sim: Sim) -> RobotApi:
+def api(sim):
     return RobotApi(sim.host, API)
 
 
-def children() -> list[psutil.Process]:
+def children():
     """Child processes of the driver (the simulated controllers are children, too)."""
     end = time.monotonic() + 2.0
     while True:
@@ -109,14 +102,14 @@ def children() -> list[psutil.Process]:
         time.sleep(0.01)
 
 
-def _words(process: psutil.Process) -> list[str]:
+def _words(process):
     try:
         return process.cmdline()
     except psutil.NoSuchProcess:
         return []
 
 
-def restore(sim: Sim) -> None:
+def restore(sim):
     """Switch off every fault and bring the robot back to running (not a protective stop)."""
     for op in ("rtde_stall", "rtde_mute", "dashboard_mute", "refuse", "refuse_motion"):
         sim.admin(op, on=False)
@@ -133,7 +126,7 @@ def restore(sim: Sim) -> None:
     sim.wait("moving", False)
 
 
-def check_resting(sim: Sim, since: int) -> None:
+def check_resting(sim, since):
     """The arm came to rest in time after a moment, and stays there."""
     state = sim.wait("moving", False)
     assert state["rest_ns"] - since < STOP_NS
@@ -142,7 +135,7 @@ def check_resting(sim: Sim, since: int) -> None:
 
 
 @contextmanager
-def server(port: int, says: Callable[[bytes], bytes]) -> Iterator[tuple[str, list[bytes]]]:
+def server(port, says):
     """Something that listens on a port, and what it was asked, one connection after the other."""
     host, asked = free_host(), []
     with socket.socket() as door:
@@ -150,7 +143,7 @@ def server(port: int, says: Callable[[bytes], bytes]) -> Iterator[tuple[str, lis
         door.bind((host, port))
         door.listen(8)
 
-        def serve() -> None:
+        def serve():
             while True:
                 try:
                     line, _ = door.accept()
@@ -179,7 +172,7 @@ GENERATIONS = ("5.11.6.1010327", "10.14.0.0")
 @pytest.fixture(
     scope="module", params=[GENERATIONS[0], pytest.param(GENERATIONS[1], marks=pytest.mark.long)]
 )
-def sim(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Iterator[Sim]:
+def sim(tmp_path_factory, request):
     """One controller of each generation for a file."""
     running = start(tmp_path_factory.mktemp("ur"), "--version", request.param)
     yield running
@@ -187,7 +180,7 @@ def sim(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
 
 
 @pytest.fixture
-def arm(sim: Sim) -> Iterator[UrArm]:
+def arm(sim):
     """An arm under control; after the test there is no fault and no process."""
     opened = controlled(sim)
     yield opened

@@ -9,12 +9,11 @@ import math
 import operator
 import random
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 
 MOTIONS = ("movej", "movel", "movep", "servoj", "movec", "servoc", "speedj", "speedl")
-OPERATORS: dict[type, Callable] = {
+OPERATORS = {
     **{ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul},
     **{ast.Div: operator.truediv, ast.Mod: operator.mod, ast.Eq: operator.eq},
     **{ast.NotEq: operator.ne, ast.Lt: operator.lt, ast.LtE: operator.le},
@@ -51,15 +50,15 @@ class ExecutedMotion:
 class Machine:
     """A controller; digital inputs read the same for the same seed."""
 
-    def __init__(self, seed: int, by_reference: bool) -> None:
+    def __init__(self, seed, by_reference):
         self.inputs = random.Random(seed)
         self.by_reference = by_reference
-        self.told: list[ExecutedMotion] = []
-        self.tool: object = None
+        self.told = []
+        self.tool = None
         self.fuel = 400
-        self.threads: list[tuple[str, list, int]] = []
+        self.threads = []
 
-    def run(self, program: str) -> list[ExecutedMotion]:
+    def run(self, program):
         """Run a program until it ends or fails; returns its motions."""
         lines = []
         for k, line in enumerate(re.split(r"\r?\n", program), start=1):
@@ -69,7 +68,7 @@ class Machine:
         body = self._block(lines)
         assert not lines
         try:
-            scopes: list[dict[str, object]] = [{}]
+            scopes = [{}]
             self._do(body, scopes)
             if len(body) == 1 and body[0][1] == "def":  # a program of one function is called
                 self.called(body[0][2], [], {}, scopes, 0)
@@ -102,7 +101,7 @@ class Machine:
             lines.pop(0)
         return out
 
-    def _do(self, body, scopes) -> None:
+    def _do(self, body, scopes):
         for number, kind, *rest in body:
             self.fuel -= 1
             if self.fuel < 0:
@@ -125,7 +124,7 @@ class Machine:
             else:
                 self._statement(rest[0], scopes, number)
 
-    def _statement(self, text, scopes, line) -> None:
+    def _statement(self, text, scopes, line):
         if text == "break":
             raise Broken
         if text.startswith("return"):

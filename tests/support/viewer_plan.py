@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilcal.cell import Cell, cell_from_config
+from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
 from hilcal.design.run_order import Confounding, Duration
 from hilcal.design.summary import (
@@ -80,18 +80,18 @@ SUMMARY = PlanSummary(
 BARE = PlanSummary(3, 10, {UNLOADED: 10}, Duration(1.0, 2.0, 0.0), "made by hand", None, (), None)
 
 
-def configured(**sections: object) -> Cell:
+def configured(**sections):
     told = load_config(CELL).model_dump(mode="json", exclude_none=True)
     config = CellConfig.model_validate(told | sections)
     return cell_from_config(config)
 
 
-def target(cell: Cell, pose: int) -> np.ndarray:
+def target(cell, pose):
     return evaluate(cell.arm, Q[pose : pose + 1]).point(cell.target[:3, 3])[0]
 
 
 @pytest.fixture(scope="module")
-def shadowed() -> Cell:
+def shadowed():
     """A screen stands between the tracker and the target in pose p1; a pillar stands apart."""
     cell = configured()
     middle = 0.45 * target(cell, 1) + 0.55 * TRACKER
@@ -105,17 +105,17 @@ def shadowed() -> Cell:
 
 
 @pytest.fixture(scope="module")
-def recording(shadowed, tmp_path_factory) -> Path:
+def recording(shadowed, tmp_path_factory):
     path = tmp_path_factory.mktemp("plan") / "plan.rrd"
     record_plan(shadowed, PLAN, SUMMARY, path)
     return path
 
 
-def rgb(value: int) -> tuple[int, int, int]:
+def rgb(value):
     return value >> 24 & 255, value >> 16 & 255, value >> 8 & 255
 
 
-def turned(quaternion: np.ndarray) -> np.ndarray:
+def turned(quaternion):
     """(K, 3) where quaternions x y z w lead the z axis."""
     x, y, z, w = np.asarray(quaternion).T
     return np.stack([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)], 1)

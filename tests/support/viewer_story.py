@@ -7,42 +7,17 @@ import numpy as np
 from hilcal.identification.residual import ErrorBlock
 from hilcal.present.document import table
 from hilcal.present.story import DependenceCurve, Story, StoryRevision
-from hilcal.robot.arm import Arm
+from hilcal.robot.catalogue import load_arm
 from hilcal.robot.scene import body_poses
 
 EFFECTS = ("joint_compliance", "base_compliance", "joint_tilt_compliance", "hysteresis")
-_DH = (  # d, a, alpha of a UR10e (Universal Robots' published DH parameters)
-    (0.1807, 0.0, np.pi / 2),
-    (0.0, -0.6127, 0.0),
-    (0.0, -0.57155, 0.0),
-    (0.17415, 0.0, np.pi / 2),
-    (0.11985, 0.0, -np.pi / 2),
-    (0.11655, 0.0, 0.0),
-)
 
 
-def ur10e() -> Arm:
-    links = np.stack([np.eye(4)] * 7)
-    for k, (d, a, alpha) in enumerate(_DH):
-        c, s = np.cos(alpha), np.sin(alpha)
-        links[k + 1] = [[1, 0, 0, a], [0, c, -s, 0], [0, s, c, d], [0, 0, 0, 1]]
-    return Arm(
-        name="ur10e",
-        links=links,
-        masses=np.array([7.369, 13.051, 3.989, 2.1, 1.98, 0.615]),
-        coms=np.zeros((6, 3)),
-        q_min=np.full(6, -2 * np.pi),
-        q_max=np.full(6, 2 * np.pi),
-        torque_max=np.array([330.0, 330, 150, 54, 54, 54]),
-        payload=12.5,
-        joint_names=tuple(f"joint{i}" for i in range(1, 7)),
-        source="UR10e DH parameters, Universal Robots",
-    )
+def ur10e():
+    return load_arm("ur10e")
 
 
-def story(
-    poses: int = 30, loads: int = 3, seed: int = 1, mode: str = "deflection", names: str = ""
-) -> Story:
+def story(poses=30, loads=3, seed=1, mode="deflection", names=""):
     """Build a story of `poses` x `loads` readings and 4 revisions with falling residuals."""
     rng = np.random.default_rng(seed)
     arm = ur10e()
@@ -116,7 +91,7 @@ LOAD = DependenceCurve(
 )
 
 
-def doubtful(names: str = "") -> Story:
+def doubtful(names=""):
     """A story with doubts: a missing effect, an ambiguous one, an unknown one, and none left."""
     told = story(poses=12, names=names)
     first, second, third, last = told.revisions

@@ -1,17 +1,12 @@
 """One simulated cell for the files that let campaigns meet faults."""
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 
-from tests.support.campaign_cases import Site, site
+from tests.support.campaign_cases import site
 
 
 @pytest.fixture(scope="module")
-def cell(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Site]:
+def cell(request, tmp_path_factory):
     """One simulated cell for a file, with a plan that is long enough for all of its runs."""
     runs = sum(
         item.path == request.path and "path" in getattr(item, "fixturenames", ())
@@ -24,7 +19,7 @@ def cell(
 
 
 @pytest.fixture
-def nothing_goes_on(cell: Site) -> Iterator[None]:
+def nothing_goes_on(cell):
     """End what a test that failed has left running, and let the arm move at its full speed."""
     yield
     cell.end_runs()
@@ -32,6 +27,6 @@ def nothing_goes_on(cell: Site) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def path(cell: Site) -> Path:
+def path(cell):
     """The campaign that the tests of a file measure, one after the other."""
     return cell.directory / "run.hilcal"

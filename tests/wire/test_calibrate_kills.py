@@ -3,7 +3,6 @@
 import os
 import signal
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ EACH = 10  # kills of one calibration
 LONGEST = 14.0  # a moment is drawn up to here, s: so long a start, its devices and some steps take
 
 
-def finished(c: CalibrationProcess) -> None:
+def finished(c):
     assert next_step(c.run).kind == "done"
     c.check_each_reading_once()
     with CampaignFile.open(c.run, read_only=True) as campaign:
@@ -29,7 +28,7 @@ def finished(c: CalibrationProcess) -> None:
 
 
 @pytest.mark.long
-def test_killed_twice_while_it_measures(tmp_path: Path) -> None:
+def test_killed_twice_while_it_measures(tmp_path):
     c = CalibrationProcess(tmp_path)
     for wanted in (2, 5):
         process = c.start()
@@ -49,7 +48,7 @@ def test_killed_twice_while_it_measures(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_killed_at_fifty_random_moments(tmp_path: Path) -> None:
+def test_killed_at_fifty_random_moments(tmp_path):
     seed = int(np.random.SeedSequence().generate_state(1)[0])
     print(f"seed {seed}")
     rng = np.random.default_rng(seed)

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import psutil
 import pytest
@@ -24,7 +23,7 @@ MEASURING_S, CASES_S, END_S = 240.0, 600.0, 15.0
 """Longest until both cells measure, until both are done, and until a process is gone."""
 
 
-def study(folder: Path, *options: str, temporary: Path | None = None) -> "subprocess.Popen[str]":
+def study(folder, *options, temporary=None):
     more = {} if temporary is None else {"TMPDIR": str(temporary)}
     return subprocess.Popen(
         [sys.executable, "-m", "studies", "corrected", str(folder), *SIZE, *options],
@@ -37,7 +36,7 @@ def study(folder: Path, *options: str, temporary: Path | None = None) -> "subpro
     )
 
 
-def until_both_measure(folder: Path, process: "subprocess.Popen[str]") -> None:
+def until_both_measure(folder, process):
     end = time.monotonic() + MEASURING_S
     while min(readings(folder, arm) for arm in ARMS) < 2:
         assert process.poll() is None, process.communicate()
@@ -45,7 +44,7 @@ def until_both_measure(folder: Path, process: "subprocess.Popen[str]") -> None:
         time.sleep(0.1)
 
 
-def readings(folder: Path, arm: str) -> int:
+def readings(folder, arm):
     try:
         with CampaignFile.open(folder / f"{arm}-{EFFECT}.hilcal", read_only=True) as campaign:
             return campaign.n_readings
@@ -53,17 +52,17 @@ def readings(folder: Path, arm: str) -> int:
         return 0
 
 
-def devices(*of: int) -> list[psutil.Process]:
+def devices(*of):
     every = [p for pid in of for p in psutil.Process(pid).children(recursive=True)]
     return [p for p in every if "drivers." in " ".join(p.cmdline())]
 
 
-def gone(family: list[psutil.Process]) -> bool:
+def gone(family):
     return not psutil.wait_procs(family, timeout=END_S)[1]
 
 
 @pytest.mark.slow
-def test_ctrl_c(tmp_path: Path) -> None:
+def test_ctrl_c(tmp_path):
     (temporary := tmp_path / "tmp").mkdir()
     process = study(tmp_path / "d", "--jobs", "2", temporary=temporary)
     try:
@@ -83,7 +82,7 @@ def test_ctrl_c(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_worker_of_a_cluster_is_killed(tmp_path: Path) -> None:
+def test_a_worker_of_a_cluster_is_killed(tmp_path):
     with scheduler() as address:
         start = ("dask", "worker", address, *WORKER)
         with running(*start) as doomed, running(*start) as other:

@@ -1,8 +1,5 @@
 """Faults of a laser tracker and a force sensor in the network, in the middle of a campaign."""
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 
 from hilcal.drivers import emscon_packets as es
@@ -12,7 +9,7 @@ pytestmark = [pytest.mark.long, pytest.mark.usefixtures("nothing_goes_on")]
 
 
 @pytest.fixture(scope="module")
-def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[cases.Site]:
+def cell(tmp_path_factory):
     with cases.site(
         tmp_path_factory.mktemp("cell"),
         poses=12,
@@ -57,16 +54,16 @@ ERROR = cases.Fault(
 
 
 @cases.parametrize_faults(AT_REST)
-def test_a_fault_while_the_arm_rests(fault: cases.Fault, cell: cases.Site, path: Path) -> None:
+def test_a_fault_while_the_arm_rests(fault, cell, path):
     cases.check_fault(fault, cell, path, moving=False)
 
 
 @pytest.mark.slow
-def test_an_error_of_the_force_sensor_stops_the_arm(cell: cases.Site, path: Path) -> None:
+def test_an_error_of_the_force_sensor_stops_the_arm(cell, path):
     cases.check_fault(ERROR, cell, path, moving=True)
 
 
-def test_faults_that_are_overcome_cost_nothing(cell: cases.Site, path: Path) -> None:
+def test_faults_that_are_overcome_cost_nothing(cell, path):
     """A lock and zeros that are lost, axes of an object, lost records."""
     run, _ = cases.start_run(cell, path, cases.Run.measuring)
     cell.ask("force", "lose", share=0.05)
@@ -86,5 +83,5 @@ def test_faults_that_are_overcome_cost_nothing(cell: cases.Site, path: Path) -> 
 
 
 @pytest.mark.slow
-def test_the_campaign_has_every_reading_exactly_once(cell: cases.Site, path: Path) -> None:
+def test_the_campaign_has_every_reading_exactly_once(cell, path):
     cases.finish(cell, path)

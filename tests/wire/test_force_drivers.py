@@ -14,12 +14,11 @@ import pytest
 from pymodbus.client import ModbusSerialClient
 from pymodbus.exceptions import ModbusIOException
 
-from hilcal.config import CellConfig
-from hilcal.drivers import bota, ft300, onrobot_hex
+from hilcal.drivers import bota, ft300
 from hilcal.drivers.ft300 import STREAM, start_stream
 from hilcal.drivers.links import close_port, open_port
 from hilcal.drivers.simulated.force_server import DRIFT_STD, ROOM
-from hilcal.errors import DeviceError, InputError
+from hilcal.errors import DeviceError
 from tests.support import force_cases as cases
 from tests.support.force_cases import instruments, simulated
 from tests.support.instruments import WRENCH, force_sensor
@@ -114,24 +113,6 @@ def test_an_ft300_that_streams_for_a_dead_program_is_taken_over(instruments):
     with cases.opened("ft300", simulated.port) as sensor:
         assert "serial number F3004242" in sensor.report().name
         assert cases.steady(sensor, 0.3).frames > 20
-
-
-@pytest.mark.parametrize(
-    "start", [ft300.open_force_sensor, bota.open_force_sensor], ids=["ft300", "bota"]
-)
-def test_a_cell_without_force_sensor_or_with_a_strange_option(start):
-    with pytest.raises(InputError, match=r"\[force_sensor\] is missing"):
-        start(CellConfig.model_validate({"robot": {"model": "ur10e"}}))
-    with pytest.raises(InputError, match='driver "x" has no option "colour"'):
-        start(cases.config("x", "/dev/null", options={"colour": "red"}))
-
-
-@pytest.mark.parametrize(
-    "options", [{}, {"counts_per_N": 50.0}, {**cases.OPTIONS["hex"], "rate_hz": 0}]
-)
-def test_a_hex_needs_its_scale(options):
-    with pytest.raises(InputError, match=r"it must be .*over 0"):
-        onrobot_hex.open_force_sensor(cases.config("hex", "/dev/null", options=options))
 
 
 @pytest.mark.parametrize("bit", [1, 2, 3, 9])
@@ -315,7 +296,7 @@ def talker(tmp_path, frame):
     path.symlink_to(os.ttyname(slave))
     stop = threading.Event()
 
-    def talk() -> None:
+    def talk():
         start, number = time.monotonic(), 0
         while not stop.wait(0.002):
             while number < (time.monotonic() - start) * 1000:
@@ -353,13 +334,13 @@ def test_values_that_cannot_be_never_pass(tmp_path, bad):
         )
 
 
-def test_ft300_serves_a_modbus_library_that_no_driver_uses() -> None:
+def test_ft300_serves_a_modbus_library_that_no_driver_uses():
     """The FT 300's driver uses minimalmodbus; this is pymodbus."""
     with force_sensor("ft300") as ft300:
         client = ModbusSerialClient(str(ft300.port), baudrate=19200, timeout=0.5, retries=0)
         assert client.connect()
 
-        def held(address: int, count: int, kind: object) -> object:
+        def held(address, count, kind):
             found = client.read_holding_registers(address, count=count, device_id=9)
             return client.convert_from_registers(found.registers, kind)
 
@@ -387,7 +368,7 @@ def test_ft300_serves_a_modbus_library_that_no_driver_uses() -> None:
             client.close()
 
 
-def test_each_sensor_has_a_zero_of_its_own() -> None:
+def test_each_sensor_has_a_zero_of_its_own():
     biases = []
     for seed in (1, 1, 2):
         with force_sensor("ft300", seed=seed) as sensor:
@@ -395,7 +376,7 @@ def test_each_sensor_has_a_zero_of_its_own() -> None:
     assert biases[0] == biases[1] != biases[2]
 
 
-def test_the_zero_drifts_as_the_sensor_warms_up() -> None:
+def test_the_zero_drifts_as_the_sensor_warms_up():
     with (
         force_sensor("bota", "--on", "0", scale=2000.0) as sensor,
         cases.opened("bota", sensor.port) as device,
@@ -413,9 +394,7 @@ def test_the_zero_drifts_as_the_sensor_warms_up() -> None:
 
 
 @pytest.mark.parametrize("kind", ["bota"])
-def test_a_saturated_gauge_is_no_reading_and_a_clock_that_wraps_loses_nothing(
-    kind, simulated
-) -> None:
+def test_a_saturated_gauge_is_no_reading_and_a_clock_that_wraps_loses_nothing(kind, simulated):
     with cases.opened(kind, simulated.port) as sensor:
         cases.steady(sensor, 0.1)
         simulated.admin("saturate", on=True)

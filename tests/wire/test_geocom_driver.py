@@ -13,7 +13,7 @@ from hilcal.drivers.geocom import (
     Link,
     open_tracker,
 )
-from hilcal.errors import DeviceError, InputError
+from hilcal.errors import DeviceError
 from hilcal.measuring.devices import Clock, TargetLostError
 from tests.support import instruments as simulated
 from tests.support.geocom_cases import GREETING, cell, line, table_instrument
@@ -255,29 +255,14 @@ def refused(error, config):
     return str(caught.value)
 
 
+def test_port_that_is_not_there(tmp_path):
+    assert "no port" in refused(DeviceError, cell(tmp_path / "absent"))
+
+
 # configuration
 
 
-@pytest.mark.parametrize(
-    ("tracker", "words"),
-    [
-        ({"frame": "base"}, ['must be "tracker"']),
-        ({"port": None}, ["port"]),
-        ({"options": {"search": 1.0}}, ["search_rad", "max_distance_m"]),
-    ],
-)
-def test_configuration_that_cannot_be_is_refused(tracker, words):
-    config = cell("/dev/x")
-    config = config.model_copy(update={"tracker": config.tracker.model_copy(update=tracker)})
-    text = refused(InputError, config)
-    assert all(word in text for word in words)
-
-
 # opening
-
-
-def test_port_that_is_not_there(tmp_path):
-    assert "no port" in refused(DeviceError, cell(tmp_path / "absent"))
 
 
 @pytest.mark.long

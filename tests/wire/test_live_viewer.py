@@ -1,40 +1,75 @@
-"""A campaign on simulated devices while a live viewer follows it: nothing waits for the viewer."""
+"""Commands that a live viewer, a real client, follows: nothing waits for it, and it sees all."""
 
 import os
 import re
 import signal
 import subprocess
+import sys
 import time
-from pathlib import Path
+from contextlib import contextmanager
 
 import psutil
 import pytest
 from rerun.chunk import RrdReader
 
 from hilcal.present.viewer.recording import executable
+from hilcal.store.campaign_file import CampaignFile
+from tests.support.bench_cases import BASE, store_campaign
 from tests.support.campaign_cases import (
     STARVED,
     TRIES,
     EndedError,
     Run,
-    Site,
     check_complete,
     check_readings,
 )
+from tests.support.timing import wait_until
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("nothing_goes_on")]
+pytestmark = pytest.mark.slow
 
 MORE_READINGS = 12
 URL = re.compile(r"rerun\+http://127\.0\.0\.1:\d+/proxy")
+LONG = 120.0
 
 
-def live_process(run: Run) -> psutil.Process:
+@pytest.fixture(autouse=True)
+def home(tmp_path, monkeypatch):
+    """Settings of the viewer go here."""
+    for name in ("HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME"):
+        monkeypatch.setenv(name, str(tmp_path))
+
+
+def begun(folder, *words):
+    """A command with --view as a process, and what it tells."""
+    told = folder / "told.txt"
+    with told.open("w") as out:
+        line = [sys.executable, "-m", "hilcal", *map(str, words), "--view"]
+        return subprocess.Popen(line, stdout=out, stderr=out, text=True), told
+
+
+@contextmanager
+def follower(told, saved):
+    """A viewer of its own that follows what a command serves."""
+    url = URL.search(told)
+    viewer = subprocess.Popen(
+        [executable(), "--port", "auto", "--save", str(saved), url.group()],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        yield viewer
+    finally:
+        viewer.kill()
+        viewer.wait()
+
+
+def live_process(run):
     """The process that serves and records."""
     children = psutil.Process(run.process.pid).children(recursive=True)
     return next(p for p in children if "hilcal.present.live_viewer" in p.cmdline())
 
 
-def drawn(recording: Path) -> int:
+def drawn(recording):
     """Readings that a recording of one session shows, with those of earlier sessions."""
     found = 0
     for kind in ("arrows", "dots"):
@@ -43,18 +78,14 @@ def drawn(recording: Path) -> int:
     return found
 
 
-def test_whatever_happens_to_the_viewer_the_campaign_is_whole(
-    cell: Site, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+@pytest.mark.usefixtures("nothing_goes_on")
+def test_whatever_happens_to_the_viewer_the_campaign_is_whole(cell, path, tmp_path):
     recording = path.with_name("run.live.rrd")
 
     # Ctrl-C: the recording is complete, and no process is left
     run = Run(cell, path, "--view")
     run.some_readings()
-    served = URL.search(run.output)
-    assert served is not None
+    assert URL.search(run.output)
     run.interrupt()
     code, words = run.end()
     assert code == 130, words
@@ -66,14 +97,7 @@ def test_whatever_happens_to_the_viewer_the_campaign_is_whole(
     # a viewer that is frozen all the time, and then the process that is killed
     run = Run(cell, path, "--view")
     run.wait_until(lambda: URL.search(run.output) is not None, "viewer")
-    found = URL.search(run.output)
-    assert found is not None
-    viewer = subprocess.Popen(
-        [executable(), "--port", "auto", "--save", str(tmp_path / "frozen.rrd"), found.group()],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    try:
+    with follower(run.output, tmp_path / "frozen.rrd") as viewer:
         time.sleep(0.5)
         viewer.send_signal(signal.SIGSTOP)
         run.some_readings()
@@ -83,9 +107,6 @@ def test_whatever_happens_to_the_viewer_the_campaign_is_whole(
         assert "the live viewer has ended; everything else goes on" in run.output
         run.interrupt()
         run.end()
-    finally:
-        viewer.kill()
-        viewer.wait()
     check_readings(cell, path)
 
     # to the end; what earlier sessions measured is in the recording as well
@@ -98,3 +119,60 @@ def test_whatever_happens_to_the_viewer_the_campaign_is_whole(
             raise EndedError(words)
     check_complete(cell, path)
     assert drawn(recording) == len(cell.plan.steps)
+
+
+def revisions(recording):
+    """The revisions whose verdicts a recording has."""
+    try:
+        chunks = RrdReader(recording).stream().filter(content="/words/verdict").to_chunks()
+        batches = [c.to_record_batch() for c in chunks]
+    except (ValueError, RuntimeError):  # nothing in it yet; a part of a message
+        return set()
+    found = [b["revision"].to_pylist() for b in batches if "revision" in b.schema.names]
+    return {k for one in found for k in one}
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_added_and_removed_a_viewer_sees_both_revisions(tmp_path):
+    run, told = store_campaign(tmp_path / "run.hilcal"), tmp_path / "told.txt"
+    for word, seen in (("add", {1, 2}), ("remove", {1, 2, 3})):
+        late = tmp_path / f"{word}.rrd"
+        line = [sys.executable, "-m", "hilcal", word, str(run), BASE, "--view"]
+        with told.open("w") as out:
+            process = subprocess.Popen(line, stdout=out, stderr=out)
+        wait_until(lambda: URL.search(told.read_text()) is not None, "served", LONG)
+        with follower(told.read_text(), late):
+            assert process.wait(LONG) == 0, told.read_text()
+            # what it had sent when it ended
+            wait_until(lambda late=late: revisions(late), "seen", LONG)
+        recording = run.with_name("run.live.rrd")
+        assert revisions(recording) == seen
+        assert RrdReader(recording).store() is not None  # it has its footer: whole
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_a_refinement_is_shown_to_its_last_revision(tmp_path):
+    run = store_campaign(tmp_path / "run.hilcal")
+    process, told = begun(tmp_path, "refine", run)
+    assert process.wait(LONG) == 0, told.read_text()
+    with CampaignFile.open(run, read_only=True) as file:
+        made = {record.number for record in file.revisions()}
+    assert len(made) > 1
+    assert revisions(run.with_name("run.live.rrd")) == made
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_sigterm_completes_the_recording_and_leaves_no_process(tmp_path):
+    run = store_campaign(tmp_path / "run.hilcal")
+    process, told = begun(tmp_path, "refine", run)
+    recording = run.with_name("run.live.rrd")
+    wait_until(lambda: recording.exists() and revisions(recording), "recorded", LONG)
+    children = psutil.Process(process.pid).children(recursive=True)
+    os.kill(process.pid, signal.SIGTERM)
+    code = process.wait(LONG)
+    assert code not in (0, 1), told.read_text()
+    assert "Traceback" not in told.read_text()
+    gone, alive = psutil.wait_procs(children, LONG)
+    assert gone
+    assert alive == []
+    assert RrdReader(recording).store() is not None  # it has its footer: whole

@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
@@ -13,12 +12,10 @@ from hilcal.cli.running import with_person
 from hilcal.config.reference import to_toml
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.operator import open_operator as open_simulated
-from hilcal.drivers.terminal_operator import open_operator as open_terminal
-from hilcal.errors import DeviceError, InputError
-from hilcal.measuring import devices
+from hilcal.errors import DeviceError
 from hilcal.store.campaign_file import CampaignFile
-from tests.support.campaign_cases import STARVED, TRIES, Site
-from tests.support.cli_cases import Capsys, run
+from tests.support.campaign_cases import STARVED, TRIES
+from tests.support.cli_cases import run
 from tests.support.paths import ROOT
 from tests.support.running_world import config
 from tests.support.screen import AtTerminal
@@ -48,7 +45,7 @@ def world(tmp_path):
 def test_the_simulated_person_hangs_what_is_asked_for_and_takes_it_off(world):
     socket, asked = world
     made = simulated(socket, hand_s=0)
-    person: devices.OperatorDevice = open_simulated(made)
+    person = open_simulated(made)
     person.hang(made.loads[0], "")
     person.hang(None, "that was 5kg")
     person.close()
@@ -83,23 +80,6 @@ def test_a_simulated_person_without_a_world_reports_it(world, tmp_path):
     assert "none.sock" in report.problems[0]
     with pytest.raises(DeviceError, match=r"none\.sock"):
         lost.hang(None, "")
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({}, 'lacks "socket": .* where the simulated operator lives'),
-        ({"socket": 3}, "socket = 3 is not valid"),
-        ({"socket": "x", "hand_s": -1}, "hand_s = -1 is not valid: .*0 to 3600"),
-        ({"socket": "x", "hand_s": True}, "hand_s = .rue is not valid"),
-        ({"socket": "x", "hands": 2}, 'no .*key "hands"'),
-        ({"socket": "x", "person": "me"}, "person = .me. is not valid: .*true"),
-    ],
-)
-def test_wrong_options_of_the_simulated_person_are_refused(options, message):
-    made = config(operator={"driver": "simulated", "options": options})
-    with pytest.raises(InputError, match=message):
-        open_simulated(made)
 
 
 # the person at the terminal, in a process whose terminal the test holds
@@ -183,13 +163,8 @@ def test_without_a_terminal_nobody_is_asked():
     assert [line[: len(want) + 7] for line in lines] == [f"error: {want}"] * 2
 
 
-def test_the_terminal_has_no_options():
-    with pytest.raises(InputError, match="has socket"):
-        open_terminal(config(operator={"options": {"socket": "x"}}))
-
-
 @pytest.fixture
-def toml(cell: Site, tmp_path: Path) -> Path:
+def toml(cell, tmp_path):
     """The simulated cell, its loads left to a person."""
     path = tmp_path / "cell.toml"
     path.write_text(to_toml(with_person(cell.config)), encoding="utf-8")
@@ -198,9 +173,7 @@ def toml(cell: Site, tmp_path: Path) -> Path:
 
 @pytest.mark.long
 @pytest.mark.usefixtures("nothing_goes_on")
-def test_questions_stay_answers_are_understood_and_ctrl_c_says_how_to_go_on(
-    cell: Site, toml: Path, tmp_path: Path
-) -> None:
+def test_questions_stay_answers_are_understood_and_ctrl_c_says_how_to_go_on(cell, toml, tmp_path):
     for left in reversed(range(TRIES)):
         path = tmp_path / f"run{left}.hilcal"
         command = ("run", toml.name, "--plan", cell.plan_file, "-o", path.name)
@@ -234,7 +207,7 @@ def test_questions_stay_answers_are_understood_and_ctrl_c_says_how_to_go_on(
         assert "Traceback" not in person.text
 
 
-def at_the_first_question(person: AtTerminal) -> None:
+def at_the_first_question(person):
     """Give a wrong answer, and then the right one."""
     person.check_words_stay(f"Take every load off the tool, and do not touch the arm. {ASKED}")
     person.type_keys("banana\n")
@@ -245,7 +218,7 @@ def at_the_first_question(person: AtTerminal) -> None:
 
 
 @pytest.mark.long
-def test_check_gives_every_fact_as_a_field(cell: Site, toml: Path, capsys: Capsys) -> None:
+def test_check_gives_every_fact_as_a_field(cell, toml, capsys):
     result = run(capsys, "check", toml, "--json")
     assert result.code == 3  # nobody is at a terminal here
     devices = {d["device"]: d for d in result.document["devices"]}

@@ -5,8 +5,6 @@ manuals. UR's own library for Python is in no package registry; its recipes are 
 
 import csv
 import struct
-from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,12 +13,12 @@ from hilcal.drivers.links import crc16 as crc16_of
 from hilcal.drivers.links import crc_modbus, crc_x25
 from hilcal.drivers.simulated.force_server import Ft300
 from tests.support.geocom_cases import crc16
-from tests.support.sim_ur_cases import ClientError, SimulatedUr, Wire, client, start
+from tests.support.sim_ur_cases import ClientError, Wire, client, start
 from tests.support.timing import wait_until
 
 
 @pytest.fixture(scope="module")
-def arm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimulatedUr]:
+def arm(tmp_path_factory):
     running = start(tmp_path_factory.mktemp("ur"))
     yield running
     running.close()
@@ -47,7 +45,7 @@ FORMAT = {"DOUBLE": "d", "VECTOR6D": "6d", "VECTOR3D": "3d", "UINT64": "Q", "UIN
           "INT32": "i", "VECTOR6INT32": "6i"}  # fmt: skip
 
 
-def test_a_recorder_gets_every_output_that_it_asks_for(arm: SimulatedUr) -> None:
+def test_a_recorder_gets_every_output_that_it_asks_for(arm):
     layout = struct.Struct(">B" + "".join(FORMAT[kind] for kind in RECORD.values()))
     with Wire(arm.host) as wire:
         assert wire.ask("V", struct.pack(">H", 2)) == b"\x01"
@@ -69,7 +67,7 @@ def test_a_recorder_gets_every_output_that_it_asks_for(arm: SimulatedUr) -> None
         assert came == ("P", b"\x01")
 
 
-def test_a_control_loop_writes_and_two_cannot_hold_one_register(arm: SimulatedUr) -> None:
+def test_a_control_loop_writes_and_two_cannot_hold_one_register(arm):
     setp = ",".join(f"input_double_register_{k}" for k in range(6)).encode()
     with Wire(arm.host) as wire, Wire(arm.host) as other:
         wire.outputs("target_q,target_qd,output_int_register_0")
@@ -90,7 +88,7 @@ def test_a_control_loop_writes_and_two_cannot_hold_one_register(arm: SimulatedUr
         wait_until(lambda: third.ask("I", setp)[0], "free: the registers")
 
 
-def test_ur_rtde_records_and_writes_inputs(arm: SimulatedUr, tmp_path: Path) -> None:
+def test_ur_rtde_records_and_writes_inputs(arm, tmp_path):
     """Its own record and control of inputs, by a library of the University of Southern Denmark."""
     path = tmp_path / "record.csv"
     with client(arm.host, "receive", "io") as run, client(arm.host) as other:
@@ -111,7 +109,7 @@ def test_ur_rtde_records_and_writes_inputs(arm: SimulatedUr, tmp_path: Path) -> 
     np.testing.assert_allclose(joints[-1], arm.admin()["q"], atol=1e-3)
 
 
-def test_an_unknown_protocol_is_not_spoken(arm: SimulatedUr) -> None:
+def test_an_unknown_protocol_is_not_spoken(arm):
     with Wire(arm.host) as wire:
         assert wire.ask("V", struct.pack(">H", 3)) == b"\x00"
         assert wire.ask("V", struct.pack(">H", 2)) == b"\x01"
@@ -120,7 +118,7 @@ def test_an_unknown_protocol_is_not_spoken(arm: SimulatedUr) -> None:
 # --- Modbus RTU: MODBUS over Serial Line V1.02, and Application Protocol V1.1b3 ------------------
 
 
-def test_a_request_that_the_line_has_damaged_is_not_answered() -> None:
+def test_a_request_that_the_line_has_damaged_is_not_answered():
     request = b"\x09\x03" + struct.pack(">HH", 500, 1)
     whole = request + crc16(request, 0xFFFF).to_bytes(2, "little")
     for bit in range(8 * len(whole)):
@@ -142,12 +140,12 @@ def test_a_request_that_the_line_has_damaged_is_not_answered() -> None:
         "09 03 06 39 00 00 FF 0E 0A F7 8B",  # ... its response
     ],
 )
-def test_checksums_of_the_makers_transcripts(frame: str) -> None:
+def test_checksums_of_the_makers_transcripts(frame):
     data = bytes.fromhex(frame)
     assert crc_modbus(data[:-2]) == data[-2:]
 
 
-def test_the_makers_start_of_the_stream_starts_it() -> None:
+def test_the_makers_start_of_the_stream_starts_it():
     sensor = Ft300()
     answer = sensor.receive(bytes.fromhex("0910019A0001020200CDCA"), np.zeros(6))
     assert sensor.streaming
@@ -156,7 +154,7 @@ def test_the_makers_start_of_the_stream_starts_it() -> None:
     assert not sensor.streaming
 
 
-def test_check_values_of_the_checksums() -> None:
+def test_check_values_of_the_checksums():
     """Of "123456789", as the catalogue of parametrised CRC algorithms (reveng) gives them."""
     assert crc_modbus(b"123456789") == bytes.fromhex("374B")
     assert crc_x25(b"123456789") == bytes.fromhex("6E90")

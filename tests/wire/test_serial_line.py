@@ -6,7 +6,6 @@ import sys
 import threading
 import time
 import tty
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,7 +31,7 @@ class Line:
     master: int
     slave: int
 
-    def unplug(self) -> None:
+    def unplug(self):
         self.path.unlink(missing_ok=True)
         for end in (self.master, self.slave):
             os.close(end)
@@ -40,7 +39,7 @@ class Line:
 
 
 @pytest.fixture
-def line(tmp_path: Path) -> Iterator[Line]:
+def line(tmp_path):
     master, slave = os.openpty()
     tty.setraw(slave)
     path = tmp_path / "adapter"
@@ -114,7 +113,7 @@ def test_a_line_is_drained_until_quiet(line):
     port = open_port("tracker", str(line.path), 19200)
     sent = threading.Event()
 
-    def talk() -> None:
+    def talk():
         for _ in range(10):
             os.write(line.master, b"late answer\r\n")
             time.sleep(0.01)
@@ -135,7 +134,7 @@ def test_a_line_that_never_is_quiet_is_told_of(line):
     port = open_port("tracker", str(line.path), 19200)
     stop = threading.Event()
 
-    def talk() -> None:
+    def talk():
         while not stop.is_set():
             os.write(line.master, b"x")
             time.sleep(0.002)

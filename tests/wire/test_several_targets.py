@@ -2,7 +2,6 @@
 
 import time
 from contextlib import closing
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from hilcal.drivers.ur import open_arm
 from hilcal.measuring.devices import PointingTracker, TargetLostError
 from hilcal.readings.readings import States
 from hilcal.robot.catalogue import configs_dir
-from tests.support.cli_cases import Capsys
 from tests.support.cli_cases import run as command
 from tests.support.reflector_cases import NAMES, OFFSETS
 from tests.support.rows import first
@@ -35,9 +33,7 @@ def made(driver):
 
 
 @pytest.mark.parametrize("driver", first(1, [*OPEN]))
-def test_the_station_measures_the_reflector_that_it_is_pointed_to(
-    driver: str, tmp_path: Path
-) -> None:
+def test_the_station_measures_the_reflector_that_it_is_pointed_to(driver, tmp_path):
     with (
         SimulatedCell.start(world_of(made(driver)), made(driver), tmp_path, 3) as cell,
         closing(OPEN[driver](cell.config)) as tracker,
@@ -58,7 +54,7 @@ def test_the_station_measures_the_reflector_that_it_is_pointed_to(
 
 
 @pytest.mark.slow
-def test_a_whole_run_with_three_reflectors(tmp_path: Path, capsys: Capsys) -> None:
+def test_a_whole_run_with_three_reflectors(tmp_path, capsys):
     text = (configs_dir() / "cells" / "demo_ur10e.toml").read_text()
     tables = "".join(
         f'[[tool.targets]]\nname = "{t["name"]}"\ntarget_m = {t["target_m"]}\n'
@@ -72,7 +68,7 @@ def test_a_whole_run_with_three_reflectors(tmp_path: Path, capsys: Capsys) -> No
     (tmp_path / "cell.toml").write_text(text)
     run, plan = tmp_path / "r.hilcal", tmp_path / "p.json"
 
-    def hilcal(*words: str) -> dict:
+    def hilcal(*words):
         done = command(capsys, *words, "--json")
         assert done.code == 0, done.err
         return done.document

@@ -4,8 +4,6 @@ import contextlib
 import itertools
 import os
 import time
-from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,26 +17,26 @@ from hilcal.drivers.simulated.admin import Operations
 from hilcal.drivers.simulated.geocom_server import PolarPoint
 from hilcal.drivers.simulated.pty_port import PtyPort
 from hilcal.drivers.simulated.world import SimulatedNoise
-from tests.support.instruments import Instrument, tracker
+from tests.support.instruments import tracker
 
 BAUD = 115200
 
 
 @pytest.fixture
-def port(tmp_path: Path) -> Iterator[PtyPort]:
+def port(tmp_path):
     port = PtyPort(tmp_path / "line", BAUD, np.random.default_rng(3))
     yield port
     port.unplug()
 
 
 @contextlib.contextmanager
-def client(port: PtyPort, baud: int = BAUD, timeout: float = 1.0) -> Iterator[serial.Serial]:
+def client(port, baud=BAUD, timeout=1.0):
     with serial.Serial(str(port.link), baud, timeout=timeout, exclusive=True) as line:
         port.pump()  # sees that the client has opened
         yield line
 
 
-def received(port: PtyPort, line: serial.Serial, count: int) -> bytes:
+def received(port, line, count):
     data, end = b"", time.monotonic() + 20.0
     while len(data) < count and time.monotonic() < end:
         port.pump()
@@ -46,7 +44,7 @@ def received(port: PtyPort, line: serial.Serial, count: int) -> bytes:
     return data
 
 
-def take(port: PtyPort, count: int) -> bytes:
+def take(port, count):
     data = b""
     for _ in range(200):
         data += port.read(0.02)
@@ -55,7 +53,7 @@ def take(port: PtyPort, count: int) -> bytes:
     return data
 
 
-def test_carries_every_byte_value_both_ways(port: PtyPort) -> None:
+def test_carries_every_byte_value_both_ways(port):
     every = bytes(range(256))
     with client(port) as line:
         port.send(every)
@@ -65,7 +63,7 @@ def test_carries_every_byte_value_both_ways(port: PtyPort) -> None:
         assert take(port, 256) == every
 
 
-def test_bytes_take_ten_bits_each(port: PtyPort) -> None:
+def test_bytes_take_ten_bits_each(port):
     frames = 60
     with client(port) as line:
         start = time.monotonic()
@@ -80,7 +78,7 @@ def test_bytes_take_ten_bits_each(port: PtyPort) -> None:
     assert took >= frames * 100 * 10 / BAUD
 
 
-def test_a_full_line_drops_whole_frames_and_counts_them(port: PtyPort) -> None:
+def test_a_full_line_drops_whole_frames_and_counts_them(port):
     frames, size = 2000, 50
     past = time.monotonic() - 100.0
     with client(port, timeout=0.1) as line:
@@ -100,7 +98,7 @@ def test_a_full_line_drops_whole_frames_and_counts_them(port: PtyPort) -> None:
     assert whole == [k.to_bytes(2, "big") * (size // 2) for k in numbers]
 
 
-def test_old_bytes_are_gone_when_a_client_opens(port: PtyPort) -> None:
+def test_old_bytes_are_gone_when_a_client_opens(port):
     past = time.monotonic() - 100.0
     for _ in range(2000):
         port.send(b"old" * 20, past)
@@ -111,7 +109,7 @@ def test_old_bytes_are_gone_when_a_client_opens(port: PtyPort) -> None:
         assert line.read(100) == b"new"
 
 
-def test_plugged_in_again_it_works_under_the_same_name(port: PtyPort) -> None:
+def test_plugged_in_again_it_works_under_the_same_name(port):
     before = os.readlink(port.link)
     port.unplug()
     other = os.openpty()  # takes the freed number: the name has to lead to the new one
@@ -127,7 +125,7 @@ def test_plugged_in_again_it_works_under_the_same_name(port: PtyPort) -> None:
             os.close(end)
 
 
-def test_refuses_what_it_does_not_know(port: PtyPort) -> None:
+def test_refuses_what_it_does_not_know(port):
     with pytest.raises(ValueError, match="unknown op 'explode'; valid: flip, cut"):
         Operations(port.faults())("explode", {})
     with pytest.raises(ValueError, match="valid"):
@@ -140,13 +138,13 @@ FAR_FROM_NOISE = 1e-3  # m: some hundred standard deviations
 
 
 @pytest.fixture(scope="module")
-def shared() -> Iterator[Instrument]:
+def shared():
     with tracker(TARGET) as station:
         yield station
 
 
 @pytest.fixture
-def station(shared: Instrument) -> Instrument:
+def station(shared):
     """The module's station with every fault switched off."""
     shared.truth(target=np.array(TARGET))
     for op in ("beam", "dist_error", "busy", "mute"):
@@ -166,42 +164,42 @@ def station(shared: Instrument) -> Instrument:
 class Line:
     """A client of its own, byte by byte."""
 
-    def __init__(self, station: Instrument, baud: int = 115200, timeout: float = 5.0) -> None:
+    def __init__(self, station, baud=115200, timeout=5.0):
         self.port = serial.Serial(str(station.port), baud, timeout=timeout, exclusive=True)
 
-    def __enter__(self) -> "Line":
+    def __enter__(self):
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         self.port.close()
 
-    def tell(self, text: str) -> str:
+    def tell(self, text):
         self.port.write(text.encode() + b"\r\n")
         return self.port.read_until(b"\r\n").decode().removesuffix("\r\n")
 
-    def ask(self, rpc: int, *parameters: str) -> list[str]:
+    def ask(self, rpc, *parameters):
         answer = self.tell(f"%R1Q,{rpc},7:{','.join(parameters)}")
         head, body = answer.split(":")
         assert head == "%R1P,0,7"
         return body.split(",")
 
-    def point(self) -> tuple[int, np.ndarray]:
+    def point(self):
         code, *values = self.ask(17017, "2")
         return int(code), cartesian(*map(float, values[:3]))
 
 
-def cartesian(hz: float, v: float, distance: float) -> np.ndarray:
+def cartesian(hz, v, distance):
     return distance * np.array([np.sin(v) * np.sin(hz), np.sin(v) * np.cos(hz), np.cos(v)])
 
 
 @contextlib.contextmanager
-def geocom(station: Instrument) -> Iterator[GeoCom]:
+def geocom(station):
     port = serial.Serial(str(station.port), 115200, timeout=5.0, exclusive=True)
     with SerialConnection(port) as connection:
         yield GeoCom(connection, checksum=True)
 
 
-def test_geocompy_reads_who_it_is(station: Instrument) -> None:
+def test_geocompy_reads_who_it_is(station):
     with geocom(station) as device:
         assert device.csv.get_instrument_name().params == "SIM LASER STATION"
         assert device.csv.get_serial_number().params == 123456
@@ -222,7 +220,7 @@ def test_geocompy_reads_who_it_is(station: Instrument) -> None:
         assert device.abort().error == 0
 
 
-def test_geocompy_reads_where_the_target_is(station: Instrument) -> None:
+def test_geocompy_reads_where_the_target_is(station):
     with geocom(station) as device:
         answer = device.bap.measure_distance_angle()
         assert answer.error == GeoComCode.OK
@@ -242,7 +240,7 @@ def test_geocompy_reads_where_the_target_is(station: Instrument) -> None:
         assert float(angles[0]) == pytest.approx(float(hz), abs=1e-4)
 
 
-def test_refuses_what_it_cannot_do(station: Instrument) -> None:
+def test_refuses_what_it_cannot_do(station):
     with Line(station) as line:
         assert line.tell("%R1Q,4711,1:") == "%R1P,0,1:3081"
         assert line.tell("%R1Q,none:") == "%R1P,3080,0:0"
@@ -254,7 +252,7 @@ def test_refuses_what_it_cannot_do(station: Instrument) -> None:
 @pytest.mark.parametrize(
     ("target", "scale"), [((0.4, 0.6, 1.3), 200.0), ((-8.0, 9.0, -6.0), 200.0)]
 )
-def test_noise_is_as_specified_and_fresh(target: tuple[float, float, float], scale: float) -> None:
+def test_noise_is_as_specified_and_fresh(target, scale):
     """The whitened errors of 250 measurements have unit variance in each direction."""
     count = 250
     d = float(np.linalg.norm(target))
@@ -278,7 +276,7 @@ def test_noise_is_as_specified_and_fresh(target: tuple[float, float, float], sca
 
 
 @pytest.mark.parametrize("point", [(0.0, 0.0, 2.0), (0.0, 0.0, -2.0), (1e-9, 0.0, 2.0)])
-def test_straight_above_and_below(point: tuple[float, float, float]) -> None:
+def test_straight_above_and_below(point):
     noise, rng = SimulatedNoise((0.0, 0.0), (1e-4, 0.0)), np.random.default_rng(1)
     for _ in range(100):
         seen = PolarPoint.of(noise.observe(np.array([point]), rng)[0])
@@ -287,7 +285,7 @@ def test_straight_above_and_below(point: tuple[float, float, float]) -> None:
         np.testing.assert_allclose(cartesian(seen.hz, seen.v, seen.distance), point, atol=2e-3)
 
 
-def test_reads_the_target_of_the_moment_when_it_has_measured(station: Instrument) -> None:
+def test_reads_the_target_of_the_moment_when_it_has_measured(station):
     station.admin("meas_s", seconds=20.0)  # a second of real time
     with Line(station) as line:
         start = time.monotonic()
@@ -304,7 +302,7 @@ def test_reads_the_target_of_the_moment_when_it_has_measured(station: Instrument
         assert float(v) == pytest.approx(PolarPoint.of(np.array([-0.1, -0.1, 0.9])).v, abs=1e-3)
 
 
-def test_does_not_wait_longer_than_asked(station: Instrument) -> None:
+def test_does_not_wait_longer_than_asked(station):
     station.admin("meas_s", seconds=1e6)
     with Line(station) as line:
         line.ask(2008, "1", "1")
@@ -315,7 +313,7 @@ def test_does_not_wait_longer_than_asked(station: Instrument) -> None:
 @pytest.mark.parametrize(
     "find", [("9013",), ("17020", "0"), ("9037", "0.05", "0.05", "0"), ("9027", "1", "1", "0", "1")]
 )
-def test_a_lost_lock_stays_lost_until_found(station: Instrument, find: tuple[str, ...]) -> None:
+def test_a_lost_lock_stays_lost_until_found(station, find):
     with Line(station) as line:
         station.admin("lock_lost")
         assert line.ask(17017, "2") == ["8710"]

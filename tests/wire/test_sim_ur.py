@@ -3,9 +3,7 @@
 import socket
 import struct
 import time
-from collections.abc import Callable, Iterator
 from contextlib import closing
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,9 +21,7 @@ from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
 from tests.support.rows import first
 from tests.support.sim_ur_cases import (
-    Client,
     Lines,
-    SimulatedUr,
     Wire,
     client,
     send_script,
@@ -39,7 +35,7 @@ STOP_NS = 500_000_000  # the arm has to stand so soon after a fault
 
 
 @pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimulatedUr]:
+def shared(tmp_path_factory):
     """One controller for a file; a protective stop can be unlocked soon."""
     running = start(tmp_path_factory.mktemp("u"))
     running.admin("set", unlock_s=0.3)
@@ -48,7 +44,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimulatedUr]:
 
 
 @pytest.fixture
-def sim(shared: SimulatedUr) -> Iterator[SimulatedUr]:
+def sim(shared):
     """A controller without faults; it has none after the test either."""
     yield shared
     shared.admin("set", unlock_s=0.3)
@@ -65,14 +61,14 @@ def sim(shared: SimulatedUr) -> Iterator[SimulatedUr]:
     shared.wait("rtde_clients", 0)
 
 
-def goal_of(sim: SimulatedUr, by: float) -> list[float]:
+def goal_of(sim, by):
     q = sim.admin()["q"]
     q[0] += by if q[0] < 0 else -by
     q[3] += 0.1 * by
     return q
 
 
-def under_way(run: Client, sim: SimulatedUr) -> list[float]:
+def under_way(run, sim):
     """Start a long motion and wait until it has its full speed."""
     goal = goal_of(sim, 1.5)
     assert run("control", "moveJ", goal, SPEED, ACCELERATION, True)
@@ -81,14 +77,14 @@ def under_way(run: Client, sim: SimulatedUr) -> list[float]:
     return goal
 
 
-def rest_after(sim: SimulatedUr, fault_ns: int) -> dict:
+def rest_after(sim, fault_ns):
     """The state once the arm stands; it came to rest within the time after the fault."""
     state = sim.wait("moving", False)
     assert 0 < state["rest_ns"] - fault_ns < STOP_NS
     return state
 
 
-def learns(run: Client, part: str, call: str, good: Callable[[Any], bool] = bool) -> Any:
+def learns(run, part, call, good=bool):
     """Wait until the client knows: what it says is as old as the last package that it has read."""
     deadline = time.monotonic() + 5.0
     while not good(answer := run(part, call)):
@@ -206,7 +202,7 @@ end
 """
 
 
-def reached(sim, text: str, goals) -> None:
+def reached(sim, text, goals):
     send_script(sim.host, text)
     moves = [f"move to {np.round(goal, 6).tolist()}" for goal in goals]
     wait_until(
@@ -218,15 +214,15 @@ def reached(sim, text: str, goals) -> None:
     assert not state["moving"]
 
 
-def test_a_program_of_compensated_points_is_carried_out(sim) -> None:
+def test_a_program_of_compensated_points_is_carried_out(sim):
     reached(sim, movej_program(["a", "b"], Q).replace("])", "], a=20, v=30)"), Q)
 
 
-def test_a_rewritten_program_goes_to_its_new_waypoints(sim) -> None:
+def test_a_rewritten_program_goes_to_its_new_waypoints(sim):
     reached(sim, with_joints(PROGRAM, waypoints(PROGRAM), Q), Q)
 
 
-def test_programs_with_other_statements_are_foreign_and_move_nothing(sim) -> None:
+def test_programs_with_other_statements_are_foreign_and_move_nothing(sim):
     before = sim.admin()["q"]
     send_script(sim.host, "def p():\n  movej([0,0,0,0,0,0])\n  while (True):\n  end\nend\n")
     wait_until(

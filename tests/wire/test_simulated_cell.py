@@ -321,7 +321,7 @@ def test_a_process_without_a_world_says_so_in_one_line(tmp_path):
     assert len((tmp_path / "world.log").read_text().splitlines()) == 1
 
 
-def listening(pid: int) -> list[str]:
+def listening(pid):
     """Addresses on which a process listens on TCP, by the kernel."""
     files = Path(f"/proc/{pid}/fd")
     held = {os.readlink(link) for link in files.iterdir() if link.is_symlink()}
@@ -335,13 +335,13 @@ def listening(pid: int) -> list[str]:
     return out
 
 
-def test_the_simulated_arm_listens_on_loopback_alone(cell) -> None:
+def test_the_simulated_arm_listens_on_loopback_alone(cell):
     found = listening(cell.processes()["arm"])
     assert len(found) == 4  # RTDE, dashboard, primary, script
     assert all(address.startswith("127.") for address in found)
 
 
-def test_admin_lines_are_of_the_user_who_started_them(cell) -> None:
+def test_admin_lines_are_of_the_user_who_started_them(cell):
     for device in DEVICES:
         line = (cell.directory / f"{device}.sock").stat()
         assert stat.S_IMODE(line.st_mode) == 0o600

@@ -30,9 +30,7 @@ SLOW = 0.3  # position of the speed slider meanwhile: the arm moves for about ha
         pytest.param(signal.SIGHUP, marks=pytest.mark.slow),
     ],
 )
-def test_a_plea_to_end_stops_the_arm_first(
-    kind: signal.Signals, cell: cases.Site, path: Path
-) -> None:
+def test_a_plea_to_end_stops_the_arm_first(kind, cell, path):
     run, goal = cases.start_run(cell, path, cases.Run.moving)
     since = time.monotonic()
     if kind == signal.SIGINT:
@@ -47,7 +45,7 @@ def test_a_plea_to_end_stops_the_arm_first(
 
 
 @pytest.mark.slow
-def test_ctrl_c_twice_in_a_row_stops_it_too(cell: cases.Site, path: Path) -> None:
+def test_ctrl_c_twice_in_a_row_stops_it_too(cell, path):
     run, goal = cases.start_run(cell, path, cases.Run.moving)
     since = time.monotonic()
     run.interrupt()
@@ -63,7 +61,7 @@ def test_ctrl_c_twice_in_a_row_stops_it_too(cell: cases.Site, path: Path) -> Non
     cases.check_readings(cell, path)
 
 
-def _kill_at_random(cell: cases.Site, path: Path, kills: int, seed: int) -> int:
+def _kill_at_random(cell, path, kills, seed):
     """Kill one run after the other; returns in how many of them the arm moved."""
     rng = np.random.default_rng(seed)
     killed = moved = starved = 0
@@ -97,7 +95,7 @@ def _kill_at_random(cell: cases.Site, path: Path, kills: int, seed: int) -> int:
     return moved
 
 
-def _sound(path: Path) -> None:
+def _sound(path):
     with CampaignFile.open(path) as campaign:
         log = RunLog(campaign)
         assert campaign.n_readings == len(log.done()) == len(log.details())
@@ -107,9 +105,7 @@ def _sound(path: Path) -> None:
     ("kills", "poses"),
     [pytest.param(2, 2, marks=pytest.mark.long), pytest.param(100, 25, marks=pytest.mark.slow)],
 )
-def test_kill_minus_nine_at_random_moments(
-    cell: cases.Site, tmp_path: Path, kills: int, poses: int
-) -> None:
+def test_kill_minus_nine_at_random_moments(cell, tmp_path, kills, poses):
     long = cell.shorter(tmp_path, poses=poses)
     path = tmp_path / "killed.hilcal"
     assert _kill_at_random(long, path, kills, seed=poses) > (10 if kills > 10 else -1)
@@ -117,7 +113,7 @@ def test_kill_minus_nine_at_random_moments(
 
 
 @pytest.mark.slow
-def test_a_full_disk_stops_the_arm_and_loses_nothing(cell: cases.Site, tmp_path: Path) -> None:
+def test_a_full_disk_stops_the_arm_and_loses_nothing(cell, tmp_path):
     short = cell.shorter(tmp_path, poses=1)
     path = tmp_path / "full.hilcal"
     run = cases.Run(short, path, limit=56 << 10)
@@ -128,12 +124,12 @@ def test_a_full_disk_stops_the_arm_and_loses_nothing(cell: cases.Site, tmp_path:
 
 
 @pytest.mark.slow
-def test_a_pose_out_of_the_trackers_sight_is_left_out(cell: cases.Site, tmp_path: Path) -> None:
+def test_a_pose_out_of_the_trackers_sight_is_left_out(cell, tmp_path):
     short = cell.shorter(tmp_path, poses=2)
     path = tmp_path / "hidden.hilcal"
     hiding = short.plan.joints("p2")
 
-    def check_ends(says: str, code: int, *more: str) -> None:
+    def check_ends(says, code, *more):
         """Run with a beam that is broken wherever the arm is near p2."""
         for left in reversed(range(cases.TRIES)):
             run = cases.Run(short, path, *more)
@@ -149,7 +145,7 @@ def test_a_pose_out_of_the_trackers_sight_is_left_out(cell: cases.Site, tmp_path
             assert cases.STARVED.search(words), words
             more = ()  # it is stored before the arm moves
 
-    def jog_home() -> None:
+    def jog_home():
         cell.ask("arm", "jog", q=short.plan.joints("reference").tolist())
 
     check_ends("line of sight", 3)
@@ -166,7 +162,7 @@ def test_a_pose_out_of_the_trackers_sight_is_left_out(cell: cases.Site, tmp_path
 
 
 @pytest.mark.slow
-def test_two_programs_at_one_cell(cell: cases.Site, tmp_path: Path) -> None:
+def test_two_programs_at_one_cell(cell, tmp_path):
     short = cell.shorter(tmp_path, poses=2)
     first, _ = cases.start_run(short, tmp_path / "first.hilcal", cases.Run.measuring)
     second = cases.Run(short, tmp_path / "second.hilcal")
@@ -178,7 +174,7 @@ def test_two_programs_at_one_cell(cell: cases.Site, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_two_programs_at_one_campaign_file(cell: cases.Site, tmp_path: Path) -> None:
+def test_two_programs_at_one_campaign_file(cell, tmp_path):
     short = cell.shorter(tmp_path, poses=1)
     path = tmp_path / "locked.hilcal"
     run, _ = cases.start_run(short, path, cases.Run.measuring)
@@ -197,9 +193,7 @@ def test_two_programs_at_one_campaign_file(cell: cases.Site, tmp_path: Path) -> 
     ("how", "interrupted"),
     [("deleted", False), ("deleted", True), ("moved", False), ("replaced", False)],
 )
-def test_a_campaign_that_is_gone_is_said_and_found(
-    cell: cases.Site, tmp_path: Path, how: str, interrupted: bool
-) -> None:
+def test_a_campaign_that_is_gone_is_said_and_found(cell, tmp_path, how, interrupted):
     """Deleted, moved or replaced by another program: the arm stops, and nothing is lost."""
     short = cell.shorter(tmp_path, poses=2)
     path = tmp_path / "gone.hilcal"
@@ -228,5 +222,5 @@ def test_a_campaign_that_is_gone_is_said_and_found(
 
 
 @pytest.mark.slow
-def test_the_stopped_campaign_has_every_reading_exactly_once(cell: cases.Site, path: Path) -> None:
+def test_the_stopped_campaign_has_every_reading_exactly_once(cell, path):
     cases.finish(cell, path)

@@ -10,8 +10,6 @@ import io
 import re
 import subprocess
 import sys
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
@@ -51,18 +49,16 @@ ANSWERS = (
 class Stranger:
     """Types commands, reads what stands on the screen, and never a line that is too long."""
 
-    def __init__(self, home: Path, columns: int) -> None:
+    def __init__(self, home, columns):
         self.home, self.columns = home, columns
-        self.typed: list[tuple[str, ...]] = []
+        self.typed = []
 
-    def sits(self, *words: str) -> AtTerminal:
+    def sits(self, *words):
         """Type a command; it goes on until it ends by itself, or the block ends."""
         self.typed.append(words)
         return AtTerminal(*words, columns=self.columns, lines=40, home=self.home)
 
-    def types(
-        self, *words: str, person: Callable[[AtTerminal], object] | None = None, code: int = 0
-    ) -> str:
+    def types(self, *words, person=None, code=0):
         """Type a command, live through it, and return all that it has left on the screen."""
         with self.sits(*words) as terminal:
             if person is not None:
@@ -75,7 +71,7 @@ class Stranger:
             assert any(line.startswith("error: ") for line in lines) is (code != 0), shown
             return shown
 
-    def same_words_as_a_file(self, *words: str) -> str:
+    def same_words_as_a_file(self, *words):
         """Type a command that only reads; the screen has the words of a log, and breaks none."""
         shown = self.types(*words)
         log = subprocess.run(
@@ -90,12 +86,12 @@ class Stranger:
         return shown
 
 
-def plain(text: str) -> set[str]:
+def plain(text):
     """The words of a text, without the rules of its tables."""
     return {word for word in text.split() if set(word) != {"─"}}
 
 
-def hangs_what_is_asked_for(terminal: AtTerminal, stop: str = "") -> None:
+def hangs_what_is_asked_for(terminal, stop=""):
     """Answer every question; press Ctrl-C when so many readings are there."""
     answered = 0
     while terminal.read_screen():
@@ -109,7 +105,7 @@ def hangs_what_is_asked_for(terminal: AtTerminal, stop: str = "") -> None:
             stop = ""
 
 
-def run_to_the_end(stranger: Stranger, *words: str) -> str:
+def run_to_the_end(stranger, *words):
     """Measure; a computer that was too busy for the devices' deadlines is no one's error."""
     while True:
         with stranger.sits(*words) as terminal:
@@ -124,10 +120,10 @@ def run_to_the_end(stranger: Stranger, *words: str) -> str:
 
 
 @pytest.mark.parametrize("columns", [80, 120])
-def test_from_nothing_to_a_calibrated_arm(columns: int, tmp_path: Path) -> None:
+def test_from_nothing_to_a_calibrated_arm(columns, tmp_path):
     stranger = Stranger(tmp_path, columns)
 
-    def answers(terminal: AtTerminal) -> None:
+    def answers(terminal):
         for k, (question, answer) in enumerate(ANSWERS):
             terminal.wait_for_words(question, sum(q == question for q, _ in ANSWERS[: k + 1]))
             terminal.type_keys(f"{answer}\n")
@@ -175,7 +171,7 @@ def test_from_nothing_to_a_calibrated_arm(columns: int, tmp_path: Path) -> None:
         assert all(word in shown for word in words if word.startswith("--")), words
 
 
-def corrected(stranger: Stranger, home: Path) -> None:
+def corrected(stranger, home):
     """Correct the joints of poses that were measured, under the load."""
     plan = load_plan(home / "plan.json")
     points = io.StringIO()

@@ -66,15 +66,6 @@ def test_report_names_everything_that_hinders_a_run(sim):
             arm.take_control(1.0, np.zeros(3))
 
 
-def test_host_and_options_are_checked():
-    with pytest.raises(InputError, match=r"\[robot\] host"):
-        open_arm(cases.config(None))
-    with pytest.raises(InputError, match=r"\[robot.options\].*receive_hz"):
-        open_arm(cases.config("127.0.0.1", receive_hz=0.5))
-    with pytest.raises(InputError, match="recieve_hz"):
-        open_arm(cases.config("127.0.0.1", recieve_hz=125.0))
-
-
 def test_bad_goals_are_refused_before_anything_moves(arm, sim):
     q = arm.sample().q
     for goal in (q[:5], np.append(q, 0.0), np.where(np.arange(6) == 2, np.nan, q), q + 10.0):
@@ -120,6 +111,13 @@ def test_payload_that_the_controller_does_not_take_is_told_by_its_cause(
     with pytest.raises(DeviceError, match=says):
         arm.set_payload(4.0, cases.COM)
     assert sim.admin()["payload"] == cases.MASS
+
+
+def test_another_centre_of_mass_than_was_set_is_told(arm, monkeypatch):
+    told = Control.set_payload
+    monkeypatch.setattr(Control, "set_payload", lambda c, mass, com: told(c, mass, com + 0.01))
+    with pytest.raises(DeviceError, match=r"it says 4 kg at .* after a payload of 4 kg at"):
+        arm.set_payload(4.0, cases.COM)
 
 
 def test_a_program_that_ends_while_a_payload_is_set_is_named(arm, sim, monkeypatch):

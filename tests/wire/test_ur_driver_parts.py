@@ -17,7 +17,7 @@ from hilcal.drivers.simulated.cell_processes import SimulatedCell, free_host
 from hilcal.drivers.simulated.ur_rtde import outputs_since
 from hilcal.drivers.simulated.ur_server import API
 from hilcal.drivers.simulated.ur_state import line
-from hilcal.drivers.ur import open_arm
+from hilcal.drivers.ur import UrArm, open_arm
 from hilcal.drivers.ur_link import states
 from hilcal.drivers.ur_link.control import MARGIN_S, MotionInProgress, deceleration, program_ended
 from hilcal.drivers.ur_link.probe import LinkError, controller
@@ -33,6 +33,7 @@ from hilcal.drivers.ur_link.reading import (
 )
 from hilcal.drivers.ur_link.supervision import RobotApi
 from hilcal.drivers.ur_link.worker import Worker, WorkerError
+from hilcal.errors import DeviceError
 from hilcal.identification.torques import check_torques
 from hilcal.measuring.route import duration
 from hilcal.robot.catalogue import load_arm
@@ -103,6 +104,20 @@ def test_gravest_safety_state_comes_first():
         assert states.safety_advice(1 << bit)
 
 
+@pytest.mark.parametrize("changes", [{"safety_status_bits": 1 << 2}, {"robot_mode": 5}])
+def test_an_arm_whose_safety_or_mode_is_not_normal_is_not_moved(changes, monkeypatch):
+    """Also where its program should still play."""
+
+    def fail(arm, symptom):
+        raise DeviceError(symptom)
+
+    monkeypatch.setattr(UrArm, "_fail", fail)
+    arm = object.__new__(UrArm)
+    arm._check_state(reading())
+    with pytest.raises(DeviceError, match="not ready to move"):
+        arm._check_state(reading(**changes))
+
+
 def test_motion_is_overdue_only_after_its_time_and_margin(monkeypatch):
     now = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
@@ -133,11 +148,11 @@ def test_worker_that_cannot_start_says_so():
         Worker("no such kind", (), 10.0)
 
 
-def test_a_moment_without_packets_is_no_slow_line() -> None:
+def test_a_moment_without_packets_is_no_slow_line():
     """A busy computer loses some tenths of a second; a slow network stays slow."""
-    counted: list[float] = []
+    counted = []
 
-    def count(seconds: float, *rates: float) -> float:
+    def count(seconds, *rates):
         counted.append(seconds)
         return rates[len(counted) - 1]
 
@@ -160,11 +175,11 @@ NOISE = 5 * 0.02 * np.array([13.0, 13.0, 11.0, 9.0, 9.0, 9.0])
     ("version", "told"),
     [((5, 22, 9, 0), False), ((5, 23, 0, 0), True), ((10, 7, 0, 0), False), ((10, 11, 0, 0), True)],
 )
-def test_versions_that_tell_torques(version: tuple[int, int, int, int], told: bool) -> None:
+def test_versions_that_tell_torques(version, told):
     assert (TORQUE in outputs_since(version)) == told
 
 
-def test_an_older_controller_is_read_without(tmp_path) -> None:
+def test_an_older_controller_is_read_without(tmp_path):
     with closing(cases.start(tmp_path)) as sim:
         assert controller(sim.host, ("timestamp", TORQUE), 2.0)[1] == ("timestamp",)
         arm = open_arm(cases.config(sim.host))
@@ -173,7 +188,7 @@ def test_an_older_controller_is_read_without(tmp_path) -> None:
         arm.close()
 
 
-def test_torques_hold_the_arm_and_the_friction_of_the_arrival(tmp_path) -> None:
+def test_torques_hold_the_arm_and_the_friction_of_the_arrival(tmp_path):
     with closing(cases.start(tmp_path, "--version", NEW)) as sim:
         with closing(cases.controlled(sim)) as arm:
             for sign in (1.0, -1.0):
@@ -195,7 +210,7 @@ def test_torques_hold_the_arm_and_the_friction_of_the_arrival(tmp_path) -> None:
         assert cases.children() == []
 
 
-def test_a_stalled_link_ends_the_torques_not_the_arm(tmp_path) -> None:
+def test_a_stalled_link_ends_the_torques_not_the_arm(tmp_path):
     with (
         closing(cases.start(tmp_path, "--version", NEW)) as sim,
         closing(open_arm(cases.config(sim.host))) as arm,
@@ -210,7 +225,7 @@ def test_a_stalled_link_ends_the_torques_not_the_arm(tmp_path) -> None:
 
 
 @pytest.mark.long
-def test_a_run_stores_torques_and_says_what_the_load_weighs(tmp_path, capsys) -> None:
+def test_a_run_stores_torques_and_says_what_the_load_weighs(tmp_path, capsys):
     """The weights are half as heavy as the cell says; friction is taken by the side of arrival."""
     simulation = {"clock": 40.0, "controller_version": "10.11.0.0", "seed": 4}
     load = [{"name": "10kg", "mass_kg": 10.0}]
@@ -241,11 +256,11 @@ def test_a_run_stores_torques_and_says_what_the_load_weighs(tmp_path, capsys) ->
 JSON = b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\nContent-Length: %d\r\n\r\n%s"
 
 
-def answer(body: bytes) -> bytes:
+def answer(body):
     return JSON % (len(body), body)
 
 
-def test_what_is_asked_goes_over_the_wire_as_the_maker_says() -> None:
+def test_what_is_asked_goes_over_the_wire_as_the_maker_says():
     with server(API, lambda asked: answer(b'{"state": "STOPPED"}')) as (host, asked):
         RobotApi(host, API).stop(2.0)
         RobotApi(host, API).order("/robotstate/v1/state", "POWER_ON", 2.0)
@@ -256,8 +271,8 @@ def test_what_is_asked_goes_over_the_wire_as_the_maker_says() -> None:
     assert asked[1].endswith(b'{"action": "POWER_ON"}')
 
 
-def test_a_path_that_has_moved_is_followed() -> None:
-    def says(asked: bytes) -> bytes:
+def test_a_path_that_has_moved_is_followed():
+    def says(asked):
         if b"/moved" in asked:
             return answer(b'{"mode": "LOCAL"}')
         return b"HTTP/1.1 308 Permanent Redirect\r\nLocation: /moved\r\nContent-Length: 0\r\n\r\n"
@@ -266,27 +281,7 @@ def test_a_path_that_has_moved_is_followed() -> None:
         assert RobotApi(host, API).in_remote_control(2.0) is False
 
 
-@pytest.mark.parametrize(
-    ("says", "words"),
-    [
-        (b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\n\r\n", "403"),
-        (b"HTTP/1.1 500 Oh\r\nContent-Length: 17\r\n\r\n{\"message\": \"no\"}", '500 "no"'),
-        (answer(b"<html>"), "JSON"),
-        (b"SSH-2.0-OpenSSH_9\r\n", "Robot API"),
-        (b"", "Robot API"),
-        (b"HTTP/1.1 307 Go\r\nLocation: /again\r\nContent-Length: 0\r\n\r\n", "307"),
-    ],
-)  # fmt: skip
-def test_other_answers_are_one_line(says: bytes, words: str) -> None:
-    with (
-        server(API, lambda asked: says) as (host, _),
-        pytest.raises(LinkError, match=words) as refused,
-    ):
-        RobotApi(host, API).stop(2.0)
-    assert "\n" not in str(refused.value)
-
-
-def test_a_mute_one_costs_its_deadline_and_no_more() -> None:
+def test_a_mute_one_costs_its_deadline_and_no_more():
     with socket.socket() as door:
         host = free_host()
         door.bind((host, API))
@@ -299,11 +294,11 @@ def test_a_mute_one_costs_its_deadline_and_no_more() -> None:
         RobotApi(host, API).check(0.3)
 
 
-def package(kind: int, body: bytes) -> bytes:
+def package(kind, body):
     return struct.pack(">iB", 5 + len(body), kind) + body
 
 
-def test_kinematics_are_found_among_other_packages() -> None:
+def test_kinematics_are_found_among_other_packages():
     rows = np.arange(24.0)
     part = package(5, struct.pack(">6I24dI", *range(6), *rows, 2) + b"later fields")
     state = package(16, package(0, b"modes") + part + package(6, b"configuration"))
@@ -314,28 +309,38 @@ def test_kinematics_are_found_among_other_packages() -> None:
     assert (found.status, found.checksum) == (2, (0, 1, 2, 3, 4, 5))
 
 
+ASK = {
+    API: lambda host: RobotApi(host, API).stop(2.0),
+    PRIMARY_PORT: lambda host: read_kinematics(host, 1.0),
+}
+NAN = package(16, package(5, struct.pack(">6I24dI", *range(6), *[float("nan")] * 24, 2)))
+
+
 @pytest.mark.parametrize(
-    "says",
+    ("port", "says", "words"),
     [
-        b"",
-        b"HTTP/1.1 400 Bad Request\r\n\r\n",
-        struct.pack(">iB", 2, 16),
-        package(16, struct.pack(">iB", 0, 5) + b"x"),
-        package(16, package(5, struct.pack(">6I24dI", *range(6), *[float("nan")] * 24, 2))),
-        package(20, b"") * 60,
+        (API, b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\n\r\n", "403"),
+        (API, b'HTTP/1.1 500 Oh\r\nContent-Length: 17\r\n\r\n{"message": "no"}', '500 "no"'),
+        (API, answer(b"<html>"), "JSON"),
+        (API, b"HTTP/1.1 307 Go\r\nLocation: /again\r\nContent-Length: 0\r\n\r\n", "307"),
+        *((API, says, "Robot API") for says in (b"", b"SSH-2.0-OpenSSH_9\r\n")),
+        *((PRIMARY_PORT, says, "primary port") for says in (
+            b"", b"HTTP/1.1 400 Bad Request\r\n\r\n", struct.pack(">iB", 2, 16),
+            package(16, struct.pack(">iB", 0, 5) + b"x"), NAN, package(20, b"") * 60,
+        )),
     ],
-)
-def test_something_else_on_the_primary_port_is_one_line(says: bytes) -> None:
+)  # fmt: skip
+def test_something_else_on_a_port_is_one_line(port, says, words):
     with (
-        server(PRIMARY_PORT, lambda asked: says) as (host, _),
-        pytest.raises(LinkError, match="primary port") as refused,
+        server(port, lambda asked: says) as (host, _),
+        pytest.raises(LinkError, match=words) as refused,
     ):
-        read_kinematics(host, 1.0)
+        ASK[port](host)
     assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize("version", cases.GENERATIONS)
-def test_a_controller_tells_the_kinematics_of_its_factory(tmp_path, version: str) -> None:
+def test_a_controller_tells_the_kinematics_of_its_factory(tmp_path, version):
     made = write(tmp_path / "cal.toml", "ur10e")
     options = ("--version", version, "--calibration", str(tmp_path / "cal.toml"))
     with (
@@ -348,7 +353,7 @@ def test_a_controller_tells_the_kinematics_of_its_factory(tmp_path, version: str
         assert dict(report.fields)["kinematics"] == report.kinematics.to_dict()
 
 
-def test_a_controller_without_a_calibration_tells_the_nominal_ones(tmp_path) -> None:
+def test_a_controller_without_a_calibration_tells_the_nominal_ones(tmp_path):
     with closing(cases.start(tmp_path)) as running:
         found = read_kinematics(running.host, 2.0)
     np.testing.assert_allclose(found.rows, nominal_rows(load_arm("ur10e")), rtol=0, atol=1e-12)

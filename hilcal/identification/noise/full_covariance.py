@@ -19,7 +19,7 @@ from hilcal.readings.covariance import (
     with_scatter,
 )
 from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import Whitening, covariance_blocks, inverse_root
+from hilcal.readings.whitening import Whitening, covariance_blocks, whitening_matrix
 from hilcal.tables.uncertainty import rounding_variance, with_rounding
 from hilcal.types import Floats
 
@@ -98,7 +98,7 @@ def with_common_scatter(cell: Cell, readings: Readings, joint_std: Floats) -> Re
     factor = _scatter(cell, readings, joint_std) if several else None
     if factor is None:
         return readings
-    largest = np.linalg.norm(inverse_root(readings.covariance) @ factor, ord=2, axis=(1, 2))
+    largest = np.linalg.norm(whitening_matrix(readings.covariance) @ factor, ord=2, axis=(1, 2))
     return replace(readings, common=factor / np.maximum(largest, 1.0)[:, None, None])
 
 

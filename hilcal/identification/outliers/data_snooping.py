@@ -45,7 +45,7 @@ from hilcal.identification.outliers.least_trimmed_squares import (
 from hilcal.model.model import Model, Prediction
 from hilcal.model.observe import motion
 from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import Mode, deflection_groups, inverse_root
+from hilcal.readings.whitening import Mode, deflection_groups, whitening_matrix
 from hilcal.robot import se3
 from hilcal.types import Bools, Floats, Ints
 
@@ -259,7 +259,7 @@ def linearised(snooping: DataSnooping, y: Floats) -> _LinearModel:
     prediction = model.predict(readings.states, theta)
     no_groups = np.zeros((0, 0), dtype=np.int64)
     members = _groups(readings) if snooping.mode == "deflection" else no_groups
-    root = inverse_root(_covariance(readings, members))
+    root = whitening_matrix(_covariance(readings, members))
     residual = _residual(readings, prediction, members)
     live = np.flatnonzero(s.prior > 0)
     if len(live) > MOST_COLUMNS:

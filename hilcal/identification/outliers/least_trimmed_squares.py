@@ -27,7 +27,7 @@ import numpy as np
 import scipy
 
 from hilcal.identification.gauss_newton import shortened
-from hilcal.readings.whitening import inverse_root
+from hilcal.readings.whitening import whitening_matrix
 from hilcal.types import Bools, Floats, Ints
 
 # All of these are choices.
@@ -236,7 +236,7 @@ class ReadingModel:
         """(N, m, m) W⁻, and (G, S, S, m, m) roots of the precision of differences in a group."""
         back = np.asarray(np.linalg.pinv(self.root), dtype=float)
         v = (back @ back.swapaxes(1, 2))[self.members]
-        return back, inverse_root(v[:, :, None] + v[:, None, :])
+        return back, whitening_matrix(v[:, :, None] + v[:, None, :])
 
 
 class Linearised(Protocol):

@@ -25,7 +25,7 @@ from hilcal.identification.registration.robot_frames import whole_turns
 from hilcal.identification.residual import ErrorBlock, error_block, noise_floor, residual
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings, ranges_of, turning_variables, variables
-from hilcal.readings.whitening import Mode, Whitening, inverse_root, whitening
+from hilcal.readings.whitening import Mode, Whitening, whitening, whitening_matrix
 from hilcal.shown import Shown
 from hilcal.types import Bools, Floats, Ints
 
@@ -218,7 +218,7 @@ def extrapolation(p: Predictive, fitted: Readings, validation: Validation) -> Ex
     units = p.model.cell.arm.units
     prediction = p.model.predict(readings.states, p.theta)
     spread, noise = p.prediction_covariance(prediction, w), p.noise_covariance(w)
-    root = inverse_root(noise)
+    root = whitening_matrix(noise)
     leverage = np.linalg.eigvalsh(root @ spread @ np.swapaxes(root, 1, 2))[:, -1]
     beyond, outside = [], np.zeros(len(w.reading), dtype=np.bool_)
     ranges = {r.variable: r for r in ranges_of(fitted.states, units)}
@@ -260,7 +260,7 @@ def extrapolation(p: Predictive, fitted: Readings, validation: Validation) -> Ex
 
 def _squares(covariance: Floats, raw: Floats) -> tuple[Floats, Ints]:
     """Squared Mahalanobis distances (D,) of residuals (D, m), and elements that were read (D,)."""
-    root = inverse_root(covariance)
+    root = whitening_matrix(covariance)
     square = np.sum(np.einsum("dij,dj->di", root, raw) ** 2, axis=1)
     return square, np.asarray(np.count_nonzero(np.any(root != 0, axis=2), axis=1))
 

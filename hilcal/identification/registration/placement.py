@@ -10,7 +10,7 @@ from hilcal.cell import Cell, Observer, plane_frame
 from hilcal.identification.outliers.least_trimmed_squares import ReadingModel
 from hilcal.model.observe import Observation, by_observer_frame, observed
 from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import inverse_root
+from hilcal.readings.whitening import whitening_matrix
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
@@ -40,7 +40,7 @@ def angles(readings: Readings) -> Floats:
     return states.q if states.q_actual is None else states.q_actual
 
 
-def inverse_roots(covariance: Floats, partial: bool = False) -> Floats:
+def rough_whitening(covariance: Floats, partial: bool = False) -> Floats:
     """(N, m, m) W with W V Wᵀ = I, V the covariance with the roughness added.
 
     With `partial`, elements of variance 0 were not read, and get no roughness either.
@@ -49,7 +49,7 @@ def inverse_roots(covariance: Floats, partial: bool = False) -> Floats:
     rough = np.repeat(np.square(ROUGHNESS), 3)[:m] * np.eye(m)
     if partial:
         rough = rough * (np.diagonal(covariance, axis1=1, axis2=2) > 0)[:, None, :]
-    return inverse_root(covariance + rough)
+    return whitening_matrix(covariance + rough)
 
 
 def free_parameters(base: bool, targets: Bools, attitudes: bool) -> Bools:
@@ -103,7 +103,7 @@ class FrameData:
         """Return the readings with the flange poses of a nominal arm."""
         value, turn = readings.value, readings.value[:, 3:] if readings.m == 6 else None
         observer = readings.states.observer
-        root = inverse_roots(readings.covariance, partial=observer is not None)
+        root = rough_whitening(readings.covariance, partial=observer is not None)
         data = cls.at(arm, angles(readings), value[:, :3], turn, root, readings.target)
         return replace(data, observer=observer)
 

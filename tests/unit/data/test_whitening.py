@@ -14,7 +14,7 @@ from hilcal.readings.covariance import (
     joint_scatter,
     tracker_covariance,
 )
-from hilcal.readings.whitening import MODES, inverse_root, measured_values, whitening
+from hilcal.readings.whitening import MODES, measured_values, whitening, whitening_matrix
 from hilcal.robot import se3
 from tests.support.readings_cases import readings_at
 from tests.support.refusals import refusal
@@ -126,11 +126,11 @@ def random_readings(rng, m, decades=3.0):
 @given(seeds, sizes)
 def test_gc_whitens_and_gu_divides_by_the_standard_deviations(seed, k):
     v = spd(np.random.default_rng(seed), 4, k)
-    f = inverse_root(v, "gc")
+    f = whitening_matrix(v, "gc")
     identity = np.tile(np.eye(k), (4, 1, 1))
     np.testing.assert_allclose(f @ v @ np.swapaxes(f, 1, 2), identity, atol=1e-9)
     eps = np.random.default_rng(seed).standard_normal((4, k))
-    white = (inverse_root(v, "gu") @ eps[:, :, None])[:, :, 0]
+    white = (whitening_matrix(v, "gu") @ eps[:, :, None])[:, :, 0]
     std = np.sqrt(np.stack([np.diag(one) for one in v]))
     np.testing.assert_allclose(white, eps / std, rtol=1e-14)
 
@@ -150,8 +150,8 @@ def test_change_of_units_changes_nothing(scaling, seed, k):
     rng = np.random.default_rng(seed)
     v, u = spd(rng, 6, k, decades=1.0), random_units(rng, k)
     a, y = rng.standard_normal((6, k, 3)), rng.standard_normal((6, k))
-    c, chi2 = estimate(inverse_root(v, scaling), a, y)
-    c_u, chi2_u = estimate(inverse_root(u[:, None] * v * u, scaling), u[:, None] * a, u * y)
+    c, chi2 = estimate(whitening_matrix(v, scaling), a, y)
+    c_u, chi2_u = estimate(whitening_matrix(u[:, None] * v * u, scaling), u[:, None] * a, u * y)
     np.testing.assert_allclose(c_u, c, rtol=1e-7, atol=1e-7 * np.abs(c).max())
     assert chi2_u == pytest.approx(chi2, rel=1e-8)
 
@@ -162,7 +162,7 @@ def test_direction_without_noise_is_left_out(seed, k, data):
     rng = np.random.default_rng(seed)
     b = rng.standard_normal((k, rank)) * random_units(rng, k)[:, None]
     v = b @ b.T
-    f = inverse_root(v, "gc")
+    f = whitening_matrix(v, "gc")
     kept = np.any(f != 0, axis=1)
     assert np.all(np.isfinite(f))
     assert kept.sum() == rank
@@ -175,7 +175,7 @@ def test_element_without_noise_is_left_out(scaling, seed, data):
     dead = data.draw(st.lists(st.integers(0, 5), min_size=1, max_size=6, unique=True))
     v = spd(np.random.default_rng(seed), 1, 6)[0]
     v[dead], v[:, dead] = 0.0, 0.0
-    f = inverse_root(v, scaling)
+    f = whitening_matrix(v, scaling)
     assert np.all(np.isfinite(f))
     assert np.all(f[:, dead] == 0)
     assert np.any(f != 0, axis=1).sum() == 6 - len(dead)

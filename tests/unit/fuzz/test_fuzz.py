@@ -11,7 +11,7 @@ from hilcal.config import CellConfig
 from hilcal.errors import HilcalError
 from hilcal.identification import parameters_document
 from hilcal.identification.carried.posterior import read_posterior
-from hilcal.identification.registration.placement import inverse_roots
+from hilcal.identification.registration.placement import rough_whitening
 from hilcal.readings.covariance import is_covariance
 from hilcal.store.plan import load_plan, read_plan
 from hilcal.tables.mapping import Mapping, load_mapping
@@ -117,7 +117,7 @@ def test_a_covariance_that_is_negative_by_rounding_registers():
     covariance = np.full((1, 3, 3), 9e-6)
     covariance[0, 0, 1] = covariance[0, 1, 0] = 9e-6 * (1.0 + 0.9e-9)
     assert is_covariance(covariance).all()
-    root = inverse_roots(covariance)
+    root = rough_whitening(covariance)
     assert np.all(np.isfinite(root))
 
 

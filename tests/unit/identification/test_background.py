@@ -264,6 +264,7 @@ def test_a_law_beside_all_effects_is_found_and_the_others_are_named(tmp_path):
     assert path.verdict == "ambiguous"
 
 
+@pytest.mark.long
 def test_a_slip_in_time_that_all_effects_fit_is_unknown():
     sample = simulate(
         DiagnosisCase("outside", "ur10e", "absolute", ("slip in time",), strength=3.0, seed=0)

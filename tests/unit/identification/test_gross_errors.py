@@ -27,7 +27,7 @@ from hilcal.identification.outliers.least_trimmed_squares import (
 from hilcal.identification.registration.misdescription import examine
 from hilcal.identification.registration.registration import register
 from hilcal.present.verdict import message
-from hilcal.readings.whitening import MODES, inverse_root, whitening
+from hilcal.readings.whitening import MODES, whitening, whitening_matrix
 from studies.gross_errors import GrossErrorCase, count, spoil
 from studies.study_cases import study_case
 from tests.support.campaigns import campaign, configuration, noiseless, plan, with_noise
@@ -379,7 +379,7 @@ def random_model(mode, rng):
     """30 readings; as deflections in groups of an unloaded and four or five loaded ones."""
     n, m, k = 30, 3, 4
     covariance = rng.normal(size=(n, m, m))
-    root = inverse_root(covariance @ covariance.swapaxes(1, 2) + 0.1 * np.eye(m))
+    root = whitening_matrix(covariance @ covariance.swapaxes(1, 2) + 0.1 * np.eye(m))
     members = np.arange(n).reshape(5, 6)
     members[2, 5] = -1
     return ReadingModel(

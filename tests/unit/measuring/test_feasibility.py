@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hilcal.cell import cell_from_config
-from hilcal.config import CellLoad, ForceSensor, Limits
+from hilcal.config import CellLoad, ForceSensor, Limits, Obstacle
 from hilcal.design.feasible import FeasibleSpace
 from hilcal.measuring.clearance import Clearance
 from hilcal.measuring.motion import SLACK_M, Guard
@@ -108,6 +108,16 @@ def test_arm_and_obstacles_that_touch_stop_the_arm():
     bench = Bench(limits=Limits(workspace_min_m=(-2, -2, -2)))
     said = Guard(bench.cell).check(sample(bench, q=np.array(folded)))
     assert "shoulder and forearm collide" in str(said)
+
+
+@pytest.mark.parametrize("deep_m", [-0.005, 0.005])
+def test_a_plate_stops_the_arm_as_soon_as_it_touches(bench, deep_m):
+    """A wall before, and behind, the outermost point of wrists and tool."""
+    low, _ = reached(bench.cell, Clearance(bench.cell).scene.parts, np.array([POSES["p1"]]))
+    wall = Obstacle(name="wall", center_m=(low[0] + deep_m - 0.1, 0, 0.5), size_m=(0.2, 4, 3))
+    config = bench.config.model_copy(update={"obstacles": (wall,)})
+    said = Guard(bench.cell.with_config(config)).check(sample(bench))
+    assert ("wall" in str(said)) is (deep_m > 0)
 
 
 HOME = (0.0, -1.2, 1.5, -1.5, -1.5, 0.0)

@@ -12,6 +12,7 @@ from hilcal.cell import Cell
 from hilcal.config import Acquire, ForceSensor, Limits
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.arrival import RoughRegistration
+from hilcal.measuring.motion import Guard
 from hilcal.measuring.progress import ReadingStored
 from hilcal.measuring.run import HOW_ON
 from hilcal.robot import chain as chains
@@ -303,6 +304,20 @@ def test_loads_change_only_at_the_reference_and_motions_carry_them(b):
     for q in where[1:]:
         assert np.allclose(q, POSES["reference"])
     assert {load for _, load in b.world.at_start} == {"none", "3kg", "pull"}
+
+
+def test_every_motion_is_guarded_with_what_hangs_and_nothing_else(b, monkeypatch):
+    checked, begun, check = [], [], Guard.check
+
+    def noted(guard, sample, wrench=None, hanging="none"):
+        checked.append(hanging)
+        return check(guard, sample, wrench, hanging)
+
+    monkeypatch.setattr(Guard, "check", noted)
+    call_before(b.rig.arm, "sample", checked.clear)
+    call_before(b.rig.arm, "start_move", lambda *_: begun.append((b.world.load, *checked)))
+    b.measure(FEW_POSES)
+    assert set(begun) == {("none", "none"), ("3kg", "3kg"), ("pull", "pull")}
 
 
 def test_an_unsafe_plan_is_refused_before_any_device_is_asked():

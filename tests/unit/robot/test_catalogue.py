@@ -1,6 +1,7 @@
 """The catalogue, URDF files and Pinocchio models describe the same arms."""
 
 import math
+import tomllib
 
 import numpy as np
 import pinocchio as pin
@@ -14,28 +15,18 @@ from hilcal.robot.scene import pinocchio_model
 from hilcal.robot.statics import Load, slot_wrenches
 from hilcal.robot.urdf import arm_from_urdf
 from tests.support.arm_cases import classic_flange, flange_at
+from tests.support.paths import ROOT
 from tests.support.refusals import refusal, refusals, refuses, with_edits
 from tests.support.space_cases import frames
 
 PI2 = math.pi / 2
 ALPHA, Z = [PI2, 0.0, 0.0, PI2, -PI2, 0.0], [0.0] * 6
-# (d1, a2, a3, d4, d5, d6) of the published tables, the weight of the whole arm, the payload, kg
-PUBLISHED = {
-    "ur3": (0.1519, -0.24365, -0.21325, 0.11235, 0.08535, 0.0819, 11.0, 3),
-    "ur5": (0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823, 18.4, 5),
-    "ur10": (0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922, 28.9, 10),
-    "ur3e": (0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921, 11.2, 3),
-    "ur5e": (0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, 20.6, 5),
-    "ur7e": (0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, 20.6, 7.5),
-    "ur8long": (0.2186, -0.8989, -0.7149, 0.1824, 0.1361, 0.1434, None, 8),
-    "ur12e": (0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655, 33.5, 12.5),
-    "ur15": (0.2186, -0.6475, -0.5164, 0.1824, 0.1361, 0.1434, 40.7, 15),
-    "ur18": (0.2186, -0.475, -0.3389, 0.1824, 0.1361, 0.1434, None, 18),
-    "ur10e": (0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655, 33.5, 12.5),
-    "ur16e": (0.1807, -0.4784, -0.36, 0.17415, 0.11985, 0.11655, 33.1, 16),
-    "ur20": (0.2363, -0.862, -0.7287, 0.201, 0.1593, 0.1543, 64.0, 20),
-    "ur30": (0.2363, -0.637, -0.5037, 0.201, 0.1593, 0.1543, 63.5, 30),
-}
+PUBLISHED = tomllib.loads((ROOT / "tests" / "data" / "published_arms.toml").read_text())
+URS, OTHERS = PUBLISHED["universal_robots"], PUBLISHED["others"]
+
+
+def test_the_catalogue_has_them_all():
+    assert set(robot_names()) == {*URS, *OTHERS}
 
 
 def rz(angle):
@@ -43,7 +34,7 @@ def rz(angle):
 
 
 def published_flange(name, q):
-    d1, a2, a3, d4, d5, d6, *_ = PUBLISHED[name]
+    d1, a2, a3, d4, d5, d6, *_ = URS[name]
     return classic_flange(np.array([Z, [0, a2, a3, 0, 0, 0], [d1, 0, 0, d4, d5, d6], ALPHA]), q)
 
 
@@ -66,87 +57,20 @@ def gravity_torques(arm, q):
     return np.array([(energy(q + h * u) - energy(q - h * u)) / (2 * h) for u in unit])
 
 
-def test_catalogue_is_complete():
-    assert set(robot_names()) == set(PUBLISHED) | set(OTHER_MAKERS)
-
-
 def drawn(x, y, z, roll, pitch, yaw):
     """The <origin> of a URDF."""
     return pin.SE3(pin.rpy.rpyToMatrix(roll, pitch, yaw), np.array([x, y, z])).homogeneous
 
 
-def upright(*joints):
-    """Joints whose frames are all parallel to the base, as industrial arms are drawn: axes x y z"""
-    axes = {"z": [0, 0, 1], "y": [0, 1, 0], "x": [1, 0, 0]}
-    return [
-        (drawn(x, y, z, 0, 0, 0), [(-1.0 if a[0] == "-" else 1.0) * c for c in axes[a[-1]]])
-        for x, y, z, a in joints
-    ]
+def in_degrees(x, y, z, *angles):
+    return drawn(x, y, z, *np.radians(angles))
 
 
-def about_z(*origins):
-    return [(drawn(*origin), [0.0, 0.0, 1.0]) for origin in origins]
-
-
-H, PI = PI2, math.pi
-# Joint origins and axes, and the flange, as the published URDFs have them; see each file's source.
-OTHER_MAKERS = {
-    "fr3": (
-        about_z((0, 0, 0.333, 0, 0, 0), (0, 0, 0, -H, 0, 0), (0, -0.316, 0, H, 0, 0),
-                (0.0825, 0, 0, H, 0, 0), (-0.0825, 0.384, 0, -H, 0, 0), (0, 0, 0, H, 0, 0),
-                (0.088, 0, 0, H, 0, 0)),
-        drawn(0, 0, 0.107, 0, 0, 0),
-    ),
-    "iiwa7": (
-        about_z((0, 0, 0.15, 0, 0, 0), (0, 0, 0.19, H, 0, PI), (0, 0.21, 0, H, 0, PI),
-                (0, 0, 0.19, H, 0, 0), (0, 0.21, 0, -H, PI, 0), (0, 0.0607, 0.19, H, 0, 0),
-                (0, 0.081, 0.0607, -H, PI, 0)),
-        drawn(0, 0, 0.045, 0, 0, 0),
-    ),
-    "iiwa14": (
-        about_z((0, 0, 0.1575, 0, 0, 0), (0, 0, 0.2025, H, 0, PI), (0, 0.2045, 0, H, 0, PI),
-                (0, 0, 0.2155, H, 0, 0), (0, 0.1845, 0, -H, PI, 0), (0, 0, 0.2155, H, 0, 0),
-                (0, 0.081, 0, -H, PI, 0)),
-        drawn(0, 0, 0.045, 0, 0, 0),
-    ),
-    "xarm6": (
-        about_z((0, 0, 0.267, 0, 0, 0), (0, 0, 0, -H, 0, 0), (0.0535, -0.2845, 0, 0, 0, 0),
-                (0.0775, 0.3425, 0, -H, 0, 0), (0, 0, 0, H, 0, 0), (0.076, 0.097, 0, -H, 0, 0)),
-        np.eye(4),
-    ),
-    "xarm7": (
-        about_z((0, 0, 0.267, 0, 0, 0), (0, 0, 0, -H, 0, 0), (0, -0.293, 0, H, 0, 0),
-                (0.0525, 0, 0, H, 0, 0), (0.0775, -0.3425, 0, H, 0, 0), (0, 0, 0, H, 0, 0),
-                (0.076, 0.097, 0, -H, 0, 0)),
-        np.eye(4),
-    ),
-    "kr10_r1100_2": (
-        upright((0, 0, 0.4, "-z"), (0.025, 0, 0, "y"), (0.56, 0, 0, "y"), (0.515, 0, 0.025, "-x"),
-                (0, 0, 0, "y"), (0.09, 0, 0, "-x")),
-        drawn(0, 0, 0, 0, H, 0),
-    ),
-    "irb120": (
-        upright((0, 0, 0, "z"), (0, 0, 0.29, "y"), (0, 0, 0.27, "y"), (0, 0, 0.07, "x"),
-                (0.302, 0, 0, "y"), (0.072, 0, 0, "x")),
-        drawn(0, 0, 0, 0, H, 0),
-    ),
-    "irb1600_10_145": (
-        upright((0, 0, 0, "z"), (0.15, 0, 0.4865, "y"), (0, 0, 0.7, "y"), (0.3, 0, 0, "x"),
-                (0.3, 0, 0, "y"), (0.065, 0, 0, "x")),
-        drawn(0, 0, 0, 0, H, 0),
-    ),
-    "m10ia": (
-        upright((0, 0, 0.45, "z"), (0.15, 0, 0, "y"), (0, 0, 0.6, "-y"), (0, 0, 0.2, "-x"),
-                (0.64, 0, 0, "-y"), (0.1, 0, 0, "-x")),
-        drawn(0, 0, 0, PI, -H, 0),
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", OTHER_MAKERS)
+@pytest.mark.parametrize("name", OTHERS)
 def test_arms_of_other_makers_are_those_of_their_urdfs(name):
     """The rows of the catalogue against the joints of the published URDF."""
-    arm, (joints, tool) = load_arm(name), OTHER_MAKERS[name]
+    arm, joints = load_arm(name), OTHERS[name]["joints"]
+    tool = in_degrees(*OTHERS[name]["flange"])
     q = np.random.default_rng(3).uniform(-2.0, 2.0, (20, len(joints)))
     found = evaluate(arm, q)
     angles = q.copy()
@@ -154,9 +78,10 @@ def test_arms_of_other_makers_are_those_of_their_urdfs(name):
         angles[:, 2] += angles[:, 1]
     for i, row in enumerate(angles):
         pose = np.eye(4)
-        for (origin, axis), angle in zip(joints, row, strict=True):
-            turn = pin.SE3(pin.AngleAxis(angle, np.array(axis)).matrix(), np.zeros(3)).homogeneous
-            pose = pose @ origin @ turn
+        for (*origin, axis), angle in zip(joints, row, strict=True):
+            about = (-1.0 if axis[0] == "-" else 1.0) * np.eye(3)["xyz".index(axis[-1])]
+            turn = pin.SE3(pin.AngleAxis(angle, about).matrix(), np.zeros(3)).homogeneous
+            pose = pose @ in_degrees(*origin) @ turn
         flange_at(found, i, pose @ tool, 1e-9)
     assert arm.source
     assert np.isfinite(arm.payload)
@@ -170,7 +95,7 @@ def test_arms_of_other_makers_are_those_of_their_urdfs(name):
         )
 
 
-@pytest.mark.parametrize("name", PUBLISHED)
+@pytest.mark.parametrize("name", URS)
 def test_pinocchio_agrees(name):
     arm, rng = load_arm(name), np.random.default_rng(2)
     model = pinocchio_model(arm)
@@ -186,11 +111,11 @@ def test_pinocchio_agrees(name):
     np.testing.assert_array_equal(model.upperEffortLimit, arm.torque_max)
 
 
-@pytest.mark.parametrize("name", PUBLISHED)
+@pytest.mark.parametrize("name", URS)
 def test_masses_and_limits_are_plausible(name):
-    arm, (*_, weight, payload) = load_arm(name), PUBLISHED[name]
+    arm, (*_, weight, payload) = load_arm(name), URS[name]
     # the foot does not move: the rest weighs less than the whole, but is most of it
-    if weight is not None:
+    if weight:
         assert 0.75 * weight < arm.masses.sum() < weight
     assert np.all(arm.masses > 0)
     assert arm.payload == payload
@@ -300,7 +225,7 @@ def turn_of(seed, n):
             for _ in range(n)]  # fmt: skip
 
 
-@given(name=st.sampled_from(sorted(PUBLISHED)), seed=st.integers(0, 2**32 - 1))
+@given(name=st.sampled_from(sorted(URS)), seed=st.integers(0, 2**32 - 1))
 def test_urdf_round_trip(tmp_path_factory, name, seed):
     arm, path = load_arm(name), tmp_path_factory.mktemp("urdf") / "arm.urdf"
     path.write_text(urdf(arm, turn_of(seed, 6)))
