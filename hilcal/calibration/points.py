@@ -191,7 +191,8 @@ def _nearest(arm: Arm, tool: Floats, name: str, near: Floats, goal: Floats) -> F
         raise InputError(
             f"point {name}: the nominal arm does not reach it from anywhere; "
             f"{1e3 * solved.residual_m[k]:.3g} mm and "
-            f"{np.degrees(solved.residual_rad[k]):.3g} degrees are left"
+            f"{np.degrees(solved.residual_rad[k]):.3g} degrees are left; valid: poses of the tool "
+            "in base axes, within its reach"
         )
     return np.asarray(q[int(np.argmin(distance))])
 

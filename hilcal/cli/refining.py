@@ -43,7 +43,12 @@ from hilcal.present.calibration import (
     validation_failure,
     validation_report,
 )
-from hilcal.present.comparison import comparison_json, comparison_report, next_command
+from hilcal.present.comparison import (
+    comparison_json,
+    comparison_report,
+    next_command,
+    tool_differs,
+)
 from hilcal.present.document import Block, heading
 from hilcal.present.fit import dependence_sentence, gross_error_lines, model_name, prior_lines
 from hilcal.present.progress import working
@@ -470,6 +475,8 @@ def validate(
     t.show(fit_and_test_lines(judged, prediction))
     t.show(validation_report(judged, prediction, result.beyond))
     t.show(shares_report(shares))
+    if result.tool:
+        t.show(tool_differs(result.tool, other.name))
     if prediction.error.rms_sigma > MOVED_TRACKER_SIGMA and not register:
         t.show(
             "Was the tracker set up anew for these readings? Then --register fits its place first."
@@ -492,6 +499,7 @@ def validate(
         error=prediction.error.to_json(),
         variance_factor=prediction.variance_factor,
         noise_floor_m=prediction.noise_floor,
+        tool_differs=list(result.tool),
         **result.beyond.to_dict(),
         **shares.to_dict(),
     )

@@ -3,7 +3,8 @@
 Alternatives. Refits take seconds to minutes on a large campaign, so an effect is eliminated, and
 others enter by forward selection, by algebra (`regression.forward_selection`). An effect that was
 added in place of one found later is often redundant: its F-test against the model without it, at
-the same linearisation, is not significant.
+the same linearisation, is not significant, and its evidence as a random effect does not favour it
+at 20 : 1. (An F-test of as many columns as there are degrees of freedom sees nothing.)
 
 Separability. Suppose suspect A with the estimated parameters β is the cause. It adds βᵀ S_A β to
 the whitened sum of squares beside the fitted model, S_A the information on A. When suspect B is
@@ -383,7 +384,11 @@ def backward_elimination(fit: Fit) -> dict[str, FamilyScore]:
         return {}
     x = model_columns(fit)
     scores = {n: eliminate_effect(fit, x, n).score() for n in judged}
-    redundant = [n for n in judged if scores[n].p_value > REDUNDANCY_LEVEL]
+    redundant = [
+        n
+        for n in judged
+        if scores[n].p_value > REDUNDANCY_LEVEL and scores[n].log_evidence < SAME_EVIDENCE
+    ]
     return {n: scores[n] for n in sorted(redundant, key=lambda n: -scores[n].p_value)}
 
 

@@ -62,7 +62,12 @@ def _setup(c: Comparison, earlier: str, later: str) -> Iterator[str]:
         place = f"estimated from them, as if it had been set up anew{unless}"
     yield f"The tracker's place is {place}."
     if c.tool:
-        yield f"[tool] {numbers.names(c.tool)} of {later} differ; those of {later} are used."
+        yield tool_differs(c.tool, later)
+
+
+def tool_differs(keys: Sequence[str], later: str) -> str:
+    """Return in one sentence whose tool is predicted where two campaigns state different ones."""
+    return f"[tool] {numbers.names(keys)} of {later} differ; those of {later} are used."
 
 
 def _today(c: Comparison, earlier: str) -> Iterator[Block]:

@@ -222,6 +222,9 @@ def single_covariance(v: Floats, loaded: Ints, reference: Ints, weights: Floats)
     return np.asarray(v[loaded] + unloaded)
 
 
+SINGULAR = 1e-9  # eigenvalue of a correlation matrix that is zero but for rounding
+
+
 def smallest_correlation(covariance: Floats) -> Floats:
     """Return the smallest eigenvalue (N,) of the correlation matrices of covariances (N, m, m).
 
@@ -242,4 +245,4 @@ def is_covariance(covariance: Floats) -> Bools:
     std = np.sqrt(np.abs(np.diagonal(covariance, axis1=1, axis2=2)))
     differs = np.abs(covariance - np.swapaxes(covariance, 1, 2))
     symmetric = np.all(differs <= 1e-9 * std[:, :, None] * std[:, None, :], axis=(1, 2))
-    return np.asarray(symmetric & (smallest_correlation(covariance) >= -1e-9))
+    return np.asarray(symmetric & (smallest_correlation(covariance) >= -SINGULAR))

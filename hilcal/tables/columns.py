@@ -13,7 +13,7 @@ from difflib import get_close_matches
 import numpy as np
 
 from hilcal.errors import InputError
-from hilcal.readings.covariance import smallest_correlation
+from hilcal.readings.covariance import SINGULAR, smallest_correlation
 from hilcal.readings.readings import SAME_POSE, ObserverKind, ObserverName, Readings
 from hilcal.robot.arm import Arm
 from hilcal.tables.grid import ColumnTable, first_true
@@ -249,7 +249,10 @@ def check_joints(table: ColumnTable, names: tuple[str, ...], q: Floats, arm: Arm
         if arm.slides[j]:
             seems = " (looks like millimetres)" if abs(q[i, j]) > 10 * most[j] else ""
         elif q[:, j].min() >= 0 and arm.q_min[j] <= q[i, j] - 2 * np.pi <= min(arm.q_max[j], 0):
-            seems = "; it is within them a whole turn on: were the angles counted from 0 to 360°?"
+            seems = (
+                "; it is within them a whole turn on: were the angles counted from 0 to 360°? "
+                "[joints] from_zero = true of a mapping reads such angles"
+            )
         unit, limits = arm.unit(j), f"{arm.q_min[j]:g} to {arm.q_max[j]:g}"
         raise InputError(
             f"{table.at(i, names[j])}: {q[i, j]:g} {unit} is beyond the limits of "
@@ -323,7 +326,7 @@ def check_covariances(table: ColumnTable, covariance: Floats) -> None:
     """Refuse covariances (N, m, m) that no error can have.
 
     A covariance is positive semi-definite; tested on the correlation matrix D V D with
-    D = diag(V)^-1/2, so that the answer does not depend on units: eigenvalues >= -1e-9.
+    D = diag(V)^-1/2, so that the answer does not depend on units: eigenvalues >= -SINGULAR.
     """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     for i, j in first_true(variance < 0):
@@ -337,7 +340,7 @@ def check_covariances(table: ColumnTable, covariance: Floats) -> None:
             f"leave out all covariance columns to use the tracker's specification"
         )
     smallest = smallest_correlation(covariance)
-    for (i,) in first_true(smallest < -1e-9):
+    for (i,) in first_true(smallest < -SINGULAR):
         why = f"smallest eigenvalue of the correlation matrix {smallest[i]:.3g}"
         if np.isinf(smallest[i]):
             why = "a covariance is larger than its two variances allow"

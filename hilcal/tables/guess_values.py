@@ -28,6 +28,7 @@ FORMATS = (
 )
 """Forms of dates that are tried, in this order."""
 RIVAL = 0.5  # Difference of the score within which another choice of columns is as good; a choice
+_WHOSE = 'base axes, or axes = "flange"; of = "load" (exerted on the tool), or "reaction"?'
 BY_VALUES = "found by their values: check the columns"
 BY_ROWS = "found by their values; row by row, or column by column?"
 RIVALS = "as good by their values:"
@@ -366,6 +367,7 @@ def _matrix(g: words.Guesser) -> bool:
 def _forces(g: words.Guesser, complete: Group) -> None:
     force, moment = (next(iter(complete.get(k, {}).values()), None) for k in ("force", "moment"))
     if force is None:
+        _vertical_force(g)
         return
     names = [force[axis] for axis in "xyz"]
     section: dict[str, object] = {"unit": g.unit(names, FORCES) or "N"}
@@ -373,8 +375,19 @@ def _forces(g: words.Guesser, complete: Group) -> None:
         turning = [moment[axis] for axis in "xyz"]
         section["moment_unit"] = g.unit(turning, MOMENTS) or "Nm"
         names += turning
-    g.doubt("wrench", 'base axes, and of = "load" (exerted on the tool), or "reaction"?')
+    g.doubt("wrench", _WHOSE)
     g.assign("wrench", names, ", ".join(map(str, section.values())), **section)
+
+
+def _vertical_force(g: words.Guesser) -> None:
+    """A force along z alone, as of a weight that hangs; the others are zero."""
+    forces = [c for c in g.columns if c.axis and c.has(words.FORCE) and g.number(c.name)]
+    if [c.axis for c in forces] != ["z"] or forces[0].name not in g.free:
+        return
+    names = [forces[0].name]
+    unit = g.unit(names, FORCES) or "N"
+    g.doubt("wrench", f"fx and fy are taken as 0; {_WHOSE}")
+    g.assign("wrench", names, f"fz, {unit}", unit=unit)
 
 
 def _std(g: words.Guesser, complete: Group, stem: tuple[object, ...], position_unit: str) -> None:

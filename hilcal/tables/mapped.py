@@ -1,5 +1,6 @@
 """Readings from a table of any kind: the exchange table, or one that a mapping explains."""
 
+import math
 import re
 from collections.abc import Mapping as Mapped
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ from typing import Generic
 import numpy as np
 
 from hilcal import limits
-from hilcal.config import CellConfig
+from hilcal.config import STANDARD_GRAVITY_M_S2, CellConfig
 from hilcal.errors import InputError
 from hilcal.readings.covariance import (
     INSTRUMENT_AND_ARM,
@@ -20,7 +21,7 @@ from hilcal.readings.covariance import (
     tracker_noise,
 )
 from hilcal.readings.readings import SAME_POSE, ObserverName, Readings
-from hilcal.robot import se3
+from hilcal.robot import chain, se3
 from hilcal.robot.arm import Arm
 from hilcal.tables import columns, units
 from hilcal.tables import mapping as forms
@@ -41,7 +42,8 @@ SIGMAS = 4.0  # Standard deviations within which two readings are the same; a ch
 REPEATED = 2e-4  # rad; rows whose joints differ by less repeat a pose; a choice
 REPEATS_TO = 4e-4  # m; ten times an arm's repeatability: of positions further apart some are wrong
 TOOL = 0.5  # m; the longest tool: with the arm's reach, the lever of its joints; a choice
-GRAVITY = (0.0, 0.0, -9.80665)  # m/s², base axes, of an arm that stands upright
+ONE_DIRECTION, MANY_DIRECTIONS = 0.99, 0.9  # length of the mean of unit vectors; a choice
+GRAVITY = (0.0, 0.0, -STANDARD_GRAVITY_M_S2)  # m/s², base axes, of an arm that stands upright
 EPOCH = 1e8  # s; times beyond three years are counted from an epoch, not from the campaign's start
 TARGET = "target of [position]"
 _DAY = 86400.0
@@ -102,9 +104,13 @@ def mapped_table(
     for name, time in (("time_s", mapping.time), ("load_time_s", mapping.load_time)):
         if time is not None:
             _put(table, grid, name, time.column, seconds(grid, time))
-    wrench = _wrench(grid, mapping, np.asarray(gravity), table)
-    table.text["load"] = _loads(grid, mapping, wrench)
     q = None if joints is None else _joint_units(joints, arm) * _block(raw, grid, joints.columns)
+    wrench = _wrench(grid, mapping, np.asarray(gravity), table)
+    if mapping.wrench is not None and mapping.wrench.axes == "flange" and q is not None:
+        wrench = _in_base_axes(wrench, arm, q)
+    if wrench.any():
+        table.number.update(zip(columns.WRENCH, wrench.T, strict=True))
+    table.text["load"] = _loads(grid, mapping, wrench)
     table.text["pose"] = _poses(grid, mapping.pose, q)
     if joints is not None and q is not None and joints.reported:
         _as_commanded(table, q, arm)
@@ -270,7 +276,20 @@ def _raw(grid: Grid, mapping: forms.PointMapping, arm: Arm) -> dict[str, Floats]
         needed += section.columns
     needed += [s.column for s in (mapping.air, mapping.cycle) if s is not None]
     needed += [s.column for s in mapping.scalars.values()]
-    return {grid.name(column): grid.numbers(column) for column in needed}
+    raw = {grid.name(column): grid.numbers(column) for column in needed}
+    for section in (mapping.joints, mapping.actual_joints):
+        if section is not None and section.from_zero:
+            half = math.pi / units.ANGLES[section.unit]
+            for name in _turning(grid, section, arm):
+                raw[name] = np.where(raw[name] > half, raw[name] - 2 * half, raw[name])
+    return raw
+
+
+def _turning(grid: Grid, section: forms.Joints, arm: Arm) -> list[str]:
+    """Names of the columns of a section whose joints turn."""
+    names = independent_columns(columns.joint_columns(arm.units), len(section.columns), arm)
+    of_joints = zip(names, section.columns, strict=True)
+    return [grid.name(column) for name, column in of_joints if name.endswith("_rad")]
 
 
 def _missing_positions(
@@ -360,19 +379,53 @@ def _wrench(grid: Grid, mapping: forms.PointMapping, gravity: Floats, table: Col
     if (w := mapping.wrench) is not None:
         scale = [units.FORCES[w.unit]] * 3 + [units.MOMENTS[w.moment_unit]] * 3
         sign = -1.0 if w.of == "reaction" else 1.0
-        for k, column in enumerate(w.columns):
+        for k, column in enumerate(w.columns, start=2 if len(w.columns) == 1 else 0):
             wrench[:, k] = sign * scale[k] * np.nan_to_num(grid.numbers(column))
             table.alias[columns.WRENCH[k]] = grid.name(column)
     if (hung := mapping.hung_mass) is not None:
-        mass = units.MASSES[hung.unit] * np.nan_to_num(grid.numbers(hung.column))
-        for (i,) in first_true(mass < 0):
-            raise InputError(f"{grid.at(i, hung.column)}: a mass is 0 or more")
+        mass = _hung_mass(grid, hung)
+        for i in np.flatnonzero(mass < 0)[:1]:
+            valid = "a mass is 0 or more"
+            if hung.unit in units.FORCES:
+                valid = "weights have one sign; of forces up and down, [wrench] takes fz"
+            raise InputError(f"{grid.at(i, hung.column)}: {valid}")
         wrench[:, :3] = mass[:, None] * gravity
         table.alias.update(dict.fromkeys(columns.WRENCH, grid.name(hung.column)))
-    wrench += 0.0  # no negative zeros
-    if wrench.any():
-        table.number.update(zip(columns.WRENCH, wrench.T, strict=True))
-    return wrench
+    return wrench + 0.0  # no negative zeros
+
+
+def _hung_mass(grid: Grid, hung: forms.HungMass) -> Floats:
+    """(N,) kg; of weights, which some count downwards as negative forces, the size."""
+    figures = np.nan_to_num(grid.numbers(hung.column))
+    if hung.unit in units.MASSES:
+        return units.MASSES[hung.unit] * figures
+    downwards = -1.0 if figures.max() <= 0 else 1.0
+    return downwards * units.FORCES[hung.unit] / STANDARD_GRAVITY_M_S2 * figures
+
+
+def _in_base_axes(wrench: Floats, arm: Arm, q: Floats) -> Floats:
+    """Turn wrenches (N, 6) about the load point from flange axes, by the nominal arm."""
+    flange = chain.evaluate(arm, arm.complete(q)).rotation[-1]
+    return se3.apply(flange[:, None], wrench.reshape(-1, 2, 3)).reshape(-1, 6)
+
+
+def _forces_of_flange(readings: Readings, arm: Arm) -> list[str]:
+    """Note forces that have one direction only where they are turned from flange axes to base."""
+    s = readings.states
+    size = np.linalg.norm(s.wrench[:, :3], axis=1)
+    loaded = size > 0
+    if not loaded.any():
+        return []
+    stated = s.wrench[loaded, :3] / size[loaded, None]
+    turned = se3.apply(chain.evaluate(arm, s.q[loaded]).rotation[-1], stated)
+    one, other = (float(np.linalg.norm(d.mean(axis=0))) for d in (turned, stated))
+    if one < ONE_DIRECTION or other > MANY_DIRECTIONS:
+        return []
+    return [
+        "the forces point this way and that in base axes, and all one way where they are taken as "
+        'in flange axes, as a sensor at the flange measures a weight: [wrench] axes = "flange" of '
+        "a mapping turns them"
+    ]
 
 
 def _loads(grid: Grid, mapping: forms.PointMapping, wrench: Floats) -> list[str]:
@@ -382,8 +435,8 @@ def _loads(grid: Grid, mapping: forms.PointMapping, wrench: Floats) -> list[str]
         text = grid.text(mapping.load.column)
         return ["none" if name.lower() in none else name for name in text]
     if (hung := mapping.hung_mass) is not None:
-        mass = np.nan_to_num(grid.numbers(hung.column))
-        return ["none" if m == 0 else f"{m:g}{hung.unit}" for m in mass]
+        figures = np.abs(np.nan_to_num(grid.numbers(hung.column)))
+        return ["none" if x == 0 else f"{x:g}{hung.unit}" for x in figures]
     return ["load" if loaded else "none" for loaded in np.asarray(wrench.any(axis=1))]
 
 
@@ -526,6 +579,7 @@ def import_readings(
     covers = INSTRUMENT_AND_ARM if stated and config.repeatability.in_tables else result.covers
     readings, copies = exchange.without_copies(result.readings)
     readings, named = exchange.named_loads(readings, config)
+    named = (*named, *_forces_of_flange(readings, arm))
     return exchange.ImportResult(
         readings, (*notes, *copies, *named), covers, stated or tracker.states_noise, not stated
     )

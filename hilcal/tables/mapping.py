@@ -155,6 +155,11 @@ class Joints(Section):
     columns: PerJoint
     slide_unit: Length = Field("m", description=_LENGTH + ", of joints that slide")
     unit: Angle = Field(description=_ANGLE)
+    from_zero: bool = Field(
+        False,
+        description="true where angles are counted from 0 to 360°: those over 180° then count as "
+        "negative ones; else false",
+    )
 
 
 class CommandedJoints(Joints):
@@ -264,22 +269,27 @@ class OneNumber(Name):
 
 
 class Wrench(Section):
-    """[wrench]: what the load exerts on the tool at the load point, base axes; empty is 0."""
+    """[wrench]: what the load exerts on the tool at the load point; empty is 0."""
 
-    columns: Annotated[tuple[Column, ...], _columns(3, 6)] = Field(
-        description="three columns: fx, fy, fz; or six with mx, my, mz"
+    columns: Annotated[tuple[Column, ...], _columns(1, 3, 6)] = Field(
+        description="three columns: fx, fy, fz; or six with mx, my, mz; or fz alone"
     )
     unit: Literal["N", "kN", "kgf", "lbf"] = Field("N", description='"N", "kN", "kgf" or "lbf"')
     moment_unit: Literal["Nm", "Nmm", "kNm"] = Field("Nm", description='"Nm", "Nmm" or "kNm"')
     of: Literal["load", "reaction"] = Field(
         "load", description='"load": exerted on the tool; "reaction": exerted by the tool'
     )
+    axes: Literal["base", "flange"] = Field(
+        "base", description='"base" or "flange": the axes in which the columns are'
+    )
 
 
 class HungMass(Name):
     """[hung_mass]: a mass that hangs at the load point; its weight is the wrench. Empty is 0."""
 
-    unit: Literal["kg", "g", "lb"] = Field("kg", description='"kg", "g" or "lb"')
+    unit: Literal["kg", "g", "lb", "N", "kN", "kgf", "lbf"] = Field(
+        "kg", description='"kg", "g" or "lb" of a mass; "N", "kN", "kgf" or "lbf" of its weight'
+    )
 
 
 class Approach(Section):

@@ -73,7 +73,7 @@ TEMPERATURE = {"temp", "temperature", "temperatur", "temperatura"}
 APPROACH = {"approach", "richtung", "direction", "anfahrt"}
 POSE = {
     "pose", "poses", "point", "punkt", "pt", "messpunkt", "posenr", "id", "name", "nr", "no",
-    "number", "index", "position", "punto", "target", "p", "pkt", "label", "repere",
+    "number", "index", "position", "pos", "punto", "target", "p", "pkt", "label", "repere",
 }  # fmt: skip
 LOAD = {"load", "last", "payload", "charge", "carga", "loadcase", "lastfall", "zuladung"}
 MASS = {"mass", "masse", "weight", "gewicht", "masa", "peso"}
@@ -161,7 +161,7 @@ def _unit(name: str) -> tuple[str, str | None]:
     ending = re.search(r"[ _/.,-]+([A-Za-z°·*]+)$", plain)
     if ending and (unit := UNITS.get(ending[1].lower())):
         single = len(ending[1]) == 1
-        if not single or ending[1] in ("m", "N", "K", "°", "s"):
+        if not single or ending[1] in ("m", "N", "K", "°", "s", "g"):
             return plain[: ending.start()], unit
     return plain, None
 
@@ -257,7 +257,7 @@ class Guesser:
         values = (self.values[name] for name in names)
         return np.stack([nothing if v is None else v for v in values], axis=1)
 
-    def assign(self, name: str, columns: Sequence[str], meaning: str, **section: object) -> None:
+    def assign(self, name: str, columns: Sequence[str], meaning: str, /, **section: object) -> None:
         """Give columns a meaning."""
         key = "column" if "column" in section else "columns"
         section = {key: columns[0] if key == "column" else list(columns)} | section

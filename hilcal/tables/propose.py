@@ -20,7 +20,8 @@ from hilcal.tables.columns import required_columns
 from hilcal.tables.grid import Cell, Grid, joined, number
 from hilcal.tables.guess_values import guess_axes, guess_by_values, is_quaternion, time_unit
 from hilcal.tables.mapping import UNLOADED, FileFormat
-from hilcal.tables.units import ANGLES, LENGTHS, MOMENTS
+from hilcal.tables.units import ANGLES, FORCES, LENGTHS, MASSES, MOMENTS
+from hilcal.types import Floats
 
 EXCHANGE_NAMES = (
     "its columns are named as an exchange table's, which (commas, header in row 1, SI units, "
@@ -142,6 +143,8 @@ def _why_unused(g: words.Guesser, column: words.ColumnName) -> str:
         return "a difference"
     if column.has(words.NOMINAL):
         return "a commanded or nominal value"
+    if column.unit in FORCES or (column.has(words.FORCE) and column.axis):
+        return "a force; [wrench] takes fx, fy, fz or fz alone, [hung_mass] a weight"
     if values is None:
         return "no numbers" if any(g.grid.text(column.name)) else "empty"
     return "its name says nothing"
@@ -183,7 +186,10 @@ def _joints(g: words.Guesser, joint_names: Sequence[str]) -> None:
     if first.has(words.MEASURED | {"qa"}):
         g.doubt("joints", f"'{names[0]}' ... are reported angles, used as the commanded ones")
     unit = words.angle_unit(g, "joints", names)
-    g.assign("joints", names, unit, unit=unit)
+    from_zero = {"from_zero": True} if _from_zero(g.block(names) * ANGLES[unit]) else {}
+    if from_zero:
+        g.doubt("joints", "counted from 0 to 360°, by their values: those over 180° are negative")
+    g.assign("joints", names, unit, unit=unit, **from_zero)
     if g.joints is not None and len(names) != g.joints:
         g.doubt("joints", f"{len(names)} columns, the arm has {g.joints} joints")
     for parsed, reported in candidates[1:]:
@@ -192,6 +198,16 @@ def _joints(g: words.Guesser, joint_names: Sequence[str]) -> None:
             if same < (0.1 if unit == "rad" else 5.7):
                 g.assign("actual_joints", reported, unit, unit=unit)
                 break
+
+
+def _from_zero(q: Floats) -> bool:
+    """Whether angles (N, k), rad, are counted from 0 to a turn: several go round, none is below 0.
+
+    A joint goes round whose values lie in the first quarter of the turn and in the last.
+    """
+    least, most = np.nanmin(q, axis=0), np.nanmax(q, axis=0)
+    within = bool(np.all(least >= 0.0) and np.all(most <= 2 * np.pi))
+    return within and int(np.sum((least < np.pi / 2) & (most > 1.5 * np.pi))) > 1
 
 
 def _with_words(g: words.Guesser, parts: Sequence[str]) -> str | None:
@@ -256,11 +272,13 @@ def guess_names(g: words.Guesser) -> None:
     _pick(g, "pose", words.POSE, lambda n: q is None or _names_poses(g, n, q))
     for c in list(g.free.values()):
         if c.has(words.MASS | words.LOAD) and g.number(c.name) and "load" not in g.free:
-            mass = c.unit in ("kg", "g", "lb") or c.has(words.MASS)
-            if mass and "hung_mass" not in g.proposal.sections:
-                unit = c.unit if c.unit in ("kg", "g", "lb") else "kg"
+            stated = c.unit if c.unit in MASSES | FORCES else None
+            if (stated or c.has(words.MASS)) and "hung_mass" not in g.proposal.sections:
+                unit = stated or "kg"
                 if "wrench" in g.proposal.sections:
                     continue
+                if unit in FORCES:
+                    g.doubt("hung_mass", "taken as a weight, which pulls down")
                 g.assign("hung_mass", [c.name], unit, column=c.name, unit=unit)
     if "hung_mass" not in g.proposal.sections:
         _pick(g, "load", words.LOAD, lambda n: True)
@@ -325,11 +343,15 @@ def _names_poses(g: words.Guesser, name: str, joints: dict[str, Any]) -> bool:
 
 def guess_scalars(g: words.Guesser) -> None:
     """Find times and the temperature of the air."""
+    read = np.ones(len(g.grid.rows), dtype=bool)  # rows that have what a reading needs
+    for needed in ("joints", "position"):
+        if needed in g.proposal.sections:
+            read &= np.isfinite(g.block(g.proposal.sections[needed]["columns"])).any(axis=1)
     for c in list(g.free.values()):
         dated = all(isinstance(cell, datetime) for cell in g.grid.cells(c.name))
         timed = dated or (c.has(words.TIME) and not c.axis)
         if "time" not in g.proposal.sections and timed:
-            guessed = time_unit(g.grid, c.name, c.unit, g.values[c.name])
+            guessed = time_unit(g.grid.rows_with(read), c.name, c.unit, g.values[c.name])
             if guessed is not None:
                 section, doubt = guessed
                 if doubt:
@@ -348,6 +370,7 @@ def guess_scalars(g: words.Guesser) -> None:
 
 
 HEAD = 400  # Lines that the dialect is guessed from
+MANY_NUMBERS = 0.5  # of those of the sheet that is read: other readings; a choice
 COMMENTS = ("//", "#", "%", "!")
 _UNIT = re.compile(
     r"[\[(<]?\s*(|-|1|m|mm|[uµμ]m|in(ch)?|\"|deg|degrees?|°|rad|mrad|n|kn|nm|n[*·]m|kg|g|s|sec|ms|"
@@ -473,7 +496,8 @@ def _layout(rows: Rows, how: FileFormat) -> tuple[dict[str, Any], tuple[str, ...
         late = [row for row in odd if row > rows[first][0]]
         if late:
             listed = ", ".join(map(str, late[:5])) + ", ..." * (len(late) > 5)
-            doubts.append(f"rows {listed} are left out: they are not of the table's length")
+            why = "they repeat the header or are not of the table's length"
+            doubts.append(f"rows {listed} are left out: {why}")
     return out, tuple(doubts)
 
 
@@ -492,11 +516,12 @@ def _commented_header(text: str, how: dict[str, Any], rows: Rows) -> dict[str, A
 
 def _spreadsheet(path: str, content: bytes) -> SniffedFile:
     best: tuple[int, str, Rows] = (0, "", [])
+    counts: dict[str, int] = {}
     book = files.workbook(path, content)
     names = book.sheetnames
     for sheet in names:
         rows = files.sheet_rows(path, book, sheet, None)
-        count = sum(isinstance(c, float) for _, cells in rows for c in cells)
+        count = counts[sheet] = sum(isinstance(c, float) for _, cells in rows for c in cells)
         if count > best[0]:
             best = count, sheet, rows
     if not best[0]:
@@ -504,6 +529,8 @@ def _spreadsheet(path: str, content: bytes) -> SniffedFile:
     how, doubts = _layout(best[2], FileFormat(header_row=0))
     if len(names) > 1:
         how["sheet"] = best[1]
+    if others := [s for s in names if s != best[1] and counts[s] > MANY_NUMBERS * best[0]]:
+        doubts = (*doubts, f"only this sheet is read, and not {', '.join(others)}")
     if how["header_row"] == 1:
         del how["header_row"]
     form = FileFormat(**how)

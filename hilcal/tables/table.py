@@ -13,7 +13,9 @@ from hilcal.readings.covariance import (
     INSTRUMENT,
     INSTRUMENT_AND_ARM,
     ROUNDING,
+    SINGULAR,
     TrackerNoise,
+    smallest_correlation,
     tracker_covariance,
 )
 from hilcal.readings.readings import ObserverName, Readings, States
@@ -130,7 +132,8 @@ def covariances_of(
     else:
         columns.check_covariances(table, stated)
         tiny = np.any(np.diagonal(stated, axis1=1, axis2=2) < min(MIN_STD) ** 2)
-        use_spec = bool(tiny) and noise is not None
+        zero = np.any(smallest_correlation(stated) <= SINGULAR)
+        use_spec = bool(tiny | zero) and noise is not None
         spec = _instrument_covariance(table, value, noise, station) if use_spec else None
         cov, raised = floored(table, stated, spec)
         notes, (covers, included) = (FROM_TABLE, *raised), _covers(table)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hilcal.errors import InputError
-from hilcal.readings.covariance import TrackerNoise, tracker_covariance
+from hilcal.readings.covariance import SINGULAR, TrackerNoise, tracker_covariance
 from hilcal.tables import units
 from hilcal.tables.grid import ColumnTable, Grid, first_true
 from hilcal.tables.mapping import Column, CovarianceColumns, Mapping, Std
@@ -202,7 +202,7 @@ def floored(
         tiny[:, block] = (v >= 0) & (v < least**2)
     rows: Bools = np.asarray(tiny.any(axis=1))
     if not rows.any():
-        return covariance, ()
+        return _regular(table, covariance, instrument)
     if instrument is None:
         i = int(np.argmax(rows))
         raise InputError(
@@ -218,7 +218,40 @@ def floored(
         f"0.1 µm, the first is row {table.rows[np.argmax(rows)]}): the noise in [tracker] takes "
         f"its place"
     )
-    return out, (note,)
+    regular, notes = _regular(table, out, instrument)
+    return regular, (note, *notes)
+
+
+def _regular(
+    table: ColumnTable, covariance: Floats, instrument: Floats | None
+) -> tuple[Floats, tuple[str, ...]]:
+    """Raise the variance to the instrument's in the directions in which none is stated.
+
+    These are the eigenvectors of eigenvalue zero of the correlation matrices, as where two errors
+    are stated as wholly correlated.
+    """
+    std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    products = std[:, :, None] * std[:, None, :]
+    values, vectors = np.linalg.eigh(covariance / products)
+    none = np.abs(values) <= SINGULAR
+    rows: Bools = np.asarray(none.any(axis=1))
+    if not rows.any():
+        return covariance, ()
+    first = int(np.argmax(rows))
+    if instrument is None:
+        raise InputError(
+            f"{table.at(first)}: the covariance states no noise in some direction (it is "
+            "singular); it must, or [tracker] must state the instrument's noise to take its place"
+        )
+    floor = np.einsum("nji,njk,nki->ni", vectors, instrument / products, vectors)
+    spread = vectors * np.where(none, floor, values)[:, None]
+    raised = spread @ np.swapaxes(vectors, 1, 2) * products
+    note = (
+        f"{int(rows.sum())} of {len(rows)} rows state a covariance without noise in some direction "
+        f"(it is singular, the first is row {table.rows[first]}): the noise in [tracker] takes its "
+        f"place there"
+    )
+    return np.where(rows[:, None, None], raised, covariance), (note,)
 
 
 def _cause(usual: float) -> str:

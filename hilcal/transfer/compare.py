@@ -39,6 +39,7 @@ from hilcal.identification.prediction.validation import (
     Judged,
     acceptance,
     extrapolation,
+    with_tool,
 )
 from hilcal.identification.registration.misdescription import refuse_misdescribed
 from hilcal.identification.registration.registration import register
@@ -114,8 +115,7 @@ def compare(
     extended, lacked = with_missing_effects(fit, changing(run.catalogue) if lacks else (), say)
     later_setting = later_readings(earlier_fit(extended), chosen, anew=anew, cell=later.cell)
     changes = find_changes(later_setting, say)
-    record, tool = later.in_use(), run.config.tool
-    keys = type(tool).model_fields
+    record = later.in_use()
     return Comparison(
         number=number,
         fit=fit,
@@ -126,7 +126,7 @@ def compare(
         shared=shared,
         anew=anew,
         told=same_setup is not None,
-        tool=tuple(k for k in keys if getattr(tool, k) != getattr(later.config.tool, k)),
+        tool=_tool_differs(run, later),
         today=error_today(later_setting, changes, nominal_rms),
         changes=changes,
         differences=None if record is None else _differences(fit, later, record, say),
@@ -189,6 +189,7 @@ def validate(
 ) -> CampaignValidation:
     """Predict readings of another campaign with a revision of this one.
 
+    Where `other` states another tool, or target on the flange, it is that which is predicted.
     Readings that the revision was fitted to are recognised in any file (see
     `hilcal.readings.same_readings`) and left out. Where all were fitted, all are predicted, and
     `judged.unseen` is False.
@@ -248,11 +249,24 @@ def validate(
         )
     chosen = readings[fresh] if mixed else readings
     say(f"predicting {len(chosen)} readings")
-    prediction = validation.validate(model, theta, fitted, chosen, mode, registered=register)
+    knows, tool = run.predictive(record, model, theta), _tool_differs(run, other)
+    if not all((*run.cell.known_targets, *other.cell.known_targets)):
+        tool = tuple(k for k in tool if not k.startswith("target"))
+    if tool:
+        knows = with_tool(knows, other.cell, fitted)
+    prediction = validation.validate(
+        knows.model, knows.theta, fitted, chosen, mode, registered=register
+    )
     say("comparing with what was measured")
-    beyond = extrapolation(run.predictive(record, model, theta), fitted, prediction)
+    beyond = extrapolation(knows, fitted, prediction)
     shares = acceptance(prediction, beyond, limit_m)
-    return CampaignValidation(model, judged, prediction, beyond, shares)
+    return CampaignValidation(model, judged, prediction, beyond, shares, tool)
+
+
+def _tool_differs(first: Campaign, second: Campaign) -> tuple[str, ...]:
+    """Return the keys of [tool] that two campaigns state differently."""
+    a, b = first.config.tool, second.config.tool
+    return tuple(k for k in type(a).model_fields if getattr(a, k) != getattr(b, k))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

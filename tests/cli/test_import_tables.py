@@ -8,6 +8,7 @@ import pytest
 from hilcal.cell import cell_from_config
 from hilcal.config import load_config
 from hilcal.robot.catalogue import configs_dir, load_arm
+from hilcal.robot.chain import evaluate
 from hilcal.store.campaign_file import CampaignFile
 from tests.support.cli_cases import ok, refused
 from tests.support.foreign_tables import CELL, campaign, lines, write
@@ -490,3 +491,21 @@ def test_a_numpy_archive_is_named(tmp_path, capsys):
         capsys, 2, "import", tmp_path / "t.npz", "--config", CELL, "-o", tmp_path / "x.hilcal"
     )
     assert "a NumPy file; save it as CSV" in line
+
+
+def test_forces_of_a_sensor_at_the_flange_are_noticed(tmp_path, capsys):
+    flange = evaluate(load_arm(load_config(CELL).robot.model), C.q).rotation[-1]
+    force = np.einsum("nji,j->ni", flange, [0.0, 0.0, -49.0])
+    header = [*NAMES, "X", "Y", "Z", "Fx", "Fy", "Fz"]
+    table = write(tmp_path / "t.csv", lines(header, np.rad2deg(C.q), 1e3 * C.position, force))
+    mapping = tmp_path / "m.toml"
+    ok(capsys, "import", table, "--config", CELL, "--preview", "-o", mapping)
+    run = ["import", table, "--config", CELL, "--format", mapping, "-o", tmp_path / "r.hilcal"]
+    assert "all one way where they are taken as in flange axes" in " ".join(
+        ok(capsys, *run).out.split()
+    )
+    mapping.write_text(mapping.read_text().replace("[wrench]", '[wrench]\naxes = "flange"'))
+    assert "flange axes" not in ok(capsys, *run, "--force").out
+    with CampaignFile.open(tmp_path / "r.hilcal") as file:
+        wrench = file.readings().states.wrench
+    np.testing.assert_allclose(wrench[:, :3], np.tile([0, 0, -49.0], (12, 1)), atol=1e-4)

@@ -3,11 +3,13 @@
 import csv
 import shutil
 
+import numpy as np
 import pytest
 
 from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.tables.table import write_table
 from tests.support.cli_cases import CELL, done, ok, refused, rehearsal, run
+from tests.support.foreign_tables import MOUNT, OFFSET, campaign, lines, write
 
 FITTED, POSES = 10, 14
 
@@ -107,6 +109,28 @@ def test_errors_stand_by_load_and_by_pose_beside_what_is_stated(folder, capsys):
     words = ok(capsys, *arguments).out
     assert words.index("load ") < words.index("worst poses")
     assert worst["pose"] in words
+
+
+def test_another_reflector_is_predicted_where_the_other_cell_has_it(tmp_path, capsys):
+    place = np.array([0.01, -0.03, 0.18])
+    cell = tmp_path / "cell.toml"
+    text = CELL.read_text(encoding="utf-8")
+    cell.write_text(text.replace("target_m = [0.06, 0.02, 0.12]", f"target_m = {place.tolist()}"))
+    at = {"a": OFFSET, "b": place}
+    for (name, offset), config, seed in zip(at.items(), (CELL, cell), (4, 5), strict=True):
+        c = campaign(20, seed)
+        position = c.position + (c.attitude * MOUNT.inv()).apply(offset - OFFSET)
+        header = [*(f"q{k}_rad" for k in range(1, 7)), "x_m", "y_m", "z_m"]
+        rows = lines(["pose", "load", *header], [f"{name}{k}" for k in range(20)], ["none"] * 20,
+                     c.q, position, separator=",", digits=7)  # fmt: skip
+        table = write(tmp_path / f"{name}.csv", rows)
+        done("import", table, "--config", config, "-o", tmp_path / f"{name}.hilcal")
+    done("identify", tmp_path / "a.hilcal", "--effects", "link_geometry")
+    arguments = ("validate", tmp_path / "a.hilcal", tmp_path / "b.hilcal")
+    d = ok(capsys, *arguments, "--json").document
+    assert d["tool_differs"] == ["target_m"]
+    assert d["error"]["rms_m"] < 2 * d["noise_floor_m"] + 1e-4
+    assert "[tool] target_m of b.hilcal differ; those of b.hilcal" in ok(capsys, *arguments).out
 
 
 def test_a_limit_is_kept_or_not_and_the_exit_code_says_so(folder, capsys):

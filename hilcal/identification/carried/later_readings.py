@@ -25,7 +25,6 @@ from functools import cached_property
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.config.cell import Tool
 from hilcal.effects.protocol import Effect, Role
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import LEVER_M
@@ -34,7 +33,7 @@ from hilcal.identification.fit import Fit, require_gc
 from hilcal.identification.gauss_newton import shortened
 from hilcal.identification.noise.arm_scatter import with_arm_scatter
 from hilcal.identification.prediction.predictive import Predictive, predictive_of
-from hilcal.identification.prediction.validation import require_columns
+from hilcal.identification.prediction.validation import other_target, require_columns
 from hilcal.identification.registration.registration import register, targets_as_fitted
 from hilcal.identification.residual import residual
 from hilcal.model.model import Model, Prediction
@@ -324,16 +323,6 @@ def directions_beside_frames(later: LaterReadings) -> Floats:
     rows = _rows(later.model, later.mean, later.lift, later.readings, later.w)
     absorbed = np.linalg.lstsq(rows[:, frames], rows[:, ~frames], rcond=None)[0]
     return np.asarray(prior - later.lift[:, frames] @ absorbed)
-
-
-def other_target(first: Cell, second: Cell) -> bool:
-    """Whether two cells have different targets, or other places of them on the flange."""
-
-    def targets(tool: Tool | None) -> object:
-        return None if tool is None else (tool.target_m, tool.target_rotvec_rad, tool.targets)
-
-    a, b = (targets(c.config.tool if c.config else None) for c in (first, second))
-    return first.target_names != second.target_names or a != b
 
 
 def _placed(fit: Fit, cell: Cell, flat: Sequence[Role], readings: Readings) -> tuple[Cell, float]:

@@ -15,6 +15,8 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 import scipy
 
+from hilcal.cell import Cell
+from hilcal.config.cell import Tool
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.prediction.predictive import Predictive
@@ -84,6 +86,40 @@ def validate(
     white = w.whiten(raw).reshape(-1)
     factor = float(white @ white) / max(w.rank - (6 if registered else 0), 1)
     return Validation(other, w, raw, error_block(raw, w), factor, registered)
+
+
+def with_tool(p: Predictive, cell: Cell, fitted: Readings) -> Predictive:
+    """Return the distribution for readings with the tool of another cell: its masses and targets.
+
+    Its targets count only where both cells state them; an error of the former ones is left out.
+    """
+    own = p.model.cell
+    tool = replace(
+        own, tool_mass=cell.tool_mass, tool_com=cell.tool_com, load_point=cell.load_point
+    )
+    effects = list(zip(p.model.effects, p.model.slices(), strict=True))
+    if all((*own.known_targets, *cell.known_targets)) and other_target(own, cell):
+        tool = tool.with_targets(cell.all_targets, cell.known_targets)
+        effects = [(e, s) for e, s in effects if e.role != "target"]
+    made = tuple(type(e)(tool, fitted.states, e.options) for e, _ in effects)
+    kept = np.concatenate([np.arange(p.model.size)[s] for _, s in effects])
+    return replace(
+        p,
+        model=replace(p.model, cell=tool, effects=made),
+        theta=p.theta[kept],
+        covariance=p.covariance[np.ix_(kept, kept)],
+        prior=p.prior[kept],
+    )
+
+
+def other_target(first: Cell, second: Cell) -> bool:
+    """Whether two cells have different targets, or other places of them on the flange."""
+
+    def targets(tool: Tool | None) -> object:
+        return None if tool is None else (tool.target_m, tool.target_rotvec_rad, tool.targets)
+
+    a, b = (targets(c.config.tool if c.config else None) for c in (first, second))
+    return first.target_names != second.target_names or a != b
 
 
 def require_columns(model: Model, readings: Readings, which: str) -> None:
@@ -321,6 +357,7 @@ class CampaignValidation(Shown):
     prediction: Validation  # of these
     beyond: Extrapolation  # their stated errors, and which of them lie outside
     shares: Acceptance  # errors by load and by pose, and against a limit
+    tool: tuple[str, ...] = ()  # keys of [tool] that are those of the other campaign
 
     def _brief(self) -> dict[str, str]:
         error, noise = self.prediction.error, self.prediction.noise_floor

@@ -1,6 +1,7 @@
 """Units, times, wrenches and uncertainties of mapped tables, against plain arithmetic."""
 
 from datetime import datetime, timedelta
+from itertools import product
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise
+from hilcal.robot.chain import evaluate
 from hilcal.tables.mapped import import_mapped
 from hilcal.tables.mapping import Mapping
 from hilcal.toml import check_section
@@ -87,6 +89,40 @@ def test_hung_masses_pull_along_gravity(tmp_path):
     expected = -9.80665 * np.array([0, 2.5, 0, 2.5, 1.0])
     np.testing.assert_allclose(x.states.wrench[:, 2], expected)
     assert [x.load_names[k] for k in x.load] == ["none", "2500g", "none", "2500g", "1000g"]
+
+
+def test_angles_from_zero_to_a_turn(tmp_path):
+    cells = {f"B{k}": np.rad2deg(Q[:, k]) % 360 for k in range(6)}
+    x = read(tmp_path, cells, joints={"columns": list(cells), "unit": "deg", "from_zero": True})
+    np.testing.assert_allclose(x.states.q, Q, atol=1e-12)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_weights_pull_as_the_masses_they_are_of(sign, tmp_path):
+    pounds = sign * np.array([0.0, 5.0, 10.0, 5.0, 0.0])
+    x = read(tmp_path, {"w": pounds}, hung_mass={"column": "w", "unit": "lbf"})
+    np.testing.assert_allclose(x.states.wrench[:, 2], -4.4482216152605 * np.abs(pounds))
+    assert x.load_names == ("none", "5lbf", "10lbf")
+
+
+def test_weights_have_one_sign(tmp_path):
+    with pytest.raises(InputError, match="row 3, column 'w': weights have one sign"):
+        read(tmp_path, {"w": [9.0, -9.0, 0, 0, 0]}, hung_mass={"column": "w", "unit": "N"})
+
+
+def test_one_force_is_that_along_z(tmp_path):
+    x = read(tmp_path, {"Fz": [0.0, -49, -98, 0, 1]}, wrench={"columns": ["Fz"]})
+    np.testing.assert_array_equal(x.states.wrench[:, 2], [0, -49, -98, 0, 1])
+    assert not np.delete(x.states.wrench, 2, axis=1).any()
+
+
+def test_wrenches_in_flange_axes_are_turned_to_those_of_the_base(tmp_path):
+    r = evaluate(ARM, Q).rotation[-1]
+    base = RNG.uniform(1, 20, (N, 2, 3))
+    own = np.einsum("nji,nkj->nki", r, base).reshape(N, 6)
+    columns = {f"{c}{a}": own[:, k] for k, (c, a) in enumerate(product("FM", "xyz"))}
+    x = read(tmp_path, columns, wrench={"columns": list(columns), "axes": "flange"})
+    np.testing.assert_allclose(x.states.wrench, base.reshape(N, 6), rtol=1e-9)
 
 
 def test_rows_of_the_same_joints_are_one_pose(tmp_path):

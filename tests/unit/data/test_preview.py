@@ -173,6 +173,53 @@ def test_lines_that_are_no_readings(tmp_path):
     assert any("are left out" in words for _, words in found.proposal.doubts)
 
 
+def test_the_header_again_and_figures_of_all_rows_at_the_end(tmp_path):
+    start = datetime(2024, 5, 28, 14)
+    times = [(start + timedelta(hours=4 * k)).strftime("%d.%m.%Y %H:%M:%S") for k in range(N)]
+    header = ["Nr", *six("A{}"), "X", "Y", "Z", "Zeit"]
+    rows = lines(header, POINTS, DEG, MM, times, comma=True).splitlines()
+    rows[10:10] = rows[:1]
+    rows.append(";".join(["Mittel", *[""] * 6, "1,0", "2,0", "3,0", ""]))
+    found = propose(write(tmp_path / "t.csv", "\n".join(rows)))
+    assert found.proposal.mapping(Mapping).time.format == "%d.%m.%Y %H:%M:%S"
+    assert ("file", f"rows 11 are left out: {NOT_READINGS}") in found.proposal.doubts
+
+
+NOT_READINGS = "they repeat the header or are not of the table's length"
+
+
+@pytest.mark.parametrize(("name", "section"), [
+    ("Load [lbf]", {"hung_mass": {"column": "Load [lbf]", "unit": "lbf"}}),
+    ("Weight (N)", {"hung_mass": {"column": "Weight (N)", "unit": "N"}}),
+    ("mass_g", {"hung_mass": {"column": "mass_g", "unit": "g"}}),
+    ("Fz [N]", {"wrench": {"columns": ["Fz [N]"], "unit": "N"}}),
+])  # fmt: skip
+def test_a_load_in_one_column_is_read_in_its_unit(name, section, tmp_path):
+    load = np.where(np.arange(N) % 2, 0.0, 50.0)
+    text = lines([*six("A{}"), "X", "Y", "Z", name], DEG, MM, load)
+    sections = propose(write(tmp_path / "t.csv", text)).proposal.sections
+    assert {k: v for k, v in sections.items() if k in ("hung_mass", "wrench", "load")} == section
+
+
+@pytest.mark.parametrize(("angles", "from_zero"), [(DEG % 360, True), (DEG, False)])
+def test_angles_counted_from_zero_are_noticed(angles, from_zero, tmp_path):
+    text = lines([*six("A{}"), "X", "Y", "Z"], angles, MM)
+    found = propose(write(tmp_path / "t.csv", text)).proposal.mapping(Mapping)
+    assert found.joints.from_zero is from_zero
+
+
+def test_distances_without_a_name_are_from_one_point(tmp_path):
+    text = lines([*six("A{}"), "Bar length [mm]"], DEG, np.linalg.norm(MM, axis=1))
+    distance = propose(write(tmp_path / "t.csv", text)).proposal.mapping(Mapping).distance
+    assert (distance.column, distance.name, distance.unit) == ("Bar length [mm]", "A", "mm")
+
+
+def test_a_force_of_unknown_direction_is_not_called_nameless(tmp_path):
+    text = lines([*six("A{}"), "X", "Y", "Z", "Fx [N]"], DEG, MM, np.arange(N) * 1.5)
+    unused = dict(propose(write(tmp_path / "t.csv", text)).proposal.unused)
+    assert unused["Fx [N]"].startswith("a force; [wrench] takes")
+
+
 def test_only_text(tmp_path):
     path = write(tmp_path / "t.csv", "name,colour\nbob,red\n")
     refusal("no columns of numbers", propose, path)

@@ -132,6 +132,15 @@ def test_parquet(tmp_path, arm):
     np.testing.assert_allclose(read(path, found, arm).value, C.position)
 
 
+def test_a_second_sheet_of_readings_is_said_to_be_left_out(tmp_path):
+    book(tmp_path / "t.xlsx")
+    out = openpyxl.load_workbook(tmp_path / "t.xlsx")
+    out.copy_worksheet(out["Data"]).title = "Tuesday"
+    out.save(tmp_path / "t.xlsx")
+    found = propose(tmp_path / "t.xlsx").proposal
+    assert ("file", "only this sheet is read, and not Tuesday") in found.doubts
+
+
 @pytest.mark.parametrize("name", ["openpyxl", "pyarrow.parquet"])
 def test_a_missing_package_is_named(name, tmp_path, monkeypatch):
     path = tmp_path / "t"

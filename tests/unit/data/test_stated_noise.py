@@ -50,6 +50,22 @@ def test_one_variance_of_zero_is_the_instruments(tmp_path, tiny):
     refusal(r"row 6: a stated variance is .*more than 0", through_a_table, tmp_path, x, None)
 
 
+def test_a_direction_without_noise_has_the_instruments(tmp_path):
+    x = simple_readings(20)
+    cov, along = x.covariance.copy(), np.array([1.0, -1.0, 0.0]) / np.sqrt(2)
+    cov[4] = 1e-10 * np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    x = replace(x, covariance=cov)
+    result = through_a_table(tmp_path, x)
+    raised = result.readings.covariance
+    spec = tracker_covariance(x.value, NOISE)
+    np.testing.assert_allclose(along @ raised[4] @ along, along @ spec[4] @ along, rtol=1e-9)
+    added = (along @ spec[4] @ along) * np.outer(along, along)
+    np.testing.assert_allclose(raised[4], cov[4] + added, rtol=1e-9, atol=1e-20)
+    np.testing.assert_array_equal(np.delete(raised, 4, axis=0), np.delete(cov, 4, axis=0))
+    assert "1 of 20 rows state a covariance without noise in some direction" in result.notes[1]
+    refusal("row 6: the covariance states no noise", through_a_table, tmp_path, x, None)
+
+
 def test_angles_have_a_floor_of_their_own(tmp_path):
     x = with_variances(simple_readings(20, m=6), 4, 1e-10, 1e-10, 1e-10, 1e-8, 0.0, 1e-8)
     assert through_a_table(tmp_path, x).readings.covariance[4, 4, 4] == NOISE.orientation_std**2

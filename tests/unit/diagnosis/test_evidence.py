@@ -13,6 +13,7 @@ from hilcal.diagnosis.effect_ranking import (
 from hilcal.diagnosis.evidence import (
     REDUNDANCY_LEVEL,
     backward_elimination,
+    model_columns,
 )
 from hilcal.diagnosis.stepwise import add, exchange, remove, trial
 from hilcal.diagnosis.verdict import diagnose
@@ -25,9 +26,10 @@ from hilcal.identification.carried.drift import carried_effects, evidence_of_car
 from hilcal.identification.carried.posterior import Posterior
 from hilcal.identification.fit import fit
 from hilcal.identification.gauss_newton import whitened_jacobian
-from hilcal.identification.linearisation import columns_of_each
+from hilcal.identification.linearisation import columns_of_each, eliminate_effect
 from hilcal.present.verdict import message
 from hilcal.refinement import Path, refine
+from hilcal.robot.chain import evaluate
 from tests.support.campaigns import NO_EFFECT, campaign, measured, plan, world_of
 from tests.support.diagnosis_cases import fitted_baseline, studied
 from tests.support.fit_cases import fitted_model
@@ -230,6 +232,19 @@ def test_what_is_there_is_not_backward_elimination(effect):
     mode = "absolute" if effect == "transmission_error" else "deflection"
     c = campaign(effect, mode, 3, poses=30, strength=1.0)
     assert effect not in backward_elimination(fitted_baseline(c, effect))
+
+
+def test_an_effect_of_as_many_columns_as_readings_is_not_called_needless():
+    c = campaign(NO_EFFECT, "absolute", 10, poses=26)
+    r = c.readings[np.unique(c.readings.pose, return_index=True)[1]]
+    q, cell = r.states.q, c.cell
+    gears = evaluate(cell.arm, q + 2e-4 * np.sin(q + np.arange(6)))
+    moved = gears.point(cell.target[:3, 3]) - evaluate(cell.arm, q).point(cell.target[:3, 3])
+    r = replace(r, value=r.value + moved @ cell.registration[:3, :3].T)
+    found = fitted_baseline(c, "link_geometry", "transmission_error", readings=r)
+    score = eliminate_effect(found, model_columns(found), "transmission_error").score()
+    assert score.p_value > REDUNDANCY_LEVEL  # 51 columns of 78 numbers
+    assert backward_elimination(found) == {}
 
 
 def test_an_early_addition_that_became_needless_is_removed():
