@@ -47,6 +47,7 @@ from hilcal.measuring.session_state import (
     detail,
     repeatability,
     sample_json,
+    stored_felt,
     stored_wrench,
 )
 from hilcal.readings.readings import Readings, States
@@ -126,8 +127,9 @@ class Session:
         for raw, value, target in zip(details, stored.value, stored.target.tolist(), strict=True):
             step = Step(raw["pose"], raw["load"], raw["cycle"])
             q, covariance = np.array(raw["q_actual"]), np.array(raw["tracker_covariance"])
-            self._state.add(step, q, value, covariance, stored_wrench(raw), target)
-        felt = details[-1].get("felt")
+            tared = stored_wrench(raw, self._meter)
+            self._state.add(step, q, value, covariance, tared, target)
+        felt = stored_felt(details[-1], self._meter)
         if self._meter is not None and felt is not None:
             self._meter.zero = np.array(felt["zero"])
             self._identify()
@@ -413,8 +415,7 @@ class Session:
         }
         if target is not None:
             session["target"] = names[target]
-        zero = None if self._meter is None else self._meter.zero
-        return row, detail(step, measured, tared, zero) | session
+        return row, detail(step, measured, tared, self._meter) | session
 
     def _tared_wrench(self, measured: MeasuredStop) -> TaredWrench | None:
         if self._meter is None or measured.force is None:

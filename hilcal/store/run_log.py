@@ -64,6 +64,35 @@ def check_same_cell(campaign: CampaignFile, config: CellConfig, base_dir: Path) 
                 f"[{section}] differs from what {campaign.path} was begun with; a campaign is "
                 "measured in one cell: start another one for this"
             )
+    _check_same_mounting(campaign, config)
+
+
+def _check_same_mounting(campaign: CampaignFile, config: CellConfig) -> None:
+    """Refuse another mounting of the force sensor than that of the measured wrenches of loads.
+
+    Wrenches of configured loads do not depend on it. Readings of older versions do not state it;
+    it is that of the configuration then.
+    """
+    begun = CellConfig.from_json(campaign.config_json)
+    if config.force_sensor is None or campaign.about(PLAN) is None or not campaign.n_readings:
+        return
+    mounting, readings = config.force_sensor.mounting, campaign.readings()
+    older = mounting if begun.force_sensor is None else begun.force_sensor.mounting
+    configured = {
+        load.name: load.wrench(np.array(config.robot.gravity_m_s2)) for load in config.loads
+    }
+    for k, raw in enumerate(RunLog(campaign).details()):
+        expected = configured.get(readings.load_names[readings.load[k]])
+        if expected is None or np.array_equal(readings.states.wrench[k], expected):
+            continue
+        stored = (raw.get("felt") or {}).get("mounting", older)
+        for key in mounting:
+            if stored.get(key) != mounting[key]:
+                raise InputError(
+                    f"[force_sensor] {key} is {mounting[key]}, and the wrenches of loads in "
+                    f"{campaign.path} were measured with {stored.get(key)}; put that back, or "
+                    "start another campaign"
+                )
 
 
 class RunLog:
