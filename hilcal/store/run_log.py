@@ -2,7 +2,8 @@
 
 import json
 import sqlite3
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial, reduce
 from pathlib import Path
@@ -113,6 +114,7 @@ class RunLog:
         where = f"{campaign.path}, its plan"
         further = enumerate(campaign.numbered(FURTHER_PLAN, 2), start=2)
         plans = [read_plan(text, where), *(read_plan(t, f"{where} {k}") for k, t in further)]
+        self._last: tuple[int, int] | None = None  # number and checksum of the last reading
         self.plans: tuple[Plan, ...] = tuple(plans)
 
     @property
@@ -162,7 +164,7 @@ class RunLog:
         details = (detail, *more)
         if len(reading) != len(details):
             raise ValueError(f"{len(reading)} readings of one step, {len(details)} details")
-        with self._campaign.transaction() as connection:
+        with self._transaction() as connection:
             last = self._campaign.insert(reading)
             for k, content in enumerate(details):
                 number, text = last - len(details) + 1 + k, json.dumps(content, allow_nan=False)
@@ -176,11 +178,30 @@ class RunLog:
                     raise InputError(
                         f"{self._campaign.path}: {step} has been measured already"
                     ) from None
+        self._last = number, row[-1]
+
+    @contextmanager
+    def _transaction(self) -> Iterator[sqlite3.Connection]:
+        """Store the changes of the block, if the last reading stored by this log is still there.
+
+        A copy over an open file, as `cp` makes it, leaves the file's identity.
+        """
+        with self._campaign.transaction() as connection:
+            if self._last is not None:
+                number, crc = self._last
+                found = connection.execute("SELECT crc FROM details WHERE id = ?", (number,))
+                if found.fetchone() != (crc,):
+                    raise InputError(
+                        f"{self._campaign.path}: reading {number} is gone: another program has "
+                        "written another file over the campaign. End it, put back the newest copy "
+                        "of the campaign; what that lacks is measured again"
+                    )
+            yield connection
 
     def event(self, kind: str, content: dict[str, Any]) -> None:
         """Append an event, with the time (UTC)."""
         text = json.dumps({"kind": kind, "utc": utc_now(), **content}, allow_nan=False)
-        with self._campaign.transaction() as connection:
+        with self._transaction() as connection:
             rows.append_text(connection, "events", text)
 
     def done(self) -> frozenset[Step]:
