@@ -225,8 +225,8 @@ class Session:
         positions: list[tuple[Floats, Floats]] = []
         for stop in start:
             self._watched(partial(self._move, stop))
-            with suppress(TargetLostError):  # a reading will search it
-                positions.append((stop.q, self._rig.tracker.measure().value[:3]))
+            with suppress(TargetLostError):  # a reading will search it again
+                positions.append((stop.q, self._place(stop)))
                 self._compare_place(stop, positions[-1][1])
         for position in positions:
             if (wrong := registration.implausible(*position)) is not None:
@@ -236,14 +236,27 @@ class Session:
             self._state.registration.add(*position)
         self._watched(self._tare)
 
+    def _place(self, stop: Stop) -> Floats:
+        """Return the position (3,) of the target, sensor axes, m.
+
+        A lost one is searched where it will be compared: a moved tracker may have lost it.
+        """
+        tracker = self._rig.tracker
+        try:
+            return tracker.measure().value[:3]
+        except TargetLostError:
+            if self._seen_before(stop) is None:
+                raise
+            tracker.find_target()
+            self._mover.checked_sample()
+            return tracker.measure().value[:3]
+
     def _compare_place(self, stop: Stop, position: Floats) -> None:
         """Ask a person if the target at the reference pose is not where it was before."""
-        before = self._state.reference
+        before = self._seen_before(stop)
         if before is None:
-            before = self._plan.about.get(SEEN)
-        if before is None or stop.name != REFERENCE or self._cell.targets is not None:
             return
-        moved = float(np.linalg.norm(position - np.asarray(before)))
+        moved = float(np.linalg.norm(position - before))
         if moved > MOVED_M:
             reason = (
                 f"the target at the reference pose is {1e3 * moved:.3g} mm from where it was before"
@@ -253,6 +266,15 @@ class Session:
                 f"{reason}. If the tracker or the target has been moved, readings before and after "
                 "do not belong together: put it back, or give up and begin a new campaign"
             )
+
+    def _seen_before(self, stop: Stop) -> Floats | None:
+        """Return where the target was at the reference pose before; None elsewhere or unknown."""
+        before = self._state.reference
+        if before is None:
+            before = self._plan.about.get(SEEN)
+        if before is None or stop.name != REFERENCE or self._cell.targets is not None:
+            return None
+        return np.asarray(before)
 
     def _move(self, stop: Stop) -> None:
         if not self._mover.is_at(stop.q):
