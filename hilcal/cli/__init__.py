@@ -6,6 +6,7 @@ import os
 import re
 import shlex
 import shutil
+import stat
 import sys
 import textwrap
 import traceback
@@ -54,7 +55,8 @@ def error_document(message: object, code: int) -> dict[str, object]:
 class WatchedStream:
     """A stream that knows whether anything was written to it, and whose reader may leave.
 
-    Without its reader, as `head`, the command goes on, since it may write files or move an arm.
+    Without its reader, as `head`, or a terminal that is closed, the command goes on, since it may
+    write files or move an arm.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -78,8 +80,12 @@ class WatchedStream:
     def _without_reader(self) -> Iterator[None]:
         try:
             yield
-        except BrokenPipeError:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+        except OSError as error:
+            number = self._stream.fileno()
+            closed_terminal = error.errno == errno.EIO and stat.S_ISCHR(os.fstat(number).st_mode)
+            if not (isinstance(error, BrokenPipeError) or closed_terminal):
+                raise
+            os.dup2(os.open(os.devnull, os.O_WRONLY), number)
 
     def __getattr__(self, name: str) -> Any:
         """Return an attribute of the stream."""

@@ -122,6 +122,11 @@ class ForceSensor(CellSection):
             raise ValueError(f'lacks "port": it must be {PORT}; or "host": {HOST}')
         return self
 
+    @property
+    def mounting(self) -> dict[str, list[float]]:
+        """Origin and axes on the flange, as JSON."""
+        return {"origin_m": list(self.origin_m), "rotvec_rad": list(self.rotvec_rad)}
+
 
 class Operator(CellSection):
     """[operator]: the person who hangs the loads.

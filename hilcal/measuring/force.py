@@ -285,6 +285,7 @@ class ForceMeter:
         """Use an open sensor, averaged over a window, real s."""
         self.sensor, self.zero, self.identified = sensor, np.zeros(6), False
         self._cell, self._seconds = cell, window
+        self.mounting = settings.mounting
         self._origin = np.array(settings.origin_m)
         self._axes = se3.rotation(np.array(settings.rotvec_rad))
         self._com = self._axes.T @ (cell.tool_com - self._origin)
@@ -369,7 +370,8 @@ class ForceMeter:
             return None
         raise CannotAnswerError(
             f"no {ENOUGH_POSES} of the {len(unloaded)} unloaded readings of the force sensor agree "
-            f"to {tolerance_N:g} N; does something touch the tool?"
+            f"to {tolerance_N:g} N; does something touch the tool, "
+            "or is rotvec_rad in [force_sensor] wrong?"
         )
 
     def load_wrench(self, tared: TaredWrench) -> Floats:

@@ -47,6 +47,7 @@ from hilcal.measuring.session_state import (
     detail,
     repeatability,
     sample_json,
+    stored_felt,
     stored_wrench,
 )
 from hilcal.readings.readings import Readings, States
@@ -126,8 +127,9 @@ class Session:
         for raw, value, target in zip(details, stored.value, stored.target.tolist(), strict=True):
             step = Step(raw["pose"], raw["load"], raw["cycle"])
             q, covariance = np.array(raw["q_actual"]), np.array(raw["tracker_covariance"])
-            self._state.add(step, q, value, covariance, stored_wrench(raw), target)
-        felt = details[-1].get("felt")
+            tared = stored_wrench(raw, self._meter)
+            self._state.add(step, q, value, covariance, tared, target)
+        felt = stored_felt(details[-1], self._meter)
         if self._meter is not None and felt is not None:
             self._meter.zero = np.array(felt["zero"])
             self._identify()
@@ -223,8 +225,8 @@ class Session:
         positions: list[tuple[Floats, Floats]] = []
         for stop in start:
             self._watched(partial(self._move, stop))
-            with suppress(TargetLostError):  # a reading will search it
-                positions.append((stop.q, self._rig.tracker.measure().value[:3]))
+            with suppress(TargetLostError):  # a reading will search it again
+                positions.append((stop.q, self._place(stop)))
                 self._compare_place(stop, positions[-1][1])
         for position in positions:
             if (wrong := registration.implausible(*position)) is not None:
@@ -234,14 +236,27 @@ class Session:
             self._state.registration.add(*position)
         self._watched(self._tare)
 
+    def _place(self, stop: Stop) -> Floats:
+        """Return the position (3,) of the target, sensor axes, m.
+
+        A lost one is searched where it will be compared: a moved tracker may have lost it.
+        """
+        tracker = self._rig.tracker
+        try:
+            return tracker.measure().value[:3]
+        except TargetLostError:
+            if self._seen_before(stop) is None:
+                raise
+            tracker.find_target()
+            self._mover.checked_sample()
+            return tracker.measure().value[:3]
+
     def _compare_place(self, stop: Stop, position: Floats) -> None:
         """Ask a person if the target at the reference pose is not where it was before."""
-        before = self._state.reference
+        before = self._seen_before(stop)
         if before is None:
-            before = self._plan.about.get(SEEN)
-        if before is None or stop.name != REFERENCE or self._cell.targets is not None:
             return
-        moved = float(np.linalg.norm(position - np.asarray(before)))
+        moved = float(np.linalg.norm(position - before))
         if moved > MOVED_M:
             reason = (
                 f"the target at the reference pose is {1e3 * moved:.3g} mm from where it was before"
@@ -251,6 +266,15 @@ class Session:
                 f"{reason}. If the tracker or the target has been moved, readings before and after "
                 "do not belong together: put it back, or give up and begin a new campaign"
             )
+
+    def _seen_before(self, stop: Stop) -> Floats | None:
+        """Return where the target was at the reference pose before; None elsewhere or unknown."""
+        before = self._state.reference
+        if before is None:
+            before = self._plan.about.get(SEEN)
+        if before is None or stop.name != REFERENCE or self._cell.targets is not None:
+            return None
+        return np.asarray(before)
 
     def _move(self, stop: Stop) -> None:
         if not self._mover.is_at(stop.q):
@@ -413,8 +437,7 @@ class Session:
         }
         if target is not None:
             session["target"] = names[target]
-        zero = None if self._meter is None else self._meter.zero
-        return row, detail(step, measured, tared, zero) | session
+        return row, detail(step, measured, tared, self._meter) | session
 
     def _tared_wrench(self, measured: MeasuredStop) -> TaredWrench | None:
         if self._meter is None or measured.force is None:

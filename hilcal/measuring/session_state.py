@@ -9,7 +9,7 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.measuring.arrival import RoughRegistration
 from hilcal.measuring.devices import ArmSample, Clock, Losses, TrackerSample, WrenchSample
-from hilcal.measuring.force import TaredWrench
+from hilcal.measuring.force import ForceMeter, TaredWrench
 from hilcal.measuring.measure import MeasuredStop
 from hilcal.robot import chain as chains
 from hilcal.robot.chain import drive_jacobian
@@ -100,9 +100,9 @@ def repeatability(visits: Sequence[UnloadedVisit]) -> RepeatabilityEstimate | No
 
 
 def detail(
-    step: Step, measured: MeasuredStop, tared: TaredWrench | None, zero: Floats | None
+    step: Step, measured: MeasuredStop, tared: TaredWrench | None, meter: ForceMeter | None
 ) -> dict[str, Any]:
-    """Return the raw data of a reading; `zero` (6,) is the session's zero of the force sensor."""
+    """Return the raw data of a reading, with the zero and the mounting of the force sensor."""
     mean = measured.mean
     out: dict[str, Any] = {
         **asdict(step),
@@ -119,15 +119,27 @@ def detail(
         "tracker": [sample_json(sample) for sample in measured.tracker],
         "force": sample_json(measured.force),
     }
-    if tared is not None and zero is not None:
-        felt = {"wrench": tared.wrench, "covariance": tared.covariance, "zero": zero}
+    if tared is not None and meter is not None:
+        felt = {"wrench": tared.wrench, "covariance": tared.covariance, "zero": meter.zero}
         out["felt"] = {name: array.tolist() for name, array in felt.items()}
+        out["felt"]["mounting"] = meter.mounting
     return out
 
 
-def stored_wrench(stored: dict[str, Any]) -> TaredWrench | None:
-    """Return the mean wrench of stored raw data; None without one."""
-    felt = stored.get("felt")
+def stored_felt(stored: dict[str, Any], meter: ForceMeter | None) -> dict[str, Any] | None:
+    """Return zero and mean wrench in stored raw data; None without them.
+
+    None, too, by a sensor that was mounted otherwise: its zero is less the tool in other axes.
+    """
+    felt: dict[str, Any] | None = stored.get("felt")
+    if meter is None or felt is None or felt.get("mounting", meter.mounting) != meter.mounting:
+        return None
+    return felt
+
+
+def stored_wrench(stored: dict[str, Any], meter: ForceMeter | None) -> TaredWrench | None:
+    """Return the mean wrench of stored raw data, see `stored_felt`; None without one."""
+    felt = stored_felt(stored, meter)
     if felt is None:
         return None
     arrays = felt["wrench"], felt["covariance"], stored["q_actual"]

@@ -2,7 +2,8 @@
 
 import json
 import sqlite3
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial, reduce
 from pathlib import Path
@@ -64,6 +65,35 @@ def check_same_cell(campaign: CampaignFile, config: CellConfig, base_dir: Path) 
                 f"[{section}] differs from what {campaign.path} was begun with; a campaign is "
                 "measured in one cell: start another one for this"
             )
+    _check_same_mounting(campaign, config)
+
+
+def _check_same_mounting(campaign: CampaignFile, config: CellConfig) -> None:
+    """Refuse another mounting of the force sensor than that of the measured wrenches of loads.
+
+    Wrenches of configured loads do not depend on it. Readings of older versions do not state it;
+    it is that of the configuration then.
+    """
+    begun = CellConfig.from_json(campaign.config_json)
+    if config.force_sensor is None or campaign.about(PLAN) is None or not campaign.n_readings:
+        return
+    mounting, readings = config.force_sensor.mounting, campaign.readings()
+    older = mounting if begun.force_sensor is None else begun.force_sensor.mounting
+    configured = {
+        load.name: load.wrench(np.array(config.robot.gravity_m_s2)) for load in config.loads
+    }
+    for k, raw in enumerate(RunLog(campaign).details()):
+        expected = configured.get(readings.load_names[readings.load[k]])
+        if expected is None or np.array_equal(readings.states.wrench[k], expected):
+            continue
+        stored = (raw.get("felt") or {}).get("mounting", older)
+        for key in mounting:
+            if stored.get(key) != mounting[key]:
+                raise InputError(
+                    f"[force_sensor] {key} is {mounting[key]}, and the wrenches of loads in "
+                    f"{campaign.path} were measured with {stored.get(key)}; put that back, or "
+                    "start another campaign"
+                )
 
 
 class RunLog:
@@ -84,6 +114,7 @@ class RunLog:
         where = f"{campaign.path}, its plan"
         further = enumerate(campaign.numbered(FURTHER_PLAN, 2), start=2)
         plans = [read_plan(text, where), *(read_plan(t, f"{where} {k}") for k, t in further)]
+        self._last: tuple[int, int] | None = None  # number and checksum of the last reading
         self.plans: tuple[Plan, ...] = tuple(plans)
 
     @property
@@ -133,7 +164,7 @@ class RunLog:
         details = (detail, *more)
         if len(reading) != len(details):
             raise ValueError(f"{len(reading)} readings of one step, {len(details)} details")
-        with self._campaign.transaction() as connection:
+        with self._transaction() as connection:
             last = self._campaign.insert(reading)
             for k, content in enumerate(details):
                 number, text = last - len(details) + 1 + k, json.dumps(content, allow_nan=False)
@@ -147,11 +178,30 @@ class RunLog:
                     raise InputError(
                         f"{self._campaign.path}: {step} has been measured already"
                     ) from None
+        self._last = number, row[-1]
+
+    @contextmanager
+    def _transaction(self) -> Iterator[sqlite3.Connection]:
+        """Store the changes of the block, if the last reading stored by this log is still there.
+
+        A copy over an open file, as `cp` makes it, leaves the file's identity.
+        """
+        with self._campaign.transaction() as connection:
+            if self._last is not None:
+                number, crc = self._last
+                found = connection.execute("SELECT crc FROM details WHERE id = ?", (number,))
+                if found.fetchone() != (crc,):
+                    raise InputError(
+                        f"{self._campaign.path}: reading {number} is gone: another program has "
+                        "written another file over the campaign. End it, put back the newest copy "
+                        "of the campaign; what that lacks is measured again"
+                    )
+            yield connection
 
     def event(self, kind: str, content: dict[str, Any]) -> None:
         """Append an event, with the time (UTC)."""
         text = json.dumps({"kind": kind, "utc": utc_now(), **content}, allow_nan=False)
-        with self._campaign.transaction() as connection:
+        with self._transaction() as connection:
             rows.append_text(connection, "events", text)
 
     def done(self) -> frozenset[Step]:

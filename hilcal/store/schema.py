@@ -71,7 +71,10 @@ _MESSAGES: dict[str, tuple[type[HilcalError], str]] = {
         InputError,
         f"a record is larger than {limits.DOCUMENT / 1e6:.0f} MB, which no campaign has",
     ),
-    "locked|busy": (InputError, "another program is writing to the campaign"),
+    "locked|busy": (
+        InputError,
+        "another program has kept the campaign locked for 5 s: end it first",
+    ),
     "readonly|unable to open": (
         InputError,
         "cannot be written ({}): the file or its folder is read-only; valid: a copy in a folder "

@@ -1,6 +1,7 @@
 """A disk that fills up while a command writes: the old file is whole, or there is none."""
 
 import os
+import pty
 import resource
 import subprocess
 import sys
@@ -169,3 +170,17 @@ def test_a_command_whose_reader_has_left_goes_on_to_its_end(fitted, tmp_path, mi
         )  # fmt: skip
     assert ended.returncode == (2 if missing else 0)
     assert (tmp_path / "o.csv").exists() is not missing
+
+
+@pytest.mark.parametrize(("words", "code"), [(("effects",), 0), (("info", "no.hilcal"), 2)])
+def test_a_command_whose_terminal_is_closed_ends_with_its_own_exit_code(tmp_path, words, code):
+    """Its streams fail then, with EIO."""
+    master, slave = pty.openpty()
+    os.close(master)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    ended = subprocess.run(
+        [sys.executable, "-m", "hilcal", *words],
+        cwd=tmp_path, stdin=slave, stdout=slave, stderr=slave, env=environment, check=False,
+    )  # fmt: skip
+    os.close(slave)
+    assert ended.returncode == code

@@ -184,3 +184,21 @@ def test_an_interrupt_between_a_transaction_s_begin_and_its_block_leaves_nothing
     interrupted.clear()
     gc.collect()
     assert complaints == []
+
+
+def test_a_file_that_was_written_over_the_open_campaign_is_not_measured_on(tmp_path):
+    """As `cp old.hilcal run.hilcal` does it: the file stays the same one for the system."""
+    path = tmp_path / "run.hilcal"
+    with _campaign(path) as campaign:
+        log = RunLog(campaign)
+        log.record(_reading(STEPS[0]), STEPS[0], {})
+        copy = path.read_bytes()
+        log.record(_reading(STEPS[1]), STEPS[1], {})
+        path.write_bytes(copy)
+        with pytest.raises(InputError, match="reading 2 is gone: another program has written"):
+            log.record(_reading(STEPS[2]), STEPS[2], {})
+        with pytest.raises(InputError, match="reading 2 is gone"):
+            log.event("finished", {"readings": 3})
+    with CampaignFile.open(path) as campaign:
+        assert RunLog(campaign).done() == frozenset(STEPS[:1])
+        RunLog(campaign).record(_reading(STEPS[1]), STEPS[1], {})

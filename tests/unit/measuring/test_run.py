@@ -17,6 +17,7 @@ from hilcal.robot import se3
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Step
 from hilcal.store.rows import content_hash
+from hilcal.store.run_log import RunLog, check_same_cell, create_run
 from hilcal.tables.table import write_table
 from tests.support.fake_bench import (
     FEW_POSES,
@@ -455,3 +456,25 @@ def test_a_campaign_goes_on_as_it_began(b, first):
         assert np.isfinite(torque[:4]).all()
         assert np.isnan(torque[4:]).all()
         assert len(b.remarks(LOST)) == 1
+
+
+def _sensor(use, rotvec_rad):
+    return ForceSensor(driver="fake", port="nowhere", use=use, rotvec_rad=rotvec_rad)
+
+
+@pytest.mark.parametrize("use", ["pulls", "all"])
+def test_wrong_axes_of_the_force_sensor_can_be_corrected_until_a_load_is_measured(use, tmp_path):
+    wrong, right = _sensor(use, (np.pi, 0.0, 0.0)), _sensor(use, (0.0, 0.0, 0.0))
+    b, plan = Bench(force_sensor=wrong), usual_plan()
+    with create_run(tmp_path / "run.hilcal", b.config, tmp_path, plan) as campaign:
+        b.store = RunLog(campaign)
+        b.measure(replace(plan, steps=plan.steps[:5]))
+        b.config = b.config.model_copy(update={"force_sensor": right})
+        check_same_cell(campaign, b.config, tmp_path)
+        readings = b.measure(plan)
+        pulled = rows(readings, "pull")
+        assert np.allclose(readings.states.wrench[pulled], [40.0, 0, 0, 0, 0, 0], atol=1e-6)
+        check_same_cell(campaign, b.config, tmp_path)
+        turned_back = b.config.model_copy(update={"force_sensor": wrong})
+        with pytest.raises(InputError, match=r"rotvec_rad is .* were measured with"):
+            check_same_cell(campaign, turned_back, tmp_path)

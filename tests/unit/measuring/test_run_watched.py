@@ -501,3 +501,13 @@ def test_a_force_sensor_that_repeats_itself_is_named(b):
     change_result(b.rig.force, "average", lambda one: replace(one, covariance=np.zeros((6, 6))))
     refusal_of(DeviceError, "frames are the same to the last digit", b.measure)
     assert b.store.rows == []
+
+
+def test_a_tracker_that_was_moved_and_has_lost_its_target_is_asked_about():
+    b = Bench()
+    plan = plan_of(("reference", "none", 0), ("p1", "none", 0), ("reference", "none", 1))
+    b.interrupt(2, plan)
+    b.world.shift = np.array([0.0, 2e-3, 0.0])
+    b.world.unseen_measurements = 2
+    b.measure(plan)
+    assert [q for q in confirmed(b) if "mm from where it was before" in q]
