@@ -38,8 +38,15 @@ from hilcal.robot.chain import Chain, drive_jacobian, evaluate
 from hilcal.types import Floats
 
 ScatterSource = Literal["estimated", "stated", "repeats", "maker", "industry", "unknown"]
-"""From the fit's residuals; `[repeatability]` of the cell; repeated readings; the robot's file;
-industrial arms, where that states none; unknown in a file of an older program."""
+"""Source of a scatter:
+
+- estimated: the fit, from its residuals;
+- stated: `[repeatability]` of the cell;
+- repeats: scatter of repeated readings beyond the instrument's noise;
+- maker: the pose repeatability that the robot's file states;
+- industry: that of industrial arms, where the robot's file states none;
+- unknown: a calibration file of an older program, which assumed zero.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

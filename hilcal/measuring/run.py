@@ -226,7 +226,7 @@ class Session:
         for stop in start:
             self._watched(partial(self._move, stop))
             with suppress(TargetLostError):  # a reading will search it again
-                positions.append((stop.q, self._place(stop)))
+                positions.append((stop.q, self._target_position(stop)))
                 self._compare_place(stop, positions[-1][1])
         for position in positions:
             if (wrong := registration.implausible(*position)) is not None:
@@ -236,7 +236,7 @@ class Session:
             self._state.registration.add(*position)
         self._watched(self._tare)
 
-    def _place(self, stop: Stop) -> Floats:
+    def _target_position(self, stop: Stop) -> Floats:
         """Return the position (3,) of the target, sensor axes, m.
 
         A lost one is searched where it will be compared: a moved tracker may have lost it.

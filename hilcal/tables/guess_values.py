@@ -28,7 +28,7 @@ FORMATS = (
 )
 """Forms of dates that are tried, in this order."""
 RIVAL = 0.5  # Difference of the score within which another choice of columns is as good; a choice
-_WHOSE = 'base axes, or axes = "flange"; of = "load" (exerted on the tool), or "reaction"?'
+_WRENCH_DOUBT = 'base axes, or axes = "flange"; of = "load" (exerted on the tool), or "reaction"?'
 BY_VALUES = "found by their values: check the columns"
 BY_ROWS = "found by their values; row by row, or column by column?"
 RIVALS = "as good by their values:"
@@ -375,7 +375,7 @@ def _forces(g: words.Guesser, complete: Group) -> None:
         turning = [moment[axis] for axis in "xyz"]
         section["moment_unit"] = g.unit(turning, MOMENTS) or "Nm"
         names += turning
-    g.doubt("wrench", _WHOSE)
+    g.doubt("wrench", _WRENCH_DOUBT)
     g.assign("wrench", names, ", ".join(map(str, section.values())), **section)
 
 
@@ -386,7 +386,7 @@ def _vertical_force(g: words.Guesser) -> None:
         return
     names = [forces[0].name]
     unit = g.unit(names, FORCES) or "N"
-    g.doubt("wrench", f"fx and fy are taken as 0; {_WHOSE}")
+    g.doubt("wrench", f"fx and fy are taken as 0; {_WRENCH_DOUBT}")
     g.assign("wrench", names, f"fz, {unit}", unit=unit)
 
 

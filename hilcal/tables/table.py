@@ -132,8 +132,8 @@ def covariances_of(
     else:
         columns.check_covariances(table, stated)
         tiny = np.any(np.diagonal(stated, axis1=1, axis2=2) < min(MIN_STD) ** 2)
-        zero = np.any(smallest_correlation(stated) <= SINGULAR)
-        use_spec = bool(tiny | zero) and noise is not None
+        singular = np.any(smallest_correlation(stated) <= SINGULAR)
+        use_spec = bool(tiny | singular) and noise is not None
         spec = _instrument_covariance(table, value, noise, station) if use_spec else None
         cov, raised = floored(table, stated, spec)
         notes, (covers, included) = (FROM_TABLE, *raised), _covers(table)

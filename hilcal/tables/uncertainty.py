@@ -202,7 +202,7 @@ def floored(
         tiny[:, block] = (v >= 0) & (v < least**2)
     rows: Bools = np.asarray(tiny.any(axis=1))
     if not rows.any():
-        return _regular(table, covariance, instrument)
+        return _regularised(table, covariance, instrument)
     if instrument is None:
         i = int(np.argmax(rows))
         raise InputError(
@@ -218,11 +218,11 @@ def floored(
         f"0.1 µm, the first is row {table.rows[np.argmax(rows)]}): the noise in [tracker] takes "
         f"its place"
     )
-    regular, notes = _regular(table, out, instrument)
+    regular, notes = _regularised(table, out, instrument)
     return regular, (note, *notes)
 
 
-def _regular(
+def _regularised(
     table: ColumnTable, covariance: Floats, instrument: Floats | None
 ) -> tuple[Floats, tuple[str, ...]]:
     """Raise the variance to the instrument's in the directions in which none is stated.

@@ -114,9 +114,9 @@ def read_krl(path: Path, frames_file: Path | None, tool: Floats | None) -> Progr
     if len(set(encodings)) > 1:
         texts = tuple(p.read_bytes().decode(encoding) for p in paths)
     config = frames_file is not None and frames_file.suffix.lower() == ".dat"
-    reader = _KrlReader(path, KRL, None if config else frames_file, tool)
+    names = [p.name for p in paths]
+    reader = _KrlReader(path, names, None if config else frames_file, tool)
     reader.text, reader.encoding = texts[0], encoding
-    reader.files, reader.data = [p.name for p in paths], {}
     for k, text in enumerate(texts):
         reader.collect(text, k)
     if frames_file is not None and config:
@@ -177,10 +177,14 @@ class _State:
 
 
 class _KrlReader(ProgramReader):
-    files: list[str]
-    data: dict[str, list[_Value]]
-    form: str | None = None
-    state = _State()
+    """Reader of the statements of a `.src` file, in the order of its text."""
+
+    def __init__(self, path: Path, files: list[str], frames_file: Path | None, tool: Floats | None):
+        super().__init__(path, KRL, frames_file, tool)
+        self.files = files
+        self.data: dict[str, list[_Value]] = {}
+        self.state = _State()
+        self.form: str | None = None
 
     def collect(self, text: str, file: int) -> None:
         """Collect all named aggregates of a file; `file` is −1 for that of --frames."""

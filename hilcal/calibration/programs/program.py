@@ -31,7 +31,9 @@ from hilcal.types import Floats, Ints
 JOINTS = 6
 DECIMAL = r"[-+]?(?:\d+\.?\d*|\.\d+)"  # pattern of a number without exponent
 UNSTATED = -99  # a flag of a configuration that is not stated
-SAME_M, SAME_RAD = 2e-9, 2e-9  # a point that moved less keeps its text; above `TOLERANCE`
+SAME_M, SAME_RAD = 2e-9, 2e-9
+"""m, rad; a point that moved less keeps its text: above the residual of the inverse, see
+`calibration.compensation.TOLERANCE`, and below the resolution of any controller."""
 GIMBAL = 1e-9  # cos B below which A and C turn about one axis
 MOVES = "{} moves, and it is not known what that carries"
 """Why a point with an external axis is not corrected."""

@@ -91,7 +91,8 @@ def validate(
 def with_tool(p: Predictive, cell: Cell, fitted: Readings) -> Predictive:
     """Return the distribution for readings with the tool of another cell: its masses and targets.
 
-    Its targets count only where both cells state them; an error of the former ones is left out.
+    Its targets are taken where both cells state theirs. Effects of the target's place are then left
+    out, as they were estimated for the other target.
     """
     own = p.model.cell
     tool = replace(
