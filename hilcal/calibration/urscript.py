@@ -30,7 +30,7 @@ import numpy as np
 from hilcal import limits
 from hilcal.calibration.compensation import invert_nominal, nominal_pose
 from hilcal.calibration.points import Points
-from hilcal.calibration.programs.program import Span, edited
+from hilcal.calibration.programs.program import CORRECTED, Span, edited
 from hilcal.calibration.urscript_statements import Statement, statements
 from hilcal.errors import InputError
 from hilcal.names import escaped
@@ -147,8 +147,6 @@ def program_points(
     return program, every, Points(names, q, poses), understood[0].tool
 
 
-CORRECTED = "# corrected by hilcal"
-"""Comment of a program whose waypoints are corrected; such a program is not corrected again."""
 _DEFINITION = re.compile(r"^[ \t]*def\b", re.MULTILINE)
 
 
@@ -167,7 +165,7 @@ def with_joints(program: str, corrected: Sequence[Waypoint], q: Floats) -> str:
     pairs = zip(corrected, q, strict=True)
     edits = [(Span(0, w.start, w.end), urscript_list(row)) for w, row in pairs]
     if mark is not None:
-        edits.append((Span(0, mark.start(), mark.start()), f"  {CORRECTED}"))
+        edits.append((Span(0, mark.start(), mark.start()), f"  # {CORRECTED}"))
     return edited(program, edits)
 
 
@@ -190,7 +188,7 @@ def movej_program(names: Sequence[str], q: Floats) -> str:
     """
     rows = zip(names, q, strict=True)
     lines = [f"  movej({urscript_list(row)})  # {escaped(name)}" for name, row in rows]
-    return "\n".join([f"def compensated():  {CORRECTED}; {UNCHECKED}", *lines, "end", ""])
+    return "\n".join([f"def compensated():  # {CORRECTED}; {UNCHECKED}", *lines, "end", ""])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

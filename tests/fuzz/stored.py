@@ -14,7 +14,8 @@ from rich.console import Console
 
 import hilcal as hc
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.urscript import CORRECTED, program_points, with_joints
+from hilcal.calibration.programs.program import CORRECTED
+from hilcal.calibration.urscript import program_points, with_joints
 from hilcal.effects import template
 from hilcal.effects.catalogue import installed
 from hilcal.identification.carried.carried_prior import carried_prior, check_arm
@@ -175,7 +176,7 @@ def _program(path: Path) -> None:
         raise Accepted("a program: joints that are not finite")
     kept = [w for w in every if not w.not_corrected]
     corrected = with_joints(program, kept, np.ones((len(kept), 6)))
-    path.write_text(corrected.replace(CORRECTED, "#"), "utf-8", newline="")
+    path.write_text(corrected.replace(CORRECTED, ""), "utf-8", newline="")
     _, again, points, _ = program_points(path, leave)
     if [(w.line, w.not_corrected) for w in again] != [(w.line, w.not_corrected) for w in every]:
         raise Accepted("a program: other waypoints than before")

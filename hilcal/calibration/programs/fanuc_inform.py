@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from hilcal.calibration.programs.program import (
+    CORRECTED,
     DECIMAL,
     JOINTS,
     MOVES,
@@ -49,11 +50,14 @@ _CONFIG = re.compile(r"CONFIG\s*:\s*'([A-Z ]*)((?:,\s*-?\d+\s*)*)'")
 _MOTION = re.compile(r"^\s*\d*\s*:?\s*([JLCAS])\s+(?=P(R)?\s*\[)(.*)", re.DOTALL)
 _P = re.compile(r"(?<![A-Z])P\s*\[\s*(?:(\d+)|([^\]]*))")
 _OPTION = re.compile(
-    r"\b(Offset|Tool_Offset|VOFFSET|INC|Skip|COORD|ATool_?Offset|BOffset|TPT)\b", re.IGNORECASE
+    r"\b(Offset|Tool_Offset|VOFFSET|INC|Skip|COORD|ATool_?Offset|BOffset|TPT|RTCP)\b", re.IGNORECASE
 )
 _REFUSED = re.compile(
     r"\b(UFRAME|UTOOL)\s*\[[^\]]*\]\s*=(?!=)|\$MNUFRAME\w*\s*\[|\$MNUTOOL\w*\s*\["
 )
+_NUMBERED = re.compile(r"^[ \t]*(\d+)[ \t]*:", re.MULTILINE)
+_TRACKING = re.compile(r"\bLINE_TRACK_SCHEDULE_NUMBER\s*:\s*[1-9]\d*")
+"""In the head of a program whose points move with a conveyor."""
 XYZWPR, J = ("X", "Y", "Z", "W", "P", "R"), tuple(f"J{k}" for k in range(1, 7))
 
 
@@ -66,6 +70,15 @@ def config_flags(q: Floats, shape: Ints) -> Ints:
 AXES = ((0, 0, 1), (0, 1, 0), (0, -1, 0), (-1, 0, 0), (0, -1, 0), (-1, 0, 0))
 """Of both makers' joints."""
 
+
+def _with_remark(text: str) -> str:
+    """Return a TP program whose last instruction is the remark `CORRECTED`."""
+    main, mark, positions = text.partition("/POS")
+    number = 1 + max((int(m[1]) for m in _NUMBERED.finditer(main)), default=0)
+    end = "\r\n" if main.endswith("\r\n") else "\n"
+    return f"{main}{number:4d}:  !{CORRECTED} ;{end}{mark}{positions}"
+
+
 LS = Language(
     name="FANUC",
     pose=of_wpr,
@@ -75,6 +88,7 @@ LS = Language(
     flags=config_flags,
     shape_flags=(True, True, True, *(False,) * JOINTS),
     motions="J, L, C or A with P[…]",
+    marked=_with_remark,
     padded=True,
 )
 
@@ -85,6 +99,11 @@ def read_ls(path: Path, frames_file: Path | None, tool: Floats | None) -> Progra
     begin = re.search(r"^/POS\b", reader.text, re.M)
     if begin is None or not re.search(r"^/MN\b", reader.text, re.M):
         raise InputError(f"{path.name}: no sections /MN and /POS; valid: a TP program as text")
+    if m := _TRACKING.search(reader.text[: begin.start()]):
+        line = line_of(reader.text, m.start())
+        raise reader.error(
+            line, f"'{m[0]}' moves its points with a conveyor", "a program without it"
+        )
     return reader.read(begin.start())
 
 
@@ -180,6 +199,7 @@ _POINT = re.compile(r"^\s*(C|P|BC|BP|EC|EX)(\d+)\s*=\s*(.*?)\s*$", re.IGNORECASE
 _NUMBER = re.compile(DECIMAL)
 _MOV = re.compile(r"^\s*(MOV[JLCS]|IMOV)\s+(.*)$", re.IGNORECASE)
 _NAME = re.compile(r"\b([CP])(\d+)\b", re.IGNORECASE)
+_NOP = re.compile(r"^NOP[ \t]*(\r?\n)", re.MULTILINE)
 _CHANGES = re.compile(r"^\s*(SFTON|MFRAME|CNVSET|SYSTART|REFP|SETTOOL)\b", re.IGNORECASE)
 
 
@@ -199,6 +219,7 @@ INFORM = Language(
     flags=rconf,
     shape_flags=(False, True, True, False, False, False),
     motions="MOVJ, MOVL, MOVC, MOVS",
+    marked=lambda text: _NOP.sub(rf"\g<0>'{CORRECTED}\g<1>", text, count=1),
 )
 
 

@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from hilcal.calibration.programs.program import (
+    CORRECTED,
     DECIMAL,
     JOINTS,
     MOVES,
@@ -59,7 +60,7 @@ _SET = re.compile(r"^\s*\$(TOOL|BASE)\s*=\s*(.+)$", re.IGNORECASE)
 _BAS = re.compile(r"^\s*BAS\s*\(\s*#(\w+)\s*(?:,\s*([^)]*))?\)", re.IGNORECASE)
 _FDAT = re.compile(r"^\s*FDAT_ACT\s*=\s*(\w+)", re.IGNORECASE)
 _INDEX = re.compile(r"^(TOOL|BASE)_DATA\s*\[\s*(\d+)\s*\]$", re.IGNORECASE)
-_OPENS = ("IF", "SWITCH", "FOR", "WHILE", "LOOP", "REPEAT", "SPLINE")
+_OPENS = ("IF", "SWITCH", "FOR", "WHILE", "LOOP", "REPEAT", "SPLINE", "PTP_SPLINE")
 _LOOPS = ("FOR", "WHILE", "LOOP", "REPEAT")
 _CLOSES = ("ENDIF", "ENDSWITCH", "ENDFOR", "ENDWHILE", "ENDLOOP", "UNTIL", "ENDSPLINE")
 _ELSE = ("ELSE", "CASE", "DEFAULT")
@@ -69,11 +70,13 @@ _NO_CALLS = (
     *("CWRITE", "CREAD", "SREAD", "SWRITE", "ANOUT", "ANIN", "TRIGGER", "INTERRUPT"),
     *("EXT", "EXTFCT", "DEF", "DEFFCT", "GLOBAL", "DECL", "SIGNAL"),
 )
+_DEFINITION = re.compile(r"^[ \t]*(GLOBAL[ \t]+)?DEF(FCT)?\b[^\r\n]*", re.IGNORECASE | re.MULTILINE)
 _FORBIDDEN = re.compile(
     r"\$(ROBROOT|WORLD|NULLFRAME|ERSYSROOT|TOOL|BASE)\b\s*(\.\w+\s*)?=(?!=)"
     r"|\$IPO_MODE\s*=\s*#TCP|\$(CORRECTION|PRO_IP)\b",
     re.IGNORECASE,
 )
+_OUTER_TOOL = re.compile(r"\$IPO_MODE\s*=\s*#TCP", re.IGNORECASE)
 _INERT = re.compile(r"^\s*(\$H_POS|\$POS_RET)\s*=\s*\w+\s*$", re.IGNORECASE)
 """Statements that read a point without a motion."""
 _APPROXIMATION = re.compile(r"\s*(CA|C_\w+)\b", re.IGNORECASE)
@@ -100,6 +103,7 @@ KRL = Language(
     flags=flags,
     shape_flags=(True, True, *(False,) * JOINTS),
     motions="PTP, LIN, CIRC and their S…",
+    marked=lambda text: _DEFINITION.sub(rf"\g<0>  ; {CORRECTED}", text, count=1),
     config_texts=_written,
     frames="a copy of $config.dat, or TOML",
 )
@@ -204,6 +208,8 @@ class _KrlReader(ProgramReader):
             elif word in _ELSE and blocks:
                 blocks[-1].append(self.state)
                 self.state = blocks[-1][0]
+            elif word == "ENDSPLINE" and blocks:
+                (self.state,) = blocks.pop()
             elif word in _CLOSES and blocks:
                 if not all(s.same(self.state) for s in blocks.pop()):
                     self._forget(f"the block that ends in line {line} sets them on some ways only")
@@ -211,6 +217,8 @@ class _KrlReader(ProgramReader):
                 if word in _LOOPS and _sets(lines[k + 1 :]):
                     self._forget(f"the loop of line {line} sets them later")
                 blocks.append([self.state])
+                if word.endswith("SPLINE"):
+                    self._with(code, line)
             elif word and re.fullmatch(r"\s*\w+\s*:\s*", code):
                 self._forget(f"line {line} is a label, which may be reached from elsewhere")
             else:
@@ -278,12 +286,13 @@ class _KrlReader(ProgramReader):
             return of_euler(numbers)
         return self.controller.pose(group, m[2], name)
 
-    def _motion(self, line: int, offset: int, code: str, m: re.Match[str]) -> None:
-        word = m[1].upper()
-        head, *with_ = re.split(r"\bWITH\b", code[m.end() :], maxsplit=1, flags=re.I)
-        previous = self.state
+    def _with(self, code: str, line: int) -> None:
+        """Set tool and base as a motion or a spline block does for itself."""
+        settings = "".join(re.split(r"\bWITH\b", code, maxsplit=1, flags=re.I)[1:])
+        if m := _OUTER_TOOL.search(settings):
+            raise self.error(line, f"'{m[0]}' changes what points mean", "a tool on the flange")
         for kind in KINDS:
-            setting = re.search(rf"\${kind}\s*=\s*(.+?)(?=,\s*\$|$)", "".join(with_), re.I)
+            setting = re.search(rf"\${kind}\s*=\s*(.+?)(?=,\s*\$|$)", settings, re.I)
             if setting:
                 text = setting[1].strip()
                 form = re.match(r"\w+\s*\(.*?\b(\w+)(?:\.\w+)?\s*\)", text)
@@ -291,6 +300,12 @@ class _KrlReader(ProgramReader):
                     self._of_form(form[1], line, [kind])
                 else:
                     self._set(kind, text, line)
+
+    def _motion(self, line: int, offset: int, code: str, m: re.Match[str]) -> None:
+        word = m[1].upper()
+        head = re.split(r"\bWITH\b", code[m.end() :], maxsplit=1, flags=re.I)[0]
+        previous = self.state
+        self._with(code, line)
         reason = ""
         if word.endswith("_REL") or word == "ASYPTP":
             reason = f"{word} is not corrected"

@@ -34,6 +34,8 @@ UNSTATED = -99  # a flag of a configuration that is not stated
 SAME_M, SAME_RAD = 2e-9, 2e-9
 """m, rad; a point that moved less keeps its text: above the residual of the inverse, see
 `calibration.compensation.TOLERANCE`, and below the resolution of any controller."""
+CORRECTED = "corrected by hilcal"
+"""Comment of a program with corrected points; such a program is not corrected again."""
 GIMBAL = 1e-9  # cos B below which A and C turn about one axis
 MOVES = "{} moves, and it is not known what that carries"
 """Why a point with an external axis is not corrected."""
@@ -107,6 +109,8 @@ class Language:
     """(K, F) configuration at joint values (K, 6), with `languages.shape` (K, 2) there."""
     shape_flags: tuple[bool, ...]  # (F,) which flags depend on the shape of the arm, too
     motions: str  # its motions, for people
+    marked: Callable[[str], str]
+    """The text of a program with the comment `CORRECTED`."""
     config_texts: Callable[[Ints, Sequence[str]], list[str]] = lambda _, texts: list(texts)
     """New texts at `ProgramPoint.config`, from the flags and the old texts."""
     padded: bool = False  # whether numbers are aligned in columns
@@ -140,10 +144,12 @@ class Program:
         flanges = se3.matrix(chain.rotation[-1], chain.position[-1])
         rows = zip(points, flanges, old_q, q, flags, strict=True)
         edits = [edit for row in rows for edit in self._edits(*row)]
-        return {
-            suffix: edited(text, [e for e in edits if e[0].file == k]).encode(self.encoding)
-            for k, (suffix, text) in enumerate(zip(self.suffixes, self.texts, strict=True))
-        }
+        new = [
+            edited(text, [e for e in edits if e[0].file == k]) for k, text in enumerate(self.texts)
+        ]
+        if edits:
+            new[0] = self.language.marked(new[0])
+        return {s: text.encode(self.encoding) for s, text in zip(self.suffixes, new, strict=True)}
 
     def _edits(
         self, p: ProgramPoint, flange: Floats, old_q: Floats, q: Floats, flags: Ints
@@ -321,6 +327,12 @@ class ProgramReader:
     ):
         self.path, self.controller = path, controller_frames(frames_file, language, tool)
         self.text, self.encoding = read_text(path)
+        if CORRECTED in self.text:
+            raise self.error(
+                line_of(self.text, self.text.index(CORRECTED)),
+                "it is corrected already, and a second correction would double the first",
+                "the original program",
+            )
         self.points: dict[str, ProgramPoint] = {}
         self.otherwise: dict[str, int] = {}
         """Points that statements other than motions use, with the line."""

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from hilcal.calibration.programs.program import (
+    CORRECTED,
     DECIMAL,
     JOINTS,
     UNSTATED,
@@ -42,6 +43,7 @@ from hilcal.types import Floats, Ints
 POSE = 7  # numbers of a pose
 LEAST = 4  # least number of arguments of a motion: point, speed, zone, tool
 UNUSED = 8e8  # numbers of external axes above this mean no axis: 9E9
+_HEAD = re.compile(r"^[ \t]*(MODULE|(LOCAL[ \t]+)?PROC)\b[^\r\n]*", re.IGNORECASE | re.MULTILINE)
 _STATEMENT = re.compile(r"[^;]*;")
 _BLANK = re.compile(r'"[^"]*"|!.*')
 _DATA = re.compile(
@@ -100,6 +102,7 @@ RAPID = Language(
     flags=flags,
     shape_flags=(False, False, False, True),
     motions="MoveJ, MoveL, MoveC, MoveAbsJ",
+    marked=lambda text: _HEAD.sub(rf"\g<0>  ! {CORRECTED}", text, count=1),
     config_texts=lambda new, texts: [str(v) for v in new[:3]],
     pose_numbers=POSE,
     frames="a module with its tooldata and wobjdata, or TOML",

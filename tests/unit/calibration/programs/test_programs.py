@@ -200,7 +200,14 @@ def test_a_corrected_program_means_the_corrected_joint_values(maker, arms, examp
     for suffix, content in found.corrected(wanted).items():
         (tmp_path / f"weld{suffix}").write_bytes(content)
         old = (EXAMPLES / f"weld{suffix}").read_bytes().decode("latin-1").split("\r\n")
-        new = content.decode("latin-1").split("\r\n")
+        text = content.decode("latin-1")
+        assert text.count("corrected by hilcal") == (suffix != ".dat")
+        if suffix != ".dat":
+            refusal(r"line \d+: it is corrected already", read, maker, arms, tmp_path)
+        mark = r"  [;!] corrected by hilcal|(  11:  !|')corrected by hilcal( ;)?\r\n"
+        text = re.sub(mark, "", text)
+        (tmp_path / f"weld{suffix}").write_bytes(text.encode("latin-1"))
+        new = text.split("\r\n")
         assert len(old) == len(new)
         for a, b in zip(old, new, strict=True):
             if "Offs(" not in a and "RelTool(" not in a:
@@ -296,6 +303,23 @@ def test_what_is_left_and_all_that_it_counts_from_stay_as_they_are(
         for p in found.program.points:
             if p.not_corrected and (p.name.startswith("line") != (suffix == ".dat")):
                 assert content.split(b"\r\n")[p.line - 1] == before[p.line - 1]
+
+
+def test_tool_and_base_of_a_spline_block_hold_within_it_alone(arms, tmp_path):
+    """Its header sets them for its points; a tool outside of the arm is refused there, too."""
+
+    def weld(statements):
+        lines = "\r\n".join(statements)
+        copied("krl", tmp_path, lambda t: t.replace("LIN XP2 C_DIS C_DIS", lines))
+        found = read("krl", arms, tmp_path, leave=True).program.points
+        return next(p for p in found if p.name.startswith("XP2"))
+
+    for word in ("SPLINE", "PTP_SPLINE"):
+        block = [f"{word} WITH $BASE = $NULLFRAME", "SPL XP2", "ENDSPLINE"]
+        np.testing.assert_array_equal(weld(block).frame, np.eye(4))
+        assert "another tool or base" in weld([*block, "LIN XP2"]).not_corrected
+    outer = ["SPLINE WITH $IPO_MODE = #TCP", *block[1:]]
+    refusal(r"\$IPO_MODE = #TCP' changes what points mean", weld, outer)
 
 
 def test_frames_on_some_ways_only_are_not_known(arms, tmp_path):
