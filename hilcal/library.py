@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -63,12 +64,16 @@ READINGS = (
     "Readings, as of hc.read_table('t.csv', cell), or a Campaign, as hc.Campaign('run.hilcal')"
 )
 
-if TYPE_CHECKING:  # needs Pinocchio, which a fit does not
+if TYPE_CHECKING:  # needs Pinocchio, which a fit does not, or takes long
+    import pandas as pd
+
     from hilcal.design.summary import CheckedPlan
     from hilcal.drivers.simulated.rehearsal import Rehearsal, SimulationCase
 
 
-def read_table(path: str | Path, cell: Cell, mapping: str | Path | None = None) -> Readings:
+def read_table(
+    path: "str | Path | pd.DataFrame", cell: Cell, mapping: str | Path | None = None
+) -> Readings:
     """Read a table of readings: the exchange table, or any other by a mapping.
 
     >>> cell = hc.Cell.load(CELL)
@@ -77,7 +82,8 @@ def read_table(path: str | Path, cell: Cell, mapping: str | Path | None = None) 
     ('none', '5kg', '10kg', 'pull x', 'pull y')
 
     Args:
-        path: the table; without a mapping the exchange table, docs/reference/exchange-table.md.
+        path: the table, a file or a pandas data frame; without a mapping the exchange table,
+            docs/reference/exchange-table.md.
         cell: the cell that the table was measured in. Where the table has no covariances, they are
             those of the cell's [tracker], or estimated from the readings where it states no noise.
             The cell's [repeatability] is added to covariances that do not include it.
@@ -87,15 +93,26 @@ def read_table(path: str | Path, cell: Cell, mapping: str | Path | None = None) 
     Raises:
         InputError: an invalid value, with row and column.
     """
-    expect(
-        path, PATHS, "path", "the path of a table; write a data frame by to_csv(path, index=False)"
-    )
+    if not isinstance(path, PATHS) and hasattr(path, "to_csv"):
+        return _read_frame(path, cell, mapping)
+    expect(path, PATHS, "path", "the path of a table, or a pandas data frame")
     expect(cell, Cell, "cell", A_CELL)
     form, config = "table" if mapping is None else mapping, cell.configured()
     imported = import_readings(Path(path), form, config, cell.arm)
     estimated, noise = with_estimated_noise(imported, cell)
     readings = full_readings(estimated.readings, estimated.covers, cell)
     return replace(readings, noise_stated=noise is None)
+
+
+def _read_frame(frame: "pd.DataFrame", cell: Cell, mapping: str | Path | None) -> Readings:
+    """Read a data frame as the CSV file that it writes, with an index that has a name."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "data frame"
+        frame.to_csv(path, index=any(name is not None for name in frame.index.names))
+        try:
+            return read_table(path, cell, mapping)
+        except InputError as error:
+            raise InputError(str(error).replace(str(path), path.name)) from None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -261,6 +261,16 @@ def test_results_are_data_frames(site, planned, tmp_path):
         frame.to_csv(tmp_path / "t.csv", index=False)
         again = hc.read_table(tmp_path / "t.csv", run.cell)
         np.testing.assert_allclose(again.value, run.readings.value, rtol=0, atol=1e-15)
+        for given in (frame, frame.set_index("pose")):
+            direct = hc.read_table(given, run.cell)
+            np.testing.assert_array_equal(direct.value, again.value)
+            assert direct.load_names == again.load_names
+        refusal(
+            "data frame: column 'q2_rad' is missing",
+            hc.read_table,
+            frame.drop(columns="q2_rad"),
+            run.cell,
+        )
         fit = hc.fit(hc.baseline(run.cell, run.readings), run.readings)
         rows = fit.to_frame()
         assert rows["pose"].tolist() == frame["pose"].tolist()
