@@ -282,7 +282,7 @@ class Scene:
 
     def _not_always(self, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
         """Return the pairs without those that touch in a large share of all states."""
-        sizes = tuple(map(_values, (self.arm, *self.parts)))
+        sizes = _values(self.arm), *(_values(part) for part in self.parts)
         checked = _seldom_touch(_Shapes(self, pairs, sizes))
         return [pair for pair, check in zip(pairs, checked, strict=True) if check]
 
