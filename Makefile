@@ -54,7 +54,8 @@ demo: $(STAMP)
 HANGS = -o faulthandler_timeout=300 -o faulthandler_exit_on_timeout=true
 TEST = $(BIN)/python -m pytest $(HANGS)
 # Devices are simulated in real time: what fails beside others at work has to pass alone.
-tests = $(TEST) -q -n 3 --dist loadfile --no-loadscope-reorder --max-worker-restart 3 $(1) || \
+# Only then do asserts show their values: to prepare that takes each process 5 s the first time.
+tests = $(TEST) -q -n 3 --assert=plain --dist loadfile --no-loadscope-reorder --max-worker-restart 3 $(1) || \
 	{ echo "once more, alone:"; $(TEST) --last-failed --last-failed-no-failures none $(1); }
 
 test: $(STAMP)

@@ -35,7 +35,8 @@ class Section(BaseModel):
     section without one must be "a section [key]".
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    # what checks the values is built when it is needed: a device's process checks none
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
     WORDS: ClassVar[Mapping[str, str]] = {}
 
     @classmethod

@@ -88,3 +88,4 @@ def pytest_collection_finish() -> None:
     """Let the collector of garbage look only at what tests make from here on."""
     gc.freeze()
     gc.enable()
+    gc.set_threshold(50_000, 20, 20)  # what tests make is numbers, hardly any of it in circles

@@ -50,25 +50,27 @@ def slot_wrenches(arm: Arm, chain: Chain, load: Load) -> Floats:
     about the axis of joint k + 1, element (k, 2) the force along it (`Arm.joint_components`).
     """
     n, count = arm.n, len(load.wrench)
-    flange = chain.position[n]
+    weights = arm.masses[:, None] * load.gravity
+    position, com = np.swapaxes(chain.position, 0, 1), np.swapaxes(chain.com, 0, 1)
     force, weight = load.wrench[:, :3], load.tool_mass * load.gravity
-    f = force + weight
-    t = load.wrench[:, 3:] + se3.cross(chain.point(load.point) - flange, force)
+    f, t = empty(count, n + 1, 3), empty(count, n + 1, 3)
+    f[:, n] = force + weight
+    for k in range(n - 1, -1, -1):
+        f[:, k] = f[:, k + 1] + weights[k]
+    t[:, n] = load.wrench[:, 3:] + se3.cross(chain.point(load.point) - position[:, n], force)
     if weight.any():
-        t += se3.cross(chain.point(load.tool_com) - flange, weight)
+        t[:, n] += se3.cross(chain.point(load.tool_com) - position[:, n], weight)
+    # of all joints at once: with few states most of the time goes into calls
+    by_force = se3.cross(position[:, 1:] - position[:, :n], f[:, 1:])
+    by_weight = se3.cross(com - position[:, :n], weights)
+    for k in range(n - 1, -1, -1):
+        t[:, k] = t[:, k + 1] + by_force[:, k] + by_weight[:, k]
+        if load.first_moment is not None:
+            moment = se3.apply(body_axes(arm, chain, k), load.first_moment[k])
+            t[:, k] += se3.cross(moment, load.gravity)
     out = empty(count, n + 1, 6)
-    for k in range(n, -1, -1):
-        if k < n:
-            weight = arm.masses[k] * load.gravity
-            t += se3.cross(chain.position[k + 1] - chain.position[k], f)
-            if weight.any():
-                t += se3.cross(chain.com[k] - chain.position[k], weight)
-                f += weight
-            if load.first_moment is not None:
-                moment = se3.apply(body_axes(arm, chain, k), load.first_moment[k])
-                t += se3.cross(moment, load.gravity)
-        np.einsum("nji,nj->ni", chain.rotation[k], f, out=out[:, k, :3])
-        np.einsum("nji,nj->ni", chain.rotation[k], t, out=out[:, k, 3:])
+    np.einsum("knji,nkj->nki", chain.rotation, f, out=out[..., :3])
+    np.einsum("knji,nkj->nki", chain.rotation, t, out=out[..., 3:])
     return out
 
 

@@ -44,7 +44,6 @@ def test_identify_takes_options_and_keeps_them(campaign, tmp_path, capsys):
     parameters = tmp_path / "parameters.csv"
     ok(capsys, "export", campaign, "--parameters", parameters)
     assert "hysteresis.j1-3" in parameters.read_text(encoding="utf-8")
-    ok(capsys, "view", campaign, "--record", tmp_path / "story.rrd")
 
 
 def test_usual_options_are_not_shown(campaign, capsys):

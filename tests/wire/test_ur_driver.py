@@ -2,6 +2,7 @@
 
 import time
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,8 @@ import pytest
 from hilcal.drivers.simulated.cell_processes import free_host
 from hilcal.drivers.ur import open_arm
 from hilcal.drivers.ur_link.control import Control
+from hilcal.drivers.ur_link.reading import Receiver
+from hilcal.drivers.ur_link.states import safety_word
 from hilcal.drivers.ur_link.worker import WorkerError
 from hilcal.errors import DeviceError, InputError
 from tests.support import ur_driver_cases as cases
@@ -76,6 +79,29 @@ def test_bad_goals_are_refused_before_anything_moves(arm, sim):
             arm.start_move(q, speed, acceleration)
     assert not sim.admin()["moving"]
     assert arm.moving() is False
+
+
+@pytest.mark.parametrize(
+    ("bits", "mode", "says"),
+    [(1 << 2, 7, "protective stop"), (1, 5, r"does not run any more \(idle \(brakes on\)\)")],
+)
+def test_an_arm_whose_safety_or_mode_is_not_normal_is_not_moved(
+    bits, mode, says, arm, sim, monkeypatch
+):
+    """Also where its program still plays."""
+    read = Receiver.read
+
+    def told(receiver, *seconds):
+        reading = read(receiver, *seconds)
+        sample = replace(reading.sample, safety=safety_word(bits))
+        return replace(reading, sample=sample, mode=mode, safety_bits=bits)
+
+    before = sim.admin()["q"]
+    goal = cases.displaced_joints(arm)
+    monkeypatch.setattr(Receiver, "read", told)
+    with pytest.raises(DeviceError, match=says):
+        arm.start_move(goal, cases.SPEED, cases.ACCELERATION)
+    assert sim.admin()["q"] == before
 
 
 def test_payload_is_set_also_with_its_centre_at_the_flange(arm, sim):

@@ -17,7 +17,7 @@ from hilcal.drivers.simulated.cell_processes import SimulatedCell, free_host
 from hilcal.drivers.simulated.ur_rtde import outputs_since
 from hilcal.drivers.simulated.ur_server import API
 from hilcal.drivers.simulated.ur_state import line
-from hilcal.drivers.ur import UrArm, open_arm
+from hilcal.drivers.ur import open_arm
 from hilcal.drivers.ur_link import states
 from hilcal.drivers.ur_link.control import MARGIN_S, MotionInProgress, deceleration, program_ended
 from hilcal.drivers.ur_link.probe import LinkError, controller
@@ -33,7 +33,6 @@ from hilcal.drivers.ur_link.reading import (
 )
 from hilcal.drivers.ur_link.supervision import RobotApi
 from hilcal.drivers.ur_link.worker import Worker, WorkerError
-from hilcal.errors import DeviceError
 from hilcal.identification.torques import check_torques
 from hilcal.measuring.route import duration
 from hilcal.robot.catalogue import load_arm
@@ -102,20 +101,6 @@ def test_gravest_safety_state_comes_first():
     for bit in range(1, 11):
         assert states.safety_word(1 | 1 << bit) != states.NORMAL
         assert states.safety_advice(1 << bit)
-
-
-@pytest.mark.parametrize("changes", [{"safety_status_bits": 1 << 2}, {"robot_mode": 5}])
-def test_an_arm_whose_safety_or_mode_is_not_normal_is_not_moved(changes, monkeypatch):
-    """Also where its program should still play."""
-
-    def fail(arm, symptom):
-        raise DeviceError(symptom)
-
-    monkeypatch.setattr(UrArm, "_fail", fail)
-    arm = object.__new__(UrArm)
-    arm._check_state(reading())
-    with pytest.raises(DeviceError, match="not ready to move"):
-        arm._check_state(reading(**changes))
 
 
 def test_motion_is_overdue_only_after_its_time_and_margin(monkeypatch):

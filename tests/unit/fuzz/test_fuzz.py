@@ -38,12 +38,12 @@ PARSERS = {parser.name: parser for parser in (*wire.parsers(), *files.parsers())
 
 COSTLY = (
     *("campaign_fit", "preview", "measured", "krl", "rapid", "inform"),
-    *("discovered", "table"),
+    *("discovered", "table", "calibration"),
 )
-"""Parsers that take long: a fifth of the inputs every time."""
+"""Parsers that take long: a tenth of the inputs every time, at least six."""
 INPUTS = {name: FEW.get(name, 150) for name in PARSERS}
 QUICK = {
-    name: count // 5 if name in COSTLY else count // 3 if count > 60 else count
+    name: max(count // 10, 6) if name in COSTLY else count // 3 if count > 60 else count
     for name, count in INPUTS.items()
 }
 RUNS = first(len(QUICK), [*QUICK.items(), *sorted(INPUTS.items() - QUICK.items())])
