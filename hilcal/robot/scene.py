@@ -6,8 +6,7 @@ Coal compute the distances.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
-from functools import lru_cache
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -282,8 +281,11 @@ class Scene:
 
     def _not_always(self, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
         """Return the pairs without those that touch in a large share of all states."""
-        sizes = _values(self.arm), *(_values(part) for part in self.parts)
-        checked = _seldom_touch(_Shapes(self, pairs, sizes))
+        low, high = self.arm.usual_range
+        q, tested = low + _spread(_SAMPLES, self.arm.n) * (high - low), Pairs(self, pairs)
+        often = tested.how_often(q)
+        near = np.zeros(len(pairs)) if is_known(self.arm) else tested.how_often(q, _NEAR)
+        checked = (often < _ALWAYS) & (near < 1.0)
         return [pair for pair, check in zip(pairs, checked, strict=True) if check]
 
 
@@ -381,31 +383,6 @@ class Pairs:
             half, turn, middle = placements
             self._geometry.geometryObjects[self._free].geometry.halfLength = half[i]
             self._state.oMg[self._free] = pin.SE3(turn[i], middle[i])
-
-
-@dataclass(frozen=True, slots=True)
-class _Shapes:
-    """An arm and the parts of a scene, equal where their numbers are."""
-
-    scene: Scene = field(compare=False)
-    pairs: list[tuple[int, int]] = field(compare=False)
-    sizes: tuple[Any, ...]
-
-
-def _values(record: Arm | Capsule) -> tuple[Any, ...]:
-    values = (getattr(record, f.name) for f in fields(record))
-    return tuple(x.tobytes() if isinstance(x, np.ndarray) else x for x in values)
-
-
-@lru_cache(maxsize=16)
-def _seldom_touch(shapes: _Shapes) -> tuple[bool, ...]:
-    """Return of each pair whether it seldom touches, at any posture; once for the same shapes."""
-    arm, tested = shapes.scene.arm, Pairs(shapes.scene, shapes.pairs)
-    low, high = arm.usual_range
-    q = low + _spread(_SAMPLES, arm.n) * (high - low)
-    often = tested.how_often(q)
-    near = np.zeros(len(shapes.pairs)) if is_known(arm) else tested.how_often(q, _NEAR)
-    return tuple(((often < _ALWAYS) & (near < 1.0)).tolist())
 
 
 def from_axis(arm: Arm, body: int, points: Floats, joint: int) -> float:
