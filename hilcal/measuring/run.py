@@ -120,7 +120,13 @@ class Session:
             return
         self._epoch = float(details[0]["epoch_wall_s"])
         last = 0.0 if stored.states.time is None else float(stored.states.time[-1])
-        self._elapsed = max(last, (self._wall() - self._epoch) * self._clock.scale)
+        pause = self._wall() - float(details[-1]["wall_s"])
+        self._elapsed = last + max(pause, 0.0) * self._clock.scale
+        if pause < 0.0:
+            self._remark(
+                f"this computer's clock is {-pause:.0f} s before the last reading: it was set back; "
+                "the pause since that reading is not known and counts as none"
+            )
         self._temperatures = stored.states.joint_temperature is not None
         self._torques = stored.states.torque is not None
         self._done = len(self._store.done())

@@ -344,11 +344,24 @@ def test_resume_measures_exactly_what_is_missing_and_time_goes_on(b):
     assert asked[1] == plan.steps[done].load == "3kg"
 
 
-@pytest.mark.long
-def test_time_never_goes_back_whatever_the_clock_on_the_wall_does(b):
+@pytest.mark.parametrize("step_s", [7200.0, -7200.0], ids=["forward", "back"])
+def test_a_clock_that_is_set_during_a_session_makes_no_pause_and_hides_none(b, step_s):
+    def wall():
+        return 90000.0 + b.world.time + step_s * (len(b.store.rows) > 3)
+
+    b.interrupt(7, wall=wall)
+    done = len(b.store.rows)
+    b.world.time += 600.0
+    gaps = np.diff(b.measure(wall=wall).states.time)
+    assert 600.0 < gaps[done - 1] < 600.0 + 120.0
+    assert not b.remarks("clock")
+
+
+def test_a_clock_that_is_set_back_between_sessions_is_said_and_time_goes_on(b):
     b.interrupt(4, wall=lambda: 5000.0 + b.world.time)
     readings = b.measure(wall=lambda: 1000.0 + b.world.time)
     assert np.all(np.diff(readings.states.time) > 0)
+    assert b.remarks("it was set back; the pause since that reading is not known")
 
 
 def test_a_clock_set_back_since_the_epoch_makes_no_time_before_it(b):
