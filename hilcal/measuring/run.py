@@ -9,7 +9,7 @@ import time
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -39,7 +39,7 @@ from hilcal.measuring.progress import (
     Remark,
     Watcher,
 )
-from hilcal.measuring.route import DryRun, Stop, dry_run, route, way_home
+from hilcal.measuring.route import Stop, dry_run, route, way_home
 from hilcal.measuring.session_state import (
     Eta,
     SessionState,
@@ -571,7 +571,7 @@ def run(
     if not missing.steps:
         watcher.notify(Phase("nothing is missing"))
         return
-    _refuse_unsafe(dry_run(cell, missing), bool(done))
+    _refuse_unsafe(cell, missing, bool(done))
     for text in dry_run(cell, plan).remarks:
         watcher.notify(Remark(text))
     setup = Setup(rig, cell, clock, watcher)
@@ -585,13 +585,22 @@ def run(
         _raise(error, trouble, session.pose if again else None)
 
 
-def _refuse_unsafe(checked: DryRun, begun: bool) -> None:
+def _refuse_unsafe(cell: Cell, missing: Plan, begun: bool) -> None:
     """Refuse a plan with problems: InputError names the first, and how many more there are."""
-    if checked.problems:
-        advice = "; --skip POSE leaves a pose out" if begun else ""
-        raise InputError(
-            f"the plan is not safe to run, nothing has moved: {checked.first_problem}{advice}"
+    checked = dry_run(cell, missing)
+    if not checked.problems:
+        return
+    home, advice = missing.home, ""
+    if begun and dry_run(cell, replace(missing, steps=(Step(home, UNLOADED),))).problems:
+        advice = (
+            f"; every session goes to {home}, which --skip cannot leave out: put back the cell "
+            "with which the campaign was begun, or begin another campaign"
         )
+    elif begun:
+        advice = "; --skip POSE leaves a pose out"
+    raise InputError(
+        f"the plan is not safe to run, nothing has moved: {checked.first_problem}{advice}"
+    )
 
 
 def _stop(arm: ArmDevice) -> str:

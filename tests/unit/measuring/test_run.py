@@ -17,7 +17,7 @@ from hilcal.robot import se3
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Step
 from hilcal.store.rows import content_hash
-from hilcal.store.run_log import RunLog, check_same_cell, create_run
+from hilcal.store.run_log import RunLog, changed_since_begun, check_same_cell, create_run
 from hilcal.tables.table import write_table
 from tests.support.fake_bench import (
     FEW_POSES,
@@ -473,6 +473,21 @@ def test_a_campaign_goes_on_as_it_began(b, first):
 
 def _sensor(use, rotvec_rad):
     return ForceSensor(driver="fake", port="nowhere", use=use, rotvec_rad=rotvec_rad)
+
+
+@pytest.mark.parametrize(
+    ("section", "keys", "said"),
+    [
+        ("repeatability", {"joint_std_rad": 2e-5}, "[repeatability] joint_std_rad is 2e-05, and"),
+        ("tracker", {"port": "elsewhere"}, None),
+        ("planning", {"readings": "absolute"}, '[planning] readings is "absolute", and was "defl'),
+    ],
+)
+def test_what_fits_do_not_know_of_a_changed_cell_is_said(b, tmp_path, section, keys, said):
+    with create_run(tmp_path / "run.hilcal", b.config, tmp_path, usual_plan()) as campaign:
+        assert changed_since_begun(campaign, b.config) == []
+        lines = changed_since_begun(campaign, b.config.with_keys(section, **keys))
+    assert [said in line for line in lines] == [True] * (said is not None)
 
 
 @pytest.mark.parametrize("use", ["pulls", "all"])
