@@ -124,8 +124,8 @@ class Session:
         self._elapsed = last + max(pause, 0.0) * self._clock.scale
         if pause < 0.0:
             self._remark(
-                f"this computer's clock is {-pause:.0f} s before the last reading: it was set back; "
-                "the pause since that reading is not known and counts as none"
+                f"this computer's clock is {-pause:.0f} s before the last reading: it was set "
+                "back; the pause since that reading is not known and counts as none"
             )
         self._temperatures = stored.states.joint_temperature is not None
         self._torques = stored.states.torque is not None
