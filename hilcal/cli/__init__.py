@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, TextIO
 
 import typer
@@ -220,6 +221,19 @@ def _words_to_complete() -> list[str]:
         return line.split()[1:]
 
 
+def _open_closed_streams() -> None:
+    """Lead standard streams that are closed, as by `>&-`, nowhere.
+
+    A campaign that is opened next would get their numbers, and with them what child processes say.
+    """
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:  # the lowest one that is free
+        os.set_inheritable(number, True)
+    os.close(number)
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))
+
+
 def execute(make: Callable[[], typer.Typer], name: str, arguments: Sequence[str]) -> None:
     """Run a command and exit; see `EXIT_CODES`.
 
@@ -227,6 +241,7 @@ def execute(make: Callable[[], typer.Typer], name: str, arguments: Sequence[str]
     With --json the error is a JSON document on stdout, too, unless the command has printed one.
     Errors that `make` raises are reported in the same way.
     """
+    _open_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")

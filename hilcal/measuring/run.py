@@ -530,6 +530,8 @@ class Session:
         if estimate is not None:
             self._event("repeatability", asdict(estimate))
             self._remark(estimate.sentence(self._joint_std))
+        if self._hook.hanging != UNLOADED:  # the plan ends so
+            self._remark(f"{self._hook.hanging} still hangs on the arm: take it off")
         self._event("finished", {"readings": self._done})
         self._watcher.notify(Phase("finished"))
 

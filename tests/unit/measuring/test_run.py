@@ -393,6 +393,11 @@ def test_a_load_left_on_at_the_very_beginning_is_asked_about_said_and_found_in_m
     assert {step for step, *_ in b.store.rows} <= {Step("reference", "none", 0)}
 
 
+def test_a_load_that_a_plan_leaves_on_the_arm_is_said_at_its_end(b):
+    b.measure(plan_of(("p1", "none", 0), ("p1", "3kg", 0)))
+    assert b.remarks("3kg still hangs on the arm: take it off")
+
+
 def test_a_finished_campaign_touches_nothing(b):
     b.measure(FEW_POSES)
     b.world.calls.clear()
