@@ -14,7 +14,6 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any, TextIO
 
 import typer
@@ -231,7 +230,7 @@ def _open_closed_streams() -> None:
     os.close(number)
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
-            setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), mode))
 
 
 def execute(make: Callable[[], typer.Typer], name: str, arguments: Sequence[str]) -> None:
@@ -313,6 +312,8 @@ def _explained(error: Exception, name: str) -> tuple[str, int]:
         return message, errors.DeviceError.exit_code
     if isinstance(error, OSError) and error.errno in _CLOSED and error.filename:
         return f"{error.filename}: no access ({os.strerror(error.errno)})", _USAGE
+    if isinstance(error, FileNotFoundError) and error.filename is None:  # of os.getcwd
+        return "the present directory has been deleted: go to another one", _USAGE
     if isinstance(error, ImportError) and (library := _LIBRARY.match(str(error))):
         package = " (libgomp1 on Debian)" if library[1] == "libgomp.so.1" else ""
         return f"the system library {library[1]} is missing: install its package{package}", _USAGE
