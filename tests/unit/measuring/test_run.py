@@ -385,10 +385,14 @@ def test_a_load_that_still_hangs_at_a_resume_is_noticed(b):
     assert [s for s, _, _ in b.store.rows] == list(usual_plan().steps)
 
 
-def test_a_load_left_on_at_the_very_beginning_is_asked_about_said_and_found_in_motion(b):
+def test_a_load_left_on_at_the_very_beginning_is_asked_about_said_and_found_in_motion():
+    b = Bench()
+    loads = (CellLoad(name="1kg", mass_kg=1.0), *b.config.loads)
+    b.world.config = b.config = b.config.model_copy(update={"loads": loads})
     b.world.load, b.world.wrong_loads = "3kg", ["3kg", "3kg"]  # both answers are wrong
     refusal_of(DeviceError, "take everything off", b.measure)
-    assert b.remarks("answered twice that nothing hangs")
+    assert [name for name, _ in b.operator.requests[:3]] == ["none", "none", "confirm"]
+    assert b.remarks("as if 3kg hung, and it was answered twice that nothing hangs")
     # where gravity has not turned in the sensor since its tare, a load is a zero
     assert {step for step, *_ in b.store.rows} <= {Step("reference", "none", 0)}
 
