@@ -164,7 +164,7 @@ class Hook:
         """Return a message on a load that seems to hang still: one that fits better than nothing.
 
         The zero is that of an earlier session. Without one it is the sensor's zero, which may be
-        far off: then a second answer that nothing hangs is believed, once a person has confirmed it.
+        far off: then a second answer that nothing hangs is believed, once a person confirms it.
         """
         if self._meter is None:
             return ""

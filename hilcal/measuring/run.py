@@ -56,6 +56,8 @@ from hilcal.store.run_log import RunLog
 from hilcal.types import Floats
 
 HOW_ON = "The campaign is safe: run again with --resume"
+HERE = "where it was left"
+AT_LAST = "where its last reading was taken"  # it may have been stopped on the way to the next
 EMERGENCY = "press the emergency stop"
 _STOPS = 3
 MOVED_M = 1e-3
@@ -220,9 +222,9 @@ class Session:
         if self._temperatures is None:
             self._temperatures = bool(np.isfinite(sample.joint_temperature).all())
         self._hook.take_all_off()
-        expected = sample.q if last_q is None else last_q
+        expected, place = (sample.q, HERE) if last_q is None else (last_q, AT_LAST)
         self._mover.goal = self._mover.agreed_start(
-            first.q, first.name, expected, self._hook.confirm
+            first.q, first.name, expected, self._hook.confirm, place
         )
         self.in_control = True
         self._rig.arm.take_control(*payload(self._cell, None))
