@@ -196,26 +196,3 @@ class Hook:
             "arm may drop or stop; look at the flange"
         )
         return ""
-        has_zero = bool(np.any(self._meter.zero))
-        believed, self._doubted = self._doubted and not has_zero, True
-        sample = self._mover.checked_sample()
-        tared = self._meter.tared(self._meter.average(), sample.q)
-        force = self._meter.load_wrench(tared)[:3]
-        felt = float(np.linalg.norm(force))
-        if felt <= self._config.operator.tolerance_N:
-            return ""
-        for load in self._config.loads:
-            if np.linalg.norm(force - load.wrench(self._cell.gravity)[:3]) < felt:
-                if believed:
-                    self.confirm(
-                        f"the force sensor feels {felt:.1f} N, as if {load.name} hung, and it was "
-                        "answered twice that nothing hangs: then its own zero is off. With a load "
-                        "that it is not told of the arm may drop or stop; look at the flange"
-                    )
-                    return ""
-                reference = "in the unloaded readings so far" if has_zero else "the tool weighs"
-                return (
-                    f"the force sensor feels {felt:.1f} N more than {reference}; {load.name} seems "
-                    "to hang still"
-                )
-        return ""

@@ -120,6 +120,11 @@ class Session:
         stored = self._store.readings()
         if not details or stored is None:
             return
+        if not all("q_actual" in raw for raw in details):
+            raise InputError(
+                "some readings of the campaign were drawn, not measured on devices: measure into "
+                "another file"
+            )
         self._epoch = float(details[0]["epoch_wall_s"])
         last = 0.0 if stored.states.time is None else float(stored.states.time[-1])
         pause = self._wall() - float(details[-1]["wall_s"])

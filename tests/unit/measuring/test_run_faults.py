@@ -441,6 +441,12 @@ def test_a_pose_that_fails_twice_is_named_and_can_be_left_out(b):
     assert steps[2] == Step("p3", "none", 0)  # from the reference, where the session begins
 
 
+def test_readings_that_were_drawn_are_not_gone_on_with(b):
+    b.interrupt(stored=2)
+    b.store.rows = [(step, reading, '{"drawn": true}') for step, reading, _ in b.store.rows]
+    refusal("were drawn, not measured on devices: measure into another", b.measure)
+
+
 def test_limits_that_leave_out_the_reference_are_to_be_put_back(b):
     """Where it cannot be left out, --skip is no advice."""
     b.interrupt(stored=4)
