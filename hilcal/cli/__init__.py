@@ -220,6 +220,19 @@ def _words_to_complete() -> list[str]:
         return line.split()[1:]
 
 
+def _open_closed_streams() -> None:
+    """Lead standard streams that are closed, as by `>&-`, nowhere.
+
+    A campaign that is opened next would get their numbers, and with them what child processes say.
+    """
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:  # the lowest one that is free
+        os.set_inheritable(number, True)
+    os.close(number)
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), mode))
+
+
 def execute(make: Callable[[], typer.Typer], name: str, arguments: Sequence[str]) -> None:
     """Run a command and exit; see `EXIT_CODES`.
 
@@ -227,6 +240,7 @@ def execute(make: Callable[[], typer.Typer], name: str, arguments: Sequence[str]
     With --json the error is a JSON document on stdout, too, unless the command has printed one.
     Errors that `make` raises are reported in the same way.
     """
+    _open_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")
@@ -298,6 +312,8 @@ def _explained(error: Exception, name: str) -> tuple[str, int]:
         return message, errors.DeviceError.exit_code
     if isinstance(error, OSError) and error.errno in _CLOSED and error.filename:
         return f"{error.filename}: no access ({os.strerror(error.errno)})", _USAGE
+    if isinstance(error, FileNotFoundError) and error.filename is None:  # of os.getcwd
+        return "the present directory has been deleted: go to another one", _USAGE
     if isinstance(error, ImportError) and (library := _LIBRARY.match(str(error))):
         package = " (libgomp1 on Debian)" if library[1] == "libgomp.so.1" else ""
         return f"the system library {library[1]} is missing: install its package{package}", _USAGE

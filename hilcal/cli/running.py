@@ -65,7 +65,7 @@ from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, load_plan, with_new_names
 from hilcal.store.procedure_log import ProcedureLog
-from hilcal.store.run_log import RunLog, check_same_cell, create_run
+from hilcal.store.run_log import RunLog, changed_since_begun, check_same_cell, create_run
 from hilcal.transfer.compare import check_factory
 from hilcal.whole_file import replace_file, spare_other
 
@@ -110,6 +110,8 @@ def run(
             campaign = stack.enter_context(CampaignFile.open(output, check_revisions=False))
             campaign.measure_alone()
             check_same_cell(campaign, config, base_dir)
+            for text in changed_since_begun(campaign, config):
+                t.notice(f"note: {text}")
             campaign_plan = RunLog(campaign).plans[0]
             if plan is not None:
                 further = RunLog(campaign).with_new_names(load_plan(plan))
@@ -225,6 +227,10 @@ def measure(
         kinds = [e["kind"] for e in log.events() if e["kind"] != "noise"]
         if kinds[-1:] == ["finished"]:  # the last session is complete: no load hangs on the arm
             return campaign.n_readings
+    if not log.plan.without(log.done()).steps:
+        t.notice("nothing is missing")
+        estimate_noise(t, cell, campaign)  # the last session may have ended before it
+        return campaign.n_readings
     with _ends_as_interrupt(t), ExitStack() as stack:
         with working(t.progress) as say:
             say("connecting to every device")

@@ -141,7 +141,9 @@ class Hook:
             if not self._at_terminal:  # a person is told with the next question
                 self._watcher.notify(Remark(f"asked to {task}: {why}"))
         if load is None:
-            why += ". If nothing does, the tool was touched while the sensor was tared"
+            why += (
+                ". If nothing does, a load hung, or the tool was touched, when the sensor was tared"
+            )
         raise WrongLoadError(f"operator: asked {TRIES} times to {task}; {why}")
 
     def _differs(self, load: CellLoad | None) -> str:
@@ -162,7 +164,7 @@ class Hook:
         """Return a message on a load that seems to hang still: one that fits better than nothing.
 
         The zero is that of an earlier session. Without one it is the sensor's zero, which may be
-        far off: then a second answer that nothing hangs is believed, with a remark.
+        far off: then a second answer that nothing hangs is believed, once a person confirms it.
         """
         if self._meter is None:
             return ""
@@ -174,19 +176,23 @@ class Hook:
         felt = float(np.linalg.norm(force))
         if felt <= self._config.operator.tolerance_N:
             return ""
-        for load in self._config.loads:
-            if np.linalg.norm(force - load.wrench(self._cell.gravity)[:3]) < felt:
-                if believed:
-                    self._watcher.notify(
-                        Remark(
-                            f"the force sensor's own zero is taken to be off by {felt:.1f} N: it "
-                            "was answered twice that nothing hangs"
-                        )
-                    )
-                    return ""
-                reference = "in the unloaded readings so far" if has_zero else "the tool weighs"
-                return (
-                    f"the force sensor feels {felt:.1f} N more than {reference}; {load.name} seems "
-                    "to hang still"
-                )
+        gravity = self._cell.gravity
+        distances = {
+            load.name: float(np.linalg.norm(force - load.wrench(gravity)[:3]))
+            for load in self._config.loads
+        }
+        name = min(distances, key=distances.__getitem__, default="")
+        if not name or distances[name] >= felt:
+            return ""
+        if not believed:
+            reference = "in the unloaded readings so far" if has_zero else "the tool weighs"
+            return (
+                f"the force sensor feels {felt:.1f} N more than {reference}; {name} seems to hang "
+                "still"
+            )
+        self.confirm(
+            f"the force sensor feels {felt:.1f} N, as if {name} hung, and it was answered twice "
+            "that nothing hangs: then its own zero is off. With a load that it is not told of the "
+            "arm may drop or stop; look at the flange"
+        )
         return ""

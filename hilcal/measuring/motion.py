@@ -257,12 +257,17 @@ class Mover:
         return self.goal is not None and np.array_equal(q, self.goal)
 
     def agreed_start(
-        self, goal: Floats, name: str, expected: Floats, ask: Callable[[str], None]
+        self,
+        goal: Floats,
+        name: str,
+        expected: Floats,
+        ask: Callable[[str], None],
+        place: str = "where it was left",
     ) -> Floats:
         """Return the position (n,) of the arm, once its way to a goal is free and people agree.
 
-        If it does not stand where it is `expected`, people are asked first, and the way is checked
-        again.
+        If it does not stand where it is `expected`, at a `place` in words, people are asked first,
+        and the way is checked again.
         """
         while True:
             q = self.free_way(goal, name).q
@@ -270,7 +275,7 @@ class Mover:
             if distance <= MOVED_RAD:
                 return q
             ask(
-                f"the arm does not stand where it was left: {joint} is {distance:.3g} rad off. Its "
+                f"the arm does not stand {place}: {joint} is {distance:.3g} rad off. Its "
                 f"way from there to {name} has been checked. It goes there next"
             )
             expected = q

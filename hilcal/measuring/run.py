@@ -9,7 +9,7 @@ import time
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -39,7 +39,7 @@ from hilcal.measuring.progress import (
     Remark,
     Watcher,
 )
-from hilcal.measuring.route import DryRun, Stop, dry_run, route, way_home
+from hilcal.measuring.route import Stop, dry_run, route, way_home
 from hilcal.measuring.session_state import (
     Eta,
     SessionState,
@@ -56,6 +56,8 @@ from hilcal.store.run_log import RunLog
 from hilcal.types import Floats
 
 HOW_ON = "The campaign is safe: run again with --resume"
+HERE = "where it was left"
+AT_LAST = "where its last reading was taken"  # it may have been stopped on the way to the next
 EMERGENCY = "press the emergency stop"
 _STOPS = 3
 MOVED_M = 1e-3
@@ -118,9 +120,20 @@ class Session:
         stored = self._store.readings()
         if not details or stored is None:
             return
+        if not all("q_actual" in raw for raw in details):
+            raise InputError(
+                "some readings of the campaign were drawn, not measured on devices: measure into "
+                "another file"
+            )
         self._epoch = float(details[0]["epoch_wall_s"])
         last = 0.0 if stored.states.time is None else float(stored.states.time[-1])
-        self._elapsed = max(last, (self._wall() - self._epoch) * self._clock.scale)
+        pause = self._wall() - float(details[-1]["wall_s"])
+        self._elapsed = last + max(pause, 0.0) * self._clock.scale
+        if pause < 0.0:
+            self._remark(
+                f"this computer's clock is {-pause:.0f} s before the last reading: it was set "
+                "back; the pause since that reading is not known and counts as none"
+            )
         self._temperatures = stored.states.joint_temperature is not None
         self._torques = stored.states.torque is not None
         self._done = len(self._store.done())
@@ -214,9 +227,9 @@ class Session:
         if self._temperatures is None:
             self._temperatures = bool(np.isfinite(sample.joint_temperature).all())
         self._hook.take_all_off()
-        expected = sample.q if last_q is None else last_q
+        expected, place = (sample.q, HERE) if last_q is None else (last_q, AT_LAST)
         self._mover.goal = self._mover.agreed_start(
-            first.q, first.name, expected, self._hook.confirm
+            first.q, first.name, expected, self._hook.confirm, place
         )
         self.in_control = True
         self._rig.arm.take_control(*payload(self._cell, None))
@@ -524,6 +537,8 @@ class Session:
         if estimate is not None:
             self._event("repeatability", asdict(estimate))
             self._remark(estimate.sentence(self._joint_std))
+        if self._hook.hanging != UNLOADED:  # the plan ends so
+            self._remark(f"{self._hook.hanging} still hangs on the arm: take it off")
         self._event("finished", {"readings": self._done})
         self._watcher.notify(Phase("finished"))
 
@@ -565,7 +580,7 @@ def run(
     if not missing.steps:
         watcher.notify(Phase("nothing is missing"))
         return
-    _refuse_unsafe(dry_run(cell, missing), bool(done))
+    _refuse_unsafe(cell, missing, bool(done))
     for text in dry_run(cell, plan).remarks:
         watcher.notify(Remark(text))
     setup = Setup(rig, cell, clock, watcher)
@@ -579,13 +594,22 @@ def run(
         _raise(error, trouble, session.pose if again else None)
 
 
-def _refuse_unsafe(checked: DryRun, begun: bool) -> None:
+def _refuse_unsafe(cell: Cell, missing: Plan, begun: bool) -> None:
     """Refuse a plan with problems: InputError names the first, and how many more there are."""
-    if checked.problems:
-        advice = "; --skip POSE leaves a pose out" if begun else ""
-        raise InputError(
-            f"the plan is not safe to run, nothing has moved: {checked.first_problem}{advice}"
+    checked = dry_run(cell, missing)
+    if not checked.problems:
+        return
+    home, advice = missing.home, ""
+    if begun and dry_run(cell, replace(missing, steps=(Step(home, UNLOADED),))).problems:
+        advice = (
+            f"; every session goes to {home}, which --skip cannot leave out: put back the cell "
+            "with which the campaign was begun, or begin another campaign"
         )
+    elif begun:
+        advice = "; --skip POSE leaves a pose out"
+    raise InputError(
+        f"the plan is not safe to run, nothing has moved: {checked.first_problem}{advice}"
+    )
 
 
 def _stop(arm: ArmDevice) -> str:

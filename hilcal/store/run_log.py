@@ -26,6 +26,8 @@ from hilcal.store.stored_schema import DETAIL, check, check_event
 PLAN = "plan"  # key of the first plan among the texts of a campaign
 FURTHER_PLAN = "plan {}"  # keys of further plans, numbered from 2
 FIXED_SECTIONS = ("robot", "tool", "loads")  # of the configuration, during a campaign
+FITTED_SECTIONS = ("tracker", "repeatability", "acquire", "planning", "ordinary", "plausible")
+"""Sections of the configuration that fits read as they were when the campaign was begun."""
 ADDRESS_KEYS = {"driver", "host", "port", "baud", "options"}  # keys of these that may change
 
 
@@ -55,17 +57,34 @@ def check_same_cell(campaign: CampaignFile, config: CellConfig, base_dir: Path) 
                 f"{base_dir / getattr(config.robot, KEYS[key])} is not what it was when "
                 f"{campaign.path} was begun; a campaign is of one robot: start another one for this"
             )
+    begun = CellConfig.from_json(campaign.config_json)
     for section in FIXED_SECTIONS:
-        stored, current = (
-            c.model_dump(mode="json", include={section: True}, exclude={section: ADDRESS_KEYS})
-            for c in (CellConfig.from_json(campaign.config_json), config)
-        )
-        if stored != current:
+        if _section(begun, section) != _section(config, section):
             raise InputError(
                 f"[{section}] differs from what {campaign.path} was begun with; a campaign is "
                 "measured in one cell: start another one for this"
             )
     _check_same_mounting(campaign, config)
+
+
+def _section(config: CellConfig, name: str) -> Any:
+    """Return a section without the addresses of its device, as JSON."""
+    return config.model_dump(mode="json", include={name: True}, exclude={name: ADDRESS_KEYS})[name]
+
+
+def changed_since_begun(campaign: CampaignFile, config: CellConfig) -> list[str]:
+    """Return what fits of a campaign do not know of a configuration, one line per key."""
+    begun, out = CellConfig.from_json(campaign.config_json), []
+    for section in FITTED_SECTIONS:
+        before, now = (_section(c, section) or {} for c in (begun, config))
+        out += [
+            f"[{section}] {key} is {json.dumps(now.get(key))}, and was "
+            f"{json.dumps(before.get(key))} when {campaign.path} was begun: fits of its readings "
+            "go by what it was"
+            for key in {**before, **now}
+            if before.get(key) != now.get(key)
+        ]
+    return out
 
 
 def _check_same_mounting(campaign: CampaignFile, config: CellConfig) -> None:

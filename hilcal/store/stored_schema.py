@@ -73,6 +73,7 @@ REVISION: Schema = _of(
 """A revision, see `store.revision`."""
 DETAIL: Schema = _of(
     epoch_wall_s=(Number | None, None),
+    wall_s=(Number | None, None),
     q_actual=(tuple[Number, ...] | None, None),
     tracker_covariance=(Matrix | None, None),
 )

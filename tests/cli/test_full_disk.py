@@ -3,6 +3,7 @@
 import os
 import pty
 import resource
+import shutil
 import subprocess
 import sys
 from contextlib import contextmanager
@@ -184,3 +185,32 @@ def test_a_command_whose_terminal_is_closed_ends_with_its_own_exit_code(tmp_path
     )  # fmt: skip
     os.close(slave)
     assert ended.returncode == code
+
+
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_a_command_whose_streams_are_closed_opens_no_file_in_their_place(fitted, closed):
+    """Child processes would write into it what they say."""
+    code = (
+        "import sys, os, typer; from hilcal import cli; app = typer.Typer()\n"
+        "@app.command()\n"
+        "def f(): print('x'); os.open('run.hilcal', os.O_RDONLY) > 2 or os._exit(1)\n"
+        "cli.execute(lambda: app, 'f', [])"
+    )
+    ended = subprocess.run(
+        ["sh", "-c", f'"$0" -c "$1" {closed}', sys.executable, code],
+        cwd=fitted, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=False,
+    )  # fmt: skip
+    assert ended.returncode == 0
+
+
+def test_a_directory_that_has_been_deleted_is_named(tmp_path):
+    shutil.copy(ROOT / "configs" / "cells" / "demo_ur10e.toml", tmp_path / "cell.toml")
+    line = 'mkdir gone; cd gone; rmdir ../gone; "$0" -m hilcal check ../cell.toml'
+    ended = subprocess.run(
+        ["sh", "-c", line, sys.executable],
+        cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=False,
+        text=True, capture_output=True,
+    )  # fmt: skip
+    assert (ended.returncode, ended.stderr.splitlines()[-1]) == (
+        2, "error: the present directory has been deleted: go to another one",
+    )  # fmt: skip

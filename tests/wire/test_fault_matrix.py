@@ -424,7 +424,7 @@ def test_an_arm_jogged_before_a_campaign_goes_on_is_asked_for(cell, path):
     run.end()
     somebody_jogs(cell)
     again = cases.Run(cell, path)
-    again.wait_until(lambda: "does not stand where it was left" in again.output, "a question")
+    again.wait_until(lambda: "does not stand where its last" in again.output, "a question")
     again.interrupt()
     again.end()
 

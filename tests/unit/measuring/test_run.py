@@ -17,7 +17,7 @@ from hilcal.robot import se3
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Step
 from hilcal.store.rows import content_hash
-from hilcal.store.run_log import RunLog, check_same_cell, create_run
+from hilcal.store.run_log import RunLog, changed_since_begun, check_same_cell, create_run
 from hilcal.tables.table import write_table
 from tests.support.fake_bench import (
     FEW_POSES,
@@ -344,11 +344,24 @@ def test_resume_measures_exactly_what_is_missing_and_time_goes_on(b):
     assert asked[1] == plan.steps[done].load == "3kg"
 
 
-@pytest.mark.long
-def test_time_never_goes_back_whatever_the_clock_on_the_wall_does(b):
+@pytest.mark.parametrize("step_s", [7200.0, -7200.0], ids=["forward", "back"])
+def test_a_clock_that_is_set_during_a_session_makes_no_pause_and_hides_none(b, step_s):
+    def wall():
+        return 90000.0 + b.world.time + step_s * (len(b.store.rows) > 3)
+
+    b.interrupt(7, wall=wall)
+    done = len(b.store.rows)
+    b.world.time += 600.0
+    gaps = np.diff(b.measure(wall=wall).states.time)
+    assert 600.0 < gaps[done - 1] < 600.0 + 120.0
+    assert not b.remarks("clock")
+
+
+def test_a_clock_that_is_set_back_between_sessions_is_said_and_time_goes_on(b):
     b.interrupt(4, wall=lambda: 5000.0 + b.world.time)
     readings = b.measure(wall=lambda: 1000.0 + b.world.time)
     assert np.all(np.diff(readings.states.time) > 0)
+    assert b.remarks("it was set back; the pause since that reading is not known")
 
 
 def test_a_clock_set_back_since_the_epoch_makes_no_time_before_it(b):
@@ -372,12 +385,21 @@ def test_a_load_that_still_hangs_at_a_resume_is_noticed(b):
     assert [s for s, _, _ in b.store.rows] == list(usual_plan().steps)
 
 
-def test_a_load_left_on_at_the_very_beginning_is_asked_about_said_and_found_in_motion(b):
+def test_a_load_left_on_at_the_very_beginning_is_asked_about_said_and_found_in_motion():
+    b = Bench()
+    loads = (CellLoad(name="1kg", mass_kg=1.0), *b.config.loads)
+    b.world.config = b.config = b.config.model_copy(update={"loads": loads})
     b.world.load, b.world.wrong_loads = "3kg", ["3kg", "3kg"]  # both answers are wrong
     refusal_of(DeviceError, "take everything off", b.measure)
-    assert b.remarks("answered twice that nothing hangs")
+    assert [name for name, _ in b.operator.requests[:3]] == ["none", "none", "confirm"]
+    assert b.remarks("as if 3kg hung, and it was answered twice that nothing hangs")
     # where gravity has not turned in the sensor since its tare, a load is a zero
     assert {step for step, *_ in b.store.rows} <= {Step("reference", "none", 0)}
+
+
+def test_a_load_that_a_plan_leaves_on_the_arm_is_said_at_its_end(b):
+    b.measure(plan_of(("p1", "none", 0), ("p1", "3kg", 0)))
+    assert b.remarks("3kg still hangs on the arm: take it off")
 
 
 def test_a_finished_campaign_touches_nothing(b):
@@ -460,6 +482,21 @@ def test_a_campaign_goes_on_as_it_began(b, first):
 
 def _sensor(use, rotvec_rad):
     return ForceSensor(driver="fake", port="nowhere", use=use, rotvec_rad=rotvec_rad)
+
+
+@pytest.mark.parametrize(
+    ("section", "keys", "said"),
+    [
+        ("repeatability", {"joint_std_rad": 2e-5}, "[repeatability] joint_std_rad is 2e-05, and"),
+        ("tracker", {"port": "elsewhere"}, None),
+        ("planning", {"readings": "absolute"}, '[planning] readings is "absolute", and was "defl'),
+    ],
+)
+def test_what_fits_do_not_know_of_a_changed_cell_is_said(b, tmp_path, section, keys, said):
+    with create_run(tmp_path / "run.hilcal", b.config, tmp_path, usual_plan()) as campaign:
+        assert changed_since_begun(campaign, b.config) == []
+        lines = changed_since_begun(campaign, b.config.with_keys(section, **keys))
+    assert [said in line for line in lines] == [True] * (said is not None)
 
 
 @pytest.mark.parametrize("use", ["pulls", "all"])

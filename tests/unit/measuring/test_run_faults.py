@@ -441,6 +441,21 @@ def test_a_pose_that_fails_twice_is_named_and_can_be_left_out(b):
     assert steps[2] == Step("p3", "none", 0)  # from the reference, where the session begins
 
 
+def test_readings_that_were_drawn_are_not_gone_on_with(b):
+    b.interrupt(stored=2)
+    b.store.rows = [(step, reading, '{"drawn": true}') for step, reading, _ in b.store.rows]
+    refusal("were drawn, not measured on devices: measure into another", b.measure)
+
+
+def test_limits_that_leave_out_the_reference_are_to_be_put_back(b):
+    """Where it cannot be left out, --skip is no advice."""
+    b.interrupt(stored=4)
+    limits = Limits(workspace_min_m=(-0.7, -1.2, 0.05), workspace_max_m=(1.2, 1.2, 1.5))
+    b.config = b.config.model_copy(update={"limits": limits})
+    refusal("goes to reference, which --skip cannot leave out: put back", b.measure)
+    assert "arm.start_move" not in b.world.calls
+
+
 def test_limits_that_were_narrowed_meanwhile_do_not_lock_a_campaign(b):
     b.interrupt(stored=4)  # p2, which reaches farthest in y, is measured without a load
     limits = Limits(workspace_min_m=(-1.2, -1.2, 0.05), workspace_max_m=(1.2, 0.3, 1.5))
