@@ -192,12 +192,9 @@ def refine_from(
 ) -> Refinement:
     """Refine a fit without estimating the correlation of its noise anew; see `refine`."""
     path = Path(first, say, history, laws, on_step, background)
-    changed = True
-    while changed:
-        path.extend()
-        changed = path.reconsider()
-        changed = changed or path.add_background() or path.add_scatter()
-    path.pool_lines()
+    path.complete()
+    if path.pool_lines():
+        path.complete()
     return Refinement(tuple(path.steps))
 
 
@@ -256,6 +253,14 @@ class Path:
     def _append(self, step: RefinementStep) -> None:
         self.steps.append(step)
         self._on_step(step)
+
+    def complete(self) -> None:
+        """Add, reconsider and fit again until nothing changes."""
+        changed = True
+        while changed:
+            self.extend()
+            changed = self.reconsider()
+            changed = changed or self.add_background() or self.add_scatter()
 
     def extend(self) -> None:
         """Add suspects while any lowers the error on poses left out."""
@@ -443,20 +448,22 @@ class Path:
         self.append(fitted, None, message="the arm's scatter enters the covariance")
         return True
 
-    def pool_lines(self) -> None:
+    def pool_lines(self) -> bool:
         """Fit effects of many lines anew, the size of each line near that of its pool.
 
         The fit replaces that of the last step, unless the error on poses left out rises by more
-        than it scatters from pose to pose. A path of one step stays as it is.
+        than it scatters from pose to pose. A path of one step stays as it is. Returns whether a
+        suspect passes beside the new lines that separate lines had hidden.
         """
         last = self.steps[-1]
         if len(self.steps) == 1 or last.fit.model.background or last.diagnosis.wrong_figures:
-            return
+            return False
         fitted = with_pooled_lines(last.fit)
         if fitted is None or predicts_better(fitted, last.fit):
-            return
+            return False
         self._evidence = self._evidence_of(fitted)
         self.steps[-1] = replace(last, fit=fitted, diagnosis=self._judge(fitted))
+        return any(s.passes for s in self.steps[-1].diagnosis.suspects)
 
     def _better(self, last: RefinementStep, alternative: Alternative) -> bool:
         """Whether an alternative is worth a trial.

@@ -12,7 +12,7 @@ from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
 from hilcal.model.model import Model
 from hilcal.present.verdict import message
-from hilcal.refinement import MOST_REVISIONS, add, refine
+from hilcal.refinement import MOST_REVISIONS, Path, add, refine, refine_from
 from hilcal.regression.leave_out import LEAST_GAIN
 from tests.support.campaigns import campaign, cell_of, measured, plan, world_of
 from tests.support.diagnosis_cases import fitted_baseline
@@ -67,6 +67,29 @@ def test_two_hidden_effects_are_found_one_after_the_other():
     assert {s.added for s in r.steps[1:]} == {"hysteresis", "encoder_offset"}
     assert r.verdict == "adequate", message(r.diagnosis)
     assert 0.7 < r.steps[-1].fit.variance_factor < 1.35
+
+
+def test_a_suspect_that_passes_beside_pooled_lines_is_added(monkeypatch):
+    """Separate lines of a gear may hide it; it was named as missing, and never added."""
+    cell, p, rng = cell_of(), plan(30, 5), np.random.default_rng(5)
+    world = world_of(cell, rng)
+    for effect in ("transmission_error", "encoder_offset"):
+        world = hide_effect(effect, cell, p.states, 3.0, "absolute", rng, world=world)
+    readings, complete, calls = measured(world, p, rng), Path.complete, []
+
+    def with_lines_first(path):
+        calls.append(path)
+        if len(calls) > 1:
+            complete(path)
+        else:
+            path.append(add(path.steps[-1].fit, "transmission_error"), "transmission_error")
+
+    monkeypatch.setattr(Path, "complete", with_lines_first)
+    r = refine_from(fit(baseline(cell, readings, "absolute"), readings, "absolute"))
+    assert len(calls) == 2
+    assert "transmission_error" in r.steps[1].fit.model.random
+    assert "encoder_offset" in [s.added for s in r.steps]
+    assert not any(s.passes for s in r.diagnosis.suspects)
 
 
 def test_nothing_hidden_adds_nothing():
