@@ -182,12 +182,15 @@ def _extensible(model: Model) -> bool:
     return model.prior is None and model.readings is not None
 
 
-def with_background(fitted: Fit, named: Collection[str]) -> Fit | None:
-    """Fit all effects of the catalogue; None where an added one becomes implausibly large.
+def with_background(
+    fitted: Fit, named: Collection[str], without: Collection[str] = ()
+) -> Fit | None:
+    """Fit all effects of the catalogue, `without` some; None where they allow no fit.
 
-    Such an effect (see `Effect.most`) stands in for one that the catalogue lacks, and may be so
-    large that the arm has no equilibrium. The effects of the model are proved: their size is not
-    limited.
+    An added effect that becomes implausibly large (see `Effect.most`) stands in for one that the
+    catalogue lacks, or cancels another one. The largest of them is left out, as a size that no arm
+    has predicts nothing, and the others are fitted again. The effects of the model are proved:
+    their size is not limited.
 
     The noise is that of the mixed model. The arm's scatter is added to the covariance. Instead of
     multiplying the instrument's noise by its estimated factor, the standard deviations of the
@@ -200,7 +203,8 @@ def with_background(fitted: Fit, named: Collection[str]) -> Fit | None:
     effects and the size of the noise.
     """
     readings = fitted.readings.as_stated()
-    model = with_all_effects(fitted.model, readings[~fitted.outlier].states)
+    states = readings[~fitted.outlier].states
+    model = with_all_effects(fitted.model, states, without=without)
     outlier, sample = fitted.outlier.copy(), readings[~fitted.outlier]
     # A run of equal shifts is not set aside reading by reading.
     disagreement = fitted.disagreement
@@ -225,8 +229,10 @@ def with_background(fitted: Fit, named: Collection[str]) -> Fit | None:
         if len(sample) < len(inliers):
             inliers = replace(inliers, scatter_stated=True)
             mixed = mixed_fit_of(model, inliers, fitted.mode, start=mixed)
-        if _implausible(mixed) - set(fitted.model.names):
-            return None
+        sizes = _plausible_shares(mixed, set(model.names) - set(fitted.model.names))
+        largest = max(sizes, key=sizes.__getitem__, default="")
+        if sizes and sizes[largest] > IMPLAUSIBLE_FACTOR:
+            return with_background(fitted, named, (*without, largest))
         return fit(
             background_model(mixed, named), readings, fitted.mode, start=mixed.theta,
             outlier=outlier if search else None,
@@ -262,14 +268,13 @@ def with_pooled_lines(fitted: Fit) -> Fit | None:
         return None
 
 
-def _implausible(mixed: MixedFit) -> set[str]:
-    """Names of the effects with a standard deviation above the plausible size."""
+def _plausible_shares(mixed: MixedFit, effects: Collection[str]) -> dict[str, float]:
+    """Largest standard deviation of each effect, over its plausible size."""
     std = mixed.prior_std()
     return {
-        effect.name
+        effect.name: float(np.max(std[rows] / (effect.most() * effect.magnitudes)))
         for effect, rows in zip(mixed.model.effects, mixed.model.slices(), strict=True)
-        if effect.role not in FRAME_ROLES
-        and np.any(std[rows] > IMPLAUSIBLE_FACTOR * effect.most() * effect.magnitudes)
+        if effect.name in effects
     }
 
 

@@ -90,14 +90,16 @@ class MixedFit:
         return out
 
 
-def with_all_effects(model: Model, states: States, harmonics: int = HARMONICS) -> Model:
-    """Return a model with every effect of its catalogue that the states allow.
+def with_all_effects(
+    model: Model, states: States, harmonics: int = HARMONICS, without: Collection[str] = ()
+) -> Model:
+    """Return a model with every effect of its catalogue that the states allow, `without` some.
 
     Effects with harmonics have at least `harmonics` of them, even if few poses cannot resolve them.
     """
     model = with_all_harmonics(model, states, harmonics)
     for kind in model.catalogue.effects:
-        if kind.name in model.names or kind.role in FRAME_ROLES:
+        if kind.name in (*model.names, *without) or kind.role in FRAME_ROLES:
             continue
         if not (kind.computable(states) and kind.applies(model.cell)):
             continue

@@ -79,6 +79,16 @@ def test_it_predicts_other_poses_far_better_than_what_is_named(found, series):
     }
 
 
+def test_of_effects_only_that_of_implausible_size_is_left_out(found, series):
+    some, (name, *_) = series[:30], background_of(found.fit).effects
+    plausible = UR10.configured().model_copy(update={"plausible": {name: 1e-3}})
+    first = fit(baseline(UR10.with_config(plausible), some, "absolute"), some, "absolute")
+    together = with_background(first, first.model.names)
+    assert together is not None
+    assert {*found.fit.model.names} - {*together.model.names} == {name}
+    assert error(together, series[500:]) < 0.5 * error(first, series[500:])
+
+
 @pytest.mark.long
 def test_it_is_stored_and_found_again(found, series):
     fit, some = found.fit, series[:30]
