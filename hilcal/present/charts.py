@@ -23,7 +23,7 @@ from hilcal.identification.carried.carried_prior import names_of
 from hilcal.identification.fit import Fit
 from hilcal.names import escaped
 from hilcal.present.document import load_name
-from hilcal.present.fit import CERTAIN, dependence_sentence
+from hilcal.present.fit import beyond_chance, dependence_sentence
 from hilcal.present.story import (
     LEVEL_NAMES,
     LIMITS,
@@ -254,8 +254,8 @@ def residual_over(
         low, beyond = (np.sqrt(np.mean(sigma[members] ** 2)) for members in (~high, high))
         median = f"{np.median(x):.0f}{unit if unit == '°' else f' {unit}'}".strip()
         says = (
-            f"Residual over {name}: {low:.2g} times the noise rms up to {median}, "
-            f"{beyond:.2g} times beyond."
+            f"Residual over {name}: {numbers.digits(low, 2)} times the noise rms up to {median}, "
+            f"{numbers.digits(beyond, 2)} times beyond."
         )
     return _residuals(d, values[d.index], f"{name} [{unit}]" if unit else name, says)
 
@@ -281,10 +281,11 @@ def _extremes(story: Story, revision: StoryRevision, group: str) -> str:
     names, row = np.unique(poses if group == "pose" else story.load_names, return_inverse=True)
     rms = np.sqrt(np.bincount(row, revision.sigma**2 / 3) / np.bincount(row))
     worst = names[int(np.argmax(rms))]
+    most, least = numbers.digits(rms.max(), 2), numbers.digits(rms.min(), 2)
     name = "the unloaded readings" if worst == UNLOADED else f"{group} {worst}"
     if len(names) == 1:
-        return f"All readings are of {name}: {rms[0]:.2g} times the noise rms."
-    return f"Worst is {name} with {rms.max():.2g} times the noise rms; best, {rms.min():.2g} times."
+        return f"All readings are of {name}: {most} times the noise rms."
+    return f"Worst is {name} with {most} times the noise rms; best, {least} times."
 
 
 def _residuals(d: ChartReadings, x: Floats, title: str, sentence: str) -> go.Figure:
@@ -377,7 +378,8 @@ def misfit_shares(d: Diagnosis) -> go.Figure:
         return empty("The misfit follows no recorded variable.")
     shares, names = [100 * v.share for v in rows], [v.variable for v in rows]
     hover = [f"{v.variable}: {100 * v.share:.0f} %, {numbers.p_equals(v.p_value)}" for v in rows]
-    colors = [MEASURED if v.p_value < CERTAIN else GREY for v in rows]
+    clear = beyond_chance(d.misfit_breakdown)
+    colors = [MEASURED if v in clear else GREY for v in rows]
     says = f"{dependence_sentence(d.misfit_breakdown)} Grey bars are within chance."
     return bars(names, shares, hover, says, "share of the misfit [%]", colors)
 
