@@ -47,8 +47,6 @@ LEVELS = (GREY, AMBER, RED)
 SYMBOLS = ("circle", "diamond", "x")  # of the levels, distinct without colours
 CONFIG: dict[str, object] = {"displayModeBar": False, "responsive": True, "scrollZoom": False}
 """Options for plotly.js: no toolbar, and the wheel scrolls the page."""
-SIGMA_LIMITS = np.sqrt(chdtri(3, 1.0 - np.array(LIMITS))).tolist()
-"""Mahalanobis distances above which a reading is doubtful, and outside."""
 _INK = {False: ("#24272e", "#d9dbe0"), True: ("#e4e5e9", "#3b3f48")}
 MAX_POINTS = 1500  # points of a chart; a choice that limits a page to 8 MB
 MOST_POSES, LONGEST_NAME = 16, 12  # poses that are all named at the axis; characters of a name
@@ -219,6 +217,11 @@ def chart_readings(
     return ChartReadings(story, revision, worst_and_even(revision.whitened_norm2, max_points))
 
 
+def sigma_limits(elements: int) -> list[float]:
+    """Return the Mahalanobis distances above which a reading is doubtful, and outside."""
+    return [float(v) for v in np.sqrt(chdtri(elements, 1.0 - np.array(LIMITS)))]
+
+
 def residual_by_pose(story: Story, revision: StoryRevision) -> go.Figure:
     """Draw the residual of each reading in σ over its pose, poses by number."""
     d, full = chart_readings(story, revision), [story.pose_name(int(i)) for i in story.first]
@@ -250,8 +253,8 @@ def residual_over(
     high = x > np.median(x)
     says = f"{name} is the same for all readings."
     if high.any():
-        sigma = revision.sigma / 3**0.5
-        low, beyond = (np.sqrt(np.mean(sigma[members] ** 2)) for members in (~high, high))
+        share = revision.whitened_norm2 / revision.elements
+        low, beyond = (np.sqrt(np.mean(share[members])) for members in (~high, high))
         median = f"{np.median(x):.0f}{unit if unit == '°' else f' {unit}'}".strip()
         says = (
             f"Residual over {name}: {numbers.digits(low, 2)} times the noise rms up to {median}, "
@@ -279,7 +282,7 @@ def residual_by_time(story: Story, revision: StoryRevision) -> go.Figure:
 def _extremes(story: Story, revision: StoryRevision, group: str) -> str:
     poses = [story.pose_name(i) for i in range(len(story))]
     names, row = np.unique(poses if group == "pose" else story.load_names, return_inverse=True)
-    rms = np.sqrt(np.bincount(row, revision.sigma**2 / 3) / np.bincount(row))
+    rms = np.sqrt(np.bincount(row, revision.whitened_norm2 / revision.elements) / np.bincount(row))
     worst = names[int(np.argmax(rms))]
     most, least = numbers.digits(rms.max(), 2), numbers.digits(rms.min(), 2)
     name = "the unloaded readings" if worst == UNLOADED else f"{group} {worst}"
@@ -293,7 +296,8 @@ def _residuals(d: ChartReadings, x: Floats, title: str, sentence: str) -> go.Fig
     y = d.revision.sigma[d.index]
     traces = [d.marks(x, y, k, rows, customdata=d.index[rows]) for k, rows in d.by_level()]
     out = figure(sentence + d.note, x=title, y="residual [σ]", traces=traces, height=320)
-    for limit, color in zip(SIGMA_LIMITS, (AMBER, RED), strict=True):
+    limits = sigma_limits(int(np.max(d.revision.elements)))
+    for limit, color in zip(limits, (AMBER, RED), strict=True):
         out.add_hline(limit, line={"color": color, "dash": "dot", "width": 1})
     return out.update_yaxes(rangemode="tozero")
 

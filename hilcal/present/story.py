@@ -33,7 +33,7 @@ from hilcal.types import Floats, Ints
 
 Mode = Literal["deflection", "absolute"]
 LEVEL_NAMES = ("inside the noise", "doubtful", "outside the noise")
-LIMITS = (0.99, 0.9999)  # quantiles of χ²(3) above which a reading is doubtful, and outside
+LIMITS = (0.99, 0.9999)  # quantiles of χ² above which a reading is doubtful, and outside
 MAX_NUMBER = 10**9
 UNDIAGNOSED = "not diagnosed"
 MIN_SHARE = 0.2
@@ -43,9 +43,10 @@ MIN_CARRIED_SHARE = 0.02  # share of the misfit below which a variable is not sh
 MOST_SUSPECTS, MOST_PARAMETERS = 3, 40
 
 
-def levels(norm2: Floats) -> Ints:
-    """Return the index (N,) into `LEVEL_NAMES` of squared Mahalanobis distances (N,), 3 dof."""
-    return np.digitize(norm2, scipy.stats.chi2.ppf(LIMITS, 3)).astype(np.int64)
+def levels(norm2: Floats, elements: Ints | int = 3) -> Ints:
+    """Return the index (N,) into `LEVEL_NAMES` of squared Mahalanobis distances (N,)."""
+    limits = (scipy.stats.chi2.ppf(q, elements) for q in LIMITS)
+    return np.sum([norm2 >= limit for limit in limits], axis=0, dtype=np.int64)
 
 
 def worst_and_even(badness: Floats, count: int) -> Ints:
@@ -83,7 +84,7 @@ class StoryRevision:
     verdict: str  # a verdict of `diagnose`, or `UNDIAGNOSED`
     residual: Floats  # (N, 3) measured - predicted, base axes, m
     predicted: Floats  # (N, 3) position, or deflection vector in deflection mode, m
-    whitened_norm2: Floats  # (N,) squared Mahalanobis distances, 3 degrees of freedom
+    whitened_norm2: Floats  # (N,) squared Mahalanobis distances
     error: ErrorBlock  # of the fitted readings
     holdout: ErrorBlock  # of whole poses left out
     cells: tuple[str, ...] = ()  # row of a table of revisions
@@ -91,6 +92,7 @@ class StoryRevision:
     """Blocks of the panels "verdict", "details" and "parameters"."""
     dependence: DependenceCurve | None = None  # the residual over its strongest cause
     laws: tuple[DependenceCurve, ...] = ()  # curves of laws that the catalogue lacks
+    elements: Ints | int = 3  # (N,) degrees of freedom of each reading: 1 of a distance or height
 
     @property
     def size_m(self) -> Floats:
@@ -105,7 +107,7 @@ class StoryRevision:
     @property
     def level(self) -> Ints:
         """(N,) index of each reading into `LEVEL_NAMES`."""
-        return levels(self.whitened_norm2)
+        return levels(self.whitened_norm2, self.elements)
 
     @property
     def name(self) -> str:
@@ -295,6 +297,7 @@ def _revision(c: Chapter, e: FullPrediction, residual: Floats, measured: Floats)
         },
         dependence=drawn,
         laws=laws(c.fit),
+        elements=np.where(e.readings.scalar[e.whitening.reading], 1, 3),
     )
 
 

@@ -66,7 +66,7 @@ def test_residuals_are_mahalanobis_distances_with_their_names_colours_and_marks(
     told, r = first
     timed = replace(told, time_s=60.0 * np.arange(len(told)))
     by_joint = charts.residual_by_joint(told, r, 1)
-    limits = (0.0, *charts.SIGMA_LIMITS, np.inf)
+    limits = (0.0, *charts.sigma_limits(3), np.inf)
     for figure in (
         charts.residual_by_pose(told, r),
         charts.residual_by_load(told, r),
@@ -88,6 +88,22 @@ def test_residuals_are_mahalanobis_distances_with_their_names_colours_and_marks(
     size = 1e6 * np.linalg.norm(r.residual[worst])
     name = f"{told.pose_name(worst)}, {told.load_names[worst]}: {size:.0f} µm"
     assert any(text.startswith(name) for trace in by_joint.data for text in trace.text)
+
+
+def test_a_distance_has_one_element(first):
+    """Whole readings of one element: their rms in σ, their levels and the lines are its own."""
+    told, r = first
+    one = replace(r, elements=np.ones(len(told), dtype=int))
+    assert one.level.sum() > r.level.sum()
+    figure = charts.residual_by_load(told, one)
+    rms = np.sqrt([np.mean(one.whitened_norm2[of]) for of in _by_load(told)])
+    assert f"with {numbers.digits(max(rms), 2)} times the noise rms" in description_of(figure)
+    lines = [shape.y0 for shape in figure.layout.shapes]
+    np.testing.assert_allclose(lines, [2.5758, 3.8906], atol=1e-4)  # of a normal distribution
+
+
+def _by_load(told):
+    return [np.array(told.load_names) == name for name in set(told.load_names)]
 
 
 @pytest.mark.parametrize("plane", ["xy", "xz"])
