@@ -281,8 +281,10 @@ def residual_by_time(story: Story, revision: StoryRevision) -> go.Figure:
 
 def _extremes(story: Story, revision: StoryRevision, group: str) -> str:
     poses = [story.pose_name(i) for i in range(len(story))]
-    names, row = np.unique(poses if group == "pose" else story.load_names, return_inverse=True)
-    rms = np.sqrt(np.bincount(row, revision.whitened_norm2 / revision.elements) / np.bincount(row))
+    of = np.array(poses if group == "pose" else story.load_names)[story.fitted]
+    names, row = np.unique(of, return_inverse=True)
+    share = (revision.whitened_norm2 / revision.elements)[story.fitted]
+    rms = np.sqrt(np.bincount(row, share) / np.bincount(row))
     worst = names[int(np.argmax(rms))]
     most, least = numbers.digits(rms.max(), 2), numbers.digits(rms.min(), 2)
     name = "the unloaded readings" if worst == UNLOADED else f"{group} {worst}"
@@ -315,8 +317,9 @@ def measured_predicted(story: Story, revision: StoryRevision) -> go.Figure:
         points = (x[d.index, k], y[d.index, k], color, SYMBOLS[k])
         traces.append(marks(*points, name=f"base {axis}", text=text, hovertemplate=hover))
     measure = "deflection" if story.mode == "deflection" else "deviation from the nominal arm"
-    total = np.sum((y - y.mean(axis=0)) ** 2)
-    share = 100 * (1 - np.sum((y - x) ** 2) / total) if total > 0 else 0.0
+    known, found = x[story.fitted], y[story.fitted]
+    total = np.sum((found - found.mean(axis=0)) ** 2)
+    share = 100 * (1 - np.sum((found - known) ** 2) / total) if total > 0 else 0.0
     says = (
         f"Measured against predicted {measure}: the model accounts for {share:.1f} % of what was "
         f"measured.{d.note}"

@@ -29,7 +29,7 @@ from hilcal.present.verdict import message
 from hilcal.robot.arm import Arm
 from hilcal.robot.scene import body_poses
 from hilcal.store.revision import change
-from hilcal.types import Floats, Ints
+from hilcal.types import Bools, Floats, Ints
 
 Mode = Literal["deflection", "absolute"]
 LEVEL_NAMES = ("inside the noise", "doubtful", "outside the noise")
@@ -134,6 +134,12 @@ class Story:
     pose_names: tuple[str, ...] = ()  # (N,); empty if the numbers are the names
     time_s: Floats | None = None  # (N,); None: unknown
     growing: bool = False  # whether further revisions may follow
+    set_aside: Bools | None = None  # (N,) gross errors, or deflections from them; None: none
+
+    @cached_property
+    def fitted(self) -> Ints:
+        """(K,) the readings that were not set aside."""
+        return np.arange(len(self)) if self.set_aside is None else np.flatnonzero(~self.set_aside)
 
     @cached_property
     def poses(self) -> Ints:
@@ -231,6 +237,7 @@ def build_story(chapters: Sequence[Chapter]) -> Story:
         target_names=readings.target_names,
         pose_names=tuple(readings.pose_names[k] for k in readings.pose[rows]),
         time_s=None if states.time is None else states.time[rows],
+        set_aside=~np.isin(rows, np.flatnonzero(~fit.outlier)[fit.whitening.reading]),
     )
 
 

@@ -1,5 +1,6 @@
 """The values that charts draw are those of the fit, the diagnosis or the story."""
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -100,6 +101,21 @@ def test_a_distance_has_one_element(first):
     assert f"with {numbers.digits(max(rms), 2)} times the noise rms" in description_of(figure)
     lines = [shape.y0 for shape in figure.layout.shapes]
     np.testing.assert_allclose(lines, [2.5758, 3.8906], atol=1e-4)  # of a normal distribution
+
+
+def test_gross_errors_are_drawn_and_in_no_sentence(first):
+    told, r = first
+    off = np.arange(len(told)) == 3
+    measured, norm2 = told.measured + off[:, None], np.where(off, 1e8, r.whitened_norm2)
+    wrong = replace(r, residual=r.residual + off[:, None], whitened_norm2=norm2)
+    story = replace(told, measured=measured, set_aside=off)
+    for draw in (charts.residual_by_pose, charts.residual_by_load):
+        figure = draw(story, wrong)
+        assert points(figure, "y").max() == pytest.approx(1e4)
+        assert not re.search(r"\d{3,} times", description_of(figure))
+    share = re.search(r"for ([0-9.]+) %", description_of(charts.measured_predicted(story, wrong)))
+    before = re.search(r"for ([0-9.]+) %", description_of(charts.measured_predicted(told, r)))
+    assert float(share[1]) == pytest.approx(float(before[1]), abs=2.0)
 
 
 def _by_load(told):
