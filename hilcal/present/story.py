@@ -46,7 +46,7 @@ MOST_SUSPECTS, MOST_PARAMETERS = 3, 40
 def levels(norm2: Floats, elements: Ints | int = 3) -> Ints:
     """Return the index (N,) into `LEVEL_NAMES` of squared Mahalanobis distances (N,)."""
     limits = (scipy.stats.chi2.ppf(q, elements) for q in LIMITS)
-    return np.sum([norm2 >= limit for limit in limits], axis=0, dtype=np.int64)
+    return np.asarray(np.sum([norm2 >= limit for limit in limits], axis=0), dtype=np.int64)
 
 
 def worst_and_even(badness: Floats, count: int) -> Ints:
