@@ -126,7 +126,7 @@ def compensate(
         )
     if slow := calibration.without_kernel(task.tool):
         t.notice(
-            f"note: {', '.join(slow)} has no compiled form: a point takes 25 to 60 ms, not 0.1 ms"
+            f"note: no compiled form of {', '.join(slow)}: a point takes 25 to 60 ms, not 0.1 ms"
         )
     pairs = zip(unclear, refusals(result, options.outside), strict=True)
     refused = ["; ".join(filter(None, pair)) for pair in pairs]

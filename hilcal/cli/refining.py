@@ -31,7 +31,7 @@ from hilcal.identification.baseline import loads_note
 from hilcal.identification.fit import all_left_out, fit
 from hilcal.identification.fit_document import frames_to_json, prior_to_json
 from hilcal.identification.linearisation import linearise
-from hilcal.identification.prediction.full_prediction import full_prediction
+from hilcal.identification.prediction.full_prediction import full_prediction, gross_errors
 from hilcal.identification.registration.misdescription import other_arm_of
 from hilcal.identification.torques import check_torques
 from hilcal.names import quoted
@@ -63,6 +63,8 @@ from hilcal.tables.units import parse_length
 from hilcal.transfer.compare import compare as compare_campaigns
 from hilcal.transfer.compare import validate as validate_campaign
 from hilcal.whole_file import replace_file, spare_other
+
+MOST_GROSS = 20  # gross errors that compare names
 
 
 def chapters_of(numbers: Iterable[int], steps: Iterable[RefinementStep]) -> list[Chapter]:
@@ -432,6 +434,9 @@ def _show_misfit(t: Terminal, run: Path, revision: int | None, catalogue: Catalo
     )
     t.show([*fit_words.where_table(places), ""])
     t.show(fit_words.worst_table(worst, left_out))
+    if gross := [f"{g.pose}/{g.load}" for g in gross_errors(fitted)]:
+        told = "Readings set aside as gross errors may be among these, and are in no figure above"
+        t.show(f"{told}: {numbers.few(gross, MOST_GROSS)}.")
     t.document(
         revision=number,
         model=list(fitted.model.named),

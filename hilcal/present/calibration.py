@@ -246,7 +246,7 @@ def compensation_report(
     errors, bands = c.before.error_m, c.after.band_m
     expected = length(float(np.sqrt(np.mean(c.after.std_m**2))))
     uncorrected = "the unloaded arm" if calibration.mode == "deflection" else "the nominal arm"
-    yield heading(f"{len(names)} points compensated")
+    yield heading(f"{len(names)} point{'s' * (len(names) != 1)} compensated")
     yield (
         f"  error before   {length(float(errors.mean()))} mean, "
         f"{length(float(errors.max()))} largest, from where {uncorrected} has the tool\n"

@@ -23,7 +23,7 @@ from hilcal.identification.carried.carried_prior import names_of
 from hilcal.identification.fit import Fit
 from hilcal.names import escaped
 from hilcal.present.document import load_name
-from hilcal.present.fit import CERTAIN, dependence_sentence
+from hilcal.present.fit import beyond_chance, dependence_sentence
 from hilcal.present.story import (
     LEVEL_NAMES,
     LIMITS,
@@ -47,8 +47,6 @@ LEVELS = (GREY, AMBER, RED)
 SYMBOLS = ("circle", "diamond", "x")  # of the levels, distinct without colours
 CONFIG: dict[str, object] = {"displayModeBar": False, "responsive": True, "scrollZoom": False}
 """Options for plotly.js: no toolbar, and the wheel scrolls the page."""
-SIGMA_LIMITS = np.sqrt(chdtri(3, 1.0 - np.array(LIMITS))).tolist()
-"""Mahalanobis distances above which a reading is doubtful, and outside."""
 _INK = {False: ("#24272e", "#d9dbe0"), True: ("#e4e5e9", "#3b3f48")}
 MAX_POINTS = 1500  # points of a chart; a choice that limits a page to 8 MB
 MOST_POSES, LONGEST_NAME = 16, 12  # poses that are all named at the axis; characters of a name
@@ -219,6 +217,11 @@ def chart_readings(
     return ChartReadings(story, revision, worst_and_even(revision.whitened_norm2, max_points))
 
 
+def sigma_limits(elements: int) -> list[float]:
+    """Return the Mahalanobis distances above which a reading is doubtful, and outside."""
+    return [float(v) for v in np.sqrt(chdtri(elements, 1.0 - np.array(LIMITS)))]
+
+
 def residual_by_pose(story: Story, revision: StoryRevision) -> go.Figure:
     """Draw the residual of each reading in σ over its pose, poses by number."""
     d, full = chart_readings(story, revision), [story.pose_name(int(i)) for i in story.first]
@@ -250,12 +253,12 @@ def residual_over(
     high = x > np.median(x)
     says = f"{name} is the same for all readings."
     if high.any():
-        sigma = revision.sigma / 3**0.5
-        low, beyond = (np.sqrt(np.mean(sigma[members] ** 2)) for members in (~high, high))
+        share = revision.whitened_norm2 / revision.elements
+        low, beyond = (np.sqrt(np.mean(share[members])) for members in (~high, high))
         median = f"{np.median(x):.0f}{unit if unit == '°' else f' {unit}'}".strip()
         says = (
-            f"Residual over {name}: {low:.2g} times the noise rms up to {median}, "
-            f"{beyond:.2g} times beyond."
+            f"Residual over {name}: {numbers.digits(low, 2)} times the noise rms up to {median}, "
+            f"{numbers.digits(beyond, 2)} times beyond."
         )
     return _residuals(d, values[d.index], f"{name} [{unit}]" if unit else name, says)
 
@@ -278,13 +281,16 @@ def residual_by_time(story: Story, revision: StoryRevision) -> go.Figure:
 
 def _extremes(story: Story, revision: StoryRevision, group: str) -> str:
     poses = [story.pose_name(i) for i in range(len(story))]
-    names, row = np.unique(poses if group == "pose" else story.load_names, return_inverse=True)
-    rms = np.sqrt(np.bincount(row, revision.sigma**2 / 3) / np.bincount(row))
+    of = np.array(poses if group == "pose" else story.load_names)[story.fitted]
+    names, row = np.unique(of, return_inverse=True)
+    share = (revision.whitened_norm2 / revision.elements)[story.fitted]
+    rms = np.sqrt(np.bincount(row, share) / np.bincount(row))
     worst = names[int(np.argmax(rms))]
+    most, least = numbers.digits(rms.max(), 2), numbers.digits(rms.min(), 2)
     name = "the unloaded readings" if worst == UNLOADED else f"{group} {worst}"
     if len(names) == 1:
-        return f"All readings are of {name}: {rms[0]:.2g} times the noise rms."
-    return f"Worst is {name} with {rms.max():.2g} times the noise rms; best, {rms.min():.2g} times."
+        return f"All readings are of {name}: {most} times the noise rms."
+    return f"Worst is {name} with {most} times the noise rms; best, {least} times."
 
 
 def _residuals(d: ChartReadings, x: Floats, title: str, sentence: str) -> go.Figure:
@@ -292,7 +298,8 @@ def _residuals(d: ChartReadings, x: Floats, title: str, sentence: str) -> go.Fig
     y = d.revision.sigma[d.index]
     traces = [d.marks(x, y, k, rows, customdata=d.index[rows]) for k, rows in d.by_level()]
     out = figure(sentence + d.note, x=title, y="residual [σ]", traces=traces, height=320)
-    for limit, color in zip(SIGMA_LIMITS, (AMBER, RED), strict=True):
+    limits = sigma_limits(int(np.max(d.revision.elements)))
+    for limit, color in zip(limits, (AMBER, RED), strict=True):
         out.add_hline(limit, line={"color": color, "dash": "dot", "width": 1})
     return out.update_yaxes(rangemode="tozero")
 
@@ -310,8 +317,9 @@ def measured_predicted(story: Story, revision: StoryRevision) -> go.Figure:
         points = (x[d.index, k], y[d.index, k], color, SYMBOLS[k])
         traces.append(marks(*points, name=f"base {axis}", text=text, hovertemplate=hover))
     measure = "deflection" if story.mode == "deflection" else "deviation from the nominal arm"
-    total = np.sum((y - y.mean(axis=0)) ** 2)
-    share = 100 * (1 - np.sum((y - x) ** 2) / total) if total > 0 else 0.0
+    known, found = x[story.fitted], y[story.fitted]
+    total = np.sum((found - found.mean(axis=0)) ** 2)
+    share = 100 * (1 - np.sum((found - known) ** 2) / total) if total > 0 else 0.0
     says = (
         f"Measured against predicted {measure}: the model accounts for {share:.1f} % of what was "
         f"measured.{d.note}"
@@ -377,7 +385,8 @@ def misfit_shares(d: Diagnosis) -> go.Figure:
         return empty("The misfit follows no recorded variable.")
     shares, names = [100 * v.share for v in rows], [v.variable for v in rows]
     hover = [f"{v.variable}: {100 * v.share:.0f} %, {numbers.p_equals(v.p_value)}" for v in rows]
-    colors = [MEASURED if v.p_value < CERTAIN else GREY for v in rows]
+    clear = beyond_chance(d.misfit_breakdown)
+    colors = [MEASURED if v in clear else GREY for v in rows]
     says = f"{dependence_sentence(d.misfit_breakdown)} Grey bars are within chance."
     return bars(names, shares, hover, says, "share of the misfit [%]", colors)
 

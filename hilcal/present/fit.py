@@ -255,9 +255,19 @@ def measurements(mode: str, readings: Readings) -> str:
     return "readings" if readings.scalar.any() else "positions"
 
 
+def beyond_chance(places: Sequence[MisfitShare]) -> list[MisfitShare]:
+    """Return the variables that count as followed, given the number of those tested."""
+    level = FALSE_ALARM / max(_tested(places), 1)
+    return [p for p in places if p.p_value < level]
+
+
+def _tested(places: Sequence[MisfitShare]) -> int:
+    return sum(p.group not in ("pose", "direction") for p in places)
+
+
 def dependence_sentence(places: Sequence[MisfitShare]) -> str:
     """Return a sentence on the variables that the misfit follows."""
-    clear = [p for p in places if p.p_value < CERTAIN and p.share > 0.05]
+    clear = [p for p in beyond_chance(places) if p.share > 0.05]
     sides = [p for p in clear if p.variable.startswith("direction") and p.share > 0.5]
     same = [p for p in clear if p.variable == POSE and p.share > 0.5]
     causes = [p for p in clear if p.variable != POSE and not p.variable.startswith("direction")][:3]
@@ -285,8 +295,7 @@ def where_table(places: Sequence[MisfitShare]) -> Iterator[Block]:
                 out.add(name, percent(p.share), numbers.chance(p.p_value))
     if shown:
         yield out
-    tested = sum(p.group not in ("pose", "direction") for p in places)
-    tests, remainder = numbers.many_tests(tested, FALSE_ALARM, "variables"), ""
+    tests, remainder = numbers.many_tests(_tested(places), FALSE_ALARM, "variables"), ""
     if small := len(places) - len(shown):
         remainder = f"; {small} more {'is' if small == 1 else 'are'} below {percent(LEAST_SHARE)}"
     yield note(

@@ -64,7 +64,7 @@ def _observer(o: Observer) -> str:
         offset = f", offset {1e3 * o.offset:.3f} mm" if 3 in o.free else ""
         return f"{o.name} is at {_place(se3.matrix(np.eye(3), inverse[:3, 3]))}{offset}"
     if o.name.kind == "gauge":
-        unit = ", ".join(f"{x:.4f}" for x in o.frame[0, :3])
+        unit = ", ".join(f"{x:z.4f}" for x in o.frame[0, :3])
         return f"{o.name} has the direction ({unit}) and reads 0 {-o.frame[0, 3]:.5f} m along it"
     return f"{o.name} stands at {_place(inverse)}"
 
@@ -144,7 +144,7 @@ def _axis_words(v: Floats, axes: str) -> str:
     k, unit = int(np.argmax(np.abs(v))), v / np.linalg.norm(v)
     if abs(unit[k]) > ALONG:
         return f"{axes} {'xyz'[k]}"
-    return f"{axes} direction ({', '.join(f'{x:.2f}' for x in unit)})"
+    return f"{axes} direction ({', '.join(f'{x:z.2f}' for x in unit)})"
 
 
 def _targets(cell: Cell) -> str:
@@ -155,11 +155,11 @@ def _targets(cell: Cell) -> str:
 
 
 def _place(t: Floats, places: tuple[int, int] = DECIMALS) -> str:
-    place = ", ".join(f"{x:.{places[0]}f}" for x in t[:3, 3])
+    place = ", ".join(f"{x:z.{places[0]}f}" for x in t[:3, 3])
     turn = np.degrees(se3.rotation_vector(t[:3, :3]))
     if not np.any(np.abs(turn) > 1e-9):
         return f"({place}) m"
-    rotation = ", ".join(f"{x:.{places[1]}f}" for x in turn)
+    rotation = ", ".join(f"{x:z.{places[1]}f}" for x in turn)
     return f"({place}) m, turned by the rotation vector ({rotation})°"
 
 

@@ -29,11 +29,11 @@ from hilcal.present.verdict import message
 from hilcal.robot.arm import Arm
 from hilcal.robot.scene import body_poses
 from hilcal.store.revision import change
-from hilcal.types import Floats, Ints
+from hilcal.types import Bools, Floats, Ints
 
 Mode = Literal["deflection", "absolute"]
 LEVEL_NAMES = ("inside the noise", "doubtful", "outside the noise")
-LIMITS = (0.99, 0.9999)  # quantiles of χ²(3) above which a reading is doubtful, and outside
+LIMITS = (0.99, 0.9999)  # quantiles of χ² above which a reading is doubtful, and outside
 MAX_NUMBER = 10**9
 UNDIAGNOSED = "not diagnosed"
 MIN_SHARE = 0.2
@@ -43,9 +43,10 @@ MIN_CARRIED_SHARE = 0.02  # share of the misfit below which a variable is not sh
 MOST_SUSPECTS, MOST_PARAMETERS = 3, 40
 
 
-def levels(norm2: Floats) -> Ints:
-    """Return the index (N,) into `LEVEL_NAMES` of squared Mahalanobis distances (N,), 3 dof."""
-    return np.digitize(norm2, scipy.stats.chi2.ppf(LIMITS, 3)).astype(np.int64)
+def levels(norm2: Floats, elements: Ints | int = 3) -> Ints:
+    """Return the index (N,) into `LEVEL_NAMES` of squared Mahalanobis distances (N,)."""
+    limits = (scipy.stats.chi2.ppf(q, elements) for q in LIMITS)
+    return np.asarray(np.sum([norm2 >= limit for limit in limits], axis=0), dtype=np.int64)
 
 
 def worst_and_even(badness: Floats, count: int) -> Ints:
@@ -83,7 +84,7 @@ class StoryRevision:
     verdict: str  # a verdict of `diagnose`, or `UNDIAGNOSED`
     residual: Floats  # (N, 3) measured - predicted, base axes, m
     predicted: Floats  # (N, 3) position, or deflection vector in deflection mode, m
-    whitened_norm2: Floats  # (N,) squared Mahalanobis distances, 3 degrees of freedom
+    whitened_norm2: Floats  # (N,) squared Mahalanobis distances
     error: ErrorBlock  # of the fitted readings
     holdout: ErrorBlock  # of whole poses left out
     cells: tuple[str, ...] = ()  # row of a table of revisions
@@ -91,6 +92,7 @@ class StoryRevision:
     """Blocks of the panels "verdict", "details" and "parameters"."""
     dependence: DependenceCurve | None = None  # the residual over its strongest cause
     laws: tuple[DependenceCurve, ...] = ()  # curves of laws that the catalogue lacks
+    elements: Ints | int = 3  # (N,) degrees of freedom of each reading: 1 of a distance or height
 
     @property
     def size_m(self) -> Floats:
@@ -105,7 +107,7 @@ class StoryRevision:
     @property
     def level(self) -> Ints:
         """(N,) index of each reading into `LEVEL_NAMES`."""
-        return levels(self.whitened_norm2)
+        return levels(self.whitened_norm2, self.elements)
 
     @property
     def name(self) -> str:
@@ -132,6 +134,12 @@ class Story:
     pose_names: tuple[str, ...] = ()  # (N,); empty if the numbers are the names
     time_s: Floats | None = None  # (N,); None: unknown
     growing: bool = False  # whether further revisions may follow
+    set_aside: Bools | None = None  # (N,) gross errors, or deflections from them; None: none
+
+    @cached_property
+    def fitted(self) -> Ints:
+        """(K,) the readings that were not set aside."""
+        return np.arange(len(self)) if self.set_aside is None else np.flatnonzero(~self.set_aside)
 
     @cached_property
     def poses(self) -> Ints:
@@ -229,6 +237,7 @@ def build_story(chapters: Sequence[Chapter]) -> Story:
         target_names=readings.target_names,
         pose_names=tuple(readings.pose_names[k] for k in readings.pose[rows]),
         time_s=None if states.time is None else states.time[rows],
+        set_aside=~np.isin(rows, np.flatnonzero(~fit.outlier)[fit.whitening.reading]),
     )
 
 
@@ -295,6 +304,7 @@ def _revision(c: Chapter, e: FullPrediction, residual: Floats, measured: Floats)
         },
         dependence=drawn,
         laws=laws(c.fit),
+        elements=np.where(e.readings.scalar[e.whitening.reading], 1, 3),
     )
 
 

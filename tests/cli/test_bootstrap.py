@@ -121,6 +121,8 @@ def test_what_is_set_aside_is_in_no_figure_of_the_fit(tmp_path, capsys):
             q = opened.readings.states.q[::7] + 0.01
             found[name] = d["error"], opened.calibration().predict(q).band_m
     assert len(d["outliers"]) == 1
+    said = " ".join(ok(capsys, "compare", run).out.split())
+    assert "set aside as gross errors may be among these, and are in no figure above: p" in said
     (good, band), (off, its) = found.values()
     for key in ("before", "fit", "holdout"):
         assert off[key]["rms_m"] == pytest.approx(good[key]["rms_m"], rel=0.1)
@@ -132,6 +134,7 @@ def test_errors_of_centimetres_are_named_at_import(tmp_path, capsys):
     readings, wrong = spoil(rehearsal("nothing").readings, 0.3, 5e-2, np.random.default_rng(0))
     run, said = imported_readings(readings, tmp_path, capsys)
     assert f"{len(wrong)} of {len(readings)} rows do not fit" in said
+    assert "A fit sets aside those that it finds to be gross errors" in " ".join(said.split())
     d = ok(capsys, "identify", run, "--readings", "absolute", "--json").document
     assert len(d["outliers"]) == len(wrong)
 

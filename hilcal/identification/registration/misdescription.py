@@ -131,7 +131,8 @@ class DescriptionFinding:
             line = f"{begin}: {'; or, as well: '.join(causes)}"
             return f"{line}; besides, {rows}" if rows else line
         if rows and not self.refused:
-            return f"{rows}; the others fit {note}. They are left out of a fit"
+            aside = "A fit sets aside those that it finds to be gross errors"
+            return f"{rows}; the others fit {note}. {aside}"
         if rows:
             return f"{begin}: {rows}; the others fit. Correct or remove them"
         return (

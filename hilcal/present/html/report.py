@@ -314,7 +314,7 @@ def _conditions(m: ReportContent) -> Iterator[Block]:
         for name, ends in (("from", q.min(axis=0)), ("to", q.max(axis=0)))
     ]
     heads = ("joint", *(str(j + 1) for j in range(q.shape[1])))
-    yield table(*heads, caption="Joint angles that were measured", rows=rows)
+    yield table(*heads, caption=f"Joint {_values(m)} that were measured", rows=rows)
     if m.test is not None:
         return
     error, fitted = left_out_errors(m.fit), r[~m.fit.outlier][m.fit.whitening.reading]
@@ -332,13 +332,17 @@ def _conditions(m: ReportContent) -> Iterator[Block]:
     yield out
 
 
+def _values(m: ReportContent) -> str:
+    return "values" if m.fit.model.cell.arm.slides.any() else "angles"
+
+
 def _not_tested(m: ReportContent) -> Iterator[str]:
     s, fit, d = m.fit.readings.states, m.fit, m.diagnosis
     if m.test is None:
         yield "No validation campaign: the errors are those of poses left out in turn."
     elif not m.test.validation.judged.unseen:
         yield f"{m.test.name} was fitted itself: it tests nothing."
-    yield "Joint angles outside of the ranges above, and loads other than those above."
+    yield f"Joint {_values(m)} outside of the ranges above, and loads other than those above."
     if not np.any(s.wrench):
         yield "Any load: all readings are unloaded."
     for values, name in (

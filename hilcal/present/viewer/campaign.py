@@ -300,7 +300,7 @@ def _pose_bars(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
     """Log the worst reading of each bar's poses, in σ, one series per level."""
     _, left, width, height = _bar_places(story, r)
     for i, name in enumerate(style.LEVEL_NAMES):
-        members = levels(height**2) == i
+        members = levels(height**2, int(np.max(r.elements))) == i
         # a level without members gets a bar of height 0
         some = members if members.any() else np.arange(len(height)) == 0
         color, tall = style.LEVEL_COLORS[i].tolist(), np.where(members, height, 0.0)[some]

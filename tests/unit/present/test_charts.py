@@ -1,5 +1,6 @@
 """The values that charts draw are those of the fit, the diagnosis or the story."""
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -66,7 +67,7 @@ def test_residuals_are_mahalanobis_distances_with_their_names_colours_and_marks(
     told, r = first
     timed = replace(told, time_s=60.0 * np.arange(len(told)))
     by_joint = charts.residual_by_joint(told, r, 1)
-    limits = (0.0, *charts.SIGMA_LIMITS, np.inf)
+    limits = (0.0, *charts.sigma_limits(3), np.inf)
     for figure in (
         charts.residual_by_pose(told, r),
         charts.residual_by_load(told, r),
@@ -88,6 +89,37 @@ def test_residuals_are_mahalanobis_distances_with_their_names_colours_and_marks(
     size = 1e6 * np.linalg.norm(r.residual[worst])
     name = f"{told.pose_name(worst)}, {told.load_names[worst]}: {size:.0f} µm"
     assert any(text.startswith(name) for trace in by_joint.data for text in trace.text)
+
+
+def test_a_distance_has_one_element(first):
+    """Whole readings of one element: their rms in σ, their levels and the lines are its own."""
+    told, r = first
+    one = replace(r, elements=np.ones(len(told), dtype=int))
+    assert one.level.sum() > r.level.sum()
+    figure = charts.residual_by_load(told, one)
+    rms = np.sqrt([np.mean(one.whitened_norm2[of]) for of in _by_load(told)])
+    assert f"with {numbers.digits(max(rms), 2)} times the noise rms" in description_of(figure)
+    lines = [shape.y0 for shape in figure.layout.shapes]
+    np.testing.assert_allclose(lines, [2.5758, 3.8906], atol=1e-4)  # of a normal distribution
+
+
+def test_gross_errors_are_drawn_and_in_no_sentence(first):
+    told, r = first
+    off = np.arange(len(told)) == 3
+    measured, norm2 = told.measured + off[:, None], np.where(off, 1e8, r.whitened_norm2)
+    wrong = replace(r, residual=r.residual + off[:, None], whitened_norm2=norm2)
+    story = replace(told, measured=measured, set_aside=off)
+    for draw in (charts.residual_by_pose, charts.residual_by_load):
+        figure = draw(story, wrong)
+        assert points(figure, "y").max() == pytest.approx(1e4)
+        assert not re.search(r"\d{3,} times", description_of(figure))
+    share = re.search(r"for ([0-9.]+) %", description_of(charts.measured_predicted(story, wrong)))
+    before = re.search(r"for ([0-9.]+) %", description_of(charts.measured_predicted(told, r)))
+    assert float(share[1]) == pytest.approx(float(before[1]), abs=2.0)
+
+
+def _by_load(told):
+    return [np.array(told.load_names) == name for name in set(told.load_names)]
 
 
 @pytest.mark.parametrize("plane", ["xy", "xz"])

@@ -20,11 +20,22 @@ from hilcal.effects.options import typical_compliances
 from hilcal.identification.fit_document import to_json
 from hilcal.identification.linearisation import linearise
 from hilcal.identification.prediction.full_prediction import full_prediction, nominal_error
+from hilcal.identification.registration.robot_frames import robot_frames
+from hilcal.model.model import Model
 from hilcal.present.diagnosis import curves, diagnosis_report, suspects_table
-from hilcal.present.fit import before_and_after, errors, fit_report, where_table, worst_poses
+from hilcal.present.fit import (
+    before_and_after,
+    dependence_sentence,
+    errors,
+    fit_report,
+    where_table,
+    worst_poses,
+)
+from hilcal.present.registration import base_line
 from hilcal.present.story import Chapter, build_story
 from hilcal.present.verdict import message
 from hilcal.present.viewer import campaign as viewer
+from hilcal.robot import se3
 from tests.support.campaigns import campaign, cell_of, noiseless, plan, with_noise, world_of
 from tests.support.fit_cases import fitted_model
 from tests.support.rows import first
@@ -87,6 +98,9 @@ def test_what_rounding_leaves_is_no_number():
         ("rad/(N·m)", [1e-5], ("µrad/(N·m)", 1e6)),
         ("furlong", [1.0], ("furlong", 1.0)),
         ("m", [], ("µm", 1e6)),
+        ("rad/(N·m)³", [2.1e-9], ("prad/(N·m)³", 1e12)),
+        ("rad/(N·m)³", [1.2e-7], ("nrad/(N·m)³", 1e9)),
+        ("m/N³", [1.7e-12], ("fm/N³", 1e15)),
     ],
 )
 def test_units_follow_the_largest_value(unit, values, expected):
@@ -203,6 +217,25 @@ def test_variables_stand_in_groups_and_those_without_a_share_are_counted(shown):
     assert "joint 1 angle" not in told
     assert not re.search(r"(?<!\d)0 %", told)
     assert "2 more are below 1 %" in told
+
+
+@pytest.mark.parametrize(
+    ("p", "followed"), [(0.003, "none of the variables"), (1e-5, "joint 2 torque (23 %)")]
+)
+def test_the_misfit_follows_what_counts_in_the_table(p, followed, shown):
+    """Of twenty variables one has such a p-value by chance."""
+    others = [MisfitShare(f"joint {k} angle", 0.02, 0.5) for k in range(1, 20)]
+    places = [MisfitShare("joint 2 torque", 0.23, p), *others]
+    assert "20 variables were tested: one counts from p < 5e-05" in shown(*where_table(places))
+    assert f"follows {followed}" in dependence_sentence(places)
+
+
+def test_a_place_has_no_negative_zero():
+    cell, turn = cell_of(), se3.rotation(np.array([-1e-5, 1e-5, -1.5]))
+    base = se3.matrix(turn, np.array([-1e-5, 2.0, -1e-5]))
+    frames = replace(robot_frames(Model(cell, ()), np.zeros(0)), base=base)
+    said = base_line(cell, frames, "deflection")
+    assert "at (0.000, 2.000, 0.000) m, turned by the rotation vector (0.00, 0.00, -85.94)" in said
 
 
 def test_a_curve_is_shown_only_where_it_is_determined_and_carries_something(shown):

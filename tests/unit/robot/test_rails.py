@@ -316,10 +316,13 @@ joint_std_rad = 1e-5
     out = ok(capsys, "compensate", run, points, "-o", tmp_path / "q.csv", "--json").document
     (point,) = out["points"]
     assert abs(point["q_corrected"][0] - 1.5) < 5e-3
+    assert "1 point compensated" in ok(capsys, "compensate", run, points).out
     header = (tmp_path / "q.csv").read_text().splitlines()[0]
     assert header.startswith("pose,q1_m,q2_rad")
     ok(capsys, "report", run, "-o", tmp_path / "r.html")
-    page = (tmp_path / "r.html").read_text()
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "Joint values that were measured" in page
+    assert "Joint values outside of the ranges" in page
     assert "joint 1 travel" in page
     ok(capsys, "export", run, "--urdf", tmp_path / "corrected.urdf")
     assert arm_from_urdf(tmp_path / "corrected.urdf").slides[0]
