@@ -54,6 +54,7 @@ from hilcal.stream import fit_stream as fit_all
 from hilcal.tables.mapped import import_readings
 from hilcal.tables.parquet_stream import open_stream
 from hilcal.types import Floats
+from hilcal.whole_file import replace_file
 
 PATHS = (str, Path)
 A_CELL = "a Cell, as hc.Cell.load('CELL.toml')"
@@ -108,7 +109,8 @@ def _read_frame(frame: "pd.DataFrame", cell: Cell, mapping: str | Path | None) -
     """Read a data frame as the CSV file that it writes, with an index that has a name."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "data frame"
-        frame.to_csv(path, index=any(name is not None for name in frame.index.names))
+        named = any(name is not None for name in frame.index.names)
+        replace_file(path, frame.to_csv(index=named))
         try:
             return read_table(path, cell, mapping)
         except InputError as error:
