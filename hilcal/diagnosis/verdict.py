@@ -69,6 +69,7 @@ from hilcal.diagnosis.noise import (
     prefers_instrument,
     within_repeatability,
 )
+from hilcal.diagnosis.order_step import step_in_order
 from hilcal.diagnosis.residual_regression import ResidualRegression
 from hilcal.identification.fit import Fit
 
@@ -90,7 +91,13 @@ def diagnose(
     Raises:
         InputError: a fit whose residual is not whitened.
     """
-    return judge(Evidence(fit, say=say), history)
+    return with_order_step(judge(Evidence(fit, say=say), history))
+
+
+def with_order_step(d: Diagnosis) -> Diagnosis:
+    """Return a diagnosis with the step in the order of the readings, where nothing else fits."""
+    unexplained = d.verdict in ("unknown_effect", "noise_misjudged") and not d.significant
+    return replace(d, step=step_in_order(d.fit)) if unexplained else d
 
 
 def judge_naming(

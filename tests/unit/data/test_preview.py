@@ -232,9 +232,11 @@ def test_encoder_counts_are_recognised(name, tmp_path):
     header = ["Punkt", *six(name), "X [mm]", "Y [mm]", "Z [mm]"]
     text = lines(header, POINTS, counts, MM, separator=",")
     proposal = propose(write(tmp_path / "a.csv", text), joints=6).proposal
-    assert "joints" not in proposal.sections and "position" in proposal.sections
+    assert "joints" not in proposal.sections
+    assert "position" in proposal.sections
     (sentence,) = proposal.missing
-    assert "look like encoder counts" in sentence and "counts per turn" in sentence
+    assert "look like encoder counts" in sentence
+    assert "counts per turn" in sentence
     assert {why for _, why in proposal.unused} == {"looks like encoder counts"}
 
 
