@@ -9,6 +9,7 @@ columns C_k of the displacement, zero before k,
 is χ² distributed without a step. The variances are estimated without a step, which enlarges them,
 so the test is conservative. The largest gain counts, at a level divided by the number of places.
 A drift in the order resembles a step; a step has to explain the readings better by 20 : 1.
+A serial correlation of the noise is not assumed: it would take up the step.
 """
 
 from collections.abc import Iterator
@@ -21,6 +22,7 @@ import scipy
 from hilcal.diagnosis.background_evidence import all_effects_at
 from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE
 from hilcal.errors import CannotAnswerError
+from hilcal.identification.background import allows_background
 from hilcal.identification.fit import Fit
 from hilcal.identification.mixed_fit import MOST_NOISE_ROWS, mixed_fit_at, shift_rows
 from hilcal.identification.outliers.data_snooping import FEWEST_IN_RUN
@@ -28,7 +30,7 @@ from hilcal.mixed.equations import Equations
 from hilcal.model.observe import motion
 from hilcal.types import Floats
 
-LEVEL = 0.01  # chance of a step where there is none; a choice
+LEVEL = 1e-3  # chance of a step where there is none; a choice
 RANK = 1e-9  # share of the largest eigenvalue below which a direction is not determined
 
 Moved = Literal["sensor", "target"]
@@ -53,10 +55,10 @@ def step_in_order(fit: Fit) -> OrderStep | None:
     """
     rows = np.flatnonzero(~fit.outlier)
     readings = fit.readings[rows].with_serial(None).as_stated()
-    few = len(readings) < 2 * FEWEST_IN_RUN
-    if fit.mode != "absolute" or few or readings.value.size > MOST_NOISE_ROWS:
+    count = readings.value.size
+    if len(readings) < 2 * FEWEST_IN_RUN or count > MOST_NOISE_ROWS:
         return None
-    if readings.observers:
+    if fit.mode != "absolute" or readings.observers or not allows_background(fit):
         return None
     model, theta = all_effects_at(fit, readings)
     try:

@@ -35,6 +35,9 @@ If several targets are read in one arrival, the arm's scatter is not stated and 
 rules are applied to the fit with the estimated scatter in its covariance (see
 `Evidence.with_arm_scatter`), and 3 becomes 5b or 5c.
 
+Where a step in the order of the readings explains what all effects leave (see `order_step`), as of
+a tracker that was moved, the verdict is `unknown_effect`, whatever else the rules say.
+
 The covariance of a judged fit includes a correlation of the noise along the order of the readings
 (see `serial_noise`). If it is not proved, since effects explain the readings as well, 3 and 5c
 become `ambiguous`.
@@ -95,9 +98,15 @@ def diagnose(
 
 
 def with_order_step(d: Diagnosis) -> Diagnosis:
-    """Return a diagnosis with the step in the order of the readings, where nothing else fits."""
-    unexplained = d.verdict in ("unknown_effect", "noise_misjudged") and not d.significant
-    return replace(d, step=step_in_order(d.fit)) if unexplained else d
+    """Return a diagnosis with the step in the order of the readings, where there is one.
+
+    It is sought where an unknown effect or the noise is blamed, and where a background or serial
+    noise may have taken it up.
+    """
+    unexplained = d.verdict in ("unknown_effect", "noise_misjudged")
+    may = unexplained or d.fit.model.background or d.fit.readings.serial is not None
+    step = step_in_order(d.fit) if may and not (d.significant or d.wrong_figures) else None
+    return d if step is None else replace(d, step=step, reason="readings_disagree")
 
 
 def judge_naming(

@@ -43,6 +43,8 @@ def headline(d: Diagnosis) -> str:
         return f"adequate for deflections; {UNCALIBRATED}"
     if d.wrong_figures:
         return "ambiguous: a figure of the cell may have been entered wrongly"
+    if d.step is not None:
+        return "unknown effect: a step in the order of the readings"
     return HEADLINES[d.verdict]
 
 
@@ -80,7 +82,7 @@ def _verdict(d: Diagnosis) -> list[str]:
         others = (f"Or else {figure}." for figure in alternatives)
         return [numbers.sentence(first), *others, "Until that is settled no effect is looked for."]
     if d.reason == "readings_disagree":
-        return [numbers.sentence(disagreement_words(d.fit))]
+        return [numbers.sentence(disagreement_words(d.fit))] if d.fit.disagreement else []
     of_reason = {
         "one_suspect": _one_suspect,
         "inseparable_suspects": _inseparable,
