@@ -100,12 +100,15 @@ def diagnose(
 def with_order_step(d: Diagnosis) -> Diagnosis:
     """Return a diagnosis with the step in the order of the readings, where there is one.
 
-    It is sought where an unknown effect or the noise is blamed, and where a background or serial
-    noise may have taken it up.
+    None is sought where a suspect passes, or stated noise explains the residual of named effects;
+    a background, the arm's scatter, serial or estimated noise may have taken up a step.
     """
-    unexplained = d.verdict in ("unknown_effect", "noise_misjudged")
-    may = unexplained or d.fit.model.background or d.fit.readings.serial is not None
-    step = step_in_order(d.fit) if may and not (d.significant or d.wrong_figures) else None
+    readings = d.fit.readings
+    hides = d.fit.model.background or readings.serial is not None or not readings.noise_stated
+    explained = d.residual_is_noise and not hides and readings.arm_scatter is None
+    if explained or d.significant or d.wrong_figures:
+        return d
+    step = step_in_order(d.fit)
     return d if step is None else replace(d, step=step, reason="readings_disagree")
 
 
