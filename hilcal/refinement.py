@@ -20,7 +20,7 @@ from hilcal.diagnosis.evidence import Alternative, Evidence
 from hilcal.diagnosis.residual_regression import Regressions
 from hilcal.diagnosis.serial_noise import serial_noise, with_serial_noise
 from hilcal.diagnosis.stepwise import add, exchange, predicts_better, remove, trial
-from hilcal.diagnosis.verdict import NO_HISTORY, judge, judge_naming
+from hilcal.diagnosis.verdict import NO_HISTORY, judge, judge_naming, with_order_step
 from hilcal.discovery.discovery import LawSearch
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.background import (
@@ -195,6 +195,7 @@ def refine_from(
     path.complete()
     if path.pool_lines():
         path.complete()
+    path.find_step()
     return Refinement(tuple(path.steps))
 
 
@@ -464,6 +465,11 @@ class Path:
         self._evidence = self._evidence_of(fitted)
         self.steps[-1] = replace(last, fit=fitted, diagnosis=self._judge(fitted))
         return any(s.passes for s in self.steps[-1].diagnosis.suspects)
+
+    def find_step(self) -> None:
+        """Look for a step in the order of the readings where the misfit is left unexplained."""
+        last = self.steps[-1]
+        self.steps[-1] = replace(last, diagnosis=with_order_step(last.diagnosis))
 
     def _better(self, last: RefinementStep, alternative: Alternative) -> bool:
         """Whether an alternative is worth a trial.

@@ -24,6 +24,8 @@ from hilcal.identification.mixed_fit import (
 )
 from hilcal.identification.noise.arm_scatter import some_poses
 from hilcal.mixed.variances import evidence
+from hilcal.model.model import Model
+from hilcal.readings.readings import Readings
 from hilcal.regression.evidence import FamilyScore
 from hilcal.types import Floats
 
@@ -63,20 +65,24 @@ def p_value_of_others(fit: Fit) -> float:
     """
     readings = fit.readings[~fit.outlier].as_stated()
     readings = readings[some_poses(readings, MOST_NOISE_ROWS / readings.value.size, SEED)]
+    model, theta = all_effects_at(fit, readings)
+    problem = linearised_problem(model, readings, fit.mode, theta)
+    random = problem.families.random
+    unnamed = [k for k, f in enumerate(random) if f.effect not in fit.model.named]
+    start = sizes_at(problem, model, theta)
+    return evidence(problem, unnamed, np.random.default_rng(SEED), start).p_value
+
+
+def all_effects_at(fit: Fit, readings: Readings) -> tuple[Model, Floats]:
+    """Return the model with all effects that the readings allow, and its parameters at the fit."""
     model = with_all_effects(fit.model, readings.states)
     fitted = {
         (e.name, p.name): value
         for e, columns in zip(fit.model.effects, fit.model.slices(), strict=True)
         for p, value in zip(e.parameters, fit.theta[columns], strict=True)
     }
-    theta = np.array(
-        [fitted.get((e.name, p.name), 0.0) for e in model.effects for p in e.parameters]
-    )
-    problem = linearised_problem(model, readings, fit.mode, theta)
-    random = problem.families.random
-    unnamed = [k for k, f in enumerate(random) if f.effect not in fit.model.named]
-    start = sizes_at(problem, model, theta)
-    return evidence(problem, unnamed, np.random.default_rng(SEED), start).p_value
+    theta = [fitted.get((e.name, p.name), 0.0) for e in model.effects for p in e.parameters]
+    return model, np.array(theta)
 
 
 def background_is_better(named: Fit, background: Fit) -> bool:

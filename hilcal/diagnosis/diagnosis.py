@@ -14,6 +14,7 @@ from hilcal.diagnosis.effect_ranking import FALSE_ALARM, Suspect
 from hilcal.diagnosis.evidence import Alternative, Insufficiency, Separability
 from hilcal.diagnosis.misfit_breakdown import MisfitShare
 from hilcal.diagnosis.noise import NoiseVerdict, PureError
+from hilcal.diagnosis.order_step import OrderStep
 from hilcal.diagnosis.pose_alone import PoseAlone
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.wrong_figures import WrongFigure
@@ -107,6 +108,7 @@ class Diagnosis(Shown, Tabular):
         background: the effects of the model's background, smallest p-values first.
         wrong_figures: figures of the cell each of which, if wrong, alone explains the misfit. No
             effect is a suspect then.
+        step: a step in the order of the readings, where nothing else explains the misfit.
     """
 
     fit: Fit
@@ -127,6 +129,7 @@ class Diagnosis(Shown, Tabular):
     pose_alone: PoseAlone | None = None
     background: tuple[BackgroundEffect, ...] = ()
     wrong_figures: tuple[WrongFigure, ...] = ()
+    step: OrderStep | None = None
 
     def _brief(self) -> dict[str, str]:
         first = self.suspects[:5]
@@ -205,6 +208,7 @@ class Diagnosis(Shown, Tabular):
             and _attributes(self.insufficiency, "effects", "refitted", "share", "variance_factor"),
             "background": [_attributes(b, "effect", "p_value", "rms_m") for b in self.background],
             "wrong_figures": [asdict(f) for f in self.wrong_figures],
+            "step": self.step and asdict(self.step),
             "pose_alone": self.pose_alone and asdict(self.pose_alone),
             "rejected": list(self.history.rejected),
             "alternatives": [

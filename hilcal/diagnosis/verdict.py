@@ -35,6 +35,9 @@ If several targets are read in one arrival, the arm's scatter is not stated and 
 rules are applied to the fit with the estimated scatter in its covariance (see
 `Evidence.with_arm_scatter`), and 3 becomes 5b or 5c.
 
+Where a step in the order of the readings explains what all effects leave (see `order_step`), as of
+a tracker that was moved, the verdict is `unknown_effect`, whatever else the rules say.
+
 The covariance of a judged fit includes a correlation of the noise along the order of the readings
 (see `serial_noise`). If it is not proved, since effects explain the readings as well, 3 and 5c
 become `ambiguous`.
@@ -69,6 +72,7 @@ from hilcal.diagnosis.noise import (
     prefers_instrument,
     within_repeatability,
 )
+from hilcal.diagnosis.order_step import step_in_order
 from hilcal.diagnosis.residual_regression import ResidualRegression
 from hilcal.identification.fit import Fit
 
@@ -90,7 +94,22 @@ def diagnose(
     Raises:
         InputError: a fit whose residual is not whitened.
     """
-    return judge(Evidence(fit, say=say), history)
+    return with_order_step(judge(Evidence(fit, say=say), history))
+
+
+def with_order_step(d: Diagnosis) -> Diagnosis:
+    """Return a diagnosis with the step in the order of the readings, where there is one.
+
+    None is sought where a suspect passes, or stated noise explains the residual of named effects;
+    a background, the arm's scatter, serial or estimated noise may have taken up a step.
+    """
+    readings = d.fit.readings
+    hides = d.fit.model.background or readings.serial is not None or not readings.noise_stated
+    explained = d.residual_is_noise and not hides and readings.arm_scatter is None
+    if explained or d.significant or d.wrong_figures:
+        return d
+    step = step_in_order(d.fit)
+    return d if step is None else replace(d, step=step, reason="readings_disagree")
 
 
 def judge_naming(

@@ -18,10 +18,11 @@ from hilcal.diagnosis.noise import (
     prefers_instrument,
     separates_instrument,
 )
+from hilcal.diagnosis.order_step import OrderStep
 from hilcal.diagnosis.wrong_figures import WrongFigure
-from hilcal.identification.prediction.full_prediction import disagreement_words
+from hilcal.identification.prediction.full_prediction import disagreement_words, reading_name
 from hilcal.numbers import few, length, p_equals, percent, sizes
-from hilcal.readings.readings import ArmScatter, SerialNoise
+from hilcal.readings.readings import ArmScatter, Readings, SerialNoise
 from hilcal.robot.arm import Arm
 
 MOST_LIKELY, MOST_HIDDEN = 4, 4  # effects of a background, and undetectable ones, that are named
@@ -42,13 +43,37 @@ def headline(d: Diagnosis) -> str:
         return f"adequate for deflections; {UNCALIBRATED}"
     if d.wrong_figures:
         return "ambiguous: a figure of the cell may have been entered wrongly"
+    if d.step is not None:
+        return "unknown effect: a step in the order of the readings"
     return HEADLINES[d.verdict]
 
 
 def message(d: Diagnosis) -> str:
     """Return the verdict in a few sentences; an effect named as missing is the first suspect."""
     serial = d.fit.readings.serial
-    return " ".join([*_verdict(d), *([] if serial is None else [correlated(serial)])])
+    step = [] if d.step is None else [_step(d.step, d.fit.readings)]
+    return " ".join([*_verdict(d), *step, *([] if serial is None else [correlated(serial)])])
+
+
+def _step(step: OrderStep, readings: Readings) -> str:
+    previous, first = ("/".join(reading_name(readings, k)) for k in (step.previous, step.first))
+    causes = {
+        "sensor": (
+            "the tracker or the base was moved",
+            "name the places of the tracker in a column 'station'",
+        ),
+        "target": (
+            "the target was moved on the tool",
+            "give the later readings another name in a column 'target'",
+        ),
+    }
+    what, how = zip(*(causes[kind] for kind in step.moved), strict=True)
+    return (
+        f"A step in the order of the readings explains {percent(step.share)} of what all effects "
+        f"leave ({p_equals(step.p_value)}): from {first} on they are {length(step.shift_m)} rms "
+        f"off. Probably {', or '.join(what)} between {previous} and {first}; "
+        f"{', or '.join(how)}."
+    )
 
 
 def _verdict(d: Diagnosis) -> list[str]:
@@ -57,7 +82,7 @@ def _verdict(d: Diagnosis) -> list[str]:
         others = (f"Or else {figure}." for figure in alternatives)
         return [numbers.sentence(first), *others, "Until that is settled no effect is looked for."]
     if d.reason == "readings_disagree":
-        return [numbers.sentence(disagreement_words(d.fit))]
+        return [numbers.sentence(disagreement_words(d.fit))] if d.fit.disagreement else []
     of_reason = {
         "one_suspect": _one_suspect,
         "inseparable_suspects": _inseparable,

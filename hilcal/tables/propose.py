@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from itertools import product
+from itertools import groupby, product
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,9 @@ EXCHANGE_NAMES = (
     "its columns are named as an exchange table's, which (commas, header in row 1, SI units, "
     "rotation vectors) is imported without --format"
 )
+
+LEAST_COUNTS = 3600.0
+"""Size that whole numbers of encoder counts exceed, and no joint's angle: ten turns; a choice."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,6 +111,7 @@ def _is_key(keys: list[str]) -> bool:
 def guess(grid: Grid, joints: int | None = None, joint_names: Sequence[str] = ()) -> words.Proposal:
     """Propose a mapping for a table."""
     g = words.Guesser(grid, joints)
+    counts = _encoder_counts(g)
     _joints(g, joint_names)
     guess_axes(g)
     _scalars(g)
@@ -124,7 +128,11 @@ def guess(grid: Grid, joints: int | None = None, joint_names: Sequence[str] = ()
         g.doubt("orientation", words.GUESSED)
     for section, sentence in (
         ("position", "no position: three columns x, y, z were not found"),
-        ("joints", "no joint angles: where they are in a file of their own, give it with --second"),
+        (
+            "joints",
+            counts
+            or "no joint angles: where they are in a file of their own, give it with --second",
+        ),
     ):
         if section not in g.proposal.sections and not (section == "position" and read):
             g.proposal.missing.append(sentence)
@@ -150,13 +158,38 @@ def _why_unused(g: words.Guesser, column: words.ColumnName) -> str:
     return "its name says nothing"
 
 
+def _encoder_counts(g: words.Guesser) -> str:
+    """Leave out neighbouring columns of encoder counts; say what is needed of them, or nothing."""
+
+    def counts(c: words.ColumnName) -> bool:
+        values = g.values[c.name]
+        if values is None or c.axis or c.unit or c.has(words.TIME | words.TORQUE):
+            return False
+        return bool(np.nanmax(np.abs(values)) > LEAST_COUNTS and _whole_numbers(g, c.name))
+
+    runs = [[c.name for c in run] for are, run in groupby(g.columns, counts) if are]
+    for names in runs:
+        if not words.FEWEST_JOINTS <= len(names) <= words.MOST_JOINTS:
+            continue
+        for name in names:
+            g.ignore(name, "looks like encoder counts")
+        largest = np.nanmax(np.abs(g.block(names)))
+        return (
+            f"no joint angles; '{names[0]}' ... '{names[-1]}' look like encoder counts (whole "
+            f"numbers up to {largest:.0f}): write columns of angles instead, (counts - counts at "
+            "the joint's zero) * 360 / (counts per turn of the joint, gear and sign included), in "
+            "degrees"
+        )
+    return ""
+
+
 def _joints(g: words.Guesser, joint_names: Sequence[str]) -> None:
     """Find joint angles by the arm's names of joints, a joint's word and number, or UR's names."""
     groups: dict[tuple[str, ...], dict[int, str]] = {}
     for c in g.columns:
         torque = c.has(words.TORQUE) or c.unit in MOMENTS
         joint = c.has(words.JOINT) or torque
-        if not c.numbers or c.axis or not joint or not g.number(c.name):
+        if not c.numbers or c.axis or not joint or not g.number(c.name) or c.name not in g.free:
             continue
         if not c.has(words.STD):
             groups.setdefault(c.words, {}).setdefault(c.numbers[-1], c.name)
@@ -172,7 +205,7 @@ def _joints(g: words.Guesser, joint_names: Sequence[str]) -> None:
             _per_joint(g, first, names)
         else:
             candidates.append((first, names))
-    by_name = {words.without_unit(c.name): c.name for c in g.columns if g.number(c.name)}
+    by_name = {words.without_unit(name): name for name in g.free if g.number(name)}
     of_arm = [by_name[name.lower()] for name in joint_names if name.lower() in by_name]
     if of_arm and len(of_arm) == len(joint_names):
         candidates.insert(0, (words.parse("joint"), of_arm))

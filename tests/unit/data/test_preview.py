@@ -223,3 +223,27 @@ def test_a_force_of_unknown_direction_is_not_called_nameless(tmp_path):
 def test_only_text(tmp_path):
     path = write(tmp_path / "t.csv", "name,colour\nbob,red\n")
     refusal("no columns of numbers", propose, path)
+
+
+@pytest.mark.parametrize("name", ["enc{}", "J{}", "motor {} position", "axis{}_counts"])
+def test_encoder_counts_are_recognised(name, tmp_path):
+    per_turn = np.array([52428800, -52428800, 52428800, 10485760, -10485760, 10485760])
+    counts = np.rint(C.q / (2 * np.pi) * per_turn).astype(int) + 12345
+    header = ["Punkt", *six(name), "X [mm]", "Y [mm]", "Z [mm]"]
+    text = lines(header, POINTS, counts, MM, separator=",")
+    proposal = propose(write(tmp_path / "a.csv", text), joints=6).proposal
+    assert "joints" not in proposal.sections
+    assert "position" in proposal.sections
+    (sentence,) = proposal.missing
+    assert "look like encoder counts" in sentence
+    assert "counts per turn" in sentence
+    assert {why for _, why in proposal.unused} == {"looks like encoder counts"}
+
+
+def test_angles_beside_encoder_counts_are_read(tmp_path):
+    counts = np.rint(1e6 * C.q).astype(int)
+    header = [*six("enc{}"), *six("q{} [°]"), "X [mm]", "Y [mm]", "Z [mm]"]
+    text = lines(header, counts, DEG, MM, separator=",")
+    proposal = propose(write(tmp_path / "a.csv", text), joints=6).proposal
+    assert proposal.sections["joints"]["columns"] == six("q{} [°]")
+    assert not proposal.missing

@@ -1,0 +1,57 @@
+"""A step in the order of the readings is named with its row, and nothing else is taken for one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilcal.diagnosis.order_step import step_in_order
+from hilcal.identification.baseline import baseline
+from hilcal.present.verdict import headline, message
+from tests.support.campaigns import campaign
+from tests.support.fit_cases import fitted_model, refined
+from tests.support.rows import first
+
+C = campaign(mode="absolute", plan_seed=0, poses=12)
+FIRST = 17
+
+
+def moved(what, size):
+    """Readings of which those from `FIRST` on are shifted in the sensor's or the target's axes."""
+    r, shift = C.readings, np.array([size, 0.0, 0.0])
+    if what == "target":
+        model = baseline(C.cell, r, "absolute")
+        axes = model.predict(r.states, np.zeros(model.size)).observation.rotation
+        shift = (axes @ shift)[FIRST:]
+    value = r.value.copy()
+    value[FIRST:, :3] += shift
+    return replace(r, value=value)
+
+
+@pytest.mark.parametrize("what", ["sensor", "target"])
+@pytest.mark.parametrize("size", [3e-4, 5e-3])
+def test_what_moved_in_the_middle_is_named_with_its_row(what, size):
+    step = step_in_order(fitted_model(C.cell, moved(what, size), "absolute"))
+    assert step.previous < FIRST <= step.first  # some between them may be set aside
+    assert step.moved[0] == what
+    assert step.shift_m == pytest.approx(size, rel=0.3)
+
+
+@pytest.mark.parametrize("what", first(1, ["sensor", "target"]))
+def test_the_verdict_names_the_step(what):
+    d = refined(C.cell, moved(what, 5e-3), "absolute").diagnosis
+    assert d.verdict == "unknown_effect"
+    assert headline(d) == "unknown effect: a step in the order of the readings"
+    assert d.to_dict()["step"]["moved"][0] == what
+    assert "was moved" in message(d)
+
+
+def test_readings_without_a_step_show_none():
+    assert step_in_order(fitted_model(C.cell, C.readings, "absolute")) is None
+
+
+def test_a_drift_is_no_step():
+    value = C.readings.value.copy()
+    value[:, 0] += np.linspace(0.0, 1e-3, len(value))
+    drifting = replace(C.readings, value=value)
+    assert step_in_order(fitted_model(C.cell, drifting, "absolute")) is None
