@@ -241,12 +241,12 @@ class Contrasts:
 
 
 def repeat_classes(readings: Readings) -> Ints:
-    """(N,) class of each reading: same joints, same load by name and wrench, same target."""
+    """(N,) class: same joints, same load by name and wrench, same target and observer."""
     s = readings.states
     parts = s.wrench[:, :3], s.wrench[:, 3:]
     size = np.repeat([np.linalg.norm(part, axis=1).max(initial=0.0) for part in parts], 3)
     wrench = s.wrench / np.where(size > 0, SAME_LOAD * size, 1.0)
-    named = 10.0 * np.stack([readings.load, readings.target], axis=1)
+    named = 10.0 * np.stack([readings.load, readings.line], axis=1)
     points = np.concatenate([s.q / SAME_ANGLE, wrench, named], axis=1)
     return groups_within(points, 1.0)
 

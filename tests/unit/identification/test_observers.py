@@ -9,6 +9,7 @@ import pytest
 from hilcal.calibration.calibration import Calibration
 from hilcal.cell import Cell
 from hilcal.config.sections import Gauge, Point
+from hilcal.diagnosis.noise import repeat_classes
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError, InputError
@@ -98,6 +99,13 @@ def test_verdicts(case):
         d = diagnose(fitted(observed(who, seed, effect=effect, strength=5.0, **kept)))
         assert d.verdict == ("adequate" if effect is None else "missing_effect")
         assert effect is None or d.suspects[0].effect == effect
+
+
+def test_readings_of_one_arrival_by_several_observers_are_no_repeats():
+    readings = observed(["A", "B", "C"], 3, base=True).readings
+    kind = repeat_classes(readings)
+    by_observer = set(zip(kind.tolist(), readings.observer.tolist(), strict=True))
+    assert len(by_observer) == len(np.unique(kind))
 
 
 def test_where_stations_points_and_gauges_are():
