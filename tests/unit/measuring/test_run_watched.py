@@ -357,7 +357,7 @@ def test_a_first_tare_that_was_leaned_on_ends_the_run_and_says_so(b):
     leans_in_phase(b, "taring", 1)
     refusal_of(
         DeviceError,
-        "a load hung or the tool was touched in the",
+        "a load hung, or the tool was touched, when the sensor was tared",
         b.measure,
         SHORT,
     )
