@@ -191,8 +191,8 @@ class Hook:
                 "still"
             )
         self.confirm(
-            f"the force sensor feels {felt:.1f} N, as if {name} hung, and it was answered twice "
-            "that nothing hangs: then its own zero is off. With a load that it is not told of the "
-            "arm may drop or stop; look at the flange"
+            f"the force sensor feels {felt:.1f} N, as if {name} hung, and the answer was twice "
+            "that nothing hangs. If so, the sensor's zero is off; if not, the arm may drop or "
+            "stop, as its controller does not know of the load. Look at the flange"
         )
         return ""

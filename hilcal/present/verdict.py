@@ -60,19 +60,20 @@ def _step(step: OrderStep, readings: Readings) -> str:
     causes = {
         "sensor": (
             "the tracker or the base was moved",
-            "name the places of the tracker in a column 'station'",
+            "name its place before and after in a column 'station' of the table",
         ),
         "target": (
             "the target was moved on the tool",
-            "give the later readings another name in a column 'target'",
+            "give the later readings a target of their own: [[tool.targets]] of the cell, and a "
+            "column 'target' of the table",
         ),
     }
     what, how = zip(*(causes[kind] for kind in step.moved), strict=True)
     return (
         f"A step in the order of the readings explains {percent(step.share)} of what all effects "
-        f"leave ({p_equals(step.p_value)}): from {first} on they are {length(step.shift_m)} rms "
-        f"off. Probably {', or '.join(what)} between {previous} and {first}; "
-        f"{', or '.join(how)}."
+        f"leave ({p_equals(step.p_value)}): the readings from {first} on are shifted by "
+        f"{length(step.shift_m)} rms. Probably {', or '.join(what)} between {previous} and "
+        f"{first}; {', or '.join(how)}."
     )
 
 

@@ -46,7 +46,6 @@ MISFIT_SCALES = (1.25, 1.5)
 """Scales of the bulk between which `MISFIT_FACTOR` is reached: noise alone, and a sure misfit."""
 SINGULAR_RIDGE = 1e-9  # as a share of a column's square: few readings determine few columns
 READINGS_AT_ONCE = 4096  # readings whose covariance is formed at a time
-SUBSETS_AT_ONCE = 32  # subsets that are fitted at a time
 LARGEST_CHI2 = 100.0  # χ² beyond which its probability is not evaluated
 LEAST_INFORMATION_SHARE = 1e-6  # share of a reading's information that must remain for a test
 
@@ -148,27 +147,20 @@ class ReadingModel:
         Readings of a group are compared with one of them, its centre: that with the least
         Σ log(1 + d²), which is near most others wherever the rest are.
         """
-        (out,) = self.distances_from_each(delta[None])
-        return out
-
-    def distances_from_each(self, deltas: Floats) -> list[tuple[Floats, Bools]]:
-        """Return `distances_from` of several δ (C, K), computed together."""
-        r = self.residual[:, :, None] - self.columns @ deltas.T
-        d2 = np.ascontiguousarray(np.sum(r**2, axis=1).T)
-        centre = np.zeros(d2.shape, dtype=np.bool_)
+        r = self.residual - self.columns @ delta
+        d2, centre = np.asarray(np.sum(r**2, axis=1)), np.zeros(len(self), dtype=np.bool_)
         if len(self.members):
             back, root = self._differences
-            x = (back @ r)[self.members]
-            off = root @ (x[:, :, None] - x[:, None, :])
-            apart, present = np.sum(off**2, axis=3), self.members >= 0
-            total = np.log1p(np.where(present[:, None, :, None], apart, 0.0)).sum(axis=2)
-            best = np.argmin(np.where(present[:, :, None], total, np.inf), axis=1)
+            x = (back @ r[:, :, None])[:, :, 0][self.members]
+            off = root @ (x[:, :, None] - x[:, None, :])[..., None]
+            apart, present = np.sum(off[..., 0] ** 2, axis=3), self.members >= 0
+            total = np.log1p(np.where(present[:, None, :], apart, 0.0)).sum(axis=2)
+            best = np.argmin(np.where(present, total, np.inf), axis=1)
             index = np.arange(len(best))
             g, s = np.nonzero(present)
-            for c, chosen in enumerate(best.T):
-                d2[c, self.members[g, s]] = apart[index, chosen, :, c][g, s]
-                centre[c, self.members[index, chosen]] = True
-        return [(self._comparable(d), at) for d, at in zip(d2, centre, strict=True)]
+            d2[self.members[g, s]] = apart[index, best][g, s]
+            centre[self.members[index, best]] = True
+        return self._comparable(d2), centre
 
     def with_lone_centres(self, used: Bools, centre: Bools) -> Bools:
         """Return the used readings (N,), and the centre of each group that has none."""
@@ -201,7 +193,7 @@ class ReadingModel:
             grouped = self.group >= 0
             sums = self._summed(self._parts * used[:, None, None])
             offset = self._offset_covariance(used) @ sums
-            both = self.with_residual.copy()
+            both = self._both.copy()
             both[grouped] -= self.root[grouped] @ offset[self.group[grouped]]
             r, b = both[:, :, -1], both[:, :, :-1]
         some = b if used.all() else b[used]
@@ -213,7 +205,7 @@ class ReadingModel:
         return delta, covariance, r - b @ delta, b
 
     @cached_property
-    def with_residual(self) -> Floats:
+    def _both(self) -> Floats:
         """(N, m, K + 1) columns and residual."""
         return np.asarray(np.concatenate([self.columns, self.residual[:, :, None]], axis=2))
 
@@ -225,18 +217,14 @@ class ReadingModel:
 
     def _offset_covariance(self, used: Bools) -> Floats:
         """(G, m, m) covariance of the offset of each group; zero without a used reading."""
-        sums = self._summed(self._information * used[:, None, None])
+        information = self.root.swapaxes(1, 2) @ self.root
+        sums = self._summed(information * used[:, None, None])
         return np.asarray(np.linalg.pinv(sums, hermitian=True), dtype=float)
 
     @cached_property
     def _parts(self) -> Floats:
         """(N, m, K + 1) Wᵀ times columns and residual."""
-        return np.asarray(self.root.swapaxes(1, 2) @ self.with_residual)
-
-    @cached_property
-    def _information(self) -> Floats:
-        """(N, m, m) Wᵀ W."""
-        return np.asarray(self.root.swapaxes(1, 2) @ self.root)
+        return np.asarray(self.root.swapaxes(1, 2) @ self._both)
 
     def _summed(self, x: Floats) -> Floats:
         """(G, ...) sums of x (N, ...) over the readings of each group."""
@@ -323,13 +311,7 @@ def _trimmed(model: ReadingModel, rng: np.random.Generator) -> tuple[Bools, Floa
     size = (part.fewest_readings + 1) * (2 if len(part.members) else 1)
     starts = np.log(MISS_PROBABILITY) / np.log1p(-((1.0 - MOST_WRONG) ** size))
     count = int(min(np.ceil(starts), MOST_SUBSETS))
-    tried = [
-        nearest(part, *found)
-        for k in range(0, count, SUBSETS_AT_ONCE)
-        for found in part.distances_from_each(
-            _from_subsets(part, min(SUBSETS_AT_ONCE, count - k), rng)
-        )
-    ]
+    tried = [nearest(part, *part.distances_from(_from_subset(part, rng))) for _ in range(count)]
     tried.sort(key=lambda t: t[1])
     best = [_concentrated(part, used) for used, _ in tried[:BEST_SUBSETS]]
     _, used, delta = min(best, key=lambda t: t[0])
@@ -359,36 +341,13 @@ def _subset_rows(model: ReadingModel, rng: np.random.Generator) -> Ints:
     return np.sort(rows[rows >= 0])
 
 
-def _from_subsets(model: ReadingModel, count: int, rng: np.random.Generator) -> Floats:
-    """δ (C, K), each from random readings that just determine it and one more; of groups two."""
-    size, grouped = model.fewest_readings + 1, len(model.members) > 0
-    if grouped:
-        rows = np.stack([_pairs(model, size, rng) for _ in range(count)])
+def _from_subset(model: ReadingModel, rng: np.random.Generator) -> Floats:
+    """δ (K,) from random readings that just determine it and one more; of groups two of each."""
+    count = model.fewest_readings + 1
+    if not len(model.members):
+        rows = rng.permutation(len(model))[:count]
     else:
-        rows = np.stack([rng.permutation(len(model))[:size] for _ in range(count)])[:, :, None]
-    present = (rows >= 0)[..., None, None]
-    both = model.with_residual[rows] * present  # (C, size, 1 or 2, m, K + 1)
-    squares = np.einsum("cgsmk,cgsmk->ck", both[..., :-1], both[..., :-1])
-    if grouped:
-        root = model.root[rows] * present
-        turned = root.swapaxes(3, 4)
-        information, sums = (turned @ root).sum(axis=2), (turned @ both).sum(axis=2)
-        offset = np.linalg.pinv(information, hermitian=True) @ sums
-        both = both - root @ offset[:, :, None]
-    both = both.reshape(count, -1, both.shape[-1])
-    r, b = both[:, :, -1:], both[:, :, :-1]
-    h = b.swapaxes(1, 2) @ b
-    diagonal = np.arange(h.shape[1])
-    h[:, diagonal, diagonal] += model.precision + SINGULAR_RIDGE * squares + 1e-300
-    right = b.swapaxes(1, 2) @ r - model.pull[:, None]
-    return np.asarray((np.linalg.inv(h) @ right)[:, :, 0])
-
-
-def _pairs(model: ReadingModel, size: int, rng: np.random.Generator) -> Ints:
-    """(size, 2) rows of two random readings of random groups; −1 where a group has one only."""
-    out = np.full((min(size, len(model.members)), 2), -1)
-    groups = model.members[rng.permutation(len(model.members))[:size]]
-    for pair, group in zip(out, groups, strict=True):
-        some = rng.permutation(group[group >= 0])[:2]
-        pair[: len(some)] = some
-    return out
+        groups = model.members[rng.permutation(len(model.members))[:count]]
+        rows = np.concatenate([rng.permutation(g[g >= 0])[:2] for g in groups])
+    few = model[rows]
+    return few.fitted(np.ones(len(few), dtype=np.bool_))[0]

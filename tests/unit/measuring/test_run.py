@@ -392,7 +392,7 @@ def test_a_load_left_on_at_the_very_beginning_is_asked_about_said_and_found_in_m
     b.world.load, b.world.wrong_loads = "3kg", ["3kg", "3kg"]  # both answers are wrong
     refusal_of(DeviceError, "take everything off", b.measure)
     assert [name for name, _ in b.operator.requests[:3]] == ["none", "none", "confirm"]
-    assert b.remarks("as if 3kg hung, and it was answered twice that nothing hangs")
+    assert b.remarks("as if 3kg hung, and the answer was twice that nothing hangs")
     # where gravity has not turned in the sensor since its tare, a load is a zero
     assert {step for step, *_ in b.store.rows} <= {Step("reference", "none", 0)}
 
