@@ -29,7 +29,7 @@ from hilcal.measuring.devices import (
 from hilcal.measuring.force import ForceMeter, TaredWrench
 from hilcal.measuring.loads import TRIES, Hook, payload
 from hilcal.measuring.measure import MeasuredStop, Measurer
-from hilcal.measuring.motion import Mover
+from hilcal.measuring.motion import LEFT, Mover
 from hilcal.measuring.progress import (
     GoalMet,
     GoalStatus,
@@ -56,7 +56,6 @@ from hilcal.store.run_log import RunLog
 from hilcal.types import Floats
 
 HOW_ON = "The campaign is safe: run again with --resume"
-HERE = "where it was left"
 AT_LAST = "where its last reading was taken"  # it may have been stopped on the way to the next
 EMERGENCY = "press the emergency stop"
 _STOPS = 3
@@ -227,7 +226,7 @@ class Session:
         if self._temperatures is None:
             self._temperatures = bool(np.isfinite(sample.joint_temperature).all())
         self._hook.take_all_off()
-        expected, place = (sample.q, HERE) if last_q is None else (last_q, AT_LAST)
+        expected, place = (sample.q, LEFT) if last_q is None else (last_q, AT_LAST)
         self._mover.goal = self._mover.agreed_start(
             first.q, first.name, expected, self._hook.confirm, place
         )
