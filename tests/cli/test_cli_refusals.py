@@ -36,6 +36,11 @@ def campaign(tmp_path):
     return imported(tmp_path / "run.hilcal", "nothing", poses=6)
 
 
+@pytest.fixture
+def fitted(tmp_path):
+    return imported(tmp_path / "run.hilcal", "nothing", poses=6, then=("identify",))
+
+
 def rows_of(path):
     return [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()]
 
@@ -72,9 +77,9 @@ def test_files_that_are_no_campaigns(good, campaign, tmp_path, capsys):
     ("export", "RUN", "--cell", "RUN", "--force"),
     ("report", "RUN", "-o", "RUN"),
     ("init", "RUN", "--robot", "ur5e", "--force")])  # fmt: skip
-def test_nothing_but_an_import_replaces_a_campaign(arguments, campaign, capsys, monkeypatch):
+def test_nothing_but_an_import_replaces_a_campaign(arguments, fitted, capsys, monkeypatch):
+    campaign = fitted
     monkeypatch.chdir(campaign.parent)
-    ok(capsys, "identify", campaign)
     kept = campaign.read_bytes()
     given = [campaign.name if a == "RUN" else a for a in arguments]
     assert re.search("choose another name|name another file", refused(capsys, 2, *given))
@@ -106,9 +111,9 @@ def test_a_plan_and_a_law_replace_no_file_of_another_kind(campaign, tmp_path, ca
     ("fleet", ".", "-o", "CELL"),
     ("fleet", ".", "-o", "prior.json", "--report", "LAW"),
     ("simulate", "CELL", "-o", ".")])  # fmt: skip
-def test_no_output_replaces_a_file_of_another_kind(arguments, campaign, capsys, monkeypatch):
+def test_no_output_replaces_a_file_of_another_kind(arguments, fitted, capsys, monkeypatch):
+    campaign = fitted
     monkeypatch.chdir(campaign.parent)
-    ok(capsys, "identify", campaign)
     names = {"RUN": campaign, "CELL": Path("cell.toml"), "LAW": Path("mine.py")}
     names["CELL"].write_bytes(CELL.read_bytes())
     names["LAW"].write_text("of my own", encoding="utf-8")
@@ -118,6 +123,7 @@ def test_no_output_replaces_a_file_of_another_kind(arguments, campaign, capsys, 
     assert {path: path.read_bytes() for path in names.values()} == kept
 
 
+@pytest.mark.long
 def test_an_output_replaces_the_one_before(campaign, capsys, monkeypatch):
     monkeypatch.chdir(campaign.parent)
     ok(capsys, "identify", campaign)
@@ -210,8 +216,8 @@ def free_port():
         return int(probe.getsockname()[1])
 
 
-def test_a_kill_leaves_every_committed_revision(campaign, capsys):
-    ok(capsys, "identify", campaign)
+def test_a_kill_leaves_every_committed_revision(fitted, capsys):
+    campaign = fitted
     process = start("refine", campaign)
     time.sleep(0.3)  # anywhere: whatever it is doing, the file stays whole
     process.kill()

@@ -199,6 +199,7 @@ def test_what_cannot_be_is_refused_in_one_line(campaign, capsys, monkeypatch, ar
     assert says in refused(capsys, 2, "report", "run.hilcal", *arguments)
 
 
+@pytest.mark.long
 def test_the_certificate_never_takes_the_arm_to_come_back_exactly(tmp_path, capsys):
     """Unloaded readings are repeated, deflections are not; the cell states no repeatability."""
     site = simulated(poses=8, cycles=3)

@@ -300,6 +300,7 @@ def exchange(tmp_path, orientation):
     return write(tmp_path / "t.csv", text), cell
 
 
+@pytest.mark.long
 def test_attitudes_of_another_convention_are_told_from_a_wrong_arm(tmp_path, capsys):
     path, cell = exchange(tmp_path, lambda c: np.radians(c.angles("xyz")))
     d = ok(capsys, "import", path, "--config", cell, "-o", tmp_path / "x.hilcal", "--json").document

@@ -456,8 +456,8 @@ class Bench:
         return [note.text for note in self.notes.of_kind(Remark) if words in note.text]
 
     def measure(self, plan=None, **more):
-        """Run a plan (the usual one if None) to its end; returns all readings."""
-        plan = plan or usual_plan()
+        """Run a plan (that of few poses if None) to its end; returns all readings."""
+        plan = plan or FEW_POSES
         run(self.rig, self.cell, plan, self.store, self.clock, self.notes, **more)
         readings = self.store.readings()
         return readings

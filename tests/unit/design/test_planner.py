@@ -142,7 +142,8 @@ def cell_file(directory, config):
 
 def test_the_command(tmp_path, capsys):
     cell, plan, table = cell_file(tmp_path, small()), tmp_path / "plan.json", tmp_path / "plan.csv"
-    result = ok(capsys, "plan", cell, "-o", plan, "--poses", "4", "--csv", table, "--json")
+    words = ("plan", cell, "-o", plan, "--poses", "4", "--quick")
+    result = ok(capsys, *words, "--csv", table, "--json")
     d = result.document
     made = load_plan(plan)
     assert d["readings"] == len(made.steps)
@@ -157,7 +158,7 @@ def test_the_command(tmp_path, capsys):
     rows = list(csv.DictReader(table.read_text(encoding="utf-8").splitlines()))
     assert len(rows) == d["readings"]
     assert [int(r["x_order"]) for r in rows] == list(range(1, len(rows) + 1))
-    words = ok(capsys, "plan", cell, "-o", plan, "--poses", "4", "--quick").out
+    words = ok(capsys, *words).out
     assert "efficiency   of the plan: at least" in words
     assert max(map(len, words.splitlines())) <= 100
 

@@ -49,14 +49,13 @@ def hidden(effect, mode, seed, poses=30, **options):
 
 @pytest.mark.parametrize("mode", MODES)
 def test_nothing_hidden_is_adequate(mode):
-    for seed in range(2):
-        d = diagnose(fitted_baseline(campaign("none", mode, seed, poses=12)))
-        assert d.verdict == "adequate", message(d)
-        assert d.significant == ()
-        of = "of the catalogue" if mode == "absolute" else "that deflections show"
-        if d.not_shown and mode == "absolute":
-            of = "that these readings could show"
-        assert f"No effect {of} is missing" in message(d)
+    d = diagnose(fitted_baseline(campaign("none", mode, 0, poses=12)))
+    assert d.verdict == "adequate", message(d)
+    assert d.significant == ()
+    of = "of the catalogue" if mode == "absolute" else "that deflections show"
+    if d.not_shown and mode == "absolute":
+        of = "that these readings could show"
+    assert f"No effect {of} is missing" in message(d)
 
 
 def test_what_deflections_cannot_show_is_part_of_the_verdict():
@@ -207,7 +206,7 @@ def test_the_factor_is_chi_square_and_so_is_what_is_left(mode, m, seeds):
         assert kstest(p, "uniform").pvalue > 1e-3 / 8
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", first(1, MODES))
 def test_estimated_covariances_do_not_bias_the_factor(mode):
     """Ten samples each, and a prior worth twenty."""
     r, rng, m = Repeated(mode, 8, m=6), np.random.default_rng(2), 6
@@ -246,7 +245,7 @@ def spoilt(r, what, rng):
     return replace(read, value=value)
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", first(1, MODES))
 @pytest.mark.parametrize(
     "what", first(3, ["along the beam", "joint 3", "10kg", "joint 1", "unloaded"])
 )

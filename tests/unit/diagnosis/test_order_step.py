@@ -29,7 +29,7 @@ def moved(what, size):
 
 
 @pytest.mark.parametrize("what", ["sensor", "target"])
-@pytest.mark.parametrize("size", [3e-4, 5e-3])
+@pytest.mark.parametrize("size", first(1, [3e-4, 5e-3]))
 def test_what_moved_in_the_middle_is_named_with_its_row(what, size):
     step = step_in_order(fitted_model(C.cell, moved(what, size), "absolute"))
     assert step.previous < FIRST <= step.first  # some between them may be set aside

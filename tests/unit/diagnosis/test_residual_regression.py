@@ -93,7 +93,7 @@ def told(c):
     return residual_regression(linearise(fitted_baseline(c)))
 
 
-QUICK = range(2)  # seeds
+QUICK = range(1)  # seeds
 
 
 def right(name, found):
@@ -116,7 +116,7 @@ def test_its_variable_is_among_the_first_two(name, mode, seeds):
 
 @pytest.mark.parametrize("mode", ["absolute", "deflection"])
 def test_noise_is_not_predictable(mode):
-    for seed in range(4):
+    for seed in range(2):
         c = campaign("none", mode, seed, poses=20)
         c = replace(c, readings=replace(c.readings, states=warm(c.readings.states, seed)))
         found = told(c)

@@ -27,7 +27,6 @@ from tests.support.campaigns import campaign, configuration
 from tests.support.diagnosis_cases import fitted_baseline
 from tests.support.fit_cases import fitted_model, refined
 from tests.support.reflector_cases import reflectors
-from tests.support.rows import first
 
 
 def evidence(effect, mode, seed, **options):
@@ -183,7 +182,8 @@ def unstated(c):
     return replace(c.readings, covariance=instrument, common=None, scatter_stated=False)
 
 
-@pytest.mark.parametrize(("mode", "seed"), first(1, [("absolute", 2), ("deflection", 0)]))
+@pytest.mark.long
+@pytest.mark.parametrize(("mode", "seed"), [("absolute", 2), ("deflection", 0)])
 def test_an_unknown_scatter_is_found_and_not_taken_for_a_cause(mode, seed):
     """Taken for independent, these readings name a cause: transmission_error in the second."""
     c = reflectors(seed=seed, poses=20, known=KNOWN, joint_std=STD)

@@ -128,7 +128,7 @@ def mounted(c, gravity):
 
 
 @pytest.mark.parametrize("mode", first(1, ["absolute", "deflection"]))
-@pytest.mark.parametrize("stated", first(2, [[0, 0, 9.80665], [9.0, 0.0, 3.8], [0, -9.80665, 0]]))
+@pytest.mark.parametrize("stated", first(1, [[0, 0, 9.80665], [9.0, 0.0, 3.8], [0, -9.80665, 0]]))
 def test_gravity_elsewhere_than_stated_is_named(mode, stated):
     """An arm that hangs, or stands on a wall; of one upside down all signs change, no residual."""
     c = campaign(NO_EFFECT, mode, 1, poses=20)
@@ -165,7 +165,7 @@ def test_forces_of_the_other_sign_or_in_flange_axes_are_named(mode, axes, sign):
     assert ("of the other sign" in message(d)) == (sign < 0)
 
 
-@pytest.mark.parametrize("mode", ["absolute", "deflection"])
+@pytest.mark.parametrize("mode", first(1, ["absolute", "deflection"]))
 def test_gravity_as_stated_is_no_wrong_figure(mode):
     """Of a base that tilts by 3°, which effects such as `base_compliance` are alike."""
     c = campaign(NO_EFFECT, mode, 1, poses=20)

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -185,9 +186,14 @@ def test_a_predictable_part_counts_from_a_third_of_the_rest_on(law, reason):
     assert d.follows[0] == "joint 4 angle"
 
 
+@cache
+def of_scattering():
+    return fitted_model(*scattering(), "absolute")
+
+
 @pytest.mark.parametrize(("share", "reason"), [(0.09, "arm_scatter"), (0.11, "no_suspect")])
 def test_a_negligible_part_that_is_predictable_is_said(share, reason):
-    e = Evidence(fitted_model(*scattering(), "absolute"))
+    e = Evidence(of_scattering())
     vars(e)["misfit_breakdown"] = (MisfitShare("joint 4 angle", share, 1e-9),)
     d = judge(e, History())
     assert (d.reason, d.predictable_share) == (reason, share)
@@ -266,11 +272,11 @@ def test_an_estimate_goes_through_json(kind):
     np.testing.assert_array_equal(with_it.as_stated().covariance, readings.covariance)
 
 
-@pytest.mark.parametrize("seeds", [12, pytest.param(300, marks=pytest.mark.slow)])
-def test_p_values_stay_uniform_with_an_estimated_covariance(seeds):
+@pytest.mark.slow
+def test_p_values_stay_uniform_with_an_estimated_covariance():
     """Those of an effect that is not there, with the covariance as estimated each time."""
     p_values = []
-    for seed in range(seeds):
+    for seed in range(300):
         cell, readings = scattering(seed=seed)
         plain = fitted_model(cell, readings, "absolute")
         with_it = with_arm_scatter(plain.model.cell, readings, estimate_arm_scatter(plain))

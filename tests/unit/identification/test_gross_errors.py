@@ -56,7 +56,7 @@ def shifted(readings, rows, shift):
     return replace(readings, value=value)
 
 
-@pytest.mark.parametrize("size", first(2, [3e-4, 0.5, 2e-3]))
+@pytest.mark.parametrize("size", first(1, [3e-4, 0.5, 2e-3]))
 @pytest.mark.parametrize("mode", MODES)
 def test_three_gross_errors_are_set_aside_and_listed(mode, size):
     r, rows = C.readings, [7, 68, 134]
@@ -108,7 +108,9 @@ def test_gross_errors_say_what_they_look_like(mode):
     assert "was the load hung" in reasons[2]
 
 
-@pytest.mark.parametrize(("m", "factor", "tried"), [(3, 1, 5000), (6, 1, 5000), (3, 4, 2000)])
+@pytest.mark.parametrize(
+    ("m", "factor", "tried"), first(1, [(3, 1, 5000), (6, 1, 5000), (3, 4, 2000)])
+)
 def test_good_readings_are_called_gross_once_in_a_thousand_campaigns(m, factor, tried):
     """Also beside a misfit twice as wide as the noise, where it is rarer."""
     rng, alarms = np.random.default_rng(m), 0
@@ -213,7 +215,7 @@ def test_a_twentieth_of_gross_errors_changes_no_verdict(effect, mode, seeds):
 @pytest.mark.parametrize("m", first(1, [3, 6]))
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize(
-    ("share", "size"), first(2, [(0.4, 5e-3), (0.4, 1e-3), (0.2, 5e-3), (0.3, 5e-2)])
+    ("share", "size"), first(1, [(0.4, 5e-3), (0.4, 1e-3), (0.2, 5e-3), (0.3, 5e-2)])
 )
 def test_all_of_many_gross_errors_are_found(share, size, mode, m):
     c = twelve(mode, m=m)
@@ -289,7 +291,7 @@ def test_an_unloaded_reading_that_several_deflections_share():
     np.testing.assert_array_equal(found.outlier, expected)
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", first(1, MODES))
 def test_readings_of_several_targets(mode):
     c = reflectors(poses=10)
     readings, wrong = spoil(c.readings, 0.3, 5e-3, np.random.default_rng(0))
@@ -357,7 +359,7 @@ def one_sided(model, readings, size, joint):
     return replace(readings, value=readings.value + moved)
 
 
-@pytest.mark.parametrize("joint", [1, 2, 3])
+@pytest.mark.parametrize("joint", first(1, [1, 2, 3]))
 def test_a_law_of_one_joint_is_not_set_aside(joint):
     c = twelve("deflection")
     model = baseline(c.cell, c.readings, "deflection")

@@ -41,7 +41,7 @@ from tests.support.refusals import refusal_of
 def ran():
     """A usual campaign at its end, to look at."""
     b = Bench()
-    b.measure()
+    b.measure(usual_plan())
     return b
 
 
@@ -68,7 +68,7 @@ def test_wrench_is_measured_or_told_as_the_cell_says(use, mass, pull):
     b = Bench(force_sensor=ForceSensor(driver="fake", port="nowhere", use=use))
     loads = (CellLoad(name="3kg", mass_kg=3.03), CellLoad(name="pull", force_N=(38.0, 0.0, 0.0)))
     b.world.config = b.config.model_copy(update={"loads": loads})
-    readings = b.measure(FEW_POSES)
+    readings = b.measure()
     weight = [0, 0, -mass * 9.80665, 0, 0, 0]
     for load, wrench in (("none", np.zeros(6)), ("3kg", weight), ("pull", [pull, 0, 0, 0, 0, 0])):
         felt = readings.states.wrench[rows(readings, load)]
@@ -92,7 +92,7 @@ def test_wrench_is_that_at_the_load_point_wherever_the_sensor_sits(b):
         return np.concatenate([axes.T @ f, axes.T @ m]) + b.world.offset
 
     change_result(b.world, "wrench", at_the_sensor)
-    readings = b.measure()
+    readings = b.measure(usual_plan())
     for name, force in (("3kg", [0, 0, -3.0 * 9.80665]), ("pull", [40.0, 0, 0])):
         assert np.allclose(
             readings.states.wrench[rows(readings, name)], [*force, 0, 0, 0], atol=1e-6
@@ -170,7 +170,7 @@ def test_the_judge_sees_all_readings_and_may_not_know(b):
             raise CannotAnswerError("too few readings")
         return LiveResidual(1e-5, 0.5) if len(readings) > 3 else LiveResidual()
 
-    b.measure(FEW_POSES, live=judge)
+    b.measure(live=judge)
     assert seen == list(range(1, len(FEW_POSES.steps) + 1))
     taken = b.notes.of_kind(ReadingStored)
     assert [t.live.residual for t in taken[:4]] == [None, None, None, 1e-5]
@@ -183,7 +183,7 @@ def test_drift_of_the_reference_pose_is_told(b):
             b.world.shift = np.array([0.0, 0.0, 4e-4])
 
     call_before(b.store, "record", shift)
-    b.measure()
+    b.measure(usual_plan())
     drifts = [content for kind, content in b.store.events if kind == "drift"]
     assert [d["over"] for d in drifts] == [True, True]
     said = b.remarks("reference pose has moved")
@@ -248,11 +248,11 @@ def test_an_arm_that_does_not_scatter_is_seldom_said_to():
 def test_without_a_tool_and_without_a_force_sensor():
     b = Bench(tool=Tool(target_m=(0.0, 0.0, 0.1)))
     b.world.tool_mass = 0.0
-    b.measure(FEW_POSES)
+    b.measure()
     assert b.world.payload[0] == 0.0
     b = Bench(force_sensor=None)
     b.world.wrong_loads = ["none", "6kg"]
-    readings = b.measure(FEW_POSES)
+    readings = b.measure()
     assert len(readings) == len(FEW_POSES.steps)
     assert np.allclose(readings.states.wrench[rows(readings, "pull")], [40.0, 0, 0, 0, 0, 0])
     assert json.loads(b.store.rows[0][2])["force"] is None
@@ -260,7 +260,7 @@ def test_without_a_tool_and_without_a_force_sensor():
 
 def test_a_wrong_load_is_asked_for_again_with_the_reason(b):
     b.world.wrong_loads = ["none", "6kg"]  # the first answer is that to "take everything off"
-    readings = b.measure(FEW_POSES)
+    readings = b.measure()
     assert len(readings) == len(FEW_POSES.steps)
     assert b.requested_loads[:3] == ["none", "3kg", "3kg"]
     assert b.operator.requests[1][1] == ""
@@ -271,16 +271,16 @@ def test_a_wrong_load_is_asked_for_again_with_the_reason(b):
 @pytest.mark.long
 def test_three_wrong_loads_end_the_run(b):
     b.world.wrong_loads = ["none", "6kg", "none", "6kg"]
-    refusal_of(DeviceError, r"asked 3 times to hang 3kg.*--resume$", b.measure)
+    refusal_of(DeviceError, r"asked 3 times to hang 3kg.*--resume$", b.measure, usual_plan())
     assert len(b.store.rows) == 5
     assert b.world.calls[-2] == "arm.stop"
     b.world.restart()
-    assert len(b.measure()) == len(usual_plan().steps)
+    assert len(b.measure(usual_plan())) == len(usual_plan().steps)
 
 
 def test_a_load_that_is_not_taken_off_is_noticed(b):
     b.world.wrong_loads = ["none", "3kg", "3kg"]
-    b.measure(FEW_POSES)
+    b.measure()
     assert b.requested_loads == ["none", "3kg", "none", "none", "pull", "none"]
     assert "3.0 kg still hangs" in b.operator.requests[3][1]
 
@@ -297,13 +297,13 @@ def test_a_swinging_load_is_weighed_twice(b):
             b.world.extra[0] = 8.0 if swings else 0.0
 
     call_before(b.rig.force, "average", swinging)
-    b.measure()
+    b.measure(usual_plan())
     assert b.requested_loads == ["none", "3kg", "none", "pull", "none"]
 
 
 def test_the_tool_is_identified_and_compared_with_the_configuration(b):
     b.world.tool_mass = 1.4
-    b.measure()
+    b.measure(usual_plan())
     assert b.store.kinds().index("tool") < b.store.kinds().index("load")
     tool = b.store.last("tool")
     assert tool["mass_kg"] == pytest.approx(1.4, abs=1e-6)
@@ -372,13 +372,13 @@ def test_a_clock_set_back_since_the_epoch_makes_no_time_before_it(b):
 
 @pytest.mark.long
 def test_a_load_that_still_hangs_at_a_resume_is_noticed(b):
-    b.interrupt(7)
+    b.interrupt(7, usual_plan())
     assert b.world.load == "3kg"
     b.world.wrong_loads = ["3kg"]  # the first answer is wrong
     # the sensor was off meanwhile
     b.world.offset = b.world.offset + np.array([2.0, 2.0, -2.0, 0, 0, 0])
     seen = len(b.operator.requests)
-    b.measure()
+    b.measure(usual_plan())
     asked = b.operator.requests[seen:]
     assert [name for name, _ in asked[:3]] == ["none", "none", "3kg"]
     assert "than in the unloaded readings so far; 3kg seems to hang still" in asked[1][1]
@@ -403,9 +403,9 @@ def test_a_load_that_a_plan_leaves_on_the_arm_is_said_at_its_end(b):
 
 
 def test_a_finished_campaign_touches_nothing(b):
-    b.measure(FEW_POSES)
+    b.measure()
     b.world.calls.clear()
-    b.measure(FEW_POSES)
+    b.measure()
     assert b.world.calls == []
     assert b.notes.of_kind(Phase)[-1].text == "nothing is missing"
 
@@ -414,9 +414,9 @@ def test_a_finished_campaign_touches_nothing(b):
 def test_the_tool_is_known_from_an_earlier_session_after_the_sensor_was_off(b):
     """Another bias in the second session: the pulls are measured right nevertheless."""
     b.world.tool_mass = 1.4
-    b.interrupt(7)
+    b.interrupt(7, usual_plan())
     b.world.offset = -b.world.offset
-    readings = b.measure()
+    readings = b.measure(usual_plan())
     felt = readings.states.wrench[rows(readings, "pull")]
     assert np.allclose(felt, [40.0, 0, 0, 0, 0, 0], atol=1e-6)
 
@@ -426,7 +426,7 @@ LOST = "no longer reports the torques"
 
 def test_torques_are_averaged_over_the_reading(b):
     b.world.torques = np.inf
-    torque = b.measure(FEW_POSES).states.torque
+    torque = b.measure().states.torque
     # means of at least three samples that scatter by 0.1 N·m
     assert np.abs(torque - TORQUE).max() < 5 * 0.1 / np.sqrt(3)
     assert not b.remarks(LOST)
@@ -471,7 +471,7 @@ def test_a_campaign_goes_on_as_it_began(b, first):
     b.world.torques = first
     b.interrupt(4, FEW_POSES)
     b.world.torques = -1 if first else np.inf
-    torque = b.measure(FEW_POSES).states.torque
+    torque = b.measure().states.torque
     if not first:
         assert torque is None
     else:

@@ -74,8 +74,8 @@ IDS = [type(f).__name__ for f in FAULTS]
 
 @pytest.mark.parametrize("kind", first(1, KINDS), ids=IDS)
 def test_fault_at_some_calls(kind):
-    """Every 97th call, other ones for each kind of fault; all of them in the slow suite."""
-    for k in range(1 + 10 * kind, calls_of_a_whole_run() + 1, 97):
+    """Every 197th call, other ones for each kind of fault; all of them in the slow suite."""
+    for k in range(1 + 10 * kind, calls_of_a_whole_run() + 1, 197):
         check_fault(FAULTS[kind], k)
 
 
@@ -265,7 +265,7 @@ LIMIT = ForceSensor(driver="fake", port="nowhere", max_force_N=120.0)
 
 def test_order_of_the_start(b):
     """The hook is cleared before anything moves, the tare comes before the first reading."""
-    b.measure(FEW_POSES)
+    b.measure()
     first = {name: b.world.calls.index(name) for name in set(b.world.calls)}
     assert first["operator.hang"] < first["arm.take_control"] < first["arm.start_move"]
     tare = b.world.calls.index("force.average", first["arm.start_move"])
@@ -299,7 +299,7 @@ def test_payload_is_set_before_a_weight_is_hung_and_after_it_is_off(b):
 def test_loads_change_only_at_the_reference_and_motions_carry_them(b):
     where = []
     call_before(b.operator, "hang", lambda *_: where.append(b.world.q.copy()))
-    b.measure(FEW_POSES)
+    b.measure()
     assert b.requested_loads == ["none", "3kg", "none", "pull", "none"]
     for q in where[1:]:
         assert np.allclose(q, POSES["reference"])
@@ -316,7 +316,7 @@ def test_every_motion_is_guarded_with_what_hangs_and_nothing_else(b, monkeypatch
     monkeypatch.setattr(Guard, "check", noted)
     call_before(b.rig.arm, "sample", checked.clear)
     call_before(b.rig.arm, "start_move", lambda *_: begun.append((b.world.load, *checked)))
-    b.measure(FEW_POSES)
+    b.measure()
     assert set(begun) == {("none", "none"), ("3kg", "3kg"), ("pull", "pull")}
 
 
@@ -400,7 +400,7 @@ def test_a_lost_target_is_found_again(b):
     b.world.unseen_measurements = (
         3  # at both stops of the approach, where nothing is read, and at the reading
     )
-    readings = b.measure(FEW_POSES)
+    readings = b.measure()
     assert len(readings) == len(FEW_POSES.steps)
     assert b.world.calls.count("tracker.find_target") == 1
     assert any("found again" in x for x in json.loads(b.store.rows[0][2])["remarks"])
@@ -422,7 +422,7 @@ def test_a_pose_that_fails_twice_is_named_and_can_be_left_out(b):
 
     call_before(b.rig.tracker, "measure", hidden)
     for again in (False, True, True):
-        said = refusal_of(DeviceError, r"line of sight.*--resume$", b.measure)
+        said = refusal_of(DeviceError, r"line of sight.*--resume$", b.measure, usual_plan())
         assert ("It failed at p2 before, too: --skip p2 goes on" in said) == again
         b.world.restart()
         b.world.unseen_measurements = b.world.not_found = 0
@@ -457,11 +457,11 @@ def test_limits_that_leave_out_the_reference_are_to_be_put_back(b):
 
 
 def test_limits_that_were_narrowed_meanwhile_do_not_lock_a_campaign(b):
-    b.interrupt(stored=4)  # p2, which reaches farthest in y, is measured without a load
+    b.interrupt(4, usual_plan())  # p2, which reaches farthest in y, is measured without a load
     limits = Limits(workspace_min_m=(-1.2, -1.2, 0.05), workspace_max_m=(1.2, 0.3, 1.5))
     b.config = b.config.model_copy(update={"limits": limits})
     done, plan = b.store.done(), usual_plan()
-    refusal("p2.*ends at 0.3 m.*--skip POSE leaves a pose out", b.measure)
+    refusal("p2.*ends at 0.3 m.*--skip POSE leaves a pose out", b.measure, usual_plan())
     assert "arm.start_move" not in b.world.calls
     b.measure(replace(plan, steps=(*done, *plan.skipping(["p2"], done, 3).steps)))
     assert {s for s in plan.steps if s.pose != "p2"} < b.store.done()
@@ -523,7 +523,7 @@ def test_somebody_who_jogs_the_arm_meanwhile_spoils_the_reading(b):
             b.world.q = b.world.q + 3e-4
 
     call_before(b.rig.force, "average", jog)
-    b.measure()
+    b.measure(usual_plan())
     assert "measured again: arm: it moved by 0.0003" in b.store.rows[1][2]
     assert len(b.store.rows) == len(usual_plan().steps)
 

@@ -44,7 +44,7 @@ def is_home(b):
 def test_a_goal_that_is_met_under_a_load():
     """The load is taken off at the reference pose, and the drift of so far is read."""
     b, plan = Bench(), usual_plan()
-    b.measure(goal=Enough(7))
+    b.measure(plan, goal=Enough(7))
     assert steps(b) == [*plan.steps[:7], Step("reference", "none", 1)]
     assert is_home(b)
     assert b.requested_loads == ["none", "3kg", "none"]
@@ -75,7 +75,7 @@ def test_a_goal_that_is_met_under_a_load():
 )
 def test_a_goal_that_is_met_elsewhere(count, more):
     b, plan = Bench(), usual_plan()
-    b.measure(goal=Enough(count))
+    b.measure(plan, goal=Enough(count))
     assert steps(b) == [*plan.steps[:count], *more]
     assert is_home(b)
     assert b.store.kinds().count("goal") == 1
@@ -113,24 +113,24 @@ def test_the_way_home_is_clear(b):
 @pytest.mark.long
 def test_what_was_left_out_is_measured_on_resuming():
     b, plan = Bench(), usual_plan()
-    b.measure(goal=Enough(7))
+    b.measure(plan, goal=Enough(7))
     b.world.restart()
-    b.measure()
+    b.measure(plan)
     assert Counter(steps(b)) == Counter(plan.steps)
     assert steps(b)[-1] == plan.steps[-1]  # the campaign still ends with a look at the drift
 
 
 def test_resuming_towards_a_farther_goal():
     b, plan = Bench(), usual_plan()
-    b.measure(goal=Enough(7))
+    b.measure(plan, goal=Enough(7))
     b.world.restart()
-    b.measure(goal=Enough(11))
+    b.measure(plan, goal=Enough(11))
     assert len(steps(b)) == 12
     assert set(steps(b)) < set(plan.steps)
     assert is_home(b)
     b.world.restart()
     b.operator.requests.clear()
-    b.measure(goal=Enough(12))  # is met already
+    b.measure(plan, goal=Enough(12))  # is met already
     assert len(steps(b)) == 12
     assert b.requested_loads == ["none"]
     assert is_home(b)
@@ -139,7 +139,7 @@ def test_resuming_towards_a_farther_goal():
 def test_a_goal_that_is_never_met():
     b, plan = Bench(), usual_plan()
     rule = Enough(0)
-    b.measure(goal=rule)
+    b.measure(plan, goal=rule)
     assert steps(b) == list(plan.steps)
     assert rule.asked == [(k, k == 15) for k in range(1, 16)]
     assert b.store.kinds().count("goal") == 1

@@ -11,7 +11,6 @@ from hilcal.measuring.measure import Measurer
 from hilcal.measuring.progress import Phase
 from hilcal.robot.chain import evaluate
 from tests.support.fake_bench import (
-    FEW_POSES,
     POSES,
     Bench,
     call_before,
@@ -251,7 +250,7 @@ def test_a_load_that_falls_off_in_motion_stops_the_arm_and_is_asked_for_again(b)
     fell, motions = falls_in_motion(b), carried(b)
     call_before(b.rig.arm, "set_payload", lambda mass, com: payloads.append((b.world.load, mass)))
     call_before(b.rig.arm, "stop", lambda: stopped.append(b.world.time))
-    readings = b.measure()
+    readings = b.measure(usual_plan())
     assert len(readings) == len(usual_plan().steps)
     assert stopped[0] - fell[0] < 0.5
     assert b.requested_loads[1:3] == ["3kg", "3kg"]
@@ -286,7 +285,7 @@ def assert_true(b):
 def test_a_load_that_falls_off_between_readings_leaves_no_reading_without_it(b):
     """It falls while the tracker measures: the reading is kept as doubted, and taken again."""
     falls_at_rest(b, "3kg", 4)
-    b.measure(FEW_POSES)
+    b.measure()
     assert b.requested_loads[1:3] == ["3kg", "3kg"]
     assert_true(b)
 
@@ -303,7 +302,7 @@ def test_leaning_on_the_tool_during_a_reading_is_kept_as_doubted_and_measured_ag
             b.world.extra = np.array([0, 60.0, 0, 0, 0, 0])
 
     call_before(b.rig.force, "average", leans)
-    readings = b.measure()
+    readings = b.measure(usual_plan())
     assert leaned
     assert len(readings) == len(usual_plan().steps)
     doubted = b.store.last("doubted")
@@ -405,7 +404,7 @@ def test_unloaded_readings_that_were_leaned_on_do_not_spoil_the_tool(b):
         b.world.extra = np.array([0, 5.0 * (len(b.store.rows) == 2), 0, 0, 0, 0])
 
     call_before(b.rig.force, "average", leans)
-    b.measure()
+    b.measure(usual_plan())
     assert b.store.last("tool")["mass_kg"] == pytest.approx(0.8, abs=1e-6)
     assert b.remarks("was the tool touched")
 
@@ -447,7 +446,7 @@ def test_who_bears_a_part_of_a_heavy_load_in_motion_is_noticed_though_it_may_swi
 @pytest.mark.long
 def test_a_load_that_stays_wrong_ends_the_run(b):
     falls_in_motion(b, "none", "none", "none")
-    refusal_of(DeviceError, r"asked 3 times to hang 3kg.*--resume$", b.measure)
+    refusal_of(DeviceError, r"asked 3 times to hang 3kg.*--resume$", b.measure, usual_plan())
     assert len(b.store.rows) == 7
 
 
