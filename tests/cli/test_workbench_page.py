@@ -327,7 +327,7 @@ def number(page, what):
 
 @needs_chromium
 @pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.long)])
-def test_the_page_fits_desktop_and_phone(browser, served, scheme, tmp_path):
+def test_the_page_fits_desktop_and_phone(browser, served, scheme):
     told: list[str] = []
     with Campaign.open(served.run, read_only=True) as o:
         readings = int((o.file.readings().load > 0).sum())
@@ -335,7 +335,6 @@ def test_the_page_fits_desktop_and_phone(browser, served, scheme, tmp_path):
     for size in (DESKTOP, PHONE):
         page.set_viewport_size(size)  # type: ignore[arg-type]
         page.wait_for_timeout(300)
-        page.screenshot(path=tmp_path / f"{scheme}-{size['width']}.png", full_page=True)
         assert page.evaluate("document.documentElement.scrollWidth") <= size["width"]
         first = page.locator("[data-part=verdict]").bounding_box()
         assert first["y"] + first["height"] < size["height"]  # the verdict is on the first screen

@@ -8,8 +8,9 @@ import pytest
 from hilcal.diagnosis.order_step import step_in_order
 from hilcal.identification.baseline import baseline
 from hilcal.present.verdict import headline, message
+from hilcal.refinement import refine
 from tests.support.campaigns import campaign
-from tests.support.fit_cases import fitted_model, refined
+from tests.support.fit_cases import fitted_model
 from tests.support.rows import first
 
 C = campaign(mode="absolute", plan_seed=0, poses=12)
@@ -39,7 +40,9 @@ def test_what_moved_in_the_middle_is_named_with_its_row(what, size):
 
 @pytest.mark.parametrize("what", first(1, ["sensor", "target"]))
 def test_the_verdict_names_the_step(what):
-    d = refined(C.cell, moved(what, 5e-3), "absolute").diagnosis
+    readings = moved(what, 5e-3)
+    start = baseline(C.cell, readings, "absolute")
+    d = refine(start, readings, "absolute", background=False).diagnosis
     assert d.verdict == "unknown_effect"
     assert headline(d) == "unknown effect: a step in the order of the readings"
     assert d.to_dict()["step"]["moved"][0] == what

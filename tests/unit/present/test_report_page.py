@@ -251,7 +251,8 @@ def test_it_is_whole_in_a_browser(made, browser, size, scheme):
 
 
 @needs_chromium
-@pytest.mark.parametrize("of", [plain, pytest.param(large, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("of", [plain, large])
 def test_it_prints_on_six_pages_at_most(made, browser, tmp_path, of):
     path = tmp_path / "short.html"
     path.write_text(page_of(of(made[0])), encoding="utf-8")

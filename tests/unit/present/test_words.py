@@ -250,6 +250,7 @@ def test_a_curve_is_shown_only_where_it_is_determined_and_carries_something(show
     assert told(2e-6, share=0.004) == ""
 
 
+@cache
 def drifting(strength):
     """Judge a drift of the tracker where nothing states the time."""
     cell, p = cell_of(registration_known=True), plan(16, 3)
@@ -283,7 +284,7 @@ def test_an_unknown_effect_never_stands_beside_nothing_predicted(strength):
 
 def test_what_the_pose_alone_predicts_is_said_so(shown):
     """Each pose is off by its own random amount; its repeats are off by the same."""
-    cell, p = cell_of(registration_known=True), plan(16, 3, 2)
+    cell, p = cell_of(registration_known=True), plan(10, 3, 2)
     rng = np.random.default_rng(4)
     r = with_noise(noiseless(world_of(cell, rng), p), rng)
     kind = r.pose * 10 + r.load  # so that only repeats have the error in common
