@@ -3,6 +3,7 @@
 import gc
 import os
 import signal
+import socket
 from pathlib import Path
 
 import hypothesis
@@ -27,6 +28,14 @@ def ipa_ur10() -> Path:
     if not path.is_dir():
         pytest.skip("data set ipa_ur10 is absent: set HILCAL_DATA to the directory that holds it")
     return path
+
+
+@pytest.fixture
+def free_port():
+    """A port that nobody listens at."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -196,9 +196,9 @@ def test_a_reader_that_leaves_early_is_no_error(campaign):
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 @pytest.mark.long
-def test_view_serves_until_it_is_told_to_stop(campaign, number, capsys):
+def test_view_serves_until_it_is_told_to_stop(campaign, number, capsys, free_port):
     ok(capsys, "identify", campaign)
-    with start("view", campaign, "--port", str(free_port())) as process:
+    with start("view", campaign, "--port", str(free_port)) as process:
         try:
             assert process.stdout.readline().startswith("Open the viewer with")
             assert "rerun+http://127.0.0.1:" in process.stdout.readline()
@@ -208,12 +208,6 @@ def test_view_serves_until_it_is_told_to_stop(campaign, number, capsys):
             process.kill()
     assert process.returncode == 0, err
     assert "Traceback" not in out + err
-
-
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def test_a_kill_leaves_every_committed_revision(fitted, capsys):

@@ -4,7 +4,6 @@ import ast
 import doctest
 import inspect
 import shutil
-import socket
 import subprocess
 import sys
 from dataclasses import replace
@@ -78,12 +77,11 @@ def names():
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=pytest.mark.long if n == "discover" else ()) for n in names()]
 )
-def test_the_examples_of_a_docstring_run(name, site):
+def test_the_examples_of_a_docstring_run(name, site, free_port):
     thing = getattr(hc, name)
-    port = _free_port()
     known = {"hc": hc, "np": np, "CELL": site.cell, "TABLE": site.table, "RUN": site.run}
     known["LATER"] = site.later
-    known["PORT"] = port
+    known["PORT"] = free_port
     known["STREAM"] = site.folder / "t.parquet"
     known["REPORT"] = site.folder / "report.html"
     finder = doctest.DocTestFinder(recurse=True)
@@ -196,7 +194,7 @@ def test_points_in_degrees_and_names_are_refused(q, wrench, said, site):
         refusal(said, asked, q, wrench)
 
 
-def test_what_a_stranger_guesses_works(site, refined, tmp_path):
+def test_what_a_stranger_guesses_works(site, refined, tmp_path, free_port):
     path = tmp_path / "run.hilcal"
     with hc.Campaign(site.run, read_only=True) as other:
         stored_readings(path, other.file.readings(), load_config(CELL))
@@ -223,14 +221,8 @@ def test_what_a_stranger_guesses_works(site, refined, tmp_path):
         assert hc.diagnose(run).verdict == found.verdict
     assert hc.validate(path, site.later).judged.unseen
     assert hc.report(path) == tmp_path / "run.html"
-    with hc.view(path, port=_free_port()) as url:
+    with hc.view(path, port=free_port) as url:
         assert url.startswith("rerun+http")
-
-
-def _free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def test_what_a_console_prints_of_a_value_is_at_most_fifteen_lines(site, refined, planned):

@@ -296,18 +296,19 @@ def fleet(one, odd):
     return Fleet((of,), tuple(mine), ()), of
 
 
-def recorded(one, path, odd):
+def recorded(drawn, path):
     rr.set_strict_mode(True)
     try:
-        record_fleet(fleet(one, odd)[0], path)
+        record_fleet(drawn, path)
     finally:
         rr.set_strict_mode(False)
     return path
 
 
 def test_the_odd_joint_alone_is_red_and_its_arm_framed(one, tmp_path):
-    path = recorded(one, tmp_path / "fleet.rrd", 1.5)
-    d = DrawnType(fleet(one, 1.5)[1], fleet(one, 1.5)[0].members)
+    drawn, of = fleet(one, 1.5)
+    path = recorded(drawn, tmp_path / "fleet.rrd")
+    d = DrawnType(of, drawn.members)
     shapes = capsules(d.arm)
     colors = [rgb(c) for c in rows(path, "/arms0/arms", "Capsules3D:colors")[0]]
     red = [k for k, c in enumerate(colors) if c == style.RED]
@@ -323,7 +324,7 @@ def test_the_odd_joint_alone_is_red_and_its_arm_framed(one, tmp_path):
 
 
 def test_an_ordinary_fleet_has_nothing_red(one, tmp_path):
-    path = recorded(one, tmp_path / "fleet.rrd", 0.0)
+    path = recorded(fleet(one, 0.0)[0], tmp_path / "fleet.rrd")
     colors = [rgb(c) for c in rows(path, "/arms0/arms", "Capsules3D:colors")[0]]
     assert style.RED not in colors
     assert "/arms0/unlike" not in entities(path)

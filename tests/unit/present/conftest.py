@@ -1,19 +1,10 @@
 """What the tests of words, pages and recordings share."""
 
 import io
-import socket
 
 import pytest
 import rerun as rr
 from rich.console import Console
-
-
-@pytest.fixture
-def free_port():
-    """A port that nobody listens at."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @pytest.fixture
