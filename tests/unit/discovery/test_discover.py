@@ -77,7 +77,7 @@ def test_a_refinement_adds_the_law_and_its_file_gives_it_back(tmp_path, monkeypa
     monkeypatch.setattr(
         sys.modules[LawSearch.__module__], "discover", lambda fit, say, name: found()
     )
-    r = refine(before.model, before.readings, before.mode, laws=laws)
+    r = refine(before.model, before.readings, before.mode, laws=laws, background=False)
     assert r.steps[0].diagnosis.verdict == "unknown_effect"
     assert [s.added for s in r.steps] == [None, "bent"]
     assert r.verdict == "adequate"

@@ -305,6 +305,7 @@ def test_targets_of_one_arrival_have_it_in_common(mode):
     assert found.variance_factor == pytest.approx(1, abs=0.25)
 
 
+@pytest.mark.long
 def test_an_orientation_stated_too_noisy_does_not_hide_the_arm():
     cell, readings = scattering(4e-5, m=6)
     covariance = readings.covariance.copy()

@@ -359,6 +359,7 @@ def test_a_tracker_that_was_moved_on_the_way_is_asked_for():
     assert "column 'station'" in said
 
 
+@pytest.mark.long
 def test_zeros_of_all_joints_that_are_a_little_elsewhere_are_named():
     """But not those of the first and the last, which base and target have."""
     zeros = np.radians([0.0, 4.5, -6.0, -2.0, 5.0, 0.0])

@@ -466,7 +466,7 @@ def test_a_lost_link_is_said_once_and_readings_go_on(b, tmp_path):
     assert some.to_json() == all_of_them.to_json()
 
 
-@pytest.mark.parametrize("first", [0, np.inf])
+@pytest.mark.parametrize("first", [0, pytest.param(np.inf, marks=pytest.mark.long)])
 def test_a_campaign_goes_on_as_it_began(b, first):
     b.world.torques = first
     b.interrupt(4, FEW_POSES)
@@ -499,7 +499,7 @@ def test_what_fits_do_not_know_of_a_changed_cell_is_said(b, tmp_path, section, k
     assert [said in line for line in lines] == [True] * (said is not None)
 
 
-@pytest.mark.parametrize("use", ["pulls", "all"])
+@pytest.mark.parametrize("use", ["pulls", pytest.param("all", marks=pytest.mark.long)])
 def test_wrong_axes_of_the_force_sensor_can_be_corrected_until_a_load_is_measured(use, tmp_path):
     wrong, right = _sensor(use, (np.pi, 0.0, 0.0)), _sensor(use, (0.0, 0.0, 0.0))
     b, plan = Bench(force_sensor=wrong), usual_plan()

@@ -171,7 +171,7 @@ def test_interrupted_on_the_way_home(fault):
     assert steps(b) == wanted
     calls = b.world.calls
     third = [k for k, name in enumerate(calls) if name == "store.recorded"][2]
-    for k in np.linspace(third + 2, len(calls), 3).round().astype(int).tolist():
+    for k in np.linspace(third + 2, len(calls), 2).round().astype(int).tolist():
         b, plan = short()
         if isinstance(fault, Killed):
             b.world.kill_at = k
