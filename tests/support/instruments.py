@@ -10,12 +10,7 @@ import numpy as np
 from hilcal.config import CellConfig
 from hilcal.drivers.simulated.admin import ask
 from hilcal.drivers.simulated.blackboard import Blackboard
-from hilcal.drivers.simulated.cell_processes import (
-    EMSCON_PORT,
-    WEB_PORT,
-    DeviceProcess,
-    free_host,
-)
+from hilcal.drivers.simulated.cell_processes import EMSCON_PORT, WEB_PORT, DeviceProcess, free_host
 from tests.support.timing import wait_until
 
 TRACKER_NOISE = ("--range-std", "5e-6", "0.15e-6", "--transverse-std", "7.5e-6", "3e-6")

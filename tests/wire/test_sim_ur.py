@@ -20,14 +20,7 @@ from hilcal.errors import DeviceError
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
 from tests.support.rows import first
-from tests.support.sim_ur_cases import (
-    Lines,
-    Wire,
-    client,
-    send_script,
-    server,
-    start,
-)
+from tests.support.sim_ur_cases import Lines, Wire, client, send_script, server, start
 from tests.support.timing import wait_until
 
 SPEED, ACCELERATION = 0.5, 1.0

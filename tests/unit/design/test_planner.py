@@ -85,8 +85,7 @@ def by_criterion(name):
 
 
 @pytest.mark.parametrize(
-    "criterion",
-    [pytest.param(c, marks=() if c == "I" else pytest.mark.long) for c in CRITERIA],
+    "criterion", [pytest.param(c, marks=() if c == "I" else pytest.mark.long) for c in CRITERIA]
 )
 def test_every_criterion_gives_a_certified_plan(criterion):
     made = by_criterion(criterion)

@@ -7,14 +7,8 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from hilcal.diagnosis.effect_ranking import (
-    candidates,
-)
-from hilcal.diagnosis.evidence import (
-    REDUNDANCY_LEVEL,
-    backward_elimination,
-    model_columns,
-)
+from hilcal.diagnosis.effect_ranking import candidates
+from hilcal.diagnosis.evidence import REDUNDANCY_LEVEL, backward_elimination, model_columns
 from hilcal.diagnosis.stepwise import add, exchange, remove, trial
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.injected_effects import hide_effect

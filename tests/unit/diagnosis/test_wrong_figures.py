@@ -157,10 +157,9 @@ def test_forces_of_the_other_sign_or_in_flange_axes_are_named(mode, axes, sign):
         assert not d.wrong_figures
         return
     (figure,) = d.wrong_figures
-    assert (figure.kind, figure.found) == (
-        "forces" if axes == "base" else "force_axes",
-        (sign,),
-    ), message(d)
+    assert (figure.kind, figure.found) == ("forces" if axes == "base" else "force_axes", (sign,)), (
+        message(d)
+    )
     assert ("in flange axes" in message(d)) == (axes == "flange")
     assert ("of the other sign" in message(d)) == (sign < 0)
 

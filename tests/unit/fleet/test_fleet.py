@@ -19,14 +19,7 @@ from hilcal.robot.scene import capsules
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.codec import write_document
 from hilcal.transfer.fleet import Fleet, diagnosed_effects, pool
-from hilcal.transfer.members import (
-    Failure,
-    Member,
-    SizeEvidence,
-    entries,
-    member_of,
-    type_sizes,
-)
+from hilcal.transfer.members import Failure, Member, SizeEvidence, entries, member_of, type_sizes
 from tests.support.calibrate_process import CELL
 from tests.support.campaigns import cell_of, configuration, noiseless, plan, with_noise, world_of
 from tests.support.cli_cases import ok, refused

@@ -12,12 +12,7 @@ from hilcal.identification.baseline import baseline, loads_differ, loads_note, w
 from hilcal.identification.carried.carried_prior import scales_of
 from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import notes, to_json
-from hilcal.identification.gauss_newton import (
-    TALL,
-    NewtonPoint,
-    linear_problem,
-    regularise,
-)
+from hilcal.identification.gauss_newton import TALL, NewtonPoint, linear_problem, regularise
 from hilcal.identification.residual import residual
 from hilcal.model.model import Model
 from hilcal.readings.readings import States
@@ -25,12 +20,7 @@ from hilcal.readings.whitening import SCALINGS, whitening
 from hilcal.robot import se3
 from tests.support.campaigns import campaign, cell_of, noiseless, plan
 from tests.support.effect_cases import make
-from tests.support.fit_cases import (
-    MODES,
-    fitted_model,
-    parameters_by_effect,
-    predicted,
-)
+from tests.support.fit_cases import MODES, fitted_model, parameters_by_effect, predicted
 from tests.support.readings_cases import readings_at
 from tests.support.refusals import refusal, refusal_of
 from tests.support.rows import first

@@ -18,11 +18,7 @@ from hilcal.identification.folds import (
     region_folds,
 )
 from hilcal.identification.gauss_newton import solve
-from hilcal.identification.prediction.predictive import (
-    Excess,
-    excess,
-    predictive_of,
-)
+from hilcal.identification.prediction.predictive import Excess, excess, predictive_of
 from hilcal.identification.prediction.validation import extrapolation, validate
 from hilcal.identification.registration.robot_frames import whole_turns
 from hilcal.identification.residual import residual

@@ -9,10 +9,7 @@ import pytest
 
 from hilcal.robot.chain import evaluate
 from hilcal.robot.urdf import arm_from_urdf
-from studies.benchmark.entrants.common import (
-    TaskInput,
-    rotation,
-)
+from studies.benchmark.entrants.common import TaskInput, rotation
 from studies.benchmark.entrants.run import HERE, main, scores
 from studies.benchmark.entrants.tables import block, kept, page
 from studies.benchmark.task import read_task, read_truth
