@@ -31,6 +31,7 @@ def quiet(text):
     """Take progress."""
 
 
+@pytest.mark.long
 def test_a_revision_in_a_cell_that_was_changed(fitted, capsys):
     run = fitted
     with Campaign.open(run) as o:
@@ -62,6 +63,7 @@ def test_a_revision_of_other_targets(run, capsys):
     ok(capsys, "diagnose", run)
 
 
+@pytest.mark.long
 def test_a_bad_revision_is_set_aside_and_fitted_again(fitted, capsys):
     run = fitted
     with Campaign.open(run) as o:
@@ -84,6 +86,7 @@ def test_what_a_file_for_others_lacks(run, tmp_path, capsys):
     ok(capsys, "compensate", run, points, "--json")
 
 
+@pytest.mark.long
 def test_masses_that_a_description_lacks(tmp_path, capsys):
     text = (configs_dir() / "robots" / "ur10e.toml").read_text()
     arm, cell, path = tmp_path / "arm.toml", tmp_path / "cell.toml", tmp_path / "run.hilcal"

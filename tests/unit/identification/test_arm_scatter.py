@@ -211,6 +211,7 @@ def test_a_noisier_instrument_is_not_the_arm(mode):
     assert "and not as if the arm scattered" in words
 
 
+@pytest.mark.long
 def test_no_arm_scatters_by_half_a_millimetre():
     d, words = judged("absolute", 4e-4)
     assert d.verdict == "noise_misjudged"
