@@ -273,11 +273,13 @@ def test_an_estimate_goes_through_json(kind):
     np.testing.assert_array_equal(with_it.as_stated().covariance, readings.covariance)
 
 
-@pytest.mark.slow
-def test_p_values_stay_uniform_with_an_estimated_covariance():
+@pytest.mark.parametrize(
+    "seeds", [pytest.param(12, marks=pytest.mark.long), pytest.param(300, marks=pytest.mark.slow)]
+)
+def test_p_values_stay_uniform_with_an_estimated_covariance(seeds):
     """Those of an effect that is not there, with the covariance as estimated each time."""
     p_values = []
-    for seed in range(300):
+    for seed in range(seeds):
         cell, readings = scattering(seed=seed)
         plain = fitted_model(cell, readings, "absolute")
         with_it = with_arm_scatter(plain.model.cell, readings, estimate_arm_scatter(plain))
