@@ -12,7 +12,7 @@ A `NewtonProblem` states the objective at a point and the linear problem there, 
 replaced by any rows with the same products.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, NamedTuple, TypeVar
 
@@ -47,6 +47,9 @@ MAX_ITERATIONS = 20  # steps; the tests of convergence allow 8
 CONVERGED = 1e-5  # motion of the whitened readings by the last step, in units of the noise
 SETTLED = 0.02  # priors and rank are chosen anew until the residual changes by less than this share
 # in a step, or is within the noise
+NEAR = 0.02  # motion of the readings by a step, in units of the noise, below which it is
+# extrapolated
+MEMORY = 5  # earlier steps of the extrapolation
 HALVINGS = 8  # most step lengths of a line search
 NOISE_STEPS, NOISE_TOLERANCE = 50, 1e-9  # iterations of the noise factor, and relative change
 
@@ -275,6 +278,7 @@ def minimum(problem: NewtonProblem[P], start: Floats | None, prior: Floats | Non
     point = problem.at(np.where(sigma > 0, y, 0.0))
     by: Regularisation  # set in the first step
     square, settled = np.inf, False
+    past: list[tuple[Floats, Floats]] = []
     for iterations in range(1, MAX_ITERATIONS + 1):
         linear = problem.linearise(point, sigma)
         if not settled:
@@ -287,16 +291,32 @@ def minimum(problem: NewtonProblem[P], start: Floats | None, prior: Floats | Non
         aim = linear.origin.copy()
         aim[linear.live] += by.basis.transform @ equations.solve(by.beta)
         moved = linear.rows @ (aim - point.y)[linear.live]
+        near = settled and float(moved @ moved) <= NEAR**2 * max(square, by.beta) * linear.rank
+        past = [*past[-MEMORY:], (aim, moved)] if near else []
+        if past:
+            aim = _extrapolated(past)
         start_point, point = point, _line_search(problem, point, aim, by)
         previous, square = square, point.mean_square(len(by.basis.singular))
         noise = max(square, by.beta) * linear.rank
         if settled and float(moved @ moved) <= CONVERGED**2 * noise:
             moved = linear.rows @ (point.y - start_point.y)[linear.live]
-            near = float(moved @ moved) <= CONVERGED**2 * noise
-            return Minimum(point, by, iterations, True, linear.rows if near else None)
+            valid = float(moved @ moved) <= CONVERGED**2 * noise
+            return Minimum(point, by, iterations, True, linear.rows if valid else None)
         del linear  # frees memory for the next one
         settled = (problem.whitened and square < 1) or abs(square / previous - 1) <= SETTLED
     return Minimum(point, by, iterations, False, None)
+
+
+def _extrapolated(past: Sequence[tuple[Floats, Floats]]) -> Floats:
+    """Return where the aims (P,) of steps lead that move the whitened readings by (R,).
+
+    Gauss-Newton's steps fall slowly along directions that the readings hardly determine. The mean
+    of the last aims, with weights of sum one, is taken whose mean motion is the least (Anderson,
+    J. ACM 12 (1965) 547-560).
+    """
+    aims, moved = (np.array(x) for x in zip(*past, strict=True))
+    weight = np.linalg.lstsq(np.diff(moved, axis=0).T, moved[-1], rcond=None)[0]
+    return np.asarray(aims[-1] - weight @ np.diff(aims, axis=0))
 
 
 def shortened(

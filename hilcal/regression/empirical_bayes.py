@@ -172,7 +172,7 @@ def solutions(p: FamilyProblem, fold: Ints) -> Floats:
     fold_rows = [p.rows[fold == f] for f in range(len(count_of))]
     grams = [a.T @ a for a in fold_rows]
     sides = [a.T @ p.target[fold == f] for f, a in enumerate(fold_rows)]
-    gram, rhs = np.sum(grams, axis=0), np.sum(sides, axis=0)
+    gram, rhs = sum(grams[1:], grams[0].copy()), np.sum(sides, axis=0)
     gram[:flat, :flat] += p.ridge
     rhs[:flat] += p.pull
     square = np.bincount(fold, weights=p.target**2)

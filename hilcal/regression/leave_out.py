@@ -88,10 +88,9 @@ class ModelFolds:
     folds: tuple[Fold, ...]
 
     @cached_property
-    def lifted(self) -> tuple[Floats, ...]:
-        """B Tᵀ (R_f, K) in the rows of each fold."""
-        rows = self.projection.rows
-        return tuple(rows[f.left_out_rows] @ f.inverse_root.T for f in self.folds)
+    def rows(self) -> tuple[Floats, ...]:
+        """B (R_f, K) in the rows of each fold."""
+        return tuple(self.projection.rows[f.left_out_rows] for f in self.folds)
 
     def left_out(self, y: Floats, of_fit: bool = False) -> LeftOutResidual:
         """Predict each row without its fold.
@@ -100,13 +99,11 @@ class ModelFolds:
         """
         total, residual = self.projection.rows.T @ y, y.copy()
         solved = []
-        for fold, lifted in zip(self.folds, self.lifted, strict=True):
+        for fold, rows in zip(self.folds, self.rows, strict=True):
             out = fold.left_out_rows
-            if of_fit:
-                solved.append(fold.inverse_root @ fold.rhs)
-            else:
-                solved.append(fold.inverse_root @ total - lifted.T @ y[out])
-            residual[out] -= lifted @ solved[-1]
+            rhs = fold.rhs if of_fit else total - rows.T @ y[out]
+            solved.append(fold.inverse_root @ rhs)
+            residual[out] -= rows @ (fold.inverse_root.T @ solved[-1])
         return LeftOutResidual(y, tuple(solved), residual)
 
 
@@ -145,13 +142,15 @@ class FamilyFolds:
 
     def __init__(self, model: ModelFolds, x: Floats) -> None:
         self._x, self._model = x, model
-        self.gram, self.cross = x.T @ x, model.projection.rows.T @ x  # XᵀX, BᵀX of all rows
+        parts = [x[f.left_out_rows] for f in model.folds]
+        grams = [part.T @ part for part in parts]
+        crosses = [rows.T @ part for rows, part in zip(model.rows, parts, strict=True)]
+        self.gram, self.cross = sum(grams, np.zeros(())), sum(crosses, np.zeros(()))  # XᵀX, BᵀX
         self._rounding = FAMILY_ROUNDING * float(self.gram.max(initial=0.0))
         self._products = []  # T BᵀX and Xᵀ M X of the other rows
-        for fold, lifted in zip(model.folds, model.lifted, strict=True):
-            out = x[fold.left_out_rows]
-            c = fold.inverse_root @ self.cross - lifted.T @ out
-            self._products.append((c, self.gram - out.T @ out - c.T @ c))
+        for fold, gram, cross in zip(model.folds, grams, crosses, strict=True):
+            c = fold.inverse_root @ (self.cross - cross)
+            self._products.append((c, self.gram - gram - c.T @ c))
 
     def left_out(self, by_model: LeftOutResidual, ridge: float = 0.0) -> Floats:
         """Return the residual (R, ...) of each row, predicted without its fold.
@@ -161,12 +160,12 @@ class FamilyFolds:
         """
         x, y, left = self._x, by_model.y, by_model.residual.copy()
         rhs = x.T @ y
-        for fold, lifted, steps, (c, gram) in zip(
-            self._model.folds, self._model.lifted, by_model.solved, self._products, strict=True
+        for fold, model_rows, steps, (c, gram) in zip(
+            self._model.folds, self._model.rows, by_model.solved, self._products, strict=True
         ):
             rows = fold.left_out_rows
             h, b = gram.copy(), rhs - x[rows].T @ y[rows] - c.T @ steps
             h[np.diag_indices_from(h)] += max(ridge, self._rounding)
             family = positive_solve(h, b)
-            left[rows] += lifted @ (c @ family) - x[rows] @ family
+            left[rows] += model_rows @ (fold.inverse_root.T @ (c @ family)) - x[rows] @ family
         return left

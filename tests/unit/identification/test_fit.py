@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import scipy.linalg as sl
 
+from hilcal.cell import Cell
+from hilcal.effects.protocol import EffectSpec
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import baseline, loads_differ, loads_note, with_effects
 from hilcal.identification.carried.carried_prior import scales_of
@@ -14,10 +16,12 @@ from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import notes, to_json
 from hilcal.identification.gauss_newton import TALL, NewtonPoint, linear_problem, regularise
 from hilcal.identification.residual import residual
+from hilcal.library import read_table
 from hilcal.model.model import Model
 from hilcal.readings.readings import States
 from hilcal.readings.whitening import SCALINGS, whitening
 from hilcal.robot import se3
+from hilcal.robot.catalogue import configs_dir
 from tests.support.campaigns import campaign, cell_of, noiseless, plan
 from tests.support.effect_cases import make
 from tests.support.fit_cases import MODES, fitted_model, parameters_by_effect, predicted
@@ -392,6 +396,21 @@ def test_a_misfit_does_not_hinder(seed, more):
     assert found.solution.iterations <= STEPS
     assert found.variance_factor > 3
     np.testing.assert_allclose(slope(found), 0.0, atol=2e-3)
+
+
+def test_directions_that_the_readings_hardly_determine_need_few_steps(ipa_ur10):
+    """Gauss-Newton alone takes 20 steps here, and 20 are no end with the next 200 poses."""
+    cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
+    path = ipa_ur10 / "Series_B" / "measurements_joint_configurations.csv"
+    readings = read_table(path, cell, "ipa-ur10")
+    some = readings[np.random.default_rng(1).permutation(len(readings))[:200]]
+    model = baseline(cell, some, "absolute")
+    for name in ("link_geometry", "link_compliance", "joint_tilt_compliance", "link_mass"):
+        model = model + EffectSpec(name)
+    found = fit(model, some, "absolute")
+    assert found.solution.converged
+    assert found.solution.iterations <= 14
+    assert found.chi2 / 149_592 == pytest.approx(1.0, abs=1e-5)  # as by Gauss-Newton alone
 
 
 @pytest.mark.parametrize("seed", range(3))
