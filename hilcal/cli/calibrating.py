@@ -200,10 +200,9 @@ def _procedure(
 ) -> Procedure:
     config = cell.configured()
     hide = (config.simulation.hide or NO_EFFECT) if rehearse else None
-    base_dir = path.absolute().parent
     if rehearse:
         config = program_config(config, hide or NO_EFFECT, catalogue)
-        cell = cell_from_config(config, base_dir)
+        cell = cell_from_config(config, cell.base_dir)
     if not output.exists():
         may_write(output, False)
         check_effects(cell, catalogue)
@@ -213,7 +212,7 @@ def _procedure(
         max_time_s, seed = parse_duration(DEFAULT_MAX_TIME, "--max-time"), config.simulation.seed
         defaults = Settings(POSES, VALIDATION, max_time_s, seed=seed)
         settings = replace(defaults, readings=config.readings_mode, hide=hide, **stated)
-        p = Procedure(output, cell, base_dir, catalogue, settings)
+        p = Procedure(output, cell, catalogue, settings)
         p.check_files()
         return p
     p = continued(output, cell, catalogue)

@@ -81,7 +81,6 @@ class Procedure:
 
     run: Path  # the campaign file that is fitted; the others are in the same directory
     cell: Cell  # as configured
-    base_dir: Path  # that paths in the configuration are relative to
     catalogue: Catalogue  # the effects that a model can have
     settings: state.Settings  # goals, sizes and seed
     prior: CarriedPrior | None = None  # the prior of every fit, from `settings.prior`
@@ -106,7 +105,7 @@ class Procedure:
             return replace(stored, settings=replace(stored.settings, **options))
         readings = config.planning.readings if config.loads else "absolute"
         default = state.Settings(seed=config.simulation.seed, readings=readings)
-        return cls(path, cell, cell.base_dir.absolute(), effects, replace(default, **options))
+        return cls(path, cell, effects, replace(default, **options))
 
     @property
     def files(self) -> state.Files:
@@ -137,7 +136,7 @@ class Procedure:
         first = entry(state.BEGUN, {"settings": self.settings.to_json()})
         texts = {COVERS_KEY: covers, ENTRY.format(1): first}
         create_run(
-            self.run, config, self.base_dir, plan, source=self._source(), more_texts=texts
+            self.run, config, self.cell.base_dir, plan, source=self._source(), more_texts=texts
         ).close()
 
     def check_files(self) -> None:
@@ -150,7 +149,7 @@ class Procedure:
 
     def resume(self, campaign: CampaignFile) -> None:
         """Store the settings in the campaign's log, where they have changed."""
-        check_same_cell(campaign, self.config, self.base_dir)
+        check_same_cell(campaign, self.config, self.cell.base_dir)
         log, settings = ProcedureLog(campaign), self.settings.to_json()
         stored = log.last(state.BEGUN)
         if stored is None or stored["settings"] != settings:
@@ -362,7 +361,7 @@ class Procedure:
             seen = readings.value[at_reference & readings.unloaded][-1, :3]
             plan = replace(plan, about={**plan.about, SEEN: seen.tolist()})
         source = self._source(f"{purpose} campaign of {self.run.name}, ")
-        create_run(path, config, self.base_dir, plan, source=source, more_texts=texts).close()
+        create_run(path, config, self.cell.base_dir, plan, source=source, more_texts=texts).close()
 
     def _source(self, prefix: str = "") -> str:
         origin = "measured" if self.settings.hide is None else "rehearsed in a simulated cell"
@@ -391,6 +390,6 @@ def checked_plan(
 def continued(run: Path, cell: Cell, catalogue: Catalogue) -> Procedure:
     """Return the calibration of a campaign file, with the file's settings."""
     with CampaignFile.open(run, read_only=True) as campaign:
-        settings, base_dir = state.settings_of(campaign), cell.base_dir.absolute()
-        check_same_cell(campaign, cell.configured(), base_dir)
-    return Procedure(run, cell, base_dir, catalogue, settings)
+        settings = state.settings_of(campaign)
+        check_same_cell(campaign, cell.configured(), cell.base_dir)
+    return Procedure(run, cell, catalogue, settings)
