@@ -41,7 +41,7 @@ from hilcal.procedure.state import DECIDED, REFINED, VALIDATED, ProcedureStep, S
 from hilcal.readings.whitening import Mode
 from hilcal.store.campaign_file import CampaignFile, may_write
 from hilcal.store.procedure_log import ProcedureLog
-from hilcal.store.run_log import RunLog
+from hilcal.store.run_log import RunLog, changed_since_begun
 from hilcal.tables.units import parse_duration, parse_length
 
 VALIDATION = 20  # Poses of a validation campaign; a choice: they determine the mean error to 10 %
@@ -227,6 +227,8 @@ def _procedure(
     with CampaignFile.open(output) as campaign:
         campaign.measure_alone()  # nobody else measures
         p.resume(campaign)
+        for text in changed_since_begun(campaign, p.config):
+            go_on.t.notice(f"note: {text}")
     go_on.t.notice(f"{output}: a calibration, {words.state_clause(p.next())}")
     return p
 
