@@ -13,6 +13,7 @@ readings is predicted; from then on the file must not change.
 """
 
 import itertools
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -166,10 +167,21 @@ class Procedure:
             return campaign.n_readings
 
     def _epoch(self) -> float | None:
-        """Return the wall time at zero of the campaign's time, s; None where unknown."""
-        with CampaignFile.open(self.run, read_only=True) as campaign:
-            details = RunLog(campaign).details() if campaign.about(PLAN) is not None else []
-        return float(details[0]["epoch_wall_s"]) if details else None
+        """Return the wall time at zero of the campaign's time, s; None where unknown.
+
+        It is that of the last reading of these campaigns, as a clock may have been set meanwhile;
+        after one that was set back the time goes on from that reading.
+        """
+        last: dict[str, Any] = {}
+        for path in (self.run, self.files.validation):
+            if path.exists():
+                with CampaignFile.open(path, read_only=True) as campaign:
+                    if campaign.about(PLAN) is not None:
+                        last = next(reversed(RunLog(campaign).details()), last)
+        wall, elapsed = last.get("wall_s"), last.get("time_s")
+        if wall is None or elapsed is None:  # not of a session
+            return last.get("epoch_wall_s")
+        return float(min(wall, time.time()) - elapsed / self.config.simulation.clock)
 
     def refine(
         self,
