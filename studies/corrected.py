@@ -174,7 +174,7 @@ def _calibrated(t: Terminal, run: Path, config: CellConfig, settings: Settings) 
         if run.exists():
             p = continued(run, cell, catalogue)
         else:
-            p = Procedure(run, cell, run.parent, catalogue, settings)
+            p = Procedure(run, cell, catalogue, settings)
         with ExitStack() as stack:
             try:
                 CalibrationOperator(t, p, stack, rehearse=True, yes=True).to_the_end()

@@ -162,12 +162,31 @@ class Controller:
 
     def protective_stop(self, why: str) -> None:
         """Stop at once and pause the program until `unlock`."""
-        arm = self.arm
-        if arm.safety_mode is not SafetyMode.NORMAL:
-            return
-        arm.note(f"protective stop: {why}")
         self._stopped_at = time.monotonic()
-        arm.safety_mode = SafetyMode.PROTECTIVE_STOP
+        self._safety_stop(SafetyMode.PROTECTIVE_STOP, f"protective stop: {why}")
+
+    def safeguard_stop(self) -> None:
+        """Stop at once and pause the program: somebody is in the guarded area."""
+        self._safety_stop(SafetyMode.SAFEGUARD_STOP, "safeguard stop")
+
+    def release_safeguard(self) -> None:
+        """End a safeguard stop; a paused program goes on by itself, as the controller has it."""
+        if self.arm.safety_mode is SafetyMode.SAFEGUARD_STOP:
+            self.arm.safety_mode = SafetyMode.NORMAL
+            self.arm.note("safeguard reset")
+            self.play()
+
+    def reduce(self, on: bool = True) -> None:
+        """Begin or end the reduced mode, in which a program runs on."""
+        if self.arm.can_run:
+            self.arm.safety_mode = SafetyMode.REDUCED if on else SafetyMode.NORMAL
+
+    def _safety_stop(self, mode: SafetyMode, why: str) -> None:
+        arm = self.arm
+        if not arm.can_run:
+            return
+        arm.note(why)
+        arm.safety_mode = mode
         self._compiling = None
         arm.runtime = Runtime.STOPPED if self._program is None else Runtime.PAUSING
         self._interrupted = arm.trajectory.goal or self._interrupted

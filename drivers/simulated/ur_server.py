@@ -8,12 +8,12 @@ PolyScope X (version 10 and later) has a Robot API in place of the last two (por
 controller, which needs an administrator here). With a calibration the kinematics are those of the
 file.
 
-Admin operations: `state`, `protective_stop`, `emergency_stop`, `release_emergency_stop`,
-`local_mode`, `remote_mode`, `kill_script`; `rtde_drop`, `rtde_stall {on}`, `rtde_mute {on}`,
-`rtde_half_frame`, `dashboard_mute {on}`, `dashboard_drop`, `refuse {on}` new RTDE clients,
-`refuse_motion {on}`, `freeze {on}` the reported joint angles only, `jog {q}` as if the arm is moved
-by hand; `set {version, slider, speed_scaling, unlock_s}`, `die`,
-`log`
+Admin operations: `state`, `protective_stop`, `safeguard_stop`, `release_safeguard`,
+`reduced_mode {on}`, `emergency_stop`, `release_emergency_stop`, `local_mode`, `remote_mode`,
+`kill_script`; `rtde_drop`, `rtde_stall {on}`, `rtde_mute {on}`, `rtde_half_frame`,
+`dashboard_mute {on}`, `dashboard_drop`, `refuse {on}` new RTDE clients, `refuse_motion {on}`,
+`freeze {on}` the reported joint angles only, `jog {q}` as if the arm is moved by hand; `set
+{version, slider, speed_scaling, unlock_s}`, `die`, `log`
 """
 
 import asyncio
@@ -161,7 +161,7 @@ def read_version(text: str) -> Version:
     raise InputError(f"version {text!r}; valid: four numbers, e.g. 5.11.6.1010327")
 
 
-_QUIET = ("state", "log", "set", "release_emergency_stop", "remote_mode")
+_QUIET = ("state", "log", "set", "release_emergency_stop", "release_safeguard", "remote_mode")
 """Operations that are not faults."""
 
 
@@ -182,6 +182,9 @@ def operations(server: UrServer, loop: asyncio.AbstractEventLoop) -> admin.Handl
     requests = admin.Operations(
         {
             "protective_stop": lambda: controller.protective_stop("admin"),
+            "safeguard_stop": controller.safeguard_stop,
+            "release_safeguard": controller.release_safeguard,
+            "reduced_mode": controller.reduce,
             "emergency_stop": controller.emergency_stop,
             "release_emergency_stop": controller.release_emergency_stop,
             "local_mode": lambda: controller.set_remote(False),

@@ -251,13 +251,17 @@ class SafetyMode(IntEnum):
     """RTDE `safety_mode` and `safety_status`, with the names of the dashboard."""
 
     NORMAL = 1
+    REDUCED = 2
     PROTECTIVE_STOP = 3
+    SAFEGUARD_STOP = 5
     ROBOT_EMERGENCY_STOP = 7
 
 
 _BITS = {
     SafetyMode.NORMAL: 1 << 0,
+    SafetyMode.REDUCED: 1 << 1,
     SafetyMode.PROTECTIVE_STOP: 1 << 2 | 1 << 10,  # of the cause, and "stopped due to safety"
+    SafetyMode.SAFEGUARD_STOP: 1 << 4 | 1 << 10,
     SafetyMode.ROBOT_EMERGENCY_STOP: 1 << 6 | 1 << 7 | 1 << 10,
 }
 """RTDE `safety_status_bits`."""
@@ -332,7 +336,8 @@ class ArmState:
     @property
     def can_run(self) -> bool:
         """Whether power and safety allow a program to run."""
-        return self.robot_mode is RobotMode.RUNNING and self.safety_mode is SafetyMode.NORMAL
+        moves = self.safety_mode in (SafetyMode.NORMAL, SafetyMode.REDUCED)
+        return self.robot_mode is RobotMode.RUNNING and moves
 
     def note(self, event: str) -> None:
         """Log an event."""

@@ -41,7 +41,7 @@ from hilcal.procedure.state import DECIDED, REFINED, VALIDATED, ProcedureStep, S
 from hilcal.readings.whitening import Mode
 from hilcal.store.campaign_file import CampaignFile, may_write
 from hilcal.store.procedure_log import ProcedureLog
-from hilcal.store.run_log import RunLog
+from hilcal.store.run_log import RunLog, changed_since_begun
 from hilcal.tables.units import parse_duration, parse_length
 
 VALIDATION = 20  # Poses of a validation campaign; a choice: they determine the mean error to 10 %
@@ -200,10 +200,9 @@ def _procedure(
 ) -> Procedure:
     config = cell.configured()
     hide = (config.simulation.hide or NO_EFFECT) if rehearse else None
-    base_dir = path.absolute().parent
     if rehearse:
         config = program_config(config, hide or NO_EFFECT, catalogue)
-        cell = cell_from_config(config, base_dir)
+        cell = cell_from_config(config, cell.base_dir)
     if not output.exists():
         may_write(output, False)
         check_effects(cell, catalogue)
@@ -213,7 +212,7 @@ def _procedure(
         max_time_s, seed = parse_duration(DEFAULT_MAX_TIME, "--max-time"), config.simulation.seed
         defaults = Settings(POSES, VALIDATION, max_time_s, seed=seed)
         settings = replace(defaults, readings=config.readings_mode, hide=hide, **stated)
-        p = Procedure(output, cell, base_dir, catalogue, settings)
+        p = Procedure(output, cell, catalogue, settings)
         p.check_files()
         return p
     p = continued(output, cell, catalogue)
@@ -228,6 +227,8 @@ def _procedure(
     with CampaignFile.open(output) as campaign:
         campaign.measure_alone()  # nobody else measures
         p.resume(campaign)
+        for text in changed_since_begun(campaign, p.config):
+            go_on.t.notice(f"note: {text}")
     go_on.t.notice(f"{output}: a calibration, {words.state_clause(p.next())}")
     return p
 

@@ -230,7 +230,7 @@ def demo(
             for step in refinement.steps:
                 compute_errors(step.fit, say)
         settings = Settings(poses, validation, seed=number, readings=r.mode, hide=case.choice)
-        p = Procedure(output, r.cell, case.base_dir, catalogue, settings)
+        p = Procedure(output, r.cell, catalogue, settings)
         with Campaign.open(output, catalogue) as o:
             if doubt is not None and doubt.record is not None:
                 o.file.append_revision(doubt.record)

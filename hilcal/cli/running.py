@@ -467,11 +467,11 @@ def lasting_cell(p: Procedure) -> Iterator[CellConfig]:
         wall_s = time.time()
         log.append(WORLD, {"wall_s": wall_s})
     choice, seed = p.settings.hide or NO_EFFECT, p.settings.seed
-    secret = case_of_plan(p.config, plan, choice, seed, p.catalogue, p.base_dir)
+    secret = case_of_plan(p.config, plan, choice, seed, p.catalogue, p.cell.base_dir)
     passed = wall_s - starts[0]["wall_s"] if starts else 0.0
     start = max(passed, 0.0) * p.config.simulation.clock
     device_seed = seed + NEXT_SEED * len(starts)
-    with simulated_cell(secret, device_seed, p.base_dir, start_s=start) as simulated:
+    with simulated_cell(secret, device_seed, p.cell.base_dir, start_s=start) as simulated:
         yield simulated.config
 
 

@@ -54,7 +54,7 @@ class Robot(sections.Conventions):
 
     model: str = Field(min_length=1)
     gravity_m_s2: Vector3 = (0.0, 0.0, -STANDARD_GRAVITY_M_S2)
-    repeatability_m: Positive | None = None
+    repeatability_m: sections.Accuracy | None = None
     driver: str | None = Field(None, min_length=1)
     host: str | None = Field(None, min_length=1)
     options: dict[str, Any] = Field(default_factory=dict)
@@ -126,7 +126,7 @@ class Tool(sections.CellSection):
     target_rotvec_rad: sections.RotationVector | None = None
     targets: tuple[Target, ...] = ()
     load_point_m: Vector3 = (0.0, 0.0, 0.0)
-    mass_kg: NonNegative = 0.0
+    mass_kg: sections.Mass = 0.0
     com_m: Vector3 = (0.0, 0.0, 0.0)
 
     @model_validator(mode="after")
@@ -184,10 +184,10 @@ class Tracker(sections.CellSection):
     base_xyz_m: sections.Place | None = None
     base_rotvec_rad: sections.RotationVector | None = None
     station_m: sections.Place | None = None
-    range_std_m: Positive = 5e-6
-    range_std_per_m: NonNegative = 0.15e-6
-    transverse_std_m: Positive = 7.5e-6
-    transverse_std_per_m: NonNegative = 3e-6
+    range_std_m: sections.InstrumentStd = 5e-6
+    range_std_per_m: sections.InstrumentStdPerMetre = 0.15e-6
+    transverse_std_m: sections.InstrumentStd = 7.5e-6
+    transverse_std_per_m: sections.InstrumentStdPerMetre = 3e-6
     orientation_std_rad: Positive = 8.7e-5
 
     @property
@@ -218,9 +218,6 @@ class Tracker(sections.CellSection):
                 f'observes = "{self.observes}" together with driver = "{self.driver}", which reads '
                 "positions; leave one of them out"
             )
-        for key in ("range_std_m", "transverse_std_m"):
-            if getattr(self, key) > 0.1:
-                raise ValueError(f"{key} = {getattr(self, key)} is over 0.1 m; is it in m?")
         return self
 
 
@@ -322,6 +319,16 @@ class CellConfig(sections.CellSection):
     def readings_mode(self) -> Literal["deflection", "absolute"]:
         """Kind of readings that will be fitted: `[planning] readings`; "absolute" without loads."""
         return self.planning.readings if self.loads else "absolute"
+
+    @property
+    def planned_mode(self) -> Literal["deflection", "absolute"]:
+        """Kind of readings that a plan is made for; an InputError for deflections without loads."""
+        if self.planning.readings == "deflection" and not self.loads:
+            raise InputError(
+                '[planning] readings = "deflection" needs [[loads]]; give one, or '
+                'readings = "absolute"'
+            )
+        return self.planning.readings
 
     def with_keys(self, section: str, **values: object) -> "CellConfig":
         """Return the configuration with other values of a section's keys, which are not checked."""

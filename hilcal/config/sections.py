@@ -22,13 +22,15 @@ def _within_a_turn(vector: tuple[float, ...], about: ValidationInfo) -> tuple[fl
     return vector
 
 
-def _within(most_m: float) -> AfterValidator:
-    """Refuse a length, or a place, in millimetres."""
+def _within(most: float, unit: str = "m") -> AfterValidator:
+    """Refuse what no cell has, e.g. a place in millimetres."""
 
     def check(value: Any, about: ValidationInfo) -> Any:
-        if np.max(np.abs(value)) > most_m and not (about.context or {}).get(STORED):
+        if np.max(np.abs(value)) > most and not (about.context or {}).get(STORED):
             shown = value if isinstance(value, float) else list(value)
-            raise ValueError(f"{about.field_name} = {shown} is over {most_m:g} m; is it in m?")
+            raise ValueError(
+                f"{about.field_name} = {shown} is over {most:g} {unit}; is it in {unit}?"
+            )
         return value
 
     return AfterValidator(check)
@@ -39,7 +41,13 @@ Place = Annotated[Vector3, _within(50.0)]
 """A place in base or tracker axes. In millimetres, an obstacle or a limit would be far away."""
 OnFlange = Annotated[Vector3, _within(5.0)]
 Accuracy = Annotated[Positive, _within(0.02)]
-"""An allowed error: arms are off by less before any calibration."""
+"""An allowed error, or a repeatability: arms are off by less before any calibration."""
+Mass = Annotated[NonNegative, _within(5000.0, "kg")]
+"""The strongest arms carry 2300 kg."""
+Force = Annotated[Vector3, _within(50_000.0, "N")]
+Moment = Annotated[Vector3, _within(50_000.0, "N·m")]
+InstrumentStd = Annotated[Positive, _within(0.1)]
+InstrumentStdPerMetre = Annotated[NonNegative, _within(0.1, "m/m")]
 
 
 class CellSection(Section):
@@ -223,9 +231,9 @@ class CellLoad(CellSection):
     """
 
     name: str = Field(min_length=1)
-    mass_kg: NonNegative = 0.0
-    force_N: Vector3 = (0.0, 0.0, 0.0)
-    moment_Nm: Vector3 = (0.0, 0.0, 0.0)
+    mass_kg: Mass = 0.0
+    force_N: Force = (0.0, 0.0, 0.0)
+    moment_Nm: Moment = (0.0, 0.0, 0.0)
     hang_m: NonNegative | None = None
     radius_m: Positive = 0.06
     cable_m: NonNegative = 0.0

@@ -254,11 +254,7 @@ def problem(
     reading and one load, all its loads, or, of few loads, a pair. The cost of a unit is its number
     of readings, the unloaded one included.
     """
-    mode = config.planning.readings
-    if mode == "deflection" and not config.loads:
-        raise InputError(
-            '[planning] readings = "deflection" needs [[loads]]; give one, or readings = "absolute"'
-        )
+    mode = config.planned_mode
     loads = (UNLOADED, *(load.name for load in config.loads))
     wrenches = (load.wrench(nominal.cell.gravity) for load in config.loads)
     if allowed is None:

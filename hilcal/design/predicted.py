@@ -49,7 +49,7 @@ def prediction_poses(
     q, where = _poses(nominal, config, feasible, is_clear)
     cell, planning = nominal.cell, config.planning
     of_loads = {load.name: load.wrench(cell.gravity) for load in config.loads}
-    deflection = planning.readings == "deflection"
+    deflection = config.planned_mode == "deflection"
     if planning.work_load == UNLOADED:
         wrenches = of_loads if deflection else {UNLOADED: np.zeros(6)}
         under = "each load" if deflection else ""
@@ -58,8 +58,6 @@ def prediction_poses(
     else:
         valid = ", ".join((UNLOADED, *of_loads))
         raise InputError(f"[planning] work_load = {planning.work_load!r}; valid: {valid}")
-    if not wrenches:
-        raise InputError('[planning] readings = "deflection" needs [[loads]]')
     states = np.tile(q, (len(wrenches), 1))
     wrench = np.repeat(np.array(list(wrenches.values())), len(q), axis=0)
     scale = np.array([p.scale for e in nominal.model.effects for p in e.parameters])[nominal.live]

@@ -35,6 +35,7 @@ class Hook:
     def __init__(self, setup: Setup, meter: ForceMeter | None, mover: Mover) -> None:
         """Start with an unknown load, until `take_all_off`."""
         self.hanging, self.since, self._doubted = UNLOADED, setup.clock.now(), False
+        self.believed = False  # whether a person denied a load that the sensor seems to feel
         self._arm, self._operator, self._meter = setup.rig.arm, setup.rig.operator, meter
         self._cell, self._config, self._mover = setup.cell, setup.cell.configured(), mover
         self._clock, self._watcher = setup.clock, setup.watcher
@@ -195,4 +196,5 @@ class Hook:
             "that nothing hangs. If so, the sensor's zero is off; if not, the arm may drop or "
             "stop, as its controller does not know of the load. Look at the flange"
         )
+        self.believed = True
         return ""

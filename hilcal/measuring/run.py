@@ -11,6 +11,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
+from itertools import takewhile
 from typing import Any, TypeVar
 
 import numpy as np
@@ -62,6 +63,8 @@ _STOPS = 3
 MOVED_M = 1e-3
 """Distance of the target at the reference pose from where earlier readings have it that a person is
 asked about, m; an arm returns by less, also as it warms up. A choice."""
+TURNED = 5.0
+"""Change of gravity in the sensor's axes, m/s², at which a load is told from its zero: 30°."""
 Done = TypeVar("Done")
 LiveModel = Callable[[Readings], LiveResidual]
 """Returns the residual of the last reading by a model fitted to the previous ones."""
@@ -150,6 +153,8 @@ class Session:
         """Visit all stops; move home as soon as the goal is met."""
         self._event("start", {"missing": sum(s.step is not None for s in stops)})
         self._begin(stops[:2])
+        if self._hook.believed:
+            self._watched(partial(self._turn, stops))
         pace = self._pace = Eta(self._clock)
         behind, ahead = list(stops[:2]), stops[2:]
         if self._goal_newly_met(last=False):  # the last session was stopped on its way home
@@ -300,6 +305,21 @@ class Session:
         if zero is not None:
             sample, q = zero
             self._event("tare", {"force": sample_json(sample), "q": q.tolist()})
+
+    def _turn(self, stops: tuple[Stop, ...]) -> None:
+        """Compare the zero where gravity has turned in the sensor, and begin the stops again.
+
+        There a load that hung during the tare is felt; until then it is a part of the zero.
+        """
+        way = tuple(takewhile(lambda s: s.hanging == UNLOADED and s.change_to is None, stops[1:]))
+        turned = (self._meter is not None and self._meter.gravity_change(s.q) > TURNED for s in way)
+        out = way[: 1 + next((k for k, enough in enumerate(turned) if enough), -1)]
+        for stop in out:
+            self._move(stop)
+        self._zero()
+        for stop in (*out[::-1], *stops[:2]):
+            self._move(stop)
+        self._tare()
 
     def _zero(self) -> tuple[WrenchSample, Floats] | None:
         """Set the zero at the present pose, unloaded; return mean wrench and joint angles."""

@@ -429,10 +429,11 @@ def correlated(n: SerialNoise) -> str:
     if not n.proved:
         rivals = " and ".join(n.instead) or "effects of the catalogue"
         doubt = f" This is in doubt: {rivals} would explain the readings as well. Repeat them."
-    low, high = n.wider
+    low, high = (f"{x:.2g}" for x in n.wider)
+    factor = low if low == high else f"{low} to {high}"
+    larger = "hardly larger" if factor == "1" else f"{factor} times as large"
     return (
         f"Readings are correlated along their order{share}: "
         f"ρ = {' ± '.join(numbers.with_std(n.rho, n.rho_error))} from one to the "
-        f"next, half-time {n.half:.2g} {unit}. Standard uncertainties are {low:.2g} to {high:.2g} "
-        f"times as large for it.{doubt}"
+        f"next, half-time {n.half:.2g} {unit}. Standard uncertainties are {larger} for it.{doubt}"
     )

@@ -13,6 +13,7 @@ readings is predicted; from then on the file must not change.
 """
 
 import itertools
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -81,7 +82,6 @@ class Procedure:
 
     run: Path  # the campaign file that is fitted; the others are in the same directory
     cell: Cell  # as configured
-    base_dir: Path  # that paths in the configuration are relative to
     catalogue: Catalogue  # the effects that a model can have
     settings: state.Settings  # goals, sizes and seed
     prior: CarriedPrior | None = None  # the prior of every fit, from `settings.prior`
@@ -106,7 +106,7 @@ class Procedure:
             return replace(stored, settings=replace(stored.settings, **options))
         readings = config.planning.readings if config.loads else "absolute"
         default = state.Settings(seed=config.simulation.seed, readings=readings)
-        return cls(path, cell, cell.base_dir.absolute(), effects, replace(default, **options))
+        return cls(path, cell, effects, replace(default, **options))
 
     @property
     def files(self) -> state.Files:
@@ -137,7 +137,7 @@ class Procedure:
         first = entry(state.BEGUN, {"settings": self.settings.to_json()})
         texts = {COVERS_KEY: covers, ENTRY.format(1): first}
         create_run(
-            self.run, config, self.base_dir, plan, source=self._source(), more_texts=texts
+            self.run, config, self.cell.base_dir, plan, source=self._source(), more_texts=texts
         ).close()
 
     def check_files(self) -> None:
@@ -150,7 +150,7 @@ class Procedure:
 
     def resume(self, campaign: CampaignFile) -> None:
         """Store the settings in the campaign's log, where they have changed."""
-        check_same_cell(campaign, self.config, self.base_dir)
+        check_same_cell(campaign, self.config, self.cell.base_dir)
         log, settings = ProcedureLog(campaign), self.settings.to_json()
         stored = log.last(state.BEGUN)
         if stored is None or stored["settings"] != settings:
@@ -167,10 +167,21 @@ class Procedure:
             return campaign.n_readings
 
     def _epoch(self) -> float | None:
-        """Return the wall time at zero of the campaign's time, s; None where unknown."""
-        with CampaignFile.open(self.run, read_only=True) as campaign:
-            details = RunLog(campaign).details() if campaign.about(PLAN) is not None else []
-        return float(details[0]["epoch_wall_s"]) if details else None
+        """Return the wall time at zero of the campaign's time, s; None where unknown.
+
+        It is that of the last reading of these campaigns, as a clock may have been set meanwhile;
+        after one that was set back the time goes on from that reading.
+        """
+        last: dict[str, Any] = {}
+        for path in (self.run, self.files.validation):
+            if path.exists():
+                with CampaignFile.open(path, read_only=True) as campaign:
+                    if campaign.about(PLAN) is not None:
+                        last = next(reversed(RunLog(campaign).details()), last)
+        wall, elapsed = last.get("wall_s"), last.get("time_s")
+        if wall is None or elapsed is None:  # not of a session
+            return last.get("epoch_wall_s")
+        return float(min(wall, time.time()) - elapsed / self.config.simulation.clock)
 
     def refine(
         self,
@@ -362,7 +373,7 @@ class Procedure:
             seen = readings.value[at_reference & readings.unloaded][-1, :3]
             plan = replace(plan, about={**plan.about, SEEN: seen.tolist()})
         source = self._source(f"{purpose} campaign of {self.run.name}, ")
-        create_run(path, config, self.base_dir, plan, source=source, more_texts=texts).close()
+        create_run(path, config, self.cell.base_dir, plan, source=source, more_texts=texts).close()
 
     def _source(self, prefix: str = "") -> str:
         origin = "measured" if self.settings.hide is None else "rehearsed in a simulated cell"
@@ -391,6 +402,6 @@ def checked_plan(
 def continued(run: Path, cell: Cell, catalogue: Catalogue) -> Procedure:
     """Return the calibration of a campaign file, with the file's settings."""
     with CampaignFile.open(run, read_only=True) as campaign:
-        settings, base_dir = state.settings_of(campaign), cell.base_dir.absolute()
-        check_same_cell(campaign, cell.configured(), base_dir)
-    return Procedure(run, cell, base_dir, catalogue, settings)
+        settings = state.settings_of(campaign)
+        check_same_cell(campaign, cell.configured(), cell.base_dir)
+    return Procedure(run, cell, catalogue, settings)

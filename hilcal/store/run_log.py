@@ -44,7 +44,12 @@ def create_run(
     """Make the campaign file of a run, with its plan and further texts, without readings."""
     texts = {PLAN: plan.to_json(), COVERS_KEY: INSTRUMENT, **(more_texts or {})}
     return CampaignFile.create(
-        path, config.to_json(), str(base_dir), source, overwrite=overwrite, more_texts=texts
+        path,
+        config.to_json(),
+        str(base_dir.absolute()),
+        source,
+        overwrite=overwrite,
+        more_texts=texts,
     )
 
 

@@ -74,6 +74,7 @@ REVISION: Schema = _of(
 DETAIL: Schema = _of(
     epoch_wall_s=(Number | None, None),
     wall_s=(Number | None, None),
+    time_s=(Number | None, None),
     q_actual=(tuple[Number, ...] | None, None),
     tracker_covariance=(Matrix | None, None),
 )

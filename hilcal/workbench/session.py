@@ -363,7 +363,13 @@ class WorkbenchSession:
         stamp: Stamp | None = None,
         changed: StoredChange | None = None,
     ) -> Snapshot:
-        """Show a revision; `stamp` is that of the file when it was read, None: its current one."""
+        """Show a revision; `stamp` is that of the file when it was read, None: its current one.
+
+        Of a file that has got readings meanwhile there is no stamp: the snapshot is outdated.
+        """
+        stamp = stamp or self._stamp()
+        if o.file.n_readings != len(o.readings):
+            stamp = (0, 0, 0)
         self.snapshot = Snapshot(
             n_readings=len(o.readings),
             records=o.file.revisions(),
@@ -371,7 +377,7 @@ class WorkbenchSession:
             number=number,
             chapters=chapters,
             story=build_story(chapters),
-            stamp=stamp or self._stamp(),
+            stamp=stamp,
             source=o.file.source,
             covariance=covariance_words(o.covariance_parts, o.noise),
             changes=o.changes,

@@ -98,6 +98,16 @@ def test_a_complete_one_is_told_again(there, capsys):
     assert (d["verdict"], d["plans"], d["rehearsed"]) == ("adequate", 1, False)
 
 
+def test_what_fits_do_not_know_of_a_changed_cell_is_said(there, capsys):
+    path = there.procedure.run
+    text = path.with_name("cell.toml").read_text(encoding="utf-8")
+    cell = path.with_name("changed.toml")
+    cell.write_text(text + "[tracker]\nrange_std_m = 2e-5\n", encoding="utf-8")
+    found = ok(capsys, "calibrate", cell, "-o", path, "--resume")
+    said = f"note: [tracker] range_std_m is 2e-05, and was 5e-06 when {path} was begun"
+    assert said in " ".join(found.err.split())
+
+
 def test_a_limit_is_judged_by_what_was_measured(there, capsys):
     path = there.procedure.run
     command = ("calibrate", path.with_name("cell.toml"), "-o", path, "--resume")

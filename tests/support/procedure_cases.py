@@ -98,7 +98,7 @@ def drawn_calibration(
         poses=poses, validation=validation, seed=seed, readings=readings, goal_m=goal_m
     )
     cell = cell_from_config(config)
-    return DrawnCalibration(Procedure(path, cell, path.parent, installed(), settings), hidden)
+    return DrawnCalibration(Procedure(path, cell, installed(), settings), hidden)
 
 
 def reopened(d):

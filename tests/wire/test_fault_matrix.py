@@ -64,6 +64,10 @@ PROTECTIVE = cases.Fault("protective stop", arm("protective_stop"), unlock, ("pr
 STALLED = cases.Fault("link stalled", arm("rtde_stall"), off("rtde_stall"), ("link",))
 ANYWHERE = (
     cases.Fault("emergency stop", arm("emergency_stop"), release, ("emergency stop",)),
+    cases.Fault(
+        "safeguard stop", arm("safeguard_stop"), arm("release_safeguard"), ("safeguard stop",)
+    ),
+    cases.Fault("reduced mode", arm("reduced_mode"), off("reduced_mode"), ("reduced mode",)),
     cases.Fault("local mode", arm("local_mode"), arm("remote_mode"), ("local",)),
     cases.Fault("program stopped", arm("kill_script"), cases.no_action, ("program",)),
     cases.Fault("link dropped", arm("rtde_drop"), cases.no_action, ("link",)),

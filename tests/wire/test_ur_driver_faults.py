@@ -89,6 +89,36 @@ def test_protective_stop_names_its_cause_and_is_recovered_from(tmp_path):
         assert any("protective stop" in problem for problem in arm.report().problems)
 
 
+@pytest.mark.parametrize("mute", [False, True])
+def test_an_arm_stopped_by_a_safeguard_stands_when_it_is_reset(arm, sim, mute):
+    """The controller lets a paused program go on, which nobody watches any more."""
+    goal = cases.under_way(arm, sim)
+    sim.admin("dashboard_mute", on=mute)
+    since = sim.admin("safeguard_stop")["fault_ns"]
+    text = cases.error_of(arm.moving)
+    cases.check_resting(sim, since)
+    assert "safeguard stop; leave the guarded area and reset the safeguard" in text
+    q = sim.admin()["q"]
+    sim.admin("release_safeguard")
+    time.sleep(1.0)
+    moved = np.abs(np.array(sim.admin()["q"]) - q).max()  # the program's watchdog ends it, too
+    assert moved < 1e-3 if mute else moved == 0.0
+    assert abs(q[0] - goal[0]) > 0.1
+    cases.restore(sim)
+    arm.take_control(cases.MASS, cases.COM)
+
+
+def test_an_arm_in_reduced_mode_is_stopped_and_goes_on_after_it(arm, sim):
+    cases.under_way(arm, sim)
+    since = sim.admin("reduced_mode")["fault_ns"]
+    assert "reduced mode; leave the zone" in cases.error_of(arm.moving)
+    cases.check_resting(sim, since)
+    with pytest.raises(DeviceError, match="reduced mode"):
+        arm.take_control(cases.MASS, cases.COM)
+    sim.admin("reduced_mode", on=False)
+    arm.take_control(cases.MASS, cases.COM)
+
+
 @pytest.mark.slow
 def test_program_that_a_protective_stop_left_paused_is_ended(tmp_path):
     with closing(cases.start(tmp_path)) as running, closing(cases.controlled(running)) as other:

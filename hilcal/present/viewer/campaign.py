@@ -126,7 +126,7 @@ def log_story(rec: rr.RecordingStream, story: Story) -> None:
 def log_static_entities(rec: rr.RecordingStream, story: Story) -> None:
     """Log the static entities: shapes of the arm, axes of the world, the guide."""
     log_static(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-    parts = style.shapes(capsules(story.arm))
+    parts = style.shapes(capsules(story.arm), style.rails(story.arm))
     style.log_shapes(rec, [*parts, *style.target_shapes(story.arm, story.targets)])
     if story.target is not None:
         names = [story.target_names[k] for k in np.unique(story.target)]

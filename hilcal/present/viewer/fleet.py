@@ -84,7 +84,7 @@ def arm_positions(d: DrawnType) -> Floats:
 def _arms(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
     """Log the arms; joints unlike the type are red, those beyond `FAR` σ amber."""
     log_static(rec, path, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-    parts = capsules(d.arm)
+    parts = [*capsules(d.arm), *style.rails(d.arm)]
     poses = body_poses(d.arm, np.resize(np.array(_STANDS), d.arm.n)[None])[0]
     body, radius = (np.array([getattr(s, k) for s in parts]) for k in ("body", "radius"))
     start, end = (

@@ -171,7 +171,8 @@ class PlanView:
 def _static_scene(rec: rr.RecordingStream, d: PlanView) -> None:
     log_static(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     of_arm, parts = len(capsules(d.cell.arm)), d.shapes.scene.parts
-    style.log_shapes(rec, style.shapes(parts[:of_arm], parts[of_arm:]))
+    dark = [*parts[of_arm:], *style.rails(d.cell.arm)]
+    style.log_shapes(rec, style.shapes(parts[:of_arm], dark))
     _obstacles(rec, d.config.obstacles)
     _workspace(rec, d)
     _beads(rec, d)

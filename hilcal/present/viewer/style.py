@@ -37,7 +37,7 @@ LEADER: Color = (165, 168, 176)
 LEVEL_NAMES = tuple(name.split()[0] for name in story.LEVEL_NAMES)  # of entities
 MARKS = {"good": "✓ ", "doubt": "✗ "}
 BALL_SIGMAS = float(np.sqrt(chdtri(3, 1.0 - story.LIMITS[0])))
-ROD, TARGET = 0.0065, 0.012  # radii of the tool's rod and of the target, shares of the reach
+ROD, TARGET = 0.0065, 0.012  # radii of rods and rails and of the target, shares of the reach
 EYE = np.array([1.05, -1.35, 0.55])
 # 3-D views use light colours and stay dark in the light theme, too.
 BACKGROUND = rrb.Background(color=(22, 24, 29), kind=rrb.BackgroundKind.SolidColor)
@@ -123,8 +123,19 @@ Shapes = list[tuple[Capsule, Color]]
 
 
 def shapes(parts: Sequence[Capsule], carried: Sequence[Capsule] = ()) -> Shapes:
-    """Return the capsules of an arm with their colours; `carried` ones are dark."""
+    """Return the capsules of an arm with their colours; `carried` ones and rails are dark."""
     return [*((p, shade(p.body)) for p in parts), *((p, DARK) for p in carried)]
+
+
+def rails(arm: Arm) -> list[Capsule]:
+    """Return a capsule along the travel of each joint that slides, on the body that carries it."""
+    size = max(arm.reach, 0.1)
+    low, high = (arm.chain_angles(np.where(arm.slides, q, 0.0)) for q in (arm.q_min, arm.q_max))
+    return [
+        Capsule("rail", j, place + low[j] * along, place + high[j] * along, ROD * size)
+        for j in np.flatnonzero(arm.slides).tolist()
+        for place, along in [(arm.links[j][:3, 3], arm.links[j][:3, 2])]
+    ]
 
 
 def target_shapes(arm: Arm, targets: Floats) -> Shapes:
@@ -177,7 +188,7 @@ class MovingArm:
 
     def __init__(self, rec: rr.RecordingStream, path: str, arm: Arm, targets: Floats) -> None:
         """Log the shapes; `targets` (T, 3) in flange axes, m."""
-        parts = [*shapes(capsules(arm)), *target_shapes(arm, targets)]
+        parts = [*shapes(capsules(arm), rails(arm)), *target_shapes(arm, targets)]
         self._rec, self._path = rec, path
         self._body = np.array([p.body for p, _ in parts], dtype=np.int64)
         self._start, self._end, radius, colors = _arrays(parts)

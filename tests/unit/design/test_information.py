@@ -347,6 +347,14 @@ def test_asked_for_effects_that_the_order_tells_are_taken_at_random():
     assert any("approach of the readings taken at random" in note for note in p.notes)
 
 
+def test_deflections_without_loads_are_refused_wherever_a_plan_begins():
+    config = config_of("deflection").model_copy(update={"loads": ()})
+    a, q = nominal_model(CELL.with_config(config)), poses_of(3)
+    for begun in (lambda: problem(a, config, q), lambda: prediction_poses(a, config, q)):
+        with pytest.raises(InputError, match=r"needs \[\[loads\]\]; give one, or"):
+            begun()
+
+
 def test_derivatives_where_the_robot_works():
     for mode, load in (("absolute", "none"), ("absolute", "10kg"), ("deflection", "10kg")):
         config = config_of(mode, work_load=load)

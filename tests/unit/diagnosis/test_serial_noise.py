@@ -11,7 +11,7 @@ from hilcal.config import load_config
 from hilcal.diagnosis.diagnosis import VERDICTS
 from hilcal.diagnosis.serial_noise import MOST_READINGS, serial_noise, with_serial_noise
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.present.verdict import message
+from hilcal.present.verdict import correlated, message
 from hilcal.readings.covariance import symmetric_root
 from hilcal.readings.whitening import MODES
 from hilcal.robot.catalogue import configs_dir
@@ -68,6 +68,15 @@ def test_intervals_of_a_frame_are_wider_and_of_differences_narrower():
     assert high > 1.5
     before, after = white.parameters["base_frame.x"].std, found.parameters["base_frame.x"].std
     assert after > 1.5 * before
+
+
+@pytest.mark.parametrize(
+    ("wider", "words"),
+    [((0.97, 1.31), "0.97 to 1.3 times as large"), ((1.001, 1.04), "hardly larger")],
+)
+def test_how_much_wider_is_said_once(wider, words):
+    noise = with_serial_noise(fitted_model(*campaign(0.9), "absolute")).readings.serial
+    assert f"Standard uncertainties are {words} for it" in correlated(replace(noise, wider=wider))
 
 
 def test_a_fit_with_it_is_found_again():

@@ -18,6 +18,7 @@ from hilcal.present.story import levels
 from hilcal.present.viewer import campaign, save, serve, style
 from hilcal.present.viewer.recording import executable
 from hilcal.robot.scene import body_poses
+from tests.support.arm_cases import RAILS, arm_of
 from tests.support.paths import ROOT
 from tests.support.picture import Shot, needs_vulkan, pictures, pixels
 from tests.support.recordings import rows, same, texts
@@ -245,6 +246,20 @@ def test_arm_of_another_shape_is_drawn(tmp_path):
     cut = {k: getattr(six, k)[:4] for k in ("masses", "coms", "joint_names", "q_min", "q_max")}
     save(replace(told, arm=replace(six, links=six.links[:5], **cut), q=told.q[:, :4]), path)
     assert len(rows(path, "/world/arm/body5", "Transform3D:translation", "pose")) == 3
+
+
+def test_a_rail_is_drawn_along_its_travel():
+    arm = arm_of(RAILS)
+    rails = style.rails(arm)
+    assert [r.body for r in rails] == np.flatnonzero(arm.slides).tolist()
+    for rail in rails:
+        q = np.zeros((2, arm.n))
+        q[:, rail.body] = arm.q_min[rail.body], arm.q_max[rail.body]
+        bodies = body_poses(arm, q)
+        on = bodies[0, rail.body]
+        ends = [on[:3, :3] @ x + on[:3, 3] for x in (rail.start, rail.end)]
+        np.testing.assert_allclose(ends, bodies[:, rail.body + 1, :3, 3], atol=1e-12)
+    assert style.rails(ur10e()) == []
 
 
 # pictures

@@ -1,5 +1,7 @@
 """A calibration from the plan to the measured improvement, stopped at every step."""
 
+import shutil
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +11,7 @@ import hilcal as hc
 from hilcal.calibration.improvement import Improvement
 from hilcal.config.cell import Repeatability
 from hilcal.config.reference import to_toml
+from hilcal.drivers.simulated.rehearsal import simulate_plan
 from hilcal.identification.carried.carried_prior import carried_prior
 from hilcal.library import load_posterior
 from hilcal.procedure.state import DECIDED, FROZEN
@@ -63,6 +66,34 @@ def test_it_goes_on_after_any_stop(done):
             if places:  # the tracker has to see the target where it did before
                 assert np.allclose(log.plans[-1].about["reference_seen_m"], places[-1], atol=1e-3)
             places.append(campaign.readings().value[0, :3])
+
+
+@pytest.mark.parametrize("set_back", [0.0, 7200.0])
+def test_time_goes_on_in_the_next_campaign_though_the_clock_was_set(tmp_path, set_back):
+    """By an hour between two sessions, and by `set_back` before the next campaign."""
+    p = drawn_calibration(tmp_path / "run.hilcal", config=small_config(1), poses=4).procedure
+    p.begin(p.plan().plan, p.config)
+    now, clock, told = time.time(), p.config.simulation.clock, []
+
+    def measure(campaign, epoch):
+        told.append(epoch)
+        log = RunLog(campaign)
+        for k, step in enumerate(log.plan.steps):
+            wall = now + set_back + 10.0 * k - 3600.0 * (k > 2)
+            drawn = simulate_plan(case, log.plan, 1).readings[k : k + 1]
+            log.record(drawn, step, {"epoch_wall_s": now, "wall_s": wall, "time_s": 200.0 * k})
+
+    case = DrawnCalibration(p, "nothing").case()
+    step = p.next()
+    count = p.measure(step, measure)
+    shutil.copy(p.run, p.files.validation)
+    p.measure(replace(step, path=p.files.validation), lambda _, epoch: told.append(epoch))
+    last = 200.0 * (count - 1)
+    elapsed = (time.time() - told[1]) * clock
+    pause = clock * max(3600.0 - set_back - 10.0 * (count - 1), 0.0)
+    assert told[0] is None
+    assert elapsed == pytest.approx(last + pause, abs=60.0 * clock)
+    assert elapsed >= last
 
 
 def test_it_is_of_as_many_poses_as_asked_for_under_every_load(done):

@@ -138,6 +138,24 @@ def test_readings_that_came_later_are_fitted_anew(run, session, snapshot):
     assert len(found.fit.readings) == len(snapshot.fit.readings) + 6
 
 
+def test_readings_that_come_during_a_fit_are_noticed(run, session, snapshot):
+    """As `hilcal run --append` writes them while the workbench computes."""
+    came = []
+
+    def meanwhile(text):
+        if not came:
+            came.append(text)
+            with CampaignFile.open(run) as file:
+                file.append_readings(file.readings()[:6])
+
+    found = session.add(snapshot, BASE, meanwhile)
+    assert session.snapshot is found
+    assert session.stale
+    refusal("changed by another command; read it again first", session.add, found, BASE)
+    assert len(session.refit(found).fit.readings) == len(snapshot.fit.readings) + 6
+    assert not session.stale
+
+
 @pytest.mark.long
 def test_fitting_anew_keeps_the_prior_of_another_campaign(run):
     earlier, later = run.with_name("earlier.hilcal"), run.with_name("later.hilcal")
