@@ -47,6 +47,8 @@ BACKGROUND = "background"  # `RefinementStep.added` of a step that adds a backgr
 UNEXPLAINED_VERDICTS = ("unknown_effect", "noise_misjudged")
 """Verdicts with which all effects are tried together where readings are many; a choice: they prove
 single effects far below the noise, and all together take minutes."""
+TAKEN_FOR_NOISE = ("arm_scatter", "background")
+"""Reasons with which a misfit may be left to noise that the readings do not state."""
 MANY_EFFECTS = 6
 """Number of added effects from which on all are tried together where readings are many, with any
 verdict; a choice: such an arm has the others, too, and each single trial takes long."""
@@ -154,8 +156,8 @@ def refine(
         say: takes progress, one line each.
         history: the steps that led to the starting model.
         laws: searches a law where the verdict is `unknown_effect`, before effects that only
-            resemble the missing one are added, and where the misfit is taken for the arm's scatter;
-            the law is then added and judged like any effect.
+            resemble the missing one are added, and where the misfit is taken for noise or the arm's
+            scatter; the law is then added and judged like any effect.
         on_step: takes each step as soon as it is judged; the last verdict can still change.
         background: whether a background of all effects is allowed.
 
@@ -283,11 +285,12 @@ class Path:
     def _add_law(self) -> bool:
         """Add a law if no effect of the catalogue explains the misfit; whether a law was added.
 
-        A law is searched as well where the misfit would be taken for the arm's scatter.
+        A law is searched as well where the misfit would be taken for noise or the arm's scatter:
+        it may act where the diagnosis does not look.
         """
         last = self.steps[-1]
         d = last.diagnosis
-        unexplained = d.verdict == "unknown_effect" or d.reason == "arm_scatter"
+        unexplained = d.verdict in UNEXPLAINED_VERDICTS or d.reason in TAKEN_FOR_NOISE
         if self._laws is None or not unexplained:
             return False
         if last.fit.readings.arm_scatter is not None and not last.fit.model.background:

@@ -36,7 +36,11 @@ rules are applied to the fit with the estimated scatter in its covariance (see
 `Evidence.with_arm_scatter`), and 3 becomes 5b or 5c.
 
 Where a step in the order of the readings explains what all effects leave (see `order_step`), as of
-a tracker that was moved, the verdict is `unknown_effect`, whatever else the rules say.
+a tracker that was moved, and more than the recorded state predicts, the verdict is
+`unknown_effect`, whatever else the rules say.
+
+Readings that disagree (`Fit.disagreement`) are called wrong only where no suspect passes and the
+misfit does not follow the recorded state.
 
 The covariance of a judged fit includes a correlation of the noise along the order of the readings
 (see `serial_noise`). If it is not proved, since effects explain the readings as well, 3 and 5c
@@ -73,6 +77,7 @@ from hilcal.diagnosis.noise import (
     within_repeatability,
 )
 from hilcal.diagnosis.order_step import step_in_order
+from hilcal.diagnosis.recorded import ROW_ORDER
 from hilcal.diagnosis.residual_regression import ResidualRegression
 from hilcal.identification.fit import Fit
 
@@ -101,7 +106,8 @@ def with_order_step(d: Diagnosis) -> Diagnosis:
     """Return a diagnosis with the step in the order of the readings, where there is one.
 
     None is sought where a suspect passes, or stated noise explains the residual of named effects;
-    a background, the arm's scatter, serial or estimated noise may have taken up a step.
+    a background, the arm's scatter, serial or estimated noise may have taken up a step. A step that
+    explains less than the recorded state predicts only resembles what is missing.
     """
     readings = d.fit.readings
     hides = d.fit.model.background or readings.serial is not None or not readings.noise_stated
@@ -109,7 +115,9 @@ def with_order_step(d: Diagnosis) -> Diagnosis:
     if explained or d.significant or d.wrong_figures:
         return d
     step = step_in_order(d.fit)
-    return d if step is None else replace(d, step=step, reason="readings_disagree")
+    if step is None or (step.share < d.predictable_share and _follows_state(d)):
+        return d
+    return replace(d, step=step, reason="readings_disagree")
 
 
 def judge_naming(
@@ -154,10 +162,11 @@ def judge(e: Evidence, history: History) -> Diagnosis:
             pure_error=e.pure_error,
             wrong_figures=e.wrong_figures,
         )
-    diagnosis = _with_arrivals(e, history)
-    if e.fit.disagreement is not None and not any(s.passes for s in diagnosis.suspects):
-        return replace(diagnosis, reason="readings_disagree")
-    return diagnosis
+    d = _with_arrivals(e, history)
+    if e.fit.disagreement is None or any(s.passes for s in d.suspects):
+        return d
+    law = d.reason == "no_suspect" and _follows_state(d)
+    return d if law else replace(d, reason="readings_disagree")
 
 
 def _with_arrivals(e: Evidence, history: History) -> Diagnosis:
@@ -272,6 +281,12 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
         pose_alone=alone,
         background=e.background,
     )
+
+
+def _follows_state(d: Diagnosis) -> bool:
+    """Whether the misfit follows the recorded state, as wrong readings do not, before the order."""
+    order = not d.follows or d.follows[0] in (ROW_ORDER, "time")
+    return d.predictable_share > PREDICTABLE and not order
 
 
 def _predicted(e: Evidence, regression: ResidualRegression) -> bool:

@@ -72,9 +72,11 @@ def refine(screen: Screen, form: Form) -> Form:
 def rss_with_law(screen: Screen, form: Form, s: Situation) -> float:
     """Sum of squares with a law, by algebra; infinite if the law is not finite."""
     linear = screen.linear
-    x = form.columns(screen, s)
+    with np.errstate(over="ignore", invalid="ignore"):  # numbers that are tried may be any
+        x = form.columns(screen, s)
     if not np.isfinite(x).all():
         return np.inf
+    x = x / max(float(np.abs(x).max()), 1e-300)  # its span counts; squares of 1e200 overflow
     return linear.test_noise[0] - float(x.T @ linear.residual @ _step(linear, x))
 
 

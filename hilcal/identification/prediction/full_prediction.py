@@ -257,8 +257,8 @@ def disagreement_words(fit: Fit) -> str:
         return (
             f"more than {100 * MOST_WRONG:.0f} % of the readings disagree with what the others "
             f"agree on, too many to tell wrong ones from right ones ({count} are beyond "
-            "the noise): none was set aside, and nothing that is fitted to them holds; find out "
-            "what went wrong in measuring"
+            "the noise): none was set aside, and nothing that is fitted to them holds; an effect "
+            "is missing, or something went wrong in measuring"
         )
     first, last = ("/".join(reading_name(readings, int(disagreement.rows[k]))) for k in (0, -1))
     return (

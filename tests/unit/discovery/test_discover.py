@@ -106,6 +106,20 @@ def test_nothing_is_searched_where_the_model_is_adequate(tmp_path):
         hc.refine(before.model, before.readings, discover=tmp_path / "nowhere")
 
 
+def test_a_law_is_searched_before_a_misfit_is_taken_for_noise(tmp_path, monkeypatch):
+    """It may act where the diagnosis does not look, as along the axis of a joint."""
+    monkeypatch.setattr(
+        sys.modules[LawSearch.__module__],
+        "discover",
+        lambda fit, say, name: Discovery(fit, "unpredictable"),
+    )
+    before, laws = campaign(stated=0.5), LawSearch(tmp_path)
+    r = refine(before.model, before.readings, before.mode, laws=laws)
+    (first, *_), (searched, *_) = r.steps, laws.discoveries
+    assert first.diagnosis.verdict == "noise_misjudged"
+    assert searched.fit is first.fit
+
+
 def test_a_law_takes_a_name_and_a_file_that_are_free(tmp_path, monkeypatch):
     (tmp_path / "found.py").write_text("mine", encoding="utf-8")
     asked = []

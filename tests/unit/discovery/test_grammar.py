@@ -163,6 +163,17 @@ def campaign():
     return fitted_model(cell, readings, "deflection"), moved
 
 
+@pytest.mark.parametrize("exponent", [60.0, 200.0, 1e4])
+def test_a_law_of_any_exponent_has_a_sum_of_squares(exponent):
+    """Powers of 1e200, which a search of exponents may try, overflow in their squares."""
+    at = screen(linearise(campaign()[0]))
+    s = at.linear.fit.solution.prediction.situation
+    torque = {v.symbol: v for v in at.grammar.known}["τ_2"]
+    raised = product(Factor(torque, shapes.POWER, (exponent,)))
+    form = Form((LawPart(sites(6)[2], raised, 0),))
+    assert rss_with_law(at, form, s) > 0.5 * at.linear.test_noise[0]
+
+
 def test_levels_weights_and_exponents_are_refined_together():
     at = screen(linearise(campaign()[0]))
     s = at.linear.fit.solution.prediction.situation

@@ -255,6 +255,23 @@ def test_more_than_can_be_told_is_said(mode):
     assert not found.fit.outlier.any()
 
 
+@pytest.mark.parametrize(
+    ("kind", "size", "angle", "every"),
+    [("many", 5e-3, lambda q: np.sin(2 * q[:, 0]), False),
+     ("alike", 1e-3, lambda q: np.maximum(np.sin(q[:, 1]), 0.0), True)],
+)  # fmt: skip
+def test_readings_that_follow_the_state_are_not_called_wrong(kind, size, angle, every):
+    """A law of one angle, which every reading of a pose has in common."""
+    r = C.readings if every else C.readings[C.readings.unloaded]
+    value = r.value.copy()
+    value[:, 1] += size * angle(r.states.q)
+    found = fitted_model(C.cell, replace(r, value=value), "absolute")
+    assert found.disagreement.kind == kind
+    d = diagnose(found)
+    assert (d.verdict, d.reason) == ("unknown_effect", "no_suspect")
+    assert d.follows[0] in message(d)
+
+
 @pytest.mark.parametrize("of_tool", [False, True])
 def test_a_block_off_alike_is_said_and_not_set_aside(of_tool):
     """From one reading to another the shift is the same in the sensor's, or the target's axes."""
