@@ -51,6 +51,7 @@ EM_STEPS = 400  # most EM steps; fleets of 30 arms take about 100
 EM_CONVERGED = 1e-4  # relative change of all variances that ends EM, far below sampling errors
 LEAST = 1e-8  # least variance, and least information on a parameter of an arm, in ordinary
 # magnitudes; far below what measurements determine
+FARTHEST = 10.0  # how far an arm's parameters may be off, in ordinary magnitudes; a choice
 START = (1.0, 0.05)  # variances τ², ω² at the start of EM
 UNDETERMINED = 5.0  # standard uncertainty, ordinary magnitudes, from which nothing is tested
 FALSE_ALARM = 0.01  # probability that an element is named in a fleet without outliers
@@ -212,7 +213,7 @@ class Hierarchy:
     covariance: Floats  # (2 K, 2 K) of (μ, β)
     between: Floats  # (K,) τ²
     within: Floats  # (K,) ω²; zero where no arm was measured twice
-    arm_mean: Floats  # (A, K) μ + u_a of each arm alone, without the prior of u_a
+    arm_mean: Floats  # (A, K) μ + u_a of each arm alone, with the prior of `FARTHEST`
     arm_variance: Floats  # (A, K) its variance by the fits and ω²
     outlier: Bools  # (A, K) elements that differ from those of the other arms
 
@@ -359,7 +360,7 @@ def _expectation(
     left_cov = u_cov[fleet.arm] + toward @ b_cov @ np.swapaxes(toward, 1, 2)
     spread = np.diag(omega2) - gain * omega2 + gain @ left_cov @ np.swapaxes(gain, 1, 2)
     e2 = e**2 + np.diagonal(spread, axis1=1, axis2=2)
-    alone = np.linalg.inv(sum_n + LEAST * eye)
+    alone = np.linalg.inv(sum_n + eye / FARTHEST**2)
     drift = fleet.time[:, None] * b[k:] if timed else np.zeros_like(fleet.mean)
     without_drift = of_arms(np.einsum("cij,cj->ci", n, fleet.mean - drift))
     arm_mean = np.einsum("akl,al->ak", alone, without_drift)

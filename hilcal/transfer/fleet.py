@@ -20,10 +20,14 @@ import scipy
 from hilcal.engine import Advance, Engine
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.carried.carried_prior import SAME_M
-from hilcal.identification.carried.posterior import Posterior, PosteriorEffect, Source
+from hilcal.identification.carried.posterior import (
+    Posterior,
+    PosteriorEffect,
+    Source,
+    information_on,
+)
 from hilcal.readings.readings import Range
 from hilcal.readings.same_readings import shared
-from hilcal.regression.schur import schur_complement
 from hilcal.regression.variance_components import (
     FALSE_ALARM,
     UNDETERMINED,
@@ -241,7 +245,7 @@ def _estimates(
         columns = np.array([i for i, name in enumerate(p.names) if name in place], dtype=np.int64)
         indices = np.array([place[p.names[i]] for i in columns], dtype=np.int64)
         scaled = p.information * (p.scale[:, None] * p.scale)
-        information[c][np.ix_(indices, indices)] = schur_complement(scaled, columns)
+        information[c][np.ix_(indices, indices)] = information_on(scaled, columns)
         mean[c, indices] = p.mean[columns] / scale[indices]
     seconds = np.array([seconds_of(m.date) for m in members])
     arm = np.array([arms.index(m.arm) for m in members])

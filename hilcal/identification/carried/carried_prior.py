@@ -34,11 +34,10 @@ import scipy.linalg as sl
 
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
-from hilcal.identification.carried.posterior import Posterior, spectrum
+from hilcal.identification.carried.posterior import Posterior, information_on, spectrum
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.same_readings import found_among_prints
-from hilcal.regression.schur import schur_complement
 from hilcal.robot.arm import Arm
 from hilcal.store.codec import decode, encode
 from hilcal.types import Bools, Floats, Ints
@@ -316,7 +315,7 @@ def _spectrum(p: Posterior, place: tuple[int, ...]) -> tuple[Floats, Floats]:
     """
     scaled = p.information * (p.scale[:, None] * p.scale)
     rows = np.array(place, dtype=np.int64)
-    some = scaled if len(place) == len(scaled) else schur_complement(scaled, rows)
+    some = scaled if len(place) == len(scaled) else information_on(scaled, rows)
     values, vectors = spectrum(some)
     return values, vectors if values.any() else np.eye(len(values))
 

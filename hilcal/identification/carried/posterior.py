@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 FORMAT, VERSION = "hilcal-posterior", 1
 OTHERS_STD = 10.0
-"""How far the others may differ when one is compared, in ordinary magnitudes; a choice."""
+"""How far others may be off, or differ when one is compared, ordinary magnitudes; a choice."""
 LEAST_INFORMATION = INFORMATION**2 / 2
 """From which a direction is determined, in ordinary magnitudes."""
 MOST_LISTED = 60  # parameters of an effect from which it is compared as a whole only; a choice
@@ -156,11 +156,10 @@ class Posterior(Brief):
         return np.flatnonzero([name.split(".", 1)[0] == effect for name in self.names])
 
     def marginal(self, parameters: Ints) -> Floats:
-        """Information (I, I) on some parameters, the others unknown: the Schur complement."""
+        """Information (I, I) on some parameters, the others hardly known; see `information_on`."""
         scaled = self.information * (self.scale[:, None] * self.scale)
-        some = schur_complement(scaled, parameters)
         scale = self.scale[parameters]
-        return determined(some) / (scale[:, None] * scale)
+        return determined(information_on(scaled, parameters)) / (scale[:, None] * scale)
 
     @property
     def std(self) -> Floats:
@@ -208,6 +207,18 @@ def spectrum(information: Floats, least: float = LEAST_INFORMATION) -> tuple[Flo
     values, vectors = np.linalg.eigh((information + information.T) / 2)
     values[values < least] = 0.0
     return values, vectors
+
+
+def information_on(information: Floats, parameters: Ints) -> Floats:
+    """Information (I, I) on some parameters, in ordinary magnitudes, the others hardly known.
+
+    The Schur complement of the information (K, K) and that of a prior of `OTHERS_STD` ordinary
+    magnitudes on the others: where these can move without limit along a gauge direction, the
+    readings would tell nothing of any parameter that moves with them, however little.
+    """
+    others = np.ones(len(information))
+    others[parameters] = 0.0
+    return schur_complement(information + np.diag(others) / OTHERS_STD**2, parameters)
 
 
 def determined(information: Floats) -> Floats:
@@ -308,7 +319,7 @@ def _likelihood(p: Posterior, chosen: Ints, scale: Floats) -> tuple[Floats, Floa
     e, values = vectors[:, values > 0], values[values > 0]
     data, mean = (e * values) @ e.T, (e / values) @ (e.T @ (information @ (p.mean / p.scale)))
     ratio = p.scale[chosen] / scale
-    return schur_complement(data, chosen) / (ratio[:, None] * ratio), mean[chosen] * ratio
+    return information_on(data, chosen) / (ratio[:, None] * ratio), mean[chosen] * ratio
 
 
 def _effect(effect: str, covariance: Floats, d: Floats, rows: Ints) -> EffectDifference:

@@ -7,9 +7,9 @@ import pytest
 import rerun as rr
 
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.baseline import baseline
+from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.carried.carried_prior import carried_prior
-from hilcal.identification.carried.posterior import Posterior
+from hilcal.identification.carried.posterior import Posterior, information_on
 from hilcal.identification.fit import fit
 from hilcal.present.html.other_pages import arms_chart, fleet_page
 from hilcal.present.viewer import style
@@ -322,3 +322,42 @@ def test_an_ordinary_fleet_has_nothing_red(one, tmp_path):
     assert style.RED not in colors
     assert "/arms0/unlike" not in entities(path)
     assert "No arm is unlike" in rows(path, "/words/type0", "TextDocument:text")[0][0]
+
+
+def test_what_others_imitate_only_far_off_is_known():
+    """Geometry imitates a joint's compliance, moved by a thousand times its ordinary magnitude."""
+    rng = np.random.default_rng(5)
+    own, others = rng.normal(size=(40, 2)), rng.normal(size=(40, 3))
+    others[:, 0] = 1e-3 * (own[:, 0] + 0.1 * own[:, 1])
+    x = np.column_stack([own, others])
+    found = information_on(x.T @ x, np.arange(2))
+    free = own - others[:, 1:] @ np.linalg.lstsq(others[:, 1:], own, rcond=None)[0]
+    np.testing.assert_allclose(found, free.T @ free, rtol=0.01)
+    imitating = np.column_stack([own, 1e3 * others])
+    found = information_on(imitating.T @ imitating, np.arange(2))
+    assert found @ [1.0, 0.1] == pytest.approx(0.0, abs=1e-2)
+
+
+def test_arms_with_all_their_geometry_have_compliances_near_the_truth():
+    """In the fits' over-complete geometry a frame that moves a little moves the compliances."""
+    arms, found, truth = 4, [], []
+    for a in range(arms):
+        rng = np.random.default_rng(a)
+        truth.append(compliances(rng))
+        readings = readings_of(truth[-1], a, poses=12)
+        start = baseline(cell_of(), readings, "absolute")
+        model = with_effects(cell_of(), readings, "absolute", (*start.names, "link_geometry"))
+        own = Posterior.of(fit(model, readings, "absolute"))
+        name, date = f"arm{a}.hilcal", "2026-01-01"
+        found.append(Member(name, f"arm{a}", "list", "ur10e", date, own, (), "adequate", 0))
+    soft = world_of(cell_of(), np.random.default_rng(7)).physics.joint_compliance
+    pooled = pool(found, ())
+    told = {p.parameter: k for k, p in enumerate(pooled.parameters)}
+    for j in (1, 2, 3, 4):
+        k = told[f"joint_compliance.j{j + 1}"]
+        off = pooled.off[:, k] + pooled.parameters[k].mean - soft[j] * np.array(truth)[:, j]
+        assert np.all(np.abs(off) < 4.5 * pooled.off_std[:, k])
+        assert np.all(pooled.off_std[:, k] < 0.2 * soft[j])
+        mean, std = soft[j] * np.mean(truth, axis=0)[j], pooled.parameters[k].mean_std
+        assert abs(pooled.parameters[k].mean - mean) < 4.5 * std < 0.9 * mean
+    assert pooled.unlike == ()
