@@ -204,10 +204,13 @@ class PoseConstants:
 
 
 def pose_constants(p: Linearisation) -> PoseConstants | None:
-    """Split the residual by displacements of each pose; None where poses have too few readings."""
+    """Split the residual by displacements of each pose.
+
+    None for a single pose, of which no reading shows another, or where poses have too few readings.
+    """
     fit, w = p.fit, p.fit.whitening
     poses = int(fit.pose.max()) + 1
-    if poses * 3 > fit.dof / 2 or len(fit.pose) < 2 * poses:
+    if poses < 2 or poses * 3 > fit.dof / 2 or len(fit.pose) < 2 * poses:
         return None
     axes = np.zeros((len(fit.pose), w.m, 3))
     axes[:, :3] = 1e-3 * fit.solution.prediction.observation.axes[w.reading]

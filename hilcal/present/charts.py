@@ -505,7 +505,7 @@ def error_per_revision(story: Story) -> go.Figure:
             f"fitted ones, over {len(steps)} revisions"
         )
     says += f"; noise alone would leave {numbers.length(story.noise_floor_m)}."
-    out = figure(says, x="error, rms [µm]", traces=traces, height=130 + 26 * len(names))
+    out = figure(says, x="error, rms [µm]", traces=traces, height=150 + 36 * len(names))
     dashed = {"color": NOISE, "dash": "dash", "width": 2}
     out.add_vline(floor, line=dashed, layer="below")
     # for the legend alone: a shape has no entry there

@@ -8,7 +8,7 @@ from hilcal.diagnosis.change import LEVEL, POWER, Candidate, Change, Limit
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.identification.carried.posterior import Differences
 from hilcal.names import quoted
-from hilcal.present.document import Block, Table, heading, note, table
+from hilcal.present.document import Block, Table, Words, heading, note, table
 from hilcal.present.fit import error_words, measurements
 
 if TYPE_CHECKING:
@@ -293,7 +293,7 @@ def type_report(t: "PooledType") -> Iterator[Block]:
     )
     if not repeated:
         yield "No arm was measured twice: what changes with time is part of the arms' spread.\n"
-    yield "Unlike the others:" if t.unlike else "No arm is unlike the others."
+    yield "Unlike the others:" if t.unlike else "No arm is unlike the others in these parameters."
     yield from (f"  {unlike_words(o)}" for o in t.unlike)
     if t.wear:
         drifts = {p.parameter: p for p in t.parameters}
@@ -310,14 +310,15 @@ def type_report(t: "PooledType") -> Iterator[Block]:
     yield from (*size_lines(t.sizes), "")
 
 
-def size_lines(sizes: Sequence["TypeSize"]) -> Iterator[str]:
+def size_lines(sizes: Sequence["TypeSize"]) -> Iterator[str | Words]:
     """Yield the [ordinary] section of CELL.toml for effects of unusual size on this type."""
     if differing := [s for s in sizes if s.differs]:
         yield "Effects whose size differs from that on other arms, for another arm of this type:"
-        yield "  [ordinary]"
+        section = ["[ordinary]"]
         for s in differing:
             factor, low, high = map(numbers.digits, (s.factor, s.low, s.high))
-            yield f"  {s.effect} = {factor} # 95 %: {low} to {high}"
+            section.append(f"{s.effect} = {factor} # 95 %: {low} to {high}")
+        yield Words("\n".join(section), "code", indent=2)
 
 
 def unlike_words(o: "UnlikeParameter") -> str:

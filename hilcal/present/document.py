@@ -192,7 +192,7 @@ def pairs(rows: Iterable[Sequence[str]]) -> Table:
 
 
 def captioned(blocks: Iterable[Block], caption: str = "") -> tuple[Block, ...]:
-    """Return blocks for a page: a paragraph for each line, and a caption for every table.
+    """Return blocks for a page: a paragraph for each line but of code, and captions of tables.
 
     The caption is the table's, else the heading right above unless it is a sentence, else
     `caption`. Of two tables with the same caption the second one adds its first head.
@@ -202,7 +202,8 @@ def captioned(blocks: Iterable[Block], caption: str = "") -> tuple[Block, ...]:
     for block in blocks:
         if isinstance(block, str | Words):
             paragraph = block if isinstance(block, Words) else Words(block)
-            lines = (line.strip() for line in paragraph.text.split("\n"))
+            apart = [paragraph.text] if paragraph.tone == "code" else paragraph.text.split("\n")
+            lines = (line.strip() for line in apart)
             out += [replace(paragraph, text=line) for line in lines if line]
             continue
         if isinstance(block, Table):

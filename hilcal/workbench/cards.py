@@ -300,7 +300,7 @@ def _side_by_side(view: View, d: Snapshot) -> None:
             place.clear()
             with place:
                 table = two_revisions(by_number[chosen[0].value], by_number[chosen[1].value])
-                draw_table(table).props("wrap-cells")
+                draw_table(table).props("wrap-cells").classes("tall")
 
         def changed() -> None:
             view.tab.pair = chosen[0].value, chosen[1].value

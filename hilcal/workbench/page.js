@@ -21,3 +21,5 @@
   };
   follow();
 })();
+/* The charts are drawn in one colour scheme: anew when that of the browser changes. */
+matchMedia("(prefers-color-scheme: dark)").onchange = (e) => emitEvent("scheme", e.matches);

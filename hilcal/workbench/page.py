@@ -55,6 +55,7 @@ def install(app: FastAPI, session: WorkbenchSession) -> None:
     async def page(request: Request) -> None:
         view = View(session, str(request.base_url))
         view.build()
+        ui.on("scheme", lambda e: view.draw_page(dark=bool(e.args)))
         await ui.context.client.connected()
         view.draw_page(dark=bool(await ui.run_javascript(DARK, timeout=5.0)))
 

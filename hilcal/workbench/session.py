@@ -384,6 +384,7 @@ class WorkbenchSession:
             cell_keys=_figures(o),
         )
         self.changed = changed
+        self.work.answers.pop("revisions", None)  # it says which revision was shown before
         self.count += 1
         return self.snapshot
 

@@ -347,6 +347,10 @@ def test_the_page_fits_desktop_and_phone(browser, served, scheme):
         expect(drawn).to_have_count(readings)
     dark = page.evaluate("getComputedStyle(document.body).backgroundColor")
     assert (sum(map(int, re.findall(r"\d+", dark)[:3])) < 200) == (scheme == "dark")
+    shown = page.locator("[data-part=fell] .ytick text").first
+    fill = shown.evaluate("e => getComputedStyle(e).fill")
+    page.emulate_media(color_scheme="light" if scheme == "dark" else "dark")
+    expect(shown).not_to_have_css("fill", fill)  # its text would be as light as the page
     assert told == []
 
 

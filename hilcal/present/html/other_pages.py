@@ -177,18 +177,20 @@ def fleet_page(fleet: "Fleet", directory: str, created: str, version: str) -> st
 
 def _fleet_screen(fleet: "Fleet") -> FirstScreen:
     odd = [o for t in fleet.types for o in t.unlike]
-    arms = list(dict.fromkeys(o.arm for o in odd))
+    defects = [s for t in fleet.types for s in t.effects_added if s.kind == "defect"]
+    words = [*map(comparison.unlike_words, odd)]
+    words += [f"{', '.join(s.arms)}: {s.effect}, a defect of single arms" for s in defects]
+    arms = list(dict.fromkeys([*(o.arm for o in odd), *(a for s in defects for a in s.arms)]))
     wear = ", ".join(name for t in fleet.types for name in t.wear)
     headline, todo = "No arm is unlike its type", "Nothing; the prior serves the next arm."
     if arms:
         headline = f"Unlike their type: {numbers.names(arms)}"
-        todo = "Measure these arms again, and look at these joints."
+        todo = "Measure these arms again, and look at what is unlike."
     pooled = sum(len(t.arms) for t in fleet.types)
     used = ("Campaigns", str(len(fleet.members)), f"used; not used: {len(fleet.failures)}")
     cards = (("Arms", str(pooled), "that were pooled"), used)
-    unlike = "; ".join(map(comparison.unlike_words, odd)) or "None."
     answers = (
-        ("Which arms are unlike, and by how much?", unlike),
+        ("Which arms are unlike, and by how much?", "; ".join(words) or "None."),
         ("What wears?", wear or "No drift that the arms have in common."),
         ("What to do?", todo),
     )

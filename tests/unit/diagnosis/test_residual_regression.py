@@ -21,10 +21,11 @@ from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
 from hilcal.present.verdict import message
+from tests.support.bench_cases import BASE
 from tests.support.campaigns import campaign, plan
 from tests.support.diagnosis_cases import fitted_baseline
 from tests.support.fit_cases import fitted_model
-from tests.support.next_cases import fine_error
+from tests.support.next_cases import doubtful, fine_error
 from tests.support.rows import first
 
 
@@ -237,6 +238,14 @@ def test_equal_to_dense_columns(mode, effects):
     assert found.gain == pytest.approx(float(np.sum((u.T @ p.residual) ** 2)), rel=1e-6)
     x = np.random.default_rng(0).standard_normal((len(p.residual), 4))
     assert found.square(x) == pytest.approx(float(np.sum((u.T @ x) ** 2)), rel=1e-6)
+
+
+def test_a_single_pose_does_not_show_what_the_pose_alone_predicts():
+    r = doubtful(BASE, 2).rehearsal
+    model = baseline(r.cell, r.readings, r.mode) + BASE - "joint_compliance"
+    d = diagnose(fit(model, r.readings, r.mode))  # the other poses are set aside as gross errors
+    assert (len(set(d.fit.pose.tolist())), pose_constants(linearise(d.fit))) == (1, None)
+    assert d.pose_alone is None
 
 
 @pytest.mark.parametrize("seed", [2, *(pytest.param(k, marks=pytest.mark.slow) for k in (0, 6))])

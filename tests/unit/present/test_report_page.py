@@ -188,6 +188,7 @@ def test_results_show_themselves_in_a_notebook(made):
             assert words in shown
             assert tags.count("table") == tags.count("caption") > 0
             assert EVIL not in shown
+            assert "<caption>missing effect?" not in shown  # its first head says so already
 
 
 def test_without_an_appendix_the_page_has_the_parameters_and_nothing_else_of_it(made, text):

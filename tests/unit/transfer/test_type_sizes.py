@@ -87,7 +87,7 @@ def test_no_campaign_tells_nothing():
 def test_the_section_can_be_copied_into_a_cell(sizes):
     heading, *section = size_lines(tuple(sizes.values()))
     assert "another arm of this type" in heading
-    ordinary = tomllib.loads("\n".join(section))["ordinary"]
+    ordinary = tomllib.loads("\n".join(map(str, section)))["ordinary"]
     assert cell_of(ordinary).configured().ordinary == ordinary
     assert ordinary["transmission_error"] == pytest.approx(
         sizes["transmission_error"].factor, rel=0.1

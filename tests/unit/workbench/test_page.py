@@ -13,7 +13,7 @@ from nicegui.testing import User, user_simulation
 from hilcal.diagnosis.diagnosis import Reason
 from hilcal.present.verdict import HEADLINES
 from hilcal.workbench.page import View
-from hilcal.workbench.session import WorkbenchSession
+from hilcal.workbench.session import Answer, WorkbenchSession
 from tests.support.bench_cases import few_effects, store_campaign
 from tests.support.rows import first
 
@@ -84,7 +84,9 @@ def test_an_answer_appears_at_its_button_and_stays(session):
             line = "[tool] mass_kg = two kilos is not valid: it must be a mass in kg, 0 or more"
             await user.should_see(line, retries=50)
             assert [line in t for t in seen(user, ui.label, "cell")] == [True]
+            session.work.answers["revisions"] = Answer("Revision 2 is shown.")
             session.load()  # as another tab does: everything is drawn anew
+            assert "revisions" not in session.work.answers  # another one may be shown now
             await asyncio.sleep(1.0)
             assert [line in t for t in seen(user, ui.label, "cell")] == [True]
             values = {e.value for e in user.find(kind=ui.input).elements}
