@@ -302,7 +302,10 @@ def _pose_alone(d: Diagnosis) -> list[str]:
 def _misjudged(d: Diagnosis) -> list[str]:
     assert d.noise is not None  # noqa: S101  (by the reason)
     repeats = d.pure_error
-    unpredicted = f"Residuals are {_spread(d)} and nothing predicts them."
+    unpredicted = (
+        f"Residuals are {_spread(d)}, and no smooth law of what is recorded predicts them (hilcal "
+        "discover tries many more)."
+    )
     if (s := d.scatter) is not None and d.fit.readings.arm_scatter is None:
         why = (
             f"The arm would have to scatter by {length(s.size_m)} rms"
