@@ -364,9 +364,8 @@ class Path:
         them together; nor where readings are many, a few effects are named and the verdict blames
         neither the noise nor an unknown effect. They stay as the model's background if the error on
         poses left out falls by a share (`background_is_better`); also by more than it scatters from
-        pose to pose, if the readings do not prove them, or the verdict `unknown_effect` says that
-        they may imitate an effect that the catalogue lacks. See `_append_background` for their
-        names.
+        pose to pose where, by the verdict `unknown_effect`, they may imitate an effect that the
+        catalogue lacks. See `_append_background` for their names.
         """
         last = self.steps[-1]
         tried = self._background_tried or bool(last.fit.model.background)
@@ -379,11 +378,11 @@ class Path:
         self._background_tried = True
         if not allows_background(last.fit):
             return False
-        proved_together = p_value_of_others(last.fit) <= JOINT_LEVEL
-        as_stated = d.residual_is_noise and last.fit.readings.arm_scatter is None
-        # The residual of serially correlated noise resembles effects.
-        if as_stated and (not proved_together or last.fit.readings.serial is not None):
-            return False
+        if d.residual_is_noise and last.fit.readings.arm_scatter is None:
+            # The residual of serially correlated noise resembles effects.
+            serial = last.fit.readings.serial is not None
+            if serial or p_value_of_others(last.fit) > JOINT_LEVEL:
+                return False
         self._say("fitting all effects of the catalogue together")
         fitted = with_background(last.fit, self._start)
         if fitted is None:
@@ -396,8 +395,7 @@ class Path:
                 return False
         if not background_is_better(named, fitted):
             return False
-        doubtful = not proved_together or d.verdict == "unknown_effect"
-        if doubtful and not predicts_better(named, fitted):
+        if d.verdict == "unknown_effect" and not predicts_better(named, fitted):
             return False
         self._say("the background of all effects predicts better; diagnosing")
         self._append_background(fitted, BACKGROUND)
