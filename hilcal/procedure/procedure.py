@@ -215,6 +215,7 @@ class Procedure:
     def decide(self, say: Say = lambda text: None) -> Decision:
         """Decide whether to measure more; a further plan is appended to the campaign."""
         with Campaign.open(self.run, self.catalogue) as o:
+            o.file.measure_alone()  # two that decide at once would append two plans
             log, run = ProcedureLog(o.file), RunLog(o.file)
             if self._refinements:
                 d = self._refinements[0].diagnosis

@@ -226,6 +226,9 @@ def test_a_goal_below_the_repeatability_is_not_measured_for_but_another_is(tmp_p
     with CampaignFile.open(d.procedure.run) as run:
         d.procedure.resume(run)
     assert d.procedure.next().kind == "decide"
+    with CampaignFile.open(d.procedure.run) as another:
+        another.measure_alone()
+        refusal("another hilcal is measuring", d.do, d.procedure.next())
     assert d.do(d.procedure.next()).reason == "goal_met"
     assert d.procedure.next().kind == "plan_validation"
 
