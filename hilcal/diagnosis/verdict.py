@@ -36,11 +36,11 @@ rules are applied to the fit with the estimated scatter in its covariance (see
 `Evidence.with_arm_scatter`), and 3 becomes 5b or 5c.
 
 Where a step in the order of the readings explains what all effects leave (see `order_step`), as of
-a tracker that was moved, and more than the recorded state predicts, the verdict is
+a tracker that was moved, and the recorded state does not predict most of it, the verdict is
 `unknown_effect`, whatever else the rules say.
 
 Readings that disagree (`Fit.disagreement`) are called wrong only where no suspect passes and the
-misfit does not follow the recorded state.
+misfit does not for the most part follow the recorded state.
 
 The covariance of a judged fit includes a correlation of the noise along the order of the readings
 (see `serial_noise`). If it is not proved, since effects explain the readings as well, 3 and 5c
@@ -89,6 +89,9 @@ BACKGROUND_OVERRIDES = ("residual_is_noise", "inseparable_addition", "arm_scatte
 MOST_POSE_SHARE = 0.5
 """Share of the misfit that all readings of a pose have in common, above which it is not the scatter
 of single arrivals; a choice."""
+MOST_OF_MISFIT = 0.5
+"""Share of the misfit that the recorded state predicts above which it is a law, and neither wrong
+readings nor a step; a choice: many large errors predict some of each other by chance."""
 
 
 def diagnose(
@@ -106,8 +109,8 @@ def with_order_step(d: Diagnosis) -> Diagnosis:
     """Return a diagnosis with the step in the order of the readings, where there is one.
 
     None is sought where a suspect passes, or stated noise explains the residual of named effects;
-    a background, the arm's scatter, serial or estimated noise may have taken up a step. A step that
-    explains less than the recorded state predicts only resembles what is missing.
+    a background, the arm's scatter, serial or estimated noise may have taken up a step. Where the
+    recorded state predicts most of the misfit, a step that explains less only resembles the law.
     """
     readings = d.fit.readings
     hides = d.fit.model.background or readings.serial is not None or not readings.noise_stated
@@ -284,9 +287,9 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
 
 
 def _follows_state(d: Diagnosis) -> bool:
-    """Whether the misfit follows the recorded state, as wrong readings do not, before the order."""
+    """Whether most of the misfit follows the recorded state, as that of wrong readings does not."""
     order = not d.follows or d.follows[0] in (ROW_ORDER, "time")
-    return d.predictable_share > PREDICTABLE and not order
+    return d.predictable_share > MOST_OF_MISFIT and not order
 
 
 def _predicted(e: Evidence, regression: ResidualRegression) -> bool:
