@@ -18,7 +18,7 @@ from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
 NORMAL = "normal"  # safety state of an arm without problems
-LEFT = "where it was left"  # a place of the arm, in words
+WHERE_LEFT = "where it was left"  # the arm, in a message
 HOW_ON = "drive it by hand to a free place in the middle of its workspace"
 SLACK_M = 0.005  # allowed sag beyond the edge of the workspace, m
 SLACK = Margins(
@@ -263,7 +263,7 @@ class Mover:
         name: str,
         expected: Floats,
         ask: Callable[[str], None],
-        place: str = LEFT,
+        place: str = WHERE_LEFT,
     ) -> Floats:
         """Return the position (n,) of the arm, once its way to a goal is free and people agree.
 
@@ -293,7 +293,7 @@ class Mover:
         """Move an arm back that was moved during a question; see `agreed_start`."""
         if self.goal is None or self.moved_by_others(self._arm.sample()) is None:
             return
-        goal, name = self.goal, LEFT
+        goal, name = self.goal, WHERE_LEFT
         self.goal = self.agreed_start(goal, name, goal, ask)
         self.move(goal, name)
 

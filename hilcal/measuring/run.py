@@ -30,7 +30,7 @@ from hilcal.measuring.devices import (
 from hilcal.measuring.force import ForceMeter, TaredWrench
 from hilcal.measuring.loads import TRIES, Hook, payload
 from hilcal.measuring.measure import MeasuredStop, Measurer
-from hilcal.measuring.motion import LEFT, Mover
+from hilcal.measuring.motion import WHERE_LEFT, Mover
 from hilcal.measuring.progress import (
     GoalMet,
     GoalStatus,
@@ -63,8 +63,8 @@ _STOPS = 3
 MOVED_M = 1e-3
 """Distance of the target at the reference pose from where earlier readings have it that a person is
 asked about, m; an arm returns by less, also as it warms up. A choice."""
-TURNED = 5.0
-"""Change of gravity in the sensor's axes, m/s², at which a load is told from its zero: 30°."""
+GRAVITY_CHANGE = 5.0
+"""Change of gravity in the sensor's axes, m/s², from which a load is told from its zero: 30°."""
 Done = TypeVar("Done")
 LiveModel = Callable[[Readings], LiveResidual]
 """Returns the residual of the last reading by a model fitted to the previous ones."""
@@ -231,7 +231,7 @@ class Session:
         if self._temperatures is None:
             self._temperatures = bool(np.isfinite(sample.joint_temperature).all())
         self._hook.take_all_off()
-        expected, place = (sample.q, LEFT) if last_q is None else (last_q, AT_LAST)
+        expected, place = (sample.q, WHERE_LEFT) if last_q is None else (last_q, AT_LAST)
         self._mover.goal = self._mover.agreed_start(
             first.q, first.name, expected, self._hook.confirm, place
         )
@@ -311,9 +311,12 @@ class Session:
 
         There a load that hung during the tare is felt; until then it is a part of the zero.
         """
+        meter = self._meter
+        if meter is None:
+            return
         way = tuple(takewhile(lambda s: s.hanging == UNLOADED and s.change_to is None, stops[1:]))
-        turned = (self._meter is not None and self._meter.gravity_change(s.q) > TURNED for s in way)
-        out = way[: 1 + next((k for k, enough in enumerate(turned) if enough), -1)]
+        turned = [k for k, s in enumerate(way) if meter.gravity_change(s.q) > GRAVITY_CHANGE]
+        out = way[: turned[0] + 1] if turned else ()
         for stop in out:
             self._move(stop)
         self._zero()

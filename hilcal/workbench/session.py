@@ -54,6 +54,7 @@ from hilcal.write_report import ReportOptions, write_report
 
 Stamp = tuple[int, int, int]
 """Size (bytes), time of the last change (ns) and inode of a file, to detect changes."""
+OUTDATED: Stamp = (0, 0, 0)  # the stamp of no file
 
 
 @dataclass(frozen=True, slots=True)
@@ -365,11 +366,11 @@ class WorkbenchSession:
     ) -> Snapshot:
         """Show a revision; `stamp` is that of the file when it was read, None: its current one.
 
-        Of a file that has got readings meanwhile there is no stamp: the snapshot is outdated.
+        Where the file has got readings meanwhile, the snapshot is outdated.
         """
         stamp = stamp or self._stamp()
         if o.file.n_readings != len(o.readings):
-            stamp = (0, 0, 0)
+            stamp = OUTDATED
         self.snapshot = Snapshot(
             n_readings=len(o.readings),
             records=o.file.revisions(),

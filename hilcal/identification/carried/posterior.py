@@ -19,7 +19,7 @@ that on d = θ_B − θ_A is the parallel sum (Anderson and Duffin, J. Math. Ana
 
 singular along every direction that one of the campaigns did not determine: what a frame absorbs, or
 a joint that did not turn. So each parameter, and each effect as a whole, is compared with all
-others free within f = `OTHERS_STD` of their ordinary magnitudes: in these,
+others free within f = `FARTHEST` of their ordinary magnitudes: in these,
 S = ((P + 1/f²)⁻¹_mm)⁻¹ − 1/f² is the information on its difference. What is known less well than
 to one magnitude is not compared.
 """
@@ -37,6 +37,7 @@ from hilcal.readings.readings import ArmScatter, Range
 from hilcal.readings.whitening import Mode
 from hilcal.regression.normal_equations import INFORMATION, NULL_SHARE
 from hilcal.regression.schur import schur_complement
+from hilcal.regression.variance_components import FARTHEST
 from hilcal.shown import Brief
 from hilcal.store.codec import decode, encode, pack, read_document, read_file, unpack
 from hilcal.types import Floats, Ints
@@ -46,8 +47,6 @@ if TYPE_CHECKING:
 
 
 FORMAT, VERSION = "hilcal-posterior", 1
-OTHERS_STD = 10.0
-"""How far others may be off, or differ when one is compared, ordinary magnitudes; a choice."""
 LEAST_INFORMATION = INFORMATION**2 / 2
 """From which a direction is determined, in ordinary magnitudes."""
 MOST_LISTED = 60  # parameters of an effect from which it is compared as a whole only; a choice
@@ -156,7 +155,7 @@ class Posterior(Brief):
         return np.flatnonzero([name.split(".", 1)[0] == effect for name in self.names])
 
     def marginal(self, parameters: Ints) -> Floats:
-        """Information (I, I) on some parameters, the others hardly known; see `information_on`."""
+        """Information (I, I), 1/SI², the others marginalised out; see `information_on`."""
         scaled = self.information * (self.scale[:, None] * self.scale)
         scale = self.scale[parameters]
         return determined(information_on(scaled, parameters)) / (scale[:, None] * scale)
@@ -210,15 +209,15 @@ def spectrum(information: Floats, least: float = LEAST_INFORMATION) -> tuple[Flo
 
 
 def information_on(information: Floats, parameters: Ints) -> Floats:
-    """Information (I, I) on some parameters, in ordinary magnitudes, the others hardly known.
+    """Information (I, I) on some parameters, the others marginalised out, in ordinary magnitudes.
 
-    The Schur complement of the information (K, K) and that of a prior of `OTHERS_STD` ordinary
-    magnitudes on the others: where these can move without limit along a gauge direction, the
-    readings would tell nothing of any parameter that moves with them, however little.
+    It is the Schur complement of the information (K, K), to which a prior of `FARTHEST` ordinary
+    magnitudes on the others is added: with a flat prior, a parameter that moves along a gauge
+    direction of the others, however little, would have no information at all.
     """
     others = np.ones(len(information))
     others[parameters] = 0.0
-    return schur_complement(information + np.diag(others) / OTHERS_STD**2, parameters)
+    return schur_complement(information + np.diag(others) / FARTHEST**2, parameters)
 
 
 def determined(information: Floats) -> Floats:
@@ -292,9 +291,9 @@ def parameter_differences(earlier: Posterior, later: Posterior) -> Differences:
     values, vectors = spectrum(first + second)
     half = vectors[:, values > 0] / np.sqrt(values[values > 0])
     parallel = (first @ half) @ (half.T @ second)
-    some = (parallel + parallel.T) / 2 + np.eye(len(common)) / OTHERS_STD**2
+    some = (parallel + parallel.T) / 2 + np.eye(len(common)) / FARTHEST**2
     covariance = np.asarray(np.linalg.inv(some), dtype=float)
-    information = 1.0 / np.diag(covariance) - 1.0 / OTHERS_STD**2
+    information = 1.0 / np.diag(covariance) - 1.0 / FARTHEST**2
     d, names = np.asarray(mean_later - mean_earlier, dtype=float), np.array(owner)
     effects = [_effect(e, covariance, d, np.flatnonzero(names == e)) for e in dict.fromkeys(owner)]
     rows = tuple(
@@ -328,7 +327,7 @@ def _effect(effect: str, covariance: Floats, d: Floats, rows: Ints) -> EffectDif
     d (K,) are the differences of all parameters, with their covariance (K, K) by both campaigns and
     the prior.
     """
-    some = np.linalg.inv(covariance[np.ix_(rows, rows)]) - np.eye(len(rows)) / OTHERS_STD**2
+    some = np.linalg.inv(covariance[np.ix_(rows, rows)]) - np.eye(len(rows)) / FARTHEST**2
     values, vectors = np.linalg.eigh((some + some.T) / 2)
     compared = values > 1.0
     total = float(np.sum(values[compared] * (vectors[:, compared].T @ d[rows]) ** 2))
