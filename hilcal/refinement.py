@@ -20,7 +20,13 @@ from hilcal.diagnosis.evidence import Alternative, Evidence
 from hilcal.diagnosis.residual_regression import Regressions
 from hilcal.diagnosis.serial_noise import serial_noise, with_serial_noise
 from hilcal.diagnosis.stepwise import add, exchange, predicts_better, remove, trial
-from hilcal.diagnosis.verdict import NO_HISTORY, judge, judge_naming, with_order_step
+from hilcal.diagnosis.verdict import (
+    NO_HISTORY,
+    judge,
+    judge_naming,
+    with_insufficiency,
+    with_order_step,
+)
 from hilcal.discovery.discovery import LawSearch
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.background import (
@@ -158,7 +164,7 @@ def refine(
         laws: searches a law where the verdict is `unknown_effect`, before effects that only
             resemble the missing one are added, and where the misfit is taken for noise or the arm's
             scatter; the law is then added and judged like any effect.
-        on_step: takes each step as soon as it is judged; the last verdict can still change.
+        on_step: takes each step as soon as it is judged; its verdict can still change.
         background: whether a background of all effects is allowed.
 
     Raises:
@@ -197,6 +203,7 @@ def refine_from(
     path.complete()
     if path.pool_lines():
         path.complete()
+    path.judge_sufficiency()
     path.find_step()
     return Refinement(tuple(path.steps))
 
@@ -250,8 +257,10 @@ class Path:
         self._evidence = self._evidence_of(fitted)
         self._append(RefinementStep(fitted, self._judge(fitted), added, removed))
 
-    def _judge(self, fitted: Fit) -> Diagnosis:
-        return judge(self._evidence, self._history(fitted))
+    def _judge(self, fitted: Fit, whole_catalogue: bool = False) -> Diagnosis:
+        # Only a search of laws needs to know early whether the whole catalogue is sufficient.
+        whole_catalogue = whole_catalogue or self._laws is not None
+        return judge(self._evidence, self._history(fitted), whole_catalogue)
 
     def _append(self, step: RefinementStep) -> None:
         self.steps.append(step)
@@ -466,6 +475,17 @@ class Path:
         self._evidence = self._evidence_of(fitted)
         self.steps[-1] = replace(last, fit=fitted, diagnosis=self._judge(fitted))
         return any(s.passes for s in self.steps[-1].diagnosis.suspects)
+
+    def judge_sufficiency(self) -> None:
+        """Judge whether the whole catalogue is sufficient, in each step where a suspect passes."""
+        last = self.steps[-1]
+        if last.diagnosis.lead is not None and last.diagnosis.insufficiency is None:
+            last = replace(last, diagnosis=self._judge(last.fit, whole_catalogue=True))
+        earlier = [
+            replace(s, diagnosis=with_insufficiency(s.diagnosis, last.diagnosis))
+            for s in self.steps[:-1]
+        ]
+        self.steps = [*earlier, last]
 
     def find_step(self) -> None:
         """Look for a step in the order of the readings where the misfit is left unexplained."""

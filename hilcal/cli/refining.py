@@ -261,8 +261,9 @@ def refine(
         if diagnosis.verdict != "adequate" and not diagnosis.dependences:
             t.show(dependence_sentence(diagnosis.misfit_breakdown))
         t.show([*words.curves(diagnosis.dependences, len(diagnosis.dependences) if details else 1)])
-        if live is not None:  # its verdict may have changed when further effects were tried
-            live.revised(chapters[-1])
+        if live is not None:  # verdicts may have changed when further effects were tried
+            for chapter in chapters:
+                live.revised(chapter)
         fitting.record_story(t, chapters, record)
     t.document(
         revisions=revisions_json(chapters),

@@ -36,8 +36,8 @@ rules are applied to the fit with the estimated scatter in its covariance (see
 `Evidence.with_arm_scatter`), and 3 becomes 5b or 5c.
 
 Where a step in the order of the readings explains what all effects leave (see `order_step`), as of
-a tracker that was moved, and the recorded state does not predict most of it, the verdict is
-`unknown_effect`, whatever else the rules say.
+a tracker that was moved, and the recorded state does not predict more of it, the verdict is
+`unknown_effect` with that step, whatever else the rules say.
 
 Readings that disagree (`Fit.disagreement`) are called wrong only where no suspect passes and the
 misfit does not for the most part follow the recorded state.
@@ -68,7 +68,13 @@ from hilcal.diagnosis.background_evidence import (
 )
 from hilcal.diagnosis.diagnosis import Diagnosis, History, Reason
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE, ranked
-from hilcal.diagnosis.evidence import Evidence, Separability, separability
+from hilcal.diagnosis.evidence import (
+    LEAST_REMAINDER,
+    Evidence,
+    Insufficiency,
+    Separability,
+    separability,
+)
 from hilcal.diagnosis.misfit_breakdown import MisfitShare
 from hilcal.diagnosis.noise import (
     PREDICTABLE,
@@ -90,8 +96,8 @@ MOST_POSE_SHARE = 0.5
 """Share of the misfit that all readings of a pose have in common, above which it is not the scatter
 of single arrivals; a choice."""
 MOST_OF_MISFIT = 0.5
-"""Share of the misfit that the recorded state predicts above which it is a law, and neither wrong
-readings nor a step; a choice: many large errors predict some of each other by chance."""
+"""Share of the misfit that the recorded state predicts above which it is a law, and not wrong
+readings; a choice: many large errors predict some of each other by chance."""
 
 
 def diagnose(
@@ -110,7 +116,7 @@ def with_order_step(d: Diagnosis) -> Diagnosis:
 
     None is sought where a suspect passes, or stated noise explains the residual of named effects;
     a background, the arm's scatter, serial or estimated noise may have taken up a step. Where the
-    recorded state predicts most of the misfit, a step that explains less only resembles the law.
+    recorded state predicts more of the misfit than a step explains, the step resembles the law.
     """
     readings = d.fit.readings
     hides = d.fit.model.background or readings.serial is not None or not readings.noise_stated
@@ -118,9 +124,34 @@ def with_order_step(d: Diagnosis) -> Diagnosis:
     if explained or d.significant or d.wrong_figures:
         return d
     step = step_in_order(d.fit)
-    if step is None or (step.share < d.predictable_share and _follows_state(d)):
+    if step is None or (step.share < d.predictable_share and not _follows_order(d)):
         return d
     return replace(d, step=step, reason="readings_disagree")
+
+
+def with_insufficiency(d: Diagnosis, last: Diagnosis) -> Diagnosis:
+    """Return the diagnosis of an earlier step where the last one leaves an unknown effect.
+
+    The effects added since then are the catalogue's best, so what they leave, the whole catalogue
+    left at the earlier step; unless it is noise, or negligible beside the misfit then.
+    """
+    if last.reason != "no_suspect" or last.noise is None or d.lead is None or d.insufficiency:
+        return d
+    share = (last.fit.chi2 - last.fit.dof) / (d.fit.chi2 - d.fit.dof)
+    if share < LEAST_REMAINDER:
+        return d
+    added = tuple(n for n in last.fit.model.named if n not in d.fit.model.named)
+    rest = Insufficiency(
+        added, len(added), share, last.fit.variance_factor, last.dependences, last.noise
+    )
+    return replace(
+        d,
+        reason="insufficient_catalogue",
+        insufficiency=rest,
+        separability=(),
+        dependences=last.dependences,
+        follows=last.follows,
+    )
 
 
 def judge_naming(
@@ -153,8 +184,12 @@ def judge_naming(
     return (*derived, last), e
 
 
-def judge(e: Evidence, history: History) -> Diagnosis:
-    """Judge a fit by its evidence and the history of its model."""
+def judge(e: Evidence, history: History, whole_catalogue: bool = True) -> Diagnosis:
+    """Judge a fit by its evidence and the history of its model.
+
+    `whole_catalogue` tells whether to test that the whole catalogue is sufficient, by refits, where
+    a suspect passes. A refinement adds the suspects anyway: see `with_insufficiency`.
+    """
     if e.wrong_figures:
         return Diagnosis(
             fit=e.fit,
@@ -165,18 +200,18 @@ def judge(e: Evidence, history: History) -> Diagnosis:
             pure_error=e.pure_error,
             wrong_figures=e.wrong_figures,
         )
-    d = _with_arrivals(e, history)
+    d = _with_arrivals(e, history, whole_catalogue)
     if e.fit.disagreement is None or any(s.passes for s in d.suspects):
         return d
     law = d.reason == "no_suspect" and _follows_state(d)
     return d if law else replace(d, reason="readings_disagree")
 
 
-def _with_arrivals(e: Evidence, history: History) -> Diagnosis:
+def _with_arrivals(e: Evidence, history: History, whole_catalogue: bool) -> Diagnosis:
     """Judge; with the arm's scatter in the covariance where readings of one arrival share it."""
     if e.with_arm_scatter is None or e.arm_scatter is None:
-        return _judged(e, history)
-    d = _judged(e.with_arm_scatter, history)
+        return _judged(e, history, whole_catalogue)
+    d = _judged(e.with_arm_scatter, history, whole_catalogue)
     scatter = replace(e.arm_scatter, predicted_share=d.predictable_share, predicted_by=d.follows)
     d = replace(d, fit=e.fit, scatter=scatter)
     if d.reason != "residual_is_noise":
@@ -186,13 +221,13 @@ def _with_arrivals(e: Evidence, history: History) -> Diagnosis:
     return replace(d, reason="arm_scatter" if plausible else "misjudged_noise", noise=noise)
 
 
-def _judged(e: Evidence, history: History) -> Diagnosis:
+def _judged(e: Evidence, history: History, whole_catalogue: bool) -> Diagnosis:
     """Judge by rules 1 to 6, with the covariance of the fit."""
     readings, arm = e.fit.readings, e.fit.model.cell.arm
     added = () if e.fit.model.background else history.added
     suspects = ranked(e.suspects, history.rejected)
     lead = suspects[0] if suspects and suspects[0].passes else None
-    insufficiency = None if lead is None else e.insufficiency
+    insufficiency = e.insufficiency if lead is not None and whole_catalogue else None
     noise, scatter = None, readings.arm_scatter
     rivals: tuple[Separability, ...] = ()
     reason: Reason
@@ -288,8 +323,12 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
 
 def _follows_state(d: Diagnosis) -> bool:
     """Whether most of the misfit follows the recorded state, as that of wrong readings does not."""
-    order = not d.follows or d.follows[0] in (ROW_ORDER, "time")
-    return d.predictable_share > MOST_OF_MISFIT and not order
+    return d.predictable_share > MOST_OF_MISFIT and not _follows_order(d)
+
+
+def _follows_order(d: Diagnosis) -> bool:
+    """Whether the misfit follows the order of the readings most, or nothing that is recorded."""
+    return not d.follows or d.follows[0] in (ROW_ORDER, "time")
 
 
 def _predicted(e: Evidence, regression: ResidualRegression) -> bool:

@@ -11,6 +11,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
 from hilcal.model.model import Model
+from hilcal.numbers import percent
 from hilcal.present.verdict import message
 from hilcal.refinement import MOST_REVISIONS, Path, add, refine, refine_from
 from hilcal.regression.leave_out import LEAST_GAIN
@@ -90,6 +91,25 @@ def test_a_suspect_that_passes_beside_pooled_lines_is_added(monkeypatch):
     assert "transmission_error" in r.steps[1].fit.model.random
     assert "encoder_offset" in [s.added for s in r.steps]
     assert not any(s.passes for s in r.diagnosis.suspects)
+
+
+def test_what_the_whole_catalogue_leaves_is_told_of_the_earlier_steps():
+    c = campaign("encoder_offset", "absolute", 2, poses=15)
+    states, value = c.readings.states, c.readings.value.copy()
+    pull = np.linalg.norm(states.wrench[:, :3], axis=1)
+    value[:, 1] += 3e-6 * pull * np.sin(2 * states.q[:, 1] + states.q[:, 2])  # outside all effects
+    readings, judged = replace(c.readings, value=value), []
+    r = refine(
+        baseline(c.cell, readings, "absolute"), readings, "absolute",
+        on_step=judged.append, background=False,
+    )  # fmt: skip
+    first, last = (s.diagnosis for s in (r.steps[0], r.steps[-1]))
+    assert judged[0].diagnosis.verdict in ("missing_effect", "ambiguous")
+    assert first.verdict == last.verdict == "unknown_effect"
+    assert f"leave {percent(first.insufficiency.share)} of it" in message(first)
+    assert first.insufficiency.effects == r.steps[-1].fit.model.named[-1:]
+    left = last.fit.chi2 - last.fit.dof
+    assert first.insufficiency.share == pytest.approx(left / (first.fit.chi2 - first.fit.dof))
 
 
 def test_nothing_hidden_adds_nothing():
