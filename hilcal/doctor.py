@@ -204,7 +204,8 @@ def packages(requirements: Iterable[str]) -> tuple[Finding, ...]:
     Requirements are those of its metadata, e.g. 'pyarrow>=17; extra == "tables"'. A requirement
     for earlier Pythons only has no wheel for this one.
     """
-    installed, out = [], []
+    installed: dict[str, str] = {}  # each once, also where several extras require it
+    out = []
     lacking: dict[str, list[str]] = {}
     for requirement in requirements:
         match, extra = _NAME.match(requirement), _EXTRA.search(requirement)
@@ -234,12 +235,12 @@ def packages(requirements: Iterable[str]) -> tuple[Finding, ...]:
             mend = f"install it anew: pip install --force-reinstall {name}=={version}"
             out.append(PROGRAM(name, "problem", f"{version} does not load: {why}", mend))
         else:
-            installed.append(f"{name} {version}")
+            installed[name] = f"{name} {version}"
     for extra_name, names in lacking.items():
         text = f"{', '.join(names)}: not installed; what needs them says so"
         mend = f'where it is wanted: pip install "hilcal[{extra_name}]"'
         out.append(PROGRAM(f"optional: {extra_name}", "ok", text, mend))
-    return (PROGRAM("packages", "ok", ", ".join(installed)), *out)
+    return (PROGRAM("packages", "ok", ", ".join(installed.values())), *out)
 
 
 def _drivers() -> Iterator[Finding]:

@@ -239,7 +239,7 @@ PRIOR = "the result of hilcal fleet"
 
 @command("""
     directory | DIR | With campaign files, in folders below as well.
-    out | -o PRIOR.json | What to expect of another arm.
+    out | -o --output PRIOR.json | What to expect of another arm.
     report | --report F.html | Write it as one HTML page.
     """)
 def fleet(

@@ -236,7 +236,7 @@ def _drifts(text: str | None) -> dict[str, float]:
     fit_validation | --fit-validation | Release a validation campaign for fitting; its file says so
         for good.
     cell | --cell CELL.toml | The cell of a stream, READINGS.parquet as RUN.
-    out | -o F.json | Of a stream: write its calibration.
+    out | -o --output F.json | Of a stream: write its calibration.
     """)
 def identify(
     t: Terminal, catalogue: Catalogue, run: Path, effects: str | None = None, scaling: str = "gc",

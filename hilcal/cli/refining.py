@@ -376,7 +376,7 @@ def _effects_against(
 
 
 @command("""
-    later | [LATER.hilcal] | A later campaign of the same arm, of 15 readings or more: what has
+    later | LATER.hilcal | A later campaign of the same arm, of 15 readings or more: what has
         changed?
     same_setup | --same-setup | With LATER: tracker and base stand as they did; else the tracker's
         place is estimated from the later readings.

@@ -27,7 +27,7 @@ from hilcal.tables.units import parse_length
 
 
 @command("""
-    later | [LATER.hilcal] | A later campaign of the same arm: compare the two.
+    later | LATER.hilcal | A later campaign of the same arm: compare the two.
     output | -o --output F.html | The page; RUN.html unless given.
     limit | --limit LENGTH | The largest 3-D position error allowed, e.g. "0.1 mm": the page says
         passed or failed.

@@ -42,6 +42,7 @@ def test_help_breaks_and_cuts_no_word_at_any_width(
         assert max(map(len, text.splitlines())) <= width
         told[width] = words(text)
     assert told[60] == told[80] == told[120]
+    assert "-o" not in told[80]  # without its long name, after a comma
     assert not [word for word in told[80] if word.endswith("...")]
     assert "130 interrupted with Ctrl-C" in " ".join(told[80]) or len(command) == 2
 

@@ -17,6 +17,7 @@ def test_packages_are_told_with_their_versions_and_those_that_lack():
     there, lacking, later, optional = packages(
         [
             "numpy>=2.0",
+            'numpy>=2.0; extra == "tables"',
             "no-such-package>=3,<4",
             'no-such-driver>=1; python_version < "3.11"',
             'no-such-tables>=1; extra == "tables"',
@@ -24,6 +25,7 @@ def test_packages_are_told_with_their_versions_and_those_that_lack():
         ]
     )
     assert there.said.startswith("numpy 2.")
+    assert "," not in there.said  # each once
     assert (lacking.name, lacking.state) == ("no-such-package", "problem")
     assert "pip install 'no-such-package>=3,<4'" in lacking.mend
     assert (later.name, later.state) == ("no-such-driver", "warning")

@@ -59,7 +59,8 @@ def correct_file(
         edits, names = edits_of(steps, new.transforms)
     else:
         raise InputError(f"{path}: an XML file of <{kind[:40]}>; valid: {KINDS}")
-    note = f"{path}: {len(names)} places changed ({', '.join(names)}), all else as it was"
+    changed = f"{len(names)} place{'s' * (len(names) != 1)} changed ({', '.join(names)})"
+    note = f"{path}: {changed if names else 'no place changed'}, all else as it was"
     if new.axis_distance > FRAME_TOLERANCE:
         note += f"; its axes lay up to {length(new.axis_distance)} from those of the nominal "
         note += nominal.name

@@ -167,9 +167,9 @@ def _log(rec: rr.RecordingStream, types: list[DrawnType]) -> None:
         _drift(rec, f"date{i}", d)
         odd = list(dict.fromkeys(o.arm for o in d.pooled.unlike))
         verb = "is" if len(odd) == 1 else "are"
-        title = f"{numbers.names(odd)} {verb} unlike the others" if odd else "No arm is unlike"
+        who = f"{numbers.names(odd)} {verb}" if odd else "No arm is"
         name, table, note, *lines = type_report(d.pooled)
-        text = style.markdown([heading(title), name, *lines, table, note])
+        text = style.markdown([heading(f"{who} unlike the others"), name, *lines, table, note])
         log_static(rec, f"words/type{i}", style.document(text))
     log_static(rec, "words/guide", style.document(GUIDE))
     recording.flush(rec)
@@ -182,7 +182,7 @@ def _blueprint(types: list[DrawnType]) -> rrb.Blueprint:
         place = arm_positions(d)
         middle = place.mean(axis=0) + np.array([0.0, 0.0, 0.35 * d.reach])
         eye = middle + (np.ptp(place, axis=0).max() + d.reach) * np.array([0.68, 0.0, 0.36])
-        name = f"{title}{len(place)} arms; a red frame: unlike the others, the red joint says where"
+        name = f"{title}{len(place)} arms; red: unlike the others"
         scenes.append(style.view3d(f"arms{i}", name, eye, middle))
         low, high = float(d.seconds.min()), float(d.seconds.max())
         wide = max(0.05 * (high - low), _LEAST_RANGE_S)

@@ -325,7 +325,7 @@ def test_an_ordinary_fleet_has_nothing_red(one, tmp_path):
     colors = [rgb(c) for c in rows(path, "/arms0/arms", "Capsules3D:colors")[0]]
     assert style.RED not in colors
     assert "/arms0/unlike" not in entities(path)
-    assert "No arm is unlike" in rows(path, "/words/type0", "TextDocument:text")[0][0]
+    assert "No arm is unlike the others\n" in rows(path, "/words/type0", "TextDocument:text")[0][0]
 
 
 def test_what_others_imitate_only_far_off_is_known():
