@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 
-from hilcal import limits
+from hilcal import limits, numbers
 from hilcal.errors import CannotAnswerError, InputError, expect
 from hilcal.identification.carried.drift import Conflict, chosen_drift, conflicts
 from hilcal.identification.folds import distinct_poses, leave_out, random_folds
@@ -225,8 +225,11 @@ class Fit(WithVarianceFactor, Tabular):
             shown[rows] &= name not in self.model.background
         return Estimates.of(self.model, self.theta, u.std, u.identifiable, shown)
 
-    def summary(self) -> str:
-        """Return the model, its errors and its parameters as plain text."""
+    def summary(self, details: bool = False) -> str:
+        """Return the model, its errors and its parameters as plain text.
+
+        Without `details` a family that shares a prior, and what is not determined, is in short.
+        """
         fitted = f"fitted to {len(self.raw)} {self.mode} readings, scaling {self.scaling}"
         lines = [f"{self.model.title}, {fitted}"]
         for poses, e in (("fitted poses", self.error), ("poses left out", self.holdout)):
@@ -236,7 +239,21 @@ class Fit(WithVarianceFactor, Tabular):
             )
         low, high = self.variance_factor_interval
         lines.append(f"  variance factor {self.variance_factor:.3g} [{low:.3g}, {high:.3g}]")
-        return "\n".join([*lines, *self.parameters.lines()])
+        if details:
+            return "\n".join([*lines, *self.parameters.lines()])
+        rows, families = list(self.parameters), []
+        for effect in self.model.effects:
+            family = [r for r in rows if r.name.startswith(f"{effect.name}.")]
+            if family and effect.groups() is not None:
+                rows = [r for r in rows if r not in family]
+                top = max(family, key=lambda r: abs(r.value or 0.0))
+                families.append(
+                    f"  {effect.name}: {len(family)} parameters, the largest:\n{top.line()}"
+                )
+        lines += Estimates(tuple(r for r in rows if r.identifiable)).lines()
+        unknown = [r.name for r in rows if not r.identifiable]
+        families += [f"  not determined: {numbers.few(unknown, 3)}"] * bool(unknown)
+        return "\n".join([*lines, *families])
 
     @property
     def residuals(self) -> "Residuals":

@@ -479,3 +479,12 @@ def test_the_summary_has_every_parameter_and_both_errors(found):
     assert all(f"{row.name} " in text for row in found.parameters)
     for error in (found.error, found.holdout):
         assert f"{1e6 * error.rms_m:.1f} µm rms" in text
+
+
+def test_the_summary_tells_a_family_in_short(found):
+    model = with_effects(found.model.cell, found.readings, found.mode, WAVES)
+    text = (fitted := fit(model, found.readings, found.mode)).summary()
+    count = sum(row.name.startswith("transmission_error.") for row in fitted.parameters)
+    assert f"transmission_error: {count} parameters, the largest:" in text
+    assert text.count("transmission_error.") == 1
+    assert all(f"{row.name} " in fitted.summary(details=True) for row in fitted.parameters)
