@@ -201,6 +201,8 @@ class UrArm:
         if motion is None:
             if self._fault:
                 self._in_control()
+            if self._control is not None:
+                self._check_state(self._read())  # of an arm at rest, too
             return False
         control = self._in_control()
         reading = self._read()  # first: the control process can hang after the program's end
@@ -345,7 +347,8 @@ def open_arm(config: CellConfig) -> UrArm:
             raise failure(host, f"its version {word} lacks {', '.join(sorted(missing))}")
         controller = UrController.of(host, version, options.robot_api_port)
         silent = controller.why_silent(_ASK_S)
-        receiver = Receiver(host, options.receive_hz, outputs, _RECEIVE_S)
+        reduced = options.reduced_mode
+        receiver = Receiver(host, options.receive_hz, outputs, _RECEIVE_S, reduced)
     except LinkError as error:
         advice = "check that the controller is on and [robot] host"
         raise failure(host, str(error), advice) from None

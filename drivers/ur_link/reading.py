@@ -117,8 +117,11 @@ class Reading:
     safety_bits: int  # the safety state as bits
 
 
-def read(answer: dict[str, Any]) -> Reading:
-    """Return the reading in an answer of the receive worker; raises ReadingError."""
+def read(answer: dict[str, Any], reduced: bool = False) -> Reading:
+    """Return the reading in an answer of the receive worker; raises ReadingError.
+
+    `reduced`: the reduced mode is normal.
+    """
     fields = answer["fields"]
 
     def checked(name: str, count: int, largest: float) -> Any:
@@ -131,7 +134,7 @@ def read(answer: dict[str, Any]) -> Reading:
     values |= {key: checked(*field) for key, field in FIELDS.items() if field[0] in fields}
     if "target_speed_fraction" in fields:  # the slider; the two multiply
         values["speed_scaling"] *= checked("target_speed_fraction", 0, 10.0)
-    bits = int(fields["safety_status_bits"])
+    bits = int(fields["safety_status_bits"]) & ~(reduced << states.REDUCED)
     host_ns, safety = int(answer["host_ns"]), states.safety_word(bits)
     sample = ArmSample(host_ns=host_ns, safety=safety, **values)
     return Reading(sample, int(fields["robot_mode"]), int(fields["runtime_state"]), bits)
@@ -140,9 +143,14 @@ def read(answer: dict[str, Any]) -> Reading:
 class Receiver:
     """Reads the arm's state; each reading is newer than its call."""
 
-    def __init__(self, host: str, hz: float, outputs: tuple[str, ...], seconds: float) -> None:
-        """Connect within `seconds`; each call raises LinkError if no new data come."""
-        self._host, self.hz = host, hz
+    def __init__(
+        self, host: str, hz: float, outputs: tuple[str, ...], seconds: float, reduced: bool = False
+    ) -> None:
+        """Connect within `seconds`; each call raises LinkError if no new data come.
+
+        `reduced`: the reduced mode is normal.
+        """
+        self._host, self.hz, self._reduced = host, hz, reduced
         self._arguments = (host, repr(hz), ",".join(outputs))
         self._worker = self._start(seconds)
 
@@ -154,7 +162,8 @@ class Receiver:
     def read(self, stale: float = PATIENCE_S) -> Reading:
         """Return the first packet newer than the call, within `stale` real s."""
         try:
-            return read(self._worker.call("sample", stale + _ANSWER_S, stale=stale))
+            answer = self._worker.call("sample", stale + _ANSWER_S, stale=stale)
+            return read(answer, self._reduced)
         except WorkerError as error:
             source = "the process that receives over RTDE: " if error.lost else ""
             raise LinkError(f"{source}{error}") from None

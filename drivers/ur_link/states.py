@@ -28,6 +28,7 @@ STOPPING, STOPPED, PLAYING, PAUSING, PAUSED, RESUMING = range(6)
 RUNTIME_STATES = ("stopping", "stopped", "playing", "pausing", "paused", "resuming")
 
 NORMAL = "normal"
+REDUCED = 1  # bit of the reduced mode
 # (bit of safety_status_bits, meaning, advice), the gravest first
 _SAFETY = (
     (9, "safety fault", "restart the controller"),
@@ -39,7 +40,12 @@ _SAFETY = (
     (4, "safeguard stop", "leave the guarded area and reset the safeguard"),
     (3, "recovery mode", "move the joints inside their limits on the pendant"),
     (10, "stopped for safety", "look at the pendant"),
-    (1, "reduced mode", "leave the zone that reduces the robot's limits"),
+    (
+        REDUCED,
+        "reduced mode",
+        "leave the zone that reduces the robot's limits; where it always works so: [robot.options] "
+        "reduced_mode = true",
+    ),
 )
 
 

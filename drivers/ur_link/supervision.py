@@ -265,6 +265,11 @@ class UrOptions(Section):
     robot_api_port: Annotated[int, Strict(), Field(ge=1, le=65535)] = Field(
         80, description="number of the TCP port of PolyScope X's Robot API, 1 to 65535"
     )
+    reduced_mode: bool = Field(
+        False,
+        description="true where the arm always works in its safety system's reduced mode",
+        examples=[True],
+    )
 
 
 def services(config: CellConfig) -> dict[int, str]:

@@ -225,7 +225,7 @@ class Mover:
         reason = next(filter(None, checked), None) or self._clock_stands(sample)
         if reason is not None:
             if sample.safety != NORMAL:
-                self._arm.moving()  # in motion the driver raises the cause and the remedy
+                self._arm.moving()  # a driver that can raises the cause and the remedy
             raise DeviceError(reason)
         if not self._under_way and (moved := self.moved_by_others(sample)) is not None:
             raise DeviceError(f"arm: {moved}")

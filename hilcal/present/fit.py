@@ -89,9 +89,13 @@ def gross_error_lines(fit: Fit, details: bool) -> Iterator[str]:
     if details:
         yield from _listed([f"  {g.pose}/{g.load}: {g.reason}" for g in gross], GROSS)
     of_load = fit.readings.load
-    for k in np.setdiff1d(of_load, of_load[~fit.outlier]):
-        name, count = fit.readings.load_names[k], int(np.sum(of_load == k))
-        yield f"All {count} readings under the load {name} are set aside: is its force right?"
+    lost = np.setdiff1d(of_load, of_load[~fit.outlier])
+    if len(lost):
+        names = numbers.names([fit.readings.load_names[k] for k in lost])
+        right = "are their forces" if len(lost) > 1 else "is its force"
+        under = f"under the load{'s' * (len(lost) > 1)} {names}"
+        count = int(np.isin(of_load, lost).sum())
+        yield f"All {count} readings {under} are set aside: {right} right?"
 
 
 def _listed(lines: Sequence[str], most: int) -> Iterator[str]:

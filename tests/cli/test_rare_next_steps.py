@@ -9,6 +9,7 @@ import pytest
 
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.changes import change_cell
+from hilcal.diagnosis.order_step import OrderStep
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.diagnosis.wrong_figures import WrongFigure
 from hilcal.discovery.discovery import Discovery
@@ -123,6 +124,7 @@ PLAN_AFTER = "hilcal plan CELL.toml -o PLAN.json --after {run}"
 
 @pytest.mark.parametrize(("reason", "words", "step"), [
     ("wrong_figure", "a figure of the cell", "hilcal diagnose {run}"),
+    ("step", "was moved in the middle of the readings", "hilcal diagnose {run}"),
     ("one_suspect", "hysteresis alone is missing", "hilcal add {run} hysteresis"),
     *(
         pytest.param(*further, marks=pytest.mark.long)
@@ -138,7 +140,12 @@ def test_what_next_says_of_each_verdict(fitted, tmp_path, capsys, reason, words,
     cell = tmp_path / "cell.toml"
     cell.write_text(re.sub(r"candidates = \d+", "candidates = 60\nagainst = []", CELL.read_text()))
     with Campaign.open(run) as o:
-        d = replace(diagnose(o.fit(), o.history()), reason=reason)
+        d = diagnose(o.fit(), o.history())
+        if reason == "step":
+            shifted = OrderStep(("target",), 20, 19, 1e-5, 1e-3, 0.9)
+            d = replace(d, reason="no_suspect", step=shifted)
+        else:
+            d = replace(d, reason=reason)
         wrong = (
             (WrongFigure("mass", "5kg", (5.0,), (9.8,), "kg", 1e-4, 2e-5),)
             if "figure" in reason

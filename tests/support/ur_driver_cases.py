@@ -32,8 +32,8 @@ def start(directory, *arguments, scale=1.0):
     return sim_ur_cases.start(directory, scale, None, *arguments)
 
 
-def controlled(sim, clock=1.0):
-    arm = open_arm(config(sim.host, clock=clock))
+def controlled(sim, clock=1.0, **options):
+    arm = open_arm(config(sim.host, clock=clock, **options))
     try:
         arm.take_control(MASS, COM)
     except BaseException:

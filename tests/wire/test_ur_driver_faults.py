@@ -108,6 +108,24 @@ def test_an_arm_stopped_by_a_safeguard_stands_when_it_is_reset(arm, sim, mute):
     arm.take_control(cases.MASS, cases.COM)
 
 
+def test_a_safeguard_stop_at_rest_is_told_with_what_to_do(arm, sim):
+    assert not arm.moving()
+    sim.admin("safeguard_stop")
+    assert "safeguard stop; leave the guarded area and reset" in cases.error_of(arm.moving)
+    sim.admin("release_safeguard")
+    cases.restore(sim)
+    arm.take_control(cases.MASS, cases.COM)
+
+
+def test_a_cell_that_always_works_in_reduced_mode_is_driven(tmp_path):
+    with closing(cases.start(tmp_path)) as running:
+        running.admin("reduced_mode")
+        with closing(cases.controlled(running, reduced_mode=True)) as arm:
+            assert not arm.report().problems
+            arm.start_move(cases.displaced_joints(arm, by=0.1), cases.SPEED, cases.ACCELERATION)
+            cases.finish(arm)
+
+
 def test_an_arm_in_reduced_mode_is_stopped_and_goes_on_after_it(arm, sim):
     cases.under_way(arm, sim)
     since = sim.admin("reduced_mode")["fault_ns"]

@@ -17,6 +17,8 @@ from hilcal.diagnosis.recorded import ROW_ORDER
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.options import typical_compliances
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import to_json
 from hilcal.identification.linearisation import linearise
 from hilcal.identification.prediction.full_prediction import full_prediction, nominal_error
@@ -28,6 +30,7 @@ from hilcal.present.fit import (
     dependence_sentence,
     errors,
     fit_report,
+    gross_error_lines,
     where_table,
     worst_poses,
 )
@@ -39,6 +42,21 @@ from hilcal.robot import se3
 from tests.support.campaigns import campaign, cell_of, noiseless, plan, with_noise, world_of
 from tests.support.fit_cases import fitted_model
 from tests.support.rows import first
+
+
+def test_loads_of_which_nothing_is_left_are_told_in_one_sentence():
+    c = campaign(poses=6)
+    r = c.readings
+    names = [n for n in r.load_names if n != "none"][:2]
+    lost = np.isin(r.load, [r.load_names.index(n) for n in names])
+    fitted = fit(baseline(c.cell, r, "absolute"), r, "absolute", outlier=lost)
+    told = list(gross_error_lines(fitted, details=False))
+    (sentence,) = [line for line in told if "force" in line]
+    assert sentence == (
+        f"All {lost.sum()} readings under the loads {names[0]} and {names[1]} are set aside: are "
+        "their forces right?"
+    )
+
 
 # numbers
 
