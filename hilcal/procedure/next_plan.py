@@ -152,7 +152,10 @@ def _settled(o: Campaign, d: Diagnosis) -> str:
     elif d.wrong_figures:
         why = f"a figure of the cell seems to be wrong, {see}"
     elif d.step is not None:
-        why = f"something was moved in the middle of the readings, {see}"
+        why = (
+            f"something was moved in the middle of the readings, {see}; the table to mend is "
+            f"written by: hilcal export {quoted(o.path)} --readings READINGS.csv"
+        )
     elif d.verdict == "noise_misjudged":
         why = f"the noise is misjudged, {see}; repeat some readings, or state the covariance anew"
     elif d.reason == "background":

@@ -124,7 +124,7 @@ PLAN_AFTER = "hilcal plan CELL.toml -o PLAN.json --after {run}"
 
 @pytest.mark.parametrize(("reason", "words", "step"), [
     ("wrong_figure", "a figure of the cell", "hilcal diagnose {run}"),
-    ("step", "was moved in the middle of the readings", "hilcal diagnose {run}"),
+    ("step", "moved in the middle", "hilcal export {run} --readings READINGS.csv"),
     ("one_suspect", "hysteresis alone is missing", "hilcal add {run} hysteresis"),
     *(
         pytest.param(*further, marks=pytest.mark.long)
@@ -154,6 +154,7 @@ def test_what_next_says_of_each_verdict(fitted, tmp_path, capsys, reason, words,
         with pytest.raises(CannotAnswerError, match=words) as said:
             doubt_to_settle(o, replace(d, wrong_figures=wrong), quiet)
     places = {"CELL.toml": cell, "PLAN.json": tmp_path / "p.json"}
+    places["READINGS.csv"] = tmp_path / "t.csv"
     follow(capsys, str(said.value), step.format(run=f"'{run}'"), **places)
 
 
