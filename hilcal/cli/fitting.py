@@ -168,12 +168,13 @@ def record_story(t: Terminal, chapters: list[Chapter], path: Path | None) -> Non
     """Write a recording, unless `path` is None."""
     if path is None:
         return
+    from hilcal.cli.showing import open_command
     from hilcal.present.viewer import save  # loads the viewer's library, which takes a while
 
     with working(t.progress) as say:
         say(f"writing {path}")
         save(build_story(chapters), path)
-    t.notice(f"recorded {path}; open it with: rerun {path}")
+    t.notice(f"recorded {path}; open it with: {open_command(path)}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ import pytest
 
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.revisions import chain
+from hilcal.cli.showing import open_command
 from hilcal.config import load_config
 from hilcal.errors import InputError
 from hilcal.store import schema
@@ -143,8 +144,10 @@ def test_every_command_that_reads_a_model_takes_a_revision(run, tmp_path, capsys
         assert (d["revision"], d["model"]) == (2, two)
     d = ok(capsys, "validate", run, run, "--revision", "2", "--json").document
     assert (d["revision"], d["model"]) == (2, two)
-    story = ("view", run, "--record", tmp_path / "s.rrd", "--json")
-    assert ok(capsys, *story).document["revisions"] == [3]
+    recording = tmp_path / "s.rrd"
+    story = ("view", run, "--record", recording, "--json")
+    assert (told := ok(capsys, *story)).document["revisions"] == [3]
+    assert f"open it with: {open_command(recording)}" in told.err
     assert ok(capsys, *story, "--revision", "2").document["revisions"] == [1, 2]
     parameters = tmp_path / "p.csv"
     ok(capsys, "export", run, "--parameters", parameters, "--revision", "2")
