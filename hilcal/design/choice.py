@@ -59,9 +59,9 @@ def objective_of(
             raise InputError('criterion "I" needs prediction poses; see [planning] work_q_rad')
         return balanced(mixed_design(problem, config, work))
     if name == "separate":
-        apart = discriminated_pairs(problem)
-        units, pairs, prior = condensed(problem.units, apart.pairs, apart.prior)
-        return Objective(units, Separate(pairs), prior, discriminated_pairs=apart)
+        discriminated = discriminated_pairs(problem)
+        units, pairs, prior = condensed(problem.units, discriminated.pairs, discriminated.prior)
+        return Objective(units, Separate(pairs), prior, discriminated_pairs=discriminated)
     if name == "E":
         return replace(of_all, criterion=E(without_prior(problem)))
     if name == "K":  # of the model alone: information on other parameters may lower it

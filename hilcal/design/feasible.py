@@ -10,7 +10,7 @@ from hilcal.cell import Cell
 from hilcal.errors import CannotAnswerError
 from hilcal.measuring.clearance import TRACKER_UNKNOWN
 from hilcal.measuring.feasibility import STATE_CHECKS, Feasibility, Margins
-from hilcal.measuring.route import beside
+from hilcal.measuring.route import pose_beside
 from hilcal.robot.chain import evaluate, joint_jacobian
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Bools, Floats
@@ -92,7 +92,7 @@ class FeasibleSpace(Feasibility):
 
     def can_start(self, q: Floats, loads: Iterable[str]) -> bool:
         """Return whether a run may begin and read again at a state (n,) under some loads."""
-        away = beside(q, self.cell.arm, self.config.limits.joint_margin_rad)[None]
+        away = pose_beside(q, self.cell.arm, self.config.limits.joint_margin_rad)[None]
         return all(
             self.allowed(away, load, STATE_CHECKS).all() and self.passable(q, away, load).all()
             for load in loads
@@ -137,9 +137,9 @@ def draw_poses(
     # states left after each reason, and samples of those that it rejects
     remaining, lost = dict.fromkeys(REASONS, 0), dict[str, Floats]()
     parts = [np.empty((0, len(low)))]
-    drawn = have = 0
+    drawn = found = 0
     max_states = max(_MOST[0], _MOST[1] * count) if max_states is None else max_states
-    while have < count and drawn < (max_states if have else _VAIN):
+    while found < count and drawn < (max_states if found else _VAIN):
         u = (sequence.random(_CHUNK) + shift) % 1.0
         q = space.cell.arm.complete(low + u * (high - low))
         for reason in REASONS:
@@ -151,8 +151,8 @@ def draw_poses(
             remaining[reason] += len(q)
         parts.append(q)
         drawn += _CHUNK
-        have += len(q)
-    if have < min_poses:
+        found += len(q)
+    if found < min_poses:
         raise CannotAnswerError(_too_few(space, drawn, remaining, lost, min_poses))
     q = np.vstack(parts)[:count]
     allowed = np.ones((len(q), len(space.loads)), dtype=np.bool_)

@@ -360,8 +360,8 @@ def _best(
 
     # The smallest of those that explain the readings equally well.
     evidence, p_value, after, best = min((t for t in sure if most - t[0] < SAME_EVIDENCE), key=size)
-    apart = [t for t in tried if all(c is not b for c in t[3] for b in best)]
-    rivals = [(c, t[0]) for t in apart for c in t[3]]
+    disjoint = [t for t in tried if all(c is not b for c in t[3] for b in best)]
+    rivals = [(c, t[0]) for t in disjoint for c in t[3]]
     rivals += [(s.candidate, s.score.log_evidence) for s in order[MOST_EXACT_FITS:]]
     same = {c.name: c for c, e in rivals if most - e < SAME_EVIDENCE}
     chance = min(p_value * tested, 1.0)

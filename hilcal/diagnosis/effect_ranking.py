@@ -301,18 +301,20 @@ def _scored(p: Linearisation, effects: Sequence[Effect]) -> Iterator[_Scored]:
     for families in columns_in_parts(p.fit, effects):
         scored = []
         for family, (s, g) in zip(families, p.families(families), strict=True):
-            of_s, largest = spectrum(s), largest_plausible(family, bare)
-            scored.append(_Scored(family, s, of_s, g, largest, p.score_of(of_s, g, largest)))
-        able = [c for c in scored if c.score.p_value < FALSE_ALARM and c.score.log_evidence > 0]
-        held_out = iter(_left_out(p, [(c.family.white, c.score) for c in able]))
-        yield from (replace(c, held_out=next(held_out)) if c in able else c for c in scored)
+            eigen, largest = spectrum(s), largest_plausible(family, bare)
+            scored.append(_Scored(family, s, eigen, g, largest, p.score_of(eigen, g, largest)))
+        significant = [
+            c for c in scored if c.score.p_value < FALSE_ALARM and c.score.log_evidence > 0
+        ]
+        held_out = iter(_left_out(p, [(c.family.white, c.score) for c in significant]))
+        yield from (replace(c, held_out=next(held_out)) if c in significant else c for c in scored)
 
 
 def _suspect(
     p: Linearisation, scored: _Scored, count: int, simulated_noise: Callable[[], SimulatedCampaigns]
 ) -> Suspect:
     """Describe one of `count` effects that are tested together, without keeping its columns."""
-    of_s, result, effect = scored.spectrum, scored.score, scored.family.effect
+    eigen, result, effect = scored.spectrum, scored.score, scored.family.effect
     s, largest, held_out = scored.information, scored.largest, scored.held_out
 
     @cache
@@ -324,8 +326,8 @@ def _suspect(
         x = effect_columns(p.fit, effect)
         units = tuple(q.unit for q in effect.parameters)
         noise, level = max(p.fit.variance_factor, 1.0), FALSE_ALARM / count
-        start = least_strength(s, x.motion, x.scale, units, p.fit.dof, noise, level, of_s.rank)
-        return least_of_family(p, x, of_s, start, level, largest, simulated_noise)
+        start = least_strength(s, x.motion, x.scale, units, p.fit.dof, noise, level, eigen.rank)
+        return least_of_family(p, x, eigen, start, level, largest, simulated_noise)
 
     return Suspect(
         effect.name, result, p.share(result.gain), left_out, explains=False, detection=least,

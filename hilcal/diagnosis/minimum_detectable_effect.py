@@ -198,21 +198,21 @@ class SuspectTests:
         r = campaigns.fitted
         g, rss = self.family.white.T @ r, np.sum(r * by_model.y, axis=0)
         scores: list[FamilyScore] = []
-        able = [False] * by_model.y.shape[1]
-        for k in range(len(able)):
+        revealed = [False] * by_model.y.shape[1]
+        for k in range(len(revealed)):
             c = score_family(self.s, g[:, k], float(rss[k]), p.fit.dof, largest=self.largest)
             scores.append(c)
-            able[k] = c.p_value < self.level and c.log_evidence > 0
-            failed = len(scores) - sum(able)
-            if 1.0 - failed / len(able) < enough:
-                return able
-        if np.mean(able) < POWER:
-            return able
+            revealed[k] = c.p_value < self.level and c.log_evidence > 0
+            failed = len(scores) - sum(revealed)
+            if 1.0 - failed / len(revealed) < enough:
+                return revealed
+        if np.mean(revealed) < POWER:
+            return revealed
         ridge = float(np.median([c.ridge for c in scores]))
         with_family = self._family_folds.left_out(by_model, ridge)
         out = []
-        for k, fit_able in enumerate(able):
+        for k, fit_reveals in enumerate(revealed):
             a, b = by_pose(p.fit, by_model.residual[:, k]), by_pose(p.fit, with_family[:, k])
             share = float(a.sum() - b.sum()) / max(float(a.sum()) - p.fit.whitening.rank, 1.0)
-            out.append(fit_able and share >= LEAST_SHARE and improves(a, b))
+            out.append(fit_reveals and share >= LEAST_SHARE and improves(a, b))
         return out

@@ -88,8 +88,8 @@ def step_in_order(fit: Fit) -> OrderStep | None:
         return None
     found.sort(key=lambda f: -f[0])
     best, _, k, p, size, share = found[0]
-    kept = tuple(kind for score, kind, *_ in found if best - score < 2 * SAME_EVIDENCE)
-    return OrderStep(kept, int(rows[k]), int(rows[k - 1]), p, size, share)
+    explanations = tuple(kind for score, kind, *_ in found if best - score < 2 * SAME_EVIDENCE)
+    return OrderStep(explanations, int(rows[k]), int(rows[k - 1]), p, size, share)
 
 
 def _gains(e: Equations, columns: Floats) -> Iterator[tuple[int, float, int, Floats]]:

@@ -81,19 +81,19 @@ def pose_alone(
     share = p.share(constants.gain - rank * remainder / (fit.dof - rank))
     if share < LEAST_SHARE or float(scipy.stats.chi2.sf(remainder, fit.dof - rank)) < MISFIT_ALARM:
         return None
-    able, states = [], fit.readings[~fit.outlier].states
+    pose_effects, states = [], fit.readings[~fit.outlier].states
     for e in (*(e for e in fit.model.effects if e.fine(states)), *effects):
         full = e.fine(states) or e
         x = p.project_out(effect_columns(fit, full).white)
         square = float(np.sum(x**2))
         if square > 0 and constants.square(x) >= SPANNED_SHARE * square:
-            able.append((len(full.parameters), e))
-    able.sort(key=lambda pair: -pair[0])
+            pose_effects.append((len(full.parameters), e))
+    pose_effects.sort(key=lambda pair: -pair[0])
     poses = int(fit.pose.max()) + 1
-    missing = int(np.ceil(able[0][0] / fit.whitening.m)) - poses if able else 0
+    missing = int(np.ceil(pose_effects[0][0] / fit.whitening.m)) - poses if pose_effects else 0
     if missing <= 0:
         return None
-    names, first = tuple(e.name for _, e in able), able[0][1]
+    names, first = tuple(e.name for _, e in pose_effects), pose_effects[0][1]
     if first.name in fit.model.names:
         return PoseAlone(share, names, poses, missing, None)
     further, power = missing, 0.0

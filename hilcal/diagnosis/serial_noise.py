@@ -117,7 +117,7 @@ def serial_noise(white: Fit) -> SerialNoise | None:
     both = problem.maximised(rivals, serial=True, start=effects)
     gain = both.value - effects.value
     if gain >= LEAST_GAIN or alone.value - effects.value >= SAME_EVIDENCE:
-        # Needless variances of rivals would absorb a part of the noise.
+        # Variances of rivals that are not needed would absorb a part of the noise.
         needed = both.value - alone.value >= SAME_EVIDENCE
         return problem.noise(*((both, rivals) if needed else (alone, problem.none)), gain)
     if effects.value - alone.value >= SAME_EVIDENCE:

@@ -8,8 +8,8 @@ stated figure by more than rounding.
 
 Where no effect of the catalogue explains the misfit, the direction of gravity in base axes is
 tried, too: the axes of the base as starts, the best of them refined; and whether the forces of a
-table are those in flange axes, or of the other sign. Loads that act the other way leave no misfit:
-they turn the sign of all compliances, and no joint gives way against its torque.
+table are those in flange axes, or of the other sign. Loads of the wrong
+sign leave no misfit, but make all compliances negative, which is impossible.
 """
 
 from collections.abc import Iterator, Sequence
@@ -54,7 +54,7 @@ DERIVATIVE_STEP: dict[FigureKind, float] = {
     "load": 1e-2, "tool_mass": 1e-1, "tool_com": 1e-2, "gravity": 1e-2,
 }  # fmt: skip
 """Steps of the derivatives: relative for wrench and mass, m for the centre of mass, rad."""
-TOLD = 5.0  # standard uncertainties from which the sign of a compliance is beyond doubt; a choice
+SIGN_SIGMA = 5.0  # standard uncertainties from which a compliance's sign is certain; a choice
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +152,7 @@ class _Figure:
         for _ in range(steps):
             if self.kind in ("tool_com", "gravity"):
                 change = change + step
-            else:  # no mass changes its sign
+            else:  # a mass stays positive
                 change = (1.0 + change) * (1.0 + np.clip(step, -LARGEST_STEP, 2.0)) - 1.0
             changed = self.applied(stated, change)
             refit = fit(changed.model, changed.readings, stated.mode, start=refit.theta)
@@ -224,10 +224,10 @@ def wrong_figures(fit: Fit, suspects: Sequence[Suspect]) -> tuple[WrongFigure, .
 
 
 def loads_reversed(fit: Fit) -> bool:
-    """Whether all compliances of joints whose sign the readings tell are negative."""
+    """Whether all joint compliances whose sign is certain are negative."""
     z = _compliances(fit)
-    told = z[np.abs(z) > TOLD]
-    return len(told) > 0 and bool(np.all(told < 0.0))
+    certain = z[np.abs(z) > SIGN_SIGMA]
+    return len(certain) > 0 and bool(np.all(certain < 0.0))
 
 
 def _compliances(fit: Fit) -> Floats:

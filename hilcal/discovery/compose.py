@@ -102,10 +102,10 @@ def _better(
     visible = square > 0
     gain = np.where(visible, slope**2 / np.where(visible, square, 1.0), 0.0)
     alone = np.where(visible, evidence(gain, 1), -np.inf)
-    has = np.asarray(one) > 0
-    safe = np.where(has, one, 1.0)
+    nonzero = np.asarray(one) > 0
+    safe = np.where(nonzero, one, 1.0)
     remainder = square - across**2 / safe
-    both = visible & has & (remainder > INDEPENDENT * square)
+    both = visible & nonzero & (remainder > INDEPENDENT * square)
     partial = slope - across * slope_one / safe
     gain = np.where(both, partial**2 / np.where(both, remainder, 1.0) + slope_one**2 / safe, 0.0)
     return np.maximum(alone, np.where(both, evidence(gain, 2) - LOG2, -np.inf))

@@ -121,9 +121,9 @@ def _simplicity(screen: Screen, t: LawTerm) -> tuple[float, ...]:
         ]
         for a, (s, _) in zip(amplitudes, t.parts, strict=True)
     ]  # fmt: skip
-    apart = max(sum(distance for distance, _ in part) for part in distances)
+    distance_of_joints = max(sum(distance for distance, _ in part) for part in distances)
     cost += any((2, "temperature") in part for part in distances)
-    return t.count + cost, sites, apart, functions
+    return t.count + cost, sites, distance_of_joints, functions
 
 
 def with_simplest_site(screen: Screen, t: LawTerm) -> LawTerm:

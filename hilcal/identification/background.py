@@ -42,8 +42,8 @@ MOST_ROWS_OF_LINES = 2000
 IMPLAUSIBLE_FACTOR = 2.0
 """Factor by which an estimated standard deviation may exceed the plausible one, as few readings
 determine it to such a factor only; a choice."""
-RETURNS = 3
-"""Most times that readings set aside beside fewer effects return; a choice."""
+MOST_CONFIRMATIONS = 3
+"""Most rounds in which gross errors of fewer effects are tested beside all effects; a choice."""
 
 HALF_WIDTH_95 = 1.96
 """Half width of a 95 % interval, in standard errors of log s."""
@@ -185,7 +185,7 @@ def _extensible(model: Model) -> bool:
 def with_background(
     fitted: Fit, named: Collection[str], without: Collection[str] = ()
 ) -> Fit | None:
-    """Fit all effects of the catalogue, `without` some; None where they allow no fit.
+    """Fit all effects of the catalogue except `without`; None where they cannot be fitted.
 
     An added effect that becomes implausibly large (see `Effect.most`) stands in for one that the
     catalogue lacks, or cancels another one. The largest of them is left out, as a size that no arm
@@ -213,11 +213,11 @@ def with_background(
     sample = sample[some_poses(sample, MOST_NOISE_ROWS / sample.value.size, SEED)]
     try:
         mixed = mixed_fit_of(model, sample, fitted.mode)
-        for _ in range(RETURNS if search else 0):
-            still = confirmed_gross_errors(mixed, readings, outlier, fitted.mode)
-            if np.array_equal(still, outlier):
+        for _ in range(MOST_CONFIRMATIONS if search else 0):
+            confirmed = confirmed_gross_errors(mixed, readings, outlier, fitted.mode)
+            if np.array_equal(confirmed, outlier):
                 break
-            outlier, sample = still, readings[~still]
+            outlier, sample = confirmed, readings[~confirmed]
             mixed = mixed_fit_of(model, sample, fitted.mode)
         if search and (gross := find_gross_errors(mixed, fitted.mode)).any():
             outlier[np.flatnonzero(~outlier)[gross]] = True

@@ -141,7 +141,7 @@ def bootstrap(
         model=replace(fit.model, readings=None),
         readings=inliers,
         group=group,
-        like=(fit.mode, fit.scaling),
+        mode_and_scaling=(fit.mode, fit.scaling),
         start=fit.theta,
         null=fit.solution.equations.basis.null.shape[1],
         seed=seed,
@@ -175,7 +175,7 @@ def _drawn(
     model: Model,
     readings: Readings,
     group: Ints,
-    like: tuple[Mode, Scaling],
+    mode_and_scaling: tuple[Mode, Scaling],
     start: Floats,
     null: int,
     seed: int,
@@ -183,9 +183,9 @@ def _drawn(
     """(K, P) parameters of some draws; NaN where a draw does not determine as many as all poses."""
     out = np.full((len(draws), model.size), np.nan)
     for row, draw in enumerate(draws):
-        some = resample(readings, group, np.random.default_rng([seed, draw]))
+        drawn = resample(readings, group, np.random.default_rng([seed, draw]))
         try:
-            solution = solve(model, some, whitening(some, *like), start=start)
+            solution = solve(model, drawn, whitening(drawn, *mode_and_scaling), start=start)
         except CannotAnswerError:
             continue
         if solution.converged and solution.equations.basis.null.shape[1] <= null:

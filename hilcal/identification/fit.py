@@ -397,13 +397,10 @@ def fit_again(
     start: Floats | None = None,
     outlier: Bools | None = None,
 ) -> Fit:
-    """Repeat a fit with what is changed, from its parameters unless `start` is given.
+    """Repeat a fit with another model or other readings, by default from its parameters.
 
-    Without `outlier`, gross errors are sought anew; only those of a fit with a background stay set
-    aside, as they were sought beside all effects, with the sizes of these estimated anew.
-
-    Raises:
-        CannotAnswerError, InputError: as `fit` does.
+    Without `outlier`, gross errors are sought again, except for a fit with a background, whose
+    gross errors were found beside all effects. Raises as `fit`.
     """
     if outlier is None and before.model.background:
         outlier = before.outlier

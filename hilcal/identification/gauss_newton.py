@@ -41,8 +41,8 @@ from hilcal.regression.schur import Projection, projection
 from hilcal.types import Bools, Floats, Ints
 
 # All of these are choices.
-TALL = 10_000  # rows from which a step reduces them to their triangle first: its rank analysis and
-# normal equations of 150,000 rows of 30 then take a tenth of the time
+TALL = 10_000  # rows from which a step first reduces them to their triangle (QR), which makes the
+# rank analysis and normal equations of 150,000 rows of 30 ten times faster
 MAX_ITERATIONS = 20  # steps; the tests of convergence allow 8
 CONVERGED = 1e-5  # motion of the whitened readings by the last step, in units of the noise
 SETTLED = 0.02  # priors and rank are chosen anew until the residual changes by less than this share
@@ -310,9 +310,9 @@ def minimum(problem: NewtonProblem[P], start: Floats | None, prior: Floats | Non
 def _extrapolated(past: Sequence[tuple[Floats, Floats]]) -> Floats:
     """Return where the aims (P,) of steps lead that move the whitened readings by (R,).
 
-    Gauss-Newton's steps fall slowly along directions that the readings hardly determine. The mean
-    of the last aims, with weights of sum one, is taken whose mean motion is the least (Anderson,
-    J. ACM 12 (1965) 547-560).
+    Gauss-Newton's steps fall slowly along directions that the readings hardly determine. Of all
+    weighted means of the last aims, weights of sum one, that with the least mean motion is returned
+    (Anderson, J. ACM 12 (1965) 547-560).
     """
     aims, moved = (np.array(x) for x in zip(*past, strict=True))
     weight = np.linalg.lstsq(np.diff(moved, axis=0).T, moved[-1], rcond=None)[0]

@@ -178,7 +178,7 @@ class Linearisation:
 
     @cached_property
     def test_noise(self) -> tuple[float, float]:
-        """Square and degrees of freedom that tests of further columns take for the noise."""
+        """Sum of squares and degrees of freedom of the noise in tests of further columns."""
         return self.noise_of(self.residual, np.ones(len(self.residual), dtype=np.bool_))
 
     def noise_of(self, residual: Floats, rows: Bools) -> tuple[float, float]:
@@ -189,12 +189,12 @@ class Linearisation:
         without a prior: with the whitened y and the sizes σ of the random parameters, Cov(y) = M⁻¹
         beside these, so that
 
-            yᵀ M y = ‖r‖² + ‖u/σ‖² ~ f χ²,    R less the parameters without a prior
+            yᵀ M y = ‖r‖² + ‖u/σ‖² ~ f χ²,    f = R less the parameters without a prior
         """
-        less = len(rows) - int(np.count_nonzero(rows))
+        dropped = len(rows) - int(np.count_nonzero(rows))
         if not self.fit.model.background:
-            return float(residual @ residual), max(self.fit.dof - less, 1.0)
-        free = float(self.fit.whitening.rank - less - self.flat)
+            return float(residual @ residual), max(self.fit.dof - dropped, 1.0)
+        free = float(self.fit.whitening.rank - dropped - self.flat)
         return float(self.marginal_residual[rows] @ residual), max(free, 1.0)
 
     @cached_property
@@ -349,14 +349,14 @@ def eliminate_columns(
     rank: int,  # number of rows with information
 ) -> ReducedModel:
     """Eliminate columns from a fitted linear model."""
-    stay = ~out & (prior > 0)
-    basis = find_basis(columns, np.ones(columns.shape[1]), np.where(stay, prior, 0.0))
+    retained = ~out & (prior > 0)
+    basis = find_basis(columns, np.ones(columns.shape[1]), np.where(retained, prior, 0.0))
     y = white + columns @ np.where(out, theta, 0.0)
     equations = normal_equations(columns, y, basis, gram)
     # Priors are about zero, not about the parameters of the fit.
     count, ridge = len(basis.singular), beta * basis.prior_precision
     z = np.zeros(len(ridge))
-    z[count:] = (theta / np.where(stay, prior, 1.0))[basis.with_prior]
+    z[count:] = (theta / np.where(retained, prior, 1.0))[basis.with_prior]
     root = equations.inverse_root(beta)
     step = basis.transform @ (root.T @ (root @ (equations.rhs - ridge * z)))
     shrunk = float(np.sum(ridge * np.sum(root**2, axis=0)))

@@ -93,7 +93,7 @@ class MixedFit:
 def with_all_effects(
     model: Model, states: States, harmonics: int = HARMONICS, without: Collection[str] = ()
 ) -> Model:
-    """Return a model with every effect of its catalogue that the states allow, `without` some.
+    """Return a model with every effect of its catalogue that the states allow, except `without`.
 
     Effects with harmonics have at least `harmonics` of them, even if few poses cannot resolve them.
     """

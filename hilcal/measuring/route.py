@@ -31,7 +31,7 @@ class Stop:
     step: Step | None = None  # the reading at the stop; None without
 
 
-def beside(q: Floats, arm: Arm, margin: float) -> Floats:
+def pose_beside(q: Floats, arm: Arm, margin: float) -> Floats:
     """Return (n,) the stop before a reference pose, `margin` from the limits, rad."""
     side = np.where(q - APPROACH_RAD >= arm.q_min + margin, 1.0, -1.0)
     return np.asarray(q - side * APPROACH_RAD)
@@ -46,7 +46,7 @@ def route(plan: Plan, arm: Arm, margin: float = 0.0) -> tuple[Stop, ...]:
     """
     base = plan.home
     q_home = plan.joints(base)
-    first = Stop(f"beside {base}", beside(q_home, arm, margin), UNLOADED)
+    first = Stop(f"beside {base}", pose_beside(q_home, arm, margin), UNLOADED)
     stops = [first, Stop(base, q_home, UNLOADED)]
     for step in plan.steps:
         last = stops[-1]

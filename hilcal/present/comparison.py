@@ -225,8 +225,8 @@ def _parameters(d: Differences | None) -> Iterator[Block]:
             f"{excluded} cannot be compared one by one: frames absorb them, or a campaign tells "
             "nothing of them."
         )
-    if d.apart:
-        yield f"Not in both, or with other options: {numbers.names(d.apart)}."
+    if d.not_in_both:
+        yield f"Not in both, or with other options: {numbers.names(d.not_in_both)}."
 
 
 def next_step(c: Comparison, earlier: str) -> str:

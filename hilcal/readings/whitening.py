@@ -57,8 +57,8 @@ def deflection_groups(readings: Readings) -> list[Group]:
     """
     if len(readings) and readings.unloaded.all():
         raise InputError("readings = deflection: there is no loaded reading; use absolute")
-    if not (has := has_unloaded(readings)).all():
-        row = int(np.argmin(has))
+    if not (with_unloaded := has_unloaded(readings)).all():
+        row = int(np.argmin(with_unloaded))
         name = readings.pose_names[readings.pose[row]]
         raise InputError(
             f"pose {name}, cycle {readings.cycle[row]}: no unloaded reading (load = none), which "
@@ -127,9 +127,9 @@ def has_unloaded(readings: Readings, *also: Ints) -> Bools:
     `also` are further numbers (N,) in which the two must agree.
     """
     group = numbered(readings.pose, readings.cycle, *also)
-    has = np.zeros(int(group.max()) + 1, dtype=bool)
-    has[group[readings.unloaded]] = True
-    return np.asarray(has[group])
+    group_has_unloaded = np.zeros(int(group.max()) + 1, dtype=bool)
+    group_has_unloaded[group[readings.unloaded]] = True
+    return np.asarray(group_has_unloaded[group])
 
 
 Scaling = Literal["none", "gu", "gc"]
@@ -293,8 +293,8 @@ def relative_rotation(r: Floats, w: Whitening) -> Floats:
             alike = np.all(b.weights == weights, axis=1)
             reference = b.reference[:, weights > 0]
             first = r[reference[:, :1]]
-            apart = se3.rotation_vector(r[reference] @ np.swapaxes(first, -1, -2))
-            mean = se3.rotation(apart.mean(axis=1, keepdims=True)) @ first
+            relative = se3.rotation_vector(r[reference] @ np.swapaxes(first, -1, -2))
+            mean = se3.rotation(relative.mean(axis=1, keepdims=True)) @ first
             turn[:, alike] = se3.rotation_vector(r[b.loaded[:, alike]] @ np.swapaxes(mean, -1, -2))
         out.append(turn.reshape(-1, 3))
     return np.concatenate(out)

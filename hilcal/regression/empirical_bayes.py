@@ -94,8 +94,8 @@ def maximise_evidence(
         dropped = active & (updated * reach < NEGLIGIBLE * beta * members)
         if iteration >= PATIENCE:
             # ... or where the evidence is largest at zero variance.
-            apart = np.maximum(1 / posterior - 1, 1e-12)
-            quality = np.bincount(group, weights=(z / posterior) ** 2 / apart, minlength=count)
+            shrinkage = np.maximum(1 / posterior - 1, 1e-12)
+            quality = np.bincount(group, weights=(z / posterior) ** 2 / shrinkage, minlength=count)
             dropped |= active & (quality < members)
         change = np.abs(np.log(np.maximum(updated, 1e-300) / np.maximum(variance, 1e-300)))
         weighty = active & ~dropped & (gamma > 0.05 * members)

@@ -166,7 +166,7 @@ class Projection:
             y − B H⁻¹ (Bᵀ y − Λ z)
 
         y is its residual, z (K,) its coordinates, used only where they have a prior. Else this step
-        would be ascribed to a column that the model nearly explains, divided by its small rest.
+        would be ascribed to a column that the model nearly explains, whose remainder is small.
         """
         return np.asarray(y - self.rows @ self.solve(self.rows.T @ y - self.ridge * z))
 

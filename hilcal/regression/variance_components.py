@@ -245,13 +245,13 @@ class Outlier:
 
 
 def hierarchy(estimates: FleetEstimates) -> tuple[Hierarchy, tuple[Outlier, ...]]:
-    """Fit the model, name the elements that differ, and fit again with these apart."""
-    apart = np.zeros((estimates.arms, estimates.mean.shape[1]), dtype=bool)
-    fitted = _em(estimates, apart)
+    """Fit the model, name the elements that differ, and fit again without a prior for these."""
+    outlier = np.zeros((estimates.arms, estimates.mean.shape[1]), dtype=bool)
+    fitted = _em(estimates, outlier)
     named = find_outliers(fitted.arm_mean, fitted.arm_variance)
     for element in named:
-        apart[element.unit, element.parameter] = True
-    return (_em(estimates, apart) if named else fitted), named
+        outlier[element.unit, element.parameter] = True
+    return (_em(estimates, outlier) if named else fitted), named
 
 
 def find_outliers(values: Floats, variance: Floats) -> tuple[Outlier, ...]:
@@ -299,31 +299,31 @@ def _distribution(y: Floats, variance: Floats) -> tuple[float, float, float]:
     return tau2, float(w @ y / w.sum()), 1.0 / float(w.sum())
 
 
-def _em(fleet: FleetEstimates, apart: Bools) -> Hierarchy:
+def _em(fleet: FleetEstimates, outlier: Bools) -> Hierarchy:
     k, repeated = fleet.mean.shape[1], fleet.repeated
     timed = repeated and bool(np.ptp(fleet.time) > 0)
     tau2 = np.full(k, START[0])
     omega2 = np.full(k, START[1] if repeated else 0.0)
-    normal = np.maximum((~apart).sum(axis=0), 1)
-    many = np.bincount(fleet.arm, minlength=fleet.arms)[fleet.arm] > 1
+    normal = np.maximum((~outlier).sum(axis=0), 1)
+    repeated = np.bincount(fleet.arm, minlength=fleet.arms)[fleet.arm] > 1
     for _ in range(EM_STEPS):
-        _, _, u2, e2, _, _ = _expectation(fleet, tau2, omega2, apart, timed)
+        _, _, u2, e2, _, _ = _expectation(fleet, tau2, omega2, outlier, timed)
         previous = np.concatenate([tau2, omega2])
-        tau2 = np.maximum(np.where(apart, 0.0, u2).sum(axis=0) / normal, LEAST)
+        tau2 = np.maximum(np.where(outlier, 0.0, u2).sum(axis=0) / normal, LEAST)
         if repeated:
-            omega2 = np.maximum(e2[many].mean(axis=0), LEAST)
+            omega2 = np.maximum(e2[repeated].mean(axis=0), LEAST)
         change = np.concatenate([tau2, omega2]) - previous
         if np.abs(change / np.maximum(previous, LEAST)).max() < EM_CONVERGED:
             break
-    b, b_cov, _, _, mean, variance = _expectation(fleet, tau2, omega2, apart, timed)
+    b, b_cov, _, _, mean, variance = _expectation(fleet, tau2, omega2, outlier, timed)
     covariance = np.zeros((2 * k, 2 * k))
     covariance[: len(b), : len(b)] = b_cov
     slope = b[k:] if timed else np.zeros(k)
-    return Hierarchy(b[:k], slope, covariance, tau2, omega2, mean, variance, apart.copy())
+    return Hierarchy(b[:k], slope, covariance, tau2, omega2, mean, variance, outlier.copy())
 
 
 def _expectation(
-    fleet: FleetEstimates, tau2: Floats, omega2: Floats, apart: Bools, timed: bool
+    fleet: FleetEstimates, tau2: Floats, omega2: Floats, outlier: Bools, timed: bool
 ) -> tuple[Floats, ...]:
     """E-step: b = (μ, β) and its covariance; E[u²], E[e²]; means of arms alone, and variances."""
     k, m, eye = fleet.mean.shape[1], fleet.information, np.eye(fleet.mean.shape[1])
@@ -341,7 +341,7 @@ def _expectation(
         return out
 
     sum_n, sum_nx, sum_ny = of_arms(n), of_arms(nx), of_arms(ny)
-    precision = np.where(apart, LEAST, 1.0 / np.maximum(tau2, LEAST))
+    precision = np.where(outlier, LEAST, 1.0 / np.maximum(tau2, LEAST))
     u_cov = np.linalg.inv(sum_n + precision[:, :, None] * eye)
     h = np.einsum("cki,ckj->ij", design, nx) - np.einsum("aki,akl,alj->ij", sum_nx, u_cov, sum_nx)
     g = np.einsum("cki,ck->i", design, ny) - np.einsum("aki,akl,al->i", sum_nx, u_cov, sum_ny)

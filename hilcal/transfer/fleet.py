@@ -171,13 +171,13 @@ def pool(members: Sequence[Member], diagnosed: Sequence[DiagnosedEffect]) -> Poo
     scale = np.array([scales[name] for name in names])
     estimates = _estimates(members, arms, names, scale)
     h, unlike_arms = hierarchy(estimates)
-    late, changed = _changes(estimates, h)
+    later, changed = _changes(estimates, h)
     of_arms = [(o, arms[o.unit], "") for o in unlike_arms]
-    of_campaigns = [(o, members[late[o.unit]].arm, members[late[o.unit]].name) for o in changed]
-    odd = []
+    of_campaigns = [(o, members[later[o.unit]].arm, members[later[o.unit]].name) for o in changed]
+    unlike = []
     for o, arm, campaign in (*of_arms, *of_campaigns):
         name, off = names[o.parameter], float(o.deviation * scale[o.parameter])
-        odd.append(UnlikeParameter(arm, campaign, name, off, units[name], o.sigma, o.p_value))
+        unlike.append(UnlikeParameter(arm, campaign, name, off, units[name], o.sigma, o.p_value))
     years = np.sqrt(np.diag(h.covariance)[len(names) :])
     certain = (
         2 * scipy.stats.norm.sf(np.abs(h.slope) / np.where(years > 0, years, np.inf)) * len(names)
@@ -202,7 +202,7 @@ def pool(members: Sequence[Member], diagnosed: Sequence[DiagnosedEffect]) -> Poo
         arms=arms,
         campaigns=tuple(m.name for m in members),
         parameters=tuple(spreads),
-        unlike=tuple(odd),
+        unlike=tuple(unlike),
         effects_added=tuple(diagnosed),
         wear=tuple(n for n, p in zip(names, certain, strict=True) if timed and p < FALSE_ALARM),
         prior=_prior(members, effects, names, scale, units, h, len(arms)),
@@ -258,16 +258,16 @@ def _changes(estimates: FleetEstimates, h: Hierarchy) -> tuple[list[int], Sequen
     """Return the repeated campaigns of arms, and the changes of arms before them."""
     covariance = np.linalg.inv(estimates.information + 1e-8 * np.eye(estimates.mean.shape[1]))
     variance = np.diagonal(covariance, axis1=1, axis2=2)
-    late, change, spread = [], [], []
+    later, change, spread = [], [], []
     for a in range(int(estimates.arm.max()) + 1):
         campaigns = np.flatnonzero(estimates.arm == a)
         campaigns = campaigns[np.argsort(estimates.time[campaigns], kind="stable")]
         for previous, current in pairwise(campaigns):
             years = estimates.time[current] - estimates.time[previous]
-            late.append(int(current))
+            later.append(int(current))
             change.append(estimates.mean[current] - estimates.mean[previous] - years * h.slope)
             spread.append(variance[current] + variance[previous])
-    return late, find_outliers(np.array(change), np.array(spread)) if late else []
+    return later, find_outliers(np.array(change), np.array(spread)) if later else []
 
 
 def _prior(

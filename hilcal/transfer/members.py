@@ -171,12 +171,12 @@ def sizes_of_arms(members: Sequence[Member]) -> list[SizeEvidence]:
 
     All campaigns of an arm have the same d_i; each would count as an arm of its own.
     """
-    told: dict[str, SizeEvidence] = {}
+    best_of_arm: dict[str, SizeEvidence] = {}
     for m in members:
         if m.sizes is not None:
-            pair = told.get(m.arm, m.sizes), m.sizes
-            told[m.arm] = max(pair, key=lambda x: float(np.trace(x.information)))
-    return list(told.values())
+            pair = best_of_arm.get(m.arm, m.sizes), m.sizes
+            best_of_arm[m.arm] = max(pair, key=lambda x: float(np.trace(x.information)))
+    return list(best_of_arm.values())
 
 
 def entries(directory: Path) -> tuple[Entry, ...]:

@@ -268,7 +268,7 @@ def _agree(arm: Arm, language: Language, q: Floats, stated: Ints) -> Bools:
     """(K, F) whether joint values (K, 6) agree with each flag; at a border, with either value."""
     shapes = shape(arm, q)
     near = (language.flags(q + d, shapes) for d in (0.0, -FLAG_BORDER, FLAG_BORDER))
-    return np.asarray(np.any([have == stated for have in near], axis=0))
+    return np.asarray(np.any([values == stated for values in near], axis=0))
 
 
 def _fits(arm: Arm, language: Language, q: Floats, stated: Ints, required: Bools) -> Bools:

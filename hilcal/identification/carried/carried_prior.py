@@ -2,12 +2,11 @@
 
     θ_B = θ_A + d,    θ_A ~ N(m, (1 + δ_0²) Λ⁻¹),    d_g ~ N(0, δ_g² S_g²)
 
-m and Λ of `Posterior`, δ_0 a doubt of the prior as a whole: it may state too small errors,
-since its model was good enough for its own poses, but is not for these. d is the drift of the arm
-since then, with one strength δ per group: the parameters of an effect that belong to one joint or
-one link. S are the ordinary magnitudes of the parameters, of a shrunk family their strengths. δ_g
-is at least `least`, and beyond that what the new readings ask for (`drift`). A model that
-lacks an effect of the posterior has that effect marginalised out of the prior.
+m and Λ of `Posterior`, δ_0 widens the prior as a whole, as a model that was adequate at the earlier
+poses may not be at these. d is the drift of the arm since then, with one strength δ per group: the
+parameters of an effect that belong to one joint or one link. S are the ordinary magnitudes of the
+parameters, or their strengths in a shrunk family. δ_g is at least `least`; the new readings may
+require more (`drift`). Effects of the posterior that a model lacks are marginalised out.
 
 Fits have coordinates y in which the prior is independent (`Coordinates`):
 
@@ -64,7 +63,7 @@ class DriftGroup:
 
     @property
     def name(self) -> str:
-        """The name for people."""
+        """Name in reports."""
         return f"{self.effect}.{self.part}" if self.part else self.effect
 
 

@@ -7,14 +7,13 @@ unit of drift, C the covariance of the prior and F the columns of parameters wit
 
 y the residual at the prior's mean; K_0 = A C Aᵀ is the doubt of the prior as a whole. The
 variances v_g of the drift maximise the restricted likelihood (REML) times a half-Cauchy prior of
-√v_g, whose scale is the drift that the effect may have had: without need v_g is zero, and a large
-drift is not forbidden. With
-P = V⁻¹ − V⁻¹ F (Fᵀ V⁻¹ F)⁻ Fᵀ V⁻¹ the fixed point is
+√v_g, whose scale is the drift that the effect may have had: v_g is zero unless the readings need
+more, and may be large. With P = V⁻¹ − V⁻¹ F (Fᵀ V⁻¹ F)⁻ Fᵀ V⁻¹ the fixed point is
 
     v_g ← v_g [yᵀ P K_g P y / (tr P K_g + 2/(s_g² + v_g))]^½
 
-and β, at least 1, follows from P y alike. The statistic yᵀ P K_g P y at v_g = 0, the others as they
-are, is a sum of weighted χ² when group g has not moved: its tail is the p-value of the group.
+and β, at least 1, follows from P y alike. The statistic yᵀ P K_g P y at v_g = 0, the others
+unchanged, is a sum of weighted χ² when group g has not moved: its tail is the p-value of the group.
 
 The log evidence of the new readings for an effect of the prior is the difference of the restricted
 log likelihoods
@@ -22,9 +21,8 @@ log likelihoods
     ℓ = −½ (log |V| + log |Fᵀ V⁻¹ F| + yᵀ P y)
 
 with the whole prior, and with the effect held at zero while the others keep their marginal
-distribution. The earlier readings count through the prior alone: without need the effect's drift is
-zero, and readings that do not depend on it say nothing against it. Directions
-of the prior without information have a standard deviation of one ordinary magnitude.
+distribution. Readings that do not depend on the effect are no evidence against it. Directions of
+the prior without information have a standard deviation of one ordinary magnitude.
 
 Sources: Patterson and Thompson, Biometrika 58 (1971) 545-554; Polson and Scott, Bayesian Analysis 7
 (2012) 887-902 (half-Cauchy priors of variances).
@@ -124,7 +122,7 @@ def chosen_drift(model: Model, solution: Solution, w: Whitening) -> Floats:
         traces = [float(np.vdot(p, k)) for k in forms]
         return np.maximum(squares, 0.0), np.maximum(traces, 0.0)
 
-    # No larger noise than stated to begin with: it would take the place of any drift.
+    # Start from the stated noise: a larger one would absorb the drift.
     beta, v, base = 1.0, np.zeros(len(forms)), rows.random @ rows.random.T
     p, residual = rows.projected(base + np.eye(len(base)))
     squares, traces = moments(p, residual)

@@ -6,10 +6,10 @@ are
     y = f(θ_A + R u + F b + D δ) + e + p,    R Rᵀ = κC,  u ~ N(0, 1),  b and δ flat
 
 b the twist of the base where the tracker was set up anew, δ changes of the arm (none to begin
-with), e ~ N(0, a V) the noise and p ~ N(0, c V̄) a misfit that all readings of a pose share: a few
-poses under several loads then tell less than as many poses. a + c is κσ², the variance factor of
-the earlier fit at poses left out; what exceeds the stated noise, κσ² − 1, is divided between a and
-c by the residual (`earlier_fit`). The minimum over u, p, b and δ of
+with), e ~ N(0, a V) the noise and p ~ N(0, c V̄) a misfit that all readings of a pose share: several
+loads at one pose then carry less information than as many poses. a + c is κσ², the variance factor
+of the earlier fit at poses left out; the excess over the stated noise, κσ² − 1, is divided between
+a and c by the residual (`earlier_fit`). The minimum over u, p, b and δ of
 
     ‖y − f‖² / (a V) + ‖u‖² + ‖p‖² / (c V̄)
 
@@ -46,7 +46,7 @@ from hilcal.types import Floats
 STEPS = 20  # most Gauss-Newton steps; they converge within four
 CONVERGED = 1e-4  # step that ends them, rms of the whitened rows
 LARGEST_CHANGE = 1e4
-"""Change of a parameter, in ordinary magnitudes, that is not tried; 10 m of a link."""
+"""Least change of a parameter, in ordinary magnitudes, that is refused; 10 m of a link."""
 LEAST_MOTION = 1e-6
 """Directions of the prior that move readings by less, in σ, are left at its mean."""
 LEAST_POSE_SHARE = 1e-3  # share of a pose in the misfit that is neglected
@@ -67,11 +67,11 @@ class EarlierFit:
 def earlier_fit(fit: Fit) -> EarlierFit:
     """Return a fit, which must be gc-scaled, with its predictive distribution."""
     require_gc(fit, "a comparison with later readings")
-    knows = predictive_of(fit)
-    beyond = max(knows.factor * knows.scatter - 1.0, 0.0)
-    shared = beyond * _share_by_pose(fit, knows, fit.readings[~fit.outlier])
-    root = _root(knows.factor * knows.covariance)
-    return EarlierFit(fit, knows, root, 1.0 + beyond - shared, shared)
+    predicted = predictive_of(fit)
+    beyond = max(predicted.factor * predicted.scatter - 1.0, 0.0)
+    shared = beyond * _share_by_pose(fit, predicted, fit.readings[~fit.outlier])
+    root = _root(predicted.factor * predicted.covariance)
+    return EarlierFit(fit, predicted, root, 1.0 + beyond - shared, shared)
 
 
 def _root(covariance: Floats) -> Floats:
@@ -79,7 +79,7 @@ def _root(covariance: Floats) -> Floats:
     return np.asarray(vectors[:, values > 0] * np.sqrt(values[values > 0]))
 
 
-def _share_by_pose(fit: Fit, knows: Predictive, inliers: Readings) -> float:
+def _share_by_pose(fit: Fit, predicted: Predictive, inliers: Readings) -> float:
     """Share of the misfit on poses left out that all readings of a pose have in common.
 
     With r_i (3,) the residual of measurement i, predicted without its pose, V_ij the stated
@@ -107,7 +107,7 @@ def _share_by_pose(fit: Fit, knows: Predictive, inliers: Readings) -> float:
             keys = zip(rows[a].tolist(), rows[b].tolist(), strict=True)
             stated.update(zip(keys, trace[a, b].tolist(), strict=True))
     jacobian = fit.model.jacobian(fit.solution.prediction, fit.theta, m)[:, :3]
-    spread = w.raw(jacobian @ _root(knows.covariance)).reshape(len(off), -1)
+    spread = w.raw(jacobian @ _root(predicted.covariance)).reshape(len(off), -1)
     x = [np.stack([tau**2, tau**2], axis=1)]
     y = [np.sum(off**2, axis=1) - np.sum(spread**2, axis=1)]
     for rows in (np.flatnonzero(fit.pose == p) for p in np.unique(fit.pose)):

@@ -48,8 +48,8 @@ if TYPE_CHECKING:
 
 FORMAT, VERSION = "hilcal-posterior", 1
 LEAST_INFORMATION = INFORMATION**2 / 2
-"""From which a direction is determined, in ordinary magnitudes."""
-MOST_LISTED = 60  # parameters of an effect from which it is compared as a whole only; a choice
+"""Least information on a determined direction, in ordinary magnitudes."""
+MOST_LISTED = 60  # parameters from which an effect is compared only as a whole; a choice
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,16 +262,16 @@ class EffectDifference:
 class Differences:
     """Two fits of one arm."""
 
-    rows: tuple[ParameterDifference, ...]  # of effects that have few, as in the earlier model
+    rows: tuple[ParameterDifference, ...]  # of effects with fewer than `MOST_LISTED`
     effects: tuple[EffectDifference, ...]  # each effect that both have
-    apart: tuple[str, ...]  # effects that only one of them has, or with other parameters
+    not_in_both: tuple[str, ...]  # effects that only one of them has, or with other parameters
 
     def to_dict(self) -> dict[str, object]:
         """Return them as JSON, SI."""
         return {
             "rows": [{**asdict(r), "z": r.z} for r in self.rows],
             "effects": [asdict(e) for e in self.effects],
-            "not_in_both": list(self.apart),
+            "not_in_both": list(self.not_in_both),
         }
 
 
@@ -282,9 +282,9 @@ def parameter_differences(earlier: Posterior, later: Posterior) -> Differences:
     owner = [n.split(".", 1)[0] for n in common]
     every = dict.fromkeys(n.split(".", 1)[0] for n in (*earlier.names, *later.names))
     sizes = {e: {len(earlier.index(e)), len(later.index(e))} for e in every}
-    apart = tuple(e for e, size in sizes.items() if size != {owner.count(e)})
+    not_in_both = tuple(e for e, size in sizes.items() if size != {owner.count(e)})
     if not common:
-        return Differences((), (), apart)
+        return Differences((), (), not_in_both)
     scale = earlier.scale[i]
     first, mean_earlier = _likelihood(earlier, i, scale)
     second, mean_later = _likelihood(later, j, scale)
@@ -308,7 +308,7 @@ def parameter_differences(earlier: Posterior, later: Posterior) -> Differences:
         for k, name in enumerate(common)
         if owner.count(owner[k]) < MOST_LISTED
     )
-    return Differences(rows, tuple(effects), apart)
+    return Differences(rows, tuple(effects), not_in_both)
 
 
 def _likelihood(p: Posterior, chosen: Ints, scale: Floats) -> tuple[Floats, Floats]:

@@ -1,11 +1,10 @@
 """Gross errors of an arm that has every effect, found in the mixed model of all effects.
 
 Where an arm has every effect, the misfit of its named effects alone is as large as a gross error,
-which data snooping (`identification.outliers.data_snooping`) then cannot tell. The mixed model of
-all effects predicts each reading from the others much better. A reading k with a gross error
-has a shift γ_k ~ N(0, G²) in each element, which a good one has not, and is one with the
-probability π. The odds that the readings of a set O have gross errors and no others, with the
-variances of all effects estimated anew,
+which data snooping (`identification.outliers.data_snooping`) then cannot detect. The mixed model of
+all effects predicts each reading from the others much better. A reading k has a gross
+error with the probability π: a shift γ_k ~ N(0, G²) in each element. The odds that the readings of
+a set O have gross errors and no others, with the variances of all effects estimated anew,
 
     log odds = ℓ(x̂_O) − ℓ(x̂) − |O| log 1/π
 
@@ -14,7 +13,7 @@ The set grows by the reading that the others predict worst, by Baarda's test of 
 present variances, and that of the largest odds is taken: while several gross errors inflate the
 variances, the odds of the first may be low, but the largest test is not small.
 
-Readings that were set aside beside fewer effects return if the others predict them well.
+Readings that a fit with fewer effects set aside are restored if the others predict them well.
 
 Source: Box and Tiao, *A Bayesian approach to some outlier problems*, Biometrika 55 (1968) 119.
 """

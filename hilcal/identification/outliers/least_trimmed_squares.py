@@ -15,7 +15,7 @@ Least trimmed squares (Rousseeuw and Van Driessen, Data Mining and Knowledge Dis
 d²_(k) ascending squared distances of the readings from the linear model with δ, h a little more
 than half of them, so that nearly half may be wrong, by any amount. A fit to the h readings that are
 nearest to a model has a lower sum (concentration); it starts from many random subsets that just
-determine the model, and the lowest sum is kept. The bulk of the distances gives the limit of a
+determine the model, and the lowest sum is used. The bulk of the distances gives the limit of a
 gross error (`rejection_limit`).
 """
 
@@ -36,9 +36,8 @@ MOST_WRONG = 0.45
 MISS_PROBABILITY, MOST_SUBSETS = 1e-3, 300
 """Probability that every subset has a wrong reading; most subsets."""
 SUBSET_READINGS, BEST_SUBSETS, MOST_FINAL_STEPS = 300, 20, 20
-"""Readings that subsets are of (source); best subsets that are continued; steps of these at
-most."""
-HALVINGS = 6  # shorter steps that are tried
+"""Readings that subsets are drawn from (source); best subsets continued; most steps of each."""
+HALVINGS = 6  # most halvings of a step
 MOST_LINEARISATIONS = 6  # gross errors may have led the first one far off
 FALSE_ALARMS = 1e-3  # expected good readings set aside per campaign under the right model
 MISFIT_FACTOR = 6.25  # of the limit with a misfit, 2.5 in distance: its tails are heavier
@@ -153,12 +152,12 @@ class ReadingModel:
             back, root = self._differences
             x = (back @ r[:, :, None])[:, :, 0][self.members]
             off = root @ (x[:, :, None] - x[:, None, :])[..., None]
-            apart, present = np.sum(off[..., 0] ** 2, axis=3), self.members >= 0
-            total = np.log1p(np.where(present[:, None, :], apart, 0.0)).sum(axis=2)
+            square, present = np.sum(off[..., 0] ** 2, axis=3), self.members >= 0
+            total = np.log1p(np.where(present[:, None, :], square, 0.0)).sum(axis=2)
             best = np.argmin(np.where(present, total, np.inf), axis=1)
             index = np.arange(len(best))
             g, s = np.nonzero(present)
-            d2[self.members[g, s]] = apart[index, best][g, s]
+            d2[self.members[g, s]] = square[index, best][g, s]
             centre[self.members[index, best]] = True
         return self._comparable(d2), centre
 
@@ -166,8 +165,8 @@ class ReadingModel:
         """Return the used readings (N,), and the centre of each group that has none."""
         if not len(self.members):
             return used
-        has = np.append(np.any(used[self.members] & (self.members >= 0), axis=1), True)
-        return np.asarray(used | (centre & ~has[self.group]))
+        has_used = np.append(np.any(used[self.members] & (self.members >= 0), axis=1), True)
+        return np.asarray(used | (centre & ~has_used[self.group]))
 
     def _comparable(self, t2: Floats) -> Floats:
         """(N,) squared distances t², converted to those of readings of m elements.
@@ -175,13 +174,13 @@ class ReadingModel:
         For a reading of fewer elements, such as a distance, χ² of the same probability; what
         exceeds `LARGEST_CHI2`, where that is rounding, is added.
         """
-        less = (self.elements_read > 0) & (self.elements_read < self.m)
-        if not less.any():
+        partly_read = (self.elements_read > 0) & (self.elements_read < self.m)
+        if not partly_read.any():
             return t2
-        near, out = np.minimum(t2[less], LARGEST_CHI2), t2.copy()
-        out[less] = (
-            scipy.stats.chi2.isf(scipy.stats.chi2.sf(near, self.elements_read[less]), self.m)
-            + t2[less]
+        near, out = np.minimum(t2[partly_read], LARGEST_CHI2), t2.copy()
+        out[partly_read] = (
+            scipy.stats.chi2.isf(scipy.stats.chi2.sf(near, self.elements_read[partly_read]), self.m)
+            + t2[partly_read]
             - near
         )
         return out

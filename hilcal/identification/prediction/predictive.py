@@ -186,8 +186,8 @@ class Predictive:
     # over that of the noise
     scatter: float  # mean variance of the fitted readings by σ² W, in units of V
     left_out: float  # mean variance of the predictions of poses left out by C, in units of V
-    scatter_m2: float  # the first of both of a 3-D position, m²
-    left_out_m2: float  # the second
+    scatter_m2: float  # `scatter` of a 3-D position, m²
+    left_out_m2: float  # `left_out` of a 3-D position, m²
 
     def prediction_covariance(self, prediction: Prediction, w: Whitening) -> Floats:
         """Return κ J C Jᵀ (D, m, m) of predicted measurements."""

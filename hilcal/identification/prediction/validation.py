@@ -94,22 +94,22 @@ def with_tool(p: Predictive, cell: Cell, fitted: Readings) -> Predictive:
     Its targets are taken where both cells state theirs. Effects of the target's place are then left
     out, as they were estimated for the other target.
     """
-    own = p.model.cell
+    fitted_cell = p.model.cell
     tool = replace(
-        own, tool_mass=cell.tool_mass, tool_com=cell.tool_com, load_point=cell.load_point
+        fitted_cell, tool_mass=cell.tool_mass, tool_com=cell.tool_com, load_point=cell.load_point
     )
     effects = list(zip(p.model.effects, p.model.slices(), strict=True))
-    if all((*own.known_targets, *cell.known_targets)) and other_target(own, cell):
+    if all((*fitted_cell.known_targets, *cell.known_targets)) and other_target(fitted_cell, cell):
         tool = tool.with_targets(cell.all_targets, cell.known_targets)
         effects = [(e, s) for e, s in effects if e.role != "target"]
     made = tuple(type(e)(tool, fitted.states, e.options) for e, _ in effects)
-    kept = np.concatenate([np.arange(p.model.size)[s] for _, s in effects])
+    indices = np.concatenate([np.arange(p.model.size)[s] for _, s in effects])
     return replace(
         p,
         model=replace(p.model, cell=tool, effects=made),
-        theta=p.theta[kept],
-        covariance=p.covariance[np.ix_(kept, kept)],
-        prior=p.prior[kept],
+        theta=p.theta[indices],
+        covariance=p.covariance[np.ix_(indices, indices)],
+        prior=p.prior[indices],
     )
 
 
@@ -270,7 +270,7 @@ def _squares(covariance: Floats, raw: Floats) -> tuple[Floats, Ints]:
 class Judged:
     """Which readings are judged."""
 
-    number: int | None  # of the revision; None for a baseline that is not kept
+    number: int | None  # of the revision; None for a baseline that is not stored
     mode: Mode
     readings: int  # number of readings in the other campaign
     fitted: int  # number of these that the revision was fitted to
@@ -322,12 +322,12 @@ class Acceptance:
 
     @property
     def passed(self) -> bool | None:
-        """Whether the limit is kept by every measurement; None where none is given."""
+        """Whether no error exceeds the limit; None without a limit."""
         return None if self.limit_m is None else self.over == 0
 
     @property
     def undecided(self) -> bool:
-        """Whether the limit is not kept, and the readings are too noisy to show that it could."""
+        """Whether the limit is exceeded, but is smaller than the noise of the readings."""
         return self.passed is False and self.limit_m is not None and self.limit_m < self.noise_m
 
     def to_dict(self) -> dict[str, object]:

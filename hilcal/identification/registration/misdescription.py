@@ -8,9 +8,9 @@ Arms of one size differ by millimetres from one generation to the next, which is
 arm before calibration. So every arm of the catalogue with as many joints is registered to the
 readings, too (`other_arm`). With e the displacements by the errors of the true arm and d those from
 one description to the other, the frames projected off, the wrong description leaves |e + d| and the
-right one |e|. One that leaves less than half of what the described one leaves is named. Were the
-described arm the right one then, |e − d| ≤ |e|/2: its errors would be larger than 2/3 |d|, and lie
-along d.
+right one |e|. One that leaves less than half of what the described one leaves is named. If the
+described arm were the right one, then |e − d| ≤ |e|/2: its errors would be larger than 2/3 |d|, and
+lie along d.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -66,7 +66,7 @@ MOST_WRONG_ROWS = 0.2  # largest share of rows that may be wrong by themselves
 SEPARATE_FIRST = ("shift", "columns")
 """Hypotheses that are combined with others only where they help by themselves; for speed."""
 LEAST_ZERO_DEG = 0.2  # zero of a single joint, degrees, that is worth mentioning
-FEWEST_BY_THEMSELVES = 10  # readings that tell a place of the tracker by themselves; a choice
+FEWEST_BY_THEMSELVES = 10  # readings that determine a place of the tracker alone; a choice
 MOST_NAMED = 8  # rows, or explanations, that are named
 ZERO_STARTS = tuple(np.radians([0.0, 45.0, -45.0, 135.0, -135.0]).tolist())  # where searches begin
 ZERO_WIDTH, ZERO_EXACT = np.pi / 4, 1e-7  # range of a search to both sides, and its tolerance, rad
@@ -236,8 +236,8 @@ def examine(registered: Registration, readings: Readings) -> DescriptionFinding 
 def _moved(cell: Cell, readings: Readings, gate: float) -> int:
     """Return the first reading from another place of the tracker, where two explain all; else 0.
 
-    The first and the last third are registered by themselves; all rows before it fit the one, all
-    others the other.
+    The first and the last third are registered separately; all rows before the returned one fit
+    the first place, all others the second.
     """
     third, m6 = len(readings) // 3, readings.m == 6
     if cell.registration_known or third < FEWEST_BY_THEMSELVES:
@@ -288,16 +288,16 @@ class _DescriptionSearch:
             return explanations
         for depth in range(most):
             additions = [h for h in singles if depth == 0 or h.kind not in SEPARATE_FIRST]
-            ways = [
+            combinations = [
                 (*partial, h)
                 for partial in beam
                 for h in additions
                 if h.subject not in [g.subject for g in partial]
             ]
-            for way in pairs(self._cell.arm.n) if depth == 1 else ():
-                if not any(h.offset and slides[h.joint - 1] for h in way):
-                    ways.append(way)
-            rough = {w: self.score(w, True) for w in dict.fromkeys(map(_sorted, ways))}
+            for combination in pairs(self._cell.arm.n) if depth == 1 else ():
+                if not any(h.offset and slides[h.joint - 1] for h in combination):
+                    combinations.append(combination)
+            rough = {w: self.score(w, True) for w in dict.fromkeys(map(_sorted, combinations))}
             best = sorted(rough, key=lambda w: (rough[w], _cost(w)))[:MOST_CAREFUL]
             scores = {**rough, **{w: self.score(w) for w in best}}
             if depth < 2 and min(scores.values()) > self.enough:
@@ -325,23 +325,23 @@ class _DescriptionSearch:
 
         def zeroed(zeros: Floats, least: float = 0.0) -> Combination:
             pairs = zip(turning, zeros.tolist(), strict=True)
-            told = [(j, z) for j, z in pairs if abs(np.degrees(z)) >= least]
-            return _sorted((*begin, *(Hypothesis("joint", j, 1, z) for j, z in told)))
+            noticeable = [(j, z) for j, z in pairs if abs(np.degrees(z)) >= least]
+            return _sorted((*begin, *(Hypothesis("joint", j, 1, z) for j, z in noticeable)))
 
         def white(zeros: Floats) -> Floats:
             return self._best(*self._problem(zeroed(zeros), self._rows)).white.ravel()
 
         found = scipy.optimize.least_squares(white, np.zeros(len(turning)), diff_step=[1e-5])
-        way = zeroed(found.x, LEAST_ZERO_DEG)
-        return {way: self.score(way)}
+        combination = zeroed(found.x, LEAST_ZERO_DEG)
+        return {combination: self.score(combination)}
 
     def shifted(self) -> tuple[Explanation, ...]:
         """Return the shift of rows that explains the readings, where one does.
 
         Where a pose has many readings, only its last one is wrong, and looks like a gross error.
         """
-        ways: list[Combination] = [(h,) for h in shifts(len(self._readings))]
-        tried = {way: self.score(way) for way in ways}
+        combinations: list[Combination] = [(h,) for h in shifts(len(self._readings))]
+        tried = {combination: self.score(combination) for combination in combinations}
         return (
             _explained(tried, min(self.enough, self.score(()) / LEAST_IMPROVEMENT)) if tried else ()
         )
@@ -353,36 +353,36 @@ class _DescriptionSearch:
             return ()
         alike = EQUALLY_GOOD * least + 1e-6
         # A hypothesis that can be left out without loss is undetermined, or was a wrong step.
-        for way in [w for w in tried if tried[w] <= alike]:
-            for h in way:
-                shorter = tuple(g for g in way if g != h)
+        for combination in [w for w in tried if tried[w] <= alike]:
+            for h in combination:
+                shorter = tuple(g for g in combination if g != h)
                 if shorter and shorter not in tried and self.score(shorter) <= alike:
                     tried = {**tried, shorter: self.score(shorter)}
         good = sorted((w for w in tried if tried[w] <= alike), key=lambda w: (_cost(w), tried[w]))
         out: dict[tuple[object, ...], Combination] = {}
-        for way in good:  # of those that differ by their zeros alone, one
-            if _cost(way) <= _cost(good[0]):
-                out.setdefault(tuple((*h.subject, h.arm, h.sign) for h in way), way)
+        for combination in good:  # of those that differ by their zeros alone, one
+            if _cost(combination) <= _cost(good[0]):
+                out.setdefault(tuple((*h.subject, h.arm, h.sign) for h in combination), combination)
         return tuple(Explanation(w, tried[w]) for w in out.values())
 
-    def _zeros(self, ways: list[Combination]) -> dict[Combination, float]:
-        """Try any constant as the zero of each joint, in addition to each of `ways`."""
+    def _zeros(self, combinations: list[Combination]) -> dict[Combination, float]:
+        """Try any constant as the zero of each joint, in addition to each of `combinations`."""
         out = {}
-        for way in ways:
-            counted = [h.joint for h in way if h.kind == "joint"]
+        for combination in combinations:
+            counted = [h.joint for h in combination if h.kind == "joint"]
             for j in range(1, self._cell.arm.n + 1):
                 if j in counted or self._cell.arm.slides[j - 1]:
                     continue
-                zero, rms = self._zero_of(way, j)
+                zero, rms = self._zero_of(combination, j)
                 if abs(np.degrees(zero)) > LEAST_ZERO_DEG:
-                    out[_sorted((*way, Hypothesis("joint", j, 1, zero)))] = rms
+                    out[_sorted((*combination, Hypothesis("joint", j, 1, zero)))] = rms
         return out
 
-    def _zero_of(self, way: Combination, joint: int) -> tuple[float, float]:
+    def _zero_of(self, combination: Combination, joint: int) -> tuple[float, float]:
         """Return the best zero of one joint, rad, and the misfit with it, m."""
 
         def zeroed(zero: float) -> Combination:
-            return (*way, Hypothesis("joint", joint, 1, zero))
+            return (*combination, Hypothesis("joint", joint, 1, zero))
 
         def square(zero: float) -> float:
             return self._best(*self._problem(zeroed(zero), self._rows), rough=True).square
@@ -392,14 +392,14 @@ class _DescriptionSearch:
         minimum = scipy.optimize.minimize_scalar(
             square, bounds=bounds, method="bounded", options={"xatol": ZERO_EXACT}
         )
-        count = int(np.count_nonzero(self._described(way).paired[self._rows]))
+        count = int(np.count_nonzero(self._described(combination).paired[self._rows]))
         rms = float(np.sqrt(minimum.fun / count))
         return float(np.arctan2(np.sin(minimum.x), np.cos(minimum.x))), rms
 
-    def _score(self, way: Combination, rough: bool = False) -> float:
+    def _score(self, combination: Combination, rough: bool = False) -> float:
         """Misfit of the nominal arm under hypotheses, m, scaled to the extent as stated."""
         self.tried += 1
-        placement = self._best(*self._problem(way, self._rows), rough)
+        placement = self._best(*self._problem(combination, self._rows), rough)
         size = float(np.sqrt(placement.square / len(placement.data)))
         return size * max(1.0, self._extent / max(_extent(placement.data.value), 1e-12))
 
@@ -407,9 +407,9 @@ class _DescriptionSearch:
         steps, rotated = (6, 0) if rough else (15, 2)
         return best_placement(data, frames, free, self.enough, steps, rotated)
 
-    def _problem(self, way: Combination, rows: Ints) -> tuple[FrameData, Frames, Bools]:
+    def _problem(self, combination: Combination, rows: Ints) -> tuple[FrameData, Frames, Bools]:
         """Flange poses and readings of some rows under some hypotheses, and what is estimated."""
-        d = self._described(way)
+        d = self._described(combination)
         rows = rows[d.paired[rows]]
         turn, m = (None, 3) if d.turn is None else (d.turn[rows], 6)
         root = np.broadcast_to(np.diag(_levers(m)), (len(rows), m, m))
@@ -424,15 +424,15 @@ class _DescriptionSearch:
         axes = m == 6 and (d.base_unknown or not fixed.all())
         return data, frames, free_parameters(d.base_unknown, ~fixed, axes)
 
-    def _described(self, way: Combination) -> Description:
-        return reduce(lambda d, h: h.applied(d), way, self._stated)
+    def _described(self, combination: Combination) -> Description:
+        return reduce(lambda d, h: h.applied(d), combination, self._stated)
 
-    def _robust(self, way: Combination) -> tuple[float, Bools, Placement]:
+    def _robust(self, combination: Combination) -> tuple[float, Bools, Placement]:
         """Register with weights by which rows that do not fit lose their influence.
 
         Rms of the rows that fit, m; (N,) those that do not; and the placement.
         """
-        data, frames, free = self._problem(way, np.arange(len(self._readings)))
+        data, frames, free = self._problem(combination, np.arange(len(self._readings)))
         placement, scale = self._best(data, frames, free), np.inf
         for _ in range(12):
             distance = np.linalg.norm(placement.white, axis=1)
@@ -444,7 +444,7 @@ class _DescriptionSearch:
         distance = np.linalg.norm(placement.white, axis=1)
         far = distance > 8.0 * max(float(np.median(distance)), self.enough / 10)
         everywhere = np.zeros(len(self._readings), dtype=bool)
-        everywhere[self._described(way).paired] = far
+        everywhere[self._described(combination).paired] = far
         return float(np.sqrt(np.mean(distance[~far] ** 2))), everywhere, placement
 
     def swapped(self, far: Bools) -> tuple[tuple[int, int], ...]:
@@ -461,18 +461,20 @@ class _DescriptionSearch:
 
 def _explained(tried: dict[Combination, float], most: float) -> tuple[Explanation, ...]:
     """Return the best of some trials where it leaves no more than `most`, m."""
-    way = min(tried, key=lambda w: tried[w])
-    return (Explanation(way, tried[way]),) if tried[way] <= most else ()
+    combination = min(tried, key=lambda w: tried[w])
+    return (Explanation(combination, tried[combination]),) if tried[combination] <= most else ()
 
 
-def _cost(way: Combination) -> int:
-    return sum(h.cost for h in way)
+def _cost(combination: Combination) -> int:
+    return sum(h.cost for h in combination)
 
 
-def _sorted(way: Combination) -> Combination:
+def _sorted(combination: Combination) -> Combination:
     """Hypotheses about the arm come first, then those about joints, then couplings."""
     rank = {"arm": 0, "joint": 1, "coupling": 2}
-    return tuple(sorted(way, key=lambda h: (rank.get(h.kind, 3), *h.subject, h.sign, h.offset)))
+    return tuple(
+        sorted(combination, key=lambda h: (rank.get(h.kind, 3), *h.subject, h.sign, h.offset))
+    )
 
 
 def _levers(m: int) -> Floats:
