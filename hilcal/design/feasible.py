@@ -100,10 +100,10 @@ class FeasibleSpace(Feasibility):
 
 
 _CHUNK = 1 << 12
-_VAIN = 1 << 15  # drawn states, all rejected, after which drawing stops
-_MOST = 1 << 19, 64  # drawn states at most, whichever is larger: in all, and per candidate
+_ALL_REJECTED = 1 << 15  # drawn states, all rejected, after which drawing stops
+_MOST_DRAWN = 1 << 19, 64  # drawn states at most, whichever is larger: in all, and per candidate
 _OF_PAIRS = ("self-collision", "obstacle")
-_LOOK = 64  # rejected states whose contacts are counted for a message
+_REJECTED_SAMPLE = 64  # rejected states whose contacts are counted for a message
 _OF_LOADS = ("payload", "torque", "force sensor", "hanging", "sight")
 
 
@@ -138,15 +138,15 @@ def draw_poses(
     remaining, lost = dict.fromkeys(REASONS, 0), dict[str, Floats]()
     parts = [np.empty((0, len(low)))]
     drawn = found = 0
-    max_states = max(_MOST[0], _MOST[1] * count) if max_states is None else max_states
-    while found < count and drawn < (max_states if found else _VAIN):
+    max_states = max(_MOST_DRAWN[0], _MOST_DRAWN[1] * count) if max_states is None else max_states
+    while found < count and drawn < (max_states if found else _ALL_REJECTED):
         u = (sequence.random(_CHUNK) + shift) % 1.0
         q = space.cell.arm.complete(low + u * (high - low))
         for reason in REASONS:
             if len(q):
                 passes = space.passes(reason, q, UNLOADED)
                 if not passes.all():
-                    lost[reason] = q[~passes][:_LOOK]
+                    lost[reason] = q[~passes][:_REJECTED_SAMPLE]
                 q = q[passes]
             remaining[reason] += len(q)
         parts.append(q)

@@ -70,7 +70,7 @@ class Comparison(Shown):
         readings: number of later readings.
         shared: number of later readings that the earlier revision was fitted to; they are left out.
         anew: whether the tracker counts as set up anew.
-        told: whether the user stated `anew`; else it follows from the cells.
+        setup_stated: whether the user stated `anew`; else it follows from the cells.
         tool: keys of [tool] that differ.
         today: the error of the earlier calibration.
         changes: the changes since.
@@ -85,7 +85,7 @@ class Comparison(Shown):
     readings: int
     shared: int
     anew: bool
-    told: bool
+    setup_stated: bool
     tool: tuple[str, ...]
     today: ErrorToday
     changes: Changes

@@ -276,35 +276,35 @@ def minimum(problem: NewtonProblem[P], start: Floats | None, prior: Floats | Non
     scale = space.scales(scales_of(model))
     y = np.zeros(model.size) if start is None else start
     point = problem.at(np.where(sigma > 0, y, 0.0))
-    by: Regularisation  # set in the first step
+    chosen: Regularisation  # set in the first step
     square, settled = np.inf, False
     past: list[tuple[Floats, Floats]] = []
     for iterations in range(1, MAX_ITERATIONS + 1):
         linear = problem.linearise(point, sigma)
         if not settled:
-            by = regularise(linear, scale, sigma, groups, choose)
-            sigma = by.prior
+            chosen = regularise(linear, scale, sigma, groups, choose)
+            sigma = chosen.prior
         linear = linear.restricted(sigma)
-        equations = linear.equations(by.basis)
+        equations = linear.equations(chosen.basis)
         if (groups[linear.live] >= 0).any() or len(space.index):  # priors that β multiplies
-            by = replace(by, beta=noise_factor(linear, equations, by.beta))
+            chosen = replace(chosen, beta=noise_factor(linear, equations, chosen.beta))
         aim = linear.origin.copy()
-        aim[linear.live] += by.basis.transform @ equations.solve(by.beta)
+        aim[linear.live] += chosen.basis.transform @ equations.solve(chosen.beta)
         moved = linear.rows @ (aim - point.y)[linear.live]
-        near = settled and float(moved @ moved) <= NEAR**2 * max(square, by.beta) * linear.rank
+        near = settled and float(moved @ moved) <= NEAR**2 * max(square, chosen.beta) * linear.rank
         past = [*past[-MEMORY:], (aim, moved)] if near else []
         if past:
             aim = _extrapolated(past)
-        start_point, point = point, _line_search(problem, point, aim, by)
-        previous, square = square, point.mean_square(len(by.basis.singular))
-        noise = max(square, by.beta) * linear.rank
+        start_point, point = point, _line_search(problem, point, aim, chosen)
+        previous, square = square, point.mean_square(len(chosen.basis.singular))
+        noise = max(square, chosen.beta) * linear.rank
         if settled and float(moved @ moved) <= CONVERGED**2 * noise:
             moved = linear.rows @ (point.y - start_point.y)[linear.live]
             valid = float(moved @ moved) <= CONVERGED**2 * noise
-            return Minimum(point, by, iterations, True, linear.rows if valid else None)
+            return Minimum(point, chosen, iterations, True, linear.rows if valid else None)
         del linear  # frees memory for the next one
         settled = (problem.whitened and square < 1) or abs(square / previous - 1) <= SETTLED
-    return Minimum(point, by, iterations, False, None)
+    return Minimum(point, chosen, iterations, False, None)
 
 
 def _extrapolated(past: Sequence[tuple[Floats, Floats]]) -> Floats:
@@ -340,15 +340,15 @@ def shortened(
     return None
 
 
-def _line_search(problem: NewtonProblem[P], point: P, aim: Floats, by: Regularisation) -> P:
+def _line_search(problem: NewtonProblem[P], point: P, aim: Floats, chosen: Regularisation) -> P:
     """Go towards `aim` (P,).
 
     The step is halved while the objective grows, as the chain may be strongly nonlinear.
     """
-    y = np.where(by.prior > 0, point.y, 0.0)
-    limit = point.objective(by) * (1 + 1e-9) + 1e-12
+    y = np.where(chosen.prior > 0, point.y, 0.0)
+    limit = point.objective(chosen) * (1 + 1e-9) + 1e-12
     reached = shortened(
-        lambda step: problem.at(y + step), aim - y, HALVINGS, lambda p: p.objective(by), limit
+        lambda step: problem.at(y + step), aim - y, HALVINGS, lambda p: p.objective(chosen), limit
     )
     return problem.at(y) if reached is None else reached
 
@@ -442,19 +442,19 @@ def solve(
         space = space.restricted(a)
     problem = _Problem(model, space, w.scaling != "none", readings, w)
     end = minimum(problem, None if start is None else space.of_theta(start), prior)
-    point, by = end.point, end.regularisation
-    live = np.flatnonzero(by.prior > 0)
-    rows = by.basis.rows(problem.columns(point, live) if end.rows is None else end.rows)
-    beta = point.mean_square(len(by.basis.singular)) if w.scaling == "none" else by.beta
+    point, chosen = end.point, end.regularisation
+    live = np.flatnonzero(chosen.prior > 0)
+    rows = chosen.basis.rows(problem.columns(point, live) if end.rows is None else end.rows)
+    beta = point.mean_square(len(chosen.basis.singular)) if w.scaling == "none" else chosen.beta
     # Formed from the rows themselves, so that folds can be subtracted exactly.
-    basis = over_all_parameters(by.basis, live, model.size)
-    target = point.white + rows @ prior_coordinates(basis, point.y, by.prior)
+    basis = over_all_parameters(chosen.basis, live, model.size)
+    target = point.white + rows @ prior_coordinates(basis, point.y, chosen.prior)
     equations = NormalEquations(basis, rows.T @ rows, rows.T @ target)
     return Solution(
         theta=point.theta,
         y=point.y,
         space=space,
-        prior=by.prior,
+        prior=chosen.prior,
         beta=beta,
         equations=equations,
         rows=rows,

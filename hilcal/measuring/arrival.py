@@ -129,7 +129,7 @@ class RoughRegistration:
             return stuck
         places = self.expected(q)
         if places is None:
-            error, limit, more = self._apart(q, position, target), APART_M, " or more"
+            error, limit, more = self._distance_error(q, position, target), APART_M, " or more"
         else:
             error, limit, more = float(np.linalg.norm(position - places[target])), PLAUSIBLE_M, ""
         if error <= limit:
@@ -157,7 +157,7 @@ class RoughRegistration:
             "not on the arm. Have it see the target"
         )
 
-    def _apart(self, q: Floats, position: Floats, target: int) -> float:
+    def _distance_error(self, q: Floats, position: Floats, target: int) -> float:
         """Return the median error of the distances from other readings, m.
 
         Zero with fewer than two other readings, one of which may be wrong.

@@ -101,7 +101,7 @@ TRACKER_UNKNOWN = (
     "the tracker's place is not known: whether it sees the target is not checked; give [sight] "
     "tracker_m"
 )
-_SHY = 1.5  # distance from the end of the beam to the target, over the radii of tool and beam
+_BEAM_END = 1.5  # distance from the end of the beam to the target, over the radii of tool and beam
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,7 +174,7 @@ class LineOfSight:
         target = chains.evaluate(cell.arm, q).point(offset)
         way = target - self.tracker
         length = np.linalg.norm(way, axis=1, keepdims=True)
-        gap = np.minimum(_SHY * (TOOL_RADIUS + radius), 0.5 * length)
+        gap = np.minimum(_BEAM_END * (TOOL_RADIUS + radius), 0.5 * length)
         end = target - gap * way / np.where(length > 0.0, length, 1.0)
         start = np.broadcast_to(self.tracker, end.shape)
         stands = [x.name for x in config.obstacles if contains(x, self.tracker, radius)]

@@ -16,7 +16,7 @@ from hilcal.measuring.progress import Answered, Phase, Question, Remark
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
-TRIES = 3
+TRIES = 3  # most requests for one load
 SWINGING_S = 2.0  # time until a load that seems wrong is weighed once more, cell s
 
 

@@ -64,7 +64,7 @@ MOVED_M = 1e-3
 """Distance of the target at the reference pose from where earlier readings have it that a person is
 asked about, m; an arm returns by less, also as it warms up. A choice."""
 GRAVITY_CHANGE = 5.0
-"""Change of gravity in the sensor's axes, m/s², from which a load is told from its zero: 30°."""
+"""Change of gravity in the sensor's axes, m/s², from which a load is distinguished from its zero: 30°."""
 Done = TypeVar("Done")
 LiveModel = Callable[[Readings], LiveResidual]
 """Returns the residual of the last reading by a model fitted to the previous ones."""
@@ -172,7 +172,7 @@ class Session:
                 remaining = pace.remaining(
                     readings_left, sum(s.change_to is not None for s in ahead)
                 )
-                self._tell(stop.step, *result, remaining)
+                self._report_stored(stop.step, *result, remaining)
         self._finish()
 
     def _goal_newly_met(self, last: bool) -> bool:
@@ -524,7 +524,9 @@ class Session:
                 "target loose, or the arm still warming up?"
             )
 
-    def _tell(self, step: Step, reading: Readings, settling: float, remaining: float) -> None:
+    def _report_stored(
+        self, step: Step, reading: Readings, settling: float, remaining: float
+    ) -> None:
         number = int(reading.target[0])
         (_, live), *others = self._compared(reading)
         stored = ReadingStored(
@@ -611,9 +613,9 @@ def run(
         session.visit(route(missing, cell.arm, cell.configured().limits.joint_margin_rad))
     except BaseException as error:
         trouble = _stop(rig.arm) if session.in_control else ""
-        again = session.pose is not None and _failed_at(store) == session.pose
+        failed_before = session.pose is not None and _failed_at(store) == session.pose
         _note(store, error, trouble, session.pose)
-        _raise(error, trouble, session.pose if again else None)
+        _raise(error, trouble, session.pose if failed_before else None)
 
 
 def _refuse_unsafe(cell: Cell, missing: Plan, begun: bool) -> None:
@@ -668,8 +670,8 @@ def _note(store: RunLog, error: BaseException, trouble: str, pose: str | None) -
         return
 
 
-def _raise(error: BaseException, trouble: str, again: str | None) -> None:
-    """Raise the error with advice; `again`: the pose where an earlier session failed, too."""
+def _raise(error: BaseException, trouble: str, failed_before: str | None) -> None:
+    """Raise the error with advice; `failed_before`: the pose where an earlier session failed, too."""
     if not isinstance(error, Exception) and not trouble:
         raise error
     sentences = [_line(error)]
@@ -677,8 +679,8 @@ def _raise(error: BaseException, trouble: str, again: str | None) -> None:
         sentences = [f"unexpected {sentences[0]} (its details are in the campaign)"]
     if trouble and EMERGENCY not in sentences[0]:
         sentences.append(f"THE ARM MAY STILL MOVE ({trouble}): {EMERGENCY}")
-    elif again is not None and isinstance(error, Exception):
-        skip = shlex.join(["--skip", again])
+    elif failed_before is not None and isinstance(error, Exception):
+        skip = shlex.join(["--skip", failed_before])
         sentences.append(f"It failed at {again} before, too: {skip} goes on without that pose")
     ended = [x if x.endswith(("?", "!")) else f"{x}." for x in sentences]
     kind = type(error) if isinstance(error, HilcalError) and not trouble else DeviceError

@@ -58,7 +58,7 @@ def _setup(c: Comparison, earlier: str, later: str) -> Iterator[str]:
         )
     place = f"that of {earlier} ({'as told' if c.told else 'both cells configure the same place'})"
     if c.anew:
-        unless = "" if c.told else " (--same-setup: nobody moved tracker or base)"
+        unless = "" if c.setup_stated else " (--same-setup: nobody moved tracker or base)"
         place = f"estimated from them, as if it had been set up anew{unless}"
     yield f"The tracker's place is {place}."
     if c.tool:

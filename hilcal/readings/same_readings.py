@@ -22,7 +22,7 @@ LENGTH_M = 1e-7  # A table in mm with four decimals is off by half of that; a ch
 ANGLE_RAD = 1e-5  # A table in degrees with three decimals is off by 0.9e-5; a choice
 ATTITUDE_RAD = 2e-5  # Three such angles together make an attitude; a choice
 SHARED = 0.1  # share of the readings that makes two campaigns of one measurement; a choice
-_APART = 10.0  # Distance of loaded from unloaded readings, in units of the tolerance
+_LOADED_OFFSET = 10.0  # Distance of loaded from unloaded readings, in units of the tolerance
 
 
 def found_among(readings: Readings, reference: Readings) -> Bools:
@@ -99,7 +99,7 @@ def _coordinates(r: Readings, attitude: bool) -> Floats:
     parts = [
         r.states.q / ANGLE_RAD,
         r.value[:, :3] / LENGTH_M,
-        np.where(r.unloaded, 0.0, _APART)[:, None],
+        np.where(r.unloaded, 0.0, _LOADED_OFFSET)[:, None],
     ]
     if attitude:  # as a matrix, since the rotation vector jumps at half a turn
         from scipy.spatial.transform import Rotation  # slow to import

@@ -125,7 +125,7 @@ def compare(
         readings=len(later.readings),
         shared=shared,
         anew=anew,
-        told=same_setup is not None,
+        setup_stated=same_setup is not None,
         tool=_tool_differs(run, later),
         today=error_today(later_setting, changes, nominal_rms),
         changes=changes,
