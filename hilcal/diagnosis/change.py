@@ -15,8 +15,8 @@ fit, whose statement counts as ν_0 degrees of freedom, so that a few lucky read
 
 The candidates with most evidence are fitted exactly. The best is a change if its p-value, times the
 number of candidates tested, is below `LEVEL`; then the next change is searched beside it. A change
-that the others make needless is removed. The readings do not separate candidates with nearly the
-same evidence (odds below 20 : 1).
+that is redundant beside the others is removed. The readings do not separate candidates with nearly
+the same evidence (odds below 20 : 1).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -401,7 +401,7 @@ def _exact(before: LaterFit, after: LaterFit, count: int) -> tuple[float, float]
 
 
 def _needed(minimum: LaterFit, steps: list[_Step], tested: int) -> tuple[LaterFit, list[_Step]]:
-    """Return the minimum and the changes without those that the others make needless."""
+    """Return the minimum and the changes without those that are redundant beside the others."""
     while len(steps) > 1:
         rss, dof = _pooled(minimum)
         without = []

@@ -42,11 +42,7 @@ def trial(before: Fit, effect: str) -> Fit | None:
 
 
 def remove(before: Fit, effect: str) -> Fit:
-    """Refit without an effect, starting from the parameters of the fit.
-
-    Raises:
-        InputError: an effect that the model lacks.
-    """
+    """Refit without an effect; InputError: the model lacks it."""
     model, start = _reduced(before.model, before.theta, effect)
     return fit_again(before, model, start=start)
 

@@ -1,7 +1,7 @@
 """Forward selection of laws with backward pruning, corrected for the size of the search.
 
-At each step the term with the best odds beside the chosen ones is added (see `problem`), and terms
-that the others make needless are removed. Of terms within odds of 20 : 1 the simplest is chosen.
+At each step the term with the best odds beside the chosen ones is added (see `problem`), and
+redundant terms are removed. Of terms within odds of 20 : 1 the simplest is chosen.
 """
 
 from collections.abc import Iterable
@@ -162,7 +162,7 @@ def _distinct(problem: SearchProblem, scored: list[ScoredTerm], count: int) -> l
 
 
 def _pruned(problem: SearchProblem, s: Selection) -> Selection:
-    """Remove terms that the others make needless."""
+    """Remove redundant terms."""
     while len(s.terms) > 1:
         worth = []
         for k, term in enumerate(s.terms):

@@ -1,4 +1,4 @@
-"""`creep`: a joint goes on giving way while the load hangs."""
+"""`creep`: a joint yields further while the load hangs."""
 
 from typing import ClassVar
 

@@ -1,4 +1,4 @@
-"""`joint_coupling`: a joint is taken along by another one."""
+"""`joint_coupling`: the motion of one joint moves another one."""
 
 import re
 from typing import ClassVar

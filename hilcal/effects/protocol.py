@@ -325,8 +325,8 @@ class Effect(ABC):
     def pools(self) -> Ints:
         """(P,) pool of each parameter, from 0: the groups of a pool are about equally strong.
 
-        For effects with `groups`: the groups of a pool tell the prior of those that the readings
-        did not need. All groups make one pool unless overridden.
+        For effects with `groups`: the groups of a pool determine the prior of those that the
+        readings did not need. By default all groups are one pool.
         """
         return np.zeros(len(self.parameters), dtype=np.int64)
 

@@ -23,8 +23,9 @@ class TransmissionError(PerJoint):
 
     Of a slide with the phase 2π q_j / (length of its travel) for q_j [m].
 
-    The evidence decides how strong each harmonic of each joint is, and drops the needless
-    ones; K only bounds the search. Joints that share parameters have the same phase at their zeros.
+    The evidence decides how strong each harmonic of each joint is, and drops those that the
+    readings do not need; K only bounds the search. Joints that share parameters have the same phase
+    at their zeros.
     """
 
     name = "transmission_error"

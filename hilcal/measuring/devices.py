@@ -185,7 +185,7 @@ class TrackerDevice(Protocol):
 
 @runtime_checkable
 class PointingTracker(TrackerDevice, Protocol):
-    """A tracker that can be told which of several targets to measure."""
+    """A tracker that can be aimed at one of several targets."""
 
     def aim(self, position: Floats, radius: float) -> None:
         """Turn to the expected position (3,) of a target, sensor axes, m; find and lock it.

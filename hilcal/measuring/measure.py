@@ -145,7 +145,7 @@ MAX_WINDOW = 10  # largest window, over K samples
 class SettleWindow:
     """Collects samples after the arm has stopped, and tests whether they are at rest.
 
-    `settled` tells whether they are; it is False before K samples.
+    `settled`: whether they are; False before K samples.
     """
 
     def __init__(self, count: int) -> None:

@@ -59,17 +59,17 @@ from hilcal.types import Floats
 HOW_ON = "The campaign is safe: run again with --resume"
 AT_LAST = "where its last reading was taken"  # it may have been stopped on the way to the next
 EMERGENCY = "press the emergency stop"
-_STOPS = 3
+_STOPS = 3  # attempts to stop the arm
 MOVED_M = 1e-3
 """Distance of the target at the reference pose from where earlier readings have it that a person is
 asked about, m; an arm returns by less, also as it warms up. A choice."""
 GRAVITY_CHANGE = 5.0
-"""Change of gravity in the sensor's axes, m/s², from which a load is distinguished from its zero: 30°."""
+"""Change of gravity in the sensor's axes, m/s², that separates a load from its zero: 30°."""
 Done = TypeVar("Done")
 LiveModel = Callable[[Readings], LiveResidual]
 """Returns the residual of the last reading by a model fitted to the previous ones."""
 StoppingRule = Callable[[Readings, bool], GoalStatus]
-"""Returns the status of the goal from all readings. The second argument tells that the plan has no
+"""Returns the status of the goal from all readings. The second argument: whether the plan has no
 further readings; else the status may be of fewer readings, as fits must not delay the campaign."""
 
 
@@ -671,7 +671,7 @@ def _note(store: RunLog, error: BaseException, trouble: str, pose: str | None) -
 
 
 def _raise(error: BaseException, trouble: str, failed_before: str | None) -> None:
-    """Raise the error with advice; `failed_before`: the pose where an earlier session failed, too."""
+    """Raise the error with advice; an earlier session failed at the pose `failed_before`, too."""
     if not isinstance(error, Exception) and not trouble:
         raise error
     sentences = [_line(error)]
@@ -681,7 +681,9 @@ def _raise(error: BaseException, trouble: str, failed_before: str | None) -> Non
         sentences.append(f"THE ARM MAY STILL MOVE ({trouble}): {EMERGENCY}")
     elif failed_before is not None and isinstance(error, Exception):
         skip = shlex.join(["--skip", failed_before])
-        sentences.append(f"It failed at {again} before, too: {skip} goes on without that pose")
+        sentences.append(
+            f"It failed at {failed_before} before, too: {skip} goes on without that pose"
+        )
     ended = [x if x.endswith(("?", "!")) else f"{x}." for x in sentences]
     kind = type(error) if isinstance(error, HilcalError) and not trouble else DeviceError
     raise kind(" ".join([*ended, HOW_ON])) from error

@@ -4,9 +4,9 @@
 
 by Newton's method with the average information. Where ℓ falls, the second derivative of the
 logarithm adds to the curvature: without it the steps of absent families are several times too long.
-A family that becomes small on the way has hardly a slope and would stay small whatever the readings
-say. So, once Newton's method has converged, the exact likelihood of each family's size, given the
-others, is searched, and the iteration continues from the best size. The average information plus Λ
+A family that becomes small on the way has nearly no slope and would stay small. So, once
+Newton's method has converged, the exact likelihood of each family's size, given the others, is
+searched, and the iteration continues from the best size. The average information plus Λ
 is the inverse covariance Σ of log s and η (Laplace).
 
 The best linear unbiased prediction, with its uncertainty and that of the variances, is

@@ -56,7 +56,8 @@ def _setup(c: Comparison, earlier: str, later: str) -> Iterator[str]:
             f"The model of {earlier} lacks {numbers.names(c.lacked)} by its own readings; added "
             "for this comparison alone (hilcal refine EARLIER keeps it)."
         )
-    place = f"that of {earlier} ({'as told' if c.told else 'both cells configure the same place'})"
+    reason = "as told" if c.setup_stated else "both cells configure the same place"
+    place = f"that of {earlier} ({reason})"
     if c.anew:
         unless = "" if c.setup_stated else " (--same-setup: nobody moved tracker or base)"
         place = f"estimated from them, as if it had been set up anew{unless}"

@@ -2,10 +2,9 @@
 
     V = s Σ̄ + R / K + R_sensor_base J Σ_q Jᵀ R_sensor_baseᵀ
 
-with Σ the instrument's covariance of one sample (`tracker_covariance`), s its systematic share
-and R the random covariance of the K samples of a reading (`covariance_of_mean`); Σ_q = diag(σ_q²)
-the scatter of the joints from one arrival to the next, J the Jacobian of the target
-(`joint_scatter`).
+with Σ the instrument's covariance of one sample (`tracker_covariance`), s its systematic share and
+R the random covariance of the K samples of a reading (`covariance_of_mean`); Σ_q = diag(σ_q²) the
+scatter of the joints from one arrival to the next, J the Jacobian of the target (`joint_scatter`).
 
 The third term needs the registration; it is added when the readings are opened
 (`identification.noise.full_covariance`), with σ_q from [repeatability]. The file states what the

@@ -1,10 +1,9 @@
 """Families, or blocks of columns, added to a model in order of their evidence.
 
-A refit with one more effect takes seconds to minutes on a large campaign. At the linearisation of
-a fit, with S and g of all families and ‖r‖² (see `evidence`), a family f with the ridge λ is added
-by the elimination of its columns (`schur.eliminate`). The log evidences of a chain of additions add
-up to ln p(r | all) − ln p(r | none), so that one large family can be compared with several small
-ones.
+A refit with one more effect takes seconds to minutes on a large campaign. At the linearisation of a
+fit, with S and g of all families and ‖r‖² (see `evidence`), a family f with the ridge λ is added by
+the elimination of its columns (`schur.eliminate`). The log evidences of a chain of additions add up
+to ln p(r | all) − ln p(r | none), so that one large family can be compared with several small ones.
 
 Blocks are chosen without each fold. With B (R, K) the columns of the model, Λ the precision of
 their prior (zero for those without one), X_l (R, W) the blocks, y the measurements less the model

@@ -17,9 +17,8 @@ A tall matrix whose rows arrive a few at a time is reduced to the triangle of it
 
 by Householder reflections (LAPACK's `tpqrt`). R'ᵀ R' equals the sum of all products of rows, but is
 never formed: nearly dependent columns lose no digits. Triangles of parts of the rows are combined
-in the same way (TSQR). Source: Demmel, Grigori, Hoemmen and Langou,
-*Communication-optimal parallel and sequential QR and LU factorizations*, SIAM J. Sci. Comput. 34
-(2012) A206-A239.
+in the same way (TSQR). Source: Demmel, Grigori, Hoemmen and Langou, *Communication-optimal parallel
+and sequential QR and LU factorizations*, SIAM J. Sci. Comput. 34 (2012) A206-A239.
 """
 
 from collections.abc import Iterable, Sequence

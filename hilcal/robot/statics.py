@@ -10,9 +10,8 @@ in slot axes change by
 
 The displacement of joint j + 1 is a turn about z_j, of a prismatic joint a shift along z_j; slot j
 stands still. The code computes the transpose: the gradient, by the motions, of a linear form of the
-slot wrenches. Source: Chen and Kao, *Conservative congruence transformation for
-joint and Cartesian stiffness matrices of robotic hands and fingers*, Int. J. Robotics Research 19
-(2000) 835-847.
+slot wrenches. Source: Chen and Kao, *Conservative congruence transformation for joint and Cartesian
+stiffness matrices of robotic hands and fingers*, Int. J. Robotics Research 19 (2000) 835-847.
 """
 
 from collections.abc import Mapping

@@ -167,7 +167,7 @@ class Failure:
 
 
 def sizes_of_arms(members: Sequence[Member]) -> list[SizeEvidence]:
-    """Return the evidence of each arm: that of its campaign which tells most.
+    """Return the evidence of each arm: that of its most informative campaign.
 
     All campaigns of an arm have the same d_i; each would count as an arm of its own.
     """

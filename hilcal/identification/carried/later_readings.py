@@ -6,10 +6,10 @@ are
     y = f(θ_A + R u + F b + D δ) + e + p,    R Rᵀ = κC,  u ~ N(0, 1),  b and δ flat
 
 b the twist of the base where the tracker was set up anew, δ changes of the arm (none to begin
-with), e ~ N(0, a V) the noise and p ~ N(0, c V̄) a misfit that all readings of a pose share: several
-loads at one pose then carry less information than as many poses. a + c is κσ², the variance factor
-of the earlier fit at poses left out; the excess over the stated noise, κσ² − 1, is divided between
-a and c by the residual (`earlier_fit`). The minimum over u, p, b and δ of
+with), e ~ N(0, a V) the noise and p ~ N(0, c V̄) a misfit that all readings of a pose share:
+several loads at one pose then carry less information than as many poses. a + c is κσ², the variance
+factor of the earlier fit at poses left out; the excess over the stated noise, κσ² − 1, is divided
+between a and c by the residual (`earlier_fit`). The minimum over u, p, b and δ of
 
     ‖y − f‖² / (a V) + ‖u‖² + ‖p‖² / (c V̄)
 
