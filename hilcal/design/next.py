@@ -79,9 +79,9 @@ def plan_separating(
     planning = config.planning.model_copy(update=update)
     cell = cell.with_config(config.model_copy(update={"planning": planning}))
     readings = request.readings or request.poses * (1 + len(config.loads))
-    asked = replace(request, criterion="separate", readings=readings)
+    separating_request = replace(request, criterion="separate", readings=readings)
     try:
-        planned = plan_readings(cell, asked, rng, fit, say)
+        planned = plan_readings(cell, separating_request, rng, fit, say)
     except InputError as error:
         if "effects to tell apart" not in str(error):
             raise

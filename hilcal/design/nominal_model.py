@@ -171,8 +171,8 @@ def build_effect(
     catalogue: Catalogue, name: str, cell: Cell, m: int, options: Options | None = None
 ) -> Effect:
     """Make an effect for a plan, from a first and a last reading in one pose."""
-    once = nominal_states(np.zeros((1, cell.arm.n)), np.zeros((1, 6)))
-    states = replace(once[np.zeros(2, dtype=int)], time=np.array([0.0, DURATION_S]))
+    one_state = nominal_states(np.zeros((1, cell.arm.n)), np.zeros((1, 6)))
+    states = replace(one_state[np.zeros(2, dtype=int)], time=np.array([0.0, DURATION_S]))
     return catalogue.make(name, cell, states, options, m)
 
 

@@ -219,8 +219,10 @@ def plan_readings(
             )
         else:
             start = relaxed.among(usable)
-            asked = objective.among(usable)
-            design = best_design(asked, budget, rng, effort=request.effort, relaxed=start)
+            usable_objective = objective.among(usable)
+            design = best_design(
+                usable_objective, budget, rng, effort=request.effort, relaxed=start
+            )
             counts = np.zeros(len(usable), dtype=np.int64)
             counts[usable] = design.counts
         units = np.flatnonzero(counts)

@@ -69,7 +69,7 @@ def step_in_order(fit: Fit) -> OrderStep | None:
     observed, situation = prediction.observation, prediction.situation
     moves = motion(model.cell, observed, situation.chain, prediction.deviation, readings.m)
     units = shift_rows(model, readings, fit.mode)
-    left = float(e.target @ e.residual)
+    remaining = float(e.target @ e.residual)
     found = []
     kinds: tuple[tuple[Moved, Floats], ...] = (
         ("sensor", moves.by_station()),
@@ -83,7 +83,7 @@ def step_in_order(fit: Fit) -> OrderStep | None:
         if p < LEVEL and better:
             shift = columns[k:, :3] @ delta
             size = float(np.sqrt(np.mean(np.sum(shift**2, axis=1))))
-            found.append((gain - 2 * rank, kind, k, p, size, gain / left))
+            found.append((gain - 2 * rank, kind, k, p, size, gain / remaining))
     if not found:
         return None
     found.sort(key=lambda f: -f[0])

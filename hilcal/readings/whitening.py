@@ -220,9 +220,9 @@ class Whitening:
         start = 0
         for b in self.buckets:
             groups, size = b.factor.shape[:2]
-            some = max(1, TOGETHER // max(size * flat.shape[1], 1))
-            for first in range(0, groups, some):
-                factor = b.factor[first : first + some]
+            at_once = max(1, TOGETHER // max(size * flat.shape[1], 1))
+            for first in range(0, groups, at_once):
+                factor = b.factor[first : first + at_once]
                 rows = slice(start, start + len(factor) * size)
                 block = flat[rows].reshape(len(factor), size, flat.shape[1])
                 out[rows] = (factor @ block).reshape(len(factor) * size, flat.shape[1])

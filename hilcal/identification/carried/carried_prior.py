@@ -314,8 +314,8 @@ def _spectrum(p: Posterior, place: tuple[int, ...]) -> tuple[Floats, Floats]:
     """
     scaled = p.information * (p.scale[:, None] * p.scale)
     rows = np.array(place, dtype=np.int64)
-    some = scaled if len(place) == len(scaled) else information_on(scaled, rows)
-    values, vectors = spectrum(some)
+    marginal = scaled if len(place) == len(scaled) else information_on(scaled, rows)
+    values, vectors = spectrum(marginal)
     return values, vectors if values.any() else np.eye(len(values))
 
 

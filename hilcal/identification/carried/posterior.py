@@ -291,8 +291,8 @@ def parameter_differences(earlier: Posterior, later: Posterior) -> Differences:
     values, vectors = spectrum(first + second)
     half = vectors[:, values > 0] / np.sqrt(values[values > 0])
     parallel = (first @ half) @ (half.T @ second)
-    some = (parallel + parallel.T) / 2 + np.eye(len(common)) / FARTHEST**2
-    covariance = np.asarray(np.linalg.inv(some), dtype=float)
+    regularised = (parallel + parallel.T) / 2 + np.eye(len(common)) / FARTHEST**2
+    covariance = np.asarray(np.linalg.inv(regularised), dtype=float)
     information = 1.0 / np.diag(covariance) - 1.0 / FARTHEST**2
     d, names = np.asarray(mean_later - mean_earlier, dtype=float), np.array(owner)
     effects = [_effect(e, covariance, d, np.flatnonzero(names == e)) for e in dict.fromkeys(owner)]
@@ -327,8 +327,8 @@ def _effect(effect: str, covariance: Floats, d: Floats, rows: Ints) -> EffectDif
     d (K,) are the differences of all parameters, with their covariance (K, K) by both campaigns and
     the prior.
     """
-    some = np.linalg.inv(covariance[np.ix_(rows, rows)]) - np.eye(len(rows)) / FARTHEST**2
-    values, vectors = np.linalg.eigh((some + some.T) / 2)
+    information = np.linalg.inv(covariance[np.ix_(rows, rows)]) - np.eye(len(rows)) / FARTHEST**2
+    values, vectors = np.linalg.eigh((information + regularised.T) / 2)
     compared = values > 1.0
     total = float(np.sum(values[compared] * (vectors[:, compared].T @ d[rows]) ** 2))
     rank = int(compared.sum())

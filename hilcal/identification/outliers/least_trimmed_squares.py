@@ -127,8 +127,8 @@ class ReadingModel:
         _, covariance, r, b = self._fitted(used)
         spread = np.empty((len(b), self.m, self.m))
         for k in range(0, len(b), READINGS_AT_ONCE):
-            some = b[k : k + READINGS_AT_ONCE]
-            spread[k : k + READINGS_AT_ONCE] = (some @ covariance) @ some.swapaxes(1, 2)
+            subset = b[k : k + READINGS_AT_ONCE]
+            spread[k : k + READINGS_AT_ONCE] = (subset @ covariance) @ subset.swapaxes(1, 2)
         if len(self.members):
             grouped = self.group >= 0
             root, offset = self.root[grouped], self._offset_covariance(used)[self.group[grouped]]
@@ -195,8 +195,8 @@ class ReadingModel:
             both = self._both.copy()
             both[grouped] -= self.root[grouped] @ offset[self.group[grouped]]
             r, b = both[:, :, -1], both[:, :, :-1]
-        some = b if used.all() else b[used]
-        rows = some.reshape(self.m * len(some), b.shape[2])
+        subset = b if used.all() else b[used]
+        rows = subset.reshape(self.m * len(subset), b.shape[2])
         h = rows.T @ rows
         h[np.diag_indices_from(h)] += self.precision + self._guard
         covariance = np.asarray(np.linalg.inv(h), dtype=float)

@@ -514,8 +514,8 @@ def other_arm(registered: Registration, readings: Readings) -> OtherArm | None:
         arm if robot is None else with_controller_conventions(arm, robot)
         for arm in other_arms(cell.arm)
     )
-    some = readings[np.unique(np.linspace(0, len(readings) - 1, ARM_ROWS).astype(int))]
-    tried = [(_misfit_with(cell, arm, some), arm) for arm in arms]
+    sample = readings[np.unique(np.linspace(0, len(readings) - 1, ARM_ROWS).astype(int))]
+    tried = [(_misfit_with(cell, arm, sample), arm) for arm in arms]
     least, arm = min(tried, key=lambda pair: pair[0], default=(np.inf, cell.arm))
     if least > OTHER_ARM_SHARE * registered.rms:
         return None
