@@ -328,7 +328,7 @@ def _effect(effect: str, covariance: Floats, d: Floats, rows: Ints) -> EffectDif
     the prior.
     """
     information = np.linalg.inv(covariance[np.ix_(rows, rows)]) - np.eye(len(rows)) / FARTHEST**2
-    values, vectors = np.linalg.eigh((information + regularised.T) / 2)
+    values, vectors = np.linalg.eigh((information + information.T) / 2)
     compared = values > 1.0
     total = float(np.sum(values[compared] * (vectors[:, compared].T @ d[rows]) ** 2))
     rank = int(compared.sum())
