@@ -37,7 +37,7 @@ class JointGroups:
 
 
 def joint_groups(effect: str, options: Options, count: int) -> JointGroups:
-    """Read the option `joints`: groups apart by "/", each as a range or joined by "+"."""
+    """Read the option `joints`: groups separated by "/", each a range or joined by "+"."""
     option = options["joints"]
     text = str(option) if type(option) is int else option
     if text == EACH:

@@ -215,7 +215,7 @@ class Effect(ABC):
     of_setup: ClassVar[bool] = False
     drift: ClassVar[float] = 0.1
     """A tenth of the ordinary magnitude, by wear and temperature; a choice. Where an arm was
-    repaired or hit, the readings ask for more."""
+    repaired or hit, it may be larger."""
     spread: ClassVar[float] = 1.0
     """Other arms of the type have parameters of the ordinary magnitude; a choice."""
     change: ClassVar[Changeable | None] = None

@@ -1,4 +1,4 @@
-"""The law that links, the base and the tool share: a slot of the chain gives way."""
+"""The law that links, the base and the tool share: a slot of the chain yields."""
 
 from abc import abstractmethod
 

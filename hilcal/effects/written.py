@@ -85,7 +85,7 @@ def option_defaults(kind: type[Effect], cell: Cell, states: States) -> dict[str,
     full = kind(cell, states).options
     try:
         part = kind(cell, states[len(states) // 3 :]).options
-    except InputError:  # fewer readings will not do
+    except InputError:  # too few readings for the effect
         part = {}
     same = {name: option_text(full.get(name)) == option_text(part.get(name)) for name in full}
     return {name: full[name] if same.get(name) else None for name in kind.option_help}
