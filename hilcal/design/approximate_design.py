@@ -348,8 +348,8 @@ def _first(program: BarrierProgram, spread: Floats) -> tuple[Ints, Floats]:
         short = np.arange(len(units))
     else:
         rate = prices(units.rows, smooth.gradient) / units.cost
-        spread = np.linspace(0, len(units) - 1, count // 4).astype(np.int64)
-        short = np.union1d(best_first(rate, count - len(spread)), spread)
+        spaced = np.linspace(0, len(units) - 1, count // 4).astype(np.int64)
+        short = np.union1d(best_first(rate, count - len(spaced)), spaced)
     shortened = replace(program, objective=program.objective.among(short))
     rows, cost = shortened.objective.units.rows, units.cost[short]
     w = np.full(len(short), budget / float(cost.sum()))

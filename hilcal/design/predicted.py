@@ -189,8 +189,8 @@ def covariance(information: Floats, flat: Bools) -> tuple[Floats, Floats]:
     count = int(determined.sum())
     transform = np.zeros((size, count + len(held)))
     transform[columns, :count] = vectors[:, determined] / np.sqrt(values[determined])
-    size = np.sqrt(np.maximum(np.diag(information)[held], 1e-300))
-    transform[held, count + np.arange(len(held))] = 1.0 / size
+    own_std = np.sqrt(np.maximum(np.diag(information)[held], 1e-300))
+    transform[held, count + np.arange(len(held))] = 1.0 / own_std
     root = transform @ inverse_root(transform.T @ information @ transform).T
     null = np.zeros((size, len(columns) - count))
     null[columns] = vectors[:, ~determined]

@@ -305,13 +305,13 @@ def _em(fleet: FleetEstimates, outlier: Bools) -> Hierarchy:
     tau2 = np.full(k, START[0])
     omega2 = np.full(k, START[1] if repeated else 0.0)
     normal = np.maximum((~outlier).sum(axis=0), 1)
-    repeated = np.bincount(fleet.arm, minlength=fleet.arms)[fleet.arm] > 1
+    in_repeated = np.bincount(fleet.arm, minlength=fleet.arms)[fleet.arm] > 1
     for _ in range(EM_STEPS):
         _, _, u2, e2, _, _ = _expectation(fleet, tau2, omega2, outlier, timed)
         previous = np.concatenate([tau2, omega2])
         tau2 = np.maximum(np.where(outlier, 0.0, u2).sum(axis=0) / normal, LEAST)
         if repeated:
-            omega2 = np.maximum(e2[repeated].mean(axis=0), LEAST)
+            omega2 = np.maximum(e2[in_repeated].mean(axis=0), LEAST)
         change = np.concatenate([tau2, omega2]) - previous
         if np.abs(change / np.maximum(previous, LEAST)).max() < EM_CONVERGED:
             break

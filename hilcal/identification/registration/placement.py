@@ -452,9 +452,9 @@ def _starts(data: FrameData, part: FrameData, frames: Frames, free: Bools) -> It
     for f in bases:
         p, observers = part.points(f) @ f.base[:3, :3].T + f.base[:3, 3], []
         for k, o in enumerate(frames.observers):
-            rows = part.observer == k
-            placed = bool(o.free) and bool(np.any(rows))
-            observers.append(_observer_placed(o, p[rows], part.value[rows]) if placed else o)
+            read_by = part.observer == k
+            placed = bool(o.free) and bool(np.any(read_by))
+            observers.append(_observer_placed(o, p[read_by], part.value[read_by]) if placed else o)
         yield replace(f, observers=tuple(observers))
 
 
