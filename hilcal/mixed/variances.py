@@ -22,9 +22,10 @@ w_i = (Uᵀ Z_fᵀ P y)_i / √μ_i, which are N(0, 1) for an absent family,
 
     T = max over λ of  Σ_i [ w_i² λ μ_i / (1 + λ μ_i) − log(1 + λ μ_i) ],    0 ≤ λ = s_f² ≤ most²
 
-The distribution of T under s_f = 0 has a point mass at zero and is simulated from the μ_i. λ is
-limited to plausible sizes: a family far larger than it can be would stand in for a mean that the
-zero mean of another prior excludes, as a tracker's scale for gears that all yield in one direction.
+λ is limited to plausible sizes: a family far larger than it can be would stand in for a mean that
+the zero mean of another prior excludes, as a tracker's scale for gears that all yield in one
+direction. The distribution of T under s_f = 0 has a point mass at zero and is simulated from the
+μ_i with λ of any size: what a plausible size hardly gains is no evidence, however rare.
 
 Sources: Patterson and Thompson, *Recovery of inter-block information when block sizes are unequal*,
 Biometrika 58 (1971) 545; Kackar and Harville, *Approximations for standard errors of estimators of
@@ -202,7 +203,7 @@ def evidence(
     w2 = (u[:, visible].T @ score) ** 2 / mu
     bound = (largest / ordinary[numbers].max()) ** 2
     ratio = float(_ratios(mu, w2[None], bound)[0])
-    drawn = _ratios(mu, rng.standard_normal((DRAWS, len(mu))) ** 2, bound)
+    drawn = _ratios(mu, rng.standard_normal((DRAWS, len(mu))) ** 2, np.inf)
     p = (1 + int(np.count_nonzero(drawn >= ratio))) / (1 + DRAWS) if ratio > 0 else 1.0
     return FamilyEvidence(ratio, float(p), len(mu))
 

@@ -168,6 +168,12 @@ def test_p_values_are_uniform_where_nothing_is_there_and_small_where_it_is():
     assert abs(len(below) / len(null) - 0.4) < 0.13
 
 
+def test_what_only_an_implausible_size_would_explain_is_not_likely():
+    made = drawn(np.random.default_rng(6), (1.0, 0.5), 0.3, 20)[0]
+    assert evidence(made, 1, np.random.default_rng(0)).p_value < 0.01
+    assert evidence(made, 1, np.random.default_rng(0), largest=1e-3).p_value > 0.1
+
+
 def test_a_family_that_others_span_has_no_evidence_of_its_own():
     rng = np.random.default_rng(7)
     p = problem(rng, scatter=False)
