@@ -306,9 +306,11 @@ def _criterion(
 ) -> float | None:
     """Change of the Bayesian information criterion by a figure; None where it explains too little.
 
-    Only inliers of the refit count: with the stated figure they may look like gross errors.
+    Only inliers of the refit count: with the stated figure they may look like gross errors. Each
+    reading that only the refit sets aside costs as many parameters as it has elements.
     """
     readings, w = stated.readings[~refit.outlier], refit.whitening
+    size += w.m * int(np.count_nonzero(refit.outlier & ~stated.outlier))
     prediction = stated.model.predict(readings.states, stated.theta)
     chi2, dof = float(np.sum(w.whiten(residual(readings, prediction, w)) ** 2)), refit.dof
     most = chi2 - least_share * max(chi2 - dof, LEAST_MISFIT * np.sqrt(2 * dof))

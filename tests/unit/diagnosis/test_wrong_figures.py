@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 import hilcal as hc
-from hilcal.diagnosis.wrong_figures import wrong_figures
+from hilcal.diagnosis.stepwise import add
+from hilcal.diagnosis.wrong_figures import BIC_MARGIN, _criterion, wrong_figures
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import fit_again
 from hilcal.model.model import Model
 from hilcal.present.verdict import message
 from hilcal.robot.chain import evaluate
@@ -114,6 +116,15 @@ def test_effects_are_no_wrong_figures(effect):
     c = campaign(effect, mode, 1, poses=16)
     d = judged(c.cell, c.readings, mode)
     assert d.suspects[0].effect == effect, message(d)
+
+
+def test_a_figure_that_sets_readings_aside_does_not_explain_them():
+    c = campaign("backlash", "deflection", 1, poses=10)
+    stated = hc.fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection")
+    aside = stated.outlier | (c.readings.load == c.readings.load_names.index("5kg"))
+    right = add(stated, "backlash")
+    assert _criterion(stated, right, 2) < -BIC_MARGIN
+    assert _criterion(stated, fit_again(right, outlier=aside), 2) > -BIC_MARGIN
 
 
 def mounted(c, gravity):
