@@ -46,7 +46,7 @@ TALL = 10_000  # rows from which a step first reduces them to their triangle (QR
 MAX_ITERATIONS = 20  # steps; the tests of convergence allow 8
 CONVERGED = 1e-5  # motion of the whitened readings by the last step, in units of the noise
 SETTLED = 0.02  # priors and rank are chosen anew until the residual changes by less than this share
-# in a step, or is within the noise
+# of itself, or of the noise, in a step
 NEAR = 0.02  # motion of the readings by a step, in units of the noise, below which it is
 # extrapolated
 MEMORY = 5  # earlier steps of the extrapolation
@@ -280,11 +280,11 @@ def minimum(problem: NewtonProblem[P], start: Floats | None, prior: Floats | Non
     square, settled = np.inf, False
     past: list[tuple[Floats, Floats]] = []
     for iterations in range(1, MAX_ITERATIONS + 1):
-        linear = problem.linearise(point, sigma)
+        # A family dropped far from the minimum may be needed at it: all are judged at each point.
+        linear = problem.linearise(point, chosen.prior if settled else sigma)
         if not settled:
             chosen = regularise(linear, scale, sigma, groups, choose)
-            sigma = chosen.prior
-        linear = linear.restricted(sigma)
+        linear = linear.restricted(chosen.prior)
         equations = linear.equations(chosen.basis)
         if (groups[linear.live] >= 0).any() or len(space.index):  # priors that β multiplies
             chosen = replace(chosen, beta=noise_factor(linear, equations, chosen.beta))
@@ -296,14 +296,15 @@ def minimum(problem: NewtonProblem[P], start: Floats | None, prior: Floats | Non
         if past:
             aim = _extrapolated(past)
         start_point, point = point, _line_search(problem, point, aim, chosen)
-        previous, square = square, point.mean_square(len(chosen.basis.singular))
+        square = point.mean_square(len(chosen.basis.singular))
         noise = max(square, chosen.beta) * linear.rank
         if settled and float(moved @ moved) <= CONVERGED**2 * noise:
             moved = linear.rows @ (point.y - start_point.y)[linear.live]
             valid = float(moved @ moved) <= CONVERGED**2 * noise
             return Minimum(point, chosen, iterations, True, linear.rows if valid else None)
         del linear  # frees memory for the next one
-        settled = (problem.whitened and square < 1) or abs(square / previous - 1) <= SETTLED
+        least = float(point.elements) if problem.whitened else 0.0
+        settled = abs(point.rss - start_point.rss) <= SETTLED * max(point.rss, least)
     return Minimum(point, chosen, iterations, False, None)
 
 

@@ -91,6 +91,15 @@ def test_the_same_data_give_the_same_numbers_and_a_fit_is_found_again_from_its_o
     assert again.chi2 == pytest.approx(a.chi2, rel=1e-6)
 
 
+def test_which_families_stay_does_not_depend_on_where_a_fit_starts():
+    c = campaign("link_geometry", "absolute", 1, poses=30, m=3, strength=3.0)
+    model = with_effects(c.cell, c.readings, "absolute", (*WAVES, "link_geometry"))
+    far = fit(model, c.readings, "absolute")
+    near = fit(model, c.readings, "absolute", start=far.theta)
+    np.testing.assert_array_equal(far.solution.prior > 0, near.solution.prior > 0)
+    assert near.chi2 == pytest.approx(far.chi2, rel=1e-3)
+
+
 def test_the_order_of_readings_and_of_effects_does_not_matter():
     c = campaign(plan_seed=0, target_known=False)
     found = fitted_model(c.cell, c.readings, "absolute", ("joint_compliance", "hysteresis"))
