@@ -504,7 +504,10 @@ class Path:
             least *= 1.0 + EXCHANGE_MARGIN
         elif len(alternative.replacements) > 1:
             least += LEAST_SHARE * last.fit.dof
-        return alternative.better and alternative.log_evidence > least
+        # What was replaced or redundant does not come back in turn.
+        if not alternative.better or not set(self._removed).isdisjoint(alternative.replacements):
+            return False
+        return alternative.log_evidence > least
 
     def _exchange(self, last: RefinementStep, alternative: Alternative) -> bool:
         """Replace an effect by its alternative, unless the error on poses left out rises.

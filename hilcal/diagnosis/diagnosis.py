@@ -71,10 +71,10 @@ CURVE_KEYS = (
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """How a model was reached, as far as the judgement depends on it."""
+    """How a model was reached, as far as refining and its judgement depend on it."""
 
     added: tuple[str, ...] = ()  # effects that diagnoses chose; others may fit as well
-    removed: tuple[str, ...] = ()  # effects that others replaced, or that were redundant
+    removed: tuple[str, ...] = ()  # effects that were taken out; refining does not add them again
     rejected: tuple[str, ...] = ()  # effects whose refit did not lower the error on poses left out
 
 

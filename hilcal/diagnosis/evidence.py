@@ -128,8 +128,8 @@ class StepwiseAlternatives:
         self._x, self._columns, self._most = catalogue_columns(fit)
         self._gram, self._products = self._x.T @ self._x, self._model.white.T @ self._x
 
-    def of(self, effect: str, excluded: Collection[str] = ()) -> Alternative:
-        """Return the effects, without the excluded ones, that together replace one."""
+    def of(self, effect: str) -> Alternative:
+        """Return the effects that together replace one."""
         reduced = eliminate_effect(self._fit, self._model, effect)
         evidence = reduced.score().log_evidence
         information = reduced.information(self._x, self._gram, self._products)
@@ -138,7 +138,7 @@ class StepwiseAlternatives:
             information, reduced.residual, noise, self._x, self._columns, self._most
         )
         # A finer form of an effect is no alternative: it contains the effect.
-        barred = {*excluded, *(name for name in self._columns if name.startswith(f"{effect}("))}
+        barred = {name for name in self._columns if name.startswith(f"{effect}(")}
         same: tuple[str, ...] = ()
         names: list[str] = []
         total = 0.0
@@ -238,7 +238,7 @@ class Evidence:
         self.fit, self._refit, self._say = fit, refit, say
         self._regressions = regressions or Regressions()
         self._background = background
-        self._alternatives: dict[tuple[str, frozenset[str]], Alternative] = {}
+        self._alternatives: dict[str, Alternative] = {}
 
     @cached_property
     def linearisation(self) -> Linearisation:
@@ -355,16 +355,13 @@ class Evidence:
         """Return the share of the misfit that trees predict; see `residual_regression`."""
         return self._regressions.tree_share(self.linearisation, other_share)
 
-    def alternatives(
-        self, effects: Collection[str], excluded: Collection[str]
-    ) -> tuple[Alternative, ...]:
-        """Return the alternatives of effects of the model, without the excluded effects."""
-        keys = [(name, frozenset(excluded)) for name in effects]
-        if any(key not in self._alternatives for key in keys):
+    def alternatives(self, effects: Collection[str]) -> tuple[Alternative, ...]:
+        """Return the alternatives of effects of the model."""
+        if any(name not in self._alternatives for name in effects):
             # Not cached: the columns of the catalogue are the largest arrays of a judgement.
             algebra = StepwiseAlternatives(self.fit)
-            self._alternatives |= {key: algebra.of(key[0], excluded) for key in keys}
-        return tuple(self._alternatives[key] for key in keys)
+            self._alternatives |= {name: algebra.of(name) for name in effects}
+        return tuple(self._alternatives[name] for name in effects)
 
 
 def backward_elimination(fit: Fit) -> dict[str, FamilyScore]:

@@ -286,7 +286,7 @@ def _judged(e: Evidence, history: History, whole_catalogue: bool) -> Diagnosis:
         elif noise.contradicted and not noise.misjudged:
             reason = "no_suspect"
         else:
-            in_doubt = any(a.inseparable for a in e.alternatives(added, history.removed))
+            in_doubt = any(a.inseparable for a in e.alternatives(added))
             reason = "inseparable_addition" if in_doubt else "residual_is_noise"
         serial = readings.serial
         if reason in ("residual_is_noise", "arm_scatter") and serial and not serial.proved:
@@ -314,7 +314,7 @@ def _judged(e: Evidence, history: History, whole_catalogue: bool) -> Diagnosis:
         redundant=e.redundant,
         separability=rivals,
         insufficiency=insufficiency,
-        alternatives=e.alternatives(added, history.removed),
+        alternatives=e.alternatives(added),
         scatter=scatter,
         pose_alone=alone,
         background=e.background,
