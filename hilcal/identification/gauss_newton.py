@@ -277,14 +277,15 @@ def minimum(problem: NewtonProblem[P], start: Floats | None, prior: Floats | Non
     y = np.zeros(model.size) if start is None else start
     point = problem.at(np.where(sigma > 0, y, 0.0))
     chosen: Regularisation  # set in the first step
-    square, settled = np.inf, False
+    kept, square, settled = sigma, np.inf, False
     past: list[tuple[Floats, Floats]] = []
     for iterations in range(1, MAX_ITERATIONS + 1):
         # A family dropped far from the minimum may be needed at it: all are judged at each point.
-        linear = problem.linearise(point, chosen.prior if settled else sigma)
+        linear = problem.linearise(point, kept if settled else sigma)
         if not settled:
             chosen = regularise(linear, scale, sigma, groups, choose)
-        linear = linear.restricted(chosen.prior)
+            kept = chosen.prior
+        linear = linear.restricted(kept)
         equations = linear.equations(chosen.basis)
         if (groups[linear.live] >= 0).any() or len(space.index):  # priors that β multiplies
             chosen = replace(chosen, beta=noise_factor(linear, equations, chosen.beta))
