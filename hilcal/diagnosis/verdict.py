@@ -137,12 +137,12 @@ def with_insufficiency(d: Diagnosis, last: Diagnosis) -> Diagnosis:
     """
     if last.reason != "no_suspect" or last.noise is None or d.lead is None or d.insufficiency:
         return d
-    share = (last.fit.chi2 - last.fit.dof) / (d.fit.chi2 - d.fit.dof)
-    if share < LEAST_REMAINDER:
+    misfit, rest = d.fit.chi2 - d.fit.dof, last.fit.chi2 - last.fit.dof
+    if not 0.0 < LEAST_REMAINDER * misfit <= rest:
         return d
     added = tuple(n for n in last.fit.model.named if n not in d.fit.model.named)
     rest = Insufficiency(
-        added, len(added), share, last.fit.variance_factor, last.dependences, last.noise
+        added, len(added), rest / misfit, last.fit.variance_factor, last.dependences, last.noise
     )
     return replace(
         d,
