@@ -211,7 +211,7 @@ def wrong_figures(fit: Fit, suspects: Sequence[Suspect]) -> tuple[WrongFigure, .
             change, refit = figure.refitted(fit, step)
         except CannotAnswerError:  # a figure without an equilibrium explains nothing
             continue
-        bic = _criterion(fit, refit, figure.size)
+        bic = criterion(fit, refit, figure.size)
         if bic is not None and figure.mistaken(change) and bic < min(best, -BIC_MARGIN):
             named.append((bic, figure.named(fit, change, refit)))
     named.sort(key=lambda pair: pair[0])
@@ -279,7 +279,7 @@ def _wrong_direction(fit: Fit, least_share: float, best: float) -> tuple[WrongFi
     if loads_reversed(fit):
         explained = refit.chi2 < fit.chi2 + BIC_MARGIN
     else:
-        bic = _criterion(fit, refit, figure.size, least_share)
+        bic = criterion(fit, refit, figure.size, least_share)
         wrong = figure.kind != "gravity" or _elsewhere(refit.model.cell.gravity, g)
         explained = wrong and bic is not None and bic < min(best, -BIC_MARGIN)
     return (figure.named(fit, np.zeros(figure.size), refit),) if explained else ()
@@ -301,9 +301,7 @@ def _figures(fit: Fit) -> Iterator[_Figure]:
         yield from (_Figure("tool_mass"), _Figure("tool_com"))
 
 
-def _criterion(
-    stated: Fit, refit: Fit, size: int, least_share: float = LEAST_SHARE
-) -> float | None:
+def criterion(stated: Fit, refit: Fit, size: int, least_share: float = LEAST_SHARE) -> float | None:
     """Change of the Bayesian information criterion by a figure; None where it explains too little.
 
     Only inliers of the refit count: with the stated figure they may look like gross errors. Each

@@ -8,7 +8,7 @@ import pytest
 
 import hilcal as hc
 from hilcal.diagnosis.stepwise import add
-from hilcal.diagnosis.wrong_figures import BIC_MARGIN, _criterion, wrong_figures
+from hilcal.diagnosis.wrong_figures import BIC_MARGIN, criterion, wrong_figures
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit_again
@@ -123,8 +123,8 @@ def test_a_figure_that_sets_readings_aside_does_not_explain_them():
     stated = hc.fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection")
     aside = stated.outlier | (c.readings.load == c.readings.load_names.index("5kg"))
     right = add(stated, "backlash")
-    assert _criterion(stated, right, 2) < -BIC_MARGIN
-    assert _criterion(stated, fit_again(right, outlier=aside), 2) > -BIC_MARGIN
+    assert criterion(stated, right, 2) < -BIC_MARGIN
+    assert criterion(stated, fit_again(right, outlier=aside), 2) > -BIC_MARGIN
 
 
 def mounted(c, gravity):
