@@ -156,7 +156,7 @@ def test_gears_that_all_give_in_one_direction_are_no_scale_of_the_tracker():
     first = fitted_model(case.cell, case.readings, "deflection")
     found = with_background(first, first.model.names)
     tested = {b.effect: b for b in background_evidence(found)}
-    assert tested["tracker_scale"].p_value < 0.001
+    assert tested["tracker_scale"].p_value > 0.05
     assert proved(tuple(tested.values())) == ("joint_stiffening",)
 
 
