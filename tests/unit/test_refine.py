@@ -93,6 +93,7 @@ def test_a_suspect_that_passes_beside_pooled_lines_is_added(monkeypatch):
     assert not any(s.passes for s in r.diagnosis.suspects)
 
 
+@pytest.mark.long
 def test_what_the_whole_catalogue_leaves_is_told_of_the_earlier_steps():
     c = campaign("encoder_offset", "absolute", 2, poses=15)
     states, value = c.readings.states, c.readings.value.copy()

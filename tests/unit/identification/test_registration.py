@@ -349,6 +349,7 @@ def test_exchanged_columns_of_joints_are_named(order, words):
     assert words in said
 
 
+@pytest.mark.long
 def test_a_tracker_that_was_moved_on_the_way_is_asked_for():
     readings, m = of_arm(), se3.matrix(se3.rotation(np.array([0.0, 0.1, 0.4])), np.ones(3))
     value = readings.value.copy()
