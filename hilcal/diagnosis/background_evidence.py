@@ -97,7 +97,7 @@ def background_is_better(named: Fit, background: Fit) -> bool:
     place[scaling.reading] = np.arange(len(other))
     counts = ~(background.outlier & named.outlier)[w.reading, None]
     square = float(np.sum(w.whiten(counts * other[place[w.reading]]) ** 2))
-    least = LEAST_GAIN / np.sqrt(len(np.unique(named.readings.pose)))
+    least = LEAST_GAIN / float(np.sqrt(len(np.unique(named.readings.pose))))
     return float(np.sum(w.whiten(counts * raw) ** 2)) <= (1 - least) ** 2 * square
 
 
