@@ -33,8 +33,8 @@ FALSE_ALARM = 0.01
 """Chance of naming any absent effect of the background, over all tested effects; a choice: poses
 left out have shown already that something is missing."""
 LEAST_GAIN = 0.2
-"""Share by which the rms error on poses left out must fall for a background, of n poses times √n; a
-choice. It scatters so where the arm has no other effects: by 0.025 of 15 poses, 0.006 of 40."""
+"""√n times the share by which the rms error on n poses left out must fall for a background; a
+choice. On an arm without other effects that share scatters by 0.025 (15 poses), 0.006 (40)."""
 JOINT_LEVEL = 0.05
 """Chance of trying a background where the residual is only noise of another size, or the arm's
 scatter; a choice: the error on poses left out has to fall, too."""

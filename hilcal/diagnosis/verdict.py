@@ -137,17 +137,18 @@ def with_insufficiency(d: Diagnosis, last: Diagnosis) -> Diagnosis:
     """
     if last.reason != "no_suspect" or last.noise is None or d.lead is None or d.insufficiency:
         return d
-    misfit, left = d.fit.chi2 - d.fit.dof, last.fit.chi2 - last.fit.dof
-    if not 0.0 < LEAST_REMAINDER * misfit <= left:
+    misfit, remainder = d.fit.chi2 - d.fit.dof, last.fit.chi2 - last.fit.dof
+    if not 0.0 < LEAST_REMAINDER * misfit <= remainder:
         return d
     added = tuple(n for n in last.fit.model.named if n not in d.fit.model.named)
-    rest = Insufficiency(
-        added, len(added), left / misfit, last.fit.variance_factor, last.dependences, last.noise
+    share = remainder / misfit
+    insufficiency = Insufficiency(
+        added, len(added), share, last.fit.variance_factor, last.dependences, last.noise
     )
     return replace(
         d,
         reason="insufficient_catalogue",
-        insufficiency=rest,
+        insufficiency=insufficiency,
         separability=(),
         dependences=last.dependences,
         follows=last.follows,

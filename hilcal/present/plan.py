@@ -263,7 +263,7 @@ def next_report(
     yield note(
         "now, then: where the first effect is there, the chance that the readings so far, and with "
         "those planned as well, reject a fit with the second in its place (test at 1 %). An effect "
-        "that the readings so far do not support is taken to displace them by 1 σ rms.\n"
+        "that the readings so far do not support is assumed to change them by 1 σ rms.\n"
     )
     yield f"{powers_summary(plan.powers, poses, readings)} {_difference(plan)}\n"
     yield from (f"note: {remark}" for remark in plan.notes)
