@@ -32,6 +32,8 @@ _WRENCH_DOUBT = 'base axes, or axes = "flange"; of = "load" (exerted on the tool
 BY_VALUES = "found by their values: check the columns"
 BY_ROWS = "found by their values; row by row, or column by column?"
 RIVALS = "as good by their values:"
+LONE = "the only other number of a row: a distance from [points.A] of the cell? a height: [gauge]"
+MOST_DEGREES = 400.0  # largest joint angle of a table, a turn and some margin; a choice
 _EXCEL = (30000.0, 60000.0)
 
 
@@ -114,7 +116,7 @@ def guess_by_values(g: words.Guesser) -> None:
     ranked: list[tuple[float, list[str], list[str]]] = []
     pairs = product([[]] if has_joints else runs(g.joints or 6), [[]] if has_position else runs(3))
     for joints, position in pairs:
-        if set(joints) & set(position) or (joints and size(joints) > 400):
+        if set(joints) & set(position) or (joints and size(joints) > MOST_DEGREES):
             continue
         score = 0.1 * ((len(free) - len(joints) - len(position)) % 3 == 0)
         if joints:
@@ -124,6 +126,8 @@ def guess_by_values(g: words.Guesser) -> None:
             score += 2.0 if far > 400 else (1.0 if far < words.MAX_POSITION_M else 0.5)
         ranked.append((score, position, joints))
     if not ranked:
+        if not has_position:
+            _lone_distance(g, free, [[]] if has_joints else runs(g.joints or 6))
         return
     ranked.sort(key=lambda r: -r[0])
     best, position, joints = ranked[0]
@@ -140,6 +144,22 @@ def guess_by_values(g: words.Guesser) -> None:
     if len(near) > 1:
         pair = [", ".join(part) for part in near[1] if part]
         g.doubt("joints", f"{RIVALS} {' and '.join(pair)}")
+
+
+def _lone_distance(g: words.Guesser, free: list[str], runs: list[list[str]]) -> None:
+    """Take the only number of a row beside its joint angles as a distance."""
+    for joints in runs:
+        other = [name for name in free if name not in joints]
+        if len(other) != 1 or (joints and np.nanmax(np.abs(g.block(joints))) > MOST_DEGREES):
+            continue
+        if joints:
+            unit = words.angle_unit(g, "joints", joints)
+            g.assign("joints", joints, unit, unit=unit)
+            g.doubt("joints", BY_VALUES)
+        unit = words.length_unit(g, "distance", other)
+        g.assign("distance", other, unit, column=other[0], unit=unit, name="A")
+        g.doubt("distance", LONE)
+        return
 
 
 def _orientation_by_values(g: words.Guesser, free: list[str]) -> None:

@@ -115,8 +115,8 @@ def guess(grid: Grid, joints: int | None = None, joint_names: Sequence[str] = ()
     _joints(g, joint_names)
     guess_axes(g)
     _scalars(g)
-    read = {"position", "distance", "gauge"} & set(g.proposal.sections)
-    if not read or "joints" not in g.proposal.sections:
+    readings = {"position", "distance", "gauge"}
+    if not readings & set(g.proposal.sections) or "joints" not in g.proposal.sections:
         guess_by_values(g)
     guess_names(g)
     guess_scalars(g)
@@ -134,7 +134,9 @@ def guess(grid: Grid, joints: int | None = None, joint_names: Sequence[str] = ()
             or "no joint angles: where they are in a file of their own, give it with --second",
         ),
     ):
-        if section not in g.proposal.sections and not (section == "position" and read):
+        if section not in g.proposal.sections and not (
+            section == "position" and readings & set(g.proposal.sections)
+        ):
             g.proposal.missing.append(sentence)
     if "pose" not in g.proposal.sections and "joints" in g.proposal.sections:
         g.doubt("pose", "no column names the pose: rows of the same joints count as one pose")

@@ -305,7 +305,8 @@ def check_joint_rounding(
     """Return a note where a rounding Δ of the joints, Δ/√12 times the reach, is over the noise."""
     size = max((step(q[:, k]) for k in range(q.shape[1])), default=0.0)
     std = unit * size / np.sqrt(12)
-    noise = float(np.sqrt(np.median(covariance[:, range(3), range(3)])))
+    variance = covariance[:, range(3), range(3)]  # zero where a reading is one number
+    noise = float(np.sqrt(np.median(variance[variance > 0.0])))
     if std * reach <= noise:
         return ()
     return (

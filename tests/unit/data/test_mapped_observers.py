@@ -136,6 +136,25 @@ def test_a_preview_proposes_the_mapping(who, tmp_path, capsys):
     )
 
 
+def test_a_table_of_joint_angles_and_one_number_without_names_is_of_distances(tmp_path, capsys):
+    r = measured(["A"], 3).readings
+    rows = np.column_stack([np.rad2deg(r.states.q), 1e3 * r.value[:, 0]])
+    np.savetxt(tmp_path / "cable.txt", rows, fmt="%.4f")
+    (tmp_path / "c.toml").write_text(CELL.read_text() + "\n[points.A]\nstd_m = 1e-4\n")
+    found = preview_table(tmp_path / "cable.txt", cell_of())
+    assert not found.proposal.missing
+    assert {where for where, _ in found.proposal.doubts} >= {"joints", "distance"}
+    (tmp_path / "m.toml").write_text(found.proposal.to_toml("cable.txt"))
+    table = imported(tmp_path / "cable.txt", found.proposal.sections, tmp_path / "c.toml")
+    np.testing.assert_allclose(table.value[:, 0], r.value[:, 0], atol=1e-7)
+    given = [tmp_path / "cable.txt", "--config", tmp_path / "c.toml"]
+    out = ok(
+        capsys, "import", *given, "--format", tmp_path / "m.toml", "-o", tmp_path / "r.hilcal"
+    ).out
+    assert "distances from A" in " ".join(out.split())
+    assert "rounded" not in out  # 0.0001° is 0.5 µm at the target, the noise 100 µm
+
+
 @pytest.mark.parametrize(("sections", "message"), [
     ({"distance": {"column": "d", "unit": "mm"}}, "name_column or name: give one"),
     ({"distance": None}, r"no reading: it must be a section \[position\]"),
