@@ -115,7 +115,7 @@ class DataSnooping:
             return SnoopingResult(every, every, 1.0)
         point, used = robust_start(linearised(self, self.y), rng)
         linear = point.linear
-        d2, centre = linear.distances_from(linear.fitted(used)[0])
+        d2, centre = linear.distances_from(linear.fitted(used))
         misfit = trimmed_variance(linear, d2, centre)
         linear = point.with_nuisance(misfit)
         for _ in range(MOST_ROUNDS):
@@ -330,7 +330,7 @@ def _tested(linear: ReadingModel, used: Bools) -> tuple[Floats, Bools]:
     """t² (N,) of all readings, and the centres of groups (N,)."""
     if not len(linear.members):
         return linear.distances(used), np.zeros_like(used)
-    _, centre = linear.distances_from(linear.fitted(used)[0])
+    _, centre = linear.distances_from(linear.fitted(used))
     return linear.distances(linear.with_lone_centres(used, centre)), centre
 
 

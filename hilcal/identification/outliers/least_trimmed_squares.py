@@ -109,13 +109,15 @@ class ReadingModel:
         precision, pull = np.append(self.precision, ones), np.append(self.pull, 0.0 * ones)
         return ReadingModel(self.residual, wide, precision, pull, self.root, self.members)
 
-    def fitted(self, used: Bools) -> tuple[Floats, Floats]:
-        """Return δ (K,) from some readings (N,), and its covariance (K, K)."""
-        return self._fitted(used)[:2]
+    def fitted(self, used: Bools) -> Floats:
+        """Return δ (K,) from some readings (N,)."""
+        h, rhs, _, _ = self._equations(used)
+        return np.asarray(np.linalg.solve(h, rhs))
 
     def residuals(self, used: Bools) -> Floats:
         """(N, m) whitened residual of all readings from the fit to the used ones (N,)."""
-        return self._fitted(used)[2]
+        h, rhs, r, b = self._equations(used)
+        return np.asarray(r - b @ np.linalg.solve(h, rhs))
 
     def distances(self, used: Bools) -> Floats:
         """(N,) squared distance t² of each reading from the fit to the used ones without it.
@@ -124,7 +126,9 @@ class ReadingModel:
         coordinates, t² = r_kᵀ (I − H_k)⁻ r_k of a used reading (Baarda's test of a shift of it),
         and r_kᵀ (I + H_k)⁻ r_k of another one; χ²_m of a good reading, whatever its leverage.
         """
-        _, covariance, r, b = self._fitted(used)
+        h, rhs, r, b = self._equations(used)
+        covariance = np.linalg.inv(h)
+        r = r - b @ (covariance @ rhs)
         spread = np.empty((len(b), self.m, self.m))
         for k in range(0, len(b), READINGS_AT_ONCE):
             subset = b[k : k + READINGS_AT_ONCE]
@@ -185,8 +189,8 @@ class ReadingModel:
         )
         return out
 
-    def _fitted(self, used: Bools) -> tuple[Floats, Floats, Floats, Floats]:
-        """δ, its covariance; residual and columns of all, from the offsets of the used ones."""
+    def _equations(self, used: Bools) -> tuple[Floats, Floats, Floats, Floats]:
+        """H (K, K) and right-hand side of H δ; r and B, from the offsets of the used readings."""
         r, b = self.residual, self.columns
         if len(self.members):
             grouped = self.group >= 0
@@ -199,9 +203,7 @@ class ReadingModel:
         rows = subset.reshape(self.m * len(subset), b.shape[2])
         h = rows.T @ rows
         h[np.diag_indices_from(h)] += self.precision + self._guard
-        covariance = np.asarray(np.linalg.inv(h), dtype=float)
-        delta = covariance @ (rows.T @ r[used].reshape(-1) - self.pull)
-        return delta, covariance, r - b @ delta, b
+        return h, rows.T @ r[used].reshape(-1) - self.pull, r, b
 
     @cached_property
     def _both(self) -> Floats:
@@ -216,9 +218,13 @@ class ReadingModel:
 
     def _offset_covariance(self, used: Bools) -> Floats:
         """(G, m, m) covariance of the offset of each group; zero without a used reading."""
-        information = self.root.swapaxes(1, 2) @ self.root
-        sums = self._summed(information * used[:, None, None])
+        sums = self._summed(self._information * used[:, None, None])
         return np.asarray(np.linalg.pinv(sums, hermitian=True), dtype=float)
+
+    @cached_property
+    def _information(self) -> Floats:
+        """(N, m, m) Wᵀ W."""
+        return np.asarray(self.root.swapaxes(1, 2) @ self.root)
 
     @cached_property
     def _parts(self) -> Floats:
@@ -323,7 +329,7 @@ def _concentrated(model: ReadingModel, used: Bools) -> tuple[float, Bools, Float
     """Sum, readings (N,), and δ (K,) that led to them."""
     total = np.inf
     for _ in range(MOST_FINAL_STEPS):
-        delta = model.fitted(used)[0]
+        delta = model.fitted(used)
         used, lowest = nearest(model, *model.distances_from(delta))
         if lowest >= total * (1 - 1e-9):
             break
@@ -349,4 +355,4 @@ def _from_subset(model: ReadingModel, rng: np.random.Generator) -> Floats:
         groups = model.members[rng.permutation(len(model.members))[:count]]
         rows = np.concatenate([rng.permutation(g[g >= 0])[:2] for g in groups])
     few = model[rows]
-    return few.fitted(np.ones(len(few), dtype=np.bool_))[0]
+    return few.fitted(np.ones(len(few), dtype=np.bool_))
