@@ -37,6 +37,14 @@ class JointCoupling(Effect):
         "before it, and the last joint by the last but two."
     }
 
+    def log_std_prior(self, pool: int) -> tuple[float, float]:
+        """A tenth of the ordinary size where the arm's description has no couplings.
+
+        Drives at the joints themselves, as of collaborative arms, take no other joint along.
+        """
+        mean, spread = super().log_std_prior(pool)
+        return mean if self.cell.arm.coupling is not None else mean - float(np.log(10.0)), spread
+
     def setup(self, states: States) -> None:
         """Read the pairs."""
         n = self.cell.arm.n
