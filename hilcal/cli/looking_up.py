@@ -72,7 +72,7 @@ def _expected(e: Effect) -> str:
     largest: dict[str, float] = {}
     for _, std, unit in expected_sizes(e):
         largest[unit] = max(largest.get(unit, 0.0), std)
-    sizes = ", ".join(f"{std:.2g}" + f" {unit}" * (unit != "1") for unit, std in largest.items())
+    sizes = ", ".join(f"{std:.1g}" + f" {unit}" * (unit != "1") for unit, std in largest.items())
     return f"; expected {sizes}" if sizes else ""
 
 
