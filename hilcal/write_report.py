@@ -35,6 +35,7 @@ class ReportOptions:
     operator: str = ""
     revision: int | None = None
     appendix: bool = False
+    register: bool = False
 
 
 def report(
@@ -47,6 +48,7 @@ def report(
     operator: str = "",
     revision: int | None = None,
     appendix: bool = False,
+    register: bool = False,
     say: Say = lambda text: None,
 ) -> Path:
     """Write the results of a campaign as one HTML page, which needs neither hilcal nor a network.
@@ -68,13 +70,14 @@ def report(
         revision: number of the revision; None: the one in use.
         appendix: add details for experts: plots of rejected suspects and of each joint,
             correlations, the same model by each scaling, commands, hashes of revisions.
+        register: the tracker was set up anew for the validation: estimate its registration first.
         say: takes progress, one line each.
 
     Raises:
         InputError: no such revision, the page cannot be written, or see `validate` and `compare`.
         CannotAnswerError: the readings do not determine the baseline, or see `validate`.
     """
-    options = ReportOptions(later, validation, limit_m, operator, revision, appendix)
+    options = ReportOptions(later, validation, limit_m, operator, revision, appendix, register)
     with opened(run) as campaign:
         page = campaign.path.with_suffix(".html") if path is None else Path(path)
         write_report(campaign, page, options, say)
@@ -92,9 +95,11 @@ def write_report(
     if not path.absolute().parent.is_dir():  # before minutes of work
         raise InputError(f"{path}: cannot be written, there is no folder {path.absolute().parent}")
     if later is not None:
-        if validation is not None or options.limit_m is not None or options.appendix:
+        alone = (validation, options.limit_m, options.appendix or None, options.register or None)
+        if any(option is not None for option in alone):
             raise InputError(
-                "a comparison of two campaigns takes no --validation, --limit or --appendix"
+                "a comparison of two campaigns takes no --validation, --register, --limit or "
+                "--appendix"
             )
         from hilcal.present.html.other_pages import comparison_page, comparison_screen
         from hilcal.transfer.compare import compare
@@ -131,9 +136,10 @@ def content_of(
     commands += [f"hilcal {c} {name}{number}" for c in ("compare", "diagnose")]
     tested = corrected = None
     if validation is not None:
-        prediction = validate(run, validation, record, limit_m, say=say)
+        prediction = validate(run, validation, record, limit_m, register=options.register, say=say)
         tested = TestCampaign(validation.path.name, _sha256(validation.path), prediction)
-        commands.append(f"hilcal validate {name} {quoted(validation.path.name)}{number}")
+        anew = " --register" * options.register
+        commands.append(f"hilcal validate {name} {quoted(validation.path.name)}{number}{anew}")
     gain = ProcedureLog(run.file).last(IMPROVED)
     if gain and record and gain["revision"] == record.number:
         corrected = gain  # measured with this revision

@@ -451,11 +451,6 @@ def _show_misfit(t: Terminal, run: Path, revision: int | None, catalogue: Catalo
     )
 
 
-MOVED_TRACKER_SIGMA = (
-    5.0  # RMS error, in units of the noise, above which a moved tracker is suspected; a guess
-)
-
-
 @command("""
     other | OTHER.hilcal | A campaign that was never fitted.
     register | --register | The tracker was set up anew: fit its place first.
@@ -483,10 +478,6 @@ def validate(
     t.show(shares_report(shares))
     if result.tool:
         t.show(tool_differs(result.tool, other.name))
-    if prediction.error.rms_sigma > MOVED_TRACKER_SIGMA and not register:
-        t.show(
-            "Was the tracker set up anew for these readings? Then --register fits its place first."
-        )
     failed: HilcalError | None = None
     if shares.passed is False:
         failure = validation_failure(shares, judged)

@@ -33,6 +33,7 @@ from hilcal.tables.units import parse_length
         passed or failed.
     validation | --validation OTHER.hilcal | A campaign that was never fitted: how well is it
         predicted?
+    register | --register | The tracker was set up anew for the validation: fit its place first.
     operator | --operator NAME | Who answers for the measurement.
     appendix | --appendix | Also what only another expert asks for: rejected suspects, each joint,
         correlations, scalings, commands, hashes of revisions.
@@ -40,7 +41,8 @@ from hilcal.tables.units import parse_length
 def report(
     t: Terminal, catalogue: Catalogue, run: Path, later: Path | None = None,
     output: Path | None = None, limit: str | None = None, validation: Path | None = None,
-    operator: str = "", revision: int | None = None, appendix: bool = False,
+    register: bool = False, operator: str = "", revision: int | None = None,
+    appendix: bool = False,
 ) -> None:  # fmt: skip
     """Write the whole story as one HTML page, a certificate first; it prints on six pages."""
     from hilcal.write_report import ReportOptions, write_report
@@ -56,7 +58,7 @@ def report(
 
         first = stack.enter_context(Campaign.open(run, catalogue, read_only=True))
         options = ReportOptions(
-            opened(later), opened(validation), limit_m, operator, revision, appendix
+            opened(later), opened(validation), limit_m, operator, revision, appendix, register
         )
         result = write_report(first, output, options, say)
     t.show(f"{result.headline}.")

@@ -58,6 +58,9 @@ DOES: Mapping[str, str] = {
 """Steps that compute, with their duration for a campaign of some hundred readings."""
 MOST_LEFT, LISTED = 6, 12  # listed points without a correction; listed compensated points
 MOST, WORST = 4, 6  # listed variables; listed poses
+MOVED_TRACKER_SIGMA = (
+    5.0  # RMS error, in units of the noise, above which a moved tracker is suspected; a guess
+)
 MIN_ERROR_RATIO = 1.5  # least rms ratio of error to stated standard deviation that is reported
 WIDER = 1.5
 """Ratio of drawn to stated standard uncertainty above which the stated one is called too small; a
@@ -380,6 +383,13 @@ def validation_report(
         yield f"  and {unlisted} more variables\n" if unlisted > 0 else ""
     if (z_all := _rms(beyond.z)) > MIN_ERROR_RATIO:
         yield f"These readings are {z_all:.2g} times as far off as the fit states.\n"
+    if test.registered:
+        yield "The tracker's place was fitted to these readings first (--register).\n"
+    elif test.error.rms_sigma > MOVED_TRACKER_SIGMA:
+        yield (
+            "Was the tracker set up anew for these readings? Then --register fits its place "
+            "first.\n"
+        )
 
 
 def _beyond(v: validation.ExceededRange) -> str:

@@ -245,6 +245,12 @@ def test_validate_finds_the_place_of_a_tracker_that_was_set_up_anew(campaign, tm
     assert set(again["error"]) == ERROR
     assert again["registered"] is True
     assert again["error"]["rms_sigma"] < 1.3
+    page, place = tmp_path / "page.html", "--register fits its place first"
+    options = "report", campaign, "--validation", far, "--limit", "1 mm", "-o", page, "--json"
+    assert ok(capsys, *options).document["passed"] is False
+    assert place in page.read_text(encoding="utf-8")
+    assert ok(capsys, *options, "--register").document["passed"] is True
+    assert place not in page.read_text(encoding="utf-8")
 
 
 def test_effects_lists_the_catalogue(capsys):
@@ -254,6 +260,7 @@ def test_effects_lists_the_catalogue(capsys):
     assert {e["source"] for e in d["effects"]} == {"built in"}
     words = ok(capsys, "effects").out
     assert all(name in words for name in installed().names)
+    assert "expected 1e-05 rad" in words  # half of 2e-5 rad, not 9.9e-06
 
 
 def test_study_scaling_and_a_scheduler_that_anybody_can_reach(capsys):
