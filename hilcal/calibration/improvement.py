@@ -163,5 +163,5 @@ def _errors(
     if calibration.mode == "absolute":
         target = calibration.nominal(tool, replace(goal, target=None))[1]
     offset = (position - target) @ calibration.base_in_tracker()[:3, :3].T
-    total = p.reading_covariance(prediction, w)
+    total = p.reading_covariance(prediction, p.noise_whitening(readings, calibration.mode))
     return raw + w.raw(offset), total, w.covariance

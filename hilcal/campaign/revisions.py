@@ -132,12 +132,7 @@ def restore(
     with damage_refused(record):
         prior, mode = _prior(record), mode_of(record)
         scaling: Scaling = SCALINGS[SCALINGS.index(record.options["scaling"])]
-        scatter = record.parameters_json.get("arm_scatter")
-        if scatter is not None:
-            readings = with_arm_scatter(model.cell, readings, ArmScatter.from_json(scatter))
-        serial = record.parameters_json.get(SERIAL)
-        if serial is not None:
-            readings = readings.with_serial(SerialNoise.from_json(serial))
+        readings = _as_fitted(record, model.cell, readings)
         outlier = np.isin(np.arange(len(readings)), record.parameters_json["outliers"])
     # Only the mixed model with re-estimated variances tells the gross errors beside a background.
     return fit(model, readings, mode, scaling, theta, prior, outlier if model.background else None)
@@ -245,9 +240,19 @@ def restore_predictive(
     stored: Mapping[str, Any] = record.parameters_json
     with damage_refused(record):
         prior, mode = _prior(record), mode_of(record)
+        readings = _as_fitted(record, model.cell, readings)
         used = np.delete(np.arange(len(readings)), np.array(stored["outliers"], dtype=int))
         sigma = float(record.result_json["identify"]["error"]["holdout"]["rms_sigma"])
     return predictive(model, theta, prior, readings[used], mode, sigma)
+
+
+def _as_fitted(record: RevisionRecord, cell: Cell, readings: Readings) -> Readings:
+    """Return the readings with the noise that the fit of a revision estimated."""
+    scatter = record.parameters_json.get("arm_scatter")
+    if scatter is not None:
+        readings = with_arm_scatter(cell, readings, ArmScatter.from_json(scatter))
+    serial = record.parameters_json.get(SERIAL)
+    return readings if serial is None else readings.with_serial(SerialNoise.from_json(serial))
 
 
 def has_background(record: RevisionRecord) -> bool:

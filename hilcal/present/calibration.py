@@ -58,9 +58,7 @@ DOES: Mapping[str, str] = {
 """Steps that compute, with their duration for a campaign of some hundred readings."""
 MOST_LEFT, LISTED = 6, 12  # listed points without a correction; listed compensated points
 MOST, WORST = 4, 6  # listed variables; listed poses
-MOVED_TRACKER_SIGMA = (
-    5.0  # RMS error, in units of the noise, above which a moved tracker is suspected; a guess
-)
+MOVED_TRACKER_RATIO = 5.0  # rms of z above which a moved tracker is suspected; a guess
 MIN_ERROR_RATIO = 1.5  # least rms ratio of error to stated standard deviation that is reported
 WIDER = 1.5
 """Ratio of drawn to stated standard uncertainty above which the stated one is called too small; a
@@ -385,7 +383,7 @@ def validation_report(
         yield f"These readings are {z_all:.2g} times as far off as the fit states.\n"
     if test.registered:
         yield "The tracker's place was fitted to these readings first (--register).\n"
-    elif test.error.rms_sigma > MOVED_TRACKER_SIGMA:
+    elif z_all > MOVED_TRACKER_RATIO:
         yield (
             "Was the tracker set up anew for these readings? Then --register fits its place "
             "first.\n"

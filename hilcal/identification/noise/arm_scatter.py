@@ -58,9 +58,17 @@ def with_prior_scatter(model: Model, readings: Readings) -> Readings:
     Unchanged without such a scatter, or where the covariance contains the arm's scatter already.
     """
     scatter = None if model.prior is None else model.prior.posterior.scatter
+    return with_missing_scatter(model.cell, readings, scatter)
+
+
+def with_missing_scatter(cell: Cell, readings: Readings, scatter: ArmScatter | None) -> Readings:
+    """Return the readings with a scatter of the arm that is known from other readings.
+
+    Unchanged where none is known, or where the covariance contains the arm's scatter already.
+    """
     if scatter is None or readings.scatter_stated or readings.arm_scatter is not None:
         return readings
-    return with_arm_scatter(model.cell, readings, scatter)
+    return with_arm_scatter(cell, readings, scatter)
 
 
 def estimate_arm_scatter(fit: Fit) -> ArmScatter | None:

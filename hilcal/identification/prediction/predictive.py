@@ -49,11 +49,12 @@ from hilcal.identification.fit import Fit, require_gc
 from hilcal.identification.folds import distinct_poses, ordinary_magnitudes, random_folds
 from hilcal.identification.gauss_newton import whitened_jacobian
 from hilcal.identification.mixed_fit import INSTRUMENT, mixed_fit_at
+from hilcal.identification.noise.arm_scatter import with_missing_scatter
 from hilcal.identification.residual import residual
 from hilcal.mixed.equations import equations, left_out
 from hilcal.mixed.variances import Variances, log_posterior
 from hilcal.model.model import Model, Prediction
-from hilcal.readings.readings import Readings, ranges_of
+from hilcal.readings.readings import ArmScatter, Readings, ranges_of
 from hilcal.readings.same_readings import prints
 from hilcal.readings.whitening import Mode, Whitening, whitening
 from hilcal.regression.schur import schur_complement
@@ -188,6 +189,12 @@ class Predictive:
     left_out: float  # mean variance of the predictions of poses left out by C, in units of V
     scatter_m2: float  # `scatter` of a 3-D position, m²
     left_out_m2: float  # `left_out` of a 3-D position, m²
+    arm_scatter: ArmScatter | None  # the arm's, estimated, which V contains
+
+    def noise_whitening(self, readings: Readings, mode: Mode) -> Whitening:
+        """Return the scaling of other readings, with the arm's estimated scatter in V."""
+        seen = with_missing_scatter(self.model.cell, readings, self.arm_scatter)
+        return whitening(replace(seen, common=readings.common), mode, "gc")
 
     def prediction_covariance(self, prediction: Prediction, w: Whitening) -> Floats:
         """Return κ J C Jᵀ (D, m, m) of predicted measurements."""
@@ -293,7 +300,7 @@ def predictive(
     return Predictive(
         model, theta, root @ root.T + from_variances, open_prior(model, theta, prior), extra, noise,
         factor, least,
-        leverage, scatter, left_out, scatter_m2, 3 * left_out_m2,
+        leverage, scatter, left_out, scatter_m2, 3 * left_out_m2, fitted.arm_scatter,
     )  # fmt: skip
 
 

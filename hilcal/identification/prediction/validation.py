@@ -218,7 +218,8 @@ def extrapolation(p: Predictive, fitted: Readings, validation: Validation) -> Ex
     w, readings, raw = validation.whitening, validation.readings, validation.raw
     units = p.model.cell.arm.units
     prediction = p.model.predict(readings.states, p.theta)
-    spread, noise = p.prediction_covariance(prediction, w), p.noise_covariance(w)
+    spread = p.prediction_covariance(prediction, w)
+    noise = p.noise_covariance(p.noise_whitening(readings, w.mode))
     root = whitening_matrix(noise)
     leverage = np.linalg.eigvalsh(root @ spread @ np.swapaxes(root, 1, 2))[:, -1]
     beyond, outside = [], np.zeros(len(w.reading), dtype=np.bool_)

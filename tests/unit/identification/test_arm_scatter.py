@@ -14,10 +14,13 @@ from hilcal.diagnosis.effect_ranking import candidates
 from hilcal.diagnosis.evidence import Evidence
 from hilcal.diagnosis.misfit_breakdown import MisfitShare
 from hilcal.diagnosis.verdict import diagnose, judge
+from hilcal.identification.background import with_background
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import effect_columns, linearise
 from hilcal.identification.noise.arm_scatter import estimate_arm_scatter, factors, with_arm_scatter
 from hilcal.identification.noise.full_covariance import with_common_scatter, with_joint_scatter
+from hilcal.identification.prediction.predictive import predictive_of
+from hilcal.identification.prediction.validation import extrapolation, validate
 from hilcal.identification.registration.registration import register
 from hilcal.present.verdict import message
 from hilcal.readings.covariance import COVERS_KEY, INSTRUMENT
@@ -127,7 +130,7 @@ def test_a_hidden_reflector_is_a_missing_reading():
     assert len(f.whitening) == np.count_nonzero(~kept.unloaded) - orphans
 
 
-def scattering(std=2e-5, m=3, seed=0, noise=1.0, poses=16, loads=3, law=0.0):
+def scattering(std=2e-5, m=3, seed=0, noise=1.0, poses=16, loads=3, law=0.0, draw=None):
     """Each reading is an arrival with joints off by `std` (n,), by the world's own kinematics.
 
     Joint 2 is off by `law` sin 3 q4 as well, which no effect of the catalogue describes.
@@ -135,6 +138,7 @@ def scattering(std=2e-5, m=3, seed=0, noise=1.0, poses=16, loads=3, law=0.0):
     cell, rng, p = cell_of(registration_known=True), np.random.default_rng(seed), plan(poses, loads)
     world = replace(world_of(cell, rng), joint_std=np.broadcast_to(std, 6))
     still = noiseless(replace(world, joint_std=np.zeros(6)), p, m)
+    rng = rng if draw is None else np.random.default_rng(draw)
     off = replace(p.states, q=p.states.q + std * rng.standard_normal(p.states.q.shape))
     off.q[:, 1] += law * np.sin(3 * p.states.q[:, 3])
     readings = with_noise(replace(still, value=world.ideal_readings(off).value(m)), rng, noise)
@@ -225,21 +229,23 @@ def test_scatter_that_is_stated_is_not_estimated():
     assert d.scatter is None
 
 
-@pytest.mark.long
-def test_refine_ends_with_the_scatter_in_the_fit_and_the_file_keeps_it(tmp_path):
-    cell, readings = scattering()
-    config = configuration()
+@pytest.fixture(scope="module")
+def refined(tmp_path_factory):
+    """Paths of a refined campaign and of one of the same arm, measured anew, and the last step."""
+    (cell, readings), (_, anew) = scattering(), scattering(draw=7)
+    folder, config = tmp_path_factory.mktemp("scatter"), configuration()
     base = {
         "base_xyz_m": tuple(cell.registration[:3, 3]),
         "base_rotvec_rad": tuple(se3.rotation_vector(cell.registration[:3, :3])),
     }
     tracker, none = config.tracker.model_copy(update=base), type(config.repeatability)()
     config = config.model_copy(update={"repeatability": none, "tracker": tracker})
-    path, about = tmp_path / "run.hilcal", {COVERS_KEY: INSTRUMENT}
-    with CampaignFile.create(
-        path, config.to_json(), str(tmp_path), "made", more_texts=about
-    ) as file:
-        file.append_readings(readings)
+    path, other, about = folder / "run.hilcal", folder / "other.hilcal", {COVERS_KEY: INSTRUMENT}
+    for name, what in ((path, readings), (other, anew)):
+        with CampaignFile.create(
+            name, config.to_json(), str(folder), "made", more_texts=about
+        ) as file:
+            file.append_readings(what)
     with hc.Campaign.open(path) as run:
         assert not run.readings.scatter_stated
         found = hc.refine(hc.baseline(run.cell, run.readings, "absolute"), run.readings, "absolute")
@@ -250,6 +256,38 @@ def test_refine_ends_with_the_scatter_in_the_fit_and_the_file_keeps_it(tmp_path)
         assert "Nothing recorded predicts it" in str(last.diagnosis.to_dict()["message"])
         assert content_hash(last.fit.readings) == content_hash(run.readings)
         run.append(found)
+    return path, other, last
+
+
+def test_fresh_readings_scatter_as_the_fit_with_a_background_estimated():
+    """Their covariance is that of the instrument: errors were 2.3 times the stated ones."""
+    (cell, readings), (_, anew) = scattering(6e-5), scattering(6e-5, draw=7)
+    plain = fitted_model(cell, readings, "absolute")
+    wide = with_background(plain, plain.model.named)
+    seen = validate(wide.model, wide.theta, wide.readings, anew, "absolute")
+    told = extrapolation(predictive_of(wide), wide.readings, seen)
+    assert np.sqrt(np.mean(told.z**2)) == pytest.approx(1, abs=0.2)
+    assert seen.noise_floor < 0.5 * seen.error.rms_m  # noise alone remains the instrument's
+
+
+@pytest.mark.long
+def test_fresh_readings_scatter_as_the_fit_estimated(refined):
+    path, other, last = refined
+    found = hc.validate(path, other)
+    assert np.sqrt(np.mean(found.beyond.z**2)) == pytest.approx(1, abs=0.15)
+    assert found.shares.everything.within > 0.9
+    alone = found.prediction.noise_floor  # of the instrument
+    assert np.sqrt(np.mean(found.beyond.stated_m**2)) > np.hypot(alone, 20e-6)
+    with hc.Campaign.open(path) as run:
+        stored = run.predictive(run.latest(), *run.restore_model(run.latest()))
+    fitted = predictive_of(last.fit)
+    assert stored.arm_scatter == fitted.arm_scatter is not None
+    assert (stored.noise, stored.factor) == pytest.approx((fitted.noise, fitted.factor), rel=1e-6)
+
+
+@pytest.mark.long
+def test_refine_ends_with_the_scatter_in_the_fit_and_the_file_keeps_it(refined):
+    path, _, last = refined
     with hc.Campaign.open(path) as run:
         again = run.fit()
         assert run.latest().has_parent
