@@ -51,8 +51,9 @@ If the model has a background that the readings prove, but not effect by effect,
 effects of the background, and the size of the noise is stated.
 
 A fit whose covariance includes the estimated scatter (`Readings.arm_scatter`) is judged by the same
-rules. Its residual may be smaller than its noise: the scatter is never negative, so instrument
-noise that is stated too large, in some elements, shows only then. The message says so.
+rules, 3 as 5b where the scatter is larger than any arm's. Its residual may be smaller than its
+noise: the scatter is never negative, so instrument noise that is stated too large, in some
+elements, shows only then. The message says so.
 """
 
 from collections.abc import Callable, Sequence
@@ -90,7 +91,9 @@ from hilcal.identification.fit import Fit
 NO_HISTORY = History()
 IN_SAMPLE = ("pose", "direction")  # first words of variables whose share is of the fitted poses
 MOST_NAMED = 2  # variables that a sentence names
-BACKGROUND_OVERRIDES = ("residual_is_noise", "inseparable_addition", "arm_scatter")
+BACKGROUND_OVERRIDES = (
+    "residual_is_noise", "inseparable_addition", "arm_scatter", "misjudged_noise",
+)  # fmt: skip
 """Reasons that "background" overrides where effects are proved together, not one by one."""
 MOST_POSE_SHARE = 0.5
 """Share of the misfit that all readings of a pose have in common, above which it is not the scatter
@@ -262,7 +265,8 @@ def _judged(e: Evidence, history: History, whole_catalogue: bool) -> Diagnosis:
         ]
         predictable = regression.share > PREDICTABLE or bool(sizes) or bool(patterns)
         noise = judge_noise(e.fit, e.pure_error, predictable)
-        in_fit = readings.arm_scatter is not None
+        in_fit = scatter is not None
+        too_much = scatter is not None and not within_repeatability(scatter, arm)
         little = noise.reason == "predictable" and max(predicted, *patterns, 0.0) <= PREDICTABLE
         same_in_pose = any(
             v.variable == "pose" and v.share > MOST_POSE_SHARE and v.p_value < FALSE_ALARM
@@ -282,7 +286,7 @@ def _judged(e: Evidence, history: History, whole_catalogue: bool) -> Diagnosis:
             reason = "no_suspect"
         elif by_arm:
             reason = "arm_scatter"
-        elif noise.misjudged and not (in_fit and noise.reason == "too_large"):
+        elif too_much or (noise.misjudged and not (in_fit and noise.reason == "too_large")):
             reason = "misjudged_noise"
         elif noise.contradicted and not noise.misjudged:
             reason = "no_suspect"
@@ -293,7 +297,7 @@ def _judged(e: Evidence, history: History, whole_catalogue: bool) -> Diagnosis:
         if reason in ("residual_is_noise", "arm_scatter") and serial and not serial.proved:
             reason = "serial_or_effect"
         if e.background and (
-            reason == "misjudged_noise"
+            (reason == "misjudged_noise" and not too_much)
             or (reason in BACKGROUND_OVERRIDES and p_value_of_others(e.fit) <= JOINT_LEVEL)
         ):
             reason, suspects = "background", (*as_suspects(e.background), *suspects)

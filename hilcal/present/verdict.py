@@ -17,6 +17,7 @@ from hilcal.diagnosis.noise import (
     PureError,
     prefers_instrument,
     separates_instrument,
+    within_repeatability,
 )
 from hilcal.diagnosis.order_step import OrderStep
 from hilcal.diagnosis.wrong_figures import WrongFigure
@@ -168,8 +169,10 @@ def _background(d: Diagnosis) -> list[str]:
     names = ", ".join(f"{b.effect} ({p_equals(b.p_value)})" for b in likely)
     noise = []
     if d.noise is not None and d.noise.misjudged:
-        times = d.fit.variance_factor**0.5
-        noise = [f"What they leave is {times:.1f} times the stated noise: repeat some readings."]
+        noise = [f"What they leave is {_spread(d)}: repeat some readings."]
+    scatter = d.fit.readings.arm_scatter
+    if scatter is not None and _beyond_repeatability(d):
+        noise += [_loose(scatter, d.fit.model.cell.arm)]
     return [
         f"{len(d.background)} effects of the catalogue together predict what the named ones leave, "
         "but these readings prove none of them by itself.",
@@ -306,12 +309,10 @@ def _misjudged(d: Diagnosis) -> list[str]:
         f"Residuals are {_spread(d)}, and no smooth law of what is recorded predicts them (hilcal "
         "discover tries many more)."
     )
-    if (s := d.scatter) is not None and d.fit.readings.arm_scatter is None:
-        why = (
-            f"The arm would have to scatter by {length(s.size_m)} rms"
-            f"{_rp_comparison(s, d.fit.model.cell.arm)}, more than an arm's repeatability: the "
-            "instrument is noisier than stated, or the arm or the target was loose."
-        )
+    in_fit = d.fit.readings.arm_scatter is not None
+    s = d.scatter
+    if s is not None and (not in_fit or _beyond_repeatability(d)):
+        why = _loose(s, d.fit.model.cell.arm)
         if prefers_instrument(s):
             why = (
                 f"They are as if the instrument were {s.instrument_factor:.2g} times as noisy as "
@@ -340,9 +341,25 @@ def _misjudged(d: Diagnosis) -> list[str]:
     ]
 
 
+def _beyond_repeatability(d: Diagnosis) -> bool:
+    """Whether the covariance of the fit includes a scatter that is larger than any arm's."""
+    s = d.fit.readings.arm_scatter
+    return s is not None and not within_repeatability(s, d.fit.model.cell.arm)
+
+
+def _loose(s: ArmScatter, arm: Arm) -> str:
+    return (
+        f"The arm would have to scatter by {length(s.size_m)} rms{_rp_comparison(s, arm)}, more "
+        "than an arm's repeatability: the instrument is noisier than stated, or the arm or the "
+        "target was loose."
+    )
+
+
 def _spread(d: Diagnosis) -> str:
     noise = "stated" if d.fit.readings.noise_stated else "estimated"
-    return f"{d.fit.variance_factor**0.5:.2g} times the {noise} noise"
+    scatter = d.fit.readings.arm_scatter
+    with_it = f" with the arm's scatter of {length(scatter.size_m)} rms" if scatter else ""
+    return f"{d.fit.variance_factor**0.5:.2g} times the {noise} noise{with_it}"
 
 
 def _repeats_scatter_less(noise: NoiseVerdict | None, repeats: PureError | None) -> list[str]:

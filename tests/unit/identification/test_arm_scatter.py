@@ -222,6 +222,16 @@ def test_no_arm_scatters_by_half_a_millimetre():
     assert "the arm or the target was loose" in words
 
 
+def test_nor_where_its_scatter_is_in_the_covariance():
+    """As beside a background, whose fit estimates the scatter of any size."""
+    cell, readings = scattering(4e-4)
+    plain = fitted_model(cell, readings, "absolute")
+    with_it = with_arm_scatter(plain.model.cell, readings, estimate_arm_scatter(plain))
+    d = diagnose(fit(plain.model, with_it, "absolute", start=plain.theta))
+    assert (d.verdict, d.scatter) == ("noise_misjudged", with_it.arm_scatter)
+    assert "more than an arm's repeatability" in str(d.to_dict()["message"])
+
+
 def test_scatter_that_is_stated_is_not_estimated():
     cell, readings = scattering()
     d = diagnose(fitted_model(cell, replace(readings, scatter_stated=True), "absolute"))
