@@ -106,7 +106,11 @@ def _varies(values: Floats) -> bool:
 
 
 def law_variables(p: Linearisation) -> list[RecordedVariable]:
-    """Variables of all laws: every recorded variable, and products with load and of two angles."""
+    """Variables of all laws: every recorded variable, and products of some.
+
+    Products are those of an angle with the size of the load, of two angles, and of the side of
+    approach with the torque of its joint.
+    """
     readings = p.fit.readings[~p.fit.outlier]
     situation = p.fit.solution.prediction.situation
     force = np.linalg.norm(readings.states.wrench, axis=1)
@@ -139,6 +143,13 @@ def law_variables(p: Linearisation) -> list[RecordedVariable]:
         elif v.kind == "approach":
             sides = np.stack([ones, v.values], axis=1)
             out.append(RecordedVariable(v.name, v.unit, v.values, sides))
+            # A gear's loop of hysteresis is as wide as the torque is large.
+            torque = situation.torque[:, v.joint]
+            if _varies(torque):
+                x = torque / np.abs(torque).max()
+                name = f"joint {v.joint + 1} torque"
+                wide = RecordedVariable(name, "N·m", torque, np.stack([np.abs(x), x], axis=1))
+                out.append(RecordedVariable(v.name, v.unit, v.values, sides[:, 1:], wide))
         else:
             smooth(v, 0.0 if v.kind == "torque" else float(np.median(v.values)))
     loads = np.unique(readings.load)

@@ -6,10 +6,11 @@ the error of one joint, or of the target along one base axis, as a smooth functi
     r = J_j f(x) + noise,    f(x) = Σ_k c_k φ_k(x)
 
 with few functions φ_k: a constant, harmonics of an angle, powers of other variables, membership
-for loads; and products of an angle with the size of the load, and of two angles. Laws are selected
-one after the other by their evidence on the other poses; the share of the misfit that they predict
-on the poses left out is the predictable share. A variable carries the share that the prediction
-loses when its values are permuted at random between readings.
+for loads; and products of an angle with the size of the load, of two angles, and of the side of
+approach with the torque of its joint. Laws are selected one after the other by their evidence on
+the other poses; the share of the misfit that they predict on the poses left out is the predictable
+share. A variable carries the share that the prediction loses when its values are permuted at random
+between readings.
 Source of the latter: Breiman, *Random forests*, Machine Learning 45 (2001) 5-32, section 10.
 
 Where the laws predict little, extremely randomised trees predict the residual, in units of its

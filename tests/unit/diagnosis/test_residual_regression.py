@@ -115,6 +115,22 @@ def test_its_variable_is_among_the_first_two(name, mode, seeds):
         assert all(each.share > 0.5 for each in found)
 
 
+def test_a_loop_of_hysteresis_that_is_as_wide_as_the_torque_is_large():
+    """The catalogue's loop has one width; the rest, s |τ|, is no law of one variable alone."""
+    c, s = campaign("none", "absolute", 3, poses=30, registration_known=True), plan(30, 1003).states
+    torque = np.abs(fitted_baseline(c).solution.prediction.situation.torque[:, 1])
+    side = np.random.default_rng(3).choice([-1.0, 1.0], s.q.shape)
+    off = np.zeros_like(s.q)
+    off[:, 1] = 2e-4 * side[:, 1] * torque / torque.max()
+    moved, at = (c.world.ideal_readings(replace(s, q=q)).position for q in (s.q + off, s.q))
+    states = replace(c.readings.states, approach=side)
+    readings = replace(c.readings, states=states, value=c.readings.value + moved - at)
+    effects = ("joint_compliance", "hysteresis")
+    found = residual_regression(linearise(fitted_model(c.cell, readings, "absolute", effects)))
+    assert found.share > 0.8
+    assert {v.variable for v in found.dependences[:2]} == {"joint 2 approach", "joint 2 torque"}
+
+
 @pytest.mark.parametrize("mode", ["absolute", "deflection"])
 def test_noise_is_not_predictable(mode):
     for seed in range(2):
