@@ -209,8 +209,8 @@ KINKED_TOLERANCE = 1e-3  # the same with kinks, where the bound closes slowly; a
 
 _ROUNDS = 200
 _STALE = 4  # rounds in which the gap must fall; a choice
-_SHORT = 2000  # units from which the first active ones are chosen; a choice
-_LEFT = 0.9  # least remaining share of weight of an optimum to start from; a choice
+_SHORT = 2000  # units among which the first active units are chosen; a choice
+_LEAST_SHARE = 0.9  # least share of an optimum's weight on a subset to start from it; a choice
 _WARM = 12  # multiplicative steps that choose the first active units
 
 
@@ -233,7 +233,7 @@ class ApproximateDesign:
     def among(self, subset: Bools) -> "ApproximateDesign | None":
         """Return the design on a subset (K,) of the units; None if too much weight is lost."""
         place, inside = np.cumsum(subset) - 1, subset[self.index]
-        if float(self.weight[inside].sum()) < _LEFT * float(self.weight.sum()):
+        if float(self.weight[inside].sum()) < _LEAST_SHARE * float(self.weight.sum()):
             return None
         return replace(
             self, index=place[self.index[inside]], weight=self.weight[inside],
@@ -270,9 +270,9 @@ def relax(
     most_spent = (1.0 - 1e-9) * cap * float(units.cost.sum())
     objective = replace(objective, criterion=criterion)
     program = BarrierProgram(objective, min(budget, most_spent), cap)
-    begun = spread if start is None else objective.information(start.weight, start.index)
-    if start is None or not criterion.value(begun) > 0.0:
-        (active, weight), order = _first(program, spread), 0.3
+    at_start = spread if start is None else objective.information(start.weight, start.index)
+    if start is None or not criterion.value(at_start) > 0.0:
+        (active, weight), order = _first_active(program, spread), 0.3
     else:
         active, weight, order = start.index, start.weight, 0.03
     best, top = np.inf, None
@@ -332,7 +332,7 @@ def _feasible(weight: Floats, cost: Floats, budget: float, cap: float) -> Floats
     return np.asarray(w + (budget - spent) / float((cap - w) @ cost) * (cap - w))
 
 
-def _first(program: BarrierProgram, spread: Floats) -> tuple[Ints, Floats]:
+def _first_active(program: BarrierProgram, spread: Floats) -> tuple[Ints, Floats]:
     """Return the units, and weights, that are largest after a few multiplicative steps.
 
     w_k <- w_k (price_k / mean price)^(2/3). Silvey, Titterington & Torsney (1978), Comm. Statistics

@@ -1,8 +1,8 @@
 """Criteria by name, and the choice of units and of the loads that are worth a change of load.
 
-A plan with potential terms is good for more than its model, and so less good for the model alone.
-A compound criterion is the mean of both: of the logarithms of the two D-efficiencies, which needs
-neither optimum, or of the two inefficiencies in the parameters' mean variance,
+A plan for the model and the potential terms together is less efficient for the model alone. The
+compound criteria D and A are means over both: D of the logarithms of the two determinants, A of the
+two mean variances, each over its least value,
 
     φ = det(M)^(1/2P) · det(M_ss)^(1/2s)          1/φ = ½ q(M)/q* + ½ q(M_ss)/q_s*
 
@@ -209,7 +209,6 @@ def compound_objective(
     rng: np.random.Generator,  # draws the poses of these optima
 ) -> Objective:
     """Return a design problem with a criterion; D and A are compound with potential terms."""
-    name = criterion_name(name)
     objective, size = objective_of(problem, config, name, work), problem.model_size
     if size == len(problem.terms) or name not in ("A", "D"):
         return objective

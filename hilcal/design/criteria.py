@@ -46,7 +46,7 @@ class D(SmoothCriterion):
     """φ(M) = det(M)^(1/P), the inverse volume of the confidence ellipsoid.
 
     Fedorov (1972), Theory of Optimal Experiments; O1 of Borm & Menq (1991), Int. J. Robotics
-    Research 10(6). With a model that may be complete, φ(M) = det(M)^(1/2P) · det(M_ss)^(1/2s).
+    Research 10(6). With `model`, the compound criterion det(M)^(1/2P) · det(M_ss)^(1/2s).
     """
 
     model: int | None = None  # s, the first parameters; None: one determinant
@@ -91,8 +91,8 @@ class MeanVariance(SmoothCriterion):
 
     With C = 1/s at s parameters it is O5 of Sun & Hollerbach (2008), IEEE ICRA; with C the mean of
     VᵀV over prediction poses, V the Jacobian of the position, the mean predicted variance:
-    Atkinson, Donev and Tobias, *Optimum Experimental Designs, with SAS* (2007), chapter 10. With a
-    model that may be complete, φ(M) = 1 / (tr(C M⁻¹) + tr(C_s M_ss⁻¹)).
+    Atkinson, Donev and Tobias, *Optimum Experimental Designs, with SAS* (2007), chapter 10. With
+    `model`, the compound criterion 1 / (tr(C M⁻¹) + tr(C_s M_ss⁻¹)).
     """
 
     c: Floats  # (P, P) C, positive semidefinite
@@ -235,7 +235,7 @@ def _smooth_min(values: Floats, vectors: Floats, width: float) -> Smooth:
     return Smooth(value, gradient, ((-1.0 / width, root, root),), (squares,), gradient)
 
 
-_WEIGHTY = 1e-5  # weight above which a pair enters the curvature
+_LEAST_WEIGHT = 1e-5  # weight above which a pair enters the curvature
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,7 +256,7 @@ class Separate(Criterion):
 
     @cached_property
     def _groups(self) -> tuple[tuple[Ints, Ints], ...]:
-        """Per rival: its parameters, the remaining nuisance, and the indices of its pairs."""
+        """Per rival effect: its parameters, and the indices of its pairs."""
         out: dict[bytes, tuple[Ints, list[int]]] = {}
         for k, pair in enumerate(self.pairs):
             rival = np.setdiff1d(pair.nuisance, self._common)
@@ -334,17 +334,17 @@ class Separate(Criterion):
         value, p = soft_min(parts, width)
         gradient = (us.T * p) @ us
         # F'' = Σ p s'' − Σ p²/μ (s' − mean)(s' − mean)ᵀ, the mean weighted by p²
-        weighty = p > _WEIGHTY
-        about = np.eye(int(weighty.sum())) - p[weighty] ** 2 / float(p[weighty] @ p[weighty])
-        curved = -(about.T * p[weighty] ** 2) @ about / (width * scale)
-        weighted = us.T * np.sqrt(np.where(weighty, p, 0.0))
-        products = [(-2.0 / scale, weighted[:, weighty], model_root)]
+        counted = p > _LEAST_WEIGHT
+        centred = np.eye(int(counted.sum())) - p[counted] ** 2 / float(p[counted] @ p[counted])
+        curved = -(centred.T * p[counted] ** 2) @ centred / (width * scale)
+        weighted = us.T * np.sqrt(np.where(counted, p, 0.0))
+        products = [(-2.0 / scale, weighted[:, counted], model_root)]
         products += [
-            (-2.0 / scale, weighted[:, which[weighty[which]]], root)
+            (-2.0 / scale, weighted[:, which[counted[which]]], root)
             for which, root in added
-            if weighty[which].any()
+            if counted[which].any()
         ]
-        squares = ((curved, us[weighty].T),)
+        squares = ((curved, us[counted].T),)
         return Smooth(value / scale, gradient / scale, tuple(products), squares, gradient)
 
     def relevant(self, units: CandidateSet, prior: Floats, budget: float) -> "Separate":

@@ -35,8 +35,8 @@ REASONS = {
     "sight": ("leave the beam free", "[sight] clearance_m, [[obstacles]], the tracker's place"),
     "hanging": ("let what hangs or pulls hang free", "[[loads]] hang_m, radius_m, cable_m"),
 }
-"""Reasons to reject a state, in the order of checking (cheap and frequent ones first): a phrase on
-the states that pass, and the keys of the configuration that decide."""
+"""Checks of a state in their order (cheap and frequently failed ones first): a phrase on the states
+that pass, and the configuration keys that decide."""
 
 
 class FeasibleSpace(Feasibility):
@@ -53,7 +53,7 @@ class FeasibleSpace(Feasibility):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Checks that are omitted, or use guesses, for lack of configuration."""
+        """Checks that are omitted or use assumed values, where the configuration lacks a key."""
         return (*(() if self.sight is not None else (TRACKER_UNKNOWN,)), *super().remarks)
 
     def reasons(self, q: Floats, load: str = UNLOADED) -> dict[str, Bools]:
@@ -101,7 +101,7 @@ class FeasibleSpace(Feasibility):
 
 _CHUNK = 1 << 12
 _ALL_REJECTED = 1 << 15  # drawn states, all rejected, after which drawing stops
-_MOST_DRAWN = 1 << 19, 64  # drawn states at most, whichever is larger: in all, and per candidate
+_MOST_DRAWN = 1 << 19, 64  # drawn states at most: the larger of a total, and a number per candidate
 _OF_PAIRS = ("self-collision", "obstacle")
 _REJECTED_SAMPLE = 64  # rejected states whose contacts are counted for a message
 _OF_LOADS = ("payload", "torque", "force sensor", "hanging", "sight")
@@ -134,8 +134,8 @@ def draw_poses(
 
     sequence = qmc.Sobol(len(low), scramble=False)
     shift = rng.random(len(low))
-    # states left after each reason, and samples of those that it rejects
-    remaining, lost = dict.fromkeys(REASONS, 0), dict[str, Floats]()
+    # states that pass up to each reason, and samples of those that it rejects
+    remaining, rejected = dict.fromkeys(REASONS, 0), dict[str, Floats]()
     parts = [np.empty((0, len(low)))]
     drawn = found = 0
     max_states = max(_MOST_DRAWN[0], _MOST_DRAWN[1] * count) if max_states is None else max_states
@@ -146,14 +146,14 @@ def draw_poses(
             if len(q):
                 passes = space.passes(reason, q, UNLOADED)
                 if not passes.all():
-                    lost[reason] = q[~passes][:_REJECTED_SAMPLE]
+                    rejected[reason] = q[~passes][:_REJECTED_SAMPLE]
                 q = q[passes]
             remaining[reason] += len(q)
         parts.append(q)
         drawn += _CHUNK
         found += len(q)
     if found < min_poses:
-        raise CannotAnswerError(_too_few(space, drawn, remaining, lost, min_poses))
+        raise CannotAnswerError(_too_few(space, drawn, remaining, rejected, min_poses))
     q = np.vstack(parts)[:count]
     allowed = np.ones((len(q), len(space.loads)), dtype=np.bool_)
     remarks = [*space.remarks]
@@ -169,11 +169,14 @@ def draw_poses(
 
 
 def _too_few(
-    space: FeasibleSpace, drawn: int, remaining: dict[str, int], lost: dict[str, Floats], least: int
+    space: FeasibleSpace,
+    drawn: int,
+    remaining: dict[str, int],
+    rejected: dict[str, Floats],
+    least: int,
 ) -> str:
     """Return a message: the first reason that leaves no state, else the one that rejects most."""
-    counts = list(remaining.values())
-    names = list(remaining)
+    names, counts = list(remaining), list(remaining.values())
     checked = [drawn, *counts[:-1]]
     share = np.array(counts) / np.maximum(checked, 1)
     worst = counts.index(0) if 0 in counts else int(np.argmin(share))
@@ -183,23 +186,24 @@ def _too_few(
         if n < n_before
     ]
     head = "no pose" if counts[-1] == 0 else f"only {counts[-1]:,} poses, {least:,} are needed"
-    why = _touching(space, names[worst], lost) or REASONS[names[worst]][1]
+    why = _touching(space, names[worst], rejected) or REASONS[names[worst]][1]
     return f"{head}: of {drawn:,} drawn states {', '.join(phrases)} ({why})"
 
 
-def _touching(space: FeasibleSpace, reason: str, lost: dict[str, Floats]) -> str:
+def _touching(space: FeasibleSpace, reason: str, rejected: dict[str, Floats]) -> str:
     """Name the bodies that touch in most of the rejected states, and the keys to look at."""
-    if reason not in _OF_PAIRS or reason not in lost:
+    if reason not in _OF_PAIRS or reason not in rejected:
         return ""
-    met = Counter(
+    pairs = Counter(
         finding.subject
-        for q in lost[reason]
+        for q in rejected[reason]
         for finding in space.findings(q[None], UNLOADED, (reason,))
     )
-    if not met:
+    if not pairs:
         return ""
-    (pair, count), look = met.most_common(1)[0], REASONS[reason][1]
-    return f"{pair} touch in {100 * count // len(lost[reason])} % of the others; look at {look}"
+    (pair, count), keys = pairs.most_common(1)[0], REASONS[reason][1]
+    share = 100 * count // len(rejected[reason])
+    return f"{pair} touch in {share} % of the others; look at {keys}"
 
 
 def _unusable(space: FeasibleSpace, q: Floats, load: str) -> str:

@@ -136,13 +136,6 @@ def parse_goal(text: str) -> Goal:
     return Goal(text, quantity, number, False, unit)
 
 
-def stds_and_values(fit: Fit) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the standard uncertainties and values of a fit's parameters by name, SI."""
-    names = [f"{e.name}.{p.name}" for e in fit.model.effects for p in e.parameters]
-    stds = {n: float(s) for n, s in zip(names, fit.uncertainty.std, strict=True)}
-    return stds, {n: float(v) for n, v in zip(names, fit.theta, strict=True)}
-
-
 def _ratio(std: float, limit: float) -> float:
     return float(np.inf) if np.isnan(std) else std / limit
 
@@ -157,16 +150,16 @@ def _wrong(text: str, why: str) -> InputError:
     return InputError(f'goal "{text}": {why}; valid: {", ".join(FORMS)}')
 
 
-FIT_TIME_SHARE = 0.1  # of the time, for fits while measuring, at most
+FIT_TIME_SHARE = 0.1  # largest share of the measuring time that fits may take
 
 
 class GoalRule:
     """Stopping rule of a campaign: a goal, checked with the fit of `hilcal identify`.
 
     The goal is met if the fit converged and the readings determine the goal's quantity. Where the
-    residual exceeds the noise, the stated uncertainty is itself an estimate, and one of many checks
-    finds it small by chance: then two consecutive fits have to meet the goal, except at the plan's
-    end. Fits take at most a share `FIT_TIME_SHARE` of the time.
+    residual exceeds the noise, the uncertainty is scaled by an estimated variance factor, which may
+    be small by chance in one of many checks: then two consecutive fits have to meet the goal,
+    except at the plan's end.
     """
 
     def __init__(
@@ -188,11 +181,11 @@ class GoalRule:
         self._work_q: tuple[tuple[float, ...], ...] = ()
         self._predicted = ""
         if self.goal.of_position:
-            shown = "position" if config.readings_mode == "absolute" else "deflection"
-            if self.goal.quantity != shown:
+            predicted = "position" if config.readings_mode == "absolute" else "deflection"
+            if self.goal.quantity != predicted:
                 raise InputError(
                     f'goal "{text}": [planning] readings = "{config.readings_mode}", which show '
-                    f"the {shown}; valid: {shown}"
+                    f"the {predicted}; valid: {predicted}"
                 )
             planning = config.planning
             if not planning.work_q_rad and planning.work_min_m is None:
@@ -202,22 +195,24 @@ class GoalRule:
             )
             self._work_q = tuple(dict.fromkeys(tuple(q) for q in work.q.tolist()))
             self._predicted = work.description
-        self._good = False  # whether the last fit met the goal
-        self._ended = self._took = -np.inf
+        self._last_met = False  # whether the last fit met the goal
+        self._fit_end = self._fit_time = -np.inf  # of the last fit, s
 
     def __call__(self, readings: Readings, last: bool) -> GoalStatus:
         """Return the status of the goal after some readings; `last`: the plan ends with them."""
         start = self._now()
-        if last or (start - self._ended >= self._took / FIT_TIME_SHARE and self._news(readings)):
+        if last or (
+            start - self._fit_end >= self._fit_time / FIT_TIME_SHARE and self._adds_data(readings)
+        ):
             try:
                 status, fitted = self._fit(readings)
                 good = status.met and fitted.solution.converged
-                sure = last or self._good or not fitted.uncertainty.inflated
-                self.status, self._good = replace(status, met=good and sure), good
+                sure = last or self._last_met or not fitted.uncertainty.inflated
+                self.status, self._last_met = replace(status, met=good and sure), good
             except (HilcalError, np.linalg.LinAlgError):
-                self.status, self._good = GoalStatus(self.goal.text), False
-            self._ended = self._now()
-            self._took = self._ended - start
+                self.status, self._last_met = GoalStatus(self.goal.text), False
+            self._fit_end = self._now()
+            self._fit_time = self._fit_end - start
         return self.status
 
     def _fitted(self, readings: Readings) -> tuple[Readings, Mode]:
@@ -227,8 +222,8 @@ class GoalRule:
         paired = readings[has_unloaded(readings)]
         return paired, "absolute" if paired.unloaded.all() else "deflection"
 
-    def _news(self, readings: Readings) -> bool:
-        """Whether the last reading adds data: not an unloaded one without a loaded one yet."""
+    def _adds_data(self, readings: Readings) -> bool:
+        """Whether the last reading adds data: loaded, or unloaded with a loaded one at its pose."""
         free = readings.unloaded
         if not free[-1] or self._fitted(readings)[1] == "absolute":
             return True
@@ -241,11 +236,12 @@ class GoalRule:
         effects = planned_effects(self._config, self._catalogue)
         model = with_effects(self._cell, readings, mode, effects, effects, self._catalogue)
         fitted = fit(model, readings, mode)
-        std, value = stds_and_values(fitted)
-        held = dict(zip(std, fitted.solution.prior == 0, strict=True))
-        std = {name: s for name, s in std.items() if not held[name]}
+        names = [f"{e.name}.{p.name}" for e in fitted.model.effects for p in e.parameters]
+        free = zip(names, fitted.uncertainty.std.tolist(), fitted.solution.prior != 0, strict=True)
+        stds = {name: std for name, std, is_free in free if is_free}
+        values = dict(zip(names, fitted.theta.tolist(), strict=True))
         position = self._position(fitted) if self._work_q else None
-        status = self.goal.status(std, value, position, self._predicted)
+        status = self.goal.status(stds, values, position, self._predicted)
         return replace(status, model=fitted.model.named, fitted=fitted.mode), fitted
 
     def _position(self, fitted: Fit) -> float:

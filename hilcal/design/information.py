@@ -187,7 +187,7 @@ PAIRS_UP_TO = 4  # number of loads up to which pairs of loads are units, too; a 
 MOST_BYTES = 600_000_000  # of the rows of all units; a choice
 MOST_PARAMETERS = 200
 SAMPLE = 300  # candidate poses to judge strengths at; a choice
-MOST_TIMES = 5.0  # factor on its expected size at which a family must cause 1 σ; a choice
+MOST_TIMES = 5.0  # a family below 1 σ at this factor on its expected size is omitted; a choice
 
 
 @dataclass(frozen=True, slots=True)
@@ -322,7 +322,7 @@ def _layout(
         )
     if not count:
         raise CannotAnswerError(
-            "no candidate pose may be taken"
+            "no candidate pose is allowed"
             + (" both unloaded and under a load" if mode == "deflection" else "")
         )
     units_of = ((pose, s) for pose, k in enumerate(pattern) for s in subsets[k])

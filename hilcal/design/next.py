@@ -41,7 +41,9 @@ class PairPower:
     rival: str  # fitted in its place
     power_now: float  # probability that the readings so far reject the rival, by a test at 1 %
     power_planned: float  # the same with the planned readings
-    not_separable: bool  # neither the planned readings nor `MANY` others reach `LEAST_POWER`
+    not_separable: (
+        bool  # neither the planned readings nor `MANY_READINGS` others reach `LEAST_POWER`
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,8 +87,8 @@ def plan_separating(
     except InputError as error:
         if "effects to tell apart" not in str(error):
             raise
-        lines = f"at most one of {', '.join(names)} changes what can be measured in this cell"
-        raise CannotAnswerError(f"{lines}: no measurement separates them") from None
+        reason = f"at most one of {', '.join(names)} changes what can be measured in this cell"
+        raise CannotAnswerError(f"{reason}: no measurement separates them") from None
     if reference is not None and not np.array_equal(reference, planned.ordered.plan.q[0]):
         planned = _from_reference(cell, planned, reference, rng, request)
     say("predicting the powers")
@@ -98,10 +100,9 @@ def plan_separating(
     omitted = [n for n in names if n not in observable]
     notes = tuple(n for n in planned.problem.notes if n.split(":")[0] in omitted)
     never = tuple((p.effect, p.rival) for p in powers if p.not_separable and p.effect in observable)
-    if never:
-        notes = (*notes, not_ruled_out(never))
+    notes += (not_ruled_out(never),) if never else ()
     weakest = min(pairs.pairs, key=lambda pair: power(pair, information))
-    shares, reach_ratio = _where(planned, weakest, information)
+    shares, reach_ratio = _shares_and_reach(planned, weakest, information)
     return SeparatingPlan(planned, powers, shares, reach_ratio, notes)
 
 
@@ -184,7 +185,9 @@ def with_reference(
     )
 
 
-def _where(planned: Planned, pair: Pair, information: Floats) -> tuple[dict[str, float], float]:
+def _shares_and_reach(
+    planned: Planned, pair: Pair, information: Floats
+) -> tuple[dict[str, float], float]:
     """Return the loads' shares in uᵀ M u of a pair, and the reach ratio (see `SeparatingPlan`)."""
     problem, u = planned.problem, pair.residual(information)
     units = np.flatnonzero(planned.counts)
@@ -192,17 +195,16 @@ def _where(planned: Planned, pair: Pair, information: Floats) -> tuple[dict[str,
     parts *= planned.counts[units]
     total = max(float(parts.sum()), 1e-300)
     shares: dict[str, float] = {}
+    m = problem.nominal.elements
     for k, part in zip(units, parts, strict=True):
         loads = problem.contents[k][1]
-        m = problem.nominal.elements
         rows = problem.units.rows[k][: m * len(loads)] @ u
         squares = np.sum(rows.reshape(len(loads), m) ** 2, axis=1)
         for load, square in zip(loads, squares, strict=True):
             share = float(square / max(float(squares.sum()), 1e-300) * part / total)
             shares[load] = shares.get(load, 0.0) + share
-
-    arm, cell = problem.nominal.cell.arm, problem.nominal.cell
-    targets = evaluate(arm, problem.candidates.q).point(cell.target[:3, 3])
+    cell = problem.nominal.cell
+    targets = evaluate(cell.arm, problem.candidates.q).point(cell.target[:3, 3])
     reaches = np.linalg.norm(targets[:, :2], axis=1)
     poses = np.array([problem.contents[k][0] for k in units])
     reach = float(reaches[poses] @ parts) / total
@@ -211,8 +213,8 @@ def _where(planned: Planned, pair: Pair, information: Floats) -> tuple[dict[str,
 
 CRITERION = "D"  # of the stated efficiency; the poses are not chosen by it
 SPARE = 2  # candidates per pose: some are unreachable from the reference; a choice
-LEAST = 60  # candidates at least, so that a reference is found; a choice
-REPEATED = 10  # one pose in so many is visited twice, for the arm's repeatability; a choice
+LEAST = 60  # candidates at least, so that a reference pose is found; a choice
+REPEATED = 10  # one of this number of poses is visited twice, for the arm's repeatability; a choice
 
 
 def plan_poses(

@@ -25,9 +25,10 @@ from hilcal.readings.readings import ObserverKind, ObserverName, States
 from hilcal.robot import se3
 from hilcal.types import Floats, Ints
 
-DISTANCE = 2.0  # reaches from the base to a tracker of unknown place; a choice
+DISTANCE = 2.0  # of a tracker of unknown place from the base, over the arm's reach; a choice
 FRAME_PRIOR = {"prior_m": 3e-3, "prior_rad": 6e-3}
-"""Frames only rotate deflections. Positions determine them up to the arm's elastic sag."""
+"""Prior of frames where deflections are planned, which frames only rotate: absolute positions
+determine frames up to the arm's elastic sag."""
 DURATION_S = 3600.0
 LOAD_TIMES_S = (5.0, 100.0)
 TEMPERATURES = (25.0, 35.0)  # of joints that warm up during a campaign, °C
@@ -95,7 +96,7 @@ def nominal_model(
     if not configured and not (cell.observers and all(o.tied for o in cell.observers)):
         shown = ", ".join(f"{v:.2g}" for v in place)
         notes.append(
-            f"the tracker's place is not configured: taken to be [{shown}] m in base axes "
+            f"the tracker's place is not configured: assumed at [{shown}] m in base axes "
             "(give [sight] tracker_m)"
         )
     registered, station = _registered(cell, place)
@@ -116,7 +117,9 @@ def nominal_model(
     if prior is not None:
         s = prior.posterior.source
         prefix = f"{s.campaign}: " if s.campaign else ""
-        notes.append(f"planned with what is known already ({prefix}{s.n_readings} readings)")
+        notes.append(
+            f"planned with the prior of another campaign ({prefix}{s.n_readings} readings)"
+        )
     live = np.arange(model.size)
     carried = carried_information(model, live)
     return NominalModel(model, theta, live, prior_std, station, m, None, tuple(notes), carried)
@@ -160,8 +163,8 @@ def model_after(fit: Fit, config: CellConfig) -> NominalModel:
     std = np.where(np.isinf(prior), np.inf, prior / np.sqrt(fit.solution.beta))
     std[fit.solution.space.index] = np.inf
     count = len(fit.readings) - int(fit.outlier.sum())
-    begun = f"planned on from {count} readings, fitted with {fit.model.title}"
-    notes = (begun, *random_columns(fit.model.effects))
+    origin = f"planned from {count} readings, fitted with {fit.model.title}"
+    notes = (origin, *random_columns(fit.model.effects))
     live, m = np.flatnonzero(fit.solution.estimated), fit.readings.m
     carried = carried_information(fit.model, live)
     return NominalModel(fit.model, fit.theta, live, std, station, m, fit, notes, carried)
@@ -186,8 +189,7 @@ def random_columns(effects: tuple[Effect, ...]) -> tuple[str, ...]:
                 "it out"
             )
     return tuple(
-        f"{e.name}: {', '.join(e.needs)} of the readings taken at random, as a shuffled order "
-        "would give them"
+        f"{e.name}: {', '.join(e.needs)} of the readings drawn at random, as in a shuffled order"
         for e in effects
         if e.needs
     )
@@ -201,7 +203,7 @@ def planned_effects(config: CellConfig, catalogue: Catalogue) -> dict[str, dict[
         raise InputError(f"[planning] model: {error}") from None
 
 
-def known_effects(names: tuple[str, ...], key: str, catalogue: Catalogue) -> tuple[str, ...]:
+def valid_effects(names: tuple[str, ...], key: str, catalogue: Catalogue) -> tuple[str, ...]:
     """Return the names of effects without duplicates; refuse unknown ones."""
     for name in names:
         try:
@@ -222,7 +224,7 @@ def check_effects(cell: Cell, catalogue: Catalogue) -> None:
         raise InputError(prefix + message) from None
     potential_names(config, model)
     for section in ("plausible", "ordinary"):
-        known_effects(tuple(getattr(config, section)), f"[{section}]", catalogue)
+        valid_effects(tuple(getattr(config, section)), f"[{section}]", catalogue)
 
 
 def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:
@@ -235,7 +237,7 @@ def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:
         kinds = (k for k in model.catalogue.effects if k.applies(cell) and k.role != "observer")
         names = tuple(kind.name for kind in kinds if not kind.needs)
     else:
-        names = known_effects(against, "[planning] against", model.catalogue)
+        names = valid_effects(against, "[planning] against", model.catalogue)
     return tuple(name for name in names if name not in model.names)
 
 

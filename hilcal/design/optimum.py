@@ -37,7 +37,7 @@ def best_design(
     rng: np.random.Generator | None = None,  # the only source of randomness
     *,
     max_count: int | None = None,  # largest count of a unit; unlimited by default
-    effort: int | None = None,  # units put into plans until the search ends; `EFFORT` by default
+    effort: int | None = None,  # number of units added in the search; `EFFORT` by default
     relaxed: ApproximateDesign | None = None,  # the continuous optimum, or a start near it
 ) -> Design:
     """Return a plan with Σ n_k c_k ≤ B whose φ(M0 + Σ n_k A_kᵀA_k) is nearly the largest.
@@ -74,7 +74,7 @@ def best_design(
     return Design(counts, value, max(relaxed.bound, value), information, cost, relaxed)
 
 
-EFFORT = 6000  # units put into plans at most, less for small plans; a choice
+EFFORT = 6000  # units added in the search at most, fewer for small plans; a choice
 KINKED_EFFORT = 1500  # the same for criteria with kinks, whose values cost more
 ENOUGH, KINKED_ENOUGH = 1.0 - 1e-6, 0.99  # share of the bound that ends the search; a choice
 
@@ -138,11 +138,13 @@ class _Search:
     def counts(self, rng: np.random.Generator, effort: int, bound: float, enough: float) -> Ints:
         """Return the counts (K,) of all units."""
         floor = np.floor(self.ideal_weight + 1e-6).astype(np.int64)
-        plan, goal = self.refilled(np.minimum(floor, self.most)), enough * bound
+        plan, goal = self.completed(np.minimum(floor, self.most)), enough * bound
         remaining = min(effort, _EACH * int(plan.counts.sum()))
-        plan, remaining = self.polished(plan, rng, remaining, goal)
-        plan, remaining = self.wandered(plan, rng, remaining, bound, goal)
-        plan, remaining = self.polished(plan, rng, max(remaining, 0) + int(plan.counts.sum()), goal)
+        plan, remaining = self.exchanged(plan, rng, remaining, goal)
+        plan, remaining = self.random_exchanges(plan, rng, remaining, bound, goal)
+        plan, remaining = self.exchanged(
+            plan, rng, max(remaining, 0) + int(plan.counts.sum()), goal
+        )
         out = np.zeros(self.count, dtype=np.int64)
         out[self.index] = plan.counts
         return out
@@ -157,12 +159,12 @@ class _Search:
         scale = float(np.abs(turned).max(initial=0.0)) or 1.0
         return np.asarray((self.table @ (turned / scale).astype(np.float32)).astype(float) * scale)
 
-    def refilled(
+    def completed(
         self, counts: Ints, banned: int = -1, rng: np.random.Generator | None = None
     ) -> _Plan:
-        """Return the plan with its free budget spent unit by unit, `banned` not first.
+        """Return the plan with its remaining budget spent unit by unit, each time on the best unit.
 
-        The best unit is taken; with `rng`, some units are passed over at random.
+        The first one is not `banned`; with `rng`, some units are skipped at random.
         """
         counts = counts.copy()
         m = self._information(counts)
@@ -197,7 +199,7 @@ class _Search:
             m = ends[k]
         return _Plan(counts, float(self.criterion.value(self._information(counts))))
 
-    def polished(
+    def exchanged(
         self, plan: _Plan, rng: np.random.Generator, effort: int, goal: float
     ) -> tuple[_Plan, int]:
         """Return the plan after exchanges of single units, and the remaining effort."""
@@ -209,7 +211,7 @@ class _Search:
                     continue
                 counts = plan.counts.copy()
                 counts[unit] -= 1
-                varied = self.refilled(counts, int(unit))
+                varied = self.completed(counts, int(unit))
                 effort -= max(1, int(varied.counts.sum() - counts.sum()))
                 stale += 1
                 if varied.value > plan.value * (1.0 + _BETTER):
@@ -219,7 +221,7 @@ class _Search:
             queue = rng.permutation(np.flatnonzero(plan.counts))
         return plan, effort
 
-    def wandered(
+    def random_exchanges(
         self, plan: _Plan, rng: np.random.Generator, effort: int, bound: float, goal: float
     ) -> tuple[_Plan, int]:
         """Return the best plan of random exchanges of a few units, and the remaining effort.
@@ -234,7 +236,7 @@ class _Search:
             counts = plan.counts.copy()
             np.subtract.at(counts, removed, 1)
             at_random = rng.random() < max(_VARIED, 2.0 / len(units))
-            varied = self.refilled(counts, int(removed[0]), rng if at_random else None)
+            varied = self.completed(counts, int(removed[0]), rng if at_random else None)
             effort -= max(1, int(varied.counts.sum() - counts.sum()))
             if varied.value > best.value * (1.0 - worse):
                 plan = varied

@@ -61,7 +61,7 @@ class UndeterminedParameter:
             why = f"no load of this cell makes a {action} {self.joint}"
             remedy = f": {self.joint} {needs} a {pull}, [[loads]] with force_N{across}, e.g. "
             remedy += "[80.0, 0.0, 0.0]"
-        return f"{self.name}: not determined; {why}. The plan goes on without it{remedy}"
+        return f"{self.name}: not determined; {why}. The plan omits it{remedy}"
 
 
 def without_undetermined(
@@ -123,8 +123,8 @@ def _named(problem: DesignProblem, k: int, confounded: Ints) -> UndeterminedPara
 
 
 HOMES = 4  # central poses, of which one becomes the reference; a choice
-PROBES = 60  # poses to judge the access from the reference; a choice
-SAMPLE = 50  # poses to judge the noise of a reading; a choice
+PROBES = 60  # poses whose access from the reference is tested; a choice
+SAMPLE = 50  # poses over which the noise of a reading is averaged; a choice
 ROUNDS = 6  # rounds of replacing poses that are unreachable from the reference; a choice
 
 Say = Callable[[str], None]
@@ -199,7 +199,7 @@ def plan_readings(
     objective = choice.compound_objective(reduced, config, criterion, work, budget, rng)
     costly: tuple[tuple[str, float], ...] = ()
     if by_poses:
-        say("weighing what each load costs")
+        say("comparing the gain of each load with its cost")
         change = config.planning.load_change_s / seconds_at_rest(config)
         costly = choice.costly_loads(objective, reduced, budget, change, rng)
     say(f"choosing poses by criterion {criterion}")
@@ -269,14 +269,14 @@ def _reference(
     bears = np.flatnonzero(drawn.allowed[:, useful].all(axis=1))
     if not len(bears):
         raise CannotAnswerError(
-            "no pose bears every load, so there is none to change them at; leave out a load "
+            "no pose bears every load, so loads cannot be changed at any; leave out a load "
             "or widen [limits]"
         )
     q = drawn.q[bears]
     nearest = bears[np.argsort(np.linalg.norm(q - np.median(drawn.q, axis=0), axis=1))]
     usable = [name for name, used in zip(drawn.loads, useful, strict=True) if used]
-    begins = (k for k in nearest if space.can_start(drawn.q[k], usable))
-    central = list(islice(begins, HOMES))
+    possible = (k for k in nearest if space.can_start(drawn.q[k], usable))
+    central = list(islice(possible, HOMES))
     if not central:
         raise CannotAnswerError(
             "no pose that bears every load can be approached; widen [limits] or the room around"

@@ -133,8 +133,8 @@ def _inside(nominal: NominalModel, q: Floats, low: Floats, high: Floats) -> Floa
 class PredictedUncertainty:
     """Standard uncertainties that a fit to the planned readings will have.
 
-    If the model is complete, as identification will state them; and with the potential terms, which
-    have to be estimated too if any of their effects is present.
+    With the model complete, they are those that identification will state; with the potential
+    terms, those of a fit that estimates these terms too.
     """
 
     terms: tuple[DesignTerm, ...]  # the model's live parameters
@@ -162,15 +162,15 @@ def predicted_uncertainty(
     of_model = information[:size, :size]
     flat = np.isinf(problem.nominal.prior_std[problem.nominal.live])
     scale = problem.scale
-    closed, null = covariance(of_model, flat)
+    of_complete, null = covariance(of_model, flat)
     flat_all = np.append(flat, np.zeros(len(scale) - size, dtype=bool))
     opened, null_open = covariance(information, flat_all)
     opened, null_open = opened[:size, :size], null_open[:size]
     prior = problem.nominal.prior_std[problem.nominal.live] / scale[:size]
-    terms, std = problem.terms[:size], _stated(closed, null, prior) * scale[:size]
+    terms, std = problem.terms[:size], _stated(of_complete, null, prior) * scale[:size]
     if work is None:
         return PredictedUncertainty(terms, std, None, None, np.zeros(0))
-    positions = positions_of(work, closed, null)
+    positions = positions_of(work, of_complete, null)
     position_open = rms(positions_of(work, opened, null_open))
     return PredictedUncertainty(terms, std, rms(positions), position_open, positions)
 
@@ -189,8 +189,8 @@ def covariance(information: Floats, flat: Bools) -> tuple[Floats, Floats]:
     count = int(determined.sum())
     transform = np.zeros((size, count + len(held)))
     transform[columns, :count] = vectors[:, determined] / np.sqrt(values[determined])
-    own_std = np.sqrt(np.maximum(np.diag(information)[held], 1e-300))
-    transform[held, count + np.arange(len(held))] = 1.0 / own_std
+    scale = np.sqrt(np.maximum(np.diag(information)[held], 1e-300))
+    transform[held, count + np.arange(len(held))] = 1.0 / scale
     root = transform @ inverse_root(transform.T @ information @ transform).T
     null = np.zeros((size, len(columns) - count))
     null[columns] = vectors[:, ~determined]
@@ -204,16 +204,18 @@ def positions_of(work: PredictionPoses, covariance: Floats, null: Floats) -> Flo
     """
     variance = np.einsum("tip,pq,tiq->t", work.derivative, covariance, work.derivative)
     std = np.sqrt(np.maximum(variance, 0.0))
-    unseen = np.linalg.norm(work.derivative @ null, axis=(1, 2))
-    return np.where(unseen <= NULL_SHARE * std, std, np.inf)
+    undetermined = np.linalg.norm(work.derivative @ null, axis=(1, 2))
+    return np.where(undetermined <= NULL_SHARE * std, std, np.inf)
 
 
 def _stated(covariance: Floats, null: Floats, prior: Floats) -> Floats:
     """Return standard uncertainties over the scales; infinite where identification refuses."""
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    flat, unseen = np.isinf(prior), np.linalg.norm(null, axis=1)
+    flat, undetermined = np.isinf(prior), np.linalg.norm(null, axis=1)
     good = np.where(
-        flat, (unseen <= NULL_SHARE * std) & (std < LARGEST_STD), std < IDENTIFIABLE_RATIO * prior
+        flat,
+        (undetermined <= NULL_SHARE * std) & (std < LARGEST_STD),
+        std < IDENTIFIABLE_RATIO * prior,
     )
     return np.where(good, std, np.inf)
 

@@ -178,11 +178,11 @@ def _slope_std(plan: Plan, times: Floats, reading_std: float) -> float | None:
     return reading_std / float(np.sqrt(moment)) if moment > 0 else None
 
 
-_SHRINK = 0.75  # factor on the time of the walks after a draw that is too long; a choice
-_TRIES = 10  # draws of one order that may be too long; a choice
+_SHRINK = 0.75  # factor on the additional time after a draw that is too long; a choice
+_TRIES = 10  # draws of one order at most, until it is short enough; a choice
 _MOVES = 30  # steps of a random walk per stop; a choice
 Passable = Callable[[Floats, Floats, str], Bools]  # start (n,), ends (M, n), load -> (M,)
-N_NEIGHBOURS = 24  # neighbours with tested motions; to others by the reference; a choice
+N_NEIGHBOURS = 24  # nearest poses with tested motions; to others via the reference; a choice
 _ALL = 6  # number of loads up to which every order is tried
 
 
@@ -208,7 +208,7 @@ class PoseReadings:
 
     pose: str
     loads: tuple[str, ...]  # "none" for an unloaded reading
-    cycles: int = 1  # cycles
+    cycles: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,7 +260,8 @@ def order_plan(
 
     Every load is hung once. Under a load, the arm follows a short tour in the metric of the leading
     joint's time. The tour is cut into loops from the reference pose, which limits the time between
-    readings there. Where no straight motion is clear, the arm moves by the reference, and reads it.
+    readings there. Where no straight motion is clear, the arm moves via the reference pose and is
+    read there.
 
     Readings of a pose under different loads are far apart in time, so that a drift resembles the
     effect of a load, or of a pose. The loss of information is ρ², see `Confounding`. It is reduced
@@ -343,9 +344,8 @@ class OrderDraws:
     # by load, between the reference and the stops: see `motion_times`
     direct: dict[str, Floats] = field(default_factory=dict)
     seconds: dict[str, Floats] = field(default_factory=dict)
-    short_tours: dict[str, list[int]] = field(
-        default_factory=dict
-    )  # shortest tours of stops, from 1
+    # by load, shortest tours of stops, from 1
+    short_tours: dict[str, list[int]] = field(default_factory=dict)
 
     def __post_init__(self, passable: Passable) -> None:
         """Find the ways and the shortest tour under each load."""
@@ -356,7 +356,7 @@ class OrderDraws:
             poses = np.array([pose for pose, _ in load_stops])
             visited = np.unique(poses)
             between = motion_times(self.q[[0, *visited]], load, passable, self.pace)
-            # between two stops at one pose, the arm moves by the reference, to arrive anew
+            # between two stops at one pose, the arm moves via the reference, to arrive again
             place = np.concatenate([[0], np.searchsorted(visited, poses) + 1])
             self.direct[load], seconds = (way[np.ix_(place, place)] for way in between)
             self.seconds[load], self.short_tours[load] = seconds, tour.short_tour(seconds, self.rng)
@@ -397,10 +397,10 @@ class OrderDraws:
                 orders[load] = self._walk(seconds, short, spare)
                 continue
             first = set(self.rng.permutation(short)[: (len(short) + 1) // 2].tolist())
-            halves = ([k for k in short if (k in first) == early] for early in (True, False))
+            halves = ([k for k in short if (k in first) == before] for before in (True, False))
             parts = [tour.improved_tour(seconds, half_of) for half_of in halves]
             lengths = [tour.length(seconds, part) for part in parts]
-            if max(lengths) >= tour.NEVER:  # a pose is in another part than its only access
+            if max(lengths) >= tour.NEVER:  # a pose is reached only from poses of the other half
                 half, orders[load] = False, self._walk(seconds, short, spare)
                 continue
             spare -= sum(lengths) - tour.length(seconds, short)
@@ -443,8 +443,8 @@ class OrderDraws:
 def motion_times(q: Floats, load: str, passable: Passable, pace: Pace) -> tuple[Floats, Floats]:
     """Return times (P + 1, P + 1) between poses (P + 1, n) under a load, the reference first, s.
 
-    Of straight motions, `NEVER` if not known to be clear; and of the same, or by the reference with
-    a reading there if that is needed.
+    First of straight motions, `NEVER` if not known to be clear; second the shorter of these and of
+    the motion via the reference with a reading there.
     """
     legs = pace.legs(q, q)
     count = len(q)

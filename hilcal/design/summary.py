@@ -37,9 +37,7 @@ from hilcal.whole_file import replace_file
 
 COMPARED = ("D", "A", "E", "K", "I")  # all but T-optimality, which needs suspects
 SHARES = (0.5, 1.0, 1.5, 2.0, 3.0)  # budgets of the curve over that of the plan; a choice
-NOTABLE_EFFICIENCY = (
-    0.9  # efficiency below which a remark states what a better plan would give; a choice
-)
+NOTABLE_EFFICIENCY = 0.9  # below it, a remark states what a better plan would give; a choice
 _LEFT_OUT = {
     "deflection": "geometry, registration, repeatability and effects outside of the model",
     "position": "repeatability and effects outside of the model",
@@ -50,33 +48,22 @@ _SEED = 20240611
 
 @dataclass(frozen=True, slots=True)
 class DetectableEffect:
-    """Minimum detectable strength of an effect outside of the model.
-
-    Attributes:
-        effect: its name.
-        least_m: RMS displacement of the target, m, that leaves a whitened residual of one sigma
-            after the model is fitted; None where the model absorbs the effect.
-    """
+    """Minimum detectable strength of an effect outside of the model."""
 
     effect: str
+    # RMS displacement of the target, m, that leaves a whitened residual of 1 σ after the model is
+    # fitted; None where the model absorbs the effect
     least_m: float | None
 
 
 @dataclass(frozen=True, slots=True)
 class PredictedParameter:
-    """Predicted standard uncertainty of a parameter.
+    """Predicted standard uncertainty of a parameter."""
 
-    Attributes:
-        name: e.g. "joint_compliance.j2".
-        std: in `unit`; infinite where the readings do not determine the parameter.
-        value: estimated or ordinary magnitude, in `unit`; None without.
-        unit: SI.
-    """
-
-    name: str
-    std: float
-    value: float | None
-    unit: str
+    name: str  # e.g. "joint_compliance.j2"
+    std: float  # in `unit`; infinite where the readings do not determine the parameter
+    value: float | None  # estimated or ordinary magnitude, in `unit`; None without
+    unit: str  # SI
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,54 +72,39 @@ class CriterionResult:
 
     The observability indices are those of Sun & Hollerbach (2008), with σ the singular values of
     the whitened Jacobian by the parameters in ordinary magnitudes.
-
-    Attributes:
-        criterion: its name.
-        position_std_m: standard uncertainty of the position at the prediction poses, m.
-        position_open_m: the same with all potential terms estimated, too.
-        joint_share: largest relative standard uncertainty of a joint compliance; None without.
-        o1: (Π σ)^(1/P) / √N, which D maximises; σ² are the eigenvalues of the Schur complement
-            of the model's parameters without a prior.
-        o2: σ_min / σ_max, which K maximises; of the model alone.
-        o3: σ_min, which E maximises.
-        efficiency: certified lower bound of the efficiency by its own criterion; None without.
     """
 
     criterion: str
-    position_std_m: float | None
-    position_open_m: float | None
-    joint_share: float | None
+    position_std_m: float | None  # standard uncertainty at the prediction poses, m
+    position_open_m: float | None  # the same with all potential terms estimated, too
+    joint_share: float | None  # largest relative std of a joint compliance; None without
+    # (Π σ)^(1/P) / √N, which D maximises; σ² are the eigenvalues of the Schur complement of the
+    # model's parameters without a prior
     o1: float
-    o2: float
-    o3: float
-    efficiency: float | None
+    o2: float  # σ_min / σ_max, which K maximises; of the model alone
+    o3: float  # σ_min, which E maximises
+    efficiency: float | None  # certified lower bound by this criterion; None without
 
 
 @dataclass(frozen=True, slots=True)
 class CurvePoint:
-    """A point of the sample-size curve.
+    """A point of the sample-size curve."""
 
-    Attributes:
-        poses: number of poses without the reference.
-        position_std_m: standard uncertainty of the position at the prediction poses, m.
-        efficiency: certified efficiency with this number of poses; None without.
-    """
-
-    poses: int
-    position_std_m: float
-    efficiency: float | None = None
+    poses: int  # without the reference
+    position_std_m: float  # standard uncertainty at the prediction poses, m
+    efficiency: float | None = None  # certified, with this number of poses; None without
 
 
 @dataclass(frozen=True, slots=True)
 class PlanSummary:
     """Cost, predicted precision and efficiency of a plan."""
 
-    poses: int  # number of poses without the reference
-    readings: int  # number of all readings, with those at the reference
+    poses: int  # without the reference
+    readings: int  # with those at the reference
     loads: dict[str, int]  # readings by load, with "none", in order
     duration: Duration
     criterion: str
-    efficiency: float | None  # certified lower bound of the efficiency; None without a certificate
+    efficiency: float | None  # certified lower bound; None without a certificate
     parameters: tuple[PredictedParameter, ...]  # predicted precision by parameter
     # RMS standard uncertainty of the prediction at the prediction poses, m; None without. Not the
     # accuracy of the robot: see `position_note`.
@@ -154,7 +126,7 @@ class PlanSummary:
 
     @property
     def position_note(self) -> str:
-        """A sentence on the meaning of `position_std_m`, and on what it excludes."""
+        """What `position_std_m` is, and what it excludes, in a sentence."""
         return position_note(self.quantity)
 
     @property
@@ -441,5 +413,5 @@ def refuse(dry: DryRun, what: str) -> None:
 
 
 def refusal(dry: DryRun, what: str) -> InputError | None:
-    """Return the error of `refuse` without raising it; None if the dry run passed."""
+    """Return the error of a plan that did not pass its dry run; None if it passed."""
     return InputError(f"{what} cannot be run: {dry.first_problem}") if dry.problems else None

@@ -248,7 +248,7 @@ def test_problems_that_cannot_be():
     a = nominal_model(cell.with_config(config))
     with pytest.raises(CannotAnswerError, match="both unloaded and under a load"):
         problem(a, config, poses_of(3), np.zeros((3, 5), dtype=bool))
-    with pytest.raises(CannotAnswerError, match="no candidate pose may be taken"):
+    with pytest.raises(CannotAnswerError, match="no candidate pose is allowed"):
         problem(a, config, np.empty((0, 6)))
     bare = config.model_copy(update={"loads": ()})
     refusal(r"needs \[\[loads\]\]", problem, a, bare, poses_of(3))
@@ -344,7 +344,7 @@ def test_potential_terms_only_add_uncertainty():
 def test_asked_for_effects_that_the_order_tells_are_taken_at_random():
     p = made(against=("hysteresis",), poses=10)
     assert len(p.of_effect("hysteresis")) == 6
-    assert any("approach of the readings taken at random" in note for note in p.notes)
+    assert any("approach of the readings drawn at random" in note for note in p.notes)
 
 
 def test_deflections_without_loads_are_refused_wherever_a_plan_begins():

@@ -405,4 +405,4 @@ def test_planning_on_from_what_is_known(tmp_path, capsys):
         name = f"joint_compliance.j{k}"
         assert on["predicted_std"][name] < alone["predicted_std"][name]
         assert on["predicted_std"][name] < std[name]
-    assert any("planned on from" in words for words in on["remarks"])
+    assert any("planned from" in words for words in on["remarks"])
