@@ -4,8 +4,8 @@ The true position of the tool differs from the prediction by
 
     Σ = κ J C Jᵀ + s² 1 + J_q Σ_q J_qᵀ
 
-C is the covariance of the parameters, which includes what families of parameters may do where
-nothing was measured (see `identification.prediction.predictive`). κ ≥ 1 scales C to the mean square
+C is the covariance of the parameters, which includes families of parameters where nothing was
+measured (see `identification.prediction.predictive`). κ ≥ 1 scales C to the mean square
 position error at held-out poses. s² is the variance of the position residuals beyond the noise,
 where χ² is larger than chance allows. Σ_q is the arm's scatter from one arrival to the next.
 
@@ -68,7 +68,7 @@ from hilcal.stream import StreamFit
 from hilcal.types import Bools, Floats, Ints
 
 LARGEST_RAD = 4.0 * np.pi
-"""rad; a choice, twice the range of most joints: larger values of joints are degrees."""
+"""rad; a choice, twice the range of most joints: larger joint values are taken for degrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,7 +250,7 @@ class Calibration(Brief):
         return self._compiled if tool is self._tracked else compiled(tool, self.mode)
 
     def without_kernel(self, tool: Floats | None = None) -> tuple[str, ...]:
-        """Names of what the compiled kernel does not cover; some hundred times slower with it."""
+        """Effects and joints that the compiled kernel does not cover: some hundred times slower."""
         kernel = self._kernel(self._tool(tool))
         return () if isinstance(kernel, Compiled) else kernel
 
@@ -305,7 +305,7 @@ class Calibration(Brief):
     def _states(
         self, q: Floats, wrench: Floats | None, recorded: Mapping[str, Floats] | None
     ) -> tuple[States, tuple[str, ...]]:
-        """Return points as states, and the columns that means fill; raises as `predict` does."""
+        """Return points as states, and the columns filled with means; raises as `predict` does."""
         n, example = self.model.cell.arm.n, state_with_every_column(self.model.cell)
         q = np.array(_numbers(q, "q"), order="C", ndmin=2)
         if q.shape[1:] != (n,) or not len(q):
@@ -383,7 +383,7 @@ class Calibration(Brief):
         """(P, K) R with κ C = R Rᵀ."""
         if self.root is not None:
             return self.root
-        assert self.covariance_source is not None  # noqa: S101  (`root` or `covariance_source` is there)
+        assert self.covariance_source is not None  # noqa: S101  (one of both is there)
         return self.covariance_source.root(self.model, self.theta, self.mode)
 
     def _moves(self, states: States) -> tuple[Floats, Floats]:

@@ -14,7 +14,7 @@ Each residual e is of the full model at equilibrium, so the solution is exact. J
 which costs a step or two more; each step reduces e about 10³ times.
 
 An arm with fewer than six joints of independent values cannot correct all of a pose. There the
-position is met, and the orientation is as near as the joints that are left allow:
+position is met, and the orientation is as near as the remaining freedom of the joints allows:
 
     q ← q + J_p⁺ e_p + (J_r N)⁺ (e_r − J_r J_p⁺ e_p),   N = I − J_p⁺ J_p
 """
@@ -192,14 +192,14 @@ def _inverse(jacobian: Floats) -> Floats:
 
 
 def _position_first(jacobian: Floats, e: Floats) -> Floats:
-    """(N, n) steps that meet positions, and orientations as far as that leaves joints free."""
+    """(N, n) steps that meet positions, then orientations with the remaining freedom of joints."""
     of_position, of_turn = jacobian[:, :3], jacobian[:, 3:]
     inverse = _inverse(of_position)
     step = np.einsum("nij,nj->ni", inverse, e[:, :3])
     free = np.eye(jacobian.shape[2]) - inverse @ of_position
     turn = np.linalg.pinv(of_turn @ free, rcond=MIN_SINGULAR_RATIO)
-    left = e[:, 3:] - np.einsum("nij,nj->ni", of_turn, step)
-    return np.asarray(step + np.einsum("nij,nj->ni", turn, left))
+    remaining = e[:, 3:] - np.einsum("nij,nj->ni", of_turn, step)
+    return np.asarray(step + np.einsum("nij,nj->ni", turn, remaining))
 
 
 def nominal_pose(arm: Arm, tool: Floats, q: Floats) -> Pose:
@@ -274,11 +274,7 @@ class ToolPoses(Brief):
 
     @property
     def band_m(self) -> Floats:
-        """(N,) radius about `position` that holds the true position with probability `BAND`, m.
-
-        For a normal error e with covariance Σ, |e|² ≈ g χ²_ν with the same mean and variance:
-        g = tr Σ²/tr Σ, ν = (tr Σ)²/tr Σ² (Satterthwaite, Biometrics Bulletin 2 (1946) 110-114).
-        """
+        """(N,) radius about `position` that holds the true position with probability `BAND`, m."""
         return band(self._stated_covariance())
 
     def _stated_covariance(self) -> Floats:
@@ -288,9 +284,10 @@ class ToolPoses(Brief):
 
 
 def band(covariance: Floats) -> Floats:
-    """(N,) radius that holds `BAND` of normal vectors with covariance (N, 3, 3).
+    """(N,) radius that holds `BAND` of normal vectors e with covariance Σ (N, 3, 3); 0 for Σ = 0.
 
-    |e|² counts as a scaled χ² of the same mean and variance; 0 for a zero covariance.
+    |e|² ≈ g χ²_ν with the same mean and variance: g = tr Σ²/tr Σ, ν = (tr Σ)²/tr Σ² (Satterthwaite,
+    Biometrics Bulletin 2 (1946) 110-114).
     """
     size = np.trace(covariance, axis1=1, axis2=2)
     shape = covariance / np.where(size > 0, size, 1.0)[:, None, None]
@@ -367,7 +364,7 @@ class Compensation(Brief):
 
     @property
     def turned_on(self) -> tuple[Outside, ...]:
-        """Joint angles that lie within the measured ranges only after whole turns."""
+        """Joint angles that lie within the measured ranges only modulo whole turns."""
         by_angle = self._calibration.measured.turned_on(replace(self._states, q=self.q))
         inside: dict[str, Bools | bool] = {o.range.variable: ~o.points for o in self.after.outside}
         remaining = [

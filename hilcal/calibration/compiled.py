@@ -8,7 +8,7 @@ wrenches is compared with
 
 (tables T, P, G by cubic splines). An effect that needs times, temperatures or sides of approach
 gives a, b and s of each point. A model with an effect of another form is not compiled, but
-evaluated as everywhere else, some hundred times slower.
+evaluated by `Model.predict`, some hundred times slower.
 """
 
 from dataclasses import dataclass, replace
@@ -35,14 +35,14 @@ EXACT = 1e-12  # largest difference, rad and m, between an effect and the form t
 
 
 class CompiledForm:
-    """The sum of the effects so far; arrays that no effect has filled have no rows."""
+    """The sum of the added effects; arrays without any effect have no rows."""
 
     def __init__(self, n: int) -> None:
         self.a, self.linear, self.by_wrench = np.zeros(n), np.zeros((n, n)), np.zeros((n, 6))
         self.b, self.compliance = np.zeros((n + 1, 6)), np.zeros((n + 1, 6, 6))
         self.by_values: Floats = np.zeros((0, 6, n))
         self.by_angle: Floats = np.zeros((0, NODES - 1, 4))
-        self.soft: Floats = np.zeros((0, NODES - 1, 4))
+        self.angle_compliance: Floats = np.zeros((0, NODES - 1, 4))
         self.by_torque: Floats = np.zeros((0, TORQUE_NODES - 1, 4))
         self.torque = np.ones(n)
         self.gain: Floats = np.zeros((0, 6))
@@ -55,7 +55,7 @@ class CompiledForm:
     def tables(self) -> tuple[Any, ...]:
         """Return first nodes, steps and polynomials of the tables, as the kernel takes them."""
         grids = -TURN, 2 * TURN / (NODES - 1), -self.torque, 2 * self.torque / (TORQUE_NODES - 1)
-        return grids, (self.by_angle, self.by_torque, self.soft)
+        return grids, (self.by_angle, self.by_torque, self.angle_compliance)
 
     def add(self, e: Effect, theta: Floats, s: Situation) -> bool:
         """Add an effect; return False where it has another form."""
@@ -65,7 +65,7 @@ class CompiledForm:
         d = e.deviation(theta, s)
         if all(x is None for x in (d.dq, d.twist, d.base, d.target)):
             return True  # effects of instruments move no tool
-        if e.needs or not _only(d):
+        if e.needs or not _joints_and_links_only(d):
             return False
         add = self._elastic if e.elastic else self._rigid
         return add(e, theta, s, d)
@@ -89,7 +89,8 @@ class CompiledForm:
             return True
         if deviation.twist is not None or deviation.dq is None:
             return False
-        return self._soft(e, theta, s, deviation.dq) or self._by_torque(e, theta, s, deviation)
+        added = self._angle_compliance(e, theta, s, deviation.dq)
+        return added or self._by_torque(e, theta, s, deviation)
 
     def _sensed(self, change: Floats, s: Situation) -> bool:
         """Add the wrench error of a force sensor on the flange: R (bias + gain Rᵀ w)."""
@@ -98,19 +99,19 @@ class CompiledForm:
             np.einsum("nij,nki->nkj", r, x.reshape(-1, 2, 3)).reshape(-1, 6)
             for x in (s.states.wrench, change)
         )
-        coefficients, left = _affine(w, y)
-        if np.abs(left).max() > 1e3 * EXACT * max(np.abs(y).max(), 1.0):
+        coefficients, remainder = _affine(w, y)
+        if np.abs(remainder).max() > 1e3 * EXACT * max(np.abs(y).max(), 1.0):
             return False
         self.gain = _added(self.gain, coefficients[:-1].T)
         self.bias = self.bias + coefficients[-1]
         return True
 
-    def _soft(self, e: Effect, theta: Floats, s: Situation, dq: Floats) -> bool:
+    def _angle_compliance(self, e: Effect, theta: Floats, s: Situation, dq: Floats) -> bool:
         """Add compliances of joints that depend on the joint's own angle."""
         waves, compliance = _waves(e, theta, replace(s, wrench=_unit_torque(s)))
         if not _same(Deviation(dq=dq), compliance * s.wrench[:, :-1, 5]):
             return False
-        self.soft = _added(self.soft, waves)
+        self.angle_compliance = _added(self.angle_compliance, waves)
         return True
 
     def _by_torque(self, e: Effect, theta: Floats, s: Situation, deviation: Deviation) -> bool:
@@ -135,15 +136,15 @@ class CompiledForm:
         dq, twist, shape = deviation.dq, deviation.twist, self.b.shape
         if twist is not None:
             flat = np.broadcast_to(twist, (TRIALS, *shape)).reshape(TRIALS, -1)
-            coefficients, left = _affine(s.angle, flat)
-            if np.abs(left).max() > EXACT:
+            coefficients, remainder = _affine(s.angle, flat)
+            if np.abs(remainder).max() > EXACT:
                 return False
             slopes = np.moveaxis(coefficients[:-1].reshape(-1, *shape), 0, -1)
         if dq is not None:
             waves, by_angle = _waves(e, theta, s)
             # The remainder may be linear in the other joints.
-            by_others, left = _affine(s.angle, dq - by_angle)
-            if not _same(Deviation(dq=dq), dq - left):
+            by_others, remainder = _affine(s.angle, dq - by_angle)
+            if not _same(Deviation(dq=dq), dq - remainder):
                 return False
             self.a += by_others[-1]
             self.linear += by_others[:-1].T
@@ -159,15 +160,15 @@ def fixed_columns_suffice(e: Effect, theta: Floats, s: Situation) -> bool:
     turned = np.roll(s.angle, 1, axis=0)
     permuted = replace(s, states=replace(s.states, q=turned), angle=turned)
     d = e.deviation(theta, s)
-    if not _only(d) or (d.dq is None and d.twist is None):
+    if not _joints_and_links_only(d) or (d.dq is None and d.twist is None):
         return False
     if not e.elastic:
         dq = np.zeros_like(s.angle) if d.dq is None else d.dq
         return _same(e.deviation(theta, permuted), dq, d.twist)
-    soft, other = (e.deviation(theta, replace(x, wrench=_unit_torque(s))).dq for x in (s, permuted))
-    if d.twist is not None or soft is None or other is None:
+    unit, other = (e.deviation(theta, replace(x, wrench=_unit_torque(s))).dq for x in (s, permuted))
+    if d.twist is not None or unit is None or other is None:
         return False
-    return _same(Deviation(dq=other), soft) and _same(d, soft * s.wrench[:, :-1, 5])
+    return _same(Deviation(dq=other), unit) and _same(d, unit * s.wrench[:, :-1, 5])
 
 
 def _unit_torque(s: Situation) -> Floats:
@@ -217,7 +218,7 @@ def repeated(s: Situation, count: int) -> Situation:
     )
 
 
-def _only(d: Deviation) -> bool:
+def _joints_and_links_only(d: Deviation) -> bool:
     return all(f is None for f in (d.base, d.station, d.target, d.scale, d.observer))
 
 
@@ -252,8 +253,8 @@ class Compiled:
 
     def covers(self, q: Floats) -> bool:
         """Whether the tables hold at joint values (N, n); some wrists turn without a stop."""
-        _, (by_angle, _, soft) = self.tables
-        return not (len(by_angle) or len(soft)) or bool(np.all(np.abs(q) <= TURN))
+        _, (by_angle, _, angle_compliance) = self.tables
+        return not (len(by_angle) or len(angle_compliance)) or bool(np.all(np.abs(q) <= TURN))
 
     def compensate(self, states: States, goal: tuple[Floats, Floats] | None) -> Inverse:
         """Joint values (N, n) and residuals (N, 2), m and rad.
@@ -266,17 +267,18 @@ class Compiled:
         q, wrench, count = states.q, states.wrench, len(states)
         by_point = self._at_points(states)
         out, residual = np.empty_like(q), np.zeros((count, 2))
-        still = self.mode == "deflection"
+        deflection = self.mode == "deflection"
         rotation, position = goal or (np.empty((count, 3, 3)), np.empty((count, 3)))
         if goal is None:
-            laws, tables = (self.laws, self.tables) if still else self.nominal
-            tool, unloaded = self.tool.pose if still else self.tool.nominal, np.zeros((count, 6))
-            deviations = by_point if still else _zeros(q.shape[1])
+            laws, tables = (self.laws, self.tables) if deflection else self.nominal
+            tool = self.tool.pose if deflection else self.tool.nominal
+            unloaded = np.zeros((count, 6))
+            deviations = by_point if deflection else _zeros(q.shape[1])
             invert_all(
                 self.arm, self.load, laws, tables, deviations, packed(tool), self.reach,
                 MAX_JOINT_STEP, TOLERANCE, q, unloaded, rotation, position, False, out, residual,
             )  # fmt: skip
-        if goal is not None or not still:
+        if goal is not None or not deflection:
             rotation, position = in_chain(self.tool, rotation, position)
         invert_all(
             self.arm, self.load, self.laws, self.tables, by_point, packed(self.tool.pose),
@@ -292,15 +294,15 @@ class Compiled:
             return zeros
         s = self.situation if len(states) == 1 else repeated(self.situation, len(states))
         s = replace(s, states=states, angle=states.q)
-        dq, twist, soft = zeros
+        dq, twist, angle_compliance = zeros
         for e, theta in self.by_point:
             d = e.deviation(theta, s)
             if e.elastic:
-                soft = soft if d.dq is None else soft + d.dq
+                angle_compliance = angle_compliance if d.dq is None else angle_compliance + d.dq
                 continue
             dq = dq if d.dq is None else dq + d.dq
             twist = twist if d.twist is None else twist + d.twist
-        return packed(dq), packed(twist), packed(soft)
+        return packed(dq), packed(twist), packed(angle_compliance)
 
 
 def compiled(tool: ToolPose, mode: Mode) -> Compiled | tuple[str, ...]:

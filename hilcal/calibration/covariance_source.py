@@ -51,7 +51,7 @@ class CovarianceSource:
         """Refuse quantities whose shapes do not fit a model."""
         r, n = self.readings, model.cell.arm.n
         count = len(r.states)
-        limits.check_numbers("what its covariance follows from", count * r.m * max(model.size, 1))
+        limits.check_numbers("the source of its covariance", count * r.m * max(model.size, 1))
         numbers("prior", self.prior, (model.size,), minimum=0.0)
         numbers("noise", self.noise, minimum=0.0)
         numbers("factor", self.factor, minimum=0.0)
@@ -113,7 +113,7 @@ class CovarianceSource:
             full[:, i, j] = full[:, j, i] = _unpacked(packed)
             return full
 
-        def maybe(name: str, read: Callable[[Any], Any]) -> Any:
+        def optional(name: str, read: Callable[[Any], Any]) -> Any:
             return None if content.get(name) is None else read(content[name])
 
         readings = Readings(
@@ -127,10 +127,10 @@ class CovarianceSource:
             pose_names=tuple(f"p{k + 1}" for k in range(min(int(content["poses"]), len(states)))),
             target_names=tuple(content["target_names"]),
             observers=tuple(ObserverName(*o) for o in content.get("observers", ())),
-            common=maybe("common", _unpacked),
-            stated=maybe("stated", square),
-            serial=maybe("serial_noise", SerialNoise.from_json),
-            along=maybe("along", _unpacked),
+            common=optional("common", _unpacked),
+            stated=optional("stated", square),
+            serial=optional("serial_noise", SerialNoise.from_json),
+            along=optional("along", _unpacked),
         )
         prior = np.array(content["prior"], dtype=float)
         return cls(readings, prior, float(content["noise"]), float(content["factor"]))

@@ -4,15 +4,15 @@ Between two joints every transform is, with the common normal of their axes,
 
     L = Rz(φ) Tz(s) Tx(a) Rx(α) Tz(t) Rz(ψ)
 
-and the parts about z add to the joints' offsets and distances, so that rows represent the relative
-poses of all axes exactly. The common normal of nearly parallel axes is far away: d of both joints
-is then large, and cancels. Rows represent neither the pose of the first axis in the base nor that
-of the flange on the last axis:
+and its parts about z add to the joints' offsets and distances d, so that the rows are exact for the
+relative poses of all axes. The common normal of nearly parallel axes is far away: d of both joints
+is then large, with opposite signs. Rows do not contain the pose of the first axis in the base, B,
+nor that of the flange on the last axis, E:
 
     T_base_flange = B Π_i row_i(q_i) E
 
-B has no part about z at its end, E none at its beginning. `base_m_rad` and `flange_m_rad` state
-them beside the rows.
+B does not end with a part about z, and E does not begin with one. A robot file has them as
+`base_m_rad` and `flange_m_rad`.
 
 Source: Craig, *Introduction to Robotics*, sections 3.3 and 3.4; Hayati, "Robot arm geometric link
 parameter estimation", IEEE CDC 1983, for parallel axes.
@@ -35,8 +35,8 @@ from hilcal.types import Floats
 
 Convention = Literal["standard", "modified"]
 CONVENTIONS: tuple[Convention, ...] = ("standard", "modified")
-PARALLEL = 1e-9  # rad; of axes that count as parallel, which moves the tool by a nanometre
-CROSSED = 0.1  # rad; above this tilt the end of a chain is in rows, as a link is; a choice
+PARALLEL = 1e-9  # rad; axes below this angle count as parallel: it moves the tool by a nanometre
+CROSSED = 0.1  # rad; above this tilt the end of a chain becomes a row, as links do; a choice
 EXACT = 1e-9  # m; smaller differences are not reported
 TRIALS = 200
 
@@ -89,7 +89,7 @@ def dh_rows(arm: Arm, convention: Convention = "standard") -> DhRows:
     offset[np.abs(offset) < 1e-15] = 0.0  # rounding errors
     slides = tuple(np.flatnonzero(arm.slides).tolist())
     rows = DhRows(convention, a, along[:, 1], alpha, offset, base, flange, slides=slides)
-    return _judged(rows, arm)
+    return _with_motions(rows, arm)
 
 
 def row_transforms(rows: DhRows, q: Floats) -> Floats:
@@ -164,7 +164,7 @@ def _ranges(arm: Arm, k: int) -> dict[str, object]:
     return out | ({"torque_max_Nm": torque} if np.isfinite(torque) else {})
 
 
-def _judged(rows: DhRows, arm: Arm) -> DhRows:
+def _with_motions(rows: DhRows, arm: Arm) -> DhRows:
     """Return the rows with the motions of the flange without B and E, at random joint values."""
     q = np.random.default_rng(20250309).uniform(-np.pi, np.pi, (TRIALS, arm.n))
     chain = evaluate(arm, q)
@@ -224,7 +224,7 @@ def twist_first(link: Floats) -> Floats:
 
 
 def _about_z(link: Floats) -> float:
-    """Angle about z of a rotation that is one about z and one about a horizontal axis."""
+    """Angle about z of a rotation about z followed by one about a horizontal axis."""
     from scipy.spatial.transform import Rotation  # slow to import
 
     z, w = Rotation.from_matrix(link[:3, :3]).as_quat()[2:]

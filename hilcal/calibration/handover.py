@@ -102,7 +102,7 @@ def urdf(arm: Arm, note: str = "") -> str:
     return f'<?xml version="1.0"?>\n{comment}{tostring(root, encoding="unicode")}\n'
 
 
-def matlab(arm: Arm, name: str, note: str = "") -> str:
+def matlab(arm: Arm, name: str, note: str) -> str:
     """Return a MATLAB function that builds an arm as a `rigidBodyTree` (Robotics System Toolbox).
 
     Bodies base, link_1 …, tool0; each joint turns about z of its fixed transform.
@@ -212,7 +212,7 @@ def frames(
 
 
 def _millimetres(pose: Floats) -> list[float]:
-    """Position in mm to 0.1 nm and rotation vector in rad, for people to type."""
+    """Position in mm to 0.1 nm and rotation vector in rad, to be typed at a pendant."""
     values = se3.six(pose)
     return [round(1e3 * v, 7) for v in values[:3]] + [round(v, 9) for v in values[3:]]
 
@@ -224,14 +224,14 @@ def origin_of(transform: Floats) -> tuple[Floats, Floats]:
     r = transform[:3, :3]
     pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
     roll = np.arctan2(r[2, 1], r[2, 2])
-    # The remainder is about z, whatever roll rounding chose.
+    # the remaining rotation is about z, even where rounding decides the roll
     about_z = r @ Rotation.from_euler("xyz", [roll, pitch, 0.0]).as_matrix().T
     yaw = np.arctan2(about_z[1, 0] - about_z[0, 1], about_z[0, 0] + about_z[1, 1])
     return transform[:3, 3], np.array([roll, pitch, yaw])
 
 
 def _yaml(value: float) -> str:
-    """Return a number with a point: readers of YAML 1.1 take 1e-05 for text."""
+    """Return a number with a decimal point: YAML 1.1 reads 1e-05 as text."""
     text = f"{value:.17g}"
     mantissa, e, exponent = text.partition("e")
     return text if "." in mantissa else f"{mantissa}.0{e}{exponent}"

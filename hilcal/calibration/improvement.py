@@ -33,28 +33,17 @@ from hilcal.types import Bools, Floats
 
 @dataclass(frozen=True, slots=True)
 class ErrorReduction:
-    """Errors of some points before and after the correction.
+    """Errors of some points before and after the correction."""
 
-    Attributes:
-        name: of the load, or "all".
-        count: number of points.
-        before: at the uncorrected joint values.
-        after: at the corrected ones.
-        noise_m: root mean square error that the tracker's noise and the arm's repeatability alone
-            would leave.
-        band_m: the largest predicted radius that holds `BAND` of the errors.
-        inside: number of points whose error is within their radius.
-        removed: share of the error beyond the noise that the correction removed,
-            1 − x_after/x_before with x² = rms² − noise²; None if x_before is zero.
-    """
-
-    name: str
-    count: int
-    before: ErrorSize
-    after: ErrorSize
-    noise_m: float
-    band_m: float
-    inside: int
+    name: str  # of the load, or "all"
+    count: int  # of points
+    before: ErrorSize  # at the uncorrected joint values
+    after: ErrorSize  # at the corrected ones
+    noise_m: float  # RMS error by the tracker's noise and the arm's repeatability alone
+    band_m: float  # largest predicted radius that holds `BAND` of the errors
+    inside: int  # number of points whose error is within their radius
+    # share of the error beyond the noise that the correction removed, 1 − x_after/x_before with
+    # x² = rms² − noise²; None if x_before is zero
     removed: float | None
 
 
@@ -126,7 +115,7 @@ def improvement(
     before: Readings,
     after: Readings,
     goal: States,
-    left_out: Sequence[tuple[str, str]] = (),
+    left_out: Sequence[tuple[str, str]],
 ) -> Improvement:
     """Compare readings of the same points at uncorrected and at corrected joint values.
 

@@ -179,20 +179,20 @@ def _deviations(
 ) -> float:
     """Write the deviations; return their largest change."""
     a, linear, by_wrench, b, compliance, by_values = laws
-    point_dq, point_twist, point_soft = by_point
+    point_dq, point_twist, point_compliance = by_point
     angle_low, angle_step, torque_low, torque_step = tables[0]
-    by_angle, by_torque, soft = tables[1]
+    by_angle, by_torque, angle_compliance = tables[1]
     n, change = len(q), 0.0
     for j in range(n):
-        new = a[j] + point_dq[j] + point_soft[j] * wrench[j, 5]
+        new = a[j] + point_dq[j] + point_compliance[j] * wrench[j, 5]
         for i in range(n):
             new += linear[j, i] * q[i]
         for e in range(6):
             new += by_wrench[j, e] * wrench[j, e]
         if len(by_angle) > 0:
             new += _interpolate(q[j], angle_low, angle_step, by_angle[j])
-        if len(soft) > 0:
-            new += _interpolate(q[j], angle_low, angle_step, soft[j]) * wrench[j, 5]
+        if len(angle_compliance) > 0:
+            new += _interpolate(q[j], angle_low, angle_step, angle_compliance[j]) * wrench[j, 5]
         if len(by_torque) > 0:
             new += _interpolate(wrench[j, 5], torque_low[j], torque_step[j], by_torque[j])
         change = max(change, abs(new - dq[j]))

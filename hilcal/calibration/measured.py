@@ -91,7 +91,7 @@ class MeasuredRanges:
         return [o for o in outside if o.points.any()]
 
     def turned_on(self, states: States) -> list[Outside]:
-        """Return the joint angles outside of their ranges if whole turns count as different."""
+        """Return the joint angles outside of their ranges, without regard to whole turns."""
         none = np.zeros(states.q.shape[1], dtype=np.bool_)
         return [o for o in self.outside(states, None, none) if o.range.unit == "rad"]
 

@@ -43,9 +43,11 @@ from hilcal.types import Floats
 
 NO_LOAD = "none"
 NEAREST_RAD = 0.5  # a solution within this distance of the start counts as the nearest; a choice
-N_STARTS = 300  # random starts to find all branches from, of six joints up to 16; a choice
+N_STARTS = 300  # random starts that find all branches, up to 16 with six joints; a choice
 LIMIT_PENALTY = 1e3  # rad; added to the distance of a solution beyond the joints' limits
-LEAST_REACH, LONGEST_TOOL = 0.05, 0.5  # of the farthest point: over, and beyond the reach, m
+LEAST_REACH, LONGEST_TOOL = 0.05, 0.5
+"""The farthest point is at least this share of the reach from the base, and at most this length, m,
+beyond the reach."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -235,7 +237,7 @@ def _guessed(path: Path, arm: Arm) -> tuple[PointMapping, str]:
             f"q1_rad … q{arm.n}_rad or q1_deg …, x_m, y_m, z_m or x_mm …, rx_rad, ry_rad, rz_rad "
             "or rx_deg …"
         )
-    return proposal.mapping(PointMapping), f"taken, in base axes: {'; '.join(understood)}"
+    return proposal.mapping(PointMapping), f"understood, in base axes: {'; '.join(understood)}"
 
 
 def _certain_unit(proposed: GridProposal, arm: Arm) -> bool:
@@ -287,12 +289,12 @@ def _checked(
 ) -> tuple[Sequence[str], Sequence[str]]:
     listed = [name for _, names, _ in groups for name in names]
     exchanged = set(exchange.known_columns(arm.units))
-    ours = {*listed, *exchanged} - {"pose", "load", "target"}
+    specific = {*listed, *exchanged} - {"pose", "load", "target"}
     for name in header:
         if name not in (*listed, "pose", "load", *exchanged) and not name.startswith(
             exchange.USER_PREFIX
         ):
-            if not ours & set(header):
+            if not specific & set(header):
                 raise _OtherNamesError(f"{path}: no column of a table of points")
             valid = ", ".join(("pose", "load", *listed))
             raise InputError(
@@ -301,15 +303,15 @@ def _checked(
             )
         if header.count(name) > 1:
             raise InputError(f"{path}: column '{name}' is there twice")
-    first: dict[str, list[str]] = {"hung": ["load"] * ("load" in header)}
+    first: dict[str, list[str]] = {"load": ["load"] * ("load" in header)}
     for quantity, names, _ in groups:
         missing = [name for name in names if name not in header]
         needed = names if quantity != "q" else exchange.independent_columns(names, 0, arm)
         lacks = [name for name in missing if name in needed]
         if lacks and len(missing) < len(names):
-            raise InputError(f"{path}: column '{lacks[0]}' is missing beside its group")
+            raise InputError(f"{path}: column '{lacks[0]}' is missing from its group")
         if not lacks:
-            key = "hung" if quantity in ("wrench", "sensed") else quantity
+            key = "load" if quantity in ("wrench", "sensed") else quantity
             first.setdefault(key, []).append(names[0])
     for options in first.values():
         if len(options) > 1:
@@ -336,7 +338,7 @@ def _poses(columns: dict[str, Floats], q: Floats | None, arm: Arm) -> Floats | N
     if position is None or (rotation is None and q is None):
         raise InputError(
             "a pose is x_m, y_m, z_m together with rx_rad, ry_rad, rz_rad, or with joint values "
-            "that say how the tool is turned; one half is missing"
+            "that determine the orientation of the tool; one half is missing"
         )
     if rotation is None:
         return se3.matrix(np.full((len(position), 3, 3), np.nan), position)

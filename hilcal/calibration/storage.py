@@ -44,9 +44,9 @@ _CELL = (
 def to_json(c: Calibration) -> dict[str, object]:
     """Return a calibration as JSON, SI."""
     cell = c.model.cell
-    std, small = np.sqrt(np.einsum("pk,pk->p", c.covariance_root, c.covariance_root)), _small(c)
-    covariance: dict[str, object] = {"learnt": small}
-    if small is None:
+    std, source = np.sqrt(np.einsum("pk,pk->p", c.covariance_root, c.covariance_root)), _source(c)
+    covariance: dict[str, object] = {"learnt": source}
+    if source is None:
         scaled = c.covariance_root / np.where(std > 0, std, 1.0)[:, None]
         text = base64.b64encode(scaled.astype("<f4").tobytes()).decode("ascii")
         covariance = {"covariance_root": text}
@@ -56,7 +56,7 @@ def to_json(c: Calibration) -> dict[str, object]:
     ]
     content = {
         "format": FORMAT,
-        "version": FACTOR_VERSION if small is None else VERSION,
+        "version": FACTOR_VERSION if source is None else VERSION,
         "hilcal": __version__,
         "source": dict(c.source),
         "readings": c.mode,
@@ -129,21 +129,21 @@ def _read(content: Mapping[str, Any], catalogue: Catalogue) -> Calibration:
     return calibration
 
 
-def _small(c: Calibration) -> dict[str, object] | None:
+def _source(c: Calibration) -> dict[str, object] | None:
     """Source of the covariance as JSON; None if it is not smaller or does not reproduce it."""
     if c.covariance_source is None:
         return None
-    small = c.covariance_source.to_json()
+    source = c.covariance_source.to_json()
     if c.root is None:
-        return small
-    if len(json.dumps(small)) > 4 * c.root.size * 4 / 3:
+        return source
+    if len(json.dumps(source)) > 4 * c.root.size * 4 / 3:
         return None
     states = c.covariance_source.readings.states
     states = states[:: max(len(states) // CHECKED_STATES, 1)]
     jacobian = c.model.jacobian(c.model.predict(states, c.theta), c.theta, 3)
-    copy = CovarianceSource.from_json(small).root(c.model, c.theta, c.mode)
+    copy = CovarianceSource.from_json(source).root(c.model, c.theta, c.mode)
     stated, copied = (np.linalg.norm(jacobian @ root, axis=(1, 2)) for root in (c.root, copy))
-    return small if np.all(np.abs(copied - stated) <= STD_TOLERANCE * stated) else None
+    return source if np.all(np.abs(copied - stated) <= STD_TOLERANCE * stated) else None
 
 
 def _cell(content: Mapping[str, Any], arm: Arm) -> Cell:
@@ -183,17 +183,17 @@ def _check_arm(arm: Arm) -> None:
     numbers("masses", arm.masses, (n,), minimum=0.0)
     numbers("coms", arm.coms, (n, 3))
     if not arm.payload >= 0.0:  # infinite where it is not known
-        raise ValueError("payload has a number that cannot be")
+        raise ValueError("payload is negative or no number")
     for name, shape in (("coupling", (n, n)), ("drive", (n, n)), ("mimic", (n, n + 1))):
         if getattr(arm, name) is not None:
             numbers(name, getattr(arm, name), shape)
     if arm.sign is not None and not np.all(np.abs(arm.sign) == np.ones(n)):
-        raise ValueError("sign is not ±1 for each joint")
+        raise ValueError("sign has other numbers than ±1")
     for ends in (arm.q_min, arm.q_max, arm.torque_max):
         if ends.shape != (n,) or np.any(np.isnan(ends)):
-            raise ValueError("limits are not one for each joint")
+            raise ValueError("not every joint has its limits")
     if len(arm.joint_names) != n or (arm.prismatic is not None and len(arm.prismatic) != n):
-        raise ValueError("joints are not named each")
+        raise ValueError("not every joint has a name and a type")
 
 
 def _check(c: Calibration, n: int) -> None:

@@ -72,7 +72,7 @@ _VALID = (
     "--leave keeps other waypoints as they are"
 )
 _NO_BRANCH = (
-    "a pose without joint values that no waypoint always comes right before; "
+    "a pose without joint values, and no waypoint that always precedes it; "
     "get_inverse_kin(pose, qnear=joints) has them"
 )
 
@@ -101,7 +101,7 @@ class Waypoint:
     blend_m: float = 0.0  # radius within which the arm passes without a stop, m
     not_corrected: str = ""  # why it is not corrected; empty if it is understood
     straight: bool = False  # whether the motion to it is a straight line
-    follows_previous: bool = False  # whether that of the text before always comes right before it
+    follows_previous: bool = False  # whether the previous one of the text always precedes it
 
 
 def waypoints(program: str) -> tuple[Waypoint, ...]:
@@ -175,8 +175,8 @@ def urscript_list(values: Floats) -> str:
 
 
 UNCHECKED = (
-    "the ways to and between these points are not checked against limits, obstacles and the floor; "
-    "set the payload first"
+    "the motions to and between these points are not checked against limits, obstacles and the "
+    "floor; set the payload first"
 )
 
 
@@ -451,11 +451,11 @@ BRANCH_MARGIN = 0.05
 controller has its own calibrated arm: of 1,024 motions of ur3e, ur5e and ur10e the branch is wrong
 in 1 at 0.02 and in none from 0.05 on, if each joint of each solution is up to 10 mrad off; 17
 remain uncertain at 0.05, 33 at 0.1, 62 at 0.2."""
-NEAREST = "another branch of the arm is as near; joint values in place of the pose say which"
+NEAREST = "another branch of the arm is as near; valid: joint values in place of the pose"
 NOT_STRAIGHT = (
-    "a straight motion from the waypoint before ends on another branch of the arm; use movej"
+    "a straight motion from the previous waypoint ends on another branch of the arm; use movej"
 )
-UNKNOWN = "the branch of the waypoint before it is not known"
+UNKNOWN = "the branch of the previous waypoint is not known"
 
 
 def doubts(

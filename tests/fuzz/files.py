@@ -15,9 +15,9 @@ import numpy as np
 
 import hilcal as hc
 from hilcal.calibration.handover import CorrectedArm, urdf
-from hilcal.calibration.own_files.correct import correct_file
 from hilcal.calibration.points import read_points
 from hilcal.calibration.programs.languages import read_program
+from hilcal.calibration.robot_files.correct import correct_file
 from hilcal.campaign.campaign import Campaign
 from hilcal.config import CellConfig, load_config
 from hilcal.identification import parameters_document

@@ -57,7 +57,7 @@ _REFUSED = re.compile(
 )
 _NUMBERED = re.compile(r"^[ \t]*(\d+)[ \t]*:", re.MULTILINE)
 _TRACKING = re.compile(r"\bLINE_TRACK_SCHEDULE_NUMBER\s*:\s*[1-9]\d*")
-"""In the head of a program whose points move with a conveyor."""
+"""Marks a program whose points move with a conveyor."""
 XYZWPR, J = ("X", "Y", "Z", "W", "P", "R"), tuple(f"J{k}" for k in range(1, 7))
 
 
@@ -256,8 +256,8 @@ class _InformReader(ProgramReader):
                 self._instruction(code, line)
             offset += len(full_line) + 1
         if base_line:
-            reason = "a base axis moves the arm, and it is not known where to"
-            raise self.error(base_line, reason, "jobs of an arm that stands")
+            reason = "a base axis moves the arm to an unknown place"
+            raise self.error(base_line, reason, "jobs of an arm with a fixed base")
         return self.program()
 
     def _instruction(self, code: str, line: int) -> None:

@@ -175,7 +175,7 @@ class _State:
     base: Floats | str = f"the program does not set $BASE {_BEFORE}"
 
     def same(self, other: "_State") -> bool:
-        """Whether tool and base are the same as in another state, or unknown for one reason."""
+        """Whether tool and base, or the reasons why they are unknown, equal those of a state."""
         pairs = (self.tool, other.tool), (self.base, other.base)
         return all(np.array_equal(a, b) for a, b in pairs)
 
@@ -212,7 +212,9 @@ class _KrlReader(ProgramReader):
                 (self.state,) = blocks.pop()
             elif word in _CLOSES and blocks:
                 if not all(s.same(self.state) for s in blocks.pop()):
-                    self._forget(f"the block that ends in line {line} sets them on some ways only")
+                    self._forget(
+                        f"the block that ends in line {line} sets them in some branches only"
+                    )
             elif word in _OPENS:
                 if word in _LOOPS and _sets(lines[k + 1 :]):
                     self._forget(f"the loop of line {line} sets them later")
@@ -243,7 +245,7 @@ class _KrlReader(ProgramReader):
             elif topic in ("PTP_PARAMS", "CP_PARAMS", "PTP_DAT", "CP_DAT", "FRAMES"):
                 self._of_form(self.form, line)
             elif topic == "INITMOV":
-                self._forget(f"BAS(#INITMOV) of line {line} sets them to what $config.dat has")
+                self._forget(f"BAS(#INITMOV) of line {line} sets them to the values of $config.dat")
         elif m := _FORBIDDEN.search(code):
             reason = f"'{m[0].strip()}' changes what points mean"
             raise self.error(line, reason, "$TOOL and $BASE as a whole, a tool on the flange")
@@ -258,7 +260,7 @@ class _KrlReader(ProgramReader):
             return
         fields = values[0].fields
         if fields.get("IPO_FRAME", ("#BASE",))[0].upper() != "#BASE":
-            reason = f"{name} has its tool outside of the arm (IPO_FRAME #TCP)"
+            reason = f"{name} has a stationary tool (IPO_FRAME #TCP)"
             raise self.error(line, reason, "a tool on the flange")
         for kind in kinds:
             self._set(kind, f"{kind}_DATA[{fields.get(f'{kind}_NO', ('0',))[0]}]", line)
@@ -275,7 +277,7 @@ class _KrlReader(ProgramReader):
             return np.eye(4)
         if value.startswith("{"):
             numbers = _Value.of(value, 0, 0, line).numbers(POSE)
-            return f"${kind} of line {line} is not whole" if numbers is None else of_euler(numbers)
+            return f"${kind} of line {line} is incomplete" if numbers is None else of_euler(numbers)
         m = _INDEX.match(value)
         if m is None or m[1].upper() != kind:
             numbers = self._numbers(value)

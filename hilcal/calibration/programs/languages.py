@@ -127,7 +127,7 @@ def _refuse(path: Path, points: tuple[ProgramPoint, ...], leave: bool) -> None:
 AXIS_TOLERANCE = 0.02  # of an axis direction; a choice, above that of any calibrated arm
 INTERSECTION_M = 1e-3  # m; largest distance of intersecting axes; a choice
 FLAG_BORDER = 1e-4
-"""rad; nearer to a flag's border, joint values have both values; a choice, above rounding."""
+"""rad; nearer to the border of a flag, both of its values agree; a choice, above rounding."""
 
 
 def form_mismatch(arm: Arm, language: Language) -> str:
@@ -137,11 +137,11 @@ def form_mismatch(arm: Arm, language: Language) -> str:
     wrong = np.linalg.norm(axes - np.array(language.axes), axis=1) > AXIS_TOLERANCE
     if wrong.any():
         k = int(np.argmax(wrong))
-        is_, should = (
+        actual, expected = (
             f"[{', '.join(f'{v:.2g}' for v in np.round(row, 3) + 0.0)}]"
             for row in (axes[k], np.array(language.axes[k], dtype=float))
         )
-        return f"axis {k + 1} with all joint values zero is {is_}, not {should}"
+        return f"axis {k + 1} with all joint values zero is {actual}, not {expected}"
     p = chain.position[:JOINTS, 0]
     normals = {k: np.cross(axes[k], axes[4]) for k in (3, 5)}
     gap = max(abs((p[k] - p[4]) @ n) / np.linalg.norm(n) for k, n in normals.items())
@@ -151,8 +151,8 @@ def form_mismatch(arm: Arm, language: Language) -> str:
 def shape(arm: Arm, q: Floats) -> Ints:
     """(K, 2) 1 where the wrist centre is behind axis 1, and 1 where it is behind the lower arm.
 
-    Both are meant in the plane of the arm, which turns with axis 1; its forward direction has axis
-    2 to its left.
+    In the plane of the arm, which turns with axis 1; axis 2 points to the left of its forward
+    direction.
     """
     chain = evaluate(arm, q)
     z, p = chain.rotation[:JOINTS, :, :, 2], chain.position[:JOINTS]
@@ -207,14 +207,14 @@ def resolve(
     remarks = []
     if ignored:
         remarks.append(
-            f"{ignored} points state a shape of the arm that is read for {language.name} arms of "
-            f"the usual form alone, and of {arm.name} {foreign}; their branch is the one that the "
-            "other flags and the point before say"
+            f"{ignored} points state a shape of the arm, which is defined only for {language.name} "
+            f"arms of the usual form, and of {arm.name} {foreign}; their branch follows from the "
+            "other flags and the previous point"
         )
     if unfit:
         remarks.append(
-            f"{unfit} points on straight lines state another configuration than that which the "
-            "point before leads to; the controller does not look at it, and it stays as written"
+            f"{unfit} points on straight lines state another configuration than the one that "
+            "follows from the previous point; the controller ignores it, and it stays as written"
         )
     return np.array(joints).reshape(-1, JOINTS), doubts, tuple(remarks)
 
@@ -231,8 +231,8 @@ def _solve(
     unknown = np.full(JOINTS, np.nan)
     if previous is None and not required.any():
         return unknown, (
-            "no configuration is stated, and no point before it is known; give --near with the "
-            "joint values that the first pose is near to"
+            "no configuration is stated, and no previous point is known; give --near with joint "
+            "values near the first pose"
         )
     if previous is not None:
         q = solutions(arm, p.tool, previous[None], goal)
@@ -248,7 +248,7 @@ def _solve(
     if not len(fitting):
         return unknown, (
             f"no solution of {arm.name} has the configuration that is stated: the description "
-            "counts joints otherwise than the controller, or it is another arm"
+            "counts joints differently from the controller, or is of another arm"
         )
     reference = np.zeros(JOINTS) if previous is None else previous
     distance = np.abs(fitting - reference).max(axis=1)
@@ -260,7 +260,7 @@ def _solve(
         not poses.any() if previous is None else nearest_other > distance[order[0]] + BRANCH_MARGIN
     )
     if not certain:
-        return best, "several branches of the arm are possible; joint values in its place say which"
+        return best, "several branches of the arm are possible; valid: joint values in its place"
     return best, ""
 
 

@@ -37,7 +37,7 @@ SAME_M, SAME_RAD = 2e-9, 2e-9
 CORRECTED = "corrected by hilcal"
 """Comment of a program with corrected points; such a program is not corrected again."""
 GIMBAL = 1e-9  # cos B below which A and C turn about one axis
-MOVES = "{} moves, and it is not known what that carries"
+MOVES = "external axis {} moves, whose effect on the tool is not known"
 """Why a point with an external axis is not corrected."""
 
 

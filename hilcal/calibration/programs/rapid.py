@@ -162,7 +162,7 @@ class _RapidReader(ProgramReader):
         return self.program()
 
     def _collected(self, statements: Sequence[tuple[int, str]]) -> _Data:
-        """Last declaration of each statement, which a header without `;` may precede."""
+        """Declarations by name; a header without `;` may precede that of a statement."""
         out: _Data = {}
         for offset, code in statements:
             for m in re.finditer(r"\b(?:LOCAL\s+|TASK\s+)?(?:CONST|PERS|VAR)\s", code, re.I):
@@ -212,10 +212,8 @@ class _RapidReader(ProgramReader):
             return f"{label} is not one {kind} of the program"
         if key in self.assigned:
             return f"line {self.assigned[key]} changes {label}"
-        numbers, start = (
-            numbers_in(values[0][1], _NUMBER, 0)[0],
-            re.sub(r"\s", "", values[0][1]).upper(),
-        )
+        numbers = numbers_in(values[0][1], _NUMBER, 0)[0]
+        start = re.sub(r"\s", "", values[0][1]).upper()
         if is_tool:
             if not start.startswith("[TRUE,[[") or len(numbers) < POSE:
                 return f"{label} is not one on the flange with numbers"
@@ -256,7 +254,7 @@ class _RapidReader(ProgramReader):
             return bare.refused(f"it is no {kind} of numbers")
         external = values[-JOINTS:]
         if np.any((external < UNUSED) & (external != 0)):
-            return bare.refused("an external axis moves, and it is not known what it carries")
+            return bare.refused("an external axis moves, whose effect on the tool is not known")
         if joints:
             return bare.at_joints(spans[:JOINTS], values[:JOINTS], np.eye(4))
         if not np.isclose(np.linalg.norm(values[3:POSE]), 1.0, atol=1e-3):

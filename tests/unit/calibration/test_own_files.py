@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hilcal.calibration.handover import CorrectedArm, matlab
-from hilcal.calibration.own_files.correct import correct_file
+from hilcal.calibration.robot_files.correct import correct_file
 from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.robot.arm import with_conventions
@@ -132,11 +132,11 @@ def test_an_mjcf_is_the_corrected_arm_to_pinocchio(arm, tmp_path):
     rounded = MJCF.replace("0.61 0.1 0", "0.612 0.1 0").replace("0 0 0.66", "0 0 0.663")
     path.write_text(rounded)
     found = correct(path, arm, new, "base", "flange")
-    assert "its axes lay up to 3.00 mm from those of the nominal krl" in found.note
+    assert "its axes were up to 3.00 mm from those of the nominal krl" in found.note
     path.write_bytes(found.content)
     np.testing.assert_allclose(seen(), poses(new), atol=NM)
     lost = correct(path, new, changed(new), "base")
-    assert "no place for the flange's own shift" in lost.note
+    assert "cannot represent the shift of the flange" in lost.note
 
 
 def sdf_flanges(text):

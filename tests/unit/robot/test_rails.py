@@ -328,7 +328,7 @@ joint_std_rad = 1e-5
     assert arm_from_urdf(tmp_path / "corrected.urdf").slides[0]
     points.write_text("pose,q1_m,q2_rad\na,1,0\n")
     said = refused(capsys, 2, "compensate", run, points)
-    assert "column 'q3_rad' is missing beside its group" in said
+    assert "column 'q3_rad' is missing from its group" in said
 
 
 ARM_AXES = [f"A{k}" for k in range(1, 7)]

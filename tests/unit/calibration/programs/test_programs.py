@@ -329,7 +329,9 @@ def test_frames_on_some_ways_only_are_not_known(arms, tmp_path):
         tmp_path,
         lambda t: t.replace("PTP home1", "IF $IN[1] THEN\r\n$BASE = $NULLFRAME\r\nENDIF"),
     )
-    refusal("block that ends in line 39 sets them on some ways only", read, "krl", arms, tmp_path)
+    refusal(
+        "block that ends in line 39 sets them in some branches only", read, "krl", arms, tmp_path
+    )
     copied(
         "krl",
         tmp_path,
@@ -355,7 +357,8 @@ def test_an_arm_of_another_form_has_its_branches_from_the_point_before(tmp_path)
     assert not any(doubts)
     np.testing.assert_allclose(found, q, atol=1e-8)
     assert (
-        "2 points state a shape of the arm that is read for KRL arms of the usual form" in said[0]
+        "2 points state a shape of the arm, which is defined only for KRL arms of the usual form"
+        in said[0]
     )
     assert "give --near" in resolve(program, arm, None)[1][0]
 

@@ -9,9 +9,9 @@ along z,
 
 o_k is the difference between the joint's zeros in the file and in the controller. H_{−1} is from
 the base of the arm to that of the file: the identity, or half a turn about z (as between `base` and
-`base_link` of a UR arm). G_n is from the flange to the tip. G and H do not contain the file's own
-errors, which may be millimetres, so that N' is exact. One transform is changed for each N'_k: that
-of its joint, after the last joint that of the first step.
+`base_link` of a UR arm). G_n is from the flange to the tip. G and H do not contain the
+errors of the file, which may be millimetres, so that N' is exact. For each N'_k one transform is
+changed: that of its joint, after the last joint that of the first step.
 """
 
 import re
@@ -32,8 +32,8 @@ from hilcal.robot import se3
 from hilcal.robot.arm import Arm, as_drawn
 from hilcal.types import Floats
 
-FRAME_TOLERANCE = 1e-6  # m, rad; of frames that count as the same: files have six decimals
-NEAR_M, NEAR_RAD = 5e-3, 1e-2  # a file with axes this near, rounded or not, is of the arm; a choice
+FRAME_TOLERANCE = 1e-6  # m, rad; nearer frames count as the same: files have six decimals
+NEAR_M, NEAR_RAD = 5e-3, 1e-2  # m, rad; a file whose axes are nearer is of this arm; a choice
 EDIT_TOLERANCE = 1e-9  # m, rad; a transform that changes less keeps its text
 Edits = list[tuple[Span, str]]
 LARGEST, SMALLEST = 1e6, 1e-6  # largest number, and least length of a direction; choices
@@ -163,21 +163,21 @@ class ChainStep:
     line: int  # of it, from 1
     transform: Floats  # (4, 4) in the previous frame
     joint: Floats | None  # (4, 4) joint axis (its z) in the frame of `transform`; None without
-    write: Callable[[Floats], Edits]  # edits of another place; InputError where there can be none
+    write: Callable[[Floats], Edits]  # edits for a new transform; InputError if impossible
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedChain:
     """A chain with a corrected arm."""
 
-    transforms: tuple[Floats, ...]  # (4, 4) new place of each step
+    transforms: tuple[Floats, ...]  # (4, 4) new transform of each step
     tip: Floats  # (4, 4) from the flange of the arm to the tip of the file
     unrepresented: Floats  # (4, 4) transform after the last joint that the file cannot represent
     axis_distance: float  # largest distance of the file's axes from those of the nominal arm, m
 
 
 def fitted_chain(steps: Sequence[ChainStep], nominal: Arm, arm: Arm, file: str) -> FittedChain:
-    """Return the places of a corrected arm in a file."""
+    """Return the transforms of a file with a corrected arm."""
     turning = [k for k, s in enumerate(steps) if s.joint is not None]
     if len(turning) != arm.n:
         names = ", ".join(escaped(steps[k].name) for k in turning)
@@ -197,9 +197,9 @@ def fitted_chain(steps: Sequence[ChainStep], nominal: Arm, arm: Arm, file: str) 
         starts.append((joint, fixed))
         axes.append(end)
         last, joint = k + 1, end
-    left, right, rough = _frames(steps, turning, old, drawn, file, nominal.name)
+    left, right, axis_distance = _frames(steps, turning, old, drawn, file, nominal.name)
     places = [s.transform for s in steps]
-    lost = np.eye(4)
+    unrepresented = np.eye(4)
     for k, (joint, fixed) in enumerate(starts):
         target = se3.inverse(left[k]) @ new[k] @ right[k]
         if k < len(turning):
@@ -208,8 +208,8 @@ def fitted_chain(steps: Sequence[ChainStep], nominal: Arm, arm: Arm, file: str) 
             following = _product(steps[turning[-1] + 2 :])
             places[turning[-1] + 1] = joint @ target @ se3.inverse(following)
         else:
-            lost = joint @ target
-    return FittedChain(tuple(places), right[-1], lost, rough)
+            unrepresented = joint @ target
+    return FittedChain(tuple(places), right[-1], unrepresented, axis_distance)
 
 
 def _frames(
@@ -225,27 +225,27 @@ def _frames(
     solutions: list[tuple[int, list[Floats], list[Floats], float]] = []
     misses: list[tuple[int, float, float]] = []
     for base in (np.eye(4), half):
-        left, right, zeros, rough = [base], [], 0, 0.0
+        left, right, zeros, axis_distance = [base], [], 0, 0.0
         for k in range(len(turning)):
             g = se3.inverse(old[k]) @ left[-1] @ drawn[k]
             if k > 0 and not _near(g):
-                # another zero: H turns about z until the next axis agrees (parallel: its place)
+                # another zero: turn H about z until the next axis agrees, or its place if parallel
                 column = 3 if np.hypot(*old[k][:2, 2]) <= NEAR_RAD else 2
                 of_arm, of_file = old[k][:2, column], (left[-1] @ drawn[k])[:2, column]
                 turn = np.arctan2(*of_arm[::-1]) - np.arctan2(*of_file[::-1])
                 left[-1], zeros = se3.screw(2, float(turn)) @ left[-1], zeros + 1
                 g = se3.inverse(old[k]) @ left[-1] @ drawn[k]
             if not _near(g):
-                misses.append((k, *_off(g)))
+                misses.append((k, *_axis_difference(g)))
                 break
-            rough = max(rough, _off(g)[0])
+            axis_distance = max(axis_distance, _axis_difference(g)[0])
             turn = np.arctan2(g[1, 0] - g[0, 1], g[0, 0] + g[1, 1])
             right.append(se3.screw(2, turn, g[2, 3]))
             left.append(right[-1])
         else:
             tip = se3.inverse(old[-1]) @ left[-1] @ drawn[-1]
             tip = np.eye(4) if pose_difference(tip, np.eye(4)) < NEAR_M else tip
-            solutions.append((zeros, left, [*right, tip], rough))
+            solutions.append((zeros, left, [*right, tip], axis_distance))
     if not solutions:
         k, away, tilt = max(misses)
         step = steps[turning[k]]
@@ -258,11 +258,11 @@ def _frames(
 
 
 def _near(g: Floats) -> bool:
-    distance, tilt = _off(g)
+    distance, tilt = _axis_difference(g)
     return distance < NEAR_M and tilt < NEAR_RAD
 
 
-def _off(g: Floats) -> tuple[float, float]:
+def _axis_difference(g: Floats) -> tuple[float, float]:
     """Distance and angle between the z axes of a frame and its reference, m and rad."""
     return float(np.hypot(*g[:2, 3])), float(np.arctan2(np.hypot(g[0, 2], g[1, 2]), g[2, 2]))
 

@@ -9,7 +9,8 @@ import numpy as np
 from hilcal import limits
 from hilcal.calibration.dh_table import dh_rows
 from hilcal.calibration.handover import CorrectedArm
-from hilcal.calibration.own_files.chain_text import (
+from hilcal.calibration.programs.program import Span, edited
+from hilcal.calibration.robot_files.chain_text import (
     EDIT_TOLERANCE,
     FRAME_TOLERANCE,
     edits_of,
@@ -17,9 +18,8 @@ from hilcal.calibration.own_files.chain_text import (
     pose_difference,
     read_xml,
 )
-from hilcal.calibration.own_files.link_trees import sdf_chain, urdf_steps
-from hilcal.calibration.own_files.mjcf_text import mjcf_steps
-from hilcal.calibration.programs.program import Span, edited
+from hilcal.calibration.robot_files.link_trees import sdf_chain, urdf_steps
+from hilcal.calibration.robot_files.mjcf_text import mjcf_steps
 from hilcal.errors import InputError
 from hilcal.numbers import length
 from hilcal.robot.arm import Arm
@@ -62,17 +62,17 @@ def correct_file(
     changed = f"{len(names)} place{'s' * (len(names) != 1)} changed ({', '.join(names)})"
     note = f"{path}: {changed if names else 'no place changed'}, all else as it was"
     if new.axis_distance > FRAME_TOLERANCE:
-        note += f"; its axes lay up to {length(new.axis_distance)} from those of the nominal "
+        note += f"; its axes were up to {length(new.axis_distance)} from those of the nominal "
         note += nominal.name
     if (shift := pose_difference(new.unrepresented, np.eye(4))) > EDIT_TOLERANCE:
         note += (
-            f"; its tip is the last moving one, which has no place for the flange's own shift "
-            f"({length(shift)}): --tip-link"
+            f"; its tip is the last moving link, which cannot represent the shift of the flange "
+            f"({length(shift)}): give --tip-link"
         )
     if pose_difference(new.tip, np.eye(4)) > FRAME_TOLERANCE:
         note += (
-            f"; its tip lies {length(float(np.linalg.norm(new.tip[:3, 3])))} from the flange of "
-            f"{nominal.name}, and keeps that"
+            f"; its tip is {length(float(np.linalg.norm(new.tip[:3, 3])))} from the flange of "
+            f"{nominal.name}, and stays there"
         )
     return CorrectedFile(edited(document.text, edits).encode("latin-1"), note)
 
@@ -100,8 +100,8 @@ def _ur_conf(path: Path, nominal: Arm, arm: Arm) -> CorrectedFile:
         for key, m in lines.items()
     ]
     note = (
-        f"{path}: the four lines delta_… changed, all else as it was. The rows have no place for "
-        f"where joint 1's axis lies in the base (up to {length(new.base_moves)}) and how the "
-        f"flange sits on the last axis (up to {length(new.flange_moves)})"
+        f"{path}: the four lines delta_… changed, all else as it was. The rows do not contain "
+        f"the pose of joint 1's axis in the base (up to {length(new.base_moves)}) and that of the "
+        f"flange on the last axis (up to {length(new.flange_moves)})"
     )
     return CorrectedFile(edited(text, edits).encode("latin-1"), note)

@@ -19,7 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.calibration.handover import origin_of
-from hilcal.calibration.own_files.chain_text import (
+from hilcal.calibration.programs.program import Span
+from hilcal.calibration.robot_files.chain_text import (
     EDIT_TOLERANCE,
     ChainStep,
     Document,
@@ -29,7 +30,6 @@ from hilcal.calibration.own_files.chain_text import (
     pose_difference,
     z_to,
 )
-from hilcal.calibration.programs.program import Span
 from hilcal.errors import InputError
 from hilcal.names import escaped
 from hilcal.robot import se3
@@ -68,7 +68,7 @@ class LinkTree:
         while out[-1] in self.parents:
             out.append(self.parents[out[-1]][0])
             if len(out) > len(self.parents) + 1:
-                raise InputError(f"{self.document.name}: its joints go round in a circle")
+                raise InputError(f"{self.document.name}: its joints form a loop")
         return out
 
     def _link(self, name: str) -> str:
@@ -117,15 +117,15 @@ def urdf_steps(document: Document, base: str | None, tip: str | None) -> list[Ch
             raise document.error(joint, reason)
         parents[child] = (parent, joint)
     up, down = LinkTree(document, parents).chain(base, tip)
-    turned = [_urdf_step(document, joint, turned=True) for joint in up]
-    return [*turned, *(_urdf_step(document, joint) for joint in down)]
+    inverted = [_urdf_step(document, joint, inverted=True) for joint in up]
+    return [*inverted, *(_urdf_step(document, joint) for joint in down)]
 
 
-def _urdf_step(document: Document, joint: Node, *, turned: bool = False) -> ChainStep:
-    """Return the step of a joint; if `turned`, from its child to its parent."""
+def _urdf_step(document: Document, joint: Node, *, inverted: bool = False) -> ChainStep:
+    """Return the step of a joint; if `inverted`, from its child to its parent."""
     kind, name = joint.attributes.get("type", ""), joint.attributes.get("name", "")
     axis = joint.child("axis")
-    if kind not in (*TURNING, "fixed") or (turned and kind != "fixed"):
+    if kind not in (*TURNING, "fixed") or (inverted and kind != "fixed"):
         raise document.error(joint, not_between(name, kind))
     along = "1 0 0" if axis is None else axis.attributes.get("xyz", "1 0 0")
     origin = joint.child("origin")
@@ -138,7 +138,7 @@ def _urdf_step(document: Document, joint: Node, *, turned: bool = False) -> Chai
         turn = z_to(document.direction(node, _values(document, node, along)))
 
     def write(new: Floats) -> Edits:
-        if turned:
+        if inverted:
             new = se3.inverse(new)
         values = dict(zip(("xyz", "rpy"), origin_of(new), strict=True))
         if origin is None:
@@ -158,7 +158,7 @@ def _urdf_step(document: Document, joint: Node, *, turned: bool = False) -> Chai
             out.append(document.attribute_edit(origin, key, numbers(values[key])))
         return out
 
-    return ChainStep(name, joint.line, se3.inverse(place) if turned else place, turn, write)
+    return ChainStep(name, joint.line, se3.inverse(place) if inverted else place, turn, write)
 
 
 def _values(document: Document, node: Node, text: str) -> Floats:
@@ -208,7 +208,7 @@ class SdfModel:
             if child.tag in ("link", "joint", "frame"):
                 name = child.attributes.get("name", "")
                 if name in self.nodes:
-                    raise document.error(child, f"a second '{escaped(name)}'; valid: names of one")
+                    raise document.error(child, f"a second '{escaped(name)}'; valid: unique names")
                 self.nodes[name] = child
         self.joints = [n for n in self.nodes.values() if n.tag == "joint"]
 
@@ -256,7 +256,7 @@ class SdfModel:
             return np.eye(4)
         if name not in self.nodes or depth > len(self.nodes):
             raise InputError(
-                f"{self.document.name}: frame '{escaped(name)}' is not there, or counts from "
+                f"{self.document.name}: frame '{escaped(name)}' is missing, or relative to "
                 "itself; valid: links, joints, frames of the model"
             )
         return self.pose(self.reference(name), new, depth + 1) @ self.written_pose(name)
@@ -269,13 +269,13 @@ class SdfModel:
             children = {self.parent_and_child(j)[1] for j in remaining}
             ready = [j for j in remaining if self.parent_and_child(j)[0] not in children]
             if not ready:
-                raise InputError(f"{self.document.name}: joints go round in a circle")
+                raise InputError(f"{self.document.name}: joints form a loop")
             out += ready
             remaining = [j for j in remaining if j not in ready]
         return out
 
     def edits(self, transforms: list[Floats]) -> tuple[Edits, list[str]]:
-        """Edits that give the steps other places, and the names of changed links and joints."""
+        """Edits for new transforms of the steps, and the names of changed links and joints."""
         new: dict[str, Floats] = {}
         new_places = dict(zip(self.chain, transforms, strict=True))
         for joint in self.ordered():
@@ -304,7 +304,7 @@ class SdfModel:
                     out.append((Span(0, element.end, element.end_tag), text))
                 names.append(name)
             along, axis_frame = self.axis(node)
-            if along is not None and axis_frame:  # an axis in another frame turns with its joint
+            if along is not None and axis_frame:  # an axis that is stated in another frame
                 old_axis = self.document.numbers(along, self.text(along), 3)
                 local = self.pose(name)[:3, :3].T @ self.pose(axis_frame)[:3, :3] @ old_axis
                 new_axis = self.pose(axis_frame, new)[:3, :3].T @ frame[:3, :3] @ local

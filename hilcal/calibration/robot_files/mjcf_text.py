@@ -11,8 +11,15 @@ import re
 
 import numpy as np
 
-from hilcal.calibration.own_files.chain_text import ChainStep, Document, Edits, Node, numbers, z_to
 from hilcal.calibration.programs.program import Span
+from hilcal.calibration.robot_files.chain_text import (
+    ChainStep,
+    Document,
+    Edits,
+    Node,
+    numbers,
+    z_to,
+)
 from hilcal.errors import InputError
 from hilcal.names import escaped
 from hilcal.robot import se3
