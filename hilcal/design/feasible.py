@@ -10,7 +10,7 @@ from hilcal.cell import Cell
 from hilcal.errors import CannotAnswerError
 from hilcal.measuring.clearance import TRACKER_UNKNOWN
 from hilcal.measuring.feasibility import STATE_CHECKS, Feasibility, Margins
-from hilcal.measuring.route import pose_beside
+from hilcal.measuring.route import approach_pose
 from hilcal.robot.chain import evaluate, joint_jacobian
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Bools, Floats
@@ -92,7 +92,7 @@ class FeasibleSpace(Feasibility):
 
     def can_start(self, q: Floats, loads: Iterable[str]) -> bool:
         """Return whether a run may begin and read again at a state (n,) under some loads."""
-        away = pose_beside(q, self.cell.arm, self.config.limits.joint_margin_rad)[None]
+        away = approach_pose(q, self.cell.arm, self.config.limits.joint_margin_rad)[None]
         return all(
             self.allowed(away, load, STATE_CHECKS).all() and self.passable(q, away, load).all()
             for load in loads

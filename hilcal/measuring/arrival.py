@@ -1,4 +1,4 @@
-"""The readings of one arrival of the arm, and a rough registration to aim the tracker by."""
+"""The readings of one arrival of the arm, and a rough registration that aims the tracker."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -17,15 +17,15 @@ from hilcal.robot.chain import drive_jacobian
 from hilcal.store.plan import Step
 from hilcal.types import Floats
 
-ENOUGH = 4  # least readings of a registration: three fix it, one more checks it
-WITNESSES = 2  # least readings whose distances check another one
-SPREAD_M = 0.05  # least second extent of a cloud of positions that fixes a rotation, m
+MIN_READINGS = 4  # least readings of a registration: three determine it, one more checks it
+MIN_OTHERS = 2  # least number of readings whose distances check another one
+SPREAD_M = 0.05  # least second singular value of centred positions that determine a rotation, m
 PLAUSIBLE_M = 0.1  # largest distance of a reading from the nominal position of its target, m
 FITS_M = 0.02
-"""Largest residual of a reading that fits a registration, m; a nominal arm errs by less."""
-STRAYS = 3  # readings that a registration omits at most; beyond that the nominal arm is wrong
+"""Largest residual of a reading that fits a registration, m; the errors of arms are smaller."""
+MOST_OMITTED = 3  # readings that a registration omits at most; else the nominal arm is wrong
 APART_M = 0.05  # largest error of a distance between two readings, m
-STUCK_M = 1e-5  # readings closer than this, m, at different poses are one old reading
+STUCK_M = 1e-5  # nearer readings at different poses, m, are one repeated reading
 STUCK_SHARE = 0.2
 """A target that moves by less than this share of the arm's motion is not on the arm."""
 MOVES_M = 0.005
@@ -34,7 +34,7 @@ MOVES_M = 0.005
 
 @dataclass(slots=True, eq=False)
 class _Sighting:
-    held: Floats  # (3,) nominal position of the target, base axes, m
+    nominal: Floats  # (3,) nominal position of the target, base axes, m
     position: Floats  # (3,) measured position, sensor axes, m
     target: int
     step: Step | None
@@ -59,14 +59,14 @@ class RoughRegistration:
         A reading that repeats the previous one is skipped: files of older versions have some.
         """
         if self._stuck(q, position, target) is None:
-            held = self._positions(q)[target]
-            self._sightings.append(_Sighting(held, np.asarray(position), target, step))
+            nominal = self._positions(q)[target]
+            self._sightings.append(_Sighting(nominal, np.asarray(position), target, step))
 
     def late_doubts(self) -> list[tuple[Step, str]]:
-        """Return the stored readings that may not be of their target, each once, with the reason.
+        """Return stored readings that may be of another target, each once, with the reason.
 
-        Once the registration is known: readings stored earlier that do not fit it. Until then: a
-        reading that the next one repeated.
+        Once the registration is known, readings that do not fit it; until then, a reading that the
+        next one repeated.
         """
         pose = self.pose()
         if pose is None:
@@ -74,15 +74,17 @@ class RoughRegistration:
             return repeated
         out = []
         for x in self._sightings:
-            far = float(_far(pose, x.held[None], x.position[None])[0])
+            far = float(_residuals(pose, x.nominal[None], x.position[None])[0])
             if far > PLAUSIBLE_M and self._cell.known_targets[x.target] and not x.doubted:
                 x.doubted = True
-                why = f"its target was {far:.3g} m from where the arm held it; another reflector?"
+                why = (
+                    f"its target was {far:.3g} m from where the arm nominal it; another reflector?"
+                )
                 out += [] if x.step is None else [(x.step, why)]
         return out
 
     def doubt_repeated(self, q: Floats, position: Floats, target: int = 0) -> None:
-        """Doubt the reading that a refused reading repeats, unless the registration is known."""
+        """Doubt the reading that a refused one repeats, while the registration is unknown."""
         if self._stuck(q, position, target) is None or self.pose():
             return
         last = self._last(target)
@@ -100,21 +102,25 @@ class RoughRegistration:
         registration = self._cell.registration
         if self._cell.registration_known:
             return registration[:3, :3], registration[:3, 3]
-        held, measured = self._places()
-        if len(held) < ENOUGH:
+        nominal, measured = self._places()
+        if len(nominal) < MIN_READINGS:
             return None
-        of_all = _kabsch(held, measured)
+        of_all = _kabsch(nominal, measured)
         if not all(self._cell.known_targets):  # a guessed target position has large residuals
             return of_all
-        for _ in range(STRAYS + 1):
-            fitted = _kabsch(held, measured)
-            if fitted is None or _far(fitted, held, measured).max() <= FITS_M:
+        for _ in range(MOST_OMITTED + 1):
+            fitted = _kabsch(nominal, measured)
+            if fitted is None or _residuals(fitted, nominal, measured).max() <= FITS_M:
                 return fitted
-            if len(held) == ENOUGH:
+            if len(nominal) == MIN_READINGS:
                 return None
-            fewer = [(np.delete(held, k, 0), np.delete(measured, k, 0)) for k in range(len(held))]
-            worst = [np.inf if (p := _kabsch(*x)) is None else _far(p, *x).max() for x in fewer]
-            held, measured = fewer[int(np.argmin(worst))]
+            fewer = [
+                (np.delete(nominal, k, 0), np.delete(measured, k, 0)) for k in range(len(nominal))
+            ]
+            worst = [
+                np.inf if (p := _kabsch(*x)) is None else _residuals(p, *x).max() for x in fewer
+            ]
+            nominal, measured = fewer[int(np.argmin(worst))]
         return of_all
 
     def expected(self, q: Floats) -> Floats | None:
@@ -123,7 +129,7 @@ class RoughRegistration:
         return None if pose is None else self._positions(q) @ pose[0].T + pose[1]
 
     def implausible(self, q: Floats, position: Floats, target: int = 0) -> str | None:
-        """Return why a reading cannot be of the target on the arm, in one line; else None."""
+        """Return why a reading cannot be of the target on the arm, in one line; None if it can."""
         stuck = self._stuck(q, position, target)
         if stuck is not None or not self._cell.known_targets[target]:
             return stuck
@@ -145,7 +151,7 @@ class RoughRegistration:
         last = self._last(target)
         if last is None:
             return None
-        moved = float(np.linalg.norm(self._positions(q)[target] - last.held))
+        moved = float(np.linalg.norm(self._positions(q)[target] - last.nominal))
         measured = float(np.linalg.norm(position - last.position))
         known_target = self._cell.known_targets[target]
         limit = max(STUCK_M, STUCK_SHARE * moved if known_target else 0.0)
@@ -163,7 +169,7 @@ class RoughRegistration:
         Zero with fewer than two other readings, one of which may be wrong.
         """
         places, positions = self._places()
-        if len(places) < WITNESSES:
+        if len(places) < MIN_OTHERS:
             return 0.0
         moved = np.linalg.norm(places - self._positions(q)[target], axis=1)
         errors = np.sort(np.abs(np.linalg.norm(positions - position, axis=1) - moved))
@@ -173,9 +179,9 @@ class RoughRegistration:
         return next((x for x in reversed(self._sightings) if x.target == target), None)
 
     def _places(self) -> tuple[Floats, Floats]:
-        """Return the nominal and measured positions (K, 3) of the readings without doubt."""
+        """Return the nominal and measured positions (K, 3) of the readings that are not doubted."""
         trusted = [x for x in self._sightings if not x.doubted]
-        return np.array([x.held for x in trusted]), np.array([x.position for x in trusted])
+        return np.array([x.nominal for x in trusted]), np.array([x.position for x in trusted])
 
     def repeatability(self, q: Floats, joint_std: Floats) -> Floats:
         """Return the covariance (3, 3) of a position by the joints' scatter, sensor axes, m².
@@ -195,20 +201,20 @@ class RoughRegistration:
         return np.array([chain.point(t[:3, 3])[0] for t in self._cell.all_targets])
 
 
-def _kabsch(held: Floats, measured: Floats) -> tuple[Floats, Floats] | None:
+def _kabsch(nominal: Floats, measured: Floats) -> tuple[Floats, Floats] | None:
     """Return the rotation (3, 3) and translation (3,) of the best fit of positions (K, 3)."""
-    h, s = held - held.mean(axis=0), measured - measured.mean(axis=0)
+    h, s = nominal - nominal.mean(axis=0), measured - measured.mean(axis=0)
     if np.linalg.svd(h, compute_uv=False)[1] < SPREAD_M:
         return None
     u, _, vt = np.linalg.svd(s.T @ h)
     flip = np.diag([1.0, 1.0, np.linalg.det(u @ vt)])
     rotation = u @ flip @ vt
-    return rotation, measured.mean(axis=0) - rotation @ held.mean(axis=0)
+    return rotation, measured.mean(axis=0) - rotation @ nominal.mean(axis=0)
 
 
-def _far(pose: tuple[Floats, Floats], held: Floats, measured: Floats) -> Floats:
+def _residuals(pose: tuple[Floats, Floats], nominal: Floats, measured: Floats) -> Floats:
     """Return the residuals (K,) of readings by a registration, m."""
-    return np.asarray(np.linalg.norm(measured - held @ pose[0].T - pose[1], axis=1))
+    return np.asarray(np.linalg.norm(measured - nominal @ pose[0].T - pose[1], axis=1))
 
 
 class ArrivalReader:
@@ -260,7 +266,9 @@ class ArrivalReader:
             try:
                 try:
                     aim()
-                except TargetLostError:  # once more: a person may have walked through the beam
+                except (
+                    TargetLostError
+                ):  # a second attempt: a person may have walked through the beam
                     aim()
                 measured = self._measurer.measure(name, aim, force, k)
                 self._check_target(measured, places, k)

@@ -90,10 +90,10 @@ def _tool(cell: Cell) -> tuple[Capsule, ...]:
     """Return capsules from the flange to load point and targets, rough positions included."""
     names = [f" {name}" for name in cell.target_names] or [""]
     places = zip(names, cell.all_targets, strict=True)
-    ways = [(_AT_LOAD, cell.load_point), *((_AT_TARGET + x, at[:3, 3]) for x, at in places)]
+    ends = [(_AT_LOAD, cell.load_point), *((_AT_TARGET + x, at[:3, 3]) for x, at in places)]
     flange = np.zeros(3)
     return tuple(
-        flange_capsule(cell.arm, name, flange, end, TOOL_RADIUS) for name, end in ways if end.any()
+        flange_capsule(cell.arm, name, flange, end, TOOL_RADIUS) for name, end in ends if end.any()
     )
 
 
@@ -135,12 +135,12 @@ class LineOfSight:
         if normal is None:
             return None
         chain = chains.evaluate(self.clearance.cell.arm, q)
-        looks = se3.apply(chain.rotation[-1], np.array(normal) / np.linalg.norm(normal))
+        normals = se3.apply(chain.rotation[-1], np.array(normal) / np.linalg.norm(normal))
         out = []
         for target in self.clearance.cell.all_targets:
             way = self.tracker - chain.point(target[:3, 3])
-            along = np.sum(looks * way, axis=1)
-            out.append(np.arctan2(np.linalg.norm(se3.cross(looks, way), axis=1), along))
+            along = np.sum(normals * way, axis=1)
+            out.append(np.arctan2(np.linalg.norm(se3.cross(normals, way), axis=1), along))
         return np.asarray(np.max(out, axis=0))
 
     def problems(self, q: Floats, load: str, where: str) -> list[str]:
@@ -203,8 +203,8 @@ def segment_distance(a: Floats, b: Floats, c: Floats, d: Floats) -> Floats:
     uu, vv, uv = _dot(u, u), _dot(v, v), _dot(u, v)
     ur, vr = _dot(u, r), _dot(v, r)
     det = uu * vv - uv * uv
-    far = det > 1e-12 * uu * vv  # not parallel
-    s = np.clip(np.where(far, (uv * vr - ur * vv) / np.where(far, det, 1.0), 0.0), 0.0, 1.0)
+    crossed = det > 1e-12 * uu * vv  # not parallel
+    s = np.clip(np.where(crossed, (uv * vr - ur * vv) / np.where(crossed, det, 1.0), 0.0), 0.0, 1.0)
     t = np.clip((uv * s + vr) / np.where(vv > _TINY, vv, 1.0), 0.0, 1.0)
     s = np.clip((uv * t - ur) / np.where(uu > _TINY, uu, 1.0), 0.0, 1.0)
     gap = r + s[..., None] * u - t[..., None] * v

@@ -64,7 +64,7 @@ class Report:
     device: str  # part of the cell: "arm", "tracker", "force sensor", "operator"
     name: str  # by its maker, with the serial number where known
     facts: tuple[tuple[str, str], ...] = ()
-    """(what, value) for people: versions, modes, rates, temperatures."""
+    """(name, text) for people: versions, modes, rates, temperatures."""
     problems: tuple[str, ...] = ()  # to be solved before a run, one clear line each
     fields: tuple[tuple[str, object], ...] = ()
     """(name, value) of the facts for scripts: numbers with their unit in the name."""
@@ -73,7 +73,7 @@ class Report:
 
 
 Row = tuple[str, str, str, object]
-"""Of a report: fact and value for people, name and value for scripts; "": not for them."""
+"""A fact of a report: name and text for people, name and value for scripts; "" omits a pair."""
 
 
 def report_of(
@@ -124,7 +124,7 @@ class ArmDevice(Protocol):
     """
 
     def report(self) -> Report:
-        """Return identity, versions, state, and every problem at once; moves nothing."""
+        """Return identity, versions, state, and all problems; moves nothing."""
 
     def sample(self) -> ArmSample:
         """Return a sample younger than 0.2 s (real time), or raise DeviceError."""
@@ -262,4 +262,4 @@ class ConfirmingOperator(OperatorDevice, Protocol):
 class TerminalPerson(OperatorDevice, Protocol):
     """An operator who may be asked at the terminal that shows the campaign."""
 
-    at_terminal: bool  # whether this is the case; the live display then pauses for the question
+    at_terminal: bool  # whether it is that terminal; the live display then pauses for the question

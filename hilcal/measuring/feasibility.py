@@ -133,7 +133,7 @@ class Feasibility:
                 yield from part.findings(kind)
 
     def unbearable(self, load: str) -> dict[str, str]:
-        """Return why arm or force sensor bear a load in no state, a line per kind."""
+        """Return why arm or force sensor cannot bear a load in any state, a line per kind."""
         arm, tool, hung_load = self.cell.arm, self.cell.tool_mass, self.shapes.load(load)
         mass = tool + (0.0 if hung_load is None else hung_load.mass_kg)
         out = {}
@@ -171,7 +171,7 @@ class Feasibility:
                 )
 
     def _search(self, kind: str, start: Floats, ends: Floats, load: str) -> tuple[Bools, Floats]:
-        """Return which motions (M,) pass a kind, and states (K, n) of the others that do not."""
+        """Return which motions (M,) pass a kind, and states (K, n) that violate it."""
         good = self._always(ends)
         turn = np.abs(self.cell.arm.chain_angles(ends - start))
         count = np.maximum(np.ceil((turn @ self._farthest) / _COARSE_M), 1).astype(np.int64)
@@ -210,7 +210,7 @@ class Feasibility:
             yield self._joints(q)
         elif kind == WORKSPACE:
             places = self._places(body_poses(self.cell.arm, q, chain), slice(None))
-            yield self._inside(self._names, places, self._radius, self._held, self._rates)
+            yield self._inside(self._names, places, self._radius, self._checked_sides, self._rates)
         elif kind == TORQUE:
             yield self._torque(chain, load)
         elif kind == SENSOR and (sensor := self.config.force_sensor) is not None:
@@ -225,10 +225,10 @@ class Feasibility:
             segments = self.shapes.segments_at(chain.point(self.cell.load_point), load)
             if segments:
                 places = np.stack([np.stack([x.start, x.end], axis=1) for x in segments], axis=1)
-                held = np.ones((len(segments), len(_SIDES)), dtype=np.bool_)
+                sides = np.ones((len(segments), len(_SIDES)), dtype=np.bool_)
                 rates = np.tile(self._at_hook, (len(segments), 1))
                 radius = np.array([x.radius for x in segments])
-                yield self._inside([x.name for x in segments], places, radius, held, rates)
+                yield self._inside([x.name for x in segments], places, radius, sides, rates)
             for segment in segments:
                 yield _Touch(scene.free, q, margins.clearance, self._towards, segment)
 
@@ -249,12 +249,12 @@ class Feasibility:
         return _Bounds(over, np.zeros((arm.n, arm.n)), np.zeros(arm.n), violation)
 
     def _inside(
-        self, names: list[str], places: Floats, radius: Floats, held: Bools, rates: Floats
+        self, names: list[str], places: Floats, radius: Floats, sides: Bools, rates: Floats
     ) -> "_Bounds":
-        """Check capsules (N, B, 2, 3) with radii (B,) against sides; `held` (B, 6): which sides."""
+        """Check capsules (N, B, 2, 3) with radii (B,) against sides (B, 6) of the workspace."""
         low, high = places.min(axis=2) - radius[:, None], places.max(axis=2) + radius[:, None]
         over = np.stack([self._box[0] - low, high - self._box[1]], axis=3)
-        body, side = np.nonzero(held)
+        body, side = np.nonzero(sides)
         margin = self.margins.workspace
 
         def violation(k: int, state: int) -> Violation:
@@ -290,7 +290,7 @@ class Feasibility:
             )
             return Violation(TORQUE, name, load, text)
 
-        # a joint turns the forces' points beyond it, or, before the axis, the axis itself
+        # a joint moves the points of the forces beyond it, or, before the axis, the axis itself
         gravity, joint = float(np.linalg.norm(cell.gravity)), np.arange(arm.n)
         weights = gravity * np.append(arm.masses, cell.tool_mass)
         torque_rate = self._levers @ np.append(weights, np.linalg.norm(pull[:3]))
@@ -337,7 +337,7 @@ class Feasibility:
         self._radius = np.array([part.radius for part in parts])
         self._rates = scene.rates
         moving = self._body > min(2, arm.n - 1)
-        self._held = np.repeat(moving[:, None], len(_SIDES), axis=1)
+        self._checked_sides = np.repeat(moving[:, None], len(_SIDES), axis=1)
         mount = self._body < min(2, arm.n - 1)
         turns = np.zeros((64, arm.n))
         first, last = (arm.q_min[0], arm.q_max[0]) if arm.slides[0] else (-np.pi, np.pi)
@@ -348,7 +348,7 @@ class Feasibility:
         fixed = self._inside(names, places, self._radius[mount], everywhere, self._rates[mount])
         outside = fixed.over.reshape(-1, len(_SIDES)) - self.margins.workspace
         respected = mount.any() & np.all(outside <= 0.0, axis=0)
-        self._held |= (~moving & ~mount)[:, None] & respected
+        self._checked_sides |= (~moving & ~mount)[:, None] & respected
         hook = on_flange(arm, self.cell.load_point)[None]
         self._at_hook = np.array([from_axis(arm, arm.n, hook, i + 1) for i in range(arm.n)])
         self._towards = scene.towards(self.cell.load_point)
@@ -387,14 +387,14 @@ class _Bounds:
 
     over: Floats  # (N, K) x
     rates: Floats  # (K, n) largest |∂x/∂θ| by the joints of the chain
-    fine: Floats  # (K,) allowed x > 0 between the samples of a motion
+    tolerance: Floats  # (K,) allowed x > 0 between the samples of a motion
     violation: Callable[[int, int], Violation]  # of column k in a state
 
     def beyond(self, rows: Ints, turn: Floats | None) -> Bools:
         """Return (R,) whether states violate a constraint, or may after turns of up to (R, n)."""
         over = self.over[rows]
         if turn is not None:
-            over = over + np.maximum(turn @ self.rates.T - self.fine, 0.0)
+            over = over + np.maximum(turn @ self.rates.T - self.tolerance, 0.0)
         return np.asarray(~np.all(over <= _ROUNDING, axis=1))  # NaN is a violation
 
     def findings(self, kind: str) -> Iterator[Violation]:

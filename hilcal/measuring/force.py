@@ -43,7 +43,7 @@ class ToolLoad:
 
     @property
     def weighed(self) -> bool:
-        """Whether the mass is above 3 sigma."""
+        """Whether the mass exceeds three standard uncertainties."""
         return bool(self.mass > 3.0 * np.sqrt(self.covariance[6, 6]))
 
     @property
@@ -138,15 +138,15 @@ def tare(
     return ToolLoad(wrench - tool, float(mass), moment, cov, gravity, chi2=0.0, dof=0)
 
 
-def shift(wrench: Floats, arm: Floats) -> Floats:
-    """Return a wrench (..., 6) at a point displaced by `arm` (..., 3): f' = f, M' = M - arm × f."""
+def shift(wrench: Floats, lever: Floats) -> Floats:
+    """Return a wrench (..., 6) at a point displaced by l (..., 3), the lever: M' = M - l × f."""
     force, moment = wrench[..., :3], wrench[..., 3:]
-    return np.concatenate([force, moment - np.cross(arm, force)], axis=-1)
+    return np.concatenate([force, moment - np.cross(lever, force)], axis=-1)
 
 
 def _check_finite(*readings: Floats) -> None:
     if not all(np.isfinite(values).all() for values in readings):
-        raise InputError("tool load: a reading has values that are no finite numbers")
+        raise InputError("tool load: a reading has values that are not finite")
 
 
 def _check_orientations(rotation: Floats, gravity: Floats) -> None:
@@ -203,13 +203,13 @@ def compare(
     e, f = expected[part], measured[part]
     expected_size, measured_size = float(np.linalg.norm(e)), float(np.linalg.norm(f))
     limit = max(tolerance_N * lever, tolerance_share * expected_size)
-    text = f"asked for {_expected_text(e, unit, gravity)}, felt {measured_size:.1f} {unit}"
+    text = f"asked for {_expected_text(e, unit, gravity)}, measured {measured_size:.1f} {unit}"
     if not np.all(np.isfinite([*f, *std[part]])):
         return False, f"{text}: the sensor gives no number"
     noise = 3.0 * float(np.max(std[part]))
     if noise > limit:
         return False, (
-            f"{text} ± {noise:.1f} {unit}: too uncertain to tell, the load may differ by "
+            f"{text} ± {noise:.1f} {unit}: too uncertain, as the load may differ by "
             f"{limit:.1f} {unit}; average longer (force_window_s in [acquire])"
         )
     difference = float(np.linalg.norm(f - e))
@@ -256,7 +256,7 @@ def _mass(force: Floats, gravity: Floats) -> float | None:
 MIN_FRAMES = 20  # frames of a mean wrench, at least
 ENOUGH_POSES = 4  # unloaded readings to identify the tool, at least
 TOOL_OFF_M = 0.01
-"""Distance of the centre of mass from the configured one that is remarked, m; a guess."""
+"""Distance of the centre of mass from the configured one that causes a remark, m; a guess."""
 _FLOOR = np.diag([1e-3**2] * 3 + [1e-4**2] * 3)
 """Least variance of a mean wrench, N² and N²·m²: rounding can hide all noise."""
 
@@ -274,9 +274,9 @@ class ForceMeter:
     """A force sensor with its zero.
 
     The zero of a session is the unloaded reading at the reference pose, less the wrench of the
-    configured tool. It makes the wrenches of sessions comparable if the sensor's own zero drifts
-    while it is off; they retain the difference of the real tool from the configured one. Once
-    `identified`, the tool is the weighed one.
+    configured tool. It makes the wrenches of sessions comparable if the sensor's zero drifts while
+    it is off; they contain the difference of the real tool from the configured one. Once
+    `identified`, the tool is the estimated one.
     """
 
     def __init__(
@@ -289,10 +289,10 @@ class ForceMeter:
         self._origin = np.array(settings.origin_m)
         self._axes = se3.rotation(np.array(settings.rotvec_rad))
         self._com = self._axes.T @ (cell.tool_com - self._origin)
-        self._tared_down: Floats | None = None
-        nothing = np.zeros((PARAMETERS, PARAMETERS))
+        self._gravity_at_tare: Floats | None = None  # (3,) sensor axes
+        exact = np.zeros((PARAMETERS, PARAMETERS))
         moment = cell.tool_mass * self._com
-        self.tool = ToolLoad(np.zeros(6), cell.tool_mass, moment, nothing, cell.gravity, 0.0, 0)
+        self.tool = ToolLoad(np.zeros(6), cell.tool_mass, moment, exact, cell.gravity, 0.0, 0)
 
     def present_wrench(self) -> Floats:
         """Return the present tared wrench (6,), sensor axes."""
@@ -301,7 +301,9 @@ class ForceMeter:
     def average(self) -> WrenchSample:
         """Return a mean of at least `MIN_FRAMES` frames, not tared."""
         sample = self.sensor.average(self._seconds)
-        if sample.frames < MIN_FRAMES:  # a fast clock's window is too short for the real line
+        if (
+            sample.frames < MIN_FRAMES
+        ):  # in a fast simulated cell the window is too short for the real data rate
             self._seconds *= 1.2 * MIN_FRAMES / max(sample.frames, 1)
             sample = self.sensor.average(self._seconds)
         variance, rounding = np.diagonal(sample.covariance), 1e-12 * (1.0 + np.abs(sample.wrench))
@@ -320,8 +322,8 @@ class ForceMeter:
     def frame(self, q: Floats) -> tuple[Floats, Floats]:
         """Return R_base_sensor and the vector (3,) from sensor to load point, base axes, m."""
         chain = chains.evaluate(self._cell.arm, np.asarray(q)[None])
-        arm = chain.point(self._cell.load_point) - chain.point(self._origin)
-        return chain.rotation[-1][0] @ self._axes, arm[0]
+        lever = chain.point(self._cell.load_point) - chain.point(self._origin)
+        return chain.rotation[-1][0] @ self._axes, lever[0]
 
     def to_flange(self, point: Floats) -> Floats:
         """Convert a point (3,) from sensor axes to flange axes, m."""
@@ -330,7 +332,7 @@ class ForceMeter:
     def set_zero(self, sample: WrenchSample, q: Floats) -> None:
         """Set the zero by an unloaded mean wrench at joint angles (n,)."""
         cell, rotation = self._cell, self.frame(q)[0]
-        self._tared_down = rotation.T @ cell.gravity
+        self._gravity_at_tare = rotation.T @ cell.gravity
         covariance = self.tared(sample, q).covariance
         zero = tare(sample.wrench, covariance, rotation, cell.gravity, cell.tool_mass, self._com)
         self.zero = zero.bias
@@ -344,12 +346,12 @@ class ForceMeter:
         gravity, its maximum.
         """
         gravity = self._cell.gravity
-        if self._tared_down is None:
+        if self._gravity_at_tare is None:
             return 2.0 * float(np.linalg.norm(gravity))
-        return float(np.linalg.norm(self.frame(q)[0].T @ gravity - self._tared_down))
+        return float(np.linalg.norm(self.frame(q)[0].T @ gravity - self._gravity_at_tare))
 
     def identify(self, unloaded: list[TaredWrench], tolerance_N: float) -> tuple[int, ...] | None:
-        """Identify the tool from unloaded readings; return the indices of outliers; None: too few.
+        """Identify the tool from unloaded readings; return indices of outliers, None if too few.
 
         A reading whose force the tool does not explain to the tolerance was not unloaded, or a
         person touched the tool: the worst one is removed until all are explained.
@@ -376,17 +378,17 @@ class ForceMeter:
 
     def load_wrench(self, tared: TaredWrench) -> Floats:
         """Return the wrench (6,) of the load at the load point, base axes, N and N·m."""
-        rotation, arm = self.frame(tared.q)
-        return shift(self.tool.load_wrench(tared.wrench, rotation), arm)
+        rotation, lever = self.frame(tared.q)
+        return shift(self.tool.load_wrench(tared.wrench, rotation), lever)
 
     def verify(
         self, load: CellLoad | None, tared: TaredWrench, operator: Operator
     ) -> tuple[bool, str]:
         """Return whether a load hangs, within the operator's tolerance, and the finding."""
-        gravity, (rotation, arm) = self._cell.gravity, self.frame(tared.q)
+        gravity, (rotation, lever) = self._cell.gravity, self.frame(tared.q)
         expected = np.zeros(6) if load is None else load.wrench(gravity)
         moved = np.eye(6)
-        moved[3:, :3] = -se3.skew(arm)
+        moved[3:, :3] = -se3.skew(lever)
         at_sensor = self.tool.load_covariance(tared.covariance, rotation)
         std = np.sqrt(np.diagonal(moved @ at_sensor @ moved.T))
         limits = operator.tolerance_N, operator.tolerance_share
@@ -410,8 +412,8 @@ class ForceMeter:
         if not weight and not place:
             return None
         return (
-            f"the force sensor feels a tool of {_tool(tool.mass, com)}, flange axes; [tool] says "
-            f"{_tool(cell.tool_mass, cell.tool_com)}"
+            f"the force sensor measures a tool of {_tool(tool.mass, com)}, flange axes; [tool] "
+            f"says {_tool(cell.tool_mass, cell.tool_com)}"
         )
 
 

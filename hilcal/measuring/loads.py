@@ -16,8 +16,8 @@ from hilcal.measuring.progress import Answered, Phase, Question, Remark
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
-TRIES = 3  # most requests for one load
-SWINGING_S = 2.0  # time until a load that seems wrong is weighed once more, cell s
+TRIES = 3  # requests for one load at most
+SWINGING_S = 2.0  # pause before a load that seems wrong is measured again, cell s
 
 
 def payload(cell: Cell, load: CellLoad | None) -> tuple[float, Floats]:
@@ -35,7 +35,7 @@ class Hook:
     def __init__(self, setup: Setup, meter: ForceMeter | None, mover: Mover) -> None:
         """Start with an unknown load, until `take_all_off`."""
         self.hanging, self.since, self._doubted = UNLOADED, setup.clock.now(), False
-        self.believed = False  # whether a person denied a load that the sensor seems to feel
+        self.load_denied = False  # whether a person denied a load that the sensor seems to measure
         self._arm, self._operator, self._meter = setup.rig.arm, setup.rig.operator, meter
         self._cell, self._config, self._mover = setup.cell, setup.cell.configured(), mover
         self._clock, self._watcher = setup.clock, setup.watcher
@@ -46,7 +46,7 @@ class Hook:
         return self._loads.get(name)
 
     def take_all_off(self) -> None:
-        """Have every load taken off before anything moves, as the load is unknown."""
+        """Have all loads removed before anything moves, since the present load is unknown."""
         self._ask(None, self._still_hangs)
         self.hanging, self.since = UNLOADED, self._clock.now()
 
@@ -62,7 +62,7 @@ class Hook:
             self._set_payload(new)
         self._suspend(self.hanging, name)
         self._ask(new, lambda: self._differs(new), answered=None if heavier else self._set_payload)
-        self._hangs(name)
+        self._note_hanging(name)
 
     def restore(self, why: str) -> None:
         """Have a wrong load corrected, where the arm stands.
@@ -75,7 +75,7 @@ class Hook:
         if load is not None and not self._differs(None):
             self._set_payload(None)
         self._ask(load, lambda: self._differs(load), why, self._set_payload)
-        self._hangs(name)
+        self._note_hanging(name)
 
     def confirm(self, question: str) -> None:
         """Ask a person whether the arm may go on."""
@@ -85,7 +85,7 @@ class Hook:
         if not self._at_terminal:
             self._watcher.notify(Remark(question))
         self._watcher.notify(Phase("waiting for the operator to look at the arm"))
-        self._asked(partial(operator.confirm, question))
+        self._ask_person(partial(operator.confirm, question))
 
     @property
     def _at_terminal(self) -> bool:
@@ -95,20 +95,20 @@ class Hook:
         self._arm.set_payload(*payload(self._cell, load))
 
     def _suspend(self, *hanging: str) -> None:
-        """Note that one of some loads hangs, and stop comparing the force with a load."""
+        """Note that one of these loads hangs, and stop comparing the force with a load."""
         self._mover.hanging = hanging
         if self._mover.watch is not None:
             self._mover.watch.suspend()
 
-    def _hangs(self, name: str) -> None:
+    def _note_hanging(self, name: str) -> None:
         """Note that a load hangs, and compare the force with it."""
         self.hanging, self.since = name, self._clock.now()
         self._mover.hanging = (name,)
         if self._mover.watch is not None:
             self._mover.watch.expect(self.load(name))
 
-    def _asked(self, ask: Callable[[], None]) -> None:
-        """Ask a person; the display pauses if the person is at its terminal."""
+    def _ask_person(self, ask: Callable[[], None]) -> None:
+        """Ask a person; the live display pauses if it is at the same terminal."""
         if self._at_terminal:
             self._watcher.notify(Question())
         ask()
@@ -130,7 +130,7 @@ class Hook:
         task = "take everything off" if load is None else f"hang {load.name}"
         for _ in range(TRIES):
             self._watcher.notify(Phase(f"waiting for the operator to {task}"))
-            self._asked(partial(self._operator.hang, load, why))
+            self._ask_person(partial(self._operator.hang, load, why))
             self._watcher.notify(Phase("checking what hangs"))
             if answered is not None:
                 answered(load)
@@ -162,20 +162,20 @@ class Hook:
         return text
 
     def _still_hangs(self) -> str:
-        """Return a message on a load that seems to hang still: one that fits better than nothing.
+        """Return a message on a load that still seems to hang: one that fits better than none.
 
-        The zero is that of an earlier session. Without one it is the sensor's zero, which may be
-        far off: then a second answer that nothing hangs is believed, once a person confirms it.
+        The zero is that of a previous session. Without one it is the sensor's zero, which may be
+        far off: then a second answer that nothing hangs is accepted, once a person confirms it.
         """
         if self._meter is None:
             return ""
         has_zero = bool(np.any(self._meter.zero))
-        believed, self._doubted = self._doubted and not has_zero, True
+        denied_twice, self._doubted = self._doubted and not has_zero, True
         sample = self._mover.checked_sample()
         tared = self._meter.tared(self._meter.average(), sample.q)
         force = self._meter.load_wrench(tared)[:3]
-        felt = float(np.linalg.norm(force))
-        if felt <= self._config.operator.tolerance_N:
+        measured = float(np.linalg.norm(force))
+        if measured <= self._config.operator.tolerance_N:
             return ""
         gravity = self._cell.gravity
         distances = {
@@ -183,18 +183,18 @@ class Hook:
             for load in self._config.loads
         }
         name = min(distances, key=distances.__getitem__, default="")
-        if not name or distances[name] >= felt:
+        if not name or distances[name] >= measured:
             return ""
-        if not believed:
+        if not denied_twice:
             reference = "in the unloaded readings so far" if has_zero else "the tool weighs"
             return (
-                f"the force sensor feels {felt:.1f} N more than {reference}; {name} seems to hang "
-                "still"
+                f"the force sensor measures {measured:.1f} N more than {reference}; {name} still "
+                "seems to hang"
             )
         self.confirm(
-            f"the force sensor feels {felt:.1f} N, as if {name} hung, and the answer was twice "
-            "that nothing hangs. If so, the sensor's zero is off; if not, the arm may drop or "
-            "stop, as its controller does not know of the load. Look at the flange"
+            f"the force sensor measures {measured:.1f} N, as if {name} hung, and the answer was "
+            "twice that nothing hangs. If so, the sensor's zero is off; if not, the arm may drop "
+            "or stop, as its controller does not know of the load. Look at the flange"
         )
-        self.believed = True
+        self.load_denied = True
         return ""

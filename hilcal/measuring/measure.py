@@ -69,7 +69,7 @@ def average(samples: Sequence[TrackerSample], systematic_share: float = 0.0) -> 
     """
     values = np.array([sample.value for sample in samples])
     stated = np.array([sample.covariance for sample in samples])
-    retained = _not_gross(values, stated.mean(axis=0))
+    retained = _inliers(values, stated.mean(axis=0))
     left_out = tuple(int(k) for k in np.flatnonzero(~retained))
     if len(left_out) > max(1.0, MOST_LEFT_OUT * len(samples)) or retained.sum() < 2:
         raise DeviceError(
@@ -116,7 +116,7 @@ def deviations(values: Floats) -> tuple[Floats, Floats]:
     return mean, residuals
 
 
-def _not_gross(values: Floats, stated: Floats) -> Bools:
+def _inliers(values: Floats, stated: Floats) -> Bools:
     """Return which samples (K,) are no gross outliers."""
     m = values.shape[1]
     white = deviations(values)[1] @ whitening_matrix(stated).T
@@ -130,7 +130,7 @@ _LOG_GROSS = float(np.log(2) + scipy.special.log_ndtr(-GROSS_SIGMA))
 
 DRIFT_P = 0.04
 """False alarm rate of the drift test. The constants here are choices, balanced by hand in
-tests/unit/measuring/test_measure.py: time lost at rest against the bias by a decay."""
+tests/unit/measuring/test_measure.py: time spent at rest against the bias by a decaying drift."""
 AFTER_DRIFT_P = 0.3
 """The same after a drift: the test is repeated at every sample, and none of the repeated tests may
 miss a drift."""
@@ -164,7 +164,7 @@ class SettleWindow:
         window = self._samples[-max(self._count, len(self._samples) // 2) :]
         trend = _trend(window)
         if trend.moment == 0.0:
-            return False  # all at one time: no trend
+            return False  # all samples at one time: no trend
         noise = 1.0
         if trend.scatter_p < SCATTER_P:
             enough = max(2 * self._count, MIN_SAMPLES) * max(1.0, np.log10(trend.scatter))
@@ -209,9 +209,9 @@ def _trend(samples: Sequence[TrackerSample]) -> _Trend:
     residuals = deviations(np.array([s.value for s in samples]))[1]
     root = whitening_matrix(np.mean([s.covariance for s in samples], axis=0))
     slope = time @ residuals / moment if moment > 0 else np.zeros(residuals.shape[1])
-    about = (residuals - np.outer(time, slope)) @ root.T
+    deviation = (residuals - np.outer(time, slope)) @ root.T
     dof = residuals.shape[1] * (len(samples) - 2)
-    total = float(np.sum(about**2))
+    total = float(np.sum(deviation**2))
     scatter, p = (total / dof, float(scipy.stats.chi2.sf(total, dof))) if dof else (0.0, 1.0)
     return _Trend(root @ slope, moment, span, scatter, p, dof)
 
@@ -321,7 +321,7 @@ class Measurer:
             return None, why
         if watch is not None and watch.differed != differed and not self._wrong(force, after):
             return None, (
-                "for a moment the force sensor felt something else than tool and load: was the "
+                "for a moment the force sensor measured another force than tool and load: was the "
                 "tool touched?"
             )
         if len({sample.value.tobytes() for sample in tracker}) == 1:

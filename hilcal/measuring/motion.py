@@ -77,7 +77,7 @@ class Guard:
         return None
 
 
-# choices, no study set them; tests/unit/measuring/test_run_watched.py shows what they detect
+# choices without a study; tests/unit/measuring/test_run_watched.py shows what they detect
 TOLERANCE_FACTOR = 2.0
 """Tolerance of a hanging load, over the tolerance when it is hung: a sensor's zero drifts."""
 SWING_SHARE = 0.3  # lateral force of a load that swings in motion, as a share of its weight: 17°
@@ -101,7 +101,7 @@ class LoadWatch:
     """
 
     def __init__(self, meter: ForceMeter, cell: Cell) -> None:
-        """Start without comparison, until `expect`."""
+        """Compare nothing until `expect`."""
         self._meter, self._cell, self._config = meter, cell, cell.configured()
         self._load: CellLoad | None = None
         self._hung = np.zeros(6)  # wrench of the load at the load point, base axes
@@ -170,11 +170,13 @@ class LoadWatch:
 
     def _message(self, tared: TaredWrench) -> str:
         part, unit, _ = judged_part(self._hung)
-        felt, hung = (np.linalg.norm(w[part]) for w in (self._meter.load_wrench(tared), self._hung))
+        measured, hung = (
+            np.linalg.norm(w[part]) for w in (self._meter.load_wrench(tared), self._hung)
+        )
         name = "nothing" if self._load is None else self._load.name
         suffix = "" if self._meter.identified else " Or is [tool] mass_kg or com_m wrong?"
         return (
-            f"the force sensor feels {felt:.1f} {unit} where {name} should hang ({hung:.1f} "
+            f"the force sensor measures {measured:.1f} {unit} where {name} should hang ({hung:.1f} "
             f"{unit}): has a load fallen off, or does somebody touch the tool?{suffix}"
         )
 
@@ -185,8 +187,8 @@ MIN_SPEED_SHARE = 0.02  # share of the speed slider below which the time limit d
 STILL_RAD = 1e-4  # largest variation of the joints of an arm at rest, rad (some encoder steps)
 MOVED_RAD = 0.005
 """Largest distance of a joint from its last goal, rad, beyond which it was moved; brakes and sag
-move it by less. A choice, no study set it: 7 mm at the end of an arm of 1.3 m."""
-OFF_WAY_RAD = 0.05
+move it by less. A choice: 7 mm at the end of an arm of 1.3 m."""
+OFF_PATH_RAD = 0.05
 """Largest distance of a joint from the straight line of its motion, rad; an arm follows its command
 to about 0.01. A choice."""
 FOLLOW_S = 0.05
@@ -214,27 +216,27 @@ class Mover:
         self._arm, self._meter, self.guard = setup.rig.arm, meter, Guard(cell)
         self._limits = Feasibility(cell)
         self._motion, self._clock, self._watcher = config.motion, setup.clock, setup.watcher
-        self._under_way = False
-        self._ticked: tuple[float, int] = (-1.0, 0)
+        self._in_motion = False
+        self._last_tick: tuple[float, int] = (-1.0, 0)
 
     def checked_sample(self) -> ArmSample:
         """Return a sample of the arm, after checks of the arm and of the force sensor."""
         sample = self._arm.sample()
-        felt = None if self._meter is None else self._meter.present_wrench()
-        checked = (self.guard.check(sample, felt, load) for load in self.hanging)
-        reason = next(filter(None, checked), None) or self._clock_stands(sample)
+        measured = None if self._meter is None else self._meter.present_wrench()
+        checked = (self.guard.check(sample, measured, load) for load in self.hanging)
+        reason = next(filter(None, checked), None) or self._frozen_clock(sample)
         if reason is not None:
             if sample.safety != NORMAL:
                 self._arm.moving()  # a driver that can raises the cause and the remedy
             raise DeviceError(reason)
-        if not self._under_way and (moved := self.moved_by_others(sample)) is not None:
+        if not self._in_motion and (moved := self.moved_by_others(sample)) is not None:
             raise DeviceError(f"arm: {moved}")
-        if self.watch is not None and felt is not None:
-            self.watch.check_frame(sample, felt, moving=self._under_way)
+        if self.watch is not None and measured is not None:
+            self.watch.check_frame(sample, measured, moving=self._in_motion)
         return sample
 
     def moved_by_others(self, sample: ArmSample) -> str | None:
-        """Return who seems to have moved the arm from its goal, and how far; else None."""
+        """Return who seems to have moved the arm from its goal, and how far; None if nobody."""
         if self.goal is None:
             return None
         for q, subject in (
@@ -265,13 +267,13 @@ class Mover:
         ask: Callable[[str], None],
         place: str = WHERE_LEFT,
     ) -> Floats:
-        """Return the position (n,) of the arm, once its way to a goal is free and people agree.
+        """Return the position (n,) of the arm, once its path to a goal is free and people agree.
 
-        If it does not stand where it is `expected`, at a `place` in words, people are asked first,
-        and the way is checked again.
+        If it is not at the `expected` position, a `place` in words, people are asked first, and the
+        path is checked again.
         """
         while True:
-            q = self.free_way(goal, name).q
+            q = self.sample_with_free_path(goal, name).q
             joint, distance = self._worst(q - expected)
             if distance <= MOVED_RAD:
                 return q
@@ -281,12 +283,12 @@ class Mover:
             )
             expected = q
 
-    def free_way(self, goal: Floats, name: str) -> ArmSample:
-        """Return a sample of the arm; refuse one not ready, or whose way to `goal` is not free."""
+    def sample_with_free_path(self, goal: Floats, name: str) -> ArmSample:
+        """Return a sample of an arm that is ready and whose path to `goal` is free; else DeviceError."""
         sample = self._arm.sample()
         if (unfit := self.guard.state(sample)) is not None:
             raise DeviceError(unfit)
-        self.check_way(sample.q, goal, name)
+        self.check_path(sample.q, goal, name)
         return sample
 
     def put_back(self, ask: Callable[[str], None]) -> None:
@@ -302,7 +304,7 @@ class Mover:
         if self.goal is None:
             self.goal = self._arm.sample().q
 
-    def check_way(self, start: Floats, goal: Floats, name: str) -> None:
+    def check_path(self, start: Floats, goal: Floats, name: str) -> None:
         """Check the straight line in joint space between two states (n,), rad."""
         for load in self.hanging:
             stops = Stop("where the arm stands", start, load), Stop(name, goal, load)
@@ -313,17 +315,17 @@ class Mover:
                 )
 
     def move(self, q: Floats, name: str) -> None:
-        """Move straight to `q` (n,), rad; the way is checked from the arm's actual position."""
+        """Move straight to `q` (n,), rad; the path is checked from the arm's actual position."""
         start = self.checked_sample().q
         if self.goal is not None and np.abs(start - self.goal).max() <= self._motion.arrival_rad:
             start = self.goal
-        self.check_way(start, q, name)
+        self.check_path(start, q, name)
         self.goal = None  # unknown until it arrives
-        self._under_way = True
+        self._in_motion = True
         try:
             self._go(start, q, name)
         finally:
-            self._under_way = False
+            self._in_motion = False
         self.goal = q
         moved = np.sign(q - start)
         self.side = np.where(moved == 0.0, self.side, moved)
@@ -367,13 +369,13 @@ class Mover:
         way = goal - start
         share = np.clip((sample.q - start) @ way / max(float(way @ way), 1e-30), 0.0, 1.0)
         joint, deviation = self._worst(sample.q - start - share * way)
-        if not deviation <= OFF_WAY_RAD:
+        if not deviation <= OFF_PATH_RAD:
             raise DeviceError(
                 f"arm: {joint} has left the straight way to {name} by {deviation:.3g} rad; does "
                 "another program command the arm, or does somebody push it?"
             )
         joint, lag = self._worst(sample.q_target - sample.q)
-        if not lag <= OFF_WAY_RAD + FOLLOW_S * self._motion.speed_rad_s:
+        if not lag <= OFF_PATH_RAD + FOLLOW_S * self._motion.speed_rad_s:
             raise DeviceError(
                 f"arm: {joint} is told to be {lag:.3g} rad from where it is, on the way to "
                 f"{name}: its angle is old, or something holds the joint"
@@ -390,11 +392,11 @@ class Mover:
             )
         return last
 
-    def _clock_stands(self, sample: ArmSample) -> str | None:
-        """Return a message if the controller's clock stands still, or None."""
-        stamp, since = self._ticked
+    def _frozen_clock(self, sample: ArmSample) -> str | None:
+        """Return a message if the controller's clock stands still; else None."""
+        stamp, since = self._last_tick
         if sample.timestamp != stamp:
-            self._ticked = sample.timestamp, sample.host_ns
+            self._last_tick = sample.timestamp, sample.host_ns
         elif sample.host_ns - since > FROZEN_S * 1e9:
             return f"arm: its clock has stood still for {FROZEN_S:g} s; its data are old"
         return None

@@ -31,8 +31,8 @@ class Stop:
     step: Step | None = None  # the reading at the stop; None without
 
 
-def pose_beside(q: Floats, arm: Arm, margin: float) -> Floats:
-    """Return (n,) the stop before a reference pose, `margin` from the limits, rad."""
+def approach_pose(q: Floats, arm: Arm, margin: float) -> Floats:
+    """Return (n,) the stop before a reference pose, at least `margin` from the limits, rad."""
     side = np.where(q - APPROACH_RAD >= arm.q_min + margin, 1.0, -1.0)
     return np.asarray(q - side * APPROACH_RAD)
 
@@ -42,11 +42,11 @@ def route(plan: Plan, arm: Arm, margin: float = 0.0) -> tuple[Stop, ...]:
 
     The first two stops, beside the reference pose and at it, move every joint, so that the approach
     sides of all readings are known. Loads are changed at the reference pose. A repeated reading is
-    approached anew.
+    approached again.
     """
     base = plan.home
     q_home = plan.joints(base)
-    first = Stop(f"beside {base}", pose_beside(q_home, arm, margin), UNLOADED)
+    first = Stop(f"beside {base}", approach_pose(q_home, arm, margin), UNLOADED)
     stops = [first, Stop(base, q_home, UNLOADED)]
     for step in plan.steps:
         last = stops[-1]
@@ -188,7 +188,7 @@ def route_problems(limits: Feasibility, stops: tuple[Stop, ...]) -> list[str]:
 
 def _remarks(plan: Plan, limits: Feasibility) -> list[str]:
     out = []
-    is_test = "purpose" in plan.about  # of a model: unloaded readings may be in another file
+    is_test = "purpose" in plan.about  # a test of a model, whose unloaded readings may be elsewhere
     unloaded = {(s.pose, s.cycle) for s in plan.steps if s.load == UNLOADED}
     unpaired = [s for s in plan.steps if (s.pose, s.cycle) not in unloaded]
     if unpaired and not is_test and limits.config.readings_mode == "deflection":

@@ -48,7 +48,7 @@ from hilcal.measuring.session_state import (
     detail,
     repeatability,
     sample_json,
-    stored_felt,
+    stored_force,
     stored_wrench,
 )
 from hilcal.readings.readings import Readings, States
@@ -61,16 +61,16 @@ AT_LAST = "where its last reading was taken"  # it may have been stopped on the 
 EMERGENCY = "press the emergency stop"
 _STOPS = 3  # attempts to stop the arm
 MOVED_M = 1e-3
-"""Distance of the target at the reference pose from where earlier readings have it that a person is
-asked about, m; an arm returns by less, also as it warms up. A choice."""
+"""Distance of the target at the reference pose from its previous position, m, above which a person
+is asked; an arm returns more exactly, even while it warms up. A choice."""
 GRAVITY_CHANGE = 5.0
 """Change of gravity in the sensor's axes, m/s², that separates a load from its zero: 30°."""
 Done = TypeVar("Done")
 LiveModel = Callable[[Readings], LiveResidual]
 """Returns the residual of the last reading by a model fitted to the previous ones."""
 StoppingRule = Callable[[Readings, bool], GoalStatus]
-"""Returns the status of the goal from all readings. The second argument: whether the plan has no
-further readings; else the status may be of fewer readings, as fits must not delay the campaign."""
+"""Returns the status of the goal from all readings. The second argument is whether the plan has no
+further readings; else the status may be of fewer ones, as fits must not delay the campaign."""
 
 
 class Session:
@@ -86,7 +86,7 @@ class Session:
         goal: StoppingRule | None = None,
         epoch: float | None = None,
     ) -> None:
-        """Read the stored readings of earlier sessions; no device is used yet."""
+        """Read the stored readings of previous sessions; no device is used yet."""
         self.in_control = False
         rig, cell, config = setup.rig, setup.cell, setup.cell.configured()
         self._rig, self._cell, self._config = rig, cell, config
@@ -94,7 +94,7 @@ class Session:
         self._plan, self._store, self._live, self._wall = plan, store, live, wall
         self._rule = goal
         self._goal: GoalStatus | None = None
-        self.pose: str | None = None  # of the reading that is under way
+        self.pose: str | None = None  # of the current reading
         self._meter: ForceMeter | None = None
         if rig.force is not None and config.force_sensor is not None:
             window = setup.clock.real(config.acquire.force_window_s)
@@ -114,9 +114,9 @@ class Session:
         self._epoch = start if epoch is None else epoch
         self._start = setup.clock.now()
         self._elapsed = max(start - self._epoch, 0.0) * setup.clock.scale
-        self._remember()
+        self._restore()
 
-    def _remember(self) -> None:
+    def _restore(self) -> None:
         """Restore times, tool, reference and unloaded positions from the stored readings."""
         details = self._store.details()
         stored = self._store.readings()
@@ -144,33 +144,33 @@ class Session:
             q, covariance = np.array(raw["q_actual"]), np.array(raw["tracker_covariance"])
             tared = stored_wrench(raw, self._meter)
             self._state.add(step, q, value, covariance, tared, target)
-        felt = stored_felt(details[-1], self._meter)
-        if self._meter is not None and felt is not None:
-            self._meter.zero = np.array(felt["zero"])
+        force = stored_force(details[-1], self._meter)
+        if self._meter is not None and force is not None:
+            self._meter.zero = np.array(force["zero"])
             self._identify()
 
     def visit(self, stops: tuple[Stop, ...]) -> None:
         """Visit all stops; move home as soon as the goal is met."""
         self._event("start", {"missing": sum(s.step is not None for s in stops)})
         self._begin(stops[:2])
-        if self._hook.believed:
-            self._watched(partial(self._turn, stops))
+        if self._hook.load_denied:
+            self._watched(partial(self._check_zero, stops))
         pace = self._pace = Eta(self._clock)
-        behind, ahead = list(stops[:2]), stops[2:]
+        visited, remaining_stops = list(stops[:2]), stops[2:]
         if self._goal_newly_met(last=False):  # the last session was stopped on its way home
-            ahead = way_home(self._cell, self._plan, behind, self._store.done())
-        while ahead:
-            stop, ahead = ahead[0], ahead[1:]
-            behind.append(stop)
+            remaining_stops = way_home(self._cell, self._plan, visited, self._store.done())
+        while remaining_stops:
+            stop, remaining_stops = remaining_stops[0], remaining_stops[1:]
+            visited.append(stop)
             result = self._watched(partial(self._visit, stop))
             if stop.step is not None and result is not None:
                 pace.note_reading()
-                if self._goal_newly_met(last=all(s.step is None for s in ahead)):
+                if self._goal_newly_met(last=all(s.step is None for s in remaining_stops)):
                     done = self._store.done()
-                    ahead = way_home(self._cell, self._plan, behind, done)
-                readings_left = sum(s.step is not None for s in ahead)
+                    remaining_stops = way_home(self._cell, self._plan, visited, done)
+                readings_left = sum(s.step is not None for s in remaining_stops)
                 remaining = pace.remaining(
-                    readings_left, sum(s.change_to is not None for s in ahead)
+                    readings_left, sum(s.change_to is not None for s in remaining_stops)
                 )
                 self._report_stored(stop.step, *result, remaining)
         self._finish()
@@ -227,7 +227,7 @@ class Session:
         stand at its last reading.
         """
         first, last_q = start[0], self._state.last_q
-        sample = self._mover.free_way(first.q, first.name)
+        sample = self._mover.sample_with_free_path(first.q, first.name)
         if self._temperatures is None:
             self._temperatures = bool(np.isfinite(sample.joint_temperature).all())
         self._hook.take_all_off()
@@ -256,21 +256,21 @@ class Session:
     def _target_position(self, stop: Stop) -> Floats:
         """Return the position (3,) of the target, sensor axes, m.
 
-        A lost one is searched where it will be compared: a moved tracker may have lost it.
+        A lost target is searched if its position will be compared: the tracker may have been moved.
         """
         tracker = self._rig.tracker
         try:
             return tracker.measure().value[:3]
         except TargetLostError:
-            if self._seen_before(stop) is None:
+            if self._previous_position(stop) is None:
                 raise
             tracker.find_target()
             self._mover.checked_sample()
             return tracker.measure().value[:3]
 
     def _compare_place(self, stop: Stop, position: Floats) -> None:
-        """Ask a person if the target at the reference pose is not where it was before."""
-        before = self._seen_before(stop)
+        """Ask a person if the target at the reference pose is not at its previous position."""
+        before = self._previous_position(stop)
         if before is None:
             return
         moved = float(np.linalg.norm(position - before))
@@ -284,8 +284,8 @@ class Session:
                 "do not belong together: put it back, or give up and begin a new campaign"
             )
 
-    def _seen_before(self, stop: Stop) -> Floats | None:
-        """Return where the target was at the reference pose before; None elsewhere or unknown."""
+    def _previous_position(self, stop: Stop) -> Floats | None:
+        """Return the previous position of the target at the reference pose; None if unknown."""
         before = self._state.reference
         if before is None:
             before = self._plan.about.get(SEEN)
@@ -306,10 +306,10 @@ class Session:
             sample, q = zero
             self._event("tare", {"force": sample_json(sample), "q": q.tolist()})
 
-    def _turn(self, stops: tuple[Stop, ...]) -> None:
-        """Compare the zero where gravity has turned in the sensor, and begin the stops again.
+    def _check_zero(self, stops: tuple[Stop, ...]) -> None:
+        """Check the zero at another direction of gravity in the sensor, then start again.
 
-        There a load that hung during the tare is felt; until then it is a part of the zero.
+        A load that hung during the tare is part of the zero, and shows only there.
         """
         meter = self._meter
         if meter is None:
@@ -396,8 +396,8 @@ class Session:
                 step, measured.q, mean.value, mean.covariance, tared, target or 0
             )
             if shift is not None:
-                self._tell_drift(step, shift)
-        self._look_back()
+                self._report_drift(step, shift)
+        self._report_doubtful()
         return rows[0], sum(measured.settling for measured in measurements)
 
     def _check(self, measurements: list[MeasuredStop], details: list[dict[str, Any]]) -> None:
@@ -410,10 +410,10 @@ class Session:
         for measured in measurements:
             position, target = measured.mean.value[:3], measured.target or 0
             self._state.registration.doubt_repeated(measured.q, position, target)
-        self._look_back()
+        self._report_doubtful()
         raise wrong
 
-    def _look_back(self) -> None:
+    def _report_doubtful(self) -> None:
         """Report stored readings that have become doubtful."""
         for step, why in self._state.registration.late_doubts():
             self._event("doubted", {"why": why, "reading": asdict(step), "stored": True})
@@ -433,11 +433,8 @@ class Session:
         self, stop: Stop, step: Step, measured: MeasuredStop
     ) -> tuple[Readings, dict[str, Any]]:
         """Return one reading, with the instrument's covariance, and its raw data."""
-        tared, target, names = (
-            self._tared_wrench(measured),
-            measured.target,
-            self._cell.target_names,
-        )
+        tared = self._tared_wrench(measured)
+        target, names = measured.target, self._cell.target_names
         elapsed = self._elapsed + measured.end_time - self._start
         temperature, torque = self._temperature(measured), self._torque(measured)
         states = States(
@@ -513,7 +510,7 @@ class Session:
         self._torques_lost = lost
         return np.full(self._cell.arm.n, np.nan) if measured.torque is None else measured.torque
 
-    def _tell_drift(self, step: Step, shift: Shift) -> None:
+    def _report_drift(self, step: Step, shift: Shift) -> None:
         limit = self._config.acquire.drift_limit_sigma
         content = {"shift_m": shift.metres.tolist(), "sigma": shift.sigma}
         self._event("drift", {"cycle": step.cycle, **content, "over": shift.sigma > limit})
@@ -588,8 +585,8 @@ def run(
     """Measure the missing steps of a plan, until the goal is met.
 
     Every reading is stored before the next motion. After any exception, a keyboard interrupt
-    included, the arm is stopped before anything else. The rig stays open. What has been measured
-    already is not checked again: limits may have been narrowed since. `live` compares each reading
+    included, the arm is stopped before anything else. The rig stays open. Steps that were measured
+    are not checked again: limits may have been narrowed since. `live` compares each reading
     with a model. Once the `goal` is met, the arm moves home, the load is taken off, and the
     other steps are not measured. `wall` is the time of day, s, which continues the campaign's time
     after a pause; it counts from `epoch`, by default the start of the first session.
@@ -671,7 +668,7 @@ def _note(store: RunLog, error: BaseException, trouble: str, pose: str | None) -
 
 
 def _raise(error: BaseException, trouble: str, failed_before: str | None) -> None:
-    """Raise the error with advice; an earlier session failed at the pose `failed_before`, too."""
+    """Raise the error with advice; a previous session failed at the pose `failed_before`, too."""
     if not isinstance(error, Exception) and not trouble:
         raise error
     sentences = [_line(error)]

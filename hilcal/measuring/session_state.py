@@ -32,7 +32,7 @@ class RepeatabilityEstimate:
     """The scatter between arrivals at one pose."""
 
     poses: int  # poses with several readings
-    dof: int  # readings less poses
+    dof: int  # number of readings minus number of poses
     scatter: float  # RMS distance of a reading from its pose's mean, m, unbiased
     instrument: float  # the same by the instrument's noise alone, m
     joint_std: float  # scatter of every joint that explains the excess, rad; 0 without excess
@@ -126,10 +126,10 @@ def detail(
     return out
 
 
-def stored_felt(stored: dict[str, Any], meter: ForceMeter | None) -> dict[str, Any] | None:
+def stored_force(stored: dict[str, Any], meter: ForceMeter | None) -> dict[str, Any] | None:
     """Return zero and mean wrench in stored raw data; None without them.
 
-    None, too, by a sensor that was mounted otherwise: its zero is less the tool in other axes.
+    Also None if the sensor was mounted differently: its zero excludes the tool in other axes.
     """
     felt: dict[str, Any] | None = stored.get("felt")
     if meter is None or felt is None or felt.get("mounting", meter.mounting) != meter.mounting:
@@ -138,8 +138,8 @@ def stored_felt(stored: dict[str, Any], meter: ForceMeter | None) -> dict[str, A
 
 
 def stored_wrench(stored: dict[str, Any], meter: ForceMeter | None) -> TaredWrench | None:
-    """Return the mean wrench of stored raw data, see `stored_felt`; None without one."""
-    felt = stored_felt(stored, meter)
+    """Return the mean wrench of stored raw data, see `stored_force`; None without one."""
+    felt = stored_force(stored, meter)
     if felt is None:
         return None
     arrays = felt["wrench"], felt["covariance"], stored["q_actual"]
@@ -175,7 +175,7 @@ LOADING_S = 60.0
 
 
 class Eta:
-    """Durations of readings with their motions, and of load changes, cell s; estimates the rest."""
+    """Estimates the remaining time from durations of readings with motions, and of load changes."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock, self._mark, self._moving = clock, clock.now(), 0.0

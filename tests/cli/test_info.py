@@ -112,7 +112,7 @@ def measured(tmp_path):
             for k in range(4 * session, 4 * session + 4):
                 log.record(r[k : k + 1], steps[k], {"remarks": []})
             log.event("load", {"hanging": "5kg"})
-            fell = "the force sensor feels 0.0 N where 5kg should hang"
+            fell = "the force sensor measures 0.0 N where 5kg should hang"
             log.event("doubted", {"why": fell, "reading": {"pose": "p1", "load": "5kg"}})
             log.event("load", {"hanging": None, "why": fell})
             shift = [3e-5 * session, 0.0, 4e-5 * session]
@@ -153,7 +153,7 @@ def test_a_measured_campaign_says_by_what_and_how_it_was_measured(measured, caps
         "at most 50.0 µm (7.0 σ), 50.0 µm at the last; 1 over the limit of 6 σ",
         "began, 15 readings missing",
         "load 5kg",
-        "reading of p1, 5kg kept as doubted: the force sensor feels 0.0 N where 5kg should hang",
+        "reading of p1, 5kg kept as doubted: the force sensor measures 0.0 N where 5kg should hang",
         "failed: tracker: it lost its target",
         "the reference pose has moved by 7.0 σ, over the limit",
         "None yet: hilcal identify or refine makes one.",

@@ -403,7 +403,7 @@ def test_the_operator_hangs_the_wrong_load_and_is_told(cell, tmp_path):
     run = cases.Run(short, path)
     code, words = run.end()
     assert code == 0, words
-    assert "asked to take everything off: the force sensor feels" in words
+    assert "asked to take everything off: the force sensor measures" in words
     cases.check_readings(short, path)
 
 

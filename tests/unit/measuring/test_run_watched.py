@@ -346,7 +346,7 @@ def test_leaning_in_the_first_motion_or_during_a_tare_is_asked_for_and_not_tared
     b.world.hurry = 1.0
     leans_in_phase(b, phase, number)
     b.measure(SHORT)
-    assert any("feels 60.0 N where nothing should hang" in why for _, why in b.operator.requests)
+    assert any("measures 60.0 N where nothing should hang" in why for _, why in b.operator.requests)
     zeros = [d["felt"]["zero"] for d in b.store.details()]
     assert np.allclose(zeros, b.world.offset, atol=1e-6)
 

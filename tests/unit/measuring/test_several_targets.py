@@ -171,7 +171,7 @@ def test_all_targets_of_an_arrival_that_was_leaned_on_are_kept_as_doubted(tmp_pa
         doubted = [e for e in RunLog(file).events() if e["kind"] == "doubted"]
     assert [e["reading"]["target"] for e in doubted] == list(NAMES)
     words = event_words(doubted[0])
-    assert "reading of p3, none, R1 kept as doubted: the force sensor feels" in words
+    assert "reading of p3, none, R1 kept as doubted: the force sensor measures" in words
 
 
 @pytest.mark.parametrize(("name", "count"), first(0, [("tracker.measure", 60), ("tracker.aim", 8)]))

@@ -132,7 +132,7 @@ def test_a_sensor_mounted_the_other_way_round_and_values_that_are_no_numbers_are
     for name, values in given.items():
         wrong = given | {name: values.copy()}
         wrong[name][2, ..., 0] = np.nan
-        refusal("values that are no finite numbers", identify_tool_load, **wrong, gravity=GRAVITY)
+        refusal("values that are not finite", identify_tool_load, **wrong, gravity=GRAVITY)
 
 
 def test_a_massless_tool_has_its_centre_of_mass_nowhere(rng):
@@ -193,33 +193,33 @@ SIN, COS = np.sin(np.radians(14.0)), np.cos(np.radians(14.0))
 ASLANT = np.linalg.norm(WEIGHT[:3]) * np.array([SIN, 0.0, -COS, 0.0, 0.0, 0.0])
 MOMENT = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 10.0])
 OFF = np.array([1.0, -1.0, 1.0, 5.0, -3.0, 1.0])
-UNSURE = "asked for 10 kg (98.1 N), felt 98.1 N ± 6.0 N: too uncertain to tell"
+UNSURE = "asked for 10 kg (98.1 N), measured 98.1 N ± 6.0 N: too uncertain"
 
 
 @pytest.mark.parametrize(
     ("expected", "measured", "std", "right", "text"),
     [
-        (WEIGHT, WEIGHT + OFF, 0.1, True, "asked for 10 kg (98.1 N), felt 97.1 N"),
-        (0 * WEIGHT, np.full(6, 0.5), 0.1, True, "asked for nothing, felt 0.9 N"),
-        (WEIGHT, WEIGHT / 2, 0.1, False, "asked for 10 kg (98.1 N), felt 49.0 N: that is about 5"),
+        (WEIGHT, WEIGHT + OFF, 0.1, True, "asked for 10 kg (98.1 N), measured 97.1 N"),
+        (0 * WEIGHT, np.full(6, 0.5), 0.1, True, "asked for nothing, measured 0.9 N"),
+        (WEIGHT, WEIGHT / 2, 0.1, False, "asked for 10 kg (98.1 N), measured 49.0 N: that is about 5"),
         (
             WEIGHT, ASLANT, 0.1, False,  # a sensor that is mounted otherwise than described
-            "asked for 10 kg (98.1 N), felt 98.1 N: that is 100 % of it, 14° off its direction",
+            "asked for 10 kg (98.1 N), measured 98.1 N: that is 100 % of it, 14° off its direction",
         ),
-        (WEIGHT, 0.01 * WEIGHT, 0.1, False, "asked for 10 kg (98.1 N), felt 1.0 N: that is"),
-        (0 * WEIGHT, WEIGHT / 2, 0.1, False, "asked for nothing, felt 49.0 N: about 5.0 kg still"),
-        (0 * WEIGHT, PULL, 0.1, False, "asked for nothing, felt 50.0 N: something still pulls"),
-        (PULL, 0.8 * PULL, 0.1, False, "asked for 50.0 N, felt 40.0 N: that is 80 % of it, 0° off"),
+        (WEIGHT, 0.01 * WEIGHT, 0.1, False, "asked for 10 kg (98.1 N), measured 1.0 N: that is"),
+        (0 * WEIGHT, WEIGHT / 2, 0.1, False, "asked for nothing, measured 49.0 N: about 5.0 kg still"),
+        (0 * WEIGHT, PULL, 0.1, False, "asked for nothing, measured 50.0 N: something still pulls"),
+        (PULL, 0.8 * PULL, 0.1, False, "asked for 50.0 N, measured 40.0 N: that is 80 % of it, 0° off"),
         (
             PULL, np.roll(PULL, 1), 0.1, False,
-            "asked for 50.0 N, felt 50.0 N: that is 100 % of it, 90° off its direction",
+            "asked for 50.0 N, measured 50.0 N: that is 100 % of it, 90° off its direction",
         ),
-        (WEIGHT, np.full(6, np.nan), 0.1, False, "asked for 10 kg (98.1 N), felt nan N: the"),
+        (WEIGHT, np.full(6, np.nan), 0.1, False, "asked for 10 kg (98.1 N), measured nan N: the"),
         (WEIGHT, WEIGHT, 2.0, False, UNSURE),
-        (MOMENT, MOMENT, 0.01, True, "asked for 10.0 N·m, felt 10.0 N·m"),
+        (MOMENT, MOMENT, 0.01, True, "asked for 10.0 N·m, measured 10.0 N·m"),
         (
             MOMENT, 0.5 * MOMENT, 0.01, False,
-            "asked for 10.0 N·m, felt 5.0 N·m: that is 50 % of it, 0° off its direction",
+            "asked for 10.0 N·m, measured 5.0 N·m: that is 50 % of it, 0° off its direction",
         ),
     ],
 )  # fmt: skip
