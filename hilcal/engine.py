@@ -29,7 +29,7 @@ import traceback
 import warnings
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import cache
 from multiprocessing import resource_tracker
@@ -52,7 +52,15 @@ if TYPE_CHECKING:  # takes half a second to import
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Advance = Callable[[int], None]
+Counting = Callable[[str, int], AbstractContextManager[Advance]]
+"""Shows the progress of a number of items under a label, as `present.progress.counting` does."""
 Versions = tuple[tuple[str, str], ...]
+
+
+def uncounted(label: str, total: int) -> AbstractContextManager[Advance]:
+    """Show no progress."""
+    return nullcontext(lambda step: None)
+
 
 MOST_DEATHS = 3
 """Most workers that may die with one item before it is given up; Dask's own, a choice."""

@@ -6,14 +6,12 @@ memory, as they would need all readings at once:
 
 - Registration, starting model and starting values are those of a sample of at most `SAMPLE`
   readings, spread evenly.
-- Tenths of the stream, in its order, are left out instead of poses, since the errors of
-  consecutive readings are not independent.
-- Readings beyond the limit of a gross error are set aside after a fit, in at most
-  `OUTLIER_ROUNDS` rounds.
+- Tenths of the stream, in its order, are left out instead of poses, as the errors of consecutive
+  readings depend on each other.
+- Gross errors are set aside after a fit, in at most `OUTLIER_ROUNDS` rounds.
 """
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TypeVar
@@ -24,7 +22,7 @@ import scipy
 from hilcal.cell import Cell
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.options import Options
-from hilcal.engine import Advance, Engine
+from hilcal.engine import Counting, Engine, uncounted
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.carried.carried_prior import (
@@ -195,12 +193,6 @@ MAX_NAMED = 10  # most gross errors that are named; a choice
 OUTLIER_ROUNDS = 2  # most searches for gross errors that are followed by a new fit; a choice
 MAX_OUTLIER_SHARE = 0.05  # largest share of gross errors; a choice: more are a misfit of the model
 
-Counting = Callable[[str, int], AbstractContextManager[Advance]]
-
-
-def _silent(name: str, total: int) -> AbstractContextManager[Advance]:
-    return nullcontext(lambda step: None)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _StreamPoint(NewtonPoint):
@@ -216,7 +208,7 @@ class _Stream(NewtonProblem[_StreamPoint]):
 
     work: PassTask
     engine: Engine
-    counting: Counting = _silent
+    counting: Counting = uncounted
     passed: list[int] = field(default_factory=list)
 
     def at(self, y: Floats) -> _StreamPoint:
@@ -292,13 +284,13 @@ def fit_stream(
     effects: Mapping[str, Options] | None = None,
     catalogue: Catalogue | None = None,
     prior: CarriedPrior | None = None,
-    counting: Counting = _silent,
+    counting: Counting = uncounted,
 ) -> StreamFit:
     """Fit a model to a stream of absolute readings.
 
     Args:
         effects: options by effect, in addition to unknown frames; None: the baseline.
-        counting: shows the progress of a pass, as `present.progress.counting` does.
+        counting: shows the progress of a pass.
 
     Raises:
         CannotAnswerError: too few readings, or an unknown frame that they do not determine.

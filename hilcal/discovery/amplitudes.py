@@ -1,7 +1,7 @@
 """The amplitude of a law: a product of functions of recorded quantities.
 
 The complexity of a product is the sum of those of its shapes; a sum of joint angles as quantity
-adds 1. A function f(u) of a composed quantity u = Σ w_i φ_i is no sum of products: the pull of
+adds 1. A function f(u) of a composed quantity u = Σ w_i φ_i is not a sum of products: the pull of
 a hose that is taut beyond a length u0 is max(u − u0, 0), where u depends on two joints, for example
 as cos q_5·cos q_6. Its derivative with respect to the transmitted wrenches W follows from the chain
 rule, ∂f/∂W = f'(u) Σ w_i ∂φ_i/∂W.
@@ -133,7 +133,7 @@ def _wrenches(n: int) -> Iterator[Variable]:
             yield Variable("load", ("load",), f"|{letter}|", f"|{letter}|", unit, norm)
         text, code = f"{letter}_{axis}", f"s.states.wrench[:, {c}]"
         yield Variable("load", ("load",), text, text, unit, code, vector=letter, axis=c % 3)
-    for c, word, letter, axis, unit in _COMPONENTS:  # causes of the sensor's own errors
+    for c, word, letter, axis, unit in _COMPONENTS:  # causes of the sensor's errors
         yield Variable(
             "sensor", (f"force sensor {word} {axis}",), f"{letter}S_{axis}",
             rf"{letter}_{{S,{axis}}}", unit, f"recorded(s)[:, {c}]",
@@ -226,14 +226,17 @@ class Factor:
         """Power of the variable's unit in the unit of the factor."""
         return self.shape.power(self.numbers)
 
-    def written(self, way: str) -> str:
+    def written(self, notation: str) -> str:
         """Return the factor as "text", "latex" or Python "code", or its slope as "slope_code"."""
         v = self.variable
-        if way in ("text", "latex"):
-            x, numbers = v.symbol if way == "text" else v.latex, [f"{x:g}" for x in self.numbers]
+        if notation in ("text", "latex"):
+            x, numbers = (
+                v.symbol if notation == "text" else v.latex,
+                [f"{x:g}" for x in self.numbers],
+            )
         else:
             x, numbers = v.code, [repr(x) for x in self.numbers]
-        return str(getattr(self.shape, way)(x, numbers))
+        return str(getattr(self.shape, notation)(x, numbers))
 
 
 @dataclass(frozen=True)
@@ -310,7 +313,7 @@ class Amplitude:
         return unit_of(self.powers)
 
     def of_joint(self, old: int, new: int, quantities: list[Variable]) -> "Amplitude | None":
-        """Return the law with the quantities of joint `new`; None if `quantities` lack one."""
+        """Return the product with the quantities of joint `new`; None if `quantities` lack one."""
         return self._with(
             lambda v: v.joint == old and v.kind != "sum",
             lambda v, w: (
@@ -322,7 +325,7 @@ class Amplitude:
         )
 
     def of_axis(self, old: int, new: int, quantities: list[Variable]) -> "Amplitude | None":
-        """Return the law with the vectors' components along two axes exchanged."""
+        """Return the product with the vectors' components along two axes exchanged."""
         swap = {old: new, new: old}
         return self._with(
             lambda v: bool(v.vector) and v.axis in swap,

@@ -4,16 +4,16 @@ f(u) with u = φ₁ + Σ w_i φ_i, where φ_i are products of functions of at mo
 single-index model, one step of projection pursuit (Friedman and Stuetzle 1981, JASA 76, 817).
 
 1. All bends and steps of single products are screened at all sites; see `bends`.
-2. The arguments of the best are extended by a further product: f(u + w φ) ≈ f(u) + w φ f'(u). The
-   gain of φ f'(u) beside f(u) and f'(u) ranks all φ, its coefficient gives w (Gauss-Newton).
-3. Levels, weights and an exponent of the very best are refined together, with the coefficient
+2. The arguments of the best ones are extended by a further product: f(u + w φ) ≈ f(u) + w φ f'(u).
+   The gain of φ f'(u) beside f(u) and f'(u) ranks all φ; its coefficient gives w (Gauss-Newton).
+3. Levels, weights and an exponent of the `REFINED` best are refined together, with the coefficient
    projected out.
 
 The price of such a candidate is that of all arguments of its complexity and of the levels, and
 ½ ln ν for each weight and exponent.
 
-The best of the screening are also multiplied by every function of another quantity, and their free
-numbers are varied (`grown`), at the price of all products of the same kind, or values tried.
+The best candidates of the screening are also multiplied by functions of other quantities, and their
+free numbers are varied (`grown`). The price is that of all such products, or of all tried values.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 
 from hilcal.discovery import shapes
 from hilcal.discovery.amplitudes import Amplitude, Factor, composed, different
-from hilcal.discovery.screen import LEAST_MOTION, VISIBLE, unit_rows
+from hilcal.discovery.screen import INDEPENDENT, LEAST_MOTION, LOG2, VISIBLE, unit_rows
 from hilcal.discovery.shapes import Shape
 from hilcal.types import Floats
 
@@ -33,20 +33,18 @@ if TYPE_CHECKING:
     from hilcal.discovery.problem import CandidateTerms
     from hilcal.discovery.screen import LawTerm, ScreenedTerm
 
-BEST, EXTENDED = 10, 3  # Bends, and products of each, that are extended; a choice, by time
+BEST, EXTENDED = 10, 3  # Bends that are extended, and further products of each; a choice, by time
 LARGEST_SUM = 3  # Products of a sum at most; a choice
-QUANTITIES = 2  # Recorded quantities of an argument at most; a choice: more are too many sums
+QUANTITIES = 2  # Recorded quantities of an argument at most; a choice, by the number of sums
 REFINED = 2  # Functions of single products, and of sums, that are refined; a choice, by time
 QUANTILES = tuple(k / 20 for k in range(1, 20))  # Levels that are tried, as quantiles
 WEIGHT_FACTORS = (0.4, 0.7, 1.0, 1.5, 2.2)
 """Weights that are tried, over the linearised one; a choice."""
 EVALUATIONS = 60  # Evaluations of the sum of squares per refined number; a choice
 DIGITS = 3
-INDEPENDENT = 1e-3  # Least share of a column's square beside other columns; a choice
 REJECTED = 1e12
 POWERS = {"above": shapes.ABOVE_POWER, "below": shapes.BELOW_POWER}
 LEAST_POWER, MOST_POWER = 0.5, 4.0  # of a bend; at least 1 under wrenches; a choice
-LOG2 = float(np.log(2.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,7 +96,7 @@ class SiteSums:
 def _better(
     evidence: Any, slope: Floats, square: Floats, across: Floats, slope_one: Any, one: Any
 ) -> Floats:
-    """Log evidence of columns, the larger of without and with a constant beside them."""
+    """Log evidence of columns without or with a constant at the site, whichever is larger."""
     visible = square > 0
     gain = np.where(visible, slope**2 / np.where(visible, square, 1.0), 0.0)
     alone = np.where(visible, evidence(gain, 1), -np.inf)
@@ -328,13 +326,13 @@ def _refined(candidates: CandidateTerms, site: SiteSums, b: _Bent) -> Amplitude:
 
 MOST_COMPLEXITY = 4  # Complexity of a product; a choice
 MOST_FACTORS = 3  # Factors of a product; a choice
-GROWN, VARIED = 12, 24  # Candidates that are multiplied, and varied; a choice, by time
-RETAINED = 24  # Best of either that are scored in full; a choice
+GROWN, VARIED = 12, 24  # Candidates that are multiplied, or varied; a choice, by time
+RETAINED = 24  # Best results of either that are scored in full; a choice
 NUMBER_FACTORS = (0.35, 0.5, 0.7, 0.85, 1.2, 1.4, 2.0, 2.8)  # by which numbers are varied; a choice
 
 
 def grown(candidates: CandidateTerms, best: list[ScreenedTerm]) -> list[LawTerm]:
-    """Return the best of the screening with further factors, and with other numbers."""
+    """Return terms of the best screened candidates with further factors, or other numbers."""
     distinct = list({(x.s, x.f): x for x in best}.values())
     products = [(x.s, a, 0.0) for x in distinct[:GROWN] for a in _products(candidates, x.s, x.f)]
     numbers = [(x.s, a, price) for x in distinct[:VARIED] for a, price in _numbers(candidates, x.f)]

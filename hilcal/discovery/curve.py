@@ -6,10 +6,9 @@ residual of the fit with the law, the partial residual of this reading is
 
     y = Σ_p θ_p f_p(x) + Tᵀ r / (TᵀT g),    std = 1 / (|T| |g|)
 
-Waves of high order are drawn over one period. For an effect from a file the motion m of a site is
+Waves of high order are drawn over one period. For an effect from a file, the motion m of a site is
 drawn over a quantity x that its formula names, divided by another one g if the formula is a
-product. Of all such pairs (x, g) the one with the smoothest m/g over x is drawn (von Neumann's
-ratio).
+product: the pair (x, g) with the smoothest m/g over x, by von Neumann's ratio.
 """
 
 import re
@@ -103,7 +102,7 @@ def _curve(
 
 
 def _usable(std: Floats, divisor: Floats) -> Ints:
-    """Indices of the readings that determine a motion that is divided by the other factors."""
+    """Indices of the readings that determine the motion over the other factors."""
     size = np.abs(divisor)
     return np.flatnonzero(np.isfinite(std) & (size > LEAST_DIVISOR * float(size.max())))
 

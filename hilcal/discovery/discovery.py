@@ -66,7 +66,7 @@ Reason = Literal["law", "adequate", "catalogue", "no_law", "unpredictable"]
 """
 LEAST_SHARE = 0.1  # of the misfit on poses left out that a law must explain
 LEAST_COSINE = 0.7  # Least cosine of an effect of the catalogue that resembles a law; a choice
-MOST_RIVALS = 2  # Alternatives that can be written as effects; a choice: `next` separates few
+MOST_RIVALS = 2  # Alternatives that are written as effects; a choice: `next` separates few
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,7 +139,7 @@ def discover(
     require_gc(fit, "a search for laws")
     linear = linearise(fit)
     noise = float(scipy.stats.chi2.sf(fit.chi2, fit.dof)) >= MISFIT_ALARM
-    # A background takes up a part of what a law would explain.
+    # a background explains a part of what a law would explain
     if noise and not (fit.model.background and residual_regression(linear).significant):
         return Discovery(fit, "adequate")
     say("forming all candidates")
@@ -148,7 +148,7 @@ def discover(
     problem = SearchProblem(screening)
     selections = search(problem)
     if not selections:
-        return _silent(fit, screening, say, 0.0)
+        return _without_laws(fit, screening, say, 0.0)
     best = max(selections, key=lambda s: s.total)
     say("comparing with the catalogue")
     effects = known_effects(fit)
@@ -160,7 +160,7 @@ def discover(
         say("repeating the search without each fold of poses")
         folds = search_by_folds(screening)
         if not folds.significant or folds.share < LEAST_SHARE:
-            answer = _silent(fit, screening, say, folds.share)
+            answer = _without_laws(fit, screening, say, folds.share)
         else:
             answer = _laws(fit, problem, selections, folds, effects, say, name)
     return replace(answer, unfitted=explained.unfitted)
@@ -178,8 +178,10 @@ def rival_sources(d: Discovery) -> dict[str, str]:
     return out
 
 
-def _silent(fit: Fit, screening: Screen, say: Callable[[str], None], searched: float) -> Discovery:
-    say("asking what is predictable at all")
+def _without_laws(
+    fit: Fit, screening: Screen, say: Callable[[str], None], searched: float
+) -> Discovery:
+    say("estimating what is predictable at all")
     regression = residual_regression(screening.linear)
     predictable = regression.share > PREDICTABLE
     return Discovery(
@@ -207,7 +209,7 @@ def _laws(
     for s in selections:
         form, kind = refine(screen, form_of(screen, s.terms)), structure_of(screen, s.terms)
         if kind not in chance:
-            refused.append((form.text(), "the model explains all that it moves the readings by"))
+            refused.append((form.text(), "the model explains all of its motion of the readings"))
             continue
         say(f"refitting with {form.text()}")
         try:
@@ -221,12 +223,12 @@ def _laws(
         evidence = (
             f"It explains {100 * share:.0f} % of the misfit on poses left out; p-value "
             f"{law.p_value:.1g}, corrected\nfor the size of the search. Among the structures that "
-            f"the search met, its own has the probability {law.probability:.2f}."
+            f"the search tried, that of this law has the probability {law.probability:.2f}."
         )
         source = source_of_form(form, name, coefficients, evidence, f"{name}.py")
         fitted.append((law, after, squares_after, source, kind))
     if not fitted:
-        silent = _silent(fit, screen, say, folds.share)
+        silent = _without_laws(fit, screen, say, folds.share)
         return replace(silent, reason="no_law", refused=tuple(refused))
     best = min(
         (squares_after for _, _, squares_after, _, _ in fitted), key=lambda x: float(x.sum())
@@ -239,7 +241,7 @@ def _laws(
         return bool(excess.mean() <= np.std(excess) / root)
 
     retained = [x for x in fitted if as_good(x[2])]
-    say("asking what is predictable at all")
+    say("estimating what is predictable at all")
     attainable = residual_regression(screen.linear).share
     laws = tuple(replace(x[0], name=_numbered(name, k)) for k, x in enumerate(retained, start=1))
     names: dict[Hashable, str] = {}

@@ -23,7 +23,7 @@ HIGHEST_MULTIPLE = 512
 
 
 def functions(v: Variable, x: Floats, most: int) -> list[Factor]:
-    """Return the functions of a quantity x (N,); those of complexity `most` enter no product."""
+    """Return the functions of a quantity x (N,); those of complexity `most` are in no product."""
     linear = Factor(v, shapes.LINEAR)
     if v.kind in WAVES:
         waves = [
@@ -42,8 +42,8 @@ BENDS = (0.3, 0.7)  # Initial bends, as quantiles; a choice
 
 
 def _bent(v: Variable, x: Floats, most: int) -> list[Factor]:
-    """Return functions that are zero up to some value, from either side, and symmetric ones."""
-    alone = v.kind in ("force", "load", "sensor", "place")  # many, rarely bent: in no product
+    """Return functions that are zero on one side of a value, and functions of the magnitude."""
+    alone = v.kind in ("force", "load", "sensor", "place")  # too many bends for products
     out = [
         Factor(v, replace(f, cost=most) if alone else f, (_round(bend),))
         for bend in np.quantile(x, BENDS).tolist()
@@ -69,11 +69,10 @@ def _curved(v: Variable, x: Floats) -> list[Factor]:
     def even(*powers: float) -> list[Factor]:
         return [Factor(v, shapes.EVEN, (p, near)) for p in powers]
 
-    def saturation(share: float) -> Factor:
-        return Factor(v, shapes.SATURATION, (_round(share * middle),))
+    saturation = Factor(v, shapes.SATURATION, (_round(0.05 * middle),))
 
     if v.kind == "gravity":
-        return [saturation(0.05), *even(1.0, 2.0)]
+        return [saturation, *even(1.0, 2.0)]
     if v.kind == "temperature":
         return [*even(2.0, 1.0), Factor(v, shapes.PLUS)]
     if v.kind == "sensor":  # curvatures, and different gains of the sensor for pull and push
@@ -81,7 +80,7 @@ def _curved(v: Variable, x: Floats) -> list[Factor]:
     if v.kind in ("torque", "force", "load") and both_signs:
         powers = (0.5, 2.0, 3.0) if v.kind == "torque" else ()
         odd = [Factor(v, shapes.ODD, (p, near)) for p in powers]
-        return [Factor(v, shapes.PLUS), Factor(v, shapes.MINUS), saturation(0.05), *odd]
+        return [Factor(v, shapes.PLUS), Factor(v, shapes.MINUS), saturation, *odd]
     if v.kind in ("torque", "force"):
         return [*even(2.0), Factor(v, shapes.ODD, (0.5, near))]
     grown = even(2.0) if x.min() < 0 else [Factor(v, shapes.POWER, (p,)) for p in (0.5, 2.0)]
@@ -174,7 +173,7 @@ class Grammar:
         """Return the amplitude with sine for cosine in its first periodic factor."""
         if k < len(self.amplitudes):
             return int(self.partner[k]) if self.partner[k] >= 0 else None
-        partner = _turned(self.amplitude(k))
+        partner = _sine_for_cosine(self.amplitude(k))
         return None if partner is None else self.index(partner)
 
     def place(self, amplitude: Amplitude) -> int | None:
@@ -205,7 +204,7 @@ class Grammar:
         return np.asarray(np.log(count[self.cost]) + log(2.0) * self.cost)
 
     def price_of(self, a: Amplitude, sites: int) -> float:
-        """Return the price of any product, as if all of its complexity had been tried."""
+        """Return the price of any product, as if all products of its complexity were tried."""
         if len(a.factors) == 1 and isinstance(u := a.factors[0].variable, Composed):
             # Further products of a sum are priced where they are added.
             argument = float(self.price_of_argument[u.terms[0][1].cost])
@@ -295,7 +294,7 @@ def grammar(quantities: list[Variable], s: Situation, poses: int = 0) -> Grammar
     )
     place = {pairs[k]: index for index, k in enumerate(nonzero.tolist())}
     by_key = {_key(a): k for k, a in enumerate(amplitudes)}
-    turned = (_turned(a) for a in amplitudes)
+    turned = (_sine_for_cosine(a) for a in amplitudes)
     partner = np.array([-1 if t is None else by_key.get(_key(t), -1) for t in turned])
     of_single = np.array([place.get((i, -1), -1) for i in range(-1, len(singles))])
     first, second = np.array(pairs)[nonzero].T
@@ -335,7 +334,7 @@ def _products(value: Floats, pairs: Ints) -> tuple[Floats, Floats, Ints]:
     return out, size[nonzero], nonzero
 
 
-def _turned(a: Amplitude) -> Amplitude | None:
+def _sine_for_cosine(a: Amplitude) -> Amplitude | None:
     """Return the amplitude with sine for cosine in its first periodic factor; None for none."""
     for i, f in enumerate(a.factors):
         if f.shape.name == "cos":

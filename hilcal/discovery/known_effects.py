@@ -25,7 +25,7 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownEffects:
-    """The effects of the catalogue beside a fit."""
+    """The effects of the catalogue that a fit lacks."""
 
     names: tuple[str, ...]  # effects that explain the misfit together, in the order of adding
     odds: tuple[float, ...]  # that each adds: log evidence minus the log of the choice
@@ -65,7 +65,7 @@ def effects_replacing_law(
     fit: Fit, problem: SearchProblem, law: Selection, effects: KnownEffects
 ) -> Replacement:
     """Return the effects that explain the misfit as well as a law, at odds of 20 : 1; or none."""
-    # A law whose exact refit fails is not preferred to effects whose refit does not.
+    # a law whose exact refit fails is not preferred to effects whose exact refit succeeds
     if effects.total > law.total - LEAST_LOG_ODDS:
         return Replacement(effects.names)
     alike = resembling(problem, law, effects)

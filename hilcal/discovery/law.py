@@ -87,7 +87,7 @@ class Form:
         part = next(p for p in self.parts if p.coefficient == coefficient)
         site, powers = part.site.unit, dict(part.amplitude.powers)
         if part.site.field == "sensor" and site in powers:
-            # Cancel a force by a force; people do not cancel an angle by an angle.
+            # a force cancels a force; rad per rad is written
             power = powers.pop(site) - 1.0
             powers |= {site: power} if power > 0 else {}
             site = "1" if power >= 0 else unit_of({site: -power})
@@ -180,7 +180,7 @@ def coefficients(form: Form, step: Floats, std: Floats) -> tuple[Coefficient, ..
 
 @dataclass(frozen=True, slots=True)
 class SelectionFrequency:
-    """How often the searches without a fold found a cause again."""
+    """Share of the searches without a fold that found a cause again."""
 
     acts_on: str
     variables: tuple[str, ...]  # quantities that move it
@@ -251,7 +251,7 @@ ORDINARY_COEFFICIENT = 1e-4  # Ordinary magnitude of an unknown coefficient, SI;
 PROPOSED = "Proposed by `hilcal discover`"  # in the head of every file of a law
 _HEAD = '''"""`{name}`: {formula}
 
-{proposed}; change it as you like. Every command takes it:
+{proposed}; edit it as you like. Every command can use it:
 
     hilcal effects --effects-from {file}
     hilcal add RUN.hilcal {name} --effects-from {file}
@@ -277,7 +277,7 @@ class {class_name}(Effect):
 {attributes}
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """The coefficients; the scale is the magnitude that was found, to one digit."""
+        """The coefficients; the scale is the estimated magnitude, to one digit."""
         return (
 {parameters}
         )
@@ -303,7 +303,7 @@ _SENSOR = '''
         return out
 
     def wrench_change(self, theta: Floats, s: Situation) -> Floats:
-        """Change of the load's wrench: what acts is what was recorded less the error."""
+        """Change of the load's wrench: the acting wrench is the recorded one minus the error."""
         return acting_change(s, np.einsum("npc,p->nc", self.sensor_columns(s), theta))
 
     def wrench_columns(self, theta: Floats, s: Situation) -> Floats:
@@ -319,7 +319,7 @@ def source_of_form(
     form: Form,
     name: str,
     values: tuple[Coefficient, ...] = (),  # for ordinary magnitudes
-    evidence: str = "Nothing is stated of its evidence.",  # lines for its docstring
+    evidence: str = "Its evidence is not stated.",  # lines for its docstring
     file: str = "F.py",
 ) -> str:
     """Return the Python file of a law."""

@@ -12,15 +12,20 @@ from functools import cached_property
 import numpy as np
 
 from hilcal.discovery.compose import composed_terms, grown
-from hilcal.discovery.screen import LawTerm, ScoredTerm, Screen, ScreenedTerm
+from hilcal.discovery.screen import (
+    INDEPENDENT,
+    LOG2,
+    LawTerm,
+    ScoredTerm,
+    Screen,
+    ScreenedTerm,
+)
 from hilcal.identification.linearisation import Linearisation
 from hilcal.regression.evidence import FamilyScore, score_family
 from hilcal.regression.schur import Projection, projection
 from hilcal.types import Bools, Floats, Ints
 
 EXTENDED = 40  # Candidates that are extended to other axes and joints; a choice
-INDEPENDENT = 1e-3  # Least share of a column's square beside chosen terms; a choice
-LOG2 = float(np.log(2.0))
 LOG_ZERO = 2 * LOG2  # Price of a free zero of one of two factors, and of the choice of factor
 LEAST_RIDGE = 1e-6  # For directions of the model that some rows do not determine; a choice
 
@@ -33,7 +38,7 @@ def _refitted(linear: Linearisation, rows: Bools) -> tuple[Projection, Floats]:
 
 
 class SearchProblem:
-    """The search on some of the rows."""
+    """The misfit in some of the rows, with the model refitted to these."""
 
     def __init__(self, screen: Screen, rows: Bools | None = None) -> None:
         """Refit the model to some of the rows (R,); by default to all."""
@@ -49,7 +54,7 @@ class SearchProblem:
         self.square = self.share * screen.square
         self.across = self.share * screen.across
         self.across_one = self.share * screen.across_constant
-        # With many readings, the screening uses some of these rows only.
+        # of many readings, the screening uses only some of these rows
         self.screened = self.rows & screen.rows
         self.screened_share = float(self.screened.sum() / self.rows.sum())
         self._thin, self._thin_residual = self.model, self.residual
@@ -147,7 +152,7 @@ class CandidateTerms:
 
     @cached_property
     def _same_causes(self) -> tuple[Bools, Floats]:
-        """(F,) which amplitudes have no further quantity; prices of such terms by complexity."""
+        """(F,) amplitudes of chosen quantities alone; prices of such terms, by complexity."""
         screen, (places, names) = self.problem.screen, self._chosen_causes
         same = np.fromiter((d <= names for d in screen.grammar.depends), np.bool_)
         cost = screen.grammar.cost
@@ -185,7 +190,7 @@ class CandidateTerms:
         )
 
     def best(self) -> dict[str, list["ScreenedTerm"]]:
-        """Return the candidates with the best odds, by their free numbers beside the coefficient.
+        """Return the candidates with the best odds, by their free numbers besides the coefficient.
 
         Keys: "" for none; "p" for the phase, by the partner; "c" for a constant at the site, "pc"
         for both; "1" and "2" for the zero of the first and second factor of a product.
@@ -234,7 +239,7 @@ class CandidateTerms:
         return best
 
     def evidence(self, gain: Floats, count: int) -> Floats:
-        """Log evidence of columns at the best strength, by Laplace; only for the short list."""
+        """Log evidence of columns at the best strength, by Laplace, to choose the short list."""
         share = np.clip(gain / np.float32(self.problem.screened_share * self.rss), 0.0, 0.99999)
         share = share.astype(np.float32)
         ratio = np.maximum(share * np.float32(self.dof / count), np.float32(1.0))
@@ -268,7 +273,7 @@ class CandidateTerms:
     def shortlist(self) -> list[LawTerm]:
         """Return the candidates with the best odds, extended to phases, axes and joints."""
         best_of, one = self.best(), self.problem.screen.constant
-        turned = self.problem.screen.grammar.with_sine
+        substituted = self.problem.screen.grammar.with_sine
         out: dict[tuple[tuple[tuple[int, int], ...], bool], LawTerm] = {}
 
         def add(t: LawTerm) -> None:
@@ -280,7 +285,7 @@ class CandidateTerms:
             add(self.term(((x.s, x.f), (x.s, one)), LOG2))
         for key, extra in (("p", ()), ("pc", (one,))):
             for x in best_of[key][:EXTENDED]:
-                partner = turned(x.f)
+                partner = substituted(x.f)
                 if partner is not None:
                     parts = ((x.s, x.f), (x.s, partner), *((x.s, k) for k in extra))
                     add(self.term(parts, LOG2 * (1 + len(extra))))
@@ -319,8 +324,10 @@ class CandidateTerms:
             # A vector's components along all axes of the site.
             by_axis = []
             for k in of_group:
-                turned = amplitude.of_axis(site.axis % 3, screen.sites[k].axis % 3, grammar.known)
-                index = None if turned is None else place(turned)
+                substituted = amplitude.of_axis(
+                    site.axis % 3, screen.sites[k].axis % 3, grammar.known
+                )
+                index = None if substituted is None else place(substituted)
                 if index is not None:
                     by_axis.append((k, index))
             yield from self._separate_and_common(visible(by_axis))
@@ -330,8 +337,8 @@ class CandidateTerms:
         for k, o in enumerate(screen.sites):
             if (o.field, o.axis) != (site.field, site.axis) or o.joint < 0:
                 continue
-            turned = amplitude.of_joint(site.joint, o.joint, grammar.known)
-            index = None if turned is None else place(turned)
+            substituted = amplitude.of_joint(site.joint, o.joint, grammar.known)
+            index = None if substituted is None else place(substituted)
             if index is not None:
                 by_joint.append((k, index))
         yield from self._separate_and_common(visible(by_joint))

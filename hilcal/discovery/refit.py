@@ -1,8 +1,8 @@
 """Refinement of a law's free numbers, and its refit in the exact model.
 
 The search takes the numbers in a law's functions, such as an exponent, from a coarse grid. They are
-refined to the least sum of squares, with the coefficients of law and model projected out. Refined
-numbers are used if they gain more evidence than they cost, else those of the grid.
+refined to the least sum of squares, with the coefficients of law and model projected out, and used
+if they gain more evidence than they cost; else those of the grid stay.
 """
 
 from collections.abc import Sequence
@@ -72,11 +72,11 @@ def refine(screen: Screen, form: Form) -> Form:
 def rss_with_law(screen: Screen, form: Form, s: Situation) -> float:
     """Sum of squares with a law, by algebra; infinite if the law is not finite."""
     linear = screen.linear
-    with np.errstate(over="ignore", invalid="ignore"):  # numbers that are tried may be any
+    with np.errstate(over="ignore", invalid="ignore"):  # tried numbers may be extreme
         x = form.columns(screen, s)
     if not np.isfinite(x).all():
         return np.inf
-    x = x / max(float(np.abs(x).max()), 1e-300)  # its span counts; squares of 1e200 overflow
+    x = x / max(float(np.abs(x).max()), 1e-300)  # only its span matters; squares of 1e200 overflow
     return linear.test_noise[0] - float(x.T @ linear.residual @ _step(linear, x))
 
 

@@ -5,12 +5,12 @@ of each reading by an ordinary motion of the site. So for all amplitudes A (F, N
 
     xᵀ v  = A (T_sᵀ v),        xᵀ M x = diag(A Q_s Aᵀ),    Q_s = T_sᵀ M T_s (N, N)
 
-and no column is formed: a million candidates take seconds. Many readings are thinned to whole poses
-for this; the short list is scored on all readings.
+and no column is formed: a million candidates take seconds. Of many readings, those of some poses
+are used; the short list is scored on all readings.
 
-A bend at a level of a function of two quantities, as of a hose that is taut beyond a length that
-depends on two joints, is no product of functions of each. So products φ of two quantities are
-arguments themselves: max(φ − φ0, 0), max(φ0 − φ, 0) and tanh((φ − φ0)/w), at some levels φ0.
+A function of two quantities that bends at a level, as of a hose that is taut beyond a length that
+depends on two joints, is not a product of functions of each. So products φ of two quantities are
+also arguments: max(φ − φ0, 0), max(φ0 − φ, 0) and tanh((φ − φ0)/w), at some levels φ0.
 """
 
 from dataclasses import dataclass
@@ -71,7 +71,9 @@ class ScreenedTerm:
 MOST_READINGS = 400  # Most readings of the screening; a choice: time grows with their square
 VISIBLE = 1e-4  # Least share of a column's square beside the model, for single precision
 ALIAS_COSINE = 1 - 1e-9  # Least cosine of the motions of equivalent sites; rounding
-LEAST_MOTION = 1e-4  # Square of a whitened column that counts as zero
+LEAST_MOTION = 1e-4  # Square of a whitened column below which it counts as zero
+INDEPENDENT = 1e-3  # Least share of a column's square beside other columns; a choice
+LOG2 = float(np.log(2.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,11 +130,11 @@ class Screen:
         return self.grammar.amplitudes.index(Amplitude(()))
 
     def visible(self, site: int, amplitude: int) -> bool:
-        """Whether a candidate is visible beside the model; True for grown ones, unchecked."""
+        """Whether a candidate is visible beside the model; True for added ones, unchecked."""
         return amplitude >= len(self.price) or bool(self.square[site, amplitude] > 0)
 
     def price_of(self, amplitude: int) -> float:
-        """Return the price of a candidate, also of a grown one."""
+        """Return the price of a candidate, also of one that was added later."""
         if amplitude < len(self.price):
             return float(self.price[amplitude])
         return self.grammar.price_of(self.grammar.amplitude(amplitude), len(self.sites))

@@ -20,8 +20,8 @@ BEAM = 3  # First terms that start a selection each; a choice
 MOST_TERMS = 3  # Most terms of a law; a choice
 MOST_COEFFICIENTS = 8  # Most coefficients of a law; a choice: more are not readable
 LEAST_LOG_ODDS = 3.0  # Log odds, corrected for the search, that a further term needs: 20 : 1
-FALSE_ALARM = 1e-3  # Chance of a first term if nothing is hidden, over the whole search
-SAME_CORRELATION = 0.98  # Correlation of projected columns above which they count as the same law
+FALSE_ALARM = 1e-3  # Probability that the whole search finds a first term in noise
+SAME_CORRELATION = 0.98  # Correlation of projected columns above which two laws count as one
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Selection:
 
 
 def search(problem: SearchProblem, most: int = MOST_TERMS, beam: int = BEAM) -> list[Selection]:
-    """Return the best selection of each number of terms that is worth it; none for chance."""
+    """Return the best selection of each number of terms with sufficient odds; none if by chance."""
     ordered = _ordered(problem)
     if not ordered or ordered[0].odds <= LEAST_LOG_ODDS:
         return []
@@ -73,11 +73,11 @@ def search(problem: SearchProblem, most: int = MOST_TERMS, beam: int = BEAM) -> 
             keep(s)
     return [
         replace(s, terms=tuple(with_simplest_site(problem.screen, t) for t in s.terms))
-        for s in worth_their_length(best[k] for k in sorted(best))
+        for s in sufficiently_better(best[k] for k in sorted(best))
     ]
 
 
-def worth_their_length(selections: Iterable[Selection]) -> list[Selection]:
+def sufficiently_better(selections: Iterable[Selection]) -> list[Selection]:
     """Return the selections that have odds of 20 : 1 over every shorter one."""
     out: list[Selection] = []
     for s in selections:
@@ -102,7 +102,7 @@ def _ordered(problem: SearchProblem, chosen: tuple[LawTerm, ...] = ()) -> list[S
 
 
 def _simplicity(screen: Screen, t: LawTerm) -> tuple[float, ...]:
-    """Numbers and complexity, rank of sites, joints apart, rank of functions; smaller is simpler.
+    """Complexity, rank of sites, distance of joints, rank of functions; smaller is simpler.
 
     A coefficient, and a number that is not on the grid, count as a unit of complexity each. A
     quantity of the site's own joint is simpler than one of another joint. A joint's temperature
@@ -194,7 +194,7 @@ def _exchanged(problem: SearchProblem, s: Selection, last: int) -> Selection:
 
 
 def with_first_price(terms: tuple[LawTerm, ...]) -> tuple[LawTerm, ...]:
-    """Return terms with the first at its price as first term."""
+    """Return terms, the first one at its price as the first term."""
     return (replace(terms[0], price=terms[0].price_alone), *terms[1:])
 
 

@@ -82,7 +82,7 @@ def _exponent(p: Numbers) -> float:
     return p[0]
 
 
-def _past_slope(x: str, power: str) -> str:
+def _power_slope(x: str, power: str) -> str:
     return f"{power} * np.maximum({x}, 1e-12) ** ({power} - 1) * ({x} > 0)"
 
 
@@ -176,14 +176,14 @@ BELOW = Shape(
 ABOVE_POWER = Shape(
     "above_power", 3,
     lambda x, p: f"np.maximum({x} - {_bracketed(p[0])}, 0.0) ** {p[1]}",
-    lambda x, p: _past_slope(f"({x} - {_bracketed(p[0])})", p[1]),
+    lambda x, p: _power_slope(f"({x} - {_bracketed(p[0])})", p[1]),
     lambda x, p: f"max({x} - {_bracketed(p[0])}, 0)^{p[1]}",
     lambda p: p[1], (0, 1), (0,),
 )  # fmt: skip
 BELOW_POWER = Shape(
     "below_power", 3,
     lambda x, p: f"np.maximum({p[0]} - {x}, 0.0) ** {p[1]}",
-    lambda x, p: f"-{_past_slope(f'({p[0]} - {x})', p[1])}",
+    lambda x, p: f"-{_power_slope(f'({p[0]} - {x})', p[1])}",
     lambda x, p: f"max({p[0]} - {x}, 0)^{p[1]}",
     lambda p: p[1], (0, 1), (0,),
 )  # fmt: skip

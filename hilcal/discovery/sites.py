@@ -17,8 +17,8 @@ from hilcal.types import Floats
 
 ORDINARY = {"rad": 1e-4, "m": 1e-4, "1": 1e-5, "N": 1.0, "N·m": 0.1}
 """Ordinary motions by unit: 0.1 mrad, 0.1 mm, 10 ppm of the distance; and ordinary errors of a
-force sensor. A choice: it only places the range of strengths that the evidence tries, which spans a
-factor of a million."""
+force sensor. A choice: it only centres the range of strengths of the evidence, a factor of a
+million."""
 Place = Field | Literal["sensor"]
 SETUP = ("target", "tracker", "force sensor")  # groups that are new in each campaign
 _AXES = "xyz"
@@ -56,7 +56,7 @@ class Site:
 
         Transmitted wrenches (`elastic`) move only parts of the arm. They move the base by the twist
         of the frame before joint 1; other causes move it by the base's own frame. Readings of the
-        force sensor (`sensed`) cause only the sensor's own errors.
+        force sensor (`sensed`) cause only the sensor's errors.
         """
         if self.field == "sensor" or sensed:
             return self.field == "sensor" and not elastic

@@ -7,7 +7,7 @@ coefficients (`FamilyScore.marginal`). The priors of the search are its price fo
 
     P(S | r) = Σ_numbers exp(evidence + log prior) / the same over all structures and no law
 
-over the structures that the search meets: all of one term on the short list, and all that differ
+over the structures that the search tries: all of one term on the short list, and all that differ
 from a chosen law in one term, or have one more. Structures within odds of 20 : 1 of the likeliest
 are returned (Occam's window; Madigan and Raftery 1994, J. Am. Stat. Assoc. 89, 1535), and the best
 of each complexity. With mean μ_S and covariance V_S of a reading by a structure, the average has
@@ -54,7 +54,7 @@ class Structure:
 
     kind: Hashable  # sites and functions; see `structure_of`
     form: Form
-    probability: float  # posterior, among all structures that the search met
+    probability: float  # posterior, among all structures that the search tried
     holdout_share: float  # share of the misfit on poses left out that it explains, by algebra
     step: Floats  # (P,) posterior mean of its coefficients, in ordinary motions
     root: Floats  # (P, Q) root of their posterior covariance
@@ -77,9 +77,8 @@ def posterior(odds: Mapping[Hashable, Sequence[float]]) -> dict[Hashable, float]
 def structures(problem: SearchProblem, selections: Sequence[Selection]) -> tuple[Structure, ...]:
     """Return the likely structures and the best of each complexity, the likeliest first."""
     screen = problem.screen
-    met = _met(problem, selections)
     groups: dict[Hashable, list[tuple[float, Terms]]] = {}
-    for odds, terms in met:
+    for odds, terms in _laws_nearby(problem, selections):
         groups.setdefault(structure_of(screen, terms), []).append((odds, terms))
     chosen = {structure_of(screen, s.terms): s.terms for s in selections}
     for s in selections:
@@ -98,7 +97,7 @@ def structures(problem: SearchProblem, selections: Sequence[Selection]) -> tuple
         for kind in order
         if kind in likely or kind in simplest.values()
     ]
-    out = [x for x in out if len(x.step)]  # else the model absorbs it
+    out = [x for x in out if len(x.step)]  # without those that the model absorbs
     return tuple(x for x in out if x.kind in likely or x in pareto(out))
 
 
@@ -117,7 +116,9 @@ def _function(f: Factor) -> Hashable:
     return quantity, f.shape.name, f.numbers if f.shape.name in ("cos", "sin") else ()
 
 
-def _met(problem: SearchProblem, selections: Iterable[Selection]) -> list[tuple[float, Terms]]:
+def _laws_nearby(
+    problem: SearchProblem, selections: Iterable[Selection]
+) -> list[tuple[float, Terms]]:
     """Return log odds against no law, and terms, of the laws near the chosen ones."""
     bases: dict[Terms, None] = {(): None}
     for s in selections:
@@ -146,7 +147,7 @@ def _met(problem: SearchProblem, selections: Iterable[Selection]) -> list[tuple[
 
 
 def log_odds(problem: SearchProblem, terms: Terms) -> float:
-    """Return the log posterior odds of a law with its present numbers, against none."""
+    """Return the log posterior odds of a law with these numbers, against no law."""
     if not terms:
         return 0.0
     terms = with_first_price(terms)

@@ -284,7 +284,7 @@ class Mover:
             expected = q
 
     def sample_with_free_path(self, goal: Floats, name: str) -> ArmSample:
-        """Return a sample of an arm that is ready and whose path to `goal` is free; else DeviceError."""
+        """Return a sample of the arm; DeviceError unless it is ready and its path is free."""
         sample = self._arm.sample()
         if (unfit := self.guard.state(sample)) is not None:
             raise DeviceError(unfit)

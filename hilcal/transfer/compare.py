@@ -1,6 +1,6 @@
 """What has changed on an arm: between two campaigns, or since its factory measured it.
 
-`compare` finds changes between campaigns and the current error of the earlier calibration;
+`compare` finds changes between campaigns, and the present error of the earlier calibration.
 `validate` predicts another campaign's readings, without those that were fitted.
 
 `check_factory` tests a few readings: all effects of the catalogue are fitted together, starting
@@ -56,7 +56,7 @@ from hilcal.types import Bools
 LEVEL = 1e-3
 """p-value below which the geometry counts as changed; a choice."""
 MIN_READINGS = 8
-"""Least number of readings, in view of the nine unknowns of the frames; a choice."""
+"""Least number of readings, for the nine unknowns of the frames; a choice."""
 
 
 def compare(
@@ -96,7 +96,7 @@ def compare(
     if run.cell.arm.name != later.cell.arm.name:
         raise InputError(
             f"{later.path}: another arm ({later.cell.arm.name}) than that of {run.path} "
-            f"({run.cell.arm.name}): its errors differ everywhere; compare campaigns of one arm"
+            f"({run.cell.arm.name}); valid: two campaigns of one arm"
         )
     number, fit = run.fit_in_use(say, revision)
     chosen, shared = _fresh(run, later, fit, number)
@@ -110,11 +110,11 @@ def compare(
     say("predicting what the earlier calibration leaves")
     in_use = run.in_use(revision)
     judged: Mapping[str, Any] = {} if in_use is None else in_use.result_json.get("diagnose", {})
-    # A model is not extended if its diagnosis named no missing effect.
+    # a model whose diagnosis named no missing effect is not extended
     lacks = judged.get("verdict", "missing_effect") == "missing_effect"
     extended, lacked = with_missing_effects(fit, changing(run.catalogue) if lacks else (), say)
-    later_setting = later_readings(earlier_fit(extended), chosen, anew=anew, cell=later.cell)
-    changes = find_changes(later_setting, say)
+    comparison_setting = later_readings(earlier_fit(extended), chosen, anew=anew, cell=later.cell)
+    changes = find_changes(comparison_setting, say)
     record = later.in_use()
     return Comparison(
         number=number,
@@ -127,7 +127,7 @@ def compare(
         anew=anew,
         setup_stated=same_setup is not None,
         tool=_tool_differs(run, later),
-        today=error_today(later_setting, changes, nominal_rms),
+        today=error_today(comparison_setting, changes, nominal_rms),
         changes=changes,
         differences=None if record is None else _differences(fit, later, record, say),
     )
@@ -160,7 +160,7 @@ def _fresh(run: Campaign, later: Campaign, fit: Fit, number: int | None) -> tupl
         model = "the baseline" if number is None else f"revision {number}"
         raise CannotAnswerError(
             f"{later.path}: {model} of {run.path} was fitted to all its {len(readings)} readings; "
-            "what has changed is seen only in later ones"
+            "only later readings show what has changed"
         )
     return readings[fresh], int(fitted.sum())
 
@@ -189,7 +189,7 @@ def validate(
 ) -> CampaignValidation:
     """Predict readings of another campaign with a revision of this one.
 
-    Where `other` states another tool, or target on the flange, it is that which is predicted.
+    If `other` states another tool, or target on the flange, the prediction is for that one.
     Readings that the revision was fitted to are recognised in any file (see
     `hilcal.readings.same_readings`) and left out. Where all were fitted, all are predicted, and
     `judged.unseen` is False.

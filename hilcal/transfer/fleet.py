@@ -1,13 +1,12 @@
 """A fleet: campaigns are fitted and diagnosed by the engine, and pooled by type of arm.
 
-Effects in at least the share `TRAIT_SHARE` of the campaigns are pooled; parameters with a strength
-of their own (shrunk families) are not. A parameter is pooled if at least two arms determine it.
+Effects in at least the share `TRAIT_SHARE` of the campaigns are pooled; parameters of shrunk
+families are not. A parameter is pooled if at least two arms determine it.
 Time is in years since the arm's first campaign. See `regression.variance_components.hierarchy`.
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -17,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import scipy
 
-from hilcal.engine import Advance, Engine
+from hilcal.engine import Counting, Engine, uncounted
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.carried.carried_prior import SAME_M
 from hilcal.identification.carried.posterior import (
@@ -65,7 +64,7 @@ class UnlikeParameter:
     """A parameter of one arm that differs from the other arms of its type."""
 
     arm: str
-    campaign: str  # campaign before which the arm changed; empty if the arm itself is unlike
+    campaign: str  # campaign before which the arm changed; empty if the arm differs in all
     parameter: str  # "effect.parameter"
     off: float  # difference from the expected value, SI
     unit: str
@@ -95,7 +94,7 @@ class DiagnosedEffect:
 
     effect: str
     arms: tuple[str, ...]  # arms with the effect
-    of: int  # number of all arms
+    of: int  # number of arms
     kind: str  # "trait" of the type, "defect" of single arms, or "some"
 
 
@@ -107,9 +106,8 @@ class PooledType:
     arms: tuple[str, ...]
     campaigns: tuple[str, ...]
     parameters: tuple[Spread, ...]
-    unlike: tuple[
-        UnlikeParameter, ...
-    ]  # differences of arms, then changes of arms; most certain first
+    # differences of arms, then changes of arms; most certain first
+    unlike: tuple[UnlikeParameter, ...]
     effects_added: tuple[DiagnosedEffect, ...]  # effects that diagnoses added, most frequent first
     wear: tuple[str, ...]  # parameters whose common drift is certain
     prior: Posterior  # prediction for another arm
@@ -171,9 +169,11 @@ def pool(members: Sequence[Member], diagnosed: Sequence[DiagnosedEffect]) -> Poo
     scale = np.array([scales[name] for name in names])
     estimates = _estimates(members, arms, names, scale)
     h, unlike_arms = hierarchy(estimates)
-    later, changed = _changes(estimates, h)
+    repeated, changed = _changes(estimates, h)
     of_arms = [(o, arms[o.unit], "") for o in unlike_arms]
-    of_campaigns = [(o, members[later[o.unit]].arm, members[later[o.unit]].name) for o in changed]
+    of_campaigns = [
+        (o, members[repeated[o.unit]].arm, members[repeated[o.unit]].name) for o in changed
+    ]
     unlike = []
     for o, arm, campaign in (*of_arms, *of_campaigns):
         name, off = names[o.parameter], float(o.deviation * scale[o.parameter])
@@ -258,16 +258,16 @@ def _changes(estimates: FleetEstimates, h: Hierarchy) -> tuple[list[int], Sequen
     """Return the repeated campaigns of arms, and the changes of arms before them."""
     covariance = np.linalg.inv(estimates.information + 1e-8 * np.eye(estimates.mean.shape[1]))
     variance = np.diagonal(covariance, axis1=1, axis2=2)
-    later, change, spread = [], [], []
+    repeated, change, spread = [], [], []
     for a in range(int(estimates.arm.max()) + 1):
         campaigns = np.flatnonzero(estimates.arm == a)
         campaigns = campaigns[np.argsort(estimates.time[campaigns], kind="stable")]
         for previous, current in pairwise(campaigns):
             years = estimates.time[current] - estimates.time[previous]
-            later.append(int(current))
+            repeated.append(int(current))
             change.append(estimates.mean[current] - estimates.mean[previous] - years * h.slope)
             spread.append(variance[current] + variance[previous])
-    return later, find_outliers(np.array(change), np.array(spread)) if later else []
+    return repeated, find_outliers(np.array(change), np.array(spread)) if repeated else []
 
 
 def _prior(
@@ -311,9 +311,6 @@ def _prior(
     )
 
 
-Counting = Callable[[str, int], AbstractContextManager[Advance]]
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Fleet:
     """Pooled results of a fleet."""
@@ -329,16 +326,11 @@ class Fleet:
         return fragment(fleet_report(self))
 
 
-def _silent(label: str, total: int) -> AbstractContextManager[Advance]:
-    return nullcontext(lambda step: None)
-
-
-def fleet(directory: Path, engine: Engine, counting: Counting = _silent) -> Fleet:
+def fleet(directory: Path, engine: Engine, counting: Counting = uncounted) -> Fleet:
     """Fit and diagnose the campaigns in a directory and below it, and pool them by type of arm.
 
     Nothing is stored in the campaigns. Campaigns that fail are listed with the reason, and so are
-    those whose nominal links differ from the first of their type. `counting` shows progress, as
-    `present.progress.counting` does.
+    those whose nominal links differ from the first of their type.
 
     Raises:
         InputError: campaigns share readings, as copies and extensions do, which would count twice.
@@ -348,8 +340,8 @@ def fleet(directory: Path, engine: Engine, counting: Counting = _silent) -> Flee
     if same := shared(engine.map(prints_of, listed)):
         first_name, second_name = sorted(listed[k].name for k in same)
         raise InputError(
-            f"{directory}: {first_name} and {second_name} have readings in common: one measurement "
-            "counts once; leave one of them out"
+            f"{directory}: {first_name} and {second_name} have readings in common, which would "
+            "count twice; leave one of them out"
         )
     with counting("campaigns", len(listed)) as advance:
         results = engine.map(member_of, listed, advance=advance)
@@ -369,14 +361,14 @@ def fleet(directory: Path, engine: Engine, counting: Counting = _silent) -> Flee
     types, members = [], []
     for kind, pairs in kinds.items():
         try:
-            pooled_type, pooled_members, lost = _type(pairs, engine, counting)
+            pooled_type, pooled_members, failed = _type(pairs, engine, counting)
         except CannotAnswerError as error:
             failures.append(Failure(f"type {kind}", str(error)))
             members += [member for _, member in pairs]
             continue
         types.append(pooled_type)
         members += pooled_members
-        failures += lost
+        failures += failed
     if not types:
         first = failures[0]
         message = f"{first.name}: {first.reason}"
@@ -393,17 +385,17 @@ def _type(
     diagnosed = diagnosed_effects(members)
     traits = tuple(s.effect for s in diagnosed if s.kind == "trait")
     lacking = [k for k, m in enumerate(members) if not set(traits) <= set(m.added)]
-    lost: list[Failure] = []
+    failed: list[Failure] = []
     if traits and lacking:
         run = partial(member_of, effects=traits)
         with counting(f"campaigns again, with {', '.join(traits)}", len(lacking)) as advance:
             results = engine.map(run, [pairs[k][0] for k in lacking], advance=advance)
         for k, result in zip(lacking, results, strict=True):
             if isinstance(result, Failure):
-                lost.append(replace(result, reason=f"with {', '.join(traits)}: {result.reason}"))
+                failed.append(replace(result, reason=f"with {', '.join(traits)}: {result.reason}"))
             else:
                 members[k] = replace(result, added=members[k].added)
-    return pool(members, diagnosed), members, lost
+    return pool(members, diagnosed), members, failed
 
 
 def to_json(fleet: Fleet, priors: Mapping[str, str]) -> dict[str, object]:

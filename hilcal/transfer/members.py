@@ -99,7 +99,7 @@ def evidence_of(variances: Variances, ordinary: dict[str, float]) -> SizeEvidenc
         if not f.known:
             b[k, effects.index(f.effect)] = 1.0
     slope = precision @ (x - mean)
-    # Curvature that the logarithm adds where the likelihood falls; see `mixed.variances`.
+    # curvature by the logarithm where the likelihood falls; see `mixed.variances`
     information = variances.equations.information + np.diag(np.maximum(-2.0 * slope, 0.0))
     shipped = mean - b @ np.log([ordinary.get(e, 1.0) for e in effects])
     gain = information @ np.linalg.inv(information + precision)
@@ -169,7 +169,7 @@ class Failure:
 def sizes_of_arms(members: Sequence[Member]) -> list[SizeEvidence]:
     """Return the evidence of each arm: that of its most informative campaign.
 
-    All campaigns of an arm have the same d_i; each would count as an arm of its own.
+    All campaigns of an arm have the same d_i, and must not count as several arms.
     """
     best_of_arm: dict[str, SizeEvidence] = {}
     for m in members:
@@ -238,7 +238,7 @@ def member_of(entry: Entry, effects: tuple[str, ...] = ()) -> Member | Failure:
             return _member(entry, run, effects)
     except HilcalError as error:
         return Failure(entry.name, str(error).removeprefix(f"{entry.path}: "))
-    except Exception as error:  # one campaign must not end the others'
+    except Exception as error:  # a failure of one campaign must not affect the others
         of_effect = failure_of(error)
         return Failure(entry.name, str(of_effect or f"unexpected {type(error).__name__}: {error}"))
 

@@ -21,7 +21,7 @@ from hilcal.discovery.law import Form, LawPart, effect_class, source_of_form
 from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.refit import refit_exactly
 from hilcal.discovery.screen import LawTerm, screen
-from hilcal.discovery.search import LEAST_LOG_ODDS, Selection, search, worth_their_length
+from hilcal.discovery.search import LEAST_LOG_ODDS, Selection, search, sufficiently_better
 from hilcal.discovery.sites import ORDINARY
 from hilcal.effects.catalogue import installed
 from hilcal.effects.check import check_effect
@@ -230,8 +230,8 @@ def test_a_longer_law_has_to_be_more_likely_than_every_shorter_one():
         Selection((LawTerm(((0, 0),), 0.0),) * k, odds)
         for k, odds in ((1, (182.3,)), (2, (171.9, 9.0)), (3, (171.9, 9.0, 5.0)))
     )
-    assert worth_their_length([one, two, three]) == [one, three]
-    assert worth_their_length([one, two]) == [one]
+    assert sufficiently_better([one, two, three]) == [one, three]
+    assert sufficiently_better([one, two]) == [one]
 
 
 def with_zero(symbol, *more):

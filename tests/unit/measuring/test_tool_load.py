@@ -201,15 +201,18 @@ UNSURE = "asked for 10 kg (98.1 N), measured 98.1 N ± 6.0 N: too uncertain"
     [
         (WEIGHT, WEIGHT + OFF, 0.1, True, "asked for 10 kg (98.1 N), measured 97.1 N"),
         (0 * WEIGHT, np.full(6, 0.5), 0.1, True, "asked for nothing, measured 0.9 N"),
-        (WEIGHT, WEIGHT / 2, 0.1, False, "asked for 10 kg (98.1 N), measured 49.0 N: that is about 5"),
+        (
+            WEIGHT, WEIGHT / 2, 0.1, False,
+            "asked for 10 kg (98.1 N), measured 49.0 N: that is about 5",
+        ),
         (
             WEIGHT, ASLANT, 0.1, False,  # a sensor that is mounted otherwise than described
             "asked for 10 kg (98.1 N), measured 98.1 N: that is 100 % of it, 14° off its direction",
         ),
         (WEIGHT, 0.01 * WEIGHT, 0.1, False, "asked for 10 kg (98.1 N), measured 1.0 N: that is"),
-        (0 * WEIGHT, WEIGHT / 2, 0.1, False, "asked for nothing, measured 49.0 N: about 5.0 kg still"),
+        (0 * WEIGHT, WEIGHT / 2, 0.1, False, "asked for nothing, measured 49.0 N: about 5.0 kg"),
         (0 * WEIGHT, PULL, 0.1, False, "asked for nothing, measured 50.0 N: something still pulls"),
-        (PULL, 0.8 * PULL, 0.1, False, "asked for 50.0 N, measured 40.0 N: that is 80 % of it, 0° off"),
+        (PULL, 0.8 * PULL, 0.1, False, "asked for 50.0 N, measured 40.0 N: that is 80 % of it, 0°"),
         (
             PULL, np.roll(PULL, 1), 0.1, False,
             "asked for 50.0 N, measured 50.0 N: that is 100 % of it, 90° off its direction",
