@@ -61,9 +61,9 @@ class Cell(Brief):
     registration: Floats  # (4, 4) T_sensor_base: maps base into sensor (tracker) coordinates
     registration_known: bool  # False where it has to be estimated
     target_known: bool  # False where the offset of a target has to be estimated
-    config: CellConfig | None = None  # that it was made from; None if from numbers alone
-    base_dir: Path = Path()  # that relative paths in `config` refer to
-    # whether effects take measured joint torques, where readings have them, instead of those
+    config: CellConfig | None = None  # its source; None if it was made from numbers alone
+    base_dir: Path = Path()  # reference of relative paths in `config`
+    # whether effects use measured joint torques, where readings have them, instead of those
     # computed from the described masses and loads
     measured_torques: bool = False
     # the factory's kinematics, from a file; `arm` has them where the configuration says so
@@ -117,7 +117,7 @@ class Cell(Brief):
         return not self.observers or any(o.tied for o in self.observers)
 
     def _observer(self, name: ObserverName, first: bool) -> Observer:
-        """Return an observer by its description; `first` is the first station."""
+        """Return an observer by its description; `first`: whether it is the first station."""
         frame = np.eye(4)
         if name.kind == "station":
             return Observer(name, frame, () if first else tuple(range(6)))
@@ -161,7 +161,7 @@ STANDARD_GRAVITY = np.array([0.0, 0.0, -STANDARD_GRAVITY_M_S2])
 
 def cell_from_config(
     config: CellConfig,
-    base_dir: Path | None = None,  # that paths of the robot's files are relative to
+    base_dir: Path | None = None,  # reference of relative paths of the robot's files
     robot_file: str | None = None,  # its text, as a campaign stores it; then no file is read
     calibration_file: str | None = None,  # the same of the factory's kinematics
 ) -> Cell:
@@ -224,6 +224,6 @@ def tracker_place(cell: Cell) -> Floats | None:
 
 
 def _pose(xyz: tuple[float, ...] | None, rotvec: tuple[float, ...] | None) -> Floats:
-    """Return a pose (4, 4); None is no translation, or no rotation."""
+    """Return a pose (4, 4), without the translation or the rotation that is None."""
     zero = (0.0, 0.0, 0.0)
     return se3.of_six([*(xyz or zero), *(rotvec or zero)])

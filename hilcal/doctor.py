@@ -60,16 +60,15 @@ GROUPS = {
     "hilcal.operators": "operators",
 }
 NOT_FOR_USERS = ("all", "dev", "docs", "release")  # Extras that no command needs
-MAX_LATENCY_MS = (
-    1  # Largest latency timer: how long the driver holds bytes; default 16 (FTDI, AN232B-04)
-)
+MAX_LATENCY_MS = 1
+"""Largest latency timer, for which the driver holds bytes back; default 16 (FTDI, AN232B-04)."""
 INTERFERING_SERVICES = {
     "ModemManager": "it talks to serial adapters that are plugged in",
     "brltty": "it takes adapters for Braille displays",
 }
 """Services that open adapters of other programs."""
-SECONDS = 1.0  # Most time for an answer. A choice: on a cell's own network it takes a millisecond
-SLOW_S = 0.02  # longer than any connection to a controller in the same room takes, s. A choice
+SECONDS = 1.0  # Longest time for an answer; a choice: in the network of a cell it takes 1 ms
+SLOW_S = 0.02  # s; a connection to a controller in the same room is faster; a choice
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _BELOW = re.compile(r"""python_version\s*<\s*["'](\d+)\.(\d+)["']""")
 _EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
@@ -121,7 +120,7 @@ def disk(folder: Path) -> Iterator[Finding]:
     yield COMPUTER(name, "warning" if little else "ok", f"{free / 1e9:.1f} GB free", mend)
     kind = _file_system(folder)
     if kind in ON_NETWORK:
-        text = f"a file system on the network ({kind}): its locks are not to be relied on"
+        text = f"a file system on the network ({kind}): its locks are not reliable"
         mend = "measure into a folder of a local disk, and copy the file afterwards"
         yield COMPUTER("file system", "warning", text, mend)
     try:
@@ -179,7 +178,7 @@ def _memory() -> Finding:
 def load(measured: Callable[[], tuple[float, float, float]] = os.getloadavg) -> Finding:
     """Return whether other programs occupy the processors; an arm needs commands in time."""
     cores, busy = os.cpu_count() or 1, measured()[0]
-    text, mend = f"{cores}; in the last minute {busy:.1f} programs wanted one at a time", ""
+    text, mend = f"{cores}; {busy:.1f} of them were wanted on average in the last minute", ""
     if busy > cores:
         mend = "end other programs: the arm stops by itself where this program is 0.1 s late"
     return COMPUTER("processors", "warning" if mend else "ok", text, mend)

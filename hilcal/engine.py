@@ -63,7 +63,7 @@ def uncounted(label: str, total: int) -> AbstractContextManager[Advance]:
 
 
 MOST_DEATHS = 3
-"""Most workers that may die with one item before it is given up; Dask's own, a choice."""
+"""Most workers that may die with one item before it is given up; as in Dask."""
 
 
 class ClusterError(HilcalError):
@@ -204,7 +204,7 @@ class Processes:
         for worker in workers:
             worker.process.join()
             worker.line.close()
-            self.all.discard(worker)  # an abandoned `results` may end its workers again
+            self.all.discard(worker)  # `results`, closed early, may end its workers again
 
 
 class _Worker:

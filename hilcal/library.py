@@ -106,7 +106,7 @@ def read_table(
 
 
 def _read_frame(frame: "pd.DataFrame", cell: Cell, mapping: str | Path | None) -> Readings:
-    """Read a data frame as the CSV file that it writes, with an index that has a name."""
+    """Read a data frame by its CSV file, with its index if that has a name."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "data frame"
         named = any(name is not None for name in frame.index.names)
@@ -313,7 +313,7 @@ def fit(
         prior: the posterior of another campaign of this arm, for the effects that the model shares
             with it (`baseline` adds the others); or (P,) standard deviations of zero-mean priors,
             infinite for flat ones, zero for parameters fixed at zero; None: those of the effects.
-        mode: another name of `readings`; results call it `mode`.
+        mode: another name of `readings`, as in results.
 
     Raises:
         InputError: another kind of readings or of scaling, or a deflection without its unloaded

@@ -162,7 +162,7 @@ def read_text(path: Path, most: int) -> str:
 
 @contextmanager
 def memory(name: str) -> Iterator[None]:
-    """Limit the memory that a block may take to `MEMORY`; an InputError where it needs more.
+    """Limit the memory that a block may use to `MEMORY`; an InputError where it needs more.
 
     A reserve is freed first, since even a small object may need memory when that has run out.
     """

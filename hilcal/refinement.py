@@ -44,8 +44,6 @@ from hilcal.readings.whitening import Mode
 from hilcal.shown import Brief, Shown
 from hilcal.store.revision import change
 
-__all__ = ["Refinement", "RefinementStep", "add", "predicts_better", "refine", "remove"]
-
 MOST_REVISIONS = 15
 MOST_SCATTERS = 2
 """Estimates of the arm's scatter at most: the first, and another after further effects."""
@@ -54,7 +52,7 @@ UNEXPLAINED_VERDICTS = ("unknown_effect", "noise_misjudged")
 """Verdicts with which all effects are tried together where readings are many; a choice: they prove
 single effects far below the noise, and all together take minutes."""
 TAKEN_FOR_NOISE = ("arm_scatter", "background")
-"""Reasons with which a misfit may be left to noise that the readings do not state."""
+"""Reasons of a diagnosis that attributes the misfit to noise that the readings do not state."""
 MANY_EFFECTS = 6
 """Number of added effects from which on all are tried together where readings are many, with any
 verdict; a choice: such an arm has the others, too, and each single trial takes long."""
@@ -141,10 +139,10 @@ def refine(
 ) -> Refinement:
     """Fit, diagnose, add the first suspect, and repeat.
 
-    An effect stays only if the error on poses left out falls and the refit keeps the promise of the
-    linearisation (see `diagnosis.effect_ranking`). If the readings do not separate the first
-    suspect from others, the first is added: any of them lowers the error. When no suspect remains,
-    every addition is reconsidered: a redundant effect is removed, and an effect that others replace
+    An effect stays only if the error on poses left out falls and the refit lowers χ² about as much
+    as the linearisation predicts (see `diagnosis.effect_ranking`). If the readings do not separate
+    the first suspect from others, the first is added: any of them lowers the error. When no suspect
+    remains, every addition is reconsidered: a redundant effect is removed, and one that others replace
     better is exchanged for them. If the residual is then more than noise, all effects of the
     catalogue are fitted together (`Path.add_background`). If the rest of the misfit is the arm's
     scatter, the last step is a fit with the scatter in the covariance, so weights, uncertainties
@@ -177,7 +175,7 @@ def refine(
     last = refinement.fit
     if last.model.names == first.model.names:
         return refinement
-    # The misfit of the first model may have hidden a correlation of the noise, or imitated one.
+    # the misfit of the first model may have hidden or imitated a correlation of the noise
     white = last
     if last.readings.serial is not None:
         plain = last.readings.with_serial(None)
@@ -185,7 +183,11 @@ def refine(
     noise = serial_noise(white)
     if (noise is None) == (last.readings.serial is None):
         return refinement
-    say("the noise is correlated along the order" if noise else "the noise is white after all")
+    say(
+        "the noise is correlated along the order"
+        if noise
+        else "the noise is not correlated along the order"
+    )
     first = fit(model, first.readings.with_serial(noise), mode)
     return refine_from(first, say, history, laws, on_step, background)
 
@@ -198,7 +200,7 @@ def refine_from(
     on_step: Callable[[RefinementStep], None] = lambda step: None,
     background: bool = True,
 ) -> Refinement:
-    """Refine a fit without estimating the correlation of its noise anew; see `refine`."""
+    """Refine a fit with the correlation of its noise as it is; see `refine`."""
     path = Path(first, say, history, laws, on_step, background)
     path.complete()
     if path.pool_lines():
@@ -220,7 +222,7 @@ class Path:
         on_step: Callable[[RefinementStep], None] = lambda step: None,
         background: bool = True,
     ) -> None:
-        """Start with a fit whose effects stay; `history` tells how its model was reached."""
+        """Start with a fit whose effects stay; `history` has the steps that led to its model."""
         self._background = background
         self.steps: list[RefinementStep] = []
         self._start, self._start_history, self._say = first.model.named, history, say
@@ -258,7 +260,7 @@ class Path:
         self._append(RefinementStep(fitted, self._judge(fitted), added, removed))
 
     def _judge(self, fitted: Fit, whole_catalogue: bool = False) -> Diagnosis:
-        # Only a search of laws needs to know early whether the whole catalogue is sufficient.
+        # only a search of laws needs to know already here whether the catalogue is sufficient
         whole_catalogue = whole_catalogue or self._laws is not None
         return judge(self._evidence, self._history(fitted), whole_catalogue)
 
@@ -276,7 +278,7 @@ class Path:
 
     def extend(self) -> None:
         """Add suspects while any lowers the error on poses left out."""
-        # Where suspects are rejected, the step is judged anew: a law may be searched after all.
+        # after suspects are rejected and the step is judged again, a law may be searched
         while self._room and (
             self._add_law()
             or (self._has_many_effects() and self.add_background())
@@ -311,15 +313,15 @@ class Path:
         if not larger.model.background:
             self.append(larger, law, message=f"added {law}")
             return True
-        # The sizes were estimated without the law, and are larger by what they took up of it.
-        anew = with_background(larger, [*last.fit.model.named, law])
-        self._append_background(larger if anew is None else anew, law)
+        # the sizes of the background were estimated without the law, and contain a part of it
+        refitted = with_background(larger, [*last.fit.model.named, law])
+        self._append_background(larger if refitted is None else refitted, law)
         return True
 
     def _add_suspect(self) -> bool:
         """Try the suspects, best first; returns whether one was added.
 
-        The step is judged anew where suspects were rejected.
+        The step is judged again where suspects were rejected.
         """
         last, better = self.steps[-1], None
         n_rejected = len(self._rejected)
@@ -344,9 +346,9 @@ class Path:
         return True
 
     def reconsider(self) -> bool:
-        """Judge every addition anew; returns whether one was removed or exchanged."""
+        """Judge every addition again; returns whether one was removed or exchanged."""
         last = self.steps[-1]
-        # The effects named beside a background do not depend on earlier additions.
+        # the effects named beside a background do not depend on previous additions
         if last.diagnosis.wrong_figures or last.fit.model.background:
             return False
         added = [n for n in last.fit.model.named if n not in self._start]
@@ -460,7 +462,7 @@ class Path:
         return True
 
     def pool_lines(self) -> bool:
-        """Fit effects of many lines anew, the size of each line near that of its pool.
+        """Fit effects of many lines again, the size of each line shrunk to that of its pool.
 
         The fit replaces that of the last step, unless the error on poses left out rises by more
         than it scatters from pose to pose. A path of one step stays as it is. Returns whether a
@@ -504,7 +506,7 @@ class Path:
             least *= 1.0 + EXCHANGE_MARGIN
         elif len(alternative.replacements) > 1:
             least += LEAST_SHARE * last.fit.dof
-        # What was replaced or redundant does not come back in turn.
+        # effects that were removed or replaced are not added again
         if not alternative.better or not set(self._removed).isdisjoint(alternative.replacements):
             return False
         return alternative.log_evidence > least

@@ -86,7 +86,7 @@ def make_design(rng: np.random.Generator, arm: Arm, poses: int) -> StudyDesign:
     if len(q) < poses:
         raise CannotAnswerError(
             f"{arm.name}: only {len(q)} feasible poses of {poses} under the study's wrenches; "
-            "take fewer poses or a stronger arm"
+            "choose a stronger arm"
         )
     chain = evaluate(arm, q)
     target = chain.point(TARGET)
@@ -166,6 +166,7 @@ def _correlation(covariance: Floats) -> Floats:
 # Correlation ρ, whether unloaded readings are shared, generator of the noise.
 _Experiment = tuple[float, bool, np.random.Generator]
 LEVEL = 0.95
+POSES = 30
 CORRELATIONS = (0.0, 0.3, 0.6, 0.9, 0.99)
 # name, factor of lengths in m, factor of angles in rad
 UNITS: tuple[tuple[str, float, float], ...] = (
@@ -177,37 +178,22 @@ UNITS: tuple[tuple[str, float, float], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class StudyCell:
-    """One scaling of one experiment; `_mc` are standard uncertainties of the Monte-Carlo.
-
-    Attributes:
-        scaling: "none", "gu" or "gc".
-        correlation: share ρ of each element's variance that is common to the elements.
-        unit: units of the deflections.
-        shared_unloaded: whether the loads of a pose share one unloaded reading.
-        error_over_bound: root mean square over runs and parameters of the error of a parameter
-            in units of its bound, sqrt(F⁻¹_jj); 1 if the bound is attained.
-        error_over_bound_mc: standard uncertainty of `error_over_bound`.
-        coverage: share of the stated 95 % intervals that contain the true parameter.
-        coverage_mc: standard uncertainty of `coverage`.
-        variance_factor: mean χ²/dof of the whitened residual; None for `none`, where it is not
-            defined.
-        parameter_error_over_bound: (n,) `error_over_bound` per parameter.
-        parameter_coverage: (n,) `coverage` per parameter.
-        unit_shift: largest change of any estimate in any run between a unit and the first unit,
-            in units of the bound.
-    """
+    """One scaling of one experiment; `_mc` are standard uncertainties of the Monte-Carlo."""
 
     scaling: Scaling
-    correlation: float
-    unit: str
-    shared_unloaded: bool
+    correlation: float  # share ρ of each element's variance that is common to the elements
+    unit: str  # units of the deflections
+    shared_unloaded: bool  # whether the loads of a pose share one unloaded reading
+    # root mean square over runs and parameters of the error of a parameter in units of its bound,
+    # sqrt(F⁻¹_jj); 1 if the bound is attained
     error_over_bound: float
     error_over_bound_mc: float
-    coverage: float
+    coverage: float  # share of the stated 95 % intervals that contain the true parameter
     coverage_mc: float
-    variance_factor: float | None
-    parameter_error_over_bound: tuple[float, ...]
-    parameter_coverage: tuple[float, ...]
+    variance_factor: float | None  # mean χ²/dof of the whitened residual; None for `none`
+    parameter_error_over_bound: tuple[float, ...]  # (n,)
+    parameter_coverage: tuple[float, ...]  # (n,)
+    # largest change of an estimate between a unit and the first unit, in units of the bound
     unit_shift: float
 
 
@@ -249,7 +235,6 @@ def scaling_study(
     correlations: Sequence[float] = CORRELATIONS,
     *,
     arm: Arm | None = None,
-    poses: int = 30,
     engine: Engine = IN_PROCESS,
     advance: Advance | None = None,
 ) -> ScalingStudy:
@@ -259,21 +244,19 @@ def scaling_study(
     with shared and one with separate unloaded readings. The engine computes the experiments, see
     `n_experiments`, in parallel. All scalings and units have the same noise. `arm` None: the UR10e.
     """
-    check(runs, correlations, poses)
-    design = make_design(rng, arm or load_arm("ur10e"), poses)
+    check(runs, correlations)
+    design = make_design(rng, arm or load_arm("ur10e"), POSES)
     tasks = _experiments(rng, design, correlations, runs)
     results = engine.map(partial(_cells, design=design, runs=runs), tasks, advance=advance)
     typical = _off_diagonal(design.reading_correlation) / _off_diagonal(design.arm_correlation)
     cells = tuple(cell for of_one in results for cell in of_one)
-    return ScalingStudy(design.arm.name, runs, poses, len(design.wrenches), typical, cells)
+    return ScalingStudy(design.arm.name, runs, POSES, len(design.wrenches), typical, cells)
 
 
-def check(runs: int, correlations: Sequence[float] = CORRELATIONS, poses: int = 30) -> None:
+def check(runs: int, correlations: Sequence[float] = CORRELATIONS) -> None:
     """Raise InputError for invalid arguments of `scaling_study`, before workers are started."""
     if runs < 2:
         raise InputError(f"runs = {runs}: a Monte-Carlo study needs 2 or more")
-    if poses < 2:
-        raise InputError(f"poses = {poses}: the regression needs 2 or more")
     if not len(correlations):
         raise InputError("correlations: none given; give one or more in [0, 1)")
     for rho in correlations:

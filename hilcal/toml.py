@@ -35,7 +35,7 @@ class Section(BaseModel):
     section without one must be "a section [key]".
     """
 
-    # what checks the values is built when it is needed: a device's process checks none
+    # validators are built when they are needed: the process of a device needs none
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
     WORDS: ClassVar[Mapping[str, str]] = {}
 
@@ -109,7 +109,7 @@ def _check_whole(data: dict[str, Any], where: str) -> None:
 def check_section(data: object, section: type[S], where: str, stored: bool = False) -> S:
     """Check a dictionary against `section`; `where` names its origin in InputErrors of one line.
 
-    What is `stored` was checked when it was new: it is valid where checks were added since.
+    A `stored` document was checked when it was written: checks that were added since do not apply.
     """
     check_names(data, where)
     try:
@@ -124,7 +124,7 @@ def check_json(text: str, section: type[S], where: str) -> S:
 
 
 def read_json(text: str, where: str) -> Any:
-    """Return what a JSON document holds; an InputError if it is not JSON, too deep or too large."""
+    """Return the content of a JSON document; InputError if invalid, too deep or too large."""
     try:
         return parse_json(text)
     except json.JSONDecodeError as error:
@@ -150,7 +150,7 @@ def _whole(digits: str) -> int:
 
 
 def suggest(name: str, valid: Sequence[str]) -> str:
-    """Return ' (did you mean "x"?)' for a close name; long ones, which take long, are left out."""
+    """Return ' (did you mean "x"?)' for a close name; long names, which take long, are skipped."""
     near = [v for v in islice(valid, 1000) if len(v) <= _SHORT]
     close = difflib.get_close_matches(name, near, n=1) if len(name) <= _SHORT else ()
     return f' (did you mean "{close[0]}"?)' if close else ""

@@ -22,13 +22,13 @@ def replace_file(path: str | Path, content: str | bytes, *, must_be_new: bool = 
 
 
 def spare_campaign(path: str | Path) -> None:
-    """Refuse the path of a campaign for anything else: its readings cannot be made again."""
+    """Refuse to overwrite a campaign, whose readings cannot be measured again."""
     if _head(path).startswith(SQLITE):
         raise InputError(f"{path}: a campaign is there, which is kept; choose another name")
 
 
 def spare_other(path: str | Path, kind: str, mark: str) -> None:
-    """Refuse the path of a file that is neither empty nor of a kind, as a cell's or a program's.
+    """Refuse to overwrite a file that is neither empty nor of a kind.
 
     Args:
         path: the file that is to be written; any name is valid for a new one.
@@ -41,8 +41,8 @@ def spare_other(path: str | Path, kind: str, mark: str) -> None:
 
 
 def _head(path: str | Path) -> bytes:
-    """Return the beginning of a file; nothing of what is no file, or cannot be read."""
-    with suppress(OSError):  # said when it is written
+    """Return the beginning of a file; empty if it is no file or cannot be read."""
+    with suppress(OSError):  # reported when it is written
         if Path(path).is_file():
             with Path(path).open("rb") as stream:
                 return stream.read(_HEAD)
@@ -56,12 +56,12 @@ def replacing(
     """Yield the path of an empty file, which replaces `path` at the end of the block.
 
     If the block or the process ends early, an existing file is unchanged. Of a link, the file that
-    it points to is replaced. The new file has the permissions of the old one. A device, a pipe and
-    the file that this program prints to cannot be replaced: their own path is yielded.
+    it points to is replaced. The new file has the permissions of the old one. A device, a
+    pipe and the file that this program prints to cannot be replaced: their own path is yielded.
 
     Args:
         must_be_new: refuse to replace a file.
-        campaign: the new file is a campaign; nothing else replaces one.
+        campaign: the new file is a campaign, which alone may replace a campaign.
 
     Raises:
         InputError: the file cannot be written, exists and `must_be_new`, or is a campaign.

@@ -112,7 +112,7 @@ def write_report(
         with ExitStack() as stack:
             default = Files(run.path).validation
             if validation is None and default.is_file():
-                say(f"taking {default.name}, which stands beside it, as validation campaign")
+                say(f"using {default.name} in the same folder as validation campaign")
                 opened = Campaign.open(default, run.catalogue, read_only=True)
                 validation = stack.enter_context(opened)
             content = content_of(run, replace(options, validation=validation), say)

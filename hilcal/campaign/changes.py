@@ -9,6 +9,7 @@ from hilcal.config.cell import Changes
 from hilcal.diagnosis.diagnosis import Diagnosis, History
 from hilcal.diagnosis.effect_ranking import Suspect, added_suspect
 from hilcal.diagnosis.serial_noise import with_serial_noise
+from hilcal.diagnosis.stepwise import add, remove
 from hilcal.diagnosis.verdict import NO_HISTORY, diagnose
 from hilcal.effects.options import Options
 from hilcal.effects.written import write_effect
@@ -16,7 +17,6 @@ from hilcal.identification.background import with_background
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.noise.arm_scatter import with_arm_scatter, with_prior_scatter
-from hilcal.refinement import add, remove
 from hilcal.store.revision import RevisionRecord
 
 Say = Callable[[str], None]

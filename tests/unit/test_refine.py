@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
+from hilcal.diagnosis.stepwise import add
 from hilcal.drivers.simulated.injected_effects import hide_effect
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
@@ -13,7 +14,7 @@ from hilcal.identification.linearisation import linearise
 from hilcal.model.model import Model
 from hilcal.numbers import percent
 from hilcal.present.verdict import message
-from hilcal.refinement import MOST_REVISIONS, Path, add, refine, refine_from
+from hilcal.refinement import MOST_REVISIONS, Path, refine, refine_from
 from hilcal.regression.leave_out import LEAST_GAIN
 from tests.support.campaigns import campaign, cell_of, measured, plan, world_of
 from tests.support.diagnosis_cases import fitted_baseline

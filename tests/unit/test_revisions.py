@@ -9,12 +9,12 @@ import pytest
 
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.revisions import chain, restore, restore_model, to_record
+from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
 from hilcal.identification.fit_document import to_json, with_nulls
 from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.readings.whitening import usual_mode
-from hilcal.refinement import add
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.revision import from_text, to_text
 from hilcal.store.rows import content_hash

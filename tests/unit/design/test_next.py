@@ -25,13 +25,13 @@ from hilcal.design.nominal_model import model_after
 from hilcal.design.planner import PlanRequest
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.pose_alone import pose_powers
+from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.rehearsal import planned_states, simulate
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import effect_columns, linearise
-from hilcal.refinement import add
 from hilcal.regression.evidence import family_power
 from hilcal.regression.schur import projection, schur_complement
 from hilcal.store.plan import REFERENCE, UNLOADED

@@ -10,6 +10,7 @@ from scipy.stats import f as f_distribution
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.diagnosis.noise import judge_noise, pure_error
+from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.injected_effects import DEFLECTION_EFFECTS
 from hilcal.effects.catalogue import BUILT_IN
@@ -19,7 +20,6 @@ from hilcal.identification.linearisation import linearise
 from hilcal.model.observe import motion
 from hilcal.present.diagnosis import detectable_sizes
 from hilcal.present.verdict import headline, message
-from hilcal.refinement import add
 from tests.support.campaigns import campaign, noiseless, plan, with_noise
 from tests.support.diagnosis_cases import fitted_baseline
 from tests.support.refusals import refusal

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from hilcal.diagnosis.residual_regression import Dependence
+from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.linearisation import HeldOut
 from hilcal.identification.prediction.full_prediction import full_prediction
 from hilcal.present.html.report import left_out_errors
 from hilcal.present.story import Chapter, build_story, curve, of_left_out, pose_numbers
-from hilcal.refinement import add
 from hilcal.robot.chain import evaluate
 from tests.support.cli_cases import rehearsal
 from tests.support.fit_cases import fitted_model

@@ -143,7 +143,6 @@ def test_arm_too_weak_is_said():
 
 @pytest.mark.parametrize(("options", "message"), [
     ({"runs": 1}, "runs = 1"),
-    ({"poses": 1}, "poses = 1"),
     ({"correlations": ()}, "none given"),
     ({"correlations": (0.5, 1.0)}, r"correlation 1: must be in \[0, 1\)"),
     ({"correlations": (-0.1,)}, r"correlation -0.1: must be"),
