@@ -142,14 +142,14 @@ def refine(
     An effect stays only if the error on poses left out falls and the refit lowers χ² about as much
     as the linearisation predicts (see `diagnosis.effect_ranking`). If the readings do not separate
     the first suspect from others, the first is added: any of them lowers the error. When no suspect
-    remains, every addition is reconsidered: a redundant effect is removed, and one that others replace
-    better is exchanged for them. If the residual is then more than noise, all effects of the
-    catalogue are fitted together (`Path.add_background`). If the rest of the misfit is the arm's
-    scatter, the last step is a fit with the scatter in the covariance, so weights, uncertainties
-    and p-values include it. In the last fit the lines of a transmission error are shrunk to the
-    size of their pool, which predicts better than separate lines (`with_pooled_lines`). All fits
-    include a correlation of the noise along the order of the readings (`diagnosis.serial_noise`),
-    which would otherwise be taken for effects.
+    remains, every addition is reconsidered: a redundant effect is removed, and one that others
+    replace better is exchanged for them. If the residual is then more than noise, all effects of
+    the catalogue are fitted together (`Path.add_background`). If the rest of the misfit is the
+    arm's scatter, the last step is a fit with the scatter in the covariance, so weights,
+    uncertainties and p-values include it. In the last fit the lines of a transmission error are
+    shrunk to the size of their pool, which predicts better than separate lines
+    (`with_pooled_lines`). All fits include a correlation of the noise along the order of the
+    readings (`diagnosis.serial_noise`), which would otherwise be taken for effects.
 
     Args:
         model: the starting model. Its effects stay, except those of a carried prior that the

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hilcal.calibration import urscript
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensation import Compensation
 from hilcal.calibration.points import Points, on_branch, read_points
+from hilcal.calibration.programs import urscript
 from hilcal.calibration.programs.languages import READERS, ResolvedProgram, read_program
 from hilcal.campaign.campaign import Campaign
 from hilcal.cli.options import check_new, command

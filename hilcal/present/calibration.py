@@ -12,7 +12,7 @@ from hilcal.calibration.compensation import BAND, Compensation
 from hilcal.calibration.improvement import Improvement
 from hilcal.calibration.measured import CONDITION_NAMES, Outside
 from hilcal.calibration.programs.program import ProgramPoint
-from hilcal.calibration.urscript import Waypoint
+from hilcal.calibration.programs.urscript import Waypoint
 from hilcal.identification.bootstrap import Bootstrap
 from hilcal.identification.carried.carried_prior import names_of
 from hilcal.identification.prediction import validation

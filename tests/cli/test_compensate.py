@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import hilcal as hc
-from hilcal.calibration.urscript import waypoints
+from hilcal.calibration.programs.urscript import waypoints
 from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.readings.readings import States
 from hilcal.robot.chain import evaluate

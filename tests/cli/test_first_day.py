@@ -18,7 +18,7 @@ import pytest
 from scipy.stats import chi2
 
 import hilcal as hc
-from hilcal.calibration.urscript import waypoints
+from hilcal.calibration.programs.urscript import waypoints
 from hilcal.config import load_config
 from hilcal.drivers.simulated.mechanics import displacement
 from hilcal.drivers.simulated.rehearsal import (

@@ -15,7 +15,7 @@ from rich.console import Console
 import hilcal as hc
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.programs.program import CORRECTED
-from hilcal.calibration.urscript import program_points, with_joints
+from hilcal.calibration.programs.urscript import program_points, with_joints
 from hilcal.effects import template
 from hilcal.effects.catalogue import installed
 from hilcal.identification.carried.carried_prior import carried_prior, check_arm

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as some
 from scipy.spatial.transform import Rotation
 
-from hilcal.calibration.urscript import movej_program, waypoints, with_joints
+from hilcal.calibration.programs.urscript import movej_program, waypoints, with_joints
 from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.drivers.simulated.cell_processes import free_host
 from hilcal.drivers.simulated.ur_programs import ScriptStream

@@ -1,1 +1,1 @@
-"""Programs of robots in their makers' languages: KRL, RAPID, Fanuc LS, INFORM."""
+"""Programs of robots in their makers' languages: URScript, KRL, RAPID, Fanuc LS, INFORM."""

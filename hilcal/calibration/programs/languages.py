@@ -20,7 +20,7 @@ from hilcal.calibration.programs.fanuc_inform import read_jbi, read_ls
 from hilcal.calibration.programs.krl import read_krl
 from hilcal.calibration.programs.program import JOINTS, UNSTATED, Language, Program, ProgramPoint
 from hilcal.calibration.programs.rapid import read_rapid
-from hilcal.calibration.urscript import BRANCH_MARGIN
+from hilcal.calibration.programs.urscript import BRANCH_MARGIN
 from hilcal.errors import InputError
 from hilcal.names import escaped
 from hilcal.robot.arm import Arm

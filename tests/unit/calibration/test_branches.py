@@ -4,7 +4,7 @@ import numpy as np
 
 from hilcal.calibration.compensation import invert
 from hilcal.calibration.points import Points, on_branch
-from hilcal.calibration.urscript import NEAREST, NOT_STRAIGHT, UNKNOWN, doubts, waypoints
+from hilcal.calibration.programs.urscript import NEAREST, NOT_STRAIGHT, UNKNOWN, doubts, waypoints
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
 from hilcal.robot.se3 import rotation_vector

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from hilcal.calibration.points import on_branch, read_points
-from hilcal.calibration.urscript import movej_program, program_points, waypoints
+from hilcal.calibration.programs.urscript import movej_program, program_points, waypoints
 from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.robot.catalogue import load_arm

@@ -10,7 +10,12 @@ import re
 import numpy as np
 import pytest
 
-from hilcal.calibration.urscript import movej_program, program_points, waypoints, with_joints
+from hilcal.calibration.programs.urscript import (
+    movej_program,
+    program_points,
+    waypoints,
+    with_joints,
+)
 from hilcal.errors import InputError
 from hilcal.robot import se3
 from tests.support.refusals import refusal, refusals, refuses

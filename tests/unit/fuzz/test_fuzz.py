@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.urscript import program_points
+from hilcal.calibration.programs.urscript import program_points
 from hilcal.config import CellConfig
 from hilcal.errors import HilcalError
 from hilcal.identification import parameters_document

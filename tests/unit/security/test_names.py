@@ -39,7 +39,7 @@ from hilcal.calibration import storage
 from hilcal.calibration.dh_table import dh_rows, to_csv, to_toml
 from hilcal.calibration.handover import ur_kinematics, urdf
 from hilcal.calibration.points import read_points
-from hilcal.calibration.urscript import movej_program, waypoints
+from hilcal.calibration.programs.urscript import movej_program, waypoints
 from hilcal.cli import Failures, WatchedStream
 from hilcal.cli.compensating import _csv
 from hilcal.cli.terminal import Terminal

@@ -31,7 +31,7 @@ from hilcal import limits
 from hilcal.calibration.compensation import invert_nominal, nominal_pose
 from hilcal.calibration.points import Points
 from hilcal.calibration.programs.program import CORRECTED, Span, edited
-from hilcal.calibration.urscript_statements import Statement, statements
+from hilcal.calibration.programs.urscript_statements import Statement, statements
 from hilcal.errors import InputError
 from hilcal.names import escaped
 from hilcal.robot import se3
