@@ -231,7 +231,7 @@ def packages(requirements: Iterable[str]) -> tuple[Finding, ...]:
                 importlib.import_module(NATIVE[name])
         except Exception as error:
             why = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
-            mend = f"install it anew: pip install --force-reinstall {name}=={version}"
+            mend = f"install it again: pip install --force-reinstall {name}=={version}"
             out.append(PROGRAM(name, "problem", f"{version} does not load: {why}", mend))
         else:
             installed[name] = f"{name} {version}"

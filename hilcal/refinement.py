@@ -154,7 +154,7 @@ def refine(
     Args:
         model: the starting model. Its effects stay, except those of a carried prior that the
             readings contradict (`contradicted_effects`). The prior is in every fit, with the arm's
-            scatter if the earlier campaign estimated it.
+            scatter if the previous campaign estimated it.
         readings: all readings.
         mode: "deflection" or "absolute".
         say: takes progress, one line each.
@@ -483,11 +483,11 @@ class Path:
         last = self.steps[-1]
         if last.diagnosis.lead is not None and last.diagnosis.insufficiency is None:
             last = replace(last, diagnosis=self._judge(last.fit, whole_catalogue=True))
-        earlier = [
+        previous = [
             replace(s, diagnosis=with_insufficiency(s.diagnosis, last.diagnosis))
             for s in self.steps[:-1]
         ]
-        self.steps = [*earlier, last]
+        self.steps = [*previous, last]
 
     def find_step(self) -> None:
         """Look for a step in the order of the readings where the misfit is left unexplained."""

@@ -178,22 +178,37 @@ UNITS: tuple[tuple[str, float, float], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class StudyCell:
-    """One scaling of one experiment; `_mc` are standard uncertainties of the Monte-Carlo."""
+    """One scaling of one experiment; `_mc` are standard uncertainties of the Monte-Carlo.
+
+    Attributes:
+        scaling: "none", "gu" or "gc".
+        correlation: share ρ of each element's variance that is common to the elements.
+        unit: units of the deflections.
+        shared_unloaded: whether the loads of a pose share one unloaded reading.
+        error_over_bound: root mean square over runs and parameters of the error of a parameter
+            in units of its bound, sqrt(F⁻¹_jj); 1 if the bound is attained.
+        error_over_bound_mc: standard uncertainty of `error_over_bound`.
+        coverage: share of the stated 95 % intervals that contain the true parameter.
+        coverage_mc: standard uncertainty of `coverage`.
+        variance_factor: mean χ²/dof of the whitened residual; None for `none`, where it is not
+            defined.
+        parameter_error_over_bound: (n,) `error_over_bound` per parameter.
+        parameter_coverage: (n,) `coverage` per parameter.
+        unit_shift: largest change of any estimate in any run between a unit and the first unit,
+            in units of the bound.
+    """
 
     scaling: Scaling
-    correlation: float  # share ρ of each element's variance that is common to the elements
-    unit: str  # units of the deflections
-    shared_unloaded: bool  # whether the loads of a pose share one unloaded reading
-    # root mean square over runs and parameters of the error of a parameter in units of its bound,
-    # sqrt(F⁻¹_jj); 1 if the bound is attained
+    correlation: float
+    unit: str
+    shared_unloaded: bool
     error_over_bound: float
     error_over_bound_mc: float
-    coverage: float  # share of the stated 95 % intervals that contain the true parameter
+    coverage: float
     coverage_mc: float
-    variance_factor: float | None  # mean χ²/dof of the whitened residual; None for `none`
-    parameter_error_over_bound: tuple[float, ...]  # (n,)
-    parameter_coverage: tuple[float, ...]  # (n,)
-    # largest change of an estimate between a unit and the first unit, in units of the bound
+    variance_factor: float | None
+    parameter_error_over_bound: tuple[float, ...]
+    parameter_coverage: tuple[float, ...]
     unit_shift: float
 
 

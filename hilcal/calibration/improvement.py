@@ -33,17 +33,28 @@ from hilcal.types import Bools, Floats
 
 @dataclass(frozen=True, slots=True)
 class ErrorReduction:
-    """Errors of some points before and after the correction."""
+    """Errors of some points before and after the correction.
 
-    name: str  # of the load, or "all"
-    count: int  # of points
-    before: ErrorSize  # at the uncorrected joint values
-    after: ErrorSize  # at the corrected ones
-    noise_m: float  # RMS error by the tracker's noise and the arm's repeatability alone
-    band_m: float  # largest predicted radius that holds `BAND` of the errors
-    inside: int  # number of points whose error is within their radius
-    # share of the error beyond the noise that the correction removed, 1 − x_after/x_before with
-    # x² = rms² − noise²; None if x_before is zero
+    Attributes:
+        name: of the load, or "all".
+        count: number of points.
+        before: at the uncorrected joint values.
+        after: at the corrected ones.
+        noise_m: root mean square error that the tracker's noise and the arm's repeatability alone
+            would leave.
+        band_m: the largest predicted radius that holds `BAND` of the errors.
+        inside: number of points whose error is within their radius.
+        removed: share of the error beyond the noise that the correction removed,
+            1 − x_after/x_before with x² = rms² − noise²; None if x_before is zero.
+    """
+
+    name: str
+    count: int
+    before: ErrorSize
+    after: ErrorSize
+    noise_m: float
+    band_m: float
+    inside: int
     removed: float | None
 
 

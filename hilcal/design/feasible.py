@@ -137,9 +137,9 @@ def draw_poses(
     # states that pass up to each reason, and samples of those that it rejects
     remaining, rejected = dict.fromkeys(REASONS, 0), dict[str, Floats]()
     parts = [np.empty((0, len(low)))]
-    drawn = found = 0
+    drawn = accepted = 0
     max_states = max(_MOST_DRAWN[0], _MOST_DRAWN[1] * count) if max_states is None else max_states
-    while found < count and drawn < (max_states if found else _ALL_REJECTED):
+    while accepted < count and drawn < (max_states if accepted else _ALL_REJECTED):
         u = (sequence.random(_CHUNK) + shift) % 1.0
         q = space.cell.arm.complete(low + u * (high - low))
         for reason in REASONS:
@@ -151,8 +151,8 @@ def draw_poses(
             remaining[reason] += len(q)
         parts.append(q)
         drawn += _CHUNK
-        found += len(q)
-    if found < min_poses:
+        accepted += len(q)
+    if accepted < min_poses:
         raise CannotAnswerError(_too_few(space, drawn, remaining, rejected, min_poses))
     q = np.vstack(parts)[:count]
     allowed = np.ones((len(q), len(space.loads)), dtype=np.bool_)

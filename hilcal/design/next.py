@@ -173,7 +173,7 @@ def with_reference(
     rng: np.random.Generator,
     ordering: Ordering,
 ) -> Planned:
-    """Return a plan with other counts of its units, ordered anew."""
+    """Return a plan with other counts of its units, in a new order."""
     problem, usable, objective = planned.problem, np.flatnonzero(planned.usable), planned.objective
     information = objective.prior + objective.units.information(counts.astype(float))
     value, cost = float(objective.criterion.value(information)), counts @ problem.units.cost

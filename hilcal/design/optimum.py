@@ -44,7 +44,7 @@ def best_design(
 
     The integer parts of the continuous weights are completed unit by unit: the next unit is the one
     with which the plan is best if the continuous optimum spends the remaining budget. Then each
-    unit is removed in turn and its budget spent anew (Fedorov 1972). Where this stops improving,
+    unit is removed in turn and its budget spent again (Fedorov 1972). Where this stops improving,
     a few random units are removed at once, and slightly worse plans are accepted for a while.
     """
     rng = np.random.default_rng(0) if rng is None else rng

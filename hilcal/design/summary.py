@@ -48,22 +48,33 @@ _SEED = 20240611
 
 @dataclass(frozen=True, slots=True)
 class DetectableEffect:
-    """Minimum detectable strength of an effect outside of the model."""
+    """Minimum detectable strength of an effect outside of the model.
+
+    Attributes:
+        effect: its name.
+        least_m: RMS displacement of the target, m, that leaves a whitened residual of one sigma
+            after the model is fitted; None where the model absorbs the effect.
+    """
 
     effect: str
-    # RMS displacement of the target, m, that leaves a whitened residual of 1 σ after the model is
-    # fitted; None where the model absorbs the effect
     least_m: float | None
 
 
 @dataclass(frozen=True, slots=True)
 class PredictedParameter:
-    """Predicted standard uncertainty of a parameter."""
+    """Predicted standard uncertainty of a parameter.
 
-    name: str  # e.g. "joint_compliance.j2"
-    std: float  # in `unit`; infinite where the readings do not determine the parameter
-    value: float | None  # estimated or ordinary magnitude, in `unit`; None without
-    unit: str  # SI
+    Attributes:
+        name: e.g. "joint_compliance.j2".
+        std: in `unit`; infinite where the readings do not determine the parameter.
+        value: estimated or ordinary magnitude, in `unit`; None without.
+        unit: SI.
+    """
+
+    name: str
+    std: float
+    value: float | None
+    unit: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,27 +83,42 @@ class CriterionResult:
 
     The observability indices are those of Sun & Hollerbach (2008), with σ the singular values of
     the whitened Jacobian by the parameters in ordinary magnitudes.
+
+    Attributes:
+        criterion: its name.
+        position_std_m: standard uncertainty of the position at the prediction poses, m.
+        position_open_m: the same with all potential terms estimated, too.
+        joint_share: largest relative standard uncertainty of a joint compliance; None without.
+        o1: (Π σ)^(1/P) / √N, which D maximises; σ² are the eigenvalues of the Schur complement
+            of the model's parameters without a prior.
+        o2: σ_min / σ_max, which K maximises; of the model alone.
+        o3: σ_min, which E maximises.
+        efficiency: certified lower bound of the efficiency by this criterion; None without.
     """
 
     criterion: str
-    position_std_m: float | None  # standard uncertainty at the prediction poses, m
-    position_open_m: float | None  # the same with all potential terms estimated, too
-    joint_share: float | None  # largest relative std of a joint compliance; None without
-    # (Π σ)^(1/P) / √N, which D maximises; σ² are the eigenvalues of the Schur complement of the
-    # model's parameters without a prior
+    position_std_m: float | None
+    position_open_m: float | None
+    joint_share: float | None
     o1: float
-    o2: float  # σ_min / σ_max, which K maximises; of the model alone
-    o3: float  # σ_min, which E maximises
-    efficiency: float | None  # certified lower bound by this criterion; None without
+    o2: float
+    o3: float
+    efficiency: float | None
 
 
 @dataclass(frozen=True, slots=True)
 class CurvePoint:
-    """A point of the sample-size curve."""
+    """A point of the sample-size curve.
 
-    poses: int  # without the reference
-    position_std_m: float  # standard uncertainty at the prediction poses, m
-    efficiency: float | None = None  # certified, with this number of poses; None without
+    Attributes:
+        poses: number of poses without the reference.
+        position_std_m: standard uncertainty of the position at the prediction poses, m.
+        efficiency: certified efficiency with this number of poses; None without.
+    """
+
+    poses: int
+    position_std_m: float
+    efficiency: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -235,7 +235,7 @@ class ArrivalReader:
         if not isinstance(tracker, PointingTracker):
             raise InputError(
                 f"the cell has the targets {', '.join(cell.target_names)}, but the tracker's "
-                "driver cannot be told which to measure (it has no method `aim`); valid: one "
+                "driver cannot select one (it has no method `aim`); valid: one "
                 'target, or a driver that can, as "geocom"'
             )
         self._tracker = tracker
@@ -259,7 +259,7 @@ class ArrivalReader:
                 self._announced = True
             return [self._measurer.measure(name, target=0)]
         readings: list[MeasuredStop] = []
-        lost: list[str] = []
+        unread: list[str] = []
         force: WrenchSample | None = None
         for k, target in enumerate(self._cell.target_names):
             aim = partial(self._tracker.aim, places[k], self._radius)
@@ -273,13 +273,13 @@ class ArrivalReader:
                 measured = self._measurer.measure(name, aim, force, k)
                 self._check_target(measured, places, k)
             except TargetLostError as error:
-                lost.append(f"target {target} is not read: {error}")
+                unread.append(f"target {target} is not read: {error}")
                 continue
             force = measured.force
             readings.append(measured)
         if not readings:
-            raise DeviceError(f"{name}: {lost[0]} (and so are all others)")
-        for reason in lost:
+            raise DeviceError(f"{name}: {unread[0]} (and so are all others)")
+        for reason in unread:
             self._watcher.notify(Remark(f"{name}: {reason}"))
         return readings
 

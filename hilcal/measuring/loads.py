@@ -139,7 +139,7 @@ class Hook:
             why = wrong()
             if not why:
                 return
-            if not self._at_terminal:  # a person is told with the next question
+            if not self._at_terminal:  # a person at the terminal reads it in the next question
                 self._watcher.notify(Remark(f"asked to {task}: {why}"))
         if load is None:
             why += (

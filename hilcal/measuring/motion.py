@@ -377,7 +377,7 @@ class Mover:
         joint, lag = self._worst(sample.q_target - sample.q)
         if not lag <= OFF_PATH_RAD + FOLLOW_S * self._motion.speed_rad_s:
             raise DeviceError(
-                f"arm: {joint} is told to be {lag:.3g} rad from where it is, on the way to "
+                f"arm: {joint} is commanded {lag:.3g} rad away from its position, on the way to "
                 f"{name}: its angle is old, or something holds the joint"
             )
         if last is None or np.abs(sample.q - last.q).max() > FROZEN_RAD:

@@ -50,17 +50,29 @@ class LiveResidual:
 
 @dataclass(frozen=True, slots=True)
 class GoalStatus:
-    """Status of a campaign's goal; without `worst`, unknown."""
+    """Status of a campaign's goal; without `worst`, unknown.
 
-    text: str  # the goal as the user wrote it
+    Attributes:
+        text: the goal as the user wrote it.
+        met: whether it is met.
+        worst: name of the parameter, or "position" or "deflection", of the worst uncertainty.
+        std: its standard uncertainty, in `unit`; infinite where the readings do not determine it.
+        ratio: std over the limit; at most 1 where the goal is met.
+        unit: "%" or SI.
+        model: names of the fitted effects.
+        fitted: "deflection" or "absolute", the kind of the fitted readings.
+        quantity: full name of the quantity of `std`; empty while unknown.
+    """
+
+    text: str
     met: bool = False
-    worst: str | None = None  # parameter, or "position" or "deflection", of the worst uncertainty
-    std: float | None = None  # its standard uncertainty, in `unit`; infinite where not determined
-    ratio: float | None = None  # std over the limit; at most 1 where the goal is met
-    unit: str | None = None  # "%" or SI
-    model: tuple[str, ...] | None = None  # names of the fitted effects
-    fitted: str | None = None  # kind of the fitted readings: "deflection" or "absolute"
-    quantity: str = ""  # full name of the quantity of `std`; empty while unknown
+    worst: str | None = None
+    std: float | None = None
+    ratio: float | None = None
+    unit: str | None = None
+    model: tuple[str, ...] | None = None
+    fitted: str | None = None
+    quantity: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON object; a number that is not finite becomes null."""

@@ -116,7 +116,7 @@ class _FanucReader(ProgramReader):
             variable = any(index for _, index in names)
             if m is None or _OPTION.search(code) or variable:
                 for name in positions if variable else [n for n, _ in names]:
-                    self.otherwise.setdefault(name, line)
+                    self.other_uses.setdefault(name, line)
             if m is None:
                 continue
             if m[2] or not names:
@@ -267,7 +267,7 @@ class _InformReader(ProgramReader):
         names = [_key(*n.groups()) for n in _NAME.finditer(code)]
         if m is None or m[1].upper() == "IMOV":
             for name in names:
-                self.otherwise.setdefault(name, line)
+                self.other_uses.setdefault(name, line)
             if m is not None:
                 self.mark_not_corrected(line, "IMOV is not corrected")
         elif len(names) != 1 or names[0] not in self.positions:

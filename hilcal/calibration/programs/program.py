@@ -334,7 +334,7 @@ class ProgramReader:
                 "the original program",
             )
         self.points: dict[str, ProgramPoint] = {}
-        self.otherwise: dict[str, int] = {}
+        self.other_uses: dict[str, int] = {}
         """Points that statements other than motions use, with the line."""
 
     def mark_not_corrected(self, line: int, why: str) -> None:
@@ -359,7 +359,7 @@ class ProgramReader:
 
     def program(self, texts: Sequence[str] = (), suffixes: Sequence[str] = ()) -> Program:
         """Return the program with all recorded points."""
-        for name, line in self.otherwise.items():
+        for name, line in self.other_uses.items():
             if name in self.points and not self.points[name].not_corrected:
                 point = self.points[name]
                 self.points[name] = point.refused(f"line {line} uses or changes it otherwise")

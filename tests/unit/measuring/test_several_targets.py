@@ -193,7 +193,7 @@ def test_a_killed_run_goes_on_with_whole_arrivals(tmp_path, name, count):
 
 def test_what_cannot_be_pointed_is_refused(tmp_path):
     b = Bench(tool=TOOL)
-    refusal(r"driver cannot be told which .* no method `aim`", measure, b, tmp_path / "r.hilcal")
+    refusal(r"driver cannot select one .* no method `aim`", measure, b, tmp_path / "r.hilcal")
     rough = TOOL.targets[1].model_copy(update={"target_m": None})
     tool = TOOL.model_copy(update={"targets": (TOOL.targets[0], rough)})
     b = Bench(tool=tool)
