@@ -8,9 +8,9 @@ test of e beyond both follows a noncentral χ² of non-centrality
 whose degrees of freedom are the number of visible directions of S (`regression.evidence`). At the
 readings so far, S is that of a diagnosis that tests e with f in the model.
 
-β of an effect that the readings so far support is drawn from its posterior beside the fitted
-model, at the prior strength of highest evidence: the estimate after adding the effect, to first
-order. A diagnosis scores the effect by the same evidence, mean and scale.
+For an effect that the readings so far support, β is drawn from its posterior when it is added to
+the fitted model, to first order, at the prior strength of highest evidence. A diagnosis scores the
+effect by the same evidence, mean and scale.
 """
 
 from collections.abc import Sequence
@@ -98,7 +98,7 @@ def supported_parameters(problem: DesignProblem, count: int) -> dict[str, Floats
 
 
 def posterior_draws(linear: Linearisation, effect: Effect, count: int) -> Floats | None:
-    """Return (count, P) parameters, SI, of an effect beside the model of a gc-scaled fit.
+    """Return (count, P) parameters, SI, of an effect that is added to a gc-scaled fit.
 
     The mean of the posterior, then draws from it; None where the readings do not support the effect
     (`SUPPORTED`).
@@ -128,10 +128,10 @@ def not_separable_message(pairs: Sequence[tuple[str, str]]) -> str:
 
 def not_ruled_out(pairs: Sequence[tuple[str, str]]) -> str:
     """Return a message on pairs (present effect, rival) whose rival cannot be ruled out."""
-    listed = [f"{fs} where {e} is there" for e, fs in _by_effect(pairs).items()]
+    listed = [f"{fs} if {e} is present" for e, fs in _by_effect(pairs).items()]
     return (
-        f"no measurement in this cell rules out {', nor '.join(listed)}: {MANY_READINGS} of the "
-        f"best readings would do so with a chance of less than {100 * LEAST_POWER:.0f} %"
+        f"no measurement in this cell rules out {', nor '.join(listed)}: the best "
+        f"{MANY_READINGS} readings would do so with a probability below {100 * LEAST_POWER:.0f} %"
     )
 
 

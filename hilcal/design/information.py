@@ -397,7 +397,7 @@ def potential(
         family, rms = families[k], strength[k]
         if rms * MOST_TIMES < 1.0:
             notes.append(
-                f"{family.name}: not planned for; {MOST_TIMES:g} times as large as arms have it, "
+                f"{family.name}: not planned for; at {MOST_TIMES:g} times its usual size on arms "
                 f"it would change these readings by {MOST_TIMES * rms:.2g} σ"
             )
         elif len(family.parameters) > room:

@@ -246,17 +246,17 @@ def remarks(planned: Planned) -> tuple[str, ...]:
         std = 1e6 / np.sqrt(planned.design.value)
         quantity = planned.work.description.split(" ")[0]
         best = (
-            f"; as many readings, at the most informative poses and loads (--readings "
-            f"{readings}), to no less than {std * np.sqrt(efficiency):.3g} µm"
+            f"; the same number of readings at the most informative poses and loads (--readings "
+            f"{readings}) would reach {std * np.sqrt(efficiency):.3g} µm at best"
         )
         omitted += (
-            f"with every effect of the catalogue as large as arms have it, the {quantity} is "
+            f"with every effect of the catalogue at its usual size on arms, the {quantity} is "
             f"predicted to {std:.3g} µm (rms){best if suboptimal else ''}",
         )
     elif suboptimal:
         omitted += (
-            f"as many readings, at the most informative poses and loads (--readings "
-            f"{readings}), are up to {100 / efficiency - 100:.0f} % more efficient",
+            f"the same number of readings at the most informative poses and loads (--readings "
+            f"{readings}) would be up to {100 / efficiency - 100:.0f} % more efficient",
         )
     undetermined = (u.remark for u in planned.undetermined)
     notes = (*undetermined, *omitted, *planned.candidates.remarks, *planned.problem.notes)

@@ -193,7 +193,7 @@ def in_motion(b, change, motion=4):
 @pytest.mark.parametrize(
     ("names", "said"),
     [
-        (("q",), "told to be .* rad from where it is.*its angle is old"),
+        (("q",), "commanded .* rad away from its position.*its angle is old"),
         (("q", "q_target"), r"joint angles have stood still for 0\.6 s"),
         (("timestamp",), "its clock has stood still"),
     ],

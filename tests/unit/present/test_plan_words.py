@@ -152,8 +152,8 @@ def test_no_chance_is_certain_and_none_is_given_where_nothing_would_do():
         (B, A, "2 %", "not in this cell"),
     ]
     assert not_ruled_out([(B, A)]) == (
-        f"no measurement in this cell rules out {A} where {B} is there: 100 of the best readings "
-        "would do so with a chance of less than 20 %"
+        f"no measurement in this cell rules out {A} if {B} is present: the best 100 readings would "
+        "do so with a probability below 20 %"
     )
 
 
