@@ -193,8 +193,8 @@ class Predictive:
 
     def noise_whitening(self, readings: Readings, mode: Mode) -> Whitening:
         """Return the scaling of other readings, with the arm's estimated scatter in V."""
-        seen = with_missing_scatter(self.model.cell, readings, self.arm_scatter)
-        return whitening(replace(seen, common=readings.common), mode, "gc")
+        scattered = with_missing_scatter(self.model.cell, readings, self.arm_scatter)
+        return whitening(replace(scattered, common=readings.common), mode, "gc")
 
     def prediction_covariance(self, prediction: Prediction, w: Whitening) -> Floats:
         """Return κ J C Jᵀ (D, m, m) of predicted measurements."""
