@@ -158,6 +158,18 @@ def within_repeatability(scatter: ArmScatter, arm: Arm) -> bool:
     return RP_PER_RMS * scatter.size_m <= MOST_SCATTER * stated_repeatability(arm)
 
 
+def exceeds_repeatability(scatter: ArmScatter, arm: Arm) -> bool:
+    """Whether the scatter exceeds what any arm's repeatability allows, by two standard errors.
+
+    The size² is in proportion to Σ σ_k², so that its relative standard error is
+    2 (Σ (σ_k u_k)²)^½ / Σ σ_k², u_k the standard uncertainty of σ_k.
+    """
+    std, error = np.array(scatter.std), np.array(scatter.std_error)
+    relative = float(np.linalg.norm(std * error)) / max(float(np.sum(std**2)), 1e-300)
+    least = replace(scatter, size_m=scatter.size_m * max(1.0 - 2.0 * relative, 0.0))
+    return not within_repeatability(least, arm)
+
+
 def prefers_instrument(scatter: ArmScatter) -> bool:
     """Whether the readings prefer, beyond doubt, an instrument that is noisier than stated."""
     return scatter.log_evidence < -SAME_EVIDENCE

@@ -79,6 +79,7 @@ from hilcal.diagnosis.evidence import (
 from hilcal.diagnosis.misfit_breakdown import MisfitShare
 from hilcal.diagnosis.noise import (
     PREDICTABLE,
+    exceeds_repeatability,
     judge_noise,
     prefers_instrument,
     within_repeatability,
@@ -266,7 +267,7 @@ def _judged(e: Evidence, history: History, whole_catalogue: bool) -> Diagnosis:
         predictable = regression.share > PREDICTABLE or bool(sizes) or bool(patterns)
         noise = judge_noise(e.fit, e.pure_error, predictable)
         in_fit = scatter is not None
-        too_much = scatter is not None and not within_repeatability(scatter, arm)
+        too_much = scatter is not None and exceeds_repeatability(scatter, arm)
         little = noise.reason == "predictable" and max(predicted, *patterns, 0.0) <= PREDICTABLE
         same_in_pose = any(
             v.variable == "pose" and v.share > MOST_POSE_SHARE and v.p_value < FALSE_ALARM

@@ -15,9 +15,9 @@ from hilcal.diagnosis.noise import (
     USUAL_REPEATABILITY_M,
     NoiseVerdict,
     PureError,
+    exceeds_repeatability,
     prefers_instrument,
     separates_instrument,
-    within_repeatability,
 )
 from hilcal.diagnosis.order_step import OrderStep
 from hilcal.diagnosis.wrong_figures import WrongFigure
@@ -344,7 +344,7 @@ def _misjudged(d: Diagnosis) -> list[str]:
 def _beyond_repeatability(d: Diagnosis) -> bool:
     """Whether the covariance of the fit includes a scatter that is larger than any arm's."""
     s = d.fit.readings.arm_scatter
-    return s is not None and not within_repeatability(s, d.fit.model.cell.arm)
+    return s is not None and exceeds_repeatability(s, d.fit.model.cell.arm)
 
 
 def _loose(s: ArmScatter, arm: Arm) -> str:
