@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from hilcal.diagnosis.background_evidence import BackgroundEffect
+from hilcal.diagnosis.confounding import Confounded
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM, Suspect
 from hilcal.diagnosis.evidence import Alternative, Insufficiency, Separability
 from hilcal.diagnosis.misfit_breakdown import MisfitShare
@@ -109,6 +110,8 @@ class Diagnosis(Shown, Tabular):
         wrong_figures: figures of the cell each of which, if wrong, alone explains the misfit. No
             effect is a suspect then.
         step: a step in the order of the readings, where nothing else explains the misfit.
+        confounded: effects that are named, or the first suspect, which the readings explain as
+            well with another recorded variable, such as the air temperature for the time.
     """
 
     fit: Fit
@@ -130,6 +133,7 @@ class Diagnosis(Shown, Tabular):
     background: tuple[BackgroundEffect, ...] = ()
     wrong_figures: tuple[WrongFigure, ...] = ()
     step: OrderStep | None = None
+    confounded: tuple[Confounded, ...] = ()
 
     def _brief(self) -> dict[str, str]:
         first = self.suspects[:5]
@@ -216,6 +220,7 @@ class Diagnosis(Shown, Tabular):
                 for a in self.alternatives
                 if a.inseparable
             ],
+            "confounded": [asdict(c) for c in self.confounded],
             "needless": list(self.redundant),
             "carriers": [_attributes(v, *CURVE_KEYS) for v in self.dependences],
             "arm_scatter": self.scatter and self.scatter.to_json(),

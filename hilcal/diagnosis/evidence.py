@@ -33,6 +33,7 @@ import numpy as np
 import scipy
 
 from hilcal.diagnosis.background_evidence import BackgroundEffect, background_evidence
+from hilcal.diagnosis.confounding import Confounded, confounded
 from hilcal.diagnosis.effect_ranking import (
     FALSE_ALARM,
     SAME_EVIDENCE,
@@ -350,6 +351,11 @@ class Evidence:
             dependences=regression.dependences,
             noise=noise,
         )
+
+    def confounded(self, suspect: str | None) -> tuple[Confounded, ...]:
+        """Return the effects of the model, and the suspect, whose variable is in doubt."""
+        effect = next((e for e in self.effects if e.name == suspect), None)
+        return confounded(self.fit, effect)
 
     def tree_share(self, other_share: float) -> float:
         """Return the share of the misfit that trees predict; see `residual_regression`."""

@@ -324,6 +324,7 @@ def _judged(e: Evidence, history: History, whole_catalogue: bool) -> Diagnosis:
         scatter=scatter,
         pose_alone=alone,
         background=e.background,
+        confounded=e.confounded(None if lead is None else lead.effect),
     )
 
 

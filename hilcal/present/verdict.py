@@ -7,6 +7,7 @@ import numpy as np
 from hilcal import numbers
 from hilcal.calibration.scatter import ScatterSource
 from hilcal.diagnosis.background_evidence import POSSIBLE_LEVEL
+from hilcal.diagnosis.confounding import Confounded
 from hilcal.diagnosis.diagnosis import Diagnosis, Verdict
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE, Suspect
 from hilcal.diagnosis.evidence import Separability
@@ -53,7 +54,9 @@ def message(d: Diagnosis) -> str:
     """Return the verdict in a few sentences; an effect named as missing is the first suspect."""
     serial = d.fit.readings.serial
     step = [] if d.step is None else [_step(d.step, d.fit.readings)]
-    return " ".join([*_verdict(d), *step, *([] if serial is None else [correlated(serial)])])
+    doubts = [_confounded(c) for c in d.confounded]
+    doubts += [] if serial is None else [correlated(serial)]
+    return " ".join([*_verdict(d), *step, *doubts])
 
 
 def _step(step: OrderStep, readings: Readings) -> str:
@@ -75,6 +78,16 @@ def _step(step: OrderStep, readings: Readings) -> str:
         f"leave ({p_equals(step.p_value)}): the readings from {first} on are shifted by "
         f"{length(step.shift_m)} rms. Probably {', or '.join(what)} between {previous} and "
         f"{first}; {', or '.join(how)}."
+    )
+
+
+def _confounded(c: Confounded) -> str:
+    variables = numbers.names([c.variable, *c.instead])
+    return (
+        f"{c.effect} follows the {c.variable}, but could as well follow the "
+        f"{numbers.names(c.instead, 'or')}: {variables} change together in these readings. "
+        "Readings in which they do not would tell; until then it predicts only while they go on "
+        "together."
     )
 
 

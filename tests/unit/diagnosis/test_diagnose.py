@@ -147,6 +147,20 @@ def test_the_misfit_follows_the_variable_that_drives_it(effect, mode, kind):
     assert strongest.p_value < 1e-10
 
 
+@pytest.mark.parametrize(("wave", "instead"), [(0.0, ("air temperature",)), (3.0, ())])
+def test_an_effect_in_time_may_be_one_in_an_air_temperature_that_rises_with_it(wave, instead):
+    c = hidden("tracker_drift", "absolute", 0)
+    t = (c.readings.states.time - c.readings.states.time.min()) / np.ptp(c.readings.states.time)
+    air = 20.0 + 4.0 * t + wave * np.sin(12.0 * t)
+    states = replace(c.readings.states, air_temperature=air, joint_temperature=None)
+    before = fitted_baseline(c, readings=replace(c.readings, states=states))
+    for d in (diagnose(before), diagnose(add(before, "tracker_drift"))):  # suspected, and named
+        found = next((x for x in d.confounded if x.effect == "tracker_drift"), None)
+        assert (() if found is None else found.instead) == instead
+        assert ("could as well follow the air temperature" in message(d)) == bool(instead)
+        assert len(d.to_dict()["confounded"]) == len(d.confounded)
+
+
 def test_a_diagnosis_needs_whitened_residuals():
     c = campaign(plan_seed=0)
     found = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute", "none")
