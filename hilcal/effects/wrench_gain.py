@@ -16,8 +16,10 @@ class WrenchGain(ForceSensorEffect):
     """
 
     name = "wrench_gain"
-    summary = "wrench read = (1 + g) true per axis: the force sensor has a gain error"
-    change = Changeable("setup", "force sensor", "the gain of the force sensor")
+    summary = "wrench read = (1 + g) true per axis: a force sensor's gain, or wrong masses of loads"
+    change = Changeable(
+        "setup", "force sensor", "the gain of the force sensor, or the masses stated of the loads"
+    )
     plausible = 50.0  # 50 %: a wrong calibration matrix, a channel that hardly reads. A choice.
 
     parameters = tuple(

@@ -22,7 +22,12 @@ from hilcal.diagnosis.noise import (
 )
 from hilcal.diagnosis.order_step import OrderStep
 from hilcal.diagnosis.wrong_figures import WrongFigure
-from hilcal.identification.prediction.full_prediction import disagreement_words, reading_name
+from hilcal.effects.force_sensor import ForceSensorEffect
+from hilcal.identification.prediction.full_prediction import (
+    disagreement_words,
+    full_prediction,
+    reading_name,
+)
 from hilcal.numbers import few, length, p_equals, percent, sizes
 from hilcal.readings.readings import ArmScatter, Readings, SerialNoise
 from hilcal.robot.arm import Arm
@@ -35,6 +40,9 @@ HEADLINES: Mapping[Verdict, str] = {
     "unknown_effect": "unknown effect: an effect is missing that the catalogue does not hold",
     "noise_misjudged": "the noise is not what was stated",
 }
+RESIDUAL_IS_NOISE = ("residual_is_noise", "inseparable_addition", "arm_scatter", "background")
+"""Reasons that call the residual of the fitted poses noise."""
+MANY_TIMES = 3.0  # ratio of errors from which the verdict names the one on poses left out; a choice
 UNCALIBRATED = "geometry is not calibrated"
 """Limit of deflections: errors that are the same under every load cancel in them."""
 
@@ -54,7 +62,7 @@ def message(d: Diagnosis) -> str:
     """Return the verdict in a few sentences; an effect named as missing is the first suspect."""
     serial = d.fit.readings.serial
     step = [] if d.step is None else [_step(d.step, d.fit.readings)]
-    doubts = [_confounded(c) for c in d.confounded]
+    doubts = [*_left_out(d), *_stated_loads(d), *map(_confounded, d.confounded)]
     doubts += [] if serial is None else [correlated(serial)]
     return " ".join([*_verdict(d), *step, *doubts])
 
@@ -79,6 +87,46 @@ def _step(step: OrderStep, readings: Readings) -> str:
         f"{length(step.shift_m)} rms. Probably {', or '.join(what)} between {previous} and "
         f"{first}; {', or '.join(how)}."
     )
+
+
+def _left_out(d: Diagnosis) -> list[str]:
+    """Return a sentence where the residual is noise, but predictions are far worse."""
+    if d.reason not in RESIDUAL_IS_NOISE:
+        return []
+    held, fitted = d.fit.holdout.rms_m, d.fit.error.rms_m
+    floor = full_prediction(d.fit).noise_floor
+    if held < MANY_TIMES * max(fitted, floor):
+        return []
+    what = "deflections" if d.fit.mode == "deflection" else "positions"
+    return [
+        f"But predicted {what} are off by {length(held)} rms on poses left out, where fitted poses "
+        f"leave {length(fitted)} and noise alone {length(floor)}: that is what to expect of new "
+        "poses, until more poses, spread over all joints, are measured."
+    ]
+
+
+def _stated_loads(d: Diagnosis) -> list[str]:
+    """Return a sentence where an effect corrects a wrench that only the stated masses give."""
+    situation = d.fit.solution.prediction.situation
+    recorded = situation.states.wrench
+    size, g = np.linalg.norm(recorded[:, :3], axis=1), situation.cell.gravity
+    loaded = size > 0.0
+    weights = np.outer(size, g) / max(float(np.linalg.norm(g)), 1e-300)
+    if not loaded.any() or not np.allclose(recorded[:, :3], weights, atol=1e-6 * size.max()):
+        return []
+    named = [e for e in d.fit.model.effects if e.name in d.fit.model.named]
+    correct = [e.name for e in named if isinstance(e, ForceSensorEffect)]
+    if not correct:
+        return []
+    acting = np.linalg.norm(situation.load.wrench[loaded, :3], axis=1)
+    factor = float(np.mean(acting / size[loaded]))
+    # In deflections a common factor of all masses is one of all compliances.
+    by = f", here by a factor of {factor:.3g} on average" if d.fit.mode == "absolute" else ""
+    return [
+        "No force sensor measured these loads: their forces are the weights that are stated. So "
+        f"{' and '.join(correct)} may stand for masses that are stated wrongly{by}: weigh the "
+        "loads."
+    ]
 
 
 def _confounded(c: Confounded) -> str:

@@ -20,6 +20,8 @@ from hilcal.diagnosis.verdict import diagnose, judge
 from hilcal.identification.background import with_background
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
+from hilcal.identification.prediction.full_prediction import full_prediction
+from hilcal.numbers import length
 from hilcal.present.verdict import message
 from hilcal.refinement import refine
 from studies.study_cases import study_case
@@ -76,6 +78,17 @@ def test_rejected_suspects_are_not_named_until_none_is_left(effect, mode, seed):
     assert d.suspects[0].effect in rejected
     assert f"{d.suspects[0].effect}, explains" in message(d)
     assert "does not lower the error on poses left out" in message(d)
+
+
+@pytest.mark.parametrize(("times", "said"), [(1.5, False), (5.0, True)])
+def test_an_adequate_model_that_predicts_far_worse_than_it_fits_says_so(times, said):
+    d = diagnose(fitted_baseline(campaign("none", "absolute", 0, poses=20)))
+    worse = replace(d.fit)
+    rms = times * full_prediction(d.fit).noise_floor
+    worse.__dict__["holdout"] = replace(d.fit.holdout, rms_m=rms)
+    d = replace(d, fit=worse)
+    assert d.verdict == "adequate"
+    assert (f"are off by {length(rms)} rms on poses left out" in message(d)) == said
 
 
 def test_an_adequate_model_is_in_doubt_where_another_effect_could_replace_an_addition():

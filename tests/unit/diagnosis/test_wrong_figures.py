@@ -1,5 +1,6 @@
 """A load's or the tool's mass that was entered wrongly is asked before any effect is named."""
 
+import re
 import sys
 from dataclasses import replace
 
@@ -116,6 +117,19 @@ def test_effects_are_no_wrong_figures(effect):
     c = campaign(effect, mode, 1, poses=16)
     d = judged(c.cell, c.readings, mode)
     assert d.suspects[0].effect == effect, message(d)
+
+
+def test_a_gain_of_loads_that_nothing_measured_is_one_of_their_masses():
+    """Too small to be a mistake of one figure; all masses are."""
+    c = campaign(NO_EFFECT, "absolute", 1, poses=20)
+    weights = np.isin(c.readings.load, [0, *map(c.readings.load_names.index, ("5kg", "10kg"))])
+    light = replace(c.readings.states, wrench=c.readings.states.wrench / 1.1)
+    readings = replace(c.readings, states=light)
+    said = r"wrench_gain may stand for masses .* by a factor of 1\.(0[6-9]|1)\d* on average"
+    for chosen, hang in ((readings[weights], True), (readings, False)):  # the others pull
+        fit = hc.fit(baseline(c.cell, chosen, "absolute"), chosen, "absolute")
+        gained = add(fit, "wrench_gain")
+        assert bool(re.search(said, message(hc.diagnose(gained)))) == hang
 
 
 def test_a_figure_that_sets_readings_aside_does_not_explain_them():
