@@ -15,8 +15,11 @@ from hilcal.types import Floats
 
 BAUD = 460800
 SKIPPED = 1
-_STATUS = ((2, "is loaded over its range; take the load off"), (4, "measures nothing valid"),
-           (8, "sends raw values; configure it to send N and N·m"))  # fmt: skip
+_STATUS = (
+    (2, "is loaded over its range; take the load off"),
+    (4, "reports an invalid measurement"),
+    (8, "sends raw values; configure it to send N and N·m"),
+)
 
 
 def _overload(wrench: Floats, status: int) -> str:

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from hilcal.config import CellConfig
 from hilcal.config.cell import Tracker as TrackerConfig
 from hilcal.drivers import emscon_packets as es
-from hilcal.drivers.links import address, check_own_axes, network_failures
+from hilcal.drivers.links import address, check_tracker_frame, network_failures
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import Clock, Report, Row, TargetLostError, TrackerSample, report_of
 from hilcal.readings.covariance import tracker_covariance, tracker_noise
@@ -42,7 +42,7 @@ _LEAST_S, _PAUSE_S = 1.0, 0.1
 _FARTHEST_M = 500.0  # beyond the reach of any tracker
 _UNITS = struct.pack("<5I", 0, 0, 0, 0, 0)  # m, rad, °C, mbar, % of relative humidity
 _ORDERS = ("xyz", "XYZ")
-_STEP, _SAME = 1e-6, 1e-4
+_STEP, _SAME_ROTATION = 1e-6, 1e-4  # rad
 
 
 class EmsconOptions(Section):
@@ -98,7 +98,7 @@ class EmsconConnection:
         while True:
             kind, body = self._packet(deadline)
             if kind in (es.COMMAND, es.ERROR):
-                number, status = self._two(body)
+                number, status = self._command_and_status(body)
                 if number == command or (kind == es.ERROR and number == es.UNKNOWN):
                     return status, body[8:]
 
@@ -108,10 +108,13 @@ class EmsconConnection:
             kind, body = self._packet(deadline)
             if kind in (es.SINGLE, es.SINGLE2, es.PROBE):
                 if len(body) < 4:
-                    self.strange("a packet that is cut short")
+                    self.refuse("a packet that is cut short")
                 return kind, int.from_bytes(body[:4], "little"), body[4:]
-            if kind == es.ERROR and self._two(body)[0] in (es.START_MEASUREMENT, es.UNKNOWN):
-                return kind, self._two(body)[1], b""
+            if kind == es.ERROR and self._command_and_status(body)[0] in (
+                es.START_MEASUREMENT,
+                es.UNKNOWN,
+            ):
+                return kind, self._command_and_status(body)[1], b""
 
     def drain(self) -> None:
         """Read what the server has sent by itself; old results are dropped."""
@@ -124,11 +127,11 @@ class EmsconConnection:
         try:
             return struct.unpack_from(layout, body)
         except struct.error:
-            self.strange("an answer that is too short")
+            self.refuse("an answer that is too short")
 
-    def _two(self, body: bytes) -> tuple[int, int]:
+    def _command_and_status(self, body: bytes) -> tuple[int, int]:
         if len(body) < 8:
-            self.strange("a packet that is cut short")
+            self.refuse("a packet that is cut short")
         number, status = struct.unpack_from("<II", body)
         return number, status
 
@@ -156,7 +159,7 @@ class EmsconConnection:
             if len(self._buffer) >= es.HEADER.size:
                 size, kind = es.HEADER.unpack_from(self._buffer)
                 if not es.HEADER.size <= size <= es.LARGEST:
-                    self.strange("what is no packet of emScon")
+                    self.refuse("data that are not emScon packets")
                 if len(self._buffer) >= size:
                     body = bytes(self._buffer[es.HEADER.size : size])
                     del self._buffer[:size]
@@ -183,7 +186,7 @@ class EmsconConnection:
             raise DeviceError(f"{DEVICE} at {self.where}: the tracker has closed the connection")
         self._buffer += data
 
-    def strange(self, content: str) -> NoReturn:
+    def refuse(self, content: str) -> NoReturn:
         """Refuse what the server sent, and close the connection."""
         self.close()
         raise DeviceError(
@@ -311,7 +314,7 @@ class EmsconTracker:
         try:
             result = es.measurement(kind, body)
         except struct.error:
-            self._line.strange(f"a result of {len(body)} bytes")
+            self._line.refuse(f"a result of {len(body)} bytes")
         if (result.quaternion is None) == (self._options.target == "pose"):
             raise DeviceError(f"{DEVICE}: measuring: the tracker measures in another mode than set")
         size = float(np.linalg.norm(result.position))
@@ -330,7 +333,7 @@ class EmsconTracker:
             return self._config.orientation_std_rad**2 * np.eye(3)
         for order in _ORDERS:
             nominal = Rotation.from_euler(order, result.angles)
-            if (nominal * turn.inv()).magnitude() < _SAME:
+            if (nominal * turn.inv()).magnitude() < _SAME_ROTATION:
                 moved = Rotation.from_euler(order, result.angles + _STEP * np.eye(3))
                 J = (moved * nominal.inv()).as_rotvec().T / _STEP
                 C = J @ stated @ J.T
@@ -338,12 +341,15 @@ class EmsconTracker:
         return float(np.linalg.eigvalsh(stated)[-1]) * np.eye(3)  # unknown order of the angles
 
     def _ready(self, seconds: float = 0.0) -> float:
-        """Restore connection and settings where lost; return a deadline, extended by `seconds`."""
+        """Restore a lost connection and lost settings; return the deadline of the next command.
+
+        `seconds`: time of measuring or moving, in addition to `DEADLINE_S`.
+        """
         until = time.monotonic() + DEADLINE_S + seconds
-        again = not self._line.open
-        if again:
+        reset = not self._line.open
+        if reset:
             self._line = self._connect()
-            self._remarks.append("the connection to the tracker was lost and made again")
+            self._remarks.append("the connection to the tracker was lost and restored")
         self._line.drain()
         changes, self._line.changes = self._line.changes, []
         for change in changes:
@@ -352,10 +358,10 @@ class EmsconTracker:
                 raise DeviceError(f"{DEVICE}: {es.CLOSING[change]}; is it switched off?")
             if change in es.RESTARTED:
                 self._remarks.append(f"{es.RESTARTED[change]}: its axes may have moved")
-            again |= change in es.SETTINGS_CHANGED or change in es.RESTARTED
+            reset |= change in es.SETTINGS_CHANGED or change in es.RESTARTED
             if change == es.INITIALIZATION_CHANGED:
                 self._remarks.append(HOMED)
-        if again:
+        if reset:
             self._set_up(until)
         elif es.REFLECTOR_CHANGED in changes:
             self._check_reflector(until)
@@ -387,7 +393,7 @@ class EmsconTracker:
         self._line.changes = [c for c in self._line.changes if c in es.CLOSING]
 
     def _check_reflector(self, until: float) -> None:
-        """Set the reflector at the first call; later refuse another, whose centre is elsewhere."""
+        """Set the reflector at the first call; refuse a later change: centres of types differ."""
         body = self._do("reading its reflector", es.GET_REFLECTOR, until=until)
         (number,) = self._line.unpack("<i", body)
         names = self._reflectors(until)
@@ -426,7 +432,7 @@ class EmsconTracker:
         return out
 
     def _system(self, until: float) -> tuple[int, ...]:
-        """Last status, state of tracker, laser and distance meter, version (3), weather, 2 more."""
+        """Last status; states of tracker, laser, distance meter; version (3); weather; 2 others."""
         body = self._do("reading its state", es.GET_SYSTEM_STATUS, until=until)
         return self._line.unpack("<4I3iI2i", body)
 
@@ -457,7 +463,7 @@ def open_tracker(config: CellConfig) -> EmsconTracker:
     """Connect to the tracker that [tracker] names; nothing turns."""
     tracker = config.tracker
     host, port = address("[tracker]", "emscon", tracker.host, es.PORT)
-    check_own_axes(tracker)
+    check_tracker_frame(tracker)
     options = check_section(tracker.options, EmsconOptions, "[tracker] options")
     clock = Clock(config.simulation.clock)
     return EmsconTracker(lambda: EmsconConnection(host, port), tracker, options, clock)

@@ -2,8 +2,8 @@
 
 Every packet is little-endian, packed to 4 bytes, and begins with its size (int32, header included)
 and its type (uint32). A command is sent as its number and its parameters; the answer is its number,
-its status and its content. A result is its status and the measurement. Unasked, the server sends
-errors (command, status) and changes of its state.
+its status and its content. A result is its status and the measurement. The server also sends errors
+(command, status) and changes of its state, without a request.
 
 Source: Leica Geosystems, emScon TPI V3.6, `ES_C_API_Def.h` (LTD, AT901 and AT40x trackers).
 """

@@ -112,7 +112,7 @@ class ByDeviceClock:
     continues it: then the device has restarted its counter.
     """
 
-    LEARN = 20
+    PERIOD_STEPS = 20
     LONGEST_S = 30.0
 
     def __init__(self, tick_s: float, bits: int) -> None:
@@ -121,7 +121,7 @@ class ByDeviceClock:
         self._last: int | None = None
         self._stray: int | None = None
         self._steps: list[int] = []
-        self._period = 0.0  # ticks; 0 until `LEARN` steps have come
+        self._period = 0.0  # ticks; 0 until `PERIOD_STEPS` steps have come
 
     @property
     def rate(self) -> float:
@@ -151,7 +151,7 @@ class ByDeviceClock:
             self.lost += max(0, round(step / self._period) - 1)
             return
         self._steps.append(step)
-        if len(self._steps) == self.LEARN:
+        if len(self._steps) == self.PERIOD_STEPS:
             self._period = float(np.median(self._steps))
             self.lost += sum(max(0, round(step / self._period) - 1) for step in self._steps)
 
@@ -162,19 +162,19 @@ class ByArrival:
     Each frame is due one period after its predecessor. The schedule follows early frames at once
     and late ones slowly (sender and host have different clocks). A frame late by `LATE` periods or
     more shows how many are missing. Frames that were only delayed then come early by this schedule,
-    and are subtracted from the count again; to see them, the schedule is held for `DOUBT` times the
-    delay.
+    and are subtracted from the count again; to detect them, the schedule is held for `HOLD` times
+    the delay.
     """
 
     LATE = 0.9
     FOLLOW = 0.05
-    DOUBT = 10.0
+    HOLD = 10.0
 
     def __init__(self, rate: float) -> None:
         self.lost = 0
         self.rate = rate
         self._due: float | None = None  # when the newest frame was due
-        self._doubt_until = -math.inf  # until then missing frames may only be delayed
+        self._hold_until = -math.inf  # until then missing frames may turn out to be delayed
 
     def follow(self, count: int, ticks: Sequence[int], now: float) -> list[bool]:
         """See `ByDeviceClock.follow`; all are in place."""
@@ -184,13 +184,13 @@ class ByArrival:
         missing = 0
         if late >= self.LATE:
             missing = math.floor(late + 1.0 - self.LATE)
-            self._doubt_until = now + self.DOUBT * late * period
-        elif now < self._doubt_until and late < 0.0:
+            self._hold_until = now + self.HOLD * late * period
+        elif now < self._hold_until and late < 0.0:
             missing = -min(self.lost, math.floor(-late + 1.0 - self.LATE))
         self.lost += missing
         late -= missing
         follow = self.FOLLOW if late > 0.0 else 1.0
-        if now < self._doubt_until:
+        if now < self._hold_until:
             follow = 0.0
         self._due += (missing + follow * late) * period
         return [True] * count
@@ -200,11 +200,11 @@ LossCounter = ByDeviceClock | ByArrival
 
 DEVICE = "force sensor"
 STALE_S = 0.5
-"""Age at which the newest frame is stale. A busy computer hands bytes over late: the kernel passes
-them on in a thread that competes with all programs; 0.2 s are not rare."""
+"""Age at which the newest frame is stale. On a busy computer bytes arrive late, because the kernel
+passes them on in a thread that competes with all programs; delays of 0.2 s are not rare."""
 POLL_S = 0.005
-LOOK_S = 1.0
-"""Time for the reader to look once more; an idle computer needs two passes, 2 `POLL_S`."""
+RECHECK_S = 1.0
+"""Longest wait for another pass of the reader; an idle computer needs two passes, 2 `POLL_S`."""
 SLICE_S = 0.05
 MIN_SHARE = 0.5  # least share of the frames due in a window for a mean
 FEW, MAX_LOST = 5, 0.01  # this number of lost frames plus this share of all is no problem
@@ -333,7 +333,7 @@ class ForceStream:
         return self._counter.rate
 
     def report(self) -> Report:
-        """Say who answered, rate, temperature, counters, and every problem."""
+        """Report the sensor, its rate, temperature and counters, and every problem."""
         count, celsius, rate = self.losses(), self._temperature, self.rate
         rows: list[Row] = [(key, value, key.replace(" ", "_"), value) for key, value in self._facts]
         counted = f"{count.frames}, lost {count.lost}, corrupt {count.corrupt}"
@@ -379,12 +379,12 @@ class ForceStream:
                     waiting = self._port.in_waiting
                     if waiting:
                         data = self._port.read(waiting)
-                        self._take(data, time.monotonic_ns())
+                        self._store(data, time.monotonic_ns())
                     self._passes += 1
         except DeviceError as error:
             self._failure = str(error)
 
-    def _take(self, data: bytes, stamp: int) -> None:
+    def _store(self, data: bytes, stamp: int) -> None:
         """Store the frames that these bytes complete; `stamp`: time of reading, ns."""
         bodies = self._deframer.push(data)
         self._bytes += len(data)
@@ -419,7 +419,7 @@ class ForceStream:
         On a busy computer the reader may be late, not the sensor. So the reader first gets one
         complete pass that begins after this call.
         """
-        enough, end = self._passes + 2, time.monotonic() + LOOK_S
+        enough, end = self._passes + 2, time.monotonic() + RECHECK_S
         while self._failure or time.monotonic() - self._frame_time > STALE_S:
             if self._failure or self._passes >= enough or time.monotonic() > end:
                 raise DeviceError(self._silence())

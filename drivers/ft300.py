@@ -105,18 +105,18 @@ def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
     port = open_port(DEVICE, path, section.baud or BAUD, timeout=0.1)
     try:
         with line_failures(DEVICE, path):
-            firmware, number = _begin(port)
+            firmware, number = _start(port)
     except BaseException:
-        _end(port)
+        _stop(port)
         close_port(port)
         raise
     name = f"{SENSOR.name}, serial number {number}"
     facts = (("firmware", firmware),)
-    stream = fs.ForceStream(port, SENSOR, name, facts, before_close=lambda: _end(port))
+    stream = fs.ForceStream(port, SENSOR, name, facts, before_close=lambda: _stop(port))
     return stream.started(FIRST_FRAME_S)
 
 
-def _begin(port: serial.Serial) -> tuple[str, str]:
+def _start(port: serial.Serial) -> tuple[str, str]:
     """Start the stream; return firmware and serial number."""
     heard = False
     for _ in range(2):
@@ -134,7 +134,8 @@ def _begin(port: serial.Serial) -> tuple[str, str]:
                 f"{DEVICE}: port {port.port}: it does not stream, {error}; is it an FT 300?"
             ) from None
     complaint = (
-        "what comes is no answer; the rate is wrong, the line is disturbed, or it is no FT 300"
+        "the bytes received are no answer; the rate is wrong, the line is disturbed, or it is no "
+        "FT 300"
         if heard
         else "nobody answers; check the sensor's power, its cable and the rate"
     )
@@ -152,7 +153,7 @@ def _text(port: serial.Serial, address: int, count: int) -> str:
     return text if text and text.isascii() and text.isprintable() else data.hex()
 
 
-def _end(port: serial.Serial) -> None:
+def _stop(port: serial.Serial) -> None:
     """End the stream; never raises."""
     with contextlib.suppress(OSError, termios.error):
         port.write(STOP)

@@ -27,7 +27,7 @@ from pydantic import Field
 
 from hilcal.config import CellConfig
 from hilcal.config.cell import Tracker as TrackerConfig
-from hilcal.drivers.links import check_own_axes, close_port, drain, line_failures, open_port
+from hilcal.drivers.links import check_tracker_frame, close_port, drain, line_failures, open_port
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import Clock, Report, Row, TargetLostError, TrackerSample, report_of
 from hilcal.readings.covariance import TrackerNoise, tracker_covariance
@@ -44,7 +44,7 @@ OK = 0
 UNKNOWN = frozenset({5, 27, 3081})
 """Not implemented, not available, no such request: the instrument lacks the request."""
 BUSY = frozenset({13, 1293})
-"""Another process inside the instrument is at work; repeat the request later."""
+"""Another process inside the instrument is running; repeat the request later."""
 GARBLED = frozenset({3073, 3074, 3076, 3078, 3080, 3082, 3085, 3087, 3093, 3094, 3101, 3102})
 """Request or reply was damaged or out of step; repeat the request after draining the line."""
 
@@ -176,7 +176,7 @@ class Link:
             with line_failures(DEVICE, path):
                 if not drain(self._port, _QUIET_S, _DRAIN_S):
                     raise DeviceError(
-                        f"{DEVICE}: bytes keep coming from port {path} that nobody asked for; "
+                        f"{DEVICE}: port {path} keeps sending bytes without a request; "
                         f"is another instrument connected there, or is {baud} Bd wrong?"
                     )
             self._connection = _Connection(self._port)
@@ -200,7 +200,7 @@ class Link:
         """
         complaint, silent, damaged = "", 0, 0
         while damaged < _TRIES and time.monotonic() < deadline:
-            answer, complaint = self._once(request, values, parsers, seconds, deadline)
+            answer, complaint = self._exchange(request, values, parsers, seconds, deadline)
             if answer is not None and answer.code not in BUSY:
                 return answer
             if answer is not None:
@@ -210,7 +210,7 @@ class Link:
             if isinstance(self._connection.failure, TimeoutError):
                 silent += 1
                 if silent == 1:  # does even the simplest request get no reply?
-                    self._once(NULL, (), (), ANSWER_S, deadline)
+                    self._exchange(NULL, (), (), ANSWER_S, deadline)
                 if isinstance(self._connection.failure, TimeoutError):
                     break
         raise DeviceError(f"{DEVICE} at {self._path}: {complaint or 'no answer in time'}")
@@ -227,7 +227,7 @@ class Link:
                 self._connection.raise_if_broken()
         raise DeviceError(f"{DEVICE} at {self._path}: {self._silence()}")
 
-    def _once(
+    def _exchange(
         self, request: int, values: Values, parsers: Parsers, seconds: float, until: float
     ) -> tuple[Reply | None, str]:
         """One exchange: a valid reply or None, and the complaint about an invalid one."""
@@ -268,7 +268,7 @@ class Link:
             return "it answers without checksum, so damage on the line would go unnoticed"
         if received.startswith(b"%R1P,"):
             return f"answers arrive damaged or cut short; {self._hint()}"
-        return f"what comes is no GeoCOM; {self._hint()}"
+        return f"the bytes received are not GeoCOM; {self._hint()}"
 
     def _hint(self) -> str:
         return f"is {self._baud} Bd right, and does no other program use this port?"
@@ -283,7 +283,7 @@ _LEAST_S = 1.0
 _DISTANCE, _CORRECTED, _DISTANCE_PROGRAM = 1, 1, 2  # TMC_DEF_DIST, TMC_AUTO_INC, BAP_DEF_DIST
 _LOW_BATTERY, _INTERNAL = 10, 2  # %, power source
 CIRCLE = 2.0 * np.pi + 1e-6  # full circle with rounding error, rad
-LARGEST_STD = 0.01  # rad; a choice, a thousand times what the poorest total station states (2 mgon)
+LARGEST_STD = 0.01  # rad; a choice: 300 times the least accurate total station's 2 mgon
 LARGEST_TILT = 0.5 * np.pi  # rad; no station measures upside down
 
 
@@ -308,11 +308,9 @@ class GeoComOptions(Section):
     )
     lock: bool = Field(True, description="true or false: whether the instrument follows the target")
     min_distance_m: NonNegative = Field(
-        0.2, description="the least distance that is believed in m, 0 or more"
+        0.2, description="shorter distances in m are refused, 0 or more"
     )
-    max_distance_m: Positive = Field(
-        100.0, description="the largest distance that is believed in m, over 0"
-    )
+    max_distance_m: Positive = Field(100.0, description="longer distances in m are refused, over 0")
 
 
 class GeoComTracker:
@@ -414,7 +412,7 @@ class GeoComTracker:
             if self._options.lock and not locked:
                 problems.append("it is not locked on its target")
         try:
-            rows += self._sight(self._measure())
+            rows += self._target_rows(self._measure())
         except DeviceError as error:
             if not isinstance(error, TargetLostError):
                 try:  # does it answer at all?
@@ -445,11 +443,11 @@ class GeoComTracker:
                 f"{nearest:g} to {farthest:g} m; does it aim at something else?"
             )
         if not (abs(polar.hz) <= CIRCLE and 0.0 <= polar.v <= CIRCLE):
-            _strange(f"angles of {polar.hz:.6g} and {polar.v:.6g} rad")
+            _refuse(f"angles of {polar.hz:.6g} and {polar.v:.6g} rad")
         if not 0.0 <= polar.angle_std <= LARGEST_STD:
-            _strange(f"a standard deviation of its angles of {polar.angle_std:.3g} rad")
+            _refuse(f"a standard deviation of its angles of {polar.angle_std:.3g} rad")
         if polar.tilt is not None and max(map(abs, polar.tilt)) > LARGEST_TILT:
-            _strange(f"an inclination of {max(map(abs, polar.tilt)):.3g} rad")
+            _refuse(f"an inclination of {max(map(abs, polar.tilt)):.3g} rad")
         return polar
 
     def _full(self, until: float, measuring: float) -> PolarReading | None:
@@ -474,8 +472,8 @@ class GeoComTracker:
         hz, v, std, cross, length, _, distance, ms = numbers(answer, 8)
         if ms == self._last_ms and ms > 0:
             raise DeviceError(
-                f"{DEVICE}: measuring: the instrument gives the distance of the measurement "
-                "before again, not a new one; is another program using it?"
+                f"{DEVICE}: measuring: the instrument gives the previous distance again "
+                "instead of a new one; is another program using it?"
             )
         self._last_ms = ms
         return PolarReading(answer.host_ns, hz, v, distance, std, (cross, length), warning)
@@ -499,7 +497,7 @@ class GeoComTracker:
         across = noise.transverse_std_m + noise.transverse_std_per_m * d
         return noise.range_std_m + noise.range_std_per_m * d, max(across, polar.angle_std * d)
 
-    def _sight(self, polar: PolarReading) -> list[Row]:
+    def _target_rows(self, polar: PolarReading) -> list[Row]:
         along, across = self._spread(polar)
         target = (
             f"{polar.distance:.4f} m away; standard deviation {1e6 * along:.1f} µm along the "
@@ -533,7 +531,7 @@ def open_tracker(config: CellConfig) -> GeoComTracker:
             '[tracker] driver = "geocom" lacks "port": the serial port, '
             'e.g. "/dev/serial/by-id/usb-FTDI_..."'
         )
-    check_own_axes(tracker)
+    check_tracker_frame(tracker)
     options = check_section(tracker.options, GeoComOptions, "[tracker] options")
     link = Link(tracker.port, tracker.baud or BAUD)
     return GeoComTracker(link, tracker, options, Clock(config.simulation.clock))
@@ -552,11 +550,11 @@ def numbers(answer: Reply, count: int) -> Floats:
     """Return the (count,) numbers of a measurement."""
     numbers = np.array(answer.values, dtype=np.float64)
     if numbers.shape != (count,):
-        _strange(f"{len(answer.values)} values instead of {count}")
+        _refuse(f"{len(answer.values)} values instead of {count}")
     if not np.all(np.isfinite(numbers)):
-        _strange("values that are no numbers")
+        _refuse("values that are no numbers")
     return numbers
 
 
-def _strange(data: str) -> NoReturn:
+def _refuse(data: str) -> NoReturn:
     raise DeviceError(f"{DEVICE}: measuring: the instrument gives {data}; is it a GeoCOM station?")

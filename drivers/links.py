@@ -32,7 +32,7 @@ def open_port(device: str, path: str, baud: int, timeout: float = 0.5) -> serial
             path, baud, timeout=timeout, write_timeout=max(timeout, 0.5), exclusive=True
         )
     except (OSError, termios.error) as error:
-        raise DeviceError(f"{device}: {_why_not_open(path, error)}") from None
+        raise DeviceError(f"{device}: {_opening_failure(path, error)}") from None
     except (ValueError, OverflowError):
         raise InputError(
             f"{device}: {baud} is no rate of port {path}; valid are e.g. 9600, 19200, 115200"
@@ -49,7 +49,7 @@ def line_failures(device: str, path: str) -> Iterator[None]:
             f"{device}: port {path} takes no more bytes; check cable and power"
         ) from None
     except (OSError, termios.error) as error:
-        raise DeviceError(f"{device}: {_why_broken(path, error)}") from None
+        raise DeviceError(f"{device}: {_line_failure(path, error)}") from None
 
 
 def drain(port: serial.Serial, quiet: float, limit: float) -> bool:
@@ -74,7 +74,7 @@ def close_port(port: Any) -> None:
         port.close()
 
 
-def _why_not_open(path: str, error: Exception) -> str:
+def _opening_failure(path: str, error: Exception) -> str:
     number = getattr(error, "errno", None)
     if number in (errno.EAGAIN, errno.EBUSY):
         return f"port {path} is in use by another program; end that one, then try again"
@@ -89,7 +89,7 @@ def _why_not_open(path: str, error: Exception) -> str:
     return f"port {path} cannot be opened ({os.strerror(number) if number else error})"
 
 
-def _why_broken(path: str, error: Exception) -> str:
+def _line_failure(path: str, error: Exception) -> str:
     if not os.path.exists(path):
         return f"port {path} is gone; was its adapter unplugged?"
     number = error.args[0] if isinstance(error, termios.error) else getattr(error, "errno", None)
@@ -170,8 +170,8 @@ def network_failures(device: str, where: str) -> Iterator[None]:
         raise DeviceError(f"{device} at {where}: the connection failed ({reason})") from None
 
 
-def check_own_axes(tracker: Tracker) -> None:
-    """Refuse any [tracker] frame but "tracker", for instruments that measure in their own axes."""
+def check_tracker_frame(tracker: Tracker) -> None:
+    """Refuse any [tracker] frame but "tracker": the instrument measures in its own axes."""
     if tracker.frame != "tracker":
         raise InputError(
             f'[tracker] frame = "{tracker.frame}": this instrument measures in its own axes; it '

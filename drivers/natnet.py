@@ -25,7 +25,7 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from hilcal.config import CellConfig
-from hilcal.drivers.links import address, check_own_axes, network_failures
+from hilcal.drivers.links import address, check_tracker_frame, network_failures
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import Report, Row, TargetLostError, TrackerSample, report_of
 from hilcal.toml import Section, check_section
@@ -70,7 +70,7 @@ def connect(version: Version) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class NatNetServer:
-    """Who answered, and how it sends frames."""
+    """The server that answered, and how it sends frames."""
 
     name: str
     program: str
@@ -83,12 +83,12 @@ def server(content: bytes) -> NatNetServer:
     """Parse the answer to `connect`; raises struct.error if cut short."""
     name, *numbers = _SERVER.unpack_from(content)
     version = numbers[4], numbers[5]
-    called = name.split(b"\0")[0].decode("utf-8", "replace")
-    port, where = 0, ""
+    text = name.split(b"\0")[0].decode("utf-8", "replace")
+    port, address = 0, ""
     if len(content) >= _SERVER.size + _CONNECTION.size:
         _, port, multicast, *group = _CONNECTION.unpack_from(content, _SERVER.size)
-        where = ".".join(map(str, group)) if multicast else ""
-    return NatNetServer(called, ".".join(map(str, numbers[:4])), version, port, where)
+        address = ".".join(map(str, group)) if multicast else ""
+    return NatNetServer(text, ".".join(map(str, numbers[:4])), version, port, address)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +117,7 @@ class Reader:
         """Return the next number."""
         return int(self.take(_COUNT)[0])
 
-    def listed(self) -> tuple[int, int]:
+    def list_head(self) -> tuple[int, int]:
         """Return the number of elements of a list, and where it ends (0: not stated)."""
         count = self.count()
         size = self.count() if self.version >= FIRST_SIZED else 0
@@ -143,17 +143,17 @@ def frame(content: bytes, version: Version) -> tuple[int, list[Body]]:
     """Return a frame's number and its rigid bodies."""
     r = Reader(content, version)
     number = r.count()
-    sets, end = r.listed()
+    sets, end = r.list_head()
     if end:
         r.skip(end - r.at)
     else:
         for _ in range(sets):
             r.text()
             r.skip(12 * r.count())
-    markers, _ = r.listed()  # unlabelled
+    markers, _ = r.list_head()  # unlabelled
     r.skip(12 * markers)
     bodies = []
-    for _ in range(r.listed()[0]):
+    for _ in range(r.list_head()[0]):
         v = r.take(_BODY)
         tracked = bool(int(v[9]) & 1)
         bodies.append(Body(int(v[0]), np.array(v[1:4]), np.array(v[4:8]), tracked))
@@ -267,7 +267,7 @@ class NatNetTracker:
         self._frames(1)
 
     def report(self) -> Report:
-        """Say who answered, and measure once."""
+        """Report the server and the rigid body, and measure once."""
         s = self._server
         sent = f"multicast {s.group}:{s.data_port}" if s.group else "to this computer"
         rows: list[Row] = [
@@ -305,7 +305,7 @@ class NatNetTracker:
             start = heard = tracked = requested = time.monotonic()
             until = start + DEADLINE_S + count / SLOWEST_HZ
             out: list[Body] = []
-            foreign: set[int] = set()
+            others: set[int] = set()
             while len(out) < count:
                 now = time.monotonic()
                 if now - heard > DEADLINE_S or now > until:
@@ -317,7 +317,7 @@ class NatNetTracker:
                     requested = now
                     self._send(connect(NEWEST))
                 if now - tracked > LOST_S and heard > tracked:
-                    listed = f"; in the frames: {sorted(foreign)}" if foreign else ""
+                    listed = f"; in the frames: {sorted(others)}" if others else ""
                     raise TargetLostError(
                         f"{DEVICE} at {self.where}: the rigid body {self._name} is not seen{listed}"
                     )
@@ -325,7 +325,7 @@ class NatNetTracker:
                 if bodies is None:
                     continue
                 heard = time.monotonic()
-                foreign |= {b.number for b in bodies if b.number != self._body}
+                others |= {b.number for b in bodies if b.number != self._body}
                 for body in bodies:
                     if body.number == self._body and body.tracked:
                         tracked = heard
@@ -350,16 +350,16 @@ class NatNetTracker:
     def _greet(self) -> NatNetServer:
         content = self._ask(connect(NEWEST), SERVER_INFO)
         with self._parsing("the answer is not a NatNet server's; is this its command port?"):
-            found = server(content)
-        if found.version > NEWEST:
+            answered = server(content)
+        if answered.version > NEWEST:
             command = f"Bitstream,{NEWEST[0]}.{NEWEST[1]}".encode() + b"\0"
             answer = self._ask(message(REQUEST, command), RESPONSE)
-            if found.group or answer[:4] not in (bytes(4), command[:4]):
-                self._refuse(found)
-            found = replace(found, version=NEWEST)
-        if found.version < OLDEST:
-            self._refuse(found)
-        return found
+            if answered.group or answer[:4] not in (bytes(4), command[:4]):
+                self._refuse(answered)
+            answered = replace(answered, version=NEWEST)
+        if answered.version < OLDEST:
+            self._refuse(answered)
+        return answered
 
     def _refuse(self, server: NatNetServer) -> None:
         raise self._error(
@@ -397,14 +397,14 @@ class NatNetTracker:
     def _rigid_body(self) -> tuple[int, str]:
         content = self._ask(message(REQUEST_DESCRIPTIONS), DESCRIPTIONS)
         with self._parsing(f"its descriptions are not of NatNet {self._version}"):
-            found = names(content, self._server.version)
+            bodies = names(content, self._server.version)
         body = self._options.rigid_body
-        if body is None and len(found) == 1:
-            return next(iter(found.items()))
-        for number, name in found.items():
+        if body is None and len(bodies) == 1:
+            return next(iter(bodies.items()))
+        for number, name in bodies.items():
             if body in (name, str(number)):
                 return number, name
-        listed = ", ".join(f'"{name}"' for name in found.values()) or "none is streamed"
+        listed = ", ".join(f'"{name}"' for name in bodies.values()) or "none is streamed"
         wrong = "rigid_body is missing" if body is None else f'no rigid body "{body}"'
         raise InputError(f"[tracker] options: {wrong}; valid: {listed}")
 
@@ -437,6 +437,6 @@ def open_tracker(config: CellConfig) -> NatNetTracker:
     """Connect to the server that [tracker] names."""
     tracker = config.tracker
     host, port = address("[tracker]", "natnet", tracker.host, PORT)
-    check_own_axes(tracker)
+    check_tracker_frame(tracker)
     options = check_section(tracker.options, NatNetOptions, "[tracker] options")
     return NatNetTracker(host, port, options)

@@ -59,7 +59,7 @@ class NetFtOptions(Section):
     web_port: Whole = Field(80, description="the port of the sensor's page, 1 to 65535")
     rate_hz: Positive | None = Field(
         None,
-        description="records per second, over 0, where the sensor's page does not tell",
+        description="records per second, over 0, where the sensor's page does not state it",
         examples=[1000.0],
     )
 
@@ -148,7 +148,7 @@ def page(host: str, port: int) -> str:
             wrong = f"it has no page netftapi2.xml (HTTP status {answer.status})"
             ok = answer.status == http.client.OK
         except http.client.HTTPException as error:
-            wrong, ok = f"what comes is no web page ({type(error).__name__})", False
+            wrong, ok = f"the answer is no web page ({type(error).__name__})", False
     if not ok:
         raise DeviceError(f"{DEVICE} at {where}: {wrong}; is this a Net F/T?")
     return xml
@@ -181,13 +181,13 @@ def sensor_format(xml: str, options: NetFtOptions, where: str) -> fs.SensorForma
     ]
     if not all(counts) or not all(units):
         raise DeviceError(
-            f"{DEVICE} at {where}: its page tells no counts per unit, or in units that are not "
-            f'known ("{names[0]}" and "{names[1]}"); set N and N-m there'
+            f"{DEVICE} at {where}: its page states no counts per unit, or in unknown units "
+            f'("{names[0]}" and "{names[1]}"); set N and N-m there'
         )
     rate = options.rate_hz or _number(xml, "comrdtrate")
     if not rate:
         raise DeviceError(
-            f"{DEVICE} at {where}: its page does not tell its rate; give [force_sensor.options] "
+            f"{DEVICE} at {where}: its page does not state its rate; give [force_sensor.options] "
             "rate_hz, records per second"
         )
     return fs.SensorFormat(

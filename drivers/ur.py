@@ -64,7 +64,7 @@ class UrArm:
         receiver: Receiver,
         torques: TorqueReader | None = None,
     ) -> None:
-        """`silent`: why the supervision does not answer; empty if it does."""
+        """Use an open connection; `silent`: why the supervision does not answer, or empty."""
         self._controller, self._silent = controller, silent
         self._receiver, self._torques = receiver, torques
         self._host, self._model = controller.host, config.robot.model
@@ -74,7 +74,7 @@ class UrArm:
         self._motion: command.MotionInProgress | None = None
         self._brake = command.deceleration(config.motion.speed_rad_s)
         self._fault = ""
-        self._was_ours = False
+        self._program_uploaded = False
 
     @property
     def workers(self) -> tuple[int, ...]:
@@ -105,8 +105,8 @@ class UrArm:
     def take_control(self, mass: float, com: Floats) -> None:
         """Take control of the arm and set its payload; see `ArmDevice.take_control`."""
         if self._motion is not None:
-            raise failure(self._host, "the motion before has not ended")
-        self._give_back()
+            raise failure(self._host, "the previous motion has not ended")
+        self._release_control()
         try:
             self._receiver.read()
         except LinkError:
@@ -121,12 +121,12 @@ class UrArm:
             raise failure(self._host, f"cannot take control: {self._silent}")
         self._end_program()
         self._control = command.take_control(self._controller, self._receiver)
-        self._was_ours = True
+        self._program_uploaded = True
         self._fault = ""
         try:
             self.set_payload(mass, com)
         except BaseException:
-            self._give_back()
+            self._release_control()
             raise
 
     def set_payload(self, mass: float, com: Floats) -> None:
@@ -143,7 +143,7 @@ class UrArm:
         try:
             control.set_payload(mass, com)
         except WorkerError as error:
-            self._not_done(command.not_commanded(error))
+            self._fail_without_effect(command.not_commanded(error))
         end = time.monotonic() + _PAYLOAD_S
         while True:
             reading = self._read()
@@ -157,11 +157,11 @@ class UrArm:
             if abs(sample.payload - mass) <= _MASS_KG and com_error <= _COM_M:
                 return
             if reading.runtime != states.PLAYING:
-                self._not_done("it did not take the payload")
+                self._fail_without_effect("it did not take the payload")
             if time.monotonic() > end:
                 self._fail(
-                    f"it says {sample.payload:g} kg at {np.round(reported, 4).tolist()} m after a "
-                    f"payload of {mass:g} kg at {np.round(com, 4).tolist()} m was set"
+                    f"it reports {sample.payload:g} kg at {np.round(reported, 4).tolist()} m after "
+                    f"a payload of {mass:g} kg at {np.round(com, 4).tolist()} m was set"
                 )
 
     def start_move(self, q: Floats, speed: float, acceleration: float) -> None:
@@ -179,7 +179,7 @@ class UrArm:
                 raise InputError(f"{name} {value} is not valid: over 0 and up to {top}")
         control = self._in_control()
         if self._motion is not None:
-            raise failure(self._host, "the motion before has not ended")
+            raise failure(self._host, "the previous motion has not ended")
         reading = self._read()
         self._check_state(reading)
         if reading.runtime != states.PLAYING:
@@ -191,9 +191,9 @@ class UrArm:
         try:
             accepted = control.move(q, speed, acceleration, motion.brake)
         except WorkerError as error:
-            self._not_done(command.not_commanded(error))
+            self._fail_without_effect(command.not_commanded(error))
         if not accepted:
-            self._not_done("it did not take the motion")
+            self._fail_without_effect("it did not take the motion")
 
     def moving(self) -> bool:
         """Whether the motion is still going on; see `Arm.moving`."""
@@ -227,9 +227,9 @@ class UrArm:
 
     def stop(self) -> None:
         """Stop the arm in every available way; returns when it stands."""
-        if self._control is None and self._stands_already():
+        if self._control is None and self._is_at_rest():
             return
-        if self._control is not None and self._brakes.ease(self._control, self._brake):
+        if self._control is not None and self._brakes.stop_in_control(self._control, self._brake):
             self._motion = None
             return
         halt = self._brakes.halt(self._control, self._brake)
@@ -237,7 +237,7 @@ class UrArm:
         self._fault = "its program was ended to stop it"
         if not halt.at_rest:
             why = f" ({halt.link_failure})" if halt.link_failure else ""
-            raise failure(self._host, f"it was told to stop{why}", HOLD_ON)
+            raise failure(self._host, f"it was commanded to stop{why}", HOLD_ON)
 
     def close(self) -> None:
         """Stop, give control back, end all child processes. Never raises."""
@@ -245,7 +245,7 @@ class UrArm:
             if self._motion is not None:
                 self.stop()
         with contextlib.suppress(Exception):
-            self._give_back()
+            self._release_control()
         with contextlib.suppress(Exception):
             self._end_program()
         with contextlib.suppress(Exception):
@@ -259,19 +259,19 @@ class UrArm:
             raise failure(self._host, f"it is not under control{why}", CONTROL)
         return self._control
 
-    def _give_back(self) -> None:
+    def _release_control(self) -> None:
         control, self._control, self._motion = self._control, None, None
         if control is not None:
             control.release()
 
     def _end_program(self) -> None:
         """End our program, which ur_rtde may have uploaded again after a lost link."""
-        if self._was_ours and not self._silent:
+        if self._program_uploaded and not self._silent:
             with contextlib.suppress(LinkError):
                 self._controller.supervision.stop(_ASK_S)
-                self._was_ours = False
+                self._program_uploaded = False
 
-    def _stands_already(self) -> bool:
+    def _is_at_rest(self) -> bool:
         """Whether an arm not under control stands."""
         with contextlib.suppress(LinkError):
             first, second = self._receiver.read(), self._receiver.read()
@@ -292,7 +292,7 @@ class UrArm:
         if reading.sample.safety != states.NORMAL or reading.mode != states.RUNNING:
             self._fail("it is not ready to move")
 
-    def _not_done(self, symptom: str) -> NoReturn:
+    def _fail_without_effect(self, symptom: str) -> NoReturn:
         """Fail on a command without effect; the cause may be that the program has ended."""
         with contextlib.suppress(LinkError):  # the stop detects the lost link, too
             reading = self._receiver.read(STALE_S)
@@ -319,7 +319,7 @@ def _why_ended(reading: Reading, control: command.Control) -> str:
     return command.UNWATCHED if expired else command.program_ended(reading, late)
 
 
-def _lacking(python: tuple[int, ...]) -> str:
+def _missing_library(python: tuple[int, ...]) -> str:
     cause, remedy = "is not installed", install("rtde_control")
     if python >= NO_WHEEL:
         cause = f"has no wheel for Python {python[0]}.{python[1]}"
@@ -337,7 +337,7 @@ def open_arm(config: CellConfig) -> UrArm:
         )
     options = check_section(dict(config.robot.options), UrOptions, "[robot.options]")
     if importlib.util.find_spec("rtde_control") is None:
-        raise InputError(_lacking(sys.version_info[:2]))
+        raise InputError(_missing_library(sys.version_info[:2]))
     try:
         version, available = probe.controller(host, (*OUTPUTS, TORQUE), _PROBE_S)
         outputs = tuple(name for name in available if name != TORQUE)

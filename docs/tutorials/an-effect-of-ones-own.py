@@ -191,7 +191,7 @@ chart.update_yaxes(title=f"{curve.of}, {curve.unit}")
 # This arm is a simulated one, so that the truth can be looked up:
 
 # %%
-print("hidden was", arm.world.own_law.effect.summary)
+print("hidden was", arm.world.user_effect.effect.summary)
 print(f"a = {arm.world.truth['invented.a']:.3g} rad/(N·m)")
 assert law.formula == "dq_3 = a·cos(q_5)·τ_3"
 (a,) = law.parameters

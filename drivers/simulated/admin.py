@@ -1,4 +1,4 @@
-"""Common parts of the processes of simulated devices: the admin line, and the end with the parent.
+"""Common parts of the processes of simulated devices: admin line, and ending with the parent.
 
 The admin line, for faults and tests, takes JSON lines over a Unix socket.
 """
@@ -20,8 +20,8 @@ from hilcal.errors import DeviceError, HilcalError
 Handler = Callable[[str, dict[str, Any]], Any]
 
 PRIORITY = -10
-"""Niceness of a device that has started, where it may be set: beside programs that compute, its
-turns came up to 0.1 s late, and a driver rightly takes an arm as lost after 0.2 s."""
+"""Niceness of a started device, where the system permits it. Without it, a device on a busy
+computer runs up to 0.1 s late; a driver counts an arm as lost after 0.2 s."""
 
 
 def ask(path: Path, op: str, timeout: float = 5.0, **arguments: Any) -> Any:

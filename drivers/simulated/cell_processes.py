@@ -285,7 +285,10 @@ def _check(world: World, config: CellConfig, directory: Path) -> None:
         )
     with contextlib.suppress(DeviceError):
         admin.ask(directory / "world.sock", "state", timeout=1.0)
-        raise InputError(f"simulated cell: another one runs in {directory}; valid: another one")
+        raise InputError(
+            f"simulated cell: another one runs in {directory}; valid: a directory for "
+            "this cell alone"
+        )
 
 
 def _devices(

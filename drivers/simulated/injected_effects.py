@@ -7,8 +7,8 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.drivers.simulated.mechanics import rotation_vector
-from hilcal.drivers.simulated.own_law import OwnLaw
 from hilcal.drivers.simulated.truth import Truth, joint_temperature, long_links, rated_torque
+from hilcal.drivers.simulated.user_effect import HiddenUserEffect
 from hilcal.drivers.simulated.world import IdealReading, SimulatedNoise, World, place_tracker
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
@@ -146,7 +146,7 @@ _SENSOR_ERRORS = ("wrench_bias", "wrench_gain", "sensor_misalignment")  # need a
 READINGS_MODES = ("absolute", "deflection")
 _TOLERANCE = 1e-4
 _TRIALS = 25
-_SOFTER = 1.5  # a stiffening gear is softer at no torque (catalogues: K1 is about half of K3)
+_SOFTER = 1.5  # a stiffening gear is softer at low torque (catalogues: K1 is about half of K3)
 _TARGET_SCATTER = 2e-3  # m, scatter of an unknown target about its configured place
 
 
@@ -191,7 +191,7 @@ def softened(world: World, effect: object) -> World:
 
 
 def hide_effect(
-    effect: str | OwnLaw,
+    effect: str | HiddenUserEffect,
     cell: Cell,
     states: States,
     strength_sigma: float,
@@ -222,7 +222,7 @@ def hide_effect(
         world = softened(world_without_effect(cell, rng), effect)
     if effect == "none" or strength_sigma == 0.0:
         return world
-    if isinstance(effect, OwnLaw):
+    if isinstance(effect, HiddenUserEffect):
         name, hidden, reference = effect.effect.name, _user_effect(effect, world, rng), world
     else:
         name = effect
@@ -243,10 +243,12 @@ def hide_effect(
     return hidden(_scaled(strength, strength_sigma, name, readings_mode))
 
 
-def _user_effect(law: OwnLaw, world: World, rng: np.random.Generator) -> Callable[[float], World]:
+def _user_effect(
+    law: HiddenUserEffect, world: World, rng: np.random.Generator
+) -> Callable[[float], World]:
     """Return the world with a user's effect as a function of its strength."""
     direction = law.draw(rng)
-    return lambda factor: replace(world, own_law=replace(law, theta=factor * direction))
+    return lambda factor: replace(world, user_effect=replace(law, theta=factor * direction))
 
 
 def _shipped_effect(
@@ -283,14 +285,14 @@ def _shipped_effect(
     return hidden, replace(world, physics=clean)
 
 
-def _check(effect: str | OwnLaw, strength: float, mode: str, m: int) -> None:
+def _check(effect: str | HiddenUserEffect, strength: float, mode: str, m: int) -> None:
     if mode not in READINGS_MODES:
         raise InputError(f"readings {mode!r} is unknown; valid: {', '.join(READINGS_MODES)}")
     if m not in (3, 6):
         raise InputError(f"a reading has {m} elements; valid: 3 (position) or 6 (pose)")
     if not (np.isfinite(strength) and strength >= 0.0):
-        raise InputError(f"strength {strength} sigma cannot be; valid: a number >= 0")
-    if isinstance(effect, OwnLaw):
+        raise InputError(f"strength {strength} sigma is not valid; valid: a number >= 0")
+    if isinstance(effect, HiddenUserEffect):
         return
     if effect not in (*ALL_EFFECTS, "none"):
         valid = ", ".join((*ALL_EFFECTS, "none"))

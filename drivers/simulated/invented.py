@@ -1,6 +1,6 @@
 """`invented`: a law that the catalogue lacks, for `hilcal demo --hide invented`.
 
-It is hidden like a user's effect (`own_law`); the program under rehearsal does not get this file.
+It is hidden like a user's effect (`user_effect`); the program that fits does not get this file.
 """
 
 import numpy as np

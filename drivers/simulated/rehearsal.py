@@ -12,8 +12,8 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.drivers.simulated import injected_effects as injected
 from hilcal.drivers.simulated.cell_processes import SimulatedCell
-from hilcal.drivers.simulated.own_law import own_law
 from hilcal.drivers.simulated.truth import warm_up
+from hilcal.drivers.simulated.user_effect import hidden_user_effect
 from hilcal.drivers.simulated.world import SimulatedNoise, World
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
@@ -38,8 +38,8 @@ def choices() -> tuple[str, ...]:
     return tuple(e for e in injected.ALL_EFFECTS if e != "joint_compliance")
 
 
-def own_choices(catalogue: Catalogue | None) -> tuple[str, ...]:
-    """User's effects that can be hidden; see `own_law`."""
+def user_choices(catalogue: Catalogue | None) -> tuple[str, ...]:
+    """User's effects that can be hidden; see `user_effect`."""
     effects = () if catalogue is None else catalogue.with_role("effect")
     return tuple(k.name for k in effects if k.name not in injected.ALL_EFFECTS)
 
@@ -51,7 +51,7 @@ def invented_law(catalogue: Catalogue) -> Catalogue:
 
 def check_choice(choice: str, catalogue: Catalogue | None = None) -> None:
     """Raise InputError, with the valid choices, for what cannot be hidden."""
-    valid = (*choices(), *own_choices(catalogue), RANDOM, NO_EFFECT)
+    valid = (*choices(), *user_choices(catalogue), RANDOM, NO_EFFECT)
     if choice not in valid:
         raise InputError(f"hide {choice!r}{suggest(choice, valid)}; valid: {', '.join(valid)}")
 
@@ -151,7 +151,7 @@ def simulation_case(
 ) -> SimulationCase:
     """Make a simulated cell and hide an effect in it, at the strength of `[simulation]`.
 
-    `choice` is one of `choices()` or `own_choices(catalogue)`, "random" or "nothing"; the strength
+    `choice` is one of `choices()` or `user_choices(catalogue)`, "random" or "nothing"; the strength
     is that at the states which `visit` returns, with the tracker's `noise` of one reading.
     """
     config = program_config(config, choice, catalogue)
@@ -165,8 +165,8 @@ def simulation_case(
         hidden = str(rng.choice([e for e in choices() if e not in excluded]))
     v = visit(cell)
     law = None
-    if catalogue is not None and hidden in own_choices(catalogue):
-        law = own_law(catalogue, hidden, cell, v.states)
+    if catalogue is not None and hidden in user_choices(catalogue):
+        law = hidden_user_effect(catalogue, hidden, cell, v.states)
     loaded = choice in injected.DEFLECTION_EFFECTS if law is None else law.effect.elastic
     mode: Mode = "deflection" if loaded and _paired(v) else "absolute"
     joint_std = config.repeatability.per_joint(cell.arm.n)
@@ -216,12 +216,12 @@ def simulate(
         pose_names=tuple(f"p{i + 1}" for i in range(int(np.max(pose)) + 1)),
         target_names=world.cell.target_names if states.target is not None else (),
     )
-    arrival, sight = None, world.ideal_readings(states)
+    arrival, ideal = None, world.ideal_readings(states)
     if states.target is not None:
         arrival = readings.arrivals
-        readings = replace(readings, common=sight.jacobian[:, :m] * world.joint_std)
+        readings = replace(readings, common=ideal.jacobian[:, :m] * world.joint_std)
     value = world.observe(states, rng, m, arrival)
-    return replace(readings, value=value, covariance=world.covariance(sight, m))
+    return replace(readings, value=value, covariance=world.covariance(ideal, m))
 
 
 _LOADING = 60.0  # s, to change a load

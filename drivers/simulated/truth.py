@@ -1,7 +1,7 @@
 """The hidden parameters of a simulated world, named like the effects that they cause; their laws.
 
-The laws are those of causes beside the load (sides, temperatures, time, joint angles), and of the
-errors of a force sensor.
+The laws here are those of joint angles, approach sides, temperatures and time, and of the errors of
+a force sensor; those of the load are in `mechanics`.
 """
 
 import itertools
@@ -215,7 +215,7 @@ def further_compliance(hidden: Truth, arm: Arm, states: States) -> Floats | None
         angle = arm.phases(states.q)
         extra = cos * np.cos(2.0 * angle) + sin * np.sin(2.0 * angle)
     if np.any(hidden.creep):
-        lack = "do not tell how long the load has hung; valid: seconds since its last change"
+        lack = "do not state how long the load has hung; valid: seconds since its last change"
         time = required_column("creep", "load_time", states.load_time, lack)
         growth = hidden.creep * np.log10(1.0 + time)
         creep = growth[:, None] * hidden.joint_compliance

@@ -65,7 +65,7 @@ class Controller:
     def __init__(self, arm: ArmState, board: Blackboard) -> None:
         self.arm, self._board = arm, board
         self.scripts, self.unlock_after = 0, UNLOCK_AFTER
-        self.hears: Callable[[int], bool] = lambda register: False
+        self.has_client: Callable[[int], bool] = lambda register: False
         """Whether a client that writes an integer register is connected."""
         self._program: programs.ControlScript | programs.WaypointProgram | None = None
         self._compiling: tuple[float, str] | None = None
@@ -93,7 +93,9 @@ class Controller:
         program, waits = self._program, False
         if program is not None and program.late and arm.runtime is Runtime.PLAYING:
             # a connected client is late because the computer is busy
-            connected = isinstance(program, programs.ControlScript) and self.hears(program.register)
+            connected = isinstance(program, programs.ControlScript) and self.has_client(
+                program.register
+            )
             waits = program.late < PATIENCE and connected
             if not waits:
                 self.stop_program("watchdog: no input package in time")
@@ -170,7 +172,7 @@ class Controller:
         self._safety_stop(SafetyMode.SAFEGUARD_STOP, "safeguard stop")
 
     def release_safeguard(self) -> None:
-        """End a safeguard stop; a paused program goes on by itself, as the controller has it."""
+        """End a safeguard stop; a paused program goes on by itself, as on a real controller."""
         if self.arm.safety_mode is SafetyMode.SAFEGUARD_STOP:
             self.arm.safety_mode = SafetyMode.NORMAL
             self.arm.note("safeguard reset")

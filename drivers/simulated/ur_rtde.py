@@ -179,8 +179,8 @@ class Sensors:
             return self._readers[name]()
         register = _REGISTER.fullmatch(name)
         if register:
-            file = self._arm.out_int if register[1] == "int" else self._arm.out_double
-            return (file[int(register[2])],)
+            values = self._arm.out_int if register[1] == "int" else self._arm.out_double
+            return (values[int(register[2])],)
         return _FIXED.get(name) or (0.0,) * int(FORMATS[OUTPUTS[name]][:-1] or 1)
 
     def _array(self, name: str) -> Floats:
@@ -349,23 +349,23 @@ class RtdeLink:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         links = self._links
         links.links.add(self)
-        links.arm.note("rtde client came")
+        links.arm.note("rtde client connected")
         try:
             while True:
                 size, kind = HEADER.unpack(await self._reader.readexactly(HEADER.size))
                 body = await self._reader.readexactly(max(0, size - HEADER.size))
                 if not links.arm.rtde_mute:
-                    self._take(chr(kind), body)
+                    self._handle(chr(kind), body)
         except (asyncio.IncompleteReadError, OSError):
             pass
         except (struct.error, ValueError, IndexError) as error:
-            links.arm.note(f"rtde client sent nonsense: {error}")
+            links.arm.note(f"rtde client sent invalid data: {error}")
         finally:
             self.started = False
             links.links.discard(self)
             for name in [name for name, owner in links.owners.items() if owner is self]:
                 del links.owners[name]
-            links.arm.note("rtde client went")
+            links.arm.note("rtde client disconnected")
             self.writer.close()
 
     def send(self, now: float) -> None:
@@ -394,7 +394,7 @@ class RtdeLink:
             self._links.arm.note("rtde client does not read: cut off")
             self.writer.transport.abort()
 
-    def _take(self, kind: str, body: bytes) -> None:
+    def _handle(self, kind: str, body: bytes) -> None:
         arm = self._links.arm
         if kind == "U":
             self._input(body)

@@ -49,9 +49,7 @@ _LINE = 1 << 16  # bytes; longest line
 Version = tuple[int, int, int, int]
 
 
-def switched_on(
-    arm: Arm, board: Blackboard, version: Version, rng: np.random.Generator
-) -> ArmState:
+def powered_on(arm: Arm, board: Blackboard, version: Version, rng: np.random.Generator) -> ArmState:
     """Return the state of a controller after power-on; the arm is where it stood before."""
     last, clock = board.read("arm"), WorldClock(board)
     alive = bool(last["alive"])
@@ -80,17 +78,17 @@ class UrServer:
         self.controller = control.Controller(state, board)
         sensors = Sensors(state, board, rng)
         self.rtde = RtdeLinks(state, sensors, self.controller.step)
-        self.controller.hears = self.rtde.has_writer
+        self.controller.has_client = self.rtde.has_writer
         arm = state.kinematics.arm
-        self.is_x = state.version[0] >= POLYSCOPE_X
-        supervision = control.RobotApiServer if self.is_x else control.DashboardServer
+        self.is_polyscope_x = state.version[0] >= POLYSCOPE_X
+        supervision = control.RobotApiServer if self.is_polyscope_x else control.DashboardServer
         self.dashboard = supervision(self.controller)
         status = control.NOT_INITIALISED if factory is None else factory.status
         rows = None if factory is None else factory.rows
         self.primary = control.PrimaryPort(
             self.controller, _rows(arm) if rows is None else rows, status
         )
-        self._host, self._supervised = host, api_port if self.is_x else DASHBOARD
+        self._host, self._supervised = host, api_port if self.is_polyscope_x else DASHBOARD
         self._rtde_server: asyncio.Server | None = None
         self._servers: list[asyncio.Server] = []
 
@@ -100,7 +98,7 @@ class UrServer:
             await self._listen(self.primary.run, PRIMARY),
             await self._listen(self.dashboard.run, self._supervised),
         ]
-        if not self.is_x:
+        if not self.is_polyscope_x:
             self._servers.append(await self._listen(self._run_script, SCRIPT))
         await self.accept(True)
 
@@ -133,7 +131,7 @@ class UrServer:
             return await asyncio.start_server(client, self._host, port, limit=_LINE)
         except OSError as error:
             raise DeviceError(
-                f"simulated arm: {self._host}:{port} is in use or cannot be had "
+                f"simulated arm: {self._host}:{port} is in use or not available "
                 f"({error.strerror}); each simulated arm needs an address 127.x.y.z of its own"
             ) from None
 
@@ -290,7 +288,7 @@ def start(options: admin.Arguments) -> admin.Device:
     except (OSError, ValueError) as error:
         raise DeviceError(f"simulated arm: no shared world at {world} ({error})") from None
     rng = np.random.default_rng(options.seed)
-    state = switched_on(arm, board, read_version(options.version), rng)
+    state = powered_on(arm, board, read_version(options.version), rng)
     server = UrServer(state, board, options.host, rng, options.api_port, factory)
     loop = asyncio.new_event_loop()
     loop.run_until_complete(server.open())

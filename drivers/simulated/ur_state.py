@@ -18,7 +18,7 @@ from hilcal.types import Floats
 
 REGISTERS = 48  # of each kind and direction
 GRAVITY = np.array([0.0, 0.0, -9.80665])
-_NOTHING = 1e-9  # rad: no motion
+_NO_MOTION = 1e-9  # rad; a shorter motion is none
 Goal = tuple[Floats, float, float]
 """Joint angles (n,), rad, speed and acceleration of the leading joint."""
 
@@ -74,19 +74,19 @@ class LinearMotion:
         return sum(piece[0] for piece in self.pieces)
 
     def at(self, time: float) -> tuple[float, float]:
-        """Return path and speed of the leading joint at a time since the start."""
-        way = 0.0
+        """Return path (rad) and speed (rad/s) of the leading joint, `time` s after the start."""
+        path = 0.0
         for duration, speed, acceleration in self.pieces:
             t = min(time, duration)
-            way += speed * t + 0.5 * acceleration * t * t
+            path += speed * t + 0.5 * acceleration * t * t
             if time < duration:
-                return way, speed + acceleration * t
+                return path, speed + acceleration * t
             time -= duration
-        return way, 0.0
+        return path, 0.0
 
-    def point(self, distance: float) -> Floats:
+    def point(self, path: float) -> Floats:
         """Return the joint angles (n,) at a path of the leading joint, rad."""
-        return self.origin + self.direction * distance
+        return self.origin + self.direction * path
 
     @property
     def length(self) -> float:
@@ -99,16 +99,16 @@ def line(origin: Floats, goal: Floats, speed: float, acceleration: float) -> Lin
 
     v = min(speed, sqrt(a d)), ramps of v / a, and d / v - v / a in between.
     """
-    way = goal - origin
-    length = float(np.max(np.abs(way)))
-    if length < _NOTHING:
+    shift = goal - origin
+    length = float(np.max(np.abs(shift)))
+    if length < _NO_MOTION:
         return None
     acceleration = max(acceleration, 1e-6)
     top = min(max(speed, 1e-6), float(np.sqrt(acceleration * length)))
     ramp = top / acceleration
     cruise = max(0.0, length / top - ramp)
     pieces = ((ramp, 0.0, acceleration), (cruise, top, 0.0), (ramp, top, -acceleration))
-    return LinearMotion(origin, way / length, pieces)
+    return LinearMotion(origin, shift / length, pieces)
 
 
 class Trajectory:
@@ -125,7 +125,7 @@ class Trajectory:
         self._now = now
         self._segment: LinearMotion | None = None
         self._time = 0.0  # along the segment
-        self._stands: float | None = None  # start of a rest within the segment, at rate 0
+        self._rest_start: float | None = None  # start of a rest within the segment, at rate 0
         self._stopping = False
         self._next: Goal | None = None
         self._goal: Goal | None = None
@@ -169,19 +169,19 @@ class Trajectory:
         self._next = None
         if self._segment is None:
             return
-        way, speed = self._segment.at(self._time)
+        path, speed = self._segment.at(self._time)
         speed *= self.rate
         if speed <= 1e-9:
-            self.q = self._segment.point(way)
-            self._end(now if self._stands is None else self._stands)
+            self.q = self._segment.point(path)
+            self._end(now if self._rest_start is None else self._rest_start)
             return
         if not self._stopping:
-            distance = max(self._segment.length - way, 1e-9)
+            distance = max(self._segment.length - path, 1e-9)
             deceleration = max(deceleration, 0.5 * speed**2 / distance)
         elif deceleration <= -self._segment.pieces[0][2]:
             return  # a stop is never slowed down
         pieces = ((speed / deceleration, speed, -deceleration),)
-        self._segment = LinearMotion(self._segment.point(way), self._segment.direction, pieces)
+        self._segment = LinearMotion(self._segment.point(path), self._segment.direction, pieces)
         self._time, self._stopping = 0.0, True
 
     def advance(self, now: float) -> None:
@@ -190,13 +190,13 @@ class Trajectory:
             rate = 1.0 if self._stopping else self.rate
             step, remaining = (now - self._now) * rate, self._segment.duration - self._time
             if rate > 0.0:
-                self._stands = None
-            elif self._stands is None:
-                self._stands = self._now
+                self._rest_start = None
+            elif self._rest_start is None:
+                self._rest_start = self._now
             if step < remaining:
                 self._time += step
-                way, speed = self._segment.at(self._time)
-                self.q, self.qd = self._segment.point(way), self._segment.direction * speed * rate
+                path, speed = self._segment.at(self._time)
+                self.q, self.qd = self._segment.point(path), self._segment.direction * speed * rate
                 break
             self.q = self._segment.point(self._segment.length)
             self._now += remaining / rate
@@ -211,10 +211,10 @@ class Trajectory:
 
     def _begin(self, goal: Floats, speed: float, acceleration: float) -> None:
         self._segment = line(self.q, goal, speed, acceleration)
-        self._time, self._stopping, self._stands = 0.0, False, None
+        self._time, self._stopping, self._rest_start = 0.0, False, None
         self._goal = goal, speed, acceleration
         if self._segment is not None:
-            moves = np.abs(goal - self.q) > _NOTHING
+            moves = np.abs(goal - self.q) > _NO_MOTION
             self.side = np.where(moves, np.sign(goal - self.q), self.side)
 
     def _end(self, time: float) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.drivers.simulated import mechanics as mech
 from hilcal.drivers.simulated import truth as laws
-from hilcal.drivers.simulated.own_law import OwnLaw
+from hilcal.drivers.simulated.user_effect import HiddenUserEffect
 from hilcal.readings.readings import States
 from hilcal.types import Floats, Ints
 
@@ -106,7 +106,7 @@ class World:
     offsets: Floats | None = None
     """(T, 3) displacement of each of several targets from its configured place, flange axes, m.
     `physics.target_offset` moves all of them."""
-    own_law: OwnLaw | None = None
+    user_effect: HiddenUserEffect | None = None
     """A user's effect, in addition to the mechanics."""
     _tree: mech.ElasticTree = field(init=False, repr=False)
 
@@ -116,7 +116,7 @@ class World:
     @property
     def truth(self) -> dict[str, float]:
         """The hidden parameters that are not zero, as "effect.part": value in SI."""
-        law = {} if self.own_law is None else self.own_law.truth
+        law = {} if self.user_effect is None else self.user_effect.truth
         return {**self.physics.nonzero_parameters(self.cell.arm), **law}
 
     @property
@@ -128,7 +128,7 @@ class World:
     def drifts(self) -> bool:
         """Whether the target moves with time or temperature while arm and load rest."""
         causes = ("tracker_drift", "creep", "thermal_growth", "thermal_joint_drift")
-        return self.own_law is not None or any(np.any(getattr(self.physics, c)) for c in causes)
+        return self.user_effect is not None or any(np.any(getattr(self.physics, c)) for c in causes)
 
     def equilibrium(self, states: States, slip: Floats | None = None) -> mech.Equilibrium:
         """Return the equilibrium of N states; `slip` (N, n): error of the drives at rest, rad."""
@@ -183,8 +183,8 @@ class World:
             by_drive, (equilibrium.flange[:, :3, :3] @ target[..., :3, 3:])[:, :, 0]
         )
         jac = np.concatenate([R @ jac[:, :3], R @ jac[:, 3:]], axis=1)
-        if self.own_law is not None:
-            shift, turn = self.own_law.displacements(
+        if self.user_effect is not None:
+            shift, turn = self.user_effect.displacements(
                 self.cell, frame, hidden.joint_compliance, states
             )
             position, rotation = position + shift, turn @ rotation
@@ -218,8 +218,8 @@ class World:
         """
         k = np.arange(len(states)) if arrival is None else arrival
         slip = self.joint_std * rng.standard_normal((int(k.max()) + 1, states.q.shape[1]))[k]
-        sight = self.ideal_readings(states, slip)
-        observed = self.noise.observe(self._from_station(sight.position), rng)
+        ideal = self.ideal_readings(states, slip)
+        observed = self.noise.observe(self._from_station(ideal.position), rng)
         axes, origin = self.station[:3, :3], self.station[:3, 3:]
         position = observed @ axes - (axes.T @ origin)[:, 0]
         if m == 3:
@@ -227,7 +227,7 @@ class World:
         turn = mech.rotation_matrices(
             self.noise.orientation_std * rng.standard_normal((len(states), 3))
         )
-        return np.hstack([position, mech.rotation_vector(turn @ sight.rotation)])
+        return np.hstack([position, mech.rotation_vector(turn @ ideal.rotation)])
 
     def _from_station(self, position: Floats) -> Floats:
         """Return positions (N, 3) in sensor axes as positions in station axes."""

@@ -30,8 +30,8 @@ from hilcal.config import CellConfig
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.blackboard import MOST_TARGETS, Blackboard
 from hilcal.drivers.simulated.mechanics import rotation_matrices
-from hilcal.drivers.simulated.own_law import OwnLaw
 from hilcal.drivers.simulated.truth import AIR, Truth, warm_up
+from hilcal.drivers.simulated.user_effect import HiddenUserEffect
 from hilcal.drivers.simulated.world import SimulatedNoise, World
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
@@ -111,7 +111,7 @@ class WorldState:
             self._handled = number if state == self._published else -1
 
     def hang(self, name: str | None) -> str | None:
-        """Hang a load, or take it off (None); return the load that hangs, by mistake another."""
+        """Hang a load, or take it off (None); return the load that hangs (see `mistake`)."""
         with self._lock:
             requested = self._number(name)
             load = self._mistakes.pop(0) if self._mistakes else requested
@@ -202,19 +202,19 @@ class WorldState:
         rest = world.equilibrium(states, slip)
         targets = np.full((MOST_TARGETS, 3), np.nan)
         if world.cell.targets is None:
-            sight = world.ideal_readings(states, slip, rest)
+            ideal = world.ideal_readings(states, slip, rest)
         else:
             count = len(world.cell.targets)
             repeated = replace(states[np.zeros(count, dtype=np.int64)], target=np.arange(count))
-            sight = world.ideal_readings(repeated, np.repeat(slip, count, axis=0))
-            targets[:count] = sight.position
+            ideal = world.ideal_readings(repeated, np.repeat(slip, count, axis=0))
+            targets[:count] = ideal.position
         flange = rest.flange[0]
         self._board.write(
             "truth",
             load=self._load,
             load_since=self._since,
-            target=sight.position[0],
-            target_rotation=sight.rotation[0],
+            target=ideal.position[0],
+            target_rotation=ideal.rotation[0],
             targets=targets,
             flange=flange,
             sensor_wrench=self._sensor_wrench(flange[:3, :3], wrench),
@@ -303,7 +303,7 @@ def write_world(path: Path, world: World, config: CellConfig, base_dir: Path | N
         "config": json.loads(config.to_json()),
         "base_dir": None if base_dir is None else str(base_dir.resolve()),
         "physics": {f.name: _listed(getattr(world.physics, f.name)) for f in fields(Truth)},
-        "own": None if world.own_law is None else world.own_law.to_json(),
+        "own": None if world.user_effect is None else world.user_effect.to_json(),
         "noise": asdict(world.noise),
         "joint_reference": world.joint_reference,
         **{name: _listed(getattr(world, name)) for name in _ARRAYS},
@@ -324,7 +324,9 @@ def read_world(path: Path) -> tuple[World, CellConfig]:
             physics=Truth(**{name: _array(value) for name, value in data["physics"].items()}),
             noise=SimulatedNoise(along, across, noise["orientation_std"]),
             joint_reference=data["joint_reference"],
-            own_law=None if data["own"] is None else OwnLaw.from_json(cell, data["own"]),
+            user_effect=None
+            if data["own"] is None
+            else HiddenUserEffect.from_json(cell, data["own"]),
             **{name: _array(data[name]) for name in _ARRAYS},
         )
     except OSError as error:

@@ -1,9 +1,9 @@
 """The child processes of the driver: `python -m hilcal.drivers.ur_link.children LIFE PARENT KIND`.
 
 `receive` holds the receive interface of ur_rtde. A reading is returned only if it is new: the
-controller's timestamp has to change within the `stale` seconds of the request. That the library
-reports a connection proves nothing, since its getters repeat the last values for ever; a reported
-disconnection is believed.
+controller's timestamp has to change within the `stale` seconds of the request. A connection that
+the library reports proves nothing, because its getters repeat the last values of a lost one; a
+disconnection that it reports is real.
 
 `control` holds the control interface and serves the robot's watchdog. During a motion the
 controller stops its program, and so the arm, after 0.1 s without a sign of life: when this process
@@ -289,7 +289,7 @@ def control(host: str, hz: str, lease: str, relayed: str, upper_registers: str) 
 TORQUE = "actual_current_as_torque"
 _CONNECT_S, _STALE_S = 4.0, 0.8
 _MEMORY_S = 1.0
-"""Between requests the packets of this last time are kept, s; a choice."""
+"""Between requests only the packets of the last second are kept; a choice."""
 _PACKET = struct.Struct(">B7d")
 
 

@@ -190,7 +190,7 @@ def _start(controller: UrController, end: float) -> Control:
 
 
 def _check_ready(controller: UrController, receiver: Receiver) -> None:
-    """Refuse a robot that cannot be controlled; end a paused program, which a stop may leave."""
+    """Refuse a robot that cannot be controlled; end a program that a stop has left paused."""
     host, reading = controller.host, receiver.read()
     if reading.sample.safety != states.NORMAL:
         raise failure(host, reading.sample.safety, states.safety_advice(reading.safety_bits))
@@ -228,7 +228,7 @@ _RENEW_S = 1.5
 _TAKEN_S = 0.05
 """Time before closing the connection, real s: the controller drops a program whose sender leaves
 before it has taken the program; a choice."""
-UNWATCHED = "nobody watched its motion for 0.5 s, so it was stopped"
+UNWATCHED = "its motion was not supervised for 0.5 s, so it was stopped"
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,7 +247,7 @@ class Brakes:
     controller: UrController
     receiver: Receiver
 
-    def ease(self, control: Control, brake: float) -> bool:
+    def stop_in_control(self, control: Control, brake: float) -> bool:
         """Stop through the control worker and keep control; return whether the arm stands."""
         with contextlib.suppress(WorkerError, LinkError):
             control.stop(brake, 0.3)
@@ -294,7 +294,7 @@ class Brakes:
         return Halt(reading or self.receiver.read(STALE_S), reading is not None, "")
 
     def _by_script(self, brake: float) -> None:
-        """Send a program that brakes the arm along its path; `brake`: leading joint, rad/s²."""
+        """Send a program that stops the arm along its path; `brake`: as for `halt`."""
         program = f"def stop_arm():\n  stopj({brake:.3f})\nend\n"
         with (
             contextlib.suppress(LinkError),
@@ -340,7 +340,7 @@ def cause_of(controller: UrController, halt: Halt, symptom: str) -> tuple[str, s
 
 def program_ended(reading: Reading, late: float) -> str:
     """Return why the robot's program ended; `late` is the longest pause in the signs of life, s."""
-    busy = f"this computer was too busy for {late:.2f} s to show that it lives"
+    busy = f"this computer was too busy to send a sign of life for {late:.2f} s"
     if late > 1.0 / WATCHDOG_HZ:
         return f"its watchdog stopped it: {busy}"
     word = states.runtime_word(reading.runtime)

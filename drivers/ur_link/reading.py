@@ -55,7 +55,7 @@ def read_kinematics(host: str, seconds: float) -> FactoryKinematics:
                 return of_rows(rows, "the controller", values[30], tuple(values[:6]))
             except InputError as error:
                 raise LinkError(f"{_PRIMARY}: {error}") from None
-    raise LinkError(f"{_PRIMARY} does not tell the arm's kinematics")
+    raise LinkError(f"{_PRIMARY} does not send the arm's kinematics")
 
 
 def _kinematics_part(body: bytes) -> bytes | None:
@@ -252,7 +252,7 @@ _ASK_S = 1.5
 
 
 def survey(controller: UrController, receiver: Receiver, model: str, silent: str) -> Report:
-    """Ask all that needs no motion; `silent`: why the supervision does not answer, else empty."""
+    """Report all that needs no motion; `silent`: why the supervision does not answer, or empty."""
     supervision, hz = controller.supervision, receiver.hz
     version = states.version_word(controller.version)
     rows: list[Row] = [
@@ -265,11 +265,11 @@ def survey(controller: UrController, receiver: Receiver, model: str, silent: str
         kinematics = read_kinematics(controller.host, _ASK_S)
         rows.append(("", "", "kinematics", kinematics.to_dict()))
     except LinkError as error:
-        rows.append(("its kinematics", f"not told: {error}", "", None))
+        rows.append(("its kinematics", f"not reported: {error}", "", None))
         if controller.script_port == PRIMARY_PORT:
             problems.append(
-                f"{error}; programs go by it, so that the arm cannot be controlled without it: "
-                "enable the primary client interface in the controller's settings, under services"
+                f"{error}; programs are sent through it, so the arm cannot be controlled without "
+                "it: enable the primary client interface in the controller's settings, services"
             )
     if silent:
         rows.append((supervision.name, silent, "", None))

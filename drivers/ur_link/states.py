@@ -36,7 +36,7 @@ _SAFETY = (
     (6, "emergency stop of the robot", "release the emergency stop and switch the robot on"),
     (5, "emergency stop of the system", "release the emergency stop and switch the robot on"),
     (7, "emergency stop", "release the emergency stop and switch the robot on"),
-    (2, "protective stop", "look what the arm touched, unlock it on the pendant"),
+    (2, "protective stop", "find out what the arm touched, unlock it on the pendant"),
     (4, "safeguard stop", "leave the guarded area and reset the safeguard"),
     (3, "recovery mode", "move the joints inside their limits on the pendant"),
     (10, "stopped for safety", "look at the pendant"),

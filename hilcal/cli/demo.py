@@ -250,12 +250,12 @@ def demo(
         improved = _put_to_use(t, p, m.measure_missing, without_devices)
     ok, outcome = _judge(r, refinement) if laws is None else _judge_law(r, refinement, laws)
     t.show([verdict_line(refinement.diagnosis), "", heading(outcome)])
-    if r.world.own_law is not None and laws is not None:
+    if r.world.user_effect is not None and laws is not None:
         t.show(
-            f"The simulated arm moved by {r.world.own_law.effect.summary} with the model's own "
+            f"The simulated arm moved by {r.world.user_effect.effect.summary} with the model's own "
             "mechanics, like a law of a user's own: this shows whether such a campaign reveals it."
         )
-    elif r.world.own_law is not None:
+    elif r.world.user_effect is not None:
         t.show(
             f"The simulated arm moved by the law of {r.hidden} itself: this shows whether such a "
             "campaign reveals it, not whether the law is right."
@@ -386,7 +386,7 @@ def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:
 
 
 def _judge_law(r: Rehearsal, refinement: Refinement, laws: LawSearch) -> tuple[bool, str]:
-    hidden_law = r.world.own_law
+    hidden_law = r.world.user_effect
     if hidden_law is None:
         return False, "Nothing was hidden."
     ((_, true),) = hidden_law.truth.items()

@@ -265,7 +265,7 @@ def _alive(pid):
 CAMPAIGN_S = 900.0  # a whole campaign may take so long, s
 STARVED = re.compile(
     r"no new data over RTDE|no answer within|by its watchdog|too busy|nothing came for|"
-    r"nobody watched its motion"
+    r"its motion was not supervised"
 )
 """What a run says, too, where this computer has given one of the processes no turn for long."""
 TRIES = 3

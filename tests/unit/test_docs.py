@@ -200,7 +200,7 @@ def test_the_commands_of_the_guide_to_effects(campaign_of, monkeypatch, capsys):
     rehearsed = [words for words in commands if words[0] in ("demo", "simulate")]
     assert [words[0] for words in commands[: -len(rehearsed) or None]] == ["effects", "diagnose"]
     for words in commands:
-        if words not in rehearsed:  # hiding an effect of one's own: test_own_law
+        if words not in rehearsed:  # hiding an effect of one's own: test_user_effect
             ok(capsys, *words)
     module = ModuleType("cable_pull")
     law, check, *_ = blocks(guide)

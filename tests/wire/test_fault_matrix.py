@@ -156,7 +156,7 @@ TRACKER = (
     cases.switch("tracker mute", "tracker", "mute", "tracker", "no answer"),
     cases.switch("tracker busy", "tracker", "busy", "tracker", "1293"),
     unplugged("tracker"),
-    rate("tracker", 9600, 115200, "no answer|what comes is no GeoCOM"),
+    rate("tracker", 9600, 115200, "no answer|the bytes received are not GeoCOM"),
 )
 
 FORCE = (

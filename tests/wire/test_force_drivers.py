@@ -269,7 +269,7 @@ def test_the_wrong_sensor_is_told(instruments):
     port = instruments("bota").port
     cases.fails(
         lambda: ft300.open_force_sensor(cases.config("ft300", port, baud=460800)),
-        "what comes is no answer; .* or it is no FT 300",
+        "the bytes received are no answer; .* or it is no FT 300",
     )
     port = instruments("hex").port
     cases.fails(

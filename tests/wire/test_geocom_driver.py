@@ -286,7 +286,7 @@ def test_force_sensor_at_the_port_is_no_instrument():
 
 def test_other_instrument_that_answers_something_else():
     with table_instrument({0: lambda *_: b"*11....+00000000\r\n"}) as (port, _):
-        assert "no GeoCOM" in refused(DeviceError, cell(port))
+        assert "are not GeoCOM" in refused(DeviceError, cell(port))
 
 
 def test_replies_without_checksum_are_refused():

@@ -123,7 +123,7 @@ def test_payload_is_set_also_with_its_centre_at_the_flange(arm, sim):
 @pytest.mark.parametrize(
     ("op", "says"),
     [
-        (None, r"it says 2\.5 kg at .* after a payload of 4 kg"),
+        (None, r"it reports 2\.5 kg at .* after a payload of 4 kg"),
         ("local_mode", "it was switched to local mode; switch it to remote control"),
         ("kill_script", "it did not take the payload: its program is stopped"),
     ],
@@ -197,8 +197,8 @@ def test_motion_that_nobody_watches_stops_by_itself(arm, sim):
     state = sim.wait("moving", False)
     assert state["rest_ns"] - last < 500_000_000 + cases.STOP_NS
     assert abs(state["q"][0] - goal[0]) > 0.05
-    assert "nobody watched" in cases.error_of(arm.moving)
-    with pytest.raises(DeviceError, match="nobody watched"):
+    assert "not supervised" in cases.error_of(arm.moving)
+    with pytest.raises(DeviceError, match="not supervised"):
         arm.start_move(goal, 0.5, 0.5)
     arm.take_control(cases.MASS, cases.COM)
     assert arm.moving() is False

@@ -24,7 +24,7 @@ from scipy.io import savemat
 import hilcal as hc
 from hilcal import limits
 from hilcal.cli import main
-from hilcal.drivers.simulated.own_law import check_hash
+from hilcal.drivers.simulated.user_effect import check_hash
 from hilcal.errors import InputError
 from hilcal.identification import parameters_document
 from hilcal.readings.covariance import INSTRUMENT

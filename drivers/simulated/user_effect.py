@@ -27,7 +27,7 @@ from hilcal.types import Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class OwnLaw:
+class HiddenUserEffect:
     """An effect with its true parameters."""
 
     effect: Effect
@@ -79,7 +79,7 @@ class OwnLaw:
         }
 
     @staticmethod
-    def from_json(cell: Cell, data: dict[str, Any]) -> "OwnLaw":
+    def from_json(cell: Cell, data: dict[str, Any]) -> "HiddenUserEffect":
         """Return the law of `to_json`."""
         catalogue = installed()
         if data["file"] is not None:
@@ -87,7 +87,9 @@ class OwnLaw:
             catalogue = catalogue.with_file(Path(data["file"]))
         states = States(**{k: np.array(v) for k, v in data["states"].items()})
         effect = catalogue.make(data["name"], cell, states, data["options"])
-        return OwnLaw(effect, states, catalogue, np.array(data["theta"], dtype=np.float64))
+        return HiddenUserEffect(
+            effect, states, catalogue, np.array(data["theta"], dtype=np.float64)
+        )
 
 
 def check_hash(path: Path, sha256: str) -> None:
@@ -100,7 +102,9 @@ def check_hash(path: Path, sha256: str) -> None:
         raise InputError(f"{path}: changed since the simulated world was made")
 
 
-def own_law(catalogue: Catalogue, name: str, cell: Cell, states: States) -> OwnLaw:
+def hidden_user_effect(
+    catalogue: Catalogue, name: str, cell: Cell, states: States
+) -> HiddenUserEffect:
     """Return an effect with all parameters 0, set up for the states of a campaign."""
     effect = catalogue.make(name, cell, states)
-    return OwnLaw(effect, states, catalogue, np.zeros(len(effect.parameters)))
+    return HiddenUserEffect(effect, states, catalogue, np.zeros(len(effect.parameters)))

@@ -8,13 +8,13 @@ import pytest
 from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.injected_effects import world_without_effect
-from hilcal.drivers.simulated.own_law import own_law
 from hilcal.drivers.simulated.rehearsal import (
     case_of_plan,
     check_choice,
-    own_choices,
     simulate_plan,
+    user_choices,
 )
+from hilcal.drivers.simulated.user_effect import hidden_user_effect
 from hilcal.drivers.simulated.world_server import read_world, write_world
 from hilcal.effects.catalogue import installed
 from hilcal.errors import InputError
@@ -37,12 +37,12 @@ def file(tmp_path):
 
 @pytest.fixture
 def law(file):
-    return own_law(installed().with_file(file), "mine", cell_of(), plan(6).states)
+    return hidden_user_effect(installed().with_file(file), "mine", cell_of(), plan(6).states)
 
 
 def world_with(law, theta):
     world = world_without_effect(cell_of(), np.random.default_rng(1))
-    return world, replace(world, own_law=replace(law, theta=np.array([theta])))
+    return world, replace(world, user_effect=replace(law, theta=np.array([theta])))
 
 
 def test_the_target_moves_as_the_world_moves_it_when_the_joint_turns(law):
@@ -99,12 +99,14 @@ def test_what_the_simulated_cell_does_not_measure_is_named(file):
     file.write_text(CLASS.replace("summary", 'needs = ("air_temperature",)\n    summary'))
     catalogue = installed().with_file(file)
     with pytest.raises(InputError, match="mine needs air_temperature"):
-        own_law(catalogue, "mine", cell_of(), replace(plan(6).states, air_temperature=None))
+        hidden_user_effect(
+            catalogue, "mine", cell_of(), replace(plan(6).states, air_temperature=None)
+        )
 
 
 def test_only_effects_of_ones_own_are_added_to_the_choices(law):
-    assert own_choices(law.catalogue) == ("mine",)
-    assert own_choices(installed()) == ()  # all that ship have mechanics of their own
+    assert user_choices(law.catalogue) == ("mine",)
+    assert user_choices(installed()) == ()  # all that ship have mechanics of their own
     check_choice("mine", law.catalogue)
     refusal("hide 'mine'", check_choice, "mine", installed())
     refusal(r"hide 'mime' \(did you mean \"mine\"\?\)", check_choice, "mime", law.catalogue)
