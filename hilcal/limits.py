@@ -146,18 +146,29 @@ def check_shared(shared: int, elements: int, groups: int) -> None:
         )
 
 
-def read_bytes(path: Path, most: int) -> bytes:
-    """Read a file; an InputError where it has more than `most` bytes."""
-    with path.open("rb") as stream:
-        data = stream.read(most + 1)
-        if len(data) > most:
-            check_size(str(path), max(path.stat().st_size, len(data)), most)
-        return data
+def read_bytes(path: Path, most: int, missing: str = "no such file") -> bytes:
+    """Read a file.
+
+    Raises:
+        InputError: a file that does not exist (with the text `missing`), cannot be read, or has
+            more than `most` bytes.
+    """
+    try:
+        with path.open("rb") as stream:
+            data = stream.read(most + 1)
+            if len(data) > most:
+                check_size(str(path), max(path.stat().st_size, len(data)), most)
+            return data
+    except FileNotFoundError:
+        raise InputError(f"{path}: {missing}") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
 
 
-def read_text(path: Path, most: int) -> str:
-    """Read a UTF-8 text of at most `most` bytes; raises as `read_bytes`, or UnicodeDecodeError."""
-    return read_bytes(path, most).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
+def read_text(path: Path, most: int, missing: str = "no such file") -> str:
+    """Read a text in UTF-8 with any line ends; raises as `read_bytes`, or UnicodeDecodeError."""
+    text = read_bytes(path, most, missing).decode("utf-8")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 @contextmanager

@@ -67,11 +67,7 @@ def load_section(path: Path, section: type[S]) -> S:
 def read_toml(path: Path) -> dict[str, Any]:
     """Read a TOML file as a dictionary."""
     try:
-        text = limits.read_text(path, limits.SETTINGS)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; expected a TOML file") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+        text = limits.read_text(path, limits.SETTINGS, "no such file; expected a TOML file")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not UTF-8 text (byte {error.start}); expected TOML") from None
     for number, line in enumerate(text.split("\n"), start=1):

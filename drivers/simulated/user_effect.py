@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from hilcal import limits
 from hilcal.cell import Cell
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.joint_compliance import JointCompliance
@@ -94,10 +95,7 @@ class HiddenUserEffect:
 
 def check_hash(path: Path, sha256: str) -> None:
     """Raise InputError for a file that has changed since the world was made."""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    content = limits.read_bytes(path, limits.PROGRAM)
     if hashlib.sha256(content).hexdigest() != sha256:
         raise InputError(f"{path}: changed since the simulated world was made")
 

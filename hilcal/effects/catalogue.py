@@ -68,13 +68,8 @@ class EffectFile:
 
 def read_effects(path: Path) -> EffectFile:
     """Run a Python file and return the effects in it; names that begin with "_" do not count."""
-    try:
-        content = limits.read_bytes(path, limits.PROGRAM)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; expected a Python file of effects") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    return effects_of(content, path)
+    missing = "no such file; expected a Python file of effects"
+    return effects_of(limits.read_bytes(path, limits.PROGRAM, missing), path)
 
 
 def effects_of(content: bytes, path: Path) -> EffectFile:

@@ -111,10 +111,10 @@ def read_factory(path: Path, nominal: Arm, text: str | None = None) -> FactoryKi
     if kind not in (".conf", ".yaml", ".yml", ".toml"):
         raise InputError(f"{path}: not the kinematics of an arm; valid: {KINDS}")
     try:
-        text = limits.read_text(path, limits.PROGRAM) if text is None else text
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{path}: {reason}; expected {KINDS}") from None
+        if text is None:
+            text = limits.read_text(path, limits.PROGRAM, f"no such file; expected {KINDS}")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: {error}; expected {KINDS}") from None
     try:
         if kind == ".conf":
             factory = _of_conf(text, nominal, str(path))

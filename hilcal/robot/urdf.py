@@ -220,9 +220,8 @@ def _read(path: Path) -> tuple[pin.Model, dict[str, Mimic]]:
     parser = expat.ParserCreate()
     parser.StartElementHandler, parser.EndElementHandler = start, end
     try:
-        parser.Parse(limits.read_bytes(path, limits.PROGRAM), True)
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}; expected a URDF file") from None
+        missing = "no such file; expected a URDF file"
+        parser.Parse(limits.read_bytes(path, limits.PROGRAM, missing), True)
     except expat.ExpatError as error:
         raise InputError(f"{path.name}: not XML: {error}; expected a URDF file") from None
     with _captured_stderr() as log:

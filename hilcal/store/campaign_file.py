@@ -1,6 +1,6 @@
 """RUN.hilcal: one SQLite file with immutable readings and appended model revisions.
 
-If an open file is moved, deleted or replaced, its new place is found, or a copy is written.
+If an open file is moved, deleted or replaced, its new path is found, or a copy is written.
 """
 
 import itertools
@@ -40,7 +40,7 @@ ACCEPTED = "accepted {}"  # keys of the acceptances, numbered from 1; the last o
 _MEANWHILE = 1000  # most readings appended during a fit; a choice: each takes a second
 _HASHED = 1_000_000  # most readings that are hashed to find the fitted ones; a choice: seconds
 _OTHER_READINGS = (
-    "the readings were changed after revision {} had been fitted to them (their SHA-256 is another)"
+    "the readings were changed after revision {} had been fitted to them (their SHA-256 differs)"
 )
 _META = ("config", "base_dir", "source", "created", "program_version")
 Identity = tuple[int, int]
@@ -116,16 +116,16 @@ class CampaignFile:
                 schema.check_file(connection, path)
                 file = cls(path, connection)
                 if check_revisions and (bad := file.bad_revision()) is not None:
-                    raise InputError(f"{path}: {bad[1]}; {_mend(path)}")
+                    raise InputError(f"{path}: {bad[1]}; {_repair_hint(path)}")
                 return file
             except BaseException:
                 connection.close()
                 raise
 
     def measure_alone(self) -> None:
-        """Refuse a campaign that is being measured; until `close`, let nobody else measure it.
+        """Lock the campaign for measuring until `close`; refuse one that is being measured.
 
-        Fits may read it, and append revisions, meanwhile.
+        Other processes may still read it, and append revisions.
         """
         if self._measuring is None:
             self._measuring = schema.lock(self.path)
@@ -156,7 +156,7 @@ class CampaignFile:
         return int(count)
 
     def about(self, key: str) -> str | None:
-        """A further text about the campaign, as given to `create`; None if it was not given."""
+        """A text about the campaign, as given to `create`; None if it was not given."""
         return self._meta.get(key)
 
     @contextmanager
@@ -182,7 +182,7 @@ class CampaignFile:
         if identity(self.path) == self._identity:
             return
         if self._new_place is None:
-            self._new_place = moved_to(self._identity) or rescued(self.connection, self.path)
+            self._new_place = moved_to(self._identity) or rescue(self.connection, self.path)
         raise MovedFileError(
             f"{self.path}: deleted, replaced or moved while it was open; all {self.n_readings} "
             f"readings stored so far are in {self._new_place}: move that back to {self.path} first"
@@ -204,11 +204,11 @@ class CampaignFile:
             elif stored != layout:
                 differ = sorted({name for name, _ in set(stored) ^ set(layout)})
                 raise InputError(
-                    f"{self.path}: the readings differ from those before in {', '.join(differ)}; "
-                    f"a campaign holds one kind of reading, start another for these"
+                    f"{self.path}: the readings differ from those before in {', '.join(differ)}; a "
+                    "campaign holds one kind of reading: start another campaign for these"
                 )
             readings = self._numbered_targets(readings)
-            self._claim_observers(readings)
+            self._store_observers(readings)
             limits.check_fitted(self.n_readings + len(readings), readings.m, f"{self.path}: ")
         rows.check_poses(self.connection, self.path, readings)
         return rows.insert_readings(self.connection, readings)
@@ -269,13 +269,13 @@ class CampaignFile:
 
     def revisions(self) -> tuple[RevisionRecord, ...]:
         """Return all revisions, oldest first; refuse damaged ones."""
-        records, damaged = self._sound_revisions()
+        records, damaged = self._undamaged_revisions()
         if damaged is not None:
-            raise InputError(f"{self.path}: {damaged[1]}; {_mend(self.path)}")
+            raise InputError(f"{self.path}: {damaged[1]}; {_repair_hint(self.path)}")
         return records
 
-    def _sound_revisions(self) -> tuple[tuple[RevisionRecord, ...], tuple[int, str] | None]:
-        """Return the revisions before the first damaged one, and number and defect of that."""
+    def _undamaged_revisions(self) -> tuple[tuple[RevisionRecord, ...], tuple[int, str] | None]:
+        """Return the revisions before the first damaged one, and its number and defect."""
         records: list[RevisionRecord] = []
         with schema.sqlite_errors(self.path), limits.memory(str(self.path)):
             stored = self.connection.execute("SELECT id, content, crc FROM revisions ORDER BY id")
@@ -302,12 +302,12 @@ class CampaignFile:
         return records[number - 1]
 
     def bad_revision(self) -> tuple[int, str] | None:
-        """Return number and defect of the first revision that is damaged or of other readings.
+        """Return number and defect of the first damaged revision, or of one of other readings.
 
-        A revision's hash must be that of the first readings: of those that were fitted, or, in
-        files of older programs, of those and the next ones, which were appended during the fit.
+        A revision stores how many readings were fitted, and their hash. Older programs hashed also
+        the readings that were appended during the fit, so that hash is accepted, too.
         """
-        records, damaged = self._sound_revisions()
+        records, damaged = self._undamaged_revisions()
         fitted = [(r.number, *basis) for r in records if (basis := fitted_to(r)) is not None]
         if not fitted:
             return damaged
@@ -356,8 +356,8 @@ class CampaignFile:
             raise self._damaged("its observers")
         return tuple(ObserverName(kind, name) for kind, name in stored)
 
-    def _claim_observers(self, readings: Readings) -> None:
-        """Fix the observers by the first readings; refuse other observers later."""
+    def _store_observers(self, readings: Readings) -> None:
+        """Store the observers of the first readings; refuse later readings of other observers."""
         if readings.states.torque is not None or readings.states.observer is not None:
             schema.require(self.connection, schema.MORE_COLUMNS)
         if readings.states.observer is None:
@@ -366,10 +366,10 @@ class CampaignFile:
             text = json.dumps([[o.kind, o.name] for o in readings.observers])
             rows.insert_meta(self.connection, _OBSERVERS, text)
         if self._observers() != readings.observers:
-            raise InputError(f"{self.path}: the readings are by other observers than those before")
+            raise InputError(f"{self.path}: the observers differ from those of earlier readings")
 
     def _numbered_targets(self, readings: Readings) -> Readings:
-        """Return the readings with targets numbered as in the file, by the first readings."""
+        """Return the readings with targets numbered as in the first readings of the file."""
         if readings.states.target is None:
             return readings
         if self.texts().get(_TARGETS) is None:
@@ -386,12 +386,12 @@ class CampaignFile:
         return replace(readings, states=states, target_names=names)
 
 
-def _mend(path: Path) -> str:
+def _repair_hint(path: Path) -> str:
     return f"valid: an untouched copy; or set the revision aside: hilcal repair {quoted(path)}"
 
 
 def identity(path: Path | str) -> Identity | None:
-    """Return device and inode of a file, which identify it under any name; None without a file."""
+    """Return device and inode of a file, which identify it by any path; None without a file."""
     with suppress(OSError):
         status = os.stat(path)
         return status.st_dev, status.st_ino
@@ -410,7 +410,7 @@ def moved_to(target: Identity | None) -> Path | None:
     return None
 
 
-def rescued(connection: sqlite3.Connection, path: Path) -> Path:
+def rescue(connection: sqlite3.Connection, path: Path) -> Path:
     """Write a copy of an open file that was deleted, in the same directory; return its path."""
     home = path.absolute().parent
     folder = home if home.is_dir() else Path(tempfile.gettempdir())
@@ -447,9 +447,9 @@ def new_campaign(
                 finally:
                     connection.close()
         except BaseException:
-            _without_sidecars(new)
+            _remove_journals(new)
             raise
-        _without_sidecars(Path(os.path.realpath(path)))  # another file's journal
+        _remove_journals(Path(os.path.realpath(path)))  # another file's journal
 
 
 def may_write(path: Path, overwrite: bool) -> None:
@@ -462,7 +462,7 @@ def may_write(path: Path, overwrite: bool) -> None:
         raise InputError(f"{path}: exists and is not a campaign; it is not overwritten")
 
 
-def _without_sidecars(path: Path) -> None:
+def _remove_journals(path: Path) -> None:
     """Remove journals that SQLite would replay into a new file of this name."""
     for end in ("-journal", "-wal", "-shm"):
         path.with_name(path.name + end).unlink(missing_ok=True)

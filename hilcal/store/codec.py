@@ -77,7 +77,7 @@ def numbers(
     if array.shape != tuple(shape):
         raise ValueError(f"{name} has shape {array.shape}; expected {tuple(shape)}")
     if not np.all((array >= minimum) & (array <= LARGEST)):
-        raise ValueError(f"{name} has a number that cannot be")
+        raise ValueError(f"{name} has a number that is out of range")
     return array
 
 
@@ -88,7 +88,7 @@ def frames(name: str, values: object, *, several: bool = False) -> Floats:
     turn = array[..., :3, :3]
     orthonormal = np.allclose(turn @ np.swapaxes(turn, -1, -2), np.eye(3), atol=1e-6)
     if not orthonormal or np.any(array[..., 3, :] != [0.0, 0.0, 0.0, 1.0]):
-        raise ValueError(f"{name} is no frame: a rotation and a translation")
+        raise ValueError(f"{name} is not a homogeneous matrix of a rotation and a translation")
     return array
 
 
@@ -130,9 +130,8 @@ def read_document(
 def read_file(path: Path, name: str, read: Callable[[Any], T]) -> T:
     """Return the value that `read` makes of a JSON file's content."""
     try:
-        content = parse_json(limits.read_text(path, limits.DOCUMENT))
-    except OSError as error:
-        raise InputError(f"{path}: no {name}: it cannot be read ({error.strerror})") from None
+        missing = f"no such file; expected a {name}"
+        content = parse_json(limits.read_text(path, limits.DOCUMENT, missing))
     except ValueError as error:
         raise InputError(f"{path}: no {name}: {error}") from None
     try:

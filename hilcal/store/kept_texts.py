@@ -5,6 +5,7 @@ line sets the command as typed while it runs.
 """
 
 import json
+import os
 import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -33,28 +34,27 @@ def robot_file_of(config_json: str, base_dir: str) -> dict[str, str]:
 def check_robot(
     path: Path, config_json: str, robot_text: str | None, calibration: str | None = None
 ) -> None:
-    """Refuse a campaign whose robot is in a file outside of it, whose path is not trusted."""
+    """Refuse a campaign that lacks its robot's file: the path in it is not trusted."""
     if calibration is None and (file := _robot_value(config_json, "calibration")):
         raise InputError(
-            f"{path}: its robot's kinematics are in a file that it does not hold, {file!r}, and "
-            "which is not read; valid: a campaign that was made where that file was"
+            f"{path}: its robot's kinematics are in a file that it does not hold, {file!r}, which "
+            "is not read; valid: a campaign made on a computer that has this file"
         )
     model = _robot_value(config_json, "model")
     if robot_text is None and Path(model).suffix.lower() in _KINDS:
         raise InputError(
-            f"{path}: its robot is in a file that it does not hold, {model!r}, and which is not "
-            f"read; give that file yourself: hilcal repair {quoted(path)} "
-            f"--robot FILE{Path(model).suffix}"
+            f"{path}: its robot is in a file that it does not hold, {model!r}, which is not read; "
+            f"add the file: hilcal repair {quoted(path)} --robot FILE{Path(model).suffix}"
         )
 
 
 def text_of(path: Path, key: str = ROBOT_FILE) -> dict[str, str]:
-    """Return the text of a robot's file by its key; empty where it cannot be read."""
+    """Return the text of a robot's file by its key; empty where it cannot be read as text."""
+    if not (path.is_file() and os.access(path, os.R_OK)):
+        return {}
     try:
-        if not path.is_file():
-            return {}
         return {key: limits.read_text(path, limits.PROGRAM)}
-    except (OSError, UnicodeDecodeError):
+    except UnicodeDecodeError:
         return {}
 
 
@@ -65,7 +65,7 @@ def _robot_value(config_json: str, key: str) -> str:
 
 
 COMMAND = "command"  # key of the command, in the texts of a file and in the options of a revision
-_command: ContextVar[str | None] = ContextVar("typed", default=None)
+_command: ContextVar[str | None] = ContextVar("command", default=None)
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from hilcal.shown import Brief
 from hilcal.toml import read_json, suggest
 from hilcal.types import Floats
 
-LARGEST = 1e3  # upper bound of joint angles, rad; a choice: larger numbers are damage
+LARGEST = 1e3  # upper bound of joint angles, rad; a choice: larger numbers show damage
 FORMAT = "hilcal-plan"
 VERSION = 1
 UNLOADED = "none"
@@ -76,10 +76,11 @@ class Plan(Brief):
         return json.dumps({**head, **self.about, "poses": poses, "steps": steps}, indent=1)
 
     def skipping(self, poses: Sequence[str], done: frozenset[Step], cycle: int) -> "Plan":
-        """Return what is missing besides `done`, without some poses; `about` lists these.
+        """Return the steps that are not in `done`, without those at `poses`, which `about` lists.
 
-        Across a gap the arm moves by the pose where loads are changed, and reads it, as the planner
-        has it where a straight motion is not known to be clear. `cycle` is new in the campaign.
+        The straight motion past a removed step may not be clear: there the arm moves to the pose
+        where loads are changed and takes a reading, as in a planned order. `cycle`: the number of
+        the first cycle that is not used in the campaign.
         """
         missing, home = self.without(done).steps, self.home
         valid = list(dict.fromkeys(s.pose for s in missing if s.pose != home))
@@ -114,10 +115,9 @@ class Plan(Brief):
 def load_plan(path: Path) -> Plan:
     """Read a plan file."""
     try:
-        text = limits.read_text(path, limits.DOCUMENT)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such plan file; make one with: hilcal plan") from None
-    except (OSError, UnicodeDecodeError) as error:
+        missing = "no such plan file; make one with: hilcal plan"
+        text = limits.read_text(path, limits.DOCUMENT, missing)
+    except UnicodeDecodeError as error:
         raise InputError(f"{path}: cannot be read ({error})") from None
     return read_plan(text, str(path))
 
@@ -202,12 +202,12 @@ def with_new_names(plan: Plan, campaign: Plan, number: int) -> Plan:
     if (REFERENCE in plan.pose_names) != (REFERENCE in campaign.pose_names):
         side = "the plan" if REFERENCE in plan.pose_names else "the campaign"
         raise InputError(f'only {side} has a pose "{REFERENCE}"; valid: both or none')
-    there = dict(zip(campaign.pose_names, campaign.q, strict=True))
-    used = {*there, *plan.pose_names}
+    existing = dict(zip(campaign.pose_names, campaign.q, strict=True))
+    used = {*existing, *plan.pose_names}
     names, q = [], []
     for name, joints in zip(plan.pose_names, plan.q, strict=True):
-        same = name == REFERENCE or np.abs(joints - there.get(name, joints)).max() <= SAME_POSE
-        q.append(there.get(name, joints) if same else joints)
+        same = name == REFERENCE or np.abs(joints - existing.get(name, joints)).max() <= SAME_POSE
+        q.append(existing.get(name, joints) if same else joints)
         if not same:
             free = (f"{name}-{number}{f'-{k}' * (k > 1)}" for k in itertools.count(1))
             name = next(new for new in free if new not in used)

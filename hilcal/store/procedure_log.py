@@ -4,7 +4,7 @@ Entries are only appended to the campaign file. With the readings, plans and rev
 they are the complete state of the procedure (`hilcal.procedure`).
 
 The readings of a validation campaign must never have been fitted. Its file states the purpose, and
-fits refuse it until it is released; the release is recorded in the file for good.
+fits refuse it until it is released; the release is recorded in the file and cannot be undone.
 """
 
 import json
@@ -79,27 +79,27 @@ def purpose_of(campaign: CampaignFile) -> str | None:
     return campaign.about(PURPOSE)
 
 
-def _only_tests(campaign: CampaignFile) -> bool:
+def _is_test(campaign: CampaignFile) -> bool:
     """Whether a campaign was measured to test a model, and has not been released for fitting."""
     return purpose_of(campaign) is not None and RELEASED not in campaign.texts()
 
 
 def release(campaign: CampaignFile, reason: str) -> None:
     """Release a test campaign for fitting; its file records it."""
-    if _only_tests(campaign):
+    if _is_test(campaign):
         with campaign.transaction() as connection:
             rows.insert_meta(connection, RELEASED, json.dumps({"utc": utc_now(), "by": reason}))
 
 
 def refuse_fitting(campaign: CampaignFile) -> None:
     """Refuse a test campaign that has not been released for fitting."""
-    if not _only_tests(campaign):
+    if not _is_test(campaign):
         return
-    tests = purpose_of(campaign) == VALIDATION
-    kind = "a validation campaign" if tests else "the run at corrected targets"
+    validates = purpose_of(campaign) == VALIDATION
+    kind = "a validation campaign" if validates else "the run at corrected targets"
     tested = campaign.about(CALIBRATION)
     raise InputError(
-        f"{campaign.path}: {kind}{f' of {tested}' if tested else ''}, never to be fitted: it tests "
-        "the model; to fit it all the same, which its file then says for good: hilcal identify "
-        f"{quoted(campaign.path)} --fit-validation"
+        f"{campaign.path}: {kind}{f' of {tested}' if tested else ''}, which tests the model and is "
+        "never fitted; to fit it nevertheless, which its file then records permanently: "
+        f"hilcal identify {quoted(campaign.path)} --fit-validation"
     )

@@ -44,7 +44,7 @@ def repair(path: Path) -> RepairResult | None:
             )
             numbers = tuple(int(number) for (number,) in cursor.fetchall())
             _delete(connection, "revisions", "id", numbers)
-            _delete(connection, "meta", "key", _naming(file, first))
+            _delete(connection, "meta", "key", _keys_naming(file, first))
     return RepairResult(why, numbers, original)
 
 
@@ -53,7 +53,7 @@ def put_robot(path: Path, file: Path) -> None:
     with CampaignFile.open(path) as campaign:
         robot = CellConfig.from_json(campaign.config_json).robot
         if campaign.about(ROBOT_FILE) is not None or not Path(robot.model).suffix:
-            raise InputError(f"{path}: its robot is in it already; leave out --robot")
+            raise InputError(f"{path}: it holds its robot's file already; leave out --robot")
         texts = text_of(file)
         if not texts:
             raise InputError(f"--robot {file}: cannot be read as text")
@@ -66,8 +66,8 @@ def put_robot(path: Path, file: Path) -> None:
             insert_meta(connection, ROBOT_FILE, text)
 
 
-def _naming(file: CampaignFile, first: int) -> tuple[str, ...]:
-    """Return the keys of acceptances and log entries, from the first with revision >= `first`."""
+def _keys_naming(file: CampaignFile, first: int) -> tuple[str, ...]:
+    """Return the keys of acceptances and log entries, from the first that names a bad revision."""
     accepted = [[number] for number in file.acceptances()]
     entries = [[e.get("revision"), *e.get("revisions", ())] for e in ProcedureLog(file).entries()]
     keys: list[str] = []

@@ -49,16 +49,16 @@ class RevisionRecord(Brief):
     number: int = 0  # 1, 2, ... in one campaign, given by it
     removed: str | None = None  # the effect removed from the parent's model
     parent: int | None = None
-    """Number of the revision that it was made from; None for the previous one, or a first model."""
+    """Number of the parent revision; None for the previous revision, or a first model."""
 
     def _brief(self) -> dict[str, str]:
-        judged = self.result_json.get("diagnose", {})
+        diagnosis = self.result_json.get("diagnose", {})
         return {
             "number": str(self.number),
             "model": " + ".join(self.effects),
             "added": str(self.added),
             "removed": str(self.removed),
-            "verdict": str(judged.get("verdict")),
+            "verdict": str(diagnosis.get("verdict")),
             "created": f"{self.created} by hilcal {self.program_version}",
             "more": "Campaign.fit(number)",
         }
@@ -71,7 +71,7 @@ class RevisionRecord(Brief):
 
     @property
     def made_from(self) -> int | None:
-        """Number of the revision that it was made from; None for a first model."""
+        """Number of the parent revision, also where it is the previous one; None without one."""
         if not self.has_parent or self.number <= 1:
             return None
         return self.number - 1 if self.parent is None else self.parent

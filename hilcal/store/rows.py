@@ -56,7 +56,7 @@ def read_layout(text: str) -> Layout:
     if not {"q", "wrench", "value", "covariance"} <= set(widths) or m not in (3, 6):
         raise ValueError("fields that no reading has")
     if n < 1 or layout != expected:
-        raise ValueError("fields of a wrong order or width")
+        raise ValueError("fields in a wrong order or of a wrong width")
     return layout
 
 
@@ -239,7 +239,7 @@ def fetch_readings(
         return InputError(f"{path}: the campaign file is damaged{place}")
 
     if not count:
-        raise damaged(" (its readings are gone)")
+        raise damaged(" (its readings are missing)")
     limits.check_fitted(count, dict(layout)["value"], f"{path}: ")
     width = sum(width for _, width in layout)
     with limits.memory(str(path)):
@@ -309,6 +309,6 @@ def check_poses(connection: sqlite3.Connection, path: Path, readings: Readings) 
     if bad.any():
         name = readings.pose_names[readings.pose[np.argmax(bad)]]
         raise InputError(
-            f"{path}: pose '{name}' is commanded to other joints than before; "
+            f"{path}: pose '{name}' has other commanded joints than in earlier readings; "
             f"give another pose another name"
         )

@@ -59,15 +59,15 @@ def check_same_cell(campaign: CampaignFile, config: CellConfig, base_dir: Path) 
         stored_text = campaign.about(key)
         if stored_text is not None and stored_text != text:
             raise InputError(
-                f"{base_dir / getattr(config.robot, KEYS[key])} is not what it was when "
-                f"{campaign.path} was begun; a campaign is of one robot: start another one for this"
+                f"{base_dir / getattr(config.robot, KEYS[key])} has changed since {campaign.path} "
+                "was begun; a campaign is of one robot: start another one for this"
             )
     begun = CellConfig.from_json(campaign.config_json)
     for section in FIXED_SECTIONS:
         if _section(begun, section) != _section(config, section):
             raise InputError(
-                f"[{section}] differs from what {campaign.path} was begun with; a campaign is "
-                "measured in one cell: start another one for this"
+                f"[{section}] has changed since {campaign.path} was begun; a campaign is measured "
+                "in one cell: start another one for this"
             )
     _check_same_mounting(campaign, config)
 
@@ -78,14 +78,14 @@ def _section(config: CellConfig, name: str) -> Any:
 
 
 def changed_since_begun(campaign: CampaignFile, config: CellConfig) -> list[str]:
-    """Return what fits of a campaign do not know of a configuration, one line per key."""
+    """Return the changed keys that fits of a campaign ignore (`FITTED_SECTIONS`), a line each."""
     begun, out = CellConfig.from_json(campaign.config_json), []
     for section in FITTED_SECTIONS:
         before, now = (_section(c, section) or {} for c in (begun, config))
         out += [
             f"[{section}] {key} is {json.dumps(now.get(key))}, and was "
             f"{json.dumps(before.get(key))} when {campaign.path} was begun: fits of its readings "
-            "go by what it was"
+            "use the earlier value"
             for key in {**before, **now}
             if before.get(key) != now.get(key)
         ]
@@ -93,10 +93,10 @@ def changed_since_begun(campaign: CampaignFile, config: CellConfig) -> list[str]
 
 
 def _check_same_mounting(campaign: CampaignFile, config: CellConfig) -> None:
-    """Refuse another mounting of the force sensor than that of the measured wrenches of loads.
+    """Refuse a changed mounting of the force sensor, if wrenches of loads were measured with it.
 
-    Wrenches of configured loads do not depend on it. Readings of older versions do not state it;
-    it is that of the configuration then.
+    Wrenches of configured loads do not depend on it. Readings by older versions of the program do
+    not state the mounting; it is that of the campaign's configuration.
     """
     begun = CellConfig.from_json(campaign.config_json)
     if config.force_sensor is None or campaign.about(PLAN) is None or not campaign.n_readings:
@@ -123,8 +123,8 @@ def _check_same_mounting(campaign: CampaignFile, config: CellConfig) -> None:
 class RunLog:
     """Plans, readings and events that a run writes into its campaign file.
 
-    All writing is durable before a method returns. A reading, its step and its raw details are
-    stored together or not at all, and no step twice.
+    What a method has written is durable when it returns. A reading, its step and its raw details
+    are stored together or not at all, and no step is stored twice.
     """
 
     def __init__(self, campaign: CampaignFile) -> None:
@@ -143,7 +143,7 @@ class RunLog:
 
     @property
     def plan(self) -> Plan:
-        """The joined plans; of all but the last one only the measured steps."""
+        """All plans joined; only the last one keeps steps that have not been measured."""
         return self._joined(self.plans)
 
     def _joined(self, plans: Sequence[Plan]) -> Plan:
@@ -184,7 +184,7 @@ class RunLog:
     def record(
         self, reading: Readings, step: Step, detail: dict[str, Any], *more: dict[str, Any]
     ) -> None:
-        """Append the readings of a step: of each target one, with its raw details."""
+        """Append the readings of a step, one of each target, with their raw details."""
         details = (detail, *more)
         if len(reading) != len(details):
             raise ValueError(f"{len(reading)} readings of one step, {len(details)} details")
@@ -206,9 +206,9 @@ class RunLog:
 
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
-        """Store the changes of the block, if the last reading stored by this log is still there.
+        """Store the changes of the block, if the file still has the last reading of this log.
 
-        A copy over an open file, as `cp` makes it, leaves the file's identity.
+        `cp` over an open file replaces its content without a change of its device and inode.
         """
         with self._campaign.transaction() as connection:
             if self._last is not None:
@@ -218,7 +218,7 @@ class RunLog:
                     raise InputError(
                         f"{self._campaign.path}: reading {number} is gone: another program has "
                         "written another file over the campaign. End it, put back the newest copy "
-                        "of the campaign; what that lacks is measured again"
+                        "of the campaign; readings missing there are measured again"
                     )
             yield connection
 

@@ -34,7 +34,7 @@ HEADER = SQLITE
 _JOURNAL = bytes.fromhex("d9d505f920a163d7")  # also at the end of a journal that ends in a name
 
 _MEASURING = struct.pack("hhqqi4x", fcntl.F_WRLCK, os.SEEK_SET, 1 << 40, 1, 0)
-"""The lock of one who measures, see `lock`: a `struct flock` of one byte."""
+"""The lock of a measuring process, see `lock`: a `struct flock` of one byte."""
 _TABLES = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, crc INTEGER NOT NULL) WITHOUT ROWID;
 CREATE TABLE poses (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE);
@@ -112,7 +112,7 @@ def is_campaign(path: Path) -> bool:
 
 @contextmanager
 def sqlite_errors(path: Path) -> Iterator[None]:
-    """Raise SQLite's errors as errors of one line."""
+    """Turn SQLite's errors into errors of one line."""
     try:
         yield
     except UnicodeEncodeError as e:
@@ -169,8 +169,8 @@ def _journal(path: Path) -> bool:
         return False
     if not safe:
         raise InputError(
-            f"{journal}: a journal that no hilcal made, by which opening {path} would change other "
-            "files; delete it, or take the campaign without it"
+            f"{journal}: a journal that no hilcal made, through which opening {path} would change "
+            "other files; delete it, or copy the campaign without it"
         )
     return True
 
@@ -180,17 +180,20 @@ def _refuse_write_ahead_log(path: Path) -> None:
     with path.open("rb") as stream:
         if 2 in stream.read(20)[18:]:  # versions of the format, to write and to read
             raise InputError(
-                f"{path}: another program has put its changes into a write-ahead log beside it, "
-                "which no hilcal does; valid: the file as hilcal wrote it"
+                f"{path}: another program has stored its changes in a write-ahead log next to the "
+                "file, which no hilcal does; valid: the file as hilcal wrote it"
             )
 
 
 def lock(path: Path) -> int | None:
-    """Return a descriptor by which this process alone measures; refuse if another one does.
+    """Lock a campaign for measuring; return the descriptor, which holds the lock while it is open.
 
-    The lock is of a byte far from those that SQLite locks, and ends when the descriptor is closed,
-    or with the process. Where a file cannot be written, or has no locks, there is none. Source:
-    fcntl(2), open file description locks; over NFS, flock(2) would lock SQLite out.
+    The lock is on a byte far from those that SQLite locks. None for a file that cannot be written;
+    on a file system without locks nothing is locked. Source: fcntl(2), open file description
+    locks; over NFS, flock(2) would lock SQLite out.
+
+    Raises:
+        InputError: another process measures the campaign.
     """
     with suppress(OSError):
         handle = os.open(path, os.O_RDWR)
@@ -261,7 +264,7 @@ def check_file(connection: sqlite3.Connection, path: Path) -> None:
 
 def _check_schema(connection: sqlite3.Connection, path: Path, version: int) -> None:
     """Refuse tables, views, triggers and indexes, which could do harm, other than a campaign's."""
-    actual, expected = _schema(connection), _own_schema()
+    actual, expected = _schema(connection), _expected_schema()
     expected = {entry for entry in expected if version >= _SINCE.get(entry[2], 1)}
     for kind, name, *_ in sorted(actual - expected)[:1]:
         raise InputError(
@@ -281,8 +284,8 @@ def _schema(connection: sqlite3.Connection) -> set[tuple[str, str, str, str]]:
 
 
 @cache
-def _own_schema() -> set[tuple[str, str, str, str]]:
-    """Return the same for a campaign of this program; tables are the same in all versions."""
+def _expected_schema() -> set[tuple[str, str, str, str]]:
+    """Return the `_schema` of an empty campaign of this program."""
     with closing(sqlite3.connect(":memory:")) as empty:
         for statement in statements():
             empty.execute(statement)

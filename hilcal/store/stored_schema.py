@@ -81,24 +81,24 @@ DETAIL: Schema = _of(
 """The details of a reading."""
 _DOUBTFUL = _of(DETAIL, pose=Text, load=Text, target=(Text | None, None))
 """A reading that cannot be of its target under its load."""
-_HAPPENED: Schema = _of(kind=Text, utc=Text)
-_happened = partial(_of, _HAPPENED)
+_EVENT: Schema = _of(kind=Text, utc=Text)
+_event = partial(_of, _EVENT)
 EVENTS: Mapping[str, Schema] = {
-    "devices": _happened(
+    "devices": _event(
         answers=_list(_of(device=Text, driver=Text, name=Text, facts=dict[str, Text]))
     ),
-    "tare": _happened(force=_of(wrench=Wrench)),
-    "drift": _happened(shift_m=Axes, sigma=Number, over=bool),
-    "tool": _happened(mass_kg=Number, com_m=Axes),
-    "repeatability": _happened(
+    "tare": _event(force=_of(wrench=Wrench)),
+    "drift": _event(shift_m=Axes, sigma=Number, over=bool),
+    "tool": _event(mass_kg=Number, com_m=Axes),
+    "repeatability": _event(
         dof=Count, poses=Count, scatter=Number, instrument=Number, joint_std=Number
     ),
-    "load": _happened(hanging=Text | None, why=(Text, "")),  # None while a wrong load is corrected
+    "load": _event(hanging=Text | None, why=(Text, "")),  # None while a wrong load is corrected
     # stored: it is among the readings, since it was recognised too late
-    "doubted": _happened(why=Text, reading=_DOUBTFUL, stored=(bool, False)),
-    "start": _happened(missing=Count),
-    "finished": _happened(readings=Count),
-    "noise": _happened(
+    "doubted": _event(why=Text, reading=_DOUBTFUL, stored=(bool, False)),
+    "start": _event(missing=Count),
+    "finished": _event(readings=Count),
+    "noise": _event(
         factors=dict[Text, Number] | None,  # None where the covariances stay as measured
         along_m=(Number, 0.0),
         across_m=(Number, 0.0),
@@ -122,12 +122,10 @@ _SETTINGS = _of(
     under_load=(bool, False),
 )
 ENTRIES: Mapping[str, Schema] = {
-    "begun": _happened(settings=_SETTINGS),
-    "refined": _happened(
-        readings_sha256=Text, revisions=Annotated[list[Count], Field(min_length=1)]
-    ),
-    "decided": _happened(action=Text),
-    "frozen": _happened(readings_sha256=Text),
+    "begun": _event(settings=_SETTINGS),
+    "refined": _event(readings_sha256=Text, revisions=Annotated[list[Count], Field(min_length=1)]),
+    "decided": _event(action=Text),
+    "frozen": _event(readings_sha256=Text),
 }
 """Entries of a calibration's log, by kind."""
 
@@ -145,7 +143,7 @@ def check(schema: Schema, content: object) -> None:
 def check_event(content: object, known: Mapping[str, Schema] = EVENTS) -> None:
     """Refuse an invalid event of a session, or entry of a log; raises as `check` does."""
     kind = content.get("kind") if isinstance(content, dict) else None
-    check(known.get(kind, _HAPPENED) if isinstance(kind, str) else _HAPPENED, content)
+    check(known.get(kind, _EVENT) if isinstance(kind, str) else _EVENT, content)
 
 
 check_entry = partial(check_event, known=ENTRIES)

@@ -90,13 +90,8 @@ def open_grid(path: str | Path, file_format: FileFormat, check: Check | None = N
 
 
 def content_of(path: str | Path) -> bytes:
-    """Read a file."""
-    try:
-        return limits.read_bytes(Path(path), limits.TABLE)
-    except FileNotFoundError as e:
-        raise InputError(f"{path}: no such file") from e
-    except OSError as e:
-        raise InputError(f"{path}: cannot be read ({e.strerror})") from e
+    """Read the file of a table."""
+    return limits.read_bytes(Path(path), limits.TABLE)
 
 
 def kind_of(path: str, content: bytes) -> str:

@@ -256,7 +256,7 @@ def test_a_run_does_not_go_on_with_another_robot(sent, tmp_path):
         (tmp_path / "own.urdf").write_text(kept, encoding="utf-8")
         check_same_cell(campaign, config, tmp_path)
         (tmp_path / "own.urdf").write_text(urdf(load_arm("ur5e")), encoding="utf-8")
-        with pytest.raises(InputError, match=r"own\.urdf is not what it was when"):
+        with pytest.raises(InputError, match=r"own\.urdf has changed since"):
             check_same_cell(campaign, config, tmp_path)
 
 

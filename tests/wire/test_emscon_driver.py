@@ -163,7 +163,7 @@ def test_a_connection_that_fails_is_one_line_and_made_again(there, fault, said):
             device.measure()
         assert "\n" not in str(caught.value)
         sample = device.measure()
-        assert "made again" in sample.warning
+        assert "was lost and restored" in sample.warning
         assert sample.value == pytest.approx(TARGET, abs=1e-3)
 
 

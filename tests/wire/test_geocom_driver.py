@@ -281,7 +281,7 @@ def test_mute_instrument_and_wrong_rate_say_what_to_check():
 def test_force_sensor_at_the_port_is_no_instrument():
     with simulated.force_sensor("bota") as sensor:
         text = refused(DeviceError, cell(sensor.port, baud=460800))
-    assert "nobody asked for" in text
+    assert "without a request" in text
 
 
 def test_other_instrument_that_answers_something_else():

@@ -69,7 +69,7 @@ def test_other_units_of_its_page_are_converted(there):
 @pytest.mark.parametrize(
     ("elements", "said"),
     [
-        ({"scfgfu": "ounce"}, "units that are not known"),
+        ({"scfgfu": "ounce"}, "in unknown units"),
         ({"cfgcpt": ""}, "no counts per unit"),
         ({"comrdtrate": ""}, "give .* rate_hz"),
         ({"comrdte": "Disabled"}, "RDT interface is disabled"),

@@ -142,7 +142,7 @@ def test_payload_that_the_controller_does_not_take_is_told_by_its_cause(
 def test_another_centre_of_mass_than_was_set_is_told(arm, monkeypatch):
     told = Control.set_payload
     monkeypatch.setattr(Control, "set_payload", lambda c, mass, com: told(c, mass, com + 0.01))
-    with pytest.raises(DeviceError, match=r"it says 4 kg at .* after a payload of 4 kg at"):
+    with pytest.raises(DeviceError, match=r"it reports 4 kg at .* after a payload of 4 kg at"):
         arm.set_payload(4.0, cases.COM)
 
 

@@ -210,10 +210,7 @@ def edited(text: str, edits: Sequence[tuple[Span, str]]) -> str:
 
 def read_text(path: Path) -> tuple[str, str]:
     """Text of a file with unchanged line ends, and its encoding."""
-    try:
-        raw = limits.read_bytes(path, limits.SCRIPT)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read as a program: {error}") from None
+    raw = limits.read_bytes(path, limits.SCRIPT)
     if b"\x00" in raw:
         raise InputError(f"{path}: a binary file; valid: a program as text")
     try:

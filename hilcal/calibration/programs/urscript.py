@@ -124,7 +124,7 @@ def program_points(
     try:
         # ends of lines stay as they are
         program = limits.read_bytes(path, limits.SCRIPT).decode("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
         raise InputError(f"{path}: cannot be read as a program: {error}") from None
     if CORRECTED in program:
         raise InputError(

@@ -118,11 +118,8 @@ class Document:
 
 
 def read_xml(path: Path) -> Document:
-    """Read a file."""
-    try:
-        raw = limits.read_bytes(path, limits.PROGRAM)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    """Read an XML file."""
+    raw = limits.read_bytes(path, limits.PROGRAM)
     text = raw.decode("latin-1")
     top = Node("", {}, 0, 0, 0)
     open_ = [top]

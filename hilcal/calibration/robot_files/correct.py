@@ -79,10 +79,7 @@ def correct_file(
 
 def _ur_conf(path: Path, nominal: Arm, arm: Arm) -> CorrectedFile:
     """Return UR's `calibration.conf`: differences between the arm's and nominal classic DH rows."""
-    try:
-        text = limits.read_bytes(path, limits.SETTINGS).decode("latin-1")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    text = limits.read_bytes(path, limits.SETTINGS).decode("latin-1")
     lines = {m[2]: m for m in _DELTA.finditer(text)}
     if set(lines) != {"theta", "a", "d", "alpha"}:
         raise InputError(

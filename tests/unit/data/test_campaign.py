@@ -149,7 +149,7 @@ def test_readings_that_do_not_fit_are_refused_whole(run):
     bad = {
         "covariance, value": simple_readings(2, m=6),
         "differ from those before in time": replace(x, states=replace(x.states, time=None)),
-        "pose 'p1' is commanded to other joints": replace(
+        "pose 'p1' has other commanded joints": replace(
             x, states=simple_readings(4, seed=1).states
         )[1:],
         "value of reading 4 is not finite": replace(x, value=nan),

@@ -196,4 +196,4 @@ def test_the_user_gives_the_robot_of_an_old_campaign(tmp_path, capsys):
     told = ok(capsys, "repair", path, "--robot", mine, "--json").document
     assert told["robot"] == str(mine)
     ok(capsys, "identify", path)
-    assert "is in it" in refused(capsys, 2, "repair", path, "--robot", mine)
+    assert "already" in refused(capsys, 2, "repair", path, "--robot", mine)
