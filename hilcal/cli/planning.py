@@ -153,7 +153,7 @@ def check(
     if save_calibration is not None:
         kinematics = reported_kinematics(answers)
         if kinematics is None:
-            raise DeviceError("arm: it does not tell its kinematics; nothing is written")
+            raise DeviceError("arm: it does not report its kinematics; nothing is written")
         replace_file(save_calibration, kinematics.to_toml(), must_be_new=True)
         t.show(f"The kinematics of the arm's controller are in {save_calibration}.")
     failed: HilcalError | None = None

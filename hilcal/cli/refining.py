@@ -436,8 +436,10 @@ def _show_misfit(t: Terminal, run: Path, revision: int | None, catalogue: Catalo
     t.show([*fit_words.where_table(places), ""])
     t.show(fit_words.worst_table(worst, left_out))
     if gross := [f"{g.pose}/{g.load}" for g in gross_errors(fitted)]:
-        told = "Readings set aside as gross errors may be among these, and are in no figure above"
-        t.show(f"{told}: {numbers.few(gross, MOST_GROSS)}.")
+        note = (
+            "Readings set aside as gross errors may be listed here; no figure above includes them"
+        )
+        t.show(f"{note}: {numbers.few(gross, MOST_GROSS)}.")
     t.document(
         revision=number,
         model=list(fitted.model.named),

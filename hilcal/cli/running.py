@@ -565,7 +565,7 @@ def factory_check(
     factory = connect.reported_kinematics(answers) or cell.factory
     if factory is None:
         raise InputError(
-            "--factory: the arm's controller does not tell its kinematics; give [robot] calibration"
+            "--factory: no kinematics reported by the arm's controller; give [robot] calibration"
         )
     if not output.exists():
         _measure_without_loads(t, cell, catalogue, output, yes)

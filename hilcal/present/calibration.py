@@ -533,5 +533,5 @@ def bootstrap_remarks(draws: Bootstrap) -> Iterator[str]:
     if draws.failed:
         yield (
             f"{draws.failed} further draws are left out: their poses do not determine the "
-            "parameters. What is said of the others is too good by that."
+            "parameters. The figures of the other draws are therefore optimistic."
         )

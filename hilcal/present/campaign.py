@@ -162,8 +162,8 @@ def info_report(o: Overview, name: str, covariance: str) -> Iterator[Block]:
         instruments = pairs(())
         for i in o.instruments:
             number = i.serial_number
-            told = number is None or number in i.name
-            instruments.add(i.device, i.name if told else f"{i.name}, serial number {number}")
+            complete = number is None or number in i.name
+            instruments.add(i.device, i.name if complete else f"{i.name}, serial number {number}")
         yield from (heading("Instruments"), instruments, "")
         yield from (heading("Checks on the way"), pairs(_checks(o)), "")
         yield from (heading("Events (UTC)"), *_events(o), "")
@@ -327,7 +327,7 @@ def two_revisions(a: RevisionRecord, b: RevisionRecord) -> Table:
     names += [f"− {name}" for name in a.effects if name not in b.effects]
     add("model", model_name(a.effects), model_name(b.effects), " ".join(names) or "differs")
     if a.cell or b.cell:
-        add("cell", *(cell_words(r.cell) or "as told at first" for r in (a, b)))
+        add("cell", *(cell_words(r.cell) or "as in the campaign" for r in (a, b)))
     add("verdict", verdict_of(a), verdict_of(b))
     fits = [r.result_json["identify"] for r in (a, b)]
     for name, key in (("error on poses left out", "holdout"), ("error on fitted poses", "fit")):

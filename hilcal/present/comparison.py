@@ -20,9 +20,9 @@ CLEAR = 2.0  # least σ of a listed parameter of a change that has several
 FAR = 3.0  # standard deviations between which most arms lie; a choice
 KNOWN = {
     "list": "arms.csv",
-    "serial number": "the serial number that the arm told",
-    "folder": "the folder of the file, for want of a serial number",
-    "file": "the file's name, for want of anything better: each counts as an arm of its own",
+    "serial number": "the serial number that the arm reported",
+    "folder": "the folder of the file, because there is no serial number",
+    "file": "the name of the file, as nothing else is known: each file counts as another arm",
 }
 KINDS = {"trait": ", a trait of the type", "defect": ", of single arms: a defect", "some": ""}
 
@@ -56,7 +56,7 @@ def _setup(c: Comparison, earlier: str, later: str) -> Iterator[str]:
             f"The model of {earlier} lacks {numbers.names(c.lacked)} by its own readings; added "
             "for this comparison alone (hilcal refine EARLIER keeps it)."
         )
-    reason = "as told" if c.setup_stated else "both cells configure the same place"
+    reason = "as stated" if c.setup_stated else "both cells configure the same place"
     place = f"that of {earlier} ({reason})"
     if c.anew:
         unless = "" if c.setup_stated else " (--same-setup: nobody moved tracker or base)"

@@ -45,7 +45,7 @@ def html_of(value: object) -> str:
 
 @singledispatch
 def _blocks(value: object) -> Iterable[Block]:
-    raise TypeError(f"nothing is said of a {type(value).__name__}")
+    raise TypeError(f"there is no report of a {type(value).__name__}")
 
 
 _blocks.register(Fit, lambda fit: fit_report(fit, details=False))

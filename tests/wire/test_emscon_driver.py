@@ -152,7 +152,7 @@ def test_one_of_several_targets_is_aimed_at(there):
     ("fault", "said"),
     [
         (("drop", {}), "closed the connection"),
-        (("rubbish", {"data": "GET / HTTP/1.1 and more of it"}), "no packet of emScon"),
+        (("rubbish", {"data": "GET / HTTP/1.1 and more of it"}), "not emScon packets"),
         (("change", {"number": 998}), "server is being shut down"),
     ],
 )

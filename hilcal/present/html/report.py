@@ -135,7 +135,7 @@ def first_screen(m: ReportContent) -> FirstScreen:
         doubt = verdict in ("ambiguous", "noise_misjudged") and not d.wrong_figures
         tone = "doubt" if doubt else "good" if verdict == "adequate" else "bad"
         if verdict == "noise_misjudged":
-            good = f"It cannot be told, for the stated noise is wrong. {good}"
+            good = f"This cannot be judged, because the stated noise is wrong. {good}"
         else:
             yes = verdict == "adequate" or d.reason == "inseparable_addition"
             good = f"{'Yes' if yes else 'Not yet'}. {good}"
@@ -371,7 +371,7 @@ def _instruments(m: ReportContent) -> Iterator[Block]:
         out = table(*heads, caption="Instruments")
         for i in o.instruments:
             facts = "; ".join(f"{k}: {v}" for k, v in i.facts.items() if k != "serial number")
-            out.add(i.device, i.name, i.serial_number or "not told", utc(i.utc), facts)
+            out.add(i.device, i.name, i.serial_number or "not reported", utc(i.utc), facts)
         yield out
     else:
         imported = ": the readings were imported from a table" if o.planned is None else ""
