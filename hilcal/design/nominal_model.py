@@ -266,7 +266,8 @@ def nominal_states(q: Floats, wrench: Floats) -> States:
     rng = np.random.default_rng(_SEED)
     time, approach = rng.uniform(0.0, DURATION_S, len(q)), rng.choice([-1.0, 1.0], q.shape)
     load_time, warm = rng.uniform(*LOAD_TIMES_S, len(q)), rng.uniform(*TEMPERATURES, q.shape)
-    return States(q, wrench, time, load_time, joint_temperature=warm, approach=approach)
+    air = rng.uniform(*TEMPERATURES, len(q))  # a model may have effects of either thermometer
+    return States(q, wrench, time, load_time, air, warm, approach)
 
 
 def _registered(cell: Cell, place: Floats) -> tuple[Cell, Floats]:

@@ -122,6 +122,16 @@ def cov_of(p):
     return np.linalg.inv(p.information(everything_once(p)))
 
 
+@pytest.mark.parametrize("thermometer", ["air", "joints"])
+def test_a_plan_goes_on_from_an_effect_of_either_thermometer(thermometer):
+    cell = cell_of()
+    states = nominal_states(np.zeros((3, cell.arm.n)), np.zeros((3, 6)))
+    options = {"temperature": thermometer}
+    effect = installed().make("thermal_growth", cell, states, options)
+    model = nominal_model(cell.with_config(config_of("absolute"))).model + effect
+    assert np.isfinite(model.predict(states, np.zeros(model.size)).observation.position).all()
+
+
 @given(name=st.sampled_from(ARMS), seed=st.integers(0, 10**6))
 def test_a_deflection_unit_is_a_pose_whose_place_is_unknown(name, seed):
     """Deflections know what positions know when the pose's own offset is free (Schur)."""
