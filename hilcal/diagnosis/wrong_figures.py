@@ -25,6 +25,8 @@ from hilcal.errors import CannotAnswerError
 from hilcal.identification.fit import Fit, fit, with_outliers
 from hilcal.identification.linearisation import LEAST_MISFIT, linearise
 from hilcal.identification.residual import residual
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import Whitening, whitening
 from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
 from hilcal.types import Bools, Floats
@@ -305,15 +307,25 @@ def criterion(stated: Fit, refit: Fit, size: int, least_share: float = LEAST_SHA
     """Change of the Bayesian information criterion by a figure; None where it explains too little.
 
     Only inliers of the refit count: with the stated figure they may look like gross errors. Each
-    reading that only the refit sets aside costs as many parameters as it has elements.
+    reading that only the refit sets aside costs as many parameters as it has elements. A figure
+    explains nothing if the readings that both fits use speak against it.
     """
+    both = ~(stated.outlier | refit.outlier)
+    of_both = whitening(stated.readings[both], stated.mode, "gc")
+    before, after = (_chi2(f, f.readings[both], of_both) for f in (stated, refit))
+    if of_both.rank * np.log(max(after, 1e-300) / max(before, 1e-300)) > BIC_MARGIN:
+        return None
     readings, w = stated.readings[~refit.outlier], refit.whitening
     size += w.m * int(np.count_nonzero(refit.outlier & ~stated.outlier))
-    prediction = stated.model.predict(readings.states, stated.theta)
-    chi2, dof = float(np.sum(w.whiten(residual(readings, prediction, w)) ** 2)), refit.dof
+    chi2, dof = _chi2(stated, readings, w), refit.dof
     most = chi2 - least_share * max(chi2 - dof, LEAST_MISFIT * np.sqrt(2 * dof))
     if not stated.readings.noise_stated:
         most = min(most, MOST_REMAINING * chi2)
     if refit.chi2 > most:
         return None
     return float(w.rank * np.log(max(refit.chi2, 1e-300) / chi2) + size * np.log(w.rank))
+
+
+def _chi2(fit: Fit, readings: Readings, w: Whitening) -> float:
+    prediction = fit.model.predict(readings.states, fit.theta)
+    return float(np.sum(w.whiten(residual(readings, prediction, w)) ** 2))

@@ -237,7 +237,9 @@ def _background(d: Diagnosis) -> list[str]:
     return [
         f"{len(d.background)} effects of the catalogue together predict what the named ones leave, "
         "but these readings prove none of them by itself.",
-        f"Likeliest are {names}." if likely else "None stands out.",
+        f"Likeliest {'is' if len(likely) == 1 else 'are'} {names}."
+        if likely
+        else "None stands out.",
         "All of them take part in predictions.",
         "More poses, spread over all joints, tell which are there.",
         *noise,

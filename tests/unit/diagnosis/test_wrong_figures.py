@@ -141,6 +141,19 @@ def test_a_figure_that_sets_readings_aside_does_not_explain_them():
     assert criterion(stated, fit_again(right, outlier=aside), 2) > -BIC_MARGIN
 
 
+def test_a_figure_that_the_other_readings_speak_against_explains_nothing():
+    """Gross errors that the stated fit sets aside, and a refit that bends to them, do not count."""
+    c = campaign(NO_EFFECT, "absolute", 1, poses=12)
+    value = c.readings.value.copy()
+    value[:6] += 2e-3 * np.random.default_rng(0).standard_normal((6, 3))
+    readings = replace(c.readings, value=value)
+    stated = hc.fit(baseline(c.cell, readings, "absolute"), readings, "absolute")
+    assert stated.outlier[:6].all()
+    bent = fit_again(stated, outlier=np.zeros(len(readings), dtype=np.bool_))
+    assert bent.error.rms_m > 2 * stated.error.rms_m
+    assert criterion(stated, bent, 1, least_share=0.0) is None
+
+
 def mounted(c, gravity):
     """Describe a campaign under weights as if gravity were another one in base axes."""
     readings = c.readings[np.isin(c.readings.load, [0, 1, 2])]
