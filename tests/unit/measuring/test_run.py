@@ -380,7 +380,7 @@ def test_a_load_that_still_hangs_at_a_resume_is_noticed(b):
     b.measure(usual_plan())
     asked = b.operator.requests[seen:]
     assert [name for name, _ in asked[:3]] == ["none", "none", "3kg"]
-    assert "than in the unloaded readings so far; 3kg seems to hang still" in asked[1][1]
+    assert "than in the unloaded readings so far; 3kg still seems to hang" in asked[1][1]
     assert [s for s, _, _ in b.store.rows] == list(usual_plan().steps)
 
 

@@ -181,7 +181,7 @@ def test_a_validation_campaign_is_frozen(done):
     with hc.Campaign.open(files.validation) as o:
         refusal(r"a validation campaign of run\.hilcal", o.fit_in_use)
         found = hc.fit(hc.baseline(o.cell, o.readings), o.readings)
-        refusal("never to be fitted", o.append, found)
+        refusal("never fitted", o.append, found)
         assert o.latest() is None
 
 
