@@ -221,6 +221,14 @@ def test_it_is_what_the_factors_of_the_description_are_off_by(given):
     np.testing.assert_allclose(chain.rotation[-1], expected.rotation[-1], rtol=0, atol=1e-14)
 
 
+def test_couplings_are_expected_a_tenth_as_large_where_the_description_has_none():
+    means = []
+    for arm in (coupled(ODD.arm, j3q2=-1.0), ODD.arm):
+        cell = replace(ODD, arm=arm)
+        means.append(make("joint_coupling", cell, some_states(cell)).expected_log_std(0)[0])
+    assert np.exp(means[0] - means[1]) == pytest.approx(10.0)
+
+
 def test_pairs_are_those_of_arms_with_couplings_or_those_that_are_named():
     states = some_states(ODD)
     assert make("joint_coupling", ODD, states).options == {"pairs": "2:1/3:2/4:3/5:4/6:5/7:5/7:6"}
