@@ -191,7 +191,7 @@ def test_two_campaigns_of_one_arm_have_a_page_that_says_what_has_changed(campaig
 
 @pytest.mark.parametrize(("arguments", "says"), [
     (("-o", "run.hilcal"), "this is the campaign itself"),
-    (("run.hilcal", "--limit", "1 mm"), "no --validation, --limit or --appendix"),
+    (("run.hilcal", "--limit", "1 mm"), "no --validation, --register, --limit or --appendix"),
     (("--limit", "1 apple"), "--limit"),
     (("--revision", "7"), "revision 7")])  # fmt: skip
 def test_what_cannot_be_is_refused_in_one_line(campaign, capsys, monkeypatch, arguments, says):

@@ -407,7 +407,7 @@ def test_what_is_no_reading_is_a_lost_target_or_a_failure(opened, body, lost, wo
 def test_distance_of_the_measurement_before_is_no_new_reading(opened):
     device, _ = opened({2167: f"{FULL}77"})
     device.measure()
-    with pytest.raises(DeviceError, match="not a new one"):
+    with pytest.raises(DeviceError, match="instead of a new one"):
         device.measure()
 
 
