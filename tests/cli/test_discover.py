@@ -230,7 +230,7 @@ def test_next_separates_a_law_from_what_readings_do_not_tell_from_it(campaign, t
     (("-o", "nowhere/found.py"), "no folder"),
     (("-o", "found.py", "--against", "creep", "--revision", "1"), "give one of them"),
     (("-o", "found.py", "--against", "crep"), "unknown effect"),
-    (("-o", "found.py", "--against", "no.json"), "no such file; expected a calibration")])  # fmt: skip
+    (("-o", "found.py", "--against", "no.json"), "no such file")])  # fmt: skip
 def test_what_cannot_be_is_refused_by_name(campaign, capsys, given, message):
     found = run(capsys, "discover", campaign, *given)
     assert found.code == 2
