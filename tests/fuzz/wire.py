@@ -403,7 +403,7 @@ def _force(name: str) -> Parser:
         stream._deframer.push = noting  # type: ignore[method-assign]
         step = 1 + data[-1] % 64
         while at < len(data):
-            stream._take(data[at : at + step], time.monotonic_ns())
+            stream._store(data[at : at + step], time.monotonic_ns())
             at += step
         if not data[0]:
             kept = {tuple(row) for row in stream._wrench[: min(stream._count, RING)].tolist()}

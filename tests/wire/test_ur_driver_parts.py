@@ -124,7 +124,7 @@ def test_a_pause_that_the_watchdog_bears_does_not_hide_another_program():
     stopped = reading(runtime_state=states.STOPPED)
     for late in (0.0, 0.09):
         assert "another program" in program_ended(stopped, late)
-    assert "too busy for 0.09 s" in program_ended(stopped, 0.09)
+    assert "too busy to send a sign of life for 0.09 s" in program_ended(stopped, 0.09)
     assert "another program" not in program_ended(stopped, 0.2)
 
 
