@@ -16,7 +16,7 @@ class WrenchGain(ForceSensorEffect):
     """
 
     name = "wrench_gain"
-    summary = "wrench read = (1 + g) true per axis: a force sensor's gain, or wrong masses of loads"
+    summary = "wrench read = (1 + g) true per axis: the force sensor has a gain error"
     change = Changeable(
         "setup", "force sensor", "the gain of the force sensor, or the masses stated of the loads"
     )

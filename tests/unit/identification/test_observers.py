@@ -202,7 +202,7 @@ def test_tables_files_and_calibrations_keep_observers(tmp_path):
         file.append_readings(back[:10])
         file.append_readings(back[10:])
         assert content_hash(file.readings()) == content_hash(back)
-        with pytest.raises(InputError, match="other observers"):
+        with pytest.raises(InputError, match="the observers differ"):
             file.append_readings(observed(["S1", "S2", "B", "G"], 0).readings)
     made, q = Calibration.of(fitted(c)), c.readings.states.q[:4]
     made.save(tmp_path / "c.json")
