@@ -267,7 +267,7 @@ def _judged(e: Evidence, history: History, whole_catalogue: bool) -> Diagnosis:
         predictable = regression.share > PREDICTABLE or bool(sizes) or bool(patterns)
         noise = judge_noise(e.fit, e.pure_error, predictable)
         in_fit = scatter is not None
-        too_much = scatter is not None and exceeds_repeatability(scatter, arm)
+        implausible = scatter is not None and exceeds_repeatability(scatter, arm)
         little = noise.reason == "predictable" and max(predicted, *patterns, 0.0) <= PREDICTABLE
         same_in_pose = any(
             v.variable == "pose" and v.share > MOST_POSE_SHARE and v.p_value < FALSE_ALARM
@@ -287,7 +287,7 @@ def _judged(e: Evidence, history: History, whole_catalogue: bool) -> Diagnosis:
             reason = "no_suspect"
         elif by_arm:
             reason = "arm_scatter"
-        elif too_much or (noise.misjudged and not (in_fit and noise.reason == "too_large")):
+        elif implausible or (noise.misjudged and not (in_fit and noise.reason == "too_large")):
             reason = "misjudged_noise"
         elif noise.contradicted and not noise.misjudged:
             reason = "no_suspect"
@@ -298,7 +298,7 @@ def _judged(e: Evidence, history: History, whole_catalogue: bool) -> Diagnosis:
         if reason in ("residual_is_noise", "arm_scatter") and serial and not serial.proved:
             reason = "serial_or_effect"
         if e.background and (
-            (reason == "misjudged_noise" and not too_much)
+            (reason == "misjudged_noise" and not implausible)
             or (reason in BACKGROUND_OVERRIDES and p_value_of_others(e.fit) <= JOINT_LEVEL)
         ):
             reason, suspects = "background", (*as_suspects(e.background), *suspects)

@@ -308,7 +308,7 @@ def criterion(stated: Fit, refit: Fit, size: int, least_share: float = LEAST_SHA
 
     Only inliers of the refit count: with the stated figure they may look like gross errors. Each
     reading that only the refit sets aside costs as many parameters as it has elements. A figure
-    explains nothing if the readings that both fits use speak against it.
+    is rejected if the readings that both fits use are fitted worse with it.
     """
     both = ~(stated.outlier | refit.outlier)
     of_both = whitening(stated.readings[both], stated.mode, "gc")
@@ -327,5 +327,6 @@ def criterion(stated: Fit, refit: Fit, size: int, least_share: float = LEAST_SHA
 
 
 def _chi2(fit: Fit, readings: Readings, w: Whitening) -> float:
+    """Sum of squares of the whitened residual of some readings from the parameters of a fit."""
     prediction = fit.model.predict(readings.states, fit.theta)
     return float(np.sum(w.whiten(residual(readings, prediction, w)) ** 2))

@@ -40,7 +40,7 @@ class JointCoupling(Effect):
     def log_std_prior(self, pool: int) -> tuple[float, float]:
         """A tenth of the ordinary size where the arm's description has no couplings.
 
-        Drives at the joints themselves, as of collaborative arms, take no other joint along.
+        A joint that has a drive of its own, as those of collaborative arms, is not coupled.
         """
         mean, spread = super().log_std_prior(pool)
         return mean if self.cell.arm.coupling is not None else mean - float(np.log(10.0)), spread

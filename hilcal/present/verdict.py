@@ -134,8 +134,8 @@ def _confounded(c: Confounded) -> str:
     return (
         f"{c.effect} follows the {c.variable}, but could as well follow the "
         f"{numbers.names(c.instead, 'or')}: {variables} change together in these readings. "
-        "Readings in which they do not would tell; until then it predicts only while they go on "
-        "together."
+        "Readings in which they change separately would distinguish them; until then "
+        "predictions hold only while they change together."
     )
 
 
@@ -233,7 +233,7 @@ def _background(d: Diagnosis) -> list[str]:
         noise = [f"What they leave is {_spread(d)}: repeat some readings."]
     scatter = d.fit.readings.arm_scatter
     if scatter is not None and _beyond_repeatability(d):
-        noise += [_loose(scatter, d.fit.model.cell.arm)]
+        noise += [_implausible_scatter(scatter, d.fit.model.cell.arm)]
     return [
         f"{len(d.background)} effects of the catalogue together predict what the named ones leave, "
         "but these readings prove none of them by itself.",
@@ -375,7 +375,7 @@ def _misjudged(d: Diagnosis) -> list[str]:
     in_fit = d.fit.readings.arm_scatter is not None
     s = d.scatter
     if s is not None and (not in_fit or _beyond_repeatability(d)):
-        why = _loose(s, d.fit.model.cell.arm)
+        why = _implausible_scatter(s, d.fit.model.cell.arm)
         if prefers_instrument(s):
             why = (
                 f"They are as if the instrument were {s.instrument_factor:.2g} times as noisy as "
@@ -410,7 +410,7 @@ def _beyond_repeatability(d: Diagnosis) -> bool:
     return s is not None and exceeds_repeatability(s, d.fit.model.cell.arm)
 
 
-def _loose(s: ArmScatter, arm: Arm) -> str:
+def _implausible_scatter(s: ArmScatter, arm: Arm) -> str:
     return (
         f"The arm would have to scatter by {length(s.size_m)} rms{_rp_comparison(s, arm)}, more "
         "than an arm's repeatability: the instrument is noisier than stated, or the arm or the "

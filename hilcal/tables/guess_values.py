@@ -32,7 +32,7 @@ _WRENCH_DOUBT = 'base axes, or axes = "flange"; of = "load" (exerted on the tool
 BY_VALUES = "found by their values: check the columns"
 BY_ROWS = "found by their values; row by row, or column by column?"
 RIVALS = "as good by their values:"
-LONE = "the only other number of a row: a distance from [points.A] of the cell? a height: [gauge]"
+LONE = "the only other number of a row, taken as a distance from [points.A]; [gauge] for a height"
 MOST_DEGREES = 400.0  # largest joint angle of a table, a turn and some margin; a choice
 _EXCEL = (30000.0, 60000.0)
 

@@ -194,6 +194,7 @@ class Predictive:
     def noise_whitening(self, readings: Readings, mode: Mode) -> Whitening:
         """Return the scaling of other readings, with the arm's estimated scatter in V."""
         scattered = with_missing_scatter(self.model.cell, readings, self.arm_scatter)
+        # A scatter that readings of one arrival share would change the order of measurements.
         return whitening(replace(scattered, common=readings.common), mode, "gc")
 
     def prediction_covariance(self, prediction: Prediction, w: Whitening) -> Floats:

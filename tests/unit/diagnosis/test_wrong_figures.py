@@ -141,7 +141,7 @@ def test_a_figure_that_sets_readings_aside_does_not_explain_them():
     assert criterion(stated, fit_again(right, outlier=aside), 2) > -BIC_MARGIN
 
 
-def test_a_figure_that_the_other_readings_speak_against_explains_nothing():
+def test_a_figure_with_which_the_other_readings_fit_worse_is_rejected():
     """Gross errors that the stated fit sets aside, and a refit that bends to them, do not count."""
     c = campaign(NO_EFFECT, "absolute", 1, poses=12)
     value = c.readings.value.copy()
