@@ -42,7 +42,7 @@ from hilcal.diagnosis.minimum_detectable_effect import (
     least_strength,
 )
 from hilcal.diagnosis.stepwise import trial
-from hilcal.effects.protocol import Effect
+from hilcal.effects.protocol import Effect, JointResidual
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit
 from hilcal.identification.linearisation import (
@@ -56,6 +56,7 @@ from hilcal.identification.linearisation import (
     linearise,
 )
 from hilcal.identification.residual import residual
+from hilcal.model.observe import motion
 from hilcal.regression.evidence import FamilyScore, Spectrum, score_family, spectrum
 from hilcal.regression.leave_out import FamilyFolds, improves
 from hilcal.regression.schur import eliminate
@@ -176,8 +177,26 @@ def candidates(fit: Fit) -> tuple[Effect, ...]:
         if kind.name not in model.names and kind.computable(states) and kind.applies(model.cell)
     )
     random = model.random if model.background else ()
-    finer = (e.refined(states) for e in model.effects if e.name not in random)
+    present = [e for e in model.effects if e.name not in random]
+    finer = [e.refined(states) for e in present]
+    if (left := joint_residual(fit)) is not None:
+        finer += [e.refined_by(states, left, FALSE_ALARM) for e in present]
     return (*(e.for_scoring(states) for e in new), *(e for e in finer if e is not None))
+
+
+def joint_residual(fit: Fit) -> JointResidual | None:
+    """Return the residual for `Effect.refined_by`; None for deflections, where waves cancel."""
+    if fit.mode == "deflection":
+        return None
+    s, w = fit.solution.prediction, fit.whitening
+    moves = motion(fit.model.cell, s.observation, s.situation.chain, s.deviation, w.m)
+    moved, count = w.whiten_readings(moves.drives), len(w.reading)
+    return JointResidual(
+        angle=s.situation.angle[w.reading],
+        moved=moved.reshape(count, w.m, -1),
+        white=fit.white.reshape(count, w.m),
+        dof=fit.dof,
+    )
 
 
 def catalogue_columns(fit: Fit) -> tuple[Floats, dict[str, slice], dict[str, float]]:

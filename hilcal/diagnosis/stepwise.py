@@ -66,11 +66,13 @@ def _grown(
         added = present.with_options(readings.states, **merged)
         if not added.refines(present):
             raise InputError(f"effect {name} is in the model already: {', '.join(model.names)}")
+        of_present = theta[model.slices()[model.names.index(name)]].tolist()
+        values = dict(zip((p.name for p in present.parameters), of_present, strict=True))
         model, theta = _reduced(model, theta, name)
     else:
         added = model.catalogue.make(name, model.cell, readings.states, merged, readings.m)
-    grown = model + added
-    return grown, np.concatenate([theta, np.zeros(grown.size - model.size)])
+        values = {}
+    return model + added, np.append(theta, [values.get(p.name, 0.0) for p in added.parameters])
 
 
 def exchange(before: Fit, effect: str, replacement: str) -> Fit:

@@ -158,6 +158,16 @@ class LoadChange:
     first_moment: Floats | None = None  # (n, 3) of links, mass × centre, link axes, kg·m
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class JointResidual:
+    """The residual of N absolute readings, and how displacements of the joints would move them."""
+
+    angle: Floats  # (N, n), as in `Situation`
+    moved: Floats  # (N, m, n) whitened motion by a unit displacement of each joint
+    white: Floats  # (N, m) whitened residual
+    dof: float  # degrees of freedom of the residual
+
+
 class Effect(ABC):
     """A physical cause of deviations, linear in its parameters; or of another load.
 
@@ -395,6 +405,14 @@ class Effect(ABC):
 
         The refined effect is a suspect of a fit with this one: where the readings ask for it, the
         effect is present, but its model is too coarse.
+        """
+        return None
+
+    def refined_by(self, states: States, residual: JointResidual, level: float) -> "Effect | None":
+        """Return the effect with only the further parameters that a residual asks for, or None.
+
+        A suspect like that of `refined`, whose name states the whole effect. `level` is the
+        probability of a suspect where none is missing.
         """
         return None
 

@@ -6,9 +6,18 @@ from typing import ClassVar
 import numpy as np
 
 from hilcal.effects.per_joint import PerJoint
-from hilcal.effects.protocol import OWN_SPREAD, Changeable, Columns, Effect, Parameter, Situation
+from hilcal.effects.protocol import (
+    OWN_SPREAD,
+    Changeable,
+    Columns,
+    Effect,
+    JointResidual,
+    Parameter,
+    Situation,
+)
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
+from hilcal.regression.periodogram import significant_waves
 from hilcal.types import Floats, Ints
 
 MOST_HARMONICS = 120
@@ -16,6 +25,11 @@ FEWEST_HARMONICS = 4
 POSES_PER_HARMONIC = 5  # so that data outnumber its two amplitudes; a guess
 ORDINARY, ORDINARY_M = 5e-5, 1e-5  # Ordinary amplitude of a harmonic, rad; of a slide m
 SCORED_HARMONICS = 40  # Bounds the cost of scoring; a guess
+FINEST_WAVE = 1200
+"""Most periods per turn of a further wave that is searched: gears of ratio 300 err with four
+periods in a turn of the motor, encoders with one or two in a line, of which they have up to 512. A
+choice: amplitudes of finer waves are below the noise of trackers."""
+FURTHER_POOL = 16  # of further waves, above all octaves
 
 
 class TransmissionError(PerJoint):
@@ -25,7 +39,8 @@ class TransmissionError(PerJoint):
 
     The evidence decides how strong each harmonic of each joint is, and drops those that the
     readings do not need; K only bounds the search. Joints that share parameters have the same phase
-    at their zeros.
+    at their zeros. Further waves k > K, as of the lines of an encoder or the teeth of a gear, are
+    an option; a diagnosis finds those that stand out in the residual (`refined_by`).
     """
 
     name = "transmission_error"
@@ -43,6 +58,8 @@ class TransmissionError(PerJoint):
         **PerJoint.option_help,
         "harmonics": "K, the harmonics tried per joint, 1 to 1000; unless given, one for every "
         "five distinct poses, at least 4 and at most 120.",
+        "waves": "further waves k > K, in periods per turn, as [128, 405], at most 1200; none "
+        "unless given.",
     }
 
     def setup(self, states: States) -> None:
@@ -55,7 +72,19 @@ class TransmissionError(PerJoint):
         count = self.options["harmonics"]
         if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= 1000:
             raise InputError(f"effect {self.name}: harmonics = {count!r}; valid: 1 to 1000")
-        self.harmonics = np.arange(1, count + 1)
+        self._last = count
+        self.harmonics: Ints = np.union1d(np.arange(1, count + 1), self._further())
+
+    def _further(self) -> Ints:
+        """Read the further waves."""
+        stated = self.options.get("waves", [])
+        waves = list(stated) if isinstance(stated, list | tuple) else [stated]
+        if not all(type(k) is int and 1 <= k <= FINEST_WAVE for k in waves):
+            raise InputError(
+                f"effect {self.name}: waves = {stated!r}; valid: whole numbers of periods per "
+                f"turn, 1 to {FINEST_WAVE}, as [128, 405]"
+            )
+        return np.array(waves, dtype=np.int64)
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -76,10 +105,11 @@ class TransmissionError(PerJoint):
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Waves: ∂dq_j/∂a_jk = cos k q_j, ∂dq_j/∂b_jk = sin k q_j."""
-        # exp(i k q), twice as many harmonics by each product: many times as fast as sines.
-        count, done = len(self.harmonics), 1
-        waves = np.empty((*s.angle.shape, count), dtype=np.complex128)
-        waves[:, :, 0] = np.exp(1j * s.angle)
+        count, done = int(np.sum(self.harmonics == np.arange(len(self.harmonics)) + 1)), 1
+        waves = np.empty((*s.angle.shape, len(self.harmonics)), dtype=np.complex128)
+        waves[:, :, count:] = np.exp(1j * s.angle[:, :, None] * self.harmonics[count:])
+        # exp(i k q) up to k = count, twice as many by each product: many times as fast as sines.
+        waves[:, :, :1] = np.exp(1j * s.angle[:, :, None] * self.harmonics[:1])
         while done < count:
             size = min(done, count - done)
             last = waves[:, :, done - 1 : done]
@@ -94,18 +124,43 @@ class TransmissionError(PerJoint):
     def pools(self) -> Ints:
         """One pool per octave of the harmonics: spectra of gears fall with the order."""
         octave = np.floor(np.log2(self.harmonics)).astype(np.int64)
+        octave[self.harmonics > self._last] = FURTHER_POOL
         return np.tile(np.repeat(octave, 2), len(self.shared.labels))
 
     def log_std_prior(self, pool: int) -> tuple[float, float]:
-        """Amplitudes of 0.16 mrad at the first harmonic, half of that with each octave."""
-        return 1.2 - 0.7 * pool, OWN_SPREAD
+        """Amplitudes of 0.16 mrad at the first harmonic, half of that with each octave.
+
+        Of further waves, which were found since they stand out, 0.03 mrad.
+        """
+        return (-0.5 if pool == FURTHER_POOL else 1.2 - 0.7 * pool), OWN_SPREAD
+
+    def refines(self, other: Effect) -> bool:
+        """Whether this has the same waves and more, or `PerJoint.refines`."""
+        if isinstance(other, TransmissionError) and self.shared.text == other.shared.text:
+            return set(other.harmonics.tolist()) < set(self.harmonics.tolist())
+        return super().refines(other)
+
+    def refined_by(self, states: States, residual: JointResidual, level: float) -> Effect | None:
+        """Return the effect with the further waves that stand out in the residual."""
+        joints = np.unique(self.shared.joint)
+        orders = np.setdiff1d(np.arange(self._last + 1, FINEST_WAVE + 1), self.harmonics)
+        angle, moved = residual.angle[:, joints], residual.moved[:, :, joints]
+        waves = significant_waves(angle, moved, residual.white, orders, residual.dof, level)
+        if not waves:
+            return None
+        new = np.unique([k for _, k in waves])
+        every = np.union1d(self.harmonics[self.harmonics > self._last], new)
+        finer = self.with_options(states, waves=every.tolist())
+        finer.harmonics = new  # the others are in the model
+        finer.name, finer.coarse = f"{self.name}(waves={every.tolist()})", self.name
+        return finer
 
     def fine(self, states: States) -> Effect | None:
         """Return the effect with `SCORED_HARMONICS` where the poses allow fewer."""
-        if len(self.harmonics) >= SCORED_HARMONICS:
+        if self.coarse or self._last >= SCORED_HARMONICS:
             return None
         return self.with_options(states, harmonics=SCORED_HARMONICS)
 
     def for_scoring(self, states: States) -> Effect:
         """Return the effect with at most `SCORED_HARMONICS`, fewer than a fit tries."""
-        return self.with_options(states, harmonics=min(len(self.harmonics), SCORED_HARMONICS))
+        return self.with_options(states, harmonics=min(self._last, SCORED_HARMONICS))

@@ -103,8 +103,8 @@ def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
         for s in d.suspects:
             if s.passes and s.coarse:
                 yield (
-                    f"Let joints differ: {s.coarse} has one parameter for several joints; to give "
-                    f'each its own: hilcal add RUN "{s.effect}".'
+                    f"{s.coarse} of the model is too coarse; to make it finer: "
+                    f'hilcal add RUN "{s.effect}".'
                 )
         yield from doubtful_lines(d)
         yield from (*where_table(d.misfit_breakdown), "")

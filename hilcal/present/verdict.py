@@ -250,8 +250,7 @@ def _one_suspect(d: Diagnosis) -> list[str]:
     s = d.suspects[0]
     if not s.coarse:
         return [f"{s.effect} is missing: it {_explains(s)}."]
-    coarse = f"The model has one {s.coarse} for several joints."
-    return [f"Let joints differ: {s.effect} {_explains(s)}.", coarse]
+    return [f"{s.coarse} of the model is too coarse: {s.effect} {_explains(s)}."]
 
 
 def _explains(s: Suspect) -> str:

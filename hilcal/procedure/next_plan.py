@@ -134,7 +134,7 @@ def doubt_to_settle(o: Campaign, d: Diagnosis, say: Say) -> Doubt:
         return doubt
     finer = [s for s in d.suspects if s.coarse and s.effect in in_doubt(d)]
     if finer:
-        raise CannotAnswerError(f"not two effects, but one in doubt: {_differ(o, finer[0])}")
+        raise CannotAnswerError(f"not two effects, but one in doubt: {_finer(o, finer[0])}")
     raise CannotAnswerError(_settled(o, d))
 
 
@@ -169,7 +169,7 @@ def _settled(o: Campaign, d: Diagnosis) -> str:
             f"{lead.effect} alone is missing; add it with: "
             f"hilcal add {quoted(o.path)} {quoted(lead.effect)}"
         )
-        why = _differ(o, lead) if lead.coarse else add
+        why = _finer(o, lead) if lead.coarse else add
     else:
         why = "no effect of the catalogue explains the misfit"
         if d.reason == "insufficient_catalogue":
@@ -181,10 +181,10 @@ def _settled(o: Campaign, d: Diagnosis) -> str:
     return f"no suspects to separate: {why}"
 
 
-def _differ(o: Campaign, s: Suspect) -> str:
-    """Return the message on how to give joints different parameters."""
+def _finer(o: Campaign, s: Suspect) -> str:
+    """Return the message on how to make an effect finer."""
     return (
-        f"the model has one {s.coarse} for several joints; let them differ, and diagnose again: "
+        f"{s.coarse} of the model is too coarse; make it finer, and diagnose again: "
         f"hilcal add {quoted(o.path)} {quoted(s.effect)}"
     )
 

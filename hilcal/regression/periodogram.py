@@ -1,0 +1,80 @@
+"""Least-squares periodogram: waves of several variables in a residual.
+
+The elements i of reading n move by w_nij with a unit displacement of joint j. A wave of k periods
+per turn has the columns w_nij cos k q_nj and w_nij sin k q_nj. Beside nothing else it explains
+
+    χ²_jk = gᵀ A⁻¹ g,    g = Xᵀ r,    A = Xᵀ X
+
+of ‖r‖², which without such a wave is about 2 s² F(2, f − 2), with s² = ‖r‖²/f and f degrees of
+freedom. The residual of a model is not white where effects are missing. So s² is also at least that
+which the median of χ²_jk over k shows.
+
+Sources: Lomb, *Least-squares frequency analysis of unequally spaced data*, Astrophysics and Space
+Science 39 (1976) 447; the strongest waves are removed in turn, as by Högbom, *Aperture synthesis
+with a non-regular distribution of interferometer baselines*, Astronomy and Astrophysics Supplement
+15 (1974) 417.
+"""
+
+import numpy as np
+import scipy
+
+from hilcal.types import Floats, Ints
+
+ROUNDS = 5  # each finds at most one wave of each joint; a choice
+SINGULAR = 1e-6  # share of the largest determinant of A below which angles do not show a wave
+TIE = 1e-6  # share by which waves differ that are the same at all angles: the lowest is found
+AT_ONCE = 1000  # readings whose waves are computed together, for memory
+
+
+def significant_waves(
+    angle: Floats,  # (N, n) q
+    moved: Floats,  # (N, m, n) w
+    residual: Floats,  # (N, m) r, in units of the noise
+    orders: Ints,  # (K,) periods per turn that are tried, ascending
+    dof: float,  # f
+    level: float,  # probability to find any wave where there is none
+) -> list[tuple[int, int]]:
+    """Return the joints and orders of significant waves, the strongest first.
+
+    Each round fits the waves of all previous ones together, and searches what is left.
+    """
+    found: list[tuple[int, int]] = []
+    left = residual
+    for _ in range(ROUNDS):
+        free = max(dof - 2.0 * len(found), 3.0)
+        square = float(np.sum(left**2)) / free
+        best = []
+        for j in range(angle.shape[1]):
+            gain = _gains(angle[:, j], moved[:, :, j], left, orders)
+            k = int(np.argmax(gain > (1.0 - TIE) * gain.max(initial=0.0)))
+            floor = max(square, float(np.median(gain)) / scipy.stats.chi2.median(2))
+            f = gain[k] / 2.0 / max(floor - gain[k] / free, 1e-300)
+            if scipy.stats.f.sf(f, 2, free - 2) * len(orders) * angle.shape[1] < level:
+                best.append((float(gain[k]), j, int(orders[k])))
+        new = [(j, k) for _, j, k in sorted(best, reverse=True) if (j, k) not in found]
+        if not new:
+            break
+        found += new
+        waves = [w(k * angle[:, j]) for j, k in found for w in (np.cos, np.sin)]
+        joints = np.repeat([j for j, _ in found], 2)
+        x = (moved[:, :, joints] * np.stack(waves, axis=1)[:, None]).reshape(-1, len(joints))
+        y = residual.reshape(-1)
+        left = (y - x @ np.linalg.lstsq(x, y, rcond=None)[0]).reshape(residual.shape)
+    return found
+
+
+def _gains(angle: Floats, moved: Floats, residual: Floats, orders: Ints) -> Floats:
+    """χ² (K,) of the waves of one joint, with `angle` (N,), `moved` (N, m), `residual` (N, m)."""
+    a, b = np.sum(moved**2, axis=1), np.sum(moved * residual, axis=1)
+    double, g = np.zeros((2, len(orders)), dtype=np.complex128)
+    for start in range(0, len(angle), AT_ONCE):
+        rows = slice(start, start + AT_ONCE)
+        wave = np.exp(1j * angle[rows, None] * orders)
+        g += b[rows] @ wave
+        double += a[rows] @ wave**2
+    total = float(a.sum())
+    determinant = total**2 - np.abs(double) ** 2  # 4 det A
+    seen = determinant > SINGULAR * total**2
+    # A = ½ [Σa + Re D, Im D; Im D, Σa − Re D], D = Σ a exp 2ikq
+    square = total * np.abs(g) ** 2 - np.real(np.conj(double) * g**2)
+    return np.where(seen, 2.0 * square / np.where(seen, determinant, 1.0), 0.0)
