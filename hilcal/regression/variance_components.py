@@ -56,6 +56,10 @@ START = (1.0, 0.05)  # variances τ², ω² at the start of EM
 UNDETERMINED = 5.0  # standard uncertainty, ordinary magnitudes, from which nothing is tested
 FALSE_ALARM = 0.01  # probability that an element is named in a fleet without outliers
 FEWEST = 5  # least number of arms for the test for outliers: three hardly have a spread
+# Spreads τ between units, in ordinary magnitudes, and the means and widths of the prior of log τ
+LOG_SPREADS = np.linspace(np.log(1e-3), np.log(300.0), 73)
+SPREAD_MEANS = np.linspace(np.log(3e-3), np.log(3.0), 12)
+SPREAD_WIDTHS = np.geomspace(0.4, 2.5, 8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -257,46 +261,61 @@ def hierarchy(estimates: FleetEstimates) -> tuple[Hierarchy, tuple[Outlier, ...]
 def find_outliers(values: Floats, variance: Floats) -> tuple[Outlier, ...]:
     """Name elements of values (U, K), of variance (U, K), that differ from those of other units.
 
-    Each element is compared with the distribution of the same parameter over the other units, with
-    their mean and their variance beyond that of the values' errors. The worst element is removed
-    first. `FALSE_ALARM` holds for all elements together (Bonferroni), by Student's t with the
-    number of the other units. Values with a variance above `UNDETERMINED`² are ignored.
+    Element i of a parameter is compared with its distribution predicted from the other units,
+
+        p_i = ∫ 2 Φ(−|y_i − m(τ)| / √(τ² + s_i² + v(τ))) p(τ | others) dτ
+
+    with their mean m, its variance v, and the restricted likelihood of their spread τ under a prior
+    log τ ~ N(a, b²). The spreads of the other parameters determine a and b, which have uniform
+    priors on a grid: where the parameters' spreads are alike, few units suffice. `FALSE_ALARM`
+    holds for all elements together (Bonferroni). Values with a variance above `UNDETERMINED`² are
+    ignored.
     """
     determined = variance < UNDETERMINED**2
     tests = max(int(determined.sum()), 1)
+    kernels = _log_kernels()  # (H, T)
+    of_all = np.zeros((values.shape[1], len(LOG_SPREADS)))
+    for k, known in enumerate(determined.T):
+        if known.sum() > 1:
+            of_all[k] = _given_spread(values[known, k], variance[known, k])[2]
+    evidence = scipy.special.logsumexp(of_all[:, None] + kernels, axis=2)  # (K, H)
+    others = evidence.sum(axis=0) - evidence
     named: list[Outlier] = []
     for k in range(values.shape[1]):
         units = np.flatnonzero(determined[:, k])
-        while len(units) >= FEWEST and len(units) > 0.8 * determined[:, k].sum():
-            y, s2 = values[units, k], variance[units, k]
-            deviations = []
-            for i in range(len(units)):
-                tau2, mean, mean_variance = _distribution(np.delete(y, i), np.delete(s2, i))
-                deviations.append((y[i] - mean, np.sqrt(tau2 + s2[i] + mean_variance)))
-            off, sd = np.array(deviations).T
-            worst = int(np.argmax(np.abs(off / sd)))
-            sigma = abs(float(off[worst] / sd[worst]))
-            p = min(1.0, 2 * tests * float(scipy.stats.t.sf(sigma, len(units) - 2)))
-            if p >= FALSE_ALARM:
-                break
-            named.append(Outlier(int(units[worst]), k, float(off[worst]), sigma, p))
-            units = np.delete(units, worst)
+        if len(units) < FEWEST:
+            continue
+        weight = scipy.special.log_softmax(others[k])
+        prior = scipy.special.logsumexp(weight[:, None] + kernels, axis=0)
+        for unit in units.tolist():
+            rest = units[units != unit]
+            mean, mean_variance, likelihood = _given_spread(values[rest, k], variance[rest, k])
+            share = scipy.special.softmax(likelihood + prior)
+            off = values[unit, k] - mean
+            square = np.exp(2 * LOG_SPREADS) + variance[unit, k] + mean_variance
+            p = tests * float(share @ (2 * scipy.stats.norm.sf(np.abs(off) / np.sqrt(square))))
+            if p < FALSE_ALARM:
+                expected = float(share @ off)
+                sd = np.sqrt(share @ (square + (off - expected) ** 2))
+                named.append(Outlier(unit, k, expected, float(abs(expected) / sd), p))
     return tuple(sorted(named, key=lambda element: element.p_value))
 
 
-def _distribution(y: Floats, variance: Floats) -> tuple[float, float, float]:
-    """Variance of units beyond that of their errors, by REML's fixed point; mean, its variance."""
-    s2 = np.maximum(variance, LEAST)
-    tau2 = max(float(np.var(y, ddof=1) - s2.mean()), 0.0)
-    for _ in range(50):
-        w = 1.0 / (tau2 + s2)
-        mean = float(w @ y / w.sum())
-        change = float(w**2 @ ((y - mean) ** 2 - s2) / (w**2).sum() + 1.0 / w.sum())
-        tau2, previous = max(change, 0.0), tau2
-        if abs(tau2 - previous) <= EM_CONVERGED * max(tau2, LEAST):
-            break
-    w = 1.0 / (tau2 + variance)
-    return tau2, float(w @ y / w.sum()), 1.0 / float(w.sum())
+def _log_kernels() -> Floats:
+    """Log priors (H, T) of log τ on its grid, of each mean a and each width b."""
+    a, b = np.meshgrid(SPREAD_MEANS, SPREAD_WIDTHS)
+    standard = (LOG_SPREADS - a.reshape(-1, 1)) / b.reshape(-1, 1)
+    return np.asarray(scipy.special.log_softmax(-0.5 * standard**2, axis=1))
+
+
+def _given_spread(y: Floats, variance: Floats) -> tuple[Floats, Floats, Floats]:
+    """Mean of units, its variance, and the restricted log likelihood, (T,) for each spread τ."""
+    total = np.exp(2 * LOG_SPREADS)[:, None] + np.maximum(variance, LEAST)
+    precision = np.sum(1.0 / total, axis=1)
+    mean = np.sum(y / total, axis=1) / precision
+    square = np.sum((y - mean[:, None]) ** 2 / total, axis=1)
+    likelihood = -0.5 * (np.log(total).sum(axis=1) + np.log(precision) + square)
+    return mean, 1.0 / precision, likelihood
 
 
 def _em(fleet: FleetEstimates, outlier: Bools) -> Hierarchy:

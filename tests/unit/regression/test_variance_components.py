@@ -9,6 +9,7 @@ from hilcal.regression.variance_components import (
     FALSE_ALARM,
     BlockRows,
     FleetEstimates,
+    find_outliers,
     hierarchy,
     variance_components,
 )
@@ -172,3 +173,16 @@ def test_arms_measured_once_have_one_spread():
     assert not h.within.any()
     assert not h.slope.any()
     assert h.between[5] > h.between[0]
+
+
+def test_few_arms_name_what_is_twelve_spreads_off_where_spreads_are_alike():
+    rng = np.random.default_rng(0)
+    values = 0.1 * rng.normal(size=(6, 16))
+    values[4, 0] += 1.2
+    (named,) = find_outliers(values, np.full(values.shape, 1e-4))
+    assert (named.unit, named.parameter) == (4, 0)
+    assert named.deviation == pytest.approx(1.2, abs=0.3)
+    # one parameter alone tells little of its spread: Student's t of four degrees of freedom
+    assert not find_outliers(
+        np.array([[0.0, 0.1, -0.1, 0.05, 0.6, -0.05]]).T, np.full((6, 1), 1e-6)
+    )
