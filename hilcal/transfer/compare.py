@@ -39,6 +39,7 @@ from hilcal.identification.prediction.validation import (
     Judged,
     acceptance,
     extrapolation,
+    set_up_anew,
     with_tool,
 )
 from hilcal.identification.registration.misdescription import refuse_misdescribed
@@ -254,6 +255,8 @@ def validate(
         tool = tuple(k for k in tool if not k.startswith("target"))
     if tool:
         knows = with_tool(knows, other.cell, fitted)
+    if register:
+        knows = set_up_anew(knows, fitted, chosen, mode)
     prediction = validation.validate(
         knows.model, knows.theta, fitted, chosen, mode, registered=register
     )

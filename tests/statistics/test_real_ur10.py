@@ -11,7 +11,8 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.config import load_config
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import Fit, fit
-from hilcal.identification.prediction.validation import validate
+from hilcal.identification.prediction.predictive import predictive_of
+from hilcal.identification.prediction.validation import set_up_anew, validate
 from hilcal.library import read_table
 from hilcal.readings.readings import Readings
 from hilcal.refinement import Refinement, refine
@@ -93,7 +94,8 @@ def test_a_model_of_one_series_predicts_the_other(ipa_ur10):
     seen = {}
     for step in refined("B", ipa_ur10).steps:
         b = step.fit
-        found = validate(b.model, b.theta, b.readings, c.readings, "absolute", registered=True)
+        p = set_up_anew(predictive_of(b), b.readings, c.readings, "absolute")
+        found = validate(p.model, p.theta, b.readings, c.readings, "absolute", registered=True)
         seen[step.added] = found.error.mean_m
     assert seen["link_geometry"] < 0.6 * plain
     assert [*seen.values()][-1] < 0.8 * plain

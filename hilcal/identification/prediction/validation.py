@@ -65,23 +65,14 @@ def validate(
 ) -> Validation:
     """Predict other readings, which were not fitted, with a fitted model.
 
-    With `registered` the tracker was set up anew: `base_frame`, and nothing else, is estimated from
-    the other readings first.
+    `registered` says that the model's registration was fitted to them (see `set_up_anew`).
 
     Raises:
         InputError: an effect of the model needs a column that the other readings lack.
-        CannotAnswerError: the registration does not converge.
     """
     other = other.seen_by(fitted.observers)
-    if registered and other.states.observer is not None:
-        raise InputError(
-            "several observers: where they stand is told by the readings that were fitted; valid: "
-            "readings by them, without a registration anew, or by one tracker"
-        )
     require_columns(model, other, "other")
     w = whitening(other, mode, "gc")
-    if registered:
-        model, theta = _register(model, theta, fitted, other, w)
     raw = residual(other, model.predict(other.states, theta), w)
     white = w.whiten(raw).reshape(-1)
     factor = float(white @ white) / max(w.rank - (6 if registered else 0), 1)
@@ -133,31 +124,59 @@ def require_columns(model: Model, readings: Readings, which: str) -> None:
             )
 
 
-def _register(
-    model: Model, theta: Floats, fitted: Readings, other: Readings, w: Whitening
-) -> tuple[Model, Floats]:
-    """Closed-form registration to the other readings, then Gauss-Newton on `base_frame`."""
+def set_up_anew(p: Predictive, fitted: Readings, other: Readings, mode: Mode) -> Predictive:
+    """Return the distribution for a tracker that was set up anew to take the other readings.
+
+    Its registration, and nothing else, is fitted to them: in closed form, then by Gauss-Newton on
+    `base_frame`. An error δ of the other parameters moves the registration by −F⁺ J δ, where F and
+    J are whitened derivatives of the other readings by it and by δ; so what a registration absorbs
+    is no error of the prediction. All covariances are then in axes of the new tracker.
+
+    Raises:
+        InputError: several observers, or an effect needs a column that the other readings lack.
+        CannotAnswerError: the registration does not converge.
+    """
+    other = other.seen_by(fitted.observers)
+    if other.states.observer is not None:
+        raise InputError(
+            "several observers: where they stand is told by the readings that were fitted; valid: "
+            "readings by them, without a registration anew, or by one tracker"
+        )
+    model, theta = p.model, p.theta
+    require_columns(model, other, "other")
+    w = whitening(other, mode, "gc")
     targets = targets_as_fitted(model, theta)
     held = model.cell.with_targets(targets, known=(True,) * len(targets))
     registered = register(replace(held, registration_known=False), other)
     cell = replace(model.cell, registration=registered.cell.registration)
-    parts = zip(model.effects, model.slices(), strict=True)
-    retained = [(e, theta[s]) for e, s in parts if e.role != "registration"]
+    parts = list(zip(model.effects, model.slices(), strict=True))
+    retained = [(e, np.arange(model.size)[s]) for e, s in parts if e.role != "registration"]
+    indices = np.concatenate([np.zeros(0, dtype=np.int64), *(s for _, s in retained)])
     effects: list[Effect] = [type(e)(cell, fitted.states, e.options) for e, _ in retained]
     frame = model.catalogue.with_role("registration")[0](cell, fitted.states)
     moved = replace(model, cell=cell, effects=(*effects, frame))
-    values = np.concatenate([*(t for _, t in retained), np.zeros(6)])
+    values = np.concatenate([theta[indices], np.zeros(6)])
     for _ in range(STEPS):
         prediction = moved.predict(other.states, values)
         white = w.whiten(residual(other, prediction, w)).reshape(-1)
-        columns = w.whiten(w.raw(moved.jacobian_of((frame,), prediction, values, w.m)))
-        columns = columns.reshape(-1, 6)
+        rows = w.whiten(w.raw(moved.jacobian(prediction, values, w.m))).reshape(-1, moved.size)
+        columns = rows[:, -6:]
         step = np.linalg.lstsq(columns, white, rcond=1e-9)[0]
         values[-6:] += step
         if float(np.linalg.norm(columns @ step)) < CONVERGED * len(white):
-            return moved, values
-    raise CannotAnswerError(
-        "registration: does not converge on these readings; measure poses spread in space"
+            break
+    else:
+        raise CannotAnswerError(
+            "registration: does not converge on these readings; measure poses spread in space"
+        )
+    absorbed = np.linalg.lstsq(columns, rows[:, :-6], rcond=1e-9)[0]
+    lift = np.vstack([np.eye(len(indices)), -absorbed])
+    return replace(
+        p,
+        model=moved,
+        theta=values,
+        covariance=lift @ p.covariance[np.ix_(indices, indices)] @ lift.T,
+        prior=np.concatenate([p.prior[indices], np.full(6, np.inf)]),
     )
 
 

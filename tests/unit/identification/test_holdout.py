@@ -19,10 +19,11 @@ from hilcal.identification.folds import (
 )
 from hilcal.identification.gauss_newton import solve
 from hilcal.identification.prediction.predictive import Excess, excess, predictive_of
-from hilcal.identification.prediction.validation import extrapolation, validate
+from hilcal.identification.prediction.validation import extrapolation, set_up_anew, validate
 from hilcal.identification.registration.robot_frames import whole_turns
 from hilcal.identification.residual import residual
 from hilcal.readings.whitening import whitening
+from hilcal.robot import se3
 from studies.random_descriptions import readings_of
 from studies.study_cases import study_case
 from tests.support.campaigns import campaign, configuration
@@ -262,3 +263,20 @@ def test_a_joint_that_turned_on_is_validated_as_inside():
     seen = validate(found.model, found.theta, c.readings, on, "absolute")
     told = extrapolation(predictive_of(found), c.readings, seen)
     assert not any("angle" in v.variable for v in told.variables)
+
+
+def test_a_tracker_set_up_anew_has_the_same_stated_errors_wherever_it_stands():
+    found, other, _ = split(0, 1)  # its other half is outside: errors of the prediction count
+    z = []
+    for turn in (np.eye(3), se3.rotation(np.array([0.3, -1.2, 0.8]))):
+        r = other.readings
+        moved = replace(
+            r,
+            value=r.value[:, :3] @ turn.T + np.array([0.2, -0.4, 0.1]),
+            covariance=turn @ r.covariance[:, :3, :3] @ turn.T,
+        )
+        p = set_up_anew(predictive_of(found), found.readings, moved, "absolute")
+        seen = validate(p.model, p.theta, found.readings, moved, "absolute", registered=True)
+        z.append(extrapolation(p, found.readings, seen).z)
+    np.testing.assert_allclose(z[1], z[0], rtol=1e-3)
+    assert rms(z[0]) < 1.15
