@@ -21,9 +21,10 @@ class JointCoupling(Effect):
     description (`[robot] joint_coupling`, 0 where there is none); i = j is an error of a
     joint's own ratio.
 
-    Unless given, the pairs are those of `may_follow`: couplings that arms have. Errors of a joint's
-    own ratio are not among them: gears have whole numbers of teeth, and the first harmonics of
-    `transmission_error` describe a slope over the range of a joint.
+    Unless given, the pairs are those of `may_follow`, couplings that arms have, and the own ratio
+    of each joint that turns. Gears have whole numbers of teeth, but belts, scales and wrong figures
+    in a description do not; the few harmonics of `transmission_error` that readings of some ten
+    poses determine describe a slope badly. The ratio of a slide is that of `guide_error`.
     """
 
     name = "joint_coupling"
@@ -34,7 +35,7 @@ class JointCoupling(Effect):
     option_help: ClassVar = {
         "pairs": "which joint is taken along by which, as 3:2/6:5 for joint 3 by joint 2 and joint "
         "6 by joint 5; 4:4 is an error of joint 4's own ratio. Unless given, each joint by the one "
-        "before it, and the last joint by the last but two."
+        "before it, the last joint by the last but two, and the own ratio of each that turns."
     }
 
     def log_std_prior(self, pool: int) -> tuple[float, float]:
@@ -50,6 +51,7 @@ class JointCoupling(Effect):
         n = self.cell.arm.n
         slides = self.cell.arm.slides
         alike = [(j, i) for j, i in may_follow(n) if slides[j - 1] == slides[i - 1]]
+        alike = sorted([*alike, *((j + 1, j + 1) for j in range(n) if not slides[j])])
         usual = "/".join(f"{j}:{i}" for j, i in alike) or "1:1"
         text = self.options.setdefault("pairs", usual)
         pairs = _pairs(text, n)

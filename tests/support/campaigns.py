@@ -142,8 +142,8 @@ def true_parameters(world, effect, *, m=3):
 
 
 def distal_factors(arm):
-    """Where among n x n factors, row by row, those of joints behind one another are."""
+    """Where among n x n factors those of joints behind one another, and own ratios, are."""
     n = arm.n
-    pairs = np.eye(n, k=-1)
+    pairs = np.eye(n, k=-1) + np.diag(~arm.slides)
     pairs[n - 1, n - 3] = 1.0
     return np.flatnonzero(pairs * (arm.slides[:, None] == arm.slides))
