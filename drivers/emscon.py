@@ -465,5 +465,5 @@ def open_tracker(config: CellConfig) -> EmsconTracker:
     host, port = address("[tracker]", "emscon", tracker.host, es.PORT)
     check_tracker_frame(tracker)
     options = check_section(tracker.options, EmsconOptions, "[tracker] options")
-    clock = Clock(config.simulation.clock)
+    clock = Clock(config.clock)
     return EmsconTracker(lambda: EmsconConnection(host, port), tracker, options, clock)

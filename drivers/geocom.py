@@ -534,7 +534,7 @@ def open_tracker(config: CellConfig) -> GeoComTracker:
     check_tracker_frame(tracker)
     options = check_section(tracker.options, GeoComOptions, "[tracker] options")
     link = Link(tracker.port, tracker.baud or BAUD)
-    return GeoComTracker(link, tracker, options, Clock(config.simulation.clock))
+    return GeoComTracker(link, tracker, options, Clock(config.clock))
 
 
 def usable(answer: Reply) -> str:

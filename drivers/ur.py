@@ -68,7 +68,7 @@ class UrArm:
         self._controller, self._silent = controller, silent
         self._receiver, self._torques = receiver, torques
         self._host, self._model = controller.host, config.robot.model
-        self._arrival, self._clock = config.motion.arrival_rad, config.simulation.clock
+        self._arrival, self._clock = config.motion.arrival_rad, config.clock
         self._brakes = command.Brakes(controller, receiver)
         self._control: command.Control | None = None
         self._motion: command.MotionInProgress | None = None

@@ -12,7 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from hilcal.config import CellConfig
+from hilcal.config import SIMULATED, CellConfig
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.drivers.simulated.world import World
@@ -310,7 +310,7 @@ def _devices(
     out = {"world": device("world", "world_server", 0, {})}
     socket = str(here / "world.sock")
     changes["operator"] = {
-        "driver": "simulated",
+        "driver": SIMULATED,
         "options": {**config.operator.options, "socket": socket},
     }
     if is_ur(world.cell.arm):

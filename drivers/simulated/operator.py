@@ -85,5 +85,5 @@ def open_operator(config: CellConfig) -> SimulatedOperator:
         dict(config.operator.options), SimulatedPersonOptions, "[operator] options"
     )
     person = TerminalOperator(config) if options.person else None
-    clock = Clock(config.simulation.clock)
+    clock = Clock(config.clock)
     return SimulatedOperator(Path(options.socket), options.hand_s, clock, person)

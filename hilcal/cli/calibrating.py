@@ -278,7 +278,7 @@ class CalibrationOperator:
     @property
     def clock(self) -> float:
         """Clock rate of the cell relative to real time."""
-        return self.p.config.simulation.clock if self.rehearse else 1.0
+        return self.p.clock
 
     def to_the_end(self) -> None:
         """Do all remaining steps before the comparison."""

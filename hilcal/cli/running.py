@@ -245,7 +245,7 @@ def measure(
             viewer.measuring(campaign.path.name, cell, log)
         watcher = stack.enter_context(watching(t.progress, len(log.plan.steps), viewer))
         log.event("devices", {"answers": [answer_json(answer) for answer in answers]})
-        clock = Clock(config.simulation.clock)
+        clock = Clock(config.clock)
         live = LiveModel(cell)
         run_plan(rig, cell, log.plan, log, clock, watcher, live, goal=goal, epoch=epoch)
     estimate_noise(t, cell, campaign)

@@ -1,5 +1,6 @@
 """The cell's configuration: one frozen section per table of CELL.toml."""
 
+from hilcal.config.cell import SIMULATED as SIMULATED
 from hilcal.config.cell import STANDARD_GRAVITY_M_S2 as STANDARD_GRAVITY_M_S2
 from hilcal.config.cell import CellConfig as CellConfig
 from hilcal.config.cell import Repeatability as Repeatability

@@ -27,6 +27,7 @@ from hilcal.toml import (
 )
 from hilcal.types import Floats
 
+SIMULATED = "simulated"  # driver of the operator of every simulated cell
 STANDARD_GRAVITY_M_S2 = 9.80665
 
 
@@ -248,7 +249,8 @@ class Simulation(sections.CellSection):
     seed: the seed of the random numbers, a whole number, 0 or more | 4
     hide: the name of an effect to hide, or "random" | "creep"
     strength_sigma: the RMS strength of the hidden effect in sigmas of a reading, more than 0
-    clock: how much faster than real time the simulated world goes, 1 to 200 | 20.0
+    clock: how much faster than real time the simulated world goes, 1 to 200; real devices go at 1 |
+        20.0
     controller_version: the software of the simulated arm's controller, four numbers with dots
         between; from 10 on it is PolyScope X | "10.14.0.0"
     """
@@ -314,6 +316,11 @@ class CellConfig(sections.CellSection):
                     "place already; leave tracker_m out"
                 )
         return self
+
+    @property
+    def clock(self) -> float:
+        """Cell seconds per real second: `[simulation] clock` of simulated devices, else 1."""
+        return self.simulation.clock if self.operator.driver == SIMULATED else 1.0
 
     @property
     def readings_mode(self) -> Literal["deflection", "absolute"]:

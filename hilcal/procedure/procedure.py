@@ -92,6 +92,12 @@ class Procedure:
         """The configuration of the cell."""
         return self.cell.configured()
 
+    @property
+    def clock(self) -> float:
+        """Cell seconds per real second; in a rehearsal that of the simulated devices."""
+        rehearsed = self.settings.hide is not None
+        return self.config.simulation.clock if rehearsed else self.config.clock
+
     @classmethod
     def at(
         cls, run: str | Path, cell: Cell, catalogue: Catalogue | None = None, **options: Any
@@ -181,7 +187,7 @@ class Procedure:
         wall, elapsed = last.get("wall_s"), last.get("time_s")
         if wall is None or elapsed is None:  # not of a session
             return last.get("epoch_wall_s")
-        return float(min(wall, time.time()) - elapsed / self.config.simulation.clock)
+        return float(min(wall, time.time()) - elapsed / self.clock)
 
     def refine(
         self,

@@ -10,7 +10,7 @@ import pytest
 
 import hilcal.cli.running as running
 from hilcal.cli.terminal import terminal
-from hilcal.config import Repeatability
+from hilcal.config import Repeatability, load_config
 from hilcal.config.reference import to_toml
 from hilcal.design import goal as goal_rule
 from hilcal.design.goal import GoalRule
@@ -288,6 +288,23 @@ def test_run_until(site, capsys, monkeypatch):
     more = ("-o", site.directory / "more.json", "--after", path)
     ok(capsys, "plan", cell, *more, "--poses", "2", "--quick")
     ok(capsys, "refine", path)
+
+
+@pytest.mark.parametrize(("operator", "rate"), [("terminal", 1.0), ("simulated", 20.0)])
+def test_real_devices_have_real_time(site, capsys, monkeypatch, operator, rate):
+    """`init` writes [simulation] clock = 20 into a cell; it is of simulated devices alone."""
+    rates = []
+
+    def clock(scale):
+        rates.append(scale)
+        raise InputError("seen")
+
+    monkeypatch.setattr(running, "Clock", clock)
+    path = site.directory / "cell.toml"
+    config = load_config(path).with_keys("simulation", clock=20.0)
+    path.write_text(to_toml(config.with_keys("operator", driver=operator)), encoding="utf-8")
+    refused(capsys, 2, *site.command(*site.fresh))
+    assert rates == [rate]
 
 
 def test_a_wrong_goal_is_refused_before_anything_else(site, capsys):

@@ -85,6 +85,7 @@ def cell(port, scale=20.0, **tracker):
         {
             "robot": {"model": "ur10e"},
             "tracker": {"driver": "geocom", "port": str(port), **tracker},
+            "operator": {"driver": "simulated"},
             "simulation": {"clock": scale},
         }
     )

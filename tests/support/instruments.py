@@ -129,6 +129,7 @@ def cell(address, driver, **options):
         {
             "robot": {"model": "ur10e"},
             "tracker": {"driver": driver, "host": address, "options": options},
+            "operator": {"driver": "simulated"},
             "simulation": {"clock": 20.0},
         }
     )

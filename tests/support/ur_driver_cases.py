@@ -25,7 +25,8 @@ STOP_NS = 500_000_000  # in this time the arm has to stand after a fault (the re
 def config(host, model="ur10e", clock=1.0, **options):
     options = {"robot_api_port": API, **options}
     robot = {"model": model, "driver": "ur", "host": host, "options": options}
-    return CellConfig.model_validate({"robot": robot, "simulation": {"clock": clock}})
+    simulated = {"operator": {"driver": "simulated"}, "simulation": {"clock": clock}}
+    return CellConfig.model_validate({"robot": robot, **simulated})
 
 
 def start(directory, *arguments, scale=1.0):

@@ -136,7 +136,7 @@ def test_the_arm_goes_where_it_is_told_and_no_further(ready, there):
 def test_a_stop_ends_a_motion_on_the_way(ready, there):
     home = ready.arm.sample().q_target
     # over two seconds, also where the cell's clock goes faster
-    ready.arm.start_move(home + SMALL, SMALL / 2 / there[0].simulation.clock, SMALL)
+    ready.arm.start_move(home + SMALL, SMALL / 2 / there[0].clock, SMALL)
     end = time.monotonic() + 0.5
     while time.monotonic() < end:  # unwatched for 0.5 s it would stop by itself
         assert ready.arm.moving()
@@ -240,7 +240,7 @@ def test_a_second_program_is_refused_and_the_first_goes_on(ready, there):
 
 
 def test_the_clock_of_the_cell(there):
-    clock = Clock(there[0].simulation.clock)
+    clock = Clock(there[0].clock)
     begun = clock.now()
     clock.sleep(0.05)
     assert clock.now() - begun >= 0.05

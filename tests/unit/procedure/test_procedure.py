@@ -73,7 +73,7 @@ def test_time_goes_on_in_the_next_campaign_though_the_clock_was_set(tmp_path, se
     """By an hour between two sessions, and by `set_back` before the next campaign."""
     p = drawn_calibration(tmp_path / "run.hilcal", config=small_config(1), poses=4).procedure
     p.begin(p.plan().plan, p.config)
-    now, clock, told = time.time(), p.config.simulation.clock, []
+    now, clock, told = time.time(), p.clock, []
 
     def measure(campaign, epoch):
         told.append(epoch)
