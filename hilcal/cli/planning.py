@@ -161,7 +161,7 @@ def check(
     if factory is not None and (factory.exists() or not any(a.problems for a in answers)):
         from hilcal.cli.running import factory_check  # imports this module
 
-        factory_result = factory_check(t, numbers, catalogue, answers, factory, yes)
+        factory_result = factory_check(t, cell, catalogue, answers, factory, yes)
     if names := ", ".join(a.device for a in answers if a.problems):
         failed = DeviceError(f"not ready: {names}; see above")
     elif dry is not None:

@@ -64,8 +64,15 @@ from hilcal.readings.covariance import COVERS_KEY, INSTRUMENT_AND_ARM
 from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, load_plan, with_new_names
-from hilcal.store.procedure_log import ProcedureLog
-from hilcal.store.run_log import RunLog, changed_since_begun, check_same_cell, create_run
+from hilcal.store.procedure_log import ProcedureLog, refuse_fitting
+from hilcal.store.run_log import (
+    REHEARSED,
+    RunLog,
+    changed_since_begun,
+    check_same_cell,
+    check_same_devices,
+    create_run,
+)
 from hilcal.transfer.compare import check_factory
 from hilcal.whole_file import replace_file, spare_other
 
@@ -109,11 +116,13 @@ def run(
                 raise InputError("--append needs the further plan: give it with --plan PLAN")
             campaign = stack.enter_context(CampaignFile.open(output, check_revisions=False))
             campaign.measure_alone()
+            check_same_devices(campaign, rehearse)
             check_same_cell(campaign, config, base_dir)
             for text in changed_since_begun(campaign, config):
                 t.notice(f"note: {text}")
             campaign_plan = RunLog(campaign).plans[0]
             if plan is not None:
+                refuse_fitting(campaign)  # a further plan would change a frozen test
                 further = RunLog(campaign).with_new_names(load_plan(plan))
                 refuse(dry_checked(t, numbers, further), str(plan))
         else:
@@ -140,7 +149,10 @@ def run(
         if further is not None:
             RunLog(campaign).append(further)
         elif not resume:
-            campaign = stack.enter_context(create_run(output, config, base_dir, campaign_plan))
+            source = f"{REHEARSED if rehearse else 'measured'} by hilcal run"
+            campaign = stack.enter_context(
+                create_run(output, config, base_dir, campaign_plan, source=source)
+            )
         planned = len(RunLog(campaign).plan.steps) * len(numbers.all_targets)
         options = ["--rehearse"] * rehearse + ["--view"] * view
         options += [] if until is None else ["--until", until]
@@ -359,7 +371,14 @@ def on_devices(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator
             world = stack.enter_context(simulated_cell(secret, settings.seed, settings.base_dir))
         t.notice(NEWCOMER)
         campaign = stack.enter_context(
-            create_run(settings.output, world.config, settings.base_dir, plan, True)
+            create_run(
+                settings.output,
+                world.config,
+                settings.base_dir,
+                plan,
+                overwrite=True,
+                source=f"{REHEARSED} by hilcal demo",
+            )
         )
 
         def missing(file: CampaignFile, epoch: float | None = None) -> None:
@@ -550,25 +569,29 @@ def _placed(config: CellConfig, base_dir: Path) -> CellConfig:
     return config.with_keys("robot", **files)
 
 
+FACTORY_SOURCE = "measured by hilcal check --factory"
 FACTORY_POSES = 20  # Without a load; a choice: with 12, an encoder offset of 1 mrad may be in doubt
 
 
 def factory_check(
     t: Terminal,
-    cell: Cell,
+    path: Path,
     catalogue: Catalogue,
     answers: tuple[connect.ConnectionResult, ...],
     output: Path,
     yes: bool,
 ) -> dict[str, object]:
-    """Compare the arm with its factory kinematics on a campaign; measure it unless it exists."""
+    """Compare the arm with its factory kinematics on a campaign; measure what it lacks.
+
+    `path` is the cell file. An existing campaign that was not begun here is taken as it is.
+    """
+    cell = Cell.load(path)
     factory = connect.reported_kinematics(answers) or cell.factory
     if factory is None:
         raise InputError(
             "--factory: no kinematics reported by the arm's controller; give [robot] calibration"
         )
-    if not output.exists():
-        _measure_without_loads(t, cell, catalogue, output, yes)
+    _measure_without_loads(t, path, cell, catalogue, output, yes)
     with Campaign.open(output, catalogue, read_only=True) as run, working(t.progress) as say:
         say("fitting all effects from the factory's kinematics")
         checked = check_factory(
@@ -579,22 +602,39 @@ def factory_check(
 
 
 def _measure_without_loads(
-    t: Terminal, cell: Cell, catalogue: Catalogue, output: Path, yes: bool
+    t: Terminal, path: Path, cell: Cell, catalogue: Catalogue, output: Path, yes: bool
 ) -> None:
+    plan, missing = None, 0
+    if output.exists():
+        with CampaignFile.open(output, read_only=True) as campaign:
+            if campaign.source == FACTORY_SOURCE:
+                log = RunLog(campaign)
+                plan, missing = log.plan, len(log.plan.without(log.done()).steps)
+        if not missing:
+            return
     config = cell.configured()
     bare = config.with_keys("planning", readings="absolute")
     bare = bare.model_copy(update={"loads": (), "force_sensor": None})
     numbers = cell_from_config(bare, cell.base_dir)
-    with working(t.progress) as say:
-        plan = make_plan(numbers, FACTORY_POSES, config.simulation.seed, catalogue, say)
-    refuse(dry_checked(t, numbers, plan), "the plan")
+    if plan is None:
+        with working(t.progress) as say:
+            plan = make_plan(numbers, FACTORY_POSES, config.simulation.seed, catalogue, say)
+        refuse(dry_checked(t, numbers, plan), "the plan")
     steps = len(plan.steps)
     if not yes:
+        count = missing or steps
         if not person_present(t):
             raise InputError(
-                f"--factory measures {steps} readings, the arm moves; agree with --yes"
+                f"--factory measures {count} readings, the arm moves; agree with --yes"
             )
-        if not confirmed(t, f"Measure {steps} readings without a load? The arm will move."):
+        if not confirmed(t, f"Measure {count} readings without a load? The arm will move."):
             raise StoppedError("not measured, nothing has moved")
-    with create_run(output, bare, cell.base_dir, plan) as campaign:
-        measure(t, numbers, campaign)
+    line = shlex.join(("hilcal", "check", str(path), "--factory", str(output), *["--yes"] * yes))
+    with (
+        CampaignFile.open(output)
+        if missing
+        else create_run(output, bare, cell.base_dir, plan, source=FACTORY_SOURCE)
+    ) as campaign:
+        check_same_cell(campaign, bare, cell.base_dir)
+        with _resumable(campaign, steps, line):
+            measure(t, numbers, campaign)

@@ -77,9 +77,7 @@ class RoughRegistration:
             far = float(_residuals(pose, x.nominal[None], x.position[None])[0])
             if far > PLAUSIBLE_M and self._cell.known_targets[x.target] and not x.doubted:
                 x.doubted = True
-                why = (
-                    f"its target was {far:.3g} m from where the arm nominal it; another reflector?"
-                )
+                why = f"its target was {far:.3g} m from where the arm holds it; another reflector?"
                 out += [] if x.step is None else [(x.step, why)]
         return out
 

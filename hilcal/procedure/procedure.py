@@ -61,7 +61,7 @@ from hilcal.store.procedure_log import (
 )
 from hilcal.store.revision import RevisionRecord
 from hilcal.store.rows import content_hash
-from hilcal.store.run_log import PLAN, RunLog, check_same_cell, create_run
+from hilcal.store.run_log import PLAN, REHEARSED, RunLog, check_same_cell, create_run
 
 Measure = Callable[[CampaignFile, float | None], None]
 """Measures and stores the missing readings of a campaign's plan. The second argument is the wall
@@ -383,7 +383,7 @@ class Procedure:
         create_run(path, config, self.cell.base_dir, plan, source=source, more_texts=texts).close()
 
     def _source(self, prefix: str = "") -> str:
-        origin = "measured" if self.settings.hide is None else "rehearsed in a simulated cell"
+        origin = "measured" if self.settings.hide is None else REHEARSED
         return f"{prefix}{origin} by hilcal calibrate"
 
 

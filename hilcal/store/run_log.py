@@ -23,6 +23,7 @@ from hilcal.store.plan import Plan, Step, joined, read_plan, with_new_names
 from hilcal.store.revision import utc_now
 from hilcal.store.stored_schema import DETAIL, check, check_event
 
+REHEARSED = "rehearsed in a simulated cell"  # in the source of a campaign on simulated devices
 PLAN = "plan"  # key of the first plan among the texts of a campaign
 FURTHER_PLAN = "plan {}"  # keys of further plans, numbered from 2
 FIXED_SECTIONS = ("robot", "tool", "loads")  # of the configuration, during a campaign
@@ -51,6 +52,13 @@ def create_run(
         overwrite=overwrite,
         more_texts=texts,
     )
+
+
+def check_same_devices(campaign: CampaignFile, rehearse: bool) -> None:
+    """Refuse to continue a measured campaign on simulated devices, and a rehearsal on real ones."""
+    if (REHEARSED in campaign.source) != rehearse:
+        kind = "no rehearsal; leave --rehearse out" if rehearse else "a rehearsal; give --rehearse"
+        raise InputError(f"{campaign.path}: the campaign is {kind}")
 
 
 def check_same_cell(campaign: CampaignFile, config: CellConfig, base_dir: Path) -> None:

@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 import tomli_w
 
+import hilcal.cli.planning as planning
+import hilcal.cli.running as running
+from hilcal.config.reference import to_toml
+from hilcal.drivers.simulated.rehearsal import case_of_plan, simulate_plan
+from hilcal.errors import InputError
 from hilcal.procedure.state import BEGUN
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.procedure_log import ProcedureLog
+from hilcal.store.run_log import REHEARSED, RunLog, create_run
 from tests.support.calibrate_process import CELL
 from tests.support.campaign_cases import STARVED, TRIES
 from tests.support.cli_cases import ok, refused, run
@@ -29,8 +35,6 @@ def cell(tmp_path):
 def there(tmp_path_factory):
     """A calibration that is complete, of the cell in `cell.toml` beside it."""
     path = tmp_path_factory.mktemp("run")
-    from hilcal.config.reference import to_toml
-
     config = small_config(1)
     (path / "cell.toml").write_text(to_toml(config), encoding="utf-8")
     d = drawn_calibration(path / "run.hilcal", config=config, poses=4, validation=4)
@@ -143,6 +147,60 @@ def test_a_rehearsal_goes_on_as_one(there, capsys):
     path = there.procedure.run
     command = ("calibrate", path.with_name("cell.toml"), "-o", path, "--resume", "--rehearse")
     assert "no rehearsal; leave --rehearse out" in refused(capsys, 2, *command)
+
+
+def test_simulated_and_real_devices_do_not_measure_one_campaign(there, capsys, tmp_path):
+    p, path = there.procedure, tmp_path / "rehearsal.hilcal"
+    cell, source = p.run.with_name("cell.toml"), f"{REHEARSED} by hilcal run"
+    with CampaignFile.open(p.run) as campaign:
+        create_run(path, p.config, tmp_path, RunLog(campaign).plan, source=source).close()
+    line = refused(capsys, 2, "run", cell, "-o", p.run, "--resume", "--rehearse")
+    assert "no rehearsal; leave --rehearse out" in line
+    assert "a rehearsal; give --rehearse" in refused(capsys, 2, "run", cell, "-o", path, "--resume")
+
+
+def test_no_further_plan_is_measured_into_a_frozen_test(there, capsys, tmp_path):
+    p, further = there.procedure, tmp_path / "plan.json"
+    for path in (p.files.validation, p.files.corrected):
+        with CampaignFile.open(path) as campaign:
+            further.write_text(RunLog(campaign).plan.to_json(), encoding="utf-8")
+        words = ("run", p.run.with_name("cell.toml"), "-o", path, "--append", "--plan", further)
+        assert "never fitted" in refused(capsys, 2, *words)
+
+
+def test_a_factory_check_goes_on_with_what_it_lacks(tmp_path, capsys, monkeypatch):
+    """Its campaign has no loads, so that `run --resume` with the cell refuses it."""
+    config = small_config(1).with_keys("robot", calibration="k.conf")
+    rows = "".join(f"delta_{n} = [0, 0, 0, 0, 0, 0]\n" for n in ("theta", "a", "d", "alpha"))
+    (tmp_path / "k.conf").write_text(f"[mounting]\n{rows}", encoding="utf-8")
+    cell, path = tmp_path / "cell.toml", tmp_path / "factory.hilcal"
+    cell.write_text(to_toml(config), encoding="utf-8")
+
+    def measure(t, cell, campaign):
+        log = RunLog(campaign)
+        case = case_of_plan(cell.configured(), log.plan, "nothing", 1, base_dir=tmp_path)
+        drawn, done = simulate_plan(case, log.plan, 1).readings, log.done()
+        for k, step in enumerate(log.plan.steps):
+            if step not in done:
+                log.record(drawn[k : k + 1], step, {"drawn": True})
+            if k == 9 and not done:
+                raise KeyboardInterrupt
+
+    def check_factory(cell, nominal, factory, readings, catalogue):
+        raise InputError(f"{len(readings)} readings are judged")
+
+    monkeypatch.setattr(planning, "answers_of", lambda t, config: ())
+    monkeypatch.setattr(running, "measure", measure)
+    monkeypatch.setattr(running, "check_factory", check_factory)
+    words = ("check", cell, "--factory", path)
+    for more, code, said in (
+        (("--yes",), 130, "10 of 24 readings are safe; go on with: hilcal check "),
+        ((), 2, "measures 14 readings, the arm moves; agree with --yes"),
+        (("--yes",), 2, "24 readings are judged"),
+        ((), 2, "24 readings are judged"),  # nothing is missing
+    ):
+        told = run(capsys, *words, *more)
+        assert (told.code, said in told.err) == (code, True), told.err
 
 
 def test_devices_that_are_not_there_end_it_with_the_line_that_goes_on(tmp_path, capsys):
