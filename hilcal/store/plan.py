@@ -2,8 +2,9 @@
 
 import itertools
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ UNLOADED = "none"
 REFERENCE = "reference"  # the pose of drift checks and load changes
 SEEN = "reference_seen_m"  # key of `Plan.about`: the unloaded target there, sensor axes, m
 ARM = "robot"  # key of `Plan.about`: the name of the arm that the plan was made for
+DURATION = "duration_s"  # key of `Plan.about`: durations, "total" among them, s
 LEFT_OUT = "left_out"  # key of `Plan.about`: points that are not measured, each with the reason
 
 
@@ -105,9 +107,9 @@ class Plan(Brief):
         steps = steps or [Step(home, UNLOADED, cycle)]
         left_out = [{"point": p, "why": "left out by the operator"} for p in dict.fromkeys(poses)]
         about = {**self.about, LEFT_OUT: [*self.about.get(LEFT_OUT, []), *left_out]}
-        if isinstance(durations := self.about.get("duration_s"), dict):
+        if isinstance(durations := self.about.get(DURATION), dict):
             share = len(steps) / len(self.steps)
-            about["duration_s"] = {"total": share * float(durations.get("total", 0.0))}
+            about[DURATION] = {"total": share * float(durations.get("total", 0.0))}
         return replace(self, steps=tuple(steps), about=about)
 
 
@@ -119,7 +121,11 @@ def load_plan(path: Path) -> Plan:
         text = limits.read_text(path, limits.DOCUMENT, missing)
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: cannot be read ({error})") from None
-    return read_plan(text, str(path))
+    plan = read_plan(text, str(path))
+    for key, (valid, fits) in _USED_KEYS.items():
+        if key in plan.about and not fits(plan.about[key]):
+            raise InputError(f'{path}: "{key}" must be {valid}, or be left out')
+    return plan
 
 
 def read_plan(text: str, where: str) -> Plan:
@@ -134,6 +140,30 @@ def read_plan(text: str, where: str) -> Plan:
     steps = _steps(data.get("steps"), names, where)
     keys = ("format", "version", "poses", "steps")
     return Plan(names, q, steps, {key: x for key, x in data.items() if key not in keys})
+
+
+def _is_number(x: object) -> bool:
+    return isinstance(x, int | float) and not isinstance(x, bool) and isfinite(x)
+
+
+def _is_place(x: object) -> bool:
+    return isinstance(x, list) and len(x) == 3 and all(map(_is_number, x))
+
+
+def _are_left_out(x: object) -> bool:
+    keys = {"point", "why"}
+    return isinstance(x, list) and all(isinstance(p, dict) and keys <= set(p) for p in x)
+
+
+_USED_KEYS: dict[str, tuple[str, Callable[[object], bool]]] = {
+    SEEN: ("three numbers, m", _is_place),
+    LEFT_OUT: ('a list of objects with "point" and "why"', _are_left_out),
+    DURATION: (
+        'an object with a number "total", s',
+        lambda x: not isinstance(x, dict) or _is_number(x.get("total", 0.0)),
+    ),
+}
+"""Keys of `Plan.about` that a run reads: what is valid, and whether a value is."""
 
 
 def _entries(data: object, kind: str, where: str) -> list[Any]:
