@@ -327,8 +327,8 @@ class Mover:
         finally:
             self._in_motion = False
         self.goal = q
-        moved = np.sign(q - start)
-        self.side = np.where(moved == 0.0, self.side, moved)
+        way = q - start  # of joints at rest it is noise
+        self.side = np.where(np.abs(way) <= STILL_RAD, self.side, np.sign(way))
 
     def _go(self, start: Floats, q: Floats, name: str) -> None:
         motion = self._motion

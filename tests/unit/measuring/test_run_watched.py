@@ -111,6 +111,16 @@ def test_an_arm_moved_while_a_load_is_changed_goes_back_once_that_is_agreed(b, l
     assert set(motions) <= KNOWN
 
 
+def test_only_a_joint_that_was_moved_is_approached_again(b):
+    """The others stand beside their goal by the encoders' noise, which is no motion."""
+    plan = plan_of(("p1", "none", 0), ("reference", "3kg", 0), ("reference", "none", 1))
+    usual = b.measure(plan).states.approach[1]
+    b = Bench()
+    noise = 4e-6 * usual
+    jogged(b, "3kg", POSES["reference"] + noise + 0.2 * usual[0] * np.eye(6)[0])
+    assert b.measure(plan).states.approach[1].tolist() == [-usual[0], *usual[1:]]
+
+
 def test_an_operator_who_cannot_be_asked_is_not_taken_to_agree(b):
     jogged(b, "none", FREE)
 
