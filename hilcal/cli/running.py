@@ -120,11 +120,17 @@ def run(
             check_same_cell(campaign, config, base_dir)
             for text in changed_since_begun(campaign, config):
                 t.notice(f"note: {text}")
-            campaign_plan = RunLog(campaign).plans[0]
+            log = RunLog(campaign)
+            campaign_plan = log.plans[0]
             if plan is not None:
                 refuse_fitting(campaign)  # a further plan would change a frozen test
-                further = RunLog(campaign).with_new_names(load_plan(plan))
+                further = log.with_new_names(load_plan(plan))
                 refuse(dry_checked(t, numbers, further), str(plan))
+                if missing := len(log.plan.without(log.done()).steps):
+                    t.notice(
+                        f"note: {missing} readings of the previous plan are missing, and are left "
+                        "out from now on"
+                    )
         else:
             if output.exists():
                 raise InputError(

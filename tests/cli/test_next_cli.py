@@ -23,7 +23,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import REFERENCE, Plan, Step, joined, load_plan, with_new_names
-from hilcal.store.run_log import RunLog
+from hilcal.store.run_log import RunLog, create_run
 from hilcal.workbench.session import WorkbenchSession
 from tests.cli.test_until_goal import site
 from tests.support.campaigns import configuration
@@ -407,6 +407,16 @@ def test_nobody_measures_beside_a_run(site, capsys):
         assert path.read_bytes() == before
         ok(capsys, "info", path)
     assert ok(capsys, *site.command("--resume", "--json")).document["readings"]
+
+
+def test_what_an_appended_plan_leaves_out_is_said(site, capsys):
+    path, further = site.directory / "run.hilcal", str(further_plan(site))
+    config = load_config(site.directory / "cell.toml")
+    create_run(path, config, site.directory, site.plan).close()
+    told = ok(capsys, *site.command("--append", "--plan", further, "--json"))
+    missing = f"{len(site.plan.steps)} readings of the previous plan are missing"
+    assert missing in " ".join(told.err.split())
+    assert "previous plan" not in ok(capsys, *site.command("--resume", "--json")).err
 
 
 def test_wrong_ways_to_append(site, capsys):
