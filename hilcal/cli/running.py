@@ -63,7 +63,7 @@ from hilcal.procedure.state import WORLD
 from hilcal.readings.covariance import COVERS_KEY, INSTRUMENT_AND_ARM
 from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import Plan, load_plan, with_new_names
+from hilcal.store.plan import UNLOADED, Plan, load_plan, with_new_names
 from hilcal.store.procedure_log import ProcedureLog, refuse_fitting
 from hilcal.store.run_log import (
     REHEARSED,
@@ -241,12 +241,15 @@ def measure(
     campaign.measure_alone()
     log = RunLog(campaign)
     stored = log.readings()
-    if goal is not None and stored is not None and goal(stored, last=True).met:
-        kinds = [e["kind"] for e in log.events() if e["kind"] != "noise"]
-        if kinds[-1:] == ["finished"]:  # the last session is complete: no load hangs on the arm
-            return campaign.n_readings
+    kinds = [e["kind"] for e in log.events() if e["kind"] != NOISE_KEY]
+    complete = kinds[-1:] == ["finished"]  # the last session: what hangs has been said
+    if goal is not None and stored is not None and goal(stored, last=True).met and complete:
+        return campaign.n_readings
     if not log.plan.without(log.done()).steps:
         t.notice("nothing is missing")
+        hung = (log.last("load") or {}).get("hanging", UNLOADED)
+        if not complete and hung not in (None, UNLOADED):
+            t.notice(f"{hung} still hangs on the arm, if nobody took it off: take it off")
         estimate_noise(t, cell, campaign)  # the last session may have ended before it
         return campaign.n_readings
     with _ends_as_interrupt(t), ExitStack() as stack:

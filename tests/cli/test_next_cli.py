@@ -419,6 +419,15 @@ def test_what_an_appended_plan_leaves_out_is_said(site, capsys):
     assert "previous plan" not in ok(capsys, *site.command("--resume", "--json")).err
 
 
+def test_a_load_that_hung_when_the_last_session_was_killed_is_said(site, capsys):
+    said = "3kg still hangs on the arm"
+    ok(capsys, *site.command(*site.fresh))
+    assert said not in ok(capsys, *site.command("--resume")).err
+    with CampaignFile.open(site.directory / "run.hilcal") as campaign:
+        RunLog(campaign).event("load", {"hanging": "3kg"})  # killed behind a last loaded reading
+    assert said in ok(capsys, *site.command("--resume")).err
+
+
 def test_wrong_ways_to_append(site, capsys):
     further = str(further_plan(site))
     line = refused(capsys, 2, *site.command("--append", "--plan", further))
