@@ -120,7 +120,7 @@ def _plain(path: Path, arm: Arm, groups: "_Groups") -> ColumnTable | None:
 
     try:
         table = ColumnTable.of(open_grid(path, _form(path), check), *chosen)
-        return exchange.with_following(table, arm)
+        return exchange.with_mimic_joints(table, arm)
     except _OtherNamesError:
         return None
 
@@ -252,7 +252,7 @@ def _certain_unit(proposed: GridProposal, arm: Arm) -> bool:
 
 def _mapped(path: Path, arm: Arm, mapping: PointMapping) -> ColumnTable:
     mapped = mapped_table(path, mapping, arm)
-    table = exchange.with_following(mapped.table, arm)
+    table = exchange.with_mimic_joints(mapped.table, arm)
     text = {"pose": table.text["pose"]}
     if mapping.load is not None:
         text["load"] = table.text["load"]

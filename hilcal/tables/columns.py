@@ -12,6 +12,7 @@ from difflib import get_close_matches
 
 import numpy as np
 
+from hilcal.config import STANDARD_GRAVITY_M_S2
 from hilcal.errors import InputError
 from hilcal.readings.covariance import SINGULAR, smallest_correlation
 from hilcal.readings.readings import SAME_POSE, ObserverKind, ObserverName, Readings
@@ -108,9 +109,9 @@ def _closest(name: str, valid: Iterable[str]) -> str | None:
 
 
 def check_header(
-    path: str, header: Sequence[str], units: Units, arm: str, spare: Collection[str] = ()
+    path: str, header: Sequence[str], units: Units, arm: str, optional: Collection[str] = ()
 ) -> None:
-    """Refuse a header that does not fit an arm; `spare` columns may be missing."""
+    """Refuse a header that does not fit an arm; `optional` columns may be missing."""
     for k, name in enumerate(header, start=1):
         if not 0 < len(name) <= 80:
             index = "; an index? pandas leaves it out by to_csv(..., index=False)" * (not name)
@@ -122,7 +123,7 @@ def check_header(
         _check_scalar(path, header)
     if POSITION[0] in sparse_columns(header) and POSITION[0] not in header:
         needed = needed[:-3]
-    missing = [c for c in needed if c not in header and c not in spare]
+    missing = [c for c in needed if c not in header and c not in optional]
     for name in header:
         if name not in valid and not name.startswith(USER_PREFIX):
             form = f"; for a table of another form: {PREVIEW}" if missing else ""
@@ -132,7 +133,7 @@ def check_header(
         hint = _hint(missing, header, units, arm)
         raise InputError(f"{path}: column '{missing[0]}' is missing{hint}")
     for group in groups(units):
-        lacking = [c for c in group if c not in header and c not in spare]
+        lacking = [c for c in group if c not in header and c not in optional]
         if lacking and any(c in header for c in group):
             raise InputError(
                 f"{path}: column '{lacking[0]}' is missing; give all of {', '.join(group)} or none "
@@ -195,7 +196,7 @@ def check_covariance_columns(path: str, header: Sequence[str]) -> None:
         )
 
 
-def following_columns(arm: Arm) -> tuple[str, ...]:
+def mimic_columns(arm: Arm) -> tuple[str, ...]:
     """Columns of mimic joints, which a table may leave out."""
     names = (joint_columns(arm.units), actual_columns(arm.units))
     return tuple(
@@ -210,7 +211,7 @@ def independent_columns(names: tuple[str, ...], count: int, arm: Arm) -> tuple[s
     return tuple(name for name, free in zip(names, arm.independent, strict=True) if free)
 
 
-def with_following(table: ColumnTable, arm: Arm) -> ColumnTable:
+def with_mimic_joints(table: ColumnTable, arm: Arm) -> ColumnTable:
     """Return the table with the values of mimic joints filled in; stated ones must agree."""
     number = dict(table.number)
     for names in (joint_columns(arm.units), actual_columns(arm.units)):
@@ -237,7 +238,6 @@ MAX_STD = 3e-3  # m; cameras are below it, micrometres read as millimetres above
 MAX_ANGLE_STD = 0.05  # rad, 3°; the same for an orientation, a choice
 _LIMIT_MARGIN = 1e-4  # rad; rounding of a limit written with few digits
 _TRACKING = 0.1  # rad; actual and commanded joints of an arm at rest are closer
-_G = 9.80665
 
 
 def check_joints(table: ColumnTable, names: tuple[str, ...], q: Floats, arm: Arm) -> None:
@@ -345,18 +345,16 @@ def check_covariances(table: ColumnTable, covariance: Floats) -> None:
         if np.isinf(smallest[i]):
             why = "a covariance is larger than its two variances allow"
         raise InputError(f"{table.at(i)}: the covariance is not positive semi-definite ({why})")
-    std = np.sqrt(variance[:, :3].max(axis=1))
-    for (i,) in first_true(std > MAX_STD):
-        raise InputError(
-            f"{table.at(i)}: a standard deviation of {std[i]:.3g} m cannot calibrate an arm; "
-            f"covariances must be in m², m·rad and rad² (1 mm² = 1e-6 m²)"
-        )
-    turn = np.sqrt(variance[:, 3:].max(axis=1, initial=0.0))
-    for (i,) in first_true(turn > MAX_ANGLE_STD):
-        raise InputError(
-            f"{table.at(i)}: a standard deviation of {turn[i]:.3g} rad cannot calibrate an "
-            f"arm; covariances must be in m², m·rad and rad² (1 deg² = 3.05e-4 rad²)"
-        )
+    for elements, most, unit, factor in (
+        (variance[:, :3], MAX_STD, "m", "1 mm² = 1e-6 m²"),
+        (variance[:, 3:], MAX_ANGLE_STD, "rad", "1 deg² = 3.05e-4 rad²"),
+    ):
+        std = np.sqrt(elements.max(axis=1, initial=0.0))
+        for (i,) in first_true(std > most):
+            raise InputError(
+                f"{table.at(i)}: a standard deviation of {std[i]:.3g} {unit} cannot calibrate an "
+                f"arm; covariances must be in m², m·rad and rad² ({factor})"
+            )
 
 
 def check_wrenches(
@@ -365,7 +363,7 @@ def check_wrenches(
     """Refuse a wrench (N, 6) on an unloaded reading, or one that would break the arm."""
     unloaded = np.array([name == "none" for name in names])[load]
     loaded = unloaded[:, None] & (wrench != 0)
-    limit = 20 * arm.payload * _G * np.repeat([1.0, arm.reach], 3)
+    limit = 20 * arm.payload * STANDARD_GRAVITY_M_S2 * np.repeat([1.0, arm.reach], 3)
     heavy = (np.abs(wrench) > limit) & (arm.payload > 0)
     beyond = f"beyond 20 times the payload of {arm.name}; expected N and N·m"
     table.refuse(loaded, WRENCH, lambda v: f"{v:g}: the load is 'none', so the wrench must be 0")
@@ -414,31 +412,31 @@ class ObserverRows:
         """Return values (N, m) and covariances (N, m, m) with distances and heights filled in."""
         value, cov = value.copy(), cov.copy()
         for kind in KINDS:
-            column, _, spread = SCALAR[kind]
+            column, _, variance_column = SCALAR[kind]
             rows = np.flatnonzero([self.names[k].kind == kind for k in self.observer])
             if not len(rows):
                 continue
-            read = table.number[column][rows]
+            value[rows, 0] = measured = table.number[column][rows]
             low = 0.0 if kind == "point" else -MAX_DISTANCE
-            for i in rows[(read < low) | (read > MAX_DISTANCE)][:1]:
+            for i in rows[(measured < low) | (measured > MAX_DISTANCE)][:1]:
                 raise InputError(
                     f"{table.at(i, column)}: {table.number[column][i]:g} m cannot be right; "
                     f"expected {low:g} to {MAX_DISTANCE:g} m"
                 )
-            value[rows, 0] = read
-            stated = table.number.get(spread, np.full(len(table.rows), np.nan))
+            stated = table.number.get(variance_column, np.full(len(table.rows), np.nan))
             for i in rows.tolist():
                 name = self.names[self.observer[i]]
                 variance = std.get(name, np.nan) ** 2 if np.isnan(stated[i]) else stated[i]
                 if np.isnan(variance):
                     raise InputError(
                         f"{table.at(i)}: nothing states the noise of {name}; give column "
-                        f"'{spread}', the variance in m², or [{kind}s.{name.name}] std_m"
+                        f"'{variance_column}', the variance in m², or [{kind}s.{name.name}] std_m"
                     )
                 if not MIN_STD[0] ** 2 <= variance <= MAX_STD**2:
                     raise InputError(
-                        f"{table.at(i, spread)}: a variance of {variance:g} m² cannot be right; "
-                        f"expected standard deviations of {MIN_STD[0]:g} to {MAX_STD:g} m, squared"
+                        f"{table.at(i, variance_column)}: a variance of {variance:g} m² cannot be "
+                        f"right; expected standard deviations of {MIN_STD[0]:g} to {MAX_STD:g} m, "
+                        "squared"
                     )
                 cov[i, 0, 0] = variance
         return value, cov
@@ -483,21 +481,17 @@ def _name(table: ColumnTable, row: int, column: str) -> str:
 def observer_columns(readings: Readings) -> dict[str, list[str] | Floats]:
     """Return the columns that name the observers, and those of distances and heights."""
     kinds = np.array([o.kind for o in readings.observers])[readings.observer]
-    name = [readings.observers[k].name for k in readings.observer.tolist()]
+    name = np.array([o.name for o in readings.observers])[readings.observer]
     out: dict[str, list[str] | Floats] = {}
     stations = [o for o in readings.observers if o.kind == "station"]
     if stations and stations != [MAIN]:
-        out[STATION] = _names_in(name, kinds == "station")
+        out[STATION] = np.where(kinds == "station", name, "").tolist()
     for kind in KINDS:
         of_kind = kinds == kind
         if not of_kind.any():
             continue
         value, observer, variance = SCALAR[kind]
-        out[observer] = _names_in(name, of_kind)
+        out[observer] = np.where(of_kind, name, "").tolist()
         out[value] = np.where(of_kind, readings.value[:, 0], np.nan)
         out[variance] = np.where(of_kind, readings.covariance[:, 0, 0], np.nan)
     return out
-
-
-def _names_in(names: list[str], rows: Bools) -> list[str]:
-    return [name if of_kind else "" for name, of_kind in zip(names, rows.tolist(), strict=True)]

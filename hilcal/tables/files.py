@@ -74,7 +74,7 @@ def open_tables(
 @limits.bounded
 def open_grid(path: str | Path, file_format: FileFormat, check: Check | None = None) -> Grid:
     """Open one file as a table of cells; `check` is given the names of its columns."""
-    name, content = str(path), content_of(path)
+    name, content = str(path), limits.read_bytes(Path(path), limits.TABLE)
     kind = kind_of(name, content)
     with undamaged(name, "damaged, or not what its first bytes say"):
         if kind == "XLSX":
@@ -87,11 +87,6 @@ def open_grid(path: str | Path, file_format: FileFormat, check: Check | None = N
         key = "sheet" if file_format.sheet else "variable"
         raise InputError(f"{name}: text has no {key}; remove [file] {key}")
     return read_text(name, content, file_format, check)
-
-
-def content_of(path: str | Path) -> bytes:
-    """Read the file of a table."""
-    return limits.read_bytes(Path(path), limits.TABLE)
 
 
 def kind_of(path: str, content: bytes) -> str:

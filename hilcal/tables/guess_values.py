@@ -239,23 +239,18 @@ def guess_axes(g: words.Guesser) -> None:
         return
     ranked = sorted(positions, key=_rank)
     stem = ranked[0]
-    names = [positions[stem][axis] for axis in "xyz"]
-    side_by_side = _targets_side_by_side(positions, stem)
-    if side_by_side:
-        names = [positions[s][axis] for s in side_by_side for axis in "xyz"]
-        unit = words.length_unit(g, "position", names)
-        targets = [str(s[-1]) for s in side_by_side]
+    used = _targets_side_by_side(positions, stem) or [stem]
+    names = [positions[s][axis] for s in used for axis in "xyz"]
+    unit = words.length_unit(g, "position", names)
+    if len(used) > 1:
+        targets = [str(s[-1]) for s in used]
         meaning = f"{unit}, {len(targets)} targets"
         g.assign("position", names, meaning, unit=unit, targets=targets)
         g.doubt("position", words.SIDE_BY_SIDE)
     else:
-        unit = words.length_unit(g, "position", names)
         g.assign("position", names, unit, unit=unit)
-    ranked = [s for s in ranked if s not in side_by_side]
-    unused = [
-        positions[s]["x"] for s in ranked if s != stem and not set(map(str, s)) & words.NOMINAL
-    ]
-    if unused:
+    others = [s for s in ranked if s not in used and words.NOMINAL.isdisjoint(map(str, s))]
+    if unused := [positions[s]["x"] for s in others]:
         listed = ", ".join(f"'{name}' ..." for name in unused[: words.N_EXAMPLES])
         g.doubt("position", f"'{names[0]}' ... are used, not {listed}")
     marks = sentinels(g.block(names))

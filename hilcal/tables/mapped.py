@@ -46,7 +46,6 @@ ONE_DIRECTION, MANY_DIRECTIONS = 0.99, 0.9  # length of the mean of unit vectors
 GRAVITY = (0.0, 0.0, -STANDARD_GRAVITY_M_S2)  # m/s², base axes, of an arm that stands upright
 EPOCH = 1e8  # s; times beyond three years are counted from an epoch, not from the campaign's start
 TARGET = "target of [position]"
-_DAY = 86400.0
 _EXPECTED = {"iso": "a date and time like 2024-05-31T12:00:00", "excel": "days since 1899-12-30"}
 _CELSIUS = {"degC": (1.0, 0.0), "degF": (1 / 1.8, 32.0), "K": (1.0, 273.15)}
 """Size of a unit in °C, and where 0 °C is on its scale."""
@@ -280,16 +279,12 @@ def _raw(grid: Grid, mapping: forms.PointMapping, arm: Arm) -> dict[str, Floats]
     for section in (mapping.joints, mapping.actual_joints):
         if section is not None and section.from_zero:
             half = math.pi / units.ANGLES[section.unit]
-            for name in _turning(grid, section, arm):
-                raw[name] = np.where(raw[name] > half, raw[name] - 2 * half, raw[name])
+            names = independent_columns(columns.joint_columns(arm.units), len(section.columns), arm)
+            for name, column in zip(names, section.columns, strict=True):
+                if name.endswith("_rad"):
+                    angle = raw[grid.name(column)]
+                    raw[grid.name(column)] = np.where(angle > half, angle - 2 * half, angle)
     return raw
-
-
-def _turning(grid: Grid, section: forms.Joints, arm: Arm) -> list[str]:
-    """Names of the columns of a section whose joints turn."""
-    names = independent_columns(columns.joint_columns(arm.units), len(section.columns), arm)
-    of_joints = zip(names, section.columns, strict=True)
-    return [grid.name(column) for name, column in of_joints if name.endswith("_rad")]
 
 
 def _missing_positions(
@@ -481,7 +476,7 @@ def seconds(grid: Grid, time: forms.Time) -> Floats:
         values, expected = units.SECONDS[time.unit] * grid.numbers(time.column), "a time"
     elif time.unit == "excel" and not dated:
         days = pd.Series([str(c).replace(",", ".") for c in cells])
-        values = _DAY * pd.to_numeric(days, errors="coerce").to_numpy(dtype=float)
+        values = 86400.0 * pd.to_numeric(days, errors="coerce").to_numpy(dtype=float)
     else:
         form = None if dated else time.format
         texts = [str(c).strip() if form else str(c).strip().replace(",", ".") for c in cells]

@@ -40,11 +40,10 @@ def _text_encoding(name: str) -> str:
 
 PerJoint = Annotated[tuple[Column, ...], Field(min_length=1, description="one column per joint")]
 Row = Annotated[int, Strict(), Field(ge=1)]
-_UNLOADED = (
-    "none|0|no|no load|unloaded|empty|-|ohne|leer|keine|unbelastet|sans|sans charge|vide|"
-    "sin carga|vacío|senza|无|空载"
-)
-UNLOADED = tuple(_UNLOADED.split("|"))
+UNLOADED = (
+    "none", "0", "no", "no load", "unloaded", "empty", "-", "ohne", "leer", "keine", "unbelastet",
+    "sans", "sans charge", "vide", "sin carga", "vacío", "senza", "无", "空载",
+)  # fmt: skip
 """Names that mean "no load" unless the mapping lists others, in small letters; a choice."""
 
 TABLE = "table"  # The exchange table: the format that is read without a mapping
@@ -355,7 +354,6 @@ class Std(Section):
         description="true where they are the scatter of samples only: the noise in [tracker] is "
         "added, else false",
     )
-
     at_least: tuple[NonNegative, NonNegative] | None = Field(
         None,
         description="the least figure of a position and of an angle, in their units: the mean of "
@@ -370,7 +368,7 @@ class Std(Section):
         if bool(self.columns) == bool(self.values):
             raise ValueError("columns or values: give one of them")
         count = len(self.columns) or len(self.values)
-        if count not in (1, 6) and (count % 3 or not count):
+        if count != 1 and count % 3:
             raise ValueError(f"{count} figures; it must be 1, 3 or 6, or 3 for each target")
         if self.of == "point" and count != 1:
             raise ValueError(f'of = "point" with {count} figures; it must be one')

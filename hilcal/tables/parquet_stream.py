@@ -109,8 +109,7 @@ def _opened(path: Path) -> Any:
     last = "its last part is written when recording ends: was it interrupted?"
     with undamaged(path, f"not a whole Parquet file; {last}"):
         # pages are read as they are needed: a row group may be larger than the memory
-        file = parquet.ParquetFile(path, buffer_size=1 << 20, pre_buffer=False)
-    return file
+        return parquet.ParquetFile(path, buffer_size=1 << 20, pre_buffer=False)
 
 
 def _tables(path: Path, group: int, names: tuple[str, ...], count: int = CHUNK) -> Iterator[Any]:

@@ -114,30 +114,23 @@ def guess(grid: Grid, joints: int | None = None, joint_names: Sequence[str] = ()
     counts = _encoder_counts(g)
     _joints(g, joint_names)
     guess_axes(g)
-    _scalars(g)
+    _distances(g)
     readings = {"position", "distance", "gauge"}
     if not readings & set(g.proposal.sections) or "joints" not in g.proposal.sections:
         guess_by_values(g)
-    guess_names(g)
-    guess_scalars(g)
+    _names(g)
+    _times(g)
     for name, column in list(g.free.items()):
         g.ignore(name, _why_unused(g, column))
     if set(required_columns(joints or 6)) <= set(grid.names):
         g.doubt("file", EXCHANGE_NAMES)
     if g.proposal.open_convention:
         g.doubt("orientation", words.GUESSED)
-    for section, sentence in (
-        ("position", "no position: three columns x, y, z were not found"),
-        (
-            "joints",
-            counts
-            or "no joint angles: where they are in a file of their own, give it with --second",
-        ),
-    ):
-        if section not in g.proposal.sections and not (
-            section == "position" and readings & set(g.proposal.sections)
-        ):
-            g.proposal.missing.append(sentence)
+    if not readings & set(g.proposal.sections):
+        g.proposal.missing.append("no position: three columns x, y, z were not found")
+    if "joints" not in g.proposal.sections:
+        second = "no joint angles: where they are in a file of their own, give it with --second"
+        g.proposal.missing.append(counts or second)
     if "pose" not in g.proposal.sections and "joints" in g.proposal.sections:
         g.doubt("pose", "no column names the pose: rows of the same joints count as one pose")
     if not {"load", "hung_mass", "wrench"} & set(g.proposal.sections):
@@ -169,7 +162,7 @@ def _encoder_counts(g: words.Guesser) -> str:
             return False
         return bool(np.nanmax(np.abs(values)) > LEAST_COUNTS and _whole_numbers(g, c.name))
 
-    runs = [[c.name for c in run] for are, run in groupby(g.columns, counts) if are]
+    runs = [[c.name for c in run] for counted, run in groupby(g.columns, counts) if counted]
     for names in runs:
         if not words.FEWEST_JOINTS <= len(names) <= words.MOST_JOINTS:
             continue
@@ -270,7 +263,7 @@ def _per_joint(g: words.Guesser, first: words.ColumnName, names: list[str]) -> N
         g.assign("approach", names, "-1 or +1")
 
 
-def _scalars(g: words.Guesser) -> None:
+def _distances(g: words.Guesser) -> None:
     """Find distances from points and heights over planes, in rows that have no position."""
     position = g.proposal.sections.get("position", {}).get("columns", [])
     positioned = np.isfinite(g.block(position)).any(axis=1) if position else np.zeros(1, dtype=bool)
@@ -301,7 +294,7 @@ def _scalars(g: words.Guesser) -> None:
             g.free.pop(section.get(key, ""), None)
 
 
-def guess_names(g: words.Guesser) -> None:
+def _names(g: words.Guesser) -> None:
     """Find poses, loads, stations, cycles and reflectors."""
     q = g.proposal.sections.get("joints")
     _pick(g, "pose", words.POSE, lambda n: q is None or _names_poses(g, n, q))
@@ -376,7 +369,7 @@ def _names_poses(g: words.Guesser, name: str, joints: dict[str, Any]) -> bool:
     return True
 
 
-def guess_scalars(g: words.Guesser) -> None:
+def _times(g: words.Guesser) -> None:
     """Find times and the temperature of the air."""
     read = np.ones(len(g.grid.rows), dtype=bool)  # rows that have what a reading needs
     for needed in ("joints", "position"):
@@ -427,7 +420,7 @@ class SniffedFile:
 
 def sniff(path: str | Path) -> SniffedFile:
     """Guess how a file is written, and open it."""
-    content = files.content_of(path)
+    content = limits.read_bytes(Path(path), limits.TABLE)
     name = str(path)
     kind = files.kind_of(name, content)
     if kind == "XLSX":

@@ -34,7 +34,6 @@ FROM_TABLE = "covariance: from the table"
 FROM_TRACKER = "covariance: from the tracker's noise in [tracker]"
 MAX_TIME_S = 1e12  # s; longer than a campaign: seconds since 1970 are 1e9, nanoseconds 1e18
 LARGEST_NM = 1e5  # N·m; more than any joint of an arm carries
-FORM = FileFormat(encoding="utf-8")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,10 +56,14 @@ def import_table(
     std: Mapping[ObserverName, float] | None = None,
 ) -> ImportResult:
     """Read an exchange table: SI units; `station` (3,), m, is where the tracker's beam starts."""
-    chosen: list[Sequence[str]] = []
-    grid = open_grid(path, FORM, lambda header: chosen.extend(_choose(str(path), header, arm)))
-    sparse = columns.sparse_columns(grid.names)
-    table = ColumnTable.of(grid, chosen[0], chosen[1], sparse)
+    form = FileFormat(encoding="utf-8")
+    grid = open_grid(path, form, lambda header: _check_header(str(path), header, arm))
+    observers = [name for _, name, _ in columns.SCALAR.values()]
+    words = {*columns.TEXT, columns.TARGET, columns.COVERS, columns.STATION, *observers}
+    text = [name for name in grid.names if name in words]
+    valid = set(columns.known_columns(arm.units)) - words
+    number = [name for name in grid.names if name in valid]
+    table = ColumnTable.of(grid, text, number, columns.sparse_columns(grid.names))
     return readings_of(table, arm, noise, station, targets=targets, std=std)
 
 
@@ -143,26 +146,21 @@ def covariances_of(
     return cov, (*notes, *rounded), covers
 
 
-def _choose(path: str, header: Sequence[str], arm: Arm) -> tuple[Sequence[str], Sequence[str]]:
+def _check_header(path: str, header: Sequence[str], arm: Arm) -> None:
     if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
         raise InputError(
             f"{path}: columns must be separated by ',' with '.' as decimal mark; for any other "
             f"table: {columns.PREVIEW}"
         )
     check_names(header, f"{path}: row 1, column")
-    valid = columns.known_columns(arm.units)
-    if not any(name in valid for name in header):
+    if set(header).isdisjoint(columns.known_columns(arm.units)):
         raise InputError(
             f"{path}: not an exchange table: row 1 has none of its columns "
             f"({', '.join(columns.required_columns(arm.units))}); for any other table: "
             f"{columns.PREVIEW}"
         )
-    columns.check_header(path, header, arm.units, arm.name, columns.following_columns(arm))
+    columns.check_header(path, header, arm.units, arm.name, columns.mimic_columns(arm))
     columns.check_covariance_columns(path, header)
-    named = [name for _, name, _ in columns.SCALAR.values()]
-    optional = (columns.TARGET, columns.COVERS, columns.STATION, *named)
-    text = (*columns.TEXT, *(name for name in header if name in optional))
-    return text, [name for name in header if name in valid and name not in text]
 
 
 def _index(names: list[str]) -> tuple[Ints, list[str]]:
@@ -245,7 +243,7 @@ def measured_of(table: ColumnTable, arm: Arm, rows: Bools | None = None) -> tupl
 
 
 def _states(table: ColumnTable, arm: Arm) -> States:
-    table = columns.with_following(table, arm)
+    table = columns.with_mimic_joints(table, arm)
     number, n = table.number, arm.n
     joints, reported = columns.joint_columns(arm.units), columns.actual_columns(arm.units)
     torques, sides = columns.torque_columns(arm.units), columns.approach_columns(n)

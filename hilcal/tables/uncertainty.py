@@ -117,14 +117,14 @@ def _of_std(grid: Grid, mapping: Mapping, std: Std, count: int) -> tuple[Floats,
     sigma = sigma * _scale(std, m)
     correlation = np.broadcast_to(np.eye(m), (count, m, m)).copy()
     if mapping.correlation is not None:
-        upper, right = np.triu_indices(m, 1)
-        if len(mapping.correlation.columns) != len(upper):
+        row, column = np.triu_indices(m, 1)
+        if len(mapping.correlation.columns) != len(row):
             raise InputError(
                 f"{grid.path}: [correlation] has {len(mapping.correlation.columns)} columns; "
-                f"{m} standard deviations need {len(upper)}"
+                f"{m} standard deviations need {len(row)}"
             )
         value = _block(grid, mapping.correlation.columns)
-        correlation[:, upper, right] = correlation[:, right, upper] = value
+        correlation[:, row, column] = correlation[:, column, row] = value
     where = "from the table" if std.columns else "the same for all readings"
     where = f"since the table has no column '{missing[0]}'" if absent else where
     return sigma[:, :, None] * correlation * sigma[:, None, :], f"covariance: {label}, {where}"
@@ -146,9 +146,9 @@ def _of_matrix(grid: Grid, section: CovarianceColumns) -> Floats:
             raise InputError(f"{grid.at(i, section.columns[0])}: the covariance is not symmetric")
         cov = 0.5 * (cov + transposed)
     else:
-        upper, right = np.triu_indices(m)
+        row, column = np.triu_indices(m)
         cov = np.zeros((count, m, m))
-        cov[:, upper, right] = cov[:, right, upper] = figures
+        cov[:, row, column] = cov[:, column, row] = figures
     scale = _scale(section, m)
     return np.asarray(scale[:, None] * cov * scale)
 
