@@ -63,8 +63,8 @@ def snapshot(view: View, d: Snapshot) -> None:
         small_print(f"{arm.name} · {d.n_readings} readings, judged as {kind} · from {d.source}")
     _verdict(view, d)
     with ui.element("div").classes("two"):
-        _fails(view, d)
-        _missing(view, d)
+        _misfit(view, d)
+        _suspects(view, d)
         for name in ("readings", "evidence"):
             view.places[name] = ui.column().classes("part")
             view.redraw(name)
@@ -120,7 +120,7 @@ def _verdict(view: View, d: Snapshot) -> None:
         answer_label(view, "model")
 
 
-def _fails(view: View, d: Snapshot) -> None:
+def _misfit(view: View, d: Snapshot) -> None:
     with _part("Where it fails"):
         if d.diagnosis.residual_is_noise:
             small_print("Nowhere: the residuals are no larger than the noise.")
@@ -137,7 +137,7 @@ def _fails(view: View, d: Snapshot) -> None:
         small_print("Click a bar: the readings over that variable.")
 
 
-def _missing(view: View, d: Snapshot) -> None:
+def _suspects(view: View, d: Snapshot) -> None:
     rows = shown_suspects(d.diagnosis) if d.diagnosis.significant else []
     with _part("What is missing"):
         if rows:
@@ -166,8 +166,7 @@ def _missing(view: View, d: Snapshot) -> None:
                 "that much if it were not there."
             )
         else:
-            # whether an effect is missing, only the verdict says
-            small_print("No effect passes the tests by itself; what that means, the verdict says.")
+            small_print("No effect passes the tests by itself: see the verdict.")
         effects, view.adder = [s.effect for s in d.diagnosis.suspects], None
         if effects:
             kind = "unelevated" if rows else "outline"
@@ -271,7 +270,7 @@ def _revisions(view: View, d: Snapshot) -> None:
                     small_print(" · ".join([error, verdict_of(r), *marks]))
                 if r.number != d.number:
                     button(view, "Look", partial(view.show, r.number), "flat dense")
-                if r.number not in (d.number, d.in_use) or d.number != d.in_use:
+                if not r.number == d.number == d.in_use:
                     text = "Go back to it" if r.number != d.number else "Use it"
                     button(view, text, partial(view.go_back, r.number), "outline dense")
         if d.accepted is not None:
@@ -283,7 +282,7 @@ def _revisions(view: View, d: Snapshot) -> None:
 def _side_by_side(view: View, d: Snapshot) -> None:
     with _part("Two revisions side by side"):
         if len(d.records) < 2:
-            small_print("There are two to compare once something was added, removed or changed.")
+            small_print("Nothing to compare yet: each change of model or cell adds a revision.")
             return
         by_number = {r.number: r for r in d.records}
         shown = d.number or d.records[-1].number
@@ -345,12 +344,12 @@ def _cell(view: View, d: Snapshot) -> None:
             "model is then fitted anew, as a revision; what was measured stays as it is."
         )
         small_print(f"Now: {d.covariance}.")
-        for why in dict.fromkeys(f.fixed for f in d.cell_keys if f.fixed):
-            keys = [f.key for f in d.cell_keys if f.fixed == why]
+        for why in dict.fromkeys(f.why_fixed for f in d.cell_keys if f.why_fixed):
+            keys = [f.key for f in d.cell_keys if f.why_fixed == why]
             small_print(f"Not to be changed here: {', '.join(keys)}: {why}.")
         with ui.element("div").classes("figures").props("data-part=cell"):
             for f in d.cell_keys:
-                if not f.fixed:
+                if not f.why_fixed:
                     key = f.section, f.key
                     value = view.tab.texts.get(key, f.text)
                     field = ui.input(f"[{f.section}] {f.key}", value=value).props("dense outlined")

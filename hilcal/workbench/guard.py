@@ -34,7 +34,7 @@ PATHS = ("/_nicegui/", "/_nicegui_ws/", "/viewer/")
 LOOPBACK = ("127.0.0.1", "::1")
 TOKEN = "token"  # noqa: S105 (its name)
 UNUSED_S = 600.0  # time until an unused token expires, s; a choice
-_ENTERED = b"""<!doctype html><title>hilcal</title><link rel="icon" href="data:,">
+_FORWARD = b"""<!doctype html><title>hilcal</title><link rel="icon" href="data:,">
 <meta http-equiv="refresh" content="0; url=/">"""
 """A page that forwards to the workbench. After an HTTP redirection a browser that came from another
 page or a file would not send a strict cookie."""
@@ -97,7 +97,7 @@ class AccessGuard:
             self.entered = True
             cookie = f"{self._cookie}={self._secret}; HttpOnly; SameSite=Strict; Path=/"
             kind = (b"content-type", b"text/html; charset=utf-8")
-            await self._answer(send, 200, (b"set-cookie", cookie.encode()), kind, body=_ENTERED)
+            await self._answer(send, 200, (b"set-cookie", cookie.encode()), kind, body=_FORWARD)
 
     @property
     def abandoned(self) -> bool:
@@ -108,15 +108,15 @@ class AccessGuard:
         """Return why a request is not from this server's page on this machine; None if it is."""
         if (scope.get("client") or LOOPBACK)[0] not in LOOPBACK:
             return "only this machine may ask"
-        if _heads(scope, b"host") not in [[host] for host in self._hosts]:
+        if _header_values(scope, b"host") not in [[host] for host in self._hosts]:
             return "not the name of this server"
-        origins = _heads(scope, b"origin")
+        origins = _header_values(scope, b"origin")
         if scope["type"] == "websocket" and len(origins) != 1:
-            return "a socket of no page"
+            return "a WebSocket without a page"
         if any(origin not in self.origins for origin in origins):
             return "not a page of this server"
-        site = _heads(scope, b"sec-fetch-site")
-        visited = _heads(scope, b"sec-fetch-mode") == ["navigate"] and scope["path"] == "/"
+        site = _header_values(scope, b"sec-fetch-site")
+        visited = _header_values(scope, b"sec-fetch-mode") == ["navigate"] and scope["path"] == "/"
         if any(s not in ("same-origin", "none") for s in site) and not visited:
             return "not a page of this server"
         return None
@@ -124,7 +124,7 @@ class AccessGuard:
     def _has_cookie(self, scope: Scope) -> bool:
         jar = SimpleCookie()
         try:
-            jar.load("; ".join(_heads(scope, b"cookie")))
+            jar.load("; ".join(_header_values(scope, b"cookie")))
         except CookieError:
             return False
         cookie = jar.get(self._cookie)
@@ -137,10 +137,10 @@ class AccessGuard:
         return _same(tokens[0], self._token)
 
     async def _answer(
-        self, send: Send, status: int, *heads: tuple[bytes, bytes], body: bytes = b""
+        self, send: Send, status: int, *headers: tuple[bytes, bytes], body: bytes = b""
     ) -> None:
         head = {"type": "http.response.start", "status": status}
-        await send({**head, "headers": [*heads, *self._headers]})
+        await send({**head, "headers": [*headers, *self._headers]})
         await send({"type": "http.response.body", "body": body})
 
     async def _refuse(self, scope: Scope, send: Send, status: int, why: str) -> None:
@@ -159,7 +159,7 @@ class AccessGuard:
         return send_with_policy
 
 
-def _heads(scope: Scope, name: bytes) -> list[str]:
+def _header_values(scope: Scope, name: bytes) -> list[str]:
     return [value.decode("latin-1") for key, value in scope["headers"] if key.lower() == name]
 
 

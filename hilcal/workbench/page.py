@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from fastapi import FastAPI, Request
 from fastapi.responses import PlainTextResponse, Response
-from nicegui import app as bench
+from nicegui import app as nicegui_app
 from nicegui import ui
 
 from hilcal import numbers
@@ -59,7 +59,7 @@ def install(app: FastAPI, session: WorkbenchSession) -> None:
         await ui.context.client.connected()
         view.draw_page(dark=bool(await ui.run_javascript(DARK, timeout=5.0)))
 
-    bench.on_startup(lambda: read_file(session))
+    nicegui_app.on_startup(lambda: read_file(session))
 
 
 def read_file(session: WorkbenchSession) -> None:
@@ -170,10 +170,9 @@ class View:
     def _do(self, place: str, task: str, act: Callable[[Snapshot, Say], object]) -> None:
         """Start a task on this tab's snapshot; the text that `act` returns is its answer."""
         snapshot = self.tab.snapshot
-        if snapshot is not None and not self.work.start(
-            task, lambda say: act(snapshot, say), place
-        ):
-            self.work.answers[place] = Answer("Something else was being done; nothing was begun.")
+        if snapshot is None or self.work.start(task, lambda say: act(snapshot, say), place):
+            return
+        self.work.answers[place] = Answer("Another task is running; this one was not started.")
 
     def _change(
         self, place: str, verb: str, effect: str, act: Callable[[Snapshot, str, Say], Snapshot]

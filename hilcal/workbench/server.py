@@ -52,8 +52,8 @@ def _quiet_environment() -> None:
 
 
 @contextlib.contextmanager
-def _leading_to(url: str) -> Iterator[Path]:
-    """Yield a file, readable by its user only, that leads a browser to an address.
+def _forwarding_page(url: str) -> Iterator[Path]:
+    """Yield a page, readable by its user only, that forwards a browser to an address.
 
     Every user of the machine can read the arguments of all processes: a browser that is started
     with the address itself would reveal its token.
@@ -63,8 +63,8 @@ def _leading_to(url: str) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="hilcal-workbench-", dir=place) as folder:  # mode 0700
         file = Path(folder) / "open.html"
         file.touch(mode=0o600)
-        lead = f'<!doctype html><meta http-equiv="refresh" content="0; url={url}">'
-        file.write_text(lead, encoding="ascii")
+        page = f'<!doctype html><meta http-equiv="refresh" content="0; url={url}">'
+        file.write_text(page, encoding="ascii")
         yield file
 
 
@@ -124,8 +124,8 @@ def serve(
                 await super().startup(sockets)
                 announce(url)
                 if browser:
-                    lead = opening.enter_context(_leading_to(url)).as_uri()
-                    threading.Thread(target=webbrowser.open, args=(lead,), daemon=True).start()
+                    page = opening.enter_context(_forwarding_page(url)).as_uri()
+                    threading.Thread(target=webbrowser.open, args=(page,), daemon=True).start()
 
             async def on_tick(self, counter: int) -> bool:
                 if guard.entered:

@@ -65,7 +65,7 @@ class CellKey:
     key: str
     text: str  # in the syntax of CELL.toml; empty if not stated, or if estimated
     valid: str  # description of the valid values
-    fixed: str  # why these readings forbid a change; empty if they allow it
+    why_fixed: str  # why these readings forbid a change; empty if they allow it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,7 +114,7 @@ class Snapshot:
         return tuple(name for name in self.fit.model.named if name not in frames)
 
 
-def _figures(o: Campaign) -> tuple[CellKey, ...]:
+def _cell_keys(o: Campaign) -> tuple[CellKey, ...]:
     # with the instrument's noise, so that keys that need a stated noise are shown, too
     fixed, out = o.unchangeable({"tracker": dict.fromkeys(INSTRUMENT_NOISE)}), []
     for section, keys in CHANGEABLE.items():
@@ -273,11 +273,8 @@ class WorkbenchSession:
 
     def run_line(self) -> str:
         """Return the command that measures the plan into the same campaign."""
-        if self.planned is None:
-            return ""
-        return (
-            f"hilcal run CELL.toml -o {quoted(self.path)} --append --plan {quoted(self.planned[1])}"
-        )
+        plan = "PLAN" if self.planned is None else self.planned[1]
+        return f"hilcal run CELL.toml -o {quoted(self.path)} --append --plan {quoted(plan)}"
 
     @property
     def stale(self) -> bool:
@@ -320,7 +317,7 @@ class WorkbenchSession:
 
     def _require(self, snapshot: Snapshot | None, *, changed: bool = False) -> None:
         if snapshot is not self.snapshot:
-            raise InputError("the workbench has gone on since that click; nothing was changed")
+            raise InputError("the workbench has changed since that click; nothing was done")
         if self.stale and not changed:
             name = self.path.name
             raise InputError(f"{name} was changed by another command; read it again first")
@@ -368,9 +365,7 @@ class WorkbenchSession:
 
         Where the file has got readings meanwhile, the snapshot is outdated.
         """
-        stamp = stamp or self._stamp()
-        if o.file.n_readings != len(o.readings):
-            stamp = OUTDATED
+        current = o.file.n_readings == len(o.readings)
         self.snapshot = Snapshot(
             n_readings=len(o.readings),
             records=o.file.revisions(),
@@ -378,11 +373,11 @@ class WorkbenchSession:
             number=number,
             chapters=chapters,
             story=build_story(chapters),
-            stamp=stamp,
+            stamp=(stamp or self._stamp()) if current else OUTDATED,
             source=o.file.source,
             covariance=covariance_words(o.covariance_parts, o.noise),
             changes=o.changes,
-            cell_keys=_figures(o),
+            cell_keys=_cell_keys(o),
         )
         self.changed = changed
         self.work.answers.pop("revisions", None)  # it says which revision was shown before

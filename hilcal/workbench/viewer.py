@@ -24,12 +24,12 @@ FILES = {
     "re_viewer_bg.wasm": "application/wasm",
 }
 RECORDING = "application/octet-stream"
-_PATIENCE = 30.0
-_ELSEWHERE = re.compile(r"<link\b[^>]*>", re.DOTALL)
+_TIMEOUT_S = 30.0
+_LINKS = re.compile(r"<link\b[^>]*>", re.DOTALL)
 _HEAD = "<head>"
 # rerun asks for newer versions and sends usage statistics: both get an empty answer. Requests to
 # this server get the operator's cookie. (The policy of the page forbids all other requests.)
-_HERE = (
+_FETCH_HERE = (
     "<script>const asked = fetch; window.fetch = (to, how) => "
     "new URL(to.url || to, location).origin === location.origin "
     '? asked(to, {...how, credentials: "same-origin"}) '
@@ -44,7 +44,7 @@ threading.Thread(target=end, daemon=True).start()
 sys.exit(subprocess.call(sys.argv[1:], stdin=subprocess.DEVNULL))
 """
 """Runs a command until standard input ends, which also a killed parent process causes."""
-_NOBODY = "rerun+http://127.0.0.1:9/proxy"
+_NO_RECORDING = "rerun+http://127.0.0.1:9/proxy"
 """A dummy recording to show: with one, rerun opens no port for recordings."""
 
 
@@ -92,7 +92,7 @@ def _fetched() -> dict[str, bytes]:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = int(probe.getsockname()[1])
-    serve = ("--serve-web", "--bind", "127.0.0.1", "--web-viewer-port", str(port), _NOBODY)
+    serve = ("--serve-web", "--bind", "127.0.0.1", "--web-viewer-port", str(port), _NO_RECORDING)
     process = subprocess.Popen(  # noqa: S603 (our own arguments)
         [sys.executable, "-c", _SERVE, executable(), *serve],
         stdin=subprocess.PIPE,
@@ -106,18 +106,18 @@ def _fetched() -> dict[str, bytes]:
         if process.stdin is not None:
             process.stdin.close()
         process.wait()
-    page = _ELSEWHERE.sub("", files["index.html"].decode("utf-8"))
-    page = page.replace(_HEAD, _HEAD + _HERE, 1)
+    page = _LINKS.sub("", files["index.html"].decode("utf-8"))
+    page = page.replace(_HEAD, _HEAD + _FETCH_HERE, 1)
     return {**files, "index.html": page.encode("utf-8")}
 
 
 def _get(port: int, name: str, process: "subprocess.Popen[bytes]") -> bytes:
-    end = time.monotonic() + _PATIENCE
+    end = time.monotonic() + _TIMEOUT_S
     while True:
-        line = HTTPConnection("127.0.0.1", port, timeout=_PATIENCE)
+        connection = HTTPConnection("127.0.0.1", port, timeout=_TIMEOUT_S)
         try:
-            line.request("GET", f"/{name}")
-            answer = line.getresponse()
+            connection.request("GET", f"/{name}")
+            answer = connection.getresponse()
             content = answer.read()
             if answer.status == 200 and content:
                 return content
@@ -127,4 +127,4 @@ def _get(port: int, name: str, process: "subprocess.Popen[bytes]") -> bytes:
                 raise HilcalError(f"the 3-D viewer does not start: {error}") from None
             time.sleep(0.1)
         finally:
-            line.close()
+            connection.close()

@@ -72,8 +72,8 @@ def test_an_operator_adds_removes_and_goes_back(run, session):
     assert [verdict_of(r) for r in added.records] == [v.replace("_", " ") for v in judged]
 
     # the second of a double click
-    refusal("has gone on since that click; nothing was changed", session.add, snapshot, BASE)
-    refusal("has gone on", session.plan, snapshot, None, run.with_name("p.json"))
+    refusal("has changed since that click; nothing was done", session.add, snapshot, BASE)
+    refusal("has changed", session.plan, snapshot, None, run.with_name("p.json"))
     assert len(revisions(run)) == 2
 
     removed = session.remove(added, BASE)
@@ -102,7 +102,7 @@ def test_a_changed_cell_keeps_how_the_model_was_reached(run, session, snapshot):
     same = {("tool", "mass_kg"): " 0.8 "}
     refusal("no value differs from what is used already", session.change_cell, snapshot, same)
     added = session.add(snapshot, BASE)
-    refusal("has gone on since that click", session.change_cell, snapshot, mass)
+    refusal("has changed since that click", session.change_cell, snapshot, mass)
     found = session.change_cell(added, mass)
     assert (found.number, found.changes) == (3, {"tool": {"mass_kg": 1.4}})
     assert found.diagnosis.history == added.diagnosis.history
