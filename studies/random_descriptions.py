@@ -16,7 +16,7 @@ from hilcal.identification.registration.misdescription import DescriptionFinding
 from hilcal.identification.registration.registration import register
 from hilcal.readings.readings import Readings, States
 from hilcal.robot import se3
-from hilcal.robot.arm import Arm, may_follow, with_conventions
+from hilcal.robot.arm import Arm, possible_couplings, with_conventions
 from hilcal.robot.catalogue import load_arm, robot_names
 from hilcal.robot.chain import evaluate, joint_jacobian
 from hilcal.types import Floats
@@ -90,7 +90,7 @@ def random_arm(rng: np.random.Generator) -> Arm:
         return load_arm(str(rng.choice(ARMS)))
     sign, zero, coupled = rng.choice([-1.0, 1.0], 6), np.zeros(6), np.zeros((6, 6))
     if rng.random() < 0.3:
-        joint, follows = may_follow(6)[rng.integers(6)]
+        joint, follows = possible_couplings(6)[rng.integers(6)]
         coupled[joint - 1, follows - 1] = rng.choice([-1.0, 1.0])
     return with_conventions(arm, sign, zero, coupled)
 
@@ -110,7 +110,7 @@ def random_error(kind: str, arm: Arm, rng: np.random.Generator) -> tuple[Hypothe
             Hypothesis("joint", j, 1, float(np.radians(rng.uniform(3, 170)) * rng.choice([-1, 1]))),
         )
     if kind == "coupling":
-        joint, follows = may_follow(6)[int(rng.integers(1, 6))]
+        joint, follows = possible_couplings(6)[int(rng.integers(1, 6))]
         factor = float(rng.choice([-1.0, 1.0]))
         return (Hypothesis("coupling", joint, follows=follows, factor=factor),)
     if kind == "other arm":

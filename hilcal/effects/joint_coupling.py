@@ -8,7 +8,7 @@ import numpy as np
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
-from hilcal.robot.arm import may_follow
+from hilcal.robot.arm import possible_couplings
 
 ABOUT, ALONG = np.eye(6)[5], np.eye(6)[2]  # twists of a slot about, along its joint's axis
 _PAIR = re.compile(r"([0-9]{1,3}):([0-9]{1,3})")
@@ -21,8 +21,8 @@ class JointCoupling(Effect):
     description (`[robot] joint_coupling`, 0 where there is none); i = j is an error of a
     joint's own ratio.
 
-    Unless given, the pairs are those of `may_follow`, couplings that arms have, and the own ratio
-    of each joint that turns. Gears have whole numbers of teeth, but belts, scales and wrong figures
+    Unless given, the pairs are those of `possible_couplings`, couplings that arms have, and the own
+    ratio of each joint that turns. Gears have whole numbers of teeth, but belts, scales and wrong figures
     in a description do not; the few harmonics of `transmission_error` that readings of some ten
     poses determine describe a slope badly. The ratio of a slide is that of `guide_error`.
     """
@@ -50,7 +50,7 @@ class JointCoupling(Effect):
         """Read the pairs."""
         n = self.cell.arm.n
         slides = self.cell.arm.slides
-        alike = [(j, i) for j, i in may_follow(n) if slides[j - 1] == slides[i - 1]]
+        alike = [(j, i) for j, i in possible_couplings(n) if slides[j - 1] == slides[i - 1]]
         alike = sorted([*alike, *((j + 1, j + 1) for j in range(n) if not slides[j])])
         usual = "/".join(f"{j}:{i}" for j, i in alike) or "1:1"
         text = self.options.setdefault("pairs", usual)

@@ -123,7 +123,7 @@ class LineOfSight:
     def target_visible(self, q: Floats, load: str, target: int) -> Bools:
         """Return (N,) whether the beam to one target is free."""
         beam = self.beam(q, target)
-        out = ~self.clearance.scene.free.touching(q, 0.0, beam)
+        out = ~self.clearance.scene.segment_pairs.touching(q, 0.0, beam)
         for hung in self.clearance.segments(q, load):
             gap = segment_distance(beam.start, beam.end, hung.start, hung.end)
             out &= gap > beam.radius + hung.radius
@@ -155,7 +155,7 @@ class LineOfSight:
             )
         hidden, targets = self.hidden_targets(q, load), self.clearance.cell.all_targets
         if len(hidden) == len(targets):  # some hidden targets only cost readings
-            hits = self.clearance.scene.free.close_pairs(q, 0.0, self.beam(q))
+            hits = self.clearance.scene.segment_pairs.close_pairs(q, 0.0, self.beam(q))
             names = tuple(dict.fromkeys(name for name, _ in hits))
             names += tuple(x.name for x in self.clearance.segments(q, load) if not names)
             noun = "target" if len(hidden) == 1 else "targets"

@@ -216,11 +216,10 @@ class Feasibility:
         elif kind == SENSOR and (sensor := self.config.force_sensor) is not None:
             yield self._moment(sensor, chain, load)
         elif kind == ITSELF:
-            yield _Touch(
-                scene.itself, q, margins.self_collision, scene.itself.rates, guessed=self._guessed
-            )
+            pairs = scene.self_pairs
+            yield _Touch(pairs, q, margins.self_collision, pairs.rates, guessed=self._guessed)
         elif kind == OBSTACLE:
-            yield _Touch(scene.around, q, margins.clearance, scene.around.rates)
+            yield _Touch(scene.obstacle_pairs, q, margins.clearance, scene.obstacle_pairs.rates)
         elif kind == HANGING:
             segments = self.shapes.segments_at(chain.point(self.cell.load_point), load)
             if segments:
@@ -230,7 +229,7 @@ class Feasibility:
                 radius = np.array([x.radius for x in segments])
                 yield self._inside([x.name for x in segments], places, radius, sides, rates)
             for segment in segments:
-                yield _Touch(scene.free, q, margins.clearance, self._towards, segment)
+                yield _Touch(scene.segment_pairs, q, margins.clearance, self._load_rates, segment)
 
     def _joints(self, q: Floats) -> "_Bounds":
         arm, margin = self.cell.arm, self.config.limits.joint_margin_rad
@@ -351,7 +350,7 @@ class Feasibility:
         self._checked_sides |= (~moving & ~mount)[:, None] & respected
         hook = on_flange(arm, self.cell.load_point)[None]
         self._at_hook = np.array([from_axis(arm, arm.n, hook, i + 1) for i in range(arm.n)])
-        self._towards = scene.towards(self.cell.load_point)
+        self._load_rates = scene.load_rates(self.cell.load_point)
         self._farthest = np.vstack([self._rates, self._at_hook]).max(axis=0)
 
     def _set_levers(self) -> None:

@@ -176,11 +176,10 @@ def _norm(form: Mapping[tuple[int, bool], Floats]) -> float:
 
 def _responses_of(effect: Effect, theta: Floats, s: Situation) -> Iterator[SlotResponse]:
     """Compliance of one effect, from its response to unit wrenches."""
-    count = s.wrench.shape[1]
-    slots = range(count)
+    slots = range(s.wrench.shape[1])
     groups = [slots] if effect.local_response else [range(k, k + 1) for k in slots]
     for group in groups:
-        units = zeros(1 if effect.local_response else len(s.wrench), 6, count, 6)
+        units = zeros(1 if effect.local_response else len(s.wrench), 6, len(slots), 6)
         for i in range(6):
             units[:, i, group, i] = 1.0
         r = effect.response(theta, s, units)
@@ -188,8 +187,8 @@ def _responses_of(effect: Effect, theta: Floats, s: Situation) -> Iterator[SlotR
             slot = k if effect.local_response else group[0]
             if r.twist is not None:
                 yield SlotResponse(slot, k, False, slice(0, 6), slice(0, 6), r.twist[:, :, k])
-            follows = r.dq is not None and not s.torque_measured  # measured torques stay
-            if r.dq is not None and follows and k < r.dq.shape[2]:
+            # measured torques do not change with the motion
+            if r.dq is not None and not s.torque_measured and k < r.dq.shape[2]:
                 yield SlotResponse(slot, k, True, slice(0, 6), slice(0, 1), r.dq[:, :, k, None])
 
 

@@ -167,15 +167,14 @@ class Model(Brief):
 
     def _equilibrium(self, states: States, theta: Floats) -> Prediction:
         cell = self.cell
-        angle = states.q if states.q_actual is None else states.q_actual
-        angle = along_states(angle)
+        angle = along_states(states.q if states.q_actual is None else states.q_actual)
         parts = self._parts(theta)
-        turns = chains.joint_motions(cell.arm, angle)
-        chain = chains.evaluate(cell.arm, angle, nominal=turns)
-        nothing = zeros(len(states), cell.arm.n + 1, 6)
+        motions = chains.joint_motions(cell.arm, angle)
+        chain = chains.evaluate(cell.arm, angle, nominal=motions)
+        no_wrench = zeros(len(states), cell.arm.n + 1, 6)
         recorded = self._load(states, theta)
-        turned = along_states(cell.arm.phases(angle))
-        s = Situation(cell, states, turned, chain, nothing, recorded, self._compliance(theta))
+        phases = along_states(cell.arm.phases(angle))
+        s = Situation(cell, states, phases, chain, no_wrench, recorded, self._compliance(theta))
         rigid = _deviation([(e, t) for e, t in parts if not e.elastic], s)
         elastic = [(e, t) for e, t in parts if e.elastic]
         previous: float | None = None
@@ -184,7 +183,7 @@ class Model(Brief):
             wrench = slot_wrenches(cell.arm, chain, load)
             s = replace(s, chain=chain, wrench=wrench, load=load)
             deviation = _deviation(elastic, s, rigid, checked=previous is None)
-            chain = chains.evaluate(cell.arm, angle, deviation, turns)
+            chain = chains.evaluate(cell.arm, angle, deviation, motions)
             shift = np.abs(chain.position[-1] - s.chain.position[-1]).max(initial=0.0)
             turn = np.abs(chain.rotation[-1] - s.chain.rotation[-1]).max(initial=0.0)
             moved = float(max(shift, cell.arm.reach * turn))  # of the flange, m
@@ -230,7 +229,6 @@ class Model(Brief):
         places = np.split(place, np.cumsum(sizes)[:-1]) if sizes else []
         units = None if scale is None else scale[live]
         out = np.empty((count, m, len(live)))
-
         for rows in chunks(count, m * len(live)):
             self._fill(out[rows], effects, places, prediction[rows], theta, units)
         return out
@@ -271,11 +269,11 @@ class Model(Brief):
         blocks = compliance([(e, t) for e, t in self._parts(theta) if e.elastic], s)
         if not blocks:
             return moves, blocks
-        following = self._following(s, theta)
-        stiffness = geometric_stiffness(self.cell.arm, s.chain, s.load, following)
+        load_stiffness = self._load_stiffness(s, theta)
+        stiffness = geometric_stiffness(self.cell.arm, s.chain, s.load, load_stiffness)
         return at_equilibrium(moves, stiffness, blocks), blocks
 
-    def _following(self, s: Situation, theta: Floats) -> Floats | None:
+    def _load_stiffness(self, s: Situation, theta: Floats) -> Floats | None:
         """Derivative (N, 6, 6) of the acting wrench by displacement and turn of the flange.
 
         By central differences, of the corrections alone, which are a small part of the wrench.
@@ -303,8 +301,9 @@ class Model(Brief):
 
     def _compliance(self, theta: Floats) -> Floats:
         """(n,) joint compliances in force."""
-        compliances = [c for e, t in self._parts(theta) if (c := e.compliance(t)) is not None]
-        return compliances[0] if compliances else typical_compliances(self.cell)
+        compliances = (e.compliance(t) for e, t in self._parts(theta))
+        stated = next((c for c in compliances if c is not None), None)
+        return typical_compliances(self.cell) if stated is None else stated
 
     def _load(self, states: States, theta: Floats) -> Load:
         cell, point = self.cell, self.cell.load_point

@@ -89,35 +89,35 @@ def observed(
     """
     frame = np.stack([o.frame for o in observers])[number]
     kind = np.array([o.name.kind for o in observers])[number]
-    far, flat = kind == "point", kind == "gauge"
+    is_point, is_gauge = kind == "point", kind == "gauge"
     offset, turn = np.array([o.offset for o in observers])[number], frame[:, :3, :3]
     local = frame[:, :3, 3] + se3.apply(turn, sensor)
     if moved is not None:
-        observer_r, observer_p = se3.exp(_turning(moved, far))
+        observer_r, observer_p = se3.exp(_frame_twist(moved, is_point))
         local, turn = observer_p + se3.apply(observer_r, local), se3.product(observer_r, turn)
-        offset = offset + np.where(far, moved[:, 3], 0.0)
+        offset = offset + np.where(is_point, moved[:, 3], 0.0)
     length = np.linalg.norm(local, axis=1)
-    read, value = np.tile(np.eye(3), (len(local), 1, 1)), local.copy()
-    read[far | flat], value[far | flat, 1:] = 0.0, 0.0
-    read[far, 0] = local[far] / np.maximum(length[far], 1e-12)[:, None]
-    read[flat, 0, 0] = 1.0
-    value[far, 0] = length[far] + offset[far]
-    by_sensor = se3.product(read, turn)
+    by_local, value = np.tile(np.eye(3), (len(local), 1, 1)), local.copy()
+    by_local[is_point | is_gauge], value[is_point | is_gauge, 1:] = 0.0, 0.0
+    by_local[is_point, 0] = local[is_point] / np.maximum(length[is_point], 1e-12)[:, None]
+    by_local[is_gauge, 0, 0] = 1.0
+    value[is_point, 0] = length[is_point] + offset[is_point]
+    by_sensor, turned = se3.product(by_local, turn), se3.product(turn, rotation)
     return Observation(
-        value, se3.product(turn, rotation), sensor, by_sensor, sensor, local, read, by_sensor, far
+        value, turned, sensor, by_sensor, sensor, local, by_local, by_sensor, is_point
     )
 
 
-def _turning(moved: Floats, far: Bools) -> Floats:
+def _frame_twist(moved: Floats, is_distance: Bools) -> Floats:
     """Twists (N, 6) of the observers without the offsets of distances."""
-    return np.where(far[:, None] & (np.arange(6) > 2), 0.0, moved)
+    return np.where(is_distance[:, None] & (np.arange(6) > 2), 0.0, moved)
 
 
 def by_observer_frame(o: Observation, m: int, moved: Floats | None = None) -> Floats:
     """Motion (N, m, 6) of a reading by the twist of the observer's frame, as of `observed`."""
     out = zeros(len(o.position), m, 6)
     if o.local is not None and o.by_local is not None and o.is_distance is not None:
-        back = None if moved is None else -_turning(moved, o.is_distance)
+        back = None if moved is None else -_frame_twist(moved, o.is_distance)
         jacobian = twist_jacobian(np.eye(3)[None], o.local, back)
         out[:, :3] = o.by_local @ jacobian[:, :3]
         out[:, 3:] = jacobian[:, 3:m]
@@ -153,12 +153,11 @@ class ReadingDerivative:
         """Motion (N, m, 6) by the twist of a slot."""
         v, w = self._rigid(slot)
         if self.yielding is not None:
-            shift, w = self.yielding.displacement(slot), w + self.yielding.turn(slot)
-            v = v if shift is None else v + shift
+            v, w = v + self.yielding.displacement(slot), w + self.yielding.turn(slot)
         return self.by_twist(slot, v, w)
 
-    def by_twist(self, slot: int, v: Floats | None, w: Floats) -> Floats:
-        """Rows (N, m, 6) by the twist ξ of a slot, from rows by v (None for zero) and ω.
+    def by_twist(self, slot: int, v: Floats, w: Floats) -> Floats:
+        """Rows (N, m, 6) by the twist ξ of a slot, from rows by v and ω.
 
         v = R J dξ_v + R Q dξ_ω and ω = R J dξ_ω are motions of its frame, R the orientation after
         ξ, J and Q the blocks of the right Jacobian (`se3`).
@@ -173,9 +172,9 @@ class ReadingDerivative:
             self._turned[slot] = r, beyond
         turned, shift = self._turned[slot]
         out = empty(*w.shape[:2], 6)
-        out[..., :3] = 0.0 if v is None else rows_times(v, turned)
+        out[..., :3] = rows_times(v, turned)
         out[..., 3:] = rows_times(w, turned)
-        if v is not None and shift is not None:
+        if shift is not None:
             out[..., 3:] += rows_times(v, shift)
         return out
 

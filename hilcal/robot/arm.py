@@ -283,7 +283,7 @@ def _unless_one(matrix: Floats) -> Floats | None:
     return None if np.array_equal(matrix, np.eye(len(matrix))) else matrix
 
 
-def may_follow(n: int) -> tuple[tuple[int, int], ...]:
+def possible_couplings(n: int) -> tuple[tuple[int, int], ...]:
     """Return pairs of a joint that may follow another, and the other one, counted from 1.
 
     Each joint may follow the previous one (parallelograms, wrists driven through one another); the

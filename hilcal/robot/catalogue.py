@@ -52,14 +52,14 @@ class JointRow(Section):
         for key in keys[not slides]:
             if getattr(self, key) is not None:
                 raise ValueError(f"{key} of a {self.type} joint; valid: {', '.join(keys[slides])}")
-        low, high = (getattr(self, key) for key in keys[slides][:2])
-        names = " and ".join(keys[slides][:2])
+        low_key, high_key, _ = keys[slides]
+        low, high = getattr(self, low_key), getattr(self, high_key)
         if slides and (low is None or high is None):
-            raise ValueError(f"{names} are missing; a prismatic joint needs both")
+            raise ValueError(f"{low_key} and {high_key} are missing; a prismatic joint needs both")
         if (low is None) != (high is None):
-            raise ValueError(f"{names}: give both or neither")
-        if low is not None and high is not None and low >= high:
-            raise ValueError(f"{names.replace(' and', f' = {low} must be less than')} = {high}")
+            raise ValueError(f"{low_key} and {high_key}: give both or neither")
+        if low is not None and low >= high:
+            raise ValueError(f"{low_key} = {low} must be less than {high_key} = {high}")
         return self
 
     @property

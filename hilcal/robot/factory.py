@@ -36,9 +36,7 @@ N = 6
 KINDS = "a calibration.conf, a .yaml of ur_calibration, or a .toml of check --save-calibration"
 SAME_FLANGE_M = 1e-6  # m, flange difference of equal kinematics: files have at least 12 digits
 LINEARISED_STATUS = 2  # calibration status of an arm that the factory has measured
-OTHER_ARM_M = (
-    0.05  # m, flange difference of another arm; factory kinematics differ by some millimetres
-)
+OTHER_ARM_M = 0.05  # m, flange difference of another arm; one arm's is some millimetres
 _KEYS = ("theta_rad", "a_m", "d_m", "alpha_rad")
 _DELTAS = ("delta_theta", "delta_a", "delta_d", "delta_alpha")
 _BODIES = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")

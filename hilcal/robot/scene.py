@@ -167,10 +167,9 @@ def _of_any(arm: Arm) -> tuple[Capsule, ...]:
     reach = max(arm.reach - float(arm.travels.sum()), 0.1)
     radii = np.linspace(_THICK, _THIN, arm.n + 1) * reach
     names = (BASE, *arm.joint_names)
-    ends = enumerate(arm.links[:, :3, 3])
     return tuple(
         Capsule(names[k], k, np.zeros(3), end, float(radii[k]))
-        for k, end in ends
+        for k, end in enumerate(arm.links[:, :3, 3])
         if float(np.linalg.norm(end)) > _LEAST_LINK
     )
 
@@ -201,7 +200,7 @@ def pinocchio_model(arm: Arm) -> "pin.Model":
 
 _SAMPLES = 256  # states to detect pairs that touch because their shapes are crude
 _SHORT = 1e-12  # m, length of a segment without a direction
-_ALWAYS = 0.3  # share of states with contact above which a pair is not checked
+_MOST_CONTACT = 0.3  # share of states with contact above which a pair is not checked
 _NEAR = 0.03  # m; guessed shapes that are closer in every state are neighbours; a choice
 
 
@@ -229,7 +228,7 @@ class Scene:
         """Build the shapes."""
         self.arm, self.model = arm, pinocchio_model(arm)
         self.parts = (*capsules(arm), *carried)  # carried ones are on the flange
-        self.things = [(thing.name, *_obstacle(thing)) for thing in obstacles]
+        self.obstacles = [(o.name, *_obstacle(o)) for o in obstacles]
         joints = range(1, arm.n + 1)
         ends = [(part.body, np.array([part.start, part.end])) for part in self.parts]
         far = np.array([[from_axis(arm, body, end, i) for i in joints] for body, end in ends])
@@ -237,7 +236,7 @@ class Scene:
         # (P, n) largest motion of a point of a part per radian of a joint, m
         self.rates = np.where(np.arange(1, arm.n + 1) <= bodies[:, None], far, 0.0)
         count = len(self.parts)
-        last = count + len(self.things)
+        last = count + len(self.obstacles)
         distant = [
             (a, b)
             for a in range(count)
@@ -247,19 +246,20 @@ class Scene:
         around = [  # without base and shoulder, which stand at the mounting
             (a, b) for a in range(count) if self.parts[a].body > 1 for b in range(count, last)
         ]
-        checked = self._not_always(distant)
-        self.itself = Pairs(self, checked, [self._approach(a, b, far) for a, b in checked])
-        self.around = Pairs(self, around, [self.rates[a] for a, _ in around])
+        checked = self._rarely_touching(distant)
+        rates = [self._approach_rates(a, b, far) for a, b in checked]
+        self.self_pairs = Pairs(self, checked, rates)
+        self.obstacle_pairs = Pairs(self, around, [self.rates[a] for a, _ in around])
         # parts and obstacles against a segment that comes with the states
-        self.free = Pairs(self, [(a, last) for a in range(last)])
+        self.segment_pairs = Pairs(self, [(a, last) for a in range(last)])
 
-    def towards(self, point: Floats) -> Floats:
+    def load_rates(self, point: Floats) -> Floats:
         """Return rates of approach (P + obstacles, n) to a load at a point of the flange, m/rad.
 
         The load moves with the point and does not turn. A joint that turns a part turns the point
         with it, so that their rate of approach is at most their distance per radian.
         """
-        arm, n_obstacles = self.arm, len(self.things)
+        arm, n_obstacles = self.arm, len(self.obstacles)
         hook = on_flange(arm, point)
         moves = np.array([from_axis(arm, arm.n, hook[None], i) for i in range(1, arm.n + 1)])
         out = np.tile(moves, (len(self.parts) + n_obstacles, 1))
@@ -272,20 +272,20 @@ class Scene:
             row[: part.body] = farthest
         return out
 
-    def _approach(self, a: int, b: int, far: Floats) -> Floats:
+    def _approach_rates(self, a: int, b: int, far: Floats) -> Floats:
         """Return the rates (n,) of approach of two parts by the joints between them, m/rad."""
         low, high = sorted((self.parts[a].body, self.parts[b].body))
         joint = np.arange(1, self.arm.n + 1)
         between = (joint > low) & (joint <= high)
         return np.where(between, np.minimum(far[a], far[b]), 0.0)
 
-    def _not_always(self, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    def _rarely_touching(self, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
         """Return the pairs without those that touch in a large share of all states."""
         low, high = self.arm.usual_range
         q, tested = low + _spread(_SAMPLES, self.arm.n) * (high - low), Pairs(self, pairs)
-        often = tested.how_often(q)
-        near = np.zeros(len(pairs)) if is_known(self.arm) else tested.how_often(q, _NEAR)
-        checked = (often < _ALWAYS) & (near < 1.0)
+        touching = tested.contact_share(q)
+        near = np.zeros(len(pairs)) if is_known(self.arm) else tested.contact_share(q, _NEAR)
+        checked = (touching < _MOST_CONTACT) & (near < 1.0)
         return [pair for pair, check in zip(pairs, checked, strict=True) if check]
 
 
@@ -304,7 +304,7 @@ class Pairs:
         self._data, self._geometry = scene.model.createData(), pin.GeometryModel()
         free = "free", pin.coal.Capsule(1.0, 1.0), pin.SE3.Identity()
         parts = ((p.name, p.body, *_capsule(p.start, p.end, p.radius)) for p in scene.parts)
-        fixed = ((name, 0, shape, place) for name, shape, place in (*scene.things, free))
+        fixed = ((name, 0, shape, place) for name, shape, place in (*scene.obstacles, free))
         names = []
         for k, (name, body, shape, place) in enumerate((*parts, *fixed)):
             names.append(name)
@@ -344,7 +344,7 @@ class Pairs:
                     out[name] = min(out.get(name, np.inf), self._gap(k))
         return out
 
-    def how_often(self, q: Floats, margin: float = 0.0) -> Floats:
+    def contact_share(self, q: Floats, margin: float = 0.0) -> Floats:
         """Return the share (K,) of the states in which each pair is closer than a margin, m."""
         count = np.zeros(len(self._pairs))
         self._prepare(margin, None)
@@ -440,35 +440,35 @@ def _placements(segment: Segment | None, count: int) -> _Placements | None:
         return None
     shape = (count, 3)
     start, end = np.broadcast_to(segment.start, shape), np.broadcast_to(segment.end, shape)
-    way = end - start
-    return 0.5 * np.linalg.norm(way, axis=1), _turn(way), 0.5 * (start + end)
+    direction = end - start
+    return 0.5 * np.linalg.norm(direction, axis=1), _turn(direction), 0.5 * (start + end)
 
 
 def _capsule(start: Floats, end: Floats, radius: float) -> tuple[Any, Any]:
     """Return Coal's capsule, along z about its middle, and its placement."""
     import pinocchio as pin
 
-    way = end - start
-    shape = pin.coal.Capsule(radius, float(np.linalg.norm(way)))
-    return shape, pin.SE3(_turn(way[None])[0], 0.5 * (start + end))
+    direction = end - start
+    shape = pin.coal.Capsule(radius, float(np.linalg.norm(direction)))
+    return shape, pin.SE3(_turn(direction[None])[0], 0.5 * (start + end))
 
 
-def _obstacle(thing: Obstacle) -> tuple[Any, Any]:
+def _obstacle(obstacle: Obstacle) -> tuple[Any, Any]:
     """Return Coal's shape of an obstacle, and its placement."""
     import pinocchio as pin
 
-    if thing.center_m is not None and thing.size_m is not None:
-        return pin.coal.Box(*thing.size_m), pin.SE3(np.eye(3), np.array(thing.center_m))
-    if thing.bottom_m is None or thing.radius_m is None or thing.height_m is None:
-        raise ValueError(f"obstacle {thing.name} has no shape")  # refused by its section
-    middle = np.array(thing.bottom_m) + 0.5 * thing.height_m * np.array([0.0, 0.0, 1.0])
-    return pin.coal.Cylinder(thing.radius_m, thing.height_m), pin.SE3(np.eye(3), middle)
+    if obstacle.center_m is not None and obstacle.size_m is not None:
+        return pin.coal.Box(*obstacle.size_m), pin.SE3(np.eye(3), np.array(obstacle.center_m))
+    if obstacle.bottom_m is None or obstacle.radius_m is None or obstacle.height_m is None:
+        raise ValueError(f"obstacle {obstacle.name} has no shape")  # refused by its section
+    middle = np.array(obstacle.bottom_m) + 0.5 * obstacle.height_m * _Z
+    return pin.coal.Cylinder(obstacle.radius_m, obstacle.height_m), pin.SE3(np.eye(3), middle)
 
 
-def _turn(way: Floats) -> Floats:
+def _turn(direction: Floats) -> Floats:
     """Return rotations (N, 3, 3) that turn z to directions (N, 3); 1 for zero vectors."""
-    length = np.linalg.norm(way, axis=1, keepdims=True)
-    z = np.where(length > _SHORT, way / np.where(length > _SHORT, length, 1.0), [0.0, 0.0, 1.0])
+    length = np.linalg.norm(direction, axis=1, keepdims=True)
+    z = np.where(length > _SHORT, direction / np.where(length > _SHORT, length, 1.0), _Z)
     x = se3.cross(np.eye(3)[np.argmin(np.abs(z), axis=1)], z)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     return np.stack([x, se3.cross(z, x), z], axis=2)

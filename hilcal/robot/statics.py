@@ -121,10 +121,11 @@ class GeometricStiffness:
     chain: Chain
     force: list[Floats]  # (n + 1,) list of (N, 3) f_k, N
     dyad: list[Floats]  # (n + 1,) list of (N, 3, 3) D_k, N·m
-    carried: list[Floats]  # (n + 1,) list of (N, 3, 3) D_k − [m]×, N·m, m the load's moment
-    spun: list[Floats]  # (n,) list of (N, 3) D_j z_j, N·m
+    dyad_less_moment: list[Floats]  # (n + 1,) of (N, 3, 3) D_k − [m]×, N·m, m the load's moment
+    dyad_axis: list[Floats]  # (n,) list of (N, 3) D_j z_j, N·m
     load_point: Floats  # (N, 3) m
-    following: Floats | None = None  # (N, 6, 6) change of the load's wrench by the flange's motion
+    # (N, 6, 6) change of the load's wrench by the flange's motion; None for a constant wrench
+    load_stiffness: Floats | None = None
 
     def gradient(self, form: Mapping[tuple[int, bool], Floats]) -> "MotionGradient":
         """Return the gradient, by motions, of a linear form of forces and moments of slots.
@@ -133,26 +134,27 @@ class GeometricStiffness:
         """
         chain, slots = self.chain, len(self.force)
         rows = next(iter(form.values())).shape[:2]
-        load, still = zeros(*rows, 3), [zeros(*rows, 3)]
-        along = [zeros(*rows, 3) for _ in range(slots + 1)]
+        load, moment_sums = zeros(*rows, 3), [zeros(*rows, 3)]
+        by_turn = [zeros(*rows, 3) for _ in range(slots + 1)]
         for k in range(slots):
             of = {m: form[k, m] for m in (False, True) if (k, m) in form}
             base = {m: rows_times(b, chain.rotation[k], transposed=True) for m, b in of.items()}
-            still.append(still[-1])
+            moment_sums.append(moment_sums[-1])
             if (by_moment := base.get(True)) is not None:
-                still[-1] = still[-1] + by_moment
-                along[k] += rows_times(by_moment, self.carried[k], transposed=True)
-                if self.following is not None:
+                moment_sums[-1] = moment_sums[-1] + by_moment
+                by_turn[k] += rows_times(by_moment, self.dyad_less_moment[k], transposed=True)
+                if self.load_stiffness is not None:
                     load += se3.cross(by_moment, (self.load_point - chain.position[k])[:, None])
             if (by_force := base.get(False)) is not None:
-                along[k] += se3.cross(by_force, self.force[k][:, None])
+                by_turn[k] += se3.cross(by_force, self.force[k][:, None])
                 load += by_force
         for k in range(slots - 1, -1, -1):
-            along[k] += along[k + 1]
+            by_turn[k] += by_turn[k + 1]
         flange = None
-        if self.following is not None:
-            flange = rows_times(np.concatenate([load, still[-1]], axis=2), self.following)
-        return MotionGradient(self, still, along, flange)
+        if self.load_stiffness is not None:
+            by_wrench = np.concatenate([load, moment_sums[-1]], axis=2)
+            flange = rows_times(by_wrench, self.load_stiffness)
+        return MotionGradient(self, moment_sums, by_turn, flange)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,19 +163,19 @@ class MotionGradient:
 
     stiffness: GeometricStiffness
     # (n + 2,) sums (N, m, 3) of the moments' coefficients over the slots i < k, base axes
-    still: list[Floats]
-    along: list[Floats]  # (n + 2,) gradients (N, m, 3) by a turn of slots i ≥ k
+    moment_sums: list[Floats]
+    by_turn: list[Floats]  # (n + 2,) gradients (N, m, 3) by a turn of slots i ≥ k
     flange: Floats | None  # (N, m, 6) gradient by the flange's motion through the load's wrench
 
     def joint(self, j: int) -> Floats:
         """Return the gradient (N, m) by the displacement of joint j + 1."""
-        s, flange, still = self.stiffness, self.flange, self.still[j + 1]
+        s, flange, moments = self.stiffness, self.flange, self.moment_sums[j + 1]
         z = s.chain.rotation[j, :, :, 2]
         if j in s.chain.slides:
             # slot j stands still; the force through it is shifted along z relative to p_j
-            out = _rows_dot(still, se3.cross(z, s.force[j]))
+            out = _rows_dot(moments, se3.cross(z, s.force[j]))
             return out if flange is None else out + _rows_dot(flange[..., :3], z)
-        out = _rows_dot(self.along[j + 1], z) + _rows_dot(still, s.spun[j])
+        out = _rows_dot(self.by_turn[j + 1], z) + _rows_dot(moments, s.dyad_axis[j])
         if flange is not None:
             lever = s.chain.position[-1] - s.chain.position[j]
             out += _rows_dot(flange[..., 3:], z)
@@ -182,13 +184,13 @@ class MotionGradient:
 
     def displacement(self, j: int) -> Floats:
         """Return the gradient (N, m, 3) by the displacement of all beyond slot j, base axes."""
-        out = se3.cross(self.stiffness.force[j][:, None], self.still[j])
+        out = se3.cross(self.stiffness.force[j][:, None], self.moment_sums[j])
         return out if self.flange is None else self.flange[..., :3] + out
 
     def turn(self, j: int) -> Floats:
         """Return the gradient (N, m, 3) by the turn of all beyond slot j about p_j, base axes."""
         chain, flange = self.stiffness.chain, self.flange
-        out = self.along[j] + rows_times(self.still[j], self.stiffness.dyad[j])
+        out = self.by_turn[j] + rows_times(self.moment_sums[j], self.stiffness.dyad[j])
         if flange is not None:
             lever = (chain.position[-1] - chain.position[j])[:, None]
             out = out + (flange[..., 3:] + se3.cross(lever, flange[..., :3]))
@@ -196,7 +198,7 @@ class MotionGradient:
 
 
 def geometric_stiffness(
-    arm: Arm, chain: Chain, load: Load, following: Floats | None = None
+    arm: Arm, chain: Chain, load: Load, load_stiffness: Floats | None = None
 ) -> GeometricStiffness:
     """Prepare the geometric stiffness of a chain under a load."""
     n, p = arm.n, chain.position
@@ -221,9 +223,9 @@ def geometric_stiffness(
             dyad[:, axis, axis] -= trace
     moment = load.wrench[:, 3:]
     turned = se3.skew(moment) if moment.any() else None
-    carried = dyads if turned is None else [dyad - turned for dyad in dyads]
-    spun = [se3.apply(dyads[j], chain.rotation[j, :, :, 2]) for j in range(n)]
-    return GeometricStiffness(chain, forces, dyads, carried, spun, point, following)
+    less_moment = dyads if turned is None else [dyad - turned for dyad in dyads]
+    dyad_axis = [se3.apply(dyads[j], chain.rotation[j, :, :, 2]) for j in range(n)]
+    return GeometricStiffness(chain, forces, dyads, less_moment, dyad_axis, point, load_stiffness)
 
 
 def rows_times(rows: Floats, matrix: Floats, *, transposed: bool = False) -> Floats:

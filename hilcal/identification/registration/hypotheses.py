@@ -11,7 +11,7 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.config.sections import Conventions
 from hilcal.robot import se3
-from hilcal.robot.arm import Arm, may_follow, with_controller_conventions, with_conventions
+from hilcal.robot.arm import Arm, possible_couplings, with_controller_conventions, with_conventions
 from hilcal.robot.catalogue import load_arm, other_arms
 from hilcal.types import Bools, Floats
 
@@ -244,7 +244,7 @@ def hypotheses(d: Description) -> Iterator[Hypothesis]:
             for quarter in (0, 2, 1, -1):
                 if (sign < 0 or quarter) and not (quarter and slides[j - 1]):
                     yield Hypothesis("joint", j, sign, quarter * np.pi / 2)
-    for joint, follows in may_follow(n):
+    for joint, follows in possible_couplings(n):
         for factor in (1.0, -1.0) if slides[joint - 1] == slides[follows - 1] else ():
             yield Hypothesis("coupling", joint, follows=follows, factor=factor)
     simple = ["millimetres", "metres", "joint_degrees", "joint_radians", "mirrored"]

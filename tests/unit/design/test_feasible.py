@@ -456,7 +456,7 @@ def test_a_motion_that_is_planned_passes_and_touches_nothing(c, seed, load):
             inside, apart = gaps(space.shapes, between, load)
             assert inside >= -BETWEEN_M - 1e-9
             assert apart > 0.0
-            assert space.shapes.scene.itself.distance(between) > 0.0
+            assert space.shapes.scene.self_pairs.distance(between) > 0.0
 
 
 @pytest.mark.long

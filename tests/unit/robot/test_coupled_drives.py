@@ -153,7 +153,8 @@ def test_shapes_of_turned_and_coupled_joints_are_those_of_the_drawn_arm():
             np.testing.assert_allclose(here, there, atol=1e-12)
     here, there = Scene(arm), Scene(drawn)
     for one, two in zip(q, theta, strict=True):
-        assert here.itself.distance(one) == pytest.approx(there.itself.distance(two), abs=1e-9)
+        distance = there.self_pairs.distance(two)
+        assert here.self_pairs.distance(one) == pytest.approx(distance, abs=1e-9)
 
 
 def test_the_situation_says_whose_angles_they_are():

@@ -38,15 +38,15 @@ def test_usual_poses_are_free_and_folded_ones_are_not(name):
     scene = Scene(load_arm(name), obstacles=(TABLE,))
     usual = np.array([UPRIGHT, [0.0, -1.5, 1.5, -1.5, -1.5, 0.0], *POSES.values()])
     assert is_known(load_arm(name)) == (name not in ("ur8long", "ur15", "ur18"))  # guessed
-    assert scene.itself.close_pairs(usual, 0.01) == {}
-    assert scene.around.close_pairs(usual, 0.01) == {}
+    assert scene.self_pairs.close_pairs(usual, 0.01) == {}
+    assert scene.obstacle_pairs.close_pairs(usual, 0.01) == {}
     folded = np.array([[0.0, -1.5, 3.0, -1.5, -1.5, 0.0]])
-    hit = {name for pair in scene.itself.close_pairs(folded) for name in pair}
+    hit = {name for pair in scene.self_pairs.close_pairs(folded) for name in pair}
     assert {"upper arm", "wrist 1"} <= hit
-    assert scene.itself.touching(folded).all()
+    assert scene.self_pairs.touching(folded).all()
     down = np.array([[0.0, 0.4, 0.3, -1.5, -1.5, 0.0]])  # through the table
-    assert ("forearm", "table") in scene.around.close_pairs(down)
-    assert scene.around.touching(down).all()
+    assert ("forearm", "table") in scene.obstacle_pairs.close_pairs(down)
+    assert scene.obstacle_pairs.touching(down).all()
 
 
 FOOT = {"ur3": 128, "ur3e": 128, "ur5": 149, "ur5e": 149, "ur20": 245, "ur30": 245}
@@ -73,14 +73,15 @@ def test_known_distances_to_a_ball_a_box_and_a_cylinder():
     at = 0.5 * side + [0.0, 0.0, height]
     ball = Segment("ball", at, at, 0.05)
     scene = Scene(arm)
-    assert scene.free.distance(UPRIGHT, ball) == pytest.approx(0.5 - 0.1762 - 0.06 - 0.05, abs=1e-6)
+    distance = scene.segment_pairs.distance(UPRIGHT, ball)
+    assert distance == pytest.approx(0.5 - 0.1762 - 0.06 - 0.05, abs=1e-6)
     turned = np.array([np.pi, *UPRIGHT[1:]])
-    assert scene.free.distance(turned, ball) > 0.4
+    assert scene.segment_pairs.distance(turned, ball) > 0.4
     box = Obstacle(name="wall", center_m=(0.0, -0.5, height), size_m=(0.1, 0.2, 0.1))
     tube = 0.5 - 0.1 - 0.1762 - 0.06
     for thing in (box, Obstacle(name="x", bottom_m=(0, -0.5, 0.45), radius_m=0.1, height_m=0.06)):
         for margin, touches in ((tube - 1e-3, False), (tube + 1e-3, True)):
-            hit = Scene(arm, obstacles=(thing,)).around.touching(UPRIGHT[None], margin)
+            hit = Scene(arm, obstacles=(thing,)).obstacle_pairs.touching(UPRIGHT[None], margin)
             assert hit.all() == touches
 
 
@@ -107,7 +108,7 @@ def test_whatever_is_free_is_free_by_another_way_to_count(name, thing, seed):
     arm = load_arm(name)
     scene = Scene(arm, obstacles=(thing,))
     q = np.random.default_rng(seed).uniform(-np.pi, np.pi, (20, 6))
-    itself, around = scene.itself.touching(q, 0.01), scene.around.touching(q, 0.02)
+    itself, around = scene.self_pairs.touching(q, 0.01), scene.obstacle_pairs.touching(q, 0.02)
     coarse = 0.04 * arm.reach / 2  # the ends of the points' spacing
     for k, state in enumerate(q):
         at = frames(arm, state)
@@ -125,18 +126,18 @@ def test_no_gap_closes_faster_than_its_rate(name, thing, seed):
     """What is nearest after turns of the joints was no farther before than the bound says."""
     arm, rng = arm_of(name), np.random.default_rng(seed)
     scene, point = Scene(arm, obstacles=(thing,)), rng.normal(0.0, 0.1, 3)
-    towards = scene.towards(point)
+    towards = scene.load_rates(point)
     q = rng.uniform(-2.0, 2.0, (20, arm.n))
     turns = rng.uniform(-1.0, 1.0, q.shape) * np.eye(arm.n)[rng.integers(0, arm.n, len(q))]
     places = [evaluate(arm, states).point(point) for states in (q, q + turns)]
     for k, turn in enumerate(np.abs(turns)):
         old, new = q[k : k + 1], (q + turns)[k : k + 1]
         was, here = (Segment("hung", at[k], at[k] - [0.0, 0.0, 0.2], 0.02) for at in places)
-        for pairs in (scene.itself, scene.around):
+        for pairs in (scene.self_pairs, scene.obstacle_pairs):
             near = pairs.distance(new[0]) + pairs.rates @ turn + 1e-4
             assert pairs.touching(old, near).all()
-        near = scene.free.distance(new[0], here) + towards @ turn + 1e-4
-        assert scene.free.touching(old, near, was).all()
+        near = scene.segment_pairs.distance(new[0], here) + towards @ turn + 1e-4
+        assert scene.segment_pairs.touching(old, near, was).all()
 
 
 def test_an_arm_of_unknown_shape_gets_links_and_can_move():
@@ -148,7 +149,7 @@ def test_an_arm_of_unknown_shape_gets_links_and_can_move():
         length = np.linalg.norm(arm.links[part.body][:3, 3])
         assert np.linalg.norm(part.end - part.start) == pytest.approx(length)
     q = np.random.default_rng(0).uniform(-2.0, 2.0, (200, arm.n))
-    share = Scene(arm).itself.touching(q, 0.0).mean()
+    share = Scene(arm).self_pairs.touching(q, 0.0).mean()
     assert 0.0 < share < 0.9
 
 
