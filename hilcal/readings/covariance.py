@@ -171,8 +171,8 @@ def scatter_alone(readings: Readings, factor: Floats) -> Readings:
 def symmetric_root(covariance: Floats) -> Floats:
     """S (..., m, m) of covariances, see `readings.readings`."""
     std = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-    per = 1.0 / np.where(std > 0, std, 1.0)
-    values, vectors = np.linalg.eigh(covariance * per[..., :, None] * per[..., None, :])
+    per_std = 1.0 / np.where(std > 0, std, 1.0)
+    values, vectors = np.linalg.eigh(covariance * per_std[..., :, None] * per_std[..., None, :])
     root = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
     return np.asarray(std[..., :, None] * (root @ np.swapaxes(vectors, -1, -2)))
 

@@ -282,7 +282,7 @@ class Readings(Tabular):
         number = self.states.observer
         return np.zeros(len(self), dtype=np.int64) if number is None else number
 
-    def seen_by(self, observers: Sequence[ObserverName]) -> "Readings":
+    def with_observers(self, observers: Sequence[ObserverName]) -> "Readings":
         """Return the readings with observers numbered as in `observers`; without any unchanged.
 
         Raises:

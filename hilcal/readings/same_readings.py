@@ -56,9 +56,9 @@ def shared(campaigns: Sequence[Floats]) -> tuple[int, int] | None:
     from scipy.spatial import cKDTree  # slow to import
 
     for width in sorted({c.shape[1] for c in campaigns}):
-        same = [(k, np.unique(c, axis=0)) for k, c in enumerate(campaigns) if c.shape[1] == width]
-        campaign = np.concatenate([np.full(len(rows), k) for k, rows in same])
-        rows = np.concatenate([rows for _, rows in same])
+        alike = [(k, np.unique(c, axis=0)) for k, c in enumerate(campaigns) if c.shape[1] == width]
+        campaign = np.concatenate([np.full(len(rows), k) for k, rows in alike])
+        rows = np.concatenate([rows for _, rows in alike])
         if len(rows) < 2:
             continue
         tree = cKDTree(rows)
@@ -69,7 +69,7 @@ def shared(campaigns: Sequence[Floats]) -> tuple[int, int] | None:
         near = np.isfinite(distance)
         partner = np.full(len(rows), -1)
         partner[near] = campaign[nearest[near]]
-        for k, unique in same:
+        for k, unique in alike:
             partners = partner[campaign == k]
             partners = partners[(partners >= 0) & (partners != k)]
             if len(partners) > SHARED * len(unique):
@@ -86,12 +86,8 @@ def never_fitted(readings: Readings, fitted: Readings, deflections: bool) -> tup
     if not deflections:
         return repeated, ~repeated
     group = numbered(readings.pose, readings.cycle, readings.target)
-    spoilt = np.zeros(group.max(initial=-1) + 1, dtype=np.bool_)
-    spoilt[group[repeated & readings.unloaded]] = True
-    unseen = ~repeated & ~spoilt[group]
-    loaded = np.zeros(len(spoilt), dtype=np.bool_)
-    loaded[group[unseen & ~readings.unloaded]] = True
-    return repeated, unseen & loaded[group]
+    unseen = ~repeated & ~np.isin(group, group[repeated & readings.unloaded])
+    return repeated, unseen & np.isin(group, group[unseen & ~readings.unloaded])
 
 
 def _coordinates(r: Readings, attitude: bool) -> Floats:

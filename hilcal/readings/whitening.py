@@ -64,12 +64,10 @@ def deflection_groups(readings: Readings) -> list[Group]:
             f"pose {name}, cycle {readings.cycle[row]}: no unloaded reading (load = none), which "
             "a deflection needs; measure it, or use --readings absolute"
         )
-    keys = [readings.pose, readings.cycle]
     rows = np.flatnonzero(has_unloaded(readings, readings.line))
     unloaded, target = readings.unloaded[rows], readings.line[rows]
-    if readings.common is None:
-        keys.append(readings.line)
-    group = numbered(*(i[rows] for i in keys))
+    lines = [target] * (readings.common is None)
+    group = numbered(readings.pose[rows], readings.cycle[rows], *lines)
     order, starts, sizes = in_groups(group, target, ~unloaded)
     count = np.add.reduceat(unloaded[order].astype(np.int64), starts)
     alike = np.zeros_like(starts)
@@ -137,7 +135,7 @@ Mode = Literal["deflection", "absolute"]
 SCALINGS: tuple[Scaling, ...] = ("none", "gu", "gc")
 MODES: tuple[Mode, ...] = ("deflection", "absolute")
 RANK_TOLERANCE = 1e-10
-TOGETHER = 1_000_000  # Numbers that are whitened at a time; a choice by memory
+NUMBERS_AT_ONCE = 1_000_000  # numbers that are whitened in one step; a choice by memory
 RUN = 200  # measurements in a run of correlated noise; a choice: of fewer all is exact
 
 
@@ -220,7 +218,7 @@ class Whitening:
         start = 0
         for b in self.buckets:
             groups, size = b.factor.shape[:2]
-            at_once = max(1, TOGETHER // max(size * flat.shape[1], 1))
+            at_once = max(1, NUMBERS_AT_ONCE // max(size * flat.shape[1], 1))
             for first in range(0, groups, at_once):
                 factor = b.factor[first : first + at_once]
                 rows = slice(start, start + len(factor) * size)
@@ -265,14 +263,14 @@ def whitening(readings: Readings, mode: Mode, scaling: Scaling = "gc") -> Whiten
 
 
 def _innovations(covariance: Floats) -> Floats:
-    """S⁻¹ (1, k, k) of a run, S = D L, C = L Lᵀ; for the rule, C's diagonal grows a little."""
+    """S⁻¹ (1, k, k) of a run, S = D L, L Lᵀ = C + ε 1, ε = 1e-10 for a rank-deficient C."""
     std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     positive = std > 0
-    per = np.where(positive, 1.0, 0.0) / np.where(positive, std, 1.0)
-    c = covariance * per[:, :, None] * per[:, None, :]
+    per_std = np.where(positive, 1.0, 0.0) / np.where(positive, std, 1.0)
+    c = covariance * per_std[:, :, None] * per_std[:, None, :]
     c += np.where(positive, RANK_TOLERANCE, 1.0)[:, :, None] * np.eye(c.shape[1])
     lower = np.linalg.cholesky(c)[0]
-    inverse = solve_triangular(lower, np.diag(per[0]), lower=True, check_finite=False)
+    inverse = solve_triangular(lower, np.diag(per_std[0]), lower=True, check_finite=False)
     return np.asarray(inverse[None])
 
 

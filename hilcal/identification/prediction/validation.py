@@ -70,7 +70,7 @@ def validate(
     Raises:
         InputError: an effect of the model needs a column that the other readings lack.
     """
-    other = other.seen_by(fitted.observers)
+    other = other.with_observers(fitted.observers)
     require_columns(model, other, "other")
     w = whitening(other, mode, "gc")
     raw = residual(other, model.predict(other.states, theta), w)
