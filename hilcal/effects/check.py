@@ -79,10 +79,10 @@ def example_situation(cell: Cell, states: States) -> Situation:
     chain = chains.evaluate(cell.arm, angle)
     load = Load(states.wrench, cell.load_point, cell.tool_mass, cell.tool_com, cell.gravity)
     wrench = slot_wrenches(cell.arm, chain, load)
-    turned = cell.arm.phases(angle)
-    for array in (wrench, turned):
+    phases = cell.arm.phases(angle)
+    for array in (wrench, phases):
         array.flags.writeable = False
-    return Situation(cell, states, turned, chain, wrench, load, typical_compliances(cell))
+    return Situation(cell, states, phases, chain, wrench, load, typical_compliances(cell))
 
 
 NAME = re.compile(r"[a-z][a-z0-9_]*")

@@ -13,7 +13,6 @@ from hilcal.readings.readings import States
 
 USUAL_ORDERS, MOST_ORDERS = 4, 12
 STRAIGHTNESS, SCALE, TILT = 2e-5, 5e-5, 5e-5
-
 """Ordinary amplitudes: 20 µm across the travel, 50 µm along it at either end, 50 µrad. Guides of
 machine tools are better, rack-driven tracks of robots worse; a choice."""
 
@@ -49,9 +48,9 @@ class GuideError(Effect):
         if isinstance(k, bool) or not isinstance(k, int) or not 1 <= k <= MOST_ORDERS:
             raise InputError(f"effect {self.name}: orders = {k!r}; valid: 1 to {MOST_ORDERS}")
         self.orders = k
-        terms = [("x", i) for i in range(2, k + 1)] + [("y", i) for i in range(2, k + 1)]
-        terms += [("z", 1)] + [(turn, i) for turn in AXES[3:] for i in range(1, k + 1)]
-        self._terms = tuple(terms)
+        straightness = [(axis, i) for axis in "xy" for i in range(2, k + 1)]
+        tilts = [(turn, i) for turn in AXES[3:] for i in range(1, k + 1)]
+        self._terms = (*straightness, ("z", 1), *tilts)
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -4,11 +4,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from hilcal.effects.link_geometry import AXES
 from hilcal.effects.options import PRIOR_HELP
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
 from hilcal.readings.readings import States
-
-_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 class ObserverFrame(Effect):
@@ -45,7 +44,7 @@ class ObserverFrame(Effect):
         """Shift, turn and offset, as far as they are unknown."""
         out = []
         for k, element in self.free:
-            o, axis = self.cell.observers[k].name, _AXES[element]
+            o, axis = self.cell.observers[k].name, AXES[element]
             unit = "m" if element < 3 else "rad"
             meaning = f"turn about {axis[-1]}" if element > 2 else f"shift along {axis}"
             if o.kind == "point" and element == 3:

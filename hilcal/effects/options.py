@@ -9,8 +9,6 @@ from hilcal.errors import InputError
 from hilcal.types import Floats
 
 Options = Mapping[str, object]
-
-
 TYPICAL_TWIST, TYPICAL_SHIFT = 2e-3, 7e-5
 """Twist of a joint at its rated torque where its compliance is unknown, rad, and shift of a slide
 at its rated force, m. Guesses within the 0.3 to 5 mrad of most arms, and for racks and screws of

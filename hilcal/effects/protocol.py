@@ -82,7 +82,7 @@ class Situation:
     # the drives where joints are coupled, and the phase of its travel where a joint slides
     # (`Arm.phases`)
     angle: Floats
-    chain: Chain  # the deviated chain, or None before it is known
+    chain: Chain  # the deviated chain
     # (N, n + 1, 6) wrench transmitted through each slot, slot axes; element (j, 5) is the torque τ
     # about the axis of joint j + 1, (j, 2) the force along it
     wrench: Floats
@@ -369,9 +369,8 @@ class Effect(ABC):
         `plausible`, times the factor that `[plausible]` of the cell has for the effect.
         """
         config = self.cell.config
-        return self.plausible * (
-            1.0 if config is None else config.plausible.get(type(self).name, 1.0)
-        )
+        factor = 1.0 if config is None else config.plausible.get(type(self).name, 1.0)
+        return self.plausible * factor
 
     @classmethod
     def usual_options(cls, m: int) -> Options:

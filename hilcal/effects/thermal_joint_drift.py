@@ -27,11 +27,11 @@ class ThermalJointDrift(PerJoint):
     def setup(self, states: States) -> None:
         """Take the temperatures at the first reading as the reference unless given."""
         super().setup(states)
-        warm = states.joint_temperature
-        assert warm is not None  # noqa: S101 - checked at construction
+        temperature = states.joint_temperature
+        assert temperature is not None  # noqa: S101 - checked at construction
         if "reference_degC" not in self.options:
             first = 0 if states.time is None else int(np.argmin(states.time))
-            self.options["reference_degC"] = [float(t) for t in warm[first]]
+            self.options["reference_degC"] = temperature[first].tolist()
         self.reference = numbers(self.name, self.options, "reference_degC", self.cell.arm.n)
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:

@@ -36,9 +36,8 @@ class TrackerDrift(Effect):
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Rates of displacement and rotation; 0.2 mm and 0.2 mrad over the campaign."""
-        return tuple(Parameter(a, "m/s", 2e-4 / self.span) for a in "xyz") + tuple(
-            Parameter(f"r{a}", "rad/s", 2e-4 / self.span) for a in "xyz"
-        )
+        units = (("", "m/s"), ("r", "rad/s"))
+        return tuple(Parameter(f"{r}{a}", u, 2e-4 / self.span) for r, u in units for a in "xyz")
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Unit twists times the time since the reference."""
