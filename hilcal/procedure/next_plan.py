@@ -112,15 +112,12 @@ def next_plan(
     `poses` is as in `separating_plan`. `cell` replaces the campaign's where it has changed. To
     `compare` criteria and numbers of poses takes longer. Raises as `separating_plan` does.
     """
-    numbers = o.cell if cell is None else cell
-    chosen = separating_plan(numbers, doubt, poses, rng, say, reference_in(o.file))
+    cell = o.cell if cell is None else cell
+    chosen = separating_plan(cell, doubt, poses, rng, say, reference_in(o.file))
     compare = compare and not doubt.pose_alone
-    summary = summarise(
-        chosen.planned, numbers.configured(), rng, say, compare=compare, curve=compare
-    )
+    summary = summarise(chosen.planned, cell.configured(), rng, say, compare=compare, curve=compare)
     say("checking every motion in a dry run")
-    checked_plan = checked(numbers, plan_of(chosen, doubt.suspects), summary)
-    return NextPlan(chosen, checked_plan)
+    return NextPlan(chosen, checked(cell, plan_of(chosen, doubt.suspects), summary))
 
 
 def doubt_to_settle(o: Campaign, d: Diagnosis, say: Say) -> Doubt:
@@ -140,10 +137,8 @@ def doubt_to_settle(o: Campaign, d: Diagnosis, say: Say) -> Doubt:
 
 def _settled(o: Campaign, d: Diagnosis) -> str:
     """Return the message that there are no suspects to separate, with the next step."""
-    see, further = (
-        f"see hilcal diagnose {quoted(o.path)}",
-        f"hilcal plan CELL.toml -o PLAN.json --after {quoted(o.path)}",
-    )
+    see = f"see hilcal diagnose {quoted(o.path)}"
+    further = f"hilcal plan CELL.toml -o PLAN.json --after {quoted(o.path)}"
     if d.verdict == "adequate":
         why = (
             f"the model is adequate; to sharpen it, plan on with: {further}, or separate named "
@@ -165,11 +160,9 @@ def _settled(o: Campaign, d: Diagnosis) -> str:
         )
     elif d.verdict == "missing_effect":
         lead = d.suspects[0]
-        add = (
-            f"{lead.effect} alone is missing; add it with: "
-            f"hilcal add {quoted(o.path)} {quoted(lead.effect)}"
-        )
-        why = _finer(o, lead) if lead.coarse else add
+        add = f"hilcal add {quoted(o.path)} {quoted(lead.effect)}"
+        missing = f"{lead.effect} alone is missing; add it with: {add}"
+        why = _finer(o, lead) if lead.coarse else missing
     else:
         why = "no effect of the catalogue explains the misfit"
         if d.reason == "insufficient_catalogue":
@@ -281,28 +274,23 @@ class FurtherMeasuring:
             return replace(further, reason="time")
         return replace(further, reason="plans") if len(self.plans) >= MAX_PLANS else further
 
-    def _reference(self) -> Floats | None:
-        return reference_of(self.plans[0])
-
     def _separating(self, error: PredictedError) -> Decision | None:
         """Return the decision on the diagnosis' doubt; None without a doubt."""
         doubt = doubt_of(self.d, self.say)
         if doubt is None:
             return None
-        nothing = Decision("inseparable", self.d.verdict, error, suspects=doubt.suspects)
-        poses = self.settings.poses
+        inseparable = Decision("inseparable", self.d.verdict, error, suspects=doubt.suspects)
+        poses, reference = self.settings.poses, reference_of(self.plans[0])
         try:
-            chosen = separating_plan(
-                self.cell, doubt, None, self.rng, self.say, self._reference(), poses
-            )
+            chosen = separating_plan(self.cell, doubt, None, self.rng, self.say, reference, poses)
         except (CannotAnswerError, InputError):
-            return nothing
+            return inseparable
         separable = [p for p in chosen.powers if not p.not_separable]
         if max((p.power_planned - p.power_now for p in separable), default=0.0) < MIN_POWER_GAIN:
-            return nothing
+            return inseparable
         plan, power = plan_of(chosen, doubt.suspects), min(p.power_planned for p in separable)
         seconds = duration_of(plan)
-        return replace(nothing, reason="doubt", power=power, plan=plan, seconds=seconds)
+        return replace(inseparable, reason="doubt", power=power, plan=plan, seconds=seconds)
 
     def _sharpening(self, error: PredictedError) -> Decision | None:
         """Return the decision on the predicted error; None where it meets the goal."""
@@ -313,13 +301,12 @@ class FurtherMeasuring:
         if error.floor_m >= goal:
             return replace(decision, reason="floor")
         self.say("planning what would lower the predicted error")
-        config = self.cell.configured()
-        planning = config.planning.model_copy(update={"readings": self.d.fit.mode})
-        cell = self.cell.with_config(config.model_copy(update={"planning": planning}))
+        config = self.cell.configured().with_keys("planning", readings=self.d.fit.mode)
+        cell, request = self.cell.with_config(config), PlanRequest(self.settings.poses)
+        reference = reference_of(self.plans[0])
         try:
             planned = plan_readings(
-                *(cell, PlanRequest(self.settings.poses), self.rng, self.d.fit, self.say),
-                reference=self._reference(),
+                cell, request, self.rng, self.d.fit, self.say, reference=reference
             )
         except (CannotAnswerError, InputError):
             return decision

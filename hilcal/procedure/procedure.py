@@ -110,8 +110,7 @@ class Procedure:
         if path.exists():
             stored = continued(path, cell, effects)
             return replace(stored, settings=replace(stored.settings, **options))
-        readings = config.planning.readings if config.loads else "absolute"
-        default = state.Settings(seed=config.simulation.seed, readings=readings)
+        default = state.Settings(seed=config.simulation.seed, readings=config.readings_mode)
         return cls(path, cell, effects, replace(default, **options))
 
     @property
@@ -211,11 +210,11 @@ class Procedure:
             self.keep(o, refinement)
         return refinement
 
-    def keep(self, o: Campaign, found: Refinement) -> tuple[int, ...]:
+    def keep(self, o: Campaign, refinement: Refinement) -> tuple[int, ...]:
         """Store the revisions of a refinement; return their numbers."""
-        records = [o.record(s.fit, s.diagnosis, s.added, s.removed) for s in found.steps]
-        content = {"readings_sha256": o.data_hash, "verdict": found.verdict}
-        self._refinements[:] = [found]
+        records = [o.record(s.fit, s.diagnosis, s.added, s.removed) for s in refinement.steps]
+        content = {"readings_sha256": o.data_hash, "verdict": refinement.verdict}
+        self._refinements[:] = [refinement]
         return ProcedureLog(o.file).append(state.REFINED, content, revisions=records)
 
     def decide(self, say: Say = lambda text: None) -> Decision:
@@ -344,8 +343,8 @@ class Procedure:
 
     def _planned(self) -> Cell:
         """Return the cell for planning, with the kind of readings that is fitted."""
-        planning = self.config.planning.model_copy(update={"readings": self.settings.readings})
-        return self.cell.with_config(self.config.model_copy(update={"planning": planning}))
+        config = self.config.with_keys("planning", readings=self.settings.readings)
+        return self.cell.with_config(config)
 
     def _record(self, o: Campaign) -> RevisionRecord:
         refined = ProcedureLog(o.file).last(state.REFINED)
@@ -376,9 +375,9 @@ class Procedure:
         texts = {PURPOSE: purpose, CALIBRATION: state.identity(self.run), COVERS_KEY: covers}
         config, readings = CellConfig.from_json(o.file.config_json), o.file.readings()
         at_reference = np.array(readings.pose_names)[readings.pose] == REFERENCE
-        if (at_reference & readings.unloaded).any():
-            seen = readings.value[at_reference & readings.unloaded][-1, :3]
-            plan = replace(plan, about={**plan.about, SEEN: seen.tolist()})
+        if (unloaded := at_reference & readings.unloaded).any():
+            position = readings.value[unloaded][-1, :3]
+            plan = replace(plan, about={**plan.about, SEEN: position.tolist()})
         source = self._source(f"{purpose} campaign of {self.run.name}, ")
         create_run(path, config, self.cell.base_dir, plan, source=source, more_texts=texts).close()
 

@@ -78,7 +78,7 @@ def validation_plan(
     states = replace(last, q=drawn.q, q_actual=None, target=None)
     for name in loads:
         wrench = calibration.loads.get(name, np.zeros(6))
-        usable[name] &= usable[UNLOADED] & ~_far(calibration, states, wrench)
+        usable[name] &= usable[UNLOADED] & ~_outside_range(calibration, states, wrench)
     selected: list[tuple[int, str]] = []
     for k in range(len(drawn.q)):
         # The loads in turn; the next load where the pose does not bear this one.
@@ -154,13 +154,13 @@ def _within(cell: Cell, q: Floats) -> Cell:
     return replace(cell, arm=replace(arm, q_min=q_min, q_max=q_max))
 
 
-def _far(calibration: Calibration, states: States, wrench: Floats) -> Bools:
+def _outside_range(calibration: Calibration, states: States, wrench: Floats) -> Bools:
     """Return whether each state is outside the measured range (N,); temperature is ignored."""
     prediction = calibration.predict(states.q, wrench, recorded=recorded_columns(states))
-    far = np.zeros(len(states), dtype=np.bool_)
+    outside = np.zeros(len(states), dtype=np.bool_)
     for o in prediction.outside:
-        far |= o.points & ("temperature" not in o.range.variable)
-    return far
+        outside |= o.points & ("temperature" not in o.range.variable)
+    return outside
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -258,8 +258,8 @@ def _compensated(
     if calibration.mode == "deflection":
         # The goal is the pose of the unloaded arm, in the state of its reading.
         tool = tool_of(calibration.model, calibration.theta, None)
-        free = replace(points.readings.states[points.unloaded[order]], target=None)
-        rotation, position = tool_poses(tool, tool.model.predict(free, tool.theta))
+        unloaded = replace(points.readings.states[points.unloaded[order]], target=None)
+        rotation, position = tool_poses(tool, tool.model.predict(unloaded, tool.theta))
         poses = se3.matrix(rotation, position)
     return calibration.compensate(
         nominal, states.wrench, wanted=poses, recorded=recorded_columns(states)
@@ -319,8 +319,8 @@ def paired(validation: Readings, corrected: Readings, mode: str) -> tuple[Readin
     moved = replace(uncorrected, states=c.states, value=c.value, covariance=c.covariance)
     if mode == "absolute":
         return uncorrected, moved
-    free = validation[np.unique(bases)]
-    return Readings.joined([free, uncorrected]), Readings.joined([free, moved])
+    unloaded = validation[np.unique(bases)]
+    return Readings.joined([unloaded, uncorrected]), Readings.joined([unloaded, moved])
 
 
 def left_out_of(plan: Plan) -> list[tuple[str, str]]:
@@ -354,6 +354,6 @@ def expected_states(
     repeated = last[np.zeros(len(plan.steps), dtype=np.int64)]
     sides = approach_sides(stops)
     columns = {"time": np.array(times), "load_time": np.array(load_times), "approach": sides}
-    recorded_columns = {name: v for name, v in columns.items() if getattr(last, name) is not None}
+    recorded = {name: v for name, v in columns.items() if getattr(last, name) is not None}
     q = np.array([plan.joints(step.pose) for step in plan.steps])
-    return replace(repeated, q=q, wrench=wrench, q_actual=None, target=None, **recorded_columns)
+    return replace(repeated, q=q, wrench=wrench, q_actual=None, target=None, **recorded)

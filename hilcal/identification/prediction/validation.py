@@ -136,7 +136,7 @@ def set_up_anew(p: Predictive, fitted: Readings, other: Readings, mode: Mode) ->
         InputError: several observers, or an effect needs a column that the other readings lack.
         CannotAnswerError: the registration does not converge.
     """
-    other = other.seen_by(fitted.observers)
+    other = other.with_observers(fitted.observers)
     if other.states.observer is not None:
         raise InputError(
             "several observers: where they stand is told by the readings that were fitted; valid: "
