@@ -359,14 +359,14 @@ def load_config(path: Path) -> CellConfig:
 Changes = Mapping[str, Mapping[str, Any]]  # Values by key, by section
 
 INSTRUMENT_NOISE = (
-    *("range_std_m", "range_std_per_m", "transverse_std_m", "transverse_std_per_m"),
+    "range_std_m", "range_std_per_m", "transverse_std_m", "transverse_std_per_m",
     "orientation_std_rad",
-)
+)  # fmt: skip
 """Keys of [tracker]: the noise of a tracker."""
 CHANGEABLE: Mapping[str, tuple[str, ...]] = {
     "tracker": (*INSTRUMENT_NOISE, "base_xyz_m", "base_rotvec_rad", "station_m"),
     "repeatability": ("joint_std_rad",),
-    "tool": (*("target_m", "target_rotvec_rad", "targets", "load_point_m"), *("mass_kg", "com_m")),
+    "tool": ("target_m", "target_rotvec_rad", "targets", "load_point_m", "mass_kg", "com_m"),
 }
 """Keys that can be changed, by section."""
 _WHERE = "the cell"
@@ -406,10 +406,9 @@ def read_value(section: str, key: str, text: str) -> Any:
     except (tomllib.TOMLDecodeError, RecursionError, ValueError):
         parsed = {}
     if list(parsed) != [key]:
-        must = described(section, key)
         raise InputError(
             f"{_WHERE}: [{section}] {key} = {' '.join(text.split())[:60]} is not valid: it must be "
-            f"{must}"
+            f"{described(section, key)}"
         )
     return parsed[key]
 

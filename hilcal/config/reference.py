@@ -1,6 +1,5 @@
 """The reference of CELL.toml: unit, default and example of every key; a commented CELL.toml."""
 
-import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,15 +13,13 @@ from hilcal.errors import InputError
 from hilcal.names import escaped
 from hilcal.toml import Section, section_of, suggest
 
-_UNITS = dict(
-    re.findall(
-        r"(\S+)=(.+?)(?:; |$)",
-        "_m_s2=m/s²; _rad_s2=rad/s²; _rad_s=rad/s; _std_per_m=m/m; _std_m=m; _m=m; _rad=rad; "
-        "_deg=deg; _kg=kg; _Nm=N·m; _N=N; _s=s; _hz=Hz; _sigma=σ; _share=1; baud=Bd; "
-        "samples=readings; frames=frames; web_port=TCP; candidates=poses; clock=times real time; "
-        "singularity=1; factor=1; direction=1",
-    )
-)
+_UNITS = {
+    "_m_s2": "m/s²", "_rad_s2": "rad/s²", "_rad_s": "rad/s", "_std_per_m": "m/m", "_m": "m",
+    "_rad": "rad", "_deg": "deg", "_kg": "kg", "_Nm": "N·m", "_N": "N", "_s": "s", "_hz": "Hz",
+    "_sigma": "σ", "_share": "1", "baud": "Bd", "samples": "readings", "frames": "frames",
+    "web_port": "TCP", "candidates": "poses", "clock": "times real time", "singularity": "1",
+    "factor": "1", "direction": "1",
+}  # fmt: skip
 """Units by the end of a key's name; the first match counts."""
 REQUIRED = "required"
 NOT_SET = "not set"
@@ -140,8 +137,8 @@ SHOWN_KEYS = {
     "robot": ("model", "repeatability_m", "driver", "host"),
     "tool": ("target_m", "load_point_m", "mass_kg", "com_m"),
     "tracker": (
-        *("driver", "port", "frame", "range_std_m", "range_std_per_m"),
-        *("transverse_std_m", "transverse_std_per_m"),
+        "driver", "port", "frame", "range_std_m", "range_std_per_m", "transverse_std_m",
+        "transverse_std_per_m",
     ),
     "force_sensor": ("driver", "port", "origin_m"),
     "repeatability": ("joint_std_rad",),
@@ -150,7 +147,7 @@ SHOWN_KEYS = {
     "sight": ("tracker_m", "target_normal"),
     "planning": ("model", "readings", "criterion", "work_min_m", "work_max_m", "candidates"),
     "simulation": ("hide", "clock"),
-}
+}  # fmt: skip
 """Keys in a new CELL.toml, as values or as examples; `hilcal config` explains all keys."""
 _HEAD = """\
 # {title}

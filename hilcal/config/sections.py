@@ -64,7 +64,7 @@ class CellSection(Section):
 
 def check_distinct(section: str, named: Sequence[Any]) -> None:
     """Refuse two sections of the same name."""
-    names = [thing.name for thing in named]
+    names = [entry.name for entry in named]
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f'two [[{section}]] have the name "{name}"; names must differ')
@@ -389,11 +389,9 @@ class Planning(CellSection):
 
     @model_validator(mode="after")
     def _work(self) -> "Planning":
-        low, high = self.work_min_m, self.work_max_m
-        if (low is None) != (high is None):
-            stated, missing = ("work_min_m", "work_max_m")[:: 1 if high is None else -1]
-            raise ValueError(f"{stated} alone; a box needs {missing} too")
-        if low is not None and self.work_q_rad:
+        if (self.work_min_m is None) != (self.work_max_m is None):
+            raise ValueError("work_min_m or work_max_m alone; a box needs both")
+        if self.work_min_m is not None and self.work_q_rad:
             raise ValueError("work_q_rad together with work_min_m; give one of them")
         _check_box(self, "work_min_m", "work_max_m")
         if len({len(q) for q in self.work_q_rad}) > 1:
