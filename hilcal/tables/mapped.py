@@ -6,6 +6,7 @@ from collections.abc import Mapping as Mapped
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from itertools import compress
 from pathlib import Path
 from typing import Generic
 
@@ -161,9 +162,8 @@ def import_mapped(
         notes += _stale(grid, position, q)
     notes += [*(stated or result.notes[:1]), *result.notes[1:]]
     unit, name = units.ANGLES[mapping.joints.unit], mapping.joints.unit
-    names = independent_columns(columns.joint_columns(arm.units), q.shape[1], arm)
-    q = q[:, [k for k, column in enumerate(names) if column.endswith("_rad")]]
-    notes += check_joint_rounding(q / unit, unit, name, result.readings.covariance, arm.reach)
+    angles = q[:, _turn(mapping.joints, arm)] / unit
+    notes += check_joint_rounding(angles, unit, name, result.readings.covariance, arm.reach)
     return exchange.ImportResult(readings, tuple(notes))
 
 
@@ -253,9 +253,14 @@ def _quantities(
 
 def _joint_units(section: forms.Joints, arm: Arm) -> Floats:
     """(k,) rad, or m where a joint slides, per unit of each of the section's columns."""
-    names = independent_columns(columns.joint_columns(arm.units), len(section.columns), arm)
     angle, length = units.ANGLES[section.unit], units.LENGTHS[section.slide_unit]
-    return np.array([length if name.endswith("_m") else angle for name in names])
+    return np.where(_turn(section, arm), angle, length)
+
+
+def _turn(section: forms.Joints, arm: Arm) -> Bools:
+    """(k,) which of the section's columns are of joints that turn."""
+    turn = ~arm.slides
+    return turn if len(section.columns) == arm.n else turn[arm.independent]
 
 
 def _raw(grid: Grid, mapping: forms.PointMapping, arm: Arm) -> dict[str, Floats]:
@@ -279,11 +284,9 @@ def _raw(grid: Grid, mapping: forms.PointMapping, arm: Arm) -> dict[str, Floats]
     for section in (mapping.joints, mapping.actual_joints):
         if section is not None and section.from_zero:
             half = math.pi / units.ANGLES[section.unit]
-            names = independent_columns(columns.joint_columns(arm.units), len(section.columns), arm)
-            for name, column in zip(names, section.columns, strict=True):
-                if name.endswith("_rad"):
-                    angle = raw[grid.name(column)]
-                    raw[grid.name(column)] = np.where(angle > half, angle - 2 * half, angle)
+            for column in compress(section.columns, _turn(section, arm)):
+                angle = raw[grid.name(column)]
+                raw[grid.name(column)] = np.where(angle > half, angle - 2 * half, angle)
     return raw
 
 
@@ -313,8 +316,8 @@ def nines(position: Floats) -> list[float]:
 def _complete(grid: Grid, raw: dict[str, Floats], sparse: Sequence[str]) -> tuple[Bools, list[str]]:
     """Rows with a value in each used column, of `sparse` ones in one; a note on the others."""
     missing = np.stack([np.isnan(values) for values in raw.values()], axis=1)
-    some = [k for k, name in enumerate(raw) if name in sparse]
-    missing[:, some] = missing[:, some].all(axis=1, keepdims=True)
+    of_sparse = np.isin(list(raw), sparse)
+    missing[:, of_sparse] = missing[:, of_sparse].all(axis=1, keepdims=True)
     bad: Bools = np.asarray(missing.any(axis=1))
     count, first = int(bad.sum()), int(np.argmax(bad))
     if count > MAX_LOST_SHARE * len(bad):
@@ -413,8 +416,8 @@ def _forces_of_flange(readings: Readings, arm: Arm) -> list[str]:
         return []
     stated = s.wrench[loaded, :3] / size[loaded, None]
     turned = se3.apply(chain.evaluate(arm, s.q[loaded]).rotation[-1], stated)
-    one, other = (float(np.linalg.norm(d.mean(axis=0))) for d in (turned, stated))
-    if one < ONE_DIRECTION or other > MANY_DIRECTIONS:
+    in_base, in_flange = (np.linalg.norm(d.mean(axis=0)) for d in (stated, turned))
+    if in_flange < ONE_DIRECTION or in_base > MANY_DIRECTIONS:
         return []
     return [
         "the forces point this way and that in base axes, and all one way where they are taken as "
@@ -509,8 +512,9 @@ def _plausible(
     """Leave out implausible readings; a note on each reason.
 
     A reading is stale where it equals the previous one within the scatter (N, m, m) of both though
-    the joints were sent elsewhere. Readings that repeat a pose are odd, all of them, where their
-    positions differ by more than `REPEATS_TO` + lever · Σ|dq|, the most that the joints move it.
+    the joints were sent elsewhere. Readings that repeat a pose contradict each other, all of them,
+    where their positions differ by more than `REPEATS_TO` + lever · Σ|dq|, the most that the joints
+    move it.
     """
     from scipy.spatial import cKDTree
 
@@ -525,19 +529,18 @@ def _plausible(
     i, j = used[pairs[:, 0]], used[pairs[:, 1]]
     apart = np.linalg.norm(value[i, :3] - value[j, :3], axis=1)
     wrong = apart > REPEATS_TO + lever * np.abs(q[i] - q[j]).sum(axis=1)
-    odd = np.zeros(len(q), dtype=bool)
-    odd[i[wrong]] = odd[j[wrong]] = True
+    contradictory = np.isin(np.arange(len(q)), [i[wrong], j[wrong]])
     notes = [
         f"{int(bad.sum())} of {len(bad)} rows left out ({_listed(rows[bad])}): {why}"
         for bad, why in (
             (stale, "the same reading as the row before, though the joints were sent on"),
-            (odd, "they repeat a pose but disagree by more than noise can explain"),
+            (contradictory, "they repeat a pose but disagree by more than noise can explain"),
         )
         if bad.any()
     ]
-    if (stale | odd).all():
+    if (stale | contradictory).all():
         raise InputError("no row can be used; expected one measured pose per row")
-    plausible = readings[~(stale | odd)]
+    plausible = readings[~(stale | contradictory)]
     used, pose = np.unique(plausible.pose, return_inverse=True)
     names = tuple(plausible.pose_names[k] for k in used)
     return replace(plausible, pose=pose, pose_names=names), notes

@@ -445,11 +445,15 @@ def sniff(path: str | Path) -> SniffedFile:
     how |= layout
     if how["header_row"] == 0 and "comment" in how:
         how |= _commented_header(text, how, rows)
-    if how["header_row"] == 1:
-        del how["header_row"]
-    if how.get("separator") == ",":
+    if how["separator"] == ",":
         del how["separator"]
-    return SniffedFile(how, files.open_grid(path, FileFormat(**how)), doubts)
+    file_format = FileFormat(**how)
+    return SniffedFile(_stated(file_format), files.open_grid(path, file_format), doubts)
+
+
+def _stated(file_format: FileFormat) -> dict[str, Any]:
+    """Return the keys of [file] that are not as in a plain CSV file."""
+    return file_format.model_dump(mode="json", exclude_defaults=True)
 
 
 def _dialect(path: str, lines: list[str], comment: str | None) -> dict[str, Any]:
@@ -460,10 +464,8 @@ def _dialect(path: str, lines: list[str], comment: str | None) -> dict[str, Any]
         blank = separator == "blanks" and thousands == " "
         if decimal == separator or thousands in (decimal, separator) or blank:
             continue
-        keys = {"separator": separator}
-        keys |= {"decimal": decimal} if decimal != "." else {}
-        keys |= {"thousands": thousands} if thousands else {}
-        form = FileFormat(**{**keys, "comment": comment, "header_row": 0})
+        keys = {"separator": separator, "decimal": decimal, "thousands": thousands}
+        form = FileFormat(**keys, comment=comment, header_row=0)
         try:
             rows = [cells for _, cells in files.records(path, body, form)]
         except InputError:
@@ -559,7 +561,5 @@ def _spreadsheet(path: str, content: bytes) -> SniffedFile:
         how["sheet"] = best[1]
     if others := [s for s in names if s != best[1] and counts[s] > MANY_NUMBERS * best[0]]:
         doubts = (*doubts, f"only this sheet is read, and not {', '.join(others)}")
-    if how["header_row"] == 1:
-        del how["header_row"]
     form = FileFormat(**how)
-    return SniffedFile(how, files.grid_of_rows(path, best[2], form), doubts)
+    return SniffedFile(_stated(form), files.grid_of_rows(path, best[2], form), doubts)
