@@ -91,7 +91,7 @@ class Target(sections.CellSection):
     """
 
     name: str = Field(min_length=1)
-    target_m: Vector3 | None = None
+    target_m: sections.OnFlange | None = None
     target_rotvec_rad: sections.RotationVector | None = None
     estimate: bool = False
 
@@ -104,8 +104,6 @@ class Target(sections.CellSection):
 
 
 def _check_target(xyz: tuple[float, ...] | None, rotvec: tuple[float, ...] | None) -> None:
-    if xyz is not None and max(map(abs, xyz)) > 5.0:
-        raise ValueError(f"target_m = {list(xyz)} lies over 5 m off the flange; is it in m?")
     if rotvec is not None and xyz is None:
         raise ValueError("target_rotvec_rad without target_m; give both or neither")
 
@@ -123,19 +121,15 @@ class Tool(sections.CellSection):
     com_m: $VECTOR_M: the tool's centre of mass, flange axes | [0.01, 0.0, 0.06]
     """
 
-    target_m: Vector3 | None = None
+    target_m: sections.OnFlange | None = None
     target_rotvec_rad: sections.RotationVector | None = None
     targets: tuple[Target, ...] = ()
-    load_point_m: Vector3 = (0.0, 0.0, 0.0)
+    load_point_m: sections.OnFlange = (0.0, 0.0, 0.0)
     mass_kg: sections.Mass = 0.0
-    com_m: Vector3 = (0.0, 0.0, 0.0)
+    com_m: sections.OnFlange = (0.0, 0.0, 0.0)
 
     @model_validator(mode="after")
     def _sound(self) -> "Tool":
-        for key in ("load_point_m", "com_m"):
-            value = getattr(self, key)
-            if max(map(abs, value)) > 5.0:
-                raise ValueError(f"{key} = {list(value)} lies over 5 m off the flange; is it in m?")
         _check_target(self.target_m, self.target_rotvec_rad)
         if self.targets and (self.target_m or self.target_rotvec_rad):
             raise ValueError(

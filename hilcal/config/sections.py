@@ -40,6 +40,7 @@ RotationVector = Annotated[Vector3, AfterValidator(_within_a_turn)]
 Place = Annotated[Vector3, _within(50.0)]
 """A place in base or tracker axes. In millimetres, an obstacle or a limit would be far away."""
 OnFlange = Annotated[Vector3, _within(5.0)]
+Length = Annotated[NonNegative, _within(50.0)]
 Accuracy = Annotated[Positive, _within(0.02)]
 """An allowed error, or a repeatability: arms are off by less before any calibration."""
 Mass = Annotated[NonNegative, _within(5000.0, "kg")]
@@ -234,9 +235,9 @@ class CellLoad(CellSection):
     mass_kg: Mass = 0.0
     force_N: Force = (0.0, 0.0, 0.0)
     moment_Nm: Moment = (0.0, 0.0, 0.0)
-    hang_m: NonNegative | None = None
-    radius_m: Positive = 0.06
-    cable_m: NonNegative = 0.0
+    hang_m: Length | None = None
+    radius_m: Annotated[Positive, _within(50.0)] = 0.06
+    cable_m: Length = 0.0
 
     @model_validator(mode="after")
     def _some_load(self) -> "CellLoad":
@@ -249,9 +250,6 @@ class CellLoad(CellSection):
             )
         if self.cable_m > 0.0 and not any(self.force_N):
             raise ValueError(f'load "{self.name}" has cable_m without force_N; it has no direction')
-        for key in ("hang_m", "radius_m", "cable_m"):
-            if (getattr(self, key) or 0.0) > 50.0:
-                raise ValueError(f"{key} = {getattr(self, key)} is over 50 m; is it in m?")
         return self
 
     @property
@@ -448,12 +446,10 @@ class Sight(CellSection):
     tracker_m: Place | None = None
     target_normal: Vector3 | None = None
     incidence_max_rad: Annotated[float, Strict(), Field(gt=0, le=np.pi / 2)] = 0.5
-    clearance_m: NonNegative = 0.03
+    clearance_m: Annotated[NonNegative, _within(1.0)] = 0.03
 
     @model_validator(mode="after")
     def _plausible(self) -> "Sight":
         if self.target_normal is not None and not any(self.target_normal):
             raise ValueError("target_normal = [0.0, 0.0, 0.0] points nowhere; e.g. [0, 0, 1]")
-        if self.clearance_m > 1.0:
-            raise ValueError(f"clearance_m = {self.clearance_m} is over 1 m; is it in m?")
         return self

@@ -217,15 +217,13 @@ def with_controller_conventions(arm: Arm, conventions: Conventions) -> Arm:
                 f"joint_coupling: of joints {c.joint} and {c.follows} one slides and one turns; "
                 "valid: two that slide, or two that turn"
             )
-    for j in np.flatnonzero(
-        arm.slides & (np.array(conventions.joint_offset_deg or (0.0,) * arm.n) != 0)
-    ):
+    offset = np.radians(conventions.joint_offset_deg or (0.0,) * arm.n)
+    for j in np.flatnonzero(arm.slides & (offset != 0)):
         raise InputError(
             f"joint_offset_deg of joint {j + 1}, which slides; valid: 0, with its zero in d_m or "
             "in the <origin> of the joint"
         )
     sign = np.array(conventions.joint_sign or (1,) * arm.n, dtype=float)
-    offset = np.radians(conventions.joint_offset_deg or (0.0,) * arm.n)
     coupling, counted = np.zeros((2, arm.n, arm.n))
     for c in conventions.joint_coupling:
         coupling[c.joint - 1, c.follows - 1] += c.factor
