@@ -129,9 +129,9 @@ def next_step(run: Path) -> ProcedureStep:
     return ProcedureStep("done", run)
 
 
-def opened(path: Path, purpose: str, run: Path, *, read_only: bool = True) -> CampaignFile:
+def opened(path: Path, purpose: str, run: Path) -> CampaignFile:
     """Open a test campaign of the calibration `run`; refuse a file of another purpose or run."""
-    campaign = CampaignFile.open(path, read_only=read_only)
+    campaign = CampaignFile.open(path, read_only=True)
     if campaign.about(PURPOSE) != purpose or campaign.about(CALIBRATION) != identity(run):
         campaign.close()
         raise InputError(f"{path}: not the {purpose} campaign of {run}; rename or move it away")

@@ -51,8 +51,8 @@ def description_gaps(
     ):
         if joints:
             out.append(
-                f"no {kind} limit in {file} for {', '.join(joints)}: plans have none there, and "
-                f"what compliance counts as ordinary is taken from {usual}"
+                f"no {kind} limit in {file} for {', '.join(joints)}: plans do not limit it, and "
+                f"their ordinary compliance is that of a joint rated {usual}"
             )
     return tuple(out)
 

@@ -127,8 +127,8 @@ def read_factory(path: Path, nominal: Arm, text: str | None = None) -> FactoryKi
     difference = flange_difference(with_factory(nominal, factory), nominal)[1]
     if not difference < OTHER_ARM_M:
         raise InputError(
-            f"{factory.source}: of another arm than {nominal.name}: its flange lies up to "
-            f"{1e3 * difference:.0f} mm from where that one's does"
+            f"{factory.source}: the kinematics of another arm than {nominal.name}: the flanges "
+            f"differ by up to {1e3 * difference:.0f} mm"
         )
     return factory
 
@@ -137,8 +137,8 @@ def with_factory(nominal: Arm, factory: FactoryKinematics) -> Arm:
     """Return an arm with measured kinematics, with frames as near as possible to nominal."""
     if nominal.n != N or nominal.coupling is not None or nominal.drive is not None:
         raise InputError(
-            f"{factory.source}: kinematics of an arm of {N} joints that turn each by itself; "
-            f"{nominal.name} is another one"
+            f"{factory.source}: kinematics of an arm of {N} uncoupled joints, which {nominal.name} "
+            "is not"
         )
     nominal_frame, frame = nominal.links[0], factory.links[0]
     links = factory.links.copy()
@@ -153,9 +153,9 @@ def with_factory(nominal: Arm, factory: FactoryKinematics) -> Arm:
     return replace(nominal, links=links, source=f"{nominal.source}; kinematics: {factory.source}")
 
 
-def flange_difference(first: Arm, second: Arm, states: int = 400) -> tuple[float, float]:
-    """Return the distance of the flanges of two arms, RMS and largest, m, over random states."""
-    q = np.random.default_rng(20251126).uniform(-np.pi, np.pi, (states, first.n))
+def flange_difference(first: Arm, second: Arm) -> tuple[float, float]:
+    """Return the distance of the flanges of two arms, RMS and largest, m, over 400 random poses."""
+    q = np.random.default_rng(20251126).uniform(-np.pi, np.pi, (400, first.n))
     difference = evaluate(first, q).position[-1] - evaluate(second, q).position[-1]
     distance = np.linalg.norm(difference, axis=1)
     return float(np.sqrt(np.mean(distance**2))), float(distance.max())

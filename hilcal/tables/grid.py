@@ -229,7 +229,7 @@ def joined(
             if where.setdefault(key, k) != k:
                 raise InputError(
                     f"{second.at(k, match[1])}: '{key}' is in row {second.rows[where[key]]}, too; "
-                    "rows to match by must differ"
+                    "a column that matches rows must differ in each"
                 )
         partner = np.array([where.get(key, -1) for key in first.text(match[0])], dtype=np.int64)
         if np.all(partner < 0):

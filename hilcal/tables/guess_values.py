@@ -31,7 +31,7 @@ RIVAL = 0.5  # Difference of the score within which another choice of columns is
 _WRENCH_DOUBT = 'base axes, or axes = "flange"; of = "load" (exerted on the tool), or "reaction"?'
 BY_VALUES = "found by their values: check the columns"
 BY_ROWS = "found by their values; row by row, or column by column?"
-RIVALS = "as good by their values:"
+RIVALS = "these fit as well by their values:"
 LONE = "the only other number of a row, taken as a distance from [points.A]; [gauge] for a height"
 MOST_DEGREES = 400.0  # largest joint angle of a table, a turn and some margin; a choice
 _EXCEL = (30000.0, 60000.0)

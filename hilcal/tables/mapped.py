@@ -408,7 +408,7 @@ def _in_base_axes(wrench: Floats, arm: Arm, q: Floats) -> Floats:
 
 
 def _forces_of_flange(readings: Readings, arm: Arm) -> list[str]:
-    """Note forces that have one direction only where they are turned from flange axes to base."""
+    """Note forces that all have one direction if, and only if, they are read in flange axes."""
     s = readings.states
     size = np.linalg.norm(s.wrench[:, :3], axis=1)
     loaded = size > 0
@@ -420,9 +420,9 @@ def _forces_of_flange(readings: Readings, arm: Arm) -> list[str]:
     if in_flange < ONE_DIRECTION or in_base > MANY_DIRECTIONS:
         return []
     return [
-        "the forces point this way and that in base axes, and all one way where they are taken as "
-        'in flange axes, as a sensor at the flange measures a weight: [wrench] axes = "flange" of '
-        "a mapping turns them"
+        "taken in base axes the forces have many directions; taken in flange axes they all have "
+        'one, as a weight that a sensor at the flange measures: [wrench] axes = "flange" of a '
+        "mapping reads them so"
     ]
 
 

@@ -168,7 +168,7 @@ def _unit(name: str) -> tuple[str, str | None]:
 
 MAX_ANGLE_RAD = 2 * np.pi + 0.1  # rad; a larger angle is in degrees
 MAX_POSITION_M = 50.0  # A larger position is in millimetres: no arm is measured from 50 m
-GUESSED = "the convention is a guess; --config CELL.toml lets the arm decide"
+GUESSED = "the convention is a guess; with --config CELL.toml the arm's joint values decide"
 SIDE_BY_SIDE = "several targets: name them as in the cell's [[tool.targets]]"
 REPORTED = 5e-3  # rad; encoders at rest in one pose differ by less, commanded poses by more
 FEWEST_JOINTS, MOST_JOINTS = 4, 8

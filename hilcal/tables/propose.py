@@ -150,7 +150,7 @@ def _why_unused(g: words.Guesser, column: words.ColumnName) -> str:
         return "a force; [wrench] takes fx, fy, fz or fz alone, [hung_mass] a weight"
     if values is None:
         return "no numbers" if any(g.grid.text(column.name)) else "empty"
-    return "its name says nothing"
+    return "its name is not recognised"
 
 
 def _encoder_counts(g: words.Guesser) -> str:

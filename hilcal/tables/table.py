@@ -350,11 +350,11 @@ def named_loads(readings: Readings, config: CellConfig) -> tuple[Readings, tuple
         name = readings.load_names[k]
         if name == UNLOADED or s.wrench[readings.load == k].any():
             continue
-        where = "is not stated by the table, nor by [[loads]] of the cell: it is taken as none"
+        origin = "is not stated by the table, nor by [[loads]] of the cell: it is taken as 0"
         if plain(name) in wrenches:
             wrench[readings.load == k] = wrenches[plain(name)]
-            where = "is that of [[loads]] of the cell, since the table states none"
-        notes.append(f"load {name}: its force {where}")
+            origin = "is that of [[loads]] of the cell, since the table states none"
+        notes.append(f"load {name}: its force {origin}")
     return replace(readings, states=replace(s, wrench=wrench)), tuple(notes)
 
 

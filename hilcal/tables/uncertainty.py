@@ -169,9 +169,9 @@ def _doubt(mapping: Mapping, cov: Floats, instrument: Floats) -> tuple[str, ...]
         return ()
     kind = "standard deviations" if std.kind == "variance" else "variances"
     return (
-        f"the stated standard deviations are {1e6 * stated:.3g} µm as a rule, the instrument's in "
-        f"[tracker] {1e6 * usual:.3g} µm; read as {kind} the figures would be {1e6 * guess:.3g} "
-        f"µm: check [std] kind and unit",
+        f"the stated standard deviations have a median of {1e6 * stated:.3g} µm, the instrument's "
+        f"in [tracker] of {1e6 * usual:.3g} µm; read as {kind} the figures would be "
+        f"{1e6 * guess:.3g} µm: check [std] kind and unit",
     )
 
 
@@ -196,8 +196,9 @@ def floored(
         if 0 < usual < least:
             i = int(np.argmax((v > 0).any(axis=1)))
             raise InputError(
-                f"{table.at(i)}: the stated standard deviations are {usual:.2g} {unit} as a rule; "
-                f"no instrument reaches {least:g} {unit}{_cause(usual) if unit == 'm' else ''}"
+                f"{table.at(i)}: the stated standard deviations have a median of {usual:.2g} "
+                f"{unit}; no instrument reaches {least:g} {unit}"
+                f"{_cause(usual) if unit == 'm' else ''}"
             )
         tiny[:, block] = (v >= 0) & (v < least**2)
     rows: Bools = np.asarray(tiny.any(axis=1))
@@ -240,8 +241,8 @@ def _regularised(
     first = int(np.argmax(rows))
     if instrument is None:
         raise InputError(
-            f"{table.at(first)}: the covariance states no noise in some direction (it is "
-            "singular); it must, or [tracker] must state the instrument's noise to take its place"
+            f"{table.at(first)}: the covariance is singular, without noise in some direction; give "
+            "another one, or state the instrument's noise in [tracker], which takes its place there"
         )
     floor = np.einsum("nji,njk,nki->ni", vectors, instrument / products, vectors)
     spread = vectors * np.where(none, floor, values)[:, None]
@@ -311,6 +312,6 @@ def check_joint_rounding(
         return ()
     return (
         f"joint angles are rounded to {size:g} {name}, up to {1e3 * std * reach:.2g} mm at the "
-        f"target, more than the noise; write more digits, or count it: [repeatability] "
+        f"target, more than the noise; write more digits, or add it to the noise: [repeatability] "
         f"joint_std_rad = {std:.2g}",
     )

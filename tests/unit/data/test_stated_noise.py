@@ -63,7 +63,7 @@ def test_a_direction_without_noise_has_the_instruments(tmp_path):
     np.testing.assert_allclose(raised[4], cov[4] + added, rtol=1e-9, atol=1e-20)
     np.testing.assert_array_equal(np.delete(raised, 4, axis=0), np.delete(cov, 4, axis=0))
     assert "1 of 20 rows state a covariance without noise in some direction" in result.notes[1]
-    refusal("row 6: the covariance states no noise", through_a_table, tmp_path, x, None)
+    refusal("row 6: the covariance is singular", through_a_table, tmp_path, x, None)
 
 
 def test_angles_have_a_floor_of_their_own(tmp_path):
