@@ -53,17 +53,17 @@ def observe(
     rotation = chain.rotation[-1]
     if deviation.target is not None:
         offset = offset + deviation.target[:, :3]
-        rotation = se3.product(rotation, se3.rotation(_once(deviation.target[:, 3:])))
+        rotation = se3.product(rotation, se3.rotation(_row_if_constant(deviation.target[:, 3:])))
     rotation = se3.product(rotation, turn)
     base_position = position = chain.point(offset)
     if deviation.base is not None:
-        base_r, base_p = se3.exp(_once(deviation.base))
+        base_r, base_p = se3.exp(_row_if_constant(deviation.base))
         position = base_p + se3.apply(base_r, position)
         rotation, axes = se3.product(base_r, rotation), se3.product(axes, base_r)
     position = origin + se3.apply(cell.registration[:3, :3], position)
     rotation = se3.product(cell.registration[:3, :3], rotation)
     if deviation.station is not None:
-        station_r, station_p = se3.exp(_once(deviation.station))
+        station_r, station_p = se3.exp(_row_if_constant(deviation.station))
         position = station_p + se3.apply(station_r, position)
         rotation, axes = se3.product(station_r, rotation), se3.product(station_r, axes)
     if deviation.scale is not None:
@@ -193,14 +193,14 @@ class ReadingDerivative:
     def by_base(self) -> Floats:
         """Motion (N, m, 6) by the twist of the base."""
         o, base = self.observation, self.deviation.base
-        base = None if base is None else _once(base)
+        base = None if base is None else _row_if_constant(base)
         moved = twist_jacobian(np.eye(3)[None], o.base_position, base)
         return _to_sensor(o, self.deviation, moved, self.m)
 
     def by_station(self) -> Floats:
         """Motion (N, m, 6) by the twist of the station; exp(ξ + δ) = exp(J_r(−ξ) δ) exp(ξ)."""
         station, scale = self.deviation.station, self.deviation.scale
-        back = None if station is None else -_once(station)
+        back = None if station is None else -_row_if_constant(station)
         moved = twist_jacobian(np.eye(3)[None], self._unscaled(), back)
         if scale is not None:
             moved[:, :3] *= 1 + scale[:, None, None]
@@ -214,7 +214,7 @@ class ReadingDerivative:
         moved[:, :3, :3] = moved[:, 3:, 3:] = flange
         if self.deviation.target is not None:
             # The turn as read is exp(ω) before the target's own axes: ∂ = J_r(−ω).
-            turn = -_once(self.deviation.target)
+            turn = -_row_if_constant(self.deviation.target)
             turn[:, :3] = 0.0
             moved[:, 3:, 3:] = se3.product(flange, se3.right_jacobian_blocks(turn)[0])
         return _to_sensor(self.observation, self.deviation, moved, self.m)
@@ -253,7 +253,7 @@ def motion(
     return ReadingDerivative(cell, observation, chain, deviation, m, dq)
 
 
-def _once(x: Floats) -> Floats:
+def _row_if_constant(x: Floats) -> Floats:
     """Return x (N, E), or one row of it (1, E) where all are the same."""
     return x[:1] if len(x) and (x == x[:1]).all() else x
 

@@ -131,11 +131,11 @@ def doubt_to_settle(o: Campaign, d: Diagnosis, say: Say) -> Doubt:
         return doubt
     finer = [s for s in d.suspects if s.coarse and s.effect in in_doubt(d)]
     if finer:
-        raise CannotAnswerError(f"not two effects, but one in doubt: {_finer(o, finer[0])}")
-    raise CannotAnswerError(_settled(o, d))
+        raise CannotAnswerError(f"not two effects, but one in doubt: {_finer_advice(o, finer[0])}")
+    raise CannotAnswerError(_nothing_to_separate(o, d))
 
 
-def _settled(o: Campaign, d: Diagnosis) -> str:
+def _nothing_to_separate(o: Campaign, d: Diagnosis) -> str:
     """Return the message that there are no suspects to separate, with the next step."""
     see = f"see hilcal diagnose {quoted(o.path)}"
     further = f"hilcal plan CELL.toml -o PLAN.json --after {quoted(o.path)}"
@@ -162,7 +162,7 @@ def _settled(o: Campaign, d: Diagnosis) -> str:
         lead = d.suspects[0]
         add = f"hilcal add {quoted(o.path)} {quoted(lead.effect)}"
         missing = f"{lead.effect} alone is missing; add it with: {add}"
-        why = _finer(o, lead) if lead.coarse else missing
+        why = _finer_advice(o, lead) if lead.coarse else missing
     else:
         why = "no effect of the catalogue explains the misfit"
         if d.reason == "insufficient_catalogue":
@@ -174,7 +174,7 @@ def _settled(o: Campaign, d: Diagnosis) -> str:
     return f"no suspects to separate: {why}"
 
 
-def _finer(o: Campaign, s: Suspect) -> str:
+def _finer_advice(o: Campaign, s: Suspect) -> str:
     """Return the message on how to make an effect finer."""
     return (
         f"{s.coarse} of the model is too coarse; make it finer, and diagnose again: "

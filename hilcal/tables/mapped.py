@@ -314,7 +314,7 @@ def nines(position: Floats) -> list[float]:
 
 
 def _complete(grid: Grid, raw: dict[str, Floats], sparse: Sequence[str]) -> tuple[Bools, list[str]]:
-    """Rows with a value in each used column, of `sparse` ones in one; a note on the others."""
+    """(N,) rows with values in all used columns, of `sparse` ones in any; a note on the others."""
     missing = np.stack([np.isnan(values) for values in raw.values()], axis=1)
     of_sparse = np.isin(list(raw), sparse)
     missing[:, of_sparse] = missing[:, of_sparse].all(axis=1, keepdims=True)
@@ -557,7 +557,10 @@ def import_readings(
     arm: Arm,
     second: Path | None = None,
 ) -> exchange.ImportResult:
-    """Read a table by `form`, "table", a mapping, its name or file; the cell states the rest."""
+    """Read a table in the `form` "table" (exchange table), or by a mapping, its name or its file.
+
+    The cell states what a table lacks: noise, frames, targets, and the forces of loads.
+    """
     mapping = form if isinstance(form, forms.Mapping) else None
     if mapping is None and str(form) != forms.TABLE:
         mapping = forms.find_mapping(str(form), forms.Mapping)
