@@ -271,7 +271,7 @@ class ControlInterface:
 
 
 def control(host: str, hz: str, lease: str, relayed: str, upper_registers: str) -> Serve:
-    """Take control; `relayed`, `upper_registers`: 1 or 0, see `supervision.Generation`."""
+    """Take control; `relayed`, `upper_registers`: 1 or 0, see `supervision.UrController`."""
     from rtde_control import RTDEControlInterface as Interface
 
     flags = int(Interface.FLAG_UPLOAD_SCRIPT) | int(Interface.FLAG_NO_EXT_FT)

@@ -415,7 +415,7 @@ class _Touch:
     q: Floats  # (N, n) joint angles, rad
     margin: float  # m
     rates: Floats  # (K, n) largest rate of approach of each pair, m/rad
-    segment: Segment | None = None  # hanging load or cable in the N states, for `Scene.free`
+    segment: Segment | None = None  # hanging load or cable in the N states
     guessed: str = ""  # remark on guessed shapes; empty where they are known
 
     def beyond(self, rows: Ints, turn: Floats | None) -> Bools:

@@ -59,10 +59,9 @@ def import_table(
     form = FileFormat(encoding="utf-8")
     grid = open_grid(path, form, lambda header: _check_header(str(path), header, arm))
     observers = [name for _, name, _ in columns.SCALAR.values()]
-    words = {*columns.TEXT, columns.TARGET, columns.COVERS, columns.STATION, *observers}
-    text = [name for name in grid.names if name in words]
-    valid = set(columns.known_columns(arm.units)) - words
-    number = [name for name in grid.names if name in valid]
+    texts = {*columns.TEXT, columns.TARGET, columns.COVERS, columns.STATION, *observers}
+    numbers = set(columns.known_columns(arm.units)) - texts
+    text, number = ([n for n in grid.names if n in names] for names in (texts, numbers))
     table = ColumnTable.of(grid, text, number, columns.sparse_columns(grid.names))
     return readings_of(table, arm, noise, station, targets=targets, std=std)
 
