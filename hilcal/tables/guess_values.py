@@ -193,7 +193,7 @@ def _take_matrix(g: words.Guesser, names: list[str], position: list[str]) -> Non
 
 def _take_quaternion(g: words.Guesser, names: list[str]) -> None:
     g.assign("orientation", names, "quaternion, w first", convention="quaternion-wxyz")
-    g.proposal.open_convention = True
+    g.proposal.convention_guessed = True
 
 
 def _kind(c: words.ColumnName) -> str:
@@ -344,7 +344,7 @@ def _columns_like(
 def _angles(g: words.Guesser, names: list[str], convention: str) -> None:
     unit = words.angle_unit(g, "orientation", names)
     g.assign("orientation", names, f"{convention}, {unit}", convention=convention, unit=unit)
-    g.proposal.open_convention = True
+    g.proposal.convention_guessed = True
 
 
 def _numbered_quaternion(g: words.Guesser) -> bool:

@@ -194,7 +194,7 @@ class Proposal:
     doubts: list[tuple[str, str]] = field(default_factory=list)  # by section: what to check
     unused: list[tuple[str, str]] = field(default_factory=list)  # columns, and why
     missing: list[str] = field(default_factory=list)  # sentences on quantities that an import needs
-    open_convention: bool = False  # whether the orientation's convention is a guess
+    convention_guessed: bool = False  # whether that of the orientation is a guess
     alternatives: list[tuple[list[str], list[str]]] = field(default_factory=list)
     """columns of the position and of the joints that are as good by their values, the chosen ones
     first; empty lists where names decide."""

@@ -124,7 +124,7 @@ def guess(grid: Grid, joints: int | None = None, joint_names: Sequence[str] = ()
         g.ignore(name, _why_unused(g, column))
     if set(required_columns(joints or 6)) <= set(grid.names):
         g.doubt("file", EXCHANGE_NAMES)
-    if g.proposal.open_convention:
+    if g.proposal.convention_guessed:
         g.doubt("orientation", words.GUESSED)
     if not readings & set(g.proposal.sections):
         g.proposal.missing.append("no position: three columns x, y, z were not found")

@@ -208,7 +208,7 @@ def _decide_convention(proposed: GridProposal, arm: Arm) -> list[str]:
     guessed, fitting = (rotations(name, values, unit) for name in (section["convention"], decided))
     if not np.allclose(guessed, fitting):
         section["convention"] = decided
-    proposal.open_convention = False
+    proposal.convention_guessed = False
     meaning = ", ".join(str(v) for key, v in section.items() if key != "columns")
     proposal.quantities[:] = [
         replace(u, meaning=meaning) if u.section == "orientation" else u
