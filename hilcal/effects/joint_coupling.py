@@ -22,9 +22,9 @@ class JointCoupling(Effect):
     joint's own ratio.
 
     Unless given, the pairs are those of `possible_couplings`, couplings that arms have, and the own
-    ratio of each joint that turns. Gears have whole numbers of teeth, but belts, scales and wrong figures
-    in a description do not; the few harmonics of `transmission_error` that readings of some ten
-    poses determine describe a slope badly. The ratio of a slide is that of `guide_error`.
+    ratio of each joint that turns. Gears have whole numbers of teeth, but belts, scales and wrong
+    figures in a description do not; the few harmonics of `transmission_error` that readings of some
+    ten poses determine describe a slope badly. The ratio of a slide is that of `guide_error`.
     """
 
     name = "joint_coupling"
