@@ -130,7 +130,8 @@ def test_joints_that_differ_are_let_differ(campaign, tmp_path, capsys):
     assert f'hilcal add RUN "{finer}"' in told
     assert found["suspects"][0]["effect"] == finer
     assert found["suspects"][0]["finer_than"] == "joint_compliance"
-    assert found["message"].startswith(f"Let joints differ: {finer} explains")
+    coarse = "joint_compliance of the model is too coarse"
+    assert found["message"].startswith(f"{coarse}: {finer} explains")
     assert found["tests"]["each"] == found["tests"]["level"] / found["tests"]["count"]
     refused_ = refused(capsys, 4, "next", campaign, "-o", tmp_path / "next.json")
     assert f"hilcal add {campaign} '{finer}'" in refused_

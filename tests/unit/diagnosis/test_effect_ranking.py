@@ -138,11 +138,11 @@ def test_the_verdict_is_to_let_joints_differ(arm, joints):
     assert d.significant[0] == EACH
     lead = d.suspects[0]
     assert lead.share > 0.95
-    assert message(d).startswith(f"Let joints differ: {EACH} explains")
+    assert message(d).startswith(f"joint_compliance of the model is too coarse: {EACH} explains")
     assert lead.to_dict()["finer_than"] == "joint_compliance"
     assert (
-        "Let joints differ: joint_compliance has one parameter for several joints; to give each "
-        f'its own: hilcal add RUN "{EACH}".'
+        "joint_compliance of the model is too coarse; to make it finer: "
+        f'hilcal add RUN "{EACH}".'
     ) in list(diagnosis_report(d))
 
 
