@@ -279,10 +279,10 @@ def _plausible_shares(mixed: MixedFit, effects: Collection[str]) -> dict[str, fl
 
 
 def _scatter(mixed: MixedFit) -> ArmScatter:
-    """Return the arm's scatter of a mixed fit, in units of the instrument's noise."""
+    """Return the arm's scatter of a mixed fit."""
     noise = mixed.std(INSTRUMENT)
     k = mixed.problem.names.index(SCATTER)
-    std, error = mixed.std(SCATTER) / noise * SCATTER_RAD, mixed.variances.covariance[k, k] ** 0.5
+    std, error = mixed.std(SCATTER) * SCATTER_RAD, mixed.variances.covariance[k, k] ** 0.5
     moved = joint_factors(mixed.model.cell, mixed.readings, np.full(mixed.model.cell.arm.n, std))
     return ArmScatter(
         kind="joints",
@@ -291,6 +291,7 @@ def _scatter(mixed: MixedFit) -> ArmScatter:
         size_m=float(np.sqrt(np.mean(np.sum(moved[:, :3] ** 2, axis=(1, 2))))),
         log_evidence=0.0,
         instrument_factor=float(noise),
+        unit=float(noise),
     )
 
 

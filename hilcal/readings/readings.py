@@ -102,6 +102,8 @@ class ArmScatter:
         size_m: rms over the readings of the 3-D displacement of the target.
         log_evidence: log odds of this against noise of the instrument that is larger than stated.
         instrument_factor: factor of the instrument's standard deviations in that alternative.
+        unit: factor of the instrument's standard deviations beside a background, where it is
+            estimated, too. The covariance is in units of it: (σ / unit)² is added.
         predicted_share: share of the misfit on poses left out that recorded variables predict.
         predicted_by: the variables that predict it, at most two.
     """
@@ -112,6 +114,7 @@ class ArmScatter:
     size_m: float
     log_evidence: float
     instrument_factor: float
+    unit: float = 1.0
     predicted_share: float = 0.0
     predicted_by: tuple[str, ...] = ()
 

@@ -48,7 +48,7 @@ def factors(cell: Cell, readings: Readings, kind: ScatterKind) -> tuple[Floats, 
 def with_arm_scatter(cell: Cell, readings: Readings, scatter: ArmScatter) -> Readings:
     """Return the readings with an estimated scatter added to their stated covariance."""
     parts = zip(factors(cell, readings, scatter.kind), scatter.std, strict=True)
-    f = np.concatenate([std * factor for factor, std in parts], axis=2)
+    f = np.concatenate([std / scatter.unit * factor for factor, std in parts], axis=2)
     return replace(with_scatter(readings, f), stated=readings.covariance, arm_scatter=scatter)
 
 
@@ -58,7 +58,8 @@ def with_prior_scatter(model: Model, readings: Readings) -> Readings:
     Unchanged without such a scatter, or where the covariance contains the arm's scatter already.
     """
     scatter = None if model.prior is None else model.prior.posterior.scatter
-    return with_missing_scatter(model.cell, readings, scatter)
+    alone = None if scatter is None else replace(scatter, unit=1.0)
+    return with_missing_scatter(model.cell, readings, alone)
 
 
 def with_missing_scatter(cell: Cell, readings: Readings, scatter: ArmScatter | None) -> Readings:

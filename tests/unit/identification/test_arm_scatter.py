@@ -311,7 +311,7 @@ def test_refine_ends_with_the_scatter_in_the_fit_and_the_file_keeps_it(refined):
 @pytest.mark.parametrize("kind", ["joints", "each joint", "isotropic"])
 def test_an_estimate_goes_through_json(kind):
     count = 6 if kind == "each joint" else 1
-    s = ArmScatter(kind, (1e-5,) * count, (1e-6,) * count, 2e-5, 4.0, 1.5, 0.01)
+    s = ArmScatter(kind, (1e-5,) * count, (1e-6,) * count, 2e-5, 4.0, 1.5, predicted_share=0.01)
     assert ArmScatter.from_json(s.to_json()) == s
     cell, readings = scattering(0.0)
     with_it = with_arm_scatter(register(cell, readings).cell, readings, s)

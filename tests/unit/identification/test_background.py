@@ -167,6 +167,18 @@ def test_bands_do_not_depend_on_how_large_the_noise_is_stated(series):
     assert sizes[1] == pytest.approx(sizes[0], rel=0.2)
 
 
+def test_the_scatter_does_not_depend_on_how_large_the_noise_is_stated(series):
+    found = []
+    for by in (1.0, 25.0):
+        some = replace(series[:40], covariance=by * series[:40].covariance)
+        first = fit(baseline(UR10, some, "absolute"), some, "absolute")
+        found.append(with_background(first, first.model.names).readings.arm_scatter)
+    usual, larger = found
+    assert larger.unit < 0.5 * usual.unit
+    assert larger.size_m == pytest.approx(usual.size_m, rel=0.2)
+    assert larger.std == pytest.approx(usual.std, rel=0.2)
+
+
 HIDDEN = (
     "link_geometry", "transmission_error", "encoder_offset", "joint_tilt_compliance",
     "joint_coupling", "hysteresis", "tool_compliance",
