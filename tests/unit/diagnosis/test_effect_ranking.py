@@ -141,8 +141,7 @@ def test_the_verdict_is_to_let_joints_differ(arm, joints):
     assert message(d).startswith(f"joint_compliance of the model is too coarse: {EACH} explains")
     assert lead.to_dict()["finer_than"] == "joint_compliance"
     assert (
-        "joint_compliance of the model is too coarse; to make it finer: "
-        f'hilcal add RUN "{EACH}".'
+        f'joint_compliance of the model is too coarse; to make it finer: hilcal add RUN "{EACH}".'
     ) in list(diagnosis_report(d))
 
 
