@@ -138,8 +138,8 @@ class StepwiseAlternatives:
         families = families_beside(
             information, reduced.residual, noise, self._x, self._columns, self._most
         )
-        # A finer form of an effect is no alternative: it contains the effect.
-        barred = {name for name in self._columns if name.startswith(f"{effect}(")}
+        # A finer form of an effect of the model contains it, and is a suspect by itself.
+        barred = {name for name in self._columns if "(" in name}
         same: tuple[str, ...] = ()
         names: list[str] = []
         total = 0.0

@@ -1,7 +1,7 @@
 """`transmission_error`: gears and encoders err periodically with the joint angle."""
 
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -73,18 +73,18 @@ class TransmissionError(PerJoint):
         if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= 1000:
             raise InputError(f"effect {self.name}: harmonics = {count!r}; valid: 1 to 1000")
         self._last = count
-        self.harmonics: Ints = np.union1d(np.arange(1, count + 1), self._further())
+        self.harmonics: Ints = np.unique([*range(1, count + 1), *self._further()])
 
-    def _further(self) -> Ints:
+    def _further(self) -> list[Any]:
         """Read the further waves."""
         stated = self.options.get("waves", [])
-        waves = list(stated) if isinstance(stated, list | tuple) else [stated]
+        waves = [*stated] if isinstance(stated, list | tuple) else [stated]
         if not all(type(k) is int and 1 <= k <= FINEST_WAVE for k in waves):
             raise InputError(
                 f"effect {self.name}: waves = {stated!r}; valid: whole numbers of periods per "
                 f"turn, 1 to {FINEST_WAVE}, as [128, 405]"
             )
-        return np.array(waves, dtype=np.int64)
+        return waves
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

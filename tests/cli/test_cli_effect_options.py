@@ -106,7 +106,8 @@ def test_effects_shows_options_and_defaults(capsys):
     assert d["backlash"]["options"] == ["joints", "crossing"]
     assert d["backlash"]["defaults"] == {"joints": "each", "crossing": 0.01}
     assert d["creep"]["defaults"] == {"joints": "common"}
-    assert d["transmission_error"]["defaults"] == {"joints": "each", "harmonics": None}
+    by_readings = {"harmonics": None, "waves": None}
+    assert d["transmission_error"]["defaults"] == {"joints": "each", **by_readings}
     assert d["joint_compliance"]["option_help"]["joints"].startswith("which joints have a")
     assert d["link_geometry"]["options"] == []
     assert d["link_geometry"]["defaults"] == {}
