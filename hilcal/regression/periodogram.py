@@ -21,6 +21,9 @@ import scipy
 from hilcal.types import Floats, Ints
 
 ROUNDS = 5  # each finds at most one wave of each joint; a choice
+LEAST_SHARE = 0.005
+"""Share of ‖r‖² below which a wave is not worth its parameters, however sure: without it the rms
+falls by a quarter of a per cent. A choice."""
 SINGULAR = 1e-6  # share of the largest determinant of A below which angles do not show a wave
 TIE = 1e-6  # share by which waves differ that are the same at all angles: the lowest is found
 AT_ONCE = 64  # orders that are computed together
@@ -34,7 +37,7 @@ def significant_waves(
     dof: float,  # f
     level: float,  # probability to find any wave where there is none
 ) -> list[tuple[int, int]]:
-    """Return the joints and orders of significant waves, the strongest first.
+    """Return the joints and orders of significant waves above `LEAST_SHARE`, the strongest first.
 
     Each round fits the waves of all previous ones together, and searches what is left.
     """
@@ -42,14 +45,15 @@ def significant_waves(
     left = residual
     for _ in range(ROUNDS):
         free = max(dof - 2.0 * len(found), 3.0)
-        square = float(np.sum(left**2)) / free
-        best = []
+        total = float(np.sum(left**2))
+        square, best = total / free, []
         for j in range(angle.shape[1]):
             gain = _gains(angle[:, j], moved[:, :, j], left, orders)
             k = int(np.argmax(gain > (1.0 - TIE) * gain.max(initial=0.0)))
             floor = max(square, float(np.median(gain)) / scipy.stats.chi2.median(2))
             f = gain[k] / 2.0 / max(floor - gain[k] / free, 1e-300)
-            if scipy.stats.f.sf(f, 2, free - 2) * len(orders) * angle.shape[1] < level:
+            p = scipy.stats.f.sf(f, 2, free - 2) * len(orders) * angle.shape[1]
+            if p < level and gain[k] > LEAST_SHARE * total:
                 best.append((float(gain[k]), j, int(orders[k])))
         new = [(j, k) for _, j, k in sorted(best, reverse=True) if (j, k) not in found]
         if not new:
