@@ -179,8 +179,8 @@ def candidates(fit: Fit) -> tuple[Effect, ...]:
     random = model.random if model.background else ()
     present = [e for e in model.effects if e.name not in random]
     finer = [e.refined(states) for e in present]
-    if (left := joint_residual(fit)) is not None:
-        finer += [e.refined_by(states, left, FALSE_ALARM) for e in present]
+    if (of_joints := joint_residual(fit)) is not None:
+        finer += [e.refined_by(states, of_joints, FALSE_ALARM) for e in present]
     return (*(e.for_scoring(states) for e in new), *(e for e in finer if e is not None))
 
 

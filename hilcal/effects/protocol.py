@@ -408,10 +408,10 @@ class Effect(ABC):
         return None
 
     def refined_by(self, states: States, residual: JointResidual, level: float) -> "Effect | None":
-        """Return the effect with only the further parameters that a residual asks for, or None.
+        """Return the effect with only the parameters that it lacks by a residual, or None.
 
         A suspect like that of `refined`, whose name states the whole effect. `level` is the
-        probability of a suspect where none is missing.
+        probability to return one where the residual is noise.
         """
         return None
 

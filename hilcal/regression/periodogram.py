@@ -42,13 +42,13 @@ def significant_waves(
     Each round fits the waves of all previous ones together, and searches what is left.
     """
     found: list[tuple[int, int]] = []
-    left = residual
+    remaining = residual
     for _ in range(ROUNDS):
         free = max(dof - 2.0 * len(found), 3.0)
-        total = float(np.sum(left**2))
+        total = float(np.sum(remaining**2))
         square, best = total / free, []
         for j in range(angle.shape[1]):
-            gain = _gains(angle[:, j], moved[:, :, j], left, orders)
+            gain = _gains(angle[:, j], moved[:, :, j], remaining, orders)
             k = int(np.argmax(gain > (1.0 - TIE) * gain.max(initial=0.0)))
             floor = max(square, float(np.median(gain)) / scipy.stats.chi2.median(2))
             f = gain[k] / 2.0 / max(floor - gain[k] / free, 1e-300)
@@ -63,7 +63,7 @@ def significant_waves(
         joints = np.repeat([j for j, _ in found], 2)
         x = (moved[:, :, joints] * np.stack(waves, axis=1)[:, None]).reshape(-1, len(joints))
         y = residual.reshape(-1)
-        left = (y - x @ np.linalg.lstsq(x, y, rcond=None)[0]).reshape(residual.shape)
+        remaining = (y - x @ np.linalg.lstsq(x, y, rcond=None)[0]).reshape(residual.shape)
     return found
 
 
@@ -79,7 +79,7 @@ def _gains(angle: Floats, moved: Floats, residual: Floats, orders: Ints) -> Floa
     g, double = np.concatenate(sums, axis=1)[:, orders - orders[0]]
     total = float(a.sum())
     determinant = total**2 - np.abs(double) ** 2  # 4 det A
-    seen = determinant > SINGULAR * total**2
+    determined = determinant > SINGULAR * total**2
     # A = ½ [Σa + Re D, Im D; Im D, Σa − Re D], D = Σ a exp 2ikq
     square = total * np.abs(g) ** 2 - np.real(np.conj(double) * g**2)
-    return np.where(seen, 2.0 * square / np.where(seen, determinant, 1.0), 0.0)
+    return np.where(determined, 2.0 * square / np.where(determined, determinant, 1.0), 0.0)
