@@ -1,20 +1,21 @@
-"""Whether the readings show one step in their order: the tracker, the base or the target was moved.
+"""Whether the readings show one step in their order: something was moved between two of them.
 
-From an unknown reading k on, the sensor is displaced by a twist (6), or the target on the tool by a
-shift (3). With P of the mixed model of all effects at its variances (`mixed.equations`) and the
-columns C_k of the displacement, zero before k,
+From an unknown reading k on, the sensor is displaced by a twist (6), the target on the tool by a
+shift (3), or one joint from its zero (1), as where it slipped or lost its reference. With P of the
+mixed model of all effects at its variances (`mixed.equations`) and the columns C_k of the
+displacement, zero before k,
 
     gain_k = gᵀ M⁻¹ g,   g = C_kᵀ P y,   M = C_kᵀ P C_k
 
 is χ² distributed without a step. The variances are estimated without a step, which enlarges them,
-so the test is conservative. The largest gain counts, at a level divided by the number of places.
+so the test is conservative. The largest gain counts, at a level divided by the number of places,
+and by that of kinds: the sensor, the target and all joints together count alike.
 A drift in the order resembles a step; a step has to explain the readings better by 20 : 1.
 A serial correlation of the noise is not assumed: it would take up the step.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import scipy
@@ -33,17 +34,18 @@ from hilcal.types import Floats
 LEVEL = 1e-3  # chance of a step where there is none; a choice
 RANK = 1e-9  # share of the largest eigenvalue below which a direction is not determined
 
-Moved = Literal["sensor", "target"]
+SENSOR, TARGET, JOINT = "sensor", "target", "joint"
 
 
 @dataclass(frozen=True, slots=True)
 class OrderStep:
     """A step in the order of the readings."""
 
-    moved: tuple[Moved, ...]  # what may have moved, the better explanation first
+    moved: tuple[str, ...]  # what may have moved, the better explanation first: the sensor, the
+    # target, or a joint with its number, as "joint 2"
     first: int  # row of the first reading after the step
     previous: int  # row of the last reading before it
-    p_value: float  # times the number of tested places
+    p_value: float  # times the number of tested places and kinds
     shift_m: float  # rms displacement of the positions after the step, m
     share: float  # of the squares that all effects leave
 
@@ -71,15 +73,19 @@ def step_in_order(fit: Fit) -> OrderStep | None:
     units = shift_rows(model, readings, fit.mode)
     remaining = float(e.target @ e.residual)
     found = []
-    kinds: tuple[tuple[Moved, Floats], ...] = (
-        ("sensor", moves.by_station()),
-        ("target", moves.by_target()[:, :, :3]),
-    )
-    for kind, columns in kinds:
+    drives = moves.drives
+    n = drives.shape[2]
+    kinds: list[tuple[str, int, Floats]] = [  # with the number of kinds alike
+        (SENSOR, 1, moves.by_station()),
+        (TARGET, 1, moves.by_target()[:, :, :3]),
+        *((f"{JOINT} {j + 1}", n, drives[:, :, [j]]) for j in range(n)),
+    ]
+    for kind, alike, columns in kinds:
         gains = list(_gains(e, np.einsum("rnm,nmq->rnq", units, columns)))
         k, gain, rank, delta = max(gains[1:], key=lambda g: g[1])
         better = gain - gains[0][1] > 2 * SAME_EVIDENCE
-        p = min(2 * (len(gains) - 1) * float(scipy.stats.chi2.sf(gain, rank)), 1.0)
+        tests = 3 * alike * (len(gains) - 1)
+        p = min(tests * float(scipy.stats.chi2.sf(gain, rank)), 1.0)
         if p < LEVEL and better:
             shift = columns[k:, :3] @ delta
             size = float(np.sqrt(np.mean(np.sum(shift**2, axis=1))))

@@ -80,12 +80,14 @@ def _step(step: OrderStep, readings: Readings) -> str:
             "column 'target' of the table",
         ),
     }
-    what, how = zip(*(causes[kind] for kind in step.moved), strict=True)
+    apart = "import the readings before and after it as two campaigns"
+    joints = {kind: (f"{kind} slipped or lost its zero", apart) for kind in step.moved}
+    what, how = zip(*((joints | causes)[kind] for kind in step.moved), strict=True)
     return (
         f"A step in the order of the readings explains {percent(step.share)} of what all effects "
         f"leave ({p_equals(step.p_value)}): the readings from {first} on are shifted by "
         f"{length(step.shift_m)} rms. Probably {', or '.join(what)} between {previous} and "
-        f"{first}; {', or '.join(how)}."
+        f"{first}; {', or '.join(dict.fromkeys(how))}."
     )
 
 

@@ -51,6 +51,27 @@ def test_the_verdict_names_the_step(what):
     assert "was moved" in message(d)
 
 
+@pytest.mark.parametrize("joint", first(1, [2, 3]))
+def test_a_joint_that_slipped_is_named_with_its_row(joint):
+    r, model = C.readings, baseline(C.cell, C.readings, "absolute")
+    q = r.states.q.copy()
+    q[FIRST:, joint - 1] += 3e-4
+    at = np.zeros(model.size)
+    truth, stated = (model.predict(s, at).observation.position for s in (with_q(q), r.states))
+    value = r.value.copy()
+    value[:, :3] += truth - stated
+    start = fitted_model(C.cell, replace(r, value=value), "absolute")
+    d = with_order_step(replace(diagnose(start), reason="no_suspect", suspects=(), step=None))
+    assert d.step.moved == (f"joint {joint}",)
+    assert d.step.previous < FIRST <= d.step.first
+    assert f"joint {joint} slipped or lost its zero" in message(d)
+    assert "two campaigns" in message(d)
+
+
+def with_q(q):
+    return replace(C.readings.states, q=q)
+
+
 def test_readings_without_a_step_show_none():
     assert step_in_order(fitted_model(C.cell, C.readings, "absolute")) is None
 
