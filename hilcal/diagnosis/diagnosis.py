@@ -269,6 +269,8 @@ def effect_probabilities(steps: Sequence[Diagnosis], effects: Iterable[str]) -> 
     names = tuple(effects)
     p = {name: _probability(evidence.get(name, 0.0)) for name in {*names, *evidence}}
     for a in alternatives:
+        if not a.sufficient:
+            continue
         log_odds = np.clip(
             a.log_evidence - a.effect_log_evidence - len(a.replacements) + 1,
             -LARGEST_LOG_EVIDENCE,

@@ -6,6 +6,10 @@ added in place of one found later is often redundant: its F-test against the mod
 the same linearisation, is not significant, and its evidence as a random effect does not favour it
 at 20 : 1. (An F-test of as many columns as there are degrees of freedom sees nothing.)
 
+This evidence leaves the noise free. So others that leave a misfit by the stated noise, where the
+model leaves none, are no alternatives, whatever their evidence: beside them something would be
+missing.
+
 Separability. Suppose suspect A with the estimated parameters β is the cause. It adds βᵀ S_A β to
 the whitened sum of squares beside the fitted model, S_A the information on A. When suspect B is
 fitted instead, the share
@@ -94,6 +98,11 @@ MOST_BY_ALGEBRA = 6
 REDUNDANCY_LEVEL = 0.01  # p-value above which an effect is redundant
 
 
+def is_misfit(square: float, dof: float) -> bool:
+    """Whether a sum of squares is larger than noise of variance 1 allows."""
+    return float(scipy.stats.chi2.sf(square, dof)) < MISFIT_ALARM
+
+
 @dataclass(frozen=True, slots=True)
 class Alternative:
     """Other effects that could replace an effect of the model."""
@@ -103,6 +112,7 @@ class Alternative:
     same_as: tuple[str, ...]  # single effects that the readings do not separate from the effect
     replacements: tuple[str, ...]  # effects that replace it together, in the order of adding
     log_evidence: float  # of the replacements together
+    sufficient: bool = True  # whether the replacements leave no misfit that the model does not
 
     @property
     def better(self) -> bool:
@@ -112,7 +122,7 @@ class Alternative:
     @property
     def as_good(self) -> bool:
         """Whether the replacements explain as much as the effect."""
-        return self.log_evidence > self.effect_log_evidence - SAME_EVIDENCE
+        return self.sufficient and self.log_evidence > self.effect_log_evidence - SAME_EVIDENCE
 
     @property
     def inseparable(self) -> bool:
@@ -128,6 +138,8 @@ class StepwiseAlternatives:
         self._fit, self._model = fit, model_columns(fit)
         self._x, self._columns, self._most = catalogue_columns(fit)
         self._gram, self._products = self._x.T @ self._x, self._model.white.T @ self._x
+        estimated = fit.readings.arm_scatter is not None or not fit.readings.noise_stated
+        self._may_misfit = estimated or is_misfit(fit.chi2, fit.dof)
 
     def of(self, effect: str) -> Alternative:
         """Return the effects that together replace one."""
@@ -142,18 +154,28 @@ class StepwiseAlternatives:
         barred = {name for name in self._columns if "(" in name}
         same: tuple[str, ...] = ()
         names: list[str] = []
-        total = 0.0
+        total, sufficient = 0.0, True
         for step in forward_selection(families.without(barred), MOST_REPLACEMENTS):
             if not names and evidence > SAME_EVIDENCE:
                 single = [(n, s.log_evidence) for n, s in step.scores.items()]
-                same = tuple(n for n, e in single if abs(e - evidence) < SAME_EVIDENCE < e)
+                same = tuple(
+                    n
+                    for n, e in single
+                    if abs(e - evidence) < SAME_EVIDENCE < e
+                    and self._suffices(step.before, step.scores[n])
+                )
             if step.score.log_evidence <= SAME_EVIDENCE:
                 break
             total += step.score.log_evidence - (PRICE_OF_EFFECT if names else 0.0)
             names.append(step.name)
+            sufficient = self._suffices(step.before, step.score)
             if total > evidence + SAME_EVIDENCE:
                 break
-        return Alternative(effect, evidence, same, tuple(names), total)
+        return Alternative(effect, evidence, same, tuple(names), total, sufficient)
+
+    def _suffices(self, before: CandidateFamilies, added: FamilyScore) -> bool:
+        """Whether a family leaves no misfit: if it is there, ‖r‖²_t is χ² with ν dof."""
+        return self._may_misfit or not is_misfit(before.rss - added.gain, before.dof)
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,7 +304,7 @@ class Evidence:
     @cached_property
     def misfit(self) -> bool:
         """Whether χ² is larger than the stated noise allows."""
-        return float(scipy.stats.chi2.sf(self.fit.chi2, self.fit.dof)) < MISFIT_ALARM
+        return is_misfit(self.fit.chi2, self.fit.dof)
 
     @cached_property
     def regression(self) -> ResidualRegression:
@@ -328,8 +350,7 @@ class Evidence:
         current, names, misfit = self.fit, list[str](), self.fit.chi2 - self.fit.dof
         while True:
             effects, square, dof = whole_catalogue(current)
-            is_noise = float(scipy.stats.chi2.sf(square, dof)) >= MISFIT_ALARM
-            if is_noise or square - dof < LEAST_REMAINDER * misfit:
+            if not is_misfit(square, dof) or square - dof < LEAST_REMAINDER * misfit:
                 return None
             if not effects or len(names) == MOST_REFITS:
                 break

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from hilcal.diagnosis.effect_ranking import (
+    SAME_EVIDENCE,
     acts_through_load,
     beyond_geometry,
     candidates,
@@ -14,20 +15,20 @@ from hilcal.diagnosis.effect_ranking import (
     rank_suspects,
     unloaded_readings,
 )
-from hilcal.diagnosis.evidence import StepwiseAlternatives
+from hilcal.diagnosis.evidence import StepwiseAlternatives, is_misfit
 from hilcal.diagnosis.minimum_detectable_effect import least_strength
 from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.errors import InputError
-from hilcal.identification.baseline import with_effects
+from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import effect_columns, linearise
 from hilcal.present.diagnosis import detectable_sizes, diagnosis_report
 from hilcal.present.verdict import message
 from hilcal.refinement import refine
 from hilcal.regression.evidence import spectrum
-from tests.support.campaigns import NO_EFFECT, campaign, configuration, measured, plan
+from tests.support.campaigns import NO_EFFECT, campaign, configuration, measured, plan, with_noise
 from tests.support.diagnosis_cases import fitted_baseline, studied
 from tests.support.fit_cases import fitted_model
 from tests.support.refusals import refusal
@@ -164,6 +165,34 @@ def test_a_finer_form_is_no_alternative_to_the_effect(arm):
     assert "creep(joints=each)" in [e.name for e in candidates(found)]
     alternative = StepwiseAlternatives(found).of("creep")
     assert not any("creep" in name for name in (*alternative.same_as, *alternative.replacements))
+
+
+def test_others_that_leave_a_misfit_are_no_alternative_whatever_their_evidence():
+    """A wave over a part of its range looks like a zero and a ratio, but for the noise."""
+    c = campaign(plan_seed=0, poses=30)
+    r = c.readings[np.flatnonzero(~c.readings.states.wrench.any(axis=1))]
+    q = r.states.q.mean(axis=0) + 0.7 * (r.states.q - r.states.q.mean(axis=0))
+    turned = q.copy()
+    turned[:, 2] += 2e-4 * np.sin(q[:, 2] + 1.0)
+    start, value = baseline(c.cell, r, "absolute"), r.value.copy()
+    there = start.predict(replace(r.states, q=turned), np.zeros(start.size)).observation
+    value[:, :3] = there.position
+    clean = replace(r, states=replace(r.states, q=q), value=value)
+    readings = with_noise(clean, np.random.default_rng(2))
+
+    def fitted(*effects):
+        model = baseline(c.cell, readings, "absolute")
+        for name in effects:
+            model = model + model.catalogue.make(name, c.cell, readings.states)
+        return fit(model, readings, "absolute")
+
+    found = fitted("transmission_error")
+    a = StepwiseAlternatives(found).of("transmission_error")
+    others = fitted(*a.replacements)
+    assert a.log_evidence > a.effect_log_evidence - SAME_EVIDENCE
+    assert not is_misfit(found.chi2, found.dof)
+    assert is_misfit(others.chi2, others.dof)
+    assert not a.inseparable
 
 
 def test_only_what_is_finer_takes_the_place_of_an_effect(arm):
