@@ -278,9 +278,13 @@ class Guesser:
 
     def unit(self, names: Sequence[str], valid: Collection[str] | None = None) -> str | None:
         """Return the valid unit that the names of columns, or the row of units, agree on."""
-        stated = {self.columns[self.grid.names.index(name)].unit for name in names}
-        unit = stated.pop() if len(stated) == 1 else None
+        stated = self.units(names)
+        unit = stated[0] if len(stated) == 1 else None
         return unit if valid is None or unit in valid else None
+
+    def units(self, names: Sequence[str]) -> list[str | None]:
+        """Return the different units of columns; None where one states none."""
+        return list(dict.fromkeys(self.columns[self.grid.names.index(n)].unit for n in names))
 
 
 def angle_unit(g: Guesser, section: str, names: Sequence[str]) -> str:
@@ -292,10 +296,19 @@ def angle_unit(g: Guesser, section: str, names: Sequence[str]) -> str:
             g.doubt(section, f"named rad, but up to {largest:.4g}: read as degrees")
             return "deg"
         return stated
-    if largest > MAX_ANGLE_RAD:
-        return "deg"
-    g.doubt(section, f"no unit stated; rad, since no angle exceeds {largest:.3g}")
-    return "rad"
+    unit = "deg" if largest > MAX_ANGLE_RAD else "rad"
+    if different := _different_units(g, names, ANGLES):
+        g.doubt(section, f"{different}; all read as {unit}")
+    elif unit == "rad":
+        g.doubt(section, f"no unit stated; rad, since no angle exceeds {largest:.3g}")
+    return unit
+
+
+def _different_units(g: Guesser, names: Sequence[str], valid: Collection[str]) -> str:
+    """Return what to do where columns are in several units; nothing where they are not."""
+    units = [unit for unit in g.units(names) if unit in valid]
+    several = f"columns in {', '.join(units)}: a mapping has one unit, convert the others"
+    return several if len(units) > 1 else ""
 
 
 def length_unit(g: Guesser, section: str, names: Sequence[str]) -> str:
@@ -304,5 +317,7 @@ def length_unit(g: Guesser, section: str, names: Sequence[str]) -> str:
         return stated
     largest = float(np.nanmax(np.abs(g.block(names))))
     unit = "mm" if largest > MAX_POSITION_M else "m"
-    g.doubt(section, f"no unit stated; {unit}, since the largest is {largest:.4g}")
+    different = _different_units(g, names, LENGTHS)
+    why = f"{different}; all read as {unit}" if different else ""
+    g.doubt(section, why or f"no unit stated; {unit}, since the largest is {largest:.4g}")
     return unit

@@ -208,6 +208,15 @@ def test_angles_counted_from_zero_are_noticed(angles, from_zero, tmp_path):
     assert found.joints.from_zero is from_zero
 
 
+def test_columns_of_several_units_are_said_so(tmp_path):
+    header = ["A1 [rad]", *six("A{} [deg]")[1:], "X [mm]", "Y [mm]", "Z [m]"]
+    text = lines(header, C.q[:, :1], DEG[:, 1:], MM[:, :2], C.position[:, 2:])
+    doubts = propose(write(tmp_path / "t.csv", text)).proposal.doubts
+    convert = "a mapping has one unit, convert the others; all read as"
+    assert ("joints", f"columns in rad, deg: {convert} deg") in doubts
+    assert ("position", f"columns in mm, m: {convert} mm") in doubts
+
+
 def test_distances_without_a_name_are_from_one_point(tmp_path):
     text = lines([*six("A{}"), "Bar length [mm]"], DEG, np.linalg.norm(MM, axis=1))
     distance = propose(write(tmp_path / "t.csv", text)).proposal.mapping(Mapping).distance
