@@ -13,7 +13,13 @@ class TrackerScale(Effect):
 
     name = "tracker_scale"
     summary = "position read = (1 + s) position: the tracker's ranges have a scale error"
-    change = Changeable("setup", "tracker's scale", "the tracker's scale")
+    change = Changeable(
+        "setup",
+        "tracker's scale",
+        "the tracker's scale",
+        # all links that grow by one factor look alike, but for the tool
+        cause="air, instrument, or an arm that is warmer and so longer, by 10 to 30 ppm/K?",
+    )
     plausible = 100.0  # 1 mm/m: photogrammetry without a bar; refraction makes 0.05. A choice.
     of_setup = True
 
