@@ -306,7 +306,7 @@ def angle_unit(g: Guesser, section: str, names: Sequence[str]) -> str:
 
 def _different_units(g: Guesser, names: Sequence[str], valid: Collection[str]) -> str:
     """Return what to do where columns are in several units; nothing where they are not."""
-    units = [unit for unit in g.units(names) if unit in valid]
+    units = [unit for unit in g.units(names) if unit is not None and unit in valid]
     several = f"columns in {', '.join(units)}: a mapping has one unit, convert the others"
     return several if len(units) > 1 else ""
 
