@@ -83,20 +83,20 @@ DEFAULT_OPTIONS = CalibrationOptions()
 
 @command(f"""
     output | -o --output RUN.hilcal | The campaign file; RUN.validation.hilcal and
-        RUN.corrected.hilcal go beside it.
-    resume | --resume | Go on with what RUN.hilcal holds, after any stop.
-    skip | --skip POSE | With --resume: leave out a pose that cannot be measured; repeatable.
-    goal | --goal LENGTH | The error of the position that is wanted, e.g. "0.1 mm"; of absolute
-        readings: it is measured on until 95 % of points are predicted to be within it after
-        compensation, as far as that can be had.
-    limit | --limit LENGTH | The largest error allowed at the corrected targets, as measured; exit 5
-        where it is not kept.
-    max_time | --max-time TIME | The longest that measuring to fit may take in all,
-        "{DEFAULT_MAX_TIME}" unless given.
-    poses | --poses | Size of the plan, {POSES} unless given.
-    validation | --validation | Poses of the validation campaign, {VALIDATION} unless given.
-    rehearse | --rehearse | In one simulated cell, from the first to the last.
-    yes | --yes -y | Do not ask before the arm moves; for scripts.
+        RUN.corrected.hilcal are written to the same folder.
+    resume | --resume | Continue the calibration in RUN.hilcal, after any stop.
+    skip | --skip POSE | With --resume: omit a pose that cannot be measured; repeatable.
+    goal | --goal LENGTH | Target position error, e.g. "0.1 mm", for absolute readings: more is
+        measured until 95 % of points are predicted to be within it after compensation, or until
+        more readings would not help.
+    limit | --limit LENGTH | Largest measured error allowed at the corrected targets; exit 5 if it
+        is exceeded.
+    max_time | --max-time TIME | Longest total time for the readings that are fitted; default
+        "{DEFAULT_MAX_TIME}".
+    poses | --poses | Number of poses of the first plan; default {POSES}.
+    validation | --validation | Number of poses of the validation campaign; default {VALIDATION}.
+    rehearse | --rehearse | Do all steps in a simulated cell.
+    yes | --yes -y | Move the arm without asking; for scripts.
     """)
 def calibrate(
     t: Terminal, catalogue: Catalogue, cell: Path, output: Path, resume: bool = False,

@@ -36,13 +36,13 @@ from hilcal.whole_file import PAGE, replace_file, spare_other
 
 
 @command("""
-    table | TABLE | What was measured.
-    config | --config CELL.toml | The cell it was measured in.
-    output | -o --output RUN.hilcal | The campaign file to make; with --preview, the mapping file.
-    kind | --format FORMAT | table, ipa-ur10, a mapping that comes with the program, or a mapping
-        file.
-    second | --second TABLE | The second file, e.g. of the joints.
-    preview | --preview | Show how the table could be read; make no campaign.
+    table | TABLE | The table of readings.
+    config | --config CELL.toml | The cell in which it was measured.
+    output | -o --output RUN.hilcal | The campaign file to write; with --preview, the mapping file.
+    kind | --format FORMAT | Format of the table: table, ipa-ur10, another mapping of the program,
+        or a mapping file.
+    second | --second TABLE | A second file of the same readings, e.g. with the joint values.
+    preview | --preview | Propose a mapping of the columns; no campaign is written.
     """)
 def import_(
     t: Terminal, table: Path, config: Path | None = None, output: Path | None = None,
@@ -160,7 +160,7 @@ def show_preview(
 
 @command()
 def info(t: Terminal, run: Path) -> None:
-    """Say what a campaign holds: readings, instruments, drift, events, revisions."""
+    """List the contents of a campaign: readings, instruments, drift, events, revisions."""
     with CampaignFile.open(run, read_only=True) as file:
         content = overview(file)
         parts = covariance_parts(file.about(COVERS_KEY), content.config)
@@ -176,11 +176,11 @@ def info(t: Terminal, run: Path) -> None:
 
 
 @command("""
-    number | N | The revision; the latest one if left out.
-    release | --release | Accept none: the latest one is used again.
+    number | N | The revision; default: the latest one.
+    release | --release | Accept no revision: commands use the latest one again.
     """)
 def accept(t: Terminal, run: Path, number: int | None = None, release: bool = False) -> None:
-    """Choose the revision that every command uses from now on, whatever is added later."""
+    """Choose the revision that every command uses, even if later ones are added."""
     if release and number is not None:
         raise InputError("--release accepts no revision; leave out the number")
     with CampaignFile.open(run) as file:
@@ -205,10 +205,10 @@ def accept(t: Terminal, run: Path, number: int | None = None, release: bool = Fa
 
 
 @command("""
-    robot | --robot FILE | URDF or DH table of its robot, for a campaign that does not hold it.
+    robot | --robot FILE | URDF or DH table of the robot, for a campaign that lacks it.
     """)
 def repair(t: Terminal, run: Path, robot: Path | None = None) -> None:
-    """Open a campaign again that a bad revision closes: it is set aside, no reading is."""
+    """Set aside a damaged revision, so that a campaign can be opened; its readings stay."""
     result = repaired(run)
     if robot is not None:
         put_robot(run, robot)
@@ -238,15 +238,15 @@ PRIOR = "the result of hilcal fleet"
 
 
 @command("""
-    directory | DIR | With campaign files, in folders below as well.
-    out | -o --output PRIOR.json | What to expect of another arm.
-    report | --report F.html | Write it as one HTML page.
+    directory | DIR | Folder with campaign files; its subfolders are searched, too.
+    out | -o --output PRIOR.json | The prior for another arm of the type.
+    report | --report F.html | Also write a report as one HTML page.
     """)
 def fleet(
     t: Terminal, directory: Path, out: Path, report: Path | None = None, record: Path | None = None,
     workers: int | None = None, scheduler: str | None = None,
 ) -> None:  # fmt: skip
-    """Pool many campaigns: a prior for other arms, arms unlike their type, drift."""
+    """Pool many campaigns: a prior for other arms, arms that differ from their type, drift."""
     # these import the modules for fitting and reports
     from hilcal.cli.fitting import check_record
     from hilcal.cli.showing import open_command

@@ -10,57 +10,59 @@ from typer.core import TyperGroup
 
 _LISTED = """
 Try it:
-demo | demo | Rehearse the whole story on a simulated cell, through real drivers and wires.
+demo | demo | Run a complete campaign on a simulated cell, through the real drivers and protocols.
 simulate | running
-    | Run simulated devices for a cell until Ctrl-C, for `check` and `run` to talk to.
+    | Run the simulated devices of a cell until Ctrl-C; `check` and `run` connect to them.
 All in one:
 calibrate | calibrating
     | Plan, measure, fit, measure what is in doubt, validate, correct, and measure the gain.
 Prepare:
-init | preparing | Write a commented CELL.toml: asks at a terminal, else takes the options.
+init | preparing | Write a commented CELL.toml from answers at the terminal, or from options.
 config | looking_up | Explain the sections and keys of CELL.toml: unit, default, example.
 check | planning | Connect to every device and report its state; nothing moves without --factory.
 plan | planning
-    | Choose poses, loads and their order, with a proof of how near to the best they are.
+    | Choose poses, loads and their order, with a proven lower bound of the efficiency.
 Measure:
 run | running
     | Measure a campaign: every step of the plan, each reading stored before the next motion.
 import | campaigns | Make a campaign file from a table of readings.
-info | campaigns | Say what a campaign holds: readings, instruments, drift, events, revisions.
+info | campaigns | List the contents of a campaign: readings, instruments, drift, events, revisions.
 repair | campaigns
-    | Open a campaign again that a bad revision closes: it is set aside, no reading is.
+    | Set aside a damaged revision, so that a campaign can be opened; its readings stay.
 Fit, and find what is missing:
 identify | fitting | Fit a model to the readings, and keep it as a revision.
 compare | refining
     | Show where the model fails; with a later campaign, what has changed on the arm.
-diagnose | refining | Say which effect the model lacks.
-add | refining | Add an effect to the model: error before and after.
-remove | refining | Take an effect out of the model: error before and after.
-refine | refining | Diagnose and add until the model is adequate.
-discover | refining | Search a law for what no effect explains, and write it as an effect.
+diagnose | refining | Name the effect that the model lacks.
+add | refining | Add an effect to the model; print the error before and after.
+remove | refining | Remove an effect from the model; print the error before and after.
+refine | refining | Diagnose, and add missing effects until the model is adequate.
+discover | refining | Search for a law that explains what no effect does, and write it as an effect.
 next | planning
-    | Plan the measurements that separate the leading suspects; exit 4 where none are in doubt.
+    | Plan the measurements that separate the leading suspects; exit 4 if none are in doubt.
 bootstrap | fitting
-    | Draw the poses again, refit, and compare the scatter with the stated uncertainties.
+    | Resample the poses, refit, and compare the scatter with the stated uncertainties.
 workbench | showing
-    | Compare, add, remove, change the cell, measure next on one page of this machine alone.
+    | Compare, add, remove, change the cell, measure next: a browser page of this machine alone.
 Many arms:
-fleet | campaigns | Pool many campaigns: a prior for other arms, arms unlike their type, drift.
+fleet | campaigns
+    | Pool many campaigns: a prior for other arms, arms that differ from their type, drift.
 Use the result:
-validate | refining | Predict readings of another campaign with the model.
+validate | refining
+    | Predict the readings of another campaign, and compare them with the measured ones.
 compensate | compensating
-    | Find the joint values that put the tool where it was asked to be, under a load.
+    | Compute the joint values that bring the tool to given poses under a load.
 accept | campaigns
-    | Choose the revision that every command uses from now on, whatever is added later.
+    | Choose the revision that every command uses, even if later ones are added.
 report | showing
-    | Write the whole story as one HTML page, a certificate first; it prints on six pages.
-view | showing | Tell the story of the revisions in rerun.
-export | exporting | Hand over: readings, parameters, calibration, URDF, DH, frames.
+    | Write a report as one HTML page, beginning with a certificate; printed, six pages.
+view | showing | Show the readings and revisions of a campaign in the rerun viewer.
+export | exporting | Write readings, parameters, calibration, URDF, DH table or frames to files.
 Look up:
-effects | looking_up | List the effects that a model can have; `new` begins one of your own.
-study | | Studies of the program's own mathematics.
+effects | looking_up | List the effects that a model can have; `new` writes a file for one of yours.
+study | | Run numerical studies of the methods.
 doctor | preparing
-    | Look at packages, ports, permissions, network, clock and disk of this computer.
+    | Check packages, ports, permissions, network, clock and disk of this computer.
 """
 """Name, module and summary of each command, in the order of the work."""
 

@@ -71,21 +71,22 @@ DEFAULT_OPTIONS = CompensationOptions()
 
 
 @command("""
-    model | RUN.hilcal | A campaign with a revision, or a calibration (JSON).
-    points | POINTS | Where to go: a table (CSV, XLSX …) or a program: UR .script, KUKA .src, ABB
-        .mod, FANUC .ls, Yaskawa .jbi.
-    output | -o --output F | Write CSV, JSON or a program; repeatable.
-    load | --load NAME | The load at every point, of [[loads]].
+    model | RUN.hilcal | A campaign with a revision, or an exported calibration (JSON).
+    points | POINTS | Target points: a table (CSV, XLSX …) or a program: UR .script, KUKA .src,
+        ABB .mod, FANUC .ls, Yaskawa .jbi.
+    output | -o --output F | Write the joint values as CSV, JSON or program; repeatable.
+    load | --load NAME | Load at every point, one of [[loads]] of the cell.
     wrench | --wrench "FX FY FZ MX MY MZ" | Force and moment at the load point, base axes, N and
         N·m.
-    tool | --tool "X Y Z RX RY RZ" | The tool on the flange, m and rad; the tracked target unless
-        given.
-    near | --near "Q1 Q2 .. QN" | Joint values near the first pose, degrees; m of slides.
+    tool | --tool "X Y Z RX RY RZ" | Pose of the tool on the flange, m and rad; default: the tracked
+        target.
+    near | --near "Q1 Q2 .. QN" | Joint values near the first point, in degrees, for slides in
+        m.
     frames | --frames F | The controller's tools and bases, for programs of other makers than UR:
         TOML, $config.dat or a RAPID module.
-    outside | --allow-outside | Also points outside of what was measured.
-    leave | --leave | Keep waypoints of a program that cannot be corrected as they are.
-    kind | --format FORMAT | table, or a mapping, as for import.
+    outside | --allow-outside | Accept points outside of the measured range, too.
+    leave | --leave | Leave waypoints of a program unchanged if they cannot be corrected.
+    kind | --format FORMAT | Format of a table of points: table, or a mapping as of import.
     force | --force | Replace existing files.
     """)
 def compensate(
@@ -93,7 +94,7 @@ def compensate(
     options: CompensationOptions = DEFAULT_OPTIONS, revision: int | None = None,
     kind: str = "table", force: bool = False,
 ) -> None:  # fmt: skip
-    """Find the joint values that put the tool where it was asked to be, under a load."""
+    """Compute the joint values that bring the tool to given poses under a load."""
     for path in output or ():
         _check_output(path, points, force)
     with working(t.progress) as say:

@@ -186,14 +186,16 @@ VALIDATION = 10  # Poses of the validation campaign; a choice for the same reaso
 
 
 @command("""
-    hide | --hide EFFECT | An effect, random, nothing, or invented: a law that the catalogue lacks.
-    seed | --seed | Of everything random.
-    output | -o --output RUN.hilcal | The campaign file to make.
-    poses | --poses | See hilcal plan.
-    validation | --validation | Poses at which the corrected arm is measured.
-    without_devices | --without-devices | Draw the readings at once, through no wire.
-    ambiguous | --ambiguous | Measure little at first, so that the effect is in doubt; then what
-        settles it.
+    hide | --hide EFFECT | Effect that the simulated arm has and the model lacks; random; nothing;
+        or invented: a law that is not in the catalogue.
+    seed | --seed | Seed of all random numbers.
+    output | -o --output RUN.hilcal | The campaign file to write.
+    poses | --poses | Number of poses, see hilcal plan.
+    validation | --validation | Number of poses at which the corrected arm is measured.
+    without_devices | --without-devices | Simulate the readings without drivers and devices; takes
+        seconds.
+    ambiguous | --ambiguous | Measure only so much at first that the effect is in doubt, then what
+        separates the suspects.
     """)
 def demo(
     t: Terminal, catalogue: Catalogue, hide: str | None = None, seed: int | None = None,
@@ -201,7 +203,7 @@ def demo(
     without_devices: bool = False, ambiguous: bool = False, record: Path | None = None,
     effects_from: list[Path] | None = None,
 ) -> None:  # fmt: skip
-    """Rehearse the whole story on a simulated cell, through real drivers and wires."""
+    """Run a complete campaign on a simulated cell, through the real drivers and protocols."""
     check_record(record)
     config = load_config(configs_dir() / "cells" / CELL)
     number = check_seed(config.simulation.seed if seed is None else seed)

@@ -118,25 +118,26 @@ class ExportOptions:
 
 
 @command("""
-    readings | --readings F.csv|F.parquet | The readings as stored, to be imported again.
-    table | --table F.csv|F.parquet | The same with the arm's scatter in their covariance.
-    cell | --cell CELL.toml | The cell's configuration, for --readings.
-    residuals | --residuals F.csv|F.parquet | Residuals of the fit and on poses left out, one row a
-        reading.
-    revisions | --revisions F.csv|F.parquet | All revisions: model, errors, verdict.
-    parameters | --parameters F.json|F.csv | Parameters of the model; in JSON with their covariance.
-    calibration | --calibration F.json | The identified arm, ready for compensate on any machine.
+    readings | --readings F.csv|F.parquet | The readings as stored; hilcal import reads them.
+    table | --table F.csv|F.parquet | The readings with the arm's scatter in their covariance.
+    cell | --cell CELL.toml | Configuration of the cell, to import --readings.
+    residuals | --residuals F.csv|F.parquet | Residuals of the fit and on poses left out, one row
+        per reading.
+    revisions | --revisions F.csv|F.parquet | All revisions with model, errors and verdict.
+    parameters | --parameters F.json|F.csv | Parameters of the model; JSON: with their covariance.
+    calibration | --calibration F.json | The identified arm, for hilcal compensate on any machine.
     urdf | --urdf F.urdf | The arm with its corrected geometry.
-    dh | --dh F.toml|F.csv | The same as a DH table.
-    modified | --dh-modified | Rows of --dh as Craig writes them.
-    ur_kinematics | --ur-kinematics F.yaml | The same for UR's ROS driver: kinematics_params_file.
-    ur_hash | --ur-hash calib_N | The connected arm's hash, so that the driver takes the file for
-        its own.
-    frames | --frames F.json | Tool and base as fitted, and as a controller takes them.
-    matlab | --matlab F.m | A MATLAB function that builds it as a rigidBodyTree.
-    into | --into F | A description of yours whose numbers are replaced: URDF, xacro, MJCF, SDF,
-        UR's calibration.conf; needs --force, repeatable.
-    base_link | --base-link NAME | Link or body of --into that the arm begins at.
+    dh | --dh F.toml|F.csv | The corrected geometry as a DH table.
+    modified | --dh-modified | Rows of --dh in the modified convention (Craig).
+    ur_kinematics | --ur-kinematics F.yaml | The corrected geometry for UR's ROS driver:
+        kinematics_params_file.
+    ur_hash | --ur-hash calib_N | Hash of the connected arm, which the driver compares with that of
+        the file.
+    frames | --frames F.json | Poses of tool and base as fitted, and in the controller's format.
+    matlab | --matlab F.m | A MATLAB function that builds the corrected arm as a rigidBodyTree.
+    into | --into F | Correct the numbers in an existing description: URDF, xacro, MJCF, SDF,
+        UR's calibration.conf; needs --force; repeatable.
+    base_link | --base-link NAME | Link or body of --into that is the arm's base.
     tip_link | --tip-link NAME | Link, body or site of --into that is its flange.
     force | --force | Replace existing files.
     """)
@@ -144,7 +145,7 @@ def export(
     t: Terminal, catalogue: Catalogue, run: Path, options: ExportOptions,
     revision: int | None = None, force: bool = False,
 ) -> None:  # fmt: skip
-    """Hand over: readings, parameters, calibration, URDF, DH, frames."""
+    """Write readings, parameters, calibration, URDF, DH table or frames to files."""
     options.check(force)
     if revision is not None and not options.of_model:
         raise InputError("--revision is about the model; give --parameters or --calibration, too")

@@ -231,13 +231,15 @@ def _drifts(text: str | None) -> dict[str, float]:
 
 
 @command("""
-    effects | --effects A,B | Effects to fit, besides unknown frames; with options:
-        creep(joints=each).
-    scaling | --scaling S | none, gu, gc or all, side by side.
-    fit_validation | --fit-validation | Release a validation campaign for fitting; its file says so
-        for good.
-    cell | --cell CELL.toml | The cell of a stream, READINGS.parquet as RUN.
-    out | -o --output F.json | Of a stream: write its calibration.
+    effects | --effects A,B | Effects to fit in addition to unknown frames, with options in
+        parentheses: creep(joints=each).
+    scaling | --scaling S | Weighting of the readings: none, gu (standard deviations), gc (full
+        covariance), or all to compare them.
+    fit_validation | --fit-validation | Fit a validation campaign, too; its file records permanently
+        that it has been fitted.
+    cell | --cell CELL.toml | Configuration of the cell, for a stream: READINGS.parquet in place of
+        RUN.
+    out | -o --output F.json | For a stream: the calibration to write.
     """)
 def identify(
     t: Terminal, catalogue: Catalogue, run: Path, effects: str | None = None, scaling: str = "gc",
@@ -349,15 +351,15 @@ def identify_stream(
 
 
 @command("""
-    draws | --draws N | Campaigns drawn.
-    seed | --seed | Of the draws.
+    draws | --draws N | Number of resampled campaigns.
+    seed | --seed | Seed of the resampling.
     """)
 def bootstrap(
     t: Terminal, catalogue: Catalogue, run: Path, revision: int | None = None, draws: int = DRAWS,
     seed: int = 0, workers: int | None = None, scheduler: str | None = None,
     effects_from: list[Path] | None = None,
 ) -> None:  # fmt: skip
-    """Draw the poses again, refit, and compare the scatter with the stated uncertainties."""
+    """Resample the poses, refit, and compare the scatter with the stated uncertainties."""
     check_draws(draws, seed)
     count = check_workers(workers, scheduler, effects_from)
     with (

@@ -41,7 +41,7 @@ OPTIONS_NOTE = (
 def effects(
     ctx: typer.Context, effects_from: list[Path] | None = None, as_json: bool = False
 ) -> None:
-    """List the effects that a model can have; `new` begins one of your own."""
+    """List the effects that a model can have; `new` writes a file for one of yours."""
     if ctx.invoked_subcommand is not None:
         return
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
@@ -111,11 +111,11 @@ def _document(e: Effect, defaults: dict[str, object], catalogue: Catalogue) -> d
 
 
 @command("""
-    name | NAME | Lower case, digits and _.
-    output | -o --output FILE.py | The file; NAME.py by default.
+    name | NAME | Name of the effect: lower-case letters, digits and _.
+    output | -o --output FILE.py | The file to write; default NAME.py.
     """)
 def new(t: Terminal, name: str, output: Path | None = None) -> None:
-    """Write a file with one effect that works as it stands, to be changed into your own."""
+    """Write a Python file with a working example of an effect, to be changed."""
     path = Path(f"{name}.py") if output is None else output
     if not NAME.fullmatch(name) or keyword.iskeyword(name):
         raise InputError(
@@ -156,7 +156,7 @@ DRIVERS_OWN: dict[str, type[Section]] = {
 
 
 @command("""
-    section | SECTION | One of them, e.g. tracker.
+    section | SECTION | Explain the keys of this section, e.g. tracker.
     """)
 def config(t: Terminal, section: str | None = None) -> None:
     """Explain the sections and keys of CELL.toml: unit, default, example."""
@@ -167,9 +167,9 @@ def config(t: Terminal, section: str | None = None) -> None:
 
 
 @command("""
-    runs | --runs | Monte-Carlo runs.
-    seed | --seed | Of the random numbers.
-    workers | --workers N | Processes of this machine; 1 by default.
+    runs | --runs | Number of simulated campaigns.
+    seed | --seed | Seed of the random numbers.
+    workers | --workers N | Number of processes on this machine; 1 by default.
     """)
 def scaling(
     t: Terminal, runs: int = 2000, seed: int = 1, workers: int | None = None,

@@ -32,30 +32,33 @@ def _declared(text: str) -> dict[str, Any]:
 
 
 SHARED = _declared("""
-as_json | --json | One JSON document on stdout; words and progress on stderr.
+as_json | --json | Print one JSON document to stdout; everything else goes to stderr.
 run | RUN.hilcal | The campaign file.
-revision | --revision N | This revision, not the accepted or the latest one.
-details | --details | Print everything, not one screen of it.
-record | --record F.rrd | Write a recording for rerun.
-view | --view | Serve a live rerun viewer on this machine, and record to RUN.live.rrd beside the
-    campaign. It never delays the command.
-readings | --readings KIND | deflection or absolute.
-effects_from | --effects-from FILE.py | Effects of your own, see hilcal effects new; repeatable.
-prior | --prior OTHER.hilcal | What another campaign taught of this arm: its file, or the JSON of a
-    posterior.
-prior_of | --prior-of KIND | Whose campaign that was: arm (the same) or type (another arm of the
+revision | --revision N | Use this revision, not the accepted or the latest one.
+details | --details | Print the complete report instead of one screen.
+record | --record F.rrd | Write a recording for the rerun viewer.
+view | --view | Serve a live rerun viewer on this machine, and record to RUN.live.rrd next to the
+    campaign; the command never waits for the viewer.
+readings | --readings KIND | Kind of readings that are fitted: deflection or absolute.
+effects_from | --effects-from FILE.py | Add the effects of a Python file (see hilcal effects new);
+    repeatable.
+prior | --prior OTHER.hilcal | Prior of the parameters: another campaign, or the JSON of a
+    posterior, as hilcal fleet writes it.
+prior_of | --prior-of KIND | Origin of the prior: arm (this arm) or type (another arm of the same
     type).
-drift | --drift A=X,B=X | By how much effects have changed since then, in ordinary magnitudes.
-cell | CELL.toml | The cell.
-plan | --plan PLAN | The plan, see hilcal plan.
-output | -o --output PLAN | The plan file to make.
-poses | --poses | So many poses, each read unloaded and under every load that it bears.
-seed | --seed | Of the random candidates.
-quick | --quick | Without comparing criteria and numbers of poses.
-csv | --csv F.csv | The plan as a table, too.
-workers | --workers N | Processes of this machine; one per processor by default.
-jobs | --jobs | Processes; one per processor by default.
-own_jobs | --jobs | Processes; 1 by default.
+drift | --drift A=X,B=X | Expected change of effects since the prior, in their ordinary
+    magnitudes.
+cell | CELL.toml | Configuration of the cell.
+plan | --plan PLAN | A plan that hilcal plan or next has written.
+output | -o --output PLAN | The plan file to write.
+poses | --poses | Number of poses; each is read unloaded and under every load that is possible
+    there.
+seed | --seed | Seed of the random candidate poses.
+quick | --quick | Do not compare criteria and numbers of poses.
+csv | --csv F.csv | Also write the plan as a table.
+workers | --workers N | Number of processes on this machine; one per processor by default.
+jobs | --jobs | Number of processes; one per processor by default.
+own_jobs | --jobs | Number of processes; 1 by default.
 force | --force | Replace an existing file.
 """)
 """Options and arguments that several commands have, by parameter."""
@@ -72,7 +75,7 @@ SHARED["scheduler"] = typer.Option(
     "--scheduler",
     metavar="ADDRESS",
     callback=_open_to_others,
-    help="Compute on a Dask cluster instead, as tls://host:8786, or tcp:// without protection.",
+    help="Compute on a Dask cluster: tls://host:8786, or tcp:// without encryption.",
 )
 Json = Annotated[bool, SHARED["as_json"]]
 Jobs = Annotated[int | None, SHARED["jobs"]]

@@ -71,12 +71,12 @@ def _check_places(output: Path, csv: Path | None = None) -> None:
 
 
 @command(f"""
-    readings | --readings | Or so many readings, repeats not counted, at as many poses and under
-        those loads that are most informative.
+    readings | --readings | Number of readings, repeats not counted, instead of --poses: poses and
+        loads are chosen by their information.
     criterion | --criterion {"|".join(CRITERIA)} | The optimality criterion.
-    after | --after RUN.hilcal | Plan on from what it knows already.
-    unloaded_first | --unloaded-first | All unloaded readings before the loads: for run --until; a
-        drift costs more.
+    after | --after RUN.hilcal | Plan what is best to measure in addition to this campaign.
+    unloaded_first | --unloaded-first | Plan all unloaded readings before those under load, for run
+        --until; a drift then costs more information.
     """)
 def plan(
     t: Terminal, catalogue: Catalogue, cell: Path, output: Path, poses: int = POSES,
@@ -85,7 +85,7 @@ def plan(
     unloaded_first: bool = False, quick: bool = False, csv: Path | None = None,
     record: Path | None = None, details: bool = False,
 ) -> None:  # fmt: skip
-    """Choose poses, loads and their order, with a proof of how near to the best they are."""
+    """Choose poses, loads and their order, with a proven lower bound of the efficiency."""
     fitting.check_record(record)
     _check_places(output, csv)
     if revision is not None and after is None:
@@ -121,10 +121,10 @@ def plan(
 
 @command("""
     save_calibration | --save-calibration F.toml | Write the kinematics that the arm's controller
-        holds, for [robot] calibration.
-    factory | --factory F.hilcal | Is the arm still what its factory measured? Measures a few
-        readings without a load into a new campaign, or takes those of one that is there.
-    yes | --yes -y | With --factory: do not ask before the arm moves.
+        reports, for [robot] calibration.
+    factory | --factory F.hilcal | Compare the arm with its factory calibration: measure a few
+        readings without a load into F.hilcal, or use those that it holds.
+    yes | --yes -y | With --factory: move the arm without asking.
     """)
 def check(
     t: Terminal, catalogue: Catalogue, cell: Path, plan: Path | None = None,
@@ -226,10 +226,10 @@ def refuse_unready(answers: tuple[ConnectionResult, ...]) -> None:
 
 
 @command("""
-    poses | --poses | As many readings as so many poses take under every load, 20 unless given; new
-        poses, where a misfit depends on the pose alone.
-    suspects | --suspects A,B | Separate these, whatever is diagnosed.
-    cell | --cell CELL.toml | The cell, where it has other loads now.
+    poses | --poses | Size of the plan: as many readings as this number of poses takes under every
+        load, default 20; number of new poses if the misfit depends on the pose alone.
+    suspects | --suspects A,B | Separate these effects instead of the diagnosed suspects.
+    cell | --cell CELL.toml | Configuration of the cell, if its loads have changed.
     """)
 def next_(
     t: Terminal, catalogue: Catalogue, run: Path, output: Path, poses: int | None = None,
@@ -238,7 +238,7 @@ def next_(
     prior: fitting.PriorOptions = fitting.NO_PRIOR, record: Path | None = None,
     details: bool = False,
 ) -> None:  # fmt: skip
-    """Plan the measurements that separate the leading suspects; exit 4 where none are in doubt."""
+    """Plan the measurements that separate the leading suspects; exit 4 if none are in doubt."""
     fitting.check_record(record)
     _check_places(output, csv)
     carried = prior.load(catalogue)

@@ -211,23 +211,24 @@ tracker_place | Where does the tracker stand, roughly? x, y, z in m, base axes |
 
 @command(f"""
     cell | CELL.toml | The file to write.
-    robot | --robot | The arm, e.g. ur10e, or a .urdf.
-    host | --host | Address of its controller.
-    repeatability | --repeatability LENGTH | As the maker states it (ISO 9283), e.g. "0.05 mm".
-    tracker | --tracker | The tracker's driver.
-    tracker_port | --tracker-port | Its serial port, or its address in the network.
-    tracker_accuracy | --tracker-accuracy LENGTH | Standard deviation of a point, e.g. "8 um + 3
-        um/m".
-    force_sensor | --force-sensor | The force sensor's driver.
-    force_port | --force-port | Its serial port, or its address in the network.
-    target | --target X,Y,Z | The target in flange axes, m.
-    load_point | --load-point X,Y,Z | Where loads act, flange axes, m.
-    tool_mass | --tool-mass KG | Of the tool.
-    tool_com | --tool-com X,Y,Z | The tool's centre of mass, m.
+    robot | --robot | Type of the arm, e.g. ur10e, or a .urdf file.
+    host | --host | Network address of the arm's controller.
+    repeatability | --repeatability LENGTH | Pose repeatability that the maker states (ISO 9283),
+        e.g. "0.05 mm".
+    tracker | --tracker | Driver of the tracker.
+    tracker_port | --tracker-port | Serial port or network address of the tracker.
+    tracker_accuracy | --tracker-accuracy LENGTH | Standard deviation of a measured point, e.g. "8
+        um + 3 um/m".
+    force_sensor | --force-sensor | Driver of the force sensor.
+    force_port | --force-port | Serial port or network address of the force sensor.
+    target | --target X,Y,Z | Position of the tracked target, flange axes, m.
+    load_point | --load-point X,Y,Z | Point at which loads act, flange axes, m.
+    tool_mass | --tool-mass KG | Mass of the tool.
+    tool_com | --tool-com X,Y,Z | Centre of mass of the tool, flange axes, m.
     load | --load LOAD | A load, {LOADS}; repeatable.
-    readings | --readings KIND | absolute (unless given) or deflection: what is fitted.
-    floor | --floor Z | Height that the arm stays above, m.
-    tracker_place | --tracker-place X,Y,Z | Of the tracker in base axes, m.
+    readings | --readings KIND | Kind of readings that are fitted: absolute (default) or deflection.
+    floor | --floor Z | Least height of arm and load, base axes, m.
+    tracker_place | --tracker-place X,Y,Z | Position of the tracker, base axes, m.
     """)
 def init(
     t: Terminal, cell: Path = Path("CELL.toml"), robot: str | None = None, host: str | None = None,
@@ -238,7 +239,7 @@ def init(
     readings: str | None = None, floor: str | None = None, tracker_place: str | None = None,
     force: bool = False,
 ) -> None:  # fmt: skip
-    """Write a commented CELL.toml: asks at a terminal, else takes the options."""
+    """Write a commented CELL.toml from answers at the terminal, or from options."""
     options = {f"--{name.replace('_', '-')}": value for name, value in locals().items()}
     asks = person_present(t) and not t.json
     check_folder(cell, str(cell))
@@ -333,11 +334,11 @@ def _complete(draft: Draft) -> None:
 
 
 @command("""
-    cell | CELL.toml | Also look at this cell's ports and addresses.
-    folder | --folder DIR | Where campaigns are stored.
+    cell | CELL.toml | Also check the ports and addresses of this cell.
+    folder | --folder DIR | Folder in which campaigns are stored.
     """)
 def doctor(t: Terminal, cell: Path | None = None, folder: Path = Path(".")) -> None:
-    """Look at packages, ports, permissions, network, clock and disk of this computer."""
+    """Check packages, ports, permissions, network, clock and disk of this computer."""
     findings: list[machine.Finding] = []
     with working(t.progress) as say:
         say("looking at what is installed")

@@ -90,7 +90,7 @@ def _verdict(c: Chapter, stored: str) -> str:
 
 @command()
 def diagnose(t: Terminal, catalogue: Catalogue, run: Path, revision: int | None = None) -> None:
-    """Say which effect the model lacks."""
+    """Name the effect that the model lacks."""
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         number, fitted = fitting.fit_of(t, o, say, revision)
         o.require_gc(number, fitted.scaling, "diagnosing")
@@ -103,13 +103,14 @@ def diagnose(t: Terminal, catalogue: Catalogue, run: Path, revision: int | None 
 
 
 @command("""
-    effect | EFFECT | See hilcal effects; with options: "creep(joints=each)".
+    effect | EFFECT | An effect of hilcal effects, with options in parentheses:
+        "creep(joints=each)".
     """)
 def add(
     t: Terminal, catalogue: Catalogue, run: Path, effect: str, revision: int | None = None,
     record: Path | None = None, view: bool = False,
 ) -> None:  # fmt: skip
-    """Add an effect to the model: error before and after."""
+    """Add an effect to the model; print the error before and after."""
     effects = read_effects_text(effect, "EFFECT", catalogue)
     if len(effects) != 1:
         raise InputError(f"EFFECT {effect!r} has {len(effects)} effects; valid: one")
@@ -118,13 +119,13 @@ def add(
 
 
 @command("""
-    effect | EFFECT | One of the model.
+    effect | EFFECT | An effect of the model.
     """)
 def remove(
     t: Terminal, catalogue: Catalogue, run: Path, effect: str, revision: int | None = None,
     record: Path | None = None, view: bool = False,
 ) -> None:  # fmt: skip
-    """Take an effect out of the model: error before and after."""
+    """Remove an effect from the model; print the error before and after."""
     catalogue[effect]  # an unknown name is refused
     _change(t, run, revision, effect, record, view, catalogue, None)
 
@@ -185,10 +186,10 @@ def _change(
     effects | --effects A,B | Effects to start from, as for identify.
     from_latest | --from-latest | Start from the latest revision.
     revision | --revision N | Start from this revision.
-    discover | --discover | Where no effect explains the misfit, search a law and add it; its effect
-        is written beside the campaign: found.py.
-    background | --background/--no-background | Where named effects leave more than noise, also fit
-        all others of the catalogue, as a background that predicts.
+    discover | --discover | If no effect explains the misfit, search for a law and add it; it is
+        written as an effect to found.py in the folder of the campaign.
+    background | --background/--no-background | If the named effects leave more than noise, also fit
+        all others of the catalogue, as a background that improves predictions.
     """)
 def refine(
     t: Terminal, catalogue: Catalogue, run: Path, effects: str | None = None,
@@ -196,7 +197,7 @@ def refine(
     prior: fitting.PriorOptions = fitting.NO_PRIOR, discover: bool = False, background: bool = True,
     record: Path | None = None, view: bool = False, details: bool = False,
 ) -> None:  # fmt: skip
-    """Diagnose and add until the model is adequate."""
+    """Diagnose, and add missing effects until the model is adequate."""
     named = fitting.effects_of_option(effects, catalogue)
     fitting.check_record(record)
     start = "--revision" if revision is not None else "--from-latest" if from_latest else ""
@@ -302,17 +303,18 @@ LAW = "a law of hilcal discover"
 
 
 @command("""
-    output | -o --output F.py | The effect, to be edited.
-    against | --against MODEL | Beside this model instead of the revision in use: effects A,B;
-        baseline; or the file of an exported calibration, whose effects are fitted to this run.
-    alternatives | --alternatives | Also write laws that these readings do not distinguish from it:
-        F_or_1.py; hilcal next plans what separates them.
+    output | -o --output F.py | Python file for the law, written as an effect that can be edited.
+    against | --against MODEL | Search in the residual of this model, not of the revision in use:
+        effects A,B; baseline; or an exported calibration, whose effects are fitted to this
+        campaign.
+    alternatives | --alternatives | Also write the laws that these readings do not distinguish from
+        the best one: F_or_1.py ...; hilcal next plans what separates them.
     """)
 def discover(
     t: Terminal, catalogue: Catalogue, run: Path, output: Path, against: str | None = None,
     alternatives: bool = False, revision: int | None = None,
 ) -> None:  # fmt: skip
-    """Search a law for what no effect explains, and write it as an effect."""
+    """Search for a law that explains what no effect does, and write it as an effect."""
     effects = _effects_against(against, catalogue)
     name = output.stem
     if output.suffix != ".py" or not NAME.fullmatch(name) or name in catalogue.names:
@@ -376,10 +378,10 @@ def _effects_against(
 
 
 @command("""
-    later | LATER.hilcal | A later campaign of the same arm, of 15 readings or more: what has
-        changed?
-    same_setup | --same-setup | With LATER: tracker and base stand as they did; else the tracker's
-        place is estimated from the later readings.
+    later | LATER.hilcal | Show what has changed on the arm since RUN.hilcal: a later campaign of
+        15 readings or more.
+    same_setup | --same-setup | With LATER.hilcal: tracker and base were not moved; otherwise the
+        tracker's place is estimated from the later readings.
     """)
 def compare(
     t: Terminal, catalogue: Catalogue, run: Path, later: Path | None = None,
@@ -454,16 +456,16 @@ def _show_misfit(t: Terminal, run: Path, revision: int | None, catalogue: Catalo
 
 
 @command("""
-    other | OTHER.hilcal | A campaign that was never fitted.
-    register | --register | The tracker was set up anew: fit its place first.
-    limit | --limit LENGTH | The largest 3-D position error allowed, e.g. "0.1 mm"; exit 5 where it
-        is not kept.
+    other | OTHER.hilcal | A campaign whose readings were never fitted.
+    register | --register | Fit the place of the tracker first, if it has been moved.
+    limit | --limit LENGTH | Largest 3-D position error allowed, e.g. "0.1 mm"; exit 5 if it is
+        exceeded.
     """)
 def validate(
     t: Terminal, catalogue: Catalogue, run: Path, other: Path, register: bool = False,
     limit: str | None = None, revision: int | None = None,
 ) -> None:  # fmt: skip
-    """Predict readings of another campaign with the model."""
+    """Predict the readings of another campaign, and compare them with the measured ones."""
     limit_m = None if limit is None else parse_length(limit, "--limit")
     with (
         Campaign.open(run, catalogue, read_only=True) as o,

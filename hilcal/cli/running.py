@@ -79,14 +79,14 @@ from hilcal.whole_file import replace_file, spare_other
 
 @command("""
     output | -o --output RUN.hilcal | The campaign file.
-    resume | --resume | Go on with what is missing in RUN.hilcal.
-    skip | --skip POSE | With --resume: leave out a pose that cannot be measured; repeatable.
-    append | --append | Measure a further plan into RUN.hilcal, see hilcal next.
-    rehearse | --rehearse | On simulated devices, started for this run.
-    until | --until GOAL | End as soon as a goal is met, e.g. "joint std < 2 %" or "deflection std <
-        20 um": the arm goes home, and the load is taken off. Exit 4 where all readings do not do;
-        they are kept.
-    yes | --yes -y | Without --plan: do not ask whether to measure what was planned.
+    resume | --resume | Measure what is missing in RUN.hilcal.
+    skip | --skip POSE | With --resume: omit a pose that cannot be measured; repeatable.
+    append | --append | Add the readings of a further plan to RUN.hilcal, see hilcal next.
+    rehearse | --rehearse | Measure on simulated devices that are started for this run.
+    until | --until GOAL | Stop as soon as a goal is met, e.g. "joint std < 2 %" or "deflection std
+        < 20 um": the arm goes home, and the load is taken off. Exit 4 if it is not met after all
+        readings; they are kept.
+    yes | --yes -y | Without --plan: measure the plan that is made without asking.
     """)
 def run(
     t: Terminal, catalogue: Catalogue, cell: Path, output: Path, plan: Path | None = None,
@@ -508,18 +508,20 @@ MAX_CLOCK = 200.0  # Largest clock rate of a simulated world, as in `[simulation
 
 
 @command("""
-    output | -o --output DIR | Where the devices meet; gets a cell.toml.
-    hide | --hide EFFECT | An effect, random or nothing.
-    seed | --seed | Of everything random.
-    person | --person | `run` asks you for each load, as in a real cell; without it nobody is asked.
-    clock | --clock N | The simulated world goes so many times faster than real time, e.g. 20.
+    output | -o --output DIR | Folder for the connections of the devices and their cell.toml.
+    hide | --hide EFFECT | Effect that the simulated arm has and the model lacks; random; or
+        nothing.
+    seed | --seed | Seed of all random numbers.
+    person | --person | `run` asks you to change each load, as in a real cell; otherwise loads
+        change by themselves.
+    clock | --clock N | Speed of the simulated time relative to real time, e.g. 20.
     """)
 def simulate(
     catalogue: Catalogue, cell: Path, output: Path, plan: Path | None = None,
     hide: str | None = None, seed: int | None = None, person: bool = False,
     clock: float | None = None,
 ) -> None:  # fmt: skip
-    """Run simulated devices for a cell until Ctrl-C, for `check` and `run` to talk to."""
+    """Run the simulated devices of a cell until Ctrl-C; `check` and `run` connect to them."""
     t = terminal(False)
     numbers = Cell.load(cell)
     config = numbers.configured()

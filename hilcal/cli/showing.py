@@ -27,15 +27,16 @@ from hilcal.tables.units import parse_length
 
 
 @command("""
-    later | LATER.hilcal | A later campaign of the same arm: compare the two.
-    output | -o --output F.html | The page; RUN.html unless given.
-    limit | --limit LENGTH | The largest 3-D position error allowed, e.g. "0.1 mm": the page says
-        passed or failed.
-    validation | --validation OTHER.hilcal | A campaign that was never fitted: how well is it
-        predicted?
-    register | --register | The tracker was set up anew for the validation: fit its place first.
-    operator | --operator NAME | Who answers for the measurement.
-    appendix | --appendix | Also what only another expert asks for: rejected suspects, each joint,
+    later | LATER.hilcal | A later campaign of the same arm: the page compares the two.
+    output | -o --output F.html | The page to write; default RUN.html.
+    limit | --limit LENGTH | Largest 3-D position error allowed, e.g. "0.1 mm": the page states
+        PASSED or FAILED.
+    validation | --validation OTHER.hilcal | A campaign that was never fitted: the page states how
+        well it is predicted.
+    register | --register | Fit the place of the tracker to the validation campaign first, if it has
+        been moved.
+    operator | --operator NAME | The person responsible for the measurement.
+    appendix | --appendix | Add an appendix for experts: rejected suspects, residuals by joint,
         correlations, scalings, commands, hashes of revisions.
     """)
 def report(
@@ -44,7 +45,7 @@ def report(
     register: bool = False, operator: str = "", revision: int | None = None,
     appendix: bool = False,
 ) -> None:  # fmt: skip
-    """Write the whole story as one HTML page, a certificate first; it prints on six pages."""
+    """Write a report as one HTML page, beginning with a certificate; printed, six pages."""
     from hilcal.write_report import ReportOptions, write_report
 
     limit_m = None if limit is None else parse_length(limit, "--limit")
@@ -78,13 +79,13 @@ END_DELAY_S = 5.0  # Longest delay of the end of the process by a server of a pa
 
 
 @command("""
-    port | --port | Port to serve viewers on.
+    port | --port | Port at which viewers connect.
     """)
 def view(
     t: Terminal, catalogue: Catalogue, run: Path, revision: int | None = None,
     record: Path | None = None, port: int = PORT,
 ) -> None:  # fmt: skip
-    """Tell the story of the revisions in rerun."""
+    """Show the readings and revisions of a campaign in the rerun viewer."""
     check_record(record)
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         chapters = o.chapters(say, revision)
@@ -153,12 +154,12 @@ def viewer_command() -> str:
 
 
 @command("""
-    run | RUN.hilcal|TABLE | The campaign file, or a table.
-    config | --config CELL.toml | Begin with a table, measured in this cell.
-    kind | --format FORMAT | Of the table, as hilcal import takes it.
-    second | --second TABLE | The second file of a table.
-    output | -o --output RUN.hilcal | Of a table; TABLE.hilcal beside it else.
-    port | --port | Port on this machine; 8787, or a free one, unless given.
+    run | RUN.hilcal|TABLE | The campaign file, or a table of readings.
+    config | --config CELL.toml | Import a table that was measured in this cell.
+    kind | --format FORMAT | Format of the table, see hilcal import.
+    second | --second TABLE | A second file of the same readings, see hilcal import.
+    output | -o --output RUN.hilcal | Campaign file for a table; default TABLE.hilcal.
+    port | --port | Port on this machine; default 8787, or a free one.
     no_browser | --no-browser | Do not open the page, only print its address.
     """)
 def workbench(
@@ -166,7 +167,7 @@ def workbench(
     second: Path | None = None, output: Path | None = None, port: int | None = None,
     no_browser: bool = False,
 ) -> None:  # fmt: skip
-    """Compare, add, remove, change the cell, measure next on one page of this machine alone."""
+    """Compare, add, remove, change the cell, measure next: a browser page of this machine alone."""
     from hilcal.workbench.guard import UNUSED_S
     from hilcal.workbench.server import require_nicegui, serve
     from hilcal.workbench.session import WorkbenchSession
