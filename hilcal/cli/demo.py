@@ -247,7 +247,7 @@ def demo(
         t.show(errors_by_revision(chapters))
         truth = true_and_fitted(refinement.steps[-1].fit, r.world.truth)
         if truth:
-            t.show(heading("What was found against what is true"))
+            t.show(heading("Fitted and true parameters"))
             t.show([*truth_table(truth)])
         improved = _put_to_use(t, p, m.measure_missing, without_devices)
     ok, outcome = _judge(r, refinement) if laws is None else _judge_law(r, refinement, laws)

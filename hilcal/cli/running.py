@@ -53,7 +53,7 @@ from hilcal.measuring.run import run as run_plan
 from hilcal.names import quoted
 from hilcal.numbers import sentence
 from hilcal.present.campaign import factory_words
-from hilcal.present.diagnosis import NEWCOMER
+from hilcal.present.diagnosis import RUN_EXPLANATION
 from hilcal.present.live_viewer import LiveViewer
 from hilcal.present.plan import plan_facts
 from hilcal.present.progress import Say, counting, full_words, missed_words, watching, working
@@ -378,7 +378,7 @@ def on_devices(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator
             secret = settings.case(plan)
             say("starting the simulated devices")
             world = stack.enter_context(simulated_cell(secret, settings.seed, settings.base_dir))
-        t.notice(NEWCOMER)
+        t.notice(RUN_EXPLANATION)
         campaign = stack.enter_context(
             create_run(
                 settings.output,

@@ -33,7 +33,7 @@ TITLES: Mapping[str, str] = {
     "plan": "Choose a plan",
     "measure": "Measure",
     "refine": "Fit, and find what is missing",
-    "decide": "Is more to be measured?",
+    "decide": "Decide whether to measure more",
     "plan_validation": "Plan a validation campaign",
     "measure_validation": "Measure the validation campaign",
     "validate": "Predict the validation campaign",
@@ -45,15 +45,11 @@ DOES: Mapping[str, str] = {
     "plan": "Poses, loads and their order are chosen: seconds to a minute",
     "refine": "Effects are added until what is left is noise: seconds to minutes, by the number of "
     "readings",
-    "decide": "What is in doubt, and what further readings would tell, is predicted: seconds; a "
-    "minute where something is in doubt",
-    "plan_validation": "Poses within what was measured are drawn, none of those that were fitted: "
-    "seconds",
-    "validate": "The readings are frozen by their hash and then predicted: seconds",
-    "correct": "Joint values are found at which each pose is where it should be under its load: "
-    "seconds",
-    "compare": "Each point as measured at its uncorrected and at its corrected joint values: "
-    "seconds",
+    "decide": "The gain of further readings is predicted: seconds; a minute if in doubt",
+    "plan_validation": "New poses are drawn within the measured range: seconds",
+    "validate": "A hash of the readings is stored, then they are predicted: seconds",
+    "correct": "Joint values are computed that bring the tool to each pose under its load: seconds",
+    "compare": "Measured errors at uncorrected and corrected joint values are compared: seconds",
 }
 """Steps that compute, with their duration for a campaign of some hundred readings."""
 MOST_LEFT, LISTED = 6, 12  # listed points without a correction; listed compensated points
@@ -124,15 +120,14 @@ def decision_report(
         "inseparable": f"{names} are in doubt, and no measurement in this cell separates them: any "
         "of them corrects these readings. Nothing more is measured.",
         "time": f"{cost} would {would}; --max-time does not allow them.",
-        "plans": f"{cost} would {would}, but as many plans before did not do; "
-        "nothing more is measured.",
-        "unknown_effect": "Something is missing that no effect of the catalogue explains: more "
-        "readings of this kind will not name it. The validation says how much it matters.",
-        "noise_misjudged": "The stated noise is wrong; more readings will not mend that. The "
-        "validation says how far the arm is off.",
+        "plans": f"{cost} would {would}, but the previous plans did not; nothing more is measured.",
+        "unknown_effect": "An effect is missing that is not in the catalogue: more readings of "
+        "this kind will not name it. The validation shows how much it matters.",
+        "noise_misjudged": "The stated noise is wrong; more readings will not correct that. The "
+        "validation states the error of the arm.",
         "missing_effect": "An effect is missing that does not lower the error on poses left out.",
-        "ambiguous": "Several effects explain the misfit alike, or a figure that was entered "
-        "wrongly does: the diagnosis names them.",
+        "ambiguous": "Several effects explain the misfit equally well, or a wrongly entered figure "
+        "does: the diagnosis names them.",
     }
     yield f"{reasons[d.reason]}\n"
 
@@ -142,9 +137,9 @@ def validation_lines(test: validation.Acceptance) -> Iterator[str]:
     e = test.everything
     rms, most, stated, noise = map(length, (e.rms_m, e.max_m, e.stated_m, test.noise_m))
     yield (
-        f"{e.count} measurements that nothing was fitted to are predicted to {rms} rms, {most} at "
+        f"{e.count} measurements that were never fitted are predicted to {rms} rms, {most} at "
         f"most; the fit states {stated}, noise alone would leave {noise}. {100 * e.within:.0f} % "
-        "lie inside of their 95 % region.\n"
+        "lie inside their 95 % region.\n"
     )
 
 
@@ -173,7 +168,7 @@ def improvement_report(gain: Improvement, limit_m: float | None) -> Iterator[Blo
     )
     e, removed = gain.everything, ""
     if e.removed is not None:
-        removed = f"; of what exceeded the noise {100 * e.removed:.1f} % is gone"
+        removed = f"; of what exceeded the noise {100 * e.removed:.1f} % is removed"
     uncorrected = len(gain.left_out)
     without = f" {uncorrected} points could not be corrected." if uncorrected else ""
     yield (
@@ -182,9 +177,9 @@ def improvement_report(gain: Improvement, limit_m: float | None) -> Iterator[Blo
         f"{removed}. {e.inside} of {e.count} lie within their predicted 95 % band.{without}"
     )
     for name, why in gain.left_out[:MOST_LEFT]:
-        yield f"left out: {name}: {why}"
+        yield f"not corrected: {name}: {why}"
     if uncorrected > MOST_LEFT:
-        yield f"left out: {uncorrected - MOST_LEFT} more"
+        yield f"not corrected: {uncorrected - MOST_LEFT} more"
     if limit_m is not None:
         over, scope = gain.over(limit_m), " for deflections" if gain.mode == "deflection" else ""
         verdict = f"PASSED{scope}: no error at the corrected targets is"
@@ -272,7 +267,7 @@ def compensation_report(
             f"{o.range.variable}: in {int(o.points.sum())} of {len(names)} points whole turns from "
             f"what was measured, {np.degrees(o.range.low):.1f}° to "
             f"{np.degrees(o.range.high):.1f}°. "
-            "The model is the same there; what cables do is not in it."
+            "The model is the same there, but does not include forces of cables."
         )
     if len(names) > LISTED:
         yield f"The {LISTED} of {len(names)} points with the largest error before are listed."
@@ -316,7 +311,7 @@ def waypoints_table(outcomes: Sequence[WaypointOutcome]) -> Iterator[Block]:
     """Yield a table of all waypoints of a program; nothing without waypoints."""
     if not outcomes:
         return
-    out = table("line", "waypoint", "why")
+    out = table("line", "waypoint", "reason")
     for f in outcomes:
         passed = f"the arm passes its place within {length(f.blend_m)} and does not stop"
         out.add(str(f.line), f.done, f.why or (passed if f.blend_m > 0 else ""))
@@ -368,26 +363,23 @@ def validation_report(
     out.add("noise alone", length(test.noise_floor), "", "", "1.00", "", "")
     yield out
     yield note(
-        "stated: standard deviation that the fit states for these readings, what it does not know "
-        "where nothing was measured included; z: error over it.\n"
+        "stated: standard deviation that the fit states for these readings, with extrapolation; "
+        "z: ratio of error to stated.\n"
     )
     if not (count := int(beyond.outside.sum())):
-        yield "All of them lie inside of what was measured.\n"
+        yield "All of them lie inside the measured range.\n"
     else:
         total = len(beyond.outside)
-        yield f"Extrapolation: {count} of {total} lie outside of what was measured:"
+        yield f"Extrapolation: {count} of {total} lie outside the measured range:"
         yield from (f"  {_beyond(v)}" for v in beyond.variables[:MOST])
         unlisted = len(beyond.variables) - MOST
         yield f"  and {unlisted} more variables\n" if unlisted > 0 else ""
     if (z_all := _rms(beyond.z)) > MIN_ERROR_RATIO:
         yield f"These readings are {z_all:.2g} times as far off as the fit states.\n"
     if test.registered:
-        yield "The tracker's place was fitted to these readings first (--register).\n"
+        yield "The place of the tracker was fitted to these readings (--register).\n"
     elif z_all > MOVED_TRACKER_RATIO:
-        yield (
-            "Was the tracker set up anew for these readings? Then --register fits its place "
-            "first.\n"
-        )
+        yield ("If the tracker was moved before these readings: --register fits its place first.\n")
 
 
 def _beyond(v: validation.ExceededRange) -> str:
@@ -460,7 +452,7 @@ def validation_failure(test: validation.Acceptance, judged: validation.Judged) -
         return head
     return (
         f"{head}; but noise alone leaves {length(test.noise_m)} rms, so that these "
-        "readings cannot tell: measure with less noise, or give a limit above it"
+        "readings cannot decide: measure with less noise, or give a larger limit"
     )
 
 
@@ -514,8 +506,8 @@ def bootstrap_remarks(draws: Bootstrap) -> Iterator[str]:
             )
         else:
             yield (
-                f"Stated too small, or few poses carry it: {listed}. Take the drawn one, and "
-                "measure more poses that move these parameters."
+                f"Stated too small, or determined by few poses: {listed}. Use the drawn one, and "
+                "measure more poses that depend on these parameters."
             )
     elif draws.fit.uncertainty.inflated:
         yield (

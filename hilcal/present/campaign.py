@@ -69,8 +69,8 @@ def doctor_summary(findings: Sequence[Finding]) -> str:
     warnings = sum(f.state == "warning" for f in findings)
     more = f"; {warnings} warning{'s' * (warnings != 1)}, marked !" if warnings else ""
     if problems:
-        return f"{len(problems)} of {len(findings)} hinder a campaign: {', '.join(problems)}{more}"
-    return f"Nothing hinders a campaign{more}."
+        return f"{len(problems)} of {len(findings)} prevent a campaign: {', '.join(problems)}{more}"
+    return f"Nothing prevents a campaign{more}."
 
 
 def import_preview(proposal: Proposal, rows: int, source: str) -> Iterator[Block]:
@@ -138,18 +138,18 @@ def factory_words(check: "FactoryCheck") -> Iterator[Block]:
     lengths = (check.moved_m, check.moved_std_m, check.factory_m, check.nominal_m, check.noise_m)
     moved, std, factory, nominal, noise = map(numbers.length, lengths)
     conclusion = (
-        "The arm is what its factory measured, as far as these readings tell "
-        f"(p = {check.p_value:.2g}): what they leave of its geometry"
+        "These readings show no difference from the factory calibration "
+        f"(p = {check.p_value:.2g}): the difference in geometry"
     )
     if check.changed:
         conclusion = (
-            "The arm is no longer what its factory measured: its geometry has changed "
+            "The geometry of the arm has changed since the factory calibration "
             f"(p = {check.p_value:.1g}), which"
         )
     yield from ("", f"{conclusion} moves the target by {moved} (rms, ± {std}).")
     yield (
-        f"From the factory's kinematics {check.readings} readings are {factory} off (rms, the "
-        f"arm's own weight in it), from the maker's nominal ones {nominal}; their noise is {noise}."
+        f"The rms error of {check.readings} readings, the arm's weight included, is {factory} with "
+        f"the factory's kinematics and {nominal} with the maker's nominal ones; noise: {noise}."
     )
 
 
@@ -165,20 +165,20 @@ def info_report(o: Overview, name: str, covariance: str) -> Iterator[Block]:
             complete = number is None or number in i.name
             instruments.add(i.device, i.name if complete else f"{i.name}, serial number {number}")
         yield from (heading("Instruments"), instruments, "")
-        yield from (heading("Checks on the way"), pairs(_checks(o)), "")
+        yield from (heading("Checks during the run"), pairs(_checks(o)), "")
         yield from (heading("Events (UTC)"), *_events(o), "")
     yield heading("Revisions")
     if not o.revisions:
-        yield "None yet: hilcal identify or refine makes one."
+        yield "None yet: hilcal identify and refine make one."
         return
     yield from _revisions_tables(o)
     error_name = "error" if o.readings is None else error_words(o.readings)
     yield note(
-        f"fit, left out: rms of the {error_name}, of the fitted poses and of poses left out, "
-        "there in σ of the noise as well; v.f.: variance factor."
+        f"fit, left out: rms {error_name} at fitted poses and at poses left out; σ: the latter in "
+        "units of the noise; v.f.: variance factor."
     )
     yield (
-        "→ used by every command: the latest one; hilcal accept RUN N chooses another."
+        "→ used by every command (the latest one); hilcal accept RUN N chooses another one."
         if o.accepted is None
         else f"→ revision {o.accepted} is accepted: every command uses it."
     )
@@ -230,7 +230,7 @@ def _checks(o: Overview) -> Iterator[tuple[str, str]]:
         yield "tool", f"{o.tool['mass_kg']:.3f} kg, its centre at {com} mm in flange axes"
     if o.repeatability is not None:
         r = RepeatabilityEstimate(**o.repeatability)
-        joints = "that of the joints is too small to be seen"
+        joints = "that of the joints is too small to be estimated"
         if r.significant:
             joints = f"joints {numbers.digits(1e6 * r.joint_std, 2)} µrad"
         scatter, alone = numbers.length(r.scatter), numbers.length(r.instrument)
@@ -257,7 +257,7 @@ def event_words(e: Mapping[str, Any]) -> str:
         return f"began, {e['missing']} readings missing"
     if kind == "load":
         if e["hanging"] is None:
-            return str(e.get("why", "")) or "another load hangs than should"
+            return str(e.get("why", "")) or "a load hangs that should not"
         return "nothing hangs" if e["hanging"] == "none" else f"load {e['hanging']}"
     if kind == "doubted":
         r = e["reading"]

@@ -346,7 +346,7 @@ def workspace(
         traces.append(line(lines[:, 0], lines[:, 1], color=LEVELS[k]))
         traces.append(d.marks(target[:, 0], target[:, 1], k, members, size=5, showlegend=False))
     outside = int((revision.level == len(LEVELS) - 1).sum())
-    says = "The same from the side."
+    says = "The same readings from the side."
     if plane == "xy":
         says = (
             f"Targets with their errors, {times:g} times enlarged: {outside} of {len(story)} "
@@ -367,13 +367,13 @@ def added_variable(r: DependenceCurve, effect: str) -> go.Figure:
     hover = "would explain %{x:.1f}, residual %{y:.1f}<extra></extra>"
     traces = [
         marks(r.x[rows], r.y[rows], name="readings", size=5, hovertemplate=hover),
-        line(ends, ends, "if it is right: slope 1", dash="dash"),
+        line(ends, ends, "if the effect is right: slope 1", dash="dash"),
         line(ends, slope * ends, f"found: slope {slope:.2f}", RED),
     ]
     note = "" if len(rows) == len(r.x) else f" Of {len(r.x)} points {len(rows)} are drawn."
     says = (
-        f"Residual against what {effect} would explain: slope {slope:.2f}, where 1 means that it "
-        f"is right and 0 that it explains nothing.{note}"
+        f"Residual against what {effect} would explain: slope {slope:.2f}; 1: the effect is right, "
+        f"0: it explains nothing.{note}"
     )
     return figure(says, x="it would explain [µm]", y=r.y_label, traces=traces, height=340)
 
@@ -545,7 +545,11 @@ def family_sizes(sizes: Sequence[FamilySize]) -> go.Figure:
         height=130 + 22 * len(shown),
         traces=traces,
         # 1, 2 and 5 of each decade
-        xaxis={"type": "log", "dtick": "D2", "title": {"text": "size, by that of an ordinary arm"}},
+        xaxis={
+            "type": "log",
+            "dtick": "D2",
+            "title": {"text": "size relative to that of an ordinary arm"},
+        },
         yaxis={"categoryorder": "array", "categoryarray": order, "title": {"text": ""}},
         shapes=[{**ordinary, "line": {"color": NOISE, "width": 1, "dash": "dash"}}],
     )

@@ -59,8 +59,8 @@ def _setup(c: Comparison, earlier: str, later: str) -> Iterator[str]:
     reason = "as stated" if c.setup_stated else "both cells configure the same place"
     place = f"that of {earlier} ({reason})"
     if c.anew:
-        unless = "" if c.setup_stated else " (--same-setup: nobody moved tracker or base)"
-        place = f"estimated from them, as if it had been set up anew{unless}"
+        unless = "" if c.setup_stated else " (--same-setup: tracker and base were not moved)"
+        place = f"estimated from them, as if it had been moved{unless}"
     yield f"The tracker's place is {place}."
     if c.tool:
         yield tool_differs(c.tool, later)
@@ -78,13 +78,13 @@ def _today(c: Comparison, earlier: str) -> Iterator[Block]:
     heads = (error_words(t.prediction.readings), "rms", "mean", "largest", "expected", "as drawn")
     yield table(*heads, rows=[(f"calibration of {earlier}", *sizes, drawing)])
     yield (
-        f"The error is {numbers.digits(t.z, 2)} times what it states, all correlations counted "
+        f"The error is {numbers.digits(t.z, 2)} times the stated one, correlations included "
         f"({numbers.p_equals(t.p_value)}): {'no ' * (t.p_value >= LEVEL)}more than its uncertainty."
     )
     # The expected error includes the distance of the poses from the measured ones (leverage).
     variables = (v for v in t.beyond.variables if v.variable != "leverage")
     if ranges := numbers.few([f"{v.variable} ({v.count})" for v in variables], 3):
-        yield f"Outside of what {earlier} measured: {ranges}; an error there need not be a change."
+        yield f"Outside the range of {earlier}: {ranges}; an error there need not be a change."
 
 
 def headline(c: Comparison) -> str:
@@ -185,17 +185,17 @@ def _limits(c: Comparison) -> Iterator[Block]:
             by_joint.setdefault(limit.part, {})[limit.change.words] = _least(limit)
     shown = list(dict.fromkeys(name for row in by_joint.values() for name in row))
     rows = ((part, *(row.get(name, "-") for name in shown)) for part, row in by_joint.items())
-    yield table("would have been seen", *shown, rows=rows)
+    yield table("detectable change", *shown, rows=rows)
     yield (
         f"The smallest change that these readings would have shown in {POWER * 10:.0f} cases of "
         f"10; where nothing has changed, a change is claimed once in {1 / LEVEL:.0f}."
     )
     zeros = [x.part for x in changes.limits if x.change.by_frame and _least(x) == "-"]
     if c.mode == "deflection":
-        yield "Deflections do not show zeros and geometry: these cancel in them."
+        yield "Deflections do not show joint zeros and geometry: these cancel in them."
     elif zeros:
-        frames = "the place of the tracker, estimated anew," if c.anew else "a frame"
-        yield f"Not to be seen: the zero of {numbers.names(zeros)}; {frames} absorbs it."
+        frames = "the place of the tracker, estimated again," if c.anew else "a frame"
+        yield f"Not detectable: the zero of {numbers.names(zeros)}; {frames} absorbs it."
 
 
 def _least(limit: Limit) -> str:
@@ -205,7 +205,7 @@ def _least(limit: Limit) -> str:
 def _parameters(d: Differences | None) -> Iterator[Block]:
     if d is None:
         return
-    yield from ("", heading("Both campaigns' own fits, as far as they can be compared"))
+    yield from ("", heading("The separate fits of both campaigns, as far as they can be compared"))
     comparable = sorted(((r.z, r) for r in d.rows if r.z is not None), key=lambda zr: -abs(zr[0]))
     if comparable:
         out = table("parameter", "before", "after", "by", "±", "unit", "σ", left=(0, 5))
@@ -223,8 +223,8 @@ def _parameters(d: Differences | None) -> Iterator[Block]:
         yield f"{e.effect}, as a whole: χ² {e.chi2:.0f} of {e.rank} ({chance})."
     if excluded := len(d.rows) - len(comparable):
         yield (
-            f"{excluded} cannot be compared one by one: frames absorb them, or a campaign tells "
-            "nothing of them."
+            f"{excluded} cannot be compared one by one: frames absorb them, or a campaign does not "
+            "determine them."
         )
     if d.not_in_both:
         yield f"Not in both, or with other options: {numbers.names(d.not_in_both)}."
@@ -234,14 +234,14 @@ def next_step(c: Comparison, earlier: str) -> str:
     """Return the recommended next step as a clause."""
     changes = c.changes
     if c.another_arm:
-        return "calibrate it by itself."
+        return "calibrate it separately."
     if not changes.found and changes.explained:
         return f"nothing; the calibration of {earlier} holds."
     arm = [x for x in changes.found if x.candidate.of_arm]
     if changes.explained and changes.found and not arm:
-        return f"put the setup right, and compare again; the calibration of {earlier} holds."
+        return f"correct the setup, and compare again; the calibration of {earlier} holds."
     parts = numbers.names(list(dict.fromkeys(x.candidate.part for x in arm))) or "the arm"
-    return f"recalibrate {parts}, with what {earlier} knows as prior; more readings make it surer."
+    return f"recalibrate {parts}, with {earlier} as prior; more readings reduce the uncertainty."
 
 
 def next_command(c: Comparison, earlier: str, later: str) -> str | None:

@@ -27,7 +27,7 @@ from hilcal.present.fit import (
     model_name,
     where_table,
 )
-from hilcal.present.verdict import broken, headline, implausible, message
+from hilcal.present.verdict import headline, implausible, message, unconfirmed
 from hilcal.readings.readings import Readings
 from hilcal.types import Floats
 
@@ -44,12 +44,12 @@ COMPARED = 24  # most parameters that are compared with the true ones
 FEW, LEAST_BINS = 3, 3  # most effects that a law is said to resemble; least bins of a curve
 RARE = 0.01  # probability below which only "< 1 %" is written
 NOT_TRIED = "could not be tried in the exact model"
-NEWCOMER = f"""\
-The lines that follow are those of a real run: what the arm does, and each reading with its pose,
-load and cycle. It begins beside the reference pose, so that every joint arrives there from a known
-side. From {FEWEST_POSES} poses on, a first model predicts each reading before it counts: the
-residual is how far it misses. While it is fitted to few poses, and lacks what is hidden, that is a
-lot."""
+RUN_EXPLANATION = f"""\
+The following lines are those of a real run: the motions of the arm, and each reading with its pose,
+load and cycle. The run begins next to the reference pose, so that every joint reaches it from a
+known side. From {FEWEST_POSES} poses on, a first model predicts each reading before it is fitted to
+it, and the residual is printed: large while the model is fitted to few poses and lacks the hidden
+effect."""
 
 
 def verdict_line(d: Diagnosis) -> Words:
@@ -80,9 +80,9 @@ def addition_lines(s: Suspect) -> Iterator[str]:
         yield f"{s.effect} is implausible: it {implausible(s)}."
     if not s.keeps:
         yield (
-            f"The linearisation promised that {s.effect} explains {percent(s.share)} of "
-            f"the misfit; the refit kept {percent(max(s.kept, 0.0))} of that: remove it, hilcal "
-            f"remove RUN {s.effect}."
+            f"{s.effect} was predicted to explain {percent(s.share)} of the misfit; the refit "
+            f"confirms {percent(max(s.kept, 0.0))} of that. To remove it: hilcal remove RUN "
+            f"{s.effect}."
         )
 
 
@@ -96,7 +96,7 @@ def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
         yield suspects_table(d)
         yield note(
             "explains: share of the misfit, the error beyond noise, that adding the effect would "
-            "remove; p-value: chance of that much if it were not there. "
+            "remove; p-value: chance of that share without the effect. "
             f"{numbers.many_tests(d.tested, FALSE_ALARM)}\n"
         )
     if d.verdict != "adequate":
@@ -111,15 +111,15 @@ def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
     if d.verdict in ("unknown_effect", "noise_misjudged"):
         if d.verdict == "noise_misjudged" or d.predictable_share >= LEAST_SHARE:
             predicted = percent(d.predictable_share)
-            yield f"What is recorded predicts {predicted} of the misfit on poses left out."
+            yield f"The recorded variables predict {predicted} of the misfit on poses left out."
         if d.insufficiency is not None:
             refitted = d.insufficiency.effects[: d.insufficiency.refitted]
             yield f"The residual{' with ' * bool(refitted)}{numbers.names(refitted)}:"
         yield from curves(d.dependences)
     if d.verdict == "unknown_effect":
         yield note(
-            "An effect of your own: hilcal effects new NAME writes one to begin with, and "
-            "--effects-from FILE.py tries it."
+            "To try an effect of your own: hilcal effects new NAME writes an example, "
+            "--effects-from FILE.py adds it to the catalogue."
         )
     if (e := d.pure_error) is not None:
         scatter = f"Repeated readings scatter {e.factor**0.5:.2f} times as much as stated"
@@ -165,14 +165,14 @@ def added_effect_sentence(before: Fit, after: Fit, effect: str) -> str:
         return f"With {effect} the error on poses left out falls {change}."
     return (
         f"With {effect} the error on poses left out does not fall ({change}): these readings do "
-        "not show this effect. The revisions before it are still there."
+        "not show this effect. The previous revisions are still stored."
     )
 
 
 def removed_effect_sentence(before: Fit, after: Fit, effect: str) -> str:
     """Return a sentence on the change of the error on poses left out by a removed effect."""
     needed = predicts_better(after, before)
-    verb, end = ("rises", "it belongs there") if needed else ("goes", "it is not needed")
+    verb, end = ("rises", "it is needed") if needed else ("goes", "it is not needed")
     change = f"from {length(before.holdout.rms_m)} to {length(after.holdout.rms_m)}"
     return f"Without {effect} the error on poses left out {verb} {change}: {end}."
 
@@ -184,18 +184,19 @@ def detectable_sizes(d: Diagnosis) -> Iterator[Block]:
     if visible:
         least = [(s.effect, s.least) for s in visible]
         rows = [(e, length(x.displacement_m), numbers.sizes(x.parameters)) for e, x in least]
-        heads = ("not found", "would be seen from", "its parameters, rms")
+        heads = ("not found", "detectable from", "its parameters, rms")
         yield from ("", table(*heads, rows=rows, left=(0, 2)))
         yield note(
-            "would be seen from: rms displacement of the target at which nine campaigns like this "
-            "one in ten would name the effect; rms of the parameters that make it.\n"
+            "detectable from: rms displacement of the target at which nine of ten campaigns like "
+            "this one would name the effect, and the rms of its parameters for that "
+            "displacement.\n"
         )
     for s in not_named:
         if (finest := s.least.finest_m) is not None:
             when = f"from {length(finest)}" if np.isfinite(finest) else "at no size"
-            yield f"A {s.effect} finer than these poses resolve would be seen {when}.\n"
+            yield f"A {s.effect} finer than these poses resolve would be detectable {when}.\n"
     if hidden := d.not_shown:
-        yield f"At no plausible size would these readings show {numbers.names(hidden, 'or')}.\n"
+        yield f"These readings cannot show, at any plausible size: {numbers.names(hidden)}.\n"
 
 
 def doubtful_lines(d: Diagnosis) -> Iterator[str]:
@@ -204,7 +205,7 @@ def doubtful_lines(d: Diagnosis) -> Iterator[str]:
         if not s.plausible and s.score.p_value < CERTAIN:
             yield f"{s.effect} is implausible: it {implausible(s)}."
         elif not s.keeps:
-            yield f"{s.effect} is not named: {broken(s)}."
+            yield f"{s.effect} is not named: {unconfirmed(s)}."
 
 
 def redundant_line(d: Diagnosis) -> Iterator[str]:
@@ -219,16 +220,16 @@ def redundant_line(d: Diagnosis) -> Iterator[str]:
 
 def curves(dependences: Sequence[Dependence], most: int = CURVES) -> Iterator[Block]:
     """Yield the curve of each variable that explains at least `LEAST_SHARE` of the misfit."""
-    carrying = [d for d in dependences if d.share >= LEAST_SHARE][:most]
-    for d in carrying:
-        carries = f"{d.variable} carries {percent(d.share)}"
+    shown = [d for d in dependences if d.share >= LEAST_SHARE][:most]
+    for d in shown:
+        explains = f"{d.variable} explains {percent(d.share)}"
         if d.determined:
-            yield f"{carries}; {erring_quantity(d)} errs by:"
+            yield f"{explains}; error of {erring_quantity(d)}:"
             head = f"{d.variable} [{d.unit}]" if d.unit else d.variable
             yield from (_binned((head, "error"), d.y_unit, (d.x, d.y, d.error), d.labels), "")
         else:
-            yield f"{carries}, but these readings do not determine its curve."
-    if any(d.determined for d in carrying):
+            yield f"{explains}, but these readings do not determine its curve."
+    if any(d.determined for d in shown):
         yield note("±: standard uncertainty; the mean over the bins is taken as zero.")
 
 
@@ -301,7 +302,7 @@ def true_and_fitted(fit: Fit, truth: Mapping[str, float]) -> list[TrueAndFitted]
 
 def truth_table(rows: Sequence[TrueAndFitted]) -> Iterator[Block]:
     """Yield the table of estimated and true parameters."""
-    out = table("parameter", "true", "found", "±", "unit", "off by", left=(0, 4))
+    out = table("parameter", "true", "fitted", "±", "unit", "off by", left=(0, 4))
     for r in rows[:COMPARED]:
         unit, factor = numbers.unit_for(r.unit, [r.true, r.value])
         value, spread = numbers.with_std(factor * r.value, factor * r.std)
@@ -322,8 +323,8 @@ def discovery_report(d: Discovery) -> Iterator[Block]:
         yield from curves(d.carried)
         return
     yield (
-        f"{d.candidates} candidates were tried. Searched for without them, laws explain "
-        f"{percent(d.searched_share)} of the misfit on poses left out."
+        f"{d.candidates} candidates were tried. On poses left out of the search, laws explain "
+        f"{percent(d.searched_share)} of the misfit."
     )
     for k, law in enumerate(d.laws):
         yield ""
@@ -343,8 +344,8 @@ def discovery_report(d: Discovery) -> Iterator[Block]:
     yield from ("", rows)
     moved, std = map(length, d.average_m())
     yield (
-        f"Averaged over them by their probability, laws move the readings by {moved} rms; what is "
-        f"then predicted has a standard uncertainty of {std}, the choice of the law included."
+        f"Averaged by their probability, laws move the readings by {moved} rms; this prediction "
+        f"has a standard uncertainty of {std}, the choice of the law included."
     )
     for law_name, why in (*d.refused, *d.unfitted):
         yield f"{law_name} {NOT_TRIED} ({why})."
@@ -356,8 +357,8 @@ def no_law_sentence(d: Discovery) -> str:
     helps = "measure more poses, or record what else may matter"
     if any(c.variable == ROW_ORDER for c in d.carried[:1]):
         helps = (
-            "it depends mostly on the order of the readings, whose times are missing: without "
-            "them no law of time can be searched, so add them"
+            "it depends mostly on the order of the readings: add their times, without which no law "
+            "of time can be searched for"
         )
     why = (
         f"no law: {percent(d.attainable)} of the misfit is predictable on poses left out, but "
@@ -395,9 +396,9 @@ def _law(law: Law, d: Discovery, first: bool) -> Iterator[Block]:
         share += f", {percent(min(law.holdout_share / d.attainable, 1.0))} of what can be"
     yield f"  explains     {share}"
     before = d.fit.variance_factor
-    yield f"  left         variance factor {law.variance_factor:.2f}, before {before:.2f}"
+    yield f"  remains      variance factor {law.variance_factor:.2f}, before {before:.2f}"
     yield f"  chance       {numbers.p_equals(law.p_value)}, corrected for the size of the search"
-    yield "  found again  in the searches without some poses:"
+    yield "  repeated in  searches without some of the poses:"
     for a in law.selection_frequencies:
         causes = f" by {', '.join(a.variables)}" if a.variables else ""
         yield f"    {a.acts_on}{causes}: {percent(a.share)}"
@@ -408,7 +409,7 @@ def _law(law: Law, d: Discovery, first: bool) -> Iterator[Block]:
         for symbol, low, high, u in law.ranges
     ]
     if ranges:
-        yield f"  seen for     {', '.join(ranges)}; nothing is known outside"
+        yield f"  valid for    {', '.join(ranges)}; not tested outside"
 
 
 def coefficient(c: Coefficient) -> str:
@@ -423,11 +424,11 @@ def refined_laws(s: LawSearch) -> Iterator[Block]:
         if not d.laws:
             yield numbers.sentence(no_law_sentence(d))
         elif (law := d.laws[0]).name not in s.files:
-            yield f"{law.formula} was tried, and did not lower the error on poses left out."
+            yield f"{law.formula} was tried; it did not lower the error on poses left out."
         else:
             yield heading(f"{law.name}: a law that the catalogue does not have")
             yield from _law(law, d, first=True)
             yield (
-                f"It is the effect {law.name} in {s.files[law.name]}, to be edited; commands that "
-                "read these revisions take it by --effects-from.\n"
+                f"It is stored as the effect {law.name} in {s.files[law.name]}; commands that read "
+                "these revisions need it: --effects-from.\n"
             )

@@ -43,8 +43,8 @@ GROUPS: dict[Group, str] = {
 }
 """Groups of the table of variables in their order, with the format of a row's name."""
 CERTAIN = 0.005
-TELL_P = 1e-3  # Bonferroni-corrected p-value of a disagreement with the prior that is reported
-MOST_TOLD = 5
+CONFLICT_P = 1e-3  # Bonferroni-corrected p-value of a disagreement with the prior that is reported
+MOST_CONFLICTS = 5
 
 
 def model_name(names: Sequence[str]) -> str:
@@ -71,8 +71,8 @@ def fit_report(fit: Fit, details: bool = True) -> Iterator[Block]:
         return
     yield _variance_factor(fit)
     if null := [str(d) for d in fit.uncertainty.null]:
-        several = f"{len(null)} directions" if len(null) > 1 else "1 direction"
-        yield f"{several} cannot be seen in these readings: {numbers.few(null, 1)}."
+        several = f"{len(null)} combination{'s' * (len(null) > 1)} of parameters"
+        yield f"These readings do not determine {several}: {numbers.few(null, 1)}."
     yield from gross_error_lines(fit, details=False)
     if (loads := loads_note(fit)) is not None:
         yield numbers.sentence(loads)
@@ -84,7 +84,9 @@ def gross_error_lines(fit: Fit, details: bool) -> Iterator[str]:
     if not (gross := gross_errors(fit)):
         return
     were = f"{len(gross)} readings are" if len(gross) > 1 else "1 reading is"
-    total = f"{were} set aside as gross error{'s' * (len(gross) > 1)}, and in none of these figures"
+    total = (
+        f"{were} set aside as gross error{'s' * (len(gross) > 1)}, not included in these figures"
+    )
     yield f"{total} (pose/load):" if details else f"{total}; --details lists them."
     if details:
         yield from _listed([f"  {g.pose}/{g.load}: {g.reason}" for g in gross], GROSS)
@@ -92,10 +94,10 @@ def gross_error_lines(fit: Fit, details: bool) -> Iterator[str]:
     lost = np.setdiff1d(of_load, of_load[~fit.outlier])
     if len(lost):
         names = numbers.names([fit.readings.load_names[k] for k in lost])
-        right = "are their forces" if len(lost) > 1 else "is its force"
+        whose = "their forces" if len(lost) > 1 else "its force"
         under = f"under the load{'s' * (len(lost) > 1)} {names}"
         count = int(np.isin(of_load, lost).sum())
-        yield f"All {count} readings {under} are set aside: {right} right?"
+        yield f"All {count} readings {under} are set aside: check {whose}."
 
 
 def _listed(lines: Sequence[str], most: int) -> Iterator[str]:
@@ -187,7 +189,7 @@ def _errors(
 def before_and_after(fit: Fit) -> str:
     """Return a sentence on the errors without and with the fitted model."""
     nominal, floor = length(nominal_error(fit).rms_m), length(full_prediction(fit).noise_floor)
-    without = f"The rigid nominal arm, its frames fitted alone, is off by {nominal} rms"
+    without = f"The rigid nominal arm with fitted frames is off by {nominal} rms"
     if fit.mode == "deflection":
         without = f"Deflections of {nominal} rms were measured"
     with_model = f"the model leaves {length(fit.error.rms_m)}"
@@ -206,8 +208,8 @@ def remarks(fit: Fit) -> Iterator[Block]:
         yield correlated(serial)
     yield _scaling_remark(fit)
     if null := fit.uncertainty.null:
-        noun = "directions, parameters that move together," if len(null) > 1 else "direction"
-        yield f"{len(null)} {noun} cannot be seen in these readings:"
+        noun = "combinations" if len(null) > 1 else "combination"
+        yield f"These readings do not determine {len(null)} {noun} of parameters:"
         yield from _listed([f"  {d}" for d in null], DIRECTIONS)
     yield from fitted_lines(fit)
     yield from (f"{remark[0].upper()}{remark[1:]}." for remark in notes(fit))
@@ -241,7 +243,7 @@ def _scaling_remark(fit: Fit) -> str:
     return (
         f"Condition number {numbers.condition(unscaled)} in physical units, "
         f"{numbers.condition(scaled)} after parameter scaling: parameter scaling "
-        f"{'was needed' if needed else 'made no difference that matters'}."
+        f"{'was needed' if needed else 'was not needed'}."
     )
 
 
@@ -278,7 +280,7 @@ def dependence_sentence(places: Sequence[MisfitShare]) -> str:
     named = numbers.names([f"{p.variable} ({percent(p.share)})" for p in causes])
     statement = f"The misfit follows {named or 'none of the variables'}"
     if not causes and not sides and not same:
-        return f"{statement}: neither joints nor load, time or direction."
+        return f"{statement}: neither joints nor loads, time or direction."
     if sides:
         side = sides[0].variable.removeprefix("direction ")
         statement += f"; {percent(sides[0].share)} of it is {side}"
@@ -372,8 +374,8 @@ def scalings_table(fits: Mapping[Scaling, Fit]) -> Iterator[Block]:
         out.add(name, *cells, "")
     yield out
     yield note(
-        "none: least squares as is; gu: weighted by standard deviations; gc: whitened by the full "
-        "covariance, pose by pose. The revision that is kept is that of gc."
+        "none: unweighted least squares; gu: weighted by standard deviations; gc: whitened by the "
+        "full covariance of each pose. The fit with gc is stored."
     )
 
 
@@ -419,15 +421,15 @@ def prior_lines(fit: Fit) -> list[str]:
     name += f", revision {source.revision}" if source.revision else ""
     lines = [f"Prior: {name} ({source.n_readings} readings{arm})."]
     # groups of parameters in which prior and readings disagree beyond chance, worst first
-    moved = [c for c in fit.conflicts if c.p_value * len(fit.conflicts) < TELL_P]
-    for c in moved[:MOST_TOLD]:
+    moved = [c for c in fit.conflicts if c.p_value * len(fit.conflicts) < CONFLICT_P]
+    for c in moved[:MOST_CONFLICTS]:
         g, effect = c.group, c.group.effect.replace("_", " ")
         name = f"the {effect} of {g.part}" if g.part else f"the {effect}"
         name = name if g.joint is None else f"joint {g.joint}'s {effect}"
         sigma = f"{min(c.moved_sigma, 37):.1f} σ of what the prior allows"
-        lines.append(f"  {name} has moved by {sigma}: wear, a crash or a repair?")
-    if len(moved) > MOST_TOLD:
-        lines.append(f"  … and {len(moved) - MOST_TOLD} more (--json lists them)")
+        lines.append(f"  {name} has moved by {sigma} (wear, a crash or a repair?).")
+    if len(moved) > MOST_CONFLICTS:
+        lines.append(f"  … and {len(moved) - MOST_CONFLICTS} more (--json lists them)")
     in_prior = {e.name for e in prior.posterior.effects}
     new = [e.name for e in fit.model.effects if belongs_to_arm(e) and e.name not in in_prior]
     ask = "hilcal compare EARLIER LATER says what has changed"

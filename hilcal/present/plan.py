@@ -22,7 +22,7 @@ CRITERIA = {
 }
 BAR = 30
 SCREEN = 4  # remarks on the first screen; the most important come first
-NAMED_FROM = "a diagnosis names what is about ten times as large"
+NAMED_FROM = "a diagnosis names effects about ten times as large"
 """6 to 16 times in one simulated campaign of 20 poses: tests at the level of a whole catalogue."""
 UNCERTAIN = 1e-3  # least certified efficiency that is reported: the last printed digit
 SIMILAR_RATIO = 1.1
@@ -48,14 +48,14 @@ def plan_screen(s: PlanSummary) -> Iterator[Block]:
     if detectable := _detectable(s):
         (first, least), (last, most) = detectable[0], detectable[-1]
         yield (
-            f"Outside of the model: {first} of {least}, ..., {last} of {most} are one sigma of "
+            f"Outside the model: {first} of {least}, ..., {last} of {most} are one σ of "
             f"these readings; {NAMED_FROM}."
         )
     yield from _undetectable(s)
     yield from (f"note: {remark}" for remark in s.remarks[:SCREEN])
     unlisted = len(s.remarks) - SCREEN
     details = f"{unlisted} more notes, every parameter" if unlisted > 0 else "every parameter"
-    yield f"--details: {details}, criteria, numbers of poses, effects outside of the model."
+    yield f"--details: {details}, criteria, numbers of poses, effects outside the model."
 
 
 def _effect_rows(parameters: Sequence[PredictedParameter]) -> Iterator[tuple[str, ...]]:
@@ -83,7 +83,7 @@ def plan_report(s: PlanSummary) -> Iterator[Block]:
         yield heading("Predicted standard uncertainty")
         heads = ("parameter", "±", "magnitude", "unit", "± in %")
         yield table(*heads, rows=_parameter_rows(s.parameters), left=(0, 3))
-        yield note("magnitude: estimated so far, else the effect's ordinary magnitude.\n")
+        yield note("magnitude: the estimate so far, or the ordinary magnitude of the effect.\n")
     if s.criteria:
         yield heading("Comparison of criteria, for the same number of readings")
         yield from _criteria_table(s)
@@ -91,11 +91,11 @@ def plan_report(s: PlanSummary) -> Iterator[Block]:
         yield heading("Sample-size curve: how many poses are enough")
         yield from (_curve(s), f"{enough_poses_sentence(s.curve)}\n")
     if s.detectable:
-        yield heading("Minimum detectable effects outside of the model")
+        yield heading("Minimum detectable effects outside the model")
         if detectable := _detectable(s):
             yield table("effect", "from", rows=detectable)
             yield note(
-                "from: rms displacement of the target that is one sigma of these readings; "
+                "from: rms displacement of the target that is one σ of these readings; "
                 f"{NAMED_FROM}.\n"
             )
         yield from (f"{sentence}\n" for sentence in _undetectable(s))
@@ -105,7 +105,7 @@ def plan_report(s: PlanSummary) -> Iterator[Block]:
 def efficiency_sentence(efficiency: float) -> str:
     """Return a sentence on a certified efficiency, rounded down because it is a lower bound."""
     if efficiency < UNCERTAIN:
-        return "of the plan: not certified, since the bound of the best plan did not close"
+        return "of the plan: not certified, as the bound of the best plan did not converge"
     return f"of the plan: at least {_percent(efficiency)} (certified lower bound); not accuracy"
 
 
@@ -117,7 +117,7 @@ def cost_rows(s: PlanSummary) -> Iterator[tuple[str, str]]:
     """Yield names and values of the costs and predicted results of a plan."""
     fewer = ""
     if s.asked_poses not in (None, s.poses):
-        fewer = f": the cell leaves no more of {s.asked_poses}, so that some are read again"
+        fewer = f": the cell leaves no more of {s.asked_poses}; some are read again"
     yield "poses", f"{s.poses} and the reference{fewer}"
     loads = ", ".join(f"{load_name(name)} {count}" for name, count in s.loads.items())
     yield "readings", f"{s.readings}: {loads}"
@@ -258,12 +258,12 @@ def next_report(
     plan: SeparatingPlan, poses: int, readings: int, details: bool = True
 ) -> Iterator[Block]:
     """Yield the powers of pairs of suspects; without `details` of each suspect's weakest pair."""
-    yield heading("Telling the suspects apart")
+    yield heading("Power to separate the suspects")
     yield power_table(plan.powers if details else _weakest(plan.powers))
     yield note(
-        "now, then: where the first effect is there, the chance that the readings so far, and with "
-        "those planned as well, reject a fit with the second in its place (test at 1 %). An effect "
-        "that the readings so far do not support is assumed to change them by 1 σ rms.\n"
+        "now, then: if the first effect is present, the chance that the readings so far (now), or "
+        "with the planned ones (then), reject a fit with the second in its place (test at 1 %). An "
+        "effect that the readings so far do not support is assumed to change them by 1 σ rms.\n"
     )
     yield f"{powers_summary(plan.powers, poses, readings)} {_difference(plan)}\n"
     yield from (f"note: {remark}" for remark in plan.notes)
@@ -273,16 +273,16 @@ def poses_report(
     plan: SeparatingPlan, poses: int, readings: int, details: bool = True
 ) -> Iterator[Block]:
     """Yield the plan of poses for a misfit that depends on the pose alone; see `next_report`."""
-    yield heading("Poses where nothing was read yet")
+    yield heading("New poses")
     yield (
-        f"The misfit is the same under every load of a pose, so that loads tell nothing of it: "
-        f"{readings} unloaded readings at {poses} poses, spread over the joints' range.\n"
+        f"The misfit is the same under every load of a pose, so that loads do not help: {readings} "
+        f"unloaded readings at {poses} poses, spread over the joints' range.\n"
     )
     if plan.powers:
         yield power_table(plan.powers if details else _weakest(plan.powers), "and this is fitted")
         yield note(
-            "now, then: chance that it passes every test of a missing effect, poses left out "
-            "included, with the readings so far and with those planned as well.\n"
+            "now, then: chance that it passes every test of a missing effect, also on poses left "
+            "out, with the readings so far and with the planned ones.\n"
         )
 
 
@@ -295,9 +295,9 @@ def _weakest(powers: Sequence[PairPower]) -> tuple[PairPower, ...]:
     return tuple(least.values())
 
 
-def power_table(powers: Sequence[PairPower], rival: str = "this is ruled out") -> Table:
+def power_table(powers: Sequence[PairPower], rival: str = "chance to rule out") -> Table:
     """Return the table of powers of pairs, with the readings so far and with the plan."""
-    return table("if this is there", rival, "now", "then", rows=power_rows(powers), left=(0, 1))
+    return table("if this is present", rival, "now", "then", rows=power_rows(powers), left=(0, 1))
 
 
 def power_rows(powers: Sequence[PairPower]) -> Iterator[tuple[str, str, str, str]]:
@@ -321,13 +321,13 @@ def powers_summary(powers: Sequence[PairPower], poses: int, readings: int) -> st
     least = min(able, key=lambda t: t.power_planned)
     if least.power_planned < SEPARATED_POWER:
         return (
-            f"{head}: the weakest pair is {least.effect}, where it is there, and {least.rival}, "
+            f"{head}: the weakest pair is {least.effect}, if it is present, and {least.rival}, "
             f"which they rule out with a chance of {_chance(least.power_planned)} "
             f"({_chance(least.power_now)} now); more poses raise it."
         )
     what = "what can be separated in this cell: each of these pairs"
     if len(able) == len(powers):
-        what = "the suspects: whichever is there, each of the others is ruled out"
+        what = "the suspects: whichever is present, each of the others is ruled out"
     at_least = min(int(100 * least.power_planned + 1e-9), 99)  # rounded down
     return f"{head} separate {what} with a chance of at least {at_least} %."
 

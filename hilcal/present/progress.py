@@ -122,7 +122,7 @@ def missed_words(status: events.GoalStatus, count: int) -> str:
     line += f": {full_words(status)}"
     if status.ratio is None or not isfinite(status.ratio):
         return line
-    missed = f"{status.ratio:.2g} times what is asked for"
+    missed = f"{status.ratio:.2g} times the goal"
     return f"{line}, {missed if status.ratio > 1.0 else 'but the fit did not converge'}"
 
 

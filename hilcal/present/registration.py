@@ -96,7 +96,7 @@ def base_line(cell: Cell, frames: RobotFrames, mode: Mode = "absolute") -> str:
     if not frames.base_stated:
         why = "the nominal arm on it has the axis of joint 1 where the readings have it"
         if mode == "deflection":
-            why, places = f"{why}; deflections tell it no better", (3, 2)
+            why, places = f"{why}; deflections do not determine it better", (3, 2)
     return f"The robot's base: at {_place(frames.base, places)} in the tracker frame; {why}."
 
 
@@ -114,7 +114,7 @@ def undetermined_lines(registration: Registration) -> Iterator[str]:
     for u in registration.undetermined:
         direction = _undetermined(u, names)
         verb = "separate" if " from " in direction else "determine"
-        yield f"The poses cannot {verb} {direction}: {why}; it stays near the start."
+        yield f"The poses cannot {verb} {direction}: {why}; it stays near its initial value."
 
 
 def _undetermined(u: Undetermined, names: tuple[str, ...]) -> str:

@@ -37,7 +37,7 @@ HEADLINES: Mapping[Verdict, str] = {
     "adequate": "adequate: the residual is noise",
     "missing_effect": "an effect is missing",
     "ambiguous": "ambiguous: these readings do not separate the suspects",
-    "unknown_effect": "unknown effect: an effect is missing that the catalogue does not hold",
+    "unknown_effect": "unknown effect: an effect is missing that is not in the catalogue",
     "noise_misjudged": "the noise is not what was stated",
 }
 RESIDUAL_IS_NOISE = ("residual_is_noise", "inseparable_addition", "arm_scatter", "background")
@@ -102,8 +102,8 @@ def _left_out(d: Diagnosis) -> list[str]:
     what = "deflections" if d.fit.mode == "deflection" else "positions"
     return [
         f"But predicted {what} are off by {length(held)} rms on poses left out, where fitted poses "
-        f"leave {length(fitted)} and noise alone {length(floor)}: that is what to expect of new "
-        "poses, until more poses, spread over all joints, are measured."
+        f"leave {length(fitted)} and noise alone {length(floor)}: expect the former at new poses "
+        "until more poses, spread over all joints, are measured."
     ]
 
 
@@ -145,7 +145,11 @@ def _verdict(d: Diagnosis) -> list[str]:
     if d.wrong_figures:  # each alone explains the misfit
         first, *alternatives = map(_wrong_figure, d.wrong_figures)
         others = (f"Or else {figure}." for figure in alternatives)
-        return [numbers.sentence(first), *others, "Until that is settled no effect is looked for."]
+        return [
+            numbers.sentence(first),
+            *others,
+            "No effect is searched for until this is corrected.",
+        ]
     if d.reason == "readings_disagree":
         return [numbers.sentence(disagreement_words(d.fit))] if d.fit.disagreement else []
     of_reason = {
@@ -187,7 +191,7 @@ def _wrong_figure(f: WrongFigure) -> str:
         )
     if f.kind == "gravity":
         opposite = float(np.dot(f.found, f.stated)) < -0.999 * float(np.dot(f.stated, f.stated))
-        why = "no joint gives way against its torque" if opposite else change.strip("()")
+        why = "no joint deflects against its torque" if opposite else change.strip("()")
         estimated, stated = (", ".join(f"{x + 0.0:.2f}" for x in v) for v in (f.found, f.stated))
         return (
             f"gravity seems to be ({estimated}) m/s² in base axes, not ({stated}) ({why}): see "
@@ -196,7 +200,7 @@ def _wrong_figure(f: WrongFigure) -> str:
     if f.kind in ("forces", "force_axes"):
         axes = ["in flange axes, not base axes"] * (f.kind == "force_axes")
         are = " and ".join([*axes, *["of the other sign"] * (f.found[0] < 0.0)])
-        why = change if f.rms_with_m < 0.9 * f.rms_m else "(no joint gives way against its torque)"
+        why = change if f.rms_with_m < 0.9 * f.rms_m else "(no joint deflects against its torque)"
         return (
             f"the forces seem to be {are} {why}: a table states what a load exerts on the tool, in "
             'base axes (a mapping may say [wrench] of = "reaction"); correct it, and import again'
@@ -238,12 +242,12 @@ def _background(d: Diagnosis) -> list[str]:
         noise += [_implausible_scatter(scatter, d.fit.model.cell.arm)]
     return [
         f"{len(d.background)} effects of the catalogue together predict what the named ones leave, "
-        "but these readings prove none of them by itself.",
-        f"Likeliest {'is' if len(likely) == 1 else 'are'} {names}."
+        "but these readings prove none of them individually.",
+        f"Most likely {'is' if len(likely) == 1 else 'are'} {names}."
         if likely
         else "None stands out.",
-        "All of them take part in predictions.",
-        "More poses, spread over all joints, tell which are there.",
+        "Predictions include all of them.",
+        "More poses, spread over all joints, would show which are present.",
         *noise,
     ]
 
@@ -269,14 +273,14 @@ def implausible(s: Suspect) -> str:
     return f"would need parameters of {needed} rms, where up to {most} is plausible"
 
 
-def broken(s: Suspect) -> str:
+def unconfirmed(s: Suspect) -> str:
     """Return a clause on the share of the linear prediction that the exact model confirms."""
-    return f"the exact model keeps {percent(max(s.kept, 0.0))} of what its linearisation promises"
+    return f"the exact model confirms {percent(max(s.kept, 0.0))} of what the linear one predicts"
 
 
 def _inseparable(d: Diagnosis) -> list[str]:
     lead, rivals = d.suspects[0], d.separability
-    advice = "Run hilcal next: it plans what separates them. Or add one and judge on new poses."
+    advice = "hilcal next plans what separates them; or add one and test it on new poses."
     if not any(r.possible for r in rivals):
         advice = "Add one: readings of this kind are predicted as well with any of them."
     return [
@@ -302,7 +306,7 @@ def _insufficient(d: Diagnosis) -> list[str]:
     return [
         f"{lead.effect} explains {percent(lead.share)} of the misfit, but all effects of the "
         f"catalogue together leave {percent(i.share)} of it.",
-        f"The residuals are then {i.variance_factor**0.5:.2g} times the stated noise{follows}.",
+        f"Then the residuals are {i.variance_factor**0.5:.2g} times the stated noise{follows}.",
         f"So {lead.effect} may only resemble the missing effect.",
         *_repeats_scatter_less(i.noise, d.pure_error),
     ]
@@ -317,7 +321,7 @@ def _no_suspect(d: Diagnosis) -> list[str]:
         if not best.plausible:
             but = implausible(best)
         elif not best.keeps:
-            but = broken(best)
+            but = unconfirmed(best)
         none = (
             f"The best effect of the catalogue, {best.effect}, explains {percent(best.share)} "
             f"of it, but {but}."
@@ -340,7 +344,7 @@ def _no_suspect(d: Diagnosis) -> list[str]:
             "All effects of the catalogue together explain the fitted poses (residuals are "
             f"{_spread(d)}), but not poses left out: {predicted} of the misfit there is "
             f"predictable, and no effect of the catalogue explains it{follows}.",
-            "All of them take part in predictions; each may only resemble the missing effect.",
+            "Predictions include all of them; each may only resemble the missing effect.",
         ]
     return [
         f"Residuals are {_spread(d)}.",
@@ -361,7 +365,7 @@ def _pose_alone(d: Diagnosis) -> list[str]:
         f"{percent(a.share)} of the misfit is the same under every load of a pose: it depends on "
         "the pose alone.",
         f"{first} finer than {a.poses} poses can resolve{alternatives} would do that.",
-        "So would an arm that repeats worse than stated, where each pose was arrived at once.",
+        "So would a repeatability worse than stated, as each pose was reached once only.",
         f"{a.more} more poses would decide{chance}.",
     ]
 
@@ -380,7 +384,7 @@ def _misjudged(d: Diagnosis) -> list[str]:
         if prefers_instrument(s):
             why = (
                 f"They are as if the instrument were {s.instrument_factor:.2g} times as noisy as "
-                "stated, and not as if the arm scattered: mend the stated noise, or repeat some "
+                "stated, and not as if the arm scattered: correct the stated noise, or repeat some "
                 "readings to be sure."
             )
         return [unpredicted, why]
@@ -401,7 +405,7 @@ def _misjudged(d: Diagnosis) -> list[str]:
     few = "Without repeated readings" if repeats is None else "With so few repeated readings"
     return [
         unpredicted,
-        f"{few} it cannot be known whether the noise is larger than stated: repeat some readings.",
+        f"{few} it is not known whether the noise is larger than stated: repeat some readings.",
     ]
 
 
@@ -450,7 +454,7 @@ def _arm_scatter(d: Diagnosis) -> list[str]:
         size = length(s.predicted_share**0.5 * s.size_m)
         predicted = (
             f"{percent(s.predicted_share)} of it, {size} rms, follows {causes} on poses left out, "
-            "which is negligible beside the rest."
+            "which is negligible compared with the rest."
         )
     doubt = []
     if not separates_instrument(s):
@@ -479,14 +483,14 @@ def sigmas(s: ArmScatter) -> str:
         return f"the target scatters by σ = {' ± '.join(pairs[0])} µm along each axis"
     if s.kind == "joints":
         return f"each joint scatters by σ_q = {' ± '.join(pairs[0])} µrad"
-    told = [j for j in range(len(pairs)) if s.std[j] > s.std_error[j]]
-    clear = ", ".join(f"joint {j + 1} {' ± '.join(pairs[j])}" for j in told)
-    return f"the joints scatter by σ_q [µrad] = {clear}, the others by less than can be told"
+    clear = [j for j in range(len(pairs)) if s.std[j] > s.std_error[j]]
+    listed = ", ".join(f"joint {j + 1} {' ± '.join(pairs[j])}" for j in clear)
+    return f"the joints scatter by σ_q [µrad] = {listed}, the others by less than can be estimated"
 
 
 def _rp_comparison(s: ArmScatter, arm: Arm) -> str:
     """Return the comparison with the repeatability RP of ISO 9283."""
-    states = "arms of industry have 0.02 to 0.1 mm"
+    states = "industrial arms have 0.02 to 0.1 mm"
     if arm.repeatability is not None:
         states = f"the maker states {numbers.digits(1e3 * arm.repeatability, 2)} mm"
     return f" (RP of ISO 9283 about {length(RP_PER_RMS * s.size_m)}; {states})"
@@ -500,7 +504,7 @@ def repeatability_source(source: ScatterSource, arm: Arm) -> str:
         "estimated": "type A: estimated with the model",
         "stated": "type B: as [repeatability] states it",
         "repeats": "type A: scatter of the repeated readings",
-        "industry": "type B: not known; RP of arms of industry is up to "
+        "industry": "type B: not known; RP of industrial arms is up to "
         f"{length(USUAL_REPEATABILITY_M)}",
     }.get(source, "not known")
 

@@ -99,7 +99,7 @@ def test_wrong_readings_are_listed_and_the_others_fitted(tmp_path, capsys):
     r = readings
     names = sorted((r.pose_names[r.pose[k]], r.load_names[r.load[k]]) for k in wrong)
     assert sorted((o["pose"], o["load"]) for o in d["outliers"]) == names
-    told = f"{len(wrong)} readings are set aside as gross errors, and in none of these figures"
+    told = f"{len(wrong)} readings are set aside as gross errors, not included in these figures"
     for asked in (("identify",), ("refine",), ("identify", "--details"), ("refine", "--details")):
         words = ok(capsys, asked[0], run, "--readings", "absolute", *asked[1:]).out
         assert told in " ".join(words.split())

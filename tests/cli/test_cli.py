@@ -164,7 +164,7 @@ def test_remove_takes_out_what_is_needless_and_says_what_is_not(campaign, capsys
     assert d["verdict"] == "adequate"
     result = ok(capsys, "remove", campaign, "hysteresis")
     assert "− hysteresis" in result.out
-    assert "it belongs there" in result.out
+    assert "it is needed" in result.out
     assert "not in the model" in refused(capsys, 2, "remove", campaign, "hysteresis")
     assert "unknown effect" in refused(capsys, 2, "remove", campaign, "friction")
 

@@ -156,7 +156,7 @@ def test_a_measured_campaign_says_by_what_and_how_it_was_measured(measured, caps
         "reading of p1, 5kg kept as doubted: the force sensor measures 0.0 N where 5kg should hang",
         "failed: tracker: it lost its target",
         "the reference pose has moved by 7.0 σ, over the limit",
-        "None yet: hilcal identify or refine makes one.",
+        "None yet: hilcal identify and refine make one.",
     ):
         assert part in words, part
 

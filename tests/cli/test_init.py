@@ -215,7 +215,7 @@ def test_the_document_and_the_words_say_the_same(tmp_path, capsys):
     names = {f["name"] for f in d["findings"]}
     assert {"hilcal", "Python", "packages", "clock", "writing", "processors"} <= names
     words = " ".join(ok(capsys, "doctor", CELL, "--folder", tmp_path).out.split())
-    assert "Nothing hinders a campaign" in words
+    assert "Nothing prevents a campaign" in words
     assert "can be read" in words
 
 

@@ -32,4 +32,4 @@ def test_a_load_without_force_takes_that_of_the_cell_or_is_told_apart(name, tmp_
         assert "gross" not in fitted
     else:
         assert "load 7 kg: its force is not stated by the table" in told
-        assert "All 14 readings under the load 7 kg are set aside: is its force right?" in fitted
+        assert "All 14 readings under the load 7 kg are set aside: check its force." in fitted

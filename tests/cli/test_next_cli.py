@@ -70,7 +70,7 @@ def test_next_in_json_and_in_words(ambiguous, tmp_path, capsys):
     assert again.read_bytes() == plan.read_bytes()
     for part in (
         f"In doubt: {BASE} or {TILT}.",
-        "this is ruled out",
+        "chance to rule out",
         "What separates the weakest pair comes from ",
         "power to separate the leading suspects",
         f"--append --plan {again}",

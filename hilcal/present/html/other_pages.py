@@ -86,7 +86,7 @@ def arms_chart(t: "PooledType") -> go.Figure:
             look["hovertext"] = list(map(charts.label, hover))
             y_names = list(map(charts.label, y))
             traces.append(charts.marks(np.array(x), y_names, color, symbol, 9, **look))
-    says = f"The {len(t.arms)} arms of the type are alike within what they scatter by."
+    says = f"The {len(t.arms)} arms of the type differ by no more than their scatter."
     if arms := sorted({arm for arm, _ in odd}):
         verb = "is" if len(arms) == 1 else "are"
         says = f"{', '.join(arms)} {verb} unlike the others of the type."
@@ -182,16 +182,16 @@ def _fleet_screen(fleet: "Fleet") -> FirstScreen:
     words += [f"{', '.join(s.arms)}: {s.effect}, a defect of single arms" for s in defects]
     arms = list(dict.fromkeys([*(o.arm for o in odd), *(a for s in defects for a in s.arms)]))
     wear = ", ".join(name for t in fleet.types for name in t.wear)
-    headline, todo = "No arm is unlike its type", "Nothing; the prior serves the next arm."
+    headline, todo = "No arm differs from its type", "Nothing; use the prior for the next arm."
     if arms:
-        headline = f"Unlike their type: {numbers.names(arms)}"
-        todo = "Measure these arms again, and look at what is unlike."
+        headline = f"Different from their type: {numbers.names(arms)}"
+        todo = "Measure these arms again, and inspect the parts that differ."
     pooled = sum(len(t.arms) for t in fleet.types)
     used = ("Campaigns", str(len(fleet.members)), f"used; not used: {len(fleet.failures)}")
     cards = (("Arms", str(pooled), "that were pooled"), used)
     answers = (
-        ("Which arms are unlike, and by how much?", "; ".join(words) or "None."),
-        ("What wears?", wear or "No drift that the arms have in common."),
+        ("Which arms differ, and by how much?", "; ".join(words) or "None."),
+        ("What drifts with time?", wear or "No drift that the arms have in common."),
         ("What to do?", todo),
     )
     return FirstScreen(headline, "bad" if arms else "good", answers, cards)

@@ -59,7 +59,7 @@ from hilcal.types import Floats
 
 MOST_CURVES, MOST_LISTED, MOST_PARAMETERS, MOST_LAWS = 2, 6, 48, 4
 """Most curves, suspects, parameters and curves of laws on the page; choices."""
-NOT_KEPT = "not kept: made by a program of one's own, at the workbench, or before hilcal kept it"
+NOT_STORED = "not stored: made by the library, at the workbench, or by an older version"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,8 +126,8 @@ def first_screen(m: ReportContent) -> FirstScreen:
     if (prior := m.fit.model.prior) is not None:
         good += f" It also rests on a prior: {prior.posterior.source.campaign or 'a posterior'}."
     if d is None:
-        title, tone = "not judged: only a model fitted with scaling gc can be", "doubt"
-        missing = "Not judged; hilcal identify --scaling gc, then hilcal diagnose, say it."
+        title, tone = "not judged: this needs a fit with scaling gc", "doubt"
+        missing = "Not judged; run hilcal identify --scaling gc, then hilcal diagnose."
     else:
         title, missing = headline(d), message(d)
         if verdict == "missing_effect" and d.lead is not None:
@@ -204,7 +204,7 @@ def limit_words(m: ReportContent) -> tuple[str, bool | None]:
         count, over, passed, most = a.everything.count, a.over, bool(a.passed), a.everything.max_m
         end = f" (campaign {m.test.name}, never fitted; largest {length(most)})."
         if a.undecided:
-            end += " Noise alone exceeds the limit, so that these readings cannot tell."
+            end += " Noise alone exceeds the limit, so that these readings cannot decide."
     else:
         error = left_out_errors(m.fit)
         count, over = len(error), int(np.sum(error > m.limit_m))
@@ -300,13 +300,13 @@ def _conditions(m: ReportContent) -> Iterator[Block]:
     about = {} if m.plan is None else m.plan.about
     efficiency, criterion = about.get("efficiency"), about.get("criterion")
     if m.plan is None:
-        yield "The readings were imported; the file holds no plan, so nothing proves the choice."
+        yield "The readings were imported without a plan, so that no efficiency is certified."
     elif not isinstance(efficiency, int | float):
         yield "They were planned."
     else:
         yield (
-            f"This choice is at least {100 * efficiency:.1f} % as informative as the best possible "
-            f"one, by criterion {criterion}: a bound that the general equivalence theorem proves."
+            f"Efficiency of this choice by criterion {criterion}: at least {100 * efficiency:.1f} "
+            "% of the best possible one (bound by the general equivalence theorem)."
         )
     q, units = r.states.q, m.fit.model.cell.arm.units
     rows = [
@@ -361,7 +361,7 @@ def _not_tested(m: ReportContent) -> Iterator[str]:
     if fit.mode == "deflection":
         yield "Geometry: deflections were fitted, in which it cancels."
     if d is not None and d.not_shown:
-        yield f"At no plausible size would these readings show {numbers.names(d.not_shown, 'or')}."
+        yield f"These readings cannot show, at any plausible size: {numbers.names(d.not_shown)}."
 
 
 def _instruments(m: ReportContent) -> Iterator[Block]:
@@ -409,7 +409,7 @@ def _revisions(m: ReportContent) -> PageSection:
 
 def _where(m: ReportContent) -> PageSection:
     held_out, d = (m.story, m.left_out), m.diagnosis
-    gross = " Readings set aside as gross errors are drawn, too." * bool(m.fit.outlier.any())
+    gross = " Gross errors are drawn, too." * bool(m.fit.outlier.any())
     parts: list[Block] = [
         f"Errors are those of poses left out: each is predicted by a fit to the others.{gross}",
         Chart("By pose", charts.residual_by_pose(*held_out), wide=True),
@@ -449,14 +449,14 @@ def _noise(m: ReportContent) -> str:
     quantity = "deflection" if m.fit.mode == "deflection" else "reading"
     return (
         f"{repeats} of {len(fitted)} readings repeat an earlier one, too few to judge the noise of "
-        f"a {quantity} by them: the model alone does."
+        f"a {quantity}: it is judged by the model alone."
     )
 
 
 def _evidence(m: ReportContent) -> PageSection:
     d, title = m.diagnosis, "What is missing, with its evidence"
     if d is None:
-        reason = "Not diagnosed: only a model fitted with scaling gc can be."
+        reason = "Not diagnosed: this needs a fit with scaling gc."
         return PageSection("evidence", title, (reason,))
     parts: list[Block] = []
     if d.verdict == "adequate":  # other verdicts are on the first screen
@@ -493,8 +493,8 @@ def _laws(m: ReportContent) -> Iterator[PageSection]:
         *(table("", "", rows=rows, caption=caption) for caption, rows in facts.items()),
         *(Chart(f"{law.title}: {law.y_label}", charts.curve_chart(law)) for law in shown),
         note(
-            "Each point is the mean over readings of the law's value plus what it leaves of them. "
-            "Nothing is known outside of the range that is drawn, nor within its gaps."
+            "Each point is the mean over readings of the law's value plus their residual. The law "
+            "is not tested outside the drawn range, nor within its gaps."
         ),
     )
     yield PageSection("laws", "Laws beyond the catalogue", parts)
@@ -518,7 +518,7 @@ def _parameters(m: ReportContent) -> PageSection:
     parts += fit_words.background_line(fit)
     if sizes := family_sizes(fit):
         parts.append(
-            Chart("What this arm is made of", charts.family_sizes(sizes), wide=True, height=0)
+            Chart("Size of each family of effects", charts.family_sizes(sizes), wide=True, height=0)
         )
     return PageSection("parameters", "Parameters", tuple(parts))
 
@@ -557,7 +557,7 @@ def _rejected(m: ReportContent) -> Iterator[Block]:
         yield _suspects_table(d.suspects[MOST_LISTED:], "Other suspects")
     rejected = [s for s in d.suspects if not s.passes and s.plausible and s.share >= LEAST_SHARE]
     yield from _added_variables(d, rejected)
-    yield from captioned(detectable_sizes(d), "What could have been seen")
+    yield from captioned(detectable_sizes(d), "Detectable sizes")
 
 
 def _planned(m: ReportContent) -> Iterator[Block]:
@@ -578,8 +578,10 @@ def _provenance(m: ReportContent) -> Iterator[Block]:
     heads = ("revision", "made (UTC)", "hilcal", "SHA-256 of its readings")
     rows = [(str(r.number), utc(r.created), r.program_version, r.data_hash) for r in o.revisions]
     yield table(*heads, rows=rows, caption="Revisions by time and program")
-    typed = [("the campaign", o.command or NOT_KEPT)]
-    typed += [(f"revision {r.number}", str(r.options.get(COMMAND, NOT_KEPT))) for r in o.revisions]
+    typed = [("the campaign", o.command or NOT_STORED)]
+    typed += [
+        (f"revision {r.number}", str(r.options.get(COMMAND, NOT_STORED))) for r in o.revisions
+    ]
     yield table("made", "by", rows=typed, caption="Commands as they were typed")
     yield heading("Commands that show the same")
     yield from (Words(c, "code") for c in m.commands)

@@ -65,7 +65,7 @@ readings **before** it.
 the model does not know yet would leave 99 % of the readings; an arrow that leaves its ball = the
 model is wrong there. All arrows are in units of that noise. Grey: noise. Amber: beyond 99 %.
 Red: beyond 99.99 %. Blue dots were measured before there was a model, or in an earlier session.
-After 300 readings only arrows that leave their balls are drawn; below stand all.
+After 300 readings only arrows that leave their balls are drawn; all are drawn below.
 
 A campaign of more than 1000 readings is divided into 150 groups, one after the other. The last
 reading is always drawn; of the earlier ones only those stay that were the worst of their group so
@@ -74,7 +74,7 @@ far, here and below. The words count all readings, and the log lists them.
 **Residual of each reading** (below): the same along the time of day, in σ as on the
 terminal (rms of the three axes): 1 is noise, the green line 99 %.
 
-What is missing in the model is not asked while measuring: `hilcal refine` does, afterwards.
+Missing effects are not searched for while measuring; `hilcal refine` does that afterwards.
 """
 
 
@@ -161,12 +161,12 @@ class LiveTally:
         """Yield the progress of the campaign and the verdict so far."""
         if self.judged == 0:
             yield heading("Measuring: no judgement yet")
-            yield "The first readings tell where tracker and target are; then each one is compared."
+            yield "The first readings determine tracker and target; then each one is compared."
         else:
             title, advice = "✓ So far noise explains the readings", ""
             if scipy.stats.binom.sf(self.outside - 1, self.judged, 1.0 - LIMITS[0]) < ALARM:
                 title = "✗ The simple model fails: look at the red arrows"
-                advice = " Something is missing in it: hilcal refine says what, after measuring."
+                advice = " An effect is missing in it: hilcal refine names it after measuring."
             yield heading(title)
             yield (
                 f"{self.outside} of {self.judged} ({numbers.percent(self.outside / self.judged)}) "

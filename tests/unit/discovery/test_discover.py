@@ -164,8 +164,8 @@ def test_a_drift_of_readings_without_times_is_said_to_need_them(monkeypatch):
     monkeypatch.setattr(sys.modules[Discovery.__module__], "search", lambda problem: [])
     d = discover(before)
     assert (d.reason, d.carried[0].variable) == ("no_law", "row order")
-    assert "whose times are missing" in no_law_sentence(d)
-    assert "row order carries" in "".join(map(str, discovery_report(d)))
+    assert "add their times" in no_law_sentence(d)
+    assert "row order explains" in "".join(map(str, discovery_report(d)))
     assert discovery_json(d)["carried_by"][0]["variable"] == "row order"
 
 
@@ -220,7 +220,7 @@ def test_the_curve_of_a_law_lies_where_the_readings_are():
         assert count.sum() == len(c.x)
         assert np.all(np.abs(y - np.interp(x, *c.line)) < 5 * std)
     told = "".join(str(part) for part in discovery_report(found()))
-    assert "seen for" in told
+    assert "valid for" in told
     drawn = discovery_json(found())["curves"][0]
     assert drawn["binned"][0]["readings"] == by_angle.binned[3][0]
 

@@ -125,12 +125,12 @@ def test_the_page_shows_who_is_unlike(with_odd):
     ]
     lost = (Failure("x<b>.hilcal", "no campaign"),)
     html = fleet_page(Fleet((of,), tuple(fleet), lost), "fleet", "2026-04-01T00:00:00", "1")
-    assert f"Unlike their type: arm{ODD}" in html
+    assert f"Different from their type: arm{ODD}" in html
     assert "joint_compliance.j3" in html
     assert "x&lt;b&gt;.hilcal: no campaign" in html
     like = Fleet((replace(of, unlike=()),), tuple(fleet), ())
     like = fleet_page(like, "fleet", "2026-04-01T00:00:00", "1")
-    assert f"Unlike their type: arm{ODD}" in like  # by its defect alone
+    assert f"Different from their type: arm{ODD}" in like  # by its defect alone
     assert f"arm{ODD}: creep, a defect of single arms" in like
 
 

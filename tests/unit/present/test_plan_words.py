@@ -65,7 +65,7 @@ def test_what_is_absent_is_not_told(shown):
 
 def test_other_poses_than_asked_for_and_parameters_left_open_are_explained(shown):
     words = " ".join(shown(replace(SUMMARY, asked_poses=24)).split())
-    fewer = "3 and the reference: the cell leaves no more of 24, so that some are read again"
+    fewer = "3 and the reference: the cell leaves no more of 24; some are read again"
     assert fewer in words
     assert "the cell leaves" not in shown(replace(SUMMARY, asked_poses=3))
     lost = PredictedParameter("joint_compliance.j1", np.inf, 4.2e-6, "rad/(N·m)")
@@ -131,8 +131,8 @@ NEVER = PairPower(B, A, 0.02, 0.05, True)
 @pytest.mark.parametrize(
     ("powers", "words"),
     [
-        ((SURE, SURE), "separate the suspects: whichever is there, each of the others is ruled"),
-        ((SURE, WEAK), f"the weakest pair is {B}, where it is there, and {A}, which they rule out"),
+        ((SURE, SURE), "separate the suspects: whichever is present, each of the others is ruled"),
+        ((SURE, WEAK), f"the weakest pair is {B}, if it is present, and {A}, which they rule out"),
         ((SURE, NEVER), "separate what can be separated in this cell: each of these pairs"),
         ((NEVER, NEVER), "rule out none of the suspects"),
     ],

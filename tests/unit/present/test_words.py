@@ -183,7 +183,7 @@ def test_before_of_positions_is_the_rigid_arm_in_frames_of_its_own(absolute, sho
     assert absolute.error.rms_m < 0.2 * before.rms_m
     assert 0.1 * np.abs(turned).max() < before.rms_m < 3.0 * np.abs(turned).sum(axis=1).max()
     report = shown(*fit_report(absolute))
-    assert "The rigid nominal arm, its frames fitted alone, is off by" in report
+    assert "The rigid nominal arm with fitted frames is off by" in report
     assert f"before: rigid nominal arm {numbers.length(before.rms_m)}" in shown(errors(absolute))
     assert to_json(absolute)["error"]["before"] == before.to_json()
 
@@ -262,7 +262,7 @@ def test_a_curve_is_shown_only_where_it_is_determined_and_carries_something(show
         of = Dependence("time", "s", share, "joint 2", np.zeros(3), x, y, np.full(5, error), "rad")
         return shown(*curves([of]))
 
-    assert "joint 2 errs by" in told(2e-6)
+    assert "error of joint 2:" in told(2e-6)
     assert "do not determine its curve" in told(5e-2)
     assert "±" not in told(5e-2)
     assert told(2e-6, share=0.004) == ""
