@@ -71,7 +71,7 @@ class Shown(Brief):
     __slots__ = ()
 
     def _repr_html_(self) -> str:
-        return str(presenter().html_of(self))
+        return str(presenter("notebook").html_of(self))
 
 
 class Tabular(Brief):
@@ -86,10 +86,10 @@ class Tabular(Brief):
         load, residual, and residual of the fit without the pose. A diagnosis has a row per suspect,
         best first. A plan has a row per reading in the order of measuring.
         """
-        frame: pd.DataFrame = presenter().frame_of(self)
+        frame: pd.DataFrame = presenter("notebook").frame_of(self)
         return frame
 
 
-def presenter() -> Any:
-    """Return `hilcal.present`, a higher layer that writes the texts: imported when needed."""
-    return import_module("hilcal.present")
+def presenter(module: str) -> Any:
+    """Import a module of `hilcal.present`, a higher layer, when its texts are needed."""
+    return import_module(f"hilcal.present.{module}")

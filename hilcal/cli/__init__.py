@@ -53,10 +53,10 @@ def error_document(message: object, code: int) -> dict[str, object]:
 
 
 class WatchedStream:
-    """A stream that knows whether anything was written to it, and whose reader may leave.
+    """A stream that records whether anything was written to it, and tolerates a closed reader.
 
-    Without its reader, as `head`, or a terminal that is closed, the command goes on, since it may
-    write files or move an arm.
+    If its reader ends, such as `head` or a closed terminal, the command goes on, since it may write
+    files or move an arm.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -94,7 +94,7 @@ class WatchedStream:
 
 @dataclass(frozen=True, slots=True)
 class Failures:
-    """Tells people, and with --json scripts, why a command failed."""
+    """Reports why a command failed, in a line and with --json as a document."""
 
     as_json: bool
     out: WatchedStream  # where the document goes
@@ -112,7 +112,7 @@ class Failures:
 
 
 def _laid_out(line: str) -> str:
-    """Return a line as a terminal shows it: wrapped, a command at its end on a line of its own."""
+    """Return a line as a terminal shows it: wrapped, a command at its end on a separate line."""
     if not sys.stderr.isatty():
         return line
     match = _COMMAND.match(line)
@@ -187,7 +187,7 @@ def _group(command: commands.Command) -> typer.Typer:
 
 
 def _placeholder() -> None:
-    """Stand for a command that is listed but not called."""
+    """Do nothing; placeholder of a command that is listed but not called."""
 
 
 def _version(requested: bool) -> None:
@@ -221,9 +221,9 @@ def _words_to_complete() -> list[str]:
 
 
 def _open_closed_streams() -> None:
-    """Lead standard streams that are closed, as by `>&-`, nowhere.
+    """Redirect closed standard streams, as by `>&-`, to the null device.
 
-    A campaign that is opened next would get their numbers, and with them what child processes say.
+    Otherwise the next opened campaign would get their numbers, and the output of child processes.
     """
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:  # the lowest one that is free
         os.set_inheritable(number, True)
@@ -313,7 +313,7 @@ def _explained(error: Exception, name: str) -> tuple[str, int]:
     if isinstance(error, OSError) and error.errno in _CLOSED and error.filename:
         return f"{error.filename}: no access ({os.strerror(error.errno)})", _USAGE
     if isinstance(error, FileNotFoundError) and error.filename is None:  # of os.getcwd
-        return "the present directory has been deleted: go to another one", _USAGE
+        return "the working directory has been deleted: change to another one", _USAGE
     if isinstance(error, ImportError) and (library := _LIBRARY.match(str(error))):
         package = " (libgomp1 on Debian)" if library[1] == "libgomp.so.1" else ""
         return f"the system library {library[1]} is missing: install its package{package}", _USAGE

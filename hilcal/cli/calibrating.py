@@ -120,8 +120,8 @@ def calibrate(
     if prior is not None:
         if options.prior is None and Path(prior).parent != output.absolute().parent:
             raise InputError(
-                f"{output}: its prior is {prior!r}, and no file elsewhere is read because a "
-                f"campaign names it; give it yourself: --prior {quoted(prior)}"
+                f"{output}: its prior is {prior!r}; a file that a campaign names is read from the "
+                f"campaign's folder only; confirm it with: --prior {quoted(prior)}"
             )
         if p.next().kind in FITTED_LATER:
             p = replace(p, prior=PriorOptions(Path(prior)).load(catalogue))
@@ -132,25 +132,25 @@ def calibrate(
     if skip:
         step = p.next()
         if not (resume and step.moves):
-            raise InputError("--skip leaves out what --resume would measure; nothing is missing")
+            raise InputError("--skip omits poses that --resume would measure; none is missing")
         with CampaignFile.open(step.path) as campaign:
             RunLog(campaign).skip(skip)
     if not (rehearse or output.exists()):
         drivers_of(config)  # refuses a cell without them before anything is planned
     with go_on.explained(p), ExitStack() as stack:
         live = stack.enter_context(live_viewer(t, view, output))
-        CalibrationOperator(t, p, stack, rehearse, yes, live).to_the_end()
+        CalibrationOperator(t, p, stack, rehearse, yes, live).run_steps()
         with working(t.progress) as say:
             improvement = p.compare(say)
     limit_m, files = p.settings.limit_m, p.files
     t.show(words.step_heading(ProcedureStep("compare", output)))
     t.show(words.improvement_report(improvement, limit_m))
     t.show(
-        f"\nThe calibration is in {output}, its test in {files.validation.name} and "
-        f"{files.corrected.name}. Correct your points and programs with:"
+        f"\nThe calibration is in {output}, its tests are in {files.validation.name} and "
+        f"{files.corrected.name}. To correct points and programs:"
     )
     t.command(shlex.join(["hilcal", "compensate", str(output), "POINTS"]))
-    t.show("Write it up as one HTML page, with a certificate first:")
+    t.show("To write a report as one HTML page that begins with a certificate:")
     t.command(shlex.join(["hilcal", "report", str(output), "--operator", "NAME"]))
     failed: HilcalError | None = None
     if limit_m is not None and improvement.over(limit_m):
@@ -172,7 +172,7 @@ class _Continuation:
 
         def safe() -> str:
             if not p.run.exists():
-                return f"{p.run} is not there; begin again with: {self.start}"
+                return f"{p.run} does not exist; start again with: {self.start}"
             return f"everything measured so far is safe; go on with: {self.resume}"
 
         try:
@@ -207,7 +207,7 @@ def _procedure(
         may_write(output, False)
         check_effects(cell, catalogue)
         if resume:
-            go_on.t.notice(f"{output} is not there yet: the calibration begins")
+            go_on.t.notice(f"{output} does not exist yet: the calibration starts")
         _refuse_goal(config.readings_mode, stated, path)
         max_time_s, seed = parse_duration(DEFAULT_MAX_TIME, "--max-time"), config.simulation.seed
         defaults = Settings(POSES, VALIDATION, max_time_s, seed=seed)
@@ -220,7 +220,7 @@ def _procedure(
         kind = "no rehearsal; leave --rehearse out" if rehearse else "a rehearsal; give --rehearse"
         raise InputError(f"{output}: its calibration is {kind}")
     if not resume:
-        message = f"{output}: a calibration is there already, {words.state_clause(p.next())}"
+        message = f"{output}: holds a calibration already, {words.state_clause(p.next())}"
         raise InputError(f"{message}; go on with: {go_on.resume}")
     _refuse_goal(p.settings.readings, stated, path)
     p = replace(p, settings=replace(p.settings, **stated))
@@ -237,8 +237,8 @@ def _refuse_goal(kind: Mode, stated: dict[str, Any], cell: Path) -> None:
     """Refuse a position error as the goal of deflections, which do not show it."""
     if kind == "deflection" and "goal_m" in stated:
         raise InputError(
-            "--goal is an error of the position, which deflections do not show: a calibration with "
-            f'[planning] readings = "absolute" in {cell} reaches it; or leave out --goal'
+            "--goal is a position error, which deflections do not show: set "
+            f'[planning] readings = "absolute" in {cell}, or leave out --goal'
         )
 
 
@@ -264,7 +264,7 @@ def _document(p: Procedure) -> dict[str, object]:
 
 @dataclass(slots=True)
 class CalibrationOperator:
-    """Does the steps of a calibration, and asks before the arm moves."""
+    """Carries out the steps of a calibration; asks before the arm moves."""
 
     t: Terminal
     p: Procedure
@@ -280,8 +280,8 @@ class CalibrationOperator:
         """Clock rate of the cell relative to real time."""
         return self.p.clock
 
-    def to_the_end(self) -> None:
-        """Do all remaining steps before the comparison."""
+    def run_steps(self) -> None:
+        """Do all remaining steps up to the comparison."""
         while (step := self.p.next()).kind not in ("done", "compare"):
             self.t.show(words.step_heading(step, self.clock))
             if step.moves:

@@ -87,7 +87,7 @@ def import_(
     if likely_arm is not None:
         lines.append(f"Note: {words.other_arm_line(likely_arm)}")
     if misdescription is not None:
-        begin = "Nothing can be fitted yet" if misdescription.refused else "Note"
+        begin = "No model can be fitted yet" if misdescription.refused else "Note"
         lines.append(f"{begin}: {misdescription.words(cell, readings)}.")
     t.show(Words(line, indent=2) for line in lines)
     t.document(
@@ -110,7 +110,7 @@ def import_(
 
 
 def _targets(cell: Cell, readings: Readings) -> list[dict[str, Any]]:
-    """Name, number of readings and whether the offset is known, of several targets."""
+    """Return name, number of readings and whether the offset is known, of several targets."""
     if readings.states.target is None:
         return []
     count = np.bincount(readings.target, minlength=len(readings.target_names))
@@ -143,7 +143,7 @@ def show_preview(
         replace_file(output, proposal.to_toml(table.name))
         t.notice(f"{output}: the mapping; import with --format {output}")
     else:
-        t.notice("nothing was written; -o mapping.toml keeps this as a mapping to edit")
+        t.notice("nothing was written; -o mapping.toml writes this mapping to a file")
     t.document(
         mapping=proposal.sections,
         understood=[
@@ -212,15 +212,15 @@ def repair(t: Terminal, run: Path, robot: Path | None = None) -> None:
     result = repaired(run)
     if robot is not None:
         put_robot(run, robot)
-        t.show(f"{run} holds its robot now: {robot}")
+        t.show(f"The description of the robot, {robot}, is stored in {run}.")
     if result is None and robot is None:
-        t.show(f"{run}: no revision is bad; nothing was changed.")
+        t.show(f"{run}: no revision is damaged; nothing was changed.")
     if result is not None:
         numbers = ", ".join(map(str, result.revisions))
         t.show(
             f"{run}: {result.defect}. Set aside: revision{'s' * (len(result.revisions) > 1)} "
-            f"{numbers}. All readings are there; the file as it was is {result.original}. Fit "
-            "again with:"
+            f"{numbers}. All readings are kept; {result.original} is the original file. To fit "
+            "again:"
         )
         t.command(f"hilcal identify {quoted(run)}")
     t.document(
@@ -273,7 +273,9 @@ def fleet(
         spare_other(path, PRIOR, FORMAT)
         write_document(path, arm_type.prior.to_json())
         written[arm_type.type] = str(path)
-        t.show(f"\n{path}: what to expect of another {arm_type.type}, for --prior {quoted(path)}")
+        t.show(
+            f"\n{path}: the prior for another {arm_type.type}; use it with --prior {quoted(path)}"
+        )
     document = to_json(pooled, written)
     if report is not None:
         write_fleet_report(pooled, directory, report)

@@ -147,7 +147,7 @@ def compensate(
     written = [str(path) for path in files]
     t.show(compensation_report(calibration, task.points.names, q, result))
     t.show(waypoints_table(outcomes))
-    hint = "Nothing is written; -o F.csv, F.json or F.script keeps the joint values."
+    hint = "Nothing was written; -o F.csv, F.json or F.script writes the joint values."
     t.show(f"\nWritten: {', '.join(written)}." if written else f"\n{hint}")
     for path in files if task.program is None and task.foreign is None else ():
         if path.suffix in PROGRAMS:
@@ -191,9 +191,11 @@ def _task(
     if options.tool is not None:
         six = _numbers(options.tool, 6, "--tool")
         if np.abs(six[:3]).max() > 5.0:
-            raise InputError(f"--tool {options.tool!r} lies over 5 m off the flange; is it in m?")
+            raise InputError(
+                f"--tool {options.tool!r} lies over 5 m from the flange; valid: metres"
+            )
         if np.linalg.norm(six[3:]) > 2 * np.pi + 1e-6:
-            raise InputError(f"--tool {options.tool!r} is turned by over a turn; is it in rad?")
+            raise InputError(f"--tool {options.tool!r} is rotated by over a turn; valid: radians")
         tool = se3.matrix(se3.rotation(six[3:]), six[:3])
     if path.suffix.lower() in READERS:
         foreign = read_program(
@@ -243,7 +245,7 @@ def _wrench(
 ) -> Floats | None:
     load, wrench = options.load, options.wrench
     if sum(x is not None for x in (load, wrench, points.wrench, points.sensor_wrench)) > 1:
-        raise InputError("the load is given twice; valid: one of --load, --wrench, columns")
+        raise InputError("more than one load is given; valid: one of --load, --wrench, columns")
     if wrench is not None:
         return _numbers(wrench, 6, "--wrench")
     if load is None or load == "none":

@@ -147,7 +147,7 @@ def _resembled(r: Rehearsal, case: running.RehearsalSettings) -> bool:
 
 
 def _left_open(r: Rehearsal, case: running.RehearsalSettings) -> bool:
-    """Whether the diagnosis leaves the hidden effect in doubt, and all rivals are separable."""
+    """Whether the diagnosis leaves the hidden effect in doubt, with separable rivals only."""
     d = judge(Evidence(_fit(r, case.catalogue)), History())
     return r.hidden in left_open(d) and all(rival.possible for rival in d.separability)
 
@@ -165,7 +165,7 @@ def diagnose_first(
     if not suspects:
         return FirstDiagnosis(len(r.readings), None, None, document)
     t.show(step_report(1, model_name(fitted.model.named), d))
-    t.show(heading(f"Ambiguous between {numbers.names(suspects)}: what would settle it?"))
+    t.show(heading(f"Ambiguous between {numbers.names(suspects)}: readings that separate them"))
     with working(t.progress) as say:
         place = first_plan.joints(REFERENCE) if REFERENCE in first_plan.pose_names else None
         rng = np.random.default_rng(seed)
@@ -254,19 +254,19 @@ def demo(
     t.show([verdict_line(refinement.diagnosis), "", heading(outcome)])
     if r.world.user_effect is not None and laws is not None:
         t.show(
-            f"The simulated arm moved by {r.world.user_effect.effect.summary} with the model's own "
-            "mechanics, like a law of a user's own: this shows whether such a campaign reveals it."
+            f"The simulated arm followed {r.world.user_effect.effect.summary}, computed with the "
+            "mechanics of the model: this tests whether such a campaign reveals the law."
         )
     elif r.world.user_effect is not None:
         t.show(
-            f"The simulated arm moved by the law of {r.hidden} itself: this shows whether such a "
-            "campaign reveals it, not whether the law is right."
+            f"The simulated arm followed the law of {r.hidden} as the model has it: this tests "
+            "whether such a campaign reveals the effect, not whether the law is right."
         )
     record_story(t, chapters, record)
     files_given = [*(effects_from or ()), *(() if laws is None else laws.files.values())]
     options = "".join(f" --effects-from {quoted(path)}" for path in files_given)
-    t.show(f"\nThe campaign is in {output}. Go on with: hilcal view {quoted(output)}{options}")
-    t.show("As one HTML page, with a certificate first:")
+    t.show(f"\nThe campaign is in {output}. To look at it: hilcal view {quoted(output)}{options}")
+    t.show("To write a report as one HTML page that begins with a certificate:")
     t.command(f"hilcal report {quoted(output)}{options}")
     t.document(
         campaign=str(output),
@@ -341,15 +341,15 @@ def _campaign(
                 yield m, r, doubt
                 return
             if not another or tries == MAX_CAMPAIGNS:
-                t.show("These readings leave no doubt; another --seed or --hide may.\n")
+                t.show("These readings separate the suspects; another --seed or --hide may not.\n")
                 yield m, r, doubt
                 return
-        t.show("These readings leave no doubt: another arm is measured.\n")
+        t.show("These readings separate the suspects: another arm is measured.\n")
 
 
 def _put_to_use(t: Terminal, p: Procedure, measure: Measure, drawn: bool) -> Improvement | None:
     """Move the simulated arm to corrected targets, and report the errors measured there."""
-    t.show(heading("Put to use"))
+    t.show(heading("Test of the corrected arm"))
     try:
         p.stop()
         while (step := p.next()).kind not in ("compare", "done"):
@@ -364,7 +364,7 @@ def _put_to_use(t: Terminal, p: Procedure, measure: Measure, drawn: bool) -> Imp
         return None
     t.show([*improvement_report(improved, None), ""])
     if drawn:
-        t.show("What the tracker measures was drawn in the simulated world, through no wire.\n")
+        t.show("The measurements were simulated without drivers and devices.\n")
     return improved
 
 
@@ -373,11 +373,15 @@ def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:
     loads = [name for k, name in enumerate(r.readings.load_names) if k in used and name != "none"]
     poses = len(np.unique(r.readings.pose))
     secret = {
-        NO_EFFECT: "Nothing is hidden in it; the program does not know that.",
-        RANDOM: "An effect, drawn at random, is hidden in it.",
-        INVENTED: "A law is hidden in it that no effect of the catalogue describes; the program "
-        "does not know that.",
-    }.get(choice, f"The effect {r.hidden} is hidden in it; the program does not know which.")
+        NO_EFFECT: "No effect is hidden; the program does not know that.",
+        RANDOM: "The simulated arm has one more effect than the model, drawn at random.",
+        INVENTED: "The simulated arm follows a law that is not in the catalogue; the program does "
+        "not know that.",
+    }.get(
+        choice,
+        f"The simulated arm has the effect {r.hidden}, which the model lacks; the program does not "
+        "know that.",
+    )
     t.show(heading(f"A simulated {r.cell.arm.name} and a laser tracker, seed {seed}"))
     t.show(
         f"{poses} poses, unloaded and under {len(loads)} loads ({', '.join(loads)}): "
@@ -390,18 +394,18 @@ def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:
 def _judge_law(r: Rehearsal, refinement: Refinement, laws: LawSearch) -> tuple[bool, str]:
     hidden_law = r.world.user_effect
     if hidden_law is None:
-        return False, "Nothing was hidden."
+        return False, "No effect was hidden."
     ((_, true),) = hidden_law.truth.items()
     unit, factor = numbers.unit_for(hidden_law.effect.parameters[0].unit, [true])
-    hidden = f"Hidden was a law: {hidden_law.effect.summary}, a = {factor * true:.3g} {unit}"
+    hidden = f"The hidden law was {hidden_law.effect.summary}, a = {factor * true:.3g} {unit}"
     soft = r.world.physics.joint_compliance
     moved, _ = hidden_law.displacements(r.cell, r.world.registration, soft, r.readings.states)
     for previous, step in pairwise(refinement.steps):
         d = next((d for d in laws.discoveries if d.laws and d.laws[0].name == step.added), None)
         if d is not None:
             law, same = d.laws[0], agreement(previous.fit, step.fit, moved)
-            statement = f"Found was {law.formula}, which agrees with it over these readings by a"
-            return same >= SAME_CORRELATION, f"{hidden}. {statement} correlation of {same:.3f}."
+            statement = f"The law found is {law.formula}; its correlation with the hidden one over"
+            return same >= SAME_CORRELATION, f"{hidden}. {statement} these readings is {same:.3f}."
     return False, f"{hidden}. It was not found."
 
 
@@ -409,10 +413,10 @@ def _judge(r: Rehearsal, refinement: Refinement) -> tuple[bool, str]:
     added = [s.added for s in refinement.steps if s.added]
     if r.hidden == NO_EFFECT:
         if not added and refinement.verdict == "adequate":
-            return True, "Nothing was hidden, and nothing was found."
+            return True, "No effect was hidden, and none was found."
         verdict = refinement.verdict.replace("_", " ")
-        return False, f"Nothing was hidden, but the verdict is {verdict}."
-    hidden = f"Hidden was {r.hidden}, at {r.strength_sigma:g} times the noise"
+        return False, f"No effect was hidden, but the verdict is {verdict}."
+    hidden = f"The hidden effect was {r.hidden}, at {r.strength_sigma:g} times the noise"
     suspects = refinement.steps[0].diagnosis.suspects
     same = suspects[0].same_as if suspects else ()
     if r.hidden in added:

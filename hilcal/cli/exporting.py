@@ -103,7 +103,7 @@ class ExportOptions:
             (self.tip_link is not None, "--tip-link", self.into, "--into"),
         ):
             if value and not target:
-                raise InputError(f"{name} is about {needs}; give it, too")
+                raise InputError(f"{name} needs {needs}; give it, too")
         if twice := [path for path in self.paths if self.paths.count(path) > 1]:
             raise InputError(f"{twice[0]}: two things cannot be written to one file")
         if self.matlab is not None and not re.fullmatch(r"[A-Za-z]\w{0,62}", self.matlab.stem):
@@ -148,7 +148,7 @@ def export(
     """Write readings, parameters, calibration, URDF, DH table or frames to files."""
     options.check(force)
     if revision is not None and not options.of_model:
-        raise InputError("--revision is about the model; give --parameters or --calibration, too")
+        raise InputError("--revision selects a model; give --parameters or --calibration, too")
     with Campaign.open(run, catalogue, read_only=True) as campaign:
         record = campaign.in_use(revision)
         if record is None and (options.of_model or options.revisions is not None):
@@ -277,7 +277,7 @@ def _write_geometry(calibration: Calibration, options: ExportOptions) -> Iterato
     if options.frames is not None:
         files[options.frames] = handover.frames(calibration, arm, beyond)
         messages.append(
-            f"{options.frames}: tool and base, as fitted and as a controller takes them"
+            f"{options.frames}: tool and base as fitted, and in the controller's format"
         )
     if options.matlab is not None:
         files[options.matlab] = handover.matlab(arm.arm, options.matlab.stem, f"{note}. {base}")
@@ -291,7 +291,7 @@ def _write_geometry(calibration: Calibration, options: ExportOptions) -> Iterato
     yield from (*messages, base)
     if arm.not_included:
         effects = ", ".join(arm.not_included)
-        yield f"Not in it, since not constant: {effects}; hilcal compensate has it"
+        yield f"Not included, as not constant: {effects}; hilcal compensate corrects it"
 
 
 def _ends(

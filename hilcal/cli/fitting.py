@@ -50,7 +50,7 @@ def fit_of(t: Terminal, run: Campaign, say: Say, revision: int | None) -> tuple[
     number, fitted = run.fit_in_use(say, revision)
     if number is None:
         t.notice(
-            f"no revision yet: taking the baseline {_summary(fitted)}; hilcal identify keeps it"
+            f"no revision yet: using the baseline {_summary(fitted)}; hilcal identify stores it"
         )
     return number, fitted
 
@@ -106,7 +106,7 @@ def compute_errors(fitted: Fit, say: Say) -> None:
 
 def revision_name(number: int | None) -> str:
     """Return a revision's name in a heading; None is the baseline that is not stored."""
-    return "Baseline, not kept" if number is None else f"Revision {number}"
+    return "Baseline, not stored" if number is None else f"Revision {number}"
 
 
 def mode_of_option(run: Campaign, kind: str | None) -> Mode:
@@ -189,7 +189,7 @@ class PriorOptions:
         """Return the prior; None without `--prior`."""
         if self.prior is None:
             if self.drift is not None:
-                raise InputError("--drift is of a prior; give --prior OTHER.hilcal as well")
+                raise InputError("--drift belongs to a prior; give --prior OTHER.hilcal, too")
             return None
         from hilcal.library import load_posterior  # imports the whole library
 
@@ -263,13 +263,13 @@ def identify(
         identify_stream(t, run, cell, named, catalogue, carried, out, count, scheduler)
         return
     if any(option is not None for option in (cell, out, workers, scheduler)):
-        raise InputError("--cell, -o, --workers and --scheduler are of a stream, READINGS.parquet")
+        raise InputError("--cell, -o, --workers and --scheduler are for a stream, READINGS.parquet")
     with Campaign.open(run, catalogue) as o:
         if fit_validation and purpose_of(o.file) is not None:
             release(o.file, "hilcal identify --fit-validation")
             t.notice(
-                f"{run}: A VALIDATION CAMPAIGN IS FITTED. Its readings test no model any more that "
-                "learns from this one; the file says so from now on"
+                f"{run}: A VALIDATION CAMPAIGN IS FITTED. Its readings no longer test a model that "
+                "uses this fit; the file records that"
             )
         refuse_fitting(o.file)
         mode = mode_of_option(o, readings)
@@ -345,7 +345,7 @@ def identify_stream(
     if out is not None:
         source = {"stream": path.name, "readings": stream_fit.readings}
         calibration_of_stream(stream_fit, source).save(out)
-        t.show(f"\n{out}: the calibration, for compensate and hc.Calibration")
+        t.show(f"\n{out}: the calibration, for hilcal compensate and hc.Calibration")
         document["calibration"] = str(out)
     t.document(document)
 

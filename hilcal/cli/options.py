@@ -156,7 +156,9 @@ def check_workers(
 ) -> int | None:
     """Return the number of processes: 1 with effects of a file."""
     if effects_from and (scheduler is not None or workers not in (None, 1)):
-        raise InputError("--effects-from: other processes do not have its effects; --workers 1")
+        raise InputError(
+            "--effects-from: other processes do not have its effects; valid: --workers 1"
+        )
     return 1 if effects_from else workers
 
 

@@ -89,7 +89,7 @@ def plan(
     fitting.check_record(record)
     _check_places(output, csv)
     if revision is not None and after is None:
-        raise InputError("--revision is one of a campaign; give the campaign with --after")
+        raise InputError("--revision belongs to a campaign; give the campaign with --after")
     if prior.prior is not None and after is not None:
         raise InputError("--after has the prior of its revision; leave out --prior")
     carried = prior.load(catalogue)
@@ -115,7 +115,7 @@ def plan(
         checked_plan = checked(numbers, plan_, summary)
     write(t, numbers, checked_plan, output, csv, record)
     t.show(plan_report(checked_plan.summary) if details else plan_screen(checked_plan.summary))
-    t.show(f"The plan is in {output}: a file that you may edit. Every limit was checked.")
+    t.show(f"The plan is in {output}; you may edit the file. Every limit was checked.")
     t.document({**checked_plan.to_dict(), "plan": str(output)})
 
 
@@ -200,7 +200,7 @@ def make_plan(
     catalogue: Catalogue,
     say: Say = lambda text: None,
 ) -> Plan:
-    """Return a plan whose poses are each read unloaded and under every load that they bear."""
+    """Return a plan; each pose is read unloaded and under every load possible there."""
     rng = np.random.default_rng(check_seed(seed))
     return with_origin(plan_readings(cell, PlanRequest(poses), rng, None, say, catalogue))
 
@@ -257,7 +257,7 @@ def next_(
     report = next_report if doubt.pose_alone is None else poses_report
     t.show(report(chosen, checked_plan.summary.poses, checked_plan.summary.readings, details))
     t.show(plan_report(checked_plan.summary) if details else brief_plan(checked_plan.summary))
-    t.show(f"The plan is in {output}. Measure it into the same campaign with:")
+    t.show(f"The plan is in {output}. To add its readings to the campaign:")
     t.show(
         f"  hilcal run {quoted(cell or 'CELL.toml')} -o {quoted(run)} --append "
         f"--plan {quoted(output)}"

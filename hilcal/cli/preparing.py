@@ -248,7 +248,7 @@ def init(
     )
     draft = Draft(cell.absolute().parent)
     if asks:
-        t.notice(f"Enter alone leaves a question open; Ctrl-C ends, and {cell} is not written.\n")
+        t.notice(f"Press Enter to skip a question; Ctrl-C stops without writing {cell}.\n")
     for question in questions():
         stated = options[question.option]
         if stated is not None:
@@ -266,7 +266,7 @@ def init(
     replace_file(cell, written)
     t.show(heading(f"Written: {cell}"))
     t.show(
-        "Look it over: what was not answered stands there as an example. Then, without any "
+        "Check the file: it has examples for what was not answered. Then, without any "
         f"device:\n  hilcal plan {quoted(cell)} -o plan.json\n"
         f"  hilcal run {quoted(cell)} --plan plan.json --rehearse -o rehearsal.hilcal\n"
         f"and with the devices{_lacking(draft)}:\n  hilcal check {quoted(cell)} --plan plan.json"
@@ -366,7 +366,7 @@ def _cell(path: Path | None) -> tuple[CellConfig | None, list[machine.Finding]]:
         config = load_config(path)
         cell_from_config(config, path.absolute().parent)  # its robot's file, too
     except InputError as error:
-        mend = "mend the file; hilcal config explains every key"
+        mend = "correct the file; hilcal config explains every key"
         return None, [machine.Finding("cell", str(path), "problem", str(error), mend)]
     return config, [machine.Finding("cell", str(path), "ok", "can be read")]
 

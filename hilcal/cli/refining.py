@@ -255,7 +255,7 @@ def refine(
         if note := loads_note(refinement.fit):
             t.show(numbers.sentence(note))
         if names := ", ".join(refinement.rejected):
-            t.show(f"Tried and left out, since the error on poses left out did not fall: {names}.")
+            t.show(f"Tried, but not added, as the error on poses left out did not fall: {names}.")
         if laws is not None:
             t.show(words.refined_laws(laws))
         diagnosis = refinement.diagnosis
@@ -319,7 +319,7 @@ def discover(
     name = output.stem
     if output.suffix != ".py" or not NAME.fullmatch(name) or name in catalogue.names:
         raise InputError(
-            f"-o {output}: the effect is called after its file; valid: lower-case letters, digits "
+            f"-o {output}: the effect has the name of its file; valid: lower-case letters, digits "
             "and _, a letter first, .py at the end, and no name of the catalogue"
         )
     if effects is not None and revision is not None:
@@ -390,7 +390,7 @@ def compare(
     """Show where the model fails; with a later campaign, what has changed on the arm."""
     if later is None:
         if same_setup:
-            raise InputError("--same-setup goes with a later campaign: compare A.hilcal B.hilcal")
+            raise InputError("--same-setup needs a later campaign: compare A.hilcal B.hilcal")
         _show_misfit(t, run, revision, catalogue)
         return
     with (
@@ -399,7 +399,7 @@ def compare(
         working(t.progress) as say,
     ):
         if o.in_use(revision) is None:
-            t.notice(f"{run}: no revision yet, taking the baseline; hilcal refine makes a model")
+            t.notice(f"{run}: no revision yet, using the baseline; hilcal refine makes a model")
         comparison = compare_campaigns(
             o, later_run, revision, same_setup=same_setup or None, say=say
         )
@@ -416,7 +416,7 @@ def _show_misfit(t: Terminal, run: Path, revision: int | None, catalogue: Catalo
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         number, fitted = fitting.fit_of(t, o, say, revision)
         o.require_gc(number, fitted.scaling, "comparing")
-        say("looking where it fails")
+        say("examining where the model fails")
         places = misfit_breakdown(linearise(fitted))
         fitting.compute_errors(fitted, say)
         e, left_out = full_prediction(fitted), bool(fitted.model.background)
@@ -438,9 +438,7 @@ def _show_misfit(t: Terminal, run: Path, revision: int | None, catalogue: Catalo
     t.show([*fit_words.where_table(places), ""])
     t.show(fit_words.worst_table(worst, left_out))
     if gross := [f"{g.pose}/{g.load}" for g in gross_errors(fitted)]:
-        note = (
-            "Readings set aside as gross errors may be listed here; no figure above includes them"
-        )
+        note = "Gross errors may be listed here; the figures above do not include them"
         t.show(f"{note}: {numbers.few(gross, MOST_GROSS)}.")
     t.document(
         revision=number,

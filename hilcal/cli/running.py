@@ -100,7 +100,7 @@ def run(
     goal = None if until is None else GoalRule(until, numbers, catalogue)
     base_dir = cell.absolute().parent
     if skip and not resume:
-        raise InputError("--skip leaves out what is missing of a campaign; give it with --resume")
+        raise InputError("--skip omits missing poses of a campaign; give it with --resume")
     if rehearse:  # refuses an effect that cannot be hidden before anything is planned
         program_config(config, config.simulation.hide or NO_EFFECT, catalogue)
     elif plan is None and not resume:
@@ -109,7 +109,9 @@ def run(
         further: Plan | None = None
         if resume or append:
             if resume and append:
-                raise InputError("--append begins a further plan, --resume goes on; give one")
+                raise InputError(
+                    "--append adds a plan, --resume continues the present one; give one"
+                )
             if resume and plan is not None:
                 raise InputError("--plan with --resume: the plan is in the campaign; leave it out")
             if append and plan is None:
@@ -128,14 +130,14 @@ def run(
                 refuse(dry_checked(t, numbers, further), str(plan))
                 if missing := len(log.plan.without(log.done()).steps):
                     t.notice(
-                        f"note: {missing} readings of the previous plan are missing, and are left "
-                        "out from now on"
+                        f"note: {missing} readings of the previous plan are missing; they will not "
+                        "be measured"
                     )
         else:
             if output.exists():
                 raise InputError(
-                    f"{output}: the file exists; go on with it by --resume, add a plan by "
-                    "--append, or choose another name"
+                    f"{output}: the file exists; --resume continues it, --append adds a plan; or "
+                    "choose another name"
                 )
             campaign_plan = (
                 load_plan(plan) if plan else _default_plan(t, cell, numbers, catalogue, yes)
@@ -192,15 +194,13 @@ def _default_plan(t: Terminal, path: Path, cell: Cell, catalogue: Catalogue, yes
     options = ("--seed", str(seed)) if seed else ()
     line = shlex.join(("hilcal", "plan", str(path), "-o", "plan.json", *options))
     if notes := len(planned.summary.remarks):
-        t.show(f"What it assumes and leaves out ({notes} note{'s' * (notes > 1)}):")
+        t.show(f"Its assumptions ({notes} note{'s' * (notes > 1)}) are printed by:")
         t.command(line)
     if yes or not person_present(t):
         return planned.plan
     t.notice("")
     if not confirmed(t, "Measure this plan now? The arm will move."):
-        raise StoppedError(
-            f"not measured, nothing has moved. To see, keep or change the whole plan: {line}"
-        )
+        raise StoppedError(f"not measured, nothing has moved. To write the plan to a file: {line}")
     return planned.plan
 
 
@@ -242,14 +242,16 @@ def measure(
     log = RunLog(campaign)
     stored = log.readings()
     kinds = [e["kind"] for e in log.events() if e["kind"] != NOISE_KEY]
-    complete = kinds[-1:] == ["finished"]  # the last session: what hangs has been said
+    complete = kinds[-1:] == [
+        "finished"
+    ]  # the last session, which has reported the load on the arm
     if goal is not None and stored is not None and goal(stored, last=True).met and complete:
         return campaign.n_readings
     if not log.plan.without(log.done()).steps:
         t.notice("nothing is missing")
         hung = (log.last("load") or {}).get("hanging", UNLOADED)
         if not complete and hung not in (None, UNLOADED):
-            t.notice(f"{hung} still hangs on the arm, if nobody took it off: take it off")
+            t.notice(f"load {hung} may still be on the arm: take it off")
         estimate_noise(t, cell, campaign)  # the last session may have ended before it
         return campaign.n_readings
     with _ends_as_interrupt(t), ExitStack() as stack:
@@ -284,7 +286,7 @@ def estimate_noise(t: Terminal, cell: Cell, campaign: CampaignFile) -> None:
         log.event(NOISE_KEY, {"factors": None})
 
 
-IN_SIGHT = "where the arm hides the target, drive it by hand to where the tracker sees it"
+IN_SIGHT = "if the arm hides the target, move the arm by hand until the tracker sees it"
 
 
 def _sighted(
@@ -439,7 +441,7 @@ def in_process(t: Terminal, settings: RehearsalSettings, plan: Plan) -> Iterator
             return measured(with_new_names(next_plan, plan, 2), 2, last_time() + BREAK_S)
 
         def missing(file: CampaignFile, epoch: float | None = None) -> None:
-            # Campaigns are told apart by the number of letters appended to the first one's name.
+            # The letters appended to the name of the first campaign identify a campaign.
             log, number = RunLog(file), 3 + len(file.path.stem) - len(settings.output.stem)
             start = last_time() + number * BREAK_S
             drawn = simulate_plan(secret, log.plan, [settings.seed, number], start).readings
@@ -468,7 +470,7 @@ def retry_after_failures(
             if tries <= 0:
                 raise
             t.notice(f"note: {error}")
-            t.notice("going on with what is missing")
+            t.notice("continuing with the missing readings")
 
 
 def _write(t: Terminal, campaign: CampaignFile, readings: Readings) -> None:
@@ -539,7 +541,7 @@ def simulate(
     )  # refuses an effect that cannot be hidden, before planning
     with working(t.progress) as say:
         if plan is None:
-            say("planning a campaign, to know how strong an effect has to be")
+            say("planning a campaign, from which the size of the effect follows")
             campaign_plan = make_plan(numbers, POSES, number, catalogue, say)
         else:
             campaign_plan = load_plan(plan)
@@ -551,8 +553,8 @@ def simulate(
     ):
         cancels = "the hidden effect may cancel" if choice == RANDOM else f"{choice} cancels"
         t.notice(
-            f"warning: deflections are planned and fitted, and {cancels} in them; set readings = "
-            f'"absolute" in [planning] of {cell} for a campaign that shows it'
+            f"warning: deflections are planned and fitted, and {cancels} in them; to show it, set "
+            f'readings = "absolute" in [planning] of {cell}'
         )
     with end_signals(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as wait, ExitStack() as stack:
         with working(t.progress) as say:
@@ -560,13 +562,13 @@ def simulate(
             simulated = stack.enter_context(simulated_cell(secret, number, base_dir, output))
         written = with_person(simulated.config) if person else simulated.config
         replace_file(target, SIMULATED + to_toml(_placed(written, base_dir)))
-        t.show(f"The devices run. Their cell is {target}; go on in another terminal with:")
+        t.show(f"The devices run; their cell is {target}. In another terminal:")
         t.command(shlex.join(("hilcal", "check", str(target))))
         plan_option = () if plan is None else ("--plan", str(plan))
         t.command(shlex.join(("hilcal", "run", str(target), *plan_option, "-o", "run.hilcal")))
-        t.show("Ctrl-C ends them.")
+        t.show("Ctrl-C stops them.")
         wait()
-    t.show("The devices have ended.")
+    t.show("The devices have stopped.")
 
 
 def with_person(config: CellConfig) -> CellConfig:
@@ -636,7 +638,7 @@ def _measure_without_loads(
         count = missing or steps
         if not person_present(t):
             raise InputError(
-                f"--factory measures {count} readings, the arm moves; agree with --yes"
+                f"--factory measures {count} readings and moves the arm; agree with --yes"
             )
         if not confirmed(t, f"Measure {count} readings without a load? The arm will move."):
             raise StoppedError("not measured, nothing has moved")

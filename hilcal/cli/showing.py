@@ -101,7 +101,7 @@ def view(
     guard = _end_of_process()  # an unresponsive viewer may delay the end; the campaign is closed
     try:
         with end_signals(signal.SIGINT, signal.SIGTERM) as wait, serve(story, port=port) as url:
-            t.show("Open the viewer with:")
+            t.show("To open the viewer:")
             t.command(f"{viewer_command()} {url}")
             t.document({"url": url, "revisions": [c.number for c in chapters]})
             sys.stdout.flush()
@@ -121,7 +121,7 @@ def _end_of_process() -> threading.Timer:
 
 @contextmanager
 def live_viewer(t: Terminal, requested: bool, run: Path) -> Iterator[LiveViewer | None]:
-    """Start a live viewer for the block if requested; it records beside the campaign."""
+    """Start a live viewer for the block if requested; it records to the campaign's folder."""
     if not requested:
         yield None
         return
@@ -131,7 +131,7 @@ def live_viewer(t: Terminal, requested: bool, run: Path) -> Iterator[LiveViewer 
             say("starting the live viewer")
             live.start()
         if live.url is not None:
-            t.show("Watch it on this machine, now or later, with:")
+            t.show("To watch on this machine, now or later:")
             t.command(f"{viewer_command()} {live.url}")
         yield live
     finally:
@@ -177,7 +177,7 @@ def workbench(
         table, run = run, run.with_suffix(".hilcal") if output is None else output
         _import(t, table, config, run, kind, second)
     elif kind != "table" or second is not None or output is not None:
-        raise InputError("--format, --second and -o are of a table; give --config CELL.toml, too")
+        raise InputError("--format, --second and -o are for a table; give --config CELL.toml, too")
     elif run.is_file() and not is_campaign(run):
         raise InputError(f"{run}: no campaign; to begin with a table, give --config CELL.toml, too")
     with CampaignFile.open(run, read_only=True) as file:
@@ -188,10 +188,12 @@ def workbench(
         t.command(url)
         t.document({"url": url, "run": str(run)})
         sys.stdout.flush()
-        t.notice(f"It lets one browser in, within {UNUSED_S / 60:g} minutes. Serving until Ctrl-C.")
+        t.notice(
+            f"One browser can open it, within {UNUSED_S / 60:g} minutes. Serving until Ctrl-C."
+        )
 
     if not serve(WorkbenchSession(run, catalogue), port, announce, browser=not no_browser):
-        t.notice("Nobody opened it: its address is no longer valid. Start it again.")
+        t.notice("The page was not opened in time: its address is no longer valid. Start it again.")
     _end_of_process().start()  # a fit in a thread may delay the end; stored revisions are durable
 
 
@@ -200,15 +202,13 @@ def _import(
 ) -> None:
     if run.exists():
         raise InputError(
-            f"{run}: the file exists, and is left as it is; open it with hilcal workbench "
-            f"{quoted(run)}, or name another one for the table with -o"
+            f"{run}: the file exists and is not changed; open it with hilcal workbench "
+            f"{quoted(run)}, or choose another name for the table with -o"
         )
     from hilcal.library import import_campaign
 
     with working(t.progress) as say:
         imported = import_campaign(table, config, run, kind, second, say=say)
-    t.notice(
-        f"{len(imported.readings)} readings of {table} are in {run} now; the table is not changed."
-    )
+    t.notice(f"{len(imported.readings)} readings of {table} were written to {run}.")
     for note in (*imported.notes, covariance_words(imported.parts, imported.noise)):
         t.notice(note)

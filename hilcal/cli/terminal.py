@@ -112,7 +112,7 @@ def confirmed(t: Terminal, question: str) -> bool:
         answer = answer.strip().lower()
         if answer in (*YES, *NO):
             return answer in YES
-        t.notice(f"{answer!r} is no answer. Type y or n, and press Enter.")
+        t.notice(f"{answer!r} is not an answer. Type y or n, and press Enter.")
 
 
 POLL = 0.2  # Longest delay of the reaction to a signal that does not interrupt the sleep, s

@@ -140,7 +140,7 @@ class Diagnosis(Shown, Tabular):
         return {
             "model": self.fit.model.title,
             "verdict": f"{self.verdict} ({self.reason})",
-            "message": presenter().message(self),
+            "message": presenter("verdict").message(self),
             **{f"suspects[{k}]": repr(s) for k, s in enumerate(first)},
             "and": f"{len(self.suspects) - len(first)} more suspects",
         }
@@ -191,7 +191,7 @@ class Diagnosis(Shown, Tabular):
         return {
             "model": list(self.fit.model.named),
             "verdict": self.verdict,
-            "message": presenter().message(self),
+            "message": presenter("verdict").message(self),
             "reason": self.reason,
             "variance_factor": self.fit.variance_factor,
             "variance_factor_interval": list(self.fit.variance_factor_interval),

@@ -305,9 +305,9 @@ def where_table(places: Sequence[MisfitShare]) -> Iterator[Block]:
     if small := len(places) - len(shown):
         remainder = f"; {small} more {'is' if small == 1 else 'are'} below {percent(LEAST_SHARE)}"
     yield note(
-        "share of the misfit: what a smooth law of the variable predicts on poses left out (these "
-        "overlap); what is the same in all readings of a pose; what points along a direction"
-        f"{remainder}. p-value: chance of that share in noise; {tests}"
+        "share of the misfit: the part that a smooth law of the variable predicts on poses left "
+        "out (parts overlap), that is the same in all readings of a pose, or that points along a "
+        f"direction{remainder}. p-value: chance of that share in noise; {tests}"
     )
 
 

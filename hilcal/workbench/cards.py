@@ -112,7 +112,7 @@ def _verdict(view: View, d: Snapshot) -> None:
             ):
                 text = f"<b>{plain(value)}</b><span>{plain(name)}</span>"
                 ui.html(text, sanitize=False).classes("number")
-        name = "Baseline, not kept yet" if d.number is None else f"Revision {d.number}"
+        name = "Baseline, not stored" if d.number is None else f"Revision {d.number}"
         with ui.row().classes("items-center").style("gap: 6px 10px"):
             small_print(f"{name}: {model_name(fit.model.named)}")
             for effect in d.removable:
@@ -389,7 +389,7 @@ def plan_card(view: View, d: Snapshot) -> None:
         small_print(
             f"If {effect} is there, {rival} is ruled out: {power_now} now, {power_then} then."
         )
-    ui.label(f"The plan is in {path.name}. Measure it into the same campaign with:")
+    ui.label(f"The plan is in {path.name}. To add its readings to the campaign:")
     ui.label(view.session.run_line()).classes("code")
     small_print("Then read the file again here.")
 

@@ -195,7 +195,7 @@ def test_a_factory_check_goes_on_with_what_it_lacks(tmp_path, capsys, monkeypatc
     words = ("check", cell, "--factory", path)
     for more, code, said in (
         (("--yes",), 130, "10 of 24 readings are safe; go on with: hilcal check "),
-        ((), 2, "measures 14 readings, the arm moves; agree with --yes"),
+        ((), 2, "measures 14 readings and moves the arm; agree with --yes"),
         (("--yes",), 2, "24 readings are judged"),
         ((), 2, "24 readings are judged"),  # nothing is missing
     ):

@@ -100,7 +100,7 @@ def test_the_baseline_is_taken_where_there_is_no_revision_and_kept_by_what_chang
     campaign, capsys
 ):
     result = ok(capsys, "compare", campaign, "--json")
-    assert "no revision yet: taking the baseline" in result.err
+    assert "no revision yet: using the baseline" in result.err
     d = result.document
     assert d["revision"] is None
     assert {"fit", "holdout"} == set(d["error"])

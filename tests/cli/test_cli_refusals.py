@@ -267,7 +267,8 @@ def test_it_is_said_that_deflections_do_not_show_what_is_hidden(
     path, words = tmp_path / "CELL.toml", CELL.read_text(encoding="utf-8")
     path.write_text(words.replace("[planning]", "[planning]\nagainst = []"), encoding="utf-8")
     told = run(capsys, "simulate", path, "-o", tmp_path / "out", "--hide", hidden)
-    warned = f'{hidden} cancels in them; set readings = "absolute"' in " ".join(told.err.split())
+    warning = f'{hidden} cancels in them; to show it, set readings = "absolute"'
+    warned = warning in " ".join(told.err.split())
     assert warned == said
 
 

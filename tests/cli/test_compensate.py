@@ -176,7 +176,7 @@ def test_points_outside_are_refused_by_name_unless_told_otherwise(capsys, fitted
     (("--wrench", "0 0"), "--wrench '0 0'; valid: 6 numbers"),
     (("--tool", "a b c d e f"), "--tool 'a b c d e f'; valid: 6 numbers"),
     (("--tool", "0 0 100 0 0 0"), "--tool '0 0 100 0 0 0' lies over 5 m off the flange"),
-    (("--tool", "0 0 0.1 0 180 0"), "is turned by over a turn; is it in rad?"),
+    (("--tool", "0 0 0.1 0 180 0"), "is rotated by over a turn; valid: radians"),
     (("-o", "x.pdf"), "x.pdf: unknown kind of file; valid: .csv, .json, .script"),
     (("--revision", "7"), "revision")])  # fmt: skip
 def test_wrong_options_are_refused(capsys, fitted, tmp_path, arguments, words):

@@ -207,7 +207,7 @@ def test_a_person_is_shown_the_plan_and_asked(columns, toml):
         for words in FACTS:
             assert words in person.text
         person.type_keys("maybe\n")
-        person.check_words_stay("'maybe' is no answer. Type y or n, and press Enter.")
+        person.check_words_stay("'maybe' is not an answer. Type y or n, and press Enter.")
         person.wait_for_words("n = no:", 2)
         person.type_keys("n\n")
         assert person.wait_for_end() == 130

@@ -149,7 +149,7 @@ def test_the_corrected_table_is_a_robot_again(capsys, fitted, tmp_path):
     options = ("--urdf", "--dh", "--ur-kinematics", "--frames")
     given = [word for pair in zip(options, paths, strict=True) for word in pair]
     shown = ok(capsys, "export", fitted, *given, "--ur-hash", "calib_12345").out
-    assert "Not in it, since not constant: joint_compliance" in shown
+    assert "Not included, as not constant: joint_compliance" in shown
     assert "hash: calib_12345" in paths[2].read_text()
     q = np.random.default_rng(0).uniform(-3, 3, (20, 6))
     urdf, table = (evaluate(load_arm(str(path)), q) for path in paths[:2])

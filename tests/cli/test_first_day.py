@@ -271,7 +271,7 @@ def test_every_export_puts_the_arm_where_the_tracker_finds_it(day):
     """But for what it says that it leaves out: an arm of this geometry that does not yield."""
     words = "--urdf a.urdf --dh a.toml --ur-kinematics a.yaml --frames frames.json"
     said = day.at("export", RUN, *words.split(), "--calibration", "arm.json")
-    assert "Not in it, since not constant: joint_compliance" in said.text
+    assert "Not included, as not constant: joint_compliance" in said.text
     assert the_same_base(said.text) == the_same_base(day.said["refine"].text)
     told = json.loads((day.home / "frames.json").read_text())
     base, tool = pose(told["base_in_tracker"]), pose(told["tool_on_flange"])

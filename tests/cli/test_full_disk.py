@@ -215,5 +215,5 @@ def test_a_directory_that_has_been_deleted_is_named(tmp_path):
         text=True, capture_output=True,
     )  # fmt: skip
     assert (ended.returncode, ended.stderr.splitlines()[-1]) == (
-        2, "error: the present directory has been deleted: go to another one",
+        2, "error: the working directory has been deleted: change to another one",
     )  # fmt: skip

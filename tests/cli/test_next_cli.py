@@ -63,7 +63,7 @@ def test_next_in_json_and_in_words(ambiguous, tmp_path, capsys):
     assert d["poses"] > 0
     assert set(d["predicted_std"]) > {"joint_compliance.j1"}
     assert len(table.read_text(encoding="utf-8").splitlines()) == 1 + d["readings"]
-    assert "ruled out" in result.err  # words are on stderr
+    assert "rule out" in result.err  # words are on stderr
 
     again = tmp_path / "again.json"
     words = ok(capsys, "next", ambiguous, "-o", again, "--quick", "--poses", "4", "--details").out

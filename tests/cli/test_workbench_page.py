@@ -495,7 +495,7 @@ def test_a_table_becomes_a_calibration_at_one_page(browser, tmp_path, capsys):
     assert told == []
     assert table.read_bytes() == before
     line = refused(capsys, 2, "workbench", table, "--config", config)
-    assert "t.hilcal: the file exists, and is left as it is; open it with hilcal workbench" in line
+    assert "t.hilcal: the file exists and is not changed; open it with hilcal workbench" in line
     assert "give --config CELL.toml, too" in refused(capsys, 2, "workbench", table)
     mapped = ("workbench", table, "--config", config, "-o", tmp_path / "o.hilcal", "--format", "x")
     assert "--format x is unknown" in refused(capsys, 2, *mapped)

@@ -133,7 +133,7 @@ def test_from_nothing_to_a_calibrated_arm(columns, tmp_path):
     assert "certified lower bound" in stranger.types(*plan, "--poses", "8")
     rehearsal = ("--plan", "plan.json", "--person", "--clock", "20", "--hide", HIDDEN)
     with stranger.sits("simulate", "CELL.toml", "-o", "DIR", *rehearsal) as devices:
-        devices.wait_for_words("Ctrl-C ends them.")
+        devices.wait_for_words("Ctrl-C stops them.")
         check = stranger.types("check", "DIR/cell.toml", "--plan", "plan.json")
         assert "All devices are ready. Nothing was moved." in check
         assert "The plan keeps every limit" in check

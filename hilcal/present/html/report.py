@@ -140,7 +140,7 @@ def first_screen(m: ReportContent) -> FirstScreen:
             yes = verdict == "adequate" or d.reason == "inseparable_addition"
             good = f"{'Yes' if yes else 'Not yet'}. {good}"
         if verdict == "adequate":
-            missing = "Nothing that these readings could show."
+            missing = "No effect that these readings could show."
         elif d.lead is not None and not d.wrong_figures:
             name = d.lead.coarse or d.lead.effect
             missing += f" {name} is: {d.fit.model.catalogue[name].summary}."
@@ -237,7 +237,7 @@ def _certificate(m: ReportContent) -> PageSection:
         parts.append(out)
     for title, blocks in (
         ("Uncertainty", _uncertainty(m.fit)),
-        ("Limit", _limit(m)),
+        ("Limit" if m.test is None else "Limit and validation", _limit(m)),
         ("Poses and loads", _conditions(m)),
         ("What was not tested", [Items(tuple(_not_tested(m)))]),
         ("Measured with", _instruments(m)),
@@ -279,7 +279,7 @@ def _uncertainty(fit: Fit) -> Iterator[Block]:
 def _limit(m: ReportContent) -> Iterator[Block]:
     verdict, passed = limit_words(m)
     if passed is None:
-        yield "No limit was given (hilcal report --limit LENGTH), so nothing is passed or failed."
+        yield "No limit was given (hilcal report --limit LENGTH), so that none is tested."
     else:
         yield Words(verdict, "strong")
     if m.test is not None:
@@ -300,7 +300,7 @@ def _conditions(m: ReportContent) -> Iterator[Block]:
     about = {} if m.plan is None else m.plan.about
     efficiency, criterion = about.get("efficiency"), about.get("criterion")
     if m.plan is None:
-        yield "The readings were imported without a plan, so that no efficiency is certified."
+        yield "The file holds no plan, so that no efficiency is certified."
     elif not isinstance(efficiency, int | float):
         yield "They were planned."
     else:
@@ -374,8 +374,7 @@ def _instruments(m: ReportContent) -> Iterator[Block]:
             out.add(i.device, i.name, i.serial_number or "not reported", utc(i.utc), facts)
         yield out
     else:
-        imported = ": the readings were imported from a table" if o.planned is None else ""
-        yield f"The file names no instrument{imported}."
+        yield f"The file names no instrument; origin of the readings: {o.source}."
     yield note(f"Noise of the readings: {covariance_words(m.covariance)}.")
     yield identity(
         ("Robot", o.config.robot.model),

@@ -115,6 +115,15 @@ def test_the_page_is_one_file_with_its_headings_tables_and_sentences(text):
     assert outline.of("a", "href") == [f"#{i}" for i in ids]
 
 
+def test_readings_without_instruments_are_not_called_imported(made):
+    m = made[0]
+    drawn = replace(m.overview, instruments=(), source="rehearsal without devices")
+    page = page_of(plain(replace(m, overview=drawn, plan=None)))
+    assert "origin of the readings: rehearsal without devices." in page
+    assert "The file holds no plan" in page
+    assert "readings were imported" not in page
+
+
 def test_names_are_text_and_what_is_in_scripts_is_json(text):
     assert EVIL not in text
     assert "<img" not in text.split("<body>")[1].split("<script>/**")[0]

@@ -53,8 +53,8 @@ def test_loads_of_which_nothing_is_left_are_told_in_one_sentence():
     told = list(gross_error_lines(fitted, details=False))
     (sentence,) = [line for line in told if "force" in line]
     assert sentence == (
-        f"All {lost.sum()} readings under the loads {names[0]} and {names[1]} are set aside: are "
-        "their forces right?"
+        f"All {lost.sum()} readings under the loads {names[0]} and {names[1]} are set aside: "
+        "check their forces."
     )
 
 
