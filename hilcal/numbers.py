@@ -92,15 +92,22 @@ def digits(value: float, count: int = 3) -> str:
     return f"{value:.{count - 1}e}"
 
 
-def with_std(value: float, std: float) -> tuple[str, str]:
-    """Write a value and its standard uncertainty with two significant digits of the latter."""
+def with_std(value: float, std: float, *more: float) -> tuple[str, ...]:
+    """Write a value, its standard uncertainty with two significant digits, and values like it.
+
+    All have the decimals of the uncertainty; it is empty if it is not a positive number.
+    """
     if not (math.isfinite(std) and std > 0):
-        return digits(value), ""
+        return digits(value), "", *map(digits, more)
     places = 1 - math.floor(math.log10(std))
     if not -7 < places < 8:
-        return digits(value), digits(std, 2)
-    places = max(places, 0)
-    return f"{value:.{places}f}", f"{std:.{places}f}"
+        return digits(value), digits(std, 2), *map(digits, more)
+    return tuple(f"{x:.{max(places, 0)}f}" for x in (value, std, *more))
+
+
+def plus_minus(value: float, std: float) -> str:
+    """Write a value with its standard uncertainty as "a ± b", or alone without one."""
+    return " ± ".join(filter(None, with_std(value, std)))
 
 
 def percent(share: float) -> str:

@@ -41,12 +41,12 @@ from hilcal.readings.whitening import Mode, usual_mode
 from hilcal.refinement import Refinement
 from hilcal.shown import Brief
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.kept_texts import CALIBRATION_FILE, ROBOT_FILE, check_robot, running_command
 from hilcal.store.overview import overview
 from hilcal.store.procedure_log import refuse_fitting
 from hilcal.store.revision import CELL, STORED_HASH, RevisionRecord
 from hilcal.store.rows import content_hash
 from hilcal.store.run_log import PLAN, RunLog
+from hilcal.store.stored_texts import CALIBRATION_FILE, ROBOT_FILE, check_robot, running_command
 from hilcal.tables.table import covers_with_rounding, write_table
 from hilcal.types import Floats
 

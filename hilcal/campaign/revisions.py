@@ -24,9 +24,9 @@ from hilcal.names import quoted
 from hilcal.readings.readings import ArmScatter, Readings, SerialNoise
 from hilcal.readings.whitening import MODES, SCALINGS, Mode, Scaling
 from hilcal.store.codec import LARGEST, frames, numbers
-from hilcal.store.kept_texts import COMMAND
 from hilcal.store.revision import CARRIED, STORED_HASH, RevisionRecord, to_text
 from hilcal.store.rows import content_hash
+from hilcal.store.stored_texts import COMMAND
 from hilcal.types import Floats
 
 _WIDEST = 1e100

@@ -22,7 +22,7 @@ from hilcal import __version__, errors
 from hilcal.cli import commands
 from hilcal.names import escaped
 from hilcal.optional import missing_package
-from hilcal.store.kept_texts import recording_command
+from hilcal.store.stored_texts import recording_command
 
 DEBUG = "HILCAL_DEBUG"
 _COMPLETE = "_HILCAL_COMPLETE"

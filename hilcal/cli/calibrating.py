@@ -11,7 +11,6 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.fitting import PriorOptions
 from hilcal.cli.options import POSES, command
 from hilcal.cli.planning import answers_of, refuse_unready
-from hilcal.cli.refining import chapters_of, errors_by_revision
 from hilcal.cli.running import lasting_cell, measure, retry_after_failures
 from hilcal.cli.showing import live_viewer
 from hilcal.cli.terminal import Terminal, confirmed, person_present
@@ -36,6 +35,7 @@ from hilcal.present.fit import prior_lines
 from hilcal.present.live_viewer import LiveViewer
 from hilcal.present.plan import plan_facts
 from hilcal.present.progress import working
+from hilcal.present.story import chapters_of, errors_by_revision
 from hilcal.procedure.procedure import Procedure, continued
 from hilcal.procedure.state import DECIDED, REFINED, VALIDATED, ProcedureStep, Settings
 from hilcal.readings.whitening import Mode

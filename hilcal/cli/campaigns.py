@@ -22,16 +22,16 @@ from hilcal.names import quoted
 from hilcal.present import registration as words
 from hilcal.present.campaign import import_preview, info_report
 from hilcal.present.document import Words, heading
-from hilcal.present.fit import model_name, target_words
+from hilcal.present.fit import model_name
 from hilcal.present.progress import counting, working
 from hilcal.readings.covariance import COVERS_KEY
 from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.kept_texts import CALIBRATION_FILE, ROBOT_FILE, check_robot
 from hilcal.store.overview import overview, to_json
 from hilcal.store.repair import put_robot
 from hilcal.store.repair import repair as repaired
 from hilcal.store.revision import RevisionRecord
+from hilcal.store.stored_texts import CALIBRATION_FILE, ROBOT_FILE, check_robot
 from hilcal.whole_file import PAGE, replace_file, spare_other
 
 
@@ -73,7 +73,12 @@ def import_(
     t.show(f"  robot {model}; {kind}\n  loads: {', '.join(loads)}")
     targets = _targets(cell, readings)
     if targets:
-        t.show("  targets: " + "; ".join(target_words(**x) for x in targets))
+        offset = {True: "known", False: "estimated"}
+        named = (
+            f"{x['name']} ({x['n_readings']} readings, offset {offset[x['known']]})"
+            for x in targets
+        )
+        t.show(f"  targets: {'; '.join(named)}")
     torques = check_torques(cell, readings)
     registered = misdescription = likely_arm = None
     lines = [*notes, *words.torque_lines(torques)]

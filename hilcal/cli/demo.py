@@ -17,7 +17,7 @@ from hilcal.cli import running
 from hilcal.cli.fitting import check_record, compute_errors, record_story
 from hilcal.cli.options import check_seed, command
 from hilcal.cli.planning import separates
-from hilcal.cli.refining import changed, chapters_of, errors_by_revision, revisions_json
+from hilcal.cli.refining import revisions_json
 from hilcal.cli.terminal import Terminal
 from hilcal.config import load_config
 from hilcal.design.next import plan_separating
@@ -60,6 +60,7 @@ from hilcal.present.document import heading
 from hilcal.present.fit import model_name
 from hilcal.present.plan import next_report
 from hilcal.present.progress import Say, working
+from hilcal.present.story import chapters_of, errors_by_revision
 from hilcal.present.verdict import message
 from hilcal.procedure.next_plan import plan_of
 from hilcal.procedure.procedure import Measure, Procedure
@@ -68,10 +69,10 @@ from hilcal.refinement import Refinement
 from hilcal.refinement import refine as refine_model
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile, may_write
-from hilcal.store.kept_texts import COMMAND
 from hilcal.store.plan import REFERENCE, Plan
 from hilcal.store.revision import RevisionRecord
 from hilcal.store.rows import content_hash
+from hilcal.store.stored_texts import COMMAND
 
 STRENGTH = 4.0  # Size of the hidden effect, in units of the noise: significant in so few readings
 FIRST_POSES = 6  # Poses of the first campaign
@@ -240,7 +241,7 @@ def demo(
             numbered = p.keep(o, refinement)
         chapters = chapters_of(numbered, refinement.steps)
         for c, s in zip(chapters, refinement.steps, strict=True):
-            t.show(step_report(c.number, changed(c), s.diagnosis))
+            t.show(step_report(c.number, c.change, s.diagnosis))
         if laws is not None:
             t.show(refined_laws(laws))
         t.show(heading("The error, revision by revision"))

@@ -25,8 +25,8 @@ from hilcal.numbers import length
 from hilcal.present.progress import Say, working
 from hilcal.present.registration import base_line
 from hilcal.readings.covariance import INSTRUMENT
-from hilcal.store.kept_texts import ROBOT_FILE
 from hilcal.store.revision import RevisionRecord
+from hilcal.store.stored_texts import ROBOT_FILE
 from hilcal.tables.write import check_suffix, revision_table, write_columns
 from hilcal.whole_file import replace_file
 

@@ -9,7 +9,7 @@ from hilcal import numbers
 from hilcal.calibration.calibration import calibration_of_stream
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
-from hilcal.cli.options import check_folder, check_workers, command
+from hilcal.cli.options import check_output, check_workers, command
 from hilcal.cli.terminal import Terminal
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.effects.catalogue import Catalogue
@@ -41,7 +41,7 @@ from hilcal.stream import fit_stream
 from hilcal.stream import to_json as stream_json
 from hilcal.tables.files import is_parquet
 from hilcal.tables.parquet_stream import open_stream
-from hilcal.whole_file import RECORDING, spare_other
+from hilcal.whole_file import RECORDING
 
 
 def fit_of(t: Terminal, run: Campaign, say: Say, revision: int | None) -> tuple[int | None, Fit]:
@@ -159,9 +159,7 @@ def effect_titles(model: Model, readings: Readings) -> tuple[str, ...]:
 
 def check_record(path: Path | None) -> None:
     """Refuse a recording that cannot be written, before any work is done."""
-    if path is not None:
-        check_folder(path, f"--record {path}")
-        spare_other(path, "a recording", RECORDING)
+    check_output(path, "--record", "a recording", RECORDING)
 
 
 def record_story(t: Terminal, chapters: list[Chapter], path: Path | None) -> None:

@@ -13,6 +13,7 @@ import typer
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
+from hilcal.whole_file import spare_other
 
 F = TypeVar("F", bound=Callable[..., None])
 POSES = 20
@@ -173,6 +174,13 @@ def check_new(path: Path, force: bool) -> None:
     """Refuse to replace a file without --force."""
     if path.exists() and not force:
         raise InputError(f"{path}: the file exists; choose another name or give --force")
+
+
+def check_output(path: Path | None, option: str, kind: str, mark: str) -> None:
+    """Refuse a missing folder and a file of another kind, before any work; see `spare_other`."""
+    if path is not None:
+        check_folder(path, f"{option} {path}")
+        spare_other(path, kind, mark)
 
 
 def check_folder(path: Path, option: str) -> None:

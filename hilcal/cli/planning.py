@@ -10,7 +10,7 @@ from hilcal import numbers as words_of
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
 from hilcal.cli import fitting
-from hilcal.cli.options import POSES, check_folder, check_seed, command
+from hilcal.cli.options import POSES, check_output, check_seed, command
 from hilcal.cli.terminal import Terminal
 from hilcal.config import CellConfig
 from hilcal.design.choice import CRITERIA, criterion_name
@@ -35,7 +35,7 @@ from hilcal.procedure.procedure import with_origin
 from hilcal.procedure.state import reference_in
 from hilcal.store.plan import FORMAT, Plan, load_plan
 from hilcal.tables.write import ORDER, plan_csv
-from hilcal.whole_file import replace_file, spare_other
+from hilcal.whole_file import replace_file
 
 
 def write(
@@ -61,13 +61,10 @@ def write(
             record_plan(cell, checked_plan.plan, checked_plan.summary, record, powers)
 
 
-def _check_places(output: Path, csv: Path | None = None) -> None:
-    """Refuse files of other kinds and missing folders, before planning, which takes a while."""
-    check_folder(output, f"-o {output}")
-    spare_other(output, "a plan", FORMAT)
-    if csv is not None:
-        check_folder(csv, f"--csv {csv}")
-        spare_other(csv, "the table of a plan", ORDER)
+def _check_outputs(output: Path, csv: Path | None, record: Path | None) -> None:
+    check_output(output, "-o", "a plan", FORMAT)
+    check_output(csv, "--csv", "the table of a plan", ORDER)
+    fitting.check_record(record)
 
 
 @command(f"""
@@ -86,8 +83,7 @@ def plan(
     record: Path | None = None, details: bool = False,
 ) -> None:  # fmt: skip
     """Choose poses, loads and their order, with a proven lower bound of the efficiency."""
-    fitting.check_record(record)
-    _check_places(output, csv)
+    _check_outputs(output, csv, record)
     if revision is not None and after is None:
         raise InputError("--revision belongs to a campaign; give the campaign with --after")
     if prior.prior is not None and after is not None:
@@ -239,8 +235,7 @@ def next_(
     details: bool = False,
 ) -> None:  # fmt: skip
     """Plan the measurements that separate the leading suspects; exit 4 if none are in doubt."""
-    fitting.check_record(record)
-    _check_places(output, csv)
+    _check_outputs(output, csv, record)
     carried = prior.load(catalogue)
     rng = np.random.default_rng(check_seed(seed))
     if poses is not None and poses < 1:

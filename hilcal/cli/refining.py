@@ -1,7 +1,7 @@
 """`compare`, `validate`, `diagnose`, `add`, `remove`, `refine`, `discover`: what a model lacks."""
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.changes import add_effect, remove_effect
 from hilcal.cli import fitting
-from hilcal.cli.options import check_folder, command
+from hilcal.cli.options import check_output, command
 from hilcal.cli.showing import live_viewer
 from hilcal.cli.terminal import Terminal
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
@@ -49,43 +49,21 @@ from hilcal.present.comparison import (
     next_command,
     tool_differs,
 )
-from hilcal.present.document import Block, heading
+from hilcal.present.document import heading
 from hilcal.present.fit import dependence_sentence, gross_error_lines, model_name, prior_lines
 from hilcal.present.progress import working
 from hilcal.present.registration import covariance_words, fitted_lines, other_arm_line, torque_lines
-from hilcal.present.story import Chapter
+from hilcal.present.story import Chapter, chapters_of, errors_by_revision
 from hilcal.present.verdict import message
 from hilcal.refinement import RefinementStep as RefinementStep
 from hilcal.refinement import refine as refine_model
 from hilcal.store.procedure_log import refuse_fitting
-from hilcal.store.revision import change
 from hilcal.tables.units import parse_length
 from hilcal.transfer.compare import compare as compare_campaigns
 from hilcal.transfer.compare import validate as validate_campaign
 from hilcal.whole_file import replace_file, spare_other
 
 MOST_GROSS = 20  # gross errors that compare names
-
-
-def chapters_of(numbers: Iterable[int], steps: Iterable[RefinementStep]) -> list[Chapter]:
-    """Return the steps of a refinement as chapters with the numbers of their revisions."""
-    pairs = zip(numbers, steps, strict=True)
-    return [Chapter(n, s.added, s.fit, s.diagnosis, s.removed) for n, s in pairs]
-
-
-def errors_by_revision(chapters: Sequence[Chapter], stored: str = "") -> list[Block]:
-    """Return the errors by revision, with the verdict `stored` where it has none, and their key."""
-    rows = [(c.number, changed(c), c.fit, _verdict(c, stored)) for c in chapters]
-    return [words.revisions_table(rows), words.key(chapters[-1].fit.readings)]
-
-
-def changed(c: Chapter) -> str:
-    """Return the change that a revision makes; empty for a first model."""
-    return change(c.added, c.removed, c.fit.readings.arm_scatter is not None)
-
-
-def _verdict(c: Chapter, stored: str) -> str:
-    return stored if c.diagnosis is None else c.diagnosis.verdict
 
 
 @command()
@@ -159,8 +137,8 @@ def _change(
                 live.revised(new)
         old, d = o.file.revision(number), c.diagnosis
         verdict = str(old.result_json.get("diagnose", {}).get("verdict", ""))
-        pair = [Chapter(number, old.added, previous, None, old.removed), new]
-        t.show(errors_by_revision(pair, verdict))
+        pair = [Chapter(number, old.added, previous, None, old.removed, verdict), new]
+        t.show(errors_by_revision(pair))
         named = write_effect(effect, options or {})
         t.show(
             words.added_effect_sentence(previous, c.fit, named)
@@ -174,7 +152,7 @@ def _change(
                 chapters = o.chapters(say, c.number)
             fitting.record_story(t, chapters, record)
     t.document(
-        revisions=revisions_json(pair, verdict),
+        revisions=revisions_json(pair),
         verdict=d.verdict,
         message=message(d),
         **{} if c.expected is None else {"addition": c.expected.to_dict()},
@@ -280,8 +258,8 @@ def refine(
     )
 
 
-def revisions_json(chapters: Iterable[Chapter], stored: str = "") -> list[dict[str, object]]:
-    """Return the revisions for JSON; `stored` is as in `errors_by_revision`."""
+def revisions_json(chapters: Iterable[Chapter]) -> list[dict[str, object]]:
+    """Return the revisions for JSON."""
     return [
         {
             "revision": r.number,
@@ -293,7 +271,7 @@ def revisions_json(chapters: Iterable[Chapter], stored: str = "") -> list[dict[s
             "variance_factor": r.fit.variance_factor,
             "variance_factor_interval": list(r.fit.variance_factor_interval),
             "error": {"fit": r.fit.error.to_json(), "holdout": r.fit.holdout.to_json()},
-            "verdict": _verdict(r, stored) or None,
+            "verdict": r.verdict or None,
         }
         for r in chapters
     ]
@@ -324,8 +302,7 @@ def discover(
         )
     if effects is not None and revision is not None:
         raise InputError("--against and --revision: give one of them")
-    check_folder(output, f"-o {output}")
-    spare_other(output, LAW, PROPOSED)
+    check_output(output, "-o", LAW, PROPOSED)
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         number: int | None = None
         if effects is None:

@@ -474,11 +474,10 @@ def bootstrap_report(draws: Bootstrap) -> Iterator[Block]:
     for k in np.flatnonzero(draws.compared):
         theta, std = float(fit.theta[k]), float(fit.uncertainty.std[k])
         unit, factor = numbers.unit_for(units[k], [theta])
-        value, stated = numbers.with_std(factor * theta, factor * std)
-        drawn = numbers.with_std(0.0, factor * float(draws.std[k]))[1]
-        places = len(stated.partition(".")[2])
-        between = " to ".join(f"{factor * float(end[k]):.{places}f}" for end in ends)
-        out.add(names[k], value, stated, drawn, f"{draws.ratio[k]:.2f}", between, unit)
+        limits = (factor * float(end[k]) for end in ends)
+        value, stated, *between = numbers.with_std(factor * theta, factor * std, *limits)
+        drawn, ratio = numbers.with_std(0.0, factor * float(draws.std[k]))[1], draws.ratio[k]
+        out.add(names[k], value, stated, drawn, f"{ratio:.2f}", " to ".join(between), unit)
     if out.rows:
         meaning = "± drawn: standard deviation over the draws."
         yield from (out, note(f"± stated: standard uncertainty of the fit. {meaning}\n"))

@@ -69,8 +69,8 @@ def doctor_summary(findings: Sequence[Finding]) -> str:
     warnings = sum(f.state == "warning" for f in findings)
     more = f"; {warnings} warning{'s' * (warnings != 1)}, marked !" if warnings else ""
     if problems:
-        return f"{len(problems)} of {len(findings)} prevent a campaign: {', '.join(problems)}{more}"
-    return f"Nothing prevents a campaign{more}."
+        return f"{len(problems)} of {len(findings)} checks failed: {', '.join(problems)}{more}"
+    return f"No check failed{more}."
 
 
 def import_preview(proposal: Proposal, rows: int, source: str) -> Iterator[Block]:
@@ -385,4 +385,4 @@ def _value(p: Mapping[str, Any] | None, factor: float) -> str:
     if p["value"] is None or not p["identifiable"]:
         return UNSEEN
     std = float("nan") if p["std"] is None else factor * float(p["std"])
-    return " ± ".join(filter(None, numbers.with_std(factor * float(p["value"]), std)))
+    return numbers.plus_minus(factor * float(p["value"]), std)

@@ -211,9 +211,8 @@ def _parameters(d: Differences | None) -> Iterator[Block]:
         out = table("parameter", "before", "after", "by", "±", "unit", "σ", left=(0, 5))
         for z, r in comparable[:MOST_ROWS]:
             unit, factor = numbers.unit_for(r.unit, [r.before, r.after, r.difference])
-            difference, error = numbers.with_std(factor * r.difference, factor * (r.std or 0.0))
-            places = len(error.partition(".")[2])
-            sizes = (f"{factor * v:.{places}f}" for v in (r.before, r.after))
+            values = (factor * v for v in (r.difference, r.std or 0.0, r.before, r.after))
+            difference, error, *sizes = numbers.with_std(*values)
             out.add(r.name, *sizes, difference, error, unit, f"{abs(z):.1f}")
         yield out
         if len(comparable) > MOST_ROWS:

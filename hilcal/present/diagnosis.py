@@ -16,27 +16,19 @@ from hilcal.discovery.discovery import Discovery, LawSearch
 from hilcal.discovery.law import Coefficient, Law
 from hilcal.discovery.structures import pareto
 from hilcal.identification.fit import Fit
-from hilcal.identification.prediction.full_prediction import full_prediction
 from hilcal.numbers import length, percent
 from hilcal.present.document import Block, Table, Tone, Words, heading, note, table
 from hilcal.present.fit import (
     CERTAIN,
     dependence_sentence,
-    error_words,
     holdout_sentence,
     model_name,
     where_table,
 )
 from hilcal.present.verdict import headline, implausible, message, unconfirmed
-from hilcal.readings.readings import Readings
 from hilcal.types import Floats
 
 SUSPECTS = 6
-REVISION_HEADS = (
-    *("rev.", "model", "poses\nfitted", "\nσ", "poses\nleft out", "\nσ"),
-    *("variance\nfactor", "verdict"),
-)
-"""Heads of a table of revisions."""
 NEAR = 0.99  # least component of a direction that is named after its axis; a choice
 BARS = "▁▂▃▄▅▆▇█"
 CURVES = 2
@@ -132,30 +124,6 @@ def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
             )
     yield from redundant_line(d)
     yield from detectable_sizes(d)
-
-
-def revisions_table(rows: Sequence[tuple[int, str, Fit, str]]) -> Table:
-    """Return the table of revisions (number, change, fit, verdict) with their errors."""
-    out = table(*REVISION_HEADS, rows=(revision_cells(*row) for row in rows), left=(0, 1, 7))
-    floor = length(full_prediction(rows[-1][2]).noise_floor)
-    out.add("", "noise alone", floor, "1.00", floor, "1.00", "1", "", tone="note")
-    return out
-
-
-def revision_cells(number: int, change: str, fit: Fit, verdict: str) -> tuple[str, ...]:
-    """Return the cells of a revision in `revisions_table`."""
-    errors = (x for e in (fit.error, fit.holdout) for x in (length(e.rms_m), f"{e.rms_sigma:.2f}"))
-    model = change or model_name(fit.model.named)
-    factor = numbers.digits(fit.variance_factor)
-    return str(number), model, *errors, factor, verdict.replace("_", " ")
-
-
-def key(readings: Readings) -> Words:
-    """Return the explanation of the columns of `revisions_table`."""
-    return note(
-        f"Errors: rms of the {error_words(readings)}, and of all elements in σ, one standard "
-        "deviation of the noise.\n"
-    )
 
 
 def added_effect_sentence(before: Fit, after: Fit, effect: str) -> str:
@@ -258,10 +226,8 @@ def _binned(
     bars = f"{heads[1]} [{unit}] {''.join(BARS[round(h)] for h in height.tolist())}"
     out = table(heads[0], bars, "±", *(() if law is None else ("law",)))
     for k in range(len(x)):
-        value, spread = numbers.with_std(factor * float(y[k]), factor * float(error[k]))
-        places = len(value.partition(".")[2])
-        law_cell = () if law is None else (f"{factor * law[k]:.{places}f}",)
-        out.add(names[k] if names else numbers.digits(float(x[k])), value, spread, *law_cell)
+        values = (factor * float(v[k]) for v in (y, error, law) if v is not None)
+        out.add(names[k] if names else numbers.digits(float(x[k])), *numbers.with_std(*values))
     return out
 
 
@@ -305,10 +271,9 @@ def truth_table(rows: Sequence[TrueAndFitted]) -> Iterator[Block]:
     out = table("parameter", "true", "fitted", "±", "unit", "off by", left=(0, 4))
     for r in rows[:COMPARED]:
         unit, factor = numbers.unit_for(r.unit, [r.true, r.value])
-        value, spread = numbers.with_std(factor * r.value, factor * r.std)
-        places = len(value.partition(".")[2])
+        value, spread, true = numbers.with_std(*(factor * v for v in (r.value, r.std, r.true)))
         off = f"{abs(r.value - r.true) / r.std:.1f} ±" if r.std > 0 else ""
-        out.add(r.name, f"{factor * r.true:.{places}f}", value, spread, unit, off)
+        out.add(r.name, true, value, spread, unit, off)
     yield out
     if len(rows) > COMPARED:
         yield f"... and {len(rows) - COMPARED} more"

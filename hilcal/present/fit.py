@@ -321,11 +321,6 @@ class Worst:
     sigma: float
 
 
-def target_words(name: str, n_readings: int, known: bool) -> str:
-    """Return the description of one of several targets."""
-    return f"{name} ({n_readings} readings, its offset {'known' if known else 'estimated'})"
-
-
 def worst_poses(e: FullPrediction) -> list[Worst]:
     """Return the worst measurement of each of the worst poses, in units of the noise."""
     distance, out = np.sqrt(e.mahalanobis2), dict[str, Worst]()
@@ -348,9 +343,9 @@ def scalings_table(fits: Mapping[Scaling, Fit]) -> Iterator[Block]:
     """Yield a table of parameters, errors and condition numbers, with a column per scaling."""
 
     def entry(f: Fit, k: int, factor: float) -> str:
-        sizes = factor * float(f.theta[k]), factor * float(f.uncertainty.std[k])
-        written = " ± ".join(filter(None, numbers.with_std(*sizes)))
-        return written if f.uncertainty.identifiable[k] else "-"
+        std = factor * float(f.uncertainty.std[k])
+        identifiable = f.uncertainty.identifiable[k]
+        return numbers.plus_minus(factor * float(f.theta[k]), std) if identifiable else "-"
 
     yield heading("The same readings with every scaling")
     columns, model = list(fits.values()), next(iter(fits.values())).model

@@ -25,9 +25,9 @@ from hilcal.present.comparison import comparison_report
 from hilcal.present.document import Block
 from hilcal.present.fit import fit_report, stream_report
 from hilcal.present.plan import plan_report
+from hilcal.present.story import chapters_of, errors_by_revision
 from hilcal.readings.readings import Readings
 from hilcal.refinement import Refinement
-from hilcal.store.revision import change
 from hilcal.stream import StreamFit
 from hilcal.tables.table import exchange_columns
 from hilcal.tables.write import plan_csv
@@ -68,15 +68,8 @@ def _(tested: CampaignValidation) -> Iterator[Block]:
 
 @_blocks.register
 def _(path: Refinement) -> Iterator[Block]:
-    rows = []
-    for k, s in enumerate(path.steps, start=1):
-        changed = change(s.added, s.removed, s.fit.readings.arm_scatter is not None)
-        rows.append((k, changed, s.fit, s.diagnosis.verdict))
-    yield from (
-        diagnosis.revisions_table(rows),
-        diagnosis.key(path.fit.readings),
-        diagnosis.verdict_line(path.diagnosis),
-    )
+    yield from errors_by_revision(chapters_of(range(1, len(path.steps) + 1), path.steps))
+    yield diagnosis.verdict_line(path.diagnosis)
 
 
 def frame_of(value: object) -> "pd.DataFrame":

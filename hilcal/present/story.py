@@ -3,7 +3,7 @@
 import itertools
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
@@ -22,10 +22,12 @@ from hilcal.identification.fit import Fit, all_left_out, mahalanobis2
 from hilcal.identification.prediction.full_prediction import FullPrediction, full_prediction
 from hilcal.identification.residual import ErrorBlock
 from hilcal.model.model import Model
+from hilcal.numbers import digits, length
 from hilcal.present import diagnosis
-from hilcal.present.document import Block
-from hilcal.present.fit import errors, holdout_sentence, model_name, parameters
+from hilcal.present.document import Block, note, table
+from hilcal.present.fit import error_words, errors, holdout_sentence, model_name, parameters
 from hilcal.present.verdict import message
+from hilcal.refinement import RefinementStep
 from hilcal.robot.arm import Arm
 from hilcal.robot.scene import body_poses
 from hilcal.store.revision import change
@@ -36,6 +38,11 @@ LEVEL_NAMES = ("inside the noise", "doubtful", "outside the noise")
 LIMITS = (0.99, 0.9999)  # quantiles of χ² above which a reading is doubtful, and outside
 MAX_NUMBER = 10**9
 UNDIAGNOSED = "not diagnosed"
+REVISION_HEADS = (
+    *("rev.", "model", "poses\nfitted", "\nσ", "poses\nleft out", "\nσ"),
+    *("variance\nfactor", "verdict"),
+)
+"""Heads of a table of revisions."""
 MIN_SHARE = 0.2
 """Least share of the predictable misfit that the first suspect explains for its chart to be shown
 instead of that of the strongest variable; a guess."""
@@ -195,6 +202,44 @@ class Chapter:
     fit: Fit
     diagnosis: Diagnosis | None
     removed: str | None = None
+    stored_verdict: str = ""  # of a revision without a diagnosis
+
+    @property
+    def verdict(self) -> str:
+        """The verdict; empty if the revision was not diagnosed."""
+        return self.stored_verdict if self.diagnosis is None else self.diagnosis.verdict
+
+    @property
+    def change(self) -> str:
+        """The change of the model, e.g. "+ hysteresis"; empty for a first model."""
+        return change(self.added, self.removed, self.fit.readings.arm_scatter is not None)
+
+    @property
+    def cells(self) -> tuple[str, ...]:
+        """The row of the revision in a table with `REVISION_HEADS`."""
+        fit, verdict = self.fit, self.verdict or UNDIAGNOSED
+        sizes = [(length(e.rms_m), f"{e.rms_sigma:.2f}") for e in (fit.error, fit.holdout)]
+        model, factor = self.change or model_name(fit.model.named), digits(fit.variance_factor)
+        return str(self.number), model, *sizes[0], *sizes[1], factor, verdict.replace("_", " ")
+
+
+def chapters_of(numbers: Iterable[int], steps: Iterable[RefinementStep]) -> list[Chapter]:
+    """Return the steps of a refinement as chapters with the numbers of their revisions."""
+    pairs = zip(numbers, steps, strict=True)
+    return [Chapter(n, s.added, s.fit, s.diagnosis, s.removed) for n, s in pairs]
+
+
+def errors_by_revision(chapters: Sequence[Chapter]) -> Iterator[Block]:
+    """Yield the table of the errors and verdicts of revisions, and its explanation."""
+    last = chapters[-1].fit
+    floor = length(full_prediction(last).noise_floor)
+    out = table(*REVISION_HEADS, rows=(c.cells for c in chapters), left=(0, 1, 7))
+    out.add("", "noise alone", floor, "1.00", floor, "1.00", "1", "", tone="note")
+    yield out
+    yield note(
+        f"Errors: rms of the {error_words(last.readings)}, and of all elements in σ, one standard "
+        "deviation of the noise.\n"
+    )
 
 
 def build_story(chapters: Sequence[Chapter]) -> Story:
@@ -274,12 +319,11 @@ def pose_numbers(names: Sequence[str]) -> Ints:
 
 
 def _revision(c: Chapter, e: FullPrediction, residual: Floats, measured: Floats) -> StoryRevision:
-    d, judged, drawn = c.diagnosis, UNDIAGNOSED, None
-    changed = change(c.added, c.removed, c.fit.readings.arm_scatter is not None)
+    d, drawn = c.diagnosis, None
     verdict: list[Block] = [f"{UNDIAGNOSED.capitalize()}: run hilcal diagnose for a verdict."]
     details: list[Block] = [holdout_sentence(c.fit)]
     if d is not None:
-        judged, drawn = d.verdict, strongest_dependence(d)
+        drawn = strongest_dependence(d)
         verdict = [
             message(d),
             *([diagnosis.suspects_table(d, MOST_SUSPECTS)] if d.significant else []),
@@ -289,14 +333,14 @@ def _revision(c: Chapter, e: FullPrediction, residual: Floats, measured: Floats)
             details.append(f"Drawn: {drawn.y_label} against {drawn.x_label}. {drawn.description}")
     return StoryRevision(
         revision=c.number,
-        change=changed,
-        verdict=judged,
+        change=c.change,
+        verdict=c.verdict or UNDIAGNOSED,
         residual=residual,
         predicted=measured - residual,
         whitened_norm2=mahalanobis2(e.raw[:, :3], e.whitening.covariance[:, :3, :3]),
         error=c.fit.error,
         holdout=c.fit.holdout,
-        cells=diagnosis.revision_cells(c.number, changed, c.fit, judged),
+        cells=c.cells,
         panels={
             "verdict": (*verdict, f"Model: {model_name(c.fit.model.named)}."),
             "details": (*details, errors(c.fit)),

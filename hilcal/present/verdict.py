@@ -478,13 +478,13 @@ def _arm_scatter(d: Diagnosis) -> list[str]:
 
 def sigmas(s: ArmScatter) -> str:
     """Return the standard deviations of the arm's scatter with their uncertainties."""
-    pairs = [numbers.with_std(1e6 * v, 1e6 * e) for v, e in zip(s.std, s.std_error, strict=True)]
+    texts = [numbers.plus_minus(1e6 * v, 1e6 * e) for v, e in zip(s.std, s.std_error, strict=True)]
     if s.kind == "isotropic":
-        return f"the target scatters by σ = {' ± '.join(pairs[0])} µm along each axis"
+        return f"the target scatters by σ = {texts[0]} µm along each axis"
     if s.kind == "joints":
-        return f"each joint scatters by σ_q = {' ± '.join(pairs[0])} µrad"
-    clear = [j for j in range(len(pairs)) if s.std[j] > s.std_error[j]]
-    listed = ", ".join(f"joint {j + 1} {' ± '.join(pairs[j])}" for j in clear)
+        return f"each joint scatters by σ_q = {texts[0]} µrad"
+    clear = [j for j in range(len(texts)) if s.std[j] > s.std_error[j]]
+    listed = ", ".join(f"joint {j + 1} {texts[j]}" for j in clear)
     return f"the joints scatter by σ_q [µrad] = {listed}, the others by less than can be estimated"
 
 
@@ -522,6 +522,6 @@ def correlated(n: SerialNoise) -> str:
     larger = "hardly larger" if factor == "1" else f"{factor} times as large"
     return (
         f"Readings are correlated along their order{share}: "
-        f"ρ = {' ± '.join(numbers.with_std(n.rho, n.rho_error))} from one to the "
+        f"ρ = {numbers.plus_minus(n.rho, n.rho_error)} from one to the "
         f"next, half-time {n.half:.2g} {unit}. Standard uncertainties are {larger} for it.{doubt}"
     )

@@ -22,7 +22,6 @@ from hilcal.names import quoted
 from hilcal.readings.readings import ObserverKind, ObserverName, Readings
 from hilcal.store import rows, schema
 from hilcal.store.codec import decode
-from hilcal.store.kept_texts import robot_file_of, running_command
 from hilcal.store.revision import (
     RevisionRecord,
     fitted_to,
@@ -33,6 +32,7 @@ from hilcal.store.revision import (
     utc_now,
 )
 from hilcal.store.rows import Layout, content_hash, layout_of, read_layout
+from hilcal.store.stored_texts import robot_file_of, running_command
 from hilcal.whole_file import replacing
 
 _TARGETS, _OBSERVERS = "targets", "observers"

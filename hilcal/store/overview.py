@@ -12,9 +12,9 @@ from hilcal.config import CellConfig
 from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.codec import encode
-from hilcal.store.kept_texts import COMMAND
 from hilcal.store.revision import RevisionRecord
 from hilcal.store.run_log import PLAN, RunLog
+from hilcal.store.stored_texts import COMMAND
 from hilcal.types import Floats
 
 _SERIAL = re.compile(r"serial(?: number)?:? (\S+)", re.IGNORECASE)

@@ -9,9 +9,9 @@ from hilcal.errors import InputError
 from hilcal.robot.catalogue import load_arm
 from hilcal.store import schema
 from hilcal.store.campaign_file import ACCEPTED, CampaignFile, free_place
-from hilcal.store.kept_texts import ROBOT_FILE, text_of
 from hilcal.store.procedure_log import ENTRY, ProcedureLog
 from hilcal.store.rows import insert_meta
+from hilcal.store.stored_texts import ROBOT_FILE, text_of
 from hilcal.whole_file import replace_file
 
 

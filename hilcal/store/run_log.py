@@ -18,10 +18,10 @@ from hilcal.readings.covariance import COVERS_KEY, INSTRUMENT
 from hilcal.readings.readings import Readings
 from hilcal.store import rows, schema
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.kept_texts import KEYS, robot_file_of
 from hilcal.store.plan import Plan, Step, joined, read_plan, with_new_names
 from hilcal.store.revision import utc_now
 from hilcal.store.stored_schema import DETAIL, check, check_event
+from hilcal.store.stored_texts import KEYS, robot_file_of
 
 REHEARSED = "rehearsed in a simulated cell"  # in the source of a campaign on simulated devices
 PLAN = "plan"  # key of the first plan among the texts of a campaign

@@ -122,7 +122,7 @@ def test_what_is_set_aside_is_in_no_figure_of_the_fit(tmp_path, capsys):
             found[name] = d["error"], opened.calibration().predict(q).band_m
     assert len(d["outliers"]) == 1
     said = " ".join(ok(capsys, "compare", run).out.split())
-    assert "set aside as gross errors may be listed here; no figure above includes them: p" in said
+    assert "Gross errors may be listed here; the figures above do not include them: p" in said
     (good, band), (off, its) = found.values()
     for key in ("before", "fit", "holdout"):
         assert off[key]["rms_m"] == pytest.approx(good[key]["rms_m"], rel=0.1)

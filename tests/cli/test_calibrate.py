@@ -81,11 +81,11 @@ def test_a_goal_needs_readings_that_show_it(there, cell, capsys):
 def test_the_plain_command_says_what_is_there(there, capsys):
     path = there.procedure.run
     line = refused(capsys, 2, "calibrate", path.with_name("cell.toml"), "-o", path, "--yes")
-    assert "a calibration is there already, it is complete; go on with: hilcal calibrate" in line
+    assert "holds a calibration already, it is complete; go on with: hilcal calibrate" in line
     assert line.endswith("--resume --yes")
     again = ("calibrate", path.with_name("cell.toml"), "-o", path, "--yes", "--resume")
     told = run(capsys, *again, "--skip", "v1")
-    assert (told.code, "nothing is missing" in told.err) == (2, True)
+    assert (told.code, "none is missing" in told.err) == (2, True)
 
 
 def test_a_complete_one_is_told_again(there, capsys):

@@ -128,7 +128,7 @@ def test_into_the_labs_own_urdf(lab, capsys):
     there = flanges(true, q) @ se3.matrix(np.eye(3), TOOL)
     assert np.linalg.norm((made - there)[:, :3, 3], axis=1).max() < 6e-5
     for given, words in (
-        (("--urdf", folder / "n.urdf", "--tip-link", "x"), "--tip-link is about --into"),
+        (("--urdf", folder / "n.urdf", "--tip-link", "x"), "--tip-link needs --into"),
         (("--into", folder / "no.urdf"), "no.urdf: no such file; valid: a URDF"),
         (("--into", mine, "--force", "--tip-link", "x"), "link 'x' is there 0 times; valid: base"),
         (("--matlab", folder / "1.m"), "valid: a name that MATLAB calls"),

@@ -225,7 +225,7 @@ def test_next_separates_a_law_from_what_readings_do_not_tell_from_it(campaign, t
 
 
 @pytest.mark.parametrize(("given", "message"), [
-    (("-o", "found.txt"), "the effect is called after its file"),
+    (("-o", "found.txt"), "the effect has the name of its file"),
     (("-o", "creep.py"), "no name of the catalogue"),
     (("-o", "nowhere/found.py"), "no folder"),
     (("-o", "found.py", "--against", "creep", "--revision", "1"), "give one of them"),

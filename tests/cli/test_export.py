@@ -164,8 +164,8 @@ def test_the_corrected_table_is_a_robot_again(capsys, fitted, tmp_path):
     (("--readings", "{out}/r.xlsx"), "unknown kind of table; valid: .csv or .parquet"),
     (("--parameters", "{out}/p.txt"), "--parameters"),
     (("--dh", "{out}/d.json"), "valid: .toml or .csv"),
-    (("--dh-modified", "--urdf", "{out}/a.urdf"), "--dh-modified is about --dh"),
-    (("--ur-hash", "calib_1", "--urdf", "{out}/a.urdf"), "--ur-hash is about"),
+    (("--dh-modified", "--urdf", "{out}/a.urdf"), "--dh-modified needs --dh"),
+    (("--ur-hash", "calib_1", "--urdf", "{out}/a.urdf"), "--ur-hash needs"),
     (("--ur-kinematics", "{out}/k.yaml", "--ur-hash", "mine"), "valid: calib_ and digits"),
     (("--table", "{out}/t.csv", "--readings", "{out}/t.csv"), "two things cannot be written"),
 ])  # fmt: skip

@@ -19,16 +19,16 @@ from hilcal.present.html.report import page
 from hilcal.readings.covariance import COVERS_KEY, INSTRUMENT
 from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.kept_texts import (
+from hilcal.store.overview import overview
+from hilcal.store.plan import Plan, Step
+from hilcal.store.run_log import RunLog, check_same_cell, create_run
+from hilcal.store.stored_texts import (
     CALIBRATION_FILE,
     COMMAND,
     ROBOT_FILE,
     recording_command,
     running_command,
 )
-from hilcal.store.overview import overview
-from hilcal.store.plan import Plan, Step
-from hilcal.store.run_log import RunLog, check_same_cell, create_run
 from hilcal.write_report import ReportOptions, content_of
 from tests.support.campaigns import campaign, configuration
 from tests.support.cli_cases import CELL, done, ok, refused, rehearsal, stored_readings

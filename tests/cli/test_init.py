@@ -215,7 +215,7 @@ def test_the_document_and_the_words_say_the_same(tmp_path, capsys):
     names = {f["name"] for f in d["findings"]}
     assert {"hilcal", "Python", "packages", "clock", "writing", "processors"} <= names
     words = " ".join(ok(capsys, "doctor", CELL, "--folder", tmp_path).out.split())
-    assert "Nothing prevents a campaign" in words
+    assert "No check failed" in words
     assert "can be read" in words
 
 
@@ -237,4 +237,4 @@ def test_what_hinders_a_campaign_is_named_and_ends_with_3(tmp_path, capsys):
     cell.write_text("[robot]\nmodel = 3\n", encoding="utf-8")
     result = run(capsys, "doctor", cell, "--folder", tmp_path)
     assert result.code == 3
-    assert "mend the file" in result.out
+    assert "correct the file" in result.out

@@ -420,7 +420,7 @@ def test_what_an_appended_plan_leaves_out_is_said(site, capsys):
 
 
 def test_a_load_that_hung_when_the_last_session_was_killed_is_said(site, capsys):
-    said = "3kg still hangs on the arm"
+    said = "load 3kg may still be on the arm"
     ok(capsys, *site.command(*site.fresh))
     assert said not in ok(capsys, *site.command("--resume")).err
     with CampaignFile.open(site.directory / "run.hilcal") as campaign:

@@ -79,8 +79,8 @@ def test_a_bad_revision_is_set_aside_and_fitted_again(fitted, capsys):
 def test_what_a_file_for_others_lacks(run, tmp_path, capsys):
     ok(capsys, "identify", run, "--effects", "joint_compliance,creep", "--readings", "absolute")
     told = ok(capsys, "export", run, "--urdf", tmp_path / "arm.urdf").out
-    assert "since not constant" in told
-    assert "hilcal compensate has it" in told
+    assert "as not constant" in told
+    assert "hilcal compensate corrects it" in told
     (points := tmp_path / "p.csv").write_text(
         "q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad,load\n0.1,-1.5,1.2,-1.0,0.7,0.2,5kg\n"
     )

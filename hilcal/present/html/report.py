@@ -29,7 +29,6 @@ from hilcal.present.calibration import (
 )
 from hilcal.present.campaign import info_report, utc
 from hilcal.present.diagnosis import (
-    REVISION_HEADS,
     detectable_sizes,
     doubtful_lines,
     redundant_line,
@@ -49,12 +48,20 @@ from hilcal.present.document import (
 )
 from hilcal.present.html import FirstScreen, render
 from hilcal.present.registration import base_line, covariance_words
-from hilcal.present.story import Chapter, Story, StoryRevision, curve, laws, regressor
+from hilcal.present.story import (
+    REVISION_HEADS,
+    Chapter,
+    Story,
+    StoryRevision,
+    curve,
+    laws,
+    regressor,
+)
 from hilcal.present.verdict import headline, message, repeatability_source
 from hilcal.readings.whitening import Scaling
-from hilcal.store.kept_texts import COMMAND
 from hilcal.store.overview import Overview
 from hilcal.store.plan import Plan
+from hilcal.store.stored_texts import COMMAND
 from hilcal.types import Floats
 
 MOST_CURVES, MOST_LISTED, MOST_PARAMETERS, MOST_LAWS = 2, 6, 48, 4
@@ -474,7 +481,7 @@ def _added_variables(d: Diagnosis, suspects: Sequence[Suspect]) -> Iterator[Char
 
 def _suspects_table(rows: Sequence[Suspect], caption: str) -> Table:
     heads = ("effect", "explains", "on poses left out", "log evidence", "p-value", "passes")
-    out = table(*heads, "not separable from", caption=caption)
+    out = table(*heads, "inseparable from", caption=caption)
     for s in rows:
         shares = percent(s.share), percent(max(s.holdout_share, 0.0))
         scores = f"{s.score.log_evidence:z.1f}", numbers.chance(s.score.p_value)

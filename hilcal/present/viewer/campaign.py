@@ -10,11 +10,11 @@ import rerun.blueprint as rrb
 
 from hilcal import numbers
 from hilcal.errors import HilcalError, InputError
-from hilcal.present.diagnosis import REVISION_HEADS
 from hilcal.present.document import Block, heading, table
 from hilcal.present.live_viewer import PORT
 from hilcal.present.story import (
     LEVEL_NAMES,
+    REVISION_HEADS,
     DependenceCurve,
     Story,
     StoryRevision,
