@@ -415,7 +415,7 @@ def loads_report(test: validation.Acceptance) -> Iterator[Block]:
     every = () if len(test.loads) == 1 else (test.everything,)
     yield _shares_table("load", "at", (*test.loads, *every), test.limit_m)
     region = f"{100 * validation.BAND:.0f} % region"
-    yield note(f"in 95 %: share of the readings inside of their stated {region}.\n")
+    yield note(f"in 95 %: share of the readings inside their stated {region}.\n")
 
 
 def worst_table(test: validation.Acceptance) -> Table:
@@ -469,7 +469,7 @@ def bootstrap_report(draws: Bootstrap) -> Iterator[Block]:
         f"{draws.poses}, with replacement.\n"
     )
     heads = ("parameter", "value", "± stated", "± drawn", "ratio", "95 % of the draws", "unit")
-    out, names = table(*heads, left=(0, 6)), names_of(fit.model)
+    out, names = table(*heads, left=(0, 5, 6)), names_of(fit.model)
     units = [p.unit for e in fit.model.effects for p in e.parameters]
     for k in np.flatnonzero(draws.compared):
         theta, std = float(fit.theta[k]), float(fit.uncertainty.std[k])
@@ -477,7 +477,7 @@ def bootstrap_report(draws: Bootstrap) -> Iterator[Block]:
         limits = (factor * float(end[k]) for end in ends)
         value, stated, *between = numbers.with_std(factor * theta, factor * std, *limits)
         drawn, ratio = numbers.with_std(0.0, factor * float(draws.std[k]))[1], draws.ratio[k]
-        out.add(names[k], value, stated, drawn, f"{ratio:.2f}", " to ".join(between), unit)
+        out.add(names[k], value, stated, drawn, f"{ratio:.2f}", ", ".join(between), unit)
     if out.rows:
         meaning = "± drawn: standard deviation over the draws."
         yield from (out, note(f"± stated: standard uncertainty of the fit. {meaning}\n"))
@@ -489,8 +489,8 @@ def bootstrap_remarks(draws: Bootstrap) -> Iterator[str]:
     ratios, solution = draws.ratio[draws.compared], draws.fit.solution
     if len(ratios):
         yield (
-            f"Over the draws the parameters scatter {ratios.min():.2f} to {ratios.max():.2f} times "
-            f"as far as is stated (median {np.median(ratios):.2f})."
+            f"Over the draws the parameters scatter by {ratios.min():.2f} to {ratios.max():.2f} "
+            f"times the stated uncertainty (median {np.median(ratios):.2f})."
         )
     wide = sorted(np.flatnonzero(draws.ratio > WIDER), key=lambda k: -draws.ratio[k])
     if wide:
@@ -515,7 +515,7 @@ def bootstrap_remarks(draws: Bootstrap) -> Iterator[str]:
             "joint space, are the ones to use."
         )
     elif len(ratios):
-        yield f"None scatters more than {WIDER:g} times as far: the stated ones can be used."
+        yield f"None scatters by more than {WIDER:g} times it: the stated ones can be used."
     if excluded := int((solution.estimated & ~draws.compared).sum()):
         yield (
             f"{excluded} parameters are not compared: the readings do not determine them, or they "

@@ -1,9 +1,11 @@
 """Standard uncertainties: the spread of repeated campaigns, and of poses that are drawn again."""
 
+import io
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from rich.console import Console
 from scipy.stats import chi2
 
 from hilcal.engine import open_engine
@@ -13,7 +15,8 @@ from hilcal.identification.carried.carried_prior import prior_of
 from hilcal.identification.fit import fit
 from hilcal.identification.folds import distinct_poses
 from hilcal.model.model import Model
-from hilcal.present.calibration import bootstrap_remarks
+from hilcal.present import calibration
+from hilcal.present.calibration import bootstrap_remarks, bootstrap_report
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES, whitening
 from tests.support.campaigns import campaign, noiseless, plan, with_noise
@@ -161,6 +164,17 @@ def test_its_spread_is_that_of_repeated_campaigns():
     ratios = [drawn(f, 60).std[COMPLIANCE] / true for f in repeated[:3]]
     # 18 ratios, each known to some 18 %, those of one parameter with a common 11 %
     assert 0.85 < np.exp(np.mean(np.log(ratios))) < 1.15
+
+
+def test_the_table_of_long_names_fits_80_columns(monkeypatch):
+    draws, console = drawn(fitted(poses=12), 20), Console(width=80, file=io.StringIO())
+    name = "transmission_error.j1.cos1"
+    monkeypatch.setattr(calibration, "names_of", lambda model: (name,) * model.size)
+    console.print(*bootstrap_report(draws))
+    lines = console.file.getvalue().splitlines()
+    assert max(map(len, lines)) <= 80
+    assert sum(name in line and "±" not in line for line in lines) == draws.compared.sum()
+    assert not any("ratio:" in line for line in lines)  # no list in place of the table
 
 
 @pytest.mark.long
