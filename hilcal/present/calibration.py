@@ -41,7 +41,7 @@ TITLES: Mapping[str, str] = {
     "measure_corrected": "Measure at the corrected targets",
     "compare": "Compare before and after",
 }
-DOES: Mapping[str, str] = {
+DESCRIPTIONS: Mapping[str, str] = {
     "plan": "Poses, loads and their order are chosen: seconds to a minute",
     "refine": "Effects are added until what is left is noise: seconds to minutes, by the number of "
     "readings",
@@ -52,21 +52,21 @@ DOES: Mapping[str, str] = {
     "compare": "Measured errors at uncorrected and corrected joint values are compared: seconds",
 }
 """Steps that compute, with their duration for a campaign of some hundred readings."""
-MOST_LEFT, LISTED = 6, 12  # listed points without a correction; listed compensated points
-MOST, WORST = 4, 6  # listed variables; listed poses
+MOST_NOT_CORRECTED, MOST_POINTS = 6, 12  # listed points: without a correction, compensated
+MOST_VARIABLES, MOST_POSES = 4, 6  # listed variables; listed poses
 MOVED_TRACKER_RATIO = 5.0  # rms of z above which a moved tracker is suspected; a guess
 MIN_ERROR_RATIO = 1.5  # least rms ratio of error to stated standard deviation that is reported
-WIDER = 1.5
+WIDE_RATIO = 1.5
 """Ratio of drawn to stated standard uncertainty above which the stated one is called too small; a
 choice. 200 draws determine a standard deviation to 5 %, few poses much less well."""
-CROWDED = 0.5  # effective parameters per pose above which the draws scatter too widely; a choice
+MAX_PARAMETERS_PER_POSE = 0.5  # effective ones, above which the draws scatter too much; a choice
 
 
 def step_heading(step: "ProcedureStep", clock: float = 1.0) -> Iterator[Block]:
     """Yield the next step and its duration; `clock` is in cell seconds per real second."""
     yield from ("", heading(TITLES[step.kind]))
     if not step.moves:
-        yield f"{DOES[step.kind]}.\n"
+        yield f"{DESCRIPTIONS[step.kind]}.\n"
         return
     of_planned = "" if step.missing == step.planned else f" of {step.planned}"
     changes = step.load_changes
@@ -176,10 +176,10 @@ def improvement_report(gain: Improvement, limit_m: float | None) -> Iterator[Blo
         f"instead of {length(e.before.mean_m)}, measured by the tracker at {e.count} points"
         f"{removed}. {e.inside} of {e.count} lie within their predicted 95 % band.{without}"
     )
-    for name, why in gain.left_out[:MOST_LEFT]:
+    for name, why in gain.left_out[:MOST_NOT_CORRECTED]:
         yield f"not corrected: {name}: {why}"
-    if uncorrected > MOST_LEFT:
-        yield f"not corrected: {uncorrected - MOST_LEFT} more"
+    if uncorrected > MOST_NOT_CORRECTED:
+        yield f"not corrected: {uncorrected - MOST_NOT_CORRECTED} more"
     if limit_m is not None:
         over, scope = gain.over(limit_m), " for deflections" if gain.mode == "deflection" else ""
         verdict = f"PASSED{scope}: no error at the corrected targets is"
@@ -256,7 +256,7 @@ def compensation_report(
         yield f"  {joints} joints correct the position alone; orientations are off by {turned:.2g}°"
     yield f"  {base_line(calibration.model.cell, calibration.frames, calibration.mode)}"
     rows = table("point", "before", "after, 95 %", "largest correction")
-    for k in sorted(np.argsort(-errors, kind="stable")[:LISTED]):
+    for k in sorted(np.argsort(-errors, kind="stable")[:MOST_POINTS]):
         turn = np.abs(c.q[k] - before[k])
         joint = int(np.argmax(turn))
         largest = f"joint {joint + 1}: {numbers.joint_value(turn[joint], c.units[joint], 3)}"
@@ -269,8 +269,8 @@ def compensation_report(
             f"{np.degrees(o.range.high):.1f}°. "
             "The model is the same there, but does not include forces of cables."
         )
-    if len(names) > LISTED:
-        yield f"The {LISTED} of {len(names)} points with the largest error before are listed."
+    if len(names) > MOST_POINTS:
+        yield f"The {MOST_POINTS} of {len(names)} points with the largest error before are listed."
 
 
 def _contributions(calibration: Calibration, unstated: Sequence[str]) -> Iterator[str]:
@@ -371,8 +371,8 @@ def validation_report(
     else:
         total = len(beyond.outside)
         yield f"Extrapolation: {count} of {total} lie outside the measured range:"
-        yield from (f"  {_beyond(v)}" for v in beyond.variables[:MOST])
-        unlisted = len(beyond.variables) - MOST
+        yield from (f"  {_beyond(v)}" for v in beyond.variables[:MOST_VARIABLES])
+        unlisted = len(beyond.variables) - MOST_VARIABLES
         yield f"  and {unlisted} more variables\n" if unlisted > 0 else ""
     if (z_all := _rms(beyond.z)) > MIN_ERROR_RATIO:
         yield f"These readings are {z_all:.2g} times as far off as the fit states.\n"
@@ -420,7 +420,7 @@ def loads_report(test: validation.Acceptance) -> Iterator[Block]:
 
 def worst_table(test: validation.Acceptance) -> Table:
     """Return the errors of the worst poses."""
-    return _shares_table("worst poses", "load", test.poses[:WORST], test.limit_m)
+    return _shares_table("worst poses", "load", test.poses[:MOST_POSES], test.limit_m)
 
 
 def _shares_table(
@@ -492,11 +492,11 @@ def bootstrap_remarks(draws: Bootstrap) -> Iterator[str]:
             f"Over the draws the parameters scatter by {ratios.min():.2f} to {ratios.max():.2f} "
             f"times the stated uncertainty (median {np.median(ratios):.2f})."
         )
-    wide = sorted(np.flatnonzero(draws.ratio > WIDER), key=lambda k: -draws.ratio[k])
+    wide = sorted(np.flatnonzero(draws.ratio > WIDE_RATIO), key=lambda k: -draws.ratio[k])
     if wide:
         names = names_of(draws.fit.model)
         listed = numbers.few([f"{names[k]} ({draws.ratio[k]:.1f} times)" for k in wide], 5)
-        if solution.effective > CROWDED * draws.poses:
+        if solution.effective > MAX_PARAMETERS_PER_POSE * draws.poses:
             yield (
                 f"Wider than stated: {listed}. This does not show that the stated ones are too "
                 f"small: the fit spends {solution.effective:.0f} degrees of freedom on "
@@ -515,7 +515,7 @@ def bootstrap_remarks(draws: Bootstrap) -> Iterator[str]:
             "joint space, are the ones to use."
         )
     elif len(ratios):
-        yield f"None scatters by more than {WIDER:g} times it: the stated ones can be used."
+        yield f"None scatters by more than {WIDE_RATIO:g} times it: the stated ones can be used."
     if excluded := int((solution.estimated & ~draws.compared).sum()):
         yield (
             f"{excluded} parameters are not compared: the readings do not determine them, or they "

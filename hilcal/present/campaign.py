@@ -26,11 +26,11 @@ if TYPE_CHECKING:
     from hilcal.transfer.compare import FactoryCheck
 
 MARKS = {"ok": "✓", "warning": "!", "problem": "✗"}
-WIDEST, LISTED = 34, 12  # most characters of a table cell; most unused columns that are listed
+MOST_CHARACTERS, MOST_COLUMNS = 34, 12  # of a table cell; unused ones that are listed
 LISTED_EVENTS = ("start", "load", "moved", "doubted", "goal", "interrupted", "failed", "finished")
 """Kinds of events that are always listed; drift is listed only above its limit."""
 MOST_EVENTS = 30
-NONE, UNSEEN = "–", "not determined"
+NO_VALUE, UNDETERMINED = "–", "not determined"
 
 
 def sections_overview(tables: Sequence[KeyTable]) -> Iterator[Block]:
@@ -84,8 +84,8 @@ def import_preview(proposal: Proposal, rows: int, source: str) -> Iterator[Block
     if understood:
         yield table("what", "columns", "meaning", "first row", rows=understood, left=(0, 1, 2, 3))
     unused = [f"{name} ({why})" for name, why in proposal.unused]
-    if len(unused) > LISTED:
-        unused = [*unused[:LISTED], f"and {len(unused) - LISTED} more"]
+    if len(unused) > MOST_COLUMNS:
+        unused = [*unused[:MOST_COLUMNS], f"and {len(unused) - MOST_COLUMNS} more"]
     for title, sentences in (
         ("missing:", proposal.missing),
         ("unsure:", [f"{column}: {doubt}" for column, doubt in proposal.doubts]),
@@ -97,9 +97,9 @@ def import_preview(proposal: Proposal, rows: int, source: str) -> Iterator[Block
 
 
 def _short(cells: Sequence[str]) -> str:
-    """Join names or values, of many the first two and the last, cut to WIDEST characters."""
+    """Join names or values, of many the first two and the last, cut to a width."""
     line = ", ".join(cells) if len(cells) <= 3 else f"{cells[0]}, {cells[1]} … {cells[-1]}"
-    return line if len(line) <= WIDEST else line[: WIDEST - 1] + "…"
+    return line if len(line) <= MOST_CHARACTERS else line[: MOST_CHARACTERS - 1] + "…"
 
 
 def check_report(answers: "tuple[ConnectionResult, ...]", dry: "DryRun | None") -> Iterator[Block]:
@@ -344,11 +344,11 @@ def two_revisions(a: RevisionRecord, b: RevisionRecord) -> Table:
         unit_si = next(str(p["unit"]) for p in both if p is not None)
         unit, factor = numbers.unit_for(unit_si, values)
         first, second = (_value(p, factor) for p in both)
-        if {first, second} <= {NONE, UNSEEN}:
+        if {first, second} <= {NO_VALUE, UNDETERMINED}:
             continue
         moved = factor * (values[1] - values[0])
         difference = ("+" * (moved > 0) + numbers.digits(moved, 2)).replace("-", "−")
-        difference *= not {first, second} & {NONE, UNSEEN}
+        difference *= not {first, second} & {NO_VALUE, UNDETERMINED}
         add(f"{name} [{unit}]" if unit else name, first, second, difference)
     return out
 
@@ -356,7 +356,7 @@ def two_revisions(a: RevisionRecord, b: RevisionRecord) -> Table:
 def verdict_of(record: RevisionRecord) -> str:
     """Return the verdict, or a dash without one."""
     verdict = record.result_json.get("diagnose", {}).get("verdict")
-    return NONE if verdict is None else str(verdict).replace("_", " ")
+    return NO_VALUE if verdict is None else str(verdict).replace("_", " ")
 
 
 def left_out_m(record: RevisionRecord) -> float:
@@ -381,8 +381,8 @@ def refitted(before: Fit, after: Fit) -> str:
 
 def _value(p: Mapping[str, Any] | None, factor: float) -> str:
     if p is None:
-        return NONE
+        return NO_VALUE
     if p["value"] is None or not p["identifiable"]:
-        return UNSEEN
+        return UNDETERMINED
     std = float("nan") if p["std"] is None else factor * float(p["std"])
     return numbers.plus_minus(factor * float(p["value"]), std)

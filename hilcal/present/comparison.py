@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 MOST_PARAMETERS, MOST_ROWS = 6, 12  # listed parameters of a change; of both fits
 CLEAR = 2.0  # least σ of a listed parameter of a change that has several
 FAR = 3.0  # standard deviations between which most arms lie; a choice
-KNOWN = {
+ARM_SOURCES = {
     "list": "arms.csv",
     "serial number": "the serial number that the arm reported",
     "folder": "the folder of the file, because there is no serial number",
@@ -268,7 +268,8 @@ def fleet_report(fleet: "Fleet") -> Iterator[Block]:
 def closing(fleet: "Fleet") -> Iterator[Block]:
     """Yield how arms were identified, and the files that were not used."""
     sources = {m.arm_source for m in fleet.members}
-    yield f"Which arm a campaign is of: by {'; '.join(KNOWN[k] for k in KNOWN if k in sources)}."
+    by = "; ".join(words for source, words in ARM_SOURCES.items() if source in sources)
+    yield f"Arms are identified by {by}."
     if fleet.failures:
         yield from ("", heading(f"Not used: {len(fleet.failures)}"))
         yield from (f"  {f.name}: {f.reason}" for f in fleet.failures)

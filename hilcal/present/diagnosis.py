@@ -19,7 +19,7 @@ from hilcal.identification.fit import Fit
 from hilcal.numbers import length, percent
 from hilcal.present.document import Block, Table, Tone, Words, heading, note, table
 from hilcal.present.fit import (
-    CERTAIN,
+    MAX_SHOWN_P,
     dependence_sentence,
     holdout_sentence,
     model_name,
@@ -28,13 +28,13 @@ from hilcal.present.fit import (
 from hilcal.present.verdict import headline, implausible, message, unconfirmed
 from hilcal.types import Floats
 
-SUSPECTS = 6
-NEAR = 0.99  # least component of a direction that is named after its axis; a choice
+MOST_SUSPECTS = 6
+ALONG = 0.99  # least component of a direction that is named after its axis; a choice
 BARS = "▁▂▃▄▅▆▇█"
-CURVES = 2
-COMPARED = 24  # most parameters that are compared with the true ones
-FEW, LEAST_BINS = 3, 3  # most effects that a law is said to resemble; least bins of a curve
-RARE = 0.01  # probability below which only "< 1 %" is written
+MOST_CURVES = 2
+MOST_COMPARED = 24  # most parameters that are compared with the true ones
+MOST_RESEMBLING, LEAST_BINS = 3, 3  # listed effects that a law resembles; bins of a curve
+MIN_SHOWN = 0.01  # probability below which only "< 1 %" is written
 NOT_TRIED = "could not be tried in the exact model"
 RUN_EXPLANATION = f"""\
 The following lines are those of a real run: the motions of the arm, and each reading with its pose,
@@ -50,7 +50,7 @@ def verdict_line(d: Diagnosis) -> Words:
     return Words(f"Verdict: {headline(d)}.\n{message(d)}", tone, headline(d))
 
 
-def suspects_table(d: Diagnosis, most: int = SUSPECTS) -> Table:
+def suspects_table(d: Diagnosis, most: int = MOST_SUSPECTS) -> Table:
     """Return the table of the most significant suspects."""
     heads = ("missing effect?", "explains", "on poses left out", "p-value", "inseparable from")
     out = table(*heads, left=(0, 4))
@@ -62,8 +62,8 @@ def suspects_table(d: Diagnosis, most: int = SUSPECTS) -> Table:
 
 
 def shown_suspects(d: Diagnosis) -> list[Suspect]:
-    """Return the suspects that pass the test or have a p-value below `CERTAIN`."""
-    return [s for s in d.suspects if s.passes or s.score.p_value < CERTAIN]
+    """Return the suspects that pass the test or have a p-value below `MAX_SHOWN_P`."""
+    return [s for s in d.suspects if s.passes or s.score.p_value < MAX_SHOWN_P]
 
 
 def addition_lines(s: Suspect) -> Iterator[str]:
@@ -170,7 +170,7 @@ def detectable_sizes(d: Diagnosis) -> Iterator[Block]:
 def doubtful_lines(d: Diagnosis) -> Iterator[str]:
     """Yield suspects with an implausible size, or with less gain than predicted."""
     for s in d.suspects:
-        if not s.plausible and s.score.p_value < CERTAIN:
+        if not s.plausible and s.score.p_value < MAX_SHOWN_P:
             yield f"{s.effect} is implausible: it {implausible(s)}."
         elif not s.keeps:
             yield f"{s.effect} is not named: {unconfirmed(s)}."
@@ -186,7 +186,7 @@ def redundant_line(d: Diagnosis) -> Iterator[str]:
         )
 
 
-def curves(dependences: Sequence[Dependence], most: int = CURVES) -> Iterator[Block]:
+def curves(dependences: Sequence[Dependence], most: int = MOST_CURVES) -> Iterator[Block]:
     """Yield the curve of each variable that explains at least `LEAST_SHARE` of the misfit."""
     shown = [d for d in dependences if d.share >= LEAST_SHARE][:most]
     for d in shown:
@@ -206,7 +206,7 @@ def erring_quantity(d: Dependence) -> str:
     if d.y_unit == "rad":
         return d.moves
     main = int(np.argmax(np.abs(d.direction)))
-    if d.direction[main] > NEAR:
+    if d.direction[main] > ALONG:
         return f"the {d.moves} along base {'xyz'[main]}"
     along = ", ".join(f"{v:.2f}" for v in d.direction)
     return f"the {d.moves} along ({along}) in base axes"
@@ -269,14 +269,14 @@ def true_and_fitted(fit: Fit, truth: Mapping[str, float]) -> list[TrueAndFitted]
 def truth_table(rows: Sequence[TrueAndFitted]) -> Iterator[Block]:
     """Yield the table of estimated and true parameters."""
     out = table("parameter", "true", "fitted", "±", "unit", "off by", left=(0, 4))
-    for r in rows[:COMPARED]:
+    for r in rows[:MOST_COMPARED]:
         unit, factor = numbers.unit_for(r.unit, [r.true, r.value])
         value, spread, true = numbers.with_std(*(factor * v for v in (r.value, r.std, r.true)))
         off = f"{abs(r.value - r.true) / r.std:.1f} ±" if r.std > 0 else ""
         out.add(r.name, true, value, spread, unit, off)
     yield out
-    if len(rows) > COMPARED:
-        yield f"... and {len(rows) - COMPARED} more"
+    if len(rows) > MOST_COMPARED:
+        yield f"... and {len(rows) - MOST_COMPARED} more"
     yield note("±: standard uncertainty; off by: the error in units of it.\n")
 
 
@@ -304,7 +304,8 @@ def discovery_report(d: Discovery) -> Iterator[Block]:
     rows = table("law", "probability", "complexity", "on poses left out", "")
     for s in d.structures:
         remark = ", ".join(filter(None, (s.law, "best of its size" if s in best else "")))
-        likely = percent(s.probability) if s.probability >= RARE else f"< {100 * RARE:g} %"
+        p = s.probability
+        likely = percent(p) if p >= MIN_SHOWN else f"< {100 * MIN_SHOWN:g} %"
         rows.add(s.form.text(), likely, str(s.form.complexity), percent(s.holdout_share), remark)
     yield from ("", rows)
     moved, std = map(length, d.average_m())
@@ -367,7 +368,7 @@ def _law(law: Law, d: Discovery, first: bool) -> Iterator[Block]:
     for a in law.selection_frequencies:
         causes = f" by {', '.join(a.variables)}" if a.variables else ""
         yield f"    {a.acts_on}{causes}: {percent(a.share)}"
-    if near := [f"{r.effect} (cosine {r.cosine:.2f})" for r in law.resembles[:FEW]]:
+    if near := [f"{r.effect} (cosine {r.cosine:.2f})" for r in law.resembles[:MOST_RESEMBLING]]:
         yield f"  resembles    {', '.join(near)}"
     ranges = [
         f"{symbol} {numbers.digits(low)} to {numbers.digits(high)}{'' if u == '1' else f' {u}'}"

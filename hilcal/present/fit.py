@@ -30,9 +30,9 @@ from hilcal.readings.whitening import Scaling
 from hilcal.stream import StreamFit
 from hilcal.types import Ints
 
-ALL_ROWS, SCREEN = 60, 6  # parameters in detail, and on the first screen
+ALL_ROWS, SCREEN_ROWS = 60, 6  # parameters in detail, and on the first screen
 PARAMETER_COLUMNS = ("parameter", "value", "±", "unit", "meaning")
-STRONGEST, DIRECTIONS, GROSS, MOST_LISTED = 5, 8, 8, 6
+MOST_STRONGEST, MOST_DIRECTIONS, MOST_GROSS, MOST_POSES = 5, 8, 8, 6
 POSE = "pose"
 GROUPS: dict[Group, str] = {
     "joints": "{}",
@@ -42,7 +42,7 @@ GROUPS: dict[Group, str] = {
     "direction": "points {}",
 }
 """Groups of the table of variables in their order, with the format of a row's name."""
-CERTAIN = 0.005
+MAX_SHOWN_P = 0.005  # p-value below which a suspect that does not pass is shown, too
 CONFLICT_P = 1e-3  # Bonferroni-corrected p-value of a disagreement with the prior that is reported
 MOST_CONFLICTS = 5
 
@@ -64,7 +64,7 @@ def fit_report(fit: Fit, details: bool = True) -> Iterator[Block]:
     yield heading(f"Model: {model_name(fit.model.named)}")
     yield f"Fitted to {kind(fit)}; scaling {fit.scaling}."
     yield f"{before_and_after(fit)}\n"
-    yield from parameters(fit, ALL_ROWS if details else SCREEN)
+    yield from parameters(fit, ALL_ROWS if details else SCREEN_ROWS)
     yield from (errors(fit), "")
     if details:
         yield from remarks(fit)
@@ -89,7 +89,7 @@ def gross_error_lines(fit: Fit, details: bool) -> Iterator[str]:
     )
     yield f"{total} (pose/load):" if details else f"{total}; --details lists them."
     if details:
-        yield from _listed([f"  {g.pose}/{g.load}: {g.reason}" for g in gross], GROSS)
+        yield from _listed([f"  {g.pose}/{g.load}: {g.reason}" for g in gross], MOST_GROSS)
     of_load = fit.readings.load
     lost = np.setdiff1d(of_load, of_load[~fit.outlier])
     if len(lost):
@@ -155,7 +155,7 @@ def _family(fit: Fit, effect: Effect, index: Ints) -> str:
     rms = ", ".join(f"{j} {numbers.digits(factor * v**0.5)}" for j, v in joints.items())
     named = ", ".join(
         f"{effect.parameters[k].name} {numbers.digits(factor * float(theta[k]))}"
-        for k in np.argsort(-np.abs(theta), kind="stable")[:STRONGEST]
+        for k in np.argsort(-np.abs(theta), kind="stable")[:MOST_STRONGEST]
     )
     return (
         f"{effect.name}: {int(live.sum())} of {len(index)} parameters kept"
@@ -210,7 +210,7 @@ def remarks(fit: Fit) -> Iterator[Block]:
     if null := fit.uncertainty.null:
         noun = "combinations" if len(null) > 1 else "combination"
         yield f"These readings do not determine {len(null)} {noun} of parameters:"
-        yield from _listed([f"  {d}" for d in null], DIRECTIONS)
+        yield from _listed([f"  {d}" for d in null], MOST_DIRECTIONS)
     yield from fitted_lines(fit)
     yield from (f"{remark[0].upper()}{remark[1:]}." for remark in notes(fit))
     yield from gross_error_lines(fit, details=True)
@@ -312,7 +312,7 @@ def where_table(places: Sequence[MisfitShare]) -> Iterator[Block]:
 
 
 @dataclass(frozen=True, slots=True)
-class Worst:
+class WorstReading:
     """The worst measurement of a pose: its 3-D error in m, and all its elements together in σ."""
 
     pose: str
@@ -321,18 +321,18 @@ class Worst:
     sigma: float
 
 
-def worst_poses(e: FullPrediction) -> list[Worst]:
+def worst_poses(e: FullPrediction) -> list[WorstReading]:
     """Return the worst measurement of each of the worst poses, in units of the noise."""
-    distance, out = np.sqrt(e.mahalanobis2), dict[str, Worst]()
+    distance, out = np.sqrt(e.mahalanobis2), dict[str, WorstReading]()
     for k in np.argsort(-distance, kind="stable").tolist():
         (pose, load), target = e.name(k), e.target_name(k)
-        if pose not in out and len(out) < MOST_LISTED:
+        if pose not in out and len(out) < MOST_POSES:
             name, error = f"{pose} {target or ''}".rstrip(), float(np.linalg.norm(e.raw[k, :3]))
-            out[pose] = Worst(name, load, error, float(distance[k]))
+            out[pose] = WorstReading(name, load, error, float(distance[k]))
     return list(out.values())
 
 
-def worst_table(worst: Sequence[Worst], left_out: bool = False) -> Table:
+def worst_table(worst: Sequence[WorstReading], left_out: bool = False) -> Table:
     """Return the table of the worst poses, as fitted or as predicted when left out."""
     title = "worst poses, each left out" if left_out else "worst poses"
     rows = ((w.pose, w.load, length(w.error_m), f"{w.sigma:.1f}") for w in worst)

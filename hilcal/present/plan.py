@@ -20,11 +20,11 @@ CRITERIA = {
     "I": "mean variance of the predicted position",
     "separate": "power to separate the leading suspects (T-optimality)",
 }
-BAR = 30
-SCREEN = 4  # remarks on the first screen; the most important come first
+BAR_WIDTH = 30
+MOST_REMARKS = 4  # remarks on the first screen; the most important come first
 NAMED_FROM = "a diagnosis names effects about ten times as large"
 """6 to 16 times in one simulated campaign of 20 poses: tests at the level of a whole catalogue."""
-UNCERTAIN = 1e-3  # least certified efficiency that is reported: the last printed digit
+MIN_EFFICIENCY = 1e-3  # least certified efficiency that is reported: the last printed digit
 SIMILAR_RATIO = 1.1
 """Poses are enough if their predicted uncertainty is at most this multiple of that at the end of
 the curve. A choice."""
@@ -52,8 +52,8 @@ def plan_screen(s: PlanSummary) -> Iterator[Block]:
             f"these readings; {NAMED_FROM}."
         )
     yield from _undetectable(s)
-    yield from (f"note: {remark}" for remark in s.remarks[:SCREEN])
-    unlisted = len(s.remarks) - SCREEN
+    yield from (f"note: {remark}" for remark in s.remarks[:MOST_REMARKS])
+    unlisted = len(s.remarks) - MOST_REMARKS
     details = f"{unlisted} more notes, every parameter" if unlisted > 0 else "every parameter"
     yield f"--details: {details}, criteria, numbers of poses, effects outside the model."
 
@@ -104,7 +104,7 @@ def plan_report(s: PlanSummary) -> Iterator[Block]:
 
 def efficiency_sentence(efficiency: float) -> str:
     """Return a sentence on a certified efficiency, rounded down because it is a lower bound."""
-    if efficiency < UNCERTAIN:
+    if efficiency < MIN_EFFICIENCY:
         return "of the plan: not certified, as the bound of the best plan did not converge"
     return f"of the plan: at least {_percent(efficiency)} (certified lower bound); not accuracy"
 
@@ -215,7 +215,7 @@ def _curve(s: PlanSummary) -> Table:
     out = table("poses", "predicted ±", "", left=(2,))
     top = max(point.position_std_m for point in s.curve)
     for point in s.curve:
-        size = max(1, round(BAR * point.position_std_m / top)) if top > 0 else 1
+        size = max(1, round(BAR_WIDTH * point.position_std_m / top)) if top > 0 else 1
         this = point.poses == s.poses
         bar, std = "█" * size + "  this plan" * this, length(point.position_std_m)
         out.add(str(point.poses), std, bar, tone="strong" if this else "text")
