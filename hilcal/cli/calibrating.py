@@ -105,8 +105,8 @@ def calibrate(
     effects_from: list[Path] | None = None,
 ) -> None:  # fmt: skip
     """Plan, measure, fit, measure what is in doubt, validate, correct, and measure the gain."""
-    numbers = Cell.load(cell)
-    config = numbers.configured()
+    robot_cell = Cell.load(cell)
+    config = robot_cell.configured()
     settings = options.settings()
     if config.limits.accuracy_m is not None and not resume:
         settings.setdefault("limit_m", config.limits.accuracy_m)
@@ -115,7 +115,7 @@ def calibrate(
     flags += [] if options.prior is None else ["--prior", str(options.prior)]
     flags += [word for path in effects_from or () for word in ("--effects-from", str(path))]
     go_on = _Continuation(t, shlex.join([*line, "--resume", *flags]), shlex.join([*line, *flags]))
-    p = _procedure(cell, output, resume, rehearse, numbers, catalogue, settings, go_on)
+    p = _procedure(cell, output, resume, rehearse, robot_cell, catalogue, settings, go_on)
     prior = p.settings.prior
     if prior is not None:
         if options.prior is None and Path(prior).parent != output.absolute().parent:

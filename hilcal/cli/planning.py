@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from hilcal import numbers as words_of
+from hilcal import numbers
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
 from hilcal.cli import fitting
@@ -89,7 +89,7 @@ def plan(
     if prior.prior is not None and after is not None:
         raise InputError("--after has the prior of its revision; leave out --prior")
     carried = prior.load(catalogue)
-    numbers = Cell.load(cell)
+    robot_cell = Cell.load(cell)
     unloaded: Literal["around", "first"] = "first" if unloaded_first else "around"
     if criterion is not None and criterion_name(criterion) not in CRITERIA:
         raise InputError(f"--criterion {criterion!r} is unknown; valid: {', '.join(CRITERIA)}")
@@ -101,15 +101,15 @@ def plan(
                 fitted, reference = fitting.fit_of(t, run, say, revision)[1], reference_in(run.file)
         rng = np.random.default_rng(check_seed(seed))
         chosen = plan_readings(
-            numbers, request, rng, fitted, say, catalogue, carried, reference=reference
+            robot_cell, request, rng, fitted, say, catalogue, carried, reference=reference
         )
         plan_ = replace(chosen.ordered.plan, about=about(chosen))
         summary = summarise(
-            chosen, numbers.configured(), rng, say, compare=not quick, curve=not quick
+            chosen, robot_cell.configured(), rng, say, compare=not quick, curve=not quick
         )
         say("checking every motion in a dry run")
-        checked_plan = checked(numbers, plan_, summary)
-    write(t, numbers, checked_plan, output, csv, record)
+        checked_plan = checked(robot_cell, plan_, summary)
+    write(t, robot_cell, checked_plan, output, csv, record)
     t.show(plan_report(checked_plan.summary) if details else plan_screen(checked_plan.summary))
     t.show(f"The plan is in {output}; you may edit the file. Every limit was checked.")
     t.document({**checked_plan.to_dict(), "plan": str(output)})
@@ -131,16 +131,16 @@ def check(
         raise InputError(f"--save-calibration {save_calibration}; valid: a name that ends in .toml")
     if save_calibration is not None and save_calibration.exists():
         raise InputError(f"{save_calibration}: the file exists; choose another name")
-    numbers = Cell.load(cell)
+    robot_cell = Cell.load(cell)
     try:
-        check_effects(numbers, catalogue)
+        check_effects(robot_cell, catalogue)
     except InputError as error:
         raise InputError(f"{cell.name}: {error}") from None
     dry = None
     if plan is not None:
-        dry = dry_checked(t, numbers, load_plan(plan))
+        dry = dry_checked(t, robot_cell, load_plan(plan))
     try:
-        answers = with_kinematics(answers_of(t, numbers.configured()), numbers)
+        answers = with_kinematics(answers_of(t, robot_cell.configured()), robot_cell)
     except InputError:  # the cell names no device: report the plan alone
         if dry is None or not dry.problems:
             raise
@@ -245,10 +245,10 @@ def next_(
         doubt = _without_suspects(t, o, revision, _named(suspects, catalogue), say, carried)
         compare = (details or t.json) and not quick
         planned = next_plan(o, doubt, poses, rng, say, cell=changed, compare=compare)
-        numbers = o.cell if changed is None else changed
+        robot_cell = o.cell if changed is None else changed
     chosen, checked_plan, effects = planned.separating, planned.checked, doubt.suspects
-    write(t, numbers, checked_plan, output, csv, record, chosen.powers)
-    t.show(f"In doubt: {words_of.names(effects, 'or')}.\n")
+    write(t, robot_cell, checked_plan, output, csv, record, chosen.powers)
+    t.show(f"In doubt: {numbers.names(effects, 'or')}.\n")
     report = next_report if doubt.pose_alone is None else poses_report
     t.show(report(chosen, checked_plan.summary.poses, checked_plan.summary.readings, details))
     t.show(plan_report(checked_plan.summary) if details else brief_plan(checked_plan.summary))

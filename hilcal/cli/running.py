@@ -95,9 +95,9 @@ def run(
     effects_from: list[Path] | None = None,
 ) -> None:  # fmt: skip
     """Measure a campaign: every step of the plan, each reading stored before the next motion."""
-    numbers = Cell.load(cell)
-    config = numbers.configured()
-    goal = None if until is None else GoalRule(until, numbers, catalogue)
+    robot_cell = Cell.load(cell)
+    config = robot_cell.configured()
+    goal = None if until is None else GoalRule(until, robot_cell, catalogue)
     base_dir = cell.absolute().parent
     if skip and not resume:
         raise InputError("--skip omits missing poses of a campaign; give it with --resume")
@@ -127,7 +127,7 @@ def run(
             if plan is not None:
                 refuse_fitting(campaign)  # a further plan would change a frozen test
                 further = log.with_new_names(load_plan(plan))
-                refuse(dry_checked(t, numbers, further), str(plan))
+                refuse(dry_checked(t, robot_cell, further), str(plan))
                 if missing := len(log.plan.without(log.done()).steps):
                     t.notice(
                         f"note: {missing} readings of the previous plan are missing; they will not "
@@ -140,16 +140,16 @@ def run(
                     "choose another name"
                 )
             campaign_plan = (
-                load_plan(plan) if plan else _default_plan(t, cell, numbers, catalogue, yes)
+                load_plan(plan) if plan else _default_plan(t, cell, robot_cell, catalogue, yes)
             )
-            refuse(dry_checked(t, numbers, campaign_plan), str(plan or "the plan"))
+            refuse(dry_checked(t, robot_cell, campaign_plan), str(plan or "the plan"))
         if rehearse:
             with working(t.progress) as say:
                 say("starting the simulated devices")
                 choice, seed = config.simulation.hide or NO_EFFECT, config.simulation.seed
                 secret = case_of_plan(config, campaign_plan, choice, seed, catalogue, base_dir)
                 config = stack.enter_context(simulated_cell(secret, seed, base_dir)).config
-                numbers = numbers.with_config(config)
+                robot_cell = robot_cell.with_config(config)
         else:
             connect.drivers_of(config)  # before a campaign is begun
         if skip:
@@ -161,14 +161,14 @@ def run(
             campaign = stack.enter_context(
                 create_run(output, config, base_dir, campaign_plan, source=source)
             )
-        planned = len(RunLog(campaign).plan.steps) * len(numbers.all_targets)
+        planned = len(RunLog(campaign).plan.steps) * len(robot_cell.all_targets)
         options = ["--rehearse"] * rehearse + ["--view"] * view
         options += [] if until is None else ["--until", until]
         options += [word for path in effects_from or () for word in ("--effects-from", str(path))]
         line = shlex.join(("hilcal", "run", str(cell), "-o", str(output), "--resume", *options))
         live = stack.enter_context(live_viewer(t, view, output))
         with _resumable(campaign, planned, line):
-            measured = measure(t, numbers, campaign, goal, viewer=live)
+            measured = measure(t, robot_cell, campaign, goal, viewer=live)
     document: dict[str, object] = {"campaign": str(output), "readings": measured}
     document["planned"] = planned
     if goal is not None:
@@ -525,14 +525,14 @@ def simulate(
 ) -> None:  # fmt: skip
     """Run the simulated devices of a cell until Ctrl-C; `check` and `run` connect to them."""
     t = terminal(False)
-    numbers = Cell.load(cell)
-    config = numbers.configured()
+    robot_cell = Cell.load(cell)
+    config = robot_cell.configured()
     number = check_seed(config.simulation.seed if seed is None else seed)
     if clock is not None:
         if not 1.0 <= clock <= MAX_CLOCK:
             raise InputError(f"--clock {clock:g}; valid: a number from 1 to {MAX_CLOCK:g}")
         config = config.with_keys("simulation", clock=clock)
-        numbers = numbers.with_config(config)
+        robot_cell = robot_cell.with_config(config)
     base_dir, target = cell.absolute().parent, output / "cell.toml"
     spare_other(target, "a cell of hilcal simulate", SIMULATED)
     choice = hide or config.simulation.hide or NO_EFFECT
@@ -542,7 +542,7 @@ def simulate(
     with working(t.progress) as say:
         if plan is None:
             say("planning a campaign, from which the size of the effect follows")
-            campaign_plan = make_plan(numbers, POSES, number, catalogue, say)
+            campaign_plan = make_plan(robot_cell, POSES, number, catalogue, say)
         else:
             campaign_plan = load_plan(plan)
         say("preparing the simulated cell")
@@ -628,11 +628,11 @@ def _measure_without_loads(
     config = cell.configured()
     bare = config.with_keys("planning", readings="absolute")
     bare = bare.model_copy(update={"loads": (), "force_sensor": None})
-    numbers = cell_from_config(bare, cell.base_dir)
+    robot_cell = cell_from_config(bare, cell.base_dir)
     if plan is None:
         with working(t.progress) as say:
-            plan = make_plan(numbers, FACTORY_POSES, config.simulation.seed, catalogue, say)
-        refuse(dry_checked(t, numbers, plan), "the plan")
+            plan = make_plan(robot_cell, FACTORY_POSES, config.simulation.seed, catalogue, say)
+        refuse(dry_checked(t, robot_cell, plan), "the plan")
     steps = len(plan.steps)
     if not yes:
         count = missing or steps
@@ -650,4 +650,4 @@ def _measure_without_loads(
     ) as campaign:
         check_same_cell(campaign, bare, cell.base_dir)
         with _resumable(campaign, steps, line):
-            measure(t, numbers, campaign)
+            measure(t, robot_cell, campaign)

@@ -27,7 +27,7 @@ ARM_SOURCES = {
 KINDS = {"trait": ", a trait of the type", "defect": ", of single arms: a defect", "some": ""}
 
 
-def words_of(c: Candidate) -> str:
+def part_name(c: Candidate) -> str:
     """Return a name of the part that may have changed."""
     name = c.change.words or c.effect
     if c.joint:
@@ -117,11 +117,11 @@ def _changes(c: Comparison) -> Iterator[Block]:
     for change in changes.found:
         yield sentence(change)
         if change.same_as:
-            alternatives = numbers.names([words_of(o) for o in change.same_as], "or")
+            alternatives = numbers.names([part_name(o) for o in change.same_as], "or")
             yield f"  These readings do not distinguish it from {alternatives}."
     yield from ("", _table(changes.found))
     candidates = (x.candidate for x in changes.found)
-    if setup := dict.fromkeys(words_of(x) for x in candidates if not x.of_arm):
+    if setup := dict.fromkeys(part_name(x) for x in candidates if not x.of_arm):
         yield f"Not of the arm: {numbers.names(list(setup))}."
     yield _remainder(c)
     tests = numbers.many_tests(changes.tested, LEVEL, "candidates")
@@ -131,7 +131,7 @@ def _changes(c: Comparison) -> Iterator[Block]:
 def sentence(change: Change) -> str:
     """Return a change in one sentence."""
     c, s = change.candidate, change.sizes[0]
-    name, why = words_of(c), c.change.cause
+    name, why = part_name(c), c.change.cause
     head = name[:1].upper() + name[1:]
     if len(change.sizes) > 1:
         return (

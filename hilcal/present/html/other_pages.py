@@ -59,7 +59,7 @@ def error_by_pose(c: Comparison) -> go.Figure:
 def changes_chart(c: Comparison) -> go.Figure:
     """Draw the rms displacement of the target by each change in the later readings."""
     moved = [1e6 * x.moved_m for x in c.changes.found]
-    names = [comparison.words_of(x.candidate) for x in c.changes.found]
+    names = [comparison.part_name(x.candidate) for x in c.changes.found]
     hover = [f"{n}: {m:.0f} µm rms" for n, m in zip(names, moved, strict=True)]
     says = f"{names[0]} moves the target most: {moved[0]:.0f} µm rms." if names else "No change."
     return charts.bars(names, moved, hover, says, "moves the target by, rms [µm]")
