@@ -200,7 +200,7 @@ def test_view_serves_until_it_is_told_to_stop(campaign, number, capsys, free_por
     ok(capsys, "identify", campaign)
     with start("view", campaign, "--port", str(free_port)) as process:
         try:
-            assert process.stdout.readline().startswith("Open the viewer with")
+            assert process.stdout.readline().startswith("To open the viewer")
             assert "rerun+http://127.0.0.1:" in process.stdout.readline()
             process.send_signal(number)
             out, err = process.communicate(timeout=60)

@@ -75,13 +75,13 @@ def test_the_demo_in_words(tmp_path, capsys, monkeypatch):
         "noise alone",
         "poses",
         "adequate",
-        "Hidden was hysteresis",
+        "The hidden effect was hysteresis",
         "It was found and added",
         "measured by the tracker at 10 points",
     ):
         assert part in " ".join(words.split())
     assert max(map(len, words.splitlines())) <= 100
-    assert f"Go on with: hilcal view {path}" in " ".join(words.split())
+    assert f"To look at it: hilcal view {path}" in " ".join(words.split())
     ok(capsys, "view", path, "--record", recording.with_name("again.rrd"))
     assert f"hilcal report {path}" in words
     ok(capsys, "report", path, "-o", tmp_path / "demo.html")

@@ -45,8 +45,8 @@ def test_without_a_revision(run, tmp_path, capsys):
         ("identify", later, "--prior", run),
     ):
         assert "hilcal identify" in refused(capsys, 2, *arguments)
-    assert "hilcal identify or refine makes one" in ok(capsys, "info", run).out
-    assert "hilcal identify keeps it" in " ".join(ok(capsys, "diagnose", run).err.split())
+    assert "hilcal identify and refine make one" in ok(capsys, "info", run).out
+    assert "hilcal identify stores it" in " ".join(ok(capsys, "diagnose", run).err.split())
     assert "hilcal refine makes a model" in " ".join(ok(capsys, "compare", run, later).err.split())
     ok(capsys, "identify", run)
     for arguments in (("accept", run), ("export", run, "--parameters", out), ("diagnose", run)):

@@ -278,7 +278,7 @@ def test_run_until(site, capsys, monkeypatch):
     said = f'goal "j2 std < 0.01 %" is not met after all {total} readings: standard uncertainty'
     assert said in line[0]
     assert " % of its value, " in line[0]
-    assert "times what is asked for" in line[0]
+    assert "times the goal" in line[0]
     monkeypatch.setattr(running.connect, "connect", None)  # the devices may be off
     assert "goal" not in ok(capsys, *site.command("--resume", "--json")).document
     assert run(capsys, *site.command("--resume", "--until", "j2 std < 0.01 %")).code == 4

@@ -187,7 +187,7 @@ main(["workbench", {str(run)!r}, "--no-browser", "--port", "0", "--json"])
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120
     )
     assert done.returncode == 0
-    assert "Nobody opened it" in done.stderr
+    assert "The page was not opened" in done.stderr
     assert "token=" in json.loads(done.stdout)["url"]
 
 

@@ -149,7 +149,7 @@ def test_a_pose_out_of_the_trackers_sight_is_left_out(cell, tmp_path):
         cell.ask("arm", "jog", q=short.plan.joints("reference").tolist())
 
     check_ends("line of sight", 3)
-    check_ends("drive it by hand to where the tracker sees it", 3)
+    check_ends("move the arm by hand until the tracker sees it", 3)
     jog_home()
     check_ends("--skip p2 goes on without that pose", 3)
     jog_home()
