@@ -397,7 +397,7 @@ def _beyond(v: validation.ExceededRange) -> str:
 def shares_report(test: validation.Acceptance) -> Iterator[Block]:
     """Yield the errors by load, the worst poses, and the verdict on a limit."""
     yield from loads_report(test)
-    yield from (worst_table(test), "")
+    yield from (worst_poses_table(test), "")
     if test.limit_m is None:
         return
     size, a, worst = length(test.limit_m), test.everything, test.poses[0]
@@ -418,7 +418,7 @@ def loads_report(test: validation.Acceptance) -> Iterator[Block]:
     yield note(f"in 95 %: share of the readings inside their stated {region}.\n")
 
 
-def worst_table(test: validation.Acceptance) -> Table:
+def worst_poses_table(test: validation.Acceptance) -> Table:
     """Return the errors of the worst poses."""
     return _shares_table("worst poses", "load", test.poses[:MOST_POSES], test.limit_m)
 

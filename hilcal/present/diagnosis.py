@@ -9,6 +9,7 @@ from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE, Suspect
 from hilcal.diagnosis.live_model import FEWEST_POSES
+from hilcal.diagnosis.noise import PureError
 from hilcal.diagnosis.recorded import ROW_ORDER
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.stepwise import predicts_better
@@ -114,8 +115,7 @@ def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
             "--effects-from FILE.py adds it to the catalogue."
         )
     if (e := d.pure_error) is not None:
-        scatter = f"Repeated readings scatter {e.factor**0.5:.2f} times as much as stated"
-        yield f"{scatter} ({e.dof:.0f} degrees of freedom)."
+        yield repeats_sentence(e)
         if (w := e.where) is not None:
             low, high = (v**0.5 for v in w.interval)
             yield (
@@ -124,6 +124,15 @@ def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
             )
     yield from redundant_line(d)
     yield from detectable_sizes(d)
+
+
+def repeats_sentence(e: PureError) -> str:
+    """Return a sentence on the scatter of repeated readings."""
+    low, high = e.interval
+    return (
+        f"Repeated readings scatter {e.factor**0.5:.2f} times as much as stated (variance factor "
+        f"{e.factor:.2f}, 95 % interval {low:.2f} to {high:.2f}, {e.dof:.0f} degrees of freedom)."
+    )
 
 
 def added_effect_sentence(before: Fit, after: Fit, effect: str) -> str:

@@ -25,13 +25,14 @@ from hilcal.present.calibration import (
     fit_and_test_lines,
     loads_report,
     validation_report,
-    worst_table,
+    worst_poses_table,
 )
 from hilcal.present.campaign import info_report, utc
 from hilcal.present.diagnosis import (
     detectable_sizes,
     doubtful_lines,
     redundant_line,
+    repeats_sentence,
 )
 from hilcal.present.document import (
     Block,
@@ -442,12 +443,7 @@ def _where(m: ReportContent) -> PageSection:
 def _noise(m: ReportContent) -> str:
     e = None if m.diagnosis is None else m.diagnosis.pure_error
     if e is not None:
-        low, high = e.interval
-        return (
-            f"Repeated readings scatter {e.factor**0.5:.2f} times as much as stated (variance "
-            f"factor {e.factor:.2f}, 95 % interval {low:.2f} to {high:.2f}, {e.dof:.0f} degrees of "
-            "freedom)."
-        )
+        return repeats_sentence(e)
     fitted = m.fit.readings[~m.fit.outlier]
     repeats = len(fitted) - len(np.unique(repeat_classes(fitted)))
     if not repeats:
@@ -535,7 +531,7 @@ def _appendix(m: ReportContent) -> Iterator[PageSection]:
         for j in range(m.story.arm.n)
     ]
     if m.test is not None:
-        joints.append(replace(worst_table(m.test.validation.shares), caption="Worst poses"))
+        joints.append(replace(worst_poses_table(m.test.validation.shares), caption="Worst poses"))
     explained = (
         *captioned(fit_words.parameters(m.fit), "Parameters with standard uncertainties"),
         *captioned(fit_words.remarks(m.fit)),
