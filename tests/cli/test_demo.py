@@ -119,7 +119,7 @@ def test_an_effect_of_ones_own_is_hidden_and_found(tmp_path, capsys):
     assert d["truth"]["mine.a"] == parameter["true"] != 0.0
     assert abs(parameter["value"] - parameter["true"]) < 4 * parameter["std"]
     words = " ".join(result.err.split())
-    assert "moved by the law of mine itself" in words
+    assert "followed the law of mine as the model has it" in words
     assert f"hilcal view {path} --effects-from {file}" in words
 
 
@@ -134,7 +134,7 @@ def test_an_invented_law_is_discovered(tmp_path, capsys):
     assert search["laws"][0]["formula"] == "dq_3 = a·cos(q_5)·τ_3"
     law = tmp_path / "law_of_demo.py"
     assert search["written"] == str(law)
-    assert "no effect of the catalogue describes" in words
+    assert "a law that is not in the catalogue" in words
     assert f"hilcal view {path} --effects-from {law}" in words
     stored = ok(capsys, "diagnose", path, "--effects-from", law, "--json")
     assert stored.document["verdict"] == "adequate"
