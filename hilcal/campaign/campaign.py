@@ -18,7 +18,7 @@ from hilcal.diagnosis.background_evidence import background_evidence
 from hilcal.diagnosis.diagnosis import Diagnosis, History
 from hilcal.diagnosis.evidence import Evidence
 from hilcal.diagnosis.serial_noise import with_serial_noise
-from hilcal.diagnosis.verdict import diagnose, judge_naming
+from hilcal.diagnosis.verdict import diagnose, judge_naming, with_insufficiency
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError, expect
 from hilcal.identification.baseline import baseline
@@ -508,7 +508,10 @@ class Campaign(Brief):
         while len(judged) < len(fits):
             group = _named_from(fits[len(judged) :])
             say(f"diagnosing revision {numbers[id(group[-1])]}")
-            judged += _judged(group, lambda f: self.history(numbers[id(f)]), say)
+            is_last = len(judged) + len(group) == len(fits)
+            judged += _judged(group, lambda f: self.history(numbers[id(f)]), say, is_last)
+        if (end := judged[-1]) is not None:
+            judged = [d and with_insufficiency(d, end) for d in judged]
         return [
             Chapter(r.number, r.added, f, d, r.removed)
             for r, f, d in zip(records, fits, judged, strict=True)
@@ -516,13 +519,16 @@ class Campaign(Brief):
 
 
 def _judged(
-    fits: Sequence[Fit], history: Callable[[Fit], History], say: Say
+    fits: Sequence[Fit], history: Callable[[Fit], History], say: Say, whole_catalogue: bool
 ) -> Sequence[Diagnosis | None]:
-    """Diagnose a fit, or fits that name more and more effects of one background."""
+    """Diagnose a fit, or fits that name more and more effects of one background.
+
+    For `whole_catalogue` see `judge`.
+    """
     if fits[0].scaling != "gc":
         return [None]
     if len(fits) == 1:
-        return [diagnose(fits[0], history(fits[0]), say)]
+        return [diagnose(fits[0], history(fits[0]), say, whole_catalogue)]
     tested = background_evidence(fits[0])
     return judge_naming(
         fits, tested, history, lambda remaining: Evidence(fits[-1], say=say, background=remaining)

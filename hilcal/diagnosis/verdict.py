@@ -105,14 +105,19 @@ readings; a choice: many large errors predict some of each other by chance."""
 
 
 def diagnose(
-    fit: Fit, history: History = NO_HISTORY, say: Callable[[str], None] = lambda text: None
+    fit: Fit,
+    history: History = NO_HISTORY,
+    say: Callable[[str], None] = lambda text: None,
+    whole_catalogue: bool = True,
 ) -> Diagnosis:
     """Judge a fit, reached by the changes of `history`; `say` takes progress, one line each.
+
+    For `whole_catalogue` see `judge`.
 
     Raises:
         InputError: a fit whose residual is not whitened.
     """
-    return with_order_step(judge(Evidence(fit, say=say), history))
+    return with_order_step(judge(Evidence(fit, say=say), history, whole_catalogue))
 
 
 def with_order_step(d: Diagnosis) -> Diagnosis:
@@ -136,18 +141,25 @@ def with_order_step(d: Diagnosis) -> Diagnosis:
 def with_insufficiency(d: Diagnosis, last: Diagnosis) -> Diagnosis:
     """Return the diagnosis of an earlier step where the last one leaves an unknown effect.
 
-    The effects added since then are the catalogue's best, so what they leave, the whole catalogue
-    left at the earlier step; unless it is noise, or negligible beside the misfit then.
+    The effects added since then are the catalogue's best, so what they leave, and all further
+    effects if the last step tested these, the whole catalogue left at the earlier step; unless it
+    is noise, or negligible beside the misfit then.
     """
-    if last.reason != "no_suspect" or last.noise is None or d.lead is None or d.insufficiency:
-        return d
-    misfit, remainder = d.fit.chi2 - d.fit.dof, last.fit.chi2 - last.fit.dof
-    if not 0.0 < LEAST_REMAINDER * misfit <= remainder:
+    if d.lead is None or d.insufficiency is not None:
         return d
     added = tuple(n for n in last.fit.model.named if n not in d.fit.model.named)
-    share = remainder / misfit
-    insufficiency = Insufficiency(
-        added, len(added), share, last.fit.variance_factor, last.dependences, last.noise
+    misfit, remainder = d.fit.chi2 - d.fit.dof, last.fit.chi2 - last.fit.dof
+    rest = last.insufficiency
+    if rest is None and last.reason == "no_suspect" and last.noise is not None:
+        factor = last.fit.variance_factor
+        rest = Insufficiency((), 0, 1.0, factor, last.dependences, last.noise)
+    if rest is None or not 0.0 < LEAST_REMAINDER * misfit <= rest.share * remainder:
+        return d
+    insufficiency = replace(
+        rest,
+        effects=(*added, *rest.effects),
+        refitted=len(added) + rest.refitted,
+        share=rest.share * remainder / misfit,
     )
     return replace(
         d,
