@@ -20,6 +20,12 @@ from hilcal.diagnosis.evidence import Alternative, Evidence
 from hilcal.diagnosis.residual_regression import Regressions
 from hilcal.diagnosis.serial_noise import serial_noise, with_serial_noise
 from hilcal.diagnosis.stepwise import add, exchange, predicts_better, remove, trial
+from hilcal.diagnosis.unknown_law import (
+    REMAINDER,
+    has_remainder,
+    with_remainder,
+    without_remainder,
+)
 from hilcal.diagnosis.verdict import (
     NO_HISTORY,
     judge,
@@ -36,6 +42,7 @@ from hilcal.identification.background import (
 )
 from hilcal.identification.carried.drift import carried_effects
 from hilcal.identification.fit import Fit, fit, fit_again
+from hilcal.identification.linearisation import linearise
 from hilcal.identification.mixed_fit import MOST_NOISE_ROWS
 from hilcal.identification.noise.arm_scatter import with_arm_scatter, with_prior_scatter
 from hilcal.model.model import Model
@@ -274,7 +281,7 @@ class Path:
         while changed:
             self.extend()
             changed = self.reconsider()
-            changed = changed or self.add_background() or self.add_scatter()
+            changed = changed or self.add_background() or self.add_remainder() or self.add_scatter()
 
     def extend(self) -> None:
         """Add suspects while any lowers the error on poses left out."""
@@ -307,7 +314,7 @@ class Path:
         if last.fit.readings.arm_scatter is not None and not last.fit.model.background:
             return False
         proposed = self._laws.propose(last.fit, self._say)
-        if proposed is None or not predicts_better(last.fit, proposed[0]):
+        if proposed is None or not predicts_better(without_remainder(last.fit), proposed[0]):
             return False
         larger, law = proposed
         if not larger.model.background:
@@ -412,15 +419,36 @@ class Path:
         self._append_background(fitted, BACKGROUND)
         return True
 
+    def add_remainder(self) -> bool:
+        """Fit what follows joint angles beside named effects alone; whether the model has it now.
+
+        See `with_remainder`; a background has its own.
+        """
+        last = self.steps[-1]
+        tried = has_remainder(last.fit) or last.fit.model.background
+        if not self._background or tried or not self._room:
+            return False
+        if last.diagnosis.reason != "no_suspect":
+            return False
+        fitted = with_remainder(last.fit, self._regressions)
+        if fitted is None:
+            return False
+        self._say("what follows joint angles predicts better; diagnosing")
+        self._append_background(fitted, REMAINDER)
+        return True
+
     def _append_background(self, fitted: Fit, added: str) -> None:
         """Append a fit with a background, and the same fit with more and more effects named.
 
-        Those are named that the readings prove beside all others; none where smooth laws predict
-        what the background leaves on poses left out, as any may only resemble what is missing.
+        Where smooth laws predict what the background leaves on poses left out, it has a remainder
+        (`with_remainder`). Those effects are named that the readings prove beside all others; none
+        where laws predict what the remainder leaves, as any may only resemble what is missing.
         """
+        fitted = with_remainder(fitted, self._regressions) or fitted
         tested = background_evidence(fitted)
-        unknown = self._evidence_of(fitted, tested).regression.significant
-        names = () if unknown else proved(tested)[: MOST_REVISIONS - len(self.steps) - 1]
+        unknown = self._regressions.of(linearise(fitted)).significant
+        names = [] if unknown else [name for name in proved(tested) if name != REMAINDER]
+        names = names[: MOST_REVISIONS - len(self.steps) - 1]
         fits = [fitted]
         for name in names:
             model = fits[-1].model

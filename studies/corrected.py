@@ -177,7 +177,7 @@ def _calibrated(t: Terminal, run: Path, config: CellConfig, settings: Settings) 
             p = Procedure(run, cell, catalogue, settings)
         with ExitStack() as stack:
             try:
-                CalibrationOperator(t, p, stack, rehearse=True, yes=True).to_the_end()
+                CalibrationOperator(t, p, stack, rehearse=True, yes=True).run_steps()
             except DeviceError as error:
                 if not starts_left:
                     raise

@@ -8,8 +8,10 @@ from hilcal.campaign.revisions import carried_of, has_background, mode_of
 from hilcal.config.cell import Changes
 from hilcal.diagnosis.diagnosis import Diagnosis, History
 from hilcal.diagnosis.effect_ranking import Suspect, added_suspect
+from hilcal.diagnosis.residual_regression import Regressions
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.diagnosis.stepwise import add, remove
+from hilcal.diagnosis.unknown_law import with_remainder, without_remainder
 from hilcal.diagnosis.verdict import NO_HISTORY, diagnose
 from hilcal.effects.options import Options
 from hilcal.effects.written import write_effect
@@ -50,6 +52,8 @@ def add_effect(
 ) -> StoredChange:
     """Add an effect to a revision's model, and store the fit as a revision made from it.
 
+    A remainder may have taken up the effect: it is fitted anew to what the effect leaves.
+
     `number` is None where no revision exists; then `before` and `before_diagnosis` are stored, too,
     once the effect is fitted.
 
@@ -59,7 +63,8 @@ def add_effect(
     """
     named = write_effect(effect, options)
     say(f"adding {named}")
-    after = add(before, effect, options=options)
+    after = add(without_remainder(before), effect, options=options)
+    after = with_remainder(after, Regressions()) or after
     added = named if effect in before.model.names else effect
     return _stored(o, number, before, after, say, before_diagnosis, added=added)
 
@@ -102,7 +107,7 @@ def _stored(
     number = o.store(before, before_diagnosis) if number is None else number
     new_number = o.store(after, d, added, removed, number)
     promised = added is not None and before.scaling == "gc"
-    expected = added_suspect(before, after) if promised else None
+    expected = added_suspect(without_remainder(before), after) if promised else None
     return StoredChange(number, before, new_number, after, d, added, removed, expected)
 
 

@@ -59,6 +59,7 @@ from hilcal.diagnosis.noise import (
 from hilcal.diagnosis.pose_alone import PoseAlone, pose_alone
 from hilcal.diagnosis.residual_regression import Dependence, Regressions, ResidualRegression
 from hilcal.diagnosis.stepwise import trial
+from hilcal.diagnosis.unknown_law import without_remainder
 from hilcal.diagnosis.wrong_figures import WrongFigure, loads_reversed, wrong_figures
 from hilcal.effects.protocol import Effect
 from hilcal.identification.carried.drift import carried_effects, evidence_of_carried
@@ -308,8 +309,11 @@ class Evidence:
 
     @cached_property
     def regression(self) -> ResidualRegression:
-        """The share of the misfit on poses left out that smooth laws, or trees, predict."""
-        return self._regressions.of(self.linearisation)
+        """The share of the misfit on poses left out that smooth laws, or trees, predict.
+
+        The misfit is that without a remainder, which is fitted to it.
+        """
+        return self._regressions.of(linearise(without_remainder(self.fit)))
 
     @cached_property
     def arm_scatter(self) -> ArmScatter | None:

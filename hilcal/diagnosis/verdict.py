@@ -187,13 +187,14 @@ def judge_naming(
     last = judge(e, history(fits[-1]))
     background = {b.effect for b in last.background}
     suspects = [s for s in last.suspects if s.effect not in background]
+    unknown = last.reason == "no_suspect"
     derived = (
         replace(
             last,
             fit=f,
             history=history(f),
-            reason="background",
-            suspects=(*as_suspects(effects), *suspects),
+            reason=last.reason if unknown else "background",
+            suspects=(*(() if unknown else as_suspects(effects)), *suspects),
             background=effects,
         )
         for f, effects in zip(fits[:-1], unnamed, strict=False)

@@ -21,6 +21,7 @@ import scipy
 
 from hilcal.diagnosis.noise import MISFIT_ALARM, PREDICTABLE
 from hilcal.diagnosis.residual_regression import Dependence, residual_regression
+from hilcal.diagnosis.unknown_law import without_remainder
 from hilcal.discovery.curve import Curve, curves
 from hilcal.discovery.known_effects import (
     KnownEffects,
@@ -137,6 +138,7 @@ def discover(
     """
     expect(fit, Fit, "fit", "a Fit, as of hc.fit(model, readings)")
     require_gc(fit, "a search for laws")
+    fit = without_remainder(fit)
     linear = linearise(fit)
     noise = float(scipy.stats.chi2.sf(fit.chi2, fit.dof)) >= MISFIT_ALARM
     # a background explains a part of what a law would explain
@@ -455,14 +457,17 @@ class LawSearch:
             for path in old:
                 path.unlink(missing_ok=True)
         self.discoveries: list[Discovery] = []  # the searches, in order
+        self._searched: list[Fit] = []
         self.files: dict[str, Path] = {}  # of laws that were written, by name; see `write`
         self._folder, self._name = folder, name
         self._sources: dict[str, str] = {}
 
     def propose(self, fitted: Fit, say: Callable[[str], None]) -> tuple[Fit, str] | None:
         """Return the fit with a law, and the law's name; None if no law is proposed."""
-        if any(d.fit is fitted for d in self.discoveries) or len(self.discoveries) == MOST_SEARCHES:
+        if any(f is fitted for f in self._searched) or len(self.discoveries) == MOST_SEARCHES:
             return None
+        self._searched.append(fitted)
+        fitted = without_remainder(fitted)
         name = self._free_name(fitted)
         d = discover(fitted, say, name)
         self.discoveries.append(d)

@@ -31,6 +31,7 @@ from hilcal.effects.observer_frame import ObserverFrame
 from hilcal.effects.options import Options
 from hilcal.effects.periodic_joint_compliance import PeriodicJointCompliance
 from hilcal.effects.protocol import Effect, Role, line_in, source_of
+from hilcal.effects.remainder import Remainder
 from hilcal.effects.sensor_misalignment import SensorMisalignment
 from hilcal.effects.target_offset import TargetOffset
 from hilcal.effects.thermal_growth import ThermalGrowth
@@ -53,7 +54,7 @@ BUILT_IN: tuple[type[Effect], ...] = (
     BaseCompliance, ToolCompliance, PeriodicJointCompliance, Backlash,
     Creep, ThermalGrowth, ThermalJointDrift, LinkMass, LoadPoint, WrenchBias,
     WrenchGain, SensorMisalignment, TrackerDrift, TrackerScale,
-    ObserverFrame,
+    ObserverFrame, Remainder,
 )  # fmt: skip
 
 

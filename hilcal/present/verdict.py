@@ -21,6 +21,7 @@ from hilcal.diagnosis.noise import (
     separates_instrument,
 )
 from hilcal.diagnosis.order_step import OrderStep
+from hilcal.diagnosis.unknown_law import REMAINDER
 from hilcal.diagnosis.wrong_figures import WrongFigure
 from hilcal.effects.force_sensor import ForceSensorEffect
 from hilcal.identification.prediction.full_prediction import (
@@ -339,6 +340,14 @@ def _no_suspect(d: Diagnosis) -> list[str]:
         repeats += [f"{percent(d.repeated_share)} of the misfit is the same in them."]
     predicted = percent(share) if share >= 0.005 else f"{100 * share:.1g} %"
     follows = f"; it follows {' and '.join(d.follows)}" if d.follows else ""
+    remainder = [b for b in d.background if b.effect == REMAINDER]
+    if remainder:
+        return [
+            f"{predicted} of the misfit at poses left out is predictable, and the effects of the "
+            f"catalogue together do not explain it{follows}.",
+            "Until its law is known, a smooth function of that is fitted, the remainder: it moves "
+            f"the target by {length(remainder[0].rms_m)} rms.",
+        ]
     if d.fit.model.background:
         return [
             "All effects of the catalogue together explain the fitted poses (residuals are "

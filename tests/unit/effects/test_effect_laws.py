@@ -105,7 +105,8 @@ TILTING = (
 )
 SENSOR = ("wrench_bias", "wrench_gain", "sensor_misalignment")
 ON_COMPLIANCE = ("joint_stiffening", "creep", "link_mass", "load_point", *SENSOR)
-ALONE = tuple((n,) for n in ALL_NAMES if n not in ON_COMPLIANCE)
+# What is unknown has no mechanics in the world.
+ALONE = tuple((n,) for n in ALL_NAMES if n not in (*ON_COMPLIANCE, "remainder"))
 TOGETHER = tuple(("joint_compliance", n) for n in ON_COMPLIANCE)
 EVERYTHING = tuple(tuple(n for n in NAMES if n not in SENSOR or n == one) for one in SENSOR)
 """All effects, but one error of the force sensor at a time: their products are left out."""
@@ -131,6 +132,29 @@ def test_prediction_is_what_the_world_shows(names, arm):
         assert turn <= limit / reach + 1e-11
         assert limit < 0.05 * moved
         assert moved > 1e-9  # a hundred times the tolerance
+
+
+def test_a_remainder_moves_joints_and_the_whole_arm_by_waves_of_other_angles():
+    states = some_states(UR10E, 6)
+    effect = make("remainder", UR10E, states, {"laws": "2:4/base:1"})
+    names = [p.name for p in effect.parameters]
+    values = {"j2.q4.sin3": 2e-3, "j2.q4.cos1": -1e-3, "base.y.q1.cos2": 3e-4}
+    theta = np.array([values.get(name, 0.0) for name in names])
+    assert sum(name in values for name in names) == len(values)
+    moved = Model(UR10E, (effect,)).predict(states, theta).observation.position
+    turned = states.q.copy()
+    turned[:, 1] += 2e-3 * np.sin(3 * states.q[:, 3]) - 1e-3 * np.cos(states.q[:, 3])
+    base = Model(UR10E, (make("base_frame", UR10E, states),))
+    for k, shift in enumerate(3e-4 * np.cos(2 * states.q[:, 0])):
+        one = replace(states, q=turned, q_actual=None)[np.array([k])]
+        expected = base.predict(one, np.array([0, shift, 0, 0, 0, 0])).observation.position
+        np.testing.assert_allclose(moved[k], expected[0], atol=1e-12)
+
+
+@pytest.mark.parametrize("laws", ["", "2:7", "0:1", "2:4/2:4", "tool:1", 3])
+def test_a_remainder_refuses_other_laws(laws):
+    with pytest.raises(InputError, match=r"remainder: laws = .* valid: pairs of joints 1 to 6"):
+        make("remainder", UR10E, some_states(UR10E, 6), {"laws": laws})
 
 
 def test_drift_starts_at_its_reference_time():

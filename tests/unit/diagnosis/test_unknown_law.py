@@ -1,0 +1,50 @@
+"""A law that the catalogue lacks is predicted by a remainder until it is known."""
+
+import numpy as np
+import pytest
+
+from hilcal.diagnosis.unknown_law import REMAINDER, without_remainder
+from hilcal.discovery.discovery import discover
+from hilcal.identification.baseline import baseline
+from hilcal.refinement import refine
+from studies.all_effects_command import AllEffectsCase, campaign_of
+from studies.few_poses_command import share_in_band
+
+pytestmark = pytest.mark.long
+POSES = 60
+SMALL = 0.05  # of ordinary sizes: the law is most of the errors
+
+
+def refined(law_rad):
+    case = AllEffectsCase(POSES, 0, SMALL, without=False, law_rad=law_rad)
+    cell, readings, fresh = campaign_of(case)
+    return refine(baseline(cell, readings, "absolute"), readings, "absolute"), fresh
+
+
+def errors(fit, readings):
+    return readings.value - fit.model.predict(readings.states, fit.theta).observation.position
+
+
+def rms(error):
+    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+
+
+def test_a_law_that_the_catalogue_lacks_is_predicted_and_stays_unknown():
+    refinement, fresh = refined(5e-4)  # joint 2 errs by 0.5 mrad sin 3 q4
+    last, diagnosis = refinement.fit, refinement.steps[-1].diagnosis
+    assert refinement.verdict == "unknown_effect"
+    assert diagnosis.follows == ("joint 4 angle",)
+    assert [e.options["laws"] for e in last.model.effects if e.name == REMAINDER] == ["2:4"]
+    assert REMAINDER in last.model.background
+    assert REMAINDER in {b.effect for b in diagnosis.background if b.p_value < 1e-3}
+    plain = without_remainder(last)
+    assert rms(errors(last, fresh)) < 0.3 * rms(errors(plain, fresh))
+    assert share_in_band(last, fresh, errors(last, fresh)) > 0.9
+    # The law itself is searched beside the other effects alone.
+    assert "sin(3·q_4)" in discover(last).laws[0].formula
+
+
+def test_an_arm_without_such_a_law_has_no_remainder():
+    refinement, _ = refined(0.0)
+    assert REMAINDER not in refinement.fit.model.names
+    assert refinement.verdict != "unknown_effect"
