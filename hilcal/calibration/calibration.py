@@ -47,6 +47,7 @@ from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import InputError
 from hilcal.identification.fit import Fit
+from hilcal.identification.gauss_newton import derivative
 from hilcal.identification.prediction.predictive import position_factor, predictive
 from hilcal.identification.registration.robot_frames import (
     RobotFrames,
@@ -398,7 +399,7 @@ class Calibration(Brief):
 
     def _spread(self, tool: ToolPose, prediction: Prediction) -> Floats:
         """(N, 3, K) J R of the position, in axes of the chain."""
-        jacobian = tool.model.jacobian(prediction, tool.theta, 3)
+        jacobian = derivative(tool.model, prediction, tool.theta, 3, self.mode)
         jacobian = np.swapaxes(prediction.observation.axes, 1, 2) @ jacobian
         return np.asarray(jacobian @ self.covariance_root[tool.columns])
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from hilcal.effects.protocol import FRAME_ROLES, EffectSpec
 from hilcal.errors import CannotAnswerError
+from hilcal.identification.gauss_newton import whitened_jacobian
 from hilcal.identification.noise.full_covariance import joint_factors, whitened_blocks
 from hilcal.identification.residual import residual
 from hilcal.mixed.equations import Equations
@@ -278,7 +279,7 @@ def _linearise(
     """Linearise at theta (P,)."""
     prediction = model.predict(readings.states, theta)
     white = w.whiten(residual(readings, prediction, w)).reshape(-1)
-    jacobian = w.whiten_readings(model.jacobian(prediction, theta, w.m))
+    jacobian = whitened_jacobian(model, prediction, theta, w, np.arange(model.size))
     rows = np.column_stack([white, jacobian])
     if parts:
         rows, noise = _noise_of(parts, readings, w, rows)

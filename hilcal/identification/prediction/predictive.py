@@ -47,7 +47,7 @@ from hilcal.identification.carried.carried_prior import coordinates_of, scales_o
 from hilcal.identification.carried.posterior import Posterior, PosteriorEffect, Source, determined
 from hilcal.identification.fit import Fit, require_gc
 from hilcal.identification.folds import distinct_poses, ordinary_magnitudes, random_folds
-from hilcal.identification.gauss_newton import whitened_jacobian
+from hilcal.identification.gauss_newton import derivative, whitened_jacobian
 from hilcal.identification.mixed_fit import INSTRUMENT, mixed_fit_at
 from hilcal.identification.noise.arm_scatter import with_missing_scatter
 from hilcal.identification.residual import residual
@@ -199,7 +199,7 @@ class Predictive:
 
     def prediction_covariance(self, prediction: Prediction, w: Whitening) -> Floats:
         """Return κ J C Jᵀ (D, m, m) of predicted measurements."""
-        jacobian = w.raw(self.model.jacobian(prediction, self.theta, w.m))
+        jacobian = w.raw(derivative(self.model, prediction, self.theta, w.m, w.mode))
         spread = np.einsum("dip,pq,djq->dij", jacobian, self.covariance, jacobian, optimize=True)
         return np.asarray(self.factor * spread)
 
@@ -289,7 +289,7 @@ def predictive(
         share = np.trace(np.linalg.solve(stated.covariance, wider), axis1=1, axis2=2)
         scatter = noise * float(share.mean()) / w.m
         b = rows_in(stated)
-    position = w.raw(model.jacobian(prediction, theta, 3)).reshape(-1, model.size)
+    position = w.raw(derivative(model, prediction, theta, 3, mode)).reshape(-1, model.size)
     position = space.columns(position) * std
     rows, points = w.rows_of(fold), np.repeat(fold, 3)
     left_out, left_out_m2 = left_out_variances(

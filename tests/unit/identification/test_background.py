@@ -30,6 +30,7 @@ from hilcal.mixed.variances import evidence
 from hilcal.readings.whitening import whitening
 from hilcal.refinement import BACKGROUND, refine
 from hilcal.robot.catalogue import configs_dir
+from hilcal.robot.chain import evaluate
 from hilcal.store.revision import from_text, to_text
 from hilcal.store.rows import content_hash
 from studies.all_effects_command import AllEffectsCase, campaign_of
@@ -76,6 +77,22 @@ def test_it_predicts_other_poses_far_better_than_what_is_named(found, series):
         *found.fit.model.named,
         *(s.effect for s in found.diagnosis.suspects if s.score.p_value < 0.1),
     }
+
+
+def test_one_orientation_does_not_tell_where_the_target_is(series):
+    """What the fit says of the arm's errors must not tell the target's place, which they move."""
+    turns = evaluate(UR10.arm, series.states.q).rotation[-1]
+    cosine = np.einsum("nij,ij->n", turns, turns[0])
+    some = series[np.argsort(-cosine)[:120:6]]
+    model = baseline(UR10, some, "absolute")
+    mixed = mixed_fit(model, some, "absolute")
+    (target,) = (f for f in mixed.problem.families.random if f.effect == "target_offset")
+    place = model.cell.target[:3, 3] + mixed.theta[target.parameters]
+    coordinates = np.isin(mixed.problem.family, mixed.problem.families.random.index(target))
+    variance = np.diagonal(mixed.covariance)[mixed.problem.flat :][coordinates]
+    std = target.magnitude * np.sqrt(variance)
+    assert std.min() > 0.15  # 0.3 m is known before anything is measured
+    assert np.abs(place - [0.0, 0.0, 0.093]).max() < 0.3  # 0.093 m by all 1490 poses
 
 
 def test_of_effects_only_that_of_implausible_size_is_left_out(found, series):
