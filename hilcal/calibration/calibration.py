@@ -114,7 +114,9 @@ class Calibration(Brief):
         if not model.cell.measured_torques:  # nothing follows from them
             used = replace(used, states=replace(used.states, torque=None))
         p = predictive(model, fit.theta, fit.solution.prior, used, fit.mode, fit.holdout.rms_sigma)
-        values, vectors = np.linalg.eigh(p.covariance)
+        std = np.sqrt(np.diagonal(p.covariance))
+        std = np.where(std > 0.0, std, 1.0)  # units differ: a target's place, a gear's compliance
+        values, vectors = np.linalg.eigh(p.covariance / (std[:, None] * std))
         noise = np.trace(p.noise_covariance(fit.whitening)[:, :3, :3], axis1=1, axis2=2)
         kappa = position_factor(p, fit.holdout.rms_m)
         # A deflection is the difference of two readings.
@@ -128,7 +130,7 @@ class Calibration(Brief):
             model=replace(model, readings=None, prior=None),
             theta=fit.theta,
             mode=fit.mode,
-            root=vectors * np.sqrt(kappa * np.maximum(values, 0.0)),
+            root=std[:, None] * vectors * np.sqrt(kappa * np.maximum(values, 0.0)),
             misfit=p.excess.position / readings,
             scatter=scatter_of(fit),
             measured=MeasuredRanges.of(used.states, p, noise, model.cell.arm.units),

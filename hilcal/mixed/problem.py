@@ -5,7 +5,9 @@
 All R_k are diagonal. For rows whitened by the stated covariance R_0 = 1, the instrument; R_1, the
 arm's scatter, is block diagonal, and its eigenvectors turn the rows so that both are diagonal
 (`independent_rows`). Columns are scaled to ordinary magnitudes, X = [Q | Z D^½] with Q an
-orthonormal basis of the frames' columns.
+orthonormal basis of the frames' columns. A frame of known size, as a target that the poses leave
+open, hardly differs from the others: its columns have no part in the span of Q, which would cancel
+by nine digits, and the coordinates of Q are b plus that part.
 """
 
 from collections.abc import Sequence
@@ -41,6 +43,7 @@ class MixedProblem:
     families: Families  # of the other columns
     family: Ints  # (K − k,) family of each other column
     noise: tuple[Noise, ...]  # components, that of the instrument first
+    absorbed: Floats  # (k, K − k) Qᵀ Z D^½ of families of known size, zero for others
     zeros: int = 0  # further rows, zero in y and x, with the variance exp(2 η) of the instrument
 
     @property
@@ -76,15 +79,17 @@ class MixedProblem:
 
     def coordinates(self, jacobian: Floats) -> Floats:
         """Return columns (..., K) from derivatives (..., P) by the model's parameters."""
-        random = self.families.random
-        parts = [jacobian[..., self.families.frames] @ self.frames]
-        parts += [jacobian[..., f.parameters] * f.magnitude for f in random]
-        return np.concatenate(parts, axis=-1)
+        frames = jacobian[..., self.families.frames] @ self.frames
+        random = [jacobian[..., f.parameters] * f.magnitude for f in self.families.random]
+        columns = np.concatenate([frames[..., :0], *random], axis=-1)
+        return np.concatenate([frames, columns - frames @ self.absorbed], axis=-1)
 
     def parameters(self, c: Floats, size: int) -> Floats:
         """Return parameters (size, ...) of the model from coordinates (K, ...)."""
         theta = np.zeros((size, *c.shape[1:]))
-        theta[self.families.frames] = self.frames @ c[: self.flat]
+        theta[self.families.frames] = self.frames @ (
+            c[: self.flat] - self.absorbed @ c[self.flat :]
+        )
         start = self.flat
         for f in self.families.random:
             stop = start + len(f.parameters)
@@ -105,7 +110,7 @@ class MixedProblem:
         renumbered = np.cumsum(~np.isin(np.arange(len(self.families.random)), numbers)) - 1
         return MixedProblem(
             self.y, x, self.frames, Families(self.families.frames, random),
-            renumbered[self.family[retained]], self.noise, self.zeros,
+            renumbered[self.family[retained]], self.noise, self.absorbed[:, retained], self.zeros,
         )  # fmt: skip
 
     def compressed(self) -> "MixedProblem":
@@ -135,11 +140,17 @@ def mixed_problem(
     frames = _frame_basis(jacobian[:, families.frames])
     random = families.random
     counts = [len(f.parameters) for f in random]
+    family = np.repeat(np.arange(len(random)), counts)
     problem = MixedProblem(
-        y, jacobian, frames, families, np.repeat(np.arange(len(random)), counts), tuple(noise),
+        y, jacobian, frames, families, family, tuple(noise),
+        np.zeros((frames.shape[1], len(family))),
     )  # fmt: skip
     x = problem.coordinates(jacobian)
-    return MixedProblem(y, x, frames, families, problem.family, problem.noise)
+    known = np.array([f.known for f in random], dtype=np.bool_)[family]
+    q = x[:, : problem.flat]
+    absorbed = np.where(known, q.T @ x[:, problem.flat :], 0.0)
+    x[:, problem.flat :][:, known] -= q @ absorbed[:, known]
+    return replace(problem, x=x, absorbed=absorbed)
 
 
 def independent_rows(covariance: Floats, measured: Bools) -> tuple[Floats, Floats]:

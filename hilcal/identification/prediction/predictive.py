@@ -66,6 +66,9 @@ ITERATIONS = 20  # of the noise factor; it converges within a few
 MOST_ROUNDS = 6  # most times that the covariance is computed anew as W changes; a choice
 MOST_LEVERAGE = 0.99  # of a row; that of a row which alone determines something is 1
 ROUNDING = 1e-9  # least share of a direction's information that is not of one fold
+FRAMES_FREEDOM = 10.0
+"""Prior of frames without one, in units of that of other frames; a choice: half a percent of the
+motion of these is lost."""
 CHUNK = 4096  # measurements that are processed at once, for memory
 MOST_ROWS = 600  # elements beyond which variances count as known: of 200 poses of a real UR10
 # the factor is 1.00 to 1.06, and a draw costs the cube of the rows; a choice
@@ -236,7 +239,10 @@ def predictive(
         variances = mixed_fit_at(model, fitted, mode, theta)
         arm = fitted.arm_scatter  # the standard deviations are in units of its factor
         noise_factor = (variances.std(INSTRUMENT) if arm is None else arm.instrument_factor) ** 2
-        prior = prior * np.sqrt(noise_factor)
+        prior = prior.copy()
+        for effect, columns in zip(model.effects, model.slices(), strict=True):
+            if effect.name in model.random:  # see `identification.background.background_model`
+                prior[columns] *= np.sqrt(noise_factor)
         least = variance_spread(variances, stated.rows_of(fold))
         e = variances.equations
         motion = e.problem.parameters(e.sensitivity, model.size)
@@ -330,8 +336,20 @@ def left_out_variances(
 
 
 def open_prior(model: Model, theta: Floats, prior: Floats) -> Floats:
-    """Prior standard deviations (P,) where the readings leave parameters open."""
-    return family_prior(model, np.where(np.isinf(prior), ordinary_magnitudes(model, theta), prior))
+    """Prior standard deviations (P,) where the readings leave parameters open.
+
+    Frames without a prior follow those with one: where all poses have one orientation, the base
+    takes up any place of the target, and must be free to.
+    """
+    std = np.where(np.isinf(prior), ordinary_magnitudes(model, theta), prior)
+    units = np.array([p.unit for e in model.effects for p in e.parameters])
+    frames = np.array(
+        [e.role in FRAME_ROLES for e in model.effects for p in e.parameters], dtype=np.bool_
+    )
+    for unit in np.unique(units[frames]):
+        held, free = (frames & (units == unit) & part for part in (std == prior, np.isinf(prior)))
+        std[free] = np.maximum(std[free], FRAMES_FREEDOM * prior[held].max(initial=0.0))
+    return family_prior(model, std)
 
 
 def family_prior(model: Model, prior: Floats) -> Floats:

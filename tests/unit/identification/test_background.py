@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.scatter import budget
 from hilcal.campaign.revisions import restore, to_record
 from hilcal.cell import Cell
@@ -79,13 +80,17 @@ def test_it_predicts_other_poses_far_better_than_what_is_named(found, series):
     }
 
 
-def test_one_orientation_does_not_tell_where_the_target_is(series):
-    """What the fit says of the arm's errors must not tell the target's place, which they move."""
+@pytest.fixture(scope="module")
+def one_orientation(series):
     turns = evaluate(UR10.arm, series.states.q).rotation[-1]
     cosine = np.einsum("nij,ij->n", turns, turns[0])
-    some = series[np.argsort(-cosine)[:120:6]]
-    model = baseline(UR10, some, "absolute")
-    mixed = mixed_fit(model, some, "absolute")
+    return series[np.argsort(-cosine)[:120:6]]
+
+
+def test_one_orientation_does_not_tell_where_the_target_is(one_orientation):
+    """What the fit says of the arm's errors must not tell the target's place, which they move."""
+    model = baseline(UR10, one_orientation, "absolute")
+    mixed = mixed_fit(model, one_orientation, "absolute")
     (target,) = (f for f in mixed.problem.families.random if f.effect == "target_offset")
     place = model.cell.target[:3, 3] + mixed.theta[target.parameters]
     coordinates = np.isin(mixed.problem.family, mixed.problem.families.random.index(target))
@@ -93,6 +98,21 @@ def test_one_orientation_does_not_tell_where_the_target_is(series):
     std = target.magnitude * np.sqrt(variance)
     assert std.min() > 0.15  # 0.3 m is known before anything is measured
     assert np.abs(place - [0.0, 0.0, 0.093]).max() < 0.3  # 0.093 m by all 1490 poses
+
+
+def test_the_band_of_one_orientation_is_narrow_in_it_and_wide_in_others(one_orientation):
+    start = fit(baseline(UR10, one_orientation, "absolute"), one_orientation, "absolute")
+    fitted = with_background(start, start.model.names)
+    assert fitted is not None
+    calibration, states = Calibration.of(fitted), one_orientation.states
+    measured = calibration.predict(states.q)
+    other = calibration.predict(states.q + np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]))
+    std, other_std = (
+        np.sqrt(np.trace(p.covariance, axis1=1, axis2=2).mean()) for p in (measured, other)
+    )
+    assert std < 0.3e-3 < 0.2 < other_std
+    assert not any(o.points.mean() > 0.1 for o in measured.outside)
+    assert np.any([o.points for o in other.outside], axis=0).all()
 
 
 def test_of_effects_only_that_of_implausible_size_is_left_out(found, series):
