@@ -83,7 +83,7 @@ def test_it_predicts_other_poses_far_better_than_what_is_named(found, series):
 @pytest.fixture(scope="module")
 def one_orientation(series):
     turns = evaluate(UR10.arm, series.states.q).rotation[-1]
-    cosine = np.einsum("nij,ij->n", turns, turns[0])
+    cosine = np.einsum("nij,ij->n", turns, turns[3])
     return series[np.argsort(-cosine)[:120:6]]
 
 
@@ -110,7 +110,7 @@ def test_the_band_of_one_orientation_is_narrow_in_it_and_wide_in_others(one_orie
     std, other_std = (
         np.sqrt(np.trace(p.covariance, axis1=1, axis2=2).mean()) for p in (measured, other)
     )
-    assert std < 0.3e-3 < 0.2 < other_std
+    assert std < 0.3e-3 < 0.4 < other_std
     assert not any(o.points.mean() > 0.1 for o in measured.outside)
     assert np.any([o.points for o in other.outside], axis=0).all()
 
