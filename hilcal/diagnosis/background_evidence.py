@@ -12,7 +12,6 @@ import numpy as np
 
 from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE, Suspect
 from hilcal.diagnosis.minimum_detectable_effect import Strength
-from hilcal.identification.background import IMPLAUSIBLE_FACTOR
 from hilcal.identification.fit import Fit, all_left_out
 from hilcal.identification.linearisation import HeldOut
 from hilcal.identification.mixed_fit import (
@@ -110,12 +109,11 @@ def background_evidence(fit: Fit) -> tuple[BackgroundEffect, ...]:
     problem, log_std = mixed.equations.problem, mixed.log_std
     rng, random = np.random.default_rng(SEED), problem.families.random
     moves = fit.whitening.raw(model.jacobian(fit.solution.prediction, theta, 3))  # (D, 3, P)
-    most = {e.name: e.most() for e in model.effects}
     tested = []
     numbered = [(k, f) for k, f in enumerate(random) if f.effect in model.background]
     for name, group in groupby(numbered, lambda kf: kf[1].effect):
         numbers, families = zip(*group, strict=True)
-        test = evidence(problem, numbers, rng, log_std, IMPLAUSIBLE_FACTOR * most[name])
+        test = evidence(problem, numbers, rng, log_std, families[0].largest)
         if not test.rank:
             continue
         index = np.concatenate([f.parameters for f in families])

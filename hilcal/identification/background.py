@@ -31,6 +31,7 @@ from hilcal.identification.mixed_fit import (
 from hilcal.identification.noise.arm_scatter import some_poses, with_arm_scatter
 from hilcal.identification.noise.full_covariance import joint_factors
 from hilcal.identification.outliers.gross_errors import confirmed_gross_errors, find_gross_errors
+from hilcal.mixed.families import IMPLAUSIBLE_FACTOR
 from hilcal.model.model import Model
 from hilcal.readings.readings import ArmScatter
 from hilcal.types import Floats
@@ -39,9 +40,6 @@ MOST_ROWS = 10_000
 """Most elements of readings for which a background is fitted; a choice: it takes minutes."""
 MOST_ROWS_OF_LINES = 2000
 """Most elements of readings for which lines are pooled; a choice: it takes some seconds."""
-IMPLAUSIBLE_FACTOR = 2.0
-"""Factor by which an estimated standard deviation may exceed the plausible one, as few readings
-determine it to such a factor only; a choice."""
 MOST_CONFIRMATIONS = 3
 """Most rounds in which gross errors of fewer effects are tested beside all effects; a choice."""
 

@@ -22,6 +22,9 @@ from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.model.model import Model
 from hilcal.types import Floats, Ints
 
+IMPLAUSIBLE_FACTOR = 2.0
+"""Factor by which an estimated standard deviation may exceed the plausible one, as few readings
+determine it to such a factor only; a choice."""
 KNOWN_SPREAD = 1e-3  # spread of the logarithm of a standard deviation that is known
 ARM_SPREAD = 1.5
 """Spread between arms: a factor of 4.5 either way, so that errors of a tenth or of ten times the
@@ -51,6 +54,7 @@ class Family:
     prior: LogStdPrior  # of log s
     known: bool = False  # whether s is known; its log s is then independent of other families'
     pool: str = ""  # pool that the family is a line of; empty where it is none
+    largest: float = np.inf  # s up to which a size is plausible, with `IMPLAUSIBLE_FACTOR`
     pool_spread: float = 0.0  # spread of the term that the log s of a pool's lines share
 
 
@@ -119,7 +123,7 @@ def _of_effect(effect: Effect, index: Ints) -> list[Family]:
         out.append(
             Family(
                 name, effect.name, index[in_family], effect.magnitudes[in_family],
-                LogStdPrior(*prior),
+                LogStdPrior(*prior), largest=IMPLAUSIBLE_FACTOR * effect.most(),
             )
         )  # fmt: skip
     return out
@@ -137,7 +141,7 @@ def _lines(effect: Effect, index: Ints) -> list[Family]:
             out.append(
                 Family(
                     name, effect.name, index[in_line], effect.magnitudes[in_line], prior,
-                    pool=pool.name, pool_spread=pool.prior.spread,
+                    pool=pool.name, largest=pool.largest, pool_spread=pool.prior.spread,
                 )
             )  # fmt: skip
     return out

@@ -237,6 +237,23 @@ def test_a_family_does_not_stay_small_where_the_iteration_began():
     np.testing.assert_allclose(found.log_std, usual.log_std, atol=0.05)
 
 
+def test_no_size_is_sought_beyond_the_plausible_ones():
+    """A direction that the rows hardly show fits a misfit with a size that no arm has."""
+    rng = np.random.default_rng(12)
+    rows = 300
+    jacobian = np.hstack([np.ones((rows, 1)), rng.standard_normal((rows, 6))])
+    jacobian[:, 6] *= 1e-3
+    sizes = np.array([1.0, 1.2, -0.9, 0.8, -1.1, 1e4])
+    y = jacobian[:, 1:] @ sizes + 0.5 * rng.standard_normal(rows)
+    stated = {}
+    for largest in (np.inf, 6.0):
+        one = replace(family("a", 1, 6), magnitude=np.ones(6), largest=largest)
+        made = mixed_problem(y, jacobian, Families(np.arange(1), (one,)), [instrument(rows)])
+        stated[largest] = estimate_variances(made, np.array([0.0, 0.0]), search=True).std("a")
+    assert stated[np.inf] > 1000.0
+    assert 0.5 < stated[6.0] < 6.0
+
+
 def test_rows_are_turned_so_that_blocks_of_noise_are_diagonal():
     rng = np.random.default_rng(11)
     half = rng.standard_normal((4, 5, 2))  # of a rank below that of the rows
