@@ -47,7 +47,11 @@ def effects(
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     cell, rail = example_cell(), example_cell(slides=True)
     states = example_states(cell)
-    instances = [kind(cell if kind.applies(cell) else rail, states) for kind in catalogue.effects]
+    slides = [kind.applies(rail) and not kind.applies(cell) for kind in catalogue.effects]
+    instances = [
+        kind(rail if only else cell, states)
+        for kind, only in zip(catalogue.effects, slides, strict=True)
+    ]
     defaults = {e.name: option_defaults(type(e), e.cell, states) for e in instances}
     out = table("effect", "law", left=(0, 1))
     for e in instances:

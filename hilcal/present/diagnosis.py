@@ -111,8 +111,9 @@ def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
         yield from curves(d.dependences)
     if d.verdict == "unknown_effect":
         yield note(
-            "To try an effect of your own: hilcal effects new NAME writes an example, "
-            "--effects-from FILE.py adds it to the catalogue."
+            "To search for its law: hilcal discover RUN -o law.py. To try an effect of your own: "
+            "hilcal effects new NAME writes an example, --effects-from FILE.py adds it to the "
+            "catalogue."
         )
     if (e := d.pure_error) is not None:
         yield repeats_sentence(e)
