@@ -72,8 +72,8 @@ def _laws(fit: Fit, dependences: Sequence[Dependence]) -> set[str]:
 
 
 def _present(fit: Fit) -> set[str]:
-    of_model = (e.options["laws"] for e in fit.model.effects if e.name == REMAINDER)
-    return {law for text in of_model for law in str(text).split("/")}
+    of_model = (e.laws for e in fit.model.effects if isinstance(e, Remainder))
+    return {law for laws in of_model for law in laws}
 
 
 def _with_laws(fit: Fit, laws: set[str]) -> Fit | None:

@@ -41,7 +41,7 @@ class Remainder(Effect):
         """Read the laws."""
         n = self.cell.arm.n
         usual = [f"{j}:{i}" for j in range(1, n + 1) for i in range(1, n + 1) if i != j]
-        text = self.options.setdefault("laws", "/".join(usual) or f"{BASE}:1")
+        text = self.options.get("laws", "/".join(usual) or f"{BASE}:1")
         found = [_LAW.fullmatch(t.strip()) for t in text.split("/")] if type(text) is str else []
         laws = [(m[1], int(m[2])) for m in found if m]
         valid = (moved == BASE or 1 <= int(moved) <= n for moved, _ in laws)
@@ -52,6 +52,7 @@ class Remainder(Effect):
                 f"effect {self.name}: laws = {text!r}; valid: pairs of joints 1 to {n} or {BASE}, "
                 f"and joints, each once, as 2:4/{BASE}:1"
             )
+        self.laws = tuple(f"{moved}:{i}" for moved, i in laws)
         self._joints = [(int(moved) - 1, i - 1) for moved, i in laws if moved != BASE]
         self._base = [i - 1 for moved, i in laws if moved == BASE]
 

@@ -82,7 +82,7 @@ def test_a_law_is_written_as_an_effect_and_told(campaign, tmp_path, capsys, monk
     assert [x["probability"] for x in found.document["structures"]] == [0.7, 0.2, 0.01]
     assert [x["pareto"] for x in found.document["structures"]] == [True, False, False]
     assert "best of its size" in found.err
-    assert "Averaged over them" in found.err
+    assert "Averaged by their probability" in found.err
     assert found.document["average"]["std_m"] > 0
     assert f"--suspects bent,bent_or_1 --effects-from {out} --effects-from {other}" in found.err
     files = ("--effects-from", out, "--effects-from", other)

@@ -499,7 +499,7 @@ def test_a_table_becomes_a_calibration_at_one_page(browser, tmp_path, capsys):
     assert "give --config CELL.toml, too" in refused(capsys, 2, "workbench", table)
     mapped = ("workbench", table, "--config", config, "-o", tmp_path / "o.hilcal", "--format", "x")
     assert "--format x is unknown" in refused(capsys, 2, *mapped)
-    assert "are of a table" in refused(capsys, 2, "workbench", served.run, "--format", "ipa-ur10")
+    assert "are for a table" in refused(capsys, 2, "workbench", served.run, "--format", "ipa-ur10")
 
 
 def unstated(path):

@@ -29,7 +29,7 @@ MODES = ("absolute", "deflection")
 NAMES = tuple(
     e.name
     for e in BUILT_IN
-    if e.name not in ("joint_compliance", "guide_error") and e.role != "observer"
+    if e.name not in ("joint_compliance", "guide_error", "remainder") and e.role != "observer"
 )
 HIDDEN = [
     *((n, "deflection" if n in DEFLECTION_EFFECTS else "absolute") for n in NAMES),
