@@ -194,7 +194,7 @@ def test_a_revision_keeps_its_command_and_the_page_shows_it(run, capsys):
     html = page(m)
     assert "Commands as they were typed" in html
     assert "base_frame,joint_compliance" in html
-    assert html.count("not kept: ") == 2  # the file, and revision 2
+    assert html.count("not stored: ") == 2  # the file, and revision 2
     assert m.limit_m == 2e-4  # of [limits] accuracy_m
     assert "within 200 µm" in html
 
