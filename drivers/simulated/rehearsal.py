@@ -15,7 +15,7 @@ from hilcal.drivers.simulated.cell_processes import SimulatedCell
 from hilcal.drivers.simulated.truth import warm_up
 from hilcal.drivers.simulated.user_effect import hidden_user_effect
 from hilcal.drivers.simulated.world import SimulatedNoise, World
-from hilcal.effects.catalogue import Catalogue
+from hilcal.effects.catalogue import BUILT_IN, Catalogue
 from hilcal.errors import InputError
 from hilcal.measuring.route import approach_sides, route
 from hilcal.readings.covariance import COVERS_KEY, INSTRUMENT_AND_ARM
@@ -41,7 +41,8 @@ def choices() -> tuple[str, ...]:
 def user_choices(catalogue: Catalogue | None) -> tuple[str, ...]:
     """User's effects that can be hidden; see `user_effect`."""
     effects = () if catalogue is None else catalogue.with_role("effect")
-    return tuple(k.name for k in effects if k.name not in injected.ALL_EFFECTS)
+    own = (k for k in effects if k not in BUILT_IN)
+    return tuple(k.name for k in own if k.name not in injected.ALL_EFFECTS)
 
 
 def invented_law(catalogue: Catalogue) -> Catalogue:

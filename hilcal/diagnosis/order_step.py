@@ -8,8 +8,8 @@ displacement, zero before k,
     gain_k = gᵀ M⁻¹ g,   g = C_kᵀ P y,   M = C_kᵀ P C_k
 
 is χ² distributed without a step. The variances are estimated without a step, which enlarges them,
-so the test is conservative. The largest gain counts, at a level divided by the number of places,
-and by that of kinds: the sensor, the target and all joints together count alike.
+so the test is conservative. The largest gain counts, at a level divided by the number of places;
+the sensor, the target and all joints together have half of the level each.
 A drift in the order resembles a step; a step has to explain the readings better by 20 : 1.
 A serial correlation of the noise is not assumed: it would take up the step.
 """
@@ -31,7 +31,7 @@ from hilcal.mixed.equations import Equations
 from hilcal.model.observe import motion
 from hilcal.types import Floats
 
-LEVEL = 1e-3  # chance of a step where there is none; a choice
+LEVEL = 1e-3  # chance of a step of sensor or target where there is none; a choice
 RANK = 1e-9  # share of the largest eigenvalue below which a direction is not determined
 
 SENSOR, TARGET, JOINT = "sensor", "target", "joint"
@@ -84,7 +84,7 @@ def step_in_order(fit: Fit) -> OrderStep | None:
         gains = list(_gains(e, np.einsum("rnm,nmq->rnq", units, columns)))
         k, gain, rank, delta = max(gains[1:], key=lambda g: g[1])
         better = gain - gains[0][1] > 2 * SAME_EVIDENCE
-        tests = 3 * alike * (len(gains) - 1)
+        tests = 2 * alike * (len(gains) - 1)
         p = min(tests * float(scipy.stats.chi2.sf(gain, rank)), 1.0)
         if p < LEVEL and better:
             shift = columns[k:, :3] @ delta

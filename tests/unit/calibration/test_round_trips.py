@@ -153,7 +153,8 @@ def test_predicting_what_was_inverted_is_the_target_to_a_nanometre(effect):
     q = regular(c, rng.uniform(-2.8, 2.8, (40, 6)))
     wrench = np.hstack([rng.uniform(-80, 80, (len(q), 3)), rng.uniform(-5, 5, (len(q), 3))])
     recorded = surroundings(rng, len(q))
-    assert isinstance(compiled(c._tracked, "absolute"), Compiled)
+    # The compiled form has joints that err by their own angle only.
+    assert isinstance(compiled(c._tracked, "absolute"), Compiled) == (effect != "remainder")
     k = c.compensate(q, wrench, recorded=recorded, std=False)
     assert k.inverse.solved.all()
     again = c.predict(k.q, wrench, recorded=recorded, std=False)

@@ -244,7 +244,7 @@ def test_a_family_is_seen_from_where_poses_left_out_show_it_and_not_finer_than_p
     assert s.least.finest_m == np.inf
     assert s.least.to_dict()["finer_than_poses"] == {"visible": False, "displacement_m": None}
     said = [line for line in detectable_sizes(diagnose(f)) if isinstance(line, str)]
-    assert f"A {ERROR} finer than these poses resolve would be seen at no size.\n" in said
+    assert f"A {ERROR} finer than these poses resolve would be detectable at no size.\n" in said
 
 
 @pytest.mark.long
