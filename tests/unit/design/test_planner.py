@@ -94,6 +94,7 @@ def test_every_criterion_gives_a_certified_plan(criterion):
     assert made.ordered.plan.steps
 
 
+@pytest.mark.long
 def test_absolute_readings_are_planned_one_by_one():
     made = planned(small(readings="absolute"), readings=25)
     assert all(len(loads) == 1 for _, loads in made.problem.contents)
@@ -139,6 +140,7 @@ def cell_file(directory, config):
     return path
 
 
+@pytest.mark.long
 def test_the_command(tmp_path, capsys):
     cell, plan, table = cell_file(tmp_path, small()), tmp_path / "plan.json", tmp_path / "plan.csv"
     words = ("plan", cell, "-o", plan, "--poses", "4", "--quick")

@@ -100,6 +100,7 @@ def test_one_orientation_does_not_tell_where_the_target_is(one_orientation):
     assert np.abs(place - [0.0, 0.0, 0.093]).max() < 0.3  # 0.093 m by all 1490 poses
 
 
+@pytest.mark.long
 def test_the_band_of_one_orientation_is_narrow_in_it_and_wide_in_others(one_orientation):
     start = fit(baseline(UR10, one_orientation, "absolute"), one_orientation, "absolute")
     fitted = with_background(start, start.model.names)
