@@ -245,7 +245,7 @@ def step_report(number: int, change: str, d: Diagnosis) -> Iterator[Block]:
     """Yield the error of one revision, the variables that it follows, and the suspects."""
     yield heading(f"Revision {number}: {change or model_name(d.fit.model.named)}")
     yield holdout_sentence(d.fit)
-    if d.verdict != "adequate":
+    if d.verdict != "adequate" and not d.dependences:
         yield dependence_sentence(d.misfit_breakdown)
     if d.significant:
         yield from ("", suspects_table(d))

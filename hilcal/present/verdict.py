@@ -345,7 +345,7 @@ def _no_suspect(d: Diagnosis) -> list[str]:
         return [
             f"{predicted} of the misfit at poses left out is predictable, and the effects of the "
             f"catalogue together do not explain it{follows}.",
-            "Until its law is known, a smooth function of that is fitted, the remainder: it moves "
+            "Until its law is known, waves of joint angles, the remainder, predict it: they move "
             f"the target by {length(remainder[0].rms_m)} rms.",
         ]
     if d.fit.model.background:

@@ -170,6 +170,8 @@ def misfit_sentence(m: ReportContent) -> str:
     worst = f"Of the poses left out, {place} is furthest off: {length(error.max())}."
     if d is None:
         return worst
+    if d.follows and not d.residual_is_noise:  # on poses left out, if not on the fitted ones
+        return f"{worst} The misfit there follows {' and '.join(d.follows)}."
     if not d.residual_is_noise:
         return f"{worst} {fit_words.dependence_sentence(d.misfit_breakdown)}"
     # The sum of squares of R whitened elements of standard deviation 1 is distributed as χ²(R).

@@ -6,6 +6,7 @@ import pytest
 from hilcal.diagnosis.unknown_law import REMAINDER, without_remainder
 from hilcal.discovery.discovery import discover
 from hilcal.identification.baseline import baseline
+from hilcal.present.verdict import message
 from hilcal.refinement import refine
 from studies.all_effects_command import AllEffectsCase, campaign_of
 from studies.few_poses_command import share_in_band
@@ -34,6 +35,9 @@ def test_a_law_that_the_catalogue_lacks_is_predicted_and_stays_unknown():
     last, diagnosis = refinement.fit, refinement.steps[-1].diagnosis
     assert refinement.verdict == "unknown_effect"
     assert diagnosis.follows == ("joint 4 angle",)
+    said = message(diagnosis)
+    assert "it follows joint 4 angle" in said
+    assert "waves of joint angles, the remainder, predict it" in said
     assert [e.options["laws"] for e in last.model.effects if e.name == REMAINDER] == ["2:4"]
     assert REMAINDER in last.model.background
     assert REMAINDER in {b.effect for b in diagnosis.background if b.p_value < 1e-3}
