@@ -31,8 +31,6 @@ def test_words_and_document_and_nothing_is_written(tmp_path, capsys):
 
 def test_what_it_refuses(tmp_path, capsys):
     few = imported(tmp_path / "few.hilcal", "nothing", poses=5)
-    said = refused(capsys, 2, "bootstrap", few, "--draws", "3")
-    assert "draws 3, seed 0; valid: at least 20 draws" in said
     ended = command(capsys, "bootstrap", few, "--workers", "1")
     assert (ended.code, ended.out) == (4, "")
     assert "error: 5 distinct poses were fitted" in ended.err
@@ -67,43 +65,11 @@ def test_a_misfit_that_the_prior_does_not_know_is_told(tmp_path, capsys):
     assert "did not have joint_tilt_compliance; hilcal compare" in " ".join(out.split())
 
 
-def test_priors_that_cannot_be_are_refused(tmp_path, capsys):
-    old = imported(tmp_path / "old.hilcal", "nothing", then=("identify",))
-    other = tmp_path / "other.json"
-    other.write_text("{}")
-    for words, said in (
-        (("--prior", old), "count twice"),
-        (("--prior", tmp_path / "none.hilcal"), "cannot be read"),
-        (("--prior", other), "hilcal-posterior"),
-        (("--prior", old, "--prior-of", "cousin"), "arm, type"),
-        (("--prior", old, "--drift", "creep=1"), "joint_compliance"),
-        (("--drift", "creep=1"), "--prior"),
-    ):
-        assert said in refused(capsys, 2, "identify", old, *words)
-
-
 def imported_readings(readings, folder, capsys):
     write_table(readings, folder / "t.csv", INSTRUMENT_AND_ARM)
     run = folder / "run.hilcal"
     said = ok(capsys, "import", folder / "t.csv", "--config", CELL, "-o", run).out
     return run, " ".join(said.split())
-
-
-@pytest.mark.long
-def test_wrong_readings_are_listed_and_the_others_fitted(tmp_path, capsys):
-    readings, wrong = spoil(rehearsal("nothing").readings, 0.2, 5e-3, np.random.default_rng(0))
-    run, _ = imported_readings(readings, tmp_path, capsys)
-    d = ok(capsys, "refine", run, "--readings", "absolute", "--json").document
-    assert d["verdict"] == "adequate"
-    d = ok(capsys, "identify", run, "--readings", "absolute", "--json").document
-    r = readings
-    names = sorted((r.pose_names[r.pose[k]], r.load_names[r.load[k]]) for k in wrong)
-    assert sorted((o["pose"], o["load"]) for o in d["outliers"]) == names
-    told = f"{len(wrong)} readings are set aside as gross errors, not included in these figures"
-    for asked in (("identify",), ("refine",), ("identify", "--details"), ("refine", "--details")):
-        words = ok(capsys, asked[0], run, "--readings", "absolute", *asked[1:]).out
-        assert told in " ".join(words.split())
-        assert (f"  {names[0][0]}/{names[0][1]}: " in words) == ("--details" in asked)
 
 
 def test_what_is_set_aside_is_in_no_figure_of_the_fit(tmp_path, capsys):
@@ -137,17 +103,3 @@ def test_errors_of_centimetres_are_named_at_import(tmp_path, capsys):
     assert "A fit sets aside those that it finds to be gross errors" in " ".join(said.split())
     d = ok(capsys, "identify", run, "--readings", "absolute", "--json").document
     assert len(d["outliers"]) == len(wrong)
-
-
-@pytest.mark.long
-def test_a_bumped_tracker_is_said_and_never_adequate(tmp_path, capsys):
-    readings = rehearsal("nothing").readings
-    value = readings.value.copy()
-    value[40:62, :3] += [4e-3, 3e-3, 0.0]
-    run, _ = imported_readings(replace(readings, value=value), tmp_path, capsys)
-    d = ok(capsys, "identify", run, "--readings", "absolute", "--json").document
-    assert d["outliers"] == []
-    assert any("22 of 70 readings" in n and "by the same shift" in n for n in d["notes"])
-    words = " ".join(ok(capsys, "refine", run, "--readings", "absolute").out.split())
-    assert "by the same shift" in words
-    assert ok(capsys, "diagnose", run, "--json").document["verdict"] != "adequate"

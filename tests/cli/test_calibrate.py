@@ -42,26 +42,6 @@ def there(tmp_path_factory):
     return d
 
 
-def test_nothing_moves_where_nobody_can_be_asked(cell, capsys):
-    out = cell.with_name("run.hilcal")
-    line = refused(capsys, 2, "calibrate", cell, "-o", out)
-    assert "give --yes" in line
-    assert not out.exists()
-
-
-@pytest.mark.parametrize(("option", "value", "said"), [
-    ("--goal", "0.1", "has no unit"),
-    ("--limit", "much", "is not understood"),
-    ("--max-time", "2 days", 'valid: a duration over 0 in s, min, h, e.g. "90 min"'),
-    ("--poses", "0", "valid: a whole number from 1"),
-    ("--validation", "0", "valid: a whole number from 1")])  # fmt: skip
-def test_bad_options(cell, capsys, option, value, said):
-    line = refused(
-        capsys, 2, "calibrate", cell, "-o", cell.with_name("run.hilcal"), "--yes", option, value
-    )
-    assert said in line
-
-
 @pytest.mark.long
 def test_a_goal_needs_readings_that_show_it(there, cell, capsys):
     """Deflections know nothing of the unloaded arm, however well the model predicts them."""

@@ -267,9 +267,6 @@ def test_study_scaling_and_a_scheduler_that_anybody_can_reach(capsys):
     d = ok(capsys, "study", "scaling", "--runs", "20", "--json").document
     assert d["runs"] == 20
     assert set(d["summary"]) == {"none", "gu", "gc"}
-    assert "2 or more" in refused(capsys, 2, "study", "scaling", "--runs", "1")
-    both = ("--workers", "2", "--scheduler", "tls://127.0.0.1:1")
-    assert "own workers" in refused(capsys, 2, "study", "scaling", *both)
     given = ("study", "scaling", "--workers", "2", "--scheduler", "tcp://127.0.0.1:1")
     said, error = run(capsys, *given).err.splitlines()
     assert said.startswith("--scheduler tcp://127.0.0.1:1: without TLS")

@@ -82,25 +82,6 @@ def test_refine_starts_from_options(campaign, capsys):
     assert added == {"hysteresis", "joint_compliance(joints=each)"}
 
 
-@pytest.mark.parametrize(("text", "wrong"), [
-    ("hysteresis(colour=1)", "effect hysteresis: unknown option 'colour'; valid: joints"),
-    ("backlash(crossing=wide)", "effect backlash: crossing = 'wide'; valid: a finite number"),
-])  # fmt: skip
-def test_what_is_wrong_is_said_in_one_line_and_nothing_is_stored(campaign, capsys, text, wrong):
-    for command in (("identify", campaign, "--effects", f"joint_compliance,{text}"),
-                    ("refine", campaign, "--effects", text),
-                    ("add", campaign, text)):  # fmt: skip
-        assert wrong in refused(capsys, 2, *command)
-    assert revisions(campaign) == []
-
-
-def test_other_refusals(campaign, capsys):
-    assert "has 2 effects; valid: one" in refused(capsys, 2, "add", campaign, "creep,hysteresis")
-    assert "has 0 effects; valid: one" in refused(capsys, 2, "add", campaign, "")
-    assert "--effects is empty" in refused(capsys, 2, "identify", campaign, "--effects", " , ")
-    assert "unknown effect" in refused(capsys, 2, "remove", campaign, "creep(joints=1)")
-
-
 def test_effects_shows_options_and_defaults(capsys):
     d = {e["name"]: e for e in ok(capsys, "effects", "--json").document["effects"]}
     assert d["backlash"]["options"] == ["joints", "crossing"]
@@ -120,25 +101,3 @@ def test_effects_shows_options_and_defaults(capsys):
         "(joints=1-3)",
     ):
         assert part in words
-
-
-@pytest.mark.long
-def test_joints_that_differ_are_let_differ(campaign, tmp_path, capsys):
-    finer = "joint_compliance(joints=each)"
-    ok(capsys, "identify", campaign, "--effects", "joint_compliance(joints=common)")
-    found = ok(capsys, "diagnose", campaign, "--json").document
-    told = " ".join(ok(capsys, "diagnose", campaign).out.split())
-    assert f'hilcal add RUN "{finer}"' in told
-    assert found["suspects"][0]["effect"] == finer
-    assert found["suspects"][0]["finer_than"] == "joint_compliance"
-    coarse = "joint_compliance of the model is too coarse"
-    assert found["message"].startswith(f"{coarse}: {finer} explains")
-    assert found["tests"]["each"] == found["tests"]["level"] / found["tests"]["count"]
-    refused_ = refused(capsys, 4, "next", campaign, "-o", tmp_path / "next.json")
-    assert f"hilcal add {campaign} '{finer}'" in refused_
-    result = ok(capsys, "add", campaign, finer)
-    assert f"With {finer} the error on poses left out falls" in " ".join(result.out.split())
-    (_, last) = revisions(campaign)
-    assert last[0] == ("base_frame", "joint_compliance")
-    assert last[1] == finer
-    assert last[2]["joint_compliance"] == {"joints": "each"}

@@ -1,10 +1,10 @@
 """What is wrong is said in one line, with the exit code of its kind."""
 
 import re
+import shlex
 import signal
 import socket
 import sys
-import time
 import warnings
 from pathlib import Path
 
@@ -12,7 +12,6 @@ import pytest
 
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.errors import InputError
-from hilcal.store.campaign_file import CampaignFile
 from tests.support.cli_cases import (
     CELL,
     imported,
@@ -24,6 +23,7 @@ from tests.support.cli_cases import (
     stored_readings,
     table,
 )
+from tests.support.refusals import check, refusals
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +39,45 @@ def campaign(tmp_path):
 @pytest.fixture
 def fitted(tmp_path):
     return imported(tmp_path / "run.hilcal", "nothing", poses=6, then=("identify",))
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory):
+    """A folder with a fitted campaign, one without a revision, a cell, and files of other kinds."""
+    folder = tmp_path_factory.mktemp("lab")
+    (folder / "nothing").mkdir()
+    table(folder / "good.csv", "nothing", poses=6)
+    imported(folder / "bare.hilcal", "nothing", poses=6)
+    imported(folder / "run.hilcal", "nothing", 1, 6, ("identify", "--readings", "absolute"))
+    names = ",".join(f"q{k}_rad" for k in range(1, 7))
+    for name, text in {
+        "cell.toml": CELL.read_text(encoding="utf-8"),
+        "mine.py": "of my own",
+        "empty.json": "{}",
+        "points.csv": f"{names}\n0.1,-1.5,1.2,-1.0,0.7,0.2\n",
+        "foreign.csv": "Point;A1;A2;A3;A4;A5;A6;X;Y;Z\nP1;1;2;3;4;5;6;700;800;900\n",
+        "tabs.csv": "pose\tload\tq1_rad\nP1\tnone\t0.1\n",
+        "json.csv": '[{"pose": "P1"}]',
+        "json2.csv": '{\n "pose": "P1"\n}',
+        "page.csv": "<html><table><tr><td>1</td></tr></table></html>",
+    }.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    return folder
+
+
+def contents(folder):
+    return {path: path.is_file() and path.read_bytes() for path in folder.rglob("*")}
+
+
+@refusals("commands")
+def test_a_command_is_refused_in_one_line_and_changes_nothing(
+    case, given, lab, capsys, monkeypatch
+):
+    monkeypatch.chdir(lab)
+    before = contents(lab)
+    line = refused(capsys, 2, *shlex.split(given)).removeprefix("error: ")
+    check(case, line.replace(f"{lab}/", ""))
+    assert contents(lab) == before
 
 
 def rows_of(path):
@@ -59,70 +98,6 @@ def test_a_pose_without_an_unloaded_reading(good, tmp_path, capsys):
     assert d["readings"] == "absolute"  # deflections are not possible, so they are not the default
 
 
-def test_files_that_are_no_campaigns(good, campaign, tmp_path, capsys):
-    assert "not a hilcal campaign" in refused(capsys, 2, "compare", good)
-    line = refused(capsys, 2, "import", campaign, "--config", CELL, "-o", tmp_path / "x.hilcal")
-    assert "run.hilcal" in line
-    refused(capsys, 2, "import", good, "--config", CELL, "-o", good, "--force")
-    assert rows_of(good)  # a file of another kind is never overwritten
-
-
-@pytest.mark.parametrize("arguments", [
-    ("plan", CELL, "-o", "RUN"),
-    ("plan", CELL, "-o", "p.json", "--record", "RUN"),
-    ("next", "RUN", "-o", "RUN"),
-    ("refine", "RUN", "--record", "RUN"),
-    ("view", "RUN", "--record", "RUN"),
-    ("export", "RUN", "--calibration", "RUN", "--force"),
-    ("export", "RUN", "--cell", "RUN", "--force"),
-    ("report", "RUN", "-o", "RUN"),
-    ("init", "RUN", "--robot", "ur5e", "--force")])  # fmt: skip
-def test_nothing_but_an_import_replaces_a_campaign(arguments, fitted, capsys, monkeypatch):
-    campaign = fitted
-    monkeypatch.chdir(campaign.parent)
-    kept = campaign.read_bytes()
-    given = [campaign.name if a == "RUN" else a for a in arguments]
-    assert re.search("choose another name|name another file", refused(capsys, 2, *given))
-    assert campaign.read_bytes() == kept
-
-
-def test_a_plan_and_a_law_replace_no_file_of_another_kind(campaign, tmp_path, capsys):
-    cell, law = tmp_path / "CELL.toml", tmp_path / "mine.py"
-    cell.write_bytes(CELL.read_bytes())
-    law.write_text("of my own", encoding="utf-8")
-    ok(capsys, "identify", campaign)
-    for command in (("plan", cell), ("next", campaign)):
-        assert "exists and is not a plan" in refused(capsys, 2, *command, "-o", cell)
-    assert "is not a law of hilcal discover" in refused(capsys, 2, "discover", campaign, "-o", law)
-    assert (cell.read_bytes(), law.read_text("utf-8")) == (CELL.read_bytes(), "of my own")
-
-
-@pytest.mark.parametrize("arguments", [
-    ("report", "RUN", "-o", "CELL"),
-    ("report", "RUN", "-o", "LAW"),
-    ("view", "RUN", "--record", "CELL"),
-    ("refine", "RUN", "--record", "LAW"),
-    ("demo", "--record", "CELL"),
-    ("demo", "-o", "RUN"),
-    ("demo", "-o", "LAW"),
-    ("plan", "CELL", "-o", "p.json", "--csv", "CELL"),
-    ("plan", "CELL", "-o", "p.json", "--csv", "LAW"),
-    ("next", "RUN", "-o", "p.json", "--csv", "CELL"),
-    ("fleet", ".", "-o", "CELL"),
-    ("fleet", ".", "-o", "prior.json", "--report", "LAW"),
-    ("simulate", "CELL", "-o", ".")])  # fmt: skip
-def test_no_output_replaces_a_file_of_another_kind(arguments, fitted, capsys, monkeypatch):
-    campaign = fitted
-    monkeypatch.chdir(campaign.parent)
-    names = {"RUN": campaign, "CELL": Path("cell.toml"), "LAW": Path("mine.py")}
-    names["CELL"].write_bytes(CELL.read_bytes())
-    names["LAW"].write_text("of my own", encoding="utf-8")
-    kept = {path: path.read_bytes() for path in names.values()}
-    line = refused(capsys, 2, *(names.get(a, a) for a in arguments))
-    assert re.search("exists and is (not|no) .*; it is not overwritten", line)
-    assert {path: path.read_bytes() for path in names.values()} == kept
-
-
 @pytest.mark.long
 def test_an_output_replaces_the_one_before(campaign, capsys, monkeypatch):
     monkeypatch.chdir(campaign.parent)
@@ -134,24 +109,6 @@ def test_an_output_replaces_the_one_before(campaign, capsys, monkeypatch):
         ok(capsys, "report", campaign, "-o", "page")
         ok(capsys, "view", campaign, "--record", "r")
         ok(capsys, "plan", "cell.toml", "-o", "p", "--csv", "c", "--poses", "6", "--quick")
-
-
-def test_unknown_names_list_the_valid_ones(campaign, good, tmp_path, capsys):
-    line = refused(capsys, 2, "add", campaign, "histeresis")
-    assert "hysteresis" in line
-    assert "base_frame" in line
-    assert "hysteresis" in refused(capsys, 2, "identify", campaign, "--effects", "histeresis")
-    assert "gc" in refused(capsys, 2, "identify", campaign, "--scaling", "full")
-    assert "absolute" in refused(capsys, 2, "identify", campaign, "--readings", "relative")
-    bad = tmp_path / "cell.toml"
-    bad.write_text('[robot]\nmodel = "ur10f"\n', encoding="utf-8")
-    assert "ur10e" in refused(capsys, 2, "import", good, "--config", bad, "-o", tmp_path / "x")
-    bad.write_text('[robot]\nmodel = "ur10e"\ncolour = 1\n', encoding="utf-8")
-    assert "colour" in refused(capsys, 2, "import", good, "--config", bad, "-o", tmp_path / "x")
-    line = refused(
-        capsys, 2, "import", good, "--config", CELL, "-o", tmp_path / "x", "--format", "xls"
-    )
-    assert "ipa-ur10" in line
 
 
 def test_fewer_readings_than_parameters(tmp_path, capsys):
@@ -208,17 +165,6 @@ def test_view_serves_until_it_is_told_to_stop(campaign, number, capsys, free_por
             process.kill()
     assert process.returncode == 0, err
     assert "Traceback" not in out + err
-
-
-def test_a_kill_leaves_every_committed_revision(fitted, capsys):
-    campaign = fitted
-    process = start("refine", campaign)
-    time.sleep(0.3)  # anywhere: whatever it is doing, the file stays whole
-    process.kill()
-    process.communicate()
-    with CampaignFile.open(campaign) as stored:
-        assert len(stored.revisions()) >= 1
-    assert ok(capsys, "refine", campaign, "--json").document["verdict"] == "adequate"
 
 
 @pytest.mark.parametrize(("no_wheel", "said"), [

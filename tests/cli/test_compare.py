@@ -117,7 +117,6 @@ def test_what_cannot_be_compared_is_refused_in_one_line(site, capsys):
     told = site.config.with_keys("robot", model="ur3e")
     other = site.store("other.hilcal", readings, told)
     assert "another arm (ur3e)" in refused(capsys, 2, "compare", site.earlier, other)
-    assert "later campaign" in refused(capsys, 2, "compare", site.earlier, "--same-setup")
 
 
 def test_readings_that_were_fitted_are_left_out_and_told(site, capsys):
@@ -187,16 +186,6 @@ def test_two_campaigns_of_one_arm_have_a_page_that_says_what_has_changed(campaig
     text = page.read_text(encoding="utf-8")
     for file in (campaign, later):
         assert hashlib.sha256(file.read_bytes()).hexdigest() in text
-
-
-@pytest.mark.parametrize(("arguments", "says"), [
-    (("-o", "run.hilcal"), "this is the campaign itself"),
-    (("run.hilcal", "--limit", "1 mm"), "no --validation, --register, --limit or --appendix"),
-    (("--limit", "1 apple"), "--limit"),
-    (("--revision", "7"), "revision 7")])  # fmt: skip
-def test_what_cannot_be_is_refused_in_one_line(campaign, capsys, monkeypatch, arguments, says):
-    monkeypatch.chdir(campaign.parent)
-    assert says in refused(capsys, 2, "report", "run.hilcal", *arguments)
 
 
 @pytest.mark.long

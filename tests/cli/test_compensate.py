@@ -13,7 +13,7 @@ from hilcal.readings.readings import States
 from hilcal.robot.chain import evaluate
 from hilcal.robot.factory import with_factory
 from hilcal.robot.se3 import matrix, of_six, rotation, six
-from tests.support.cli_cases import CELL, ok, refused, rehearsal, stored_readings
+from tests.support.cli_cases import ok, refused, rehearsal, stored_readings
 from tests.support.factory_cases import factory_of
 
 JOINTS = "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg"
@@ -170,32 +170,6 @@ def test_points_outside_are_refused_by_name_unless_told_otherwise(capsys, fitted
     assert out.exists()
 
 
-@pytest.mark.parametrize(("arguments", "words"), [
-    (("--load", "2t"), "--load 2t: no such load; valid: none, 5kg, 10kg"),
-    (("--load", "10kg", "--wrench", "0 0 1 0 0 0"), "more than one load is given"),
-    (("--wrench", "0 0"), "--wrench '0 0'; valid: 6 numbers"),
-    (("--tool", "a b c d e f"), "--tool 'a b c d e f'; valid: 6 numbers"),
-    (("--tool", "0 0 100 0 0 0"), "--tool '0 0 100 0 0 0' lies over 5 m from the flange"),
-    (("--tool", "0 0 0.1 0 180 0"), "is rotated by over a turn; valid: radians"),
-    (("-o", "x.pdf"), "x.pdf: unknown kind of file; valid: .csv, .json, .script"),
-    (("--revision", "7"), "revision")])  # fmt: skip
-def test_wrong_options_are_refused(capsys, fitted, tmp_path, arguments, words):
-    assert words in refused(capsys, 2, "compensate", fitted, table(tmp_path, fitted), *arguments)
-
-
-def test_what_is_no_campaign_or_no_table_is_refused(capsys, fitted, tmp_path):
-    points = table(tmp_path, fitted)
-    assert "no such campaign" in refused(capsys, 2, "compensate", tmp_path / "a.hilcal", points)
-    (tmp_path / "a.json").write_text("{}")
-    assert "no calibration" in refused(capsys, 2, "compensate", tmp_path / "a.json", points)
-    assert "row 7 has 1 cells" in refused(capsys, 2, "compensate", fitted, CELL)
-    existing = tmp_path / "o.csv"
-    existing.write_text("mine")
-    assert "--force" in refused(capsys, 2, "compensate", fitted, points, "-o", existing)
-    bare = made(tmp_path / "bare.hilcal")
-    assert "no revision yet" in refused(capsys, 2, "compensate", bare, points)
-
-
 def test_a_load_as_the_force_sensor_reads_it_is_the_load(capsys, fitted, tmp_path):
     points = table(tmp_path, fitted)
     ok(capsys, "export", fitted, "--calibration", tmp_path / "arm.json")
@@ -257,30 +231,6 @@ def test_every_command_counts_from_one_base_which_is_the_worlds(capsys, fitted, 
     report = tmp_path / "r.html"
     ok(capsys, "report", fitted, "-o", report)
     assert "the nominal arm on it has the axis of joint 1" in report.read_text()
-
-
-def test_a_joint_whole_turns_from_what_was_measured_is_inside(capsys, fitted, tmp_path):
-    """184.8 degrees are -175.2: the arm is there as measured, and stays on the turn it is given."""
-    with hc.Campaign.open(fitted, read_only=True) as run:
-        q = np.unique(run.readings.states.q, axis=0)
-    low, high = q[:, 5].min(), q[:, 5].max()
-    k = next(k for k in np.argsort(q[:, 5]) if q[k, 5] + 2 * np.pi > high + 0.1)
-    rows = np.stack([q[k], q[k] + 2 * np.pi * np.eye(6)[5], q[k]])
-    rows[2, 5] = high + 0.5 * (low + 2 * np.pi - high)  # where no turn has it
-    assert rows[1, 5] < 2 * np.pi
-    points = tmp_path / "points.csv"
-    lines = [",".join(f"{v:.9f}" for v in np.degrees(row)) for row in rows]
-    points.write_text("\n".join([JOINTS, *lines[:2]]))
-    found = ok(capsys, "compensate", fitted, points, "--load", "10kg", "--json").document
-    here, there = (np.array(p["q_corrected"]) for p in found["points"])
-    np.testing.assert_allclose(there - here, [0, 0, 0, 0, 0, 2 * np.pi], atol=1e-6)
-    assert [p["inside"] for p in found["points"]] == [True, True]
-    shown = ok(capsys, "compensate", fitted, points, "--load", "10kg").out
-    words = "joint 6 angle: in 1 of 2 points whole turns from what was measured"
-    assert words in " ".join(shown.split())
-    points.write_text("\n".join([JOINTS, *lines]))
-    said = refused(capsys, 4, "compensate", fitted, points, "--load", "10kg")
-    assert "1 of 3 points are refused: 3: joint 6 angle" in said
 
 
 def test_a_pose_of_a_program_is_by_the_controllers_own_kinematics(capsys, fitted, tmp_path):

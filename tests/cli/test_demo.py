@@ -6,15 +6,13 @@ import pytest
 from hilcal.cli.running import TRIES, first_plan, retry_after_failures
 from hilcal.cli.terminal import terminal
 from hilcal.config import load_config
-from hilcal.drivers.simulated.rehearsal import choices
 from hilcal.errors import DeviceError, InputError
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan
 from hilcal.store.procedure_log import purpose_of
 from studies.random_campaigns import rehearse
-from tests.support.cli_cases import CELL, ok, quickly_planned, refused, run
+from tests.support.cli_cases import CELL, ok, quickly_planned, run
 from tests.support.screen import AtTerminal
-from tests.support.user_effect_cases import CLASS
 
 FAST = "--without-devices"
 
@@ -42,14 +40,6 @@ def test_the_hidden_effect_is_found(effect, tmp_path, capsys):
     with CampaignFile.open(path) as stored:
         assert 80 < stored.n_readings < 150
         assert [r.added for r in stored.revisions()] == [r["added"] for r in d["revisions"]]
-
-
-@pytest.mark.slow
-def test_nothing_hidden_is_nothing_found(tmp_path, capsys):
-    path = tmp_path / "demo.hilcal"
-    d = ok(capsys, "demo", FAST, "--hide", "nothing", "--seed", "2", "-o", path, "--json").document
-    assert (d["hidden"], d["found"], d["verdict"]) == ("nothing", True, "adequate")
-    assert [r["added"] for r in d["revisions"]] == [None]
 
 
 @pytest.mark.long
@@ -92,59 +82,6 @@ def test_the_demo_in_words(tmp_path, capsys, monkeypatch):
     assert again.out == words  # the same seed, the same story
     assert asked[0] == asked[1]
     assert "is replaced" in again.err
-
-
-def test_the_demo_does_not_replace_another_file(tmp_path, capsys, monkeypatch):
-    path = tmp_path / "notes.txt"
-    path.write_text("mine", encoding="utf-8")
-    line = refused(capsys, 2, "demo", FAST, "--hide", "nothing", "-o", path)
-    assert "notes.txt" in line
-    assert path.read_text(encoding="utf-8") == "mine"
-    monkeypatch.chdir(tmp_path)
-    assert "is not a campaign" in refused(capsys, 2, "demo", FAST, "--hide", "nothing", "-o", ".")
-
-
-@pytest.mark.slow
-def test_an_effect_of_ones_own_is_hidden_and_found(tmp_path, capsys):
-    file = tmp_path / "mine.py"
-    file.write_text(CLASS, encoding="utf-8")
-    path = tmp_path / "own.hilcal"
-    own = ("--effects-from", file)
-    line = refused(capsys, 2, "demo", FAST, "--hide", "mine", "-o", path)
-    assert "'mine'" in line
-    result = ok(capsys, "demo", FAST, "--poses", "4", "--hide", "mine", *own, "-o", path, "--json")
-    d = result.document
-    assert (d["hidden"], d["found"], d["verdict"]) == ("mine", True, "adequate")
-    (parameter,) = [p for p in d["parameters"] if p["name"] == "mine.a"]
-    assert d["truth"]["mine.a"] == parameter["true"] != 0.0
-    assert abs(parameter["value"] - parameter["true"]) < 4 * parameter["std"]
-    words = " ".join(result.err.split())
-    assert "followed the law of mine as the model has it" in words
-    assert f"hilcal view {path} --effects-from {file}" in words
-
-
-@pytest.mark.slow
-def test_an_invented_law_is_discovered(tmp_path, capsys):
-    path = tmp_path / "demo.hilcal"
-    result = ok(capsys, "demo", FAST, "--hide", "invented", "-o", path, "--json")
-    d, words = result.document, " ".join(result.err.split())
-    assert (d["hidden"], d["found"], d["verdict"]) == ("invented", True, "adequate")
-    assert [r["added"] for r in d["revisions"]] == [None, "law_of_demo"]
-    (search,) = d["discover"]
-    assert search["laws"][0]["formula"] == "dq_3 = a·cos(q_5)·τ_3"
-    law = tmp_path / "law_of_demo.py"
-    assert search["written"] == str(law)
-    assert "a law that is not in the catalogue" in words
-    assert f"hilcal view {path} --effects-from {law}" in words
-    stored = ok(capsys, "diagnose", path, "--effects-from", law, "--json")
-    assert stored.document["verdict"] == "adequate"
-
-
-def test_what_cannot_be_hidden(tmp_path, capsys):
-    line = refused(capsys, 2, "demo", "--hide", "gremlins", "-o", tmp_path / "x.hilcal")
-    assert all(name in line for name in (*choices(), "random", "nothing"))
-    line = refused(capsys, 2, "demo", "--seed", "-1", "-o", tmp_path / "x.hilcal")
-    assert "--seed" in line
 
 
 def test_a_random_choice_gives_nothing_away():
@@ -214,17 +151,6 @@ def test_a_person_is_shown_the_plan_and_asked(columns, toml):
         assert "nothing has moved" in person.text
         assert person.lines[-1] == "  hilcal plan cell.toml -o plan.json --seed 4"
     assert not (home / "run.hilcal").exists()
-
-
-@pytest.mark.slow
-def test_ctrl_c_at_the_question_and_the_end_of_the_input_are_no(toml):
-    for keys, words in (("\x03", "error: interrupted"), ("\x04", "nothing has moved")):
-        with AtTerminal("run", "cell.toml", "-o", "run.hilcal", home=toml.parent) as person:
-            person.check_words_stay("n = no:")
-            person.type_keys(keys)
-            assert person.wait_for_end() == 130
-            assert words in person.text
-    assert not (toml.parent / "run.hilcal").exists()
 
 
 @pytest.mark.long

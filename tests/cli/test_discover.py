@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -200,38 +199,3 @@ def test_a_law_is_found_written_added_and_the_model_is_adequate(motion, formula,
     added = ok(capsys, "add", campaign, "found", "--effects-from", found, "--json").document
     assert added["verdict"] == "adequate"
     assert added["revisions"][-1]["variance_factor"] < 0.4 * before["variance_factor"]
-
-
-@pytest.mark.long
-def test_next_separates_a_law_from_what_readings_do_not_tell_from_it(campaign, tmp_path, capsys):
-    square = Factor(VARIABLES["q_5"], shapes.EVEN, (2.0, 0.01))
-    other = Form((LawPart(sites(6)[2], Amplitude((square, PRODUCT[1])), 0),))
-    given: list[str | Path] = []
-    for name, form in (("found", COMPLIANCE), ("found_or_1", other)):
-        path = tmp_path / f"{name}.py"
-        source = source_of_form(form, name, (Coefficient("a", 2e-6, 1e-7, "rad/(N·m)"),))
-        path.write_text(source, encoding="utf-8")
-        given += ["--effects-from", path]
-    plan, asked = tmp_path / "plan.json", ("--poses", "4", "--quick", "--json")
-    suspects = ("--suspects", "found,found_or_1")
-    planned = ok(capsys, "next", campaign, "-o", plan, *suspects, *given, *asked).document
-    assert planned["suspects"] == ["found", "found_or_1"]
-    now, then = (
-        {(a, b): power for a, b, power in planned[key]} for key in ("separates_now", "separates")
-    )
-    assert {*then} == {("found", "found_or_1"), ("found_or_1", "found")}
-    assert all(then[pair] >= now[pair] for pair in then)
-    assert plan.exists()
-
-
-@pytest.mark.parametrize(("given", "message"), [
-    (("-o", "found.txt"), "the effect has the name of its file"),
-    (("-o", "creep.py"), "no name of the catalogue"),
-    (("-o", "nowhere/found.py"), "no folder"),
-    (("-o", "found.py", "--against", "creep", "--revision", "1"), "give one of them"),
-    (("-o", "found.py", "--against", "crep"), "unknown effect"),
-    (("-o", "found.py", "--against", "no.json"), "no such file")])  # fmt: skip
-def test_what_cannot_be_is_refused_by_name(campaign, capsys, given, message):
-    found = run(capsys, "discover", campaign, *given)
-    assert found.code == 2
-    assert message in " ".join(found.err.split())

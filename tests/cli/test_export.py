@@ -159,22 +159,6 @@ def test_the_corrected_table_is_a_robot_again(capsys, fitted, tmp_path):
     assert (tmp_path / "m.csv").read_text().startswith("joint,a_m,d_m,alpha_rad,offset_rad\n")
 
 
-@pytest.mark.parametrize(("arguments", "words"), [
-    ((), "nothing to export; give --readings"),
-    (("--readings", "{out}/r.xlsx"), "unknown kind of table; valid: .csv or .parquet"),
-    (("--parameters", "{out}/p.txt"), "--parameters"),
-    (("--dh", "{out}/d.json"), "valid: .toml or .csv"),
-    (("--dh-modified", "--urdf", "{out}/a.urdf"), "--dh-modified needs --dh"),
-    (("--ur-hash", "calib_1", "--urdf", "{out}/a.urdf"), "--ur-hash needs"),
-    (("--ur-kinematics", "{out}/k.yaml", "--ur-hash", "mine"), "valid: calib_ and digits"),
-    (("--table", "{out}/t.csv", "--readings", "{out}/t.csv"), "two things cannot be written"),
-])  # fmt: skip
-def test_what_cannot_be_written_is_refused(capsys, fitted, tmp_path, arguments, words):
-    given = [a.format(out=tmp_path) for a in arguments]
-    assert words in refused(capsys, 2, "export", fitted, *given)
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_parquet_file_that_cannot_be_readings_is_refused(capsys, tmp_path):
     import pyarrow
 

@@ -1,16 +1,14 @@
 """A new lab's first day, as the README leads it: each claim that is printed, held to the truth.
 
-`init`, `plan`, `run --rehearse`, `refine`, `next`, `report`, `compensate`, `export` and the table
-of a colleague, each at a terminal of 80 columns, in a simulated cell with a hidden effect. What the
-words tell to do next is done.
+`init`, `plan`, `run --rehearse`, `refine`, `next`, `report` and the table of a colleague, each at a
+terminal of 80 columns, in a simulated cell with a hidden effect. What the words tell to do next is
+done.
 """
 
-import csv
 import html
-import json
 import re
 import shlex
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +16,6 @@ import pytest
 from scipy.stats import chi2
 
 import hilcal as hc
-from hilcal.calibration.programs.urscript import waypoints
 from hilcal.config import load_config
 from hilcal.drivers.simulated.mechanics import displacement
 from hilcal.drivers.simulated.rehearsal import (
@@ -28,15 +25,13 @@ from hilcal.drivers.simulated.rehearsal import (
     simulate_plan,
 )
 from hilcal.readings.readings import States
-from hilcal.robot.catalogue import load_arm
-from hilcal.robot.se3 import inverse, of_six, rotation
+from hilcal.robot.se3 import rotation
 from hilcal.store.plan import load_plan
 from tests.support.campaign_cases import STARVED
 from tests.support.foreign_tables import lines as table_of
 from tests.support.foreign_tables import write
 from tests.support.screen import AtTerminal
-from tests.unit.calibration.other_eyes import by_pinocchio, flanges, urdf_model
-from tests.unit.calibration.test_base import by_ur, pose, seen
+from tests.unit.calibration.test_base import seen
 
 pytestmark = pytest.mark.slow
 HIDDEN, SEED, POSES, RUN = "link_geometry", 5, 20, "rehearsal.hilcal"
@@ -122,16 +117,10 @@ class Day:
         with hc.Campaign.open(self.home / RUN, read_only=True) as run:
             return run.calibration()
 
-    def states(self, load: str | None = None) -> States:
-        """States that were measured; under one load, each on the way to the next one."""
+    def states(self) -> States:
+        """States that were measured."""
         with hc.Campaign.open(self.home / RUN, read_only=True) as run:
-            r = run.readings
-        if load is None:
-            return r.states
-        mine = r.states[r.load == r.load_names.index(load)]
-        order = np.lexsort(mine.q.T[::-1])
-        q = mine.q[order]
-        return replace(mine[order][:-1], q=0.85 * q[:-1] + 0.15 * q[1:])
+            return run.readings.states
 
 
 @pytest.fixture(scope="module")
@@ -239,66 +228,6 @@ def test_the_report_passes_what_the_truth_passes(day):
 
 def the_same_base(text):
     return re.search(r"The robot's base: at .*? in the tracker frame", text)[0]
-
-
-def test_corrected_joint_values_put_the_tool_where_it_was_asked_to_be(day):
-    states, c = day.states("10kg"), day.calibration()
-    names = [f"m{k}" for k in range(len(states))]
-    head = ["pose", *(f"q{k}_deg" for k in range(1, 7)), "load"]
-    text = table_of(head, names, np.degrees(states.q), ["10kg"] * len(states), comma=True, digits=9)
-    write(day.home / "points.csv", text)
-    said = day.at("compensate", RUN, "points.csv", "-o", "corrected.csv", "-o", "corrected.script")
-    assert the_same_base(said.text) == the_same_base(day.said["refine"].text)
-    with (day.home / "corrected.csv").open() as stream:
-        rows = list(csv.DictReader(stream))
-    q = np.array([[float(r[f"q{j}_rad"]) for j in range(1, 7)] for r in rows])
-    program = waypoints((day.home / "corrected.script").read_text())
-    np.testing.assert_allclose([w.q for w in program], q, atol=2e-9)
-    base, tool = c.base_in_tracker(), c.tool_pose()
-    asked_for = (flanges(c.model.cell.arm, states.q) @ tool)[:, :3, 3]
-    world = day.secret.world
-    before, after = (
-        np.linalg.norm(seen(world, replace(states, q=at), base) - asked_for, axis=1)
-        for at in (states.q, q)
-    )
-    band = said.number(r"95 % of the points within ([\d.]+) (\S+);")
-    assert np.mean(after <= band) >= 0.9
-    assert abs(said.number(r"error before ([\d.]+) (\S+) mean") - before.mean()) < band
-    assert after.mean() < 0.05 * before.mean()
-
-
-def test_every_export_puts_the_arm_where_the_tracker_finds_it(day):
-    """But for what it says that it leaves out: an arm of this geometry that does not yield."""
-    words = "--urdf a.urdf --dh a.toml --ur-kinematics a.yaml --frames frames.json"
-    said = day.at("export", RUN, *words.split(), "--calibration", "arm.json")
-    assert "Not included, as not constant: joint_compliance" in said.text
-    assert the_same_base(said.text) == the_same_base(day.said["refine"].text)
-    told = json.loads((day.home / "frames.json").read_text())
-    base, tool = pose(told["base_in_tracker"]), pose(told["tool_on_flange"])
-    the_base_is_true(day, said)
-    states, c = day.states("10kg"), hc.Calibration.load(day.home / "arm.json")
-    states = replace(states, wrench=0 * states.wrench)
-    world = day.secret.world
-    soft = world.physics.joint_compliance
-    stiff = replace(world, physics=replace(world.physics, joint_compliance=0 * soft))
-    wanted, found = seen(stiff, states, base), c.predict(states.q)
-    urdf, ur = (day.home / "a.urdf").read_text(), (day.home / "a.yaml").read_text()
-    exported = {
-        "URDF": by_pinocchio(urdf_model(urdf), states.q) @ tool,
-        "DH": flanges(load_arm(str(day.home / "a.toml")), states.q) @ tool,
-        "UR": by_ur(ur, states.q) @ pose(told["tcp_for_ur_kinematics"]),
-    }
-    nominal = flanges(c.model.cell.arm, states.q) @ tool
-    for name, poses in exported.items():
-        off = np.linalg.norm(poses[:, :3, 3] - wanted, axis=1)
-        assert np.mean(off <= found.band_m) > 0.9, name
-        assert off.mean() < 0.1 * np.linalg.norm(nominal[:, :3, 3] - wanted, axis=1).mean(), name
-    predicted = np.linalg.norm(found.position - seen(world, states, base), axis=1)
-    assert np.mean(predicted <= found.band_m) > 0.9
-    controller = told["controller"]
-    there = inverse(of_six(controller["tracker_in_base_m_rad"]))
-    np.testing.assert_allclose(there, base, atol=1e-9)
-    np.testing.assert_allclose(c.base_in_tracker(), base, atol=1e-9)
 
 
 def test_the_table_of_a_colleague_tells_the_same(day):

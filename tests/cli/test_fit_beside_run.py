@@ -1,7 +1,6 @@
 """Two programs on one campaign: one measures into it, the other one fits it and stores the fit."""
 
 import sqlite3
-import time
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -93,7 +92,7 @@ def test_what_a_refinement_stores_follows_itself(run, found):
 
 
 def test_commands_beside_a_run(run, capsys):
-    """Each fits what it read, whatever comes meanwhile; more in the slow suite."""
+    """Each fits what it read, whatever comes meanwhile."""
     with appending(run, 1, pause=0.1) as process:
         with CampaignFile.open(run, read_only=True) as file:
             there = file.n_readings
@@ -114,24 +113,6 @@ def test_commands_beside_a_run(run, capsys):
 def readings_of(path):
     with CampaignFile.open(path, read_only=True) as file:
         return file.readings()
-
-
-@pytest.mark.slow
-def test_many_commands_at_random_moments_beside_a_run(fresh, tmp_path, capsys):
-    rng = np.random.default_rng(8)
-    commands = [
-        ["identify", "--readings", "absolute"],
-        ["refine", "--readings", "absolute", "--effects", "joint_compliance"],
-    ]
-    for k in range(60):
-        path = tmp_path / f"{k}.hilcal"
-        path.write_bytes(fresh)
-        with appending(path, k, pause=float(rng.choice([0.02, 0.2, 1.0]))):
-            for _ in range(3):
-                time.sleep(rng.uniform(0.0, 0.3))
-                name, *words = commands[rng.choice(len(commands))]
-                ok(capsys, name, path, *words)
-                checked(path)
 
 
 # what programs before left behind

@@ -18,7 +18,6 @@ from tests.support.cli_cases import CELL, ok, rehearsal, run, stored_readings
 from tests.support.paths import ROOT
 from tests.support.rows import first
 
-OLD = "<!DOCTYPE html>what was there"  # which a page may replace
 POINTS = "pose,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad\n" + "\n".join(
     f"w{k},{0.1 + 0.01 * k},-1.2,1.4,-1.7,-1.5,0.2" for k in range(40)
 )
@@ -50,41 +49,6 @@ def full_after(size):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-COMMANDS = [
-    *(("export", "run.hilcal", option, name) for option, name in (("--readings", "r.csv"),
-        ("--readings", "r.parquet"), ("--table", "t.csv"), ("--cell", "C.toml"), ("--parameters",
-        "p.csv"), ("--parameters", "p.json"), ("--residuals", "e.csv"), ("--calibration",
-        "c.json"))),
-    *(("compensate", "run.hilcal", "points.csv", "--load", "10kg", "-o",
-        name) for name in ("o.script", "o.csv", "o.json")),
-    ("report", "run.hilcal", "-o", "story.html"),
-    ("import", "table.csv", "--preview", "-o", "m.toml"),
-    ("effects", "new", "mine", "-o", "mine.py"),
-]  # fmt: skip
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("size", [0, 200])
-def test_a_full_disk_leaves_no_half_file(capsys, fitted, monkeypatch, size):
-    monkeypatch.chdir(fitted)
-    for command in COMMANDS:
-        output = Path(command[-1])
-        for old in (None, OLD):
-            output.unlink(missing_ok=True)
-            if old is not None:
-                output.write_text(old)
-            if command[0] == "effects" and old is not None:
-                continue
-            force = ["--force"] if old and command[0] in ("export", "import", "compensate") else []
-            here = {*Path().iterdir(), output}
-            with full_after(size):
-                ended = run(capsys, *command, *force)
-            assert ended.code == 2, (command, ended)
-            assert f"{output}: cannot be written (File too large)" in ended.err, command
-            assert (output.read_text() if output.exists() else None) == old, command
-            assert set(Path().iterdir()) <= here, command
-
-
 def test_an_import_that_finds_no_room_leaves_the_campaign_that_was_there(
     capsys, fitted, monkeypatch
 ):
@@ -104,42 +68,6 @@ def test_an_import_that_finds_no_room_leaves_the_campaign_that_was_there(
             assert f"error: {output}: cannot be written" in ended.err
             assert old.read_bytes() == kept
             assert set(Path().iterdir()) == here
-
-
-def test_a_link_stays_and_output_may_be_a_pipe(capsys, fitted, monkeypatch):
-    monkeypatch.chdir(fitted)
-    real, link = Path("real.script"), Path("link.script")
-    real.write_text(OLD)
-    link.symlink_to(real)
-    ok(capsys, "compensate", "run.hilcal", "points.csv", "--load", "10kg", "-o", link, "--force")
-    assert link.is_symlink()
-    assert "movej" in real.read_text()
-    Path("link.csv").symlink_to("none.csv")
-    ok(capsys, "export", "run.hilcal", "--readings", "link.csv", "--force")
-    assert Path("none.csv").read_text().startswith("pose,")
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("redirected", [False, True])
-def test_standard_output_is_written_straight(fitted, redirected):
-    """`--preview -o /dev/stdout` would be no .toml: a link gives the name."""
-    link, out = fitted / f"out-{redirected}.toml", fitted / "redirected"
-    link.symlink_to("/dev/stdout")
-    command = [sys.executable, "-m", "hilcal", "import", "table.csv", "--preview"]
-    command += ["-o", str(link), "--force"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    with out.open("w") as stream:
-        ended = subprocess.run(
-            command,
-            cwd=fitted,
-            env=environment,
-            stdout=stream if redirected else subprocess.PIPE,
-            check=True,
-            text=True,
-        )
-    told = out.read_text() if redirected else ended.stdout
-    assert "proposed by `hilcal import --preview`" in told
-    assert link.is_symlink()
 
 
 @pytest.mark.long

@@ -123,21 +123,6 @@ def test_an_unexpected_error_and_an_interrupt_are_documents(capsys, monkeypatch)
     assert (found.code, found.document["error"]) == (130, error)
 
 
-@pytest.mark.parametrize(("typed", "near"), [
-    ("nxt", "'next'"), ("new", "'effects'"), ("Measure", "'calibrate', 'run', 'workbench'")
-])  # fmt: skip
-def test_an_unknown_command_suggests_what_has_its_letters_or_its_word(typed, near, capsys):
-    line = refused(capsys, 2, typed)
-    assert line == f"error: No such command '{typed}'. Did you mean {near}? See hilcal -h"
-    assert refused(capsys, 2, "xyzzy") == "error: No such command 'xyzzy'; see hilcal -h"
-
-
-def test_a_usage_error_names_the_help(capsys):
-    assert refused(capsys, 2, "run", "x", "--foo").endswith("see hilcal run -h")
-    assert refused(capsys, 2, "diagnos").endswith("Did you mean 'diagnose'? See hilcal -h")
-    assert "EFFECT" in refused(capsys, 2, "add", "run.hilcal")
-
-
 HEAVY = ("numpy", "scipy", "pydantic", "pinocchio", "rerun", "sklearn", "rich.console", "dask")
 SLOW = ("asyncio", "plotly", "rerun", "sklearn")
 """Libraries that few commands need, each a tenth of a second or more to load."""

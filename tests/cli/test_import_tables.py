@@ -266,29 +266,6 @@ def test_expanded_uncertainty_of_a_point(tmp_path, capsys):
     np.testing.assert_allclose(values(tmp_path).covariance[5], expected, rtol=1e-9, atol=1e-20)
 
 
-def test_a_table_of_another_form_says_what_to_do(tmp_path, capsys):
-    path = write(tmp_path / "t.csv", GOOD)
-    line = refused(capsys, 2, "import", path, "--config", CELL, "-o", tmp_path / "x.hilcal")
-    assert "--preview" in line
-    line = refused(capsys, 2, "import", path)
-    assert "--config CELL.toml is missing" in line
-    line = refused(capsys, 2, "import", path, "--preview", "-o", tmp_path / "run.hilcal")
-    assert "mapping.toml" in line
-    both = ("--preview", "--format", "polyworks")
-    assert "--format" in refused(capsys, 2, "import", path, *both)
-
-
-@pytest.mark.parametrize(("text", "said"), [
-    ("pose\tload\tq1_rad\nP1\tnone\t0.1\n", "columns must be separated by ','"),
-    ('[{"pose": "P1"}]', "JSON; save the table as CSV"),
-    ('{\n "pose": "P1"\n}', "JSON; save the table as CSV"),
-    ("<html><table><tr><td>1</td></tr></table></html>", "HTML or XML")])  # fmt: skip
-def test_a_file_of_another_form_is_named(text, said, tmp_path, capsys):
-    path = write(tmp_path / "t.csv", text)
-    line = refused(capsys, 2, "import", path, "--config", CELL, "-o", tmp_path / "x.hilcal")
-    assert said in line
-
-
 def exchange(tmp_path, orientation):
     """An exchange table of 40 poses, and the cell of an arm whose frames are not stated."""
     c = campaign(40)

@@ -4,7 +4,6 @@ import hashlib
 import json
 import shlex
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ import pytest
 import hilcal as hc
 from hilcal.calibration.handover import urdf
 from hilcal.campaign.campaign import Campaign
-from hilcal.cell import cell_from_config
 from hilcal.config import load_config
 from hilcal.errors import InputError
 from hilcal.present.html.report import page
@@ -169,7 +167,6 @@ def test_a_campaign_that_holds_nothing_yet(tmp_path, capsys):
     ).close()
     assert ok(capsys, "info", path, "--json").document["n_readings"] == 0
     assert "none yet" in ok(capsys, "info", path).out
-    assert "no such campaign" in refused(capsys, 2, "info", tmp_path / "none.hilcal")
 
 
 @pytest.fixture
@@ -258,21 +255,6 @@ def test_a_run_does_not_go_on_with_another_robot(sent, tmp_path):
         (tmp_path / "own.urdf").write_text(urdf(load_arm("ur5e")), encoding="utf-8")
         with pytest.raises(InputError, match=r"own\.urdf has changed since"):
             check_same_cell(campaign, config, tmp_path)
-
-
-def test_a_campaign_reads_no_file_that_it_names(sent, tmp_path):
-    """The arm is the one that is kept, whatever stands at the path now."""
-    path, config = sent
-    with CampaignFile.open(path, read_only=True) as file:
-        kept, place = file.about(ROBOT_FILE), Path(file.base_dir)
-    place.mkdir()
-    (place / "own.urdf").write_text(urdf(load_arm("ur5e")), encoding="utf-8")
-    with hc.Campaign.open(path) as run:
-        assert run.cell.arm.name == "own"
-        np.testing.assert_allclose(run.cell.arm.links[2], load_arm("ur10e").links[2], atol=1e-9)
-    assert not np.allclose(
-        cell_from_config(config, place).arm.links, cell_from_config(config, None, kept).arm.links
-    )
 
 
 def test_info_reads_the_kinematics_that_the_campaign_keeps(tmp_path, capsys, monkeypatch):

@@ -10,7 +10,7 @@ import tomli_w
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
 from hilcal.config.reference import SHOWN_KEYS, tables
-from tests.support.cli_cases import CELL, ok, refused, run
+from tests.support.cli_cases import CELL, ok, run
 from tests.support.screen import AtTerminal
 
 OPTIONS = (
@@ -99,50 +99,6 @@ def test_units_are_read_as_people_write_them(words, tmp_path, capsys):
     assert c.tool.mass_kg == 0.8
     assert c.limits.workspace_min_m[2] == 0.05
     assert [(x.mass_kg, x.force_N[0]) for x in c.loads] == [(0.0, 80.0), (0.5, 0.0)]
-
-
-def test_nothing_is_overwritten_unasked(tmp_path, capsys):
-    path = tmp_path / "CELL.toml"
-    path.write_text("mine", encoding="utf-8")
-    assert "the file exists" in refused(capsys, 2, "init", path, "--robot", "ur3")
-    assert path.read_text(encoding="utf-8") == "mine"
-    ok(capsys, "init", path, "--robot", "ur3", "--force")
-    assert load_config(path).robot.model == "ur3"
-    away = tmp_path / "no" / "CELL.toml"
-    assert "make it first" in refused(capsys, 2, "init", away, "--robot", "ur3")
-
-
-WRONG = {
-    "no robot": ((), "--robot is missing, and nobody can be asked; valid: fr3, "),
-    "robot": (("--robot", "ur10f"), '--robot "ur10f": unknown robot "ur10f" (did you mean'),
-    "driver": (("--robot", "ur3", "--tracker", "geocam"), 'is unknown (did you mean "geocom"?)'),
-    "port alone": (("--robot", "ur3", "--force-port", "x"), "--force-port without --force-sensor"),
-    "vector": (("--robot", "ur3", "--target", "1,2"), "--target \"1,2\": '1,2' is 2 numbers"),
-    "number": (("--robot", "ur3", "--floor", "low"), "'low' is no number; valid: one in m"),
-    "mm": (("--robot", "ur3", "--target", "60,20,120"), "is it in m?"),
-    "g": (("--robot", "ur3", "--tool-mass", "1e30"), "is over 5000 kg; is it in kg?"),
-    "heavy": (("--robot", "ur3", "--load", "1e30 kg"), "is over 5000 kg; is it in kg?"),
-    "pull": (("--robot", "ur3", "--load", "x = 0, 1e30, 0 N"), "is over 50000 N; is it in N?"),
-    "repeats": (("--robot", "ur3", "--repeatability", "0.05"), "is over 0.02 m; is it in m?"),
-    "noise": (
-        ("--robot", "ur3", "--tracker-accuracy", "8 um + 3"),
-        "range_std_per_m = 3.0 is over 0.1 m/m; is it in m/m?",
-    ),
-    "load": (("--robot", "ur3", "--load", "five"), "'five' is no load; valid: e.g. \"5 kg\""),
-    "load twice": (("--robot", "ur3", "--load", "5 kg", "--load", "5kg"), "names must differ"),
-    "some units": (("--robot", "ur3", "--target", "60 mm, 20, 120"), "valid: all or one"),
-    "other unit": (("--robot", "ur3", "--target", "1 in, 2 in, 3 in"), "the unit in; valid: m, mm"),
-    "other arm": (("--robot", "kr10"), "a .urdf file, or of a .toml file with DH rows"),
-    "unshown": (("--robot", "ur3", "--readings", "deflection"), '"deflection" needs a load'),
-    "zero": (("--robot", "ur3", "--load", "0 kg"), "is zero"),
-}
-
-
-@pytest.mark.parametrize("case", WRONG)
-def test_a_wrong_option_is_one_line_and_writes_nothing(case, tmp_path, capsys):
-    options, said = WRONG[case]
-    assert said in refused(capsys, 2, "init", tmp_path / "CELL.toml", *options)
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.long

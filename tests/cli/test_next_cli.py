@@ -154,20 +154,6 @@ def test_pairs_that_nothing_separates_are_refused(tmp_path, capsys):
     assert "no measurement separates them" in line
 
 
-@pytest.mark.parametrize(("arguments", "words"), [
-    (("--suspects", "gremlins,hysteresis"), ("gremlins", "valid")),
-    (("--suspects", "hysteresis"), ("--suspects", "2 to 4")),
-    (("--suspects", "hysteresis,hysteresis"), ("--suspects", "twice")),
-    (("--poses", "0"), ("--poses", "from 1")),
-    (("--seed", "-1"), ("--seed",)),
-    (("--record", "no/where.rrd"), ("no folder",)),
-    (("--cell", "nothing.toml"), ("nothing.toml",))])  # fmt: skip
-def test_wrong_options(arguments, words, tmp_path, capsys):
-    path = stored(tmp_path / "run.hilcal", "nothing", 1)
-    line = refused(capsys, 2, "next", path, "-o", tmp_path / "n.json", *arguments)
-    assert all(word in line for word in words)
-
-
 # the demo
 
 

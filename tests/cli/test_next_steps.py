@@ -6,12 +6,23 @@ import re
 import shlex
 from dataclasses import replace
 
+import pandas as pd
 import pytest
 
 import hilcal as hc
-from hilcal.diagnosis.comparison import Comparison
+from hilcal.campaign.campaign import Campaign
+from hilcal.campaign.changes import change_cell
+from hilcal.diagnosis.order_step import OrderStep
+from hilcal.diagnosis.verdict import diagnose
+from hilcal.diagnosis.wrong_figures import WrongFigure
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.procedure.next_plan import doubt_to_settle
+from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.store.campaign_file import CampaignFile
-from tests.support.cli_cases import CELL, imported, ok, refused
+from hilcal.tables.parquet_stream import open_stream
+from hilcal.tables.table import write_table
+from tests.cli.test_fit_beside_run import spoil
+from tests.support.cli_cases import CELL, imported, ok, refused, rehearsal
 from tests.support.cli_cases import run as command
 
 
@@ -33,26 +44,6 @@ def run(tmp_path):
 def fitted(tmp_path):
     """The same with the baseline."""
     return imported(tmp_path / "a run.hilcal", then=("identify",))
-
-
-@pytest.mark.long
-def test_without_a_revision(run, tmp_path, capsys):
-    out, later = tmp_path / "p.json", imported(tmp_path / "later.hilcal", seed=2)
-    for arguments in (
-        ("accept", run),
-        ("export", run, "--parameters", out),
-        ("export", run, "--calibration", out),
-        ("identify", later, "--prior", run),
-    ):
-        assert "hilcal identify" in refused(capsys, 2, *arguments)
-    assert "hilcal identify and refine make one" in ok(capsys, "info", run).out
-    assert "hilcal identify stores it" in " ".join(ok(capsys, "diagnose", run).err.split())
-    assert "hilcal refine makes a model" in " ".join(ok(capsys, "compare", run, later).err.split())
-    ok(capsys, "identify", run)
-    for arguments in (("accept", run), ("export", run, "--parameters", out), ("diagnose", run)):
-        assert "no revision" not in ok(capsys, *arguments).err
-    ok(capsys, "refine", run)
-    assert "no revision" not in ok(capsys, "compare", run, later).err
 
 
 def test_readings_were_appended(fitted, capsys):
@@ -118,7 +109,6 @@ def test_nothing_to_carry_over(run, tmp_path, capsys):
     ok(capsys, "refine", run)
     told = ok(capsys, "identify", later, "--prior", run)
     assert "nothing to carry over" not in told.err
-    assert "--prior OTHER.hilcal" in refused(capsys, 2, "identify", later, "--drift", "creep=1")
     ok(capsys, "identify", later, "--prior", run, "--drift", "joint_compliance=1")
 
 
@@ -179,9 +169,116 @@ def test_a_campaign_that_calibrate_did_not_make(run, capsys):
     follow(capsys, said, f"hilcal info '{run}'")
 
 
+def quiet(text):
+    """Take progress."""
+
+
 @pytest.mark.long
-def test_another_arm_is_calibrated_by_itself(run, tmp_path, capsys, monkeypatch):
+def test_a_revision_in_a_cell_that_was_changed(fitted, capsys):
+    run = fitted
+    with Campaign.open(run) as o:
+        change_cell(o, 1, o.fit(), {"tool": {"mass_kg": 1.4}}, quiet)
+    said = refused(capsys, 2, "diagnose", run, "--revision", "1")
+    follow(capsys, said, f"hilcal accept '{run}' 1")
+    ok(capsys, "diagnose", run, "--revision", "1")
+
+
+def test_what_accept_says(fitted, capsys):
+    run = fitted
+    ok(capsys, "identify", run, "--effects", "joint_compliance")
+    follow(capsys, ok(capsys, "accept", run, "1").out, f"hilcal accept '{run}' --release")
+    assert ok(capsys, "info", run, "--json").document["accepted"] is None
+
+
+@pytest.mark.long
+def test_a_bad_revision_is_set_aside_and_fitted_again(fitted, capsys):
+    run = fitted
+    with Campaign.open(run) as o:
+        found = o.fit()
+    spoil(run, found, "damage")
+    said = refused(capsys, 2, "diagnose", run)
+    told = follow(capsys, said, f"hilcal repair '{run}'").out
+    follow(capsys, told, f"hilcal identify '{run}'")
+    ok(capsys, "diagnose", run)
+
+
+@pytest.mark.long
+def test_masses_that_a_description_lacks(tmp_path, capsys):
+    text = (configs_dir() / "robots" / "ur10e.toml").read_text()
+    arm, cell, path = tmp_path / "arm.toml", tmp_path / "cell.toml", tmp_path / "run.hilcal"
+    arm.write_text(re.sub(r"(?m)^(mass_kg|com_m|weight_kg) = .*\n", "", text))
+    cell.write_text(CELL.read_text().replace('model = "ur10e"', f'model = "{arm}"'))
+    write_table(rehearsal("nothing", 1, 12).readings, csv := tmp_path / "t.csv")
+    ok(capsys, "import", csv, "--config", cell, "-o", path)
+    options = ("--readings", "absolute", "--effects", "base_frame,joint_compliance")
+    said = ok(capsys, "identify", path, *options).out
+    follow(capsys, said, "hilcal add RUN link_mass", RUN=path)
+    assert "hilcal add" not in ok(capsys, "info", path).out
+
+
+@pytest.mark.long
+def test_an_effect_that_an_earlier_model_lacks(run, tmp_path, capsys):
     later = imported(tmp_path / "later.hilcal", seed=2)
     ok(capsys, "identify", run)
-    monkeypatch.setattr(Comparison, "another_arm", True)
-    follow(capsys, ok(capsys, "compare", run, later).out, f"hilcal refine {later}")
+    said = ok(capsys, "compare", run, later).out
+    follow(capsys, said, "hilcal refine EARLIER", EARLIER=run)
+    assert "for this comparison alone" not in ok(capsys, "compare", run, later).out
+
+
+PLAN_AFTER = "hilcal plan CELL.toml -o PLAN.json --after {run}"
+
+
+@pytest.mark.parametrize(("reason", "words", "step"), [
+    ("wrong_figure", "a figure of the cell", "hilcal diagnose {run}"),
+    ("step", "moved in the middle", "hilcal export {run} --readings READINGS.csv"),
+    ("one_suspect", "hysteresis alone is missing", "hilcal add {run} hysteresis"),
+    *(
+        pytest.param(*further, marks=pytest.mark.long)
+        for further in (
+            ("misjudged_noise", "the noise is misjudged", "hilcal diagnose {run}"),
+            ("no_suspect", "no effect of the catalogue explains", "hilcal diagnose {run}"),
+            ("background", "one by one", PLAN_AFTER),
+            ("residual_is_noise", "is adequate", PLAN_AFTER),
+        )
+    )])  # fmt: skip
+def test_what_next_says_of_each_verdict(fitted, tmp_path, capsys, reason, words, step):
+    run = fitted
+    cell = tmp_path / "cell.toml"
+    cell.write_text(re.sub(r"candidates = \d+", "candidates = 60\nagainst = []", CELL.read_text()))
+    with Campaign.open(run) as o:
+        d = diagnose(o.fit(), o.history())
+        if reason == "step":
+            shifted = OrderStep(("target",), 20, 19, 1e-5, 1e-3, 0.9)
+            d = replace(d, reason="no_suspect", step=shifted)
+        else:
+            d = replace(d, reason=reason)
+        wrong = (
+            (WrongFigure("mass", "5kg", (5.0,), (9.8,), "kg", 1e-4, 2e-5),)
+            if "figure" in reason
+            else ()
+        )
+        with pytest.raises(CannotAnswerError, match=words) as said:
+            doubt_to_settle(o, replace(d, wrong_figures=wrong), quiet)
+    places = {"CELL.toml": cell, "PLAN.json": tmp_path / "p.json"}
+    places["READINGS.csv"] = tmp_path / "t.csv"
+    follow(capsys, str(said.value), step.format(run=f"'{run}'"), **places)
+
+
+def test_a_stream_of_several_targets(run, tmp_path, capsys):
+    frame = pd.read_csv(run.with_suffix(".csv")).assign(target="one")
+    frame.drop(columns=["pose", "load"]).to_parquet(path := tmp_path / "t.parquet")
+    with pytest.raises(InputError, match="import a table of several with `hilcal import`"):
+        open_stream(path, load_arm("ur10e"), None, None)
+    cell = tmp_path / "cell.toml"
+    one = r'targets = [{ name = "one", target_m = \1 }]'
+    cell.write_text(re.sub(r"(?m)^target_m = (.*)$", one, CELL.read_text()))
+    frame.to_parquet(path)
+    ok(capsys, "import", path, "--config", cell, "-o", tmp_path / "t.hilcal")
+
+
+def test_sections_of_a_cell(tmp_path, capsys):
+    said = ok(capsys, "config").out
+    follow(capsys, said, "hilcal config SECTION", SECTION="tracker")
+    assert "hilcal init writes a file" in said
+    ok(capsys, "init", path := tmp_path / "CELL.toml", "--robot", "ur3")
+    assert "hilcal config SECTION explains" in path.read_text()

@@ -6,7 +6,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-import time
 import tomllib
 from itertools import pairwise
 from pathlib import Path
@@ -28,7 +27,7 @@ from hilcal.store.run_log import RunLog, create_run
 from hilcal.tables.columns import joint_columns
 from hilcal.tables.table import write_table
 from tests.support import readme
-from tests.support.cli_cases import run, start
+from tests.support.cli_cases import run
 from tests.support.paths import ROOT
 
 FEW = "candidates = 60\nagainst = []\n"
@@ -181,9 +180,6 @@ def others(config, directory):
     book.save(directory / "theirs.xlsx")
 
 
-FAST = "[simulation]\nclock = 20.0\n"
-"""The world of the devices goes twenty times faster than a clock."""
-READY_S = 120.0
 TRIES = 5
 DEVICE_FAILED = 3
 
@@ -199,49 +195,6 @@ def measured(capsys, words):
         words = [w for w in words if w not in ("--resume", "--append")] + ["--resume"]
         result = run(capsys, *words)
     return result
-
-
-@pytest.mark.slow
-def test_every_command_on_devices(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    text = readme.cell().replace("[planning]\n", f"[planning]\n{FEW}") + FAST
-    Path("CELL.toml").write_text(text, encoding="utf-8")
-    others(load_config(Path("CELL.toml")), tmp_path)
-    devices = start("simulate", "CELL.toml", "-o", "DIR", cwd=tmp_path)
-    try:
-        there = Path("DIR/cell.toml")
-        ended = time.monotonic() + READY_S
-        while not there.is_file():
-            assert devices.poll() is None
-            assert time.monotonic() < ended, "no DIR/cell.toml"
-            time.sleep(0.2)
-        separated = True
-        for words in readme.commands(options=True):
-            if words[0] in ELSEWHERE or ("--append" in words and not separated):
-                continue
-            given = [str(there) if w == "CELL.toml" else w for w in words]
-            if words[0] == "compensate" and words[2].endswith(".src"):
-                program(Path(words[2]), Path(words[4]))
-            elif words[0] == "compensate":
-                points(Path(words[1]), Path(words[2]))
-            if words == ["compare", "run.hilcal", "later.hilcal"]:
-                later = ["--plan", "plan.json", "-o", "later.hilcal"]
-                assert measured(capsys, ["run", str(there), *later]).code == 0
-            if words[0] == "validate":
-                plan = ["--plan", "plan.json", "-o", "other.hilcal"]
-                assert measured(capsys, ["run", str(there), *plan]).code == 0
-            result = measured(capsys, given) if words[0] == "run" else run(capsys, *given)
-            if words[0] == "next":
-                separated = result.code == 0
-                assert separated or "no suspects to separate" in result.err
-                continue
-            assert result.code == 0, (words, result.err)
-            if "--until" in words:
-                told = " ".join(result.out.split())
-                assert "standard uncertainty (rms) of the predicted deflection" in told
-    finally:
-        devices.terminate()
-        devices.communicate(timeout=30)  # closes its pipes
 
 
 FOLDER = ROOT / "docs" / "tutorials"

@@ -2,8 +2,6 @@
 
 import hashlib
 import re
-import subprocess
-import sys
 
 import pytest
 
@@ -15,12 +13,10 @@ from hilcal.errors import InputError
 from hilcal.store import schema
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.revision import from_text, to_text
-from tests.support.cli_cases import CELL, done, ok, refused, table
+from tests.support.cli_cases import CELL, done, ok, table
 from tests.support.cli_cases import run as command
-from tests.support.paths import ROOT
 from tests.support.rows import first
 
-Capsys = pytest.CaptureFixture[str]
 BASE = ["base_frame", "joint_compliance"]
 
 
@@ -110,31 +106,6 @@ def test_a_reading_connection_can_write_nothing(run):
             o.file.append_revision(record)
 
 
-KILLED = """
-import os, pathlib, sys
-from hilcal.store import schema
-connection = schema.connect(pathlib.Path(sys.argv[1]))
-connection.execute("PRAGMA cache_size = 1")
-connection.execute("BEGIN IMMEDIATE")
-for k in range(400):
-    connection.execute("INSERT INTO meta VALUES (?, ?, ?)", (f"key {k}", "x" * 3000, 0))
-os._exit(9)
-"""
-"""A program that is killed in the middle of a transaction."""
-
-
-def test_what_a_killed_program_left_unfinished_is_undone_before_it_is_read(run):
-    """A journal beside the file: SQLite must undo it, which a read-only connection cannot."""
-    before = run.read_bytes()
-    subprocess.run([sys.executable, "-c", KILLED, str(run)], cwd=ROOT, check=False)
-    assert run.with_name("run.hilcal-journal").exists()
-    assert run.read_bytes() != before
-    with Campaign.open(run, read_only=True) as o:
-        assert len(o.file.revisions()) == 3
-    assert run.read_bytes() == before
-    assert [p.name for p in run.parent.iterdir()] == ["run.hilcal"]
-
-
 @pytest.mark.long
 def test_every_command_that_reads_a_model_takes_a_revision(run, tmp_path, capsys):
     two = [*BASE, "hysteresis"]
@@ -152,11 +123,6 @@ def test_every_command_that_reads_a_model_takes_a_revision(run, tmp_path, capsys
     parameters = tmp_path / "p.csv"
     ok(capsys, "export", run, "--parameters", parameters, "--revision", "2")
     assert "hysteresis.j2" in parameters.read_text()
-    said = refused(capsys, 2, "export", run, "--table", tmp_path / "t.csv", "--revision", "2")
-    assert "--parameters" in said
-    for name in ("compare", "diagnose", "view"):
-        said = refused(capsys, 2, name, run, "--revision", "9")
-        assert said.endswith("no revision 9; there are 1 to 3")
 
 
 @pytest.mark.slow
@@ -164,7 +130,6 @@ def test_planning_on_takes_a_revision(run, cell, tmp_path, capsys):
     plan = ("plan", cell, "-o", tmp_path / "plan.json", "--poses", "2", "--quick")
     d = ok(capsys, *plan, "--after", run, "--revision", "2", "--json").document
     assert any("hysteresis" in name for name in d["predicted_std"])
-    assert "--after" in refused(capsys, 2, *plan, "--revision", "2")
 
 
 @pytest.mark.long
@@ -266,14 +231,6 @@ def test_what_is_said_of_an_accepted_revision_that_will_not_do_leads_on(
         assert o.in_use() == o.latest()
         assert o.fit().scaling == "gc"
         assert len(o.fit().readings) == len(o.readings)
-
-
-def test_what_cannot_be_accepted_is_refused(run, fresh, capsys):
-    assert "there are 1 to 3" in refused(capsys, 2, "accept", run, "7")
-    assert "there are 1 to 3" in refused(capsys, 2, "accept", run, "0")
-    assert "leave out the number" in refused(capsys, 2, "accept", run, "1", "--release")
-    run.write_bytes(fresh)
-    assert "no revision yet" in refused(capsys, 2, "accept", run)
 
 
 def version(path):

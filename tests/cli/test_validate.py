@@ -161,8 +161,3 @@ def test_a_limit_is_kept_or_not_and_the_exit_code_says_so(folder, capsys):
     result = run(capsys, *arguments, "--limit", "1 µm")  # far below the noise: no answer
     assert result.code == 4
     assert "noise alone leaves" in result.err
-
-
-def test_a_limit_that_is_no_length_is_refused(tmp_path, capsys):
-    said = refused(capsys, 2, "validate", tmp_path, tmp_path, "--limit", "0.1 in")
-    assert '--limit "0.1 in"' in said

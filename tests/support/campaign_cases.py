@@ -2,7 +2,6 @@
 
 import os
 import re
-import resource
 import signal
 import socket
 import subprocess
@@ -134,7 +133,7 @@ class EndedError(AssertionError):
 class Run:
     """One `hilcal run`, in a session of its own."""
 
-    def __init__(self, site, path, *more, limit=None, how=()):
+    def __init__(self, site, path, *more, how=()):
         """Start it; unless `how` says otherwise, `--resume` where the campaign is there already."""
         self.site, self.path = site, path
         self.log = path.with_suffix(f".{time.monotonic_ns()}.log")
@@ -149,7 +148,6 @@ class Run:
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
                 env=environment,
-                preexec_fn=None if limit is None else lambda: _limited(limit),
             )
         self._family = {self.process.pid}
         self._looked = 0.0
@@ -246,10 +244,6 @@ def still_running(processes, seconds):
         if not names or time.monotonic() > end:
             return names
         time.sleep(0.02)
-
-
-def _limited(size):
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 
 
 def _alive(pid):

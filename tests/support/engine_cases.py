@@ -3,14 +3,10 @@
 import os
 import signal
 import time
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hilcal.engine import open_engine
-
-Ints = NDArray[np.integer[Any]]
 
 
 def singular_value(item, rng):

@@ -100,7 +100,3 @@ def base_cell(points=None, gauges=None):
 def stated(names):
     """Points whose place is stated."""
     return {name: Point(position_m=POINTS[name]) for name in names}
-
-
-def moved(frame, by):
-    return np.asarray(se3.matrix(*se3.exp(by)) @ frame)

@@ -85,13 +85,6 @@ def test_odd_campaigns_are_judged_or_refused_in_words(of, extra):
     judged_or_refused(of, extra)
 
 
-@pytest.mark.slow
-@settings(max_examples=300, suppress_health_check=list(HealthCheck), derandomize=False)
-@given(odd_campaigns(), st.sampled_from([None, *EXTRA]))
-def test_many_odd_campaigns_are_judged_or_refused_in_words(of, extra):
-    judged_or_refused(of, extra)
-
-
 def test_a_campaign_in_which_nothing_is_unknown_is_judged():
     """Known frames and no load: the first model has no parameter at all."""
     cell = cell_of(registration_known=True)

@@ -7,9 +7,7 @@ process; the resumed campaign has every reading exactly once. What is overcome w
 what the person is asked to put right, ends no run.
 """
 
-import re
 import socket
-import time
 from dataclasses import replace
 from itertools import zip_longest
 
@@ -75,16 +73,6 @@ ANYWHERE = (
     cases.Fault("controller mute", arm("rtde_mute"), off("rtde_mute"), ("arm",)),
 )
 
-
-START = {
-    "mute": (arm("rtde_mute"), off("rtde_mute"), ("RTDE", "does not answer")),
-    "negotiated, then no data": (arm("rtde_stall"), off("rtde_stall"), ("data",)),
-    "refused": (arm("refuse"), off("refuse"), ("refuses the connection",)),
-    "dashboard mute": (arm("dashboard_mute"), off("dashboard_mute"), ("dashboard",)),
-    "local mode": (arm("local_mode"), arm("remote_mode"), ("local mode", "remote control")),
-    "protective stop": (arm("protective_stop"), unlock, ("protective stop", "unlock")),
-    "emergency stop": (arm("emergency_stop"), release, ("emergency stop",)),
-}
 
 ARM_MOTION = (
     replace(PROTECTIVE, patterns=("protective stop", "unlock"), fast=True),
@@ -266,58 +254,6 @@ def test_a_fault_at_rest(fault, cell, path):
     cases.check_fault(fault, cell, path, moving=False)
 
 
-@pytest.mark.slow
-def test_the_controller_loses_power_in_motion(cell, path):
-    run, _ = cases.start_run(cell, path, cases.Run.moving)
-    cell.simulated.kill("arm")
-    try:
-        assert "link" in cases.failed(run)
-        cases.check_readings(cell, path)
-        line = cases.failed(cases.Run(cell, path))  # nobody answers
-    finally:
-        cell.simulated.restart("arm")
-    assert cell.config.robot.host is not None
-    assert cell.config.robot.host in line
-
-
-@pytest.mark.slow
-def test_a_dashboard_that_is_dropped_or_mute_costs_nothing_and_the_arm_is_stopped_without_it(
-    cell, path
-):
-    def without(run):
-        cell.ask("arm", "dashboard_drop")
-        run.next_reading("a dropped dashboard")
-        cell.ask("arm", "dashboard_mute", on=True)
-        run.next_reading("a mute dashboard")
-        return run.moving()
-
-    try:
-        run, goal = cases.start_run(cell, path, without)
-        since = time.monotonic()
-        run.interrupt()
-        assert "interrupted" in cases.failed(run, 130)
-        cases.check_stopped_on_its_way(cell, since, goal)
-    finally:
-        cell.ask("arm", "dashboard_mute", on=False)
-    cases.check_readings(cell, path)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", START)
-def test_an_arm_that_is_not_ready_is_named_and_not_waited_for(name, cell, path):
-    do, undo, says = START[name]
-    arrivals = cell.ask("arm", "state")["arrivals"]
-    do(cell)
-    try:
-        line = cases.failed(cases.Run(cell, path))
-        assert cell.ask("arm", "state")["arrivals"] == arrivals
-    finally:
-        undo(cell)
-    assert "arm" in line
-    for words in says:
-        assert words in line
-
-
 def test_faults_that_are_overcome_cost_nothing(cell, path):
     """All of them in one run, each for a whole reading, at both lines at a time."""
     run, _ = cases.start_run(cell, path, cases.Run.measuring)
@@ -357,80 +293,6 @@ def test_a_load_that_falls_off_is_asked_for_again_and_no_reading_is_without_it(c
     run.interrupt()
     cases.failed(run, 130)
     cases.check_readings(cell, path)
-
-
-NOT_READY = {
-    what: [fault for fault in (*TRACKER, *FORCE) if fault.name.endswith(what)]
-    for what in ("unplugged", "mute", "at another rate")
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("what", NOT_READY)
-def test_instruments_that_are_not_ready_are_named_at_once(what, cell, path):
-    arrivals = cell.ask("arm", "state")["arrivals"]
-    for fault in NOT_READY[what]:
-        fault.cause(cell)
-    try:
-        line = cases.failed(cases.Run(cell, path))
-        assert cell.ask("arm", "state")["arrivals"] == arrivals
-    finally:
-        for fault in NOT_READY[what]:
-            fault.mend(cell)
-    assert "tracker" in line
-    assert "force sensor" in line
-
-
-@pytest.mark.slow
-def test_a_hit_stops_the_arm(cell, path):
-    """A collision is over after a moment, for the arm bounces off."""
-    run, goal = cases.start_run(cell, path, cases.Run.moving)
-    since = time.monotonic()
-    cell.ask("force", "overload", force=HIT)
-    time.sleep(0.1)
-    cell.ask("force", "overload", force=NO_FORCE)
-    line = cases.failed(run)
-    cases.check_stopped_on_its_way(cell, since, goal)
-    assert re.search(TOO_MUCH, line), line
-    cases.check_readings(cell, path)
-
-
-@pytest.mark.slow
-def test_the_operator_hangs_the_wrong_load_and_is_told(cell, tmp_path):
-    path = tmp_path / "loads.hilcal"
-    short = cell.shorter(tmp_path, poses=1)
-    cell.ask("world", "mistake", name="10kg")  # instead of nothing, at the start
-    run = cases.Run(short, path)
-    code, words = run.end()
-    assert code == 0, words
-    assert "asked to take everything off: the force sensor measures" in words
-    cases.check_readings(short, path)
-
-
-@pytest.mark.slow
-def test_an_operator_who_keeps_hanging_the_wrong_load_ends_the_run(cell, tmp_path):
-    path = tmp_path / "loads.hilcal"
-    short = cell.shorter(tmp_path, poses=1)
-    run, _ = cases.start_run(short, path, cases.Run.measuring)
-    for _ in range(1 + 3):  # the plan hangs 10kg first
-        cell.ask("world", "mistake", name="10kg")
-    line = cases.failed(run)
-    assert "asked 3 times to hang 5kg" in line
-    assert "10.0 kg" in line
-    cases.check_readings(short, path)
-    cases.finish(short, path)
-
-
-@pytest.mark.slow
-def test_an_arm_jogged_before_a_campaign_goes_on_is_asked_for(cell, path):
-    run, _ = cases.start_run(cell, path, cases.Run.measuring)
-    run.kill()
-    run.end()
-    somebody_jogs(cell)
-    again = cases.Run(cell, path)
-    again.wait_until(lambda: "does not stand where its last" in again.output, "a question")
-    again.interrupt()
-    again.end()
 
 
 def test_the_campaign_has_every_reading_exactly_once(cell, path):

@@ -13,7 +13,6 @@ import pytest
 from rerun.chunk import RrdReader
 
 from hilcal.present.viewer.recording import executable
-from hilcal.store.campaign_file import CampaignFile
 from tests.support.bench_cases import BASE, store_campaign
 from tests.support.campaign_cases import (
     STARVED,
@@ -37,14 +36,6 @@ def home(tmp_path, monkeypatch):
     """Settings of the viewer go here."""
     for name in ("HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME"):
         monkeypatch.setenv(name, str(tmp_path))
-
-
-def begun(folder, *words):
-    """A command with --view as a process, and what it tells."""
-    told = folder / "told.txt"
-    with told.open("w") as out:
-        line = [sys.executable, "-m", "hilcal", *map(str, words), "--view"]
-        return subprocess.Popen(line, stdout=out, stderr=out, text=True), told
 
 
 @contextmanager
@@ -148,31 +139,3 @@ def test_added_and_removed_a_viewer_sees_both_revisions(tmp_path):
         recording = run.with_name("run.live.rrd")
         assert revisions(recording) == seen
         assert RrdReader(recording).store() is not None  # it has its footer: whole
-
-
-@pytest.mark.filterwarnings("ignore:RRD file has no footer")
-def test_a_refinement_is_shown_to_its_last_revision(tmp_path):
-    run = store_campaign(tmp_path / "run.hilcal")
-    process, told = begun(tmp_path, "refine", run)
-    assert process.wait(LONG) == 0, told.read_text()
-    with CampaignFile.open(run, read_only=True) as file:
-        made = {record.number for record in file.revisions()}
-    assert len(made) > 1
-    assert revisions(run.with_name("run.live.rrd")) == made
-
-
-@pytest.mark.filterwarnings("ignore:RRD file has no footer")
-def test_sigterm_completes_the_recording_and_leaves_no_process(tmp_path):
-    run = store_campaign(tmp_path / "run.hilcal")
-    process, told = begun(tmp_path, "refine", run)
-    recording = run.with_name("run.live.rrd")
-    wait_until(lambda: recording.exists() and revisions(recording), "recorded", LONG)
-    children = psutil.Process(process.pid).children(recursive=True)
-    os.kill(process.pid, signal.SIGTERM)
-    code = process.wait(LONG)
-    assert code not in (0, 1), told.read_text()
-    assert "Traceback" not in told.read_text()
-    gone, alive = psutil.wait_procs(children, LONG)
-    assert gone
-    assert alive == []
-    assert RrdReader(recording).store() is not None  # it has its footer: whole

@@ -220,33 +220,6 @@ def test_eight_joints_with_two_slides_stand_where_their_kinematics_say(tmp_path)
     assert np.linalg.norm(seen[:3] - expected) < 5e-3
 
 
-@pytest.mark.long
-def test_a_campaign_of_seven_joints_is_rehearsed(tmp_path, capsys):
-    (tmp_path / "cell.toml").write_text(
-        """[robot]
-model = "fr3"
-[tool]
-target_m = [0.06, 0.02, 0.12]
-load_point_m = [0.06, 0.0, 0.1]
-[[loads]]
-name = "2kg"
-mass_kg = 2.0
-[limits]
-workspace_min_m = [-2.0, -2.0, -0.5]
-[planning]
-candidates = 100
-[simulation]
-clock = 100.0
-"""
-    )
-    cell, plan, run = (tmp_path / n for n in ("cell.toml", "plan.json", "run.hilcal"))
-    ok(capsys, "plan", cell, "--poses", "3", "-o", plan)
-    done = ok(capsys, "run", cell, "--plan", plan, "-o", run, "--rehearse", "--json").document
-    assert done["readings"] == done["planned"] > 6
-    with CampaignFile.open(run) as campaign:
-        assert campaign.readings().states.q.shape[1] == 7
-
-
 ROBOT = {"model": "ur15", "kinematics": "factory", "calibration": "cal.toml"}
 X = "10.14.0.0"
 

@@ -6,7 +6,6 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from hilcal.campaign.campaign import Campaign
 from hilcal.drivers import emscon, geocom
 from hilcal.drivers.ft300 import open_force_sensor
 from hilcal.drivers.geocom import open_tracker
@@ -15,8 +14,6 @@ from hilcal.drivers.simulated.operator import open_operator
 from hilcal.drivers.ur import open_arm
 from hilcal.measuring.devices import PointingTracker, TargetLostError
 from hilcal.readings.readings import States
-from hilcal.robot.catalogue import configs_dir
-from tests.support.cli_cases import run as command
 from tests.support.reflector_cases import NAMES, OFFSETS
 from tests.support.rows import first
 from tests.support.running_world import WEIGHT, Q, config, world_of
@@ -51,45 +48,6 @@ def test_the_station_measures_the_reflector_that_it_is_pointed_to(driver, tmp_pa
             tracker.aim(true[1], RADIUS)
         tracker.aim(true[2], RADIUS)
         assert np.linalg.norm(tracker.measure().value - true[2]) < 5e-4
-
-
-@pytest.mark.slow
-def test_a_whole_run_with_three_reflectors(tmp_path, capsys):
-    text = (configs_dir() / "cells" / "demo_ur10e.toml").read_text()
-    tables = "".join(
-        f'[[tool.targets]]\nname = "{t["name"]}"\ntarget_m = {t["target_m"]}\n'
-        f"estimate = {'false' if k == 0 else 'true'}\n"
-        for k, t in enumerate(TARGETS)
-    )
-    text = text.replace("target_m = [0.06, 0.02, 0.12]\n", "", 1)
-    text = text.replace("[tracker]\n", f"{tables}\n[tracker]\n", 1)
-    text = text.replace("seed = 4", 'seed = 4\nhide = "base_compliance"')
-    text = text.replace("strength_sigma = 3.0", "strength_sigma = 5.0")
-    (tmp_path / "cell.toml").write_text(text)
-    run, plan = tmp_path / "r.hilcal", tmp_path / "p.json"
-
-    def hilcal(*words):
-        done = command(capsys, *words, "--json")
-        assert done.code == 0, done.err
-        return done.document
-
-    cell = str(tmp_path / "cell.toml")
-    hilcal("plan", cell, "-o", str(plan), "--poses", "12")
-    words = ("run", cell, "--rehearse", "-o", str(run))
-    done = command(capsys, *words, "--plan", str(plan), "--json")
-    for _ in range(3):  # a busy machine lets the simulated controller's watchdog bite
-        if done.code == 3:
-            done = command(capsys, *words, "--resume", "--json")
-    assert done.code == 0, done.err
-    told = done.document
-    with Campaign.open(run) as campaign:
-        r = campaign.readings
-        assert told["readings"] == len(r) <= told["planned"]
-        assert np.bincount(r.target).min() > len(r) / 4
-        assert r.common is not None
-    found = hilcal("refine", str(run))
-    assert found["revisions"][-1]["model"].count("base_compliance") == 1
-    assert 0.6 < found["revisions"][-1]["variance_factor"] < 1.5
 
 
 MOUNT = {"origin_m": [0.0, 0.0, 0.04], "rotvec_rad": [0.0, 0.0, 0.7]}

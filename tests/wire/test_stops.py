@@ -7,7 +7,6 @@ reading exactly once.
 import signal
 import sqlite3
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -113,67 +112,6 @@ def test_kill_minus_nine_at_random_moments(cell, tmp_path, kills, poses):
 
 
 @pytest.mark.slow
-def test_a_full_disk_stops_the_arm_and_loses_nothing(cell, tmp_path):
-    short = cell.shorter(tmp_path, poses=1)
-    path = tmp_path / "full.hilcal"
-    run = cases.Run(short, path, limit=56 << 10)
-    line = cases.failed(run)
-    assert "make room on the disk" in line
-    assert not cell.ask("arm", "state")["moving"]
-    cases.finish(short, path)
-
-
-@pytest.mark.slow
-def test_a_pose_out_of_the_trackers_sight_is_left_out(cell, tmp_path):
-    short = cell.shorter(tmp_path, poses=2)
-    path = tmp_path / "hidden.hilcal"
-    hiding = short.plan.joints("p2")
-
-    def check_ends(says, code, *more):
-        """Run with a beam that is broken wherever the arm is near p2."""
-        for left in reversed(range(cases.TRIES)):
-            run = cases.Run(short, path, *more)
-            while run.process.poll() is None:
-                near = np.abs(np.array(cell.ask("arm", "state")["q"]) - hiding).max() < 0.02
-                cell.ask("tracker", "beam", on=bool(near))
-                time.sleep(0.01)
-            cell.ask("tracker", "beam", on=False)
-            got, words = run.end()
-            if (got, says in words) == (code, True):
-                return
-            assert left, words
-            assert cases.STARVED.search(words), words
-            more = ()  # it is stored before the arm moves
-
-    def jog_home():
-        cell.ask("arm", "jog", q=short.plan.joints("reference").tolist())
-
-    check_ends("line of sight", 3)
-    check_ends("move the arm by hand until the tracker sees it", 3)
-    jog_home()
-    check_ends("--skip p2 goes on without that pose", 3)
-    jog_home()
-    check_ends("readings are in", 0, "--skip", "p2")
-    with CampaignFile.open(path) as campaign:
-        done = RunLog(campaign).done()
-    assert {s for s in short.plan.steps if s.pose != "p2"} <= done
-    assert "p2" not in {s.pose for s in done}
-    cases.check_readings(short, path)
-
-
-@pytest.mark.slow
-def test_two_programs_at_one_cell(cell, tmp_path):
-    short = cell.shorter(tmp_path, poses=2)
-    first, _ = cases.start_run(short, tmp_path / "first.hilcal", cases.Run.measuring)
-    second = cases.Run(short, tmp_path / "second.hilcal")
-    line = cases.failed(second)
-    assert line.count("in use by another program") == 2  # both serial ports
-    code, words = first.end()
-    assert code == 0, words
-    cases.check_complete(short, tmp_path / "first.hilcal")
-
-
-@pytest.mark.slow
 def test_two_programs_at_one_campaign_file(cell, tmp_path):
     short = cell.shorter(tmp_path, poses=1)
     path = tmp_path / "locked.hilcal"
@@ -185,39 +123,6 @@ def test_two_programs_at_one_campaign_file(cell, tmp_path):
     other.close()
     assert "another program" in line
     assert not cell.ask("arm", "state")["moving"]
-    cases.finish(short, path)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("how", "interrupted"),
-    [("deleted", False), ("deleted", True), ("moved", False), ("replaced", False)],
-)
-def test_a_campaign_that_is_gone_is_said_and_found(cell, tmp_path, how, interrupted):
-    """Deleted, moved or replaced by another program: the arm stops, and nothing is lost."""
-    short = cell.shorter(tmp_path, poses=2)
-    path = tmp_path / "gone.hilcal"
-    run, _ = cases.start_run(short, path, cases.Run.measuring)
-    with CampaignFile.open(path, read_only=True) as campaign:
-        measured = campaign.n_readings
-    if how == "moved":
-        path.rename(tmp_path / "there.hilcal")
-    elif how == "deleted":
-        path.unlink()
-    else:
-        path.with_name("other").write_text("another")
-        path.with_name("other").replace(path)
-    if interrupted:
-        run.interrupt()
-    line = cases.failed(run)
-    assert "gone.hilcal: deleted, replaced or moved while it was open; all" in line
-    assert "then go on with: hilcal run" in line
-    assert not cell.ask("arm", "state")["moving"]
-    place = Path(line.partition(" are in ")[2].partition(": move that back")[0])
-    assert place.name == ("there.hilcal" if how == "moved" else "gone.rescued.hilcal")
-    with CampaignFile.open(place) as campaign:
-        assert campaign.n_readings >= measured > 0
-    place.replace(path)  # as the line says
     cases.finish(short, path)
 
 

@@ -146,20 +146,6 @@ def test_another_centre_of_mass_than_was_set_is_told(arm, monkeypatch):
         arm.set_payload(4.0, cases.COM)
 
 
-def test_a_program_that_ends_while_a_payload_is_set_is_named(arm, sim, monkeypatch):
-    set_payload = Control.set_payload
-
-    def ended(control, mass, com):
-        sim.admin("kill_script")
-        return set_payload(control, mass, com)
-
-    monkeypatch.setattr(Control, "set_payload", ended)
-    with pytest.raises(DeviceError, match="did not take the payload: its program is stopped"):
-        arm.set_payload(4.0, cases.COM)
-    with pytest.raises(DeviceError, match=r"not under control.*its program is stopped"):
-        arm.start_move(arm.sample().q, 0.5, 0.5)
-
-
 @pytest.mark.parametrize("lost", [False, True])
 def test_a_command_that_fails_since_the_program_has_ended_says_so(lost, arm, sim, monkeypatch):
     def ended(*_):

@@ -10,7 +10,7 @@ from hilcal.cli.looking_up import DRIVERS_OWN
 from hilcal.config import CellConfig
 from hilcal.config.reference import NOT_SET, REQUIRED, tables
 from hilcal.toml import section_of
-from tests.support.cli_cases import ok, refused
+from tests.support.cli_cases import ok
 from tests.support.hooks import hook
 from tests.support.paths import ROOT
 
@@ -112,5 +112,3 @@ def test_config_in_the_terminal(capsys):
     assert (one["keys"][0]["name"], one["keys"][0]["default"]) == ("name", REQUIRED)
     everything = ok(capsys, "config", "--json").document["sections"]
     assert [s["name"] for s in everything] == list(TABLES)
-    line = refused(capsys, 2, "config", "trakcer")
-    assert 'no section "trakcer" in CELL.toml (did you mean "tracker"?); valid: robot, ' in line

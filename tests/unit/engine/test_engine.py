@@ -1,11 +1,13 @@
 """Many computations: the same bits wherever they run, and nothing lost or left."""
 
 import os
+import re
 import shutil
 import signal
 import socket
 import subprocess
 import sys
+from contextlib import contextmanager
 from functools import partial
 from itertools import permutations
 from pathlib import Path
@@ -15,17 +17,8 @@ import numpy as np
 import psutil
 import pytest
 
-from hilcal.engine import Cluster, ClusterError, open_engine
+from hilcal.engine import ClusterError, open_engine
 from hilcal.errors import InputError
-from tests.support.cluster import (
-    WORKER,
-    certificates,
-    environment,
-    in_environment,
-    running,
-    scheduler,
-    tls,
-)
 from tests.support.engine_cases import die_once, negative, refuse, singular_value, strides, wait
 from tests.support.paths import ROOT
 
@@ -36,25 +29,6 @@ SEED = 11
 def here():
     with open_engine(1) as engine:
         return engine.map(singular_value, ITEMS, SEED)
-
-
-@pytest.mark.slow
-def test_a_cluster_gives_the_same_bits_though_a_worker_is_killed():
-    with scheduler() as address:
-        start = ("dask", "worker", address, *WORKER)
-        with running(*start) as doomed, running(*start), open_engine(scheduler=address) as engine:
-            assert isinstance(engine.workers, Cluster)
-            engine.workers.client.wait_for_workers(2, timeout=60)
-            done = []
-
-            def advance(step):
-                done.append(step)
-                if len(done) == 8:
-                    doomed.send_signal(signal.SIGKILL)
-
-            assert engine.map(singular_value, ITEMS, SEED, advance) == here()
-            assert doomed.wait(5) == -signal.SIGKILL
-            assert len(done) == len(ITEMS)
 
 
 def test_workers_of_this_machine_give_the_same_bits_and_can_be_reached_by_nobody():
@@ -198,3 +172,72 @@ def test_a_scheduler_without_workers_is_refused(monkeypatch):
         open_engine(scheduler=address),
     ):
         pass
+
+
+WORKER = ("--host", "127.0.0.1", "--no-nanny", "--no-dashboard", "--nthreads", "1")
+"""Of `dask worker`, behind the address."""
+
+
+def environment():
+    """As it is now, with this checkout on the path."""
+    return {**os.environ, "PYTHONPATH": str(ROOT)}
+
+
+@contextmanager
+def running(*command):
+    process = subprocess.Popen(
+        [sys.executable, "-m", *command],
+        env=environment(),
+        cwd=ROOT,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@contextmanager
+def scheduler(protocol="tcp"):
+    """A real scheduler on loopback; its address."""
+    host = ("--host", "127.0.0.1", "--protocol", protocol)
+    command = ("dask", "scheduler", *host, "--port", "0", "--no-dashboard")
+    with running(*command, "--dashboard-address", "127.0.0.1:0") as process:
+        for line in process.stderr:
+            if found := re.search(r"Scheduler at:\s*(\w+://127\S+)", line):
+                yield found[1]
+                return
+    pytest.fail("no scheduler")
+
+
+def certificates(folder, names):
+    """Make an authority of each name, and a certificate `NAME-own` of it."""
+    for name in names:
+        key = ("-newkey", "rsa:2048", "-nodes", "-keyout")
+        openssl(folder, "req", "-x509", *key, f"{name}.key", "-out", f"{name}.pem",
+                "-subj", f"/CN={name}")  # fmt: skip
+        openssl(folder, "req", *key, f"{name}-own.key", "-out", f"{name}.csr",
+                "-subj", "/CN=localhost")  # fmt: skip
+        openssl(folder, "x509", "-req", "-in", f"{name}.csr", "-CA", f"{name}.pem",
+                "-CAkey", f"{name}.key", "-CAcreateserial", "-out", f"{name}-own.pem")  # fmt: skip
+
+
+def openssl(folder, *arguments):
+    subprocess.run(["openssl", *arguments], cwd=folder, check=True, capture_output=True)
+
+
+def tls(folder, name):
+    """Dask's configuration of an authority's certificate, for scheduler, worker and client."""
+    at = "distributed.comm.tls"
+    own = {"cert": f"{folder}/{name}-own.pem", "key": f"{folder}/{name}-own.key"}
+    roles = {f"{at}.{role}.{k}": v for role in ("scheduler", "worker", "client")
+             for k, v in own.items()}  # fmt: skip
+    return {f"{at}.ca-file": f"{folder}/{name}.pem", **roles}
+
+
+def in_environment(settings):
+    """Dask's configuration as environment variables."""
+    return {f"DASK_{k}".replace(".", "__").replace("-", "_").upper(): v
+            for k, v in settings.items()}  # fmt: skip

@@ -17,10 +17,8 @@ from hilcal.present.viewer.fleet import DrawnType, arm_positions, record_fleet
 from hilcal.robot.catalogue import configs_dir
 from hilcal.robot.scene import capsules
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.codec import write_document
 from hilcal.transfer.fleet import Fleet, diagnosed_effects, pool
 from hilcal.transfer.members import Failure, Member, SizeEvidence, entries, member_of, type_sizes
-from tests.support.calibrate_process import CELL
 from tests.support.campaigns import cell_of, configuration, noiseless, plan, with_noise, world_of
 from tests.support.cli_cases import ok, refused
 from tests.support.recordings import chunks, entities, rows
@@ -160,29 +158,6 @@ def test_with_the_prior_a_new_arm_needs_fewer_poses(one):
     assert np.mean(with_it) < 0.8 * np.mean(without)
 
 
-def prior_file(one, path):
-    """What a fleet of 30 arms lets expect, as `fleet -o` writes it; and a small cell beside it."""
-    write_document(path, pool(members(one, 3), ()).prior.to_json())
-    path.with_name("cell.toml").write_text(CELL, encoding="utf-8")
-    return path
-
-
-@pytest.mark.slow
-def test_a_calibration_takes_the_prior_of_a_fleet(one, capsys, tmp_path):
-    """On simulated devices, from the plan to the corrected targets; asked for once, kept after."""
-    prior, out = prior_file(one, tmp_path / "prior.json"), tmp_path / "run.hilcal"
-    size = ("--poses", "4", "--validation", "3")
-    command = ("calibrate", tmp_path / "cell.toml", "--rehearse", "--yes", "-o", out)
-    told = ok(capsys, *command, *size, "--prior", prior, "--json")
-    words = " ".join(told.err.split())
-    assert "Prior: 60 campaigns of 30 arms of the type ur10e" in words
-    assert "of this arm" not in words
-    error = told.document["improvement"]["error"]
-    assert error["after"]["rms_m"] < 0.2 * error["before"]["rms_m"]
-    revision = ok(capsys, "info", out, "--json").document["revisions"][-1]
-    assert revision["verdict"] == "adequate"
-
-
 def store(path, *readings):
     base = str(configs_dir() / "cells")
     with CampaignFile.create(path, configuration().to_json(), base, "a test") as file:
@@ -236,12 +211,6 @@ def test_the_list_beside_the_campaigns_names_arms_and_dates(tmp_path):
     refusal(r"row 2, column 'date': 'March'", entries, tmp_path)
     (tmp_path / "arms.csv").write_text("campaign,arm\ny.hilcal,left\n")
     refusal(r"y\.hilcal: no such campaign", entries, tmp_path)
-
-
-def test_a_directory_without_campaigns_is_refused(capsys, tmp_path):
-    assert "no campaign files" in refused(capsys, 2, "fleet", tmp_path, "-o", tmp_path / "p.json")
-    told = refused(capsys, 2, "fleet", tmp_path / "none", "-o", tmp_path / "p.json")
-    assert "no directory" in told
 
 
 @pytest.mark.parametrize(

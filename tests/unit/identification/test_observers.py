@@ -1,6 +1,5 @@
 """Stations, distances and heights: derivative, registration, fits, verdicts, tables, refusals."""
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -24,7 +23,7 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.rows import content_hash
 from hilcal.tables.table import write_table
 from tests.support.campaigns import campaign, cell_of, configuration, true_parameters
-from tests.support.cli_cases import CELL, ok
+from tests.support.cli_cases import CELL
 from tests.support.effect_cases import numeric_slopes, random_theta, some_states
 from tests.support.fit_cases import fitted_model, parameters_by_effect
 from tests.support.observer_cases import NORMAL, POINTS, base_cell, observed, stated
@@ -208,23 +207,6 @@ def test_tables_files_and_calibrations_keep_observers(tmp_path):
     made.save(tmp_path / "c.json")
     again = Calibration.load(tmp_path / "c.json")
     np.testing.assert_allclose(again.predict(q).position, made.predict(q).position, atol=1e-12)
-
-
-@pytest.mark.long
-def test_commands(tmp_path, capsys):
-    c = observed(["S1", "S2", "A", "G"], 5, effect="joint_tilt_compliance", strength=5.0)
-    write_table(c.readings, tmp_path / "t.csv")
-    (tmp_path / "cell.toml").write_text(CELL.read_text())
-    run = tmp_path / "r.hilcal"
-    told = ok(capsys, "import", tmp_path / "t.csv", "--config", tmp_path / "cell.toml", "-o", run)
-    words = " ".join(told.out.split())
-    assert "60 positions by S1, 60 positions by S2, 60 distances from A, 60 heights of G" in words
-    assert re.search(r"point A is at \(1\.\d+, 0\.\d+, -0\.\d+\) m; gauge G has", words)
-    refined = ok(capsys, "refine", run, "--readings", "absolute", "--json").document
-    assert refined["verdict"] == "adequate"
-    assert refined["revisions"][-1]["added"] == "joint_tilt_compliance"
-    assert ok(capsys, "info", run, "--json").document["revisions"]
-    ok(capsys, "report", run, "-o", tmp_path / "r.html")
 
 
 HEADER = "pose,load,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad"

@@ -1,6 +1,5 @@
 """A touch probe on unknown plates: all heights are 0, and the joints tell where the plates were."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -15,9 +14,7 @@ from hilcal.identification.noise.full_covariance import with_joint_scatter
 from hilcal.readings.readings import ObserverName, States
 from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
-from hilcal.tables.table import write_table
 from tests.support.campaigns import cell_of, configuration, plan, true_parameters, world_of
-from tests.support.cli_cases import CELL, ok
 from tests.support.fit_cases import parameters_by_effect
 from tests.support.readings_cases import readings_at
 
@@ -131,34 +128,3 @@ def test_what_heights_of_0_determine_is_right_and_the_rest_is_named(plates, effe
     # 40 or 80 errors of about half as many independent ones: their rms scatters by 0.16 or less.
     assert 0.55 < np.sqrt(np.mean(np.square(z))) < 1.45
     assert 0.8 < np.mean(factors) < 1.2  # eight of 80 degrees of freedom or more: 0.055
-
-
-@pytest.mark.long
-def test_commands_name_what_the_plate_does_not_see(tmp_path, capsys):
-    _, world, readings = touched(["granite"], 20, 3)
-    write_table(readings, tmp_path / "t.csv")
-    (tmp_path / "cell.toml").write_text(CELL.read_text())
-    run, other = tmp_path / "r.hilcal", tmp_path / "other.hilcal"
-    ok(capsys, "import", tmp_path / "t.csv", "--config", tmp_path / "cell.toml", "-o", run)
-    document = json.loads(ok(capsys, "identify", run, "--json").out)
-    told = {p["name"]: p for p in document["parameters"]}
-    truth = true_parameters(world, "joint_compliance")
-    for k in range(1, 7):
-        p = told[f"joint_compliance.j{k}"]
-        assert p["identifiable"] == (k > 1)
-        if k > 1:
-            assert abs(p["value"] - truth[k - 1]) < 4 * p["std"]
-    told_by = {c: ok(capsys, c, run).out for c in ("identify", "compare", "info")}
-    assert "Not determined by these readings: joint_compliance j1" in told_by["identify"]
-    assert ok(capsys, "diagnose", run, "--json").document["verdict"] == "adequate"
-    ok(capsys, "import", tmp_path / "t.csv", "--config", tmp_path / "cell.toml", "-o", other)
-    told_by["validate"] = ok(capsys, "validate", run, other).out
-    told_by["refine"] = ok(capsys, "refine", run, "--readings", "absolute").out
-    page = tmp_path / "page.html"
-    ok(capsys, "report", run, "-o", page)
-    told_by["report"] = page.read_text()
-    for command, told_words in told_by.items():
-        words = " ".join(told_words.split())
-        assert "error of the readings" in words, command
-        for wrong in ("3-D position error", "3-D error", "predicted positions", "60 positions"):
-            assert wrong not in words, (command, wrong)

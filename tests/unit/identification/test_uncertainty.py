@@ -130,14 +130,6 @@ def test_halves_agree_within_what_is_stated_where_a_large_effect_is_missing(effe
     assert np.abs(stated).max() < 3.5
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("effect", ["link_geometry", "transmission_error", "base_compliance"])
-def test_halves_agree_within_what_is_stated_over_many_seeds(effect):
-    stated, _, _ = halves(effect, "absolute", 6.0, range(10, 25))
-    assert 0.3 < rms(stated) < 1.3
-    assert np.mean(np.abs(stated) > 1.96) < 0.1
-
-
 POSES = 40
 COMPLIANCE = slice(6, 12)  # behind the base's frame
 

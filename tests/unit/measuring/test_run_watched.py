@@ -453,13 +453,6 @@ def test_who_bears_a_part_of_a_heavy_load_in_motion_is_noticed_though_it_may_swi
     assert "6kg" in [name for name, why in b.operator.requests if "where 6kg should hang" in why]
 
 
-@pytest.mark.long
-def test_a_load_that_stays_wrong_ends_the_run(b):
-    falls_in_motion(b, "none", "none", "none")
-    refusal_of(DeviceError, r"asked 3 times to hang 3kg.*--resume$", b.measure, usual_plan())
-    assert len(b.store.rows) == 7
-
-
 def test_a_tracker_whose_target_does_not_move_with_the_arm_is_named_before_any_reading(b):
     still = b.world.position()
     b.world.position = lambda: still

@@ -182,4 +182,3 @@ def test_options_of_a_stream_are_not_of_a_campaign(capsys, stream):
     assert "--cell" in refused(capsys, 2, "identify", stream)
     told = refused(capsys, 2, "identify", stream, "--cell", CELL, "--scaling", "none")
     assert "scaling is gc" in told
-    assert "for a stream" in refused(capsys, 2, "identify", "run.hilcal", "--workers", "2")
