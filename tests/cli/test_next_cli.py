@@ -405,6 +405,7 @@ def test_what_an_appended_plan_leaves_out_is_said(site, capsys):
     assert "previous plan" not in ok(capsys, *site.command("--resume", "--json")).err
 
 
+@pytest.mark.long
 def test_a_load_that_hung_when_the_last_session_was_killed_is_said(site, capsys):
     said = "load 3kg may still be on the arm"
     ok(capsys, *site.command(*site.fresh))
@@ -418,7 +419,8 @@ def test_wrong_ways_to_append(site, capsys):
     further = str(further_plan(site))
     line = refused(capsys, 2, *site.command("--append", "--plan", further))
     assert "no such campaign file" in line
-    ok(capsys, *site.command(*site.fresh))
+    config = load_config(site.directory / "cell.toml")
+    create_run(site.directory / "run.hilcal", config, site.directory, site.plan).close()
     assert "--plan" in refused(capsys, 2, *site.command("--append"))
     assert "give one" in refused(capsys, 2, *site.command("--append", "--resume"))
     assert "--append" in refused(capsys, 2, *site.command("--plan", further))

@@ -264,6 +264,7 @@ def test_a_single_pose_does_not_show_what_the_pose_alone_predicts():
     assert d.pose_alone is None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [2, *(pytest.param(k, marks=pytest.mark.slow) for k in (0, 6))])
 def test_a_transmission_error_too_fine_for_thirty_poses_is_ambiguous(seed):
     d = diagnose(fitted_model(*fine_error(seed), "absolute"))

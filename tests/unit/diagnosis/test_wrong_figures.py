@@ -99,6 +99,7 @@ def test_a_tool_at_twice_its_mass_is_named_and_refine_adds_nothing():
     assert (figure["kind"], figure["unit"]) == ("tool_mass", "kg")
 
 
+@pytest.mark.long
 def test_a_tool_elsewhere_than_stated_is_named():
     c = campaign(NO_EFFECT, "absolute", 1, poses=20)
     shift = np.array([0.0, 0.3, 0.0])
@@ -119,6 +120,7 @@ def test_effects_are_no_wrong_figures(effect):
     assert d.suspects[0].effect == effect, message(d)
 
 
+@pytest.mark.long
 def test_a_gain_of_loads_that_nothing_measured_is_one_of_their_masses():
     """Too small to be a mistake of one figure; all masses are."""
     c = campaign(NO_EFFECT, "absolute", 1, poses=20)

@@ -106,6 +106,7 @@ def test_nothing_is_searched_where_the_model_is_adequate(tmp_path):
         hc.refine(before.model, before.readings, discover=tmp_path / "nowhere")
 
 
+@pytest.mark.long
 def test_a_law_is_searched_before_a_misfit_is_taken_for_noise(tmp_path, monkeypatch):
     """It may act where the diagnosis does not look, as along the axis of a joint."""
     monkeypatch.setattr(

@@ -207,6 +207,7 @@ def test_a_negligible_part_that_is_predictable_is_said(share, reason):
         assert ArmScatter.from_json(json.loads(json.dumps(d.scatter.to_json()))) == d.scatter
 
 
+@pytest.mark.long
 @BOTH
 def test_a_noisier_instrument_is_not_the_arm(mode):
     d, words = judged(mode, 0.0, noise=2.0)

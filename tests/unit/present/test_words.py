@@ -300,6 +300,7 @@ def test_an_unknown_effect_never_stands_beside_nothing_predicted(strength):
         assert " 0 % of the misfit" not in message(d)
 
 
+@pytest.mark.long
 def test_what_the_pose_alone_predicts_is_said_so(shown):
     """Each pose is off by its own random amount; its repeats are off by the same."""
     cell, p = cell_of(registration_known=True), plan(10, 3, 2)

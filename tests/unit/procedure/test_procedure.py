@@ -107,6 +107,7 @@ def test_it_is_of_as_many_poses_as_asked_for_under_every_load(done):
         assert [s.load for s in steps if not s.cycle].count(load) == d.procedure.settings.poses
 
 
+@pytest.mark.long
 def test_a_pose_that_cannot_be_measured_does_not_lock_it(tmp_path):
     d = drawn_calibration(tmp_path / "run.hilcal", validation=6)
     skipped, files = [], d.procedure.files
