@@ -97,22 +97,6 @@ def test_a_command_names_what_it_lacks_and_the_line_that_installs_it(package, wo
     assert "Traceback" not in ended.stderr
 
 
-@pytest.mark.long
-def test_the_library_names_what_it_lacks(folder):
-    code = (
-        "import hilcal as hc\n"
-        "with hc.Campaign.open('run.hilcal') as run:\n"
-        "    fit = hc.fit(hc.baseline(run.cell, run.readings), run.readings)\n"
-        "try: hc.report\n"
-        "except hc.InputError as error: print(error)\n"
-        "try: fit._repr_html_()\n"
-        "except NotImplementedError as error: print(error)"  # a notebook then shows the repr
-    )
-    said = without({"plotly"}, folder, code=code)
-    line = 'the package plotly is not installed: pip install "hilcal[report]"'
-    assert said.stdout.splitlines() == [f"pages: {line}"] * 2, said.stderr
-
-
 def test_every_optional_package_is_named():
     """What an extra for users brings has its line, and nothing else has."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]

@@ -360,41 +360,6 @@ def test_an_append_that_was_stopped_is_resumed(site, capsys):
     assert d["readings"] == d["planned"] == len(site.plan.steps) + 15
 
 
-@pytest.mark.long
-def test_a_pose_is_left_out_of_what_is_resumed(site, capsys):
-    ok(capsys, *site.command(*site.fresh))
-    site.bench.world.restart()
-    with CampaignFile.open(site.directory / "run.hilcal") as campaign:
-        log = RunLog(campaign)
-        done = log.done()
-        log.append(log.with_new_names(load_plan(further_plan(site))))
-        missing = log.plan.without(done).steps
-    pose = next(s.pose for s in missing if s.pose != "reference")
-    assert "with --resume" in refused(capsys, 2, *site.command("--skip", pose))
-    d = ok(capsys, *site.command("--resume", "--skip", pose, "--json")).document
-    with CampaignFile.open(site.directory / "run.hilcal") as campaign:
-        added = RunLog(campaign).done() - done
-    assert pose not in {s.pose for s in added}
-    assert {s for s in missing if s.pose != pose} <= added
-    assert d["readings"] == d["planned"] == len(done) + len(added)
-    assert "nothing is missing" in refused(capsys, 2, *site.command("--resume", "--skip", pose))
-
-
-@pytest.mark.long
-def test_nobody_measures_beside_a_run(site, capsys):
-    ok(capsys, *site.command(*site.fresh))
-    further, path = str(further_plan(site)), site.directory / "run.hilcal"
-    before = path.read_bytes()
-    with CampaignFile.open(path) as campaign:
-        campaign.measure_alone()
-        for words in (("--resume",), ("--append", "--plan", further)):
-            line = refused(capsys, 2, *site.command(*words))
-            assert "another hilcal is measuring this campaign" in line
-        assert path.read_bytes() == before
-        ok(capsys, "info", path)
-    assert ok(capsys, *site.command("--resume", "--json")).document["readings"]
-
-
 def test_what_an_appended_plan_leaves_out_is_said(site, capsys):
     path, further = site.directory / "run.hilcal", str(further_plan(site))
     config = load_config(site.directory / "cell.toml")

@@ -300,28 +300,3 @@ def test_reads_the_target_of_the_moment_when_it_has_measured(station):
         code, _, v, distance = line.ask(2108, "60000", "1")
         assert (code, float(distance)) == ("0", float(values[2]))
         assert float(v) == pytest.approx(PolarPoint.of(np.array([-0.1, -0.1, 0.9])).v, abs=1e-3)
-
-
-def test_does_not_wait_longer_than_asked(station):
-    station.admin("meas_s", seconds=1e6)
-    with Line(station) as line:
-        line.ask(2008, "1", "1")
-        code, *_, distance = line.ask(2108, "100", "1")
-        assert (code, float(distance)) == ("1285", 0.0)
-
-
-@pytest.mark.parametrize(
-    "find", [("9013",), ("17020", "0"), ("9037", "0.05", "0.05", "0"), ("9027", "1", "1", "0", "1")]
-)
-def test_a_lost_lock_stays_lost_until_found(station, find):
-    with Line(station) as line:
-        station.admin("lock_lost")
-        assert line.ask(17017, "2") == ["8710"]
-        assert line.ask(9021) == ["0", "0"]
-        assert line.ask(6021) == ["0", "0"]
-        line.ask(2008, "1", "1")
-        code, *_, distance = line.ask(2108, "5000", "1")
-        assert (code, float(distance)) == ("1285", 0.0)
-        assert line.ask(int(find[0]), *find[1:]) == ["0"]
-        assert line.ask(9021) == ["0", "1"]
-        assert line.point()[0] == 0

@@ -2,7 +2,6 @@
 
 import io
 import pickle
-import sys
 import zipfile
 from datetime import datetime, timedelta
 
@@ -139,17 +138,6 @@ def test_a_second_sheet_of_readings_is_said_to_be_left_out(tmp_path):
     out.save(tmp_path / "t.xlsx")
     found = propose(tmp_path / "t.xlsx").proposal
     assert ("file", "only this sheet is read, and not Tuesday") in found.doubts
-
-
-@pytest.mark.parametrize("name", ["openpyxl", "pyarrow.parquet"])
-def test_a_missing_package_is_named(name, tmp_path, monkeypatch):
-    path = tmp_path / "t"
-    if name == "openpyxl":
-        book(path)
-    else:
-        parquet.write_table(pyarrow.table({"X": [1.0]}), path)
-    monkeypatch.setitem(sys.modules, name, None)
-    refusal(r"\w+ is not installed: pip install .hilcal\[tables\]", open_grid, path, FileFormat())
 
 
 def _zip(**members):

@@ -1,6 +1,5 @@
 """The guard in motion, and that planner, dry run and guard judge by one rule."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,6 @@ from hilcal.measuring.motion import SLACK_M, Guard
 from hilcal.measuring.route import dry_run
 from hilcal.store.plan import UNLOADED, Plan, Step
 from tests.support.arm_cases import ODD, arm_of
-from tests.support.cli_cases import refused, run
 from tests.support.fake_bench import POSES, Bench
 from tests.support.space_cases import cell, reached
 
@@ -157,21 +155,6 @@ def test_what_the_planner_refuses_is_refused_and_stops_the_arm(config, q, word):
     found = refused_lines(config, q)
     assert any(word in line for line in found), found
     assert word in str(stopped(config, q))
-
-
-def test_run_and_check_refuse_it_before_anything_moves(tmp_path, capsys):
-    toml, plan = tmp_path / "cell.toml", tmp_path / "plan.json"
-    arm, tracker = 'driver = "ur"\nhost = "127.0.0.1"', 'driver = "geocom"\nport = "/dev/null"'
-    toml.write_text(f'[robot]\nmodel = "ur10e"\n{arm}\n[tracker]\n{tracker}\n', encoding="utf-8")
-    poses = [{"name": name, "q_rad": q} for name, q in (("reference", HOME), ("low", BELOW))]
-    steps = [{"pose": "low", "load": "none", "cycle": 0}]
-    told = {"format": "hilcal-plan", "version": 1, "poses": poses, "steps": steps}
-    plan.write_text(json.dumps(told), encoding="utf-8")
-    line = refused(capsys, 2, "run", toml, "--plan", plan, "-o", tmp_path / "x.hilcal")
-    assert "pose low: forearm is 0.726 m below the mounting plane z = 0" in line
-    assert "workspace_min_m" in line
-    checked = run(capsys, "check", toml, "--plan", plan, "--json").document["plan"]
-    assert any("pose low: wrist 3 is" in problem for problem in checked["problems"])
 
 
 def test_the_shape_of_an_unknown_arm_is_said_to_be_guessed():
