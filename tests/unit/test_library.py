@@ -194,6 +194,7 @@ def test_points_in_degrees_and_names_are_refused(q, wrench, said, site):
         refusal(said, asked, q, wrench)
 
 
+@pytest.mark.long
 def test_what_a_stranger_guesses_works(site, refined, tmp_path, free_port):
     path = tmp_path / "run.hilcal"
     with hc.Campaign(site.run, read_only=True) as other:

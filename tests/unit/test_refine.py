@@ -130,6 +130,7 @@ def with_pose_errors(readings, seed):
     return replace(readings, value=readings.value + off)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("poses", "seed"),
     [(15, 1), *(pytest.param(*other, marks=pytest.mark.slow) for other in ((15, 2), (30, 1)))],

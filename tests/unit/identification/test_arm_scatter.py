@@ -171,6 +171,7 @@ def judged(mode, std, **more):
     return d, str(d.to_dict()["message"])
 
 
+@pytest.mark.long
 @BOTH
 def test_what_is_left_to_the_arm_is_adequate_and_says_how_much(mode):
     d, words = judged(mode, 2e-5)
