@@ -21,7 +21,6 @@ from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.parquet_stream import open_stream
 from hilcal.tables.table import write_table
-from tests.cli.test_fit_beside_run import spoil
 from tests.support.cli_cases import CELL, imported, ok, refused, rehearsal
 from tests.support.cli_cases import run as command
 
@@ -58,39 +57,6 @@ def test_readings_were_appended(fitted, capsys):
     ok(capsys, "identify", run)
     follow(capsys, said, f"hilcal accept '{run}' --release")
     ok(capsys, "diagnose", run)
-
-
-@pytest.mark.long
-def test_another_scaling_or_parameters_of_another_version(run, capsys):
-    ok(capsys, "identify", run, "--scaling", "gu")
-    said = refused(capsys, 2, "diagnose", run)
-    follow(capsys, f"{said} hilcal identify RUN", "hilcal identify RUN", RUN=run)
-    ok(capsys, "diagnose", run)
-    with CampaignFile.open(run) as file:
-        record = file.revisions()[-1]
-        stored = record.parameters_json
-        names = [f"{n}_as_it_was" for n in stored["names"]]
-        file.append_revision(replace(record, parameters_json={**stored, "names": names}))
-    assert "other parameters; run hilcal identify again" in refused(capsys, 2, "diagnose", run)
-    ok(capsys, "identify", run)
-    ok(capsys, "diagnose", run)
-
-
-@pytest.mark.long
-def test_an_effect_of_ones_own(run, tmp_path, capsys):
-    empty, path = tmp_path / "empty.py", tmp_path / "my effect.py"
-    empty.write_text("")
-    said = refused(capsys, 2, "effects", "--effects-from", empty)
-    assert "hilcal effects new NAME writes one" in said
-    said = ok(capsys, "effects", "new", "my_effect", "-o", path).out
-    for step in ("effects --effects-from", "diagnose RUN.hilcal --effects-from"):
-        follow(capsys, said, f"hilcal {step} '{path}'", **{"RUN.hilcal": run})
-    ok(capsys, "add", run, "my_effect", "--effects-from", path)
-    path.write_text(f"{path.read_text()}\n# changed\n")
-    said = refused(capsys, 2, "diagnose", run, "--effects-from", path)
-    assert "fit again: hilcal identify or refine" in said
-    ok(capsys, "identify", run, "--effects-from", path)
-    ok(capsys, "diagnose", run, "--effects-from", path)
 
 
 def test_deflections_lack_the_unloaded_arm(run, tmp_path, capsys):
@@ -188,18 +154,6 @@ def test_what_accept_says(fitted, capsys):
     ok(capsys, "identify", run, "--effects", "joint_compliance")
     follow(capsys, ok(capsys, "accept", run, "1").out, f"hilcal accept '{run}' --release")
     assert ok(capsys, "info", run, "--json").document["accepted"] is None
-
-
-@pytest.mark.long
-def test_a_bad_revision_is_set_aside_and_fitted_again(fitted, capsys):
-    run = fitted
-    with Campaign.open(run) as o:
-        found = o.fit()
-    spoil(run, found, "damage")
-    said = refused(capsys, 2, "diagnose", run)
-    told = follow(capsys, said, f"hilcal repair '{run}'").out
-    follow(capsys, told, f"hilcal identify '{run}'")
-    ok(capsys, "diagnose", run)
 
 
 @pytest.mark.long

@@ -45,22 +45,11 @@ AT_REST = (
     SHAKEN,
     cases.switch("force sensor stalled", "force", "stall", "force", "nothing came"),
 )
-ERROR = cases.Fault(
-    "error of the sensor",
-    cases.act("force", "status", word=0x80000008),
-    cases.act("force", "status", word=None),
-    ("force sensor", "reports an error"),
-)
 
 
 @cases.parametrize_faults(AT_REST)
 def test_a_fault_while_the_arm_rests(fault, cell, path):
     cases.check_fault(fault, cell, path, moving=False)
-
-
-@pytest.mark.slow
-def test_an_error_of_the_force_sensor_stops_the_arm(cell, path):
-    cases.check_fault(ERROR, cell, path, moving=True)
 
 
 def test_faults_that_are_overcome_cost_nothing(cell, path):

@@ -23,7 +23,6 @@ from hilcal.robot.factory import flange_difference, of_dict, read_factory, with_
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, Step
 from hilcal.store.run_log import RunLog
-from tests.support.calibrate_process import CELL
 from tests.support.cli_cases import ok, refused, run
 from tests.support.factory_cases import write
 from tests.support.rows import first
@@ -62,26 +61,6 @@ def test_a_tracker_that_cannot_be_simulated_is_refused(tmp_path):
     made = config(tracker={"driver": "mytracker"})
     with pytest.raises(InputError, match="no simulated tracker 'mytracker'; valid: geocom, emscon"):
         SimulatedCell.start(world_of(made), made, tmp_path, 3)
-
-
-@pytest.mark.slow
-def test_a_lab_of_today_calibrates_by_one_command(tmp_path, capsys):
-    """A UR15 on PolyScope X, an AT401 and a Net F/T."""
-    toml, out = tmp_path / "cell.toml", tmp_path / "run.hilcal"
-    sensor = '[force_sensor]\ndriver = "netft"\nhost = "192.168.1.1"\n'
-    cell = CELL.replace("ur10e", "ur15") + 'controller_version = "10.12.0.1"\n'
-    toml.write_text(f'{cell}{sensor}[tracker]\ndriver = "emscon"\n', encoding="utf-8")
-    size = ("--poses", "4", "--validation", "3")
-    told = ok(capsys, "calibrate", toml, "-o", out, "--rehearse", "--yes", "--json", *size)
-    error = told.document["improvement"]["error"]
-    assert error["after"]["rms_m"] < 0.3 * error["before"]["rms_m"]
-    about = ok(capsys, "info", out).out
-    assert "SIM AT401, serial 391234" in about
-    assert "SIM NET F/T" in about
-    with CampaignFile.open(out, read_only=True) as kept:
-        arm = next(a for a in RunLog(kept).last("devices")["answers"] if a["device"] == "arm")
-    assert arm["fields"]["controller_version"].startswith("10.12")
-    assert "UR15" in arm["name"]
 
 
 @pytest.mark.slow

@@ -5,7 +5,6 @@ reading exactly once.
 """
 
 import signal
-import sqlite3
 import time
 
 import numpy as np
@@ -109,21 +108,6 @@ def test_kill_minus_nine_at_random_moments(cell, tmp_path, kills, poses):
     path = tmp_path / "killed.hilcal"
     assert _kill_at_random(long, path, kills, seed=poses) > (10 if kills > 10 else -1)
     cases.finish(long, path)
-
-
-@pytest.mark.slow
-def test_two_programs_at_one_campaign_file(cell, tmp_path):
-    short = cell.shorter(tmp_path, poses=1)
-    path = tmp_path / "locked.hilcal"
-    run, _ = cases.start_run(short, path, cases.Run.measuring)
-    with sqlite3.connect(path, isolation_level=None) as other:
-        other.execute("BEGIN EXCLUSIVE")
-        line = cases.failed(run, 2)
-        other.execute("ROLLBACK")
-    other.close()
-    assert "another program" in line
-    assert not cell.ask("arm", "state")["moving"]
-    cases.finish(short, path)
 
 
 @pytest.mark.slow
