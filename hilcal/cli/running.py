@@ -69,6 +69,7 @@ from hilcal.store.run_log import (
     REHEARSED,
     RunLog,
     changed_since_begun,
+    check_same_arm,
     check_same_cell,
     check_same_devices,
     create_run,
@@ -267,7 +268,9 @@ def measure(
         if viewer is not None:
             viewer.measuring(campaign.path.name, cell, log)
         watcher = stack.enter_context(watching(t.progress, len(log.plan.steps), viewer))
-        log.event("devices", {"answers": [answer_json(answer) for answer in answers]})
+        identities = [answer_json(answer) for answer in answers]
+        check_same_arm(log, identities)
+        log.event("devices", {"answers": identities})
         clock = Clock(config.clock)
         live = LiveModel(cell)
         run_plan(rig, cell, log.plan, log, clock, watcher, live, goal=goal, epoch=epoch)

@@ -61,6 +61,30 @@ def check_same_devices(campaign: CampaignFile, rehearse: bool) -> None:
         raise InputError(f"{campaign.path}: the campaign is {kind}")
 
 
+def check_same_arm(log: "RunLog", answers: Sequence[Mapping[str, Any]]) -> None:
+    """Refuse to continue a campaign on another arm of the same model.
+
+    Arms and controllers that report no serial number are not compared.
+
+    Args:
+        log: of the campaign.
+        answers: of the devices now, as the event "devices" of a run log stores them.
+    """
+
+    def serial_number(of: Sequence[Mapping[str, Any]]) -> str:
+        facts = (dict(a["facts"]) for a in of if a["device"] == "arm")
+        return next((str(f["serial number"]) for f in facts if f.get("serial number")), "")
+
+    events = log.events()
+    earlier = [serial_number(e["answers"]) for e in events if e["kind"] == "devices"]
+    before, now = next(filter(None, earlier), ""), serial_number(answers)
+    if before and now and before != now:
+        raise InputError(
+            f"arm: its serial number is {now}, and the campaign was begun on the arm {before}; a "
+            "campaign is of one arm: start another one for this"
+        )
+
+
 def check_same_cell(campaign: CampaignFile, config: CellConfig, base_dir: Path) -> None:
     """Refuse to continue a campaign in another cell."""
     for key, text in robot_file_of(config.to_json(), str(base_dir)).items():

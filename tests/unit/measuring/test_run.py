@@ -16,7 +16,13 @@ from hilcal.robot import chain as chains
 from hilcal.robot import se3
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.rows import content_hash
-from hilcal.store.run_log import RunLog, changed_since_begun, check_same_cell, create_run
+from hilcal.store.run_log import (
+    RunLog,
+    changed_since_begun,
+    check_same_arm,
+    check_same_cell,
+    create_run,
+)
 from hilcal.tables.table import write_table
 from tests.support.fake_bench import (
     FEW_POSES,
@@ -504,6 +510,23 @@ def test_what_fits_do_not_know_of_a_changed_cell_is_said(b, tmp_path, section, k
         assert changed_since_begun(campaign, b.config) == []
         lines = changed_since_begun(campaign, b.config.with_keys(section, **keys))
     assert [said in line for line in lines] == [True] * (said is not None)
+
+
+def test_a_campaign_does_not_go_on_with_another_arm_of_the_model(b, tmp_path):
+    def answers(**facts):
+        return [{"device": "tracker", "facts": {"serial number": "7"}}, arm | {"facts": facts}]
+
+    arm = {"device": "arm", "driver": "ur", "answers": True, "problems": [], "name": "UR5e"}
+    first, other = ({"serial number": n} for n in ("20235500001", "20235500002"))
+    with create_run(tmp_path / "run.hilcal", b.config, tmp_path, usual_plan()) as campaign:
+        log = RunLog(campaign)
+        check_same_arm(log, answers(**first))
+        for facts in ({}, first):  # a controller of before it told its number, and one that does
+            log.event("devices", {"answers": [arm | {"facts": facts}]})
+        for facts in ({}, first):
+            check_same_arm(log, answers(**facts))
+        with pytest.raises(InputError, match=r"number is 20235500002, .* 20235500001;"):
+            check_same_arm(log, answers(**other))
 
 
 @pytest.mark.parametrize("use", ["pulls", pytest.param("all", marks=pytest.mark.long)])
