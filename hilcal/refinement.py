@@ -38,7 +38,7 @@ from hilcal.errors import CannotAnswerError
 from hilcal.identification.background import (
     allows_background,
     with_background,
-    with_pooled_lines,
+    with_shrunk_effects,
 )
 from hilcal.identification.carried.drift import carried_effects
 from hilcal.identification.fit import Fit, fit, fit_again
@@ -153,10 +153,10 @@ def refine(
     replace better is exchanged for them. If the residual is then more than noise, all effects of
     the catalogue are fitted together (`Path.add_background`). If the rest of the misfit is the
     arm's scatter, the last step is a fit with the scatter in the covariance, so weights,
-    uncertainties and p-values include it. In the last fit the lines of a transmission error are
-    shrunk to the size of their pool, which predicts better than separate lines
-    (`with_pooled_lines`). All fits include a correlation of the noise along the order of the
-    readings (`diagnosis.serial_noise`), which would otherwise be taken for effects.
+    uncertainties and p-values include it. In the last fit the added effects are shrunk to
+    estimated sizes, which predicts better (`with_shrunk_effects`). All fits include a correlation
+    of the noise along the order of the readings (`diagnosis.serial_noise`), which would otherwise
+    be taken for effects.
 
     Args:
         model: the starting model. Its effects stay, except those of a carried prior that the
@@ -210,7 +210,7 @@ def refine_from(
     """Refine a fit with the correlation of its noise as it is; see `refine`."""
     path = Path(first, say, history, laws, on_step, background)
     path.complete()
-    if path.pool_lines():
+    if path.shrink():
         path.complete()
     path.judge_sufficiency()
     path.find_step()
@@ -489,17 +489,17 @@ class Path:
         self.append(fitted, None, message="the arm's scatter enters the covariance")
         return True
 
-    def pool_lines(self) -> bool:
-        """Fit effects of many lines again, the size of each line shrunk to that of its pool.
+    def shrink(self) -> bool:
+        """Fit the added effects again, their parameters shrunk to estimated sizes.
 
         The fit replaces that of the last step, unless the error on poses left out rises by more
         than it scatters from pose to pose. A path of one step stays as it is. Returns whether a
-        suspect passes beside the new lines that separate lines had hidden.
+        suspect passes now that flat parameters had hidden.
         """
         last = self.steps[-1]
         if len(self.steps) == 1 or last.fit.model.background or last.diagnosis.wrong_figures:
             return False
-        fitted = with_pooled_lines(last.fit)
+        fitted = with_shrunk_effects(last.fit, self._start)
         if fitted is None or predicts_better(fitted, last.fit):
             return False
         self._evidence = self._evidence_of(fitted)

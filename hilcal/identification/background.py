@@ -1,12 +1,12 @@
-"""Random effects of a model: its background, and the lines of shrunk effects.
+"""Random effects of a model: its background, and shrunk effects.
 
 Every arm has every effect; most effects are too small to be proved. A model with a background has
 all effects of its catalogue that the readings allow, as random effects of zero mean with the
 standard deviations that the mixed model estimates (see `hilcal.mixed`). Reports show the named
 effects as the model; the others are its background. All of them predict.
 
-Without a background, effects of many small parameters, as the lines of a gear, are random, too: see
-`with_pooled_lines`.
+Without a background, the effects that a refinement adds are random, too: see
+`with_shrunk_effects`.
 """
 
 from collections.abc import Collection
@@ -39,7 +39,8 @@ from hilcal.types import Floats
 MOST_ROWS = 10_000
 """Most elements of readings for which a background is fitted; a choice: it takes minutes."""
 MOST_ROWS_OF_LINES = 2000
-"""Most elements of readings for which lines are pooled; a choice: it takes some seconds."""
+"""Most elements of readings for which lines are shrunk; a choice: it takes some seconds, and more
+readings determine each line."""
 MOST_CONFIRMATIONS = 3
 """Most rounds in which gross errors of fewer effects are tested beside all effects; a choice."""
 
@@ -173,11 +174,8 @@ def allows_background(fitted: Fit) -> bool:
     prior states the sizes of its effects; nor has a model without readings, as no effect can be
     added to it by name.
     """
-    return len(fitted.white) <= MOST_ROWS and _extensible(fitted.model)
-
-
-def _extensible(model: Model) -> bool:
-    return model.prior is None and model.readings is not None
+    model = fitted.model
+    return len(fitted.white) <= MOST_ROWS and model.prior is None and model.readings is not None
 
 
 def with_background(
@@ -239,25 +237,31 @@ def with_background(
         return None
 
 
-def with_pooled_lines(fitted: Fit) -> Fit | None:
-    """Fit shrunk effects anew, with the size of each line near that of its pool.
+def with_shrunk_effects(fitted: Fit, flat: Collection[str]) -> Fit | None:
+    """Fit the effects anew, except the `flat` ones, with parameters shrunk to estimated sizes.
 
-    An ordinary fit chooses the variance of each line (`Effect.groups`), as a wave of one gear, from
+    Flat parameters grow in directions that the poses hardly show, and predict other poses badly:
+    the size of an effect, which all its parameters show, limits them. An ordinary fit of an effect
+    of many lines, as the waves of one gear (`Effect.groups`), chooses the variance of each from
     its few parameters alone, so that it drops real lines and retains false ones by chance. With a
     prior size common to the lines of a pool (`Effect.pools`, see `mixed.families`) the error of
     simulated transmission errors at fresh poses fell to 0.9. The noise is that of the fit.
 
     Returns:
-        The fit; None where the model has no such effect, or the readings are too many.
+        The fit; None where all effects are flat, or the readings are too many.
     """
     model = fitted.model
-    shrunk = {e.name for e in model.effects if e.groups() is not None} - set(model.random)
-    if not shrunk or not _extensible(model) or len(fitted.white) > MOST_ROWS_OF_LINES:
+    roles = {e.name: e.role for e in model.effects}
+    shrunk = {n for n in set(model.names) - set(flat) if roles[n] not in FRAME_ROLES}
+    lines = {e.name for e in model.effects if e.groups() is not None}
+    many = len(fitted.white) > MOST_ROWS_OF_LINES
+    shrunk = (shrunk - lines if many else shrunk | lines) - set(model.random)
+    if not shrunk or not allows_background(fitted):
         return None
     # The covariance contains the arm's scatter as the fit has it.
     inliers = replace(fitted.readings[~fitted.outlier], scatter_stated=True)
     try:
-        mixed = mixed_fit_of(model, inliers, fitted.mode, set(model.names) - shrunk, shrunk)
+        mixed = mixed_fit_of(model, inliers, fitted.mode, set(model.names) - shrunk, lines & shrunk)
         std = mixed.prior_std() / mixed.std(INSTRUMENT)
         parts = zip(model.effects, model.slices(), strict=True)
         random = {**model.random, **{e.name: std[rows] for e, rows in parts if e.name in shrunk}}

@@ -71,7 +71,7 @@ def test_two_hidden_effects_are_found_one_after_the_other():
     assert 0.7 < r.steps[-1].fit.variance_factor < 1.35
 
 
-def test_a_suspect_that_passes_beside_pooled_lines_is_added(monkeypatch):
+def test_a_suspect_that_passes_beside_shrunk_lines_is_added(monkeypatch):
     """Separate lines of a gear may hide it; it was named as missing, and never added."""
     cell, p, rng = cell_of(), plan(30, 5), np.random.default_rng(5)
     world = world_of(cell, rng)

@@ -174,7 +174,7 @@ def test_gears_that_all_give_in_one_direction_are_no_scale_of_the_tracker():
 
 
 @pytest.mark.long
-def test_a_model_with_pooled_lines_is_refined_further():
+def test_a_model_with_shrunk_lines_is_refined_further():
     case = case_of("absolute", ("transmission_error",), 3.0)
     found = refined(case.cell, case.readings, "absolute")
     assert "transmission_error" in found.fit.model.random

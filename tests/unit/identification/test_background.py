@@ -14,11 +14,12 @@ from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.diagnosis.stepwise import add, remove
 from hilcal.diagnosis.unknown_law import without_remainder
 from hilcal.diagnosis.verdict import diagnose
+from hilcal.effects.protocol import EffectSpec
 from hilcal.identification.background import (
     background_of,
     family_sizes,
     with_background,
-    with_pooled_lines,
+    with_shrunk_effects,
 )
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
@@ -294,10 +295,28 @@ def test_waves_of_gears_in_pools_predict_better_than_line_by_line():
     assert np.exp(np.mean(np.log(ratios))) < 0.9
 
 
-def test_without_shrunk_effects_there_are_no_lines():
+def test_flat_parameters_of_narrow_poses_predict_others_badly_and_shrunk_ones_do_not():
+    case = study_case(configuration(), "ur10e", "absolute", (), 0.0, 1, n_poses=80)
+    r, rng = case.readings[::6], np.random.default_rng(1)
+    model = baseline(case.cell, r, "absolute") + EffectSpec("link_geometry", {})
+    near, q = np.arange(len(r)) < 40, r.states.q
+    q = np.where(near[:, None], q[0] + 0.04 * (q - q[0]), q)
+    states, true = replace(r.states, q=q), np.zeros(model.size)
+    true[model.slices()[-1]] = 0.5 * model.effects[-1].magnitudes
+    true *= rng.standard_normal(model.size)
+    noise = np.linalg.cholesky(r.covariance) @ rng.standard_normal((*r.value.shape, 1))
+    value = model.predict(states, true).observation.position + noise[..., 0]
+    r = replace(r, states=states, value=value)
+    flat = add(fitted_model(case.cell, r[near], "absolute"), "link_geometry")
+    shrunk = with_shrunk_effects(flat, ("base_frame", "target_offset"))
+    assert shrunk.holdout.rms_sigma < 1.02 * flat.holdout.rms_sigma
+    assert error(shrunk, r[~near]) < 0.5 * error(flat, r[~near])
+
+
+def test_without_added_effects_nothing_is_shrunk():
     case = study_case(configuration(), "ur10e", "absolute", (), 0.0, 1, n_poses=12)
     plain = fitted_model(case.cell, case.readings, "absolute")
-    assert with_pooled_lines(plain) is None
+    assert with_shrunk_effects(plain, plain.model.names) is None
 
 
 @pytest.mark.long
