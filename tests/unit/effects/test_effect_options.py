@@ -47,7 +47,7 @@ def test_an_impossible_option_is_refused(case, given):
     refuses(case, lambda: make(name, UR10E, some_states(UR10E), json.loads(options)).prior_std())
 
 
-@pytest.mark.parametrize("name", ["hysteresis", "tracker_drift", "creep", "thermal_joint_drift"])
+@pytest.mark.parametrize("name", ["hysteresis", "tracker_drift", "creep"])
 def test_a_missing_column_is_named(name):
     (column,) = effect_class(name).needs
     states = replace(some_states(UR10E), **{column: None})
@@ -101,6 +101,28 @@ def test_joints_drift_from_where_they_were_at_first():
     untimed = replace(shuffled, time=None)
     effect = make("thermal_joint_drift", UR10E, untimed)
     np.testing.assert_array_equal(effect.reference, shuffled.joint_temperature[0])
+
+
+def test_joints_without_temperatures_warm_up_with_the_time():
+    s = situation(UR10E)
+    hot, timed = s.states, replace(s.states, joint_temperature=None)
+    effect = make("thermal_joint_drift", UR10E, timed)
+    kappa = 1e-6 * np.arange(1.0, 7.0)
+    found = effect.deviation(kappa, replace(s, states=timed)).dq
+    elapsed = timed.time - timed.time.min()
+    rise = 10.0 * (1.0 - np.exp(-elapsed[:, None] / 2400.0))
+    np.testing.assert_allclose(found, kappa * rise, rtol=0, atol=1e-18)
+    kept = make("thermal_joint_drift", UR10E, hot[5:], effect.options)  # not by temperatures now
+    np.testing.assert_array_equal(kept.deviation(kappa, s).dq, found)
+    by_temperature = make("thermal_joint_drift", UR10E, hot)
+    for states, options in (
+        (timed, by_temperature.options),
+        (replace(hot, time=None), kept.options),
+    ):
+        with pytest.raises(InputError, match="which the readings do not have; valid: "):
+            make("thermal_joint_drift", UR10E, states, options)
+    with pytest.raises(InputError, match="needs joint_temperature or time, which the readings"):
+        make("thermal_joint_drift", UR10E, replace(timed, time=None))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -214,7 +236,10 @@ def test_options_are_explained_and_defaults_are_valid(kind):
 def test_a_default_that_follows_from_the_readings_is_not_told():
     states = some_states(UR10E, 60)
     drift = option_defaults(installed()["thermal_joint_drift"], UR10E, states)
-    assert drift == {"joints": "each", "reference_degC": None}
+    assert drift == {
+        "joints": "each", "temperature": "joints", "reference_degC": None, "start_s": None,
+        "time_constant_s": None,
+    }  # fmt: skip
     assert option_defaults(installed()["transmission_error"], UR10E, states)["harmonics"] is None
     assert option_defaults(installed()["creep"], UR10E, states) == {"joints": "common"}
 
