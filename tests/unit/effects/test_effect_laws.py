@@ -245,6 +245,16 @@ def test_it_is_what_the_factors_of_the_description_are_off_by(given):
     np.testing.assert_allclose(chain.rotation[-1], expected.rotation[-1], rtol=0, atol=1e-14)
 
 
+def test_the_lowest_waves_have_a_size_each_and_those_of_an_octave_share_one():
+    effect = make("transmission_error", ODD, some_states(ODD), {"harmonics": 16})
+    pools = effect.pools().reshape(ODD.arm.n, -1, 2)
+    expected = [0, 1, 2, *[3] * 4, *[4] * 8, 5]
+    np.testing.assert_array_equal(pools, np.broadcast_to(np.array(expected)[:, None], pools.shape))
+    ordinary = np.exp([effect.expected_log_std(k)[0] for k in (0, 1, 2, 3, 4, 5)])
+    halves = np.log2(ordinary[0] / ordinary)
+    np.testing.assert_allclose(halves, [0, 1, 1, 2, 3, 4], atol=0.05)
+
+
 def test_couplings_are_expected_a_tenth_as_large_where_the_description_has_none():
     means = []
     for arm in (coupled(ODD.arm, j3q2=-1.0), ODD.arm):
