@@ -281,6 +281,9 @@ def _judged(e: Evidence, history: History, whole_catalogue: bool) -> Diagnosis:
         noise = judge_noise(e.fit, e.pure_error, predictable)
         in_fit = scatter is not None
         implausible = scatter is not None and exceeds_repeatability(scatter, arm)
+        # A scatter that is too large for an arm is noise if repeats show it: effects too small to
+        # be resolved scatter alike.
+        repeated = implausible and e.pure_error is not None
         little = noise.reason == "predictable" and max(predicted, *patterns, 0.0) <= PREDICTABLE
         same_in_pose = any(
             v.variable == "pose" and v.share > MOST_POSE_SHARE and v.p_value < FALSE_ALARM
@@ -311,7 +314,7 @@ def _judged(e: Evidence, history: History, whole_catalogue: bool) -> Diagnosis:
         if reason in ("residual_is_noise", "arm_scatter") and serial and not serial.proved:
             reason = "serial_or_effect"
         if e.background and (
-            (reason == "misjudged_noise" and not implausible)
+            (reason == "misjudged_noise" and not repeated)
             or (reason in BACKGROUND_OVERRIDES and p_value_of_others(e.fit) <= JOINT_LEVEL)
         ):
             reason, suspects = "background", (*as_suspects(e.background), *suspects)

@@ -30,6 +30,7 @@ from hilcal.identification.prediction.predictive import predictive_of
 from hilcal.library import read_table
 from hilcal.library import refine as search_laws
 from hilcal.mixed.variances import evidence
+from hilcal.present.verdict import message
 from hilcal.readings.whitening import whitening
 from hilcal.refinement import BACKGROUND, refine
 from hilcal.robot.catalogue import configs_dir
@@ -185,6 +186,18 @@ def test_the_sizes_of_its_families_are_told_with_intervals(found):
     widths = [s.high / s.low for s in sizes]
     assert widths[0] < 0.2 * max(widths)
     assert family_sizes(found.steps[0].fit) == ()
+
+
+def test_a_scatter_larger_than_an_arms_is_noise_only_where_repeats_show_it(found):
+    """What few poses do not resolve scatters alike; the effects of a background are in doubt."""
+    model = replace(found.fit.model, background=frozenset({"joint_stiffening"}))  # not there
+    scatter = replace(found.fit.readings.arm_scatter, size_m=1e-3)
+    large = replace(
+        found.fit, model=model, readings=replace(found.fit.readings, arm_scatter=scatter)
+    )
+    d = diagnose(large)
+    assert (d.verdict, d.reason) == ("ambiguous", "background")
+    assert "more than an arm's repeatability" in message(d)
 
 
 @pytest.mark.long
