@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from hilcal.effects.options import rated_moments
 from hilcal.effects.protocol import Changeable, Parameter
 from hilcal.effects.slot_compliance import SlotCompliance
 from hilcal.robot import se3
@@ -18,10 +19,16 @@ class BaseCompliance(SlotCompliance):
     name = "base_compliance"
     summary = "rotation B t_0 about the base origin: the ground gives way"
     change = Changeable("base", "base", "the ground under the base", "loose bolts?")
-    plausible = 30.0  # 90 µrad/(N·m): an arm on a trolley. A choice.
-    parameters = tuple(
-        Parameter(axis, "rad/(N·m)", 3e-6, f"rotation of the base about {axis}") for axis in "xyz"
-    )
+    plausible = 30.0  # 30 mrad at the rated torque of the first joint: on a trolley. A choice.
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """About x, y, z; 1 mrad at the rated torque of the first joint is ordinary."""
+        scale = 1e-3 / float(rated_moments(self.cell)[0])
+        return tuple(
+            Parameter(axis, "rad/(N·m)", scale, f"rotation of the base about {axis}")
+            for axis in "xyz"
+        )
 
     def laws(self) -> tuple[Ints, Floats]:
         """Twist of slot 0 by the rotation about each base axis that the moment about it causes."""

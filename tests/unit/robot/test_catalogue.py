@@ -2,6 +2,7 @@
 
 import math
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -9,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hilcal.robot.arm import UNKNOWN_TORQUE
 from hilcal.robot.catalogue import UNPUBLISHED, configs_dir, load_arm, robot_names
 from hilcal.robot.chain import evaluate
 from hilcal.robot.scene import pinocchio_model
@@ -323,3 +325,14 @@ def test_not_a_urdf(case, given, tmp_path, capfd):
     path.write_text(given.rstrip("\n"))
     refuses(case, lambda: arm_from_urdf(path), path)
     assert capfd.readouterr() == ("", "")  # the C++ parser's own output is in the message
+
+
+@pytest.mark.parametrize("name", ["ur5e", "ur10e", "ur20", "iiwa14", "xarm6"])
+def test_a_torque_that_is_not_stated_is_that_of_the_weights(name):
+    arm = load_arm(name)
+    unstated = replace(arm, torque_max=np.full(arm.n, np.inf)).ratings
+    assert 0.6 < np.median(arm.torque_max / unstated) < 1.7
+    heavy = replace(arm, masses=10 * arm.masses, torque_max=np.full(arm.n, np.inf), payload=np.inf)
+    assert heavy.ratings[1] > 3 * arm.torque_max[1]
+    bare = replace(heavy, masses=np.zeros(arm.n))
+    np.testing.assert_array_equal(bare.ratings, UNKNOWN_TORQUE)
