@@ -7,15 +7,21 @@ displacement, zero before k,
 
     gain_k = gᵀ M⁻¹ g,   g = C_kᵀ P y,   M = C_kᵀ P C_k
 
-is χ² distributed without a step. The variances are estimated without a step, which enlarges them,
-so the test is conservative. The largest gain counts, at a level divided by the number of places;
-the sensor, the target and all joints together have half of the level each.
-A drift in the order resembles a step; a step has to explain the readings better by 20 : 1.
+is χ² distributed without a step, if the variances are known. A step enlarges those that are
+estimated without it until it seems small, and even more so the larger it is. So the best steps of
+sensor, target and joints are subtracted, each alone, and the variances are those of the readings
+that become likeliest. Of the Wald statistic w with ν degrees of freedom twice the gain of the log
+likelihood follows, ν log(1 + w/ν). The largest gain counts, at a level
+divided by the number of places; the sensor, the target and all joints together have half of the
+level each.
+
+A drift in the order resembles a step, one that settles, as of an arm that warms up, the more; a
+step has to explain the readings better than any of `SETTLING` by 20 : 1.
 A serial correlation of the noise is not assumed: it would take up the step.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -25,14 +31,24 @@ from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.background import allows_background
 from hilcal.identification.fit import Fit
-from hilcal.identification.mixed_fit import MOST_NOISE_ROWS, mixed_fit_at, shift_rows
+from hilcal.identification.mixed_fit import (
+    MOST_NOISE_ROWS,
+    linearised_problem,
+    shift_rows,
+    sizes_at,
+)
 from hilcal.identification.outliers.data_snooping import FEWEST_IN_RUN
-from hilcal.mixed.equations import Equations
-from hilcal.model.observe import motion
+from hilcal.mixed.equations import Equations, equations
+from hilcal.mixed.variances import estimate_variances, log_posterior
+from hilcal.model.observe import ReadingDerivative, motion
 from hilcal.types import Floats
 
 LEVEL = 1e-3  # chance of a step of sensor or target where there is none; a choice
 RANK = 1e-9  # share of the largest eigenvalue below which a direction is not determined
+
+SETTLING = (np.inf, 0.5, 0.2, 0.1)
+"""Time constants of the tried drifts 1 − exp(−t/τ), each alone and all together, t from 0 to 1 in
+the order of the readings; a choice. The first one is a straight line."""
 
 SENSOR, TARGET, JOINT = "sensor", "target", "joint"
 
@@ -64,51 +80,112 @@ def step_in_order(fit: Fit) -> OrderStep | None:
         return None
     model, theta = all_effects_at(fit, readings)
     try:
-        e = mixed_fit_at(model, readings, fit.mode, theta).equations
+        problem = linearised_problem(model, readings, fit.mode, theta)
+        start = sizes_at(problem, model, theta)
+        e = estimate_variances(problem, start).equations
         prediction = model.predict(readings.states, theta)
+        moves = motion(
+            model.cell, prediction.observation, prediction.situation.chain, prediction.deviation,
+            readings.m,
+        )  # fmt: skip
+        units, kinds = shift_rows(model, readings, fit.mode), _kinds(moves)
+        found, _ = _found(e, units, kinds)
+        joint = next(f.kind for f in found if f.kind not in (SENSOR, TARGET))
+        freed = [
+            estimate_variances(linearised_problem(model, without, fit.mode, theta), start).equations
+            for f in found
+            if f.kind in (SENSOR, TARGET, joint)
+            for without in [replace(readings, value=readings.value - f.shift(kinds))]
+        ]
+        e = equations(problem, max(freed, key=log_posterior).log_std)
     except (CannotAnswerError, np.linalg.LinAlgError):
         return None
-    observed, situation = prediction.observation, prediction.situation
-    moves = motion(model.cell, observed, situation.chain, prediction.deviation, readings.m)
-    units = shift_rows(model, readings, fit.mode)
-    remaining = float(e.target @ e.residual)
-    found = []
-    drives = moves.drives
-    n = drives.shape[2]
-    kinds: list[tuple[str, int, Floats]] = [  # with the number of kinds alike
-        (SENSOR, 1, moves.by_station()),
-        (TARGET, 1, moves.by_target()[:, :, :3]),
-        *((f"{JOINT} {j + 1}", n, drives[:, :, [j]]) for j in range(n)),
-    ]
-    for kind, alike, columns in kinds:
-        gains = list(_gains(e, np.einsum("rnm,nmq->rnq", units, columns)))
-        k, gain, rank, delta = max(gains[1:], key=lambda g: g[1])
-        better = gain - gains[0][1] > 2 * SAME_EVIDENCE
-        tests = 2 * alike * (len(gains) - 1)
-        p = min(tests * float(scipy.stats.chi2.sf(gain, rank)), 1.0)
-        if p < LEVEL and better:
-            shift = columns[k:, :3] @ delta
-            size = float(np.sqrt(np.mean(np.sum(shift**2, axis=1))))
-            found.append((gain - 2 * rank, kind, k, p, size, gain / remaining))
-    if not found:
+    found, drift = _found(e, units, kinds)
+    best = found[0]
+    if best.p_value >= LEVEL or best.score < drift + 2 * SAME_EVIDENCE:
         return None
-    found.sort(key=lambda f: -f[0])
-    best, _, k, p, size, share = found[0]
-    explanations = tuple(kind for score, kind, *_ in found if best - score < 2 * SAME_EVIDENCE)
-    return OrderStep(explanations, int(rows[k]), int(rows[k - 1]), p, size, share)
+    size = float(np.sqrt(np.mean(np.sum(best.shift(kinds)[best.first :, :3] ** 2, axis=1))))
+    remaining = float(e.target @ e.residual)
+    return OrderStep(
+        moved=tuple(
+            f.kind for f in found if f.p_value < LEVEL and best.score - f.score < 2 * SAME_EVIDENCE
+        ),
+        first=int(rows[best.first]),
+        previous=int(rows[best.first - 1]),
+        p_value=best.p_value,
+        shift_m=size,
+        share=best.wald / remaining,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Step:
+    """The best place of a step of one kind."""
+
+    kind: str
+    first: int  # row of the first reading after it
+    wald: float  # gain
+    score: float  # gain of the log likelihood, twice, less twice the rank
+    p_value: float
+    displacement: Floats  # (q,)
+
+    def shift(self, kinds: dict[str, Floats]) -> Floats:
+        """(N, m) shift of each reading."""
+        out = kinds[self.kind] @ self.displacement
+        out[: self.first] = 0.0
+        return np.asarray(out)
+
+
+def _kinds(moves: ReadingDerivative) -> dict[str, Floats]:
+    """(N, m, q) derivatives of the readings by each kind of displacement."""
+    joints = {
+        f"{JOINT} {j + 1}": d[:, :, None] for j, d in enumerate(moves.drives.transpose(2, 0, 1))
+    }
+    return {SENSOR: moves.by_station(), TARGET: moves.by_target()[:, :, :3], **joints}
+
+
+def _found(e: Equations, units: Floats, kinds: dict[str, Floats]) -> tuple[list[_Step], float]:
+    """Return the best step of each kind, best first, and the score of the best drift."""
+    found, drift = [], 0.0
+    freedom = np.count_nonzero(units.any(axis=(1, 2))) - float(e.spent.sum()) - e.problem.flat
+    for kind, columns in kinds.items():
+        gains = list(_gains(e, np.einsum("rnm,nmq->rnq", units, columns)))
+        drift = max(
+            drift, *(_twice_log(g, freedom) - 2 * r for _, g, r, _ in gains[: len(SETTLING) + 1])
+        )
+        steps = gains[len(SETTLING) + 1 :]
+        k, gain, rank, delta = max(steps, key=lambda g: g[1])
+        twice = _twice_log(gain, freedom)
+        alike = 1 if kind in (SENSOR, TARGET) else len(kinds) - 2
+        tests = 2 * alike * len(steps)
+        p = min(tests * float(scipy.stats.chi2.sf(twice, rank)), 1.0)
+        found.append(_Step(kind, k, gain, twice - 2 * rank, p, delta))
+    return sorted(found, key=lambda f: -f.score), drift
+
+
+def _twice_log(gain: float, freedom: float) -> float:
+    """Twice the gain of the log likelihood where the size of the noise is estimated, too."""
+    return freedom * float(np.log1p(gain / freedom))
 
 
 def _gains(e: Equations, columns: Floats) -> Iterator[tuple[int, float, int, Floats]]:
-    """Yield gains with the first row, the rank and the displacement (q,): of a drift, of each step.
+    """Yield gains with the first row, the rank and the displacement (q,): of drifts, of each step.
 
     `columns` (R, N, q) are the rows by the displacement of each reading alone.
     """
     _, count, q = columns.shape
     square, score = e.score(columns.reshape(len(columns), count * q))
     by_pair, by_reading = square.reshape(count, q, count, q), score.reshape(count, q)
-    time = np.linspace(-1.0, 1.0, count)
-    drift = np.einsum("i,iajb,j->ab", time, by_pair, time)
-    yield 0, *_gain(drift, time @ by_reading)
+    time = np.linspace(0.0, 1.0, count)
+    shapes = np.stack(
+        [time if np.isinf(tau) else 1.0 - np.exp(-time / tau) for tau in SETTLING], axis=1
+    )
+    shapes -= shapes.mean(axis=0)
+    each = [shapes[:, [k]] for k in range(len(SETTLING))]
+    for x in (*each, shapes):
+        size = x.shape[1] * q
+        square = np.einsum("is,iajb,jt->satb", x, by_pair, x, optimize=True).reshape(size, size)
+        yield 0, *_gain(square, (x.T @ by_reading).reshape(size))
     later = np.cumsum(np.cumsum(by_pair[::-1, :, ::-1], axis=0), axis=2)[::-1, :, ::-1]
     scores = np.cumsum(by_reading[::-1], axis=0)[::-1]
     for k in range(FEWEST_IN_RUN, count - FEWEST_IN_RUN + 1):

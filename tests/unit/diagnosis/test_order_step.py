@@ -77,9 +77,11 @@ def test_readings_without_a_step_show_none():
     assert step_in_order(fitted_model(C.cell, C.readings, "absolute")) is None
 
 
-def test_a_drift_is_no_step():
+@pytest.mark.parametrize("settling", [None, 0.3, 0.12])
+def test_a_drift_is_no_step(settling):
     value = C.readings.value.copy()
-    value[:, 0] += np.linspace(0.0, 1e-3, len(value))
+    time = np.linspace(0.0, 1.0, len(value))
+    value[:, 0] += 1e-3 * (time if settling is None else 1.0 - np.exp(-time / settling))
     drifting = replace(C.readings, value=value)
     assert step_in_order(fitted_model(C.cell, drifting, "absolute")) is None
 
