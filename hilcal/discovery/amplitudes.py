@@ -236,7 +236,7 @@ class Factor:
             )
         else:
             x, numbers = v.code, [repr(x) for x in self.numbers]
-        return str(getattr(self.shape, notation)(x, numbers))
+        return self.shape.written(notation, x, numbers)
 
 
 @dataclass(frozen=True)

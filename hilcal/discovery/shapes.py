@@ -26,7 +26,9 @@ import numpy as np
 from hilcal.types import Floats
 
 Numbers = tuple[float, ...]
-_Written = Callable[[str, list[str]], str]
+_Written = str | Callable[[str, list[str]], str]
+"""How f(x; p) is written, from text for x and for each of p: with {x}, {p[0]}, {p[1]}, the product
+{px} of p[0] and x, and {b}, p[0] in brackets if it is negative; or a function that writes it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,28 +37,31 @@ class Shape:
 
     name: str  # e.g. "saturation"
     cost: int  # complexity
-    code: _Written  # f as Python, from Python for x and for each of p
+    code: _Written  # f as Python
     slope_code: _Written  # ∂f/∂x as Python
-    text: _Written  # f as text, from text for x and for each of p
+    text: _Written
     power: Callable[[Numbers], float] = lambda p: 0.0  # power of the unit of x in the unit of f
     free: tuple[int, ...] = ()  # indices of p that a refinement may change
     places: tuple[int, ...] = ()  # indices of p that are values of x, which may be zero or negative
 
     def value(self, x: Floats, p: Any) -> Floats:
         """Return f at x; numbers may be arrays that broadcast with it."""
-        return np.asarray(eval(_compiled(self.code), {"np": np, "x": x, "p": p}))  # noqa: S307
+        return _evaluated(self.code, x, p)
 
     def slope(self, x: Floats, p: Any) -> Floats:
         """Return ∂f/∂x at x; numbers may be arrays that broadcast with it."""
-        return np.asarray(eval(_compiled(self.slope_code), {"np": np, "x": x, "p": p}))  # noqa: S307
+        return _evaluated(self.slope_code, x, p)
 
-    def latex(self, x: str, p: list[str]) -> str:
-        """Return f in LaTeX, of x in LaTeX."""
+    def written(self, notation: str, x: str, p: list[str]) -> str:
+        """Return f as "text", "latex" or Python "code", or its slope as "slope_code"."""
+        if notation != "latex":
+            return _filled(getattr(self, notation), x, p, "·" if notation == "text" else " * ")
         if self.name == "threshold":
             return rf"\operatorname{{sign}}({x})\max(|{x}| - {p[0]}, 0)"
         if self.name == "relaxation":
             return rf"(1 - e^{{-{x}/{p[0]}}})"
-        out = self.text(x, p).replace("·", r"\,").replace("sign(", r"\operatorname{sign}(")
+        out = _filled(self.text, x, p, r"\,").replace("·", r"\,")
+        out = out.replace("sign(", r"\operatorname{sign}(")
         out = re.sub(r"(?<![\\\w])(max|cos|sin|tanh)\(", r"\\\1(", out).replace(
             "log10", r"\log_{10}"
         )
@@ -69,9 +74,21 @@ class Shape:
         return {"linear": 0, "even": 2, **dict.fromkeys(bent, 3)}.get(self.name, 1)
 
 
+def _filled(written: _Written, x: str, p: list[str], times: str) -> str:
+    if callable(written):
+        return written(x, p)
+    first = p[0] if p else ""
+    product = x if first in ("1", "1.0") else f"{first}{times}{x}"
+    return written.format(x=x, p=p, px=product, b=f"({first})" if first.startswith("-") else first)
+
+
+def _evaluated(written: _Written, x: Floats, p: Any) -> Floats:
+    return np.asarray(eval(_compiled(written), {"np": np, "x": x, "p": p}))  # noqa: S307
+
+
 @cache
-def _compiled(code: _Written) -> CodeType:
-    return compile(code("x", ["p[0]", "p[1]"]), "<function>", "eval")
+def _compiled(written: _Written) -> CodeType:
+    return compile(_filled(written, "x", ["p[0]", "p[1]"], " * "), "<function>", "eval")
 
 
 def _one(p: Numbers) -> float:
@@ -80,14 +97,6 @@ def _one(p: Numbers) -> float:
 
 def _exponent(p: Numbers) -> float:
     return p[0]
-
-
-def _power_slope(x: str, power: str) -> str:
-    return f"{power} * np.maximum({x}, 1e-12) ** ({power} - 1) * ({x} > 0)"
-
-
-def _times(k: str, x: str, sign: str = "·") -> str:
-    return x if k in ("1", "1.0") else f"{k}{sign}{x}"
 
 
 def _root(x: str, p: list[str]) -> str:
@@ -106,23 +115,9 @@ def _odd_slope(x: str, p: list[str]) -> str:
     return rounded if float(p[0]) < 1 else smooth
 
 
-def _bracketed(x: str) -> str:
-    return f"({x})" if x.startswith("-") else x
-
-
-LINEAR = Shape("linear", 1, lambda x, p: x, lambda x, p: f"np.ones_like({x})", lambda x, p: x, _one)
-COS = Shape(
-    "cos", 1,
-    lambda x, p: f"np.cos({_times(p[0], x, ' * ')})",
-    lambda x, p: f"-{p[0]} * np.sin({_times(p[0], x, ' * ')})",
-    lambda x, p: f"cos({_times(p[0], x)})",
-)  # fmt: skip
-SIN = Shape(
-    "sin", 1,
-    lambda x, p: f"np.sin({_times(p[0], x, ' * ')})",
-    lambda x, p: f"{p[0]} * np.cos({_times(p[0], x, ' * ')})",
-    lambda x, p: f"sin({_times(p[0], x)})",
-)  # fmt: skip
+LINEAR = Shape("linear", 1, "{x}", "np.ones_like({x})", "{x}", _one)
+COS = Shape("cos", 1, "np.cos({px})", "-{p[0]} * np.sin({px})", "cos({px})")
+SIN = Shape("sin", 1, "np.sin({px})", "{p[0]} * np.cos({px})", "sin({px})")
 FINE_COS, FINE_SIN = replace(COS, cost=3), replace(SIN, cost=3)  # of high orders
 ODD = Shape(
     "odd", 2,
@@ -139,85 +134,51 @@ EVEN = Shape(
     _exponent, (0,),
 )  # fmt: skip
 POWER = Shape(
-    "power", 2,
-    lambda x, p: f"np.maximum({x}, 0.0) ** {p[0]}",
-    lambda x, p: f"{p[0]} * np.maximum({x}, 0.0) ** ({p[0]} - 1)",
-    lambda x, p: f"{x}^{p[0]}",
-    _exponent, (0,),
+    "power", 2, "np.maximum({x}, 0.0) ** {p[0]}",
+    "{p[0]} * np.maximum({x}, 0.0) ** ({p[0]} - 1)", "{x}^{p[0]}", _exponent, (0,),
 )  # fmt: skip
-PLUS = Shape(
-    "plus", 2,
-    lambda x, p: f"np.maximum({x}, 0.0)",
-    lambda x, p: f"np.where({x} > 0, 1.0, 0.0)",
-    lambda x, p: f"max({x}, 0)",
-    _one,
-)  # fmt: skip
+PLUS = Shape("plus", 2, "np.maximum({x}, 0.0)", "np.where({x} > 0, 1.0, 0.0)", "max({x}, 0)", _one)
 MINUS = Shape(
-    "minus", 2,
-    lambda x, p: f"np.maximum(-{x}, 0.0)",
-    lambda x, p: f"np.where({x} < 0, -1.0, 0.0)",
-    lambda x, p: f"max(-{x}, 0)",
-    _one,
-)  # fmt: skip
+    "minus", 2, "np.maximum(-{x}, 0.0)", "np.where({x} < 0, -1.0, 0.0)", "max(-{x}, 0)", _one
+)
 ABOVE = Shape(
-    "above", 2,
-    lambda x, p: f"np.maximum({x} - {_bracketed(p[0])}, 0.0)",
-    lambda x, p: f"np.where({x} > {p[0]}, 1.0, 0.0)",
-    lambda x, p: f"max({x} - {_bracketed(p[0])}, 0)",
-    _one, (0,), (0,),
+    "above", 2, "np.maximum({x} - {b}, 0.0)", "np.where({x} > {p[0]}, 1.0, 0.0)",
+    "max({x} - {b}, 0)", _one, (0,), (0,),
 )  # fmt: skip
 BELOW = Shape(
-    "below", 2,
-    lambda x, p: f"np.maximum({p[0]} - {x}, 0.0)",
-    lambda x, p: f"np.where({x} < {p[0]}, -1.0, 0.0)",
-    lambda x, p: f"max({p[0]} - {x}, 0)",
-    _one, (0,), (0,),
+    "below", 2, "np.maximum({p[0]} - {x}, 0.0)", "np.where({x} < {p[0]}, -1.0, 0.0)",
+    "max({p[0]} - {x}, 0)", _one, (0,), (0,),
 )  # fmt: skip
 ABOVE_POWER = Shape(
-    "above_power", 3,
-    lambda x, p: f"np.maximum({x} - {_bracketed(p[0])}, 0.0) ** {p[1]}",
-    lambda x, p: _power_slope(f"({x} - {_bracketed(p[0])})", p[1]),
-    lambda x, p: f"max({x} - {_bracketed(p[0])}, 0)^{p[1]}",
-    lambda p: p[1], (0, 1), (0,),
+    "above_power", 3, "np.maximum({x} - {b}, 0.0) ** {p[1]}",
+    "{p[1]} * np.maximum(({x} - {b}), 1e-12) ** ({p[1]} - 1) * (({x} - {b}) > 0)",
+    "max({x} - {b}, 0)^{p[1]}", lambda p: p[1], (0, 1), (0,),
 )  # fmt: skip
 BELOW_POWER = Shape(
-    "below_power", 3,
-    lambda x, p: f"np.maximum({p[0]} - {x}, 0.0) ** {p[1]}",
-    lambda x, p: f"-{_power_slope(f'({p[0]} - {x})', p[1])}",
-    lambda x, p: f"max({p[0]} - {x}, 0)^{p[1]}",
-    lambda p: p[1], (0, 1), (0,),
+    "below_power", 3, "np.maximum({p[0]} - {x}, 0.0) ** {p[1]}",
+    "-{p[1]} * np.maximum(({p[0]} - {x}), 1e-12) ** ({p[1]} - 1) * (({p[0]} - {x}) > 0)",
+    "max({p[0]} - {x}, 0)^{p[1]}", lambda p: p[1], (0, 1), (0,),
 )  # fmt: skip
 SATURATION = Shape(
-    "saturation", 2,
-    lambda x, p: f"np.tanh({x} / {p[0]})",
-    lambda x, p: f"(1 - np.tanh({x} / {p[0]}) ** 2) / {p[0]}",
-    lambda x, p: f"tanh({x}/{p[0]})",
-    free=(0,),
+    "saturation", 2, "np.tanh({x} / {p[0]})", "(1 - np.tanh({x} / {p[0]}) ** 2) / {p[0]}",
+    "tanh({x}/{p[0]})", free=(0,),
 )  # fmt: skip
 THRESHOLD = Shape(
-    "threshold", 2,
-    lambda x, p: f"np.sign({x}) * np.maximum(np.abs({x}) - {p[0]}, 0.0)",
-    lambda x, p: f"np.where(np.abs({x}) > {p[0]}, 1.0, 0.0)",
-    lambda x, p: f"beyond({x}, {p[0]})",
-    _one, (0,),
+    "threshold", 2, "np.sign({x}) * np.maximum(np.abs({x}) - {p[0]}, 0.0)",
+    "np.where(np.abs({x}) > {p[0]}, 1.0, 0.0)", "beyond({x}, {p[0]})", _one, (0,),
 )  # fmt: skip
 LOG = Shape(
-    "log", 1,
-    lambda x, p: f"np.log10(1.0 + np.maximum({x}, 0.0))",
-    lambda x, p: f"np.where({x} > 0, 1.0, 0.0) / np.log(10.0) / (1.0 + np.maximum({x}, 0.0))",
-    lambda x, p: f"log10(1 + {x})",
+    "log", 1, "np.log10(1.0 + np.maximum({x}, 0.0))",
+    "np.where({x} > 0, 1.0, 0.0) / np.log(10.0) / (1.0 + np.maximum({x}, 0.0))",
+    "log10(1 + {x})",
 )  # fmt: skip
 RELAXATION = Shape(
-    "relaxation", 2,
-    lambda x, p: f"1.0 - np.exp(-np.maximum({x}, 0.0) / {p[0]})",
-    lambda x, p: f"np.where({x} > 0, 1.0, 0.0) * np.exp(-np.maximum({x}, 0.0) / {p[0]}) / {p[0]}",
-    lambda x, p: f"(1 - exp(-{x}/{p[0]}))",
-    free=(0,),
+    "relaxation", 2, "1.0 - np.exp(-np.maximum({x}, 0.0) / {p[0]})",
+    "np.where({x} > 0, 1.0, 0.0) * np.exp(-np.maximum({x}, 0.0) / {p[0]}) / {p[0]}",
+    "(1 - exp(-{x}/{p[0]}))", free=(0,),
 )  # fmt: skip
 STEP = Shape(
-    "step", 2,
-    lambda x, p: f"np.tanh(({x} - {p[0]}) / {p[1]})",
-    lambda x, p: f"(1 - np.tanh(({x} - {p[0]}) / {p[1]}) ** 2) / {p[1]}",
-    lambda x, p: f"tanh(({x} - {p[0]})/{p[1]})",
+    "step", 2, "np.tanh(({x} - {p[0]}) / {p[1]})",
+    "(1 - np.tanh(({x} - {p[0]}) / {p[1]}) ** 2) / {p[1]}", "tanh(({x} - {p[0]})/{p[1]})",
     free=(0, 1), places=(0,),
 )  # fmt: skip
