@@ -189,8 +189,7 @@ def share_in_band(fitted: Fit, test: Readings, error: Floats) -> float:
 def _planned(cell: Cell, readings: Readings, case: FewPosesCase) -> Ints:
     """Return the readings that a plan for predictions at all of them chooses."""
     config = cell.configured()
-    planning = config.planning.model_copy(update={"readings": "absolute"})
-    config = config.model_copy(update={"loads": [], "planning": planning})
+    config = config.with_keys("planning", readings="absolute").model_copy(update={"loads": []})
     q, m = readings.states.q, readings.value.shape[1]
     design_problem, _ = without_undetermined(
         problem(nominal_model(cell.with_config(config), m), config, q)

@@ -97,8 +97,7 @@ def _cell() -> Cell:
     """The cell of `hilcal demo`, with few candidates, so that planning takes seconds."""
     cell = Cell.load(configs_dir() / "cells" / "demo_ur10e.toml")
     config = cell.configured()
-    few = config.planning.model_copy(update={"candidates": CANDIDATES, "against": ()})
-    return replace(cell, config=config.model_copy(update={"planning": few}))
+    return cell.with_config(config.with_keys("planning", candidates=CANDIDATES, against=()))
 
 
 def _readings(cell: Cell, planned: Planned, factor: float = 1.0) -> Readings:

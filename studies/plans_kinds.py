@@ -111,8 +111,7 @@ def scene(cell: Cell, candidates: int, rng: np.random.Generator) -> Scene:
 
 def without_potential(config: CellConfig) -> CellConfig:
     """Return the configuration of a plan for the model alone."""
-    planning = config.planning.model_copy(update={"against": ()})
-    return config.model_copy(update={"planning": planning})
+    return config.with_keys("planning", against=())
 
 
 def optimal(

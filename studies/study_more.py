@@ -58,8 +58,8 @@ def measure_more(
         CellLoad(name=name, force_N=tuple(map(float, w[:3])), moment_Nm=tuple(map(float, w[3:])))
         for name, w in pulls
     )
-    planning = robot_config.planning.model_copy(update={"candidates": CANDIDATES})
-    robot_config = robot_config.model_copy(update={"loads": list(loads), "planning": planning})
+    robot_config = robot_config.with_keys("planning", candidates=CANDIDATES)
+    robot_config = robot_config.model_copy(update={"loads": list(loads)})
     # A limit on readings is faster than leaving out loads one by one.
     request = PlanRequest(poses, readings=poses * (1 + len(loads)))
     try:

@@ -137,8 +137,7 @@ def program_config(
     if choice != "base_frame":
         return config
     registration = {"base_xyz_m": REGISTRATION_XYZ, "base_rotvec_rad": REGISTRATION_ROTVEC}
-    tracker = config.tracker.model_copy(update=registration)
-    return config.model_copy(update={"tracker": tracker})
+    return config.with_keys("tracker", **registration)
 
 
 def simulation_case(

@@ -256,8 +256,7 @@ class GoalRule:
         if fitted.dof <= max(int((fitted.solution.prior == 0).sum()), 1):
             return float(np.inf)
         where = {"work_q_rad": self._work_q, "work_min_m": None, "work_max_m": None}
-        planning = self._config.planning.model_copy(update=where)
-        config = self._config.model_copy(update={"planning": planning})
+        config = self._config.with_keys("planning", **where)
         model = model_after(fitted, config)
         work = prediction_poses(model, config, np.zeros((0, self._cell.arm.n)))
         solution, u = fitted.solution, fitted.uncertainty

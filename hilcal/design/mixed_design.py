@@ -117,8 +117,7 @@ def _with_scatter(nominal: NominalModel, config: CellConfig) -> CellConfig:
     if scatter is not None and scatter.kind != "isotropic":
         std = scatter.std
     per_joint = std if len(std) > 1 else std[0]
-    repeatability = config.repeatability.model_copy(update={"joint_std_rad": per_joint})
-    return config.model_copy(update={"repeatability": repeatability})
+    return config.with_keys("repeatability", joint_std_rad=per_joint)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -41,9 +41,8 @@ class PairPower:
     rival: str  # fitted in its place
     power_now: float  # probability that the readings so far reject the rival, by a test at 1 %
     power_planned: float  # the same with the planned readings
-    not_separable: (
-        bool  # neither the planned readings nor `MANY_READINGS` others reach `LEAST_POWER`
-    )
+    not_separable: bool
+    """Neither the planned readings nor `MANY_READINGS` others reach `LEAST_POWER`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,9 +76,8 @@ def plan_separating(
     if len(names) < 2:
         raise InputError(f"{len(names)} suspects; two or more are needed to separate them")
     count = min(config.planning.candidates, CANDIDATES)
-    update = {"readings": fit.mode, "against": names, "candidates": count}
-    planning = config.planning.model_copy(update=update)
-    cell = cell.with_config(config.model_copy(update={"planning": planning}))
+    keys = {"readings": fit.mode, "against": names, "candidates": count}
+    cell = cell.with_config(config.with_keys("planning", **keys))
     readings = request.readings or request.poses * (1 + len(config.loads))
     separating_request = replace(request, criterion="separate", readings=readings)
     try:
@@ -233,8 +231,8 @@ def plan_poses(
     """
     config = cell.configured()
     count = max(SPARE * poses, LEAST)
-    planning = config.planning.model_copy(update={"readings": fit.mode, "candidates": count})
-    cell = cell.with_config(config.model_copy(update={"loads": [], "planning": planning}))
+    config = config.with_keys("planning", readings=fit.mode, candidates=count)
+    cell = cell.with_config(config.model_copy(update={"loads": []}))
     request = PlanRequest(poses, readings=poses, criterion=CRITERION, effort=0)
     planned = plan_readings(cell, request, rng, fit, say)
     say("spreading the poses")
