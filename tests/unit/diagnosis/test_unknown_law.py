@@ -10,6 +10,8 @@ from hilcal.present.verdict import message
 from hilcal.refinement import refine
 from studies.all_effects_command import AllEffectsCase, campaign_of
 from studies.few_poses_command import share_in_band
+from studies.study_cases import study_case
+from tests.support.campaigns import configuration
 
 pytestmark = pytest.mark.long
 POSES = 60
@@ -52,3 +54,12 @@ def test_an_arm_without_such_a_law_has_no_remainder():
     refinement, _ = refined(0.0)
     assert REMAINDER not in refinement.fit.model.names
     assert refinement.verdict != "unknown_effect"
+
+
+def test_a_precise_arm_with_one_such_law_has_a_remainder_and_no_other_background():
+    case = study_case(configuration(), "ur5e", "absolute", ("crossed gear",), 3.0, 0)
+    start = baseline(case.cell, case.readings, "absolute")
+    first, last = refine(start, case.readings, "absolute").steps
+    assert last.added == REMAINDER
+    assert last.diagnosis.verdict == "unknown_effect"
+    assert last.fit.holdout.rms_m < 0.5 * first.fit.holdout.rms_m
