@@ -52,7 +52,7 @@ from hilcal.measuring.session_state import (
     stored_wrench,
 )
 from hilcal.readings.readings import Readings, States
-from hilcal.store.plan import REFERENCE, SEEN, UNLOADED, Plan, Step
+from hilcal.store.plan import REFERENCE, REFERENCE_POSITION, UNLOADED, Plan, Step
 from hilcal.store.run_log import RunLog
 from hilcal.types import Floats
 
@@ -288,7 +288,7 @@ class Session:
         """Return the previous position of the target at the reference pose; None if unknown."""
         before = self._state.reference
         if before is None:
-            before = self._plan.about.get(SEEN)
+            before = self._plan.about.get(REFERENCE_POSITION)
         if before is None or stop.name != REFERENCE or self._cell.targets is not None:
             return None
         return np.asarray(before)

@@ -49,7 +49,7 @@ from hilcal.readings.whitening import usual_mode
 from hilcal.refinement import Refinement, refine
 from hilcal.refinement import RefinementStep as RefinementStep
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import REFERENCE, SEEN, Plan, read_plan
+from hilcal.store.plan import REFERENCE, REFERENCE_POSITION, Plan, read_plan
 from hilcal.store.procedure_log import (
     CALIBRATION,
     CORRECTED,
@@ -377,7 +377,7 @@ class Procedure:
         at_reference = np.array(readings.pose_names)[readings.pose] == REFERENCE
         if (unloaded := at_reference & readings.unloaded).any():
             position = readings.value[unloaded][-1, :3]
-            plan = replace(plan, about={**plan.about, SEEN: position.tolist()})
+            plan = replace(plan, about={**plan.about, REFERENCE_POSITION: position.tolist()})
         source = self._source(f"{purpose} campaign of {self.run.name}, ")
         create_run(path, config, self.cell.base_dir, plan, source=source, more_texts=texts).close()
 

@@ -23,7 +23,7 @@ FORMAT = "hilcal-plan"
 VERSION = 1
 UNLOADED = "none"
 REFERENCE = "reference"  # the pose of drift checks and load changes
-SEEN = "reference_seen_m"  # key of `Plan.about`: the unloaded target there, sensor axes, m
+REFERENCE_POSITION = "reference_seen_m"  # key of `Plan.about`: of the target, sensor axes, m
 ARM = "robot"  # key of `Plan.about`: the name of the arm that the plan was made for
 DURATION = "duration_s"  # key of `Plan.about`: durations, "total" among them, s
 LEFT_OUT = "left_out"  # key of `Plan.about`: points that are not measured, each with the reason
@@ -156,7 +156,7 @@ def _are_left_out(x: object) -> bool:
 
 
 _USED_KEYS: dict[str, tuple[str, Callable[[object], bool]]] = {
-    SEEN: ("three numbers, m", _is_place),
+    REFERENCE_POSITION: ("three numbers, m", _is_place),
     LEFT_OUT: ('a list of objects with "point" and "why"', _are_left_out),
     DURATION: (
         'an object with a number "total", s',
