@@ -421,8 +421,7 @@ def prior_lines(fit: Fit) -> list[str]:
         g, effect = c.group, c.group.effect.replace("_", " ")
         name = f"the {effect} of {g.part}" if g.part else f"the {effect}"
         name = name if g.joint is None else f"joint {g.joint}'s {effect}"
-        sigma = f"{min(c.moved_sigma, 37):.1f} σ of what the prior allows"
-        lines.append(f"  {name} has moved by {sigma} (wear, a crash or a repair?).")
+        lines.append(f"  {name} is {min(c.moved_sigma, 37):.1f} σ off what the prior allows.")
     if len(moved) > MOST_CONFLICTS:
         lines.append(f"  … and {len(moved) - MOST_CONFLICTS} more (--json lists them)")
     in_prior = {e.name for e in prior.posterior.effects}
@@ -432,6 +431,8 @@ def prior_lines(fit: Fit) -> list[str]:
         lines.append(f"  Its model did not have {numbers.names(new)}; {ask}.")
     elif fit.variance_factor_interval[0] > 1:
         lines.append(f"  With it the model leaves more than the noise; {ask}.")
-    elif not moved:
+    elif moved:
+        lines.append(f"  The arm, or the target on its tool, was changed or exchanged; {ask}.")
+    else:
         lines.append("  The readings agree with it.")
     return lines

@@ -23,6 +23,7 @@ from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import to_json
 from hilcal.identification.parameters_document import covariance_of
 from hilcal.identification.prediction.predictive import predictive
+from hilcal.present.fit import prior_lines
 from hilcal.robot.catalogue import load_arm
 from hilcal.store.codec import write_document
 from hilcal.store.revision import from_text, to_text
@@ -241,6 +242,9 @@ def test_the_joint_that_moved_is_found_and_let_go():
     document = to_json(found)["prior"]
     assert document["source"]["n_readings"] == len(both().readings)
     assert document["effects"][0]["joint"] == 3
+    _, worst_line, *_, cause = prior_lines(found)  # a moved target looks like the last link
+    assert worst_line.startswith("  joint 3's joint compliance is ")
+    assert cause.endswith("hilcal compare EARLIER LATER says what has changed.")
 
 
 def test_without_a_change_nothing_has_moved():
