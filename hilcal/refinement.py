@@ -11,6 +11,7 @@ from hilcal.diagnosis.background_evidence import (
     BackgroundEffect,
     background_evidence,
     background_is_better,
+    left_out_squares,
     p_value_of_others,
     proved,
 )
@@ -34,12 +35,15 @@ from hilcal.diagnosis.verdict import (
     with_order_step,
 )
 from hilcal.discovery.discovery import LawSearch
+from hilcal.effects.protocol import EffectSpec
+from hilcal.effects.written import chosen_options
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.background import (
     allows_background,
     with_background,
     with_shrunk_effects,
 )
+from hilcal.identification.baseline import baseline
 from hilcal.identification.carried.drift import carried_effects
 from hilcal.identification.fit import Fit, fit, fit_again
 from hilcal.identification.linearisation import linearise
@@ -48,6 +52,7 @@ from hilcal.identification.noise.arm_scatter import with_arm_scatter, with_prior
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
+from hilcal.regression.leave_out import improves
 from hilcal.shown import Brief, Shown
 from hilcal.store.revision import change
 
@@ -55,6 +60,7 @@ MOST_REVISIONS = 15
 MOST_SCATTERS = 2
 """Estimates of the arm's scatter at most: the first, and another after further effects."""
 BACKGROUND = "background"  # `RefinementStep.added` of a step that adds a background
+PRIOR = "prior"  # `RefinementStep.removed` of a step that leaves the carried prior out
 UNEXPLAINED_VERDICTS = ("unknown_effect", "noise_misjudged")
 """Verdicts with which all effects are tried together where readings are many; a choice: they prove
 single effects far below the noise, and all together take minutes."""
@@ -156,7 +162,8 @@ def refine(
     uncertainties and p-values include it. In the last fit the added effects are shrunk to
     estimated sizes, which predicts better (`with_shrunk_effects`). All fits include a correlation
     of the noise along the order of the readings (`diagnosis.serial_noise`), which would otherwise
-    be taken for effects.
+    be taken for effects. Where the readings contradict a carried prior, they are refined without
+    it, too; if that predicts poses left out better, as of another arm, these steps follow.
 
     Args:
         model: the starting model. Its effects stay, except those of a carried prior that the
@@ -175,6 +182,45 @@ def refine(
     Raises:
         InputError: too many readings.
     """
+    found = _refine(model, readings, mode, say, history, laws, on_step, background)
+    if not found.fit.contradictions:
+        return found
+    say("refining without the prior, which the readings contradict")
+    try:
+        start = _without_prior(found.steps[0].fit, readings)
+        alone = _refine(start, readings, mode, say, NO_HISTORY, laws, lambda step: None, background)
+    except CannotAnswerError:  # the readings alone are too few
+        return found
+    if not improves(*left_out_squares(found.fit, alone.fit)):
+        return found
+    say("without the prior poses left out are predicted better")
+    steps = (replace(alone.steps[0], removed=PRIOR), *alone.steps[1:])
+    for step in steps:
+        on_step(step)
+    return Refinement((*found.steps, *steps))
+
+
+def _without_prior(fitted: Fit, readings: Readings) -> Model:
+    """The starting model of the readings alone, and the effects that are not from the prior."""
+    model, prior = fitted.model, fitted.model.prior
+    carried = set() if prior is None else {e.name for e in prior.posterior.effects}
+    start = baseline(model.cell, readings, fitted.mode, model.catalogue)
+    for e in model.effects:
+        if e.name not in carried and e.name not in start.names:
+            start = start + EffectSpec(e.name, chosen_options(e, readings.states, readings.m))
+    return start
+
+
+def _refine(
+    model: Model,
+    readings: Readings,
+    mode: Mode,
+    say: Say,
+    history: History,
+    laws: LawSearch | None,
+    on_step: Callable[[RefinementStep], None],
+    background: bool,
+) -> Refinement:
     say(f"fitting {' + '.join(model.names) or 'the bare arm'}")
     readings = with_prior_scatter(model, readings.with_serial(None))
     first = with_serial_noise(fit(model, readings, mode))

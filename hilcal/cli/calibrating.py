@@ -31,11 +31,10 @@ from hilcal.measuring.run import HOW_ON
 from hilcal.names import quoted
 from hilcal.present import calibration as words
 from hilcal.present.diagnosis import verdict_line
-from hilcal.present.fit import prior_lines
 from hilcal.present.live_viewer import LiveViewer
 from hilcal.present.plan import plan_facts
 from hilcal.present.progress import working
-from hilcal.present.story import chapters_of, errors_by_revision
+from hilcal.present.story import chapters_of, errors_by_revision, prior_report
 from hilcal.procedure.procedure import Procedure, continued
 from hilcal.procedure.state import DECIDED, REFINED, VALIDATED, ProcedureStep, Settings
 from hilcal.readings.whitening import Mode
@@ -346,7 +345,7 @@ class CalibrationOperator:
                 refined = ProcedureLog(campaign).last(REFINED) or {"revisions": []}
             t.show(errors_by_revision(chapters_of(refined["revisions"], result.steps)))
             t.show([verdict_line(result.diagnosis), ""])
-            t.show(prior_lines(result.fit))
+            t.show(prior_report(result))
         elif step.kind == "decide":
             settings = p.settings
             t.show(words.decision_report(result, settings.goal_m, settings.readings, self.clock))

@@ -50,10 +50,10 @@ from hilcal.present.comparison import (
     tool_differs,
 )
 from hilcal.present.document import heading
-from hilcal.present.fit import dependence_sentence, gross_error_lines, model_name, prior_lines
+from hilcal.present.fit import dependence_sentence, gross_error_lines, model_name
 from hilcal.present.progress import working
 from hilcal.present.registration import covariance_words, fitted_lines, other_arm_line, torque_lines
-from hilcal.present.story import Chapter, chapters_of, errors_by_revision
+from hilcal.present.story import Chapter, chapters_of, errors_by_revision, prior_report
 from hilcal.present.verdict import message
 from hilcal.refinement import RefinementStep as RefinementStep
 from hilcal.refinement import refine as refine_model
@@ -226,7 +226,7 @@ def refine(
         if numbered[-1] <= n_revisions:
             t.show(f"Revision {numbered[-1]} is this model already; nothing was stored.")
         t.show([*fitted_lines(refinement.fit)][: None if details else 1])
-        t.show(prior_lines(refinement.fit))
+        t.show(prior_report(refinement))
         other_arm = other_arm_of(o.cell, o.readings) if latest is None else None
         if other_arm is not None:
             t.show(other_arm_line(other_arm))

@@ -84,20 +84,33 @@ def all_effects_at(fit: Fit, readings: Readings) -> tuple[Model, Floats]:
     return model, np.array(theta)
 
 
+def left_out_squares(first: Fit, second: Fit) -> tuple[Floats, Floats]:
+    """Squared errors (poses,) of two fits on poses left out, whitened by the noise of the second.
+
+    Gross errors of both do not count.
+    """
+    raw, w = all_left_out(second)
+    other, scaling = all_left_out(first)
+    place = np.empty(len(first.readings), dtype=np.int64)
+    place[scaling.reading] = np.arange(len(other))
+    counts = ~(second.outlier & first.outlier)[w.reading, None]
+    pose = np.unique(second.readings.pose[w.reading], return_inverse=True)[1].reshape(-1)
+
+    def of_poses(error: Floats) -> Floats:
+        white = w.whiten(counts * error).reshape(len(w), -1)
+        return np.asarray(np.bincount(pose, weights=np.sum(white**2, axis=1)), dtype=float)
+
+    return of_poses(other[place[w.reading]]), of_poses(raw)
+
+
 def background_is_better(named: Fit, background: Fit) -> bool:
     """Whether a fit with a background is better than one with the named effects alone.
 
-    The rms error on poses left out must fall by `LEAST_GAIN`/√n, n the number of poses; both errors
-    are whitened by the noise of the fit with the background. Gross errors of both do not count.
+    The rms error on poses left out must fall by `LEAST_GAIN`/√n, n the number of poses.
     """
-    raw, w = all_left_out(background)
-    other, scaling = all_left_out(named)
-    place = np.empty(len(named.readings), dtype=np.int64)
-    place[scaling.reading] = np.arange(len(other))
-    counts = ~(background.outlier & named.outlier)[w.reading, None]
-    square = float(np.sum(w.whiten(counts * other[place[w.reading]]) ** 2))
-    least = LEAST_GAIN / float(np.sqrt(len(np.unique(named.readings.pose))))
-    return float(np.sum(w.whiten(counts * raw) ** 2)) <= (1 - least) ** 2 * square
+    before, after = left_out_squares(named, background)
+    least = LEAST_GAIN / float(np.sqrt(len(before)))
+    return float(np.sum(after)) <= (1 - least) ** 2 * float(np.sum(before))
 
 
 def background_evidence(fit: Fit) -> tuple[BackgroundEffect, ...]:

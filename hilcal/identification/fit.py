@@ -33,6 +33,7 @@ Frame = Literal["sensor", "base"]
 OUTLIER_ROUNDS = 6  # most fits without gross errors, each followed by a new test; a choice
 SEED = 0  # of the random subsets of the robust start, so that equal readings give equal fits
 DRIFT_ROUNDS = 2  # most choices of a carried prior's drift, which hardly moves the linearisation
+CONFLICT_P = 1e-3  # Bonferroni-corrected p-value of a contradiction to a carried prior; a choice
 DRIFT_CHANGED = 0.1  # change of the drift, as a share of the largest, above which the fit is redone
 
 _Solved = tuple[Whitening, Solution]
@@ -198,6 +199,11 @@ class Fit(WithVarianceFactor, Tabular):
     def conflicts(self) -> tuple[Conflict, ...]:
         """Conflicts between a carried prior and the readings, worst first; empty without one."""
         return conflicts(self.model, self.solution, self.whitening)
+
+    @property
+    def contradictions(self) -> tuple[Conflict, ...]:
+        """The conflicts beyond chance, whatever their number (Bonferroni), worst first."""
+        return tuple(c for c in self.conflicts if c.p_value * len(self.conflicts) < CONFLICT_P)
 
     @property
     def theta(self) -> Floats:

@@ -43,7 +43,6 @@ GROUPS: dict[Group, str] = {
 }
 """Groups of the table of variables in their order, with the format of a row's name."""
 MAX_SHOWN_P = 0.005  # p-value below which a suspect that does not pass is shown, too
-CONFLICT_P = 1e-3  # Bonferroni-corrected p-value of a disagreement with the prior that is reported
 MOST_CONFLICTS = 5
 
 
@@ -415,8 +414,7 @@ def prior_lines(fit: Fit) -> list[str]:
     name = source.campaign or "a posterior"
     name += f", revision {source.revision}" if source.revision else ""
     lines = [f"Prior: {name} ({source.n_readings} readings{arm})."]
-    # groups of parameters in which prior and readings disagree beyond chance, worst first
-    moved = [c for c in fit.conflicts if c.p_value * len(fit.conflicts) < CONFLICT_P]
+    moved = fit.contradictions
     for c in moved[:MOST_CONFLICTS]:
         g, effect = c.group, c.group.effect.replace("_", " ")
         name = f"the {effect} of {g.part}" if g.part else f"the {effect}"

@@ -25,9 +25,16 @@ from hilcal.model.model import Model
 from hilcal.numbers import digits, length
 from hilcal.present import diagnosis
 from hilcal.present.document import Block, note, table
-from hilcal.present.fit import error_words, errors, holdout_sentence, model_name, parameters
+from hilcal.present.fit import (
+    error_words,
+    errors,
+    holdout_sentence,
+    model_name,
+    parameters,
+    prior_lines,
+)
 from hilcal.present.verdict import message
-from hilcal.refinement import RefinementStep
+from hilcal.refinement import PRIOR, Refinement, RefinementStep
 from hilcal.robot.arm import Arm
 from hilcal.robot.scene import body_poses
 from hilcal.store.revision import change
@@ -227,6 +234,20 @@ def chapters_of(numbers: Iterable[int], steps: Iterable[RefinementStep]) -> list
     """Return the steps of a refinement as chapters with the numbers of their revisions."""
     pairs = zip(numbers, steps, strict=True)
     return [Chapter(n, s.added, s.fit, s.diagnosis, s.removed) for n, s in pairs]
+
+
+def prior_report(refinement: Refinement) -> list[str]:
+    """Return the report on the prior of a refinement, also where its last steps leave it out."""
+    steps = refinement.steps
+    first = next((k for k, step in enumerate(steps) if step.removed == PRIOR), None)
+    if first is None:
+        return prior_lines(refinement.fit)
+    before, after = (length(f.holdout.rms_m) for f in (steps[first - 1].fit, refinement.fit))
+    return [
+        *prior_lines(steps[first - 1].fit),
+        f"  The prior was left out: without it poses left out are off by {after} rms, with it by "
+        f"{before}.",
+    ]
 
 
 def errors_by_revision(chapters: Sequence[Chapter]) -> Iterator[Block]:

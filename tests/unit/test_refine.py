@@ -9,12 +9,15 @@ from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.stepwise import add
 from hilcal.drivers.simulated.injected_effects import hide_effect
 from hilcal.identification.baseline import baseline
+from hilcal.identification.carried.carried_prior import carried_prior
+from hilcal.identification.carried.posterior import Posterior
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
 from hilcal.model.model import Model
 from hilcal.numbers import percent
+from hilcal.present.story import prior_report
 from hilcal.present.verdict import message
-from hilcal.refinement import MOST_REVISIONS, Path, refine, refine_from
+from hilcal.refinement import MOST_REVISIONS, PRIOR, Path, refine, refine_from
 from hilcal.regression.leave_out import LEAST_GAIN
 from tests.support.campaigns import campaign, cell_of, measured, plan, world_of
 from tests.support.diagnosis_cases import fitted_baseline
@@ -190,3 +193,18 @@ def test_it_starts_from_any_model():
     check_steps(r)
     assert r.steps[1].added == "joint_compliance"
     assert r.verdict == "adequate", message(r.diagnosis)
+
+
+def test_a_prior_of_another_arm_is_left_out():
+    old = campaign("transmission_error", "absolute", 2, poses=15, strength=20.0)
+    new = campaign("encoder_offset", "absolute", 3, poses=12, strength=20.0)
+    names = ("joint_compliance", "transmission_error")
+    prior = carried_prior(Posterior.of(fitted_model(old.cell, old.readings, "absolute", names)))
+    model = baseline(new.cell, new.readings, "absolute", prior=prior)
+    r = refine(model, new.readings, "absolute", background=False)
+    last_with = r.steps[[s.removed for s in r.steps].index(PRIOR) - 1].fit
+    assert last_with.contradictions
+    assert r.fit.model.prior is None
+    assert r.names == ("base_frame", *names, "encoder_offset")
+    assert r.fit.holdout.rms_m < 0.1 * last_with.holdout.rms_m
+    assert "The prior was left out" in prior_report(r)[-1]
