@@ -1,6 +1,6 @@
 """A fleet: campaigns are fitted and diagnosed by the engine, and pooled by type of arm.
 
-Effects in at least the share `TRAIT_SHARE` of the campaigns are pooled; parameters of shrunk
+Effects that at least the share `TRAIT_SHARE` of the campaigns name are pooled; parameters of large
 families are not. A parameter is pooled if at least two arms determine it.
 Time is in years since the arm's first campaign. See `regression.variance_components.hierarchy`.
 """
@@ -20,15 +20,20 @@ from hilcal.engine import Counting, Engine, uncounted
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.carried.carried_prior import SAME_M
 from hilcal.identification.carried.posterior import (
+    MOST_LISTED,
     Posterior,
     PosteriorEffect,
     Source,
+    determined,
     information_on,
 )
 from hilcal.readings.readings import Range
 from hilcal.readings.same_readings import shared
+from hilcal.regression.schur import positive_solve
 from hilcal.regression.variance_components import (
     FALSE_ALARM,
+    FARTHEST,
+    LEAST,
     UNDETERMINED,
     FleetEstimates,
     Hierarchy,
@@ -48,7 +53,7 @@ from hilcal.transfer.members import (
     sizes_of_arms,
     type_sizes,
 )
-from hilcal.types import Floats
+from hilcal.types import Floats, Ints
 
 TRAIT_SHARE = 0.5
 """Least share of the arms with an effect for it to count as a trait of the type; a choice."""
@@ -213,30 +218,43 @@ def pool(members: Sequence[Member], diagnosed: Sequence[DiagnosedEffect]) -> Poo
 
 
 def _common(members: Sequence[Member]) -> tuple[tuple[PosteriorEffect, ...], tuple[str, ...]]:
-    """Effects that most campaigns have, with the same options, and their parameters to pool."""
-    count = Counter(e.name for m in members for e in m.posterior.effects)
+    """Effects that most campaigns name, with the same options, and their parameters to pool."""
+    every = ((m, e.name) for m in members for e in m.posterior.effects)
+    count = Counter(name for m, name in every if name not in m.background)
     effects = []
     for name, n in count.items():
         alike = [e for m in members for e in m.posterior.effects if e.name == name]
         if n >= TRAIT_SHARE * len(members) and all(e.options == alike[0].options for e in alike):
             effects.append(alike[0])
-    pooled_names = {e.name for e in effects}
     arms: dict[str, set[str]] = {}
     for m in members:
         p = m.posterior
-        for name, std, own_precision in zip(p.names, p.std, p.own_precision, strict=True):
-            if name.split(".", 1)[0] in pooled_names and own_precision == 0 and np.isfinite(std):
-                arms.setdefault(name, set()).add(m.arm)
+        size = Counter(name.split(".", 1)[0] for name in p.names)
+        pooled = [e.name for e in effects if size[e.name] < MOST_LISTED]
+        columns = np.array([k for name in pooled for k in p.index(name)], dtype=np.int64)
+        std = without_own_precision(p, columns).std
+        for k in columns[np.isfinite(std[columns])]:
+            arms.setdefault(p.names[k], set()).add(m.arm)
     order = dict.fromkeys(name for m in members for name in m.posterior.names)
     names = tuple(name for name in order if len(arms.get(name, ())) > 1)
     used = {name.split(".", 1)[0] for name in names}
     return tuple(e for e in effects if e.name in used), names
 
 
+def without_own_precision(p: Posterior, columns: Ints) -> Posterior:
+    """Return a posterior without what effects' own priors state of the parameters `columns`."""
+    own = np.zeros(len(p.names))
+    own[columns] = p.own_precision[columns]
+    return replace(p, information=p.information - np.diag(own))
+
+
 def _estimates(
     members: Sequence[Member], arms: Sequence[str], names: Sequence[str], scale: Floats
 ) -> FleetEstimates:
-    """The members' parameters in ordinary magnitudes, with all but `names` marginalised out."""
+    """The members' parameters in ordinary magnitudes, with all but `names` marginalised out.
+
+    What their effects' own priors state of `names` is taken out; that of the others stays.
+    """
     k = len(names)
     mean, information = np.zeros((len(members), k)), np.zeros((len(members), k, k))
     place = {name: i for i, name in enumerate(names)}
@@ -244,9 +262,17 @@ def _estimates(
         p = m.posterior
         columns = np.array([i for i, name in enumerate(p.names) if name in place], dtype=np.int64)
         indices = np.array([place[p.names[i]] for i in columns], dtype=np.int64)
-        scaled = p.information * (p.scale[:, None] * p.scale)
-        information[c][np.ix_(indices, indices)] = information_on(scaled, columns)
-        mean[c, indices] = p.mean[columns] / scale[indices]
+        scaled = without_own_precision(p, columns).information * (p.scale[:, None] * p.scale)
+        right = p.information @ p.mean * p.scale  # the priors are about zero
+        others = np.isin(np.arange(len(right)), columns, invert=True)
+        if others.any():
+            inner = scaled[np.ix_(others, others)] + np.eye(int(others.sum())) / FARTHEST**2
+            absorbed = positive_solve(inner, right[others])
+            right[columns] -= scaled[np.ix_(columns, others)] @ absorbed
+        found = determined(information_on(scaled, columns))
+        information[c][np.ix_(indices, indices)] = found
+        free = np.linalg.pinv(found, rcond=LEAST, hermitian=True) @ right[columns]
+        mean[c, indices] = free * p.scale[columns] / scale[indices]
     seconds = np.array([seconds_of(m.date) for m in members])
     arm = np.array([arms.index(m.arm) for m in members])
     first = np.full(len(arms), np.inf)
@@ -370,7 +396,7 @@ def fleet(directory: Path, engine: Engine, counting: Counting = uncounted) -> Fl
         members += pooled_members
         failures += failed
     if not types:
-        first = failures[0]
+        first = failures[-1]  # of a type, where a campaign can be fitted
         message = f"{first.name}: {first.reason}"
         more = f" ({len(failures) - 1} more)" if len(failures) > 1 else ""
         raise CannotAnswerError(f"{directory}: nothing can be pooled: {message}{more}")
@@ -384,7 +410,8 @@ def _type(
     members = [member for _, member in pairs]
     diagnosed = diagnosed_effects(members)
     traits = tuple(s.effect for s in diagnosed if s.kind == "trait")
-    lacking = [k for k, m in enumerate(members) if not set(traits) <= set(m.added)]
+    has = [{e.name for e in m.posterior.effects} for m in members]  # also in a background
+    lacking = [k for k, names in enumerate(has) if not names.issuperset(traits)]
     failed: list[Failure] = []
     if traits and lacking:
         run = partial(member_of, effects=traits)

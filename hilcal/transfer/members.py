@@ -156,6 +156,7 @@ class Member:
     verdict: str
     rms_m: float  # 3-D position error on poses left out
     sizes: SizeEvidence | None = None  # None if there is no evidence
+    background: frozenset[str] = frozenset()  # effects of the model that are not named
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,9 +278,12 @@ def _member(entry: Entry, run: Campaign, effects: tuple[str, ...]) -> Member:
         date=entry.date or about.created,
         posterior=replace(posterior, scatter=None),
         added=tuple(
-            e.name for e in fitted.model.effects if belongs_to_arm(e) and e.name not in start.names
+            e.name
+            for e in fitted.model.effects
+            if belongs_to_arm(e) and e.name in fitted.model.named and e.name not in start.names
         ),
         verdict=verdict,
         rms_m=fitted.holdout.rms_m,
         sizes=size_evidence(start, fitted),
+        background=frozenset(fitted.model.background),
     )

@@ -91,6 +91,26 @@ def test_a_campaign_more_of_an_arm_is_no_arm_more(with_odd):
     assert told[0].high < type_sizes([more])[0].high
 
 
+def test_shrunk_effects_are_pooled_by_what_the_readings_say_of_them(one):
+    plain = members(one, 3)[:20]
+    shrunk = []
+    for m in plain:
+        p, own = m.posterior, (0.5 * one.scale) ** -2.0
+        information = p.information + np.diag(own)
+        mean = np.linalg.solve(information, p.information @ p.mean)
+        p = replace(p, information=information, mean=mean, own_precision=own)
+        shrunk.append(replace(m, posterior=p))
+    known = [p for p in pool(plain, []).parameters if p.mean_std < 0.1 * p.mean]
+    told = {p.parameter: p for p in pool(shrunk, []).parameters}
+    assert known
+    for p in known:
+        assert told[p.parameter].mean == pytest.approx(p.mean, rel=0.01)
+        assert told[p.parameter].between == pytest.approx(p.between, rel=0.05)
+    unnamed = [replace(m, background=frozenset({"joint_compliance"})) for m in shrunk]
+    with pytest.raises(CannotAnswerError, match="no parameter"):
+        pool(unnamed, [])
+
+
 def test_the_spread_of_arms_is_recovered_and_the_odd_one_named(one, with_odd):
     found = with_odd[1]
     assert found.parameters
