@@ -162,8 +162,9 @@ def refine(
     uncertainties and p-values include it. In the last fit the added effects are shrunk to
     estimated sizes, which predicts better (`with_shrunk_effects`). All fits include a correlation
     of the noise along the order of the readings (`diagnosis.serial_noise`), which would otherwise
-    be taken for effects. Where the readings contradict a carried prior, they are refined without
-    it, too; if that predicts poses left out better, as of another arm, these steps follow.
+    be taken for effects. Where the readings contradict a carried prior, or it leaves more than
+    noise, they are refined without it, too; if that predicts poses left out better, these steps
+    follow.
 
     Args:
         model: the starting model. Its effects stay, except those of a carried prior that the
@@ -183,9 +184,10 @@ def refine(
         InputError: too many readings.
     """
     found = _refine(model, readings, mode, say, history, laws, on_step, background)
-    if not found.fit.contradictions:
+    agrees = found.diagnosis.residual_is_noise and not found.fit.contradictions
+    if found.fit.model.prior is None or agrees:
         return found
-    say("refining without the prior, which the readings contradict")
+    say("refining without the prior, which does not explain the readings")
     try:
         start = _without_prior(found.steps[0].fit, readings)
         alone = _refine(start, readings, mode, say, NO_HISTORY, laws, lambda step: None, background)
