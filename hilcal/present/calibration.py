@@ -378,6 +378,8 @@ def validation_report(
         yield f"These readings are {z_all:.2g} times as far off as the fit states.\n"
     if test.registered:
         yield "The place of the tracker was fitted to these readings (--register).\n"
+        if z_all > MIN_ERROR_RATIO:
+            yield "hilcal compare RUN OTHER says what has changed.\n"
     elif z_all > MOVED_TRACKER_RATIO:
         yield ("If the tracker was moved before these readings: --register fits its place first.\n")
 
