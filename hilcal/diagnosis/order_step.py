@@ -17,7 +17,8 @@ level each.
 
 A drift in the order resembles a step, one that settles, as of an arm that warms up, the more; a
 step has to explain the readings better than any of `SETTLING` by 20 : 1.
-A serial correlation of the noise is not assumed: it would take up the step.
+A serial correlation of the noise is not assumed, as it would take up the step; where the fit has
+one, a step has to explain the readings better than it does.
 """
 
 from collections.abc import Iterator
@@ -101,7 +102,9 @@ def step_in_order(fit: Fit) -> OrderStep | None:
     except (CannotAnswerError, np.linalg.LinAlgError):
         return None
     found, drift = _found(e, units, kinds)
-    best = found[0]
+    best, serial = found[0], fit.readings.serial
+    if serial is not None:
+        drift = max(drift, 2 * serial.log_likelihood_ratio)
     if best.p_value >= LEVEL or best.score < drift + 2 * SAME_EVIDENCE:
         return None
     size = float(np.sqrt(np.mean(np.sum(best.shift(kinds)[best.first :, :3] ** 2, axis=1))))
