@@ -7,21 +7,20 @@ displacement, zero before k,
 
     gain_k = gᵀ M⁻¹ g,   g = C_kᵀ P y,   M = C_kᵀ P C_k
 
-is χ² distributed without a step, if the variances are known. A step enlarges those that are
-estimated without it until it seems small, and even more so the larger it is. So the best steps of
-sensor, target and joints are subtracted, each alone, and the variances are those of the readings
-that become likeliest. Of the Wald statistic w with ν degrees of freedom twice the gain of the log
-likelihood follows, ν log(1 + w/ν). The largest gain counts, at a level
-divided by the number of places; the sensor, the target and all joints together have half of the
-level each.
+is χ² distributed without a step, if the variances are known. Variances that are estimated from
+readings with a step contain it: the larger it is, the less significant it seems. So the variances
+are estimated from the readings less the best step of the sensor, of the target or of a joint,
+whichever makes them most likely. The likelihood ratio is computed from the gain w with ν degrees of
+freedom, ν log(1 + w/ν), since the size of the noise is estimated, too. The largest ratio counts, at
+a level divided by the number of places; the sensor, the target and all joints together have half of
+the level each.
 
-A drift in the order resembles a step, one that settles, as of an arm that warms up, the more; a
-step has to explain the readings better than any of `SETTLING` by 20 : 1.
+A drift resembles a step, above all one that settles, as of an arm that warms up: a step has to
+explain the readings better than each drift of `SETTLING` by 20 : 1.
 A serial correlation of the noise is not assumed, as it would take up the step; where the fit has
 one, a step has to explain the readings better than it does.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,6 +49,8 @@ RANK = 1e-9  # share of the largest eigenvalue below which a direction is not de
 SETTLING = (np.inf, 0.5, 0.2, 0.1)
 """Time constants of the tried drifts 1 − exp(−t/τ), each alone and all together, t from 0 to 1 in
 the order of the readings; a choice. The first one is a straight line."""
+
+_Gain = tuple[float, int, Floats]  # gain, rank, displacement (q,)
 
 SENSOR, TARGET, JOINT = "sensor", "target", "joint"
 
@@ -89,8 +90,8 @@ def step_in_order(fit: Fit) -> OrderStep | None:
             model.cell, prediction.observation, prediction.situation.chain, prediction.deviation,
             readings.m,
         )  # fmt: skip
-        units, kinds = shift_rows(model, readings, fit.mode), _kinds(moves)
-        found, _ = _found(e, units, kinds)
+        units, kinds = shift_rows(model, readings, fit.mode), _displacements(moves)
+        found, _ = _best_steps(e, units, kinds)
         joint = next(f.kind for f in found if f.kind not in (SENSOR, TARGET))
         freed = [
             estimate_variances(linearised_problem(model, without, fit.mode, theta), start).equations
@@ -101,7 +102,7 @@ def step_in_order(fit: Fit) -> OrderStep | None:
         e = equations(problem, max(freed, key=log_posterior).log_std)
     except (CannotAnswerError, np.linalg.LinAlgError):
         return None
-    found, drift = _found(e, units, kinds)
+    found, drift = _best_steps(e, units, kinds)
     best, serial = found[0], fit.readings.serial
     if serial is not None:
         drift = max(drift, 2 * serial.log_likelihood_ratio)
@@ -117,7 +118,7 @@ def step_in_order(fit: Fit) -> OrderStep | None:
         previous=int(rows[best.first - 1]),
         p_value=best.p_value,
         shift_m=size,
-        share=best.wald / remaining,
+        share=best.gain / remaining,
     )
 
 
@@ -127,8 +128,8 @@ class _Step:
 
     kind: str
     first: int  # row of the first reading after it
-    wald: float  # gain
-    score: float  # gain of the log likelihood, twice, less twice the rank
+    gain: float
+    score: float  # likelihood ratio less twice the rank
     p_value: float
     displacement: Floats  # (q,)
 
@@ -139,7 +140,7 @@ class _Step:
         return np.asarray(out)
 
 
-def _kinds(moves: ReadingDerivative) -> dict[str, Floats]:
+def _displacements(moves: ReadingDerivative) -> dict[str, Floats]:
     """(N, m, q) derivatives of the readings by each kind of displacement."""
     joints = {
         f"{JOINT} {j + 1}": d[:, :, None] for j, d in enumerate(moves.drives.transpose(2, 0, 1))
@@ -147,55 +148,52 @@ def _kinds(moves: ReadingDerivative) -> dict[str, Floats]:
     return {SENSOR: moves.by_station(), TARGET: moves.by_target()[:, :, :3], **joints}
 
 
-def _found(e: Equations, units: Floats, kinds: dict[str, Floats]) -> tuple[list[_Step], float]:
+def _best_steps(e: Equations, units: Floats, kinds: dict[str, Floats]) -> tuple[list[_Step], float]:
     """Return the best step of each kind, best first, and the score of the best drift."""
     found, drift = [], 0.0
     freedom = np.count_nonzero(units.any(axis=(1, 2))) - float(e.spent.sum()) - e.problem.flat
     for kind, columns in kinds.items():
-        gains = list(_gains(e, np.einsum("rnm,nmq->rnq", units, columns)))
-        drift = max(
-            drift, *(_twice_log(g, freedom) - 2 * r for _, g, r, _ in gains[: len(SETTLING) + 1])
-        )
-        steps = gains[len(SETTLING) + 1 :]
-        k, gain, rank, delta = max(steps, key=lambda g: g[1])
-        twice = _twice_log(gain, freedom)
+        drifts, steps = _gains(e, np.einsum("rnm,nmq->rnq", units, columns))
+        drift = max(drift, *(_likelihood_ratio(g, freedom) - 2 * r for g, r, _ in drifts))
+        k = max(range(len(steps)), key=lambda k: steps[k][0])
+        gain, rank, displacement = steps[k]
+        ratio = _likelihood_ratio(gain, freedom)
         alike = 1 if kind in (SENSOR, TARGET) else len(kinds) - 2
         tests = 2 * alike * len(steps)
-        p = min(tests * float(scipy.stats.chi2.sf(twice, rank)), 1.0)
-        found.append(_Step(kind, k, gain, twice - 2 * rank, p, delta))
+        p = min(tests * float(scipy.stats.chi2.sf(ratio, rank)), 1.0)
+        step = _Step(kind, FEWEST_IN_RUN + k, gain, ratio - 2 * rank, p, displacement)
+        found.append(step)
     return sorted(found, key=lambda f: -f.score), drift
 
 
-def _twice_log(gain: float, freedom: float) -> float:
+def _likelihood_ratio(gain: float, freedom: float) -> float:
     """Twice the gain of the log likelihood where the size of the noise is estimated, too."""
     return freedom * float(np.log1p(gain / freedom))
 
 
-def _gains(e: Equations, columns: Floats) -> Iterator[tuple[int, float, int, Floats]]:
-    """Yield gains with the first row, the rank and the displacement (q,): of drifts, of each step.
+def _gains(e: Equations, columns: Floats) -> tuple[list[_Gain], list[_Gain]]:
+    """Return the gains of the drifts, and those of a step at each row from `FEWEST_IN_RUN` on.
 
     `columns` (R, N, q) are the rows by the displacement of each reading alone.
     """
     _, count, q = columns.shape
     square, score = e.score(columns.reshape(len(columns), count * q))
     by_pair, by_reading = square.reshape(count, q, count, q), score.reshape(count, q)
-    time = np.linspace(0.0, 1.0, count)
-    shapes = np.stack(
-        [time if np.isinf(tau) else 1.0 - np.exp(-time / tau) for tau in SETTLING], axis=1
-    )
-    shapes -= shapes.mean(axis=0)
-    each = [shapes[:, [k]] for k in range(len(SETTLING))]
-    for x in (*each, shapes):
+    time = np.linspace(0.0, 1.0, count)[:, None]
+    each = [time if np.isinf(tau) else 1.0 - np.exp(-time / tau) for tau in SETTLING]
+    drifts = []
+    for x in (*each, np.hstack(each)):
+        x = x - x.mean(axis=0)
         size = x.shape[1] * q
         square = np.einsum("is,iajb,jt->satb", x, by_pair, x, optimize=True).reshape(size, size)
-        yield 0, *_gain(square, (x.T @ by_reading).reshape(size))
+        drifts.append(_gain(square, (x.T @ by_reading).reshape(size)))
     later = np.cumsum(np.cumsum(by_pair[::-1, :, ::-1], axis=0), axis=2)[::-1, :, ::-1]
     scores = np.cumsum(by_reading[::-1], axis=0)[::-1]
-    for k in range(FEWEST_IN_RUN, count - FEWEST_IN_RUN + 1):
-        yield k, *_gain(later[k, :, k], scores[k])
+    places = range(FEWEST_IN_RUN, count - FEWEST_IN_RUN + 1)
+    return drifts, [_gain(later[k, :, k], scores[k]) for k in places]
 
 
-def _gain(square: Floats, score: Floats) -> tuple[float, int, Floats]:
+def _gain(square: Floats, score: Floats) -> _Gain:
     """Return gᵀ M⁻¹ g, the rank of M (q, q), and M⁻¹ g (q,)."""
     scale = np.sqrt(np.maximum(np.diagonal(square), 1e-300))
     values, vectors = np.linalg.eigh(square / scale / scale[:, None])

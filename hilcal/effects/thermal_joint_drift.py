@@ -12,7 +12,7 @@ from hilcal.readings.readings import States
 from hilcal.types import Floats
 
 SOURCES = ("joints", "time")
-RISE_K = 10.0  # final rise of joints whose temperatures are not recorded: κ keeps its unit
+RISE_K = 10.0  # final rise of joints whose temperatures are not recorded; a choice
 WARM_UP_S = 2400.0
 """Time constant of joints whose temperatures are not recorded: robots need one to two hours until
 they drift no more. A choice."""

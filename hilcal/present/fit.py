@@ -430,7 +430,7 @@ def prior_lines(fit: Fit) -> list[str]:
     elif fit.variance_factor_interval[0] > 1:
         lines.append(f"  With it the model leaves more than the noise; {ask}.")
     elif moved:
-        lines.append(f"  The arm, or the target on its tool, was changed or exchanged; {ask}.")
+        lines.append(f"  The arm, or the target on its tool, may have been changed; {ask}.")
     else:
         lines.append("  The readings agree with it.")
     return lines
