@@ -7,7 +7,7 @@ failure stops the arm before anything else.
 import shlex
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
@@ -61,8 +61,8 @@ AT_LAST = "where its last reading was taken"  # it may have been stopped on the 
 EMERGENCY = "press the emergency stop"
 _STOPS = 3  # attempts to stop the arm
 MOVED_M = 1e-3
-"""Distance of the target at the reference pose from its previous position, m, above which a person
-is asked; an arm returns more exactly, even while it warms up. A choice."""
+"""Distance of the unloaded target at the reference pose from every previous position there, m,
+above which a person is asked; an arm returns more exactly, even while it warms up. A choice."""
 GRAVITY_CHANGE = 5.0
 """Change of gravity in the sensor's axes, m/s², that separates a load from its zero: 30°."""
 Done = TypeVar("Done")
@@ -243,8 +243,12 @@ class Session:
         for stop in start:
             self._watched(partial(self._move, stop))
             with suppress(TargetLostError):  # a reading will search it again
-                positions.append((stop.q, self._target_position(stop)))
-                self._compare_place(stop, positions[-1][1])
+                seen = self._target_position(stop)
+                # of several targets it is not known which one was measured
+                if self._cell.targets is None and self._compare_place(stop.name, seen):
+                    seen = self._target_position(stop)  # put back, or agreed to
+                    self._state.references.append(seen)
+                positions.append((stop.q, seen))
         for position in positions:
             if (wrong := registration.implausible(*position)) is not None:
                 raise DeviceError(wrong)
@@ -262,36 +266,42 @@ class Session:
         try:
             return tracker.measure().value[:3]
         except TargetLostError:
-            if self._previous_position(stop) is None:
+            if self._cell.targets is not None or not self._previous_positions(stop.name):
                 raise
             tracker.find_target()
             self._mover.checked_sample()
             return tracker.measure().value[:3]
 
-    def _compare_place(self, stop: Stop, position: Floats) -> None:
-        """Ask a person if the target at the reference pose is not at its previous position."""
-        before = self._previous_position(stop)
-        if before is None:
-            return
-        moved = float(np.linalg.norm(position - before))
-        if moved > MOVED_M:
-            reason = (
-                f"the target at the reference pose is {1e3 * moved:.3g} mm from where it was before"
-            )
-            self._event("moved", {"reason": reason, "moved_m": moved})
-            self._hook.confirm(
-                f"{reason}. If the tracker or the target has been moved, readings before and after "
-                "do not belong together: put it back, or give up and begin a new campaign"
-            )
+    def _compare_place(
+        self, pose: str, position: Floats, raws: Sequence[dict[str, Any]] = ()
+    ) -> bool:
+        """Ask a person if the unloaded target at the reference pose is at none of its positions.
 
-    def _previous_position(self, stop: Stop) -> Floats | None:
-        """Return the previous position of the target at the reference pose; None if unknown."""
-        before = self._state.reference
-        if before is None:
-            before = self._plan.about.get(REFERENCE_POSITION)
-        if before is None or stop.name != REFERENCE or self._cell.targets is not None:
-            return None
-        return np.asarray(before)
+        Returns whether the person was asked. `raws` are the raw data of a reading that is not
+        stored for that.
+        """
+        previous = self._previous_positions(pose)
+        moved = min((float(np.linalg.norm(position - x)) for x in previous), default=0.0)
+        if moved <= MOVED_M:
+            return False
+        reason = (
+            f"the target at the reference pose is {1e3 * moved:.3g} mm from where it was before"
+        )
+        self._event("moved", {"reason": reason, "moved_m": moved})
+        for raw in raws:
+            self._event("doubted", {"why": reason, "reading": raw})
+        self._hook.confirm(
+            f"{reason}. If the tracker or the target has been moved, readings before and after "
+            "do not belong together: put it back, or give up and begin a new campaign"
+        )
+        return True
+
+    def _previous_positions(self, pose: str) -> list[Floats]:
+        """Return the previous positions of the first target at the reference pose, unloaded."""
+        if pose != REFERENCE:
+            return []
+        stated = self._plan.about.get(REFERENCE_POSITION)
+        return [*self._state.references, *([] if stated is None else [np.asarray(stated)])]
 
     def _move(self, stop: Stop) -> None:
         if not self._mover.is_at(stop.q):
@@ -380,10 +390,11 @@ class Session:
     def _reading(self, stop: Stop, step: Step) -> tuple[Readings, float]:
         """Measure and store all targets; return the first reading and the total settling time."""
         self._watcher.notify(Phase(f"measuring {step}"))
-        measurements = self._reader.read(stop.q, stop.name)
-        pairs = [self._row(stop, step, measured) for measured in measurements]
-        rows, details = map(list, zip(*pairs, strict=True))
-        self._check(measurements, details)
+        measurements, rows, details = self._measured(stop, step)
+        first = measurements[0]
+        unloaded = step.load == UNLOADED and not first.target
+        if unloaded and self._compare_place(step.pose, first.mean.value[:3], details):
+            measurements, rows, details = self._measured(stop, step)  # put back, or agreed to
         self._store.record(Readings.joined(rows), step, details[0], *details[1:])
         self._done += 1
         for measured in measurements:
@@ -399,6 +410,16 @@ class Session:
                 self._report_drift(step, shift)
         self._report_doubtful()
         return rows[0], sum(measured.settling for measured in measurements)
+
+    def _measured(
+        self, stop: Stop, step: Step
+    ) -> tuple[list[MeasuredStop], list[Readings], list[dict[str, Any]]]:
+        """Measure all targets; return their measurements, readings and raw data."""
+        measurements = self._reader.read(stop.q, stop.name)
+        pairs = [self._row(stop, step, measured) for measured in measurements]
+        rows, details = map(list, zip(*pairs, strict=True))
+        self._check(measurements, details)
+        return measurements, rows, details
 
     def _check(self, measurements: list[MeasuredStop], details: list[dict[str, Any]]) -> None:
         """Refuse the readings of an arrival if one is of another target or load."""

@@ -217,6 +217,8 @@ class SessionState:
         self._cell, self._joint_std = cell, joint_std
         self._unloaded: dict[tuple[str, int, int], Floats] = {}
         self.visits: list[UnloadedVisit] = []
+        self.references: list[Floats] = []
+        """(3,) positions of the first target at the reference pose, unloaded, sensor axes, m."""
         self._reference: tuple[Floats, Floats] | None = None
 
     def add(
@@ -250,17 +252,13 @@ class SessionState:
         self.visits.append(UnloadedVisit(step.pose, position, instrument, float(np.sum(jac**2))))
         if step.pose != REFERENCE:
             return None
+        self.references.append(position)
         if self._reference is None:
             self._reference = position, instrument + scatter
             return None
         d = np.asarray(position - self._reference[0])
         square = float(d @ np.linalg.solve(instrument + scatter + self._reference[1], d))
         return Shift(d, float(np.sqrt(max(square, 0.0))))
-
-    @property
-    def reference(self) -> Floats | None:
-        """(3,) first position at the reference pose, sensor axes, m; None without one."""
-        return None if self._reference is None else self._reference[0]
 
     def deflection(self, step: Step, position: Floats, target: int = 0) -> float | None:
         """Return the distance of a loaded reading from its unloaded one, m; None without one."""

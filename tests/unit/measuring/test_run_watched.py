@@ -11,6 +11,7 @@ from hilcal.measuring.measure import Measurer
 from hilcal.measuring.progress import Phase
 from hilcal.robot.chain import evaluate
 from tests.support.fake_bench import (
+    FEW_POSES,
     POSES,
     Bench,
     call_before,
@@ -23,6 +24,7 @@ from tests.support.refusals import refusal_of
 from tests.support.rows import first
 
 FOLDED = np.array([3.0, -1.3, 2.9, -1.4, -1.4, 0.1])  # the forearm lies on the column
+MOVED = np.array([0.02, 0.0, 0.0])  # of a tracker's stand that was kicked, m
 FREE = np.array([0.6, -1.3, 1.6, -1.4, -1.4, 0.1])
 
 
@@ -161,6 +163,38 @@ def test_a_tracker_that_was_moved_between_sessions_is_asked_about(moved, asked, 
     questions = [q for q in confirmed(b) if "mm from where it was before" in q]
     assert len(questions) == asked
     assert ("moved" in b.store.kinds()) == asked
+
+
+@pytest.mark.parametrize("put_back", first(1, [True, False]))
+def test_a_tracker_that_is_moved_between_two_readings_is_asked_about_at_the_next_return(
+    b, put_back
+):
+    """The reading before the answer is kept as doubted; the one after it is stored."""
+
+    def kick(*_):
+        if len(b.store.rows) == 3:
+            b.world.shift = MOVED
+
+    def answer(*_):
+        if put_back:
+            b.world.shift = np.zeros(3)
+
+    call_before(b.store, "record", kick)
+    call_before(b.operator, "confirm", answer)
+    readings = b.measure()
+    assert [q[:38] for q in confirmed(b)] == ["the target at the reference pose is 20"]
+    assert {"moved", "doubted"} <= set(b.store.kinds())
+    seen = readings.value[readings.pose == 0]
+    assert np.linalg.norm(seen[-1] - seen[0]) == pytest.approx(0.0 if put_back else 0.02, abs=1e-3)
+    assert not len(FEW_POSES.without(b.store.done()).steps)
+
+
+def test_nobody_is_asked_twice_about_a_tracker_that_was_moved(b):
+    b.interrupt(3)
+    b.world.shift = MOVED
+    b.measure()
+    assert len(confirmed(b)) == 1
+    assert len(b.remarks("reference pose has moved")) == 2
 
 
 @pytest.mark.parametrize(
