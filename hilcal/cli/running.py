@@ -255,7 +255,7 @@ def measure(
             t.notice(f"load {hung} may still be on the arm: take it off")
         estimate_noise(t, cell, campaign)  # the last session may have ended before it
         return campaign.n_readings
-    with _ends_as_interrupt(t), ExitStack() as stack:
+    with _ends_as_interrupt(t) as stop_requested, ExitStack() as stack:
         with working(t.progress) as say:
             say("connecting to every device")
             rig, answers = connect.connect(config)
@@ -272,8 +272,10 @@ def measure(
         check_same_arm(log, identities)
         log.event("devices", {"answers": identities})
         clock = Clock(config.clock)
-        live = LiveModel(cell)
-        run_plan(rig, cell, log.plan, log, clock, watcher, live, goal=goal, epoch=epoch)
+        run_plan(
+            rig, cell, log.plan, log, clock, watcher, LiveModel(cell), goal=goal, epoch=epoch,
+            stop_requested=stop_requested,
+        )  # fmt: skip
     estimate_noise(t, cell, campaign)
     return campaign.n_readings
 
@@ -313,14 +315,15 @@ def _sighted(
 
 
 @contextmanager
-def _ends_as_interrupt(t: Terminal) -> Iterator[None]:
+def _ends_as_interrupt(t: Terminal) -> Iterator[Callable[[], bool]]:
     """Raise KeyboardInterrupt at the first SIGINT, SIGTERM or SIGHUP, so that the arm stops.
 
-    Stopping has its own deadlines: further signals only print a notice. Threads other than the main
-    one cannot handle signals; there, only the end of the process stops the measurement.
+    Yields whether a signal has come: a driver may suppress the exception. Stopping has its own
+    deadlines: further signals only print a notice. Threads other than the main one cannot handle
+    signals; there, only the end of the process stops the measurement.
     """
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield lambda: False
         return
     received: list[int] = []
 
@@ -331,7 +334,7 @@ def _ends_as_interrupt(t: Terminal) -> Iterator[None]:
         t.notice("stopping the arm; wait a moment")
 
     with handled((signal.SIGINT, signal.SIGTERM, signal.SIGHUP), stop):
-        yield
+        yield lambda: bool(received)
 
 
 TRIES = 4

@@ -57,6 +57,8 @@ class Setup:
     cell: Cell
     clock: Clock
     watcher: Watcher
+    stop_requested: Callable[[], bool] = lambda: False
+    """Whether a person or the system has asked for the end of the session."""
 
 
 Factory = Callable[[CellConfig], Any]

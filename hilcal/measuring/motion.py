@@ -216,11 +216,17 @@ class Mover:
         self._arm, self._meter, self.guard = setup.rig.arm, meter, Guard(cell)
         self._limits = Feasibility(cell)
         self._motion, self._clock, self._watcher = config.motion, setup.clock, setup.watcher
+        self._stop_requested = setup.stop_requested
         self._in_motion = False
         self._last_tick: tuple[float, int] = (-1.0, 0)
 
     def checked_sample(self) -> ArmSample:
-        """Return a sample of the arm, after checks of the arm and of the force sensor."""
+        """Return a sample of the arm, after checks of the arm and of the force sensor.
+
+        KeyboardInterrupt: a stop was requested, also where a driver has suppressed its interrupt.
+        """
+        if self._stop_requested():
+            raise KeyboardInterrupt
         sample = self._arm.sample()
         measured = None if self._meter is None else self._meter.present_wrench()
         checked = (self.guard.check(sample, measured, load) for load in self.hanging)

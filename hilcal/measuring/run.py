@@ -602,6 +602,7 @@ def run(
     wall: Callable[[], float] = time.time,
     goal: StoppingRule | None = None,
     epoch: float | None = None,
+    stop_requested: Callable[[], bool] = lambda: False,
 ) -> None:
     """Measure the missing steps of a plan, until the goal is met.
 
@@ -611,6 +612,7 @@ def run(
     with a model. Once the `goal` is met, the arm moves home, the load is taken off, and the
     other steps are not measured. `wall` is the time of day, s, which continues the campaign's time
     after a pause; it counts from `epoch`, by default the start of the first session.
+    `stop_requested` is asked with every sample of the arm; a stop then is a keyboard interrupt.
 
     Raises:
         InputError: the plan is not safe (names the first problem), or the store fails.
@@ -625,7 +627,7 @@ def run(
     _refuse_unsafe(cell, missing, bool(done))
     for text in dry_run(cell, plan).remarks:
         watcher.notify(Remark(text))
-    setup = Setup(rig, cell, clock, watcher)
+    setup = Setup(rig, cell, clock, watcher, stop_requested)
     session = Session(setup, plan, store, live, wall, goal, epoch)
     try:
         session.visit(route(missing, cell.arm, cell.configured().limits.joint_margin_rad))

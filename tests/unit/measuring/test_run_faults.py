@@ -189,6 +189,21 @@ def test_impatience_does_not_keep_the_arm_from_stopping():
     assert not b.world.is_moving
 
 
+def test_an_interrupt_that_a_driver_suppresses_stops_the_arm_before_its_next_motion(b):
+    asked = []
+
+    def interrupted(*_):
+        if len(b.store.rows) == 2:
+            asked.append(len(b.world.at_start))
+
+    call_before(b.rig.tracker, "measure", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        b.measure(small_plan(), stop_requested=lambda: bool(asked))
+    assert len(b.world.at_start) == asked[0]
+    assert "arm.stop" in b.world.calls[-3:]
+    assert b.store.kinds()[-1] == "interrupted"
+
+
 def test_unexpected_errors_and_errors_before_the_arm_is_ours():
     """A fault before `take_control`: somebody else's program may be running."""
     b = bench()
