@@ -61,7 +61,14 @@ from hilcal.store.procedure_log import (
 )
 from hilcal.store.revision import RevisionRecord
 from hilcal.store.rows import content_hash
-from hilcal.store.run_log import PLAN, REHEARSED, RunLog, check_same_cell, create_run
+from hilcal.store.run_log import (
+    PLAN,
+    REHEARSED,
+    SERIAL_NUMBER,
+    RunLog,
+    check_same_cell,
+    create_run,
+)
 
 Measure = Callable[[CampaignFile, float | None], None]
 """Measures and stores the missing readings of a campaign's plan. The second argument is the wall
@@ -373,6 +380,7 @@ class Procedure:
     def _create(self, path: Path, purpose: str, plan: Plan, o: Campaign) -> None:
         covers = o.file.about(COVERS_KEY) or INSTRUMENT
         texts = {PURPOSE: purpose, CALIBRATION: state.identity(self.run), COVERS_KEY: covers}
+        texts[SERIAL_NUMBER] = RunLog(o.file).serial_number()
         config, readings = CellConfig.from_json(o.file.config_json), o.file.readings()
         at_reference = np.array(readings.pose_names)[readings.pose] == REFERENCE
         if (unloaded := at_reference & readings.unloaded).any():

@@ -26,6 +26,7 @@ from hilcal.store.stored_texts import KEYS, robot_file_of
 REHEARSED = "rehearsed in a simulated cell"  # in the source of a campaign on simulated devices
 PLAN = "plan"  # key of the first plan among the texts of a campaign
 FURTHER_PLAN = "plan {}"  # keys of further plans, numbered from 2
+SERIAL_NUMBER = "serial number"  # key of that of the arm, in a campaign that tests a model of it
 FIXED_SECTIONS = ("robot", "tool", "loads")  # of the configuration, during a campaign
 FITTED_SECTIONS = ("tracker", "repeatability", "acquire", "planning", "ordinary", "plausible")
 """Sections of the configuration that fits read as they were when the campaign was begun."""
@@ -62,7 +63,7 @@ def check_same_devices(campaign: CampaignFile, rehearse: bool) -> None:
 
 
 def check_same_arm(log: "RunLog", answers: Sequence[Mapping[str, Any]]) -> None:
-    """Refuse to continue a campaign on another arm of the same model.
+    """Refuse to continue a campaign, or to test its model, on another arm of the same model.
 
     Arms and controllers that report no serial number are not compared.
 
@@ -70,19 +71,17 @@ def check_same_arm(log: "RunLog", answers: Sequence[Mapping[str, Any]]) -> None:
         log: of the campaign.
         answers: of the devices now, as the event "devices" of a run log stores them.
     """
-
-    def serial_number(of: Sequence[Mapping[str, Any]]) -> str:
-        facts = (dict(a["facts"]) for a in of if a["device"] == "arm")
-        return next((str(f["serial number"]) for f in facts if f.get("serial number")), "")
-
-    events = log.events()
-    earlier = [serial_number(e["answers"]) for e in events if e["kind"] == "devices"]
-    before, now = next(filter(None, earlier), ""), serial_number(answers)
+    before, now = log.serial_number(), _serial_number(answers)
     if before and now and before != now:
         raise InputError(
             f"arm: its serial number is {now}, and the campaign was begun on the arm {before}; a "
             "campaign is of one arm: start another one for this"
         )
+
+
+def _serial_number(answers: Sequence[Mapping[str, Any]]) -> str:
+    facts = (dict(a["facts"]) for a in answers if a["device"] == "arm")
+    return next((str(f["serial number"]) for f in facts if f.get("serial number")), "")
 
 
 def check_same_cell(campaign: CampaignFile, config: CellConfig, base_dir: Path) -> None:
@@ -259,6 +258,12 @@ class RunLog:
         text = json.dumps({"kind": kind, "utc": utc_now(), **content}, allow_nan=False)
         with self._transaction() as connection:
             rows.append_text(connection, "events", text)
+
+    def serial_number(self) -> str:
+        """Return the serial number of the campaign's arm; empty where it is not known."""
+        stated = self._campaign.about(SERIAL_NUMBER)
+        told = (_serial_number(e["answers"]) for e in self.events() if e["kind"] == "devices")
+        return stated or next(filter(None, told), "")
 
     def done(self) -> frozenset[Step]:
         """Return the steps that have been measured."""

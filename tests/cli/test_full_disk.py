@@ -134,6 +134,23 @@ def test_a_command_whose_streams_are_closed_opens_no_file_in_their_place(fitted,
     assert ended.returncode == 0
 
 
+def test_a_key_that_types_half_a_character_is_no_answer_and_no_failure():
+    """As a letter of Latin-1, or one of two bytes of which Backspace has deleted one."""
+    code = (
+        "import typer; from hilcal import cli; from hilcal.cli.terminal import confirmed, terminal\n"
+        "app = typer.Typer()\n"
+        "@app.command()\n"
+        "def f(): assert confirmed(terminal(False), 'Go?')\n"
+        "cli.execute(lambda: app, 'f', [])"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "utf-8:strict"}
+    ended = subprocess.run(
+        [sys.executable, "-c", code],
+        input=b"\xc3\ny\n", env=environment, check=False, capture_output=True,
+    )  # fmt: skip
+    assert (ended.returncode, ended.stderr.count(b"is not an answer")) == (0, 1)
+
+
 def test_a_directory_that_has_been_deleted_is_named(tmp_path):
     shutil.copy(ROOT / "configs" / "cells" / "demo_ur10e.toml", tmp_path / "cell.toml")
     line = 'mkdir gone; cd gone; rmdir ../gone; "$0" -m hilcal check ../cell.toml'

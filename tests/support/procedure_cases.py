@@ -15,6 +15,8 @@ from hilcal.store.run_log import RunLog
 from tests.support.plan_cases import changed
 
 HOUR = 3600.0
+ARM = {"device": "arm", "driver": "ur", "name": "UR10e", "facts": {"serial number": "20235500001"}}
+"""What the arm answers as the campaign begins."""
 
 
 class KilledError(BaseException):
@@ -68,6 +70,8 @@ class DrawnCalibration:
         p = self.procedure
         if step.kind == "plan":
             p.begin(p.plan().plan, p.config, covers=INSTRUMENT_AND_ARM)
+            with CampaignFile.open(p.run) as campaign:
+                RunLog(campaign).event("devices", {"answers": [ARM]})
             return None
         if step.moves:
             return p.measure(step, self.measure)

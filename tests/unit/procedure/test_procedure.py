@@ -19,9 +19,10 @@ from hilcal.readings.same_readings import found_among
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import REFERENCE
 from hilcal.store.procedure_log import ProcedureLog, purpose_of, release
-from hilcal.store.run_log import RunLog
+from hilcal.store.run_log import RunLog, check_same_arm
 from tests.support.paths import ROOT
 from tests.support.procedure_cases import (
+    ARM,
     DrawnCalibration,
     KilledError,
     drawn_calibration,
@@ -184,6 +185,15 @@ def test_a_validation_campaign_is_frozen(done):
         found = hc.fit(hc.baseline(o.cell, o.readings), o.readings)
         refusal("never fitted", o.append, found)
         assert o.latest() is None
+
+
+def test_the_model_of_an_arm_is_not_tested_on_another(done):
+    d, _ = done
+    other = {**ARM, "facts": {"serial number": "20235500002"}}
+    for path in (d.procedure.files.validation, d.procedure.files.corrected):
+        with CampaignFile.open(path) as test:
+            check_same_arm(RunLog(test), [ARM])
+            refusal(r"20235500002, .* 20235500001;", check_same_arm, RunLog(test), [other])
 
 
 def test_another_validation_campaign_is_refused(done):
