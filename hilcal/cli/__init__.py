@@ -241,7 +241,7 @@ def execute(make: Callable[[], typer.Typer], name: str, arguments: Sequence[str]
     Errors that `make` raises are reported in the same way.
     """
     _open_closed_streams()
-    for stream in (sys.stdout, sys.stderr):
+    for stream in (sys.stdin, sys.stdout, sys.stderr):  # a key may type half a character, too
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")
     debug = os.environ.get(DEBUG, "") not in ("", "0")

@@ -137,7 +137,8 @@ def test_a_command_whose_streams_are_closed_opens_no_file_in_their_place(fitted,
 def test_a_key_that_types_half_a_character_is_no_answer_and_no_failure():
     """As a letter of Latin-1, or one of two bytes of which Backspace has deleted one."""
     code = (
-        "import typer; from hilcal import cli; from hilcal.cli.terminal import confirmed, terminal\n"
+        "import typer; from hilcal import cli\n"
+        "from hilcal.cli.terminal import confirmed, terminal\n"
         "app = typer.Typer()\n"
         "@app.command()\n"
         "def f(): assert confirmed(terminal(False), 'Go?')\n"
