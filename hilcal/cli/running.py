@@ -267,7 +267,8 @@ def measure(
         assert rig is not None  # noqa: S101  (refuse_unready has raised otherwise)
         if viewer is not None:
             viewer.measuring(campaign.path.name, cell, log)
-        watcher = stack.enter_context(watching(t.progress, len(log.plan.steps), viewer))
+        total, done = len(log.plan.steps), len(log.done())
+        watcher = stack.enter_context(watching(t.progress, total, viewer, done))
         identities = [answer_json(answer) for answer in answers]
         check_same_arm(log, identities)
         log.event("devices", {"answers": identities})

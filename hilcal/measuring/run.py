@@ -562,14 +562,17 @@ class Session:
         self._watcher.notify(stored)
 
     def _compared(self, reading: Readings) -> list[tuple[int, LiveResidual]]:
-        """Return the residual of each target of an arrival, by a model of the previous readings."""
+        """Return the residual of each target of an arrival, by a model of the previous readings.
+
+        It only serves the operator's eyes: no error of it ends a campaign.
+        """
         out = [(int(k), LiveResidual()) for k in reading.target]
         readings = None if self._live is None else self._store.readings()
         if self._live is None or readings is None:
             return out
         previous = np.arange(len(readings) - len(reading))
         for k, (target, _) in enumerate(out):
-            with suppress(HilcalError):  # too few readings for a model
+            with suppress(Exception):  # too few readings for a model
                 selected = readings[np.append(previous, len(previous) + k)]
                 out[k] = target, self._live(selected)
         return out

@@ -143,9 +143,11 @@ class _Watcher:
     every event, too.
     """
 
-    def __init__(self, console: Console, total: int, also: events.Watcher | None) -> None:
+    def __init__(
+        self, console: Console, total: int, also: events.Watcher | None, stored: int
+    ) -> None:
         self.console, self._start, self._also = console, time.monotonic(), also
-        self._fields: dict[str, Any] = {"left": "", "last": "", "phase": "", "done": 0}
+        self._fields: dict[str, Any] = {"left": "", "last": "", "phase": "", "done": stored}
         self._fields["total"] = total
         self._shown: _TwoLines | None = None
 
@@ -206,10 +208,13 @@ class _Watcher:
 
 @contextmanager
 def watching(
-    console: Console, total: int, also: events.Watcher | None = None
+    console: Console, total: int, also: events.Watcher | None = None, stored: int = 0
 ) -> Iterator[_Watcher]:
-    """Yield a watcher that shows a campaign of `total` readings and passes events to `also`."""
-    watcher = _Watcher(console, total, also)
+    """Yield a watcher that shows a campaign of `total` readings and passes events to `also`.
+
+    `stored`: number of steps that previous sessions have measured.
+    """
+    watcher = _Watcher(console, total, also, stored)
     watcher.begin()
     try:
         yield watcher
