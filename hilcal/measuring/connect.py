@@ -1,11 +1,13 @@
 """Opening the devices of a configuration; comparing the kinematics of an arm's controller."""
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 from operator import methodcaller
-from typing import Any
+from threading import Thread
+from typing import Any, TypeVar
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
@@ -62,6 +64,7 @@ class Setup:
 
 
 Factory = Callable[[CellConfig], Any]
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,8 +133,7 @@ def connect(config: CellConfig) -> tuple[Rig | None, tuple[ConnectionResult, ...
     of each device. InputError: a driver is missing in the configuration, or unknown.
     """
     parts = drivers_of(config)
-    with ThreadPoolExecutor(len(parts)) as pool:
-        opened = list(pool.map(lambda part: _tried(part[2], config), parts))
+    opened = _at_once([partial(_tried, factory, config) for _, _, factory in parts])
     answers: list[ConnectionResult] = []
     for (part, name, _), (device, error) in zip(parts, opened, strict=True):
         report, why = (None, error) if error is not None else _tried(methodcaller("report"), device)
@@ -146,6 +148,24 @@ def connect(config: CellConfig) -> tuple[Rig | None, tuple[ConnectionResult, ...
         if isinstance(error, InputError):
             raise error
     return None, tuple(answers)
+
+
+def _at_once(tasks: Sequence[Callable[[], Result]]) -> list[Result]:
+    """Return the results of tasks that run at the same time.
+
+    Neither an interrupt nor the end of the process waits for them: a driver may hang.
+    """
+
+    def work(task: Callable[[], Result], future: Future[Result]) -> None:
+        try:
+            future.set_result(task())
+        except BaseException as error:
+            future.set_exception(error)
+
+    futures: list[Future[Result]] = [Future() for _ in tasks]
+    for pair in zip(tasks, futures, strict=True):
+        Thread(target=work, args=pair, daemon=True).start()
+    return [future.result() for future in futures]
 
 
 def _tried(do: Callable[..., Any], *arguments: object) -> tuple[Any, Exception | None]:

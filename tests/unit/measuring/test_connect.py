@@ -1,7 +1,9 @@
 """Drivers are found by name, also somebody else's; what fails is told, device by device."""
 
+import _thread
 import importlib
 import sys
+import threading
 from textwrap import dedent
 
 import pytest
@@ -117,6 +119,22 @@ def test_a_driver_that_fails_in_its_own_way_is_told_and_all_are_closed(foreign):
         ("tracker: ValueError: nothing said",)
     ]
     assert "their tracker at mute" in closed()
+
+
+def test_an_interrupt_does_not_wait_for_a_driver_that_hangs(foreign, monkeypatch):
+    given_up, returned = threading.Event(), threading.Event()
+
+    def hangs(config):
+        _thread.interrupt_main()
+        given_up.wait(10.0)
+        returned.set()
+
+    config = load_config(cell(foreign))
+    monkeypatch.setattr(importlib.import_module("their_devices"), "open_tracker", hangs)
+    with pytest.raises(KeyboardInterrupt):
+        connect(config)
+    assert not returned.is_set()
+    given_up.set()
 
 
 def test_a_driver_that_is_unknown_or_cannot_be_loaded_is_one_line(foreign):
