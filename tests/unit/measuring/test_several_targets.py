@@ -1,6 +1,6 @@
 """Several reflectors at each stop: pointed to, read one after the other, stored together."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -118,6 +118,24 @@ def test_each_target_is_read_at_each_stop(tmp_path):
     seen = held @ REGISTRATION[:3, :3].T + REGISTRATION[:3, 3]
     assert np.abs(r.value - seen).max() < 6 * STD
     assert np.all(np.diff(r.states.time) > 0)
+
+
+def test_a_tracker_that_is_moved_is_asked_about_with_several_targets_too(tmp_path):
+    b, tracker = bench()
+
+    def kicked(sample):
+        moved = 0.02 * (len(b.notes.of_kind(ReadingStored)) >= 6)
+        return replace(sample, value=sample.value + moved * np.array([1.0, 0.0, 0.0]))
+
+    change_result(tracker, "measure", kicked)
+    measure(b, tmp_path / "r.hilcal")
+    assert [q[:38] for n, q in b.operator.requests if n == "confirm"] == [
+        "the target at the reference pose is 20"
+    ]
+    with CampaignFile.open(tmp_path / "r.hilcal") as campaign:
+        events = RunLog(campaign).events()
+    doubted = [e["reading"]["target"] for e in events if e["kind"] == "doubted"]
+    assert doubted == list(NAMES)
 
 
 @pytest.mark.long
