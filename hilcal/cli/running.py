@@ -5,7 +5,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -210,7 +210,10 @@ def _resumable(campaign: CampaignFile, planned: int, line: str) -> Iterator[None
     """Add the number of stored readings and the command that resumes to errors of a run."""
 
     def safe() -> str:
-        return f"{campaign.n_readings} of {planned} readings are safe; go on with: {line}"
+        stored = "all stored"
+        with suppress(HilcalError):  # another program may have locked the file
+            stored = f"{campaign.n_readings} of {planned}"
+        return f"{stored} readings are safe; go on with: {line}"
 
     try:
         try:

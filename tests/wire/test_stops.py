@@ -4,8 +4,11 @@ The arm stands within half a second, no process is left, and the resumed campaig
 reading exactly once.
 """
 
+import re
 import signal
+import sqlite3
 import time
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -56,6 +59,16 @@ def test_ctrl_c_twice_in_a_row_stops_it_too(cell, path):
     assert "Traceback" not in words
     cases.check_stopped_on_its_way(cell, since, goal)
     assert run.orphans() == []
+    cases.check_readings(cell, path)
+
+
+@pytest.mark.long
+def test_a_campaign_that_another_program_locks_says_how_to_go_on(cell, path):
+    run, _ = cases.start_run(cell, path, cases.Run.measuring)
+    with closing(sqlite3.connect(path, isolation_level=None)) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        line = cases.failed(run, 2)
+        assert re.search(r"another program has kept .* locked .* --resume$", line), line
     cases.check_readings(cell, path)
 
 
