@@ -8,10 +8,14 @@ import csv
 import io
 import re
 import zipfile
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from datetime import date, datetime, time
 from importlib import import_module
+from itertools import zip_longest
+from operator import itemgetter
 from pathlib import Path
 from typing import IO, Any
 from xml.parsers import expat
@@ -142,9 +146,23 @@ def _xlsx(path: str, content: bytes, how: FileFormat, check: Check | None) -> Gr
     return grid_of_rows(path, rows, how, check)
 
 
-def workbook(path: str, content: bytes) -> Any:
+@dataclass(frozen=True, slots=True, eq=False)
+class Workbook:
+    """A workbook that is read sheet by sheet."""
+
+    reader: Any  # of openpyxl
+    merged: dict[str, list[str]]  # ranges of merged cells, by the name of a sheet's part
+
+    @property
+    def sheetnames(self) -> list[str]:
+        """Names of the sheets, in order."""
+        return list(self.reader.sheetnames)
+
+
+def workbook(path: str, content: bytes) -> Workbook:
     """Open an XLSX file with openpyxl, once its parts are known to fit into memory."""
     with undamaged(path, "damaged, or not an XLSX file"):
+        merged: dict[str, list[str]] = {}
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             members = archive.infolist()
             names = [m.filename for m in members]
@@ -158,23 +176,27 @@ def workbook(path: str, content: bytes) -> Any:
             limits.check_size(f"{path}: unpacked", size, limits.UNPACKED)
             for member in members:
                 with archive.open(member) as stream, suppress(expat.ExpatError):  # pictures
-                    _check_xml(path, member.filename, stream)
+                    merged[member.filename] = _check_xml(path, member.filename, stream)
         openpyxl = package(path, "openpyxl", "XLSX")
         book = openpyxl.load_workbook(
             io.BytesIO(content), read_only=True, data_only=True, keep_links=False
         )
     if len(book.sheetnames) > limits.SHEETS:
         raise InputError(f"{path}: {len(book.sheetnames)} sheets; valid: at most {limits.SHEETS}")
-    return book
+    return Workbook(book, merged)
 
 
-def _check_xml(path: str, name: str, stream: IO[bytes]) -> None:
-    """Limit a part of a workbook: openpyxl holds a row of a sheet, any other part as a whole."""
+def _check_xml(path: str, name: str, stream: IO[bytes]) -> list[str]:
+    """Limit a part of a workbook: openpyxl holds a row of a sheet, any other part as a whole.
+
+    Return the ranges of its merged cells, as "B2:B4".
+    """
     where, sheet = f"{path}: {name}", name.startswith("xl/worksheets/")
     most = limits.COLUMNS * 10 if sheet else limits.ELEMENTS
     depth = elements = rows = cells = 0
+    merged: list[str] = []
 
-    def start(tag: str, _: dict[str, str]) -> None:
+    def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal depth, elements, rows, cells
         depth += 1
         elements += 1
@@ -183,6 +205,8 @@ def _check_xml(path: str, name: str, stream: IO[bytes]) -> None:
             rows, elements = rows + 1, 0
             limits.check_rows(where, rows)
         cells += sheet and tag == "c"
+        if sheet and tag == "mergeCell":
+            merged.append(attributes.get("ref", ""))
         if depth > limits.XML_DEPTH or elements > most:
             deep = depth > limits.XML_DEPTH
             excess = f"{depth} elements in each other" if deep else f"{elements} elements"
@@ -202,16 +226,20 @@ def _check_xml(path: str, name: str, stream: IO[bytes]) -> None:
         limits.check_cells(where, cells)
         limits.check_size(f"{where}: a tag", fed - parser.CurrentByteIndex, limits.LINE)
     parser.Parse(b"", True)
+    return merged
 
 
 def sheet_rows(
-    path: str, book: Any, sheet: str, comment: str | None
+    path: str, book: Workbook, sheet: str, comment: str | None
 ) -> list[tuple[int, list[Cell]]]:
-    """Rows of a sheet that are neither empty nor comments, with their numbers from 1."""
+    """Rows of a sheet that are neither empty nor comments, with their numbers from 1.
+
+    What stands in merged cells counts for each of them.
+    """
     rows: list[tuple[int, list[Cell]]] = []
     count = 0
     with undamaged(path, "damaged, or not an XLSX file"):
-        read = book[sheet]
+        read = book.reader[sheet]
         read.reset_dimensions()  # the stated dimensions would pad every row
         for row, cells in enumerate(read.iter_rows(values_only=True), start=1):
             limits.check_rows(f"{path}: sheet '{sheet}'", row)
@@ -223,7 +251,28 @@ def sheet_rows(
                 count += len(plain)
                 limits.check_cells(f"{path}: sheet '{sheet}'", count)
                 rows.append((row, plain))
+        for ranges in book.merged.get(read._worksheet_path, []):
+            count += _fill(rows, ranges)
+            limits.check_cells(f"{path}: sheet '{sheet}'", count)
     return rows
+
+
+def _fill(rows: list[tuple[int, list[Cell]]], merged: str) -> int:
+    """Write the first of merged cells, "B2:B4", into the others; return how many cells that are."""
+    from openpyxl.utils import range_boundaries
+
+    left, top, right, bottom = range_boundaries(merged)
+    row = itemgetter(0)
+    covered = rows[bisect_left(rows, top, key=row) : bisect_right(rows, bottom, key=row)]
+    width = min(right, limits.COLUMNS) - left + 1
+    if not covered or covered[0][0] != top or width < 1 or len(covered[0][1]) < left:
+        return 0
+    value = covered[0][1][left - 1]
+    area: int = width * len(covered)
+    for _, cells in covered:
+        cells += [None] * (left - 1 + width - len(cells))
+        cells[left - 1 : left - 1 + width] = [value] * width
+    return area
 
 
 def _cell(value: object) -> Cell:
@@ -426,6 +475,8 @@ def grid_of_rows(
     if check is not None:
         check([text_of(c) for c in titles])
     header = [" ".join(text_of(c).split()) for c in titles]
+    if file_format.group_row is not None:
+        header = grouped(header, by_row.get(file_format.group_row, ()))
     skipped = {file_format.units_row, *file_format.skip_rows}
     body = [
         (row, c) for row, c in numbered_rows if row > file_format.header_row and row not in skipped
@@ -452,6 +503,20 @@ def grid_of_rows(
         units = {n: text_of(c) for n, c in zip(names, by_row[file_format.units_row], strict=False)}
     rows = np.array([row for row, _ in body], dtype=np.int64)
     return Grid(path, names, rows, columns, (file_format,) * len(names), units)
+
+
+def grouped(header: Sequence[str], groups: Sequence[Cell]) -> list[str]:
+    """Return a header whose repeated names begin with the group that stands over them.
+
+    The name of a group stands over its first column, or over each of them.
+    """
+    names: list[str] = []
+    group = ""
+    for name, cell in zip_longest(header, groups[: len(header)], fillvalue=None):
+        group = " ".join(text_of(cell).split()) or group
+        repeated = name and header.count(name) > 1
+        names.append(f"{group} {name}".strip() if repeated else name or "")
+    return names
 
 
 def filled(cell: Cell) -> bool:

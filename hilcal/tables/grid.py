@@ -76,6 +76,17 @@ class Grid:
         cells = (text_of(c) for c in self.cells(column))
         return [from_csv(check_name(c, self.at(k, column))) for k, c in enumerate(cells)]
 
+    def times(self, column: str | int, date: str | int | None = None) -> list[Cell]:
+        """Cells of a column of times; with a column of dates, "date time" in one."""
+        cells = list(self.cells(column))
+        if date is None:
+            return cells
+        days = self.cells(date)
+        return [
+            f"{_part(d, '%Y-%m-%d')} {_part(c, '%H:%M:%S.%f')}"
+            for d, c in zip(days, cells, strict=True)
+        ]
+
     def numbers(self, column: str | int, *, complete: bool = False) -> Floats:
         """(N,) numbers of a column, NaN where a value is missing, which `complete` refuses."""
         cells, how = self.cells(column), self._format(column)
@@ -151,6 +162,10 @@ def first_true(bad: Bools) -> list[list[int]]:
     """Place of the first true element of a mask, as a list of one; empty if all are false."""
     places: list[list[int]] = np.argwhere(bad)[:1].tolist()
     return places
+
+
+def _part(cell: Cell, form: str) -> str:
+    return cell.strftime(form) if isinstance(cell, datetime) else str(cell or "").strip()
 
 
 def text_of(cell: Cell) -> str:

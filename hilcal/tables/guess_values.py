@@ -1,6 +1,7 @@
 """Guesses of positions, orientations, forces and uncertainties, by names, axes and values."""
 
 import re
+from collections.abc import Sequence
 from datetime import datetime
 from itertools import product
 from typing import Any
@@ -8,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from hilcal.tables import proposal as words
-from hilcal.tables.grid import Grid
+from hilcal.tables.grid import Cell
 from hilcal.tables.mapped import nines
-from hilcal.tables.units import FORCES, LENGTHS, MOMENTS
+from hilcal.tables.uncertainty import PLAUSIBLE
+from hilcal.tables.units import FORCES, LENGTHS, MOMENTS, TIMES
 from hilcal.types import Floats
 
 NORM = 3e-3  # How far the length of a quaternion may be from 1: three digits
@@ -18,13 +20,21 @@ FORMATS = (
     "%d.%m.%Y %H:%M:%S",
     "%d.%m.%Y %H:%M:%S.%f",
     "%d.%m.%Y %H:%M",
+    "%d-%b-%Y %H:%M:%S",
+    "%d-%b-%Y %H:%M:%S.%f",
     "%m/%d/%Y %H:%M:%S",
     "%m/%d/%Y %I:%M:%S %p",
     "%d/%m/%Y %H:%M:%S",
+    "%m/%d/%Y %H:%M",
+    "%m/%d/%Y %I:%M %p",
+    "%d/%m/%Y %H:%M",
     "%Y/%m/%d %H:%M:%S",
+    "%Y/%m/%d %H:%M",
     "%Y-%m-%d-%H-%M-%S",
     "%H:%M:%S",
     "%H:%M:%S.%f",
+    "%H:%M",
+    "%I:%M:%S %p",
 )
 """Forms of dates that are tried, in this order."""
 RIVAL = 0.5  # Difference of the score within which another choice of columns is as good; a choice
@@ -34,6 +44,7 @@ BY_ROWS = "found by their values; row by row, or column by column?"
 RIVALS = "these fit as well by their values:"
 LONE = "the only other number of a row, taken as a distance from [points.A]; [gauge] for a height"
 MOST_DEGREES = 400.0  # largest joint angle of a table, a turn and some margin; a choice
+RECENT = 1e8  # s since 1970; later times are of a campaign. A choice
 _EXCEL = (30000.0, 60000.0)
 
 
@@ -52,23 +63,23 @@ def sentinels(position: Floats) -> list[float]:
 
 
 def time_unit(
-    grid: Grid, name: str, stated: str | None, values: Floats | None
+    cells: Sequence[Cell], stated: str | None, values: Floats | None
 ) -> tuple[dict[str, Any], str | None] | None:
     """Return unit (and format) of a column of times, and a doubt; None where it holds no times."""
-    cells = [c for c in grid.cells(name) if c not in (None, "")]
-    if len(cells) < len(grid.rows):
+    if any(c in (None, "") for c in cells):
         return None
     if all(isinstance(c, datetime) for c in cells):
         return {"unit": "iso"}, None
     if values is not None:
         if np.nanmax(values) == np.nanmin(values):
             return None
-        if stated in ("s", "ms", "min", "h"):
+        if stated in TIMES:
             return {"unit": stated}, None
         if _EXCEL[0] < np.nanmin(values) and np.nanmax(values) < _EXCEL[1]:
             return {"unit": "excel"}, "days of a spreadsheet, by their size"
-        if np.nanmin(values) > 1e11:
-            return {"unit": "ms"}, "ms since 1970, by their size"
+        for unit in ("ns", "us", "ms"):
+            if TIMES[unit] * np.nanmin(values) > RECENT:
+                return {"unit": unit}, f"{unit} since 1970, by their size"
         return {"unit": "s"}, "no unit stated; read as s"
     import pandas as pd
 
@@ -212,10 +223,8 @@ def _kind(c: words.ColumnName) -> str:
 
 Group = dict[str, dict[tuple[object, ...], dict[str, str]]]
 """Names of columns by kind, by the stem of the name (its words and numbers), by axis."""
+SQUARES = tuple(f"{unit}²" for unit in LENGTHS)
 _KINDS = words.STD | words.ROTATION | words.QUATERNION | words.FORCE | words.MOMENT
-
-
-LARGE_VARIANCE = 1e-6  # m²; a larger variance, of more than 1 mm, is in mm²
 
 
 def guess_axes(g: words.Guesser) -> None:
@@ -228,7 +237,8 @@ def guess_axes(g: words.Guesser) -> None:
             sets.setdefault(_kind(c), {}).setdefault(stem, {})[c.axis] = c.name
     if "force" not in sets and "moment" in sets:  # tx, ty, tz are then translations
         for stem, axes in sets.pop("moment").items():
-            sets.setdefault("position", {}).setdefault(stem, axes)
+            same = stem in sets.setdefault("position", {})
+            sets["position"][("t", *stem) if same else stem] = axes
     complete = {
         kind: {stem: axes for stem, axes in stems.items() if set("xyz") <= set(axes)}
         for kind, stems in sets.items()
@@ -262,6 +272,28 @@ def guess_axes(g: words.Guesser) -> None:
     _std(g, complete, stem, unit)
 
 
+def _std_unit(
+    g: words.Guesser, section: str, names: Sequence[str], power: int, usual: Sequence[str]
+) -> str:
+    """Return the unit of standard deviations (variances: power 2), stated or else by their size.
+
+    It is the first, of the `usual` ones, m, mm and um, in which they are what instruments have.
+    """
+    squared = "²" * (power - 1)
+    stated = g.unit(names, [unit + squared for unit in LENGTHS])
+    if stated is not None:
+        return stated.removesuffix("²")
+    figures = g.block(names)
+    figures = figures[figures > 0] ** (1 / power)
+    figure = float(np.median(figures)) if len(figures) else 0.0
+    tried = dict.fromkeys((*usual, "m", "mm", "um"))
+    low, high = PLAUSIBLE
+    unit = next((u for u in tried if low <= LENGTHS[u] * figure <= high), next(iter(tried)))
+    size = f"a standard deviation is then {1e6 * LENGTHS[unit] * figure:.3g} µm"
+    g.doubt(section, f"no unit stated; {unit}{squared}: {size}")
+    return unit
+
+
 def _targets_side_by_side(
     positions: dict[tuple[object, ...], dict[str, str]], stem: tuple[object, ...]
 ) -> list[tuple[object, ...]]:
@@ -289,8 +321,7 @@ def _covariance(g: words.Guesser) -> None:
     upper = ["xx", "xy", "xz", "yy", "yz", "zz"]
     if all(axes in by_axes for axes in upper):
         names = [by_axes[axes] for axes in upper]
-        unit = "mm" if np.nanmedian(g.block(names[:1])) > LARGE_VARIANCE else "m"
-        g.doubt("covariance", f"in {unit}², by their size")
+        unit = _std_unit(g, "covariance", [by_axes[axes] for axes in ("xx", "yy", "zz")], 2, ())
         g.assign("covariance", names, f"upper triangle, {unit}²", unit=unit)
 
 
@@ -414,7 +445,9 @@ def _std(g: words.Guesser, complete: Group, stem: tuple[object, ...], position_u
         return
     names = [axes[axis] for axis in "xyz"] if axes is not None else single[:1]
     first = words.parse(names[0])
-    section: dict[str, object] = {"unit": g.unit(names, LENGTHS) or position_unit}
+    squared = first.has(words.VARIANCE) or g.unit(names, SQUARES) is not None
+    unit = _std_unit(g, "std", names, 1 + squared, [position_unit])
+    section: dict[str, object] = {"unit": unit}
     turned = _columns_like(complete.get("std_angle", {}), stem)
     orientation = g.proposal.sections.get("orientation")
     if axes is not None and turned is not None and orientation is not None:
@@ -424,7 +457,7 @@ def _std(g: words.Guesser, complete: Group, stem: tuple[object, ...], position_u
     if first.has(words.EXPANDED):
         kind, section["k"] = "expanded", 2.0
         g.doubt("std", "expanded uncertainty: is k = 2 right?")
-    elif first.has(words.VARIANCE):
+    elif squared:
         kind = "variance"
     elif first.has({"u", "unc", "uncertainty", "unsicherheit", "incertitude"}):
         g.doubt("std", 'a standard deviation, or kind = "expanded" with its k?')

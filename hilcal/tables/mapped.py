@@ -29,7 +29,7 @@ from hilcal.tables import mapping as forms
 from hilcal.tables import table as exchange
 from hilcal.tables.columns import independent_columns
 from hilcal.tables.files import open_tables
-from hilcal.tables.grid import ColumnTable, Grid, first_true
+from hilcal.tables.grid import ColumnTable, Grid, first_true, text_of
 from hilcal.tables.uncertainty import check_joint_rounding, mapped_covariance, rounding_variance
 from hilcal.tables.units import defect, rotations
 from hilcal.types import Bools, Floats, Ints
@@ -46,6 +46,8 @@ TOOL = 0.5  # m; the longest tool: with the arm's reach, the lever of its joints
 ONE_DIRECTION, MANY_DIRECTIONS = 0.99, 0.9  # length of the mean of unit vectors; a choice
 GRAVITY = (0.0, 0.0, -STANDARD_GRAVITY_M_S2)  # m/s², base axes, of an arm that stands upright
 EPOCH = 1e8  # s; times beyond three years are counted from an epoch, not from the campaign's start
+DAY = 86400.0  # s
+NO_DATE = -25567  # days from 1970 to 1900-01-01, as which a time of day alone is read
 TARGET = "target of [position]"
 _EXPECTED = {"iso": "a date and time like 2024-05-31T12:00:00", "excel": "days since 1899-12-30"}
 _CELSIUS = {"degC": (1.0, 0.0), "degF": (1 / 1.8, 32.0), "K": (1.0, 273.15)}
@@ -103,7 +105,13 @@ def mapped_table(
     angles = _rotations(grid, mapping.orientation, raw, table)
     for name, time in (("time_s", mapping.time), ("load_time_s", mapping.load_time)):
         if time is not None:
-            _put(table, grid, name, time.column, seconds(grid, time))
+            values, days = seconds(grid, time)
+            _put(table, grid, name, time.column, values)
+            if days:
+                notes.append(
+                    f"times of '{grid.name(time.column)}' go back {days} times by over half a day: "
+                    "taken for midnight; a mapping names a column of dates by [time] date_column"
+                )
     q = None if joints is None else _joint_units(joints, arm) * _block(raw, grid, joints.columns)
     wrench = _wrench(grid, mapping, np.asarray(gravity), table)
     if mapping.wrench is not None and mapping.wrench.axes == "flange" and q is not None:
@@ -469,17 +477,24 @@ def _poses(grid: Grid, section: forms.PoseName | None, q: Floats | None) -> list
     return [f"row {first.setdefault(key, row)}" for row, key in zip(rows, keys, strict=True)]
 
 
-def seconds(grid: Grid, time: forms.Time) -> Floats:
-    """(N,) times in s; dates, and times since an epoch, are counted from the earliest row."""
+def seconds(grid: Grid, time: forms.Time) -> tuple[Floats, int]:
+    """(N,) times in s, and how many midnights they pass without saying so.
+
+    Dates, and times since an epoch, are counted from the earliest row. A time of day without a date
+    that is more than half a day before that of the row above is of the next day.
+    """
     import pandas as pd
 
-    cells, expected = grid.cells(time.column), time.format or _EXPECTED.get(time.unit, "a date")
+    cells, expected = (
+        grid.times(time.column, time.date_column),
+        time.format or _EXPECTED.get(time.unit, "a date"),
+    )
     dated = all(isinstance(c, datetime) for c in cells)
-    if time.unit in units.SECONDS:
-        values, expected = units.SECONDS[time.unit] * grid.numbers(time.column), "a time"
+    if time.unit in units.TIMES:
+        values, expected = units.TIMES[time.unit] * grid.numbers(time.column), "a time"
     elif time.unit == "excel" and not dated:
         days = pd.Series([str(c).replace(",", ".") for c in cells])
-        values = 86400.0 * pd.to_numeric(days, errors="coerce").to_numpy(dtype=float)
+        values = DAY * pd.to_numeric(days, errors="coerce").to_numpy(dtype=float)
     else:
         form = None if dated else time.format
         texts = [str(c).strip() if form else str(c).strip().replace(",", ".") for c in cells]
@@ -487,12 +502,15 @@ def seconds(grid: Grid, time: forms.Time) -> Floats:
         values = (when - pd.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy(dtype=float)
     for (k,) in first_true(~np.isfinite(values)):
         raise InputError(
-            f"{grid.at(k, time.column)}: '{grid.text(time.column)[k]}' is not "
+            f"{grid.at(k, time.column)}: '{text_of(cells[k])}' is not "
             f"{expected}; see unit of the times in the mapping"
         )
-    if time.unit in units.SECONDS:
-        return values - values.min() if values.min() > EPOCH else values
-    return np.asarray(np.round(values - values.min(), 6))
+    if time.unit in units.TIMES:
+        return values - values.min() if values.min() > EPOCH else values, 0
+    undated = np.all(np.floor(values / DAY) == NO_DATE)
+    midnights = undated & (np.diff(values, prepend=values[:1]) < -DAY / 2)
+    values = values + DAY * np.cumsum(midnights)
+    return np.asarray(np.round(values - values.min(), 6)), int(midnights.sum())
 
 
 def approach_by_order(q: Floats) -> Floats:

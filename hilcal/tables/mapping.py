@@ -9,7 +9,7 @@ from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise
 from hilcal.readings.readings import ObserverKind
 from hilcal.robot.catalogue import configs_dir
-from hilcal.tables.units import CONVENTIONS, NUMBERS, SECONDS, Angle, Length, Temperature
+from hilcal.tables.units import CONVENTIONS, NUMBERS, TIMES, Angle, Length, Temperature
 from hilcal.toml import NonNegative, Positive, Section, load_section, suggest
 
 Column = Annotated[str, Field(min_length=1)] | Annotated[int, Strict(), Field(ge=1)]
@@ -42,13 +42,13 @@ PerJoint = Annotated[tuple[Column, ...], Field(min_length=1, description="one co
 Row = Annotated[int, Strict(), Field(ge=1)]
 UNLOADED = (
     "none", "0", "no", "no load", "unloaded", "empty", "-", "ohne", "leer", "keine", "unbelastet",
-    "sans", "sans charge", "vide", "sin carga", "vacío", "senza", "无", "空载",
+    "sans", "sans charge", "vide", "à vide", "sin carga", "vacío", "senza", "无", "空载",
 )  # fmt: skip
 """Names that mean "no load" unless the mapping lists others, in small letters; a choice."""
 
 TABLE = "table"  # The exchange table: the format that is read without a mapping
 _COLUMN = "the name of a column, or its number from 1"
-_LENGTH = 'a unit of length: "m", "mm", "um" or "in"'
+_LENGTH = 'a unit of length: "m", "cm", "mm", "um" or "in"'
 _ANGLE = 'a unit of angles: "rad", "mrad", "deg" or "arcsec"'
 _POSITION = 'a section [position] with columns = ["x", "y", "z"] and unit = "mm" or so'
 _JOINTS = 'a section [joints] with columns, one per joint, and unit = "deg" or "rad"'
@@ -71,6 +71,11 @@ class FileFormat(Section):
     )
     header_row: Annotated[int, Strict(), Field(ge=0)] = Field(
         1, description="the row of the column names, a whole number from 1; 0 where there is none"
+    )
+    group_row: Row | None = Field(
+        None,
+        description="the row above the header whose names stand over several columns, from 1: it "
+        'tells columns of one name apart, as "Nominal X" and "Measured X"',
     )
     units_row: Row | None = Field(None, description="the row of units, a whole number from 1")
     skip_rows: tuple[Row, ...] = Field((), description="rows that are no readings, from 1")
@@ -201,18 +206,23 @@ class LoadName(Name):
 class Time(Name):
     """[time] and [load_time]: seconds, a date and time, or a spreadsheet's day number."""
 
-    unit: Literal["s", "ms", "min", "h", "iso", "excel", "format"] = Field(
-        description='"s", "ms", "min", "h", "iso" (2024-05-31T12:00:00), "excel" (days since '
-        '1899-12-30), or "format" with the key format'
+    unit: Literal["s", "ms", "us", "ns", "min", "h", "iso", "excel", "format"] = Field(
+        description='"s", "ms", "us", "ns", "min", "h", "iso" (2024-05-31T12:00:00), "excel" '
+        '(days since 1899-12-30), or "format" with the key format'
     )
     format: str | None = Field(
         None, min_length=1, description='as of strptime, e.g. "%d.%m.%Y %H:%M:%S"'
+    )
+    date_column: Column | None = Field(
+        None, description="the column of the date, where the other has the time of day alone"
     )
 
     @model_validator(mode="after")
     def _both(self) -> "Time":
         if (self.unit == "format") != (self.format is not None):
             raise ValueError('unit = "format" and the key format belong together')
+        if self.date_column is not None and self.unit not in ("iso", "format"):
+            raise ValueError('date_column needs unit = "iso" or "format", of date and time of day')
         return self
 
 
@@ -457,7 +467,7 @@ class PointMapping(Section):
             raise ValueError("[target] together with targets in [position]; give one of them")
         if figures > 6 and not targets:
             raise ValueError("[std] has more than 6 figures; it must be 1, 3 or 6")
-        if self.load_time and self.load_time.unit not in SECONDS:
+        if self.load_time and self.load_time.unit not in TIMES:
             raise ValueError('[load_time] unit must be "s", "ms", "min" or "h"')
         return self
 

@@ -18,16 +18,21 @@ from hilcal.toml import check_section
 from hilcal.types import Floats
 
 UNITS = {
-    "m": "m", "meter": "m", "metre": "m", "mm": "mm", "millimeter": "mm", "um": "um",
-    "micron": "um", "in": "in", "inch": "in", "inches": "in",
+    "m": "m", "meter": "m", "metre": "m", "cm": "cm", "mm": "mm", "millimeter": "mm", "um": "um",
+    "micron": "um", "microns": "um", "m2": "m²", "m^2": "m²", "m²": "m²", "mm2": "mm²",
+    "mm^2": "mm²", "mm²": "mm²", "um2": "um²", "um^2": "um²", "um²": "um²", "in": "in",
+    "inch": "in", "inches": "in",
     "rad": "rad", "mrad": "mrad", "deg": "deg", "degree": "deg", "degrees": "deg", "grad": "deg",
     "°": "deg", "arcsec": "arcsec",
     "n": "N", "newton": "N", "kn": "kN", "kgf": "kgf", "lbf": "lbf",
     "nm": "Nm", "n*m": "Nm", "n·m": "Nm", "nmm": "Nmm", "knm": "kNm",
     "kg": "kg", "g": "g", "lb": "lb", "lbs": "lb",
-    "s": "s", "sec": "s", "seconds": "s", "ms": "ms", "min": "min", "h": "h",
+    "s": "s", "sec": "s", "seconds": "s", "ms": "ms", "msec": "ms", "us": "us", "usec": "us",
+    "ns": "ns", "nsec": "ns", "nanoseconds": "ns", "min": "min", "h": "h",
     "c": "degC", "°c": "degC", "degc": "degC", "celsius": "degC", "k": "K", "f": "degF",
-    "°f": "degF", "degf": "degF",
+    "°f": "degF", "degf": "degF", "fahrenheit": "degF", "kelvin": "K", "℃": "degC", "℉": "degF",
+    "米": "m", "毫米": "mm", "微米": "um", "度": "deg", "弧度": "rad", "千克": "kg", "公斤": "kg",
+    "牛": "N", "秒": "s", "毫秒": "ms", "摄氏度": "degC",
 }  # fmt: skip
 """Units as they are written, in small letters, and as a mapping calls them."""
 
@@ -45,11 +50,14 @@ QUATERNION = {"q", "quat", "quaternion"}
 NOMINAL = {
     "goal", "nom", "nominal", "soll", "target", "ziel", "cmd", "command", "commanded", "ref",
     "reference", "ideal", "set", "setpoint", "programmed", "flange", "flansch", "tcp", "robot",
+    "des", "desired", "theo", "theoretical", "theoretisch", "theorique", "teorico", "planned",
+    "expected", "calc", "calculated", "computed", "berechnet", "calcule", "fk", "cad", "design",
 }  # fmt: skip
 MEASURED = {
     "meas", "measured", "measurement", "measure", "ist", "actual", "act", "track", "tracker",
     "laser", "lt", "smr", "gemessen", "mess", "messung", "mesure", "mesuree", "medido", "medida",
-    "obs", "observed", "enc", "encoder", "feedback", "reported", "recorded",
+    "real", "reel", "reelle", "obs", "observed", "enc", "encoder", "feedback", "reported",
+    "recorded",
 }  # fmt: skip
 JOINT = {
     "q", "j", "jt", "jnt", "joint", "joints", "axis", "axes", "achse", "achsen", "gelenk", "axe",
@@ -78,8 +86,8 @@ POSE = {
 LOAD = {"load", "last", "payload", "charge", "carga", "loadcase", "lastfall", "zuladung"}
 MASS = {"mass", "masse", "weight", "gewicht", "masa", "peso"}
 CYCLE = {"cycle", "zyklus", "repeat", "repetition", "wiederholung", "lauf", "ciclo"}
-TIME = {"time", "zeit", "timestamp", "date", "datum", "datetime", "zeitstempel", "temps", "hora",
-        "t"}  # fmt: skip
+TIME = {"time", "zeit", "timestamp", "stamp", "date", "datum", "datetime", "zeitstempel", "temps",
+        "hora", "t"}  # fmt: skip
 REFLECTOR = {"target", "reflector", "reflektor", "prism", "prisma", "smr", "nest"}
 AIR = {"air", "luft", "ambient", "umgebung", "room", "raum", "aire"}
 ARM_JOINTS = ("shoulder pan", "shoulder lift", "elbow", "wrist 1", "wrist 2", "wrist 3")
@@ -90,7 +98,9 @@ DIFFERENCE = {"dev", "delta", "diff", "difference", "error", "err", "residual", 
 CHINESE = {
     "关节": " joint ", "轴": " joint ", "坐标": " ", "位置": " ", "测量": " measured ",
     "温度": " temperature ", "负载": " load ", "编号": " point ", "点号": " point ",
-    "时间": " time ", "实际": " actual ", "理论": " nominal ",
+    "时间": " time ", "实际": " actual ", "理论": " nominal ", "名义": " nominal ",
+    "目标": " nominal ", "指令": " commanded ", "实测": " measured ", "载荷": " load ",
+    "质量": " mass ", "标准差": " std ", "位姿": " pose ",
 }  # fmt: skip
 """Chinese words, and the English words that replace them."""
 
@@ -158,10 +168,10 @@ def _unit(name: str) -> tuple[str, str | None]:
     for bracketed in re.finditer(r"[\[({<]\s*([^\])}>]+?)\s*[\])}>]", plain):
         if unit := UNITS.get(bracketed[1].lower()):
             return plain[: bracketed.start()] + plain[bracketed.end() :], unit
-    ending = re.search(r"[ _/.,-]+([A-Za-z°·*]+)$", plain)
+    ending = re.search(r"[ _/.,-]+([A-Za-z°·*]+|[mu]m2)$", plain)
     if ending and (unit := UNITS.get(ending[1].lower())):
-        single = len(ending[1]) == 1
-        if not single or ending[1] in ("m", "N", "K", "°", "s", "g"):
+        scale = ending[1] in ("C", "F") and "temp" in plain.lower()
+        if len(ending[1]) > 1 or scale or ending[1] in ("m", "N", "K", "°", "s", "g"):
             return plain[: ending.start()], unit
     return plain, None
 

@@ -146,6 +146,8 @@ def _why_unused(g: words.Guesser, column: words.ColumnName) -> str:
         return "a difference"
     if column.has(words.NOMINAL):
         return "a commanded or nominal value"
+    if column.has(words.TIME) and not column.axis:
+        return "no form of time that is known; [time] has unit and format"
     if column.unit in FORCES or (column.has(words.FORCE) and column.axis):
         return "a force; [wrench] takes fx, fy, fz or fz alone, [hung_mass] a weight"
     if values is None:
@@ -320,7 +322,10 @@ def _names(g: words.Guesser) -> None:
                 break
     if (load := g.proposal.sections.get("load")) is not None:
         values = {t.lower() for t in g.grid.text(load["column"])}
-        if not values & {*UNLOADED, ""}:
+        if "" in values and values & set(UNLOADED):
+            empty = sum(not t for t in g.grid.text(load["column"]))
+            g.doubt("load", f"{empty} empty cells count as no load, beside others that say so")
+        elif not values & {*UNLOADED, ""}:
             shown = ", ".join(sorted(values)[: words.N_EXAMPLES])
             g.doubt("load", f"which of its values means no load? Set none = [...] ({shown})")
     _pick(g, "station", words.STATION, lambda n: not g.number(n) and _few_values(g, n))
@@ -375,28 +380,63 @@ def _times(g: words.Guesser) -> None:
     for needed in ("joints", "position"):
         if needed in g.proposal.sections:
             read &= np.isfinite(g.block(g.proposal.sections[needed]["columns"])).any(axis=1)
+    measured = g.grid.rows_with(read)
+    timed = [c for c in g.free.values() if _timed(g, c)]
+    days = [c for c in timed if all(map(_is_day, measured.cells(c.name)))]
+    clocks = [c for c in timed if all(map(_is_clock, measured.cells(c.name)))]
+    choices: list[tuple[words.ColumnName, words.ColumnName | None]] = [
+        *product(clocks, days),
+        *((c, None) for c in sorted(timed, key=lambda c: c in days)),
+    ]
+    for c, day in choices:
+        cells = measured.times(c.name, None if day is None else day.name)
+        guessed = time_unit(cells, c.unit, g.values[c.name])
+        if guessed is not None and len(set(cells)) > 1:
+            section, doubt = guessed
+            if doubt:
+                g.doubt("time", doubt)
+            names = [c.name]
+            if day is not None:
+                section["date_column"] = day.name
+                names.append(day.name)
+            g.assign("time", names, str(section["unit"]), column=c.name, **section)
+            break
     for c in list(g.free.values()):
-        dated = all(isinstance(cell, datetime) for cell in g.grid.cells(c.name))
-        timed = dated or (c.has(words.TIME) and not c.axis)
-        if "time" not in g.proposal.sections and timed:
-            guessed = time_unit(g.grid.rows_with(read), c.name, c.unit, g.values[c.name])
-            if guessed is not None:
-                section, doubt = guessed
-                if doubt:
-                    g.doubt("time", doubt)
-                g.assign("time", [c.name], str(section["unit"]), column=c.name, **section)
-        elif (
+        if (
             "air" not in g.proposal.sections
             and (c.has(words.TEMPERATURE) or (c.has(words.AIR) and c.unit in ("degC", "K", "degF")))
             and g.number(c.name)
             and not c.numbers
         ):
-            values = g.block([c.name])
-            unit = c.unit or ("K" if np.nanmin(values) > 200 else "degC")
+            coldest = np.nanmin(g.block([c.name]))
+            unit = c.unit or ("K" if coldest > 200 else "degF" if coldest > WARMEST else "degC")
+            if c.unit is None and unit != "degC":
+                g.doubt("air", f"no unit stated; {unit}, since the least is {coldest:.4g}")
             if unit in ("degC", "degF", "K"):
                 g.assign("air", [c.name], unit, column=c.name, unit=unit)
 
 
+def _timed(g: words.Guesser, c: words.ColumnName) -> bool:
+    dated = all(isinstance(cell, datetime) for cell in g.grid.cells(c.name))
+    return dated or (c.has(words.TIME) and not c.axis)
+
+
+def _is_clock(cell: Cell) -> bool:
+    """Whether a cell holds a time of day without a date."""
+    if isinstance(cell, datetime):
+        return cell.year == 1900
+    return bool(_CLOCK.fullmatch(str(cell)))
+
+
+def _is_day(cell: Cell) -> bool:
+    """Whether a cell holds a date without a time of day."""
+    if isinstance(cell, datetime):
+        return cell == cell.replace(hour=0, minute=0, second=0, microsecond=0)
+    return isinstance(cell, str) and ":" not in cell and len(re.findall("[0-9]+", cell)) > 1
+
+
+WARMEST = 45.0  # °C of a room in which arms are measured; a choice
+_CLOCK = re.compile(r"\d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?( ?[AP]M)?", re.IGNORECASE)
 HEAD = 400  # Lines that the dialect is guessed from
 MANY_NUMBERS = 0.5  # of those of the sheet that is read: other readings; a choice
 COMMENTS = ("//", "#", "%", "!")
@@ -511,6 +551,12 @@ def _layout(rows: Rows, how: FileFormat) -> tuple[dict[str, Any], tuple[str, ...
             out["units_row"] = rows[title][0]
             title = above[-2]
         out["header_row"], header = rows[title]
+        names = [cell for cell in header if files.filled(cell)]
+        over = rows[title - 1] if title > 0 else (0, ())
+        groups = {cell for cell in over[1] if files.filled(cell)}
+        texts = not any(_is_number(cell, how) for cell in groups)
+        if len(set(names)) < len(names) and len(groups) > 1 and texts:
+            out["group_row"] = over[0]
     width = len(header) or length
     trimmed = files.length_of(header) if header else width
     odd = []
@@ -544,6 +590,15 @@ def _commented_header(text: str, how: dict[str, Any], rows: Rows) -> dict[str, A
     return {"header_row": marked[-1]} if same else {}
 
 
+def _decimal(rows: Rows) -> str:
+    """Return the decimal mark of the numbers that a spreadsheet holds as texts."""
+    texts = [c for _, cells in rows for c in cells if isinstance(c, str) and ("," in c or "." in c)]
+    comma, point = (
+        sum(_is_number(c, FileFormat(decimal=mark, separator=";")) for c in texts) for mark in ",."
+    )
+    return "," if comma > point else "."
+
+
 def _spreadsheet(path: str, content: bytes) -> SniffedFile:
     best: tuple[int, str, Rows] = (0, "", [])
     counts: dict[str, int] = {}
@@ -551,12 +606,16 @@ def _spreadsheet(path: str, content: bytes) -> SniffedFile:
     names = book.sheetnames
     for sheet in names:
         rows = files.sheet_rows(path, book, sheet, None)
-        count = counts[sheet] = sum(isinstance(c, float) for _, cells in rows for c in cells)
+        written = FileFormat(decimal=_decimal(rows))
+        numbers = (np.isfinite(number(c, written)) for _, cells in rows for c in cells)
+        count = counts[sheet] = sum(numbers)
         if count > best[0]:
             best = count, sheet, rows
     if not best[0]:
         raise InputError(f"{path}: no sheet with numbers; it has {', '.join(names)}")
-    how, doubts = _layout(best[2], FileFormat(header_row=0))
+    decimal = {"decimal": _decimal(best[2])}
+    how, doubts = _layout(best[2], FileFormat(header_row=0, **decimal))
+    how |= decimal
     if len(names) > 1:
         how["sheet"] = best[1]
     if others := [s for s in names if s != best[1] and counts[s] > MANY_NUMBERS * best[0]]:

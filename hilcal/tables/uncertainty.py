@@ -18,7 +18,7 @@ MIN_STD = (1e-7, 1e-7)  # m, rad; no instrument in air is better than 0.1 µm an
 DISTINCT = 10  # Values needed to recognise rounding: ten end in zero by chance once in 10^10
 ROUNDING_SHARE = 0.01  # Rounding is added where its variance is more than this share; a choice
 _FINEST = 1e-9
-_PLAUSIBLE = (1e-6, 1e-3)  # m; what trackers and cameras state, to guess what was meant
+PLAUSIBLE = (1e-6, 1e-3)  # m; what trackers and cameras state, to guess what was meant
 
 
 def mapped_covariance(
@@ -256,7 +256,7 @@ def _regularised(
 
 
 def _cause(usual: float) -> str:
-    low, high = _PLAUSIBLE
+    low, high = PLAUSIBLE
     looks = []
     if low <= np.sqrt(usual) <= high:
         looks.append("variances given as standard deviations")

@@ -23,17 +23,18 @@ from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.types import Floats
 
-Length = Literal["m", "mm", "um", "in"]
+Length = Literal["m", "cm", "mm", "um", "in"]
 Angle = Literal["rad", "mrad", "deg", "arcsec"]
 Temperature = Literal["degC", "degF", "K"]
 METRIC = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6}
-LENGTHS = {**METRIC, "in": 0.0254}  # Metres in a unit
+LENGTHS = {**METRIC, "cm": 1e-2, "in": 0.0254}  # Metres in a unit
 ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": 0.017453292519943295, "arcsec": 4.84813681109536e-6}
 """Radians in a unit."""
 FORCES = {"N": 1.0, "kN": 1e3, "kgf": 9.80665, "lbf": 4.4482216152605}  # Newtons in a unit
 MOMENTS = {"Nm": 1.0, "Nmm": 1e-3, "kNm": 1e3}  # Newton metres in a unit
 MASSES = {"kg": 1.0, "g": 1e-3, "lb": 0.45359237}  # Kilograms in a unit
 SECONDS = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}  # Seconds in a unit of time
+TIMES = {**SECONDS, "us": 1e-6, "ns": 1e-9}  # Seconds in a unit of the times of a table
 _QUANTITY = re.compile(
     r"\s*(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(?P<unit>\S*)\s*"
 )

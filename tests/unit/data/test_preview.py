@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from hilcal.tables.files import decoded, guessed_encoding, open_grid
+from hilcal.tables.mapped import seconds
 from hilcal.tables.mapping import Mapping, load_mapping
 from hilcal.tables.propose import propose
 from hilcal.toml import check_section, read_toml
@@ -256,3 +257,79 @@ def test_angles_beside_encoder_counts_are_read(tmp_path):
     proposal = propose(write(tmp_path / "a.csv", text), joints=6).proposal
     assert proposal.sections["joints"]["columns"] == six("q{} [°]")
     assert not proposal.missing
+
+
+@pytest.mark.parametrize("names", [
+    ("{}_des", "{}_real"), ("{} theor.", "{} mesuré"), ("X", "T{}"), ("理论{}", "实测{}"),
+])  # fmt: skip
+def test_commanded_positions_are_not_taken_for_measured_ones(names, tmp_path):
+    nominal, measured = ([name.replace("X", "{}").format(e) for e in "XYZ"] for name in names)
+    text = lines([*nominal, *six("A{}"), *measured], MM + 3.0, DEG, MM)
+    found = propose(write(tmp_path / "t.csv", text)).proposal
+    plain = names[1] == "T{}"  # the names do not tell: said
+    assert found.sections["position"]["columns"] == (nominal if plain else measured)
+    assert any("are used, not 'TX'" in words for _, words in found.doubts) is plain
+
+
+@pytest.mark.parametrize("repeated", [False, True])
+def test_names_over_several_columns_tell_those_of_one_name_apart(repeated, tmp_path):
+    header = ["Nr", *six("A{}"), *"XYZ", *"XYZ"]
+    over = [*[""] * 7, *["Nominal [mm]", *2 * ["Nominal [mm]" * repeated]]]
+    over += ["Measured [mm]", *2 * ["Measured [mm]" * repeated]]
+    text = ";".join(over) + "\n" + lines(header, POINTS, DEG, MM + 3.0, MM)
+    found = propose(write(tmp_path / "t.csv", text)).proposal.mapping(Mapping)
+    assert found.position.columns == tuple(f"Measured [mm] {e}" for e in "XYZ")
+    assert (found.file.group_row, found.file.header_row) == (1, 2)
+
+
+@pytest.mark.parametrize(("names", "figure", "section"), [
+    (("sx", "sy", "sz"), 2.5, {"std": "um"}),
+    (("sx", "sy", "sz"), 0.02, {"std": "mm"}),
+    (("sx", "sy", "sz"), 2e-5, {"std": "m"}),
+    (("sx_um", "sy_um", "sz_um"), 0.5, {"std": "um"}),
+    (("sx [mm²]", "sy [mm²]", "sz [mm²]"), 4e-4, {"std": "mm"}),
+    (("cov_xx [um^2]", "cov_xy [um^2]", "cov_xz [um^2]", "cov_yy [um^2]", "cov_yz [um^2]",
+      "cov_zz [um^2]"), 4.0, {"covariance": "um"}),
+    (("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"), 4.0, {"covariance": "um"}),
+    (("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"), 4e-4, {"covariance": "mm"}),
+    (("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"), 4e-10, {"covariance": "m"}),
+])  # fmt: skip
+def test_uncertainties_are_in_their_own_unit(names, figure, section, tmp_path):
+    figures = np.tile([figure, *[figure * (len(names) == 3)] * 2, *[figure] * 3][: len(names)], N)
+    header = [*six("A{}"), "X [mm]", "Y [mm]", "Z [mm]", *names]
+    text = lines(header, DEG, MM, figures.reshape(N, -1), digits=12)
+    sections = propose(write(tmp_path / "t.csv", text)).proposal.sections
+    found = {k: v["unit"] for k, v in sections.items() if k in ("std", "covariance")}
+    assert found == section
+    assert sections.get("std", {}).get("kind", "std") == "variance" if "²" in names[0] else "std"
+
+
+@pytest.mark.parametrize(("name", "section"), [
+    ("X [cm]", {"position": "cm"}), ("Temp_F", {"air": "degF"}), ("Temperature", {"air": "degF"}),
+    ("time_us", {"time": "us"}), ("stamp_ns", {"time": "ns"}),
+    ("负载(千克)", {"hung_mass": "kg"}),
+])  # fmt: skip
+def test_stated_units_are_not_left_out(name, section, tmp_path):
+    axes = [name.replace("X", e) for e in "XYZ"] if "X" in name else list("XYZ")
+    other = 70.0 + 0.1 * np.arange(N) if "X" not in name else POINTS
+    text = lines([*six("A{}"), *axes, name if "X" not in name else "Nr"], DEG, MM / 10, other)
+    sections = propose(write(tmp_path / "t.csv", text)).proposal.sections
+    assert {k: sections[k]["unit"] for k in section} == section
+
+
+START = datetime(2024, 5, 31, 23, 15)
+
+
+@pytest.mark.parametrize("forms", [
+    ("%d-%b-%Y %H:%M:%S",), ("%m/%d/%Y %H:%M",), ("%Y/%m/%d %H:%M",), ("%H:%M:%S",),
+    ("%Y-%m-%d", "%H:%M:%S"), ("%d.%m.%Y", "%H:%M:%S"), ("%m/%d/%Y", "%I:%M:%S %p"),
+])  # fmt: skip
+def test_times_over_midnight(forms, tmp_path):
+    stamps = [START + timedelta(minutes=5 * k) for k in range(N)]
+    names = ["Date", "Time"][-len(forms) :]
+    texts = [[t.strftime(form) for t in stamps] for form in forms]
+    text = lines([*names, *six("A{}"), "X", "Y", "Z"], *texts, DEG, MM)
+    found = propose(write(tmp_path / "t.csv", text))
+    values, midnights = seconds(found.grid, found.proposal.mapping(Mapping).time)
+    np.testing.assert_allclose(values, 300.0 * np.arange(N))
+    assert midnights == (forms == ("%H:%M:%S",))

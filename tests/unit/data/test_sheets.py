@@ -182,3 +182,27 @@ def test_an_exchange_table_may_be_a_sheet(tmp_path, arm):
     out.active.cell(3, 9, "abc")
     out.save(sheet)
     refusal(r"t.xlsx: row 3, column 'x_m': 'abc' is not a number", import_table, sheet, arm, NOISE)
+
+
+def test_merged_cells_and_numbers_as_texts(tmp_path, arm):
+    """Three repeats of each state: its load and pose stand in cells that are merged."""
+    out = openpyxl.Workbook()
+    sheet = out.active
+    sheet.append(["Pose", "Load", *NAMES, "X", "Y", "Z"])
+    for k in range(24):
+        angles = [f"{v:.6f}".replace(".", ",") for v in np.rad2deg(C.q[k // 6])]
+        load = ["none", "5 kg"][k // 3 % 2]
+        first = k % 3 == 0
+        sheet.append(["P" * first, load if first else None, *angles, *(1e3 * C.position[k // 6])])
+        sheet.cell(k + 2, 1).value = f"P{k // 6}" if k % 6 == 0 else None
+        if first:
+            sheet.merge_cells(start_row=k + 2, end_row=k + 4, start_column=2, end_column=2)
+        if k % 6 == 0:
+            sheet.merge_cells(start_row=k + 2, end_row=k + 7, start_column=1, end_column=1)
+    out.save(tmp_path / "t.xlsx")
+    found = propose(tmp_path / "t.xlsx").proposal.mapping(Mapping)
+    assert (found.file.decimal, found.pose.column) == (",", "Pose")
+    x = read(tmp_path / "t.xlsx", found, arm)
+    assert [x.load_names[k] for k in x.load] == 4 * [*3 * ["none"], *3 * ["5 kg"]]
+    assert x.pose_names == ("P0", "P1", "P2", "P3")
+    np.testing.assert_allclose(x.states.q, np.repeat(C.q[:4], 6, axis=0), atol=2e-8)
