@@ -80,7 +80,7 @@ def import_(
         )
         t.show(f"  targets: {'; '.join(named)}")
     torques = check_torques(cell, readings)
-    registered = misdescription = likely_arm = None
+    registered = misdescription = likely_arm = computed = None
     lines = [*notes, *words.torque_lines(torques)]
     with suppress(CannotAnswerError):  # the readings do not determine the registration
         registered = register(cell, readings)
@@ -89,6 +89,9 @@ def import_(
         if misdescription is None or not misdescription.refused:
             lines += words.registration_lines(registered)
             likely_arm = other_arm(registered, readings)
+            computed = words.computed_share(registered, readings)
+    if registered is not None and computed is not None:
+        lines.append(f"Note: {words.computed_line(registered, computed)}.")
     if likely_arm is not None:
         lines.append(f"Note: {words.other_arm_line(likely_arm)}")
     if misdescription is not None:
@@ -108,6 +111,7 @@ def import_(
         noise=None if noise is None else asdict(noise),
         notes=list(notes),
         description=None if misdescription is None else misdescription.to_json(cell, readings),
+        computed_positions=computed is not None,
         other_arm=None if likely_arm is None else likely_arm.to_json(),
         torques=None if torques is None else torques.to_json(),
         frames=None if registered is None else registered.to_json(),

@@ -11,7 +11,7 @@ from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.robot.chain import evaluate
 from hilcal.store.campaign_file import CampaignFile
 from tests.support.cli_cases import ok, refused
-from tests.support.foreign_tables import CELL, campaign, lines, write
+from tests.support.foreign_tables import CELL, OFFSET, campaign, lines, write
 
 C = campaign(12)
 NAMES = [f"A{k}" for k in range(1, 7)]
@@ -174,6 +174,18 @@ def test_a_good_table(tmp_path, capsys):
     np.testing.assert_allclose(x.value, C.position, atol=1e-8)
     np.testing.assert_allclose(x.states.wrench[0], [0, 0, -5 * 9.80665, 0, 0, 0])
     np.testing.assert_allclose(x.covariance[0], (2e-5) ** 2 * np.eye(3), rtol=1e-9, atol=1e-18)
+
+
+@pytest.mark.parametrize("computed", [False, True])
+def test_positions_computed_from_the_joints_are_noticed(computed, tmp_path, capsys):
+    """Commanded positions in the place of measured ones: the nominal arm fits them too well."""
+    flange = evaluate(load_arm(load_config(CELL).robot.model), C.q)
+    target = flange.position[-1] + flange.rotation[-1] @ OFFSET
+    rows = [line.split(";") for line in GOOD.splitlines()]
+    for row, position in zip(rows[1:], 1e3 * target, strict=True):
+        row[7:10] = [f"{x:.2f}" for x in position] if computed else row[7:10]
+    d = imported(capsys, tmp_path, "\n".join(map(";".join, rows)) + "\n")
+    assert d["computed_positions"] is computed
 
 
 def test_copied_rows_are_said_and_counted_once(tmp_path, capsys):
