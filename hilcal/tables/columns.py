@@ -366,7 +366,9 @@ def check_wrenches(
     limit = 20 * arm.payload * STANDARD_GRAVITY_M_S2 * np.repeat([1.0, arm.reach], 3)
     heavy = (np.abs(wrench) > limit) & (arm.payload > 0)
     beyond = f"beyond 20 times the payload of {arm.name}; expected N and N·m"
-    table.refuse(loaded, WRENCH, lambda v: f"{v:g}: the load is 'none', so the wrench must be 0")
+    zero = "the load is 'none', so the wrench must be 0"
+    tool = "what an unzeroed sensor reads of the tool is no load: its weight is [tool] mass_kg"
+    table.refuse(loaded, WRENCH, lambda v: f"{v:g}: {zero}; {tool}")
     table.refuse(heavy, WRENCH, lambda v: f"{v:g}: {beyond}")
 
 

@@ -1,9 +1,9 @@
 """Guesses of positions, orientations, forces and uncertainties, by names, axes and values."""
 
+import itertools
 import re
 from collections.abc import Sequence
 from datetime import datetime
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -125,7 +125,9 @@ def guess_by_values(g: words.Guesser) -> None:
     has_joints = "joints" in g.proposal.sections
     has_position = bool({"position", "distance", "gauge"} & set(g.proposal.sections))
     ranked: list[tuple[float, list[str], list[str]]] = []
-    pairs = product([[]] if has_joints else runs(g.joints or 6), [[]] if has_position else runs(3))
+    pairs = itertools.product(
+        [[]] if has_joints else runs(g.joints or 6), [[]] if has_position else runs(3)
+    )
     for joints, position in pairs:
         if set(joints) & set(position) or (joints and size(joints) > MOST_DEGREES):
             continue
@@ -176,7 +178,7 @@ def _lone_distance(g: words.Guesser, free: list[str], runs: list[list[str]]) -> 
 def _orientation_by_values(g: words.Guesser, free: list[str]) -> None:
     if "orientation" in g.proposal.sections:
         return
-    for width, k in product((3, 4), range(len(free) - 8)):  # 4: a position ends each row
+    for width, k in itertools.product((3, 4), range(len(free) - 8)):  # 4: a position ends each row
         rows = [free[k + i * width : k + i * width + width] for i in range(3)]
         names = [name for row in rows for name in row[:3]]
         if len(names) < 9:
@@ -436,8 +438,18 @@ def _vertical_force(g: words.Guesser) -> None:
     g.assign("wrench", names, f"fz, {unit}", unit=unit)
 
 
+def _std_beside(g: words.Guesser) -> dict[str, str] | None:
+    """Return standard deviations without an axis that each follow an axis of the position."""
+    position = g.proposal.sections["position"]["columns"]
+    after = dict(itertools.pairwise(g.columns))
+    beside = [c for c in map(after.get, map(g.column, position)) if c is not None]
+    if len(beside) != 3 or not all(c.has(words.STD) and g.number(c.name) for c in beside):
+        return None
+    return dict(zip("xyz", (c.name for c in beside), strict=True))
+
+
 def _std(g: words.Guesser, complete: Group, stem: tuple[object, ...], position_unit: str) -> None:
-    axes = _columns_like(complete.get("std", {}), stem)
+    axes = _columns_like(complete.get("std", {}), stem) or _std_beside(g)
     scalar = words.DISTANCE | words.GAUGE
     columns = [c for c in g.columns if c.name in g.free and c.has(words.STD) and not c.axis]
     single = [c.name for c in columns if g.number(c.name) and not (c.numbers or c.has(scalar))]

@@ -257,6 +257,10 @@ class Guesser:
             return None
         return values if np.isfinite(values).any() else None
 
+    def column(self, name: str) -> ColumnName:
+        """Return the parsed name of a column."""
+        return self.columns[self.grid.names.index(name)]
+
     def number(self, name: str) -> bool:
         """Whether a column holds numbers."""
         return self.values[name] is not None

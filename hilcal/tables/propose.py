@@ -131,7 +131,8 @@ def guess(grid: Grid, joints: int | None = None, joint_names: Sequence[str] = ()
     if "joints" not in g.proposal.sections:
         second = "no joint angles: where they are in a file of their own, give it with --second"
         g.proposal.missing.append(counts or second)
-    if "pose" not in g.proposal.sections and "joints" in g.proposal.sections:
+    said = any(about == "pose" for about, _ in g.proposal.doubts)
+    if "pose" not in g.proposal.sections and "joints" in g.proposal.sections and not said:
         g.doubt("pose", "no column names the pose: rows of the same joints count as one pose")
     if not {"load", "hung_mass", "wrench"} & set(g.proposal.sections):
         g.doubt("load", "no column tells the load: all readings count as unloaded")
@@ -292,6 +293,9 @@ def _distances(g: words.Guesser) -> None:
             section["name"] = "A" if kind == "distance" else "G"
             g.doubt(kind, f"no column names what it is of: all count as of {section['name']}")
         g.assign(kind, plain[:1], unit, column=plain[0], **section)
+        if plain[1:]:
+            listed = ", ".join(f"'{name}'" for name in plain[1:])
+            g.doubt(kind, f"a row has one, not {listed}: write each in a row of its own")
         for key in ("std_column", "name_column"):
             g.free.pop(section.get(key, ""), None)
 
@@ -331,6 +335,8 @@ def _names(g: words.Guesser) -> None:
     _pick(g, "station", words.STATION, lambda n: not g.number(n) and _few_values(g, n))
     _pick(g, "cycle", words.CYCLE, lambda n: g.number(n) and _whole_numbers(g, n))
     _pick(g, "target", words.REFLECTOR, lambda n: not g.number(n) and _few_values(g, n))
+    if "target" not in g.proposal.sections:
+        _pick(g, "target", words.POSE, lambda n: _in_each_state(g, n))
 
 
 def _pick(
@@ -355,12 +361,35 @@ def _few_values(g: words.Guesser, name: str) -> bool:
     return 1 < count <= min(20, len(g.grid.rows) // 2)
 
 
+def _in_each_state(g: words.Guesser, name: str) -> bool:
+    """Whether each pose has every name equally often under each load, as those of reflectors."""
+    q = g.proposal.sections.get("joints")
+    if q is None or g.number(name) or not _few_values(g, name):
+        return False
+    of_load = [g.proposal.sections.get(kind) for kind in ("load", "hung_mass")]
+    loads = [g.grid.text(section["column"]) for section in of_load if section is not None]
+    states = zip(map(tuple, g.block(q["columns"]).tolist()), *loads, strict=True)
+    names: dict[tuple[object, ...], Counter[str]] = {}
+    for state, text in zip(states, g.grid.text(name), strict=True):
+        names.setdefault(state, Counter())[text] += 1
+    count = len(set(g.grid.text(name)))
+    alike = all(len(c) == count and len(set(c.values())) == 1 for c in names.values())
+    if alike:
+        g.doubt("target", f"'{name}' has each of its names in every pose: taken for reflectors")
+    return alike
+
+
 def _names_poses(g: words.Guesser, name: str, joints: dict[str, Any]) -> bool:
     """Whether rows of one name have the same joint angles, or nearly so (then: reported angles)."""
     texts = g.grid.text(name)
     if "" in texts:
         return False
     q = g.block(joints["columns"]) * ANGLES[joints["unit"]]
+    if len(set(texts)) == len(texts) > len(np.unique(q, axis=0)):
+        g.doubt(
+            "pose", f"'{name}' names rows, not poses: rows of the same joints count as one pose"
+        )
+        return False
     first: dict[str, int] = {}
     rows = [first.setdefault(text, k) for k, text in enumerate(texts)]
     off = np.nan_to_num(np.abs(q - q[rows]))

@@ -333,3 +333,43 @@ def test_times_over_midnight(forms, tmp_path):
     values, midnights = seconds(found.grid, found.proposal.mapping(Mapping).time)
     np.testing.assert_allclose(values, 300.0 * np.arange(N))
     assert midnights == (forms == ("%H:%M:%S",))
+
+
+def test_standard_deviations_without_an_axis_follow_their_position(tmp_path):
+    pairs = np.stack([MM, SIGMA[:, :3]], axis=2).reshape(N, 6)
+    text = lines([*six("A{}"), "X", "std", "Y", "std", "Z", "std"], DEG, pairs)
+    std = propose(write(tmp_path / "t.csv", text)).proposal.sections["std"]
+    assert std["columns"] == ["std", "std (2)", "std (3)"]
+
+
+@pytest.mark.parametrize("numbers", [True, False])
+def test_names_of_rows_are_not_those_of_poses(numbers, tmp_path):
+    """Each pose is read unloaded and loaded; the rows are numbered."""
+    names = np.arange(1, 2 * N + 1) if numbers else [f"M{k}" for k in range(2 * N)]
+    twice = (np.repeat(values, 2, axis=0) for values in (DEG, MM))
+    text = lines(["No.", *six("A{}"), "X", "Y", "Z", "Load"], names, *twice, N * ["none", "5 kg"])
+    found = propose(write(tmp_path / "t.csv", text)).proposal
+    assert "pose" not in found.sections
+    assert [words.split(":")[0] for about, words in found.doubts if about == "pose"] == [
+        "'No.' names rows, not poses"
+    ]
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_reflectors_row_by_row(whole, tmp_path):
+    """Every pose has a row of each reflector under each load; names that it lacks are others."""
+    label, loads = N * ["A", "B", "A", "B"], N * ["none", "none", "5 kg", "5 kg"]
+    label[-1] = label[-1] if whole else "A"
+    four = (np.repeat(values, 4, axis=0) for values in (DEG, MM))
+    header = ["Pose", "Point", "Load", *six("A{}"), "X", "Y", "Z"]
+    text = lines(header, [p for p in POINTS for _ in range(4)], label, loads, *four)
+    found = propose(write(tmp_path / "t.csv", text)).proposal.sections
+    assert found["pose"]["column"] == "Pose"
+    assert ("target" in found) is whole
+
+
+def test_distances_that_stand_side_by_side_are_said_not_to_be_read(tmp_path):
+    text = lines([*six("A{}"), "distance 1", "distance 2"], DEG, MM[:, :2])
+    doubts = propose(write(tmp_path / "t.csv", text)).proposal.doubts
+    (said,) = [words for about, words in doubts if about == "distance" and "row" in words]
+    assert said == "a row has one, not 'distance 2': write each in a row of its own"
