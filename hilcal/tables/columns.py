@@ -244,10 +244,14 @@ def check_joints(table: ColumnTable, names: tuple[str, ...], q: Floats, arm: Arm
     """Refuse commanded joints beyond the arm's limits; (N, n), rad."""
     most = np.maximum(np.abs(arm.q_min), np.abs(arm.q_max))
     large, turns = np.abs(q[:, ~arm.slides]).max(initial=0.0), most[~arm.slides].max(initial=0.0)
-    seems = " (looks like degrees)" if large > max(turns + 1, 2 * np.pi) else ""
+    counted = (
+        "; where the controller counts from another zero or the other way, [robot] "
+        "joint_offset_deg and joint_sign of CELL.toml say so"
+    )
+    seems = " (looks like degrees)" if large > max(turns + 1, 2 * np.pi) else counted
     for i, j in first_true((q < arm.q_min - _LIMIT_MARGIN) | (q > arm.q_max + _LIMIT_MARGIN)):
         if arm.slides[j]:
-            seems = " (looks like millimetres)" if abs(q[i, j]) > 10 * most[j] else ""
+            seems = " (looks like millimetres)" if abs(q[i, j]) > 10 * most[j] else counted
         elif q[:, j].min() >= 0 and arm.q_min[j] <= q[i, j] - 2 * np.pi <= min(arm.q_max[j], 0):
             seems = (
                 "; it is within them a whole turn on: were the angles counted from 0 to 360°? "

@@ -314,17 +314,28 @@ def _rank(stem: tuple[object, ...]) -> tuple[int, int]:
 
 
 def _covariance(g: words.Guesser) -> None:
-    """Covariances "cov_x_y" ...: the upper triangle or all nine."""
+    """Covariances "cov_x_y", "Sxy", "C12" ...: the upper triangle or all nine."""
     by_axes: dict[str, str] = {}
-    for name in g.grid.names:
-        plain = "".join(ch for ch in name.lower().split("[")[0] if ch.isalpha())
-        if plain.startswith(("cov", "kov")) and plain[3:5].strip("xyz") == "":
-            by_axes[plain[3:5]] = name
+    for name in g.free:
+        plain = re.sub(r"[^a-z0-9]", "", words.without_unit(name))
+        if g.number(name) and (match := _COVARIANCE.fullmatch(plain)):
+            by_axes[match["axes"].translate(_AXIS_NUMBERS)] = name
     upper = ["xx", "xy", "xz", "yy", "yz", "zz"]
-    if all(axes in by_axes for axes in upper):
-        names = [by_axes[axes] for axes in upper]
-        unit = _std_unit(g, "covariance", [by_axes[axes] for axes in ("xx", "yy", "zz")], 2, ())
-        g.assign("covariance", names, f"upper triangle, {unit}²", unit=unit)
+    if not all(axes in by_axes for axes in upper):
+        return
+    names = [by_axes[axes] for axes in upper]
+    xx, xy, xz, yy, yz, zz = g.block(names).T
+    bounded = (xy**2 <= xx * yy) & (xz**2 <= xx * zz) & (yz**2 <= yy * zz) & (xx >= 0)
+    if not np.all(bounded[np.isfinite(g.block(names)).all(axis=1)]):
+        return
+    unit = _std_unit(g, "covariance", [by_axes[axes] for axes in ("xx", "yy", "zz")], 2, ())
+    g.assign("covariance", names, f"upper triangle, {unit}²", unit=unit)
+
+
+_COVARIANCE = re.compile(
+    r"(cov|kov|covariance|kovarianz|sigma|s|c|v)(?P<axes>[xyz]{2}|[123]{2})((u|m)?m2?)?"
+)
+_AXIS_NUMBERS = str.maketrans("123", "xyz")
 
 
 def _orientation(g: words.Guesser, complete: Group, stem: tuple[object, ...]) -> None:

@@ -293,6 +293,8 @@ def test_names_over_several_columns_tell_those_of_one_name_apart(repeated, tmp_p
     (("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"), 4.0, {"covariance": "um"}),
     (("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"), 4e-4, {"covariance": "mm"}),
     (("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"), 4e-10, {"covariance": "m"}),
+    (("Sxx", "Sxy", "Sxz", "Syy", "Syz", "Szz"), 4e-4, {"covariance": "mm"}),
+    (("C11", "C12", "C13", "C22", "C23", "C33"), 4e-4, {"covariance": "mm"}),
 ])  # fmt: skip
 def test_uncertainties_are_in_their_own_unit(names, figure, section, tmp_path):
     figures = np.tile([figure, *[figure * (len(names) == 3)] * 2, *[figure] * 3][: len(names)], N)
