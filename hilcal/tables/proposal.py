@@ -89,7 +89,7 @@ CYCLE = {"cycle", "zyklus", "repeat", "repetition", "wiederholung", "lauf", "cic
 TIME = {"time", "zeit", "timestamp", "stamp", "date", "datum", "datetime", "zeitstempel", "temps",
         "hora", "t"}  # fmt: skip
 REFLECTOR = {"target", "reflector", "reflektor", "prism", "prisma", "smr", "nest"}
-AIR = {"air", "luft", "ambient", "umgebung", "room", "raum", "aire"}
+AIR = {"air", "tamb", "amb", "luft", "ambient", "umgebung", "room", "raum", "aire"}
 ARM_JOINTS = ("shoulder pan", "shoulder lift", "elbow", "wrist 1", "wrist 2", "wrist 3")
 """Joint names of Universal Robots arms under ROS, in order."""
 

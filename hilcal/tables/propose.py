@@ -20,7 +20,7 @@ from hilcal.tables.columns import required_columns
 from hilcal.tables.grid import Cell, Grid, joined, number
 from hilcal.tables.guess_values import guess_axes, guess_by_values, is_quaternion, time_unit
 from hilcal.tables.mapping import UNLOADED, FileFormat
-from hilcal.tables.units import ANGLES, FORCES, LENGTHS, MASSES, MOMENTS
+from hilcal.tables.units import ANGLES, FORCES, LENGTHS, MASSES, MOMENTS, TIMES
 from hilcal.types import Floats
 
 EXCHANGE_NAMES = (
@@ -147,7 +147,7 @@ def _why_unused(g: words.Guesser, column: words.ColumnName) -> str:
         return "a difference"
     if column.has(words.NOMINAL):
         return "a commanded or nominal value"
-    if column.has(words.TIME) and not column.axis:
+    if values is None and column.has(words.TIME) and any(g.grid.text(column.name)):
         return "no form of time that is known; [time] has unit and format"
     if column.unit in FORCES or (column.has(words.FORCE) and column.axis):
         return "a force; [wrench] takes fx, fy, fz or fz alone, [hung_mass] a weight"
@@ -433,7 +433,7 @@ def _times(g: words.Guesser) -> None:
     for c in list(g.free.values()):
         if (
             "air" not in g.proposal.sections
-            and (c.has(words.TEMPERATURE) or (c.has(words.AIR) and c.unit in ("degC", "K", "degF")))
+            and (c.has(words.TEMPERATURE) or (c.has(words.AIR | {"t"}) and c.unit in DEGREES))
             and g.number(c.name)
             and not c.numbers
         ):
@@ -441,13 +441,17 @@ def _times(g: words.Guesser) -> None:
             unit = c.unit or ("K" if coldest > 200 else "degF" if coldest > WARMEST else "degC")
             if c.unit is None and unit != "degC":
                 g.doubt("air", f"no unit stated; {unit}, since the least is {coldest:.4g}")
-            if unit in ("degC", "degF", "K"):
+            if unit in DEGREES:
                 g.assign("air", [c.name], unit, column=c.name, unit=unit)
 
 
 def _timed(g: words.Guesser, c: words.ColumnName) -> bool:
-    dated = all(isinstance(cell, datetime) for cell in g.grid.cells(c.name))
-    return dated or (c.has(words.TIME) and not c.axis)
+    """Whether a column may hold times; "t" alone, which may be a temperature, if they rise."""
+    if all(isinstance(cell, datetime) for cell in g.grid.cells(c.name)):
+        return True
+    named = c.has(words.TIME) and not c.axis and c.unit in (None, *TIMES)
+    values = g.values[c.name]
+    return named and (c.words != ("t",) or values is None or not np.any(np.diff(values) < 0))
 
 
 def _is_clock(cell: Cell) -> bool:
@@ -464,6 +468,7 @@ def _is_day(cell: Cell) -> bool:
     return isinstance(cell, str) and ":" not in cell and len(re.findall("[0-9]+", cell)) > 1
 
 
+DEGREES = ("degC", "degF", "K")
 WARMEST = 45.0  # °C of a room in which arms are measured; a choice
 _CLOCK = re.compile(r"\d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?( ?[AP]M)?", re.IGNORECASE)
 HEAD = 400  # Lines that the dialect is guessed from

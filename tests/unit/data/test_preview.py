@@ -309,7 +309,8 @@ def test_uncertainties_are_in_their_own_unit(names, figure, section, tmp_path):
 @pytest.mark.parametrize(("name", "section"), [
     ("X [cm]", {"position": "cm"}), ("Temp_F", {"air": "degF"}), ("Temperature", {"air": "degF"}),
     ("time_us", {"time": "us"}), ("stamp_ns", {"time": "ns"}),
-    ("负载(千克)", {"hung_mass": "kg"}),
+    ("负载(千克)", {"hung_mass": "kg"}), ("T [°F]", {"air": "degF"}),
+    ("T_air [°F]", {"air": "degF"}), ("t", {"time": "s"}),
 ])  # fmt: skip
 def test_stated_units_are_not_left_out(name, section, tmp_path):
     axes = [name.replace("X", e) for e in "XYZ"] if "X" in name else list("XYZ")
