@@ -96,6 +96,9 @@ BACKGROUND_OVERRIDES = (
     "residual_is_noise", "inseparable_addition", "arm_scatter", "misjudged_noise",
 )  # fmt: skip
 """Reasons that "background" overrides where effects are proved together, not one by one."""
+OVERSTATED = 0.25
+"""Variance factor below which the stated noise is wrong, whatever a background explains: it is
+stated twice too large. A choice."""
 MOST_POSE_SHARE = 0.5
 """Share of the misfit that all readings of a pose have in common, above which it is not the scatter
 of single arrivals; a choice."""
@@ -313,9 +316,14 @@ def _judged(e: Evidence, history: History, whole_catalogue: bool) -> Diagnosis:
         serial = readings.serial
         if reason in ("residual_is_noise", "arm_scatter") and serial and not serial.proved:
             reason = "serial_or_effect"
-        if e.background and (
-            (reason == "misjudged_noise" and not repeated)
-            or (reason in BACKGROUND_OVERRIDES and p_value_of_others(e.fit) <= JOINT_LEVEL)
+        overstated = noise.reason == "too_large" and e.fit.variance_factor < OVERSTATED
+        if (
+            e.background
+            and not overstated
+            and (
+                (reason == "misjudged_noise" and not repeated)
+                or (reason in BACKGROUND_OVERRIDES and p_value_of_others(e.fit) <= JOINT_LEVEL)
+            )
         ):
             reason, suspects = "background", (*as_suspects(e.background), *suspects)
     alone = None

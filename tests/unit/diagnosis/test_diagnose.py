@@ -20,7 +20,9 @@ from hilcal.identification.linearisation import linearise
 from hilcal.model.observe import motion
 from hilcal.present.diagnosis import detectable_sizes
 from hilcal.present.verdict import headline, message
-from tests.support.campaigns import campaign, noiseless, plan, with_noise
+from hilcal.refinement import refine
+from studies.study_cases import study_case
+from tests.support.campaigns import campaign, configuration, noiseless, plan, with_noise
 from tests.support.diagnosis_cases import fitted_baseline
 from tests.support.refusals import refusal
 from tests.support.rows import first
@@ -117,6 +119,18 @@ def test_misjudged_noise_is_told_from_a_missing_effect_by_repeats(mode, factor):
     # The 95 % interval, and half as much again.
     assert low < 1.25 * factor**2
     assert high > factor**2 / 1.25
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("stated", [20.0, 100.0])
+def test_noise_that_is_stated_far_too_large_is_told_beside_a_background(stated):
+    """As by another unit; the arm's own errors are smaller than it, and all are in a background."""
+    c = study_case(configuration(), "ur5e", "absolute", (), 0.0, 1, stated=stated, n_poses=20)
+    readings = c.readings[c.readings.load == 0]
+    last = refine(baseline(c.cell, readings, "absolute"), readings, "absolute")
+    assert last.fit.model.background
+    assert last.verdict == "noise_misjudged"
+    assert "the stated covariance is too large" in message(last.diagnosis)
 
 
 def test_misjudged_noise_without_repeats_cannot_be_known_to_be_it():
