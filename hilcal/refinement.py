@@ -11,6 +11,7 @@ from hilcal.diagnosis.background_evidence import (
     BackgroundEffect,
     background_evidence,
     background_is_better,
+    explained_share,
     left_out_squares,
     p_value_of_others,
     proved,
@@ -25,6 +26,7 @@ from hilcal.diagnosis.unknown_law import (
     REMAINDER,
     has_remainder,
     with_remainder,
+    with_same_remainder,
     without_remainder,
 )
 from hilcal.diagnosis.verdict import (
@@ -461,16 +463,20 @@ class Path:
                 return False
         if not background_is_better(named, fitted):
             return False
-        if d.verdict == "unknown_effect" and not predicts_better(named, fitted):
-            return False
+        if d.verdict == "unknown_effect":
+            share = explained_share(named, fitted)
+            if not predicts_better(named, fitted) or share <= d.predictable_share:
+                return False
         self._say("the background of all effects predicts better; diagnosing")
         self._append_background(fitted, BACKGROUND)
         return True
 
     def add_remainder(self) -> bool:
-        """Fit what follows joint angles beside named effects alone; whether the model has it now.
+        """Fit what follows the pose beside the added effects alone; whether the model has it now.
 
-        See `with_remainder`; a background has its own.
+        See `with_remainder`; a background has its own. The added effects may only have resembled
+        what is missing: they go unless they predict poses left out better beside it, and can be
+        added again.
         """
         last = self.steps[-1]
         tried = has_remainder(last.fit) or last.fit.model.background
@@ -478,10 +484,16 @@ class Path:
             return False
         if last.diagnosis.reason != "no_suspect":
             return False
-        fitted = with_remainder(last.fit, self._regressions)
+        fitted = with_remainder(last.fit, self._regressions, self._start)
         if fitted is None:
             return False
-        self._say("what follows joint angles predicts better; diagnosing")
+        first = self.steps[0].fit
+        if last.fit.model.names != first.model.names:
+            bare = fit_again(last.fit, first.model, start=first.theta)
+            alone = with_same_remainder(bare, fitted, self._start)
+            if alone is not None and not predicts_better(alone, fitted):
+                fitted = alone
+        self._say("what follows the pose predicts better; diagnosing")
         self._append_background(fitted, REMAINDER)
         return True
 

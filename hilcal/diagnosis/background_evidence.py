@@ -113,6 +113,12 @@ def background_is_better(named: Fit, background: Fit) -> bool:
     return float(np.sum(after)) <= (1 - least) ** 2 * float(np.sum(before))
 
 
+def explained_share(first: Fit, second: Fit) -> float:
+    """Share of the first fit's misfit on poses left out that the second explains."""
+    before, after = (float(np.sum(x)) for x in left_out_squares(first, second))
+    return (before - after) / max(before - second.whitening.rank, 1.0)
+
+
 def background_evidence(fit: Fit) -> tuple[BackgroundEffect, ...]:
     """Test the effects of a background that the readings show; smallest p-values first."""
     model, theta = fit.model, fit.theta

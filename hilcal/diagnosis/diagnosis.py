@@ -64,8 +64,8 @@ VERDICTS: dict[Reason, Verdict] = {
 }
 """The verdict that each reason leads to."""
 CURVE_KEYS = (
-    "variable", "unit", "share", "moves", "direction", "labels", "x", "y", "error", "y_unit",
-    "determined",
+    "variable", "unit", "share", "moves", "direction", "axes", "labels", "x", "y", "error",
+    "y_unit", "determined",
 )  # fmt: skip
 """What a document holds of a `Dependence`."""
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from hilcal.identification.fit import Fit
 from hilcal.identification.linearisation import Linearisation, linearise
-from hilcal.model.observe import motion
+from hilcal.model.observe import Observation, motion
 from hilcal.readings.readings import angle_name, travel_name
 from hilcal.types import Bools, Floats, Ints
 
@@ -21,6 +21,7 @@ ROW_ORDER = "row order"
 ROUNDING = 1e-9  # least variation of a variable, as a share of its largest value
 HARMONICS = 4
 POWERS = 4
+LEAST_LOAD = 0.01  # least spread of the load, of its largest, for laws that follow its size
 LAW_COLUMNS = 9
 """Most columns of a law: functions of one joint, or three functions along three axes."""
 BINS = 8
@@ -41,6 +42,7 @@ class RecordedVariable:
     functions: Floats  # (N, F)
     factor: "RecordedVariable | None" = None  # second variable of the law
     labels: tuple[str, ...] = ()
+    only: str = ""  # `Motion.moves` of the only motion that the law describes; empty for any
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -67,7 +69,7 @@ class StateVariable:
 
     name: str  # e.g. "joint 2 angle"
     unit: str  # SI
-    kind: str  # "angle", "travel", "torque", "approach" or "other"
+    kind: str  # "angle", "travel", "torque", "approach", "gravity", "sight", "place" or "other"
     values: Floats  # (N,)
     joint: int = 0  # index of the joint, if the variable belongs to one
     labels: tuple[str, ...] = ()  # names of the values 0, 1, ... where they are not numbers
@@ -101,80 +103,182 @@ def state_variables(p: Linearisation) -> Iterator[StateVariable]:
             yield StateVariable(name, unit, "other", values)
 
 
+def place_variables(p: Linearisation) -> Iterator[StateVariable]:
+    """Yield where the target is, and the directions of gravity and of the sight at the flange.
+
+    A direction along a flange axis is the cosine of the angle between them.
+    """
+    s = p.fit.solution.prediction
+    flange, gravity = s.situation.chain.rotation[-1], s.situation.cell.gravity
+    down = gravity / max(float(np.linalg.norm(gravity)), 1e-300)
+    place = s.observation.base_position
+    found = [
+        *_along_flange("gravity", flange.swapaxes(1, 2) @ down),
+        StateVariable("target along base x", "m", "place", place[:, 0]),
+        StateVariable("target along base y", "m", "place", place[:, 1]),
+        StateVariable("distance from the base axis", "m", "place", np.hypot(*place[:, :2].T)),
+        StateVariable("height above the base", "m", "place", place[:, 2]),
+    ]
+    if (sight := _sight(s.observation)) is not None:
+        axes = s.observation.axes @ flange
+        distance = np.linalg.norm(s.observation.position, axis=1)
+        found += _along_flange("sight", np.einsum("nik,ni->nk", axes, sight))
+        found.append(StateVariable("distance from the tracker", "m", "place", distance))
+    yield from (v for v in found if _varies(v.values))
+
+
+def _along_flange(kind: str, direction: Floats) -> list[StateVariable]:
+    """Return the components of a direction (N, 3)."""
+    names = (f"{kind} along flange {axis}" for axis in "xyz")
+    return [StateVariable(n, "", kind, x) for n, x in zip(names, direction.T, strict=True)]
+
+
+def _sight(o: Observation) -> Floats | None:
+    """(N, 3) direction from one tracker, at the origin of its axes, to the target, sensor axes."""
+    if o.sensor is not None or o.is_distance is not None:
+        return None
+    distance = np.linalg.norm(o.position, axis=1, keepdims=True)
+    return np.asarray(o.position / np.maximum(distance, 1e-300))
+
+
 def _varies(values: Floats) -> bool:
     return bool(np.ptp(values) > ROUNDING * max(float(np.abs(values).max()), 1.0))
 
 
 def law_variables(p: Linearisation) -> list[RecordedVariable]:
-    """Variables of all laws: every recorded variable, and products of some.
+    """Variables of all laws: every recorded variable, the place of the target, and some products.
 
-    Products are those of an angle with the size of the load, of two angles, and of the side of
-    approach with the torque of its joint.
+    Products are those of the size of the load with an angle or a place, of two angles, of the side
+    of approach with the torque or the angle of its joint, and, of the motion of a joint alone, of
+    its torque with an angle, its temperature or the time: a compliance that these change.
     """
     readings = p.fit.readings[~p.fit.outlier]
     situation = p.fit.solution.prediction.situation
+    slides = situation.cell.arm.slides
     force = np.linalg.norm(readings.states.wrench, axis=1)
     pull = force / max(float(force.max()), 1e-300)
     load = RecordedVariable("load", "", pull, pull[:, None])
+    loaded = np.ptp(pull) > LEAST_LOAD
     out: list[RecordedVariable] = []
-    turns: list[RecordedVariable] = []
-
-    def smooth(v: StateVariable, centre: float) -> None:
-        x = v.values - centre
-        x = x / np.abs(x).max()
-        # Higher powers are less likely.
-        powers = np.stack([x**k / max(k, 1) for k in range(POWERS + 1)], axis=1)
-        # The straight line by itself, too: it is simpler than a curve of another variable.
-        out.extend(RecordedVariable(v.name, v.unit, v.values, f) for f in (powers, powers[:, :2]))
+    turns: list[RecordedVariable] = []  # first waves of each angle
+    changing: dict[int, list[RecordedVariable]] = {}  # what changes a compliance, by joint; −1: any
 
     for v in state_variables(p):
-        ones = np.ones(len(v.values))
         if v.kind in ("angle", "travel"):  # laws use the phase of a travel, reports the travel
-            angle, k = situation.angle[:, v.joint, None], np.arange(1, HARMONICS + 1)
-            waves = np.stack([np.cos(angle * k) / k, np.sin(angle * k) / k], axis=2)
-            waves = np.column_stack([ones, waves.reshape(len(ones), -1)])
+            waves = _waves(situation.angle[:, v.joint])
             out.append(RecordedVariable(v.name, v.unit, v.values, waves))
-            if np.ptp(pull) > 0.01:
+            if loaded:
                 out.append(replace(out[-1], factor=load))
-            first = np.column_stack([ones, np.cos(angle), np.sin(angle)])
-            turns.append(RecordedVariable(v.name, v.unit, v.values, first))
+            turns.append(replace(out[-1], functions=waves[:, :3], factor=None))
             if v.kind == "travel" and _varies(v.values):
-                smooth(v, float(situation.cell.arm.usual_range[0][v.joint]))
+                out += _smooth(v, float(situation.cell.arm.usual_range[0][v.joint]))
         elif v.kind == "approach":
-            sides = np.stack([ones, v.values], axis=1)
+            sides = _sides(v.values)
             out.append(RecordedVariable(v.name, v.unit, v.values, sides))
+            side = replace(out[-1], functions=sides[:, 1:])
+            if not slides[v.joint]:  # what drags over the joint, as a cable
+                out.append(replace(side, factor=_lever(v.joint, situation.angle)))
             # A gear's loop of hysteresis is as wide as the torque is large.
             torque = situation.torque[:, v.joint]
             if _varies(torque):
-                x = torque / np.abs(torque).max()
-                name = f"joint {v.joint + 1} torque"
-                wide = RecordedVariable(name, "N·m", torque, np.stack([np.abs(x), x], axis=1))
-                out.append(RecordedVariable(v.name, v.unit, v.values, sides[:, 1:], wide))
+                out.append(replace(side, factor=_torque(v.joint, torque, absolute=True)))
         else:
-            smooth(v, 0.0 if v.kind == "torque" else float(np.median(v.values)))
+            out += _smooth(v, 0.0 if v.kind == "torque" else float(np.median(v.values)))
+            if v.kind == "other":
+                changing.setdefault(v.joint if v.name.startswith("joint") else -1, []).append(
+                    out[-2]
+                )
+    for v in place_variables(p):
+        out += _smooth(v, float(np.median(v.values)))
+        if loaded and v.kind == "place":
+            out.append(replace(out[-2], factor=load))
+        if v.kind == "gravity":  # play, which gravity takes up
+            out.append(RecordedVariable(v.name, v.unit, v.values, _sides(v.values)))
     loads = np.unique(readings.load)
     if len(loads) > 1:
         member = (readings.load[:, None] == loads[:LAW_COLUMNS]).astype(float)
         names = tuple(readings.load_names[k] for k in loads)
         index = np.searchsorted(loads, readings.load).astype(float)
         out.append(RecordedVariable("load", "", index, member, None, names))
+    for j, torque in enumerate(situation.torque.T):
+        if _varies(torque):
+            by = _torque(j, torque)
+            for other in (*turns, *changing.get(j, []), *changing.get(-1, [])):
+                varying = other.functions[:, 1:]  # the constant is a compliance of the model
+                out.append(replace(other, functions=varying, factor=by, only=f"joint {j + 1}"))
     return out + [replace(a, factor=b) for a, b in combinations(turns, 2)]
 
 
-def motions(p: Linearisation) -> list[Floats]:
-    """(N, m, 1) motion by each joint, and (N, m, 3) of the target along base axes."""
+def _waves(angle: Floats) -> Floats:
+    """(N, 1 + 2 `HARMONICS`) functions of an angle (N,); higher waves are less likely."""
+    k = np.arange(1, HARMONICS + 1)
+    waves = np.stack([np.cos(angle[:, None] * k) / k, np.sin(angle[:, None] * k) / k], axis=2)
+    return np.column_stack([np.ones(len(angle)), waves.reshape(len(angle), -1)])
+
+
+def _smooth(v: StateVariable, centre: float) -> list[RecordedVariable]:
+    """Return powers of a variable; and the straight line, simpler than a curve of another one."""
+    x = v.values - centre
+    x = x / np.abs(x).max()
+    # Higher powers are less likely.
+    powers = np.stack([x**k / max(k, 1) for k in range(POWERS + 1)], axis=1)
+    return [RecordedVariable(v.name, v.unit, v.values, f) for f in (powers, powers[:, :2])]
+
+
+def _sides(values: Floats) -> Floats:
+    """(N, 2) functions of a side: 1 and the sign of the values (N,)."""
+    return np.stack([np.ones(len(values)), np.sign(values)], axis=1)
+
+
+def _lever(joint: int, angle: Floats) -> RecordedVariable:
+    turn = angle[:, joint]
+    waves = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    return RecordedVariable(angle_name(joint), "rad", turn, waves)
+
+
+def _torque(joint: int, torque: Floats, absolute: bool = False) -> RecordedVariable:
+    x = torque / np.abs(torque).max()
+    functions = np.stack([np.abs(x), x] if absolute else [x], axis=1)
+    return RecordedVariable(f"joint {joint + 1} torque", "N·m", torque, functions)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """A motion that a law describes: of a joint, of the base (a turn), or of the target."""
+
+    moves: str  # "joint 2", "base" or "target"
+    axes: str  # of the columns: "base", "flange", "sight"; "" for a joint
+    columns: Floats  # (N, m, K) displacement of the readings by `ORDINARY_MOTION` along each axis
+    unit: str  # of the motion
+
+
+def motions(p: Linearisation) -> list[Motion]:
+    """Motions by each joint; turns of the base; the target along base, flange, and sight."""
     fit, m, s = p.fit, p.fit.whitening.m, p.fit.solution.prediction
-    drives = motion(fit.model.cell, s.observation, s.situation.chain, s.deviation, m).drives
-    axes = np.zeros((len(drives), m, 3))
-    axes[:, :3] = s.observation.axes
-    return [ORDINARY_MOTION * drives[:, :, [j]] for j in range(drives.shape[2])] + [
-        ORDINARY_MOTION * axes
+    arm, o = fit.model.cell.arm, s.observation
+    drives = motion(fit.model.cell, o, s.situation.chain, s.deviation, m).drives
+    turned = np.cross(np.eye(3), o.base_position[:, None]).swapaxes(1, 2)
+    of_target = [
+        ("base", "base", "rad", o.axes @ turned),
+        ("target", "base", "m", o.axes),
+        ("target", "flange", "m", o.axes @ s.situation.chain.rotation[-1]),
     ]
+    if (sight := _sight(o)) is not None:
+        of_target.append(("target", "sight", "m", sight[:, :, None]))
+    out = [
+        Motion(f"joint {j + 1}", "", ORDINARY_MOTION * drives[:, :, [j]], arm.unit(j))
+        for j in range(arm.n)
+    ]
+    for moves, axes, unit, directions in of_target:
+        columns = np.zeros((len(drives), m, directions.shape[2]))
+        columns[:, :3] = ORDINARY_MOTION * directions
+        out.append(Motion(moves, axes, columns, unit))
+    return out
 
 
-def law_columns(p: Linearisation, v: RecordedVariable, moves: Floats) -> Floats:
+def law_columns(p: Linearisation, v: RecordedVariable, moved: Motion) -> Floats:
     """(R, WIDTH) whitened columns of a law with one of the `motions`, padded with zeros."""
-    w = p.fit.whitening
+    w, moves = p.fit.whitening, moved.columns
     functions = v.product()[:, : LAW_COLUMNS // moves.shape[2]]
     raw = (moves[:, :, :, None] * functions[:, None, None, :]).reshape(*moves.shape[:2], -1)
     out = np.zeros((w.m * len(w), LAW_COLUMNS))
@@ -218,16 +322,14 @@ class Difference:
 def recorded_values(fit: Fit) -> tuple[StateVariable, ...]:
     """Return variables (N,) of all readings that vary, load and place too; NaN for outliers."""
     used, readings = ~fit.outlier, fit.readings[~fit.outlier]
-    target = fit.solution.prediction.observation.base_position
-    varying = list(state_variables(linearise(fit)))
+    p = linearise(fit)
+    varying = list(state_variables(p))
     loads = np.unique(readings.load)
     if len(loads) > 1:
         names = tuple(readings.load_names[k] for k in loads)
         index = np.searchsorted(loads, readings.load).astype(float)
         varying.append(StateVariable("load", "", "other", index, labels=names))
-    across = np.hypot(target[:, 0], target[:, 1])
-    varying.append(StateVariable("distance from the base axis", "m", "other", across))
-    varying.append(StateVariable("height above the base", "m", "other", target[:, 2]))
+    varying += place_variables(p)
     of_all = np.full((len(varying), len(used)), np.nan)
     of_all[:, used] = [v.values for v in varying]
     return tuple(replace(v, values=x) for v, x in zip(varying, of_all, strict=True))

@@ -1,16 +1,19 @@
 """How much of a misfit the recorded variables predict on poses left out, whatever its cause.
 
 Smooth laws come first. For every recorded variable x and every motion of the arm, a law describes
-the error of one joint, or of the target along one base axis, as a smooth function of x:
+the error of one joint, or of the target along one axis, as a smooth function of x:
 
     r = J_j f(x) + noise,    f(x) = Σ_k c_k φ_k(x)
 
 with few functions φ_k: a constant, harmonics of an angle, powers of other variables, membership
 for loads; and products of an angle with the size of the load, of two angles, and of the side of
-approach with the torque of its joint. Laws are selected one after the other by their evidence on
-the other poses; the share of the misfit that they predict on the poses left out is the predictable
-share. A variable carries the share that the prediction loses when its values are permuted at random
-between readings.
+approach with the torque or the angle of its joint; and of a joint's torque with what may change its
+compliance. The base also turns, and the target moves along
+the axes of the flange, as on a mount that bends, or along the line of sight; and the place of the
+target and the directions of gravity and of the sight at the flange are variables, too. Laws are
+selected one after the other by their evidence on the other poses; the share of the misfit that they
+predict on the poses left out is the predictable share. A variable carries the share that the
+prediction loses when its values are permuted at random between readings.
 Source of the latter: Breiman, *Random forests*, Machine Learning 45 (2001) 5-32, section 10.
 
 Where the laws predict little, extremely randomised trees predict the residual, in units of its
@@ -32,6 +35,7 @@ variance*, Ann. Stat. 9 (1981) 586-596.
 """
 
 from dataclasses import dataclass, replace
+from itertools import product
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -41,6 +45,7 @@ from hilcal.diagnosis.noise import PREDICTABLE
 from hilcal.diagnosis.recorded import (
     LAW_COLUMNS,
     ORDINARY_MOTION,
+    Motion,
     RecordedVariable,
     bins_of,
     law_columns,
@@ -92,13 +97,15 @@ class Dependence:
     variable: str  # e.g. "joint 4 angle", "load", "time"
     unit: str  # of x; empty where x counts the loads of `labels`
     share: float  # loss of the predictable share when the variable's values are permuted
-    moves: str  # "joint 2", or "target" along `direction`: which of them errs
-    direction: Floats  # (3,) base axes; zero for a joint
+    moves: str  # "joint 2", "base" about or "target" along `direction`: which of them errs
+    direction: Floats  # (3,) in `axes`; zero for a joint, and for the sight
     x: Floats  # (K,) centres of the bins
     y: Floats  # (K,) mean error in each bin less the mean of all bins, rad of the joint or m
     error: Floats  # (K,) its standard error
     y_unit: str  # "rad" or "m"
     labels: tuple[str, ...] = ()  # names of the loads that x counts
+    axes: str = "base"  # of the direction: "base" or "flange"; "sight" for the line of sight
+    beside: str = ""  # the other variable of the likeliest law, if it is one of two
 
     @property
     def determined(self) -> bool:
@@ -156,8 +163,11 @@ class _Laws:
 
     def __init__(self, p: Linearisation, fold: Ints) -> None:
         self.variables, self.motions = law_variables(p), motions(p)
-        index = np.indices((len(self.variables), len(self.motions))).reshape(2, -1)
-        self.variable, self.motion = index.tolist()
+        pairs = product(range(len(self.variables)), range(len(self.motions)))
+        described = [
+            (i, k) for i, k in pairs if self.variables[i].only in ("", self.motions[k].moves)
+        ]
+        self.variable, self.motion = (list(x) for x in zip(*described, strict=True))
         self._p, self._fold = p, fold
         self._chosen: dict[int, Floats] = {}
         self.ridge = np.maximum(p.projection.ridge, LEAST_RIDGE)
@@ -260,8 +270,10 @@ def _dependences(
         v = next((v for v in laws.variables if v.names == (name,)), None)
         if value >= 0.02 * total and v is not None:
             of_name = [k for k, i in enumerate(laws.variable) if name in laws.variables[i].names]
-            number = laws.motion[_best(p, laws, of_name)]
-            out.append(_curve(p, v, number, laws.motions[number], share * value / total))
+            best = _best(p, laws, of_name)
+            curve = _curve(p, v, laws.motions[laws.motion[best]], share * value / total)
+            others = [n for n in laws.variables[laws.variable[best]].names if n != name]
+            out.append(replace(curve, beside="".join(others)))
     return tuple(out)
 
 
@@ -281,16 +293,14 @@ def _best(p: Linearisation, laws: _Laws, numbers: list[int]) -> int:
     return numbers[int(np.argmax(block_evidence(gram, slope, *p.test_noise, STRENGTHS)))]
 
 
-def _curve(
-    p: Linearisation, v: RecordedVariable, number: int, motion: Floats, share: float
-) -> Dependence:
+def _curve(p: Linearisation, v: RecordedVariable, moved: Motion, share: float) -> Dependence:
     """Mean error by bins of the variable, of a joint or along the target's principal direction."""
     bins, x = bins_of(v)
     member = (bins[:, None] == np.arange(len(x))).astype(float)
-    w = p.fit.whitening
+    w, motion = p.fit.whitening, moved.columns
     raw = (motion[:, :, :, None] * member[:, None, None, :]).reshape(*motion.shape[:2], -1)
-    joint, direction = motion.shape[2] == 1, np.zeros(3)
-    if not joint:
+    direction = np.zeros(3)
+    if motion.shape[2] == 3:
         solved, _ = _least_squares(p, w.whiten(w.raw(raw)).reshape(len(p.fit.white), -1))
         direction = np.linalg.svd(solved.reshape(3, -1), full_matrices=False)[0][:, 0]
         direction = direction * np.sign(direction[np.argmax(np.abs(direction))])
@@ -303,13 +313,14 @@ def _curve(
         variable=v.name,
         unit=v.unit,
         share=share,
-        moves=f"joint {number + 1}" if joint else "target",
+        moves=moved.moves,
         direction=direction,
         x=x,
         y=ORDINARY_MOTION * (y - y.mean()),
         error=ORDINARY_MOTION * error,
-        y_unit=p.fit.model.cell.arm.unit(number) if joint else "m",
+        y_unit=moved.unit,
         labels=v.labels,
+        axes=moved.axes or "base",
     )
 
 

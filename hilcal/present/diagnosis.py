@@ -26,11 +26,10 @@ from hilcal.present.fit import (
     model_name,
     where_table,
 )
-from hilcal.present.verdict import headline, implausible, message, unconfirmed
+from hilcal.present.verdict import erring_quantity, headline, implausible, message, unconfirmed
 from hilcal.types import Floats
 
 MOST_SUSPECTS = 6
-ALONG = 0.99  # least component of a direction that is named after its axis; a choice
 BARS = "▁▂▃▄▅▆▇█"
 MOST_CURVES = 2
 MOST_COMPARED = 24  # most parameters that are compared with the true ones
@@ -209,17 +208,6 @@ def curves(dependences: Sequence[Dependence], most: int = MOST_CURVES) -> Iterat
             yield f"{explains}, but these readings do not determine its curve."
     if any(d.determined for d in shown):
         yield note("±: standard uncertainty; the mean over the bins is taken as zero.")
-
-
-def erring_quantity(d: Dependence) -> str:
-    """Return the name of the quantity whose error depends on the variable."""
-    if d.y_unit == "rad":
-        return d.moves
-    main = int(np.argmax(np.abs(d.direction)))
-    if d.direction[main] > ALONG:
-        return f"the {d.moves} along base {'xyz'[main]}"
-    along = ", ".join(f"{v:.2f}" for v in d.direction)
-    return f"the {d.moves} along ({along}) in base axes"
 
 
 def _binned(

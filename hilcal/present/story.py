@@ -33,7 +33,7 @@ from hilcal.present.fit import (
     parameters,
     prior_lines,
 )
-from hilcal.present.verdict import message
+from hilcal.present.verdict import erring_quantity, message
 from hilcal.refinement import PRIOR, Refinement, RefinementStep
 from hilcal.robot.arm import Arm
 from hilcal.robot.scene import body_poses
@@ -417,7 +417,7 @@ def curve(d: Dependence) -> DependenceCurve:
     says = f"{numbers.percent(d.share)} of the misfit on poses left out follows {d.variable}."
     over = f"{d.variable} [{x_unit}]" if x_unit else d.variable
     error, x, y = (
-        f"error of {diagnosis.erring_quantity(d)} [{y_unit}]",
+        f"error of {erring_quantity(d)} [{y_unit}]",
         x_factor * d.x,
         y_factor * d.y,
     )

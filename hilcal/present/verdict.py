@@ -21,6 +21,7 @@ from hilcal.diagnosis.noise import (
     separates_instrument,
 )
 from hilcal.diagnosis.order_step import OrderStep
+from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.unknown_law import REMAINDER
 from hilcal.diagnosis.wrong_figures import WrongFigure
 from hilcal.effects.force_sensor import ForceSensorEffect
@@ -43,6 +44,7 @@ HEADLINES: Mapping[Verdict, str] = {
 }
 RESIDUAL_IS_NOISE = ("residual_is_noise", "inseparable_addition", "arm_scatter", "background")
 """Reasons that call the residual of the fitted poses noise."""
+ALONG = 0.99  # least component of a direction that is named after its axis; a choice
 MANY_TIMES = 3.0  # ratio of errors from which the verdict names the one on poses left out; a choice
 UNCALIBRATED = "geometry is not calibrated"
 """Limit of deflections: errors that are the same under every load cancel in them."""
@@ -340,13 +342,15 @@ def _no_suspect(d: Diagnosis) -> list[str]:
         repeats += [f"{percent(d.repeated_share)} of the misfit is the same in them."]
     predicted = percent(share) if share >= 0.005 else f"{100 * share:.1g} %"
     follows = f"; it follows {' and '.join(d.follows)}" if d.follows else ""
+    if d.dependences and d.follows[:1] == (d.dependences[0].variable,):
+        follows += f", as an error of {erring_quantity(d.dependences[0])}"
     remainder = [b for b in d.background if b.effect == REMAINDER]
     if remainder:
         return [
             f"{predicted} of the misfit at poses left out is predictable, and the effects of the "
             f"catalogue together do not explain it{follows}.",
-            "Until its law is known, waves of joint angles, the remainder, predict it: they move "
-            f"the target by {length(remainder[0].rms_m)} rms.",
+            "Until its law is known, smooth functions of the pose, the remainder, predict it: they "
+            f"move the target by {length(remainder[0].rms_m)} rms.",
         ]
     if d.fit.model.background:
         return [
@@ -361,6 +365,20 @@ def _no_suspect(d: Diagnosis) -> list[str]:
         none,
         *repeats,
     ]
+
+
+def erring_quantity(d: Dependence) -> str:
+    """Return the name of the quantity whose error depends on the variable."""
+    if d.moves not in ("base", "target"):
+        return d.moves
+    if d.axes == "sight":
+        return f"the {d.moves} along the line of sight"
+    moved = f"{d.moves} {'about' if d.y_unit == 'rad' else 'along'}"
+    main = int(np.argmax(np.abs(d.direction)))
+    if d.direction[main] > ALONG:
+        return f"the {moved} {d.axes} {'xyz'[main]}"
+    direction = ", ".join(f"{v:.2f}" for v in d.direction)
+    return f"the {moved} ({direction}) in {d.axes} axes"
 
 
 def _pose_alone(d: Diagnosis) -> list[str]:

@@ -21,8 +21,10 @@ from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
 from hilcal.present.verdict import message
+from studies.discover import DiscoveryCase, simulated
+from studies.foreign_laws import KINDS
 from tests.support.bench_cases import BASE
-from tests.support.campaigns import campaign, plan
+from tests.support.campaigns import campaign, configuration, plan
 from tests.support.diagnosis_cases import fitted_baseline
 from tests.support.fit_cases import fitted_model
 from tests.support.next_cases import doubtful, fine_error
@@ -113,6 +115,29 @@ def test_its_variable_is_among_the_first_two(name, mode, seeds):
     assert sum(right(name, each) for each in found) >= 0.9 * len(seeds)
     if seeds == QUICK:
         assert all(each.share > 0.5 for each in found)
+
+
+FOREIGN = {  # laws of the study of `discover`: what carries each, what errs, and its axes
+    "soft mount": ({f"gravity along flange {c}" for c in "xyz"}, "target", "flange"),
+    "warm pedestal": ({"air temperature"}, "base", "base"),
+    "wear": ({"time", "joint 2 torque"}, "joint 2", "base"),
+    "sinking bench": ({"distance from the base axis"}, "target", "base"),
+    "cable drag": ({"joint 4 angle", "joint 4 approach"}, "joint 3", "base"),
+    "softer when warm": ({"joint 3 temperature", "joint 3 torque"}, "joint 3", "base"),
+    "yielding bench": ({"distance from the base axis", "load"}, "target", "base"),
+    "play on gravity's side": ({"gravity along flange z"}, "target", "flange"),
+}
+
+
+@pytest.mark.parametrize("law", first(3, list(FOREIGN)))
+def test_what_carries_a_law_of_mechanics_and_what_errs_are_told(law):
+    case = simulated(configuration(), DiscoveryCase("ur5e", KINDS[law][0], law))
+    found = residual_regression(linearise(case.before))
+    variables, moves, axes = FOREIGN[law]
+    assert found.share > 0.8
+    assert found.significant
+    assert {d.variable for d in found.dependences[: len(variables)]} <= variables
+    assert (found.dependences[0].moves, found.dependences[0].axes) == (moves, axes)
 
 
 def test_a_loop_of_hysteresis_that_is_as_wide_as_the_torque_is_large():

@@ -9,6 +9,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.present.verdict import message
 from hilcal.refinement import refine
 from studies.all_effects_command import AllEffectsCase, campaign_of
+from studies.discover import DiscoveryCase, error_at, simulated
 from studies.few_poses_command import share_in_band
 from studies.study_cases import study_case
 from tests.support.campaigns import configuration
@@ -39,7 +40,7 @@ def test_a_law_that_the_catalogue_lacks_is_predicted_and_stays_unknown():
     assert diagnosis.follows == ("joint 4 angle",)
     said = message(diagnosis)
     assert "it follows joint 4 angle" in said
-    assert "waves of joint angles, the remainder, predict it" in said
+    assert "smooth functions of the pose, the remainder, predict it" in said
     assert [e.options["laws"] for e in last.model.effects if e.name == REMAINDER] == ["2:4"]
     assert REMAINDER in last.model.background
     assert REMAINDER in {b.effect for b in diagnosis.background if b.p_value < 1e-3}
@@ -63,3 +64,15 @@ def test_a_precise_arm_with_one_such_law_has_a_remainder_and_no_other_background
     assert last.added == REMAINDER
     assert last.diagnosis.verdict == "unknown_effect"
     assert last.fit.holdout.rms_m < 0.5 * first.fit.holdout.rms_m
+
+
+def test_what_sinks_with_the_reach_is_predicted_and_named_for_nothing_else():
+    asked = DiscoveryCase("ur5e", "absolute", "sinking bench")
+    case = simulated(configuration(), asked)
+    start = baseline(case.before.model.cell, case.first.readings, "absolute")
+    path = refine(start, case.first.readings, "absolute")
+    assert path.verdict == "unknown_effect"
+    assert path.diagnosis.follows == ("distance from the base axis",)
+    assert "joint_tilt_compliance" in path.names  # which resembles it, until
+    assert path.fit.model.named == start.named  # the remainder takes its place
+    assert error_at(path.fit, case.fresh) < 1.1 < 1.5 < error_at(case.before, case.fresh)

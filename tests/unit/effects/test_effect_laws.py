@@ -151,9 +151,35 @@ def test_a_remainder_moves_joints_and_the_whole_arm_by_waves_of_other_angles():
         np.testing.assert_allclose(moved[k], expected[0], atol=1e-12)
 
 
-@pytest.mark.parametrize("laws", ["", "2:7", "0:1", "2:4/2:4", "tool:1", 3])
+def test_a_remainder_follows_gravity_place_and_two_angles():
+    states = some_states(UR10E, 6)
+    laws = "3:4*5/target:gravity_x/tilt:reach"
+    effect = make("remainder", UR10E, states, {"laws": laws})
+    names = [p.name for p in effect.parameters]
+    values = {"j3.q4.sin1q5.cos1": 2e-3, "target.z.gravity_x.power2": 3e-4}
+    theta = np.array([values.get(name, 0.0) for name in names])
+    assert sum(name in values for name in names) == len(values)
+    moved = Model(UR10E, (effect,)).predict(states, theta).observation
+    turned = states.q.copy()
+    turned[:, 2] += 2e-3 * np.sin(states.q[:, 3]) * np.cos(states.q[:, 4])
+    still = Model(UR10E, ()).predict(replace(states, q=turned, q_actual=None), np.zeros(0))
+    flange = still.situation.chain.rotation[-1]
+    shift = 3e-4 * flange[:, 2, 0] ** 2  # gravity along flange x is −z of the base along it
+    z = still.observation.axes @ flange[:, :, 2, None]
+    expected = still.observation.position + shift[:, None] * z[:, :, 0]
+    np.testing.assert_allclose(moved.position, expected, atol=1e-6)  # the turn times the shift
+    theta = np.array([1e-6 * (name == "tilt.x.reach.power1") for name in names])
+    tilted = Model(UR10E, (effect,)).predict(states, theta).observation.position
+    at = Model(UR10E, ()).predict(states, np.zeros(0)).observation
+    reach = np.hypot(*at.base_position[:, :2].T) / UR10E.arm.reach
+    turn = at.axes @ np.cross([1.0, 0.0, 0.0], at.base_position)[:, :, None]
+    expected = at.position + 1e-6 * reach[:, None] * turn[:, :, 0]
+    np.testing.assert_allclose(tilted, expected, atol=1e-11)
+
+
+@pytest.mark.parametrize("laws", ["", "2:7", "3:4*7", "target:time", "0:1", "2:4/2:4", "tool:1", 3])
 def test_a_remainder_refuses_other_laws(laws):
-    with pytest.raises(InputError, match=r"remainder: laws = .* valid: pairs of joints 1 to 6"):
+    with pytest.raises(InputError, match=r"remainder: laws = .* valid: pairs of what errs"):
         make("remainder", UR10E, some_states(UR10E, 6), {"laws": laws})
 
 
