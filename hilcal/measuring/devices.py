@@ -10,6 +10,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+import numpy as np
+
 from hilcal.config import CellLoad
 from hilcal.errors import DeviceError
 from hilcal.robot.factory import FactoryKinematics
@@ -158,13 +160,19 @@ class ArmDevice(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackerSample:
-    """One measurement of the target."""
+    """One measurement of the target; DeviceError for values that no measurement has."""
 
     host_ns: int  # `time.monotonic_ns` at arrival
     value: Floats  # (m,) position in m and, for m = 6, rotation vector in rad, sensor axes
     covariance: Floats
     """(m, m) of this measurement, from the instrument's specification and its own statements."""
     warning: str = ""  # of the instrument; empty without
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that are not finite, and noise without a size."""
+        _refuse_invalid("tracker", self.value, self.covariance, (3, 6))
+        if np.linalg.eigvalsh(self.covariance)[0] <= 0.0:
+            raise DeviceError("tracker: it gives a covariance that is not positive definite")
 
 
 class TrackerDevice(Protocol):
@@ -196,13 +204,32 @@ class PointingTracker(TrackerDevice, Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WrenchSample:
-    """The raw reading of a force sensor, averaged over a window."""
+    """The raw reading of a force sensor, averaged over a window; DeviceError as `TrackerSample`."""
 
     host_ns: int  # `time.monotonic_ns` at arrival of the last frame
     wrench: Floats  # (6,) mean force and moment, sensor axes, N and N·m; not tared
     covariance: Floats  # (6, 6) of one frame in the window (not of the mean); zero for one frame
     frames: int  # number of frames in the window
     temperature: float | None = None  # of the sensor, °C; None where unknown
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that are not finite."""
+        _refuse_invalid("force sensor", self.wrench, self.covariance, (6,))
+
+
+def _refuse_invalid(device: str, value: Floats, covariance: Floats, sizes: tuple[int, ...]) -> None:
+    """Refuse a sample of a driver: the one place through which the values of all drivers pass."""
+    for name, array, shapes in (
+        ("value", value, [(m,) for m in sizes]),
+        ("covariance", covariance, [(m, m) for m in sizes if value.shape == (m,)]),
+    ):
+        if array.shape not in shapes:
+            raise DeviceError(
+                f"{device}: it gives a {name} of shape {array.shape}; valid: "
+                f"{' or '.join(map(str, shapes))}"
+            )
+        if not np.isfinite(array).all():
+            raise DeviceError(f"{device}: it gives a {name} that is not a number")
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,28 +5,17 @@ from functools import partial
 
 import numpy as np
 
-from hilcal.cell import Cell
 from hilcal.config import CellLoad
 from hilcal.errors import DeviceError
 from hilcal.measuring.connect import Setup
 from hilcal.measuring.devices import ConfirmingOperator, TerminalPerson, WrongLoadError
 from hilcal.measuring.force import ForceMeter
-from hilcal.measuring.motion import Mover
+from hilcal.measuring.motion import Mover, payload
 from hilcal.measuring.progress import Answered, Phase, Question, Remark
 from hilcal.store.plan import UNLOADED
-from hilcal.types import Floats
 
 TRIES = 3  # requests for one load at most
 SWINGING_S = 2.0  # pause before a load that seems wrong is measured again, cell s
-
-
-def payload(cell: Cell, load: CellLoad | None) -> tuple[float, Floats]:
-    """Return mass, kg, and centre of mass (3,), flange axes, m, of the tool with a weight."""
-    hung = 0.0 if load is None else load.mass_kg
-    mass = cell.tool_mass + hung
-    if mass == 0.0:
-        return 0.0, np.zeros(3)
-    return mass, (cell.tool_mass * cell.tool_com + hung * cell.load_point) / mass
 
 
 class Hook:
@@ -36,7 +25,7 @@ class Hook:
         """Start with an unknown load, until `take_all_off`."""
         self.hanging, self.since, self._doubted = UNLOADED, setup.clock.now(), False
         self.load_denied = False  # whether a person denied a load that the sensor seems to measure
-        self._arm, self._operator, self._meter = setup.rig.arm, setup.rig.operator, meter
+        self._operator, self._meter = setup.rig.operator, meter
         self._cell, self._config, self._mover = setup.cell, setup.cell.configured(), mover
         self._clock, self._watcher = setup.clock, setup.watcher
         self._loads = {load.name: load for load in self._config.loads}
@@ -59,9 +48,10 @@ class Hook:
         new, old = self.load(name), self.load(self.hanging)
         heavier = payload(self._cell, new)[0] > payload(self._cell, old)[0]
         if heavier:
-            self._set_payload(new)
+            self._mover.set_payload(new)
         self._suspend(self.hanging, name)
-        self._ask(new, lambda: self._differs(new), answered=None if heavier else self._set_payload)
+        answered = None if heavier else self._mover.set_payload
+        self._ask(new, lambda: self._differs(new), answered=answered)
         self._note_hanging(name)
 
     def restore(self, why: str) -> None:
@@ -73,8 +63,8 @@ class Hook:
         name, load = self.hanging, self.load(self.hanging)
         self._suspend(UNLOADED, name)
         if load is not None and not self._differs(None):
-            self._set_payload(None)
-        self._ask(load, lambda: self._differs(load), why, self._set_payload)
+            self._mover.set_payload(None)
+        self._ask(load, lambda: self._differs(load), why, self._mover.set_payload)
         self._note_hanging(name)
 
     def confirm(self, question: str) -> None:
@@ -90,9 +80,6 @@ class Hook:
     @property
     def _at_terminal(self) -> bool:
         return isinstance(self._operator, TerminalPerson) and self._operator.at_terminal
-
-    def _set_payload(self, load: CellLoad | None) -> None:
-        self._arm.set_payload(*payload(self._cell, load))
 
     def _suspend(self, *hanging: str) -> None:
         """Note that one of these loads hangs, and stop comparing the force with a load."""

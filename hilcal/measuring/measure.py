@@ -333,8 +333,6 @@ class Measurer:
             mean = average(tracker, self._config.acquire.systematic_share)
         except DeviceError as error:
             return None, str(error)
-        if not (np.isfinite(mean.value).all() and np.isfinite(mean.covariance).all()):
-            return None, "the tracker gives a value that is not a number"
         arm_samples.append(after)
         q = np.mean([sample.q for sample in arm_samples], axis=0)
         torques = [sample.torque for sample in arm_samples[1:] if sample.torque is not None]

@@ -17,6 +17,9 @@ from hilcal.measuring.route import Stop, duration, route_problems
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
+PAYLOAD_KG, PAYLOAD_M = 0.01, 1e-3
+"""Differences of the payload in the controller from the one that was set, beyond which it was set
+by others; choices: controllers round."""
 NORMAL = "normal"  # safety state of an arm without problems
 WHERE_LEFT = "where it was left"  # the arm, in a message
 HOW_ON = "drive it by hand to a free place in the middle of its workspace"
@@ -26,6 +29,15 @@ SLACK = Margins(
 )
 """Margins in motion, smaller than those of a dry run: an arm sags and lags, and a motion is checked
 at samples. Nothing may touch."""
+
+
+def payload(cell: Cell, load: CellLoad | None) -> tuple[float, Floats]:
+    """Return mass, kg, and centre of mass (3,), flange axes, m, of the tool with a weight."""
+    hung = 0.0 if load is None else load.mass_kg
+    mass = cell.tool_mass + hung
+    if mass == 0.0:
+        return 0.0, np.zeros(3)
+    return mass, (cell.tool_mass * cell.tool_com + hung * cell.load_point) / mass
 
 
 class Guard:
@@ -218,7 +230,18 @@ class Mover:
         self._motion, self._clock, self._watcher = config.motion, setup.clock, setup.watcher
         self._stop_requested = setup.stop_requested
         self._in_motion = False
+        self._payload: tuple[float, Floats] | None = None  # in the controller; None before control
         self._last_tick: tuple[float, int] = (-1.0, 0)
+
+    def take_control(self) -> None:
+        """Take control of the arm, with the payload of the tool alone."""
+        self._payload = payload(self.guard.cell, None)
+        self._arm.take_control(*self._payload)
+
+    def set_payload(self, load: CellLoad | None) -> None:
+        """Set the payload of the tool with a load in the controller."""
+        self._payload = payload(self.guard.cell, load)
+        self._arm.set_payload(*self._payload)
 
     def checked_sample(self) -> ArmSample:
         """Return a sample of the arm, after checks of the arm and of the force sensor.
@@ -237,6 +260,8 @@ class Mover:
             raise DeviceError(reason)
         if not self._in_motion and (moved := self.moved_by_others(sample)) is not None:
             raise DeviceError(f"arm: {moved}")
+        if (loaded := self._loaded_by_others(sample)) is not None:
+            raise DeviceError(f"arm: {loaded}")
         if self.watch is not None and measured is not None:
             self.watch.check_frame(sample, measured, moving=self._in_motion)
         return sample
@@ -253,6 +278,22 @@ class Mover:
             if not distance <= MOVED_RAD:
                 return f"{subject} it since it came here: {name} by {distance:.3g} rad"
         return None
+
+    def _loaded_by_others(self, sample: ArmSample) -> str | None:
+        """Return which payload others have set in the controller; None if nobody, or unknown."""
+        if self._payload is None or np.isnan(sample.payload):
+            return None
+        mass, com = self._payload
+        reported = com if sample.payload_com is None else sample.payload_com
+        far = np.linalg.norm(reported - com) > PAYLOAD_M
+        if abs(sample.payload - mass) <= PAYLOAD_KG and not (mass > 0.0 and far):
+            return None
+        return (
+            f"another program, or somebody at the pendant, has set its payload to "
+            f"{_payload_text(sample.payload, reported)}; it was {_payload_text(mass, com)}, tool "
+            "and load by the cell. It decides how the controller corrects the arm's deflection "
+            "and when it stops: let nothing else set it"
+        )
 
     def wait(self, seconds: float) -> None:
         """Wait `seconds`, cell s, with a check every half a real second."""
@@ -423,3 +464,7 @@ class Mover:
         if not moved <= STILL_RAD:
             return f"arm: it moved by {moved:.3g} rad during the reading"
         return None
+
+
+def _payload_text(mass: float, com: Floats) -> str:
+    return f"{mass:.3g} kg at ({', '.join(f'{x:.3f}' for x in com)}) m"

@@ -28,7 +28,7 @@ from hilcal.measuring.devices import (
     WrenchSample,
 )
 from hilcal.measuring.force import ForceMeter, TaredWrench
-from hilcal.measuring.loads import TRIES, Hook, payload
+from hilcal.measuring.loads import TRIES, Hook
 from hilcal.measuring.measure import MeasuredStop, Measurer
 from hilcal.measuring.motion import WHERE_LEFT, Mover
 from hilcal.measuring.progress import (
@@ -236,7 +236,7 @@ class Session:
             first.q, first.name, expected, self._hook.confirm, place
         )
         self.in_control = True
-        self._rig.arm.take_control(*payload(self._cell, None))
+        self._mover.take_control()
         self._watched(self._zero)
         registration = RoughRegistration(self._cell)  # of this session: the tracker may have moved
         positions: list[tuple[Floats, Floats]] = []

@@ -219,6 +219,42 @@ def test_an_arm_that_is_moved_at_rest_is_named_at_the_next_look(b, change, said)
     assert b.world.calls[-2] == "arm.stop"
 
 
+def test_a_payload_that_others_set_in_the_controller_ends_the_run(b):
+    """It changes the arm's deflection and when it stops; a resumed run sets its own."""
+
+    def others(*_):
+        if len(b.store.rows) == 2:
+            b.world.payload = (9.0, np.zeros(3))
+
+    call_before(b.store, "record", others)
+    said = r"set its payload to 9 kg at \(0.000, .*; it was 0.8 kg at \(0.010.*--resume$"
+    refusal_of(DeviceError, said, b.measure)
+    assert len(b.store.rows) == 3
+    assert b.world.calls[-2] == "arm.stop"
+    b.world.restart()
+    b.measure()
+    assert not len(FEW_POSES.without(b.store.done()).steps)
+
+
+@pytest.mark.parametrize(
+    ("device", "call", "change", "said"),
+    [
+        ("tracker", "measure", {"value": np.array([0.0, np.nan, 0.0])}, "tracker: it gives a v"),
+        ("tracker", "measure", {"covariance": np.full((3, 3), np.nan)}, "tracker: it gives a c"),
+        ("tracker", "measure", {"covariance": np.zeros((3, 3))}, "not positive definite"),
+        ("tracker", "measure", {"value": np.zeros(4)}, r"value of shape \(4,\); valid: \(3,\) or"),
+        ("force", "average", {"wrench": np.full(6, np.nan)}, "force sensor: it gives a value that"),
+        ("force", "latest", {"wrench": np.full(6, np.inf)}, "force sensor: it gives a value that"),
+    ],
+)
+def test_a_sample_without_numbers_is_named_in_one_line(b, device, call, change, said):
+    change_result(getattr(b.rig, device), call, lambda sample: replace(sample, **change))
+    line = refusal_of(DeviceError, said, b.measure)
+    assert "unexpected" not in line
+    assert "drift" not in line
+    assert b.store.rows == []
+
+
 def in_motion(b, change, motion=4):
     """Change samples of the arm from the first look on of a motion; returns when that began."""
     begun = []

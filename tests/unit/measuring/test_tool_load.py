@@ -217,7 +217,6 @@ UNSURE = "asked for 10 kg (98.1 N), measured 98.1 N ± 6.0 N: too uncertain"
             PULL, np.roll(PULL, 1), 0.1, False,
             "asked for 50.0 N, measured 50.0 N: that is 100 % of it, 90° off its direction",
         ),
-        (WEIGHT, np.full(6, np.nan), 0.1, False, "asked for 10 kg (98.1 N), measured nan N: the"),
         (WEIGHT, WEIGHT, 2.0, False, UNSURE),
         (MOMENT, MOMENT, 0.01, True, "asked for 10.0 N·m, measured 10.0 N·m"),
         (
