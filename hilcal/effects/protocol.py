@@ -241,7 +241,7 @@ class Effect(ABC):
         missing = [need for need in self.needs if not _has(states, need)]
         if missing:
             raise InputError(
-                f"effect {self.name} needs {', '.join(missing)}, which the readings do not have"
+                f"effect {self.name} needs {', '.join(missing)}, which not all readings have"
             )
         self.setup(states)
 

@@ -73,6 +73,6 @@ class ThermalGrowth(Effect):
         if self.source == "joints" and joints is not None:
             return np.asarray(joints.mean(axis=1))
         raise InputError(
-            f"effect {self.name}: temperature = {self.source!r}, which the readings do not have; "
+            f"effect {self.name}: temperature = {self.source!r}, which not all readings have; "
             f"valid: {SOURCES[self.source == 'air']}"
         )

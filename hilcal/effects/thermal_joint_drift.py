@@ -70,6 +70,6 @@ class ThermalJointDrift(PerJoint):
             warm = 1.0 - np.exp(-(states.time - self.start) / self.time_constant)
             return np.repeat(RISE_K * warm[:, None], self.cell.arm.n, axis=1)
         raise InputError(
-            f"effect {self.name}: temperature = {self.source!r}, which the readings do not have; "
+            f"effect {self.name}: temperature = {self.source!r}, which not all readings have; "
             f"valid: {SOURCES[self.source == 'joints']}"
         )

@@ -106,9 +106,9 @@ class Session:
         measurer = Measurer(setup, self._meter, self._mover)
         self._reader = ArrivalReader(setup, measurer, self._state.registration)
         self._identified = 0
-        self._temperatures: bool | None = None
-        self._torques: bool | None = None
-        self._torques_lost = self._tared = False
+        self._reported: dict[str, bool] = {}  # whether the campaign has a quantity of the arm
+        self._lost: set[str] = set()  # quantities that the last reading lacks
+        self._tared = False
         self._done = 0
         start = wall()
         self._epoch = start if epoch is None else epoch
@@ -136,8 +136,8 @@ class Session:
                 f"this computer's clock is {-pause:.0f} s before the last reading: it was set "
                 "back; the pause since that reading is not known and counts as none"
             )
-        self._temperatures = stored.states.joint_temperature is not None
-        self._torques = stored.states.torque is not None
+        self._reported["temperatures"] = stored.states.joint_temperature is not None
+        self._reported["torques"] = stored.states.torque is not None
         self._done = len(self._store.done())
         for raw, value, target in zip(details, stored.value, stored.target.tolist(), strict=True):
             step = Step(raw["pose"], raw["load"], raw["cycle"])
@@ -177,7 +177,7 @@ class Session:
 
     def _goal_newly_met(self, last: bool) -> bool:
         """Apply the stopping rule; return whether the goal has just been met, which is reported."""
-        readings = None if self._rule is None else self._store.readings()
+        readings = None if self._rule is None else self._readings()
         if self._rule is None or readings is None or (self._goal is not None and self._goal.met):
             return False
         status = self._goal = self._rule(readings, last)
@@ -228,8 +228,6 @@ class Session:
         """
         first, last_q = start[0], self._state.last_q
         sample = self._mover.sample_with_free_path(first.q, first.name)
-        if self._temperatures is None:
-            self._temperatures = bool(np.isfinite(sample.joint_temperature).all())
         self._hook.take_all_off()
         expected, place = (sample.q, WHERE_LEFT) if last_q is None else (last_q, AT_LAST)
         self._mover.goal = self._mover.agreed_start(
@@ -457,7 +455,9 @@ class Session:
         tared = self._tared_wrench(measured)
         target, names = measured.target, self._cell.target_names
         elapsed = self._elapsed + measured.end_time - self._start
-        temperature, torque = self._temperature(measured), self._torque(measured)
+        both = measured.before.joint_temperature, measured.after.joint_temperature
+        temperature = self._of_arm("temperatures", np.mean(both, axis=0))
+        torque = self._of_arm("torques", measured.torque)
         states = States(
             q=stop.q[None].copy(),
             wrench=self._wrench(step, tared)[None].copy(),
@@ -508,28 +508,24 @@ class Session:
                 return self._meter.load_wrench(tared)
         return load.wrench(self._cell.gravity)
 
-    def _temperature(self, measured: MeasuredStop) -> Floats | None:
-        """Return the joint temperatures (n,), °C, or None in a campaign without."""
-        if not self._temperatures:
-            return None
-        mean = (measured.before.joint_temperature + measured.after.joint_temperature) / 2
-        if not np.isfinite(mean).all():
-            raise DeviceError("arm: it no longer reports the temperatures of its joints")
-        return np.asarray(mean)
+    def _of_arm(self, name: str, value: Floats | None) -> Floats | None:
+        """Return a quantity (n,) that an arm may not report, NaN if it no longer does.
 
-    def _torque(self, measured: MeasuredStop) -> Floats | None:
-        """Return measured torques (n,) of the drives, N·m, NaN if lost; None without any."""
-        lost = measured.torque is None
-        if self._torques is None:
-            self._torques = not lost
-        if not self._torques:
+        None in a campaign whose first reading lacks it: the columns of a campaign do not change.
+        """
+        known = value if value is not None and np.isfinite(value).all() else None
+        if not self._reported.setdefault(name, known is not None):
             return None
-        if lost and not self._torques_lost:
+        if known is not None:
+            self._lost.discard(name)
+            return known
+        if name not in self._lost:
             self._remark(
-                "arm: it no longer reports the torques of its joints; readings go on without them"
+                f"arm: it no longer reports the {name} of its joints; readings go on without "
+                f"them, and effects that need the {name} of all readings cannot be fitted"
             )
-        self._torques_lost = lost
-        return np.full(self._cell.arm.n, np.nan) if measured.torque is None else measured.torque
+        self._lost.add(name)
+        return np.full(self._cell.arm.n, np.nan)
 
     def _report_drift(self, step: Step, shift: Shift) -> None:
         limit = self._config.acquire.drift_limit_sigma
@@ -567,7 +563,7 @@ class Session:
         It only serves the operator's eyes: no error of it ends a campaign.
         """
         out = [(int(k), LiveResidual()) for k in reading.target]
-        readings = None if self._live is None else self._store.readings()
+        readings = None if self._live is None else self._readings()
         if self._live is None or readings is None:
             return out
         previous = np.arange(len(readings) - len(reading))
@@ -576,6 +572,11 @@ class Session:
                 selected = readings[np.append(previous, len(previous) + k)]
                 out[k] = target, self._live(selected)
         return out
+
+    def _readings(self) -> Readings | None:
+        """Return all readings as fits take them; None without any."""
+        readings = self._store.readings()
+        return None if readings is None else readings.whole()
 
     def _finish(self) -> None:
         estimate = repeatability(self._state.visits)

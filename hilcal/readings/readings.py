@@ -30,6 +30,8 @@ from hilcal.types import Bools, Floats, Ints
 ObserverKind = Literal["station", "point", "gauge"]
 ScatterKind = Literal["joints", "each joint", "isotropic"]
 Clock = Literal["time", "order"]
+TEMPERATURES = ("air_temperature", "joint_temperature")
+"""Columns of `States` that are NaN in readings without them; see `Readings.whole`."""
 SAME_POSE = 1e-6  # Commanded joints of one pose agree to this, rad
 
 
@@ -43,8 +45,8 @@ class States(Brief):
             base axes, N and N·m; zero where unloaded.
         time: (N,) time since the campaign's start, s; None when unknown.
         load_time: (N,) time under the present load, s.
-        air_temperature: (N,) °C.
-        joint_temperature: (N, n) °C.
+        air_temperature: (N,) °C; NaN in stored readings without it.
+        joint_temperature: (N, n) °C; NaN in stored readings without them.
         approach: (N, n) side from which each joint arrived, -1 or +1.
         q_actual: (N, n) joint angles that the encoders reported, rad.
         torque: (N, n) measured static torques of the drives, N·m: the negative of those by load
@@ -246,6 +248,18 @@ class Readings(Tabular):
         states = States.joined([p.states for p in parts])
         joined = by_field(parts, np.concatenate)
         return replace(joined, states=states, common=None, serial=None, along=None)
+
+    def whole(self) -> "Readings":
+        """Return the readings without temperatures that some of them lack, as fits take them.
+
+        An effect of a temperature acts in every reading, so it cannot be computed from some.
+        """
+        lacking: dict[str, Any] = {
+            name: None
+            for name in TEMPERATURES
+            if (column := getattr(self.states, name)) is not None and np.isnan(column).any()
+        }
+        return replace(self, states=replace(self.states, **lacking)) if lacking else self
 
     def as_stated(self) -> "Readings":
         """Return the readings without an estimated scatter of the arm."""

@@ -360,6 +360,8 @@ class CampaignFile:
         """Store the observers of the first readings; refuse later readings of other observers."""
         if readings.states.torque is not None or readings.states.observer is not None:
             schema.require(self.connection, schema.MORE_COLUMNS)
+        if readings.whole() is not readings:
+            schema.require(self.connection, schema.LOST_TEMPERATURES)
         if readings.states.observer is None:
             return
         if self.texts().get(_OBSERVERS) is None:

@@ -16,14 +16,14 @@ from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.names import check_name, check_names
 from hilcal.readings.covariance import is_covariance
-from hilcal.readings.readings import SAME_POSE, ObserverName, Readings, States
+from hilcal.readings.readings import SAME_POSE, TEMPERATURES, ObserverName, Readings, States
 from hilcal.toml import parse_json
 from hilcal.types import Floats, Ints
 
 Layout = tuple[tuple[str, int], ...]
 """Fields of a record in order, with their number of doubles; absent quantities are left out."""
 LARGEST = 1e12  # upper bound of all quantities of a reading, in SI units: times in s are below 1e11
-OPTIONAL_FIELDS = "torque"  # NaN in single readings without it
+OPTIONAL_FIELDS = ("torque", *TEMPERATURES)  # NaN in single readings without them
 _PER_JOINT = ("q", "joint_temperature", "approach", "q_actual", "torque")
 _STATE = (
     *("q", "wrench", "time", "load_time", "air_temperature", "joint_temperature", "approach"),
@@ -70,7 +70,7 @@ def pack(readings: Readings) -> Floats:
             raise InputError(f"readings: {name} has shape {part.shape} for {count} readings")
         part = part.reshape(count, width)
         valid = np.isfinite(part).all(axis=1)
-        if name == OPTIONAL_FIELDS:
+        if name in OPTIONAL_FIELDS:
             valid |= np.isnan(part).all(axis=1)
         if not valid.all():
             i = int(np.argmin(valid))
@@ -260,7 +260,7 @@ def fetch_readings(
             records[number - 1] = np.frombuffer(record, "<f8")
             index[number - 1] = where
         plausible = np.abs(records) < LARGEST
-        if (lacking := _columns(layout).get(OPTIONAL_FIELDS)) is not None:
+        for lacking in (x for name, x in _columns(layout).items() if name in OPTIONAL_FIELDS):
             plausible[:, lacking] |= np.isnan(records[:, lacking]).all(axis=1, keepdims=True)
         if bad := np.flatnonzero(~plausible.all(axis=1))[:1].tolist():
             raise damaged(f" at reading {bad[0] + 1}")

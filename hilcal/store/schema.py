@@ -25,11 +25,12 @@ from hilcal.whole_file import SQLITE
 
 APPLICATION_ID = 0x68696C63  # "hilc"
 ONE_TARGET, SEVERAL_TARGETS, CHOSEN_REVISION = 2, 3, 4
-CARRIED_PRIOR, CHANGED_CELL, MORE_COLUMNS = 5, 6, 7
+CARRIED_PRIOR, CHANGED_CELL, MORE_COLUMNS, LOST_TEMPERATURES = 5, 6, 7, 8
 """Versions of a file: readings of one target, or of several; an accepted revision, or one not made
 from the previous one; a revision with a prior of another campaign, or in a changed cell; readings
-with joint torques, or of several observers. Older programs would misread a file of a newer one."""
-VERSION = MORE_COLUMNS
+with joint torques, or of several observers; readings of which some lack their temperatures. Older
+programs would misread a file of a newer one."""
+VERSION = LOST_TEMPERATURES
 HEADER = SQLITE
 _JOURNAL = bytes.fromhex("d9d505f920a163d7")  # also at the end of a journal that ends in a name
 

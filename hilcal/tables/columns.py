@@ -77,12 +77,15 @@ def required_columns(units: Units) -> tuple[str, ...]:
 
 
 def sparse_columns(header: Collection[str]) -> tuple[str, ...]:
-    """Number columns that may have empty cells: torques; readings, where some are one number."""
-    torques = tuple(c for c in header if re.fullmatch(r"tau[0-9]+_Nm?", c))
+    """Number columns that may have empty cells.
+
+    Torques; temperatures; readings, where some are one number.
+    """
+    lost = tuple(c for c in header if re.fullmatch(r"tau[0-9]+_Nm?|(air|joint[0-9]+)_degC", c))
     if not any(value in header for value, _, _ in SCALAR.values()):
-        return torques
+        return lost
     scalar = [c for value, _, variance in SCALAR.values() for c in (value, variance)]
-    return (*POSITION, *ROTATION, *covariance_columns(6), *scalar, *torques)
+    return (*POSITION, *ROTATION, *covariance_columns(6), *scalar, *lost)
 
 
 def groups(units: Units) -> tuple[tuple[str, ...], ...]:

@@ -93,7 +93,9 @@ def mapped_table(
     if mapping.scalars:
         position = () if mapping.position is None else mapping.position.columns
         sparse = [grid.name(c) for c in (*position, *(s.column for s in mapping.scalars.values()))]
-    keep, left_out = _complete(grid, raw, sparse)
+    optional = _optional(grid, mapping)
+    needed = {column: values for column, values in raw.items() if column not in optional}
+    keep, left_out = _complete(grid, needed, sparse)
     notes += left_out + missing_notes
     grid = grid.rows_with(keep)
     raw = {column: values[keep] for column, values in raw.items()}
@@ -319,6 +321,12 @@ def nines(position: Floats) -> list[float]:
     """Return numbers of four nines or more, which stand for a missing value."""
     values = np.unique(position[np.isfinite(position)])
     return [float(v) for v in values if re.fullmatch(r"-?9{4,}(\.0)?", repr(float(v)))]
+
+
+def _optional(grid: Grid, m: forms.PointMapping) -> set[str]:
+    """Columns without which a row is a reading all the same: temperatures."""
+    of_joints = () if m.joint_temperatures is None else m.joint_temperatures.columns
+    return {grid.name(column) for column in (*of_joints, *([m.air.column] if m.air else []))}
 
 
 def _complete(grid: Grid, raw: dict[str, Floats], sparse: Sequence[str]) -> tuple[Bools, list[str]]:

@@ -18,7 +18,7 @@ from hilcal.readings.covariance import (
     smallest_correlation,
     tracker_covariance,
 )
-from hilcal.readings.readings import ObserverName, Readings, States
+from hilcal.readings.readings import TEMPERATURES, ObserverName, Readings, States
 from hilcal.robot.arm import Arm
 from hilcal.store.plan import UNLOADED
 from hilcal.tables import columns
@@ -114,7 +114,7 @@ def readings_of(
         target_names=() if target is None else tuple(targets),
         observers=() if observed is None else observed.names,
     )
-    return ImportResult(readings, notes, covers)
+    return ImportResult(readings, (*notes, *_lost_temperatures(table, states)), covers)
 
 
 def covariances_of(
@@ -256,6 +256,7 @@ def _states(table: ColumnTable, arm: Arm) -> States:
     if actual is not None:
         columns.check_actual_joints(table, reported, actual, q)
     if temperature is not None:
+        temperature[np.isnan(temperature).any(axis=1)] = np.nan  # a row has all or none
         _in_range(table, columns.temperature_columns(n), -50, 150, "°C")
     if torque is not None:
         lost = np.isnan(torque)
@@ -280,6 +281,22 @@ def _states(table: ColumnTable, arm: Arm) -> States:
         q_actual=actual,
         torque=torque,
     )
+
+
+def _lost_temperatures(table: ColumnTable, states: States) -> list[str]:
+    """Return a note on each kind of temperature that some readings lack."""
+    out = []
+    for field in TEMPERATURES:
+        column = getattr(states, field)
+        lost = np.isnan(column.reshape(len(states), -1)).any(axis=1) if column is not None else []
+        if np.any(lost):
+            name = {"air_temperature": "air_degC"}.get(field, "joint1_degC, ...")
+            out.append(
+                f"{name}: no temperature in {int(np.sum(lost))} of {len(lost)} readings (the first "
+                f"is row {table.rows[int(np.argmax(lost))]}): fits do without this temperature, as "
+                "an effect that depends on it needs it in all"
+            )
+    return out
 
 
 def _group(table: ColumnTable, names: Sequence[str]) -> Floats | None:
@@ -372,7 +389,7 @@ def without_copies(readings: Readings) -> tuple[Readings, tuple[str, ...]]:
     scalars = [s.time, s.load_time, s.air_temperature]
     columns = [s.q, s.wrench, value, *(x[:, None] for x in scalars if x is not None)]
     names = np.stack([readings.load, readings.cycle, readings.line], axis=1)
-    keys = np.concatenate([*columns, names], axis=1)
+    keys = np.nan_to_num(np.concatenate([*columns, names], axis=1), nan=np.inf)
     _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     original = first[inverse.reshape(-1)]
     copied = original != np.arange(len(readings))

@@ -36,12 +36,14 @@ CovarianceParts = Literal[
 
 
 def full_readings(readings: Readings, covers: str | None, cell: Cell) -> Readings:
-    """Return readings with their full covariance, see `readings.covariance`.
+    """Return readings as fits take them: whole columns, and the full covariance.
+
+    See `Readings.whole` and `readings.covariance`.
 
     The arm's repeatability is added where the covariances of a file or a table cover the instrument
     alone; `covers` states what they cover, None for a file that does not state it.
     """
-    config = cell.configured()
+    config, readings = cell.configured(), readings.whole()
     parts = covariance_parts(covers, config)
     joint_std = config.repeatability.per_joint(cell.arm.n)
     if parts == "instrument and repeatability":

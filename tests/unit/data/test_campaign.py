@@ -462,6 +462,7 @@ FILES = sorted((ROOT / "tests" / "data" / "campaigns").glob("*.hilcal.gz"))
 HASHED = next(path for path in FILES if "hashed" in path.name)
 """Its revision names the hash of the readings as they are stored."""
 HASHES = {
+    "version-8": "2beafe6ae2cf3c69b3317893daff5260fc0d87f12c783ec1f6fcc4f12404925d",
     "version-7": "19cdcf16d7a45f38ddddae06b85eb02e09e42f7bcecf239add2f41c3a4091221",
     "version-5-hashed": "f91c9c4b17595fd06c9913893dded67c902babcea3f5cb885cd6e043b3e1034f",
     "version-6": "f91c9c4b17595fd06c9913893dded67c902babcea3f5cb885cd6e043b3e1034f",

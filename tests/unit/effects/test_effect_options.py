@@ -63,11 +63,13 @@ def test_growth_needs_one_of_two_temperatures():
     assert [kind.computable(s) for s in (both, air, joints, neither)] == [True, True, True, False]
     chosen = [make("thermal_growth", cell, s).options["temperature"] for s in (both, air, joints)]
     assert chosen == ["air", "air", "joints"]
-    with pytest.raises(InputError, match="needs air_temperature or joint_temperature, which the"):
+    with pytest.raises(
+        InputError, match="needs air_temperature or joint_temperature, which not all"
+    ):
         make("thermal_growth", cell, neither)
-    with pytest.raises(InputError, match="'air', which the readings do not have; valid: joints"):
+    with pytest.raises(InputError, match="'air', which not all readings have; valid: joints"):
         make("thermal_growth", cell, joints, {"temperature": "air"})
-    with pytest.raises(InputError, match="'joints', which the readings do not have; valid: air"):
+    with pytest.raises(InputError, match="'joints', which not all readings have; valid: air"):
         make("thermal_growth", cell, air, {"temperature": "joints"})
 
 
@@ -79,7 +81,7 @@ def test_a_thermometer_once_chosen_is_kept():
     assert again.options == fitted.options == {
         "reference_degC": 20.0, "temperature": "air", "links": "common",
     }  # fmt: skip
-    with pytest.raises(InputError, match="temperature = 'air', which the readings do not have"):
+    with pytest.raises(InputError, match="temperature = 'air', which not all readings have"):
         Model(UR10E, (fitted,)).predict(replace(both, air_temperature=None), np.zeros(1))
     with pytest.raises(InputError, match="temperature = 'air'"):
         make("thermal_growth", UR10E, replace(both, air_temperature=None), fitted.options)
@@ -119,9 +121,9 @@ def test_joints_without_temperatures_warm_up_with_the_time():
         (timed, by_temperature.options),
         (replace(hot, time=None), kept.options),
     ):
-        with pytest.raises(InputError, match="which the readings do not have; valid: "):
+        with pytest.raises(InputError, match="which not all readings have; valid: "):
             make("thermal_joint_drift", UR10E, states, options)
-    with pytest.raises(InputError, match="needs joint_temperature or time, which the readings"):
+    with pytest.raises(InputError, match="needs joint_temperature or time, which not all"):
         make("thermal_joint_drift", UR10E, replace(timed, time=None))
 
 

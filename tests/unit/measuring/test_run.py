@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from hilcal.campaign.campaign import Campaign
 from hilcal.config import CellLoad, ForceSensor, Repeatability, Tool
 from hilcal.errors import CannotAnswerError, DeviceError, InputError
 from hilcal.identification.torques import check_torques, require_torques
@@ -26,7 +27,7 @@ from hilcal.store.run_log import (
     check_same_cell,
     create_run,
 )
-from hilcal.tables.table import write_table
+from hilcal.tables.table import import_table, write_table
 from tests.support.fake_bench import (
     FEW_POSES,
     POSES,
@@ -503,6 +504,34 @@ def test_a_campaign_goes_on_as_it_began(b, first):
         assert np.isfinite(torque[:4]).all()
         assert np.isnan(torque[4:]).all()
         assert len(b.remarks(LOST)) == 1
+
+
+def test_temperatures_that_an_arm_no_longer_reports_lock_no_campaign(b, tmp_path):
+    """The other readings keep theirs; a fit has no column that some of its readings lack."""
+
+    def cold(sample):
+        lost = b.store.rows and len(b.store.rows) >= 4
+        return replace(sample, joint_temperature=np.full(6, np.nan)) if lost else sample
+
+    change_result(b.rig.arm, "sample", cold)
+    b.interrupt(6, FEW_POSES)
+    readings = b.measure()
+    assert len(b.remarks("no longer reports the temperatures of its joints")) == 2  # of sessions
+    temperature = readings.states.joint_temperature
+    assert np.allclose(temperature[:4], 30.0)
+    assert np.isnan(temperature[4:]).all()
+    with CampaignFile.create(tmp_path / "r.hilcal", b.config.to_json(), ".", "test") as file:
+        file.append_readings(readings[:4])
+        file.append_readings(readings[4:])
+        assert content_hash(file.readings()) == content_hash(readings)
+    with Campaign.open(tmp_path / "r.hilcal") as run:
+        assert run.readings.states.joint_temperature is None
+        with pytest.raises(InputError, match="which not all readings have"):
+            run.catalogue.make("thermal_growth", run.cell, run.readings.states)
+        run.save_table(tmp_path / "t.csv", as_stored=True)
+    imported = import_table(tmp_path / "t.csv", b.cell.arm, None)
+    assert content_hash(imported.readings) == content_hash(readings)
+    assert any("in 5 of 9 readings (the first is row 6)" in note for note in imported.notes)
 
 
 def _sensor(use, rotvec_rad):
