@@ -11,7 +11,7 @@ from hilcal.config import CellConfig
 from hilcal.measuring.clearance import TRACKER_UNKNOWN
 from hilcal.measuring.feasibility import Feasibility
 from hilcal.robot.arm import Arm
-from hilcal.store.plan import ARM, REFERENCE, UNLOADED, Plan, Step
+from hilcal.store.plan import ARM, BY_HOME, LEFT_OUT, REFERENCE, UNLOADED, Plan, Step
 from hilcal.toml import suggest
 from hilcal.types import Floats
 
@@ -42,8 +42,9 @@ def route(plan: Plan, arm: Arm, margin: float = 0.0) -> tuple[Stop, ...]:
 
     The first two stops, beside the reference pose and at it, move every joint, so that the approach
     sides of all readings are known. Loads are changed at the reference pose. A repeated reading is
-    approached again.
+    approached again. Steps that `Plan.about` lists are reached by the reference pose.
     """
+    by_home = [Step(**step) for step in plan.about.get(BY_HOME, ())]
     base = plan.home
     q_home = plan.joints(base)
     first = Stop(f"beside {base}", approach_pose(q_home, arm, margin), UNLOADED)
@@ -53,7 +54,7 @@ def route(plan: Plan, arm: Arm, margin: float = 0.0) -> tuple[Stop, ...]:
         hanging = last.hanging if last.change_to is None else last.change_to
         if step.load != hanging:
             stops.append(Stop(base, q_home, hanging, change_to=step.load))
-        elif last.step is not None and last.step.pose == step.pose:
+        elif last.step is not None and (last.step.pose == step.pose or step in by_home):
             away = (first.name, first.q) if step.pose == base else (base, q_home)
             stops.append(Stop(*away, hanging))
         stops.append(Stop(step.pose, plan.joints(step.pose), step.load, step=step))
@@ -201,6 +202,11 @@ def _remarks(plan: Plan, limits: Feasibility) -> list[str]:
         out.append(
             f'no pose has the name "{REFERENCE}": loads are changed at {plan.home}, and drift '
             "is not checked"
+        )
+    elif plan.home in [x["point"] for x in plan.about.get(LEFT_OUT, ())]:
+        out.append(
+            f"{plan.home} is read no more, as the operator has left it out: from its last reading "
+            "on nobody watches whether the tracker, the target or the arm drifts"
         )
     if limits.config.sight.target_normal is not None and limits.sight is None:
         out.append(TRACKER_UNKNOWN)

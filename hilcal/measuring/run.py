@@ -190,7 +190,7 @@ class Session:
 
     def _visit(self, stop: Stop) -> tuple[Readings, float] | None:
         step = stop.step
-        self.pose = None if step is None or step.pose == self._plan.home else step.pose
+        self.pose = None if step is None else step.pose
         self._move(stop)
         change = None if stop.change_to == self._hook.hanging else stop.change_to
         if change is not None:
@@ -639,7 +639,9 @@ def run(
         trouble = _stop(rig.arm) if session.in_control else ""
         failed_before = session.pose is not None and _failed_at(store) == session.pose
         _note(store, error, trouble, session.pose)
-        _raise(error, trouble, session.pose if failed_before else None)
+        lost = ", and without watching drift" if session.pose == plan.home else ""
+        advice = f"goes on without readings there{lost}"
+        _raise(error, trouble, session.pose if failed_before else None, advice)
 
 
 def _refuse_unsafe(cell: Cell, missing: Plan, begun: bool) -> None:
@@ -694,8 +696,11 @@ def _note(store: RunLog, error: BaseException, trouble: str, pose: str | None) -
         return
 
 
-def _raise(error: BaseException, trouble: str, failed_before: str | None) -> None:
-    """Raise the error with advice; a previous session failed at the pose `failed_before`, too."""
+def _raise(error: BaseException, trouble: str, failed_before: str | None, skipped: str) -> None:
+    """Raise the error with advice; a previous session failed at the pose `failed_before`, too.
+
+    `skipped` says what happens without that pose.
+    """
     if not isinstance(error, Exception) and not trouble:
         raise error
     sentences = [_line(error)]
@@ -705,9 +710,7 @@ def _raise(error: BaseException, trouble: str, failed_before: str | None) -> Non
         sentences.append(f"THE ARM MAY STILL MOVE ({trouble}): {EMERGENCY}")
     elif failed_before is not None and isinstance(error, Exception):
         skip = shlex.join(["--skip", failed_before])
-        sentences.append(
-            f"It failed at {failed_before} before, too: {skip} goes on without that pose"
-        )
+        sentences.append(f"It failed at {failed_before} before, too: {skip} {skipped}")
     ended = [x if x.endswith(("?", "!")) else f"{x}." for x in sentences]
     kind = type(error) if isinstance(error, HilcalError) and not trouble else DeviceError
     raise kind(" ".join([*ended, HOW_ON])) from error

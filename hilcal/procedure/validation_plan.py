@@ -325,7 +325,8 @@ def paired(validation: Readings, corrected: Readings, mode: str) -> tuple[Readin
 
 def left_out_of(plan: Plan) -> list[tuple[str, str]]:
     """Return the points that a plan leaves out, each with the reason."""
-    return [(str(x["point"]), str(x["why"])) for x in plan.about.get(LEFT_OUT, [])]
+    listed = [(str(x["point"]), str(x["why"])) for x in plan.about.get(LEFT_OUT, [])]
+    return [(point, why) for point, why in listed if point != REFERENCE]
 
 
 def expected_states(

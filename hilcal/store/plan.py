@@ -26,6 +26,7 @@ REFERENCE = "reference"  # the pose of drift checks and load changes
 REFERENCE_POSITION = "reference_seen_m"  # key of `Plan.about`: of the target, sensor axes, m
 ARM = "robot"  # key of `Plan.about`: the name of the arm that the plan was made for
 DURATION = "duration_s"  # key of `Plan.about`: durations, "total" among them, s
+BY_HOME = "by_home"  # key of `Plan.about`: steps that are reached by `Plan.home`, see `skipping`
 LEFT_OUT = "left_out"  # key of `Plan.about`: points that are not measured, each with the reason
 
 
@@ -80,20 +81,20 @@ class Plan(Brief):
     def skipping(self, poses: Sequence[str], done: frozenset[Step], cycle: int) -> "Plan":
         """Return the steps that are not in `done`, without those at `poses`, which `about` lists.
 
-        The straight motion past a removed step may not be clear: there the arm moves to the pose
-        where loads are changed and takes a reading, as in a planned order. `cycle`: the number of
+        The straight motion past a removed step may not be clear: there the arm moves by the pose
+        where loads are changed. It goes to that pose even where its readings are left out. If no
+        step remains, it is a reading there, else the last step of `done`. `cycle`: the number of
         the first cycle that is not used in the campaign.
         """
         missing, home = self.without(done).steps, self.home
-        valid = list(dict.fromkeys(s.pose for s in missing if s.pose != home))
+        valid = list(dict.fromkeys(s.pose for s in missing))
         for pose in poses:
             if pose not in valid:
-                why = "loads are changed there" if pose == home else "nothing is missing there"
                 raise InputError(
-                    f"pose {pose!r} cannot be left out: {why}{suggest(pose, valid)}; valid: "
-                    f"{', '.join(valid) or 'none'}"
+                    f"pose {pose!r} cannot be left out: nothing is missing there"
+                    f"{suggest(pose, valid)}; valid: {', '.join(valid) or 'none'}"
                 )
-        cycles, gap = itertools.count(cycle), False
+        gap, by_home = False, list(self.about.get(BY_HOME, []))
         steps: list[Step] = []
         for step in missing:
             if step.pose in poses:
@@ -101,12 +102,17 @@ class Plan(Brief):
                 continue
             last = steps[-1] if steps else None
             if gap and last and last.load == step.load and home not in (last.pose, step.pose):
-                steps.append(Step(home, step.load, next(cycles)))
+                by_home.append(asdict(step))
             steps.append(step)
             gap = False
-        steps = steps or [Step(home, UNLOADED, cycle)]
-        left_out = [{"point": p, "why": "left out by the operator"} for p in dict.fromkeys(poses)]
-        about = {**self.about, LEFT_OUT: [*self.about.get(LEFT_OUT, []), *left_out]}
+        new = [{"point": p, "why": "left out by the operator"} for p in dict.fromkeys(poses)]
+        left_out = [*self.about.get(LEFT_OUT, []), *new]
+        about = {**self.about, LEFT_OUT: left_out, BY_HOME: by_home}
+        if not steps and home not in [x["point"] for x in left_out]:
+            steps = [Step(home, UNLOADED, cycle)]
+        steps = steps or [step for step in self.steps if step in done][-1:]
+        if not steps:
+            raise InputError(f"without {', '.join(poses)} nothing is left of the plan to measure")
         if isinstance(durations := self.about.get(DURATION), dict):
             share = len(steps) / len(self.steps)
             about[DURATION] = {"total": share * float(durations.get("total", 0.0))}
@@ -155,8 +161,14 @@ def _are_left_out(x: object) -> bool:
     return isinstance(x, list) and all(isinstance(p, dict) and keys <= set(p) for p in x)
 
 
+def _are_steps(x: object) -> bool:
+    keys = {"pose", "load", "cycle"}
+    return isinstance(x, list) and all(isinstance(s, dict) and keys == set(s) for s in x)
+
+
 _USED_KEYS: dict[str, tuple[str, Callable[[object], bool]]] = {
     REFERENCE_POSITION: ("three numbers, m", _is_place),
+    BY_HOME: ('a list of objects with "pose", "load" and "cycle"', _are_steps),
     LEFT_OUT: ('a list of objects with "point" and "why"', _are_left_out),
     DURATION: (
         'an object with a number "total", s',
@@ -255,7 +267,7 @@ def with_new_names(plan: Plan, campaign: Plan, number: int) -> Plan:
 
 def joined(first: Plan, done: frozenset[Step], further: Plan) -> Plan:
     """Join the measured steps (`done`) of a previous plan and a further plan."""
-    measured = tuple(s for s in first.steps if s in done)
+    measured = tuple(s for s in first.steps if s in done and s not in further.steps)
     used = {s.pose for s in measured} | {REFERENCE}
     added = [k for k, p in enumerate(first.pose_names) if p in used and p not in further.pose_names]
     return Plan(

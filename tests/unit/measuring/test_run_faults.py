@@ -17,7 +17,7 @@ from hilcal.measuring.progress import ReadingStored
 from hilcal.measuring.run import HOW_ON
 from hilcal.robot import chain as chains
 from hilcal.robot.catalogue import configs_dir
-from hilcal.store.plan import Step
+from hilcal.store.plan import Step, joined
 from tests.support.fake_bench import (
     FEW_POSES,
     POSES,
@@ -438,22 +438,49 @@ def test_a_pose_that_fails_twice_is_named_and_can_be_left_out(b):
     call_before(b.rig.tracker, "measure", hidden)
     for again in (False, True, True):
         said = refusal_of(DeviceError, r"line of sight.*--resume$", b.measure, usual_plan())
-        assert ("It failed at p2 before, too: --skip p2 goes on" in said) == again
+        assert ("It failed at p2 before, too: --skip p2 goes on without r" in said) == again
         b.world.restart()
         b.world.unseen_measurements = b.world.not_found = 0
     assert [s.pose for s, _, _ in b.store.rows] == ["reference", "p1"]
     plan = usual_plan()
-    for pose, why in (("reference", "loads are changed there"), ("p1", "nothing is missing there")):
-        bare = replace(plan, steps=tuple(s for s in plan.steps if s.load == "none"))
-        refusal(f"{pose!r} cannot be left out: {why}", bare.skipping, [pose], b.store.done(), 3)
+    all_of_p1 = {s for s in plan.steps if s.pose == "p1"}
+    refusal("'p1' cannot be left out: nothing", plan.skipping, ["p1"], all_of_p1, 3)
+    moves = len(b.world.at_start)
     b.measure(plan.skipping(["p2"], b.store.done(), 3))
     steps = [s for s, _, _ in b.store.rows]
-    assert {s for s in plan.steps if s.pose != "p2"} < set(steps)
-    # across the gap between p1 and p3 the arm moves by the reference
-    assert [s for s in steps if s not in plan.steps] == [
-        Step("reference", load, cycle) for cycle, load in enumerate(("3kg", "pull"), start=3)
-    ]
-    assert steps[2] == Step("p3", "none", 0)  # from the reference, where the session begins
+    assert set(steps) == {s for s in plan.steps if s.pose != "p2"}
+    at = {tuple(q): name for name, q in POSES.items()}
+    names = [at.get(tuple(q.tolist()), "beside") for q, _ in b.world.at_start[moves:]]
+    # from the reference, where the session begins; across the gap the arm moves by it
+    assert names[:4] == ["beside", "reference", "p3", "p4"]
+    assert names[4:9] == ["reference", "p1", "reference", "p3", "p4"]
+
+
+def test_a_reference_that_is_out_of_sight_for_good_locks_no_campaign(b):
+    """A cabinet before the tracker: loads are changed there, and its drift is watched no more."""
+
+    def hidden():
+        lost = len(b.store.rows) > 2 and np.allclose(b.world.joints(), POSES["reference"])
+        b.world.unseen_measurements = b.world.not_found = 1000 if lost else 0
+
+    call_before(b.rig.tracker, "measure", hidden)
+    call_before(b.rig.tracker, "find_target", hidden)
+    for again in (False, True):
+        said = refusal_of(DeviceError, r"line of sight.*--resume$", b.measure)
+        b.world.restart()
+        advice = "--skip reference goes on without readings there, and without watching drift"
+        assert (advice in said) == again
+    done = b.store.done()
+    plan = FEW_POSES.skipping(["reference"], done, 3)
+    b.measure(plan)
+    assert b.store.done() == {s for s in FEW_POSES.steps if s.pose != "reference" or s in done}
+    assert b.remarks("reference is read no more, as the operator has left it out")
+    # where only returns are missing, the campaign is complete without them
+    returns = {s for s in FEW_POSES.steps if s not in b.store.done()}
+    rest = FEW_POSES.skipping(["reference"], b.store.done(), 3)
+    assert returns
+    assert not rest.without(b.store.done()).steps
+    assert len(joined(FEW_POSES, b.store.done(), rest).steps) == len(b.store.rows)
 
 
 def test_readings_that_were_drawn_are_not_gone_on_with(b):
