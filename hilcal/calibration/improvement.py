@@ -21,6 +21,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
+import scipy
 
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensation import BAND, ErrorSize, band, tool_of, tool_poses
@@ -29,6 +30,17 @@ from hilcal.identification.residual import noise_floor, residual
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import Mode, whitening
 from hilcal.types import Bools, Floats
+
+REFUTED_P = 1e-3
+"""Probability of so few points inside of their band, below which it is refuted; a choice."""
+
+
+def refuted(inside: int, count: int) -> bool:
+    """Whether so few of the points inside of their band refute it: P(B ≤ inside) < `REFUTED_P`.
+
+    B is binomial of `count` and `BAND`.
+    """
+    return bool(scipy.stats.binom.cdf(inside, count, BAND) < REFUTED_P)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +91,11 @@ class Improvement:
         return self._part("all", np.ones(len(self.poses), dtype=np.bool_))
 
     @property
+    def refuted(self) -> bool:
+        """Whether the measured errors refute the predicted bands."""
+        return refuted(self.everything.inside, self.everything.count)
+
+    @property
     def by_load(self) -> tuple[ErrorReduction, ...]:
         """The points of each load."""
         loads = np.array(self.loads)
@@ -112,6 +129,7 @@ class Improvement:
             "error": asdict(self.everything),
             "loads": [asdict(part) for part in self.by_load],
             "band_share": BAND,
+            "refuted": self.refuted,
             "points": [
                 {"pose": pose, "load": load, "before_m": before, "after_m": after, "band_m": width}
                 for pose, load, before, after, width in rows

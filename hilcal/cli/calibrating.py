@@ -144,6 +144,9 @@ def calibrate(
     limit_m, files = p.settings.limit_m, p.files
     t.show(words.step_heading(ProcedureStep("compare", output)))
     t.show(words.improvement_report(improvement, limit_m))
+    if improvement.refuted:
+        t.show("What has changed since is told by:")
+        t.command(shlex.join(["hilcal", "compare", str(output), str(files.validation)]))
     t.show(
         f"\nThe calibration is in {output}, its tests are in {files.validation.name} and "
         f"{files.corrected.name}. To correct points and programs:"

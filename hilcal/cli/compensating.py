@@ -11,6 +11,7 @@ import numpy as np
 
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensation import Compensation
+from hilcal.calibration.improvement import refuted
 from hilcal.calibration.points import Points, on_branch, read_points
 from hilcal.calibration.programs import urscript
 from hilcal.calibration.programs.languages import READERS, ResolvedProgram, read_program
@@ -20,7 +21,7 @@ from hilcal.cli.terminal import Terminal
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit_document import with_nulls
-from hilcal.names import csv_text
+from hilcal.names import csv_text, quoted
 from hilcal.present.calibration import (
     compensation_report,
     refusals,
@@ -28,8 +29,10 @@ from hilcal.present.calibration import (
     waypoints_table,
 )
 from hilcal.present.progress import working
+from hilcal.procedure.state import IMPROVED, Files
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
+from hilcal.store.procedure_log import ProcedureLog
 from hilcal.tables.columns import joint_columns
 from hilcal.tables.mapping import PointMapping, find_mapping
 from hilcal.types import Bools, Floats
@@ -99,7 +102,7 @@ def compensate(
         _check_output(path, points, force)
     with working(t.progress) as say:
         say(f"reading {model}")
-        calibration = _calibration(model, catalogue, revision)
+        calibration, doubt = _calibration(model, catalogue, revision)
         arm = calibration.model.cell.arm
         start = None if options.near is None else _numbers(options.near, arm.n, "--near")
         start = None if start is None else np.where(arm.slides, start, np.radians(start))
@@ -147,6 +150,8 @@ def compensate(
     written = [str(path) for path in files]
     t.show(compensation_report(calibration, task.points.names, q, result))
     t.show(waypoints_table(outcomes))
+    if doubt:
+        t.notice(f"warning: {doubt}")
     hint = "Nothing was written; -o F.csv, F.json or F.script writes the joint values."
     t.show(f"\nWritten: {', '.join(written)}." if written else f"\n{hint}")
     for path in files if task.program is None and task.foreign is None else ():
@@ -171,13 +176,22 @@ def _program_poses(task: _Task, calibration: Calibration, q: Floats, arm: Arm) -
     return np.where(stated, targets, nominal)
 
 
-def _calibration(path: Path, catalogue: Catalogue, revision: int | None) -> Calibration:
+def _calibration(path: Path, catalogue: Catalogue, revision: int | None) -> tuple[Calibration, str]:
+    """Return a calibration, and why its own test refutes its bands; "" where it does not."""
     if path.suffix == ".json":
         if revision is not None:
             raise InputError(f"{path}: a calibration has no revisions; leave out --revision")
-        return Calibration.load(path, catalogue)
+        return Calibration.load(path, catalogue), ""
     with Campaign.open(path, catalogue, read_only=True) as run:
-        return run.calibration(revision)
+        calibration, gain = run.calibration(revision), ProcedureLog(run.file).last(IMPROVED)
+        if gain is None or gain["revision"] != calibration.source["revision"]:
+            return calibration, ""
+        inside, count = gain["error"]["inside"], gain["error"]["count"]
+        return calibration, refuted(inside, count) * (
+            f"{path}: {inside} of {count} points that were measured at corrected targets lie "
+            "within their 95 % band: the bands stated here do not hold; calibrate again, or ask "
+            f"what has changed: hilcal compare {quoted(path)} {quoted(Files(path).validation)}"
+        )
 
 
 def _task(

@@ -8,6 +8,7 @@ import numpy as np
 import scipy
 
 from hilcal import numbers
+from hilcal.calibration.improvement import refuted
 from hilcal.calibration.scatter import COVERAGE, budget
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE, Suspect
@@ -22,6 +23,7 @@ from hilcal.numbers import length, percent
 from hilcal.present import charts
 from hilcal.present import fit as fit_words
 from hilcal.present.calibration import (
+    REFUTED,
     fit_and_test_lines,
     loads_report,
     validation_report,
@@ -215,6 +217,11 @@ def limit_words(m: ReportContent) -> tuple[str, bool | None]:
         end = f" (campaign {m.test.name}, never fitted; largest {length(most)})."
         if a.undecided:
             end += " Noise alone exceeds the limit, so that these readings cannot decide."
+    elif m.corrected is not None:
+        error = np.array([point["after_m"] for point in m.corrected["points"]])
+        count, over = len(error), int(np.sum(error > m.limit_m))
+        passed, most = over == 0, float(error.max())
+        end = f" (measured at corrected targets, never fitted; largest {length(most)})."
     else:
         error = left_out_errors(m.fit)
         count, over = len(error), int(np.sum(error > m.limit_m))
@@ -245,6 +252,8 @@ def _certificate(m: ReportContent) -> PageSection:
             name, within = load_name(str(part["name"])), f"{part['inside']} of {part['count']}"
             out.add(name, str(part["count"]), *(length(float(x)) for x in sizes), within)
         parts.append(out)
+        if refuted(m.corrected["error"]["inside"], m.corrected["error"]["count"]):
+            parts.append(Words(REFUTED, "strong"))
     for title, blocks in (
         ("Uncertainty", _uncertainty(m.fit)),
         ("Limit" if m.test is None else "Limit and validation", _limit(m)),

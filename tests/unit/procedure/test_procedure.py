@@ -8,18 +8,23 @@ import numpy as np
 import pytest
 
 import hilcal as hc
-from hilcal.calibration.improvement import Improvement
+from hilcal.calibration.improvement import Improvement, refuted
+from hilcal.campaign.campaign import Campaign
 from hilcal.config.cell import Repeatability
 from hilcal.config.reference import to_toml
 from hilcal.drivers.simulated.rehearsal import simulate_plan
 from hilcal.identification.carried.carried_prior import carried_prior
 from hilcal.library import load_posterior
+from hilcal.present.calibration import REFUTED, improvement_report, validation_lines
+from hilcal.present.html.report import limit_words
 from hilcal.procedure.state import DECIDED, FROZEN
 from hilcal.readings.same_readings import found_among
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import REFERENCE
 from hilcal.store.procedure_log import ProcedureLog, purpose_of, release
 from hilcal.store.run_log import RunLog, check_same_arm
+from hilcal.write_report import ReportOptions, content_of
+from tests.support.cli_cases import ok
 from tests.support.paths import ROOT
 from tests.support.procedure_cases import (
     ARM,
@@ -142,6 +147,34 @@ def test_the_error_falls_as_far_as_predicted(done):
     assert every.inside >= 4
     assert sum(part.count for part in found.by_load) == 6
     assert found.left_out == ()
+
+
+def test_an_arm_that_changes_before_its_validation_refutes_the_prediction(tmp_path, capsys):
+    """Alone "94 % are removed" would be said, beside bands that none of its points keeps."""
+    d = drawn_calibration(
+        tmp_path / "run.hilcal", poses=20, validation=8, readings="absolute",
+        config=small_config(readings="absolute"),
+    )  # fmt: skip
+    while (step := d.procedure.next()).kind != "done":
+        d.hidden = "nothing" if step.path == d.procedure.run else "encoder_offset"
+        found = d.do(step)
+        if step.kind == "validate":
+            assert "times as far off as the fit states" in "".join(validation_lines(found))
+    assert found.refuted
+    assert REFUTED in list(improvement_report(found, None))
+    limit = 0.9 * float(found.after_m.max())
+    with Campaign.open(d.procedure.run) as run:
+        words, passed = limit_words(content_of(run, ReportOptions(limit_m=limit)))
+        q = ",".join(map(str, run.readings.states.q[0]))
+    assert not passed
+    assert "measured at corrected targets" in words
+    points = tmp_path / "points.csv"
+    points.write_text(f"pose,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad\na,{q}\n")
+    warned = ok(capsys, "compensate", d.procedure.run, points).err
+    every = found.everything
+    assert f"warning: {d.procedure.run}: {every.inside} of {every.count} points that" in warned
+    assert not refuted(6, 8)
+    assert not refuted(0, 2)
 
 
 def test_validation_poses_lie_within_what_was_measured_and_are_new(done):
