@@ -14,7 +14,7 @@ r the load point, and (f, M) the change of its reading by the load, sensor axes:
     force = R f,   moment = R M − (r − p) × R f
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -26,7 +26,9 @@ from hilcal.identification.prediction.validation import FAR
 from hilcal.measuring.force import shift
 from hilcal.model.model import Model
 from hilcal.readings.readings import (
+    TEMPERATURES,
     Range,
+    Readings,
     States,
     angle_name,
     ranges_of,
@@ -139,6 +141,29 @@ def conditions_of(
         moved = np.sum((reference[0] - position) ** 2) + np.sum((reference[1] - spread) ** 2)
         out[name] = Condition(np.asarray(mean), float(moved) / (3 * len(sample)))
     return out
+
+
+def with_mean_temperatures(readings: Readings, conditions: Mapping[str, Condition]) -> Readings:
+    """Return readings whose lacking temperatures are those of `conditions`, v in their covariance.
+
+    So a model that needs a temperature can be tested by readings of an arm that no longer reports
+    it.
+    """
+    lacking = [n for n in TEMPERATURES if n in conditions and getattr(readings.states, n) is None]
+    if not lacking:
+        return readings
+    filled: dict[str, Any] = {
+        n: np.broadcast_to(m := conditions[n].mean, (len(readings), *m.shape)).copy()
+        for n in lacking
+    }
+    more = np.zeros((readings.m, readings.m))
+    more[:3, :3] = sum(conditions[n].variance_m2 for n in lacking) * np.eye(3)
+    return replace(
+        readings,
+        states=replace(readings.states, **filled),
+        covariance=readings.covariance + more,
+        stated=None if readings.stated is None else readings.stated + more,
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

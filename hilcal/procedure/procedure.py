@@ -24,6 +24,7 @@ import numpy as np
 
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.improvement import Improvement, improvement
+from hilcal.calibration.measured import with_mean_temperatures
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
@@ -43,7 +44,7 @@ from hilcal.procedure import state
 from hilcal.procedure.next_plan import Decision, FurtherMeasuring, PredictedError, predicted_error
 from hilcal.procedure.validation_plan import corrected_plan, left_out_of, paired, validation_plan
 from hilcal.readings.covariance import COVERS_KEY, INSTRUMENT
-from hilcal.readings.readings import ArmScatter, Readings
+from hilcal.readings.readings import TEMPERATURES, ArmScatter, Readings
 from hilcal.readings.same_readings import found_among
 from hilcal.readings.whitening import usual_mode
 from hilcal.refinement import Refinement, refine
@@ -364,7 +365,10 @@ class Procedure:
         return o.calibration(record.number), record
 
     def _readings(self, o: Campaign, record: RevisionRecord, file: CampaignFile) -> Readings:
-        """Return the readings of another file, with their covariance by the fit of a revision."""
+        """Return the readings of another file, with their covariance by the fit of a revision.
+
+        Temperatures that they lack and that the model may need are the means of the fitted ones.
+        """
         model, _ = o.restore_model(record)
         all_known = (True,) * len(model.cell.known_targets)
         cell = replace(model.cell, registration_known=True)
@@ -373,9 +377,15 @@ class Procedure:
             file.readings(), file.about(COVERS_KEY), cell.with_config(o.config)
         )
         scatter = record.parameters_json.get("arm_scatter")
-        if scatter is None:
+        if scatter is not None:
+            readings = with_arm_scatter(cell, readings, ArmScatter.from_json(scatter))
+        fitted = o.fitted_readings(record).states
+        kinds = [
+            [getattr(s, n) is not None for n in TEMPERATURES] for s in (fitted, readings.states)
+        ]
+        if kinds[0] == kinds[1]:
             return readings
-        return with_arm_scatter(cell, readings, ArmScatter.from_json(scatter))
+        return with_mean_temperatures(readings, self._calibration(o)[0].conditions)
 
     def _create(self, path: Path, purpose: str, plan: Plan, o: Campaign) -> None:
         covers = o.file.about(COVERS_KEY) or INSTRUMENT

@@ -177,6 +177,28 @@ def test_an_arm_that_changes_before_its_validation_refutes_the_prediction(tmp_pa
     assert not refuted(0, 2)
 
 
+@pytest.mark.long
+def test_an_arm_without_temperatures_in_its_validation_does_not_lock_it(tmp_path, monkeypatch):
+    """The model needs them: their means count, and the bands say whether that is enough."""
+    path, real = tmp_path / "run.hilcal", RunLog.record
+    d = drawn_calibration(
+        path, "thermal_joint_drift", poses=20, validation=6, readings="absolute",
+        config=small_config(readings="absolute"),
+    )  # fmt: skip
+
+    def cold(log, reading, *given):
+        if d.procedure.next().path != path:
+            reading = replace(reading, states=replace(reading.states, joint_temperature=None))
+        return real(log, reading, *given)
+
+    monkeypatch.setattr(RunLog, "record", cold)
+    while (step := d.procedure.next()).kind != "done":
+        found = d.do(step)
+        if step.kind == "refine":
+            assert "thermal_joint_drift" in found.fit.model.names
+    assert found.everything.count == 6
+
+
 def test_validation_poses_lie_within_what_was_measured_and_are_new(done):
     files = done[0].procedure.files
     with CampaignFile.open(files.run) as run, CampaignFile.open(files.validation) as test:
