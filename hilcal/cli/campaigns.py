@@ -36,7 +36,7 @@ from hilcal.whole_file import PAGE, replace_file, spare_other
 
 
 @command("""
-    table | TABLE | The table of readings.
+    tables | TABLE | The table of readings, one file.
     config | --config CELL.toml | The cell in which it was measured.
     output | -o --output RUN.hilcal | The campaign file to write; with --preview, the mapping file.
     kind | --format FORMAT | Format of the table: table, ipa-ur10, another mapping of the program,
@@ -45,10 +45,11 @@ from hilcal.whole_file import PAGE, replace_file, spare_other
     preview | --preview | Propose a mapping of the columns; no campaign is written.
     """)
 def import_(
-    t: Terminal, table: Path, config: Path | None = None, output: Path | None = None,
+    t: Terminal, tables: list[Path], config: Path | None = None, output: Path | None = None,
     kind: str = "table", second: Path | None = None, preview: bool = False, force: bool = False,
 ) -> None:  # fmt: skip
     """Make a campaign file from a table of readings."""
+    table = _one_file(tables)
     if preview:
         if kind != "table":
             raise InputError(f"--preview proposes a mapping; leave out --format {kind}")
@@ -80,7 +81,7 @@ def import_(
         )
         t.show(f"  targets: {'; '.join(named)}")
     torques = check_torques(cell, readings)
-    registered = misdescription = likely_arm = computed = None
+    registered = misdescription = likely_arm = None
     lines = [*notes, *words.torque_lines(torques)]
     with suppress(CannotAnswerError):  # the readings do not determine the registration
         registered = register(cell, readings)
@@ -89,9 +90,6 @@ def import_(
         if misdescription is None or not misdescription.refused:
             lines += words.registration_lines(registered)
             likely_arm = other_arm(registered, readings)
-            computed = words.computed_share(registered, readings)
-    if registered is not None and computed is not None:
-        lines.append(f"Note: {words.computed_line(registered, computed)}.")
     if likely_arm is not None:
         lines.append(f"Note: {words.other_arm_line(likely_arm)}")
     if misdescription is not None:
@@ -111,10 +109,27 @@ def import_(
         noise=None if noise is None else asdict(noise),
         notes=list(notes),
         description=None if misdescription is None else misdescription.to_json(cell, readings),
-        computed_positions=computed is not None,
+        computed_positions=misdescription is not None and misdescription.computed,
         other_arm=None if likely_arm is None else likely_arm.to_json(),
         torques=None if torques is None else torques.to_json(),
         frames=None if registered is None else registered.to_json(),
+    )
+
+
+def _one_file(tables: list[Path]) -> Path:
+    """Return the only file; of several, or a folder of such, say how to join them."""
+    if len(tables) == 1 and not tables[0].is_dir():
+        return tables[0]
+    if tables[0].is_dir():
+        found = sorted(path.suffix for path in tables[0].iterdir() if path.is_file())
+        of = [f"{quoted(tables[0])}/*{found[0] if found else '.csv'}"]
+        said = f"{tables[0]}: a folder"
+    else:
+        of, said = [quoted(path) for path in tables], f"{len(tables)} files"
+    raise InputError(
+        f"{said}; valid: one table. Files of the same columns are joined, and each row named by "
+        'its file, with: awk \'FNR > 1 || NR == 1 { print (NR == 1 ? "pose" : FILENAME) '
+        f'"," $0 }}\' {" ".join(of)} > all.csv'
     )
 
 

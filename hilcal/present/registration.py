@@ -21,9 +21,6 @@ from hilcal.types import Floats
 
 DECIMALS = 5, 4  # decimals of a position in m and of an angle in degrees. A choice
 ALONG = 0.98  # least component of a unit vector that is named after its axis
-COMPUTED = 0.3  # of the noise; no arm is as near to its nominal geometry. A choice
-FEWEST = 15  # degrees of freedom that tell so
-UNKNOWNS = 9  # of the places of base and target
 WORDS: dict[CovarianceParts, str] = {
     "instrument": "the instrument alone; the arm's own scatter is not in it ([repeatability] "
     "joint_std_rad states it)",
@@ -51,34 +48,6 @@ def registration_lines(registration: Registration) -> Iterator[str]:
             f"The nominal arm leaves {numbers.length(registration.rms)}{turn} rms."
         )
     yield from undetermined_lines(registration)
-
-
-def computed_share(registration: Registration, readings: Readings) -> float | None:
-    """Return the nominal arm's residual over the noise, where it is so small as no real arm's.
-
-    The residual's size, of the positions of one observer, is the root of Σ r²/σ² over its degrees
-    of freedom; below `COMPUTED`, the positions are computed from the joint values, or the noise is
-    stated too large. None where it is not, or where there are too few readings.
-    """
-    if readings.observers:
-        return None
-    near = ~registration.far
-    variance = np.diagonal(readings.covariance, axis1=1, axis2=2)[near, :3]
-    dof = variance.size - UNKNOWNS
-    if dof < FEWEST or not np.all(variance > 0):
-        return None
-    share = float(np.sqrt(np.sum(registration.residual[near, :3] ** 2 / variance) / dof))
-    return share if share < COMPUTED else None
-
-
-def computed_line(registration: Registration, share: float) -> str:
-    """Return the sentence on positions that are as the nominal arm computes them."""
-    return (
-        f"These positions seem to be computed from the joint values, not measured: the nominal arm "
-        f"leaves {numbers.length(registration.rms)} rms, {share:.2g} times what the noise alone "
-        "would leave. Has the table other columns, of what the tracker measured? Else the noise is "
-        "stated too large"
-    )
 
 
 def observed_words(readings: Readings) -> str:

@@ -188,6 +188,30 @@ def test_positions_computed_from_the_joints_are_noticed(computed, tmp_path, caps
     assert d["computed_positions"] is computed
 
 
+def test_of_two_sets_of_positions_the_computed_one_is_left(tmp_path, capsys):
+    """Names that say nothing, and the nominal positions first: they fit better than an arm can."""
+    flange = evaluate(load_arm(load_config(CELL).robot.model), C.q)
+    target = 1e3 * (flange.position[-1] + flange.rotation[-1] @ OFFSET)
+    off = np.random.default_rng(1).normal(scale=0.5, size=target.shape)
+    names = ["xn", "yn", "zn", "xm", "ym", "zm"]
+    table = lines([*NAMES, *names], np.rad2deg(C.q), target, target + off)
+    path, cell = write(tmp_path / "t.csv", table), tmp_path / "CELL.toml"
+    cell.write_text('[robot]\nmodel = "ur10e"\n')
+    d = ok(capsys, "import", path, "--preview", "--config", cell, "--json").document
+    assert d["mapping"]["position"]["columns"] == ["xm", "ym", "zm"]
+    why = {u["column"]: u["why"] for u in d["unused"]}
+    assert why == dict.fromkeys(names[:3], "computed from the joint values")
+
+
+def test_several_files_and_a_folder_are_joined_by_a_line(tmp_path, capsys):
+    for name in ("a.csv", "b.csv"):
+        (tmp_path / name).write_text(GOOD)
+    for given in ([tmp_path], [tmp_path / "a.csv", tmp_path / "b.csv"]):
+        said = refused(capsys, 2, "import", *given, "--config", CELL, "-o", tmp_path / "x.hilcal")
+        assert "FNR > 1" in said
+        assert ".csv > all.csv" in said
+
+
 def test_copied_rows_are_said_and_counted_once(tmp_path, capsys):
     """A block that was pasted twice, once under other names; a reading made again scatters."""
     _, *rows = GOOD.splitlines()

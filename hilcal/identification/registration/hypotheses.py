@@ -17,6 +17,7 @@ from hilcal.types import Bools, Floats
 
 SHIFTS = (1, -1, 2, -2)  # rows by which joints and positions are tried against each other
 MIRROR = np.array([1.0, -1.0, 1.0])
+LARGEST = 4 * np.pi  # rad; no joint is commanded further
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +45,7 @@ class Hypothesis:
     """One possible error of the description."""
 
     kind: str  # key of `KINDS`
-    joint: int = 0  # number from 1, where it is about one
+    joint: int = 0  # number from 1, where it is about one; negative: about all others
     sign: int = 1  # −1 where the joint turns the other way
     offset: float = 0.0  # of its zero, rad: the chain turns by sign q + offset
     follows: int = 0  # number of the joint that it follows, from 1; with `factor`
@@ -121,7 +122,49 @@ def _mapped(name: str, change: Callable[[Any], Any]) -> Applied:
 
 def _angles_by(turning: Callable[[Floats], Floats], sliding: float = 1.0) -> Applied:
     """Return a change of the joint values: a function of those that turn, a factor of slides."""
-    return lambda d, _: replace(d, q=np.where(d.arm.slides, sliding * d.q, turning(d.q)))
+
+    def applied(d: Description, h: Hypothesis) -> Description:
+        changed = np.where(d.arm.slides, sliding * d.q, turning(d.q))
+        one = np.arange(1, d.arm.n + 1) == abs(h.joint)
+        return replace(d, q=np.where(one == (h.joint > 0), changed, d.q) if h.joint else changed)
+
+    return applied
+
+
+def _units_words(of_all: str) -> Callable[[Hypothesis], str]:
+    """Return the phrase on a unit of "the joint values", of one joint or of all others."""
+
+    def words(h: Hypothesis) -> str:
+        of_one = of_all.replace("the joint values", f"joint {abs(h.joint)}'s values")
+        if h.joint >= 0:
+            return of_one if h.joint else of_all
+        return of_one.replace("'s values", "'s values alone are as described: the others")
+
+    return words
+
+
+def other_convention(arm: Arm) -> Arm | None:
+    """Return the arm with classic DH rows read as modified ones, or the other way; None for others.
+
+    Links of both are L_k = Tz(d_k) X_k Rz(o_k), with X_0 = 1 of classic rows and X_n = 1 of
+    modified ones, and the same X_k = Tx(a) Rx(alpha) one link further on.
+    """
+    r, p = arm.links[:, :3, :3], arm.links[:, :3, 3]
+    if np.abs(r[:, 0, 2]).max() > 1e-9 or np.abs(p[:, 1]).max() > 1e-9:
+        return None
+    alpha, offset = np.arctan2(-r[:, 1, 2], r[:, 2, 2]), np.arctan2(-r[:, 0, 1], r[:, 0, 0])
+    x = np.array([se3.screw(0, *pair) for pair in zip(alpha, p[:, 0], strict=True)])
+    ends = [np.allclose(x[k], np.eye(4), rtol=0.0, atol=1e-9) for k in (0, -1)]
+    if not any(ends):
+        return None
+    x = np.roll(x, -1 if ends[0] else 1, axis=0)
+    parts = zip(p[:, 2], x, offset, strict=True)
+    links = [se3.screw(2, 0.0, d) @ turn @ se3.screw(2, o) for d, turn, o in parts]
+    return replace(arm, links=np.array(links))
+
+
+def _of_other_convention(d: Description, _: Hypothesis) -> Description:
+    return replace(d, arm=other_convention(d.arm) or d.arm)
 
 
 def _mirrored(d: Description, _: Hypothesis) -> Description:
@@ -168,6 +211,12 @@ KINDS: dict[str, HypothesisKind] = {
     "arm": HypothesisKind(_another_arm, lambda h: f"the arm is another one, {h.arm}", ""),
     "joint": HypothesisKind(_recounted, _joint_words, ""),
     "coupling": HypothesisKind(_recounted, _coupling_words, ""),
+    "convention": HypothesisKind(
+        _of_other_convention,
+        'the DH rows are of the other convention; in the arm\'s file: convention = "modified", or '
+        '"standard" where it is that',
+        "",
+    ),
     "base_unknown": HypothesisKind(
         lambda d, _: replace(d, base_unknown=True),
         "the base stands elsewhere than [tracker] says",
@@ -186,10 +235,11 @@ KINDS: dict[str, HypothesisKind] = {
         "the positions are metres, and were taken for millimetres",
     ),
     "joint_degrees": HypothesisKind(
-        _angles_by(np.radians), "the joint values are degrees, not radians"
+        _angles_by(np.radians), _units_words("the joint values are degrees, not radians")
     ),
     "joint_radians": HypothesisKind(
-        _angles_by(np.degrees), "the joint values are radians, and were taken for degrees"
+        _angles_by(np.degrees),
+        _units_words("the joint values are radians, and were taken for degrees"),
     ),
     "travel_millimetres": HypothesisKind(
         _angles_by(np.positive, 1e-3),
@@ -249,6 +299,8 @@ def hypotheses(d: Description) -> Iterator[Hypothesis]:
             yield Hypothesis("coupling", joint, follows=follows, factor=factor)
     simple = ["millimetres", "metres", "joint_degrees", "joint_radians", "mirrored"]
     simple += ["travel_millimetres"] * bool(slides.any())
+    simple += ["convention"] * (other_convention(d.arm) is not None)
+    yield from _units_of_one(d)
     yield from map(Hypothesis, simple if d.turn is None else [*simple, *OF_ATTITUDES])
     yield from (Hypothesis("arm", arm=arm.name) for arm in other_arms(d.arm))
     yield from shifts(len(d.q))
@@ -259,6 +311,19 @@ def hypotheses(d: Description) -> Iterator[Hypothesis]:
     orders += [(*straight[k:], *straight[:k]) for k in range(1, n)]
     orders.append(straight[::-1])
     yield from (Hypothesis("columns", order=order) for order in dict.fromkeys(orders))
+
+
+def _units_of_one(d: Description) -> Iterator[Hypothesis]:
+    """Yield other units of the values of one joint, or of all others, that its values allow."""
+    far = np.where(d.arm.slides, 0.0, np.abs(d.q).max(axis=0))
+    for j, size in enumerate(far, start=1):
+        if size > LARGEST:
+            yield Hypothesis("joint_degrees", j)
+        if 0.0 < np.degrees(size) <= LARGEST:
+            yield Hypothesis("joint_radians", j)
+        others = np.delete(far, j - 1).max(initial=0.0)
+        if 0.0 < np.degrees(others) <= LARGEST < np.degrees(size):
+            yield Hypothesis("joint_radians", -j)
 
 
 def shifts(count: int) -> Iterator[Hypothesis]:

@@ -42,7 +42,11 @@ from hilcal.identification.registration.placement import (
     given_and_free,
     minimise,
 )
-from hilcal.identification.registration.registration import Registration, register
+from hilcal.identification.registration.registration import (
+    Registration,
+    computed_from_joints,
+    register,
+)
 from hilcal.identification.residual import noise_floor
 from hilcal.numbers import length
 from hilcal.readings.readings import Readings
@@ -100,6 +104,8 @@ class DescriptionFinding:
     swapped: tuple[tuple[int, int], ...] = ()  # pairs of them that fit each other's place
     moved: int = 0  # first reading from another place of the tracker, where that explains them
     tried: int = 0  # number of descriptions that were tried
+    computed: bool = False  # the positions are computed from the joint values, not measured
+    apart: tuple[int, int] | None = None  # two readings of one state, where such are far apart
 
     @property
     def refused(self) -> bool:
@@ -108,11 +114,17 @@ class DescriptionFinding:
         Below the gate the zero of a joint is something that effects can estimate.
         """
         zeros = all(e.changes[0].is_zero and len(e.changes) == 1 for e in self.explanations)
-        return self.rms > self.gate or not zeros
+        return self.computed or self.apart is not None or self.rms > self.gate or not zeros
 
     def words(self, cell: Cell, readings: Readings) -> str:
         """Return in one line what is wrong, and what to write instead."""
         size, rows = length(self.rms), self._rows_named(readings)
+        if self.computed:
+            return (
+                "these positions seem to be computed from the joint values, not measured: the "
+                f"nominal arm leaves {size} rms, which is their rounding. Take the columns of what "
+                "the tracker measured; if these are, write more digits"
+            )
         if self.moved:
             last, first = (self._name(readings, self.moved + k) for k in (-1, 0))
             return (
@@ -121,6 +133,15 @@ class DescriptionFinding:
                 "them? In a column 'station' each place of the tracker has a name"
             )
         note = f"({size} rms after registration)"
+        if self.apart is not None:
+            i, j = self.apart
+            distance = length(float(np.linalg.norm(readings.value[i, :3] - readings.value[j, :3])))
+            return (
+                "rows of the same joint values and load have positions far apart (two of "
+                f"{self._name(readings, i)}: {distance}), which no arm explains {note}: are they "
+                "of several reflectors, or was the tracker moved? In a column 'target' each "
+                "reflector has a name, in a column 'station' each place of the tracker"
+            )
         begin = f"the readings do not fit the description of the arm {note}"
         if self.explanations:
             causes = [
@@ -179,6 +200,8 @@ class DescriptionFinding:
             "rows": np.flatnonzero(self.rows).tolist(),
             "swapped": [list(pair) for pair in self.swapped],
             "moved": self.moved,
+            "computed": self.computed,
+            "apart": None if self.apart is None else list(self.apart),
             "tried": self.tried,
         }
 
@@ -197,6 +220,8 @@ def examine(registered: Registration, readings: Readings) -> DescriptionFinding 
     extent = np.inf if cell.registration_known else _extent(readings.value[:, :3])
     far, rms, noise = registered.far, _size(registered.residual), noise_floor(readings.covariance)
     none, fitting_rms = np.zeros_like(far), _size(registered.residual[~far])
+    if computed_from_joints(registered, readings):
+        return DescriptionFinding(rms, gate, (), none, computed=True)
     if cell.observers:  # hypotheses are tried on positions in one frame only
         fits = not (far.any() or fitting_rms > gate)
         return None if fits else DescriptionFinding(fitting_rms, gate, (), far)
@@ -217,6 +242,10 @@ def examine(registered: Registration, readings: Readings) -> DescriptionFinding 
     few = bool(bad.any() and bad.mean() <= MOST_WRONG_ROWS)
     if few and near <= search.enough:
         return DescriptionFinding(rms, gate, (), bad, search.swapped(bad), tried=1)
+    if apart := _far_apart(readings, search.enough):
+        moved = _moved(cell, readings, gate)
+        apart = None if moved else apart
+        return DescriptionFinding(rms, gate, (), none, moved=moved, tried=1, apart=apart)
     alone: Combination = (Hypothesis("attitudes"),)
     in_attitudes = readings.m == 6 and search.score(alone) <= search.enough
     explanations = search.explain(gate, DEPTH if rms > gate and not in_attitudes else 1)
@@ -231,6 +260,20 @@ def examine(registered: Registration, readings: Readings) -> DescriptionFinding 
     rows = search.robust(explanations[0].changes)[1] if explanations else none
     rows = rows if rows.mean() <= MOST_WRONG_ROWS else none
     return DescriptionFinding(rms, gate, explanations, rows, tried=search.tried)
+
+
+def _far_apart(readings: Readings, least: float) -> tuple[int, int] | None:
+    """Return two readings of one state, where most readings of such states are `least` m apart."""
+    states = np.column_stack([angles(readings), readings.states.wrench, readings.target])
+    state, count = np.unique(states, axis=0, return_inverse=True, return_counts=True)[1:]
+    position, several = readings.value[:, :3], count[state] > 1
+    mean = np.stack([np.bincount(state, x) for x in position.T], axis=1) / count[:, None]
+    off = np.where(several, np.linalg.norm(position - mean[state], axis=1), 0.0)
+    if not several.any() or np.median(off[several]) <= least / 2:
+        return None
+    i = int(np.argmax(off))
+    distance = np.where(state == state[i], np.linalg.norm(position - position[i], axis=1), 0.0)
+    return i, int(np.argmax(distance))
 
 
 def _moved(cell: Cell, readings: Readings, gate: float) -> int:
@@ -269,7 +312,10 @@ class _DescriptionSearch:
             not all(cell.known_targets),
             conventions=None if cell.config is None else cell.config.robot,
         )
-        self._rows = np.unique(np.linspace(0, len(readings) - 1, ROWS).astype(int))
+        # One of each of as many equal parts, at random: an equal spacing may follow a pattern of
+        # the rows, and read of two reflectors in turn only the first.
+        parts = np.arange(ROWS) + np.random.default_rng(0).random(ROWS)
+        self._rows = np.unique((parts * len(readings) / ROWS).astype(int))
         flange = evaluate(cell.arm, self._stated.q).position[-1]
         self._extent = min(_extent(readings.value[:, :3]), _extent(flange))
         self.score = lru_cache(maxsize=None)(self._score)

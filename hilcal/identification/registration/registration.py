@@ -42,6 +42,8 @@ from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.regression.normal_equations import echelon
 from hilcal.robot import se3
+from hilcal.robot.chain import evaluate, joint_jacobian
+from hilcal.tables.uncertainty import step
 from hilcal.types import Bools, Floats
 
 # All of these are choices.
@@ -52,6 +54,9 @@ LEAST_FAR_M = 1e-4  # m, misfit that is never far off
 SEED, ROUNDS = 0, 5  # of random subsets; most rounds in which readings join and leave
 LEAST_TURN = 1e-3  # range of a joint's angle, rad, below which it counts as never turned
 LEAST_COMPONENT = 0.05  # component of an undetermined direction that is worth mentioning
+COMPUTED = 1.2  # times the rounding of positions and joints that computed positions may be off
+EXACT = 1e-6  # share of the reach by which two programs compute one position differently
+FEWEST_FREE = 15  # elements beyond the 9 unknown places of base and target that tell so
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -163,6 +168,28 @@ def register(cell: Cell, readings: Readings) -> Registration:
         never_turned=np.ptp(angles(readings), axis=0) < LEAST_TURN,
         estimated=estimated,
     )
+
+
+def computed_from_joints(registered: Registration, readings: Readings) -> bool:
+    """Whether the positions of one tracker are the nominal arm's, computed from the joint values.
+
+    The nominal arm then leaves the rounding of positions (Δ_x per axis) and joint values (Δ_q):
+
+        Σ |r_i|² ≤ c² Σ (|Δ_x|² + |J_i Δ_q|²)/12,
+
+    J_i being the Jacobian of the target's position. The errors of a real arm are far larger.
+    """
+    cell, arm, near = registered.cell, registered.cell.arm, ~registered.far
+    if cell.observers or 3 * np.count_nonzero(near) < 9 + FEWEST_FREE:
+        return False
+    q, chain = angles(readings), evaluate(arm, angles(readings))
+    points = FrameData.of(arm, readings).points(given_and_free(cell, readings.m == 6)[0])
+    steps = [max(step(x), np.radians(step(np.degrees(x)))) for x in q.T]
+    of_joints = np.sum((joint_jacobian(chain, points)[:, :3] * steps) ** 2, axis=(1, 2))
+    of_positions = sum(step(x) ** 2 for x in readings.value[:, :3].T)
+    variance = (of_joints + of_positions) / 12 + (EXACT * arm.reach) ** 2
+    square = np.sum(registered.residual[near, :3] ** 2)
+    return bool(square <= COMPUTED**2 * np.sum(variance[near]))
 
 
 def _refuse_few(cell: Cell, readings: Readings) -> None:

@@ -14,6 +14,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 import numpy as np
@@ -24,10 +25,15 @@ from hilcal.config import CellConfig
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.registration.misdescription import examine
 from hilcal.identification.registration.placement import nearest_rotation, rotation_of_attitudes
-from hilcal.identification.registration.registration import register
+from hilcal.identification.registration.registration import (
+    Registration,
+    computed_from_joints,
+    register,
+)
 from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
+from hilcal.shown import WIDTH, Brief
 from hilcal.tables.guess_values import BY_ROWS, BY_VALUES, RIVALS
 from hilcal.tables.mapped import import_readings
 from hilcal.tables.mapping import Mapping
@@ -76,7 +82,7 @@ class Agreement:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Preview:
+class Preview(Brief):
     """How a table could be read.
 
     Attributes:
@@ -88,6 +94,19 @@ class Preview:
     rows: int
     proposal: Proposal
     outcome: tuple[str, ...] | None
+
+    def _brief(self) -> dict[str, str]:
+        p, outcome = self.proposal, self.outcome or ()
+        quantities = {u.section: f"{', '.join(u.columns)}: {u.meaning}" for u in p.quantities}
+        texts = {
+            "rows": str(self.rows),
+            "missing": "; ".join(p.missing),
+            "outcome": outcome[-1] if outcome else "",
+            "unsure": f"{len(p.doubts)}, of {', '.join(dict(p.doubts))}" if p.doubts else "",
+            "not used": ", ".join(name for name, _ in p.unused),
+            **quantities,
+        }
+        return {name: shorten(text, WIDTH) for name, text in texts.items() if text}
 
 
 def preview_table(
@@ -249,6 +268,7 @@ def _decide_columns(
     if len(proposal.alternatives) < 2:
         return []
     fits: list[tuple[float, dict[str, dict[str, Any]]]] = []
+    computed: list[str] = []  # columns
     for position, joints in proposal.alternatives[:MOST_TRIED]:
         changed = dict(proposal.sections)
         for name, columns, limit, units in (
@@ -258,14 +278,24 @@ def _decide_columns(
             if columns:
                 size = max(np.nanmax(np.abs(grid.numbers(c))) for c in columns)
                 changed[name] = {"columns": columns, "unit": units[0 if size > limit else 1]}
-        rms = _misfit_with(table, changed, settings, cell)
-        if rms is not None:
-            fits.append((rms, changed))
+        if (registered := _registered_with(table, changed, settings, cell)) is None:
+            continue
+        if computed_from_joints(*registered):  # fits better than any set that was measured
+            computed += position
+        else:
+            fits.append((registered[0].rms, changed))
+    fits = [fit for fit in fits if not set(computed) & set(fit[1]["position"]["columns"])]
     fits.sort(key=lambda fit: fit[0])
     clear = len(fits) > 1 and fits[1][0] > LEAST_RATIO * fits[0][0]
     if not fits or fits[0][0] > CLOSE_SHARE * cell.arm.reach or not (clear or len(fits) == 1):
         return []
-    proposal.sections = fits[0][1]
+    first, chosen_ones = proposal.alternatives[0], fits[0][1]
+    chosen_names = [n for kind in ("position", "joints") for n in chosen_ones[kind]["columns"]]
+    others = [name for names in first for name in names if name not in chosen_names]
+    why = {n: "computed from the joint values" if n in computed else "fits worse" for n in others}
+    unused = [pair for pair in proposal.unused if pair[0] not in chosen_names]
+    proposal.unused[:] = [*unused, *why.items()]
+    proposal.sections = chosen_ones
     for k, u in enumerate(proposal.quantities):
         if u.section in ("position", "joints"):
             section = proposal.sections[u.section]
@@ -277,18 +307,19 @@ def _decide_columns(
     second = f", others {1e3 * fits[1][0]:.0f} mm" if len(fits) > 1 else ""
     return [
         f"columns: the nominal {cell.arm.name} fits best with these: "
-        f"{1e3 * fits[0][0]:.2f} mm are left{second}"
+        f"{1e3 * fits[0][0]:.2f} mm are left{second}",
     ]
 
 
-def _misfit_with(
+def _registered_with(
     table: Path, sections: dict[str, dict[str, Any]], settings: CellConfig, cell: Cell
-) -> float | None:
-    """Rms distance, m, that the nominal arm leaves with a mapping; None where it is refused."""
+) -> tuple[Registration, Readings] | None:
+    """Return the registered nominal arm with a mapping, and its readings; None where refused."""
     only = {k: v for k, v in sections.items() if k in ("file", "second_file", "position", "joints")}
     try:
         mapping = check_section(only, Mapping, "the proposed mapping")
-        return register(cell, import_readings(table, mapping, settings, cell.arm).readings).rms
+        readings = import_readings(table, mapping, settings, cell.arm).readings
+        return register(cell, readings), readings
     except (InputError, CannotAnswerError):
         return None
 

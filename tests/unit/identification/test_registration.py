@@ -305,6 +305,7 @@ def test_a_gauge_is_not_proposed(joint):
             Hypothesis("coupling", 3, follows=2, factor=1.0),
             r"joint_coupling = \[\{ joint = 3, follows = 2, factor = 1.0 \}\]",
         ),
+        (Hypothesis("convention"), 'the DH rows .* in the arm\'s file: convention = "modified"'),
     ],
 )
 def test_the_reason_is_named_with_the_line_to_write(change, said):
@@ -317,6 +318,45 @@ def test_millimetres_and_swapped_rows_are_named():
     finding, said = found_in(moved([4, 19], [19, 4]))
     assert finding.swapped == ((4, 19),)
     assert "rows are swapped (p5/none with p20/none)" in said
+
+
+def test_one_joint_in_another_unit_is_named():
+    """The values of joint 1 alone are degrees, and were taken for such with all others."""
+    good = of_arm()
+    q = np.radians(good.states.q)
+    q[:, 0] = good.states.q[:, 0]
+    said = found_in(replace(good, states=replace(good.states, q=q)))[1]
+    assert "joint 1's values alone are as described: the others are radians" in said
+
+
+@pytest.mark.parametrize(("digits", "computed"), [(9, True), (4, True), (4, False)])
+def test_positions_computed_from_the_joints_are_refused(digits, computed):
+    """Whatever their digits are; measured ones of as few digits are not."""
+    good = of_arm()
+    arm = CELL.arm if computed else replace(CELL.arm, links=CELL.arm.links * [1, 1, 1, 1.001])
+    value = read(arm, good.states.q, BASE, pose_of(np.eye(3), OFFSET), 3)
+    readings = replace(good, value=np.round(value, digits))
+    finding, said = found_in(readings)
+    assert computed == (finding is not None and finding.computed)
+    if computed:
+        refusal(
+            "computed from the joint values, not measured", baseline, PLAIN, readings, "absolute"
+        )
+        assert finding.refused
+        assert "not measured" in said
+
+
+def test_two_reflectors_read_as_one_are_no_shifted_rows():
+    """Rows of one state that are far apart, in turn."""
+    a = of_arm()
+    there = read(CELL.arm, a.states.q, BASE, pose_of(np.eye(3), np.array([0.1, -0.05, 0.1])), 3)
+    both = a[np.repeat(np.arange(40), 2)]
+    value = both.value.copy()
+    value[1::2] = there
+    finding, said = found_in(replace(both, value=value))
+    assert finding.refused
+    assert not finding.explanations
+    assert "column 'target'" in said
 
 
 @pytest.mark.parametrize(("shift", "words"), first(1, [(-2, "2 rows before"), (1, "1 row after")]))
