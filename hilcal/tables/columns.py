@@ -248,8 +248,8 @@ def check_joints(table: ColumnTable, names: tuple[str, ...], q: Floats, arm: Arm
     most = np.maximum(np.abs(arm.q_min), np.abs(arm.q_max))
     large, turns = np.abs(q[:, ~arm.slides]).max(initial=0.0), most[~arm.slides].max(initial=0.0)
     counted = (
-        "; where the controller counts from another zero or the other way, [robot] "
-        "joint_offset_deg and joint_sign of CELL.toml say so"
+        "; where the controller counts from another zero, the other way, or a joint with the one "
+        "before it, [robot] joint_offset_deg, joint_sign and joint_coupling of CELL.toml say so"
     )
     seems = " (looks like degrees)" if large > max(turns + 1, 2 * np.pi) else counted
     for i, j in first_true((q < arm.q_min - _LIMIT_MARGIN) | (q > arm.q_max + _LIMIT_MARGIN)):
@@ -395,11 +395,16 @@ def check_names(table: ColumnTable) -> None:
 def check_same_pose(table: ColumnTable, pose: Ints, names: list[str], q: Floats, arm: Arm) -> None:
     """Refuse a pose whose commanded joints (N, n) differ between its rows."""
     first_row = np.unique(pose, return_index=True)[1]
+    reported = (
+        ". Angles that encoders reported need a column that names the pose, and [joints] "
+        "reported = true of a mapping"
+    )
     for i, j in first_true(np.abs(q - q[first_row][pose]) > SAME_POSE):
         k = int(first_row[pose[i]])
         raise InputError(
             f"{table.at(i)}: pose '{names[pose[i]]}' commands joint {j + 1} to {q[i, j]:.9g} "
             f"{arm.unit(j)}, row {table.rows[k]} to {q[k, j]:.9g}; give another pose another name"
+            f"{reported if abs(q[i, j] - q[k, j]) < _TRACKING / 20 else ''}"
         )
 
 

@@ -463,7 +463,9 @@ def _std(g: words.Guesser, complete: Group, stem: tuple[object, ...], position_u
     axes = _columns_like(complete.get("std", {}), stem) or _std_beside(g)
     scalar = words.DISTANCE | words.GAUGE
     columns = [c for c in g.columns if c.name in g.free and c.has(words.STD) and not c.axis]
-    single = [c.name for c in columns if g.number(c.name) and not (c.numbers or c.has(scalar))]
+    # "S" alone is the status of a KUKA's point
+    named = [c for c in columns if c.unit or any(len(word) > 1 for word in c.words)]
+    single = [c.name for c in named if g.number(c.name) and not (c.numbers or c.has(scalar))]
     if axes is None and not single:
         return
     names = [axes[axis] for axis in "xyz"] if axes is not None else single[:1]

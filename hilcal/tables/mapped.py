@@ -44,6 +44,7 @@ REPEATED = 2e-4  # rad; rows whose joints differ by less repeat a pose; a choice
 REPEATS_TO = 4e-4  # m; ten times an arm's repeatability: of positions further apart some are wrong
 TOOL = 0.5  # m; the longest tool: with the arm's reach, the lever of its joints; a choice
 ONE_DIRECTION, MANY_DIRECTIONS = 0.99, 0.9  # length of the mean of unit vectors; a choice
+SAME_WEIGHT = 0.1  # share by which a measured weight may be off that of the tool; a choice
 GRAVITY = (0.0, 0.0, -STANDARD_GRAVITY_M_S2)  # m/s², base axes, of an arm that stands upright
 EPOCH = 1e8  # s; times beyond three years are counted from an epoch, not from the campaign's start
 DAY = 86400.0  # s
@@ -442,6 +443,18 @@ def _forces_of_flange(readings: Readings, arm: Arm) -> list[str]:
     ]
 
 
+def _weight_of_tool(readings: Readings, weight: float) -> list[str]:
+    """Note forces that are never less than the tool's weight, N, as of a sensor not zeroed."""
+    least = float(np.linalg.norm(readings.states.wrench[:, :3], axis=1).min())
+    if weight == 0 or abs(least - weight) > SAME_WEIGHT * weight:
+        return []
+    return [
+        f"the least force of all rows, {least:.3g} N, is the weight of the tool by [tool] mass_kg: "
+        "was the sensor not zeroed? The tool's weight then counts twice: subtract it in the table, "
+        "or set [tool] mass_kg = 0"
+    ]
+
+
 def _loads(grid: Grid, mapping: forms.PointMapping, wrench: Floats) -> list[str]:
     """Names of the loads: the column's, or by the hung mass, or "load" where a wrench acts."""
     if mapping.load is not None:
@@ -606,7 +619,8 @@ def import_readings(
     covers = INSTRUMENT_AND_ARM if stated and config.repeatability.in_tables else result.covers
     readings, copies = exchange.without_copies(result.readings)
     readings, named = exchange.named_loads(readings, config)
-    named = (*named, *_forces_of_flange(readings, arm))
+    weight = config.tool.mass_kg * float(np.linalg.norm(gravity))
+    named = (*named, *_forces_of_flange(readings, arm), *_weight_of_tool(readings, weight))
     return exchange.ImportResult(
         readings, (*notes, *copies, *named), covers, stated or tracker.states_noise, not stated
     )

@@ -65,6 +65,8 @@ JOINT = {
     "achswinkel", "gelenkwinkel", "jointangle", "jointposition", "axisangle",
 }  # fmt: skip
 """Words of joint angles; with a number each."""
+POSITIONS = {"position", "positions"}
+"""Words of joint angles under ROS, with a number each, one per joint of the arm."""
 NO_ANGLE = {
     "temp", "temperature", "temperatur", "current", "strom", "torque", "moment", "drehmoment",
     "speed", "velocity", "vel", "qd", "qdd", "acc", "acceleration", "voltage", "error", "offset",
@@ -74,10 +76,19 @@ TORQUE = {"tau", "torque", "drehmoment", "moment", "gelenkmoment", "achsmoment",
 """Words of measured joint torques; with a number each."""
 DISTANCE = {"distance", "dist", "abstand", "entfernung", "length", "lange", "range", "ballbar"}
 GAUGE = {"gauge", "messuhr", "taster", "dial", "indicator", "height", "hohe", "hauteur"}
+LASERS = {"l", "laser"}
+"""Words of distances side by side, with a number each."""
+AZIMUTH = {"azimuth", "azimut", "az", "hz", "horizontal"}
+ELEVATION = {"zenith", "zenit", "elevation", "el", "v", "vz", "vertical", "polar"}
 FROM = {"from", "von", "point", "punkt", "ball", "kugel", "anchor", "bar", "plane", "ebene"}
 """Words of the point or plane of a distance or height, besides those of the quantity itself."""
 STATION = {"station", "standpunkt", "stationierung", "aufstellung"}
 TEMPERATURE = {"temp", "temperature", "temperatur", "temperatura"}
+RAIL = {
+    "track", "rail", "linear", "slide", "slider", "lift", "gantry", "carriage", "travel", "schiene",
+    "linearachse", "fahrachse", "hubachse", "e", "ext", "external",
+}  # fmt: skip
+"""Words of the travel of a joint that slides."""
 APPROACH = {"approach", "richtung", "direction", "anfahrt"}
 POSE = {
     "pose", "poses", "point", "punkt", "pt", "messpunkt", "posenr", "id", "name", "nr", "no",

@@ -114,6 +114,7 @@ def guess(grid: Grid, joints: int | None = None, joint_names: Sequence[str] = ()
     counts = _encoder_counts(g)
     _joints(g, joint_names)
     guess_axes(g)
+    _polar(g)
     _distances(g)
     readings = {"position", "distance", "gauge"}
     if not readings & set(g.proposal.sections) or "joints" not in g.proposal.sections:
@@ -126,8 +127,8 @@ def guess(grid: Grid, joints: int | None = None, joint_names: Sequence[str] = ()
         g.doubt("file", EXCHANGE_NAMES)
     if g.proposal.convention_guessed:
         g.doubt("orientation", words.GUESSED)
-    if not readings & set(g.proposal.sections):
-        g.proposal.missing.append("no position: three columns x, y, z were not found")
+    if not readings & set(g.proposal.sections) and not g.proposal.missing:
+        g.proposal.missing.append(f"no position: three columns x, y, z were not found{_by_axis(g)}")
     if "joints" not in g.proposal.sections:
         second = "no joint angles: where they are in a file of their own, give it with --second"
         g.proposal.missing.append(counts or second)
@@ -137,6 +138,14 @@ def guess(grid: Grid, joints: int | None = None, joint_names: Sequence[str] = ()
     if not {"load", "hung_mass", "wrench"} & set(g.proposal.sections):
         g.doubt("load", "no column tells the load: all readings count as unloaded")
     return g.proposal
+
+
+def _by_axis(g: words.Guesser) -> str:
+    """Say which column names the axis of a row, where a table has a row for each coordinate."""
+    for name in g.grid.names:
+        if {text.strip().lower() for text in g.grid.text(name)} == {"x", "y", "z"}:
+            return f"; '{name}' names one axis per row: write x, y, z of a point in one row"
+    return ""
 
 
 def _why_unused(g: words.Guesser, column: words.ColumnName) -> str:
@@ -186,7 +195,7 @@ def _joints(g: words.Guesser, joint_names: Sequence[str]) -> None:
     groups: dict[tuple[str, ...], dict[int, str]] = {}
     for c in g.columns:
         torque = c.has(words.TORQUE) or c.unit in MOMENTS
-        joint = c.has(words.JOINT) or torque
+        joint = c.has(words.JOINT | words.POSITIONS) or torque
         if not c.numbers or c.axis or not joint or not g.number(c.name) or c.name not in g.free:
             continue
         if not c.has(words.STD):
@@ -201,7 +210,7 @@ def _joints(g: words.Guesser, joint_names: Sequence[str]) -> None:
             continue
         if first.has(words.NO_ANGLE | words.TORQUE) or first.unit in MOMENTS:
             _per_joint(g, first, names)
-        else:
+        elif first.has(words.JOINT) or len(names) == g.joints:
             candidates.append((first, names))
     by_name = {words.without_unit(name): name for name in g.free if g.number(name)}
     of_arm = [by_name[name.lower()] for name in joint_names if name.lower() in by_name]
@@ -212,9 +221,14 @@ def _joints(g: words.Guesser, joint_names: Sequence[str]) -> None:
         candidates.append((words.parse("joint"), [str(name) for name in named]))
     if not candidates:
         return
-    candidates.sort(key=lambda f: (f[0].has(words.MEASURED | {"qa"}), not f[0].has(words.NOMINAL)))
+    measured = words.MEASURED | {"qa"}
+    candidates.sort(
+        key=lambda f: (
+            not f[0].has(words.JOINT), f[0].has(measured), not f[0].has(words.NOMINAL)
+        )
+    )  # fmt: skip
     first, names = candidates[0]
-    if first.has(words.MEASURED | {"qa"}):
+    if first.has(measured):
         g.doubt("joints", f"'{names[0]}' ... are reported angles, used as the commanded ones")
     unit = words.angle_unit(g, "joints", names)
     from_zero = {"from_zero": True} if _from_zero(g.block(names) * ANGLES[unit]) else {}
@@ -224,7 +238,7 @@ def _joints(g: words.Guesser, joint_names: Sequence[str]) -> None:
     if g.joints is not None and len(names) != g.joints:
         g.doubt("joints", f"{len(names)} columns, the arm has {g.joints} joints")
     for parsed, reported in candidates[1:]:
-        if parsed.has(words.MEASURED | {"qa"}) and len(reported) == len(names):
+        if parsed.has(measured) and len(reported) == len(names):
             same = np.nanmax(np.abs(g.block(reported) - g.block(names)))
             if same < (0.1 if unit == "rad" else 5.7):
                 g.assign("actual_joints", reported, unit, unit=unit)
@@ -266,12 +280,35 @@ def _per_joint(g: words.Guesser, first: words.ColumnName, names: list[str]) -> N
         g.assign("approach", names, "-1 or +1")
 
 
+def _polar(g: words.Guesser) -> None:
+    """Leave out angles and a range of a position in spherical coordinates, and say so."""
+    if "position" in g.proposal.sections:
+        return
+    free = [c for c in g.free.values() if g.number(c.name) and not c.axis and not c.has(words.STD)]
+    terms = (words.AZIMUTH, words.ELEVATION, words.DISTANCE | {"d", "r", "s"})
+    found = [next((c.name for c in free if c.has(t)), "") for t in terms]
+    if all(found) and len(set(found)) == 3:
+        for name in found:
+            g.ignore(name, "a spherical coordinate")
+        a, z, d = found
+        g.proposal.missing.append(
+            f"'{a}', '{z}', '{d}' are spherical coordinates: write x = d sin z cos a, "
+            "y = d sin z sin a, z = d cos z in columns of their own (z from the zenith; of an "
+            "elevation, cos and sin are exchanged)"
+        )
+
+
 def _distances(g: words.Guesser) -> None:
     """Find distances from points and heights over planes, in rows that have no position."""
     position = g.proposal.sections.get("position", {}).get("columns", [])
     positioned = np.isfinite(g.block(position)).any(axis=1) if position else np.zeros(1, dtype=bool)
     for kind, terms in (("distance", words.DISTANCE), ("gauge", words.GAUGE)):
-        named = [c for c in g.free.values() if c.has(terms) and not c.axis]
+        beside = words.LASERS if kind == "distance" and not position else set[str]()
+        named = [
+            c
+            for c in g.free.values()
+            if not c.axis and (c.has(terms) or (c.has(beside) and c.numbers))
+        ]
         plain = [c.name for c in named if g.number(c.name) and not c.has(words.STD | words.NOMINAL)]
         plain = [n for n in plain if not np.any(positioned & np.isfinite(g.block([n])[:, 0]))]
         if not plain:
@@ -382,7 +419,7 @@ def _in_each_state(g: words.Guesser, name: str) -> bool:
 def _names_poses(g: words.Guesser, name: str, joints: dict[str, Any]) -> bool:
     """Whether rows of one name have the same joint angles, or nearly so (then: reported angles)."""
     texts = g.grid.text(name)
-    if "" in texts:
+    if "" in texts or len(set(texts)) == 1:
         return False
     q = g.block(joints["columns"]) * ANGLES[joints["unit"]]
     if len(set(texts)) == len(texts) > len(np.unique(q, axis=0)):
@@ -471,6 +508,7 @@ def _is_day(cell: Cell) -> bool:
 DEGREES = ("degC", "degF", "K")
 WARMEST = 45.0  # °C of a room in which arms are measured; a choice
 _CLOCK = re.compile(r"\d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?( ?[AP]M)?", re.IGNORECASE)
+_POINT = re.compile(r"\[\[\s*[-+.\d]|\{\s*(A1|X)\s+[-+.\d]")
 HEAD = 400  # Lines that the dialect is guessed from
 MANY_NUMBERS = 0.5  # of those of the sheet that is read: other readings; a choice
 COMMENTS = ("//", "#", "%", "!")
@@ -512,6 +550,11 @@ def sniff(path: str | Path) -> SniffedFile:
         if 0 < count < 0.5 * len(lines):
             how["comment"] = mark
             break
+    if sum(map(bool, map(_POINT.search, lines))) > 0.5 * len(lines):
+        raise InputError(
+            f"{name}: its rows hold points of a robot's program, [[...], ...] or {{A1 ..., A2 "
+            "...}; write each number in a column of its own: joint angles, then x, y, z as measured"
+        )
     how |= _dialect(name, lines, how.get("comment"))
     how["header_row"] = 0
     rows = list(files.records(name, text, FileFormat(**how)))

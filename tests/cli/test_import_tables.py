@@ -485,6 +485,47 @@ def test_the_arm_decides_whether_matrices_stand_column_by_column(tmp_path, capsy
     assert not [doubt for doubt in d["unsure"] if "row by row" in str(doubt)]
 
 
+SPHERICAL = ["Hz [gon]", "V [gon]", "D [m]"]
+
+
+@pytest.mark.parametrize(
+    ("header", "section", "columns"),
+    [
+        ([*NAMES, "X", "Y", "Z", "S"], "std", None),  # the status of a KUKA's point
+        ([f"field.position{k}" for k in range(6)] + ["x", "y", "z"], "joints", 6),
+        ([*NAMES, *SPHERICAL], "missing", "spherical coordinates"),
+        ([*NAMES, "L1", "L2", "L3"], "distance", "L1"),
+    ],
+)
+def test_columns_of_robots_and_instruments(header, section, columns, tmp_path, capsys):
+    cells = [lambda c: c.q, lambda c: c.position, lambda c: np.full(len(c.q), 2)]
+    d = proposed(tmp_path, capsys, header, *cells[: 2 + (len(header) > 9)])
+    if section == "missing":
+        assert columns in d["missing"][0]
+        return
+    found = d["mapping"].get(section)
+    named = found and found.get("column", found.get("columns"))
+    assert named == (header[:columns] if columns == 6 else columns)
+
+
+@pytest.mark.parametrize("point", ["p;[[1.5,2,3,4,5,6],[9E9,9E9]];1;2", "XP={A1 1.5,A2 -90};1;2"])
+def test_points_of_a_program_are_no_columns(point, tmp_path, capsys):
+    path = write(tmp_path / "t.csv", "\n".join([point] * 20) + "\n")
+    said = refused(capsys, 2, "import", path, "--preview")
+    assert "points of a robot's program" in said
+
+
+@pytest.mark.parametrize("zeroed", [True, False])
+def test_the_weight_of_the_tool_in_the_forces_is_noticed(zeroed, tmp_path, capsys):
+    weight = np.where(np.arange(12) % 2, 0.0, 50.0) + (0.0 if zeroed else 19.6)
+    text = lines([*NAMES, "x", "y", "z", "fz"], np.rad2deg(C.q), C.position, -weight)
+    path = write(tmp_path / "t.csv", text)
+    cell = tmp_path / "CELL.toml"
+    cell.write_text('[robot]\nmodel = "ur10e"\n[tool]\nmass_kg = 2.0\n')
+    d = ok(capsys, "import", path, "--preview", "--config", cell, "--json").document
+    assert zeroed != any("was the sensor not zeroed?" in line for line in d["outcome"])
+
+
 def test_angles_from_0_to_360_beyond_a_limit_are_told_from_degrees(tmp_path, capsys):
     c = campaign(8)
     q = c.q % (2 * np.pi)

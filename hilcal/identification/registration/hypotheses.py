@@ -234,6 +234,10 @@ KINDS: dict[str, HypothesisKind] = {
         _mapped("value", lambda p: 1e3 * p),
         "the positions are metres, and were taken for millimetres",
     ),
+    "inches": HypothesisKind(
+        _mapped("value", lambda p: 25.4 * p),
+        "the positions are inches, and were taken for millimetres",
+    ),
     "joint_degrees": HypothesisKind(
         _angles_by(np.radians), _units_words("the joint values are degrees, not radians")
     ),
@@ -297,7 +301,7 @@ def hypotheses(d: Description) -> Iterator[Hypothesis]:
     for joint, follows in possible_couplings(n):
         for factor in (1.0, -1.0) if slides[joint - 1] == slides[follows - 1] else ():
             yield Hypothesis("coupling", joint, follows=follows, factor=factor)
-    simple = ["millimetres", "metres", "joint_degrees", "joint_radians", "mirrored"]
+    simple = ["millimetres", "metres", "inches", "joint_degrees", "joint_radians", "mirrored"]
     simple += ["travel_millimetres"] * bool(slides.any())
     simple += ["convention"] * (other_convention(d.arm) is not None)
     yield from _units_of_one(d)

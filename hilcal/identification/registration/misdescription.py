@@ -60,6 +60,7 @@ GATE_M, GATE_REACH = 0.010, 0.01  # the gate: rms misfit, m, or as a share of th
 # arms before calibration are 0.1 to 3 mm off, old or large ones up to 1 % of their reach
 SEARCH_SHARE = 0.3  # share of the gate above which hypotheses are tried: frames may hide a part
 GATE_EXTENT = 0.03  # share of the positions' extent that counts as a misfit where they are close
+EXTENT_LEFT = 0.1  # share of that extent that an explanation may leave
 LEVER = 0.3  # m, by which attitude errors count as position errors: an ordinary tool
 ROWS = 40  # readings that hypotheses are tried on, spread over all: seven times the unknowns
 DEPTH, BEAM = 3, (6, 3)  # most hypotheses together; best ones that a 2nd and a 3rd are tried on
@@ -355,7 +356,8 @@ class _DescriptionSearch:
             beam = sorted(scores, key=lambda w: (scores[w], _cost(w)))[: BEAM[min(depth, 1)]]
         if most > 1 and min(tried.values()) > self.enough:
             tried.update(self._all_zeros(begin))
-        return _explained(tried, min(gate, base / LEAST_IMPROVEMENT))
+        most_left = EXTENT_LEFT * self._extent
+        return _explained(tried, min(gate, base / LEAST_IMPROVEMENT, most_left))
 
     def _all_zeros(self, begin: Combination) -> dict[Combination, float]:
         """Try constants near zero as the zeros of all joints that turn together.

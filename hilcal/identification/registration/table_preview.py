@@ -10,7 +10,6 @@ arm's own errors; those of a wrong convention do not. The positions are needed: 
 the axes' names turns one convention into another, which A and B absorb.
 """
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -41,7 +40,9 @@ from hilcal.tables.proposal import (
     GUESSED,
     MAX_ANGLE_RAD,
     MAX_POSITION_M,
+    RAIL,
     SIDE_BY_SIDE,
+    Guesser,
     Proposal,
     ProposedQuantity,
 )
@@ -59,7 +60,6 @@ LEAST_RATIO = 5.0  # how much worse the next choice must fit for the first to be
 FEWEST_READINGS, MOST_READINGS = 6, 300
 """Readings below which two rotations fit too easily; readings that are tried."""
 ALTERNATIONS = 20  # steps between A and B
-_EXTERNAL = re.compile(r"e(xt)?_?[1-6]\b", re.IGNORECASE)
 _GENERIC = ("intrinsic-", "fixed-", "rotation-", "quaternion-")
 """Beginnings of the names of conventions that belong to no maker."""
 
@@ -156,14 +156,17 @@ def _name_targets(proposal: Proposal, names: list[str]) -> None:
 def _decide_travels(proposed: GridProposal, arm: Arm) -> None:
     """Decide columns and units of joints that slide, by their names and by the arm's limits.
 
-    External axes E1, E2, … are the joints that slide. Travels beyond ten times the limits are mm.
+    External axes E1, E2, …, or a track, are the joints that slide. Travels beyond ten times the
+    limits are mm.
     """
     proposal, grid = proposed.proposal, proposed.grid
     section, slides = proposal.sections.get("joints"), np.flatnonzero(arm.slides).tolist()
     if section is None or not slides:
         return
     names = list(section["columns"])
-    external = [name for name, _ in proposal.unused if _EXTERNAL.match(name)]
+    external = _travels(proposed)
+    if len(external) > len(slides):
+        external = [name for name in external if np.ptp(grid.numbers(name)) > 0]
     if len(names) + len(external) == arm.n and len(external) == len(slides):
         for j, name in zip(slides, external, strict=True):
             names.insert(j, name)
@@ -189,6 +192,13 @@ def _decide_travels(proposed: GridProposal, arm: Arm) -> None:
     k = next(k for k, u in enumerate(proposal.quantities) if u.section == "joints")
     meaning = f"{unit}, {section['slide_unit']}"
     proposal.quantities[k] = ProposedQuantity("joints", tuple(names), meaning, example)
+
+
+def _travels(proposed: GridProposal) -> list[str]:
+    """Return the unused columns of numbers that are named as a joint that slides."""
+    guesser = Guesser(proposed.grid, None)
+    free = [guesser.column(name) for name, _ in proposed.proposal.unused]
+    return [c.name for c in free if c.has(RAIL) and c.axis is None and guesser.number(c.name)]
 
 
 def _decide_convention(proposed: GridProposal, arm: Arm) -> list[str]:

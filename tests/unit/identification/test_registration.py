@@ -315,6 +315,7 @@ def test_the_reason_is_named_with_the_line_to_write(change, said):
 def test_millimetres_and_swapped_rows_are_named():
     good = of_arm()
     assert "the positions are millimetres" in found_in(replace(good, value=1e3 * good.value))[1]
+    assert "the positions are inches" in found_in(replace(good, value=good.value / 25.4))[1]
     finding, said = found_in(moved([4, 19], [19, 4]))
     assert finding.swapped == ((4, 19),)
     assert "rows are swapped (p5/none with p20/none)" in said

@@ -357,7 +357,7 @@ def plain_table(folder, header, mirrored=False):
     return their_table(folder, campaign(folder, "nothing", 2, 24)[0], header, mirrored=mirrored)
 
 
-@pytest.mark.parametrize("header", [["E1", *ARM_AXES], ALL_AXES])
+@pytest.mark.parametrize("header", [["E1", *ARM_AXES], ["Track [mm]", *ARM_AXES], ALL_AXES])
 def test_a_preview_sees_the_travel_in_mm(tmp_path, capsys, header):
     """Also that of an external axis, which controllers name apart from the arm's."""
     table = plain_table(tmp_path, header)
