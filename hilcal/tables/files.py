@@ -316,6 +316,11 @@ def _parquet(path: str, content: bytes, how: FileFormat, check: Check | None) ->
     schema = parquet.ParquetFile(io.BytesIO(content)).schema_arrow
     names = [f.name for f in schema if is_plain(f.type)]
     texts = [f.name for f in schema if is_text(f.type)]
+    if not names:
+        listed = ", ".join(schema.names[:3])
+        raise InputError(
+            f"{path}: a row of {listed} holds several numbers; write each in a column of its own"
+        )
     file = parquet.ParquetFile(io.BytesIO(content), read_dictionary=texts)
     meta = file.metadata
     limits.check_cells(path, meta.num_rows, max(len(names), 1))

@@ -37,6 +37,7 @@ FORMATS = (
     "%I:%M:%S %p",
 )
 """Forms of dates that are tried, in this order."""
+LEAST_OF_MEAN = 1e-7  # m; of a mean of 1000 samples, in the unit of the positions
 RIVAL = 0.5  # Difference of the score within which another choice of columns is as good; a choice
 _WRENCH_DOUBT = 'base axes, or axes = "flange"; of = "load" (exerted on the tool), or "reaction"?'
 BY_VALUES = "found by their values: check the columns"
@@ -106,7 +107,8 @@ def guess_by_values(g: words.Guesser) -> None:
     named = words.NOMINAL | words.STD | words.TIME | words.TEMPERATURE | words.LOAD | words.MASS
     free = []
     for name, c in g.free.items():
-        if g.number(name) and c.axis is None and not c.has(named | words.POSE):
+        of_pose = c.has(words.POSE) and not c.numbers  # "p(1)" is of a matrix
+        if g.number(name) and c.axis is None and not c.has(named) and not of_pose:
             values = g.block([name])[:, 0]
             counts = len(values) > 2 and np.all(np.diff(values) == 1)  # row numbers
             if not counts and np.ptp(values[np.isfinite(values)]) > 0:
@@ -249,7 +251,10 @@ def guess_axes(g: words.Guesser) -> None:
     if not positions:
         _matrix(g)
         return
-    ranked = sorted(positions, key=_rank)
+    still = [
+        s for s, axes in positions.items() if not np.ptp(g.block(axes[k] for k in "xyz"), 0).any()
+    ]
+    ranked = sorted(positions, key=lambda s: (s in still, *_rank(s)))
     stem = ranked[0]
     used = _targets_side_by_side(positions, stem) or [stem]
     names = [positions[s][axis] for s in used for axis in "xyz"]
@@ -290,7 +295,9 @@ def _std_unit(
     figure = float(np.median(figures)) if len(figures) else 0.0
     tried = dict.fromkeys((*usual, "m", "mm", "um"))
     low, high = PLAUSIBLE
-    unit = next((u for u in tried if low <= LENGTHS[u] * figure <= high), next(iter(tried)))
+    least = dict.fromkeys(usual, LEAST_OF_MEAN)
+    fit = (u for u in tried if least.get(u, low) <= LENGTHS[u] * figure <= high)
+    unit = next(fit, next(iter(tried)))
     size = f"a standard deviation is then {1e6 * LENGTHS[unit] * figure:.3g} µm"
     g.doubt(section, f"no unit stated; {unit}{squared}: {size}")
     return unit
@@ -339,7 +346,8 @@ _AXIS_NUMBERS = str.maketrans("123", "xyz")
 
 
 def _orientation(g: words.Guesser, complete: Group, stem: tuple[object, ...]) -> None:
-    quaternions = {s: a for s, a in complete.get("quaternion", {}).items() if "w" in a}
+    turned = complete.get("angle", {}) | complete.get("quaternion", {})
+    quaternions = {s: a for s, a in turned.items() if "w" in a}
     best = _columns_like(quaternions, stem)
     if best is not None:
         names = [best[axis] for axis in "wxyz"]

@@ -39,11 +39,22 @@ UNITS = {
 STD = {
     "std", "stdev", "stddev", "sd", "sigma", "s", "u", "unc", "uncert", "uncertainty", "u95", "u2",
     "expanded", "unsicherheit", "standardabweichung", "stabw", "incertitude", "ecart", "incert",
-    "incertidumbre", "var", "variance", "varianz", "deviation",
+    "incertidumbre", "var", "variance", "varianz", "standard",
 }  # fmt: skip
 EXPANDED = {"u95", "u2", "expanded"}
 VARIANCE = {"var", "variance", "varianz"}
-ROTATION = {"r", "rot", "rotation", "ang", "angle", "euler", "winkel", "rotvec", "rv"}
+ROTATION = {
+    "r",
+    "rot",
+    "rotation",
+    "orientation",
+    "ang",
+    "angle",
+    "euler",
+    "winkel",
+    "rotvec",
+    "rv",
+}
 FORCE = {"f", "force", "kraft", "fuerza"}
 MOMENT = {"m", "mom", "moment", "torque", "t", "drehmoment", "couple"}
 QUATERNION = {"q", "quat", "quaternion"}
@@ -98,13 +109,23 @@ LOAD = {"load", "last", "payload", "charge", "carga", "loadcase", "lastfall", "z
 MASS = {"mass", "masse", "weight", "gewicht", "masa", "peso"}
 CYCLE = {"cycle", "zyklus", "repeat", "repetition", "wiederholung", "lauf", "ciclo"}
 TIME = {"time", "zeit", "timestamp", "stamp", "date", "datum", "datetime", "zeitstempel", "temps",
-        "hora", "t"}  # fmt: skip
+        "hora", "t", "sec"}  # fmt: skip
 REFLECTOR = {"target", "reflector", "reflektor", "prism", "prisma", "smr", "nest"}
 AIR = {"air", "tamb", "amb", "luft", "ambient", "umgebung", "room", "raum", "aire"}
 ARM_JOINTS = ("shoulder pan", "shoulder lift", "elbow", "wrist 1", "wrist 2", "wrist 3")
 """Joint names of Universal Robots arms under ROS, in order."""
 
-DIFFERENCE = {"dev", "delta", "diff", "difference", "error", "err", "residual", "abweichung"}
+DIFFERENCE = {
+    "dev",
+    "deviation",
+    "delta",
+    "diff",
+    "difference",
+    "error",
+    "err",
+    "residual",
+    "abweichung",
+}
 """Words of differences, which are no readings."""
 CHINESE = {
     "关节": " joint ", "轴": " joint ", "坐标": " ", "位置": " ", "测量": " measured ",
@@ -143,7 +164,7 @@ def parse(name: str, unit_cell: str = "") -> ColumnName:
     plain = unicodedata.normalize("NFKD", stem.replace("ß", "ss")).encode("ascii", "ignore")
     words: list[str] = []
     numbers: list[int] = []
-    axis = None
+    axis, turns = None, ROTATION | QUATERNION
     for word in re.findall(r"[a-z]+\d*|\d+", plain.decode().lower()):
         if word in STD:
             words.append(word)
@@ -156,7 +177,7 @@ def parse(name: str, unit_cell: str = "") -> ColumnName:
             continue
         if letters.endswith(("temperatur", "temperature")) and letters not in TEMPERATURE:
             words += [letters[: letters.index("temp")], "temperature"]
-        elif letters in ("x", "y", "z"):
+        elif letters in ("x", "y", "z") or (letters == "w" and set(words) & turns):
             axis = letters
         elif letters[-1] in "wxyz" and letters[:-1] in _PREFIXES:
             axis = letters[-1]

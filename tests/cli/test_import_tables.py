@@ -492,6 +492,8 @@ SPHERICAL = ["Hz [gon]", "V [gon]", "D [m]"]
     ("header", "section", "columns"),
     [
         ([*NAMES, "X", "Y", "Z", "S"], "std", None),  # the status of a KUKA's point
+        ([*NAMES, "X", "Y", "Z", "Deviation"], "std", None),  # from the nominal position
+        ([*NAMES, "p(1)", "p(2)", "p(3)"], "position", 3),
         ([f"field.position{k}" for k in range(6)] + ["x", "y", "z"], "joints", 6),
         ([*NAMES, *SPHERICAL], "missing", "spherical coordinates"),
         ([*NAMES, "L1", "L2", "L3"], "distance", "L1"),
@@ -505,7 +507,23 @@ def test_columns_of_robots_and_instruments(header, section, columns, tmp_path, c
         return
     found = d["mapping"].get(section)
     named = found and found.get("column", found.get("columns"))
-    assert named == (header[:columns] if columns == 6 else columns)
+    of = {6: header[:6], 3: header[6:9]}
+    assert named == of.get(columns, columns)
+
+
+def test_a_quaternion_called_rotation_and_a_frame_that_stands_still(tmp_path, capsys):
+    header = [*NAMES, *(f"rig {k}" for k in "xyz"), *(f"target {k}" for k in "xyz")]
+    header += [f"Rotation {k}" for k in "XYZW"]
+    cells = [lambda c: c.q, lambda c: 0 * c.position + 1.5, lambda c: c.position]
+    d = proposed(tmp_path, capsys, header, *cells, lambda c: c.attitude.as_quat())
+    assert d["mapping"]["position"]["columns"] == header[9:12]
+    assert d["mapping"]["orientation"]["columns"] == [header[15], *header[12:15]]
+
+
+def test_a_standard_error_has_the_unit_of_the_positions(tmp_path, capsys):
+    header = [*NAMES, "X [mm]", "Y [mm]", "Z [mm]", "StdErr"]
+    cells = [lambda c: c.q, lambda c: 1e3 * c.position, lambda c: np.full(len(c.q), 6e-4)]
+    assert proposed(tmp_path, capsys, header, *cells)["mapping"]["std"]["unit"] == "mm"
 
 
 @pytest.mark.parametrize("point", ["p;[[1.5,2,3,4,5,6],[9E9,9E9]];1;2", "XP={A1 1.5,A2 -90};1;2"])
