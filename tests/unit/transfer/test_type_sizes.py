@@ -46,8 +46,9 @@ def measured(cell, poses, rng):
 
 
 def at_nominal(cell, of):
-    """Readings as the arm without any effect would give them."""
-    return replace(of, value=Model(cell, ()).predict(of.states, np.zeros(0)).observation.position)
+    """Readings as the arm without any effect would give them, with their noise."""
+    exact = Model(cell, ()).predict(of.states, np.zeros(0)).observation.position
+    return replace(of, value=exact + NOISE_M * np.random.default_rng(0).normal(size=exact.shape))
 
 
 def sizes_told(ordinary):
