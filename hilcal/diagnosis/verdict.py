@@ -68,7 +68,7 @@ from hilcal.diagnosis.background_evidence import (
     p_value_of_others,
 )
 from hilcal.diagnosis.diagnosis import Diagnosis, History, Reason
-from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE, ranked
+from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE, Suspect, ranked
 from hilcal.diagnosis.evidence import (
     LEAST_REMAINDER,
     Evidence,
@@ -88,6 +88,7 @@ from hilcal.diagnosis.order_step import step_in_order
 from hilcal.diagnosis.recorded import ROW_ORDER
 from hilcal.diagnosis.residual_regression import ResidualRegression
 from hilcal.identification.fit import Fit
+from hilcal.identification.mixed_fit import MOST_NOISE_ROWS
 
 NO_HISTORY = History()
 IN_SAMPLE = ("pose", "direction")  # first words of variables whose share is of the fitted poses
@@ -96,6 +97,9 @@ BACKGROUND_OVERRIDES = (
     "residual_is_noise", "inseparable_addition", "arm_scatter", "misjudged_noise",
 )  # fmt: skip
 """Reasons that "background" overrides where effects are proved together, not one by one."""
+IMITATION, NEARLY_ALL = 0.5, 0.85
+"""Share of the misfit on poses left out up to which a suspect only imitates an effect of which
+smooth laws predict more than the second share; choices. Of two hidden effects laws predict less."""
 OVERSTATED = 0.25
 """Variance factor below which the stated noise is wrong, whatever a background explains: it is
 stated twice too large. A choice."""
@@ -248,6 +252,9 @@ def _judged(e: Evidence, history: History, whole_catalogue: bool) -> Diagnosis:
     added = () if e.fit.model.background else history.added
     suspects = ranked(e.suspects, history.rejected)
     lead = suspects[0] if suspects and suspects[0].passes else None
+    if lead is not None and _imitates(e, lead):
+        passing = [s.effect for s in suspects if s.passes]
+        suspects, lead = ranked(e.suspects, {*history.rejected, *passing}), None
     insufficiency = e.insufficiency if lead is not None and whole_catalogue else None
     noise, scatter = None, readings.arm_scatter
     rivals: tuple[Separability, ...] = ()
@@ -350,6 +357,20 @@ def _judged(e: Evidence, history: History, whole_catalogue: bool) -> Diagnosis:
         background=e.background,
         confounded=e.confounded(None if lead is None else lead.effect),
     )
+
+
+def _imitates(e: Evidence, lead: Suspect) -> bool:
+    """Whether smooth laws predict nearly all of the misfit, and the first suspect little of it.
+
+    It then only resembles what is missing. Laws of many readings take long, and are not asked.
+    """
+    if (
+        not e.misfit
+        or lead.holdout_share > IMITATION
+        or e.fit.readings.value.size > MOST_NOISE_ROWS
+    ):
+        return False
+    return e.regression.significant and e.regression.share > NEARLY_ALL
 
 
 def _follows_state(d: Diagnosis) -> bool:
