@@ -390,7 +390,8 @@ class Procedure:
     def _create(self, path: Path, purpose: str, plan: Plan, o: Campaign) -> None:
         covers = o.file.about(COVERS_KEY) or INSTRUMENT
         texts = {PURPOSE: purpose, CALIBRATION: state.identity(self.run), COVERS_KEY: covers}
-        texts[SERIAL_NUMBER] = RunLog(o.file).serial_number()
+        if o.file.about(PLAN) is not None:  # measured with `run`
+            texts[SERIAL_NUMBER] = RunLog(o.file).serial_number()
         config, readings = CellConfig.from_json(o.file.config_json), o.file.readings()
         at_reference = np.array(readings.pose_names)[readings.pose] == REFERENCE
         if (unloaded := at_reference & readings.unloaded).any():
