@@ -42,7 +42,7 @@ class RecordedVariable:
     functions: Floats  # (N, F)
     factor: "RecordedVariable | None" = None  # second variable of the law
     labels: tuple[str, ...] = ()
-    only: str = ""  # `Motion.moves` of the only motion that the law describes; empty for any
+    only: str = ""  # `LawMotion.moves` of the only motion that the law describes; empty for any
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -243,7 +243,7 @@ def _torque(joint: int, torque: Floats, absolute: bool = False) -> RecordedVaria
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Motion:
+class LawMotion:
     """A motion that a law describes: of a joint, of the base (a turn), or of the target."""
 
     moves: str  # "joint 2", "base" or "target"
@@ -252,7 +252,7 @@ class Motion:
     unit: str  # of the motion
 
 
-def motions(p: Linearisation) -> list[Motion]:
+def motions(p: Linearisation) -> list[LawMotion]:
     """Motions by each joint; turns of the base; the target along base, flange, and sight."""
     fit, m, s = p.fit, p.fit.whitening.m, p.fit.solution.prediction
     arm, o = fit.model.cell.arm, s.observation
@@ -266,17 +266,17 @@ def motions(p: Linearisation) -> list[Motion]:
     if (sight := _sight(o)) is not None:
         of_target.append(("target", "sight", "m", sight[:, :, None]))
     out = [
-        Motion(f"joint {j + 1}", "", ORDINARY_MOTION * drives[:, :, [j]], arm.unit(j))
+        LawMotion(f"joint {j + 1}", "", ORDINARY_MOTION * drives[:, :, [j]], arm.unit(j))
         for j in range(arm.n)
     ]
     for moves, axes, unit, directions in of_target:
         columns = np.zeros((len(drives), m, directions.shape[2]))
         columns[:, :3] = ORDINARY_MOTION * directions
-        out.append(Motion(moves, axes, columns, unit))
+        out.append(LawMotion(moves, axes, columns, unit))
     return out
 
 
-def law_columns(p: Linearisation, v: RecordedVariable, moved: Motion) -> Floats:
+def law_columns(p: Linearisation, v: RecordedVariable, moved: LawMotion) -> Floats:
     """(R, WIDTH) whitened columns of a law with one of the `motions`, padded with zeros."""
     w, moves = p.fit.whitening, moved.columns
     functions = v.product()[:, : LAW_COLUMNS // moves.shape[2]]

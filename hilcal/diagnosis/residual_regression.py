@@ -45,7 +45,7 @@ from hilcal.diagnosis.noise import PREDICTABLE
 from hilcal.diagnosis.recorded import (
     LAW_COLUMNS,
     ORDINARY_MOTION,
-    Motion,
+    LawMotion,
     RecordedVariable,
     bins_of,
     law_columns,
@@ -293,7 +293,7 @@ def _best(p: Linearisation, laws: _Laws, numbers: list[int]) -> int:
     return numbers[int(np.argmax(block_evidence(gram, slope, *p.test_noise, STRENGTHS)))]
 
 
-def _curve(p: Linearisation, v: RecordedVariable, moved: Motion, share: float) -> Dependence:
+def _curve(p: Linearisation, v: RecordedVariable, moved: LawMotion, share: float) -> Dependence:
     """Mean error by bins of the variable, of a joint or along the target's principal direction."""
     bins, x = bins_of(v)
     member = (bins[:, None] == np.arange(len(x))).astype(float)
