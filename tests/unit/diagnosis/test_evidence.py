@@ -31,12 +31,13 @@ from tests.support.fit_cases import fitted_model
 from tests.support.refusals import refusal
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seeds", [(0,), pytest.param((1, 2, 3), marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("mode", "law", "variable"),
     [
-        pytest.param("deflection", "relaxing bench", "time under load", marks=pytest.mark.long),
-        pytest.param("absolute", "swaying bench", "air temperature", marks=pytest.mark.long),
+        ("deflection", "relaxing bench", "time under load"),
+        ("absolute", "swaying bench", "air temperature"),
         ("absolute", "coupled joint", "joint 2 torque"),
     ],
 )
