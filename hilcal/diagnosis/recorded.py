@@ -104,9 +104,10 @@ def state_variables(p: Linearisation) -> Iterator[StateVariable]:
 
 
 def place_variables(p: Linearisation) -> Iterator[StateVariable]:
-    """Yield where the target is, and the directions of gravity and of the sight at the flange.
+    """Yield where the target is, and the directions of gravity and of the sight in flange axes.
 
-    A direction along a flange axis is the cosine of the angle between them.
+    The component of a direction along a flange axis is the cosine of the angle between them. The
+    sight is from the origin of the sensor's axes: of a tracker, where it stands.
     """
     s = p.fit.solution.prediction
     flange, gravity = s.situation.chain.rotation[-1], s.situation.cell.gravity
@@ -123,7 +124,7 @@ def place_variables(p: Linearisation) -> Iterator[StateVariable]:
         axes = s.observation.axes @ flange
         distance = np.linalg.norm(s.observation.position, axis=1)
         found += _along_flange("sight", np.einsum("nik,ni->nk", axes, sight))
-        found.append(StateVariable("distance from the tracker", "m", "place", distance))
+        found.append(StateVariable("distance from the sensor's origin", "m", "place", distance))
     yield from (v for v in found if _varies(v.values))
 
 
@@ -134,7 +135,7 @@ def _along_flange(kind: str, direction: Floats) -> list[StateVariable]:
 
 
 def _sight(o: Observation) -> Floats | None:
-    """(N, 3) direction from one tracker, at the origin of its axes, to the target, sensor axes."""
+    """(N, 3) unit vector from the sensor's origin to the target, sensor axes; None of several."""
     if o.sensor is not None or o.is_distance is not None:
         return None
     distance = np.linalg.norm(o.position, axis=1, keepdims=True)
@@ -231,12 +232,14 @@ def _sides(values: Floats) -> Floats:
 
 
 def _lever(joint: int, angle: Floats) -> RecordedVariable:
+    """Return the first waves of the angle of a joint; `angle` (N, n) is of all joints, rad."""
     turn = angle[:, joint]
     waves = np.stack([np.cos(turn), np.sin(turn)], axis=1)
     return RecordedVariable(angle_name(joint), "rad", turn, waves)
 
 
 def _torque(joint: int, torque: Floats, absolute: bool = False) -> RecordedVariable:
+    """Return the torque (N,) of a joint, N·m, over its largest; with its absolute value, if so."""
     x = torque / np.abs(torque).max()
     functions = np.stack([np.abs(x), x] if absolute else [x], axis=1)
     return RecordedVariable(f"joint {joint + 1} torque", "N·m", torque, functions)

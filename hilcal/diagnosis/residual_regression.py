@@ -6,14 +6,14 @@ the error of one joint, or of the target along one axis, as a smooth function of
     r = J_j f(x) + noise,    f(x) = Σ_k c_k φ_k(x)
 
 with few functions φ_k: a constant, harmonics of an angle, powers of other variables, membership
-for loads; and products of an angle with the size of the load, of two angles, and of the side of
-approach with the torque or the angle of its joint; and of a joint's torque with what may change its
-compliance. The base also turns, and the target moves along
-the axes of the flange, as on a mount that bends, or along the line of sight; and the place of the
-target and the directions of gravity and of the sight at the flange are variables, too. Laws are
-selected one after the other by their evidence on the other poses; the share of the misfit that they
-predict on the poses left out is the predictable share. A variable carries the share that the
-prediction loses when its values are permuted at random between readings.
+for loads; and products of an angle or a place with the size of the load, of two angles, of the side
+of approach with the torque or the angle of its joint, and of a joint's torque with what may change
+its compliance. Variables are also the place of the target, and the directions of gravity and of the
+sight in flange axes. The base may turn, and the target may move along base axes, flange axes (a
+mount that bends), or the line of sight from the origin of the sensor's axes. Laws are selected one
+after the other by their evidence on the other poses; the share of the misfit that they predict on
+the poses left out is the predictable share. A variable carries the share that the prediction loses
+when its values are permuted at random between readings.
 Source of the latter: Breiman, *Random forests*, Machine Learning 45 (2001) 5-32, section 10.
 
 Where the laws predict little, extremely randomised trees predict the residual, in units of its
@@ -105,7 +105,7 @@ class Dependence:
     y_unit: str  # "rad" or "m"
     labels: tuple[str, ...] = ()  # names of the loads that x counts
     axes: str = "base"  # of the direction: "base" or "flange"; "sight" for the line of sight
-    beside: str = ""  # the other variable of the likeliest law, if it is one of two
+    other_variable: str = ""  # of the most likely law, if it is a function of two
 
     @property
     def determined(self) -> bool:
@@ -273,7 +273,7 @@ def _dependences(
             best = _best(p, laws, of_name)
             curve = _curve(p, v, laws.motions[laws.motion[best]], share * value / total)
             others = [n for n in laws.variables[laws.variable[best]].names if n != name]
-            out.append(replace(curve, beside="".join(others)))
+            out.append(replace(curve, other_variable="".join(others)))
     return tuple(out)
 
 

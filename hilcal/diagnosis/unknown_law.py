@@ -94,9 +94,9 @@ def _laws(fit: Fit, dependences: Sequence[Dependence]) -> set[str]:
     laws = set()
     for d in dependences:
         motion, x = moved.get((d.moves, d.axes)), (angles | PLACES).get(d.variable)
-        if d.beside in angles and d.variable in angles:
-            x = "*".join(sorted({angles[d.beside], angles[d.variable]}, key=int))
-        elif d.beside:  # a torque, load, side or time
+        if d.other_variable in angles and d.variable in angles:
+            x = "*".join(sorted({angles[d.other_variable], angles[d.variable]}, key=int))
+        elif d.other_variable:  # a torque, load, side or time
             continue
         if d.share < LEAST_SHARE or motion is None or x is None:
             continue

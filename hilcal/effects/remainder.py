@@ -14,7 +14,7 @@ from hilcal.types import Floats
 
 HARMONICS = 4  # those of the smooth laws of a diagnosis
 POWERS = 3
-SIDE = 0.05  # cosine at which the side of gravity has changed by three quarters; a choice
+SIDE = 0.05  # width of the change from one side of gravity to the other, a cosine; a choice
 MOTIONS: dict[str, tuple[Field, slice, str]] = {
     "base": ("base", slice(0, 3), "m"),
     "tilt": ("base", slice(3, 6), "rad"),

@@ -372,7 +372,7 @@ def erring_quantity(d: Dependence) -> str:
     if d.moves not in ("base", "target"):
         return d.moves
     if d.axes == "sight":
-        return f"the {d.moves} along the line of sight"
+        return f"the {d.moves} along the line from the sensor's origin"
     moved = f"{d.moves} {'about' if d.y_unit == 'rad' else 'along'}"
     main = int(np.argmax(np.abs(d.direction)))
     if d.direction[main] > ALONG:
