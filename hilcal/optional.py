@@ -27,7 +27,6 @@ REQUIRED = {
     "rtde_control": "ur-rtde",
     "rtde_receive": "ur-rtde",
     "serial": "pyserial",
-    "sklearn": "scikit-learn",
 }
 """Distribution by the import name of its package: required, but not by every command."""
 

@@ -91,8 +91,8 @@ class Diagnosis(Shown, Tabular):
             that explain the misfit but do not surely lower the error on poses left out, then
             the others; by decreasing evidence in each of these three groups.
         misfit_breakdown: variables that the misfit follows, largest share first.
-        predictable_share: largest share of the misfit that a generic regression, one variable or
-            one effect predicts on poses left out; 0 where there is no misfit.
+        predictable_share: largest share of the misfit that smooth laws, one variable or one effect
+            predict on poses left out; 0 where there is no misfit.
         dependences: variables that carry the predictable share, with the curve of each; of the
             residual after the refit where the catalogue is insufficient.
         follows: names of at most two variables that the unexplained misfit follows.

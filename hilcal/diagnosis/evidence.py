@@ -309,7 +309,7 @@ class Evidence:
 
     @cached_property
     def regression(self) -> ResidualRegression:
-        """The share of the misfit on poses left out that smooth laws, or trees, predict.
+        """The share of the misfit on poses left out that smooth laws predict.
 
         The misfit is that without a remainder, which is fitted to it.
         """
@@ -381,10 +381,6 @@ class Evidence:
         """Return the effects of the model, and the suspect, whose variable is in doubt."""
         effect = next((e for e in self.effects if e.name == suspect), None)
         return confounded(self.fit, effect)
-
-    def tree_share(self, other_share: float) -> float:
-        """Return the share of the misfit that trees predict; see `residual_regression`."""
-        return self._regressions.tree_share(self.linearisation, other_share)
 
     def alternatives(self, effects: Collection[str]) -> tuple[Alternative, ...]:
         """Return the alternatives of effects of the model."""

@@ -1,7 +1,7 @@
 """How much of a misfit the recorded variables predict on poses left out, whatever its cause.
 
-Smooth laws come first. For every recorded variable x and every motion of the arm, a law describes
-the error of one joint, or of the target along one axis, as a smooth function of x:
+For every recorded variable x and every motion of the arm, a law describes the error of one joint,
+or of the target along one axis, as a smooth function of x:
 
     r = J_j f(x) + noise,    f(x) = Σ_k c_k φ_k(x)
 
@@ -15,23 +15,6 @@ after the other by their evidence on the other poses; the share of the misfit th
 the poses left out is the predictable share. A variable carries the share that the prediction loses
 when its values are permuted at random between readings.
 Source of the latter: Breiman, *Random forests*, Machine Learning 45 (2001) 5-32, section 10.
-
-Where the laws predict little, extremely randomised trees predict the residual, in units of its
-noise, from everything recorded of the state. With e_t = y − f_t the error of tree t on the rows
-left out of its training, the mean over all pairs of trees
-
-    L = Σ_{s≠t} e_s·e_t / (T (T − 1))
-
-estimates the squared error of the infinitely large ensemble without bias, so few trees suffice.
-Trees are added until the standard error of the share by the choice of trees (jackknife) is
-`PRECISION`, or until they surely predict no more than without them (Student's t,
-`STOP_CONFIDENCE`). Of 157 simulated campaigns with a law that the catalogue lacks, 5 are judged
-rightly by the trees alone (a bench that yields, a gear that settles).
-
-Sources: Geurts, Ernst and Wehenkel, *Extremely randomized trees*, Machine Learning 63 (2006) 3-42,
-implementation of scikit-learn; Hoeffding, *A class of statistics with asymptotically normal
-distribution*, Ann. Math. Stat. 19 (1948) 293-325; Efron and Stein, *The jackknife estimate of
-variance*, Ann. Stat. 9 (1981) 586-596.
 """
 
 from dataclasses import dataclass, replace
@@ -39,9 +22,7 @@ from itertools import product
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from scipy.special import stdtrit
 
-from hilcal.diagnosis.noise import PREDICTABLE
 from hilcal.diagnosis.recorded import (
     LAW_COLUMNS,
     ORDINARY_MOTION,
@@ -61,15 +42,6 @@ from hilcal.regression.schur import positive_solve
 from hilcal.types import Bools, Floats, Ints
 
 FOLDS = 5
-TREES = 4  # trees added to a fold at a time; a choice
-MOST_TREES = 60
-PRECISION = 0.03
-"""Standard error of the share by the choice of trees. A choice: a third of `PREDICTABLE`. With 60
-trees per fold it is 0.01 to 0.06 on campaigns of 50 poses."""
-STOP_CONFIDENCE = 0.99
-"""Confidence that trees predict no more than another predictor, at which no trees are added."""
-LEAF_SIZE = 3
-MOST_MEASUREMENTS = 4000  # used by trees, for speed; a guess
 MOST_ROWS = 3000
 MOST_LAWS = 3
 SHUFFLES = 4
@@ -80,8 +52,6 @@ STRENGTHS = np.logspace(-2, 3, 21)
 STANDARD_ERRORS = 3.0
 """Standard errors, from pose to pose, by which laws must lower the error on poses left out; a
 choice: chance then finds a law in one campaign of a thousand."""
-SMALL_LAW_SHARE = 0.1
-"""Share predicted by smooth laws below which trees are fitted as well; a guess."""
 LAWS_AT_ONCE = 16  # laws whose columns are computed together; a choice by memory
 LEAST_SIGNAL_TO_NOISE = 2.0
 """Least ratio of a curve to its rms standard error; a choice: a smaller curve is largely error."""
@@ -129,33 +99,17 @@ class Regressions:
     def __init__(self) -> None:
         """Create an empty cache."""
         self._of: WeakKeyDictionary[Fit, ResidualRegression] = WeakKeyDictionary()
-        self._trees: WeakKeyDictionary[Fit, dict[float, float]] = WeakKeyDictionary()
 
     def of(self, p: Linearisation) -> ResidualRegression:
-        """Return the predictable share of the misfit, by laws or trees, and what carries it."""
+        """Return the predictable share of the misfit, and what carries it."""
         if p.fit not in self._of:
-            smooth = smooth_laws(p)
-            if smooth.share < SMALL_LAW_SHARE:
-                smooth = replace(smooth, share=max(smooth.share, self.tree_share(p, smooth.share)))
-            self._of[p.fit] = smooth
+            self._of[p.fit] = residual_regression(p)
         return self._of[p.fit]
 
     def same(self, renamed: Fit, fit: Fit) -> None:
         """Reuse the regression of a fit for one that differs in the effects it names only."""
         if fit in self._of:
             self._of[renamed] = self._of[fit]
-
-    def tree_share(self, p: Linearisation, other_share: float) -> float:
-        """Cached `tree_share`."""
-        shares = self._trees.setdefault(p.fit, {})
-        if other_share not in shares:
-            shares[other_share] = tree_share(p, other_share)
-        return shares[other_share]
-
-
-def residual_regression(p: Linearisation) -> ResidualRegression:
-    """Return the predictable share of the misfit, by laws or trees, and what carries it."""
-    return Regressions().of(p)
 
 
 class _Laws:
@@ -215,7 +169,7 @@ class _Laws:
         return step[:size], list(step[size:].reshape(-1, LAW_COLUMNS))
 
 
-def smooth_laws(p: Linearisation) -> ResidualRegression:
+def residual_regression(p: Linearisation) -> ResidualRegression:
     """Find the laws that predict the misfit of poses left out, and the variables that carry it."""
     white, w = p.marginal_residual, p.fit.whitening
     fold = w.rows_of(random_folds(p.fit.pose, FOLDS))
@@ -333,95 +287,3 @@ def _least_squares(p: Linearisation, x: Floats) -> tuple[Floats, Floats]:
     square, dof = p.test_noise
     variance = max(square - float(y @ gram @ y), 0.0) / max(dof - len(y), 1.0)
     return y, np.asarray(inverse * max(variance, 1e-300))
-
-
-def tree_share(p: Linearisation, other_share: float = 0.0) -> float:
-    """Return the share of the misfit that trees predict on poses left out, within [0, 1].
-
-    A share below `other_share`, which is predicted without trees, is less precise; it is 0 where no
-    more than `PREDICTABLE` remains beyond it.
-    """
-    if other_share >= 1.0 - PREDICTABLE:
-        return 0.0
-    fit, w = p.fit, p.fit.whitening
-    std = np.sqrt(np.trace(w.covariance[:, :3, :3], axis1=1, axis2=2) / 3)
-    axes = fit.solution.prediction.observation.axes[w.reading]
-    # A measurement without any stated noise has no weight, as in whitening.
-    weight = np.where(std > 0, 1.0, 0.0) / np.where(std > 0, std, 1.0)
-    target = np.einsum("dji,dj->di", axes, fit.raw[:, :3]) * weight[:, None]
-    chosen = np.arange(len(target))
-    if len(chosen) > MOST_MEASUREMENTS:
-        chosen = np.random.default_rng(0).choice(chosen, MOST_MEASUREMENTS, replace=False)
-    s, situation = fit.readings[~fit.outlier].states[w.reading], fit.solution.prediction.situation
-    angle = situation.angle[w.reading]
-    order = np.flatnonzero(~fit.outlier).astype(float)[w.reading]
-    narrow = (order if s.time is None else s.time, s.load_time, s.air_temperature)
-    features = np.concatenate(  # everything recorded of the state of each measurement
-        [
-            *(angle, np.cos(angle), np.sin(angle), situation.torque[w.reading], s.wrench),
-            *(x[:, None] for x in narrow if x is not None),
-            *(x for x in (s.joint_temperature, s.approach) if x is not None),
-        ],
-        axis=1,
-    )
-    fold, scale = random_folds(fit.pose, FOLDS)[chosen], p.rss / p.misfit()
-    share = predict_by_trees(features[chosen], target[chosen], fold, scale, other_share).share
-    return float(np.clip(share, 0.0, 1.0))
-
-
-@dataclass(frozen=True, slots=True)
-class TreePrediction:
-    """Share of a target that trees predict in rows left out."""
-
-    share: float  # of the squares of the target; negative where zero would predict better
-    std: float  # standard error of the share by the choice of trees alone
-    trees: int  # per fold
-
-
-def predict_by_trees(
-    features: Floats,  # (D, F)
-    target: Floats,  # (D, K)
-    fold: Ints,  # (D,) fold of each row, from 0; with one fold nothing is predicted
-    scale: float = 1.0,  # factor of the share; `PRECISION` holds for the product
-    other_share: float = 0.0,  # share below which the precision does not matter
-) -> TreePrediction:
-    """Return the share of ‖target‖² that trees predict in rows left out."""
-    total = float(np.sum(target**2))
-    if total <= 0 or fold.min(initial=0) == fold.max(initial=0):
-        return TreePrediction(0.0, 0.0, 0)
-    import sklearn  # slow to import
-    from sklearn.tree import ExtraTreeRegressor
-
-    x = np.ascontiguousarray(features, dtype=np.float32)
-    folds = [(rows, x[~rows], target[~rows]) for rows in (fold == f for f in np.unique(fold))]
-
-    def errors(number: int) -> Floats:
-        """(D·K,) error of the rows of each fold by the tree of that number."""
-        error = target.copy()
-        # The validation of parameters would take a fifth of the time.
-        with sklearn.config_context(skip_parameter_validation=True):
-            for f, (rows, x_train, y_train) in enumerate(folds):
-                seed = MOST_TREES * f + number
-                tree = ExtraTreeRegressor(min_samples_leaf=LEAF_SIZE, random_state=seed)
-                tree.fit(x_train, y_train, check_input=False)
-                error[rows] -= tree.predict(x[rows], check_input=False).reshape(error[rows].shape)
-        return np.asarray(error.reshape(-1))
-
-    of_trees = np.zeros((0, target.size))
-    while True:
-        of_trees = np.concatenate([of_trees, [errors(len(of_trees) + k) for k in range(TREES)]])
-        square, std = _mean_of_pairs(of_trees @ of_trees.T)
-        share, std, count = scale * (1.0 - square / total), scale * std / total, len(of_trees)
-        no_more = share + std * float(stdtrit(count - 1, STOP_CONFIDENCE)) < other_share
-        if std <= PRECISION or no_more or count >= MOST_TREES:
-            return TreePrediction(share, std, count)
-
-
-def _mean_of_pairs(products: Floats) -> tuple[float, float]:
-    """Mean product of two trees' errors, and its standard error (jackknife), from all (T, T)."""
-    count = len(products)
-    squares = np.diag(products)
-    total = float(products.sum() - squares.sum())
-    without = (total - 2 * (products.sum(axis=1) - squares)) / ((count - 1) * (count - 2))
-    variance = (count - 1) / count * float(np.sum((without - without.mean()) ** 2))
-    return total / (count * (count - 1)), float(np.sqrt(variance))

@@ -260,12 +260,11 @@ def _judged(e: Evidence, history: History, whole_catalogue: bool) -> Diagnosis:
     rivals: tuple[Separability, ...] = ()
     reason: Reason
     if lead is not None:
-        trees = e.tree_share(lead.holdout_share) if e.misfit else 0.0
-        regression = ResidualRegression(trees, ())
-        predicted = max(trees, lead.holdout_share) if e.misfit else 0.0
+        regression = ResidualRegression(0.0, ())
+        predicted = lead.holdout_share if e.misfit else 0.0
         if insufficiency is not None:
             reason = "insufficient_catalogue"
-            regression = ResidualRegression(trees, insufficiency.dependences)
+            regression = replace(regression, dependences=insufficiency.dependences)
         else:
             rivals = separability(e.linearisation, lead, e.effects) if lead.same_as else ()
             reason = "inseparable_suspects" if rivals else "one_suspect"

@@ -50,9 +50,6 @@ REVISION_HEADS = (
     *("variance\nfactor", "verdict"),
 )
 """Heads of a table of revisions."""
-MIN_SHARE = 0.2
-"""Least share of the predictable misfit that the first suspect explains for its chart to be shown
-instead of that of the strongest variable; a guess."""
 MIN_CARRIED_SHARE = 0.02  # share of the misfit below which a variable is not shown; a guess
 MOST_SUSPECTS, MOST_PARAMETERS = 3, 40
 
@@ -375,8 +372,7 @@ def _revision(c: Chapter, e: FullPrediction, residual: Floats, measured: Floats)
 
 def strongest_dependence(d: Diagnosis) -> DependenceCurve | None:
     """Return the residual over the first suspect, or over the strongest variable."""
-    by_lead = 0.0 if d.lead is None else d.lead.holdout_share
-    explained = d.insufficiency is None and by_lead >= MIN_SHARE * d.predictable_share
+    explained = d.lead is not None and d.insufficiency is None
     carried = [v for v in d.dependences if v.share >= MIN_CARRIED_SHARE and v.determined]
     if carried and d.verdict != "adequate" and not explained:
         return curve(carried[0])

@@ -72,7 +72,7 @@ def test_scoring_against_a_fit_of_the_largest_model(readings, mode, benchmark, c
 
 @pytest.mark.parametrize("mode", ["absolute", "deflection"])
 def test_diagnosing_what_nothing_explains(mode, benchmark, claim):
-    """`diagnose_s`: with smooth laws and trees on the residual, which a good suspect spares."""
+    """`diagnose_s`: with smooth laws of the residual, which a good suspect spares."""
     c = campaign("none", mode, poses=1000 // LOADS)
     found = based(replace(c, readings=replace(c.readings, covariance=c.readings.covariance / 4)))
     seconds = shortest({"diagnose": lambda: diagnose(found)}, ROUNDS)["diagnose"]

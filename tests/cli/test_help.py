@@ -123,8 +123,8 @@ def test_an_unexpected_error_and_an_interrupt_are_documents(capsys, monkeypatch)
     assert (found.code, found.document["error"]) == (130, error)
 
 
-HEAVY = ("numpy", "scipy", "pydantic", "pinocchio", "rerun", "sklearn", "rich.console", "dask")
-SLOW = ("asyncio", "plotly", "rerun", "sklearn")
+HEAVY = ("numpy", "scipy", "pydantic", "pinocchio", "rerun", "rich.console", "dask")
+SLOW = ("asyncio", "plotly", "rerun")
 """Libraries that few commands need, each a tenth of a second or more to load."""
 
 

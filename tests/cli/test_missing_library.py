@@ -22,7 +22,7 @@ sys.meta_path.insert(0, Blocked())
 {code}
 """
 COMMAND = "from hilcal.cli import main\nmain()"
-BARE = {*EXTRAS, "rerun_bindings", *REQUIRED} - {"sklearn"}
+BARE = {*EXTRAS, "rerun_bindings", *REQUIRED}
 """All but what reading, fitting and diagnosing need."""
 ROOT = Path(__file__).resolve().parents[2]
 

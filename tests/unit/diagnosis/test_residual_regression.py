@@ -4,18 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sklearn.ensemble import ExtraTreesRegressor
 
-from hilcal.diagnosis import residual_regression as module
 from hilcal.diagnosis.diagnosis import in_doubt
 from hilcal.diagnosis.misfit_breakdown import pose_constants
-from hilcal.diagnosis.residual_regression import (
-    LEAF_SIZE,
-    PRECISION,
-    TreePrediction,
-    predict_by_trees,
-    residual_regression,
-)
+from hilcal.diagnosis.residual_regression import residual_regression
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import fit
@@ -191,65 +183,6 @@ def test_a_curve_of_the_target_has_a_direction_in_base_axes():
     assert d.y_unit == "m"
     assert abs(d.direction[2]) > 0.95
     assert np.corrcoef(d.x, d.y)[0, 1] > 0.95
-
-
-POSES, LOADS, FEATURES, FOLDS = 40, 3, 6, 5
-
-
-def table(seed, size):
-    """Features, target and folds of whole poses; a law of two features, of a size in σ."""
-    rng = np.random.default_rng(seed)
-    pose = np.repeat(np.arange(POSES), LOADS)
-    x = rng.normal(size=(POSES, FEATURES))[pose]
-    x[:, -1] = np.tile(np.arange(LOADS), POSES)
-    law = np.sign(x[:, :1]) * x[:, -1:] * [1.0, -0.5, 0.0]
-    y = rng.normal(size=(len(x), 3)) + size * law
-    return x, y, rng.permutation(POSES)[pose] % FOLDS
-
-
-def of_large_forest(x, y, fold, trees=300):
-    """The share by many trees, their mean, scikit-learn's own forest."""
-    left = y.copy()
-    for f in range(FOLDS):
-        mine = fold == f
-        forest = ExtraTreesRegressor(trees, min_samples_leaf=LEAF_SIZE, random_state=7)
-        left[mine] -= forest.fit(x[~mine], y[~mine]).predict(x[mine])
-    return float(1 - np.sum(left**2) / np.sum(y**2))
-
-
-def test_few_trees_estimate_what_many_predict():
-    x, y, fold = table(0, 1.0)
-    many = of_large_forest(x, y, fold)
-    few = predict_by_trees(x, y, fold)
-    assert few.trees < 60
-    assert many > 0.2
-    assert abs(few.share - many) < 3 * few.std + 0.01  # of 300 trees, their own
-    assert few.std <= PRECISION
-
-
-def test_the_stated_error_is_that_of_other_trees(monkeypatch):
-    x, y, fold = table(1, 1.0)
-    monkeypatch.setattr(module, "PRECISION", 0.0)
-    monkeypatch.setattr(module, "MOST_TREES", 8)
-    found = []
-    for number in range(12):
-        # The number of a feature decides what a seed draws.
-        order = np.random.default_rng(number).permutation(FEATURES)
-        found.append(predict_by_trees(x[:, order], y, fold))
-    spread = np.std([f.share for f in found], ddof=1)
-    assert spread == pytest.approx(np.mean([f.std for f in found]), rel=0.6)
-
-
-@pytest.mark.parametrize("how", ["one fold", "no residual", "no rows"])
-def test_nothing_to_learn_from(how):
-    x, y, fold = table(3, 1.0)
-    if how == "one fold":
-        fold = np.zeros_like(fold)
-    elif how == "no residual":
-        y = np.zeros_like(y)
-    else:
-        x, y, fold = x[:0], y[:0], fold[:0]
-    assert predict_by_trees(x, y, fold) == TreePrediction(0.0, 0.0, 0)
 
 
 def dense(p):
