@@ -37,7 +37,8 @@ from hilcal.tables.grid import ColumnTable
 from hilcal.tables.mapped import mapped_table
 from hilcal.tables.mapping import FileFormat, PointMapping
 from hilcal.tables.proposal import GUESSED
-from hilcal.tables.propose import GridProposal, propose, sniff
+from hilcal.tables.propose import GridProposal, propose
+from hilcal.tables.sniff import sniff
 from hilcal.tables.units import LENGTHS
 from hilcal.types import Floats
 

@@ -15,7 +15,8 @@ from hilcal.readings.covariance import TrackerNoise, tracker_covariance
 from hilcal.robot.se3 import rotation
 from hilcal.tables.mapped import import_mapped
 from hilcal.tables.mapping import Mapping
-from hilcal.tables.propose import propose, sniff
+from hilcal.tables.propose import propose
+from hilcal.tables.sniff import sniff
 from hilcal.toml import check_section
 from tests.support.readings_cases import make_arm
 from tests.support.refusals import refusal
