@@ -57,7 +57,7 @@ elements, shows only then. The message says so.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -79,6 +79,7 @@ from hilcal.diagnosis.evidence import (
 from hilcal.diagnosis.misfit_breakdown import MisfitShare
 from hilcal.diagnosis.noise import (
     PREDICTABLE,
+    NoiseVerdict,
     exceeds_repeatability,
     judge_noise,
     prefers_instrument,
@@ -89,8 +90,10 @@ from hilcal.diagnosis.recorded import ROW_ORDER
 from hilcal.diagnosis.residual_regression import ResidualRegression
 from hilcal.identification.fit import Fit
 from hilcal.identification.mixed_fit import MOST_NOISE_ROWS
+from hilcal.readings.readings import ArmScatter
 
 NO_HISTORY = History()
+NOTHING_PREDICTED = ResidualRegression(0.0, ())
 IN_SAMPLE = ("pose", "direction")  # first words of variables whose share is of the fitted poses
 MOST_NAMED = 2  # variables that a sentence names
 BACKGROUND_OVERRIDES = (
@@ -248,114 +251,158 @@ def _with_arrivals(e: Evidence, history: History, whole_catalogue: bool) -> Diag
 
 def _judged(e: Evidence, history: History, whole_catalogue: bool) -> Diagnosis:
     """Judge by rules 1 to 6, with the covariance of the fit."""
-    readings, arm = e.fit.readings, e.fit.model.cell.arm
     added = () if e.fit.model.background else history.added
     suspects = ranked(e.suspects, history.rejected)
     lead = suspects[0] if suspects and suspects[0].passes else None
     if lead is not None and _imitates(e, lead):
         passing = [s.effect for s in suspects if s.passes]
         suspects, lead = ranked(e.suspects, {*history.rejected, *passing}), None
-    insufficiency = e.insufficiency if lead is not None and whole_catalogue else None
-    noise, scatter = None, readings.arm_scatter
-    rivals: tuple[Separability, ...] = ()
-    reason: Reason
-    if lead is not None:
-        regression = ResidualRegression(0.0, ())
-        predicted = lead.holdout_share if e.misfit else 0.0
-        if insufficiency is not None:
-            reason = "insufficient_catalogue"
-            regression = replace(regression, dependences=insufficiency.dependences)
-        else:
-            rivals = separability(e.linearisation, lead, e.effects) if lead.same_as else ()
-            reason = "inseparable_suspects" if rivals else "one_suspect"
-        follows = _carrying(regression)
+    if lead is None:
+        found = _without_suspect(e, suspects, added)
     else:
-        # Noise that was estimated while an effect is missing is too large to show the effect, and a
-        # background takes up what it can of the effect.
-        hides = e.fit.model.background or not readings.noise_stated
-        hidden = hides and e.regression.significant
-        regression = e.regression if e.misfit or hidden else ResidualRegression(0.0, ())
-        significant = _significant(e.misfit_breakdown)
-        follows = _carrying(regression) or tuple(v.variable for v in significant)
-        sizes = [v.share for v in significant]
-        sizes += [s.holdout_share for s in suspects if s.explains]
-        predicted = max([regression.share, *sizes]) if e.misfit or hidden else 0.0
-        # A misfit that an effect of implausible size would explain is no noise either.
-        patterns = [
-            s.holdout_share
-            for s in suspects
-            if not s.plausible and s.score.p_value * len(suspects) < FALSE_ALARM
-        ]
-        predictable = regression.share > PREDICTABLE or bool(sizes) or bool(patterns)
-        noise = judge_noise(e.fit, e.pure_error, predictable)
-        in_fit = scatter is not None
-        implausible = scatter is not None and exceeds_repeatability(scatter, arm)
-        # A scatter that is too large for an arm is noise if repeats show it: effects too small to
-        # be resolved scatter alike.
-        repeated = implausible and e.pure_error is not None
-        little = noise.reason == "predictable" and max(predicted, *patterns, 0.0) <= PREDICTABLE
-        same_in_pose = any(
-            v.variable == "pose" and v.share > MOST_POSE_SHARE and v.p_value < FALSE_ALARM
-            for v in e.misfit_breakdown
-        )
-        may = e.misfit and (noise.misjudged or little) and not in_fit and not same_in_pose
-        estimate = e.arm_scatter if may and not readings.scatter_stated else None
-        by_arm = (
-            estimate is not None
-            and not prefers_instrument(estimate)
-            and within_repeatability(estimate, arm)
-        )
-        if estimate is not None and (by_arm or noise.misjudged):
-            names = follows[:MOST_NAMED]
-            scatter = replace(estimate, predicted_share=predicted, predicted_by=names)
-        if hidden and predicted > PREDICTABLE:
-            reason = "no_suspect"
-        elif by_arm:
-            reason = "arm_scatter"
-        elif implausible or (noise.misjudged and not (in_fit and noise.reason == "too_large")):
-            reason = "misjudged_noise"
-        elif noise.contradicted and not noise.misjudged:
-            reason = "no_suspect"
-        else:
-            in_doubt = any(a.inseparable for a in e.alternatives(added))
-            reason = "inseparable_addition" if in_doubt else "residual_is_noise"
-        serial = readings.serial
-        if reason in ("residual_is_noise", "arm_scatter") and serial and not serial.proved:
-            reason = "serial_or_effect"
-        overstated = noise.reason == "too_large" and e.fit.variance_factor < OVERSTATED
-        if (
-            e.background
-            and not overstated
-            and (
-                (reason == "misjudged_noise" and not repeated)
-                or (reason in BACKGROUND_OVERRIDES and p_value_of_others(e.fit) <= JOINT_LEVEL)
-            )
-        ):
-            reason, suspects = "background", (*as_suspects(e.background), *suspects)
-    alone = None
-    if reason in ("misjudged_noise", "no_suspect") and e.misfit and not _predicted(e, regression):
+        found = _with_suspect(e, suspects, lead, whole_catalogue)
+    alone, reason = None, found.reason
+    unexplained = reason in ("misjudged_noise", "no_suspect") and e.misfit
+    if unexplained and not _predicted(e, found.regression):
         alone = e.pose_alone
         reason = reason if alone is None else "pose_alone"
     return Diagnosis(
         fit=e.fit,
         history=history,
         reason=reason,
-        suspects=suspects,
+        suspects=found.suspects,
         misfit_breakdown=e.misfit_breakdown,
-        predictable_share=predicted,
-        dependences=regression.dependences,
-        follows=follows[:MOST_NAMED],
+        predictable_share=found.predicted,
+        dependences=found.regression.dependences,
+        follows=found.follows[:MOST_NAMED],
         pure_error=e.pure_error,
-        noise=noise,
+        noise=found.noise,
         redundant=e.redundant,
-        separability=rivals,
-        insufficiency=insufficiency,
+        separability=found.rivals,
+        insufficiency=found.insufficiency,
         alternatives=e.alternatives(added),
-        scatter=scatter,
+        scatter=found.scatter,
         pose_alone=alone,
         background=e.background,
         confounded=e.confounded(None if lead is None else lead.effect),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Finding:
+    """What the rules with, or without, a suspect that passes all tests find."""
+
+    reason: Reason
+    suspects: tuple[Suspect, ...]
+    predicted: float  # share of the misfit that the first suspect, or anything recorded, predicts
+    regression: ResidualRegression  # of what the suspect, or the catalogue, leaves
+    follows: tuple[str, ...]
+    scatter: ArmScatter | None
+    noise: NoiseVerdict | None = None
+    rivals: tuple[Separability, ...] = ()
+    insufficiency: Insufficiency | None = None
+
+
+def _with_suspect(
+    e: Evidence, suspects: tuple[Suspect, ...], lead: Suspect, whole_catalogue: bool
+) -> _Finding:
+    """Rules 1 and 2: is the catalogue sufficient, and is the first suspect separable?"""
+    insufficiency = e.insufficiency if whole_catalogue else None
+    rivals: tuple[Separability, ...] = ()
+    regression = NOTHING_PREDICTED
+    reason: Reason
+    if insufficiency is not None:
+        reason = "insufficient_catalogue"
+        regression = ResidualRegression(0.0, insufficiency.dependences)
+    else:
+        rivals = separability(e.linearisation, lead, e.effects) if lead.same_as else ()
+        reason = "inseparable_suspects" if rivals else "one_suspect"
+    return _Finding(
+        reason=reason,
+        suspects=suspects,
+        predicted=lead.holdout_share if e.misfit else 0.0,
+        regression=regression,
+        follows=_carrying(regression),
+        scatter=e.fit.readings.arm_scatter,
+        rivals=rivals,
+        insufficiency=insufficiency,
+    )
+
+
+def _without_suspect(
+    e: Evidence, suspects: tuple[Suspect, ...], added: tuple[str, ...]
+) -> _Finding:
+    """Rules 3 to 6: is the residual noise, an effect outside the catalogue, or wrong noise?"""
+    readings, arm = e.fit.readings, e.fit.model.cell.arm
+    # Noise that was estimated while an effect is missing is too large to show the effect, and a
+    # background takes up what it can of the effect.
+    hides = e.fit.model.background or not readings.noise_stated
+    hidden = hides and e.regression.significant
+    regression = e.regression if e.misfit or hidden else NOTHING_PREDICTED
+    significant = _significant(e.misfit_breakdown)
+    follows = _carrying(regression) or tuple(v.variable for v in significant)
+    sizes = [v.share for v in significant]
+    sizes += [s.holdout_share for s in suspects if s.explains]
+    predicted = max([regression.share, *sizes]) if e.misfit or hidden else 0.0
+    # A misfit that an effect of implausible size would explain is no noise either.
+    patterns = [
+        s.holdout_share
+        for s in suspects
+        if not s.plausible and s.score.p_value * len(suspects) < FALSE_ALARM
+    ]
+    predictable = regression.share > PREDICTABLE or bool(sizes) or bool(patterns)
+    noise = judge_noise(e.fit, e.pure_error, predictable)
+    scatter = readings.arm_scatter
+    in_fit = scatter is not None
+    implausible = scatter is not None and exceeds_repeatability(scatter, arm)
+    little = noise.reason == "predictable" and max(predicted, *patterns, 0.0) <= PREDICTABLE
+    same_in_pose = any(
+        v.variable == "pose" and v.share > MOST_POSE_SHARE and v.p_value < FALSE_ALARM
+        for v in e.misfit_breakdown
+    )
+    may = e.misfit and (noise.misjudged or little) and not in_fit and not same_in_pose
+    estimate = e.arm_scatter if may and not readings.scatter_stated else None
+    by_arm = (
+        estimate is not None
+        and not prefers_instrument(estimate)
+        and within_repeatability(estimate, arm)
+    )
+    if estimate is not None and (by_arm or noise.misjudged):
+        names = follows[:MOST_NAMED]
+        scatter = replace(estimate, predicted_share=predicted, predicted_by=names)
+    reason: Reason
+    if hidden and predicted > PREDICTABLE:
+        reason = "no_suspect"
+    elif by_arm:
+        reason = "arm_scatter"
+    elif implausible or (noise.misjudged and not (in_fit and noise.reason == "too_large")):
+        reason = "misjudged_noise"
+    elif noise.contradicted and not noise.misjudged:
+        reason = "no_suspect"
+    else:
+        in_doubt = any(a.inseparable for a in e.alternatives(added))
+        reason = "inseparable_addition" if in_doubt else "residual_is_noise"
+    serial = readings.serial
+    if reason in ("residual_is_noise", "arm_scatter") and serial and not serial.proved:
+        reason = "serial_or_effect"
+    if _is_background(e, reason, noise, implausible):
+        reason, suspects = "background", (*as_suspects(e.background), *suspects)
+    return _Finding(reason, suspects, predicted, regression, follows, scatter, noise)
+
+
+def _is_background(e: Evidence, reason: Reason, noise: NoiseVerdict, implausible: bool) -> bool:
+    """Whether the background explains the residual, and is proved together, not one by one.
+
+    An `implausible` scatter is too large for an arm: noise if repeats show it, since effects too
+    small to be resolved scatter alike.
+    """
+    overstated = noise.reason == "too_large" and e.fit.variance_factor < OVERSTATED
+    if not e.background or overstated:
+        return False
+    repeated = implausible and e.pure_error is not None
+    if reason == "misjudged_noise" and not repeated:
+        return True
+    return reason in BACKGROUND_OVERRIDES and p_value_of_others(e.fit) <= JOINT_LEVEL
 
 
 def _imitates(e: Evidence, lead: Suspect) -> bool:
