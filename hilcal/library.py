@@ -51,7 +51,7 @@ from hilcal.store.plan import Plan
 from hilcal.store.schema import HEADER
 from hilcal.stream import StreamFit
 from hilcal.stream import fit_stream as fit_all
-from hilcal.tables.mapped import import_readings
+from hilcal.tables.importing import import_readings
 from hilcal.tables.parquet_stream import open_stream
 from hilcal.types import Floats
 from hilcal.whole_file import replace_file

@@ -18,8 +18,7 @@ DRIFT_P + SCATTER_P at most. A motion of less than about four sigmas of a sample
 the first window; more samples detect smaller drifts.
 
 **Averaging.** Several measurements at rest become one reading with the covariance of their mean,
-`readings.covariance.covariance_of_mean`. Its factor τ is 1 unless the stated noise cannot explain
-the scatter (chi² test, p < 0.001); then τ is the ratio of scatter and stated noise.
+see `readings.averaging`.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,98 +33,36 @@ from hilcal.measuring.devices import ArmSample, TargetLostError, TrackerSample, 
 from hilcal.measuring.force import ForceMeter
 from hilcal.measuring.motion import POLL_S, Mover
 from hilcal.measuring.progress import Remark
-from hilcal.readings.covariance import covariance_of_mean
+from hilcal.readings.averaging import Average, deviations, mean_of_samples
 from hilcal.readings.whitening import whitening_matrix
-from hilcal.robot import se3
-from hilcal.types import Bools, Floats
+from hilcal.types import Floats
 
-UNEXPLAINED = 1e-3
-"""Level of the test of the scatter against the stated noise; a choice, no study set it."""
-GROSS_SIGMA = 6.0
-"""Distance of a gross outlier, as the equivalent number of sigmas of a scalar; a guess."""
 MOST_LEFT_OUT = 0.2
 """Largest share of omitted samples; one sample is always allowed. A guess."""
-_MEAN_STEPS = 10
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Average:
-    """The mean of K samples."""
-
-    value: Floats  # (m,) position in m and, for m = 6, rotation vector in rad, sensor axes
-    covariance: Floats  # (m, m) of `value`; rotations as small rotations about the sensor's axes
-    scatter: float  # mean square of the scatter over the stated noise; 1 is expected
-    scatter_p: float  # p-value of the scatter under the stated noise
-    left_out: tuple[int, ...]  # indices of the gross outliers
-    warnings: tuple[str, ...]  # for people, one line each
 
 
 def average(samples: Sequence[TrackerSample], systematic_share: float = 0.0) -> Average:
-    """Average at least 2 samples of one target at rest; see the module.
+    """Average at least 2 samples of one target at rest; see `readings.averaging`.
 
-    Gross outliers are omitted: samples whose squared distance from the median, whitened by Σ̄ and
-    relative to the median distance of the window (at least that of the stated noise), is less
-    probable than `GROSS_SIGMA`. DeviceError: more than one outlier, and more than one in five.
+    DeviceError: more than one gross outlier, and more than one in five.
     """
     values = np.array([sample.value for sample in samples])
     stated = np.array([sample.covariance for sample in samples])
-    retained = _inliers(values, stated.mean(axis=0))
-    left_out = tuple(int(k) for k in np.flatnonzero(~retained))
-    if len(left_out) > max(1.0, MOST_LEFT_OUT * len(samples)) or retained.sum() < 2:
+    mean, count = mean_of_samples(values, stated, systematic_share), len(samples)
+    if len(mean.left_out) > max(1.0, MOST_LEFT_OUT * count):
         raise DeviceError(
-            f"tracker: its readings scatter: {len(left_out)} of {len(samples)} at one pose are "
+            f"tracker: its readings scatter: {len(mean.left_out)} of {count} at one pose are "
             "gross outliers; is the beam disturbed, or does something move?"
         )
-    prior = stated[retained].mean(axis=0)
-    mean, residuals = deviations(values[retained])
-    total = float(np.sum((residuals @ whitening_matrix(prior).T) ** 2))  # Σ_k r_kᵀ Σ̄⁻¹ r_k
-    dof = residuals.shape[1] * (len(residuals) - 1)
-    ratio, p = total / dof, float(scipy.stats.chi2.sf(total, dof))
-    factor = 1.0 if p >= UNEXPLAINED else ratio
-    covariance = covariance_of_mean(prior, residuals, systematic_share, factor)
-    warnings = [f"reading {k + 1} of {len(samples)} is a gross outlier, left out" for k in left_out]
-    if p < UNEXPLAINED:
+    warnings = [f"reading {k + 1} of {count} is a gross outlier, left out" for k in mean.left_out]
+    if not mean.explained:
         warnings.append(
-            f"the repeats scatter {np.sqrt(ratio):.1f} times as much as the instrument's noise "
-            f"(p = {p:.1g}); the reading's covariance was enlarged"
+            f"the repeats scatter {np.sqrt(mean.scatter):.1f} times as much as the instrument's "
+            f"noise (p = {mean.scatter_p:.1g}); the reading's covariance was enlarged"
         )
-    warnings += dict.fromkeys(
-        s.warning for s, used in zip(samples, retained, strict=True) if used and s.warning
-    )
-    return Average(mean, covariance, ratio, p, left_out, tuple(warnings))
-
-
-def deviations(values: Floats) -> tuple[Floats, Floats]:
-    """Return the mean (m,) of values (K, m), and the deviations from it (K, m).
-
-    Rotations are averaged in the tangent space: the rotation vectors of R_k R̄ᵀ have the mean zero
-    (Fréchet mean; Barfoot, *State Estimation for Robotics*, section 7.3).
-    """
-    mean = values.mean(axis=0)
-    residuals = values - mean
-    if values.shape[1] == 6:
-        rotations = se3.rotation(values[:, 3:])
-        mean_rotation = rotations[0]
-        for _ in range(_MEAN_STEPS):
-            residuals[:, 3:] = se3.rotation_vector(rotations @ mean_rotation.T)
-            step = residuals[:, 3:].mean(axis=0)
-            if np.linalg.norm(step) < 1e-14:
-                break
-            mean_rotation = se3.rotation(step) @ mean_rotation
-        mean[3:] = se3.rotation_vector(mean_rotation)
-    return mean, residuals
-
-
-def _inliers(values: Floats, stated: Floats) -> Bools:
-    """Return which samples (K,) are no gross outliers."""
-    m = values.shape[1]
-    white = deviations(values)[1] @ whitening_matrix(stated).T
-    square = np.sum((white - np.median(white, axis=0)) ** 2, axis=1)
-    usual = max(1.0, float(np.median(square) / scipy.stats.chi2.median(m)))
-    return np.asarray(scipy.stats.chi2.logsf(square / usual, m) > _LOG_GROSS)
-
-
-_LOG_GROSS = float(np.log(2) + scipy.special.log_ndtr(-GROSS_SIGMA))
+    used = (s for k, s in enumerate(samples) if k not in mean.left_out)
+    warnings += dict.fromkeys(s.warning for s in used if s.warning)
+    return replace(mean, warnings=tuple(warnings))
 
 
 DRIFT_P = 0.04

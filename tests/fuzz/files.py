@@ -25,7 +25,7 @@ from hilcal.robot.catalogue import arm_from_dh, configs_dir, load_arm
 from hilcal.robot.factory import nominal_rows, read_factory, with_factory
 from hilcal.robot.urdf import arm_from_urdf
 from hilcal.store.plan import load_plan
-from hilcal.tables.mapped import import_readings
+from hilcal.tables.importing import import_readings
 from hilcal.tables.mapping import Mapping, load_mapping
 from tests.fuzz import stored
 from tests.fuzz.bench import CELL, Bench

@@ -34,7 +34,7 @@ from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
 from hilcal.shown import WIDTH, Brief
 from hilcal.tables.guess_values import BY_ROWS, BY_VALUES, RIVALS
-from hilcal.tables.mapped import import_readings
+from hilcal.tables.importing import import_readings
 from hilcal.tables.mapping import Mapping
 from hilcal.tables.proposal import (
     GUESSED,

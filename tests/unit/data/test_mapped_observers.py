@@ -10,7 +10,7 @@ from hilcal.errors import InputError
 from hilcal.identification.noise.full_covariance import with_joint_scatter
 from hilcal.identification.registration.table_preview import preview_table
 from hilcal.identification.torques import check_torques
-from hilcal.tables.mapped import import_readings
+from hilcal.tables.importing import import_readings
 from hilcal.tables.mapping import Mapping
 from hilcal.toml import check_section
 from tests.support.campaigns import cell_of, configuration, true_parameters

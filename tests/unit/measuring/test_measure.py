@@ -7,7 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.errors import DeviceError
 from hilcal.measuring.devices import TrackerSample
-from hilcal.measuring.measure import SettleWindow, average, deviations
+from hilcal.measuring.measure import SettleWindow, average
+from hilcal.readings.averaging import deviations
 from tests.support.refusals import refusal_of
 from tests.support.rows import first
 
