@@ -16,20 +16,24 @@ Source: Gelb (ed.), *Applied Optimal Estimation* (1974), section 3.8 (exponentia
 noise).
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from textwrap import shorten
 from typing import Any, Literal
 
 import numpy as np
 
-from hilcal.errors import InputError
+from hilcal.errors import InputError, expect
 from hilcal.robot.se3 import by_field
-from hilcal.shown import Brief, Tabular
+from hilcal.shown import WIDTH, Brief, Tabular
+from hilcal.toml import suggest
 from hilcal.types import Bools, Floats, Ints
 
 ObserverKind = Literal["station", "point", "gauge"]
 ScatterKind = Literal["joints", "each joint", "isotropic"]
 Clock = Literal["time", "order"]
+Rows = int | Ints | Bools | slice | Sequence[int]
+Names = str | int | Iterable[str | int]
 TEMPERATURES = ("air_temperature", "joint_temperature")
 """Columns of `States` that are NaN in readings without them; see `Readings.whole`."""
 SAME_POSE = 1e-6  # Commanded joints of one pose agree to this, rad
@@ -72,8 +76,9 @@ class States(Brief):
     def __len__(self) -> int:
         return len(self.q)
 
-    def __getitem__(self, rows: Ints | Bools | slice) -> "States":
-        return by_field([self], lambda fields: fields[0][rows])
+    def __getitem__(self, rows: Rows) -> "States":
+        chosen = np.atleast_1d(rows) if isinstance(rows, int | np.integer) else rows
+        return by_field([self], lambda fields: fields[0][chosen])
 
     @staticmethod
     def joined(parts: Sequence["States"]) -> "States":
@@ -191,7 +196,8 @@ class Readings(Tabular):
     0 and have no variance, so that whitening drops them (`whitening.whitening_matrix`).
 
     Attributes:
-        pose: (N,) index of the commanded pose; equal numbers mean the same pose.
+        pose: (N,) index into `pose_names` of the commanded pose, which is not its name in the
+            table: `where` finds poses and loads by name.
         load: (N,) index into `load_names`; the unloaded state has the name "none".
         cycle: (N,) readings of one pose and one cycle share their unloaded reading.
         value: (N, m) position in m and, for m = 6, rotation vector in rad, sensor axes.
@@ -236,9 +242,62 @@ class Readings(Tabular):
     def __len__(self) -> int:
         return len(self.pose)
 
-    def __getitem__(self, rows: Ints | Bools | slice) -> "Readings":
+    def __getitem__(self, rows: Rows) -> "Readings":
+        states = self.states[rows]
+        rows = np.atleast_1d(rows) if isinstance(rows, int | np.integer) else rows
         chosen = by_field([self], lambda fields: fields[0][rows])
-        return replace(chosen, states=self.states[rows])
+        return replace(chosen, states=states)
+
+    def where(self, *, pose: Names | None = None, load: Names | None = None) -> Bools:
+        """(N,) which readings are of these poses and these loads, by the names of the table.
+
+            test = readings.where(pose=["p3", "p7"])
+            fit = hc.fit(model, readings[~test])
+
+        Raises:
+            InputError: a pose or a load that is not among `pose_names` or `load_names`.
+        """
+        chosen = np.ones(len(self), dtype=bool)
+        if pose is not None:
+            chosen &= np.isin(self.pose, _numbers(pose, self.pose_names, "pose"))
+        if load is not None:
+            chosen &= np.isin(self.load, _numbers(load, self.load_names, "load"))
+        return chosen
+
+    def __add__(self, other: "Readings") -> "Readings":
+        """Put readings of one cell after these; equal names are the same pose, or load.
+
+        Raises:
+            InputError: columns that one of them lacks, other targets or observers, or a pose that
+                has other commanded joints.
+        """
+        expect(other, Readings, "what is added to readings", "Readings")
+        _check_columns(self, other)
+        poses = tuple(dict.fromkeys((*self.pose_names, *other.pose_names)))
+        loads = tuple(dict.fromkeys((*self.load_names, *other.load_names)))
+        parts = [
+            replace(
+                r,
+                pose=np.array([poses.index(n) for n in r.pose_names], dtype=np.int64)[r.pose],
+                load=np.array([loads.index(n) for n in r.load_names], dtype=np.int64)[r.load],
+                pose_names=poses,
+                load_names=loads,
+            )
+            for r in (self, other)
+        ]
+        joined = Readings.joined(parts)
+        first, which = np.unique(joined.pose, return_index=True, return_inverse=True)[1:]
+        q = joined.states.q
+        moved = np.abs(q - q[first][which.reshape(-1)]).max(axis=1) > SAME_POSE
+        if moved.any():
+            name = poses[joined.pose[np.argmax(moved)]]
+            raise InputError(
+                f"pose {name!r} has other commanded joints in the readings that are added; give "
+                "another pose another name"
+            )
+        noise_stated = self.noise_stated and other.noise_stated
+        scatter_stated = self.scatter_stated and other.scatter_stated
+        return replace(joined, noise_stated=noise_stated, scatter_stated=scatter_stated)
 
     @staticmethod
     def joined(parts: Sequence["Readings"]) -> "Readings":
@@ -248,6 +307,22 @@ class Readings(Tabular):
         states = States.joined([p.states for p in parts])
         joined = by_field(parts, np.concatenate)
         return replace(joined, states=states, common=None, serial=None, along=None)
+
+    def _brief(self) -> dict[str, str]:
+        at = np.unique(self.pose)
+        poses = ", ".join(self.pose_names[k] for k in at)
+        counts = zip(*np.unique(self.load, return_counts=True), strict=True)
+        loads = [f"{self.load_names[k]} {count}" for k, count in counts]
+        texts = {
+            "readings": f"{len(self)}, of {'positions' if self.m == 3 else 'poses of the target'}",
+            "poses": f"{len(at)}: {poses}",
+            "loads": ", ".join(loads),
+            "targets": ", ".join(self.target_names),
+            "observers": ", ".join(map(str, self.observers)),
+            "noise": "stated" if self.noise_stated else "estimated from these readings",
+            "more": "to_frame(), where(pose=, load=), value, covariance, states",
+        }
+        return {name: shorten(text, WIDTH) for name, text in texts.items() if text}
 
     def whole(self) -> "Readings":
         """Return the readings without temperatures that some of them lack, as fits take them.
@@ -343,6 +418,32 @@ class Readings(Tabular):
         visit = np.empty(len(self), dtype=np.int64)
         visit[order] = np.arange(len(self)) - np.repeat(first, sizes)
         return numbered(*where, visit)
+
+
+def _numbers(wanted: Names, names: tuple[str, ...], what: str) -> list[int]:
+    """Return the numbers of names; whole numbers are names of a table, too."""
+    texts = [wanted] if isinstance(wanted, str) else [str(x) for x in np.ravel(np.array(wanted))]
+    for name in texts:
+        if name not in names:
+            raise InputError(
+                f"unknown {what} {name!r}{suggest(name, names)}; valid: {', '.join(names)}"
+            )
+    return [names.index(name) for name in texts]
+
+
+def _check_columns(a: Readings, b: Readings) -> None:
+    """Refuse readings that cannot be put together."""
+    columns = [
+        {f.name for f in fields(r.states) if getattr(r.states, f.name) is not None} for r in (a, b)
+    ]
+    if lacking := ", ".join(sorted(columns[0] ^ columns[1])):
+        raise InputError(f"some of the readings lack {lacking}; valid: equal columns")
+    if a.value.shape[1:] != b.value.shape[1:] or a.states.q.shape[1:] != b.states.q.shape[1:]:
+        raise InputError("the readings are of other arms, or positions and poses; valid: the same")
+    if (a.target_names, a.observers) != (b.target_names, b.observers):
+        raise InputError("the readings have other targets or observers; valid: the same")
+    if (a.stated is None) != (b.stated is None):
+        raise InputError("some of the readings have an estimated scatter; valid: r.as_stated()")
 
 
 def numbered(*keys: Ints) -> Ints:
