@@ -59,7 +59,7 @@ from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import States
 from hilcal.readings.whitening import Mode
 from hilcal.robot import se3
-from hilcal.robot.arm import Arm
+from hilcal.robot.arm import Arm, array_of
 from hilcal.robot.chain import evaluate
 from hilcal.robot.factory import SAME_FLANGE_M, flange_difference, of_dict, with_factory
 from hilcal.shown import Brief
@@ -68,8 +68,7 @@ from hilcal.store.schema import is_campaign
 from hilcal.stream import StreamFit
 from hilcal.types import Bools, Floats, Ints
 
-LARGEST_RAD = 4.0 * np.pi
-"""rad; a choice, twice the range of most joints: larger joint values are taken for degrees."""
+_VALID = "six, as Calibration.loads['5kg'], or a column of as many rows as q"
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,24 +308,18 @@ class Calibration(Brief):
         self, q: Floats, wrench: Floats | None, recorded: Mapping[str, Floats] | None
     ) -> tuple[States, tuple[str, ...]]:
         """Return points as states, and the columns filled with means; raises as `predict` does."""
-        n, example = self.model.cell.arm.n, state_with_every_column(self.model.cell)
-        q = np.array(_numbers(q, "q"), order="C", ndmin=2)
-        if q.shape[1:] != (n,) or not len(q):
-            raise InputError(f"q has shape {q.shape}; valid: ({n},) or (N, {n})")
-        size = np.where(np.isfinite(q) & ~self.model.cell.arm.slides, np.abs(q), 0.0)
-        if np.any(np.sum(size > LARGEST_RAD, axis=1) > 1):  # one alone may be an endless wrist
-            raise InputError(f"q has joints at {size.max():.4g} rad; valid: rad, as np.radians(q)")
+        example, q = state_with_every_column(self.model.cell), self.model.cell.arm.checked(q)
         arguments = {"wrench": np.zeros(6) if wrench is None else wrench, **(recorded or {})}
-        columns = {}
+        columns: dict[str, Any] = {}
         for name, value in arguments.items():
             kind = None if name == "q" else getattr(example, name, None)
             if kind is None:
                 raise InputError(f"{name}: no column of hilcal.States that a prediction takes")
-            shape, values = (len(q), *kind.shape[1:]), _numbers(value, name)
+            shape, values = (len(q), *kind.shape[1:]), array_of(value, name, _VALID)
             if values.shape not in (shape, shape[1:]):
                 raise InputError(f"{name} has shape {values.shape}; valid: {shape} or {shape[1:]}")
             columns[name] = np.array(np.broadcast_to(values, shape), order="C")
-        for name, column in {"q": q, **columns}.items():
+        for name, column in columns.items():
             if not np.isfinite(column).all():
                 raise InputError(f"{name} has values that are not finite")
         missing = missing_columns(self.model, States(q, **columns))
@@ -427,12 +420,3 @@ def calibration_of_stream(fit: StreamFit, source: Mapping[str, Any]) -> Calibrat
         measured=replace(measured, most_std_m=float(share * measured.most_std_m)),
         covariance_source=None,
     )
-
-
-def _numbers(values: object, name: str) -> Any:
-    """Return numbers as an array; InputError for anything else."""
-    try:
-        return np.asarray(values, dtype=float)
-    except (TypeError, ValueError):
-        valid = "; valid: six, as Calibration.loads['5kg']" if name == "wrench" else ""
-        raise InputError(f"{name} = {values!r:.60} is not an array of numbers{valid}") from None

@@ -25,12 +25,11 @@ from pathlib import Path
 import numpy as np
 
 from hilcal import limits
-from hilcal.calibration.calibration import LARGEST_RAD
 from hilcal.calibration.compensation import invert_nominal, nominal_pose
 from hilcal.errors import InputError
 from hilcal.names import quoted
 from hilcal.robot import se3
-from hilcal.robot.arm import Arm
+from hilcal.robot.arm import LARGEST_RAD, Arm
 from hilcal.tables import columns as exchange
 from hilcal.tables.files import open_grid
 from hilcal.tables.grid import ColumnTable

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 import numpy as np
 
 from hilcal import limits, numbers
+from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import CannotAnswerError, InputError, expect
 from hilcal.identification.carried.drift import Conflict, chosen_drift, conflicts
 from hilcal.identification.folds import distinct_poses, leave_out, random_folds
@@ -22,6 +23,7 @@ from hilcal.model.observe import Observation
 from hilcal.optional import needed_by
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import Mode, Scaling, Whitening, whitening, whitening_matrix
+from hilcal.robot.arm import array_of
 from hilcal.shown import Tabular
 from hilcal.toml import suggest
 from hilcal.types import Bools, Floats, Ints
@@ -99,7 +101,7 @@ class Estimates(Sequence[Estimate]):
     def __getitem__(self, key: slice) -> Sequence[Estimate]: ...
     def __getitem__(self, key: int | str | slice) -> Estimate | Sequence[Estimate]:
         """Return a parameter by place or by name; an unknown name is an InputError."""
-        if isinstance(key, int | slice):
+        if isinstance(key, int | np.integer | slice):
             return self.rows[key]
         for row in self.rows:
             if row.name == key:
@@ -169,7 +171,7 @@ class Fit(WithVarianceFactor, Tabular):
             "parameters": f"{len(self.theta)}",
             "error": f"{1e6 * self.error.rms_m:.1f} µm rms, {self.error.rms_sigma:.2f} σ",
             "chi2": f"{self.chi2:.4g} with {self.dof:.4g} degrees of freedom",
-            "more": "summary(), parameters, residuals(), to_frame(), predict()",
+            "more": "summary(), parameters, residuals(), to_frame(), to_dict(), predict()",
         }
 
     @cached_property
@@ -261,6 +263,12 @@ class Fit(WithVarianceFactor, Tabular):
         families += [f"  not determined: {numbers.few(unknown, 3)}"] * bool(unknown)
         return "\n".join([*lines, *families])
 
+    def to_dict(self) -> dict[str, object]:
+        """Return the keys of `hilcal identify --json` (docs/reference/json.md), SI."""
+        from hilcal.identification.fit_document import to_json  # which imports this module
+
+        return to_json(self)
+
     @property
     def residuals(self) -> "Residuals":
         """Residuals, measured − predicted: `residuals()` are an array, `to_frame()` a table."""
@@ -275,14 +283,27 @@ class Fit(WithVarianceFactor, Tabular):
         """Predict the readings of the sensor in N states, or in the states of readings.
 
         Raises:
-            InputError: no static equilibrium.
+            InputError: states without a column that an effect needs, of other joints, in degrees,
+                or with values that are not finite.
+            CannotAnswerError: no static equilibrium.
         """
-        states = at.states if isinstance(at, Readings) else at
         expect(
-            states, States, "at",
-            "Readings or States; at joint values: hc.Calibration.of(fit).predict(q, wrench)",
+            at, (States, Readings), "at",
+            "Readings, as of hc.read_table(table, cell), or States; at joint values: "
+            "hc.Calibration.of(fit).predict(q, wrench)",
         )  # fmt: skip
+        states = at.states if isinstance(at, Readings) else self._checked(at)
+        for e in self.model.effects:
+            if e.role not in FRAME_ROLES and not e.computable(states):
+                raise InputError(f"the model has {e.name}, which needs {', '.join(e.needs)}")
         return self.model.predict(states, self.theta).observation
+
+    def _checked(self, states: States) -> States:
+        q = self.model.cell.arm.checked(states.q)
+        wrench = array_of(states.wrench, "wrench", f"({len(q)}, 6)")
+        if wrench.shape != (len(q), 6) or not np.isfinite(wrench).all():
+            raise InputError(f"wrench has shape {wrench.shape}; valid: finite values ({len(q)}, 6)")
+        return replace(states, q=q, wrench=wrench)
 
 
 class Residuals(Sequence[Floats]):

@@ -65,6 +65,22 @@ def description_gaps(
     return tuple(out)
 
 
+LARGEST_RAD = 4.0 * np.pi
+"""rad; a choice, twice the range of most joints: larger joint values are taken for degrees."""
+JOINT_VALUES = "joint values, rad, as readings.states.q"
+
+
+def array_of(values: object, name: str, valid: str) -> Floats:
+    """Return numbers as an array; InputError for anything else."""
+    try:
+        return np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        text = repr(values)
+        if len(text) > 60 or "\n" in text:
+            text = f"a {type(values).__name__}"
+        raise InputError(f"{name} = {text} is not an array of numbers; valid: {valid}") from None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Arm(Brief):
     """A serial arm of n joints, revolute or prismatic (rails, columns, gantries).
@@ -109,6 +125,22 @@ class Arm(Brief):
     def slides(self) -> Bools:
         """(n,) which joints are prismatic."""
         return np.zeros(self.n, np.bool_) if self.prismatic is None else self.prismatic
+
+    def checked(self, q: object) -> Floats:
+        """Return joint values (N, n) as an array, also of one point (n,).
+
+        Raises:
+            InputError: another shape, values that are no numbers or not finite, or degrees.
+        """
+        values = np.array(array_of(q, "q", JOINT_VALUES), order="C", ndmin=2)
+        if values.shape[1:] != (self.n,) or not len(values):
+            raise InputError(f"q has shape {values.shape}; valid: ({self.n},) or (N, {self.n})")
+        if not np.isfinite(values).all():
+            raise InputError("q has values that are not finite")
+        size = np.where(self.slides, 0.0, np.abs(values))
+        if np.any(np.sum(size > LARGEST_RAD, axis=1) > 1):  # one alone may be an endless wrist
+            raise InputError(f"q has joints at {size.max():.4g} rad; valid: rad, as np.radians(q)")
+        return values
 
     def unit(self, joint: int) -> str:
         """Return the unit of the value of a joint, counted from 0: "rad", or "m" of a slide."""
