@@ -21,6 +21,7 @@ from hilcal.measuring.route import approach_sides, route
 from hilcal.readings.covariance import COVERS_KEY, INSTRUMENT_AND_ARM
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import Mode
+from hilcal.shown import Brief
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import UNLOADED, Plan
 from hilcal.toml import suggest
@@ -58,7 +59,7 @@ def check_choice(choice: str, catalogue: Catalogue | None = None) -> None:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SimulationCase:
+class SimulationCase(Brief):
     """A simulated cell with a hidden effect."""
 
     cell: Cell

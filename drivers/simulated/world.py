@@ -9,6 +9,7 @@ from hilcal.drivers.simulated import mechanics as mech
 from hilcal.drivers.simulated import truth as laws
 from hilcal.drivers.simulated.user_effect import HiddenUserEffect
 from hilcal.readings.readings import States
+from hilcal.shown import Brief
 from hilcal.types import Floats, Ints
 
 
@@ -93,7 +94,7 @@ class IdealReading:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class World:
+class World(Brief):
     """A simulated cell, with all that is hidden from the program."""
 
     cell: Cell  # the cell as configured, which the program knows

@@ -140,7 +140,7 @@ class Diagnosis(Shown, Tabular):
         return {
             "model": self.fit.model.title,
             "verdict": f"{self.verdict} ({self.reason})",
-            "message": presenter("verdict").message(self),
+            "message": self.message,
             **{f"suspects[{k}]": repr(s) for k, s in enumerate(first)},
             "and": f"{len(self.suspects) - len(first)} more suspects",
         }
@@ -149,6 +149,16 @@ class Diagnosis(Shown, Tabular):
     def verdict(self) -> Verdict:
         """The verdict of `reason`."""
         return VERDICTS[self.reason]
+
+    @property
+    def message(self) -> str:
+        """The verdict in a sentence."""
+        return str(presenter("verdict").message(self))
+
+    @property
+    def variance_factor(self) -> float:
+        """The variance factor of the fit."""
+        return self.fit.variance_factor
 
     @property
     def significant(self) -> tuple[str, ...]:
@@ -191,9 +201,9 @@ class Diagnosis(Shown, Tabular):
         return {
             "model": list(self.fit.model.named),
             "verdict": self.verdict,
-            "message": presenter("verdict").message(self),
+            "message": self.message,
             "reason": self.reason,
-            "variance_factor": self.fit.variance_factor,
+            "variance_factor": self.variance_factor,
             "variance_factor_interval": list(self.fit.variance_factor_interval),
             "predictable_share": self.predictable_share,
             "where": [asdict(v) for v in self.misfit_breakdown],

@@ -29,8 +29,9 @@ must explain the readings beside all effects that are constant in the arm's axes
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache, partial
+from typing import Any
 
 import numpy as np
 
@@ -97,10 +98,21 @@ class Suspect(Brief):
     same_as: tuple[str, ...] = ()  # suspects that these readings do not separate from it
     coarse: str = ""  # coarser form of the effect in the model; empty for none
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the suspect with its statistics computed, for other processes."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        values |= {name: partial(_known, values[name]()) for name in ("left_out", "detection")}
+        return Suspect, tuple(values.values())
+
     def __repr__(self) -> str:
         """Return the suspect in a line."""
         share = f"{100 * self.share:.0f} % of the misfit"
-        return f"Suspect({self.effect}, p = {self.score.p_value:.2g}, {share})"
+        return f"Suspect({self.effect}, p = {self.p_value:.2g}, {share})"
+
+    @property
+    def p_value(self) -> float:
+        """The p-value of the joint test."""
+        return self.score.p_value
 
     @property
     def holdout_share(self) -> float:
@@ -143,7 +155,7 @@ class Suspect(Brief):
         return {
             "effect": self.effect,
             "finer_than": self.coarse or None,
-            "p_value": self.score.p_value,
+            "p_value": self.p_value,
             "share": self.share,
             "holdout_share": self.holdout_share,
             "delta_bic": self.score.delta_bic,
@@ -156,6 +168,10 @@ class Suspect(Brief):
             "needs": needs,
             "kept_share": self.kept,
         }
+
+
+def _known(value: Any) -> Any:
+    return value
 
 
 def candidates(fit: Fit) -> tuple[Effect, ...]:

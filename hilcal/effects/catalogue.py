@@ -2,6 +2,7 @@
 
 import hashlib
 import sys
+from collections.abc import Iterator
 from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
 from functools import cache
@@ -44,6 +45,7 @@ from hilcal.effects.wrench_bias import WrenchBias
 from hilcal.effects.wrench_gain import WrenchGain
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
+from hilcal.shown import Brief
 from hilcal.toml import suggest
 
 ENTRY_POINT_GROUP = "hilcal.effects"
@@ -117,8 +119,8 @@ def _compiled(content: bytes, where: str) -> CodeType:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Catalogue:
-    """The effects that a model can have."""
+class Catalogue(Brief):
+    """The effects that a model can have; iterating yields their names."""
 
     effects: tuple[type[Effect], ...]  # classes with distinct names
     files: tuple[EffectFile, ...] = ()  # the files of user-defined effects
@@ -127,6 +129,13 @@ class Catalogue:
     def names(self) -> tuple[str, ...]:
         """Names of the effects, in order."""
         return tuple(kind.name for kind in self.effects)
+
+    def _brief(self) -> dict[str, str]:
+        files = {"files": ", ".join(file.path for file in self.files)} if self.files else {}
+        return {"effects": str(len(self.effects)), "names": ", ".join(self.names), **files}
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
 
     def __getitem__(self, name: str) -> type[Effect]:
         """Return the class of an effect."""
