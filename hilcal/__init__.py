@@ -35,6 +35,7 @@ _NAMES = {
         "diagnose",
         "fit",
         "fit_stream",
+        "import_campaign",
         "load_posterior",
         "plan",
         "read_table",
@@ -78,6 +79,7 @@ if TYPE_CHECKING:
     from hilcal.library import diagnose as diagnose
     from hilcal.library import fit as fit
     from hilcal.library import fit_stream as fit_stream
+    from hilcal.library import import_campaign as import_campaign
     from hilcal.library import load_posterior as load_posterior
     from hilcal.library import plan as plan
     from hilcal.library import read_table as read_table

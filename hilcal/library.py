@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -46,15 +45,16 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES, SCALINGS, Mode, usual_mode
 from hilcal.refinement import Refinement
 from hilcal.refinement import refine as refine_model
+from hilcal.shown import Brief
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import Plan
+from hilcal.store.plan import Plan, load_plan
 from hilcal.store.schema import HEADER
 from hilcal.stream import StreamFit
 from hilcal.stream import fit_stream as fit_all
+from hilcal.tables.files import table_file
 from hilcal.tables.importing import import_readings
 from hilcal.tables.parquet_stream import open_stream
 from hilcal.types import Floats
-from hilcal.whole_file import replace_file
 
 PATHS = (str, Path)
 A_CELL = "a Cell, as hc.Cell.load('CELL.toml')"
@@ -94,31 +94,17 @@ def read_table(
     Raises:
         InputError: an invalid value, with row and column.
     """
-    if not isinstance(path, PATHS) and hasattr(path, "to_csv"):
-        return _read_frame(path, cell, mapping)
-    expect(path, PATHS, "path", "the path of a table, or a pandas data frame")
-    expect(cell, Cell, "cell", A_CELL)
-    form, config = "table" if mapping is None else mapping, cell.configured()
-    imported = import_readings(Path(path), form, config, cell.arm)
+    with table_file(path) as table:
+        expect(cell, Cell, "cell", A_CELL)
+        form, config = "table" if mapping is None else mapping, cell.configured()
+        imported = import_readings(table, form, config, cell.arm)
     estimated, noise = with_estimated_noise(imported, cell)
     readings = full_readings(estimated.readings, estimated.covers, cell)
     return replace(readings, noise_stated=noise is None)
 
 
-def _read_frame(frame: "pd.DataFrame", cell: Cell, mapping: str | Path | None) -> Readings:
-    """Read a data frame by its CSV file, with its index if that has a name."""
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "data frame"
-        named = any(name is not None for name in frame.index.names)
-        replace_file(path, frame.to_csv(index=named))
-        try:
-            return read_table(path, cell, mapping)
-        except InputError as error:
-            raise InputError(str(error).replace(str(path), path.name)) from None
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class Imported:
+class Imported(Brief):
     """The result of an import."""
 
     cell: Cell
@@ -134,21 +120,43 @@ class Imported:
 
 
 def import_campaign(
-    table: Path,
-    config: Path,
-    output: Path,
-    kind: str = "table",
-    second: Path | None = None,
+    table: "str | Path | pd.DataFrame",
+    config: str | Path,
+    output: str | Path,
+    kind: str | Path = "table",
+    second: str | Path | None = None,
     *,
     overwrite: bool = False,
     say: Callable[[str], None] = lambda text: None,
 ) -> Imported:
-    """Make a campaign file from a table of readings, as `import_readings` reads it."""
+    """Make a campaign file from a table of readings, as `hilcal import` does.
+
+    >>> made = hc.import_campaign(TABLE, CELL, IMPORTED)
+    >>> len(made.readings) == len(hc.Campaign(IMPORTED).readings)
+    True
+
+    Args:
+        table: a file or a pandas data frame.
+        config: the path of the cell's configuration, CELL.toml.
+        output: the campaign file.
+        kind: as `mapping` of `read_table`.
+        second: a second file that holds the other columns of the same readings.
+        overwrite: replace an existing campaign.
+        say: takes progress, one line each.
+
+    Raises:
+        InputError: an invalid value, with row and column, or a file that exists.
+    """
+    expect(config, PATHS, "config", "the path of a CELL.toml")
+    expect(output, PATHS, "output", "the path of a campaign file")
+    config, output = Path(config), Path(output)
     settings = load_config(config)
     base_dir = config.absolute().parent
     cell = cell_from_config(settings, base_dir)
-    say(f"reading {table}")
-    imported = import_readings(table, kind, settings, cell.arm, second)
+    with table_file(table) as path:
+        say(f"reading {path}")
+        second = None if second is None else Path(second)
+        imported = import_readings(path, kind, settings, cell.arm, second)
     if not imported.noise_stated:
         say("estimating the noise, which nothing states")
     imported, noise = with_estimated_noise(imported, cell)
@@ -156,7 +164,7 @@ def import_campaign(
     texts |= {FROM_KEY: TRACKER} if imported.from_tracker else {}
     texts |= {} if noise is None else {NOISE_KEY: noise.to_json()}
     say(f"writing {output}")
-    about = settings.to_json(), str(base_dir), f"{table.name} ({Path(kind).name})"
+    about = settings.to_json(), str(base_dir), f"{path.name} ({Path(kind).name})"
     readings = imported.readings
     CampaignFile.create(
         output, *about, overwrite=overwrite, more_texts=texts, readings=readings
@@ -487,7 +495,7 @@ def plan(
 
 def simulate(
     cell: "Cell | SimulationCase",
-    plan: "CheckedPlan | Plan",
+    plan: "CheckedPlan | Plan | str | Path",
     hide: str = "nothing",
     seed: int = 0,
     catalogue: Catalogue | None = None,
@@ -507,6 +515,7 @@ def simulate(
     Args:
         cell: the cell, whose `[simulation]` has the strength of the hidden effect; or the result of
             a previous call, for a further campaign of the same arm.
+        plan: what to measure, as of `plan`, or the path of a plan file.
         hide: for a first campaign: an effect of `hilcal effects`, "random", "nothing", or
             "invented", a law that the catalogue lacks.
         seed: seed of all random numbers; for a further campaign, of its noise.
@@ -523,7 +532,8 @@ def simulate(
         from hilcal.design.summary import CheckedPlan
         from hilcal.drivers.simulated import rehearsal  # needed here alone
 
-    expect(plan, (CheckedPlan, Plan), "plan", "a plan, as of hc.plan(cell)")
+    plan = load_plan(Path(plan)) if isinstance(plan, PATHS) else plan
+    expect(plan, (CheckedPlan, Plan), "plan", "a plan, as of hc.plan(cell), or its path")
     bare_plan = plan if isinstance(plan, Plan) else plan.plan
     expect(cell, (Cell, rehearsal.SimulationCase), "cell", f"{A_CELL}, or a previous result")
     if not isinstance(cell, Cell):

@@ -17,18 +17,23 @@ from importlib import import_module
 from itertools import zip_longest
 from operator import itemgetter
 from pathlib import Path
-from typing import IO, Any
+from tempfile import TemporaryDirectory
+from typing import IO, TYPE_CHECKING, Any
 from xml.parsers import expat
 
 import numpy as np
 
 from hilcal import limits
-from hilcal.errors import InputError
+from hilcal.errors import InputError, expect
 from hilcal.optional import needed_by
 from hilcal.tables import matfile
 from hilcal.tables.grid import Cell, Check, Grid, joined, text_of, unique
 from hilcal.tables.mapping import FileFormat, PointMapping
 from hilcal.toml import suggest
+from hilcal.whole_file import replace_file
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 NUMPY = 'a NumPy file; save it as CSV: numpy.savetxt("t.csv", array, delimiter=",")'
 MAGIC = {
@@ -55,6 +60,27 @@ MAGIC = {
 }
 """First bytes of files that are no tables of text: their kind, or why they are not read."""
 KINDS = ("XLSX", "Parquet", "MAT", "text")
+
+
+@contextmanager
+def table_file(table: "str | Path | pd.DataFrame") -> Iterator[Path]:
+    """Yield the path of a table; a data frame is written as CSV, with its index if that is named.
+
+    Raises:
+        InputError: what is no path and no data frame.
+    """
+    if isinstance(table, str | Path) or not hasattr(table, "to_csv"):
+        expect(table, (str, Path), "path", "the path of a table, or a pandas data frame")
+        yield Path(table)
+        return
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "data frame"
+        named = any(name is not None for name in table.index.names)
+        replace_file(path, table.to_csv(index=named))
+        try:
+            yield path
+        except InputError as error:
+            raise InputError(str(error).replace(str(path), path.name)) from None
 
 
 def open_tables(

@@ -3,6 +3,8 @@
 import ast
 import doctest
 import inspect
+import json
+import pickle
 import shutil
 import subprocess
 import sys
@@ -81,6 +83,7 @@ def test_the_examples_of_a_docstring_run(name, site, free_port):
     thing = getattr(hc, name)
     known = {"hc": hc, "np": np, "CELL": site.cell, "TABLE": site.table, "RUN": site.run}
     known["LATER"] = site.later
+    known["IMPORTED"] = site.folder / "imported.hilcal"
     known["PORT"] = free_port
     known["STREAM"] = site.folder / "t.parquet"
     known["REPORT"] = site.folder / "report.html"
@@ -278,6 +281,94 @@ def test_results_are_data_frames(site, planned, tmp_path):
     assert frame["load"].tolist() == [step.load for step in made.plan.steps]
     q = frame[[f"q{j}_rad" for j in range(1, 7)]].to_numpy()
     np.testing.assert_array_equal(q, [made.plan.joints(step.pose) for step in made.plan.steps])
+
+
+def test_readings_are_chosen_by_the_names_of_their_table_and_put_together(site):
+    cell = hc.Cell.load(site.cell)
+    frame = hc.read_table(site.table, cell).to_frame()
+    names = {name: k for k, name in enumerate(dict.fromkeys(frame["pose"]), start=1)}
+    frame["pose"] = frame["pose"].map(names)  # from 1, so that a name is not its index
+    readings = hc.read_table(frame, cell)
+    test = readings.where(pose=3)
+    assert test.any()
+    np.testing.assert_array_equal(test, frame["pose"] == 3)
+    both = readings.where(pose=["3", "5"], load="none")
+    np.testing.assert_array_equal(both, frame["pose"].isin([3, 5]) & (frame["load"] == "none"))
+    refusal(r"unknown load '5 kg' \(did you mean \"5kg\"", readings.where, load="5 kg")
+    refusal("unknown pose 'p3'.*; valid: 1, 2, 3", readings.where, pose="p3")
+    assert [len(one) for one in readings] == [1] * len(readings)
+    again = readings[~test] + readings[test]
+    order = np.argsort(test, kind="stable")
+    np.testing.assert_array_equal(again.value, readings.value[order])
+    assert again.to_frame()["pose"].tolist() == readings.to_frame()["pose"][order].tolist()
+
+
+def test_readings_of_tables_are_put_together_by_the_names_of_poses(site):
+    cell = hc.Cell.load(site.cell)
+    frame = hc.read_table(site.table, cell).to_frame()
+    names = list(dict.fromkeys(frame["pose"]))
+    first = hc.read_table(frame[frame["pose"] != names[1]], cell)
+    second = hc.read_table(frame[frame["pose"] != names[0]].iloc[::-1], cell)
+    both = first + second
+    assert both.to_frame()["pose"].tolist() == [
+        *first.to_frame()["pose"],
+        *second.to_frame()["pose"],
+    ]
+    assert both.to_frame()["load"].tolist() == [
+        *first.to_frame()["load"],
+        *second.to_frame()["load"],
+    ]
+    moved = frame.assign(q1_rad=frame["q1_rad"] + 0.01)
+    refusal(
+        f"pose '{names[0]}' has other commanded joints",
+        lambda: first + hc.read_table(moved, cell),
+    )
+    untimed = replace(second, states=replace(second.states, time=None, load_time=np.zeros(1)))
+    refusal("some of the readings lack", lambda: first + untimed)
+
+
+def test_states_that_a_fit_cannot_predict_are_refused(site):
+    with hc.Campaign(site.run, read_only=True) as run:
+        model = hc.baseline(run)
+        fit, q = hc.fit(model, run), run.readings.states.q[:2]
+        crept = hc.fit(model + "creep", run)
+    wrench = np.zeros((2, 6))
+    assert fit.predict(hc.States(q.tolist(), wrench.tolist())).position.shape == (2, 3)
+    refusal("valid: rad, as np.radians", fit.predict, hc.States(np.degrees(q), wrench))
+    refusal("q has values that are not finite", fit.predict, hc.States(q * np.nan, wrench))
+    refusal(r"wrench has shape \(6,\); valid", fit.predict, hc.States(q, wrench[0]))
+    refusal("the model has creep, which needs", crept.predict, hc.States(q, wrench))
+
+
+def test_results_are_dictionaries_and_go_to_other_processes(site, refined):
+    d = refined.diagnosis
+    json.dumps(refined.fit.to_dict(), allow_nan=False)
+    again = pickle.loads(pickle.dumps(refined)).diagnosis
+    assert again.to_dict() == d.to_dict()
+    assert (d.message, d.variance_factor) == (d.to_dict()["message"], d.fit.variance_factor)
+    assert [s.p_value for s in d.suspects] == [s["p_value"] for s in d.to_dict()["suspects"]]
+    parameters = refined.fit.parameters
+    assert parameters[np.int64(1)] == parameters[1]
+    assert ("creep" in hc.installed(), "crep" in hc.installed()) == (True, False)
+
+
+def test_a_table_is_imported_from_a_data_frame_and_a_plan_is_measured_from_its_file(
+    site, planned, tmp_path
+):
+    cell = hc.Cell.load(site.cell)
+    frame = hc.read_table(site.table, cell).to_frame()
+    assert hc.preview_table(frame, cell).rows == len(frame)
+    made = hc.import_campaign(frame, str(site.cell), str(tmp_path / "run.hilcal"))
+    assert repr(made).count("\n") < 15
+    with hc.Campaign(tmp_path / "run.hilcal") as run:
+        np.testing.assert_array_equal(run.readings.value, made.readings.value)
+    planned.save(tmp_path / "plan.json")
+    rehearsed = hc.simulate(cell, tmp_path / "plan.json", seed=1)
+    np.testing.assert_array_equal(
+        rehearsed.readings.value, hc.simulate(cell, planned, seed=1).readings.value
+    )
+    for value in (rehearsed, rehearsed.world, hc.installed()):
+        assert repr(value).count("\n") < 15
 
 
 def test_the_calibration_of_a_campaign_is_loaded_by_its_name(site, tmp_path):

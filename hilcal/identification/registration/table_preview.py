@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import shorten
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
 from hilcal.shown import WIDTH, Brief
+from hilcal.tables.files import table_file
 from hilcal.tables.guess_values import BY_ROWS, BY_VALUES, RIVALS
 from hilcal.tables.importing import import_readings
 from hilcal.tables.mapping import Mapping
@@ -50,6 +51,9 @@ from hilcal.tables.propose import GridProposal, propose
 from hilcal.tables.units import ANGLES, CONVENTIONS, LENGTHS, NUMBERS, rotations
 from hilcal.toml import check_section
 from hilcal.types import Floats
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # All of these are choices.
 CLOSE_SHARE = 0.02  # share of the reach that a nominal arm may be off; arms are ten times better
@@ -110,7 +114,7 @@ class Preview(Brief):
 
 
 def preview_table(
-    path: str | Path, cell: Cell | None = None, second: str | Path | None = None
+    path: "str | Path | pd.DataFrame", cell: Cell | None = None, second: str | Path | None = None
 ) -> Preview:
     """Propose a mapping for a table of any form; nothing is written.
 
@@ -119,7 +123,7 @@ def preview_table(
     'rad'
 
     Args:
-        path: text, XLSX, MAT or Parquet.
+        path: text, XLSX, MAT or Parquet, or a pandas data frame.
         cell: its nominal arm decides the convention of orientations, and columns that their
             values leave open.
         second: a second file that holds the other columns of the same readings.
@@ -127,8 +131,11 @@ def preview_table(
     Raises:
         InputError: a file that cannot be read, or two that do not belong together.
     """
-    table = Path(path)
-    second = None if second is None else Path(second)
+    with table_file(path) as table:
+        return _preview(table, cell, None if second is None else Path(second))
+
+
+def _preview(table: Path, cell: Cell | None, second: Path | None) -> Preview:
     proposed = propose(
         table, second, cell.arm.n if cell else None, cell.arm.joint_names if cell else ()
     )
