@@ -1,20 +1,22 @@
 """The cell in numbers: arm, target, load point, tool, registration."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from hilcal.config import STANDARD_GRAVITY_M_S2, CellConfig, load_config
 from hilcal.config.sections import Gauge, Point
-from hilcal.errors import InputError
+from hilcal.errors import InputError, expect
 from hilcal.readings.readings import ObserverName
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm, with_controller_conventions
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.factory import FactoryKinematics, read_factory, with_factory
 from hilcal.shown import Brief
+from hilcal.toml import check_section
 from hilcal.types import Floats, Ints
 
 
@@ -134,14 +136,24 @@ class Cell(Brief):
         return Observer(name, frame, (0,) if gauge.origin_m is None else ())
 
     @classmethod
-    def load(cls, path: str | Path) -> "Cell":
-        """Read a cell from its TOML file; paths in it are relative to the file.
+    def load(cls, path: str | Path | Mapping[str, Any]) -> "Cell":
+        """Read a cell from its TOML file, or from a dictionary of sections with the same keys.
+
+        Paths in it are relative to the file, those in a dictionary to the working directory.
 
         >>> hc.Cell.load(CELL).arm.name
         'ur10e'
+        >>> hc.Cell.load({"robot": {"model": "ur5e"}, "tool": {"target_m": [0.0, 0.0, 0.1]}}).target
+        array([[1. , 0. , 0. , 0. ],
+               [0. , 1. , 0. , 0. ],
+               [0. , 0. , 1. , 0.1],
+               [0. , 0. , 0. , 1. ]])
 
         An InputError says what cannot be used: the file, a key, a value, or the robot.
         """
+        expect(path, (str, Path, Mapping), "path", "the path of a CELL.toml, or its sections")
+        if isinstance(path, Mapping):
+            return cell_from_config(check_section(dict(path), CellConfig, "the cell"), Path.cwd())
         path = Path(path)
         return cell_from_config(load_config(path), path.absolute().parent)
 

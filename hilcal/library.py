@@ -45,6 +45,7 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES, SCALINGS, Mode, usual_mode
 from hilcal.refinement import Refinement
 from hilcal.refinement import refine as refine_model
+from hilcal.robot.arm import array_of
 from hilcal.shown import Brief
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, load_plan
@@ -316,12 +317,17 @@ def fit(
     True
 
     Args:
+        model: as of `baseline`, with effects added.
+        data: readings, as of `read_table`, or a campaign.
         readings: "deflection" or "absolute"; None: as the cell plans and the data allow.
         scaling: "none", "gu" or "gc" (whitened by the full covariance).
         prior: the posterior of another campaign of this arm, for the effects that the model shares
             with it (`baseline` adds the others); or (P,) standard deviations of zero-mean priors,
             infinite for flat ones, zero for parameters fixed at zero; None: those of the effects.
         mode: another name of `readings`, as in results.
+
+    Returns:
+        The fit, in SI units: `parameters`, `residuals`, `error`, `holdout`, `summary`, `predict`.
 
     Raises:
         InputError: another kind of readings or of scaling, or a deflection without its unloaded
@@ -335,8 +341,11 @@ def fit(
     std: Floats | None = None
     if isinstance(prior, (Posterior, CarriedPrior, *PATHS)):
         model = _with_prior(model, data, prior)
-    else:
-        std = prior
+    elif prior is not None:
+        valid = f"{A_PRIOR}, or ({model.size},) standard deviations"
+        std = array_of(prior, "prior", valid)
+        if std.shape != (model.size,) or not (std >= 0).all():
+            raise InputError(f"prior of shape {std.shape} or with values below 0; valid: {valid}")
     data = with_prior_scatter(model, data)
     if scaling not in SCALINGS:
         raise InputError(f"scaling {scaling!r} is unknown; valid: {', '.join(SCALINGS)}")
@@ -358,8 +367,13 @@ def diagnose(
     ('missing_effect', 'joint_tilt_compliance')
 
     Args:
+        fit: of scaling "gc"; or a campaign, for its revision in use.
         history: effects added to and removed from the model so far; that of the revision where
             `fit` is a campaign.
+        say: takes progress, one line each.
+
+    Returns:
+        The diagnosis: `verdict`, `message`, and `suspects`, best first.
 
     Raises:
         InputError: a fit whose residual is not whitened, or of too many readings; a campaign
@@ -421,10 +435,14 @@ def refine(
 
     Args:
         model: the starting model; or a campaign alone, for its baseline.
+        data: readings, as of `read_table`, or a campaign.
         discover: a folder. Where no effect explains the misfit, a law is searched, as by
             `hilcal refine --discover`; the files of laws in the final model are written there.
         background: whether all effects of the catalogue are fitted together, as a background, where
             the named ones leave more than noise.
+
+    Returns:
+        The steps, with the `fit`, `diagnosis` and `verdict` of the last one.
 
     Raises:
         InputError: another kind of readings, a prior that does not fit them, or no such folder.
@@ -472,6 +490,10 @@ def plan(
         given: a fit of the previous readings.
         prior: the prior from another campaign of this arm, unless `given` is stated, which has its
             prior.
+        seed: seed of the choice.
+
+    Returns:
+        The plan, all motions checked: `efficiency`, `summary`, `to_frame`, `save`.
 
     Raises:
         InputError: invalid numbers or names, or a cell without configuration.

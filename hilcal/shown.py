@@ -84,7 +84,8 @@ class Tabular(Brief):
 
         Readings have the columns of the exchange table. A fit has a row per reading with pose,
         load, residual, and residual of the fit without the pose. A diagnosis has a row per suspect,
-        best first. A plan has a row per reading in the order of measuring.
+        best first. A plan has a row per reading in the order of measuring. A compensation has a row
+        per point: corrected joint values, and errors before and after.
         """
         frame: pd.DataFrame = presenter("notebook").frame_of(self)
         return frame

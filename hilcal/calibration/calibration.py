@@ -45,7 +45,7 @@ from hilcal.calibration.measured import (
 from hilcal.calibration.scatter import Scatter, scatter_of
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.protocol import FRAME_ROLES
-from hilcal.errors import InputError
+from hilcal.errors import InputError, expect
 from hilcal.identification.fit import Fit
 from hilcal.identification.gauss_newton import derivative
 from hilcal.identification.prediction.predictive import position_factor, predictive
@@ -107,6 +107,7 @@ class Calibration(Brief):
     @classmethod
     def of(cls, fit: Fit, source: Mapping[str, Any] | None = None) -> "Calibration":
         """Make the calibration of a fit; an InputError where its scaling is not gc."""
+        expect(fit, Fit, "fit", "a Fit, as of hc.fit(model, readings), or path.fit of a refinement")
         if fit.scaling != "gc":
             raise InputError(f"a calibration needs scaling gc, this fit has {fit.scaling}")
         used, model = fit.readings[~fit.outlier], fit.model

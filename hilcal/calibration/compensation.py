@@ -36,7 +36,7 @@ from hilcal.readings.readings import States
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import Chain, evaluate, joint_jacobian
-from hilcal.shown import Brief
+from hilcal.shown import Brief, Tabular
 from hilcal.types import Bools, Floats, Ints
 
 if TYPE_CHECKING:
@@ -297,7 +297,7 @@ def band(covariance: Floats) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class Compensation(Brief):
+class Compensation(Tabular):
     """Joint values that put the tool at its target pose, with errors before and after."""
 
     inverse: Inverse  # joint values and residuals
@@ -313,7 +313,7 @@ class Compensation(Brief):
         return {
             "points": f"{len(self.q)}, of which {np.count_nonzero(self.inverse.solved)} are solved",
             "q": f"array {self.q.shape}, rad, of joints that slide m",
-            "more": "q, before, after, usable, inside, limits, singular",
+            "more": "q, before, after, usable, inside, limits, singular, to_frame(), to_dict()",
         }
 
     @property
@@ -384,13 +384,14 @@ class Compensation(Brief):
             return self._calibration.nominal(self._tool, self._states)
         return self._wanted
 
-    def to_dict(self, names: Sequence[str]) -> dict[str, object]:
-        """Return the document of `compensate --json`, SI; `names` of the points.
+    def to_dict(self, names: Sequence[str] | None = None) -> dict[str, object]:
+        """Return the document of `compensate --json`, SI; `names` of the points, else 1 to N.
 
         `expected_error_m` is the root sum square of the inversion's residual and the position's
         standard deviation.
         """
         calibration, before, after = self._calibration, self.before, self.after
+        names = [str(k + 1) for k in range(len(self.q))] if names is None else names
         columns: dict[str, Sequence[Any]] = {
             "name": names,
             "q_command": self.given.tolist(),

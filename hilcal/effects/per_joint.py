@@ -39,7 +39,7 @@ class JointGroups:
 def joint_groups(effect: str, options: Options, count: int) -> JointGroups:
     """Read the option `joints`: groups separated by "/", each a range or joined by "+"."""
     option = options["joints"]
-    text = str(option) if type(option) is int else option
+    text = str(option) if type(option) is int else option if isinstance(option, str) else None
     if text == EACH:
         groups = [[j] for j in range(count)]
     elif text == COMMON:

@@ -18,7 +18,7 @@ from hilcal.identification.outliers.least_trimmed_squares import rejection_limit
 from hilcal.identification.registration.robot_frames import RobotFrames, robot_frames
 from hilcal.identification.residual import ErrorBlock, WithVarianceFactor, error_block, residual
 from hilcal.identification.uncertainty import Uncertainty, uncertainty
-from hilcal.model.model import Model
+from hilcal.model.model import Model, Prediction
 from hilcal.model.observe import Observation
 from hilcal.optional import needed_by
 from hilcal.readings.readings import Readings, States
@@ -282,11 +282,30 @@ class Fit(WithVarianceFactor, Tabular):
     def predict(self, at: States | Readings) -> Observation:
         """Predict the readings of the sensor in N states, or in the states of readings.
 
+        A fit to deflections does not correct the arm's geometry: its positions are those of the
+        nominal arm that deflects, often a millimetre from the readings. `error_of` compares
+        deflections.
+
         Raises:
             InputError: states without a column that an effect needs, of other joints, in degrees,
                 or with values that are not finite.
             CannotAnswerError: no static equilibrium.
         """
+        return self._prediction(at).observation
+
+    def error_of(self, readings: Readings) -> ErrorBlock:
+        """Error at other readings of this setup, as of poses that were not fitted.
+
+        In the kind of readings of the fit: for deflections, that of the deflections.
+
+        Raises:
+            InputError: as of `predict`; or a deflection without its unloaded reading.
+        """
+        expect(readings, Readings, "readings", "Readings, as of hc.read_table(table, cell)")
+        w = whitening(readings, self.mode)
+        return error_block(residual(readings, self._prediction(readings), w), w)
+
+    def _prediction(self, at: States | Readings) -> Prediction:
         expect(
             at, (States, Readings), "at",
             "Readings, as of hc.read_table(table, cell), or States; at joint values: "
@@ -296,7 +315,7 @@ class Fit(WithVarianceFactor, Tabular):
         for e in self.model.effects:
             if e.role not in FRAME_ROLES and not e.computable(states):
                 raise InputError(f"the model has {e.name}, which needs {', '.join(e.needs)}")
-        return self.model.predict(states, self.theta).observation
+        return self.model.predict(states, self.theta)
 
     def _checked(self, states: States) -> States:
         q = self.model.cell.arm.checked(states.q)

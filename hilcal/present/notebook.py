@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator
 from functools import singledispatch
 from typing import TYPE_CHECKING
 
+from hilcal.calibration.compensation import Compensation
 from hilcal.design.summary import CheckedPlan
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.diagnosis.diagnosis import Diagnosis
@@ -84,6 +85,12 @@ def frame_of(value: object) -> "pd.DataFrame":
         return pd.DataFrame(exchange_columns(value))
     if isinstance(value, Fit):
         return pd.DataFrame(residual_table(value))
+    if isinstance(value, Compensation):
+        frame = pd.DataFrame(value.to_dict()["points"])
+        frame = frame.drop(columns=["q_command", "q_corrected", "q_rad", "refused"])
+        for j, unit in enumerate(value.units):
+            frame[f"q{j + 1}_{unit}"] = value.q[:, j]
+        return frame
     if isinstance(value, Diagnosis):
         return pd.DataFrame(value.to_dict()["suspects"])
     raise TypeError(f"no rows for a {type(value).__name__}")

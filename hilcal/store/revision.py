@@ -52,16 +52,21 @@ class RevisionRecord(Brief):
     """Number of the parent revision; None for the previous revision, or a first model."""
 
     def _brief(self) -> dict[str, str]:
-        diagnosis = self.result_json.get("diagnose", {})
         return {
             "number": str(self.number),
             "model": " + ".join(self.effects),
             "added": str(self.added),
             "removed": str(self.removed),
-            "verdict": str(diagnosis.get("verdict")),
+            "verdict": str(self.verdict),
             "created": f"{self.created} by hilcal {self.program_version}",
             "more": "Campaign.fit(number)",
         }
+
+    @property
+    def verdict(self) -> str | None:
+        """The verdict of the diagnosis that was stored with the fit; None without one."""
+        verdict = self.result_json.get("diagnose", {}).get("verdict")
+        return None if verdict is None else str(verdict)
 
     @property
     def cell(self) -> Changes:

@@ -168,6 +168,10 @@ def test_wrong_words_are_refused_with_the_valid_ones(site):
     (lambda s: hc.fit(s.model, "run.hilcal"), r"data is of class str; valid: .*hc\.Campaign"),
     (lambda s: hc.fit(s.model, s.readings, prior="x.hilcal"), "hc.load_posterior"),
     (lambda s: hc.fit(s.model, s.readings).predict([[0.0] * 6]), r"hc\.Calibration\.of"),
+    (lambda s: hc.Calibration.of(s.model), "fit is of class Model; valid: a Fit"),
+    (lambda s: hc.Cell.load(3), "path is of class int; valid: the path of a CELL.toml"),
+    (lambda s: hc.Cell.load({"robot": {"modl": "ur10e"}}), "the cell: .*modl"),
+    (lambda s: s.model + hc.effect("creep", joints=np.ones(2)), "creep: joints = array"),
     (lambda s: hc.diagnose(s.model), "fit is of class Model; valid: a Fit"),
     (lambda s: hc.discover(str(s.run)), "fit is of class str; valid: a Fit"),
     (lambda s: hc.validate(s.model, s.run), "run is of class Model; valid: a Campaign"),
@@ -220,6 +224,7 @@ def test_what_a_stranger_guesses_works(site, refined, tmp_path, free_port):
         assert run.revisions == ()
         run.append(found)
         assert [r.number for r in run.revisions] == list(range(1, 1 + len(found.steps)))
+        assert run.revisions[-1].verdict == found.verdict
         assert run.fit(1).model.names == model.names
         assert (model + "creep" - "creep").names == model.names
         assert hc.diagnose(run).verdict == found.verdict
@@ -338,6 +343,35 @@ def test_states_that_a_fit_cannot_predict_are_refused(site):
     refusal("q has values that are not finite", fit.predict, hc.States(q * np.nan, wrench))
     refusal(r"wrench has shape \(6,\); valid", fit.predict, hc.States(q, wrench[0]))
     refusal("the model has creep, which needs", crept.predict, hc.States(q, wrench))
+
+
+@pytest.mark.parametrize("kind", ["deflection", "absolute"])
+def test_the_error_at_poses_that_were_not_fitted(kind, site):
+    with hc.Campaign(site.run, read_only=True) as run:
+        readings, model = run.readings, hc.baseline(run, readings=kind)
+    test = readings.where(pose=readings.pose_names[-2:])
+    fit = hc.fit(model, readings[~test], readings=kind)
+    fitted = fit.readings[~fit.outlier]
+    assert fit.error_of(fitted).rms_m == pytest.approx(fit.error.rms_m, rel=1e-9)
+    assert fit.error_of(readings[test]).rms_m < 3 * fit.holdout.rms_m
+    refusal("readings is of class DataFrame", fit.error_of, readings.to_frame())
+    refusal(r"or \(12,\) standard deviations", hc.fit, model, readings, prior=np.ones(5))
+
+
+def test_corrected_points_are_a_frame(site):
+    with hc.Campaign(site.run, read_only=True) as run:
+        calibration, q = hc.Calibration.of(hc.fit(hc.baseline(run), run)), run.readings.states.q[:3]
+    corrected = calibration.compensate(q, [0, 0, -50, 0, 0, 0])
+    frame = corrected.to_frame()
+    joints = [f"q{j}_rad" for j in range(1, 7)]
+    np.testing.assert_array_equal(frame[joints].to_numpy(), corrected.q)
+    assert frame["name"].tolist() == ["1", "2", "3"]
+    np.testing.assert_allclose(frame["before_m"], corrected.before.error_m)
+    refusal(
+        "q = a DataFrame is not.*; valid: joint values",
+        calibration.predict,
+        corrected.to_frame().assign(x="p"),
+    )
 
 
 def test_results_are_dictionaries_and_go_to_other_processes(site, refined):
