@@ -422,7 +422,9 @@ class Readings(Tabular):
 
 def _numbers(wanted: Names, names: tuple[str, ...], what: str) -> list[int]:
     """Return the numbers of names; whole numbers are names of a table, too."""
-    texts = [wanted] if isinstance(wanted, str) else [str(x) for x in np.ravel(np.array(wanted))]
+    if isinstance(wanted, str) or not isinstance(wanted, Iterable):
+        wanted = [wanted]
+    texts = [str(name) for name in wanted]
     for name in texts:
         if name not in names:
             raise InputError(

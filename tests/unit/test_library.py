@@ -297,7 +297,7 @@ def test_readings_are_chosen_by_the_names_of_their_table_and_put_together(site):
     test = readings.where(pose=3)
     assert test.any()
     np.testing.assert_array_equal(test, frame["pose"] == 3)
-    both = readings.where(pose=["3", "5"], load="none")
+    both = readings.where(pose={"3", 5}, load="none")
     np.testing.assert_array_equal(both, frame["pose"].isin([3, 5]) & (frame["load"] == "none"))
     refusal(r"unknown load '5 kg' \(did you mean \"5kg\"", readings.where, load="5 kg")
     refusal("unknown pose 'p3'.*; valid: 1, 2, 3", readings.where, pose="p3")
