@@ -61,9 +61,9 @@ from hilcal.present.registration import covariance_words
 from hilcal.procedure.procedure import Measure, Procedure, checked_plan
 from hilcal.procedure.state import WORLD
 from hilcal.readings.covariance import COVERS_KEY, INSTRUMENT_AND_ARM
-from hilcal.readings.readings import Readings
+from hilcal.readings.readings import SAME_POSE, Readings
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import UNLOADED, Plan, load_plan, with_new_names
+from hilcal.store.plan import REFERENCE, UNLOADED, Plan, load_plan, with_new_names
 from hilcal.store.procedure_log import ProcedureLog, refuse_fitting
 from hilcal.store.run_log import (
     REHEARSED,
@@ -127,7 +127,10 @@ def run(
             campaign_plan = log.plans[0]
             if plan is not None:
                 refuse_fitting(campaign)  # a further plan would change a frozen test
-                further = log.with_new_names(load_plan(plan))
+                given = load_plan(plan)
+                further = log.with_new_names(given)
+                if moved := _reference_moved(given, further):
+                    t.notice(f"note: {plan}: {moved}")
                 refuse(dry_checked(t, robot_cell, further), str(plan))
                 if missing := len(log.plan.without(log.done()).steps):
                     t.notice(
@@ -183,6 +186,19 @@ def run(
         line = f"hilcal plan {quoted(cell)} -o more.json --after {quoted(output)}"
         missed = CannotAnswerError(f"{missed_words(goal.status, measured)}; plan on with: {line}")
     t.document(document, missed)
+
+
+def _reference_moved(given: Plan, renamed: Plan) -> str:
+    """Return that the reference pose of a further plan is replaced by the campaign's, or ""."""
+    if REFERENCE not in given.pose_names:
+        return ""
+    far = float(np.abs(renamed.joints(REFERENCE) - given.joints(REFERENCE)).max())
+    if far <= SAME_POSE:
+        return ""
+    return (
+        f'its pose "{REFERENCE}" is up to {far:.3g} rad from that of the campaign, to which the '
+        "arm goes in its place: the drift is measured there"
+    )
 
 
 def _default_plan(t: Terminal, path: Path, cell: Cell, catalogue: Catalogue, yes: bool) -> Plan:

@@ -19,6 +19,7 @@ from hilcal.toml import read_json, suggest
 from hilcal.types import Floats
 
 LARGEST = 1e3  # upper bound of joint angles, rad; a choice: larger numbers show damage
+MOST_CYCLES = 1_000_000  # upper bound of cycles in a plan file, far below what a campaign can store
 FORMAT = "hilcal-plan"
 VERSION = 1
 UNLOADED = "none"
@@ -128,6 +129,9 @@ def load_plan(path: Path) -> Plan:
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: cannot be read ({error})") from None
     plan = read_plan(text, str(path))
+    for k, step in enumerate(plan.steps, start=1):
+        if step.cycle >= MOST_CYCLES:
+            raise InputError(f"{path}: step {k}: cycle {step.cycle} must be below {MOST_CYCLES}")
     for key, (valid, fits) in _USED_KEYS.items():
         if key in plan.about and not fits(plan.about[key]):
             raise InputError(f'{path}: "{key}" must be {valid}, or be left out')

@@ -367,6 +367,8 @@ def test_what_an_appended_plan_leaves_out_is_said(site, capsys):
     told = ok(capsys, *site.command("--append", "--plan", further, "--json"))
     missing = f"{len(site.plan.steps)} readings of the previous plan are missing"
     assert missing in " ".join(told.err.split())
+    moved = 'its pose "reference" is up to 0.02 rad from that of the campaign'
+    assert moved in " ".join(told.err.split())
     assert "previous plan" not in ok(capsys, *site.command("--resume", "--json")).err
 
 
