@@ -12,16 +12,20 @@ import numpy as np
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensation import Compensation
 from hilcal.calibration.improvement import refuted
-from hilcal.calibration.points import Points, on_branch, read_points
+from hilcal.calibration.points import Points, on_branch, read_points, stated_twice
 from hilcal.calibration.programs import urscript
 from hilcal.calibration.programs.languages import READERS, ResolvedProgram, read_program
 from hilcal.campaign.campaign import Campaign
+from hilcal.cell import Cell
 from hilcal.cli.options import check_new, command
 from hilcal.cli.terminal import Terminal
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit_document import with_nulls
+from hilcal.measuring.feasibility import Feasibility
+from hilcal.measuring.motion import PAYLOAD_KG
 from hilcal.names import csv_text, quoted
+from hilcal.numbers import length
 from hilcal.present.calibration import (
     compensation_report,
     refusals,
@@ -32,6 +36,7 @@ from hilcal.present.progress import working
 from hilcal.procedure.state import IMPROVED, Files
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
+from hilcal.store.plan import UNLOADED
 from hilcal.store.procedure_log import ProcedureLog
 from hilcal.tables.columns import joint_columns
 from hilcal.tables.mapping import PointMapping, find_mapping
@@ -150,14 +155,63 @@ def compensate(
     written = [str(path) for path in files]
     t.show(compensation_report(calibration, task.points.names, q, result))
     t.show(waypoints_table(outcomes))
+    cell = calibration.model.cell
     if doubt:
         t.notice(f"warning: {doubt}")
+    if remark := "" if task.program else _two_targets(targets, arm, on_flange):
+        t.notice(f"note: {points}: {remark}")
+    names, load = task.points.names, options.load or UNLOADED
+    cautions = _other_payload(task, wrench, cell), _not_allowed(cell, names, result.q, load)
+    for caution in filter(None, cautions):
+        t.notice(f"warning: {points}: {caution}")
     hint = "Nothing was written; -o F.csv, F.json or F.script writes the joint values."
     t.show(f"\nWritten: {', '.join(written)}." if written else f"\n{hint}")
     for path in files if task.program is None and task.foreign is None else ():
         if path.suffix in PROGRAMS:
             t.notice(f"note: {path}: {urscript.UNCHECKED}")
     t.document({**document, "written": written})
+
+
+def _two_targets(points: Points, arm: Arm, tool: Floats) -> str:
+    """Return how far stated poses are from the tool at stated joint values; "" without both."""
+    far = stated_twice(points, arm, tool)
+    if not np.isfinite(far).any():
+        return ""
+    k = int(np.nanargmax(far))
+    return (
+        f"{points.names[k]} has joint values and a pose, {length(float(far[k]))} from where the "
+        "nominal arm has the tool there (largest of all): the pose in base axes is the target, "
+        "joint values only select the branch"
+    )
+
+
+def _other_payload(task: _Task, wrench: Floats | None, cell: Cell) -> str:
+    """Return that a UR program sets another mass than the points are corrected for, or ""."""
+    stated = next((w.payload_kg for w in task.waypoints if w.payload_kg is not None), None)
+    if stated is None:
+        return ""
+    force, g = np.zeros(3) if wrench is None else wrench[:3], cell.gravity
+    mass = cell.tool_mass + float(force @ g) / max(float(g @ g), 1e-9)
+    if abs(stated - mass) <= PAYLOAD_KG:
+        return ""
+    return (
+        f"it sets a payload of {stated:.4g} kg, and is corrected for {mass:.4g} kg, the tool of "
+        "the cell with what --load or --wrench adds: where the arm carries more, say so by them"
+    )
+
+
+def _not_allowed(cell: Cell, names: Sequence[str], q: Floats, load: str) -> str:
+    """Return why the campaign's cell does not allow some joint values (N, n), or ""."""
+    if cell.config is None:
+        return ""
+    limits = Feasibility(cell)
+    bad = np.flatnonzero(~limits.allowed(q, load))
+    if not len(bad):
+        return ""
+    found = (v.line(names[bad[0]]) for v in limits.findings(q[bad[:1]], load))
+    why = next(iter((*found, *limits.unbearable(load).values())))
+    more = f" (and {len(bad) - 1} more points)" if len(bad) > 1 else ""
+    return f"the cell of the campaign does not allow {why}{more}"
 
 
 def _program_poses(task: _Task, calibration: Calibration, q: Floats, arm: Arm) -> Floats | None:

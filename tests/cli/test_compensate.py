@@ -157,6 +157,33 @@ def test_a_name_is_neither_a_line_of_a_program_nor_a_formula(capsys, fitted, tmp
     assert [point["name"] for point in told["points"]] == ["w0", "=1+1", "w2"]
 
 
+def test_what_may_be_another_motion_than_meant_is_said(capsys, fitted, tmp_path):
+    """A pose far from its joint values, another payload, a place that the cell does not allow."""
+    points, program = tmp_path / "points.csv", tmp_path / "p.script"
+    with hc.Campaign.open(fitted, read_only=True) as run:
+        q = run.readings.states.q[0]
+        tool = run.calibration().predict(q, std=False).nominal_position[0]
+    joints, place = (",".join(map(str, x)) for x in (q, tool + [0.0, 0.0, -0.03]))
+    head = f"pose,{JOINTS.replace('deg', 'rad')}"
+    points.write_text(f"{head}\nw,{joints}\n")
+    quiet = ok(capsys, "compensate", fitted, points).err
+    assert "warning" not in quiet
+    assert "joint values and a pose" not in quiet
+    points.write_text(f"{head},x_m,y_m,z_m\nw,{joints},{place}\n")
+    said = " ".join(ok(capsys, "compensate", fitted, points, "--allow-outside").err.split())
+    assert "note: " in said
+    assert "w has joint values and a pose, 30.0 mm from where the nominal arm" in said
+    low = "0,0.4,0.3,0,0.5,0"
+    points.write_text(f"{head}\nlow,{low}\nlow too,{low}\n")
+    said = " ".join(ok(capsys, "compensate", fitted, points, "--allow-outside").err.split())
+    assert "does not allow low: forearm is 0.525 m outside the workspace" in said
+    assert "(and 1 more points)" in said
+    program.write_text(f"def weld():\n  set_payload(5.8)\n  movej([{joints}])\nend\n")
+    said = " ".join(ok(capsys, "compensate", fitted, program).err.split())
+    assert "it sets a payload of 5.8 kg, and is corrected for 0.8 kg" in said
+    assert "payload" not in ok(capsys, "compensate", fitted, program, "--load", "5kg").err
+
+
 def test_points_outside_are_refused_by_name_unless_told_otherwise(capsys, fitted, tmp_path):
     points = table(
         tmp_path, fitted, fx_N="0", fy_N="0", fz_N="-400", mx_Nm="0", my_Nm="0", mz_Nm="0"

@@ -47,7 +47,8 @@ _OTHER_MOVES = ("movec", "servoc", "speedj", "speedl")
 """Functions of other motions, which are not corrected."""
 _STOPS = ("stopj", "stopl")
 _TOOL = "set_tcp"
-_PAYLOAD = ("set_payload", "set_payload_mass", "set_payload_cog", "set_target_payload")
+_MASSES = ("set_payload", "set_payload_mass", "set_target_payload")
+_PAYLOAD = (*_MASSES, "set_payload_cog")
 _SETUP = (_TOOL, *_PAYLOAD, "set_gravity")
 _HARMLESS = re.compile(
     r"a?(cos|sin|tan)|atan2|ceil|floor|d2r|r2d|log|pow|sqrt|norm|random|length|get_list_length"
@@ -98,6 +99,7 @@ class Waypoint:
     q: Floats | None = None  # (6,) joint values, or those that select the branch of `pose`, rad
     pose: Floats | None = None  # (4, 4) T_base_tool; None where the joint values are the target
     tool: Floats | None = None  # (4, 4) T_flange_tool that was set; None if none
+    payload_kg: float | None = None  # mass that was set; None if none
     blend_m: float = 0.0  # radius within which the arm passes without a stop, m
     not_corrected: str = ""  # why it is not corrected; empty if it is understood
     straight: bool = False  # whether the motion to it is a straight line
@@ -372,7 +374,10 @@ def _waypoint(p: _Program, k: int, setup: Mapping[str, tuple[int, list[Value | N
                 "not come before it; valid: once before the first motion, not in if or while"
             )
     tool = setup[_TOOL][1][0] if _TOOL in setup else None
-    return replace(out, q=target_values[0], pose=target_values[1], tool=_pose(tool))
+    masses = (setup[n][1][0] for n in _MASSES if n in setup and setup[n][1])
+    payload = next((m for m in masses if isinstance(m, float)), None)
+    q, pose = target_values
+    return replace(out, q=q, pose=pose, tool=_pose(tool), payload_kg=payload)
 
 
 def _set_up(
