@@ -163,7 +163,7 @@ def test_what_may_be_another_motion_than_meant_is_said(capsys, fitted, tmp_path)
     with hc.Campaign.open(fitted, read_only=True) as run:
         q = run.readings.states.q[0]
         tool = run.calibration().predict(q, std=False).nominal_position[0]
-    joints, place = (",".join(map(str, x)) for x in (q, tool + [0.0, 0.0, -0.03]))
+    joints, place = (",".join(map(str, x)) for x in (q, tool - np.array([0.0, 0.0, 0.03])))
     head = f"pose,{JOINTS.replace('deg', 'rad')}"
     points.write_text(f"{head}\nw,{joints}\n")
     quiet = ok(capsys, "compensate", fitted, points).err
