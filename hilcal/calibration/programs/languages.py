@@ -242,7 +242,7 @@ def _solve(
             return q[0], ""
     all_solutions = solutions(arm, p.tool, None, goal)
     if not len(all_solutions):
-        raise InputError(f"{p.name}: the nominal arm does not reach it from anywhere")
+        return unknown, "the nominal arm does not reach it from anywhere"
     turned = np.concatenate([_turned(arm, q) for q in all_solutions])
     fitting = turned[_fits(arm, language, turned, stated, required)]
     if not len(fitting):

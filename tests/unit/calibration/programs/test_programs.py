@@ -290,6 +290,7 @@ def test_what_is_not_understood_is_refused_by_line(case, given, arms, tmp_path):
         ("krl", "LIN XP2 C_DIS", "LIN XP2:XP3 C_DIS", ["line 28", "XP3 (weld.dat line 12)"]),
         ("rapid", "Offs(p30,0,0,40)", "Offs(p30,0,0,z)", ["line 19", "line 20"]),
         ("fanuc", "CNT100    ;", "CNT100 Offset,PR[1]    ;", ["P[2] (line 25)"]),
+        ("fanuc", "X =    -2.992", "X =  9000.000", ["P[1] (line 19)"]),  # out of reach
     ],
 )
 def test_what_is_left_and_all_that_it_counts_from_stay_as_they_are(
