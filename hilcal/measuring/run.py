@@ -628,7 +628,7 @@ def run(
     if not missing.steps:
         watcher.notify(Phase("nothing is missing"))
         return
-    _refuse_unsafe(cell, missing, bool(done))
+    _refuse_unsafe(cell, missing)
     for text in dry_run(cell, plan).remarks:
         watcher.notify(Remark(text))
     setup = Setup(rig, cell, clock, watcher, stop_requested)
@@ -644,19 +644,17 @@ def run(
         _raise(error, trouble, session.pose if failed_before else None, advice)
 
 
-def _refuse_unsafe(cell: Cell, missing: Plan, begun: bool) -> None:
+def _refuse_unsafe(cell: Cell, missing: Plan) -> None:
     """Refuse a plan with problems: InputError names the first, and how many more there are."""
     checked = dry_run(cell, missing)
     if not checked.problems:
         return
-    home, advice = missing.home, ""
-    if begun and dry_run(cell, replace(missing, steps=(Step(home, UNLOADED),))).problems:
+    home, advice = missing.home, "; --skip POSE leaves a pose out"
+    if dry_run(cell, replace(missing, steps=(Step(home, UNLOADED),))).problems:
         advice = (
             f"; every session goes to {home}, which --skip cannot leave out: put back the cell "
             "with which the campaign was begun, or begin another campaign"
         )
-    elif begun:
-        advice = "; --skip POSE leaves a pose out"
     raise InputError(
         f"the plan is not safe to run, nothing has moved: {checked.first_problem}{advice}"
     )

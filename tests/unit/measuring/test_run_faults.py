@@ -509,6 +509,14 @@ def test_limits_that_were_narrowed_meanwhile_do_not_lock_a_campaign(b):
     assert {s for s in plan.steps if s.pose != "p2"} < b.store.done()
 
 
+def test_limits_that_were_narrowed_before_the_first_reading_lock_no_campaign(b):
+    """As of a validation, whose plan was made and checked before."""
+    limits = Limits(workspace_min_m=(-1.2, -1.2, 0.05), workspace_max_m=(1.2, 0.3, 1.5))
+    b.config = b.config.model_copy(update={"limits": limits})
+    refusal("p2.*ends at 0.3 m.*--skip POSE leaves a pose out", b.measure, usual_plan())
+    assert b.world.calls == []
+
+
 def test_another_reflector_is_not_believed(b):
     def other(*_):
         if len(b.store.rows) == 5:
