@@ -22,7 +22,7 @@ from hilcal.cli.terminal import Terminal
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit_document import with_nulls
-from hilcal.measuring.feasibility import Feasibility
+from hilcal.measuring.feasibility import MOTION_CHECKS, Feasibility
 from hilcal.measuring.motion import PAYLOAD_KG
 from hilcal.names import csv_text, quoted
 from hilcal.numbers import length
@@ -201,14 +201,17 @@ def _other_payload(task: _Task, wrench: Floats | None, cell: Cell) -> str:
 
 
 def _not_allowed(cell: Cell, names: Sequence[str], q: Floats, load: str) -> str:
-    """Return why the campaign's cell does not allow some joint values (N, n), or ""."""
+    """Return why the campaign's cell does not allow some joint values (N, n), or "".
+
+    The joints' own limits are those of the arm, beyond which a point is refused.
+    """
     if cell.config is None:
         return ""
     limits = Feasibility(cell)
-    bad = np.flatnonzero(~limits.allowed(q, load))
+    bad = np.flatnonzero(~limits.allowed(q, load, MOTION_CHECKS))
     if not len(bad):
         return ""
-    found = (v.line(names[bad[0]]) for v in limits.findings(q[bad[:1]], load))
+    found = (v.line(names[bad[0]]) for v in limits.findings(q[bad[:1]], load, MOTION_CHECKS))
     why = next(iter((*found, *limits.unbearable(load).values())))
     more = f" (and {len(bad) - 1} more points)" if len(bad) > 1 else ""
     return f"the cell of the campaign does not allow {why}{more}"
