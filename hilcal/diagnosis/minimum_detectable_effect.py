@@ -27,14 +27,9 @@ from hilcal.identification.linearisation import (
     by_pose,
     effect_columns,
 )
-from hilcal.regression.evidence import (
-    FamilyScore,
-    Spectrum,
-    noncentrality_of_power,
-    score_family,
-)
+from hilcal.regression.evidence import Spectrum, family_tests, noncentrality_of_power
 from hilcal.regression.leave_out import FamilyFolds, LeftOutResidual, improves
-from hilcal.types import Floats
+from hilcal.types import Bools, Floats
 
 POWER = 0.9
 LEAST_SHARE = 0.01
@@ -191,28 +186,26 @@ class SuspectTests:
         """The model with the family, fitted without each fold."""
         return FamilyFolds(self.p.folds, self.family.white)
 
-    def passed(self, campaigns: SimulatedCampaigns, enough: float = 0.0) -> list[bool]:
-        """Whether each of K simulated campaigns would reveal the family."""
-        # Once a share of `enough` is out of reach, the remaining ones count as failed.
+    def passed(self, campaigns: SimulatedCampaigns, enough: float = 0.0) -> Bools:
+        """(K,) whether each of K simulated campaigns would reveal the family.
+
+        Poses are not left out where fewer than `enough` pass the test of the fitted readings.
+        """
         p, by_model = self.p, campaigns.left_out
         r = campaigns.fitted
-        g, rss = self.family.white.T @ r, np.sum(r * by_model.y, axis=0)
-        scores: list[FamilyScore] = []
-        revealed = [False] * by_model.y.shape[1]
-        for k in range(len(revealed)):
-            c = score_family(self.s, g[:, k], float(rss[k]), p.fit.dof, largest=self.largest)
-            scores.append(c)
-            revealed[k] = c.p_value < self.level and c.log_evidence > 0
-            failed = len(scores) - sum(revealed)
-            if 1.0 - failed / len(revealed) < enough:
-                return revealed
-        if np.mean(revealed) < POWER:
+        if self.s.rank == 0 or p.fit.dof <= 1:
+            return np.zeros(r.shape[1], dtype=np.bool_)
+        tests = family_tests(
+            self.s, self.family.white.T @ r, np.sum(r * by_model.y, axis=0), p.fit.dof,
+            largest=self.largest,
+        )  # fmt: skip
+        revealed = np.asarray((tests.p_value < self.level) & (tests.log_evidence > 0))
+        if np.mean(revealed) < max(enough, POWER):
             return revealed
-        ridge = float(np.median([c.ridge for c in scores]))
+        ridge = float(np.median(tests.ridge))
         with_family = self._family_folds.left_out(by_model, ridge)
-        out = []
-        for k, fit_reveals in enumerate(revealed):
+        for k in np.flatnonzero(revealed):
             a, b = by_pose(p.fit, by_model.residual[:, k]), by_pose(p.fit, with_family[:, k])
             share = float(a.sum() - b.sum()) / max(float(a.sum()) - p.fit.whitening.rank, 1.0)
-            out.append(fit_reveals and share >= LEAST_SHARE and improves(a, b))
-        return out
+            revealed[k] = share >= LEAST_SHARE and improves(a, b)
+        return revealed

@@ -39,7 +39,7 @@ import numpy as np
 import scipy
 from scipy.special import log_ndtr
 
-from hilcal.types import Bools, Floats
+from hilcal.types import Bools, Floats, Ints
 
 VISIBLE = 1e-4  # eigenvalues of S below this are not tested: an ordinary magnitude along such a
 # direction moves all data together by less than 0.01 σ; a guess
@@ -123,15 +123,62 @@ NO_EVIDENCE = FamilyScore(1.0, 0.0, 0.0, np.inf, 0, 0.0, 0.0, 0.0, np.zeros(0), 
 def log_evidence(
     lam: Floats,  # (..., P) eigenvalues of S
     explained: Floats,  # (..., P) reduction of ‖r‖² by each eigenvector without a prior
-    rss: float,  # ‖r‖²
+    rss: float | Floats,  # (...) ‖r‖²
     dof: float,  # ν
     strengths: Floats = STRENGTHS,  # (T,) τ
 ) -> tuple[Floats, Floats]:
     """Return the log evidence (T, ...) of families at each strength τ, and ‖r‖²_t / ‖r‖²."""
-    grown = 1.0 + np.multiply.outer(strengths**2 * (dof / rss), lam)
+    grown = 1.0 + np.multiply.outer(strengths**2, lam * np.expand_dims(dof / np.asarray(rss), -1))
     remaining = rss - explained.sum(axis=-1) + (explained / grown).sum(axis=-1)
     remaining = np.maximum(remaining / rss, ROUNDING)
     return -0.5 * np.log(grown).sum(axis=-1) - 0.5 * dof * np.log(remaining), remaining
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FamilyTests:
+    """Test and evidence of one family for each of K residuals."""
+
+    p_value: Floats  # (K,) of the joint test
+    by_strength: Floats  # (T, K) log evidence at each τ of a plausible size
+    best: Ints  # (K,) index of the strength with the largest evidence
+    bounded: Bools  # (K,) whether a strength above the largest plausible one has more evidence
+    ridge: Floats  # (K,) t⁻² at the best strength
+
+    @property
+    def log_evidence(self) -> Floats:
+        """(K,) gain in log evidence by adding the family."""
+        return np.asarray(self.by_strength.max(axis=0))
+
+
+def family_tests(
+    eigen: Spectrum,  # of S, with a visible direction
+    g: Floats,  # (P, K)
+    rss: Floats,  # (K,) ‖r‖², above 0
+    dof: float,
+    spent: float = 0.0,
+    largest: float = np.inf,
+) -> FamilyTests:
+    """Test a family for each of K residuals; arguments as of `score_family`."""
+    testable, rank, free = eigen.testable, eigen.rank, dof - spent
+    lam, c = eigen.values[testable], (eigen.vectors.T @ g)[testable].T
+    explained = c**2 / lam
+    if rank <= LARGE_FAMILY * free:
+        gain = np.minimum(explained.sum(axis=1), (1 - ROUNDING) * rss)
+        variance = np.maximum((rss - gain) / (free - rank), 1e-300)
+        p_value = scipy.stats.f.sf(gain / rank / variance, rank, free - rank)
+    else:
+        ratio = np.sum(c**2, axis=1) / rss
+        p_value = np.array([ratio_tail(lam, free, x) for x in ratio.tolist()])
+    evidence, remaining = log_evidence(lam, explained, rss, dof)
+    unbounded = np.argmax(evidence, axis=0)
+    if np.isfinite(largest):
+        # τ = t σ with σ² = ‖r‖²/ν, which contains what the family explains: use ‖r‖²_t instead.
+        plausible = STRENGTHS[:, None] * np.sqrt(remaining) <= largest
+        evidence = np.where(plausible, evidence, -np.inf)
+        evidence[0] = np.maximum(evidence[0], -1e300)
+    best = np.argmax(evidence, axis=0)
+    ridge = rss / (dof * STRENGTHS[best] ** 2)
+    return FamilyTests(np.asarray(p_value), evidence, best, best != unbounded, ridge)
 
 
 def score_family(
@@ -151,32 +198,22 @@ def score_family(
         largest: largest plausible standard deviation of the parameters, for the evidence only.
     """
     eigen = s if isinstance(s, Spectrum) else spectrum(s)
-    testable, rank, free = eigen.testable, eigen.rank, dof - spent
-    if rank == 0 or rss <= 0 or free <= 1:
+    testable, rank = eigen.testable, eigen.rank
+    if rank == 0 or rss <= 0 or dof - spent <= 1:
         return NO_EVIDENCE
+    tests = family_tests(eigen, g[:, None], np.array([rss]), dof, spent, largest)
+    evidence = tests.by_strength[:, 0]
     lam, c = eigen.values[testable], (eigen.vectors.T @ g)[testable]
-    explained, small = c**2 / lam, rank <= LARGE_FAMILY * free
-    if small:
-        gain = min(float(explained.sum()), (1 - ROUNDING) * rss)
-        variance = max((rss - gain) / (free - rank), 1e-300)
-        p_value = float(scipy.stats.f.sf(gain / rank / variance, rank, free - rank))
-    else:
-        p_value = ratio_tail(lam, free, float(c @ c) / rss)
-    evidence, remaining = log_evidence(lam, explained, rss, dof)
-    unbounded = int(np.argmax(evidence))
-    if np.isfinite(largest):
-        # τ = t σ with σ² = ‖r‖²/ν, which contains what the family explains: use ‖r‖²_t instead.
-        evidence = np.where(STRENGTHS * np.sqrt(remaining) <= largest, evidence, -np.inf)
-        evidence[0] = max(evidence[0], -1e300)
-    best = int(np.argmax(evidence))
-    ridge = rss / (dof * float(STRENGTHS[best]) ** 2)
+    explained, small = c**2 / lam, rank <= LARGE_FAMILY * (dof - spent)
+    best = int(tests.best[0])
+    ridge = float(tests.ridge[0])
     shrunk = lam / (lam + ridge)
     effective, gain = float(shrunk.sum()), float(shrunk @ explained)
     full, count = (float(explained.sum()), rank) if small else (gain, effective)
     step = np.zeros(len(testable))
     step[testable] = shrunk * c / lam
     return FamilyScore(
-        p_value=p_value,
+        p_value=float(tests.p_value[0]),
         log_evidence=float(evidence[best]),
         strength=float(STRENGTHS[best]),
         ridge=ridge,
@@ -187,7 +224,7 @@ def score_family(
         step=eigen.vectors @ step,
         spectrum=eigen,
         noise=max(rss - gain, ROUNDING * rss) / dof,
-        bounded=best != unbounded,
+        bounded=bool(tests.bounded[0]),
         by_strength=evidence,
     )
 
