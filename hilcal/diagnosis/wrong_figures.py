@@ -23,6 +23,7 @@ from hilcal.diagnosis.effect_ranking import Suspect
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.fit import Fit, fit, with_outliers
+from hilcal.identification.gauss_newton import solve
 from hilcal.identification.linearisation import LEAST_MISFIT, linearise
 from hilcal.identification.residual import residual
 from hilcal.readings.readings import Readings
@@ -43,6 +44,9 @@ BIC_MARGIN = 10.0
 """Difference of the criterion within which other figures are named beside the best one; very strong
 evidence (Kass and Raftery, *Bayes factors*, J. Am. Stat. Assoc. 90 (1995) 773)."""
 LEAST_PROMISE = 0.2  # share of χ² that the first step must promise for a refit; a choice
+LEAST_DIRECTION_PROMISE = 0.05
+"""The same for gravity and the axes of forces, which explain little until the direction is near; a
+choice."""
 LEAST_RELATIVE_PROMISE = 0.5  # the same, as a share of the largest promise
 MOST_STEPS = 5  # most refits of a figure; a choice, two or three are usual
 SMALL_STEP = 1.0  # largest step that needs no further refit, in units of `DERIVATIVE_STEP`
@@ -143,6 +147,17 @@ class _Figure:
         x, r = self.columns(everything)[:, 0], w.whiten(raw).reshape(-1)
         size = float(x @ r) / max(float(x @ x), 1e-300)
         return np.array([size]), size * float(x @ r) / max(float(r @ r), 1e-300)
+
+    def promise(self, stated: Fit) -> float:
+        """Share of χ² that the figure as it stands explains, gross errors as stated or none."""
+        changed, shares = self.applied(stated, np.zeros(self.size)), [0.0]
+        for rows in (~stated.outlier, np.ones_like(stated.outlier)):
+            with suppress(CannotAnswerError):
+                after, before = (_chi2_of(f, rows, stated) for f in (changed, stated))
+                shares.append(1.0 - after / max(before, 1e-300))
+            if not stated.outlier.any():
+                break
+        return max(shares)
 
     def refitted(self, stated: Fit, step: Floats, steps: int = MOST_STEPS) -> tuple[Floats, Fit]:
         """Return the best change (k,) of the figure, from a first step on, and its fit.
@@ -264,6 +279,9 @@ def _wrong_direction(fit: Fit, least_share: float, best: float) -> tuple[WrongFi
         figures += [_Figure("force_axes", sign=sign) for sign in (1.0, -1.0)]
     axes = (*np.eye(3), *-np.eye(3)) if g.any() else ()
     figures += [_Figure("gravity", axis=tuple(a.tolist())) for a in axes if _elsewhere(a, g)]
+    reversed_loads = loads_reversed(fit)
+    if not reversed_loads and not _turns(fit):
+        figures = [f for f in figures if f.promise(fit) > LEAST_DIRECTION_PROMISE]
     refits: list[tuple[Fit, _Figure]] = []
     for figure in figures:
         with suppress(CannotAnswerError):
@@ -278,13 +296,24 @@ def _wrong_direction(fit: Fit, least_share: float, best: float) -> tuple[WrongFi
         with suppress(CannotAnswerError):
             refined = figure.refitted(fit, np.zeros(2))[1]
             refit = min(refit, refined, key=lambda f: f.chi2 + BIC_MARGIN * (f is refined))
-    if loads_reversed(fit):
+    if reversed_loads:
         explained = refit.chi2 < fit.chi2 + BIC_MARGIN
     else:
         bic = criterion(fit, refit, figure.size, least_share)
         wrong = figure.kind != "gravity" or _elsewhere(refit.model.cell.gravity, g)
         explained = wrong and bic is not None and bic < min(best, -BIC_MARGIN)
     return (figure.named(fit, np.zeros(figure.size), refit),) if explained else ()
+
+
+def _turns(fit: Fit) -> bool:
+    """Whether the first step of gravity's direction, from that stated, promises enough."""
+    g = fit.model.cell.gravity
+    if not g.any():
+        return False
+    stated = _Figure("gravity", axis=tuple((g / np.linalg.norm(g)).tolist()))
+    with suppress(CannotAnswerError):
+        return stated.step(fit)[1] > LEAST_DIRECTION_PROMISE
+    return False
 
 
 def _elsewhere(gravity: Floats, stated: Floats) -> bool:
@@ -324,6 +353,13 @@ def criterion(stated: Fit, refit: Fit, size: int, least_share: float = LEAST_SHA
     if refit.chi2 > most:
         return None
     return float(w.rank * np.log(max(refit.chi2, 1e-300) / chi2) + size * np.log(w.rank))
+
+
+def _chi2_of(changed: Fit, rows: Bools, stated: Fit) -> float:
+    """χ² of some readings (N,), the parameters of a changed fit estimated from all of them."""
+    readings = changed.readings[rows]
+    w = whitening(readings, stated.mode, "gc")
+    return float(np.sum(w.whiten(solve(changed.model, readings, w, stated.theta).raw) ** 2))
 
 
 def _chi2(fit: Fit, readings: Readings, w: Whitening) -> float:
