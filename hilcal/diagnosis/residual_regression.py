@@ -124,9 +124,9 @@ class _Laws:
         self.variable, self.motion = (list(x) for x in zip(*described, strict=True))
         self._p, self._fold = p, fold
         self._chosen: dict[int, Floats] = {}
-        self.ridge = np.maximum(p.projection.ridge, LEAST_RIDGE)
+        self.model, self.ridge = _fewest(p.rows, np.maximum(p.projection.ridge, LEAST_RIDGE))
         self._y = p.marginal_residual
-        parts = [(p.rows[fold == f], self._y[fold == f]) for f in range(int(fold.max()) + 1)]
+        parts = [(self.model[fold == f], self._y[fold == f]) for f in range(int(fold.max()) + 1)]
         self._grams = [rows.T @ rows for rows, _ in parts]
         self._sides = [rows.T @ white for rows, white in parts]
 
@@ -161,12 +161,23 @@ class _Laws:
         b = np.concatenate([sum(self._sides) - self._sides[f], np.zeros(width)])
         if chosen:
             x = np.hstack([self.chosen(k)[rows] for k in chosen])
-            h[size:, :size] = x.T @ self._p.rows[rows]
+            h[size:, :size] = x.T @ self.model[rows]
             h[:size, size:] = h[size:, :size].T
             h[size:, size:] = x.T @ x + LAW_RIDGE * np.eye(width)
             b[size:] = x.T @ self._y[rows]
         step = positive_solve(h, b)
         return step[:size], list(step[size:].reshape(-1, LAW_COLUMNS))
+
+
+def _fewest(b: Floats, ridge: Floats) -> tuple[Floats, Floats]:
+    """Return at most R columns (R, K') with their ridge (K',) that predict as B (R, K), Λ (K,).
+
+    What they predict in any rows, fitted to any others, depends on B Λ⁻¹ Bᵀ alone.
+    """
+    if b.shape[1] <= len(b):
+        return b, ridge
+    u, s, _ = np.linalg.svd(b / np.sqrt(ridge), full_matrices=False)
+    return u * s, np.ones(len(s))
 
 
 def residual_regression(p: Linearisation) -> ResidualRegression:
@@ -178,7 +189,7 @@ def residual_regression(p: Linearisation) -> ResidualRegression:
     every = max(-(-len(white) * (FOLDS - 1) // (FOLDS * MOST_ROWS)), 1)
     used = np.arange(len(white)) // w.m % every == 0
     selection = BlockSelection(
-        p.rows[used], laws.ridge, laws.at(used), white[used], fold[used], p.flat
+        laws.model[used], laws.ridge, laws.at(used), white[used], fold[used], p.flat
     )
     rng = np.random.default_rng(20250302)
     # Errors of rows left out: by the model alone, and with laws.
@@ -188,8 +199,8 @@ def residual_regression(p: Linearisation) -> ResidualRegression:
         chosen = selection.without(f, MOST_LAWS, LEAST_EVIDENCE, STRENGTHS)
         plain, (step, coefficients) = laws.without(f, [])[0], laws.without(f, chosen)
         rows = fold == f
-        without[rows] = white[rows] - p.rows[rows] @ plain
-        base = white[rows] - p.rows[rows] @ step
+        without[rows] = white[rows] - laws.model[rows] @ plain
+        base = white[rows] - laws.model[rows] @ step
         curves = list(zip(chosen, coefficients, strict=True))
         error = base - sum((laws.chosen(k)[rows] @ c for k, c in curves), 0.0)
         with_laws[rows] = error
