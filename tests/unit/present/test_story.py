@@ -9,7 +9,6 @@ import pytest
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.identification.linearisation import HeldOut
 from hilcal.identification.prediction.full_prediction import full_prediction
 from hilcal.present.html.report import left_out_errors
 from hilcal.present.story import Chapter, build_story, curve, of_left_out, pose_numbers
@@ -89,15 +88,6 @@ def test_an_unknown_effect_has_a_curve_in_units_for_people():
     np.testing.assert_allclose(1e-6 * np.array([lead.y, lead.error]), [of.y, of.error])
     assert of.share > 0.9
     assert lead.description.startswith(f"{100 * of.share:.0f} % of the misfit")
-
-
-@pytest.mark.parametrize(("explains", "curves"), [(0.03, True), (0.6, False)])
-def test_a_suspect_that_explains_little_leaves_the_picture_to_the_variable(explains, curves):
-    d = unknown()
-    lead = replace(d.suspects[1], left_out=lambda: HeldOut(explains, True), explains=True)
-    named = replace(d, reason="one_suspect", suspects=(lead, d.suspects[0]))
-    r = build_story([Chapter(1, None, d.fit, named)]).revisions[0]
-    assert r.dependence.title == ("joint 4 angle" if curves else lead.effect)
 
 
 @pytest.mark.parametrize(
