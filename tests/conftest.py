@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # Shared machines are slow at times: no deadlines, and the same examples on every run.
 hypothesis.settings.register_profile("hilcal", deadline=None, derandomize=True, max_examples=50)
-hypothesis.settings.load_profile("hilcal")
+hypothesis.settings.register_profile("quick", deadline=None, derandomize=True, max_examples=20)
 
 
 def data_dir() -> Path:
@@ -48,12 +48,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
-def pytest_configure() -> None:
-    """Take signals as at a terminal, where the caller has them ignored.
+def pytest_configure(config: pytest.Config) -> None:
+    """Draw fewer examples for the quick tests; take signals as at a terminal.
 
     A shell's background job ignores SIGINT, nohup SIGHUP, and programs inherit it: those that the
     tests start would not end on them.
     """
+    quick = "not long" in config.getoption("markexpr")
+    hypothesis.settings.load_profile("quick" if quick else "hilcal")
     # Collecting makes millions of objects that all stay: looking for garbage among them took more
     # than a third of its time.
     gc.disable()
