@@ -11,8 +11,9 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.fitting import PriorOptions
 from hilcal.cli.options import POSES, command
 from hilcal.cli.planning import answers_of, refuse_unready
-from hilcal.cli.running import lasting_cell, measure, retry_after_failures
+from hilcal.cli.running import measure
 from hilcal.cli.showing import live_viewer
+from hilcal.cli.simulating import lasting_cell, retry_after_failures
 from hilcal.cli.terminal import Terminal, confirmed, person_present
 from hilcal.config import CellConfig
 from hilcal.design.nominal_model import check_effects

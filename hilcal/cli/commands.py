@@ -11,7 +11,7 @@ from typer.core import TyperGroup
 _LISTED = """
 Try it:
 demo | demo | Run a complete campaign on a simulated cell, through the real drivers and protocols.
-simulate | running
+simulate | simulating
     | Run the simulated devices of a cell until Ctrl-C; `check` and `run` connect to them.
 All in one:
 calibrate | calibrating

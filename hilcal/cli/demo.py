@@ -13,7 +13,7 @@ from hilcal import numbers
 from hilcal.calibration.improvement import Improvement
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.revisions import to_record
-from hilcal.cli import running
+from hilcal.cli import simulating
 from hilcal.cli.fitting import check_record, compute_errors, record_story
 from hilcal.cli.options import check_seed, command
 from hilcal.cli.planning import separates
@@ -102,8 +102,8 @@ class FirstDiagnosis:
 
 
 def doubtful_case(
-    settings: running.RehearsalSettings, hide: str | None, say: Say, number: int = 0
-) -> tuple[running.RehearsalSettings, Plan, bool]:
+    settings: simulating.RehearsalSettings, hide: str | None, say: Say, number: int = 0
+) -> tuple[simulating.RehearsalSettings, Plan, bool]:
     """Draw an effect to hide and a small campaign that leaves it in doubt, by seed and `number`.
 
     A case is doubtful when a rival explains the readings about as well as the hidden effect in each
@@ -121,7 +121,7 @@ def doubtful_case(
         choice = hide or str(rng.choice(HARD_TO_SEPARATE))
         case = replace(settings, config=strong, choice=choice, seed=int(rng.integers(2**31)))
         if k % ARMS_PER_PLAN == 0:
-            plan = running.first_plan(case, few, FIRST_POSES, lambda text: None)
+            plan = simulating.first_plan(case, few, FIRST_POSES, lambda text: None)
         secret = case_of_plan(strong, plan, choice, case.seed, case.world)
         drawn = [simulate_plan(secret, plan, [case.seed, 1 + j]) for j in range(NOISE_DRAWS)]
         if choice == NO_EFFECT or (
@@ -135,7 +135,7 @@ def _fit(r: Rehearsal, catalogue: Catalogue) -> Fit:
     return fit(baseline(r.cell, r.readings, r.mode, catalogue), r.readings, r.mode)
 
 
-def _resembled(r: Rehearsal, case: running.RehearsalSettings) -> bool:
+def _resembled(r: Rehearsal, case: simulating.RehearsalSettings) -> bool:
     """Whether the hidden effect or a rival is significant, and a rival fits as well."""
     p = linearise(_fit(r, case.catalogue))
     effects = [e for e in candidates(p.fit) if e.name in (r.hidden, *RESEMBLING)]
@@ -147,7 +147,7 @@ def _resembled(r: Rehearsal, case: running.RehearsalSettings) -> bool:
     return any(abs(s.score.log_evidence - evidence) < MAX_EVIDENCE_GAP for s in suspects.values())
 
 
-def _left_open(r: Rehearsal, case: running.RehearsalSettings) -> bool:
+def _left_open(r: Rehearsal, case: simulating.RehearsalSettings) -> bool:
     """Whether the diagnosis leaves the hidden effect in doubt, with separable rivals only."""
     d = judge(Evidence(_fit(r, case.catalogue)), History())
     return r.hidden in left_open(d) and all(rival.possible for rival in d.separability)
@@ -215,7 +215,7 @@ def demo(
     files = Files(output)
     for path in (files.validation, files.corrected):
         _spare_measured(path)
-    case = running.RehearsalSettings(
+    case = simulating.RehearsalSettings(
         config, hidden or RANDOM, number, output, configs_dir() / "cells", catalogue, world
     )
     laws = None
@@ -311,10 +311,14 @@ def _spare_measured(path: Path) -> None:
 
 @contextmanager
 def _campaign(
-    t: Terminal, case: running.RehearsalSettings, poses: int, without_devices: bool, ambiguous: bool
-) -> Iterator[tuple[running.RehearsedCampaign, Rehearsal, FirstDiagnosis | None]]:
+    t: Terminal,
+    case: simulating.RehearsalSettings,
+    poses: int,
+    without_devices: bool,
+    ambiguous: bool,
+) -> Iterator[tuple[simulating.RehearsedCampaign, Rehearsal, FirstDiagnosis | None]]:
     """Measure a campaign in a cell that lasts as the block; with `ambiguous` settle a doubt."""
-    measured = running.in_process if without_devices else running.on_devices
+    measured = simulating.in_process if without_devices else simulating.on_devices
     existed, first = case.output.exists(), case
     for tries in range(1, MAX_CAMPAIGNS + 1):
         another = False
@@ -323,7 +327,7 @@ def _campaign(
                 hidden = None if first.choice == RANDOM else first.choice
                 case, plan, another = doubtful_case(first, hidden, say, tries - 1)
             else:
-                plan = running.first_plan(case, case.config, poses, say)
+                plan = simulating.first_plan(case, case.config, poses, say)
         for path in (Files(case.output).validation, Files(case.output).corrected):
             path.unlink(missing_ok=True)
         with measured(t, case, plan) as m:

@@ -182,15 +182,21 @@ def test_a_ur_arm_without_ur_rtde(no_wheel, said, tmp_path, capsys, monkeypatch)
     assert line == f"error: arm: driver ur needs ur-rtde, which {said}".format(sys.version_info[1])
 
 
-@pytest.mark.parametrize("command", ["simulate", "run"])
+@pytest.mark.parametrize(
+    ("command", "plans"),
+    [
+        ("simulate", ["simulating.make_plan"]),
+        ("run", ["running.make_plan", "running.checked_plan"]),
+    ],
+)
 def test_what_cannot_be_hidden_is_refused_before_anything_is_planned(
-    command, tmp_path, capsys, monkeypatch
+    command, plans, tmp_path, capsys, monkeypatch
 ):
     def planned(*_):
         raise AssertionError("it plans first")
 
-    for name in ("make_plan", "checked_plan"):
-        monkeypatch.setattr(f"hilcal.cli.running.{name}", planned)
+    for name in plans:
+        monkeypatch.setattr(f"hilcal.cli.{name}", planned)
     path, words = tmp_path / "CELL.toml", CELL.read_text(encoding="utf-8")
     path.write_text(words.replace("[simulation]", '[simulation]\nhide = "foo"'), encoding="utf-8")
     more = ("--rehearse",) if command == "run" else ()
@@ -209,7 +215,7 @@ def test_it_is_said_that_deflections_do_not_show_what_is_hidden(
     def started(*_):
         raise InputError("no devices here")
 
-    monkeypatch.setattr("hilcal.cli.running.simulated_cell", started)
+    monkeypatch.setattr("hilcal.cli.simulating.simulated_cell", started)
     path, words = tmp_path / "CELL.toml", CELL.read_text(encoding="utf-8")
     path.write_text(words.replace("[planning]", "[planning]\nagainst = []"), encoding="utf-8")
     told = run(capsys, "simulate", path, "-o", tmp_path / "out", "--hide", hidden)

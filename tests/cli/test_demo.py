@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilcal.cli.running import TRIES, first_plan, retry_after_failures
+from hilcal.cli.simulating import TRIES, first_plan, retry_after_failures
 from hilcal.cli.terminal import terminal
 from hilcal.config import load_config
 from hilcal.errors import DeviceError, InputError
@@ -54,7 +54,7 @@ def test_the_demo_in_words(tmp_path, capsys, monkeypatch):
             made.append(first_plan(settings, quickly_planned(config), poses, say))
         return made[0]
 
-    monkeypatch.setattr("hilcal.cli.running.first_plan", plan)
+    monkeypatch.setattr("hilcal.cli.simulating.first_plan", plan)
     path, recording = tmp_path / "demo.hilcal", tmp_path / "demo.rrd"
     arguments = ("demo", FAST, "--hide", "hysteresis", "--seed", "1", "--poses", "8", "-o", path)
     words = ok(capsys, *arguments, "--record", recording).out

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hilcal.cli import demo
-from hilcal.cli.running import RehearsalSettings
+from hilcal.cli.simulating import RehearsalSettings
 from hilcal.config import load_config
 from hilcal.diagnosis.diagnosis import History, in_doubt
 from hilcal.diagnosis.evidence import Evidence

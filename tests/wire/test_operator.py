@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from hilcal.cli.running import with_person
+from hilcal.cli.simulating import with_person
 from hilcal.config.reference import to_toml
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.operator import open_operator as open_simulated
