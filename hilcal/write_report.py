@@ -14,10 +14,10 @@ from hilcal.present.html import FirstScreen
 from hilcal.present.html.report import ReportContent, TestCampaign, first_screen, page
 from hilcal.present.progress import Say
 from hilcal.present.story import build_story, of_left_out
-from hilcal.procedure.state import IMPROVED, Files
+from hilcal.procedure.state import Files
 from hilcal.readings.whitening import SCALINGS, Scaling
 from hilcal.store.overview import overview
-from hilcal.store.procedure_log import ProcedureLog
+from hilcal.store.procedure_log import IMPROVED, ProcedureLog
 from hilcal.store.revision import utc_now
 from hilcal.store.run_log import PLAN, RunLog
 from hilcal.transfer.compare import validate

@@ -98,6 +98,9 @@ class Calibration(Brief):
     covariance_source: CovarianceSource | None = None  # None where `root` is stated
     conditions: Mapping[str, Condition] = field(default_factory=dict)
     """Means that replace columns of `States` that points lack, by column."""
+    refuted_by: tuple[int, int] | None = None
+    """Points within their 95 % band, of all points of a test that refutes the bands, see
+    `improvement.refuted`; None: not refuted, or not tested."""
 
     @cached_property
     def _tracked(self) -> ToolPose:

@@ -409,6 +409,7 @@ class Compensation(Tabular):
         rows = zip(*columns.values(), strict=True)
         return {
             "calibration": dict(calibration.source),
+            "refuted": calibration.refuted_by is not None,
             "readings": calibration.mode,
             "base_in_tracker": se3.six(calibration.base_in_tracker()),
             "base_is": calibration.frames.base_is,

@@ -61,6 +61,7 @@ class Points:
     wrench: Floats | None = None  # (N, 6) at the load point, base axes; None if not stated
     sensor_wrench: Floats | None = None  # (N, 6) change of the sensor's reading, sensor axes
     recorded: Mapping[str, Floats] = field(default_factory=dict)  # other columns of `States`
+    loads: tuple[str, ...] = ()  # (N,) names of the loads; empty if not stated
     guess: str = ""  # meaning of guessed columns, for people
 
 
@@ -97,8 +98,9 @@ def read_points(
     pose_names = table.text.get("pose")
     names = tuple(pose_names) if pose_names else tuple(str(k + 1) for k in range(len(table.rows)))
     wrench, sensed = columns.pop("wrench", None), columns.pop("sensed", None)
-    if "load" in table.text:
-        wrench = np.stack([_load(table, k, loads) for k in range(len(table.rows))])
+    load_names = tuple(name or NO_LOAD for name in table.text.get("load", ()))
+    if load_names:
+        wrench = np.stack([_load(table, k, name, loads) for k, name in enumerate(load_names)])
     poses = _poses(columns, q, arm)
     if q is None and poses is None:
         raise InputError(
@@ -108,7 +110,7 @@ def read_points(
     if q is None:
         q = np.full((len(names), arm.n), np.nan)
     recorded = {k: v if v.shape[1] > 1 else v[:, 0] for k, v in columns.items()}
-    return Points(names, q, poses, wrench, sensed, recorded, guess)
+    return Points(names, q, poses, wrench, sensed, recorded, load_names, guess)
 
 
 def _plain(path: Path, arm: Arm, groups: "_Groups") -> ColumnTable | None:
@@ -331,9 +333,8 @@ def _checked(
     return text, [name for name in header if name in listed]
 
 
-def _load(table: ColumnTable, row: int, loads: Mapping[str, Floats]) -> Floats:
-    name = table.text["load"][row]
-    if name in (NO_LOAD, ""):
+def _load(table: ColumnTable, row: int, name: str, loads: Mapping[str, Floats]) -> Floats:
+    if name == NO_LOAD:
         return np.zeros(6)
     if name not in loads:
         valid = ", ".join((NO_LOAD, *loads))

@@ -73,6 +73,7 @@ def to_json(c: Calibration) -> dict[str, object]:
         "conditions": c.conditions,
         "loads": c.loads,
         "force_sensor": c.sensor,
+        "refuted_by": c.refuted_by,
     }
     return {key: encode(value) for key, value in content.items()}
 
@@ -124,6 +125,7 @@ def _read(content: Mapping[str, Any], catalogue: Catalogue) -> Calibration:
         source=content["source"],
         sensor=decode(SensorMount | None, content.get("force_sensor")),
         conditions=decode(Mapping[str, Condition], content.get("conditions", {})),
+        refuted_by=decode(tuple[int, int] | None, content.get("refuted_by")),
     )
     _check(calibration, cell.arm.n)
     return calibration
@@ -209,6 +211,8 @@ def _check(c: Calibration, n: int) -> None:
             raise ValueError(f"{name!r} is no condition")
         numbers(name, x.mean, (n,) if name in ("joint_temperature", "approach") else ())
         numbers(f"variance by {name}", x.variance_m2, minimum=0.0)
+    if c.refuted_by is not None and not 0 <= c.refuted_by[0] <= c.refuted_by[1]:
+        raise ValueError("refuted_by is not a number of points within their band, and of all")
     for name, wrench in c.loads.items():
         numbers(f"load {name}", wrench, (6,))
     if c.sensor is not None:

@@ -10,6 +10,7 @@ from typing import Any, Self
 import numpy as np
 
 from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.improvement import refuted
 from hilcal.campaign import revisions
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
@@ -42,7 +43,7 @@ from hilcal.refinement import Refinement
 from hilcal.shown import Brief
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.overview import overview
-from hilcal.store.procedure_log import refuse_fitting
+from hilcal.store.procedure_log import IMPROVED, ProcedureLog, refuse_fitting
 from hilcal.store.revision import CELL, STORED_HASH, RevisionRecord
 from hilcal.store.rows import content_hash
 from hilcal.store.run_log import PLAN, RunLog
@@ -369,7 +370,16 @@ class Campaign(Brief):
             "readings_sha256": record.data_hash,
             **self._kinematics(),
         }
-        return Calibration.of(self.restore(record), source)
+        calibration = Calibration.of(self.restore(record), source)
+        return replace(calibration, refuted_by=self._refuted_by(record))
+
+    def _refuted_by(self, record: RevisionRecord) -> tuple[int, int] | None:
+        """Return `Calibration.refuted_by` of a revision."""
+        tested = ProcedureLog(self.file).last(IMPROVED)
+        if tested is None or tested["revision"] != record.number:
+            return None
+        inside, count = tested["error"]["inside"], tested["error"]["count"]
+        return (inside, count) if refuted(inside, count) else None
 
     def _kinematics(self) -> dict[str, object]:
         """Return the controller's kinematics for a calibration; empty where unknown."""

@@ -11,7 +11,6 @@ import numpy as np
 
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensation import Compensation
-from hilcal.calibration.improvement import refuted
 from hilcal.calibration.points import Points, on_branch, read_points, stated_twice
 from hilcal.calibration.programs import urscript
 from hilcal.calibration.programs.languages import READERS, ResolvedProgram, read_program
@@ -22,22 +21,21 @@ from hilcal.cli.terminal import Terminal
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit_document import with_nulls
-from hilcal.measuring.feasibility import MOTION_CHECKS, Feasibility
+from hilcal.measuring.feasibility import MOTION_CHECKS, PAYLOAD, Feasibility
 from hilcal.measuring.motion import PAYLOAD_KG
-from hilcal.names import csv_text, quoted
+from hilcal.names import csv_text
 from hilcal.numbers import length
 from hilcal.present.calibration import (
     compensation_report,
     refusals,
+    refuted_line,
     waypoint_outcomes,
     waypoints_table,
 )
 from hilcal.present.progress import working
-from hilcal.procedure.state import IMPROVED, Files
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.store.plan import UNLOADED
-from hilcal.store.procedure_log import ProcedureLog
 from hilcal.tables.columns import joint_columns
 from hilcal.tables.mapping import PointMapping, find_mapping
 from hilcal.types import Bools, Floats
@@ -46,6 +44,10 @@ from hilcal.whole_file import replace_file
 PROGRAMS = (".script", ".urscript")
 TABLE_SUFFIXES = (".csv", ".json", *PROGRAMS)
 MAX_NAMED = 5  # Most refused points that an error names
+_UNCHECKED = (
+    "a calibration does not have the cell's workspace, obstacles and masses of loads: whether the "
+    "cell allows the points was not checked"
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,7 +109,7 @@ def compensate(
         _check_output(path, points, force)
     with working(t.progress) as say:
         say(f"reading {model}")
-        calibration, doubt = _calibration(model, catalogue, revision)
+        calibration = _calibration(model, catalogue, revision)
         arm = calibration.model.cell.arm
         start = None if options.near is None else _numbers(options.near, arm.n, "--near")
         start = None if start is None else np.where(arm.slides, start, np.radians(start))
@@ -156,14 +158,17 @@ def compensate(
     t.show(compensation_report(calibration, task.points.names, q, result))
     t.show(waypoints_table(outcomes))
     cell = calibration.model.cell
-    if doubt:
+    if doubt := refuted_line(calibration, model):
         t.notice(f"warning: {doubt}")
     if remark := "" if task.program else _two_targets(targets, arm, on_flange):
         t.notice(f"note: {points}: {remark}")
-    names, load = task.points.names, options.load or UNLOADED
-    cautions = _other_payload(task, wrench, cell), _not_allowed(cell, names, result.q, load)
+    names = task.points.names
+    loads = task.points.loads or (options.load or UNLOADED,) * len(names)
+    cautions = _other_payload(task, wrench, cell), _not_allowed(cell, names, result.q, loads)
     for caution in filter(None, cautions):
         t.notice(f"warning: {points}: {caution}")
+    if cell.config is None:
+        t.notice(f"note: {model}: {_UNCHECKED}")
     hint = "Nothing was written; -o F.csv, F.json or F.script writes the joint values."
     t.show(f"\nWritten: {', '.join(written)}." if written else f"\n{hint}")
     for path in files if task.program is None and task.foreign is None else ():
@@ -200,20 +205,24 @@ def _other_payload(task: _Task, wrench: Floats | None, cell: Cell) -> str:
     )
 
 
-def _not_allowed(cell: Cell, names: Sequence[str], q: Floats, load: str) -> str:
+def _not_allowed(cell: Cell, names: Sequence[str], q: Floats, loads: Sequence[str]) -> str:
     """Return why the campaign's cell does not allow some joint values (N, n), or "".
 
-    The joints' own limits are those of the arm, beyond which a point is refused.
+    `loads` (N,) are names. The joints' own limits are those of the arm, beyond which a point is
+    refused.
     """
     if cell.config is None:
         return ""
-    limits = Feasibility(cell)
-    bad = np.flatnonzero(~limits.allowed(q, load, MOTION_CHECKS))
-    if not len(bad):
+    limits, kinds, bad = Feasibility(cell), (*MOTION_CHECKS, PAYLOAD), np.zeros(len(q), bool)
+    for load in dict.fromkeys(loads):
+        under = np.array([name == load for name in loads])
+        bad[under] = ~limits.allowed(q[under], load, kinds)
+    if not bad.any():
         return ""
-    found = (v.line(names[bad[0]]) for v in limits.findings(q[bad[:1]], load, MOTION_CHECKS))
-    why = next(iter((*found, *limits.unbearable(load).values())))
-    more = f" (and {len(bad) - 1} more points)" if len(bad) > 1 else ""
+    k = int(np.argmax(bad))
+    found = (v.line(names[k]) for v in limits.findings(q[k][None], loads[k], kinds))
+    why = next(iter((*found, *limits.unbearable(loads[k]).values())))
+    more = f" (and {bad.sum() - 1} more points)" if bad.sum() > 1 else ""
     return f"the cell of the campaign does not allow {why}{more}"
 
 
@@ -233,22 +242,13 @@ def _program_poses(task: _Task, calibration: Calibration, q: Floats, arm: Arm) -
     return np.where(stated, targets, nominal)
 
 
-def _calibration(path: Path, catalogue: Catalogue, revision: int | None) -> tuple[Calibration, str]:
-    """Return a calibration, and why its own test refutes its bands; "" where it does not."""
+def _calibration(path: Path, catalogue: Catalogue, revision: int | None) -> Calibration:
     if path.suffix == ".json":
         if revision is not None:
             raise InputError(f"{path}: a calibration has no revisions; leave out --revision")
-        return Calibration.load(path, catalogue), ""
+        return Calibration.load(path, catalogue)
     with Campaign.open(path, catalogue, read_only=True) as run:
-        calibration, gain = run.calibration(revision), ProcedureLog(run.file).last(IMPROVED)
-        if gain is None or gain["revision"] != calibration.source["revision"]:
-            return calibration, ""
-        inside, count = gain["error"]["inside"], gain["error"]["count"]
-        return calibration, refuted(inside, count) * (
-            f"{path}: {inside} of {count} points that were measured at corrected targets lie "
-            "within their 95 % band: the bands stated here do not hold; calibrate again, or ask "
-            f"what has changed: hilcal compare {quoted(path)} {quoted(Files(path).validation)}"
-        )
+        return run.calibration(revision)
 
 
 def _task(

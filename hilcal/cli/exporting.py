@@ -22,6 +22,7 @@ from hilcal.errors import InputError
 from hilcal.identification import parameters_document
 from hilcal.identification.prediction.full_prediction import residual_table
 from hilcal.numbers import length
+from hilcal.present.calibration import refuted_line
 from hilcal.present.progress import Say, working
 from hilcal.present.registration import base_line
 from hilcal.readings.covariance import INSTRUMENT
@@ -161,7 +162,7 @@ def export(
             t.show(f"{options.revisions}: revisions 1 to {len(records)}; {record.number} is in use")
         if record is not None and options.of_model:
             with working(t.progress) as say:
-                t.show(_write_model(say, campaign, revision, record, options))
+                t.show(_write_model(t, say, campaign, revision, record, options))
     t.document({"written": [str(path) for path in options.paths]})
 
 
@@ -201,7 +202,12 @@ def cell_toml(run: Campaign) -> str:
 
 
 def _write_model(
-    say: Say, run: Campaign, revision: int | None, record: RevisionRecord, options: ExportOptions
+    t: Terminal,
+    say: Say,
+    run: Campaign,
+    revision: int | None,
+    record: RevisionRecord,
+    options: ExportOptions,
 ) -> Iterator[str]:
     number, parameters = record.number, options.parameters
     source: dict[str, object] = {"campaign": run.path.name, "revision": number}
@@ -236,6 +242,8 @@ def _write_model(
         return
     say("restoring the fit, and what it knows of other readings")
     identified = run.calibration(revision)
+    if doubt := refuted_line(identified, run.path):
+        t.notice(f"warning: {doubt}")
     if options.calibration is not None:
         identified.save(options.calibration)
         yield f"{options.calibration}: the calibration of revision {number}"

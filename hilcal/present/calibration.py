@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,12 +17,14 @@ from hilcal.calibration.programs.urscript import Waypoint
 from hilcal.identification.bootstrap import Bootstrap
 from hilcal.identification.carried.carried_prior import names_of
 from hilcal.identification.prediction import validation
+from hilcal.names import quoted
 from hilcal.numbers import length
 from hilcal.present.document import Block, Table, heading, load_name, note, table
 from hilcal.present.fit import error_words, kind, model_name
 from hilcal.present.progress import duration_text
 from hilcal.present.registration import base_line
 from hilcal.present.verdict import UNCALIBRATED, repeatability_source
+from hilcal.procedure.state import Files
 from hilcal.readings.whitening import Mode
 from hilcal.types import Floats
 
@@ -284,6 +287,22 @@ def compensation_report(
         )
     if len(names) > MOST_POINTS:
         yield f"The {MOST_POINTS} of {len(names)} points with the largest error before are listed."
+
+
+def refuted_line(calibration: Calibration, path: Path) -> str:
+    """Return that a test at corrected targets refutes a calibration; "" where none does.
+
+    `path` is its campaign, or its file, beside which the campaign is looked for.
+    """
+    if calibration.refuted_by is None:
+        return ""
+    inside, count = calibration.refuted_by
+    run = path.parent / str(calibration.source.get("campaign", "RUN.hilcal"))
+    return (
+        f"{path}: {inside} of {count} points that were measured at corrected targets lie within "
+        "their 95 % band: the bands stated here do not hold; calibrate again, or ask what has "
+        f"changed: hilcal compare {quoted(run)} {quoted(Files(run).validation)}"
+    )
 
 
 def _contributions(calibration: Calibration, unstated: Sequence[str]) -> Iterator[str]:

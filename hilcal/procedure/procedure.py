@@ -55,6 +55,7 @@ from hilcal.store.procedure_log import (
     CALIBRATION,
     CORRECTED,
     ENTRY,
+    IMPROVED,
     PURPOSE,
     VALIDATION,
     ProcedureLog,
@@ -341,9 +342,9 @@ class Procedure:
             p = o.predictive(record, *o.restore_model(record))
             gain = improvement(calibration, p, uncorrected, corrected, uncorrected.states, left_out)
             log = ProcedureLog(o.file)
-            if log.last(state.IMPROVED) is None:
+            if log.last(IMPROVED) is None:
                 content = {"revision": record.number, "readings_sha256": moved.data_hash()}
-                log.append(state.IMPROVED, {**content, **gain.to_dict()})
+                log.append(IMPROVED, {**content, **gain.to_dict()})
         return gain
 
     def _rng(self, *stream: int) -> np.random.Generator:

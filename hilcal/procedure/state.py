@@ -11,7 +11,14 @@ from hilcal.readings.whitening import Mode
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.codec import decode, encode
 from hilcal.store.plan import REFERENCE, Plan, read_plan
-from hilcal.store.procedure_log import CALIBRATION, CORRECTED, PURPOSE, VALIDATION, ProcedureLog
+from hilcal.store.procedure_log import (
+    CALIBRATION,
+    CORRECTED,
+    IMPROVED,
+    PURPOSE,
+    VALIDATION,
+    ProcedureLog,
+)
 from hilcal.store.run_log import PLAN, RunLog
 from hilcal.types import Floats
 
@@ -23,8 +30,8 @@ MOVING: tuple[Kind, ...] = get_args(Moving)
 _VALIDATING: tuple[Kind, Kind, Kind] = ("plan_validation", "measure_validation", "validate")
 _CORRECTING: tuple[Kind, Kind, Kind] = ("correct", "measure_corrected", "compare")
 BEGUN, REFINED, DECIDED, FROZEN = "begun", "refined", "decided", "frozen"
-VALIDATED, IMPROVED, WORLD = "validated", "improved", "world"
-"""Kinds of entries in the log."""
+VALIDATED, WORLD = "validated", "world"
+"""Kinds of entries in the log, beside `IMPROVED`."""
 MEASURE, STOP = "measure", "stop"
 """Decisions: measure a further plan, or stop measuring."""
 SUFFIX = ".hilcal"

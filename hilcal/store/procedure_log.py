@@ -21,6 +21,7 @@ from hilcal.store.run_log import RunLog
 from hilcal.store.stored_schema import check_entry
 
 ENTRY = "calibrate {}"  # keys of the entries, numbered from 1
+IMPROVED = "improved"  # kind: errors before and after the correction, as measured
 
 
 class ProcedureLog:

@@ -8,12 +8,13 @@ import pytest
 
 import hilcal as hc
 from hilcal.calibration.programs.urscript import waypoints
+from hilcal.config import load_config
 from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.readings.readings import States
 from hilcal.robot.chain import evaluate
 from hilcal.robot.factory import with_factory
 from hilcal.robot.se3 import matrix, of_six, rotation, six
-from tests.support.cli_cases import ok, refused, rehearsal, stored_readings
+from tests.support.cli_cases import CELL, ok, refused, rehearsal, stored_readings
 from tests.support.factory_cases import factory_of
 
 JOINTS = "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg"
@@ -21,7 +22,10 @@ JOINTS = "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg"
 
 def made(path):
     """Write a campaign without any revision."""
-    return stored_readings(path, rehearsal("nothing").readings, covers=INSTRUMENT_AND_ARM)
+    config = load_config(CELL)
+    heavy = config.loads[0].model_copy(update={"name": "heavy", "mass_kg": 13.0})
+    config = config.model_copy(update={"loads": (*config.loads, heavy)})
+    return stored_readings(path, rehearsal("nothing").readings, config, INSTRUMENT_AND_ARM)
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +72,14 @@ def test_a_table_becomes_joint_values_that_the_model_confirms(capsys, fitted, tm
         reached = c.predict(q, c.loads["10kg"], std=False).position
     assert np.abs(reached - nominal).max() < 1e-8
     np.testing.assert_allclose([w.q for w in waypoints(script.read_text())], q, atol=2e-9)
+
+
+def test_a_calibration_file_says_that_it_has_no_cell_to_check(capsys, fitted, tmp_path):
+    arm, points = tmp_path / "arm.json", table(tmp_path, fitted)
+    ok(capsys, "export", fitted, "--calibration", arm)
+    said = " ".join(ok(capsys, "compensate", arm, points).err.split())
+    assert f"note: {arm}: a calibration does not have the cell's workspace" in said
+    assert "was not checked" not in ok(capsys, "compensate", fitted, points).err
 
 
 def test_a_program_is_rewritten_and_a_calibration_file_will_do(capsys, fitted, tmp_path):
@@ -178,6 +190,14 @@ def test_what_may_be_another_motion_than_meant_is_said(capsys, fitted, tmp_path)
     said = " ".join(ok(capsys, "compensate", fitted, points, "--allow-outside").err.split())
     assert "does not allow low: forearm is 0.525 m outside the workspace" in said
     assert "(and 1 more points)" in said
+    hanging = "0,-0.3,0.3,0,1.5,0"
+    points.write_text(f"{head},load\nbare,{hanging},none\nhung,{hanging},5kg\n")
+    said = " ".join(ok(capsys, "compensate", fitted, points, "--allow-outside").err.split())
+    assert "does not allow hung: what hangs (5kg) is 0.105 m outside" in said
+    assert "more points" not in said
+    points.write_text(f"{head},load\nbare,{joints},\nmuch,{joints},heavy\n")
+    said = " ".join(ok(capsys, "compensate", fitted, points, "--allow-outside").err.split())
+    assert "tool and load are 13.8 kg; the payload of ur10e is 12.5 kg" in said
     program.write_text(f"def weld():\n  set_payload(5.8)\n  movej([{joints}])\nend\n")
     said = " ".join(ok(capsys, "compensate", fitted, program).err.split())
     assert "it sets a payload of 5.8 kg, and is corrected for 0.8 kg" in said

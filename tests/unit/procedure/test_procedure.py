@@ -171,8 +171,16 @@ def test_an_arm_that_changes_before_its_validation_refutes_the_prediction(tmp_pa
     points = tmp_path / "points.csv"
     points.write_text(f"pose,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad\na,{q}\n")
     warned = ok(capsys, "compensate", d.procedure.run, points).err
-    every = found.everything
-    assert f"warning: {d.procedure.run}: {every.inside} of {every.count} points that" in warned
+    every, arm = found.everything, tmp_path / "arm.json"
+    words = f"{every.inside} of {every.count} points that"
+    assert f"warning: {d.procedure.run}: {words}" in warned
+    exported = ok(capsys, "export", d.procedure.run, "--calibration", arm)
+    assert f"warning: {d.procedure.run}: {words}" in exported.err
+    of_file = ok(capsys, "compensate", arm, points, "--json")
+    assert f"warning: {arm}: {words}" in of_file.err
+    assert f"hilcal compare {d.procedure.run} {d.procedure.files.validation}" in of_file.err
+    assert of_file.document["refuted"]
+    assert f"refuted_by: {every.inside, every.count}" in repr(hc.Calibration.load(arm))
     assert not refuted(6, 8)
     assert not refuted(0, 2)
 
