@@ -44,6 +44,7 @@ from hilcal.whole_file import replace_file
 PROGRAMS = (".script", ".urscript")
 TABLE_SUFFIXES = (".csv", ".json", *PROGRAMS)
 MAX_NAMED = 5  # Most refused points that an error names
+SAME_MOUNTING_DEG = 1.0  # largest angle between a program's gravity and the cell's; a choice
 _UNCHECKED = (
     "a calibration does not have the cell's workspace, obstacles and masses of loads: whether the "
     "cell allows the points was not checked"
@@ -164,7 +165,11 @@ def compensate(
         t.notice(f"note: {points}: {remark}")
     names = task.points.names
     loads = task.points.loads or (options.load or UNLOADED,) * len(names)
-    cautions = _other_payload(task, wrench, cell), _not_allowed(cell, names, result.q, loads)
+    cautions = (
+        _other_payload(task, wrench, cell),
+        _other_gravity(task, cell),
+        _not_allowed(cell, names, result.q, loads),
+    )
     for caution in filter(None, cautions):
         t.notice(f"warning: {points}: {caution}")
     if cell.config is None:
@@ -191,17 +196,36 @@ def _two_targets(points: Points, arm: Arm, tool: Floats) -> str:
 
 
 def _other_payload(task: _Task, wrench: Floats | None, cell: Cell) -> str:
-    """Return that a UR program sets another mass than the points are corrected for, or ""."""
-    stated = next((w.payload_kg for w in task.waypoints if w.payload_kg is not None), None)
-    if stated is None:
+    """Return that a program states another mass than the points are corrected for, or ""."""
+    stated = [("it", w.payload_kg) for w in task.waypoints if w.payload_kg is not None]
+    if task.foreign is not None:
+        stated = [(f"line {line}", kg) for line, kg in task.foreign.program.payloads]
+    if not stated:
         return ""
     force, g = np.zeros(3) if wrench is None else wrench[:3], cell.gravity
     mass = cell.tool_mass + float(force @ g) / max(float(g @ g), 1e-9)
-    if abs(stated - mass) <= PAYLOAD_KG:
+    for where, kg in stated:
+        if abs(kg - mass) > PAYLOAD_KG:
+            return (
+                f"{where} sets a payload of {kg:.4g} kg, and is corrected for {mass:.4g} kg, the "
+                "tool of the cell with what --load or --wrench adds: where the arm carries more, "
+                "say so by them"
+            )
+    return ""
+
+
+def _other_gravity(task: _Task, cell: Cell) -> str:
+    """Return that a UR program is of an arm that is mounted otherwise, or ""."""
+    stated = next((w.gravity for w in task.waypoints if w.gravity is not None), None)
+    if stated is None or not stated.any():
+        return ""
+    across = np.linalg.norm(np.cross(stated, cell.gravity))
+    angle = float(np.degrees(np.arctan2(across, stated @ cell.gravity)))
+    if angle <= SAME_MOUNTING_DEG:
         return ""
     return (
-        f"it sets a payload of {stated:.4g} kg, and is corrected for {mass:.4g} kg, the tool of "
-        "the cell with what --load or --wrench adds: where the arm carries more, say so by them"
+        f"its set_gravity is {angle:.3g}° from [robot] gravity_m_s2 of the cell, with which it is "
+        "corrected: the arm that was measured is mounted otherwise"
     )
 
 

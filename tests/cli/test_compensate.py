@@ -202,6 +202,61 @@ def test_what_may_be_another_motion_than_meant_is_said(capsys, fitted, tmp_path)
     said = " ".join(ok(capsys, "compensate", fitted, program).err.split())
     assert "it sets a payload of 5.8 kg, and is corrected for 0.8 kg" in said
     assert "payload" not in ok(capsys, "compensate", fitted, program, "--load", "5kg").err
+    for gravity, warns in (("0, 0, 9.82", False), ("0, 6.9, 6.9", True), ("0, 0, -9.82", True)):
+        program.write_text(f"set_gravity([{gravity}])\nmovej([{joints}])\n")
+        said = " ".join(ok(capsys, "compensate", fitted, program).err.split())
+        assert ("from [robot] gravity_m_s2 of the cell" in said) == warns
+
+
+KRL = """DEF weld( )
+DECL FDAT FP1={{TOOL_NO 1,BASE_NO 0,IPO_FRAME #BASE}}
+LOAD_DATA[1]={{M {},CM {{X 0,Y 0,Z 60,A 0,B 0,C 0}},J {{X 0,Y 0,Z 0}}}}
+{}
+PTP {{{}}}
+END
+"""
+RAPID = r"""MODULE Weld
+PERS tooldata tGun:=[TRUE,[[0,0,0],[1,0,0,0]],[{},[0,0,60],[1,0,0,0],0,0,0]];
+PERS loaddata lPart:=[5,[0,0,60],[1,0,0,0],0,0,0];
+PROC main()
+{}MoveAbsJ [[{}],[9E9,9E9,9E9,9E9,9E9,9E9]]{},v100,fine,tGun;
+ENDPROC
+ENDMODULE
+"""
+
+
+@pytest.mark.parametrize(
+    ("suffix", "text", "mass"),
+    [
+        (".src", KRL.format(5.8, "BAS(#TOOL,1)", "{}"), 5.8),
+        (".src", KRL.format(5.8, "FDAT_ACT=FP1\nBAS(#PTP_PARAMS,100)", "{}"), 5.8),
+        (".src", KRL.format(1, "$LOAD = {M 5.8,CM {X 0,Y 0,Z 0,A 0,B 0,C 0}}", "{}"), 5.8),
+        (".src", KRL.format(1, "$LOAD.M = 5.8", "{}"), 5.8),
+        (".src", KRL.format(-1, "BAS(#TOOL,1)", "{}"), None),  # not stated
+        (".src", KRL.format(1, "$TOOL = $NULLFRAME", "{}"), None),
+        (".mod", RAPID.format(5.8, "", "{}", ""), 5.8),
+        (".mod", RAPID.format(0.8, "GripLoad lPart;", "{}", ""), 5.8),
+        (".mod", RAPID.format(5.8, "GripLoad load0;", "{}", ""), 5.8),
+        (".mod", RAPID.format(5.8, "GripLoad lOther;", "{}", ""), None),
+        (".mod", RAPID.format(5.8, "", "{}", r"\TLoad:=lPart"), 5.0),
+        (".mod", RAPID.format(-1, "", "{}", ""), None),
+    ],
+)
+def test_a_mass_that_a_program_of_another_maker_states_is_compared(
+    capsys, fitted, tmp_path, suffix, text, mass
+):
+    with hc.Campaign.open(fitted, read_only=True) as run:
+        values = [f"{q:.9f}" for q in np.degrees(run.readings.states.q[0])]
+    if suffix == ".src":
+        values = [f"A{k} {q}" for k, q in enumerate(values, start=1)]
+    program = tmp_path / f"weld{suffix}"
+    program.write_text(text.replace("{}", ",".join(values)))
+    said = " ".join(ok(capsys, "compensate", fitted, program).err.split())
+    assert ("sets a payload" in said) == (mass is not None)
+    if mass is not None:
+        assert f"sets a payload of {mass:.4g} kg, and is corrected for 0.8 kg" in said
+    if mass == 5.8:
+        assert "payload" not in ok(capsys, "compensate", fitted, program, "--load", "5kg").err
 
 
 def test_points_outside_are_refused_by_name_unless_told_otherwise(capsys, fitted, tmp_path):

@@ -8,7 +8,8 @@ each axis at a negative angle; the controller obeys both in PTP motions and neit
 Tool and base are `$TOOL` and `$BASE`, set earlier in the text by an assignment, `BAS(#TOOL, n)`,
 `BAS(#BASE, n)`, by an inline form (`FDAT`), or in the motion (`WITH`). Values that are set within a
 branch or a loop are unknown after its end, and both after the call of a subprogram, which may set
-them.
+them. The mass at the flange is M of `$LOAD`, which `BAS(#TOOL, n)` and an inline form set to
+`LOAD_DATA[n]`; a negative one is not stated.
 
 Source: KUKA, *KUKA System Software 8.3, Operating and Programming Instructions for System
 Integrators*, chapters 10 to 12; *Expert Programming*, status and turn.
@@ -57,6 +58,8 @@ _NAME = re.compile(r"\$?[A-Za-z_]\w*(?:\s*\[\s*\d+\s*\])?")
 _PLAIN = re.compile(rf"({_NAME.pattern})?\s*(C_\w+\b|WITH\b|\{{|$)", re.IGNORECASE)
 """A target that is a name or an aggregate, at the beginning of a motion's arguments."""
 _SET = re.compile(r"^\s*\$(TOOL|BASE)\s*=\s*(.+)$", re.IGNORECASE)
+_LOAD = re.compile(r"^\s*\$LOAD\s*(\.\s*M\s*)?=\s*(.+)$", re.IGNORECASE)
+_MASS = re.compile(rf"\bM\s+({DECIMAL}(?:[eE][-+]?\d+)?)", re.IGNORECASE)
 _BAS = re.compile(r"^\s*BAS\s*\(\s*#(\w+)\s*(?:,\s*([^)]*))?\)", re.IGNORECASE)
 _FDAT = re.compile(r"^\s*FDAT_ACT\s*=\s*(\w+)", re.IGNORECASE)
 _INDEX = re.compile(r"^(TOOL|BASE)_DATA\s*\[\s*(\d+)\s*\]$", re.IGNORECASE)
@@ -236,12 +239,16 @@ class _KrlReader(ProgramReader):
             self._motion(line, offset, code, m)
         elif m := _SET.match(code):
             self._set(m[1].upper(), m[2].strip(), line)
+        elif m := _LOAD.match(code):
+            self._load(f"M {m[2]}" if m[1] else m[2].strip(), line)
         elif m := _FDAT.match(code):
             self.form = m[1]
         elif m := _BAS.match(code):
             topic, number = m[1].upper(), (m[2] or "").strip()
             if topic in KINDS:
                 self._set(topic, f"{topic}_DATA[{number}]", line)
+                if topic == "TOOL":
+                    self._load(f"LOAD_DATA[{number}]", line)
             elif topic in ("PTP_PARAMS", "CP_PARAMS", "PTP_DAT", "CP_DAT", "FRAMES"):
                 self._of_form(self.form, line)
             elif topic == "INITMOV":
@@ -264,6 +271,17 @@ class _KrlReader(ProgramReader):
             raise self.error(line, reason, "a tool on the flange")
         for kind in kinds:
             self._set(kind, f"{kind}_DATA[{fields.get(f'{kind}_NO', ('0',))[0]}]", line)
+        if "TOOL" in kinds:
+            self._load(f"LOAD_DATA[{fields['TOOL_NO'][0]}]", line)
+
+    def _load(self, value: str, line: int) -> None:
+        """Record the mass of a load: of an aggregate, or of a declared one by its name."""
+        declared = self.data.get(_key(value), [])
+        mass = declared[0].numbers(["M"]) if len(declared) == 1 else None
+        if written := _MASS.search(value):
+            mass = np.array([float(written[1])])
+        if mass is not None and mass[0] >= 0.0:
+            self.payloads[line] = float(mass[0])
 
     def _set(self, kind: str, value: str, line: int) -> None:
         self.state = replace(self.state, **{kind.lower(): self._frame(kind, value, line)})

@@ -127,6 +127,8 @@ class Program:
     texts: tuple[str, ...]  # of its files, unchanged
     points: tuple[ProgramPoint, ...]  # in the order of their first use
     encoding: str = "utf-8"
+    payloads: tuple[tuple[int, float], ...] = ()
+    """Masses at the flange that it states, kg: tool and load together; each with its line."""
 
     @property
     def correctable_points(self) -> list[ProgramPoint]:
@@ -333,6 +335,7 @@ class ProgramReader:
         self.points: dict[str, ProgramPoint] = {}
         self.other_uses: dict[str, int] = {}
         """Points that statements other than motions use, with the line."""
+        self.payloads: dict[int, float] = {}  # `Program.payloads`
 
     def mark_not_corrected(self, line: int, why: str) -> None:
         """Record a motion that is not corrected."""
@@ -364,7 +367,8 @@ class ProgramReader:
         if not points:
             raise InputError(f"{self.path.name}: no motions; valid: {language.motions}")
         suffixes, texts = tuple(suffixes) or (self.path.suffix,), tuple(texts) or (self.text,)
-        return Program(language, suffixes, texts, points, self.encoding)
+        payloads = tuple(self.payloads.items())
+        return Program(language, suffixes, texts, points, self.encoding, payloads)
 
 
 def of_euler(values: Floats) -> Floats:

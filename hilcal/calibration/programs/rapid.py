@@ -9,6 +9,9 @@ centre behind the lower arm, and one behind axis 1.
 A robtarget is relative to the object frame of the motion's `\WObj`; its tool is the motion's last
 argument. This module or `--frames` has their `wobjdata` and `tooldata`.
 
+The mass at the flange is that of `\TLoad`, else that of the `tooldata` and of the last `GripLoad`
+of the routine; a negative one is not stated.
+
 Source: ABB, *Technical reference manual: RAPID Instructions, Functions and Data types*, robtarget,
 confdata, tooldata, wobjdata, MoveL, Offs, RelTool; *RAPID Overview*.
 """
@@ -47,7 +50,7 @@ _HEAD = re.compile(r"^[ \t]*(MODULE|(LOCAL[ \t]+)?PROC)\b[^\r\n]*", re.IGNORECAS
 _STATEMENT = re.compile(r"[^;]*;")
 _BLANK = re.compile(r'"[^"]*"|!.*')
 _DATA = re.compile(
-    r"^\s*(?:LOCAL\s+|TASK\s+)?(?:CONST|PERS|VAR)\s+(robtarget|jointtarget|tooldata|wobjdata)"
+    r"^\s*(?:LOCAL\s+|TASK\s+)?(?:CONST|PERS|VAR)\s+(robtarget|jointtarget|tooldata|wobjdata|loaddata)"
     r"\s+(\w+)\s*(\{[^}]*\})?\s*(?::=\s*(.*?))?\s*;$",
     re.IGNORECASE | re.DOTALL,
 )
@@ -64,6 +67,8 @@ _REFUSED = re.compile(
     re.IGNORECASE,
 )
 _CONF = re.compile(r"\b(ConfJ|ConfL)\s*\\\s*(On|Off)\b", re.IGNORECASE)
+_GRIP = re.compile(r"\bGripLoad\s+(\w+)", re.IGNORECASE)
+_TLOAD = re.compile(r"\\\s*TLoad\s*:=\s*(\w+)", re.IGNORECASE)
 _ASSIGNED = re.compile(r"\b([A-Za-z]\w*)(?:\.\w+|\{[^}]*\})*\s*:=")
 _NO_ASSIGNMENT = re.compile(r"(\b(CONST|PERS|VAR)\s[^;]*|\\\s*)$", re.IGNORECASE)
 _MADE = re.compile(r"^(Offs|RelTool)\s*\((.*)\)$", re.IGNORECASE | re.DOTALL)
@@ -147,7 +152,13 @@ class _RapidReader(ProgramReader):
             if not _NO_ASSIGNMENT.search(code[: m.start()])
         }
         self.used, obeyed = self._used_otherwise(), True
+        grips = any(_GRIP.search(code) for _, code in self.statements)
+        self.gripped: float | None = None if grips else 0.0  # kg
         for offset, code in self.statements:
+            if re.search(r"\bPROC\s", code, re.I):
+                self.gripped = None if grips else 0.0
+            if m := _GRIP.search(code):
+                self.gripped = self._mass("loaddata", m[1])
             if m := _REFUSED.search(code):
                 line = line_of(self.text, offset + m.start())
                 raise self.error(line, f"{m[1]} changes what points mean", "a program without it")
@@ -195,6 +206,14 @@ class _RapidReader(ProgramReader):
         work_object = re.search(r"\\\s*WObj\s*:=\s*(\w+)", options, re.I)
         tool_pose = self._frame("tooldata", tool)
         frame = self._frame("wobjdata", work_object[1] if work_object else "wobj0")
+        total = _TLOAD.search(options)
+        if total and total[1].upper() != "LOAD0":
+            mass = self._mass("loaddata", total[1])
+        else:
+            parts = self._mass("tooldata", tool), self.gripped
+            mass = None if None in parts else sum(filter(None, parts))
+        if mass is not None:
+            self.payloads[line] = mass
         joints = m[1].upper() == "MOVEABSJ"
         for place, text in targets:
             key, p = self._target(line, offset + place, text, joints)
@@ -221,6 +240,16 @@ class _RapidReader(ProgramReader):
         if not start.startswith("[FALSE,TRUE,") or len(numbers) != 2 * POSE:
             return f"{label} is not fixed, or not of numbers"
         return of_quaternion(numbers[:POSE]) @ of_quaternion(numbers[POSE:])
+
+    def _mass(self, kind: str, name: str) -> float | None:
+        """Return the mass of a tool without load or of a load, kg; None if it is not stated."""
+        if name.upper() == "LOAD0":
+            return 0.0
+        values = self.data.get(name.upper()) or self.frames.get(name.upper()) or []
+        if len(values) != 1 or values[0][0] != kind or name.upper() in self.assigned:
+            return None
+        numbers = numbers_in(values[0][1], _NUMBER, 0)[0][POSE if kind == "tooldata" else 0 :]
+        return float(numbers[0]) if len(numbers) and numbers[0] >= 0.0 else None
 
     def _target(self, line: int, offset: int, text: str, joints: bool) -> tuple[str, ProgramPoint]:
         """Return key and point of one target, without tool and reference frame."""

@@ -49,7 +49,8 @@ _STOPS = ("stopj", "stopl")
 _TOOL = "set_tcp"
 _MASSES = ("set_payload", "set_payload_mass", "set_target_payload")
 _PAYLOAD = (*_MASSES, "set_payload_cog")
-_SETUP = (_TOOL, *_PAYLOAD, "set_gravity")
+_GRAVITY = "set_gravity"
+_SETUP = (_TOOL, *_PAYLOAD, _GRAVITY)
 _HARMLESS = re.compile(
     r"a?(cos|sin|tan)|atan2|ceil|floor|d2r|r2d|log|pow|sqrt|norm|random|length|get_list_length"
     r"|(integer|binary_list)_to_(binary_list|integer)|rotvec2rpy|rpy2rotvec|inv|size|transpose"
@@ -100,6 +101,7 @@ class Waypoint:
     pose: Floats | None = None  # (4, 4) T_base_tool; None where the joint values are the target
     tool: Floats | None = None  # (4, 4) T_flange_tool that was set; None if none
     payload_kg: float | None = None  # mass that was set; None if none
+    gravity: Floats | None = None  # (3,) gravity that was set, base axes, m/s²; None if none
     blend_m: float = 0.0  # radius within which the arm passes without a stop, m
     not_corrected: str = ""  # why it is not corrected; empty if it is understood
     straight: bool = False  # whether the motion to it is a straight line
@@ -376,8 +378,12 @@ def _waypoint(p: _Program, k: int, setup: Mapping[str, tuple[int, list[Value | N
     tool = setup[_TOOL][1][0] if _TOOL in setup else None
     masses = (setup[n][1][0] for n in _MASSES if n in setup and setup[n][1])
     payload = next((m for m in masses if isinstance(m, float)), None)
+    gravity = None
+    match setup[_GRAVITY][1] if _GRAVITY in setup else ():
+        case [(_, (x, y, z))]:  # the acceleration away from the Earth
+            gravity = -np.array([x, y, z])
     q, pose = target_values
-    return replace(out, q=q, pose=pose, tool=_pose(tool), payload_kg=payload)
+    return replace(out, q=q, pose=pose, tool=_pose(tool), payload_kg=payload, gravity=gravity)
 
 
 def _set_up(
