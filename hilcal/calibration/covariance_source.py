@@ -53,7 +53,7 @@ class CovarianceSource:
         count = len(r.states)
         limits.check_numbers("the source of its covariance", count * r.m * max(model.size, 1))
         numbers("prior", self.prior, (model.size,), minimum=0.0)
-        numbers("noise", self.noise, minimum=0.0)
+        numbers("noise", self.noise, minimum=float(np.finfo(float).tiny))
         numbers("factor", self.factor, minimum=0.0)
         widths = dict.fromkeys(("q", "joint_temperature", "approach", "q_actual", "torque"), n)
         widths |= {"wrench": 6}

@@ -122,7 +122,7 @@ def _read(content: Mapping[str, Any], catalogue: Catalogue) -> Calibration:
         scatter=scatter,
         measured=decode(MeasuredRanges, content["measured"]),
         loads=decode(Mapping[str, Floats], content["loads"]),
-        source=content["source"],
+        source=dict(content["source"]),
         sensor=decode(SensorMount | None, content.get("force_sensor")),
         conditions=decode(Mapping[str, Condition], content.get("conditions", {})),
         refuted_by=decode(tuple[int, int] | None, content.get("refuted_by")),

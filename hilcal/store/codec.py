@@ -87,7 +87,8 @@ def frames(name: str, values: object, *, several: bool = False) -> Floats:
     numbers(name, array, (*array.shape[:several], 4, 4))
     turn = array[..., :3, :3]
     orthonormal = np.allclose(turn @ np.swapaxes(turn, -1, -2), np.eye(3), atol=1e-6)
-    if not orthonormal or np.any(array[..., 3, :] != [0.0, 0.0, 0.0, 1.0]):
+    rotation = orthonormal and np.all(np.linalg.det(turn) > 0.0)
+    if not rotation or np.any(array[..., 3, :] != [0.0, 0.0, 0.0, 1.0]):
         raise ValueError(f"{name} is not a homogeneous matrix of a rotation and a translation")
     return array
 

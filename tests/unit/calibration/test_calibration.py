@@ -169,7 +169,8 @@ def test_a_calibration_of_an_arm_of_unknown_payload_and_torques_comes_back(tmp_p
 
 
 def test_a_file_of_another_kind_is_refused_in_words(tmp_path):
-    good = to_json(calibrated("none"))
+    c, mirror = calibrated("none"), np.diag([-1.0, 1.0, 1.0, 1.0]).tolist()
+    good, exact = to_json(c), {**c.covariance_source.to_json(), "noise": 0.0}
     path = tmp_path / "c.json"
     for content, words in [
         ("{", "no calibration"),
@@ -179,6 +180,10 @@ def test_a_file_of_another_kind_is_refused_in_words(tmp_path):
         (json.dumps({**good, "parameters": []}), "other parameters"),
         (json.dumps({**good, "effects": [{"name": "mine", "options": {}}]}), "--effects-from"),
         (json.dumps({k: v for k, v in good.items() if k != "arm"}), "damaged"),
+        (json.dumps({**good, "source": None}), "damaged"),
+        (json.dumps({**good, "refuted_by": [3, 2]}), "damaged"),
+        (json.dumps({**good, "learnt": exact}), "noise has a number that is out"),
+        (json.dumps({**good, "cell": {**good["cell"], "target": mirror}}), "a rotation"),
     ]:
         path.write_text(content)
         error = refusal(r"c\.json", Calibration.load, path)
