@@ -45,6 +45,10 @@ PROGRAMS = (".script", ".urscript")
 TABLE_SUFFIXES = (".csv", ".json", *PROGRAMS)
 MAX_NAMED = 5  # Most refused points that an error names
 SAME_MOUNTING_DEG = 1.0  # largest angle between a program's gravity and the cell's; a choice
+_NO_LOAD = (
+    "no point has a load, and a calibration of deflections corrects nothing else: give --load, or "
+    "calibrate by absolute readings"
+)
 _UNCHECKED = (
     "a calibration does not have the cell's workspace, obstacles and masses of loads: whether the "
     "cell allows the points was not checked"
@@ -172,6 +176,8 @@ def compensate(
     )
     for caution in filter(None, cautions):
         t.notice(f"warning: {points}: {caution}")
+    if calibration.mode == "deflection" and not np.any(acting if acting is not None else 0.0):
+        t.notice(f"note: {points}: {_NO_LOAD}")
     if cell.config is None:
         t.notice(f"note: {model}: {_UNCHECKED}")
     hint = "Nothing was written; -o F.csv, F.json or F.script writes the joint values."

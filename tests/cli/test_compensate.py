@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -80,6 +81,15 @@ def test_a_calibration_file_says_that_it_has_no_cell_to_check(capsys, fitted, tm
     said = " ".join(ok(capsys, "compensate", arm, points).err.split())
     assert f"note: {arm}: a calibration does not have the cell's workspace" in said
     assert "was not checked" not in ok(capsys, "compensate", fitted, points).err
+
+
+def test_points_without_a_load_get_nothing_of_deflections(capsys, fitted, tmp_path):
+    arm, points = tmp_path / "arm.json", table(tmp_path, fitted)
+    replace(hc.Calibration.load(fitted), mode="deflection").save(arm)
+    words = "no point has a load, and a calibration of deflections corrects nothing else"
+    assert words in " ".join(ok(capsys, "compensate", arm, points).err.split())
+    assert words not in " ".join(ok(capsys, "compensate", arm, points, "--load", "5kg").err.split())
+    assert words not in " ".join(ok(capsys, "compensate", fitted, points).err.split())
 
 
 def test_a_program_is_rewritten_and_a_calibration_file_will_do(capsys, fitted, tmp_path):
