@@ -126,6 +126,7 @@ ENTRIES: Mapping[str, Schema] = {
     "refined": _event(readings_sha256=Text, revisions=Annotated[list[Count], Field(min_length=1)]),
     "decided": _event(action=Text),
     "frozen": _event(readings_sha256=Text),
+    "improved": _event(revision=Count, error=_of(inside=Count, count=Count)),
 }
 """Entries of a calibration's log, by kind."""
 

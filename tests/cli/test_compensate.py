@@ -242,6 +242,7 @@ ENDMODULE
         (".src", KRL.format(5.8, "FDAT_ACT=FP1\nBAS(#PTP_PARAMS,100)", "{}"), 5.8),
         (".src", KRL.format(1, "$LOAD = {M 5.8,CM {X 0,Y 0,Z 0,A 0,B 0,C 0}}", "{}"), 5.8),
         (".src", KRL.format(1, "$LOAD.M = 5.8", "{}"), 5.8),
+        (".src", KRL.format(1, "$LOAD.M = 5.8 + X", "{}"), None),  # computed
         (".src", KRL.format(-1, "BAS(#TOOL,1)", "{}"), None),  # not stated
         (".src", KRL.format(1, "$TOOL = $NULLFRAME", "{}"), None),
         (".mod", RAPID.format(5.8, "", "{}", ""), 5.8),

@@ -59,7 +59,7 @@ _PLAIN = re.compile(rf"({_NAME.pattern})?\s*(C_\w+\b|WITH\b|\{{|$)", re.IGNORECA
 """A target that is a name or an aggregate, at the beginning of a motion's arguments."""
 _SET = re.compile(r"^\s*\$(TOOL|BASE)\s*=\s*(.+)$", re.IGNORECASE)
 _LOAD = re.compile(r"^\s*\$LOAD\s*(\.\s*M\s*)?=\s*(.+)$", re.IGNORECASE)
-_MASS = re.compile(rf"\bM\s+({DECIMAL}(?:[eE][-+]?\d+)?)", re.IGNORECASE)
+_MASS = re.compile(rf"\bM\s+({DECIMAL}(?:[eE][-+]?\d+)?)\s*(?=[,}}]|$)", re.IGNORECASE)
 _BAS = re.compile(r"^\s*BAS\s*\(\s*#(\w+)\s*(?:,\s*([^)]*))?\)", re.IGNORECASE)
 _FDAT = re.compile(r"^\s*FDAT_ACT\s*=\s*(\w+)", re.IGNORECASE)
 _INDEX = re.compile(r"^(TOOL|BASE)_DATA\s*\[\s*(\d+)\s*\]$", re.IGNORECASE)

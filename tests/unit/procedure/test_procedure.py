@@ -21,7 +21,7 @@ from hilcal.procedure.state import DECIDED, FROZEN
 from hilcal.readings.same_readings import found_among
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import REFERENCE
-from hilcal.store.procedure_log import ProcedureLog, purpose_of, release
+from hilcal.store.procedure_log import IMPROVED, ProcedureLog, purpose_of, release
 from hilcal.store.run_log import RunLog, check_same_arm
 from hilcal.write_report import ReportOptions, content_of
 from tests.support.cli_cases import ok
@@ -183,6 +183,9 @@ def test_an_arm_that_changes_before_its_validation_refutes_the_prediction(tmp_pa
     assert f"refuted_by: {every.inside, every.count}" in repr(hc.Calibration.load(arm))
     assert not refuted(6, 8)
     assert not refuted(0, 2)
+    with CampaignFile.open(d.procedure.run) as damaged:
+        ProcedureLog(damaged).append(IMPROVED, {"revision": 1})
+    refusal(r"run\.hilcal.*error", hc.Calibration.load, d.procedure.run)
 
 
 @pytest.mark.long
