@@ -10,9 +10,9 @@ _UNITS: dict[str, tuple[tuple[str, float, float], ...]] = {
     "rad": (("µrad", 1e6, 1e-3), ("mrad", 1e3, math.inf)),
     "rad/(N·m)": (("µrad/(N·m)", 1e6, math.inf),),
     "m/N": (("nm/N", 1e9, math.inf),),
-    "m/N³": (("am/N³", 1e18, 1e-14), ("fm/N³", 1e15, math.inf)),
+    "m/N³": (("am/N³", 1e18, 1e-15), ("fm/N³", 1e15, math.inf)),
     "m/K": (("µm/K", 1e6, math.inf),),
-    "rad/(N·m)³": (("prad/(N·m)³", 1e12, 1e-8), ("nrad/(N·m)³", 1e9, math.inf)),
+    "rad/(N·m)³": (("prad/(N·m)³", 1e12, 1e-9), ("nrad/(N·m)³", 1e9, math.inf)),
     "m/s": (("µm/h", 3.6e9, math.inf),),
     "rad/s": (("µrad/h", 3.6e9, math.inf),),
     "rad/K": (("µrad/K", 1e6, math.inf),),
@@ -48,6 +48,13 @@ def joint_value(value: float, unit: str, places: int = 1) -> str:
     """Write a joint value in rad, or m of a slide, for people."""
     name, factor = joint_unit(unit)
     return f"{factor * value:.{places}f}{name if name == '°' else ' ' + name}"
+
+
+def time_unit(span_s: float) -> tuple[str, float]:
+    """Return the unit for people, and its factor, of times that span so many seconds."""
+    if span_s <= 120:
+        return "s", 1.0
+    return ("h", 1 / 3600) if span_s > 7200 else ("min", 1 / 60)
 
 
 def sizes(items: Iterable[tuple[str, float]]) -> str:
@@ -150,8 +157,9 @@ def sentence(message: str) -> str:
 
 def few(items: Sequence[str], most: int = 2) -> str:
     """Write the first names of a list, and the number of the others."""
-    remaining = len(items) - most
-    return ", ".join(items[:most]) + (f" and {remaining} more" if remaining > 0 else "")
+    if (remaining := len(items) - most) <= 0:
+        return names(items)
+    return f"{', '.join(items[:most])} and {remaining} more"
 
 
 def names(items: Sequence[str], word: str = "and") -> str:

@@ -2,17 +2,27 @@
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hilcal import numbers
-from hilcal.config.cell import Changes, write_value
+from hilcal.config.cell import CellConfig, Changes, write_value
 from hilcal.config.reference import REQUIRED, KeyTable
 from hilcal.doctor import Finding
 from hilcal.identification.fit import Fit
 from hilcal.measuring.session_state import RepeatabilityEstimate
-from hilcal.present.document import Block, Table, Words, heading, note, pairs, table
+from hilcal.present.document import (
+    Block,
+    Table,
+    Words,
+    heading,
+    load_name,
+    note,
+    pairs,
+    table,
+)
 from hilcal.present.fit import error_words, model_name
 from hilcal.present.progress import duration_text
 from hilcal.present.registration import observed_words
@@ -153,10 +163,15 @@ def factory_words(check: "FactoryCheck") -> Iterator[Block]:
     )
 
 
+def robot_name(config: CellConfig) -> str:
+    """Return the name of the arm; of one that a file describes, the name of the file."""
+    return PurePath(config.robot.model).name
+
+
 def info_report(o: Overview, name: str, covariance: str) -> Iterator[Block]:
     """Yield the contents of a campaign; `covariance` describes the covariances of its readings."""
     count = 0 if o.readings is None else len(o.readings)
-    yield heading(f"{name}: {count} readings of {o.poses} poses, {o.config.robot.model}")
+    yield heading(f"{name}: {count} readings of {o.poses} poses, {robot_name(o.config)}")
     yield from (pairs(_head(o, covariance)), "")
     if o.planned is not None:
         instruments = pairs(())
@@ -193,14 +208,14 @@ def _head(o: Overview, covariance: str) -> Iterator[tuple[str, str]]:
         extent += f", {o.plans} plans" if o.plans > 1 else ""
         time = None if o.readings is None else o.readings.states.time
         if time is not None:
-            extent += f", {np.ptp(time) / 60:.0f} min from first to last reading"
+            extent += f", {duration_text(float(np.ptp(time)))} from first to last reading"
         yield "measured", f"{o.measured} of {o.planned} planned steps in {extent}"
     if o.readings is None:
         yield "readings", "none yet"
         return
-    yield "loads", ", ".join(f"{name} {n}" for name, n in o.loads.items())
+    yield "loads", ", ".join(f"{load_name(name)} ({n})" for name, n in o.loads.items())
     if o.targets:
-        yield "targets", ", ".join(f"{name} {n}" for name, n in o.targets.items())
+        yield "targets", ", ".join(f"{name} ({n})" for name, n in o.targets.items())
     kind = "positions" if o.readings.m == 3 else "positions and orientations"
     kind = observed_words(o.readings) if o.readings.observers else kind
     yield "readings", f"{kind}; {covariance}"

@@ -226,8 +226,7 @@ def residual_by_pose(story: Story, revision: StoryRevision) -> go.Figure:
     """Draw the residual of each reading in σ over its pose, poses by number."""
     d, full = chart_readings(story, revision), [story.pose_name(int(i)) for i in story.first]
     out = _residuals(d, story.row[d.index].astype(float), "", _extremes(story, revision, "pose"))
-    short = [n if len(n) <= LONGEST_NAME else f"…{n[1 - LONGEST_NAME :]}" for n in full]
-    names, step = [label(n) for n in short], -(-len(full) // MOST_POSES)
+    names, step = [_tick(n) for n in full], -(-len(full) // MOST_POSES)
     return out.update_xaxes(tickvals=list(range(0, len(names), step)), ticktext=names[::step])
 
 
@@ -239,7 +238,7 @@ def residual_by_load(story: Story, revision: StoryRevision) -> go.Figure:
     # scattered within a load, so that points do not hide each other
     jitter = np.random.default_rng(0).uniform(-0.3, 0.3, len(position))
     out = _residuals(d, (position + jitter)[d.index], "load", _extremes(story, revision, "load"))
-    names = [label(load_name(name)) for name in loads]
+    names = [_tick(load_name(name)) for name in loads]
     return out.update_xaxes(tickvals=list(range(len(names))), ticktext=names)
 
 
@@ -255,7 +254,8 @@ def residual_over(
     if high.any():
         share = revision.whitened_norm2 / revision.elements
         low, beyond = (np.sqrt(np.mean(share[members])) for members in (~high, high))
-        median = f"{np.median(x):.0f}{unit if unit == '°' else f' {unit}'}".strip()
+        middle = float(np.median(x))
+        median = f"{middle:z.{int(abs(middle) < 10)}f}{unit if unit == '°' else f' {unit}'}".strip()
         says = (
             f"Residual over {name}: {numbers.digits(low, 2)} times the noise rms up to {median}, "
             f"{numbers.digits(beyond, 2)} times beyond."
@@ -275,8 +275,9 @@ def residual_by_time(story: Story, revision: StoryRevision) -> go.Figure:
     if story.time_s is None:
         rows = np.arange(len(story), dtype=float)
         return residual_over(story, revision, rows, "row, in the order of the file", "")
-    minutes = (story.time_s - story.time_s.min()) / 60
-    return residual_over(story, revision, minutes, "time since the first reading", "min")
+    unit, factor = numbers.time_unit(float(np.ptp(story.time_s)))
+    time = factor * (story.time_s - story.time_s.min())
+    return residual_over(story, revision, time, "time since the first reading", unit)
 
 
 def _extremes(story: Story, revision: StoryRevision, group: str) -> str:
@@ -291,6 +292,11 @@ def _extremes(story: Story, revision: StoryRevision, group: str) -> str:
     if len(names) == 1:
         return f"All readings are of {name}: {most} times the noise rms."
     return f"Worst is {name} with {most} times the noise rms; best, {least} times."
+
+
+def _tick(name: str) -> str:
+    """Return a name for an axis; of a long one the end, where names differ most."""
+    return label(name if len(name) <= LONGEST_NAME else f"…{name[1 - LONGEST_NAME :]}")
 
 
 def _residuals(d: ChartReadings, x: Floats, title: str, sentence: str) -> go.Figure:
@@ -320,8 +326,9 @@ def measured_predicted(story: Story, revision: StoryRevision) -> go.Figure:
     known, found = x[story.fitted], y[story.fitted]
     total = np.sum((found - found.mean(axis=0)) ** 2)
     share = 100 * (1 - np.sum((found - known) ** 2) / total) if total > 0 else 0.0
+    part = f"{share:.1f} %" if share > 0 else "none"
     says = (
-        f"Measured against predicted {measure}: the model accounts for {share:.1f} % of what was "
+        f"Measured against predicted {measure}: the model accounts for {part} of what was "
         f"measured.{d.note}"
     )
     x_title, y_title = (f"{v} {measure.split()[0]} [µm]" for v in ("predicted", "measured"))
@@ -453,7 +460,10 @@ def correlations(fit: Fit) -> go.Figure:
 
 def noise_check(fit: Fit) -> go.Figure:
     """Draw the histogram of the whitened residual and its expected density, N(0, 1 − p/n)."""
-    white = fit.white[np.isfinite(fit.white)]
+    white = fit.white.reshape(len(fit.raw), -1)
+    read = np.isfinite(white)  # of a distance or height the first element alone
+    read[fit.readings[~fit.outlier].scalar[fit.whitening.reading], 1:] = False
+    white = white[read]
     reach = float(np.clip(np.ceil(np.quantile(np.abs(white), 0.995)), RANGE, WIDEST))
     edges, width = np.linspace(-reach, reach, BINS + 1, retstep=True)
     counts, _ = np.histogram(np.clip(white, -reach + 1e-9, reach - 1e-9), edges)

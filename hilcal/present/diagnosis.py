@@ -92,14 +92,27 @@ def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
             f"{numbers.many_tests(d.tested, FALSE_ALARM)}\n"
         )
     if d.verdict != "adequate":
-        for s in d.suspects:
-            if s.passes and s.coarse:
-                yield (
-                    f"{s.coarse} of the model is too coarse; to make it finer: "
-                    f'hilcal add RUN "{s.effect}".'
-                )
-        yield from doubtful_lines(d)
+        yield from _paragraph([*_coarse_lines(d), *doubtful_lines(d)])
         yield from (*where_table(d.misfit_breakdown), "")
+    yield from _paragraph([*_unexplained(d), *_repeats(d), *redundant_line(d)])
+    yield from detectable_sizes(d)
+
+
+def _paragraph(parts: Sequence[Block]) -> Sequence[Block]:
+    """Return parts, if there are any, with an empty line behind."""
+    return [*parts, ""] if parts else []
+
+
+def _coarse_lines(d: Diagnosis) -> Iterator[str]:
+    for s in d.suspects:
+        if s.passes and s.coarse:
+            yield (
+                f"{s.coarse} of the model is too coarse; to make it finer: "
+                f'hilcal add RUN "{s.effect}".'
+            )
+
+
+def _unexplained(d: Diagnosis) -> Iterator[Block]:
     if d.verdict in ("unknown_effect", "noise_misjudged"):
         if d.verdict == "noise_misjudged" or d.predictable_share >= LEAST_SHARE:
             predicted = percent(d.predictable_share)
@@ -114,6 +127,9 @@ def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
             "hilcal effects new NAME writes an example, --effects-from FILE.py adds it to the "
             "catalogue."
         )
+
+
+def _repeats(d: Diagnosis) -> Iterator[str]:
     if (e := d.pure_error) is not None:
         yield repeats_sentence(e)
         if (w := e.where) is not None:
@@ -122,8 +138,6 @@ def diagnosis_report(d: Diagnosis) -> Iterator[Block]:
                 f"Most of all {w.name}: {w.factor**0.5:.2f} times as much as stated (95 % interval "
                 f"{low:.2f} to {high:.2f}; {numbers.p_equals(w.p_value)})."
             )
-    yield from redundant_line(d)
-    yield from detectable_sizes(d)
 
 
 def repeats_sentence(e: PureError) -> str:
@@ -155,14 +169,14 @@ def removed_effect_sentence(before: Fit, after: Fit, effect: str) -> str:
 
 
 def detectable_sizes(d: Diagnosis) -> Iterator[Block]:
-    """Yield the minimum detectable sizes of the effects that were not found, smallest first."""
+    """Yield the minimum detectable sizes of the effects that are not named, smallest first."""
     not_named = [s for s in d.suspects if not s.passes]
     visible = sorted((s for s in not_named if s.shown), key=lambda s: s.least.displacement_m)
     if visible:
         least = [(s.effect, s.least) for s in visible]
         rows = [(e, length(x.displacement_m), numbers.sizes(x.parameters)) for e, x in least]
-        heads = ("not found", "detectable from", "its parameters, rms")
-        yield from ("", table(*heads, rows=rows, left=(0, 2)))
+        heads = ("not named", "detectable from", "its parameters, rms")
+        yield table(*heads, rows=rows, left=(0, 2))
         yield note(
             "detectable from: rms displacement of the target at which nine of ten campaigns like "
             "this one would name the effect, and the rms of its parameters for that "
@@ -202,12 +216,21 @@ def curves(dependences: Sequence[Dependence], most: int = MOST_CURVES) -> Iterat
         explains = f"{d.variable} explains {percent(d.share)}"
         if d.determined:
             yield f"{explains}; error of {erring_quantity(d)}:"
-            head = f"{d.variable} [{d.unit}]" if d.unit else d.variable
-            yield from (_binned((head, "error"), d.y_unit, (d.x, d.y, d.error), d.labels), "")
+            head, factor = variable_head(d)
+            bins = (factor * d.x, d.y, d.error)
+            yield from (_binned((head, "error"), d.y_unit, bins, d.labels), "")
         else:
             yield f"{explains}, but these readings do not determine its curve."
     if any(d.determined for d in shown):
         yield note("±: standard uncertainty; the mean over the bins is taken as zero.")
+
+
+def variable_head(d: Dependence) -> tuple[str, float]:
+    """Return the variable of a dependence with its display unit, and the factor to it."""
+    unit, factor = numbers.joint_unit(d.unit) if d.unit in ("rad", "m") else (d.unit, 1.0)
+    if d.unit == "s":
+        unit, factor = numbers.time_unit(float(np.ptp(d.x)))
+    return f"{d.variable} [{unit}]" if unit else d.variable, factor
 
 
 def _binned(

@@ -136,7 +136,9 @@ def parameters(fit: Fit, most: int = ALL_ROWS, where: str = "--details") -> Iter
     if frames or rows:
         shown_rows = [*frames, *rows] if omitted <= 0 else [*rows, *frames][:most]
         yield table(*PARAMETER_COLUMNS, rows=shown_rows, left=(0, 3, 4))
-        pointer = f"{omitted} more parameters: {where}. " if omitted > 0 else ""
+        pointer = (
+            f"{omitted} more parameter{'s' * (omitted != 1)}: {where}. " if omitted > 0 else ""
+        )
         yield note(f"{pointer}±: standard uncertainty.\n")
     yield from families
     if undetermined:
@@ -219,10 +221,11 @@ def background_line(fit: Fit) -> Iterator[str]:
     """Yield a sentence on the background: effects in the predictions that are not named."""
     background = background_of(fit)
     if background.effects:
-        yield (
-            f"Background: {len(background.effects)} effects that are not named, together "
-            f"{length(background.rms_m)} rms; all are predicted with."
-        )
+        size, count = length(background.rms_m), len(background.effects)
+        effects = f"{count} effects that are not named, together {size} rms; all are"
+        if count == 1:
+            effects = f"{background.effects[0]}, which is not named, {size} rms; it is"
+        yield f"Background: {effects} predicted with."
 
 
 def _variance_factor(fit: Fit | StreamFit) -> str:
@@ -277,9 +280,7 @@ def dependence_sentence(places: Sequence[MisfitShare]) -> str:
     same = [p for p in clear if p.variable == POSE and p.share > 0.5]
     causes = [p for p in clear if p.variable != POSE and not p.variable.startswith("direction")][:3]
     named = numbers.names([f"{p.variable} ({percent(p.share)})" for p in causes])
-    statement = f"The misfit follows {named or 'none of the variables'}"
-    if not causes and not sides and not same:
-        return f"{statement}: neither joints nor loads, time or direction."
+    statement = f"The misfit follows {named or 'none of the recorded variables'}"
     if sides:
         side = sides[0].variable.removeprefix("direction ")
         statement += f"; {percent(sides[0].share)} of it is {side}"

@@ -29,7 +29,7 @@ from hilcal.present.calibration import (
     validation_report,
     worst_poses_table,
 )
-from hilcal.present.campaign import info_report, utc
+from hilcal.present.campaign import info_report, robot_name, utc
 from hilcal.present.diagnosis import (
     detectable_sizes,
     doubtful_lines,
@@ -119,7 +119,7 @@ class ReportContent:
 
 def page(m: ReportContent) -> str:
     """Return the report of one campaign as HTML."""
-    about = f"{m.overview.config.robot.model}, {m.name}, {m.created[:10]}"
+    about = f"{robot_name(m.overview.config)}, {m.name}, {m.created[:10]}"
     parts = (_certificate(m), *sections(m), *(_appendix(m) if m.appendix else ()))
     return render("Calibration report", about, first_screen(m), parts)
 
@@ -148,7 +148,10 @@ def first_screen(m: ReportContent) -> FirstScreen:
             good = f"This cannot be judged, because the stated noise is wrong. {good}"
         else:
             yes = verdict == "adequate" or d.reason == "inseparable_addition"
-            good = f"{'Yes' if yes else 'Not yet'}. {good}"
+            answer = "Yes" if yes else "Not yet"
+            if verdict == "unknown_effect" and d.background:
+                answer = "In part: smooth functions of the pose stand for an effect that is unknown"
+            good = f"{answer}. {good}"
         if verdict == "adequate":
             missing = "No effect that these readings could show."
         elif d.lead is not None and not d.wrong_figures:
@@ -173,7 +176,8 @@ def misfit_sentence(m: ReportContent) -> str:
     if d is None:
         return worst
     if d.follows and not d.residual_is_noise:  # on poses left out, if not on the fitted ones
-        return f"{worst} The misfit there follows {' and '.join(d.follows)}."
+        what = "What the named effects leave" if d.background else "The misfit there"
+        return f"{worst} {what} follows {' and '.join(d.follows)}."
     if not d.residual_is_noise:
         return f"{worst} {fit_words.dependence_sentence(d.misfit_breakdown)}"
     # The sum of squares of R whitened elements of standard deviation 1 is distributed as χ²(R).
@@ -270,13 +274,13 @@ def _uncertainty(fit: Fit) -> Iterator[Block]:
         yield "No uncertainty is stated: the fit is not weighted by the full covariance."
         return
     b = budget(fit)
-    error = left_out_errors(fit)[~fit.readings[~fit.outlier].scalar[fit.whitening.reading]]
+    error, of_3d = left_out_errors(fit), not fit.readings.scalar.any()
     inside = int(np.sum(error <= b.expanded))
-    quantity = "deflection" if fit.mode == "deflection" else "position"
+    quantity = "deflection" if fit.mode == "deflection" else "position" if of_3d else "reading"
     within = f"; {inside} of {len(error)} {quantity}s of poses left out are within it"
     accuracy = f"Expected accuracy of a predicted {quantity} at a pose that was not fitted"
-    expanded = f"expanded uncertainty U = {length(b.expanded)} (3-D, k = {COVERAGE:.0f})"
-    yield Words(f"{accuracy}: {expanded}{within * bool(len(error))}.", "strong")
+    expanded = f"U = {length(b.expanded)} ({'3-D, ' * of_3d}k = {COVERAGE:.0f})"
+    yield Words(f"{accuracy}: expanded uncertainty {expanded}{within}.", "strong")
     repeats = repeatability_source(b.scatter_source, fit.model.cell.arm)
     parts = (
         ("estimated parameters", "type A: errors of poses left out", b.parameters),
@@ -287,7 +291,8 @@ def _uncertainty(fit: Fit) -> Iterator[Block]:
     )
     rows = [(*x, length(u), percent((u / b.combined) ** 2)) for *x, u in parts]
     caption = "Contributions (GUM): standard uncertainties"
-    yield table("contribution", "evaluated by", "3-D", "share of u²", rows=rows, caption=caption)
+    heads = ("contribution", "evaluated by", "3-D" if of_3d else "u", "share of u²")
+    yield table(*heads, rows=rows, caption=caption)
     yield note(
         "This holds for poses and loads among those below. It does not contain what no reading "
         "here can show: an error of scale or alignment of the instrument beyond its stated "
@@ -375,7 +380,7 @@ def _not_tested(m: ReportContent) -> Iterator[str]:
         elif np.ptp(values) == 0:
             yield f"Always the same: {name}."
     if fit.readings.m == 3:
-        yield "Orientation of the tool: positions alone were measured."
+        yield "Orientation of the tool: it was not measured."
     yield "The arm in motion: all readings were taken at rest."
     if fit.mode == "deflection":
         yield "Geometry: deflections were fitted, in which it cancels."
@@ -396,7 +401,7 @@ def _instruments(m: ReportContent) -> Iterator[Block]:
         yield f"The file names no instrument; origin of the readings: {o.source}."
     yield note(f"Noise of the readings: {covariance_words(m.covariance)}.")
     yield identity(
-        ("Robot", o.config.robot.model),
+        ("Robot", robot_name(o.config)),
         ("Base", base_line(m.fit.model.cell, m.fit.frames, m.fit.mode)),
         ("Operator", m.operator or "not stated"),
         ("Campaign", f"{m.name}, made {utc(o.created)} UTC"),

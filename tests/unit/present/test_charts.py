@@ -15,6 +15,7 @@ from hilcal.present.document import description_of
 from hilcal.present.story import LEVEL_NAMES, regressor, round_factor
 from tests.support.campaigns import campaign
 from tests.support.fit_cases import fitted_model
+from tests.support.observer_cases import base_cell, observed, stated
 from tests.support.picture import contrast
 from tests.support.viewer_story import ANGLE, LOAD, story
 
@@ -205,6 +206,27 @@ def test_the_noise_check_counts_every_element():
     step, width = float(normal.x[1] - normal.x[0]), float(bar.x[1] - bar.x[0])
     assert np.sum(normal.y) * step == pytest.approx(width * len(f.white), rel=1e-3)
     assert "larger than the stated noise" in description_of(charts.noise_check(f))
+
+
+def test_the_noise_check_of_distances_counts_what_is_read():
+    c = observed(["A"], 2, poses=8, cell=base_cell(stated("A")), base=True)
+    f = fitted_model(c.cell, c.readings, "deflection")
+    chart = charts.noise_check(f)
+    assert int(np.sum(chart.data[0].y)) == len(f.raw) == f.whitening.rank
+    assert f"of {len(f.raw)} elements" in description_of(chart)
+
+
+def test_the_middle_of_a_variable_has_no_negative_zero(first):
+    told, r = first
+    values = np.linspace(-50.0, 50.0, len(told)) - 0.01
+    assert " up to 0.0°" in description_of(charts.residual_over(told, r, values, "angle", "°"))
+
+
+def test_a_long_name_of_a_load_is_shortened_at_the_axis(first):
+    told, r = first
+    names = tuple(f"a load that is pulled to the side, {name}" for name in told.load_names)
+    ticks = charts.residual_by_load(replace(told, load_names=names), r).layout.xaxis.ticktext
+    assert all(t.startswith("…") and len(t) == charts.LONGEST_NAME for t in ticks)
 
 
 @pytest.mark.parametrize("color", [charts.MEASURED, charts.NOISE, charts.HOLDOUT, *charts.LEVELS])

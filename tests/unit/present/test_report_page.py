@@ -124,6 +124,15 @@ def test_readings_without_instruments_are_not_called_imported(made):
     assert "readings were imported" not in page
 
 
+def test_an_arm_of_a_file_has_the_name_of_the_file_not_its_place(made):
+    config = made[0].overview.config
+    robot = config.robot.model_copy(update={"model": "/home/operator/cells/track.toml"})
+    overview = replace(made[0].overview, config=config.model_copy(update={"robot": robot}))
+    page = page_of(plain(replace(made[0], overview=overview)))
+    assert "track.toml" in page
+    assert "/home/operator" not in page
+
+
 def test_names_are_text_and_what_is_in_scripts_is_json(text):
     assert EVIL not in text
     assert "<img" not in text.split("<body>")[1].split("<script>/**")[0]

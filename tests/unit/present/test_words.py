@@ -116,9 +116,11 @@ def test_what_rounding_leaves_is_no_number():
         ("rad/(N·m)", [1e-5], ("µrad/(N·m)", 1e6)),
         ("furlong", [1.0], ("furlong", 1.0)),
         ("m", [], ("µm", 1e6)),
-        ("rad/(N·m)³", [2.1e-9], ("prad/(N·m)³", 1e12)),
+        ("rad/(N·m)³", [2.1e-9], ("nrad/(N·m)³", 1e9)),
         ("rad/(N·m)³", [1.2e-7], ("nrad/(N·m)³", 1e9)),
+        ("rad/(N·m)³", [9e-10], ("prad/(N·m)³", 1e12)),
         ("m/N³", [1.7e-12], ("fm/N³", 1e15)),
+        ("m/N³", [1.7e-15], ("fm/N³", 1e15)),
     ],
 )
 def test_units_follow_the_largest_value(unit, values, expected):
@@ -130,6 +132,7 @@ def test_lists_and_sentences():
     assert numbers.names(["a"]) == "a"
     assert numbers.names(["a", "b", "c"]) == "a, b and c"
     assert numbers.few(["a", "b", "c", "d"]) == "a, b and 2 more"
+    assert numbers.few(["a", "b"]) == "a and b"
 
 
 @pytest.mark.parametrize(
@@ -238,7 +241,7 @@ def test_variables_stand_in_groups_and_those_without_a_share_are_counted(shown):
 
 
 @pytest.mark.parametrize(
-    ("p", "followed"), [(0.003, "none of the variables"), (1e-5, "joint 2 torque (23 %)")]
+    ("p", "followed"), [(0.003, "none of the recorded variables"), (1e-5, "joint 2 torque (23 %)")]
 )
 def test_the_misfit_follows_what_counts_in_the_table(p, followed, shown):
     """Of twenty variables one has such a p-value by chance."""
@@ -318,3 +321,23 @@ def test_what_the_pose_alone_predicts_is_said_so(shown):
     alone = replace(d, predictable_share=0.0, follows=())
     assert f"{same} when a pose is repeated: the pose itself predicts it" in message(alone)
     assert "predicts 0 %" not in shown(*diagnosis_report(alone))
+
+
+def test_a_diagnosis_has_no_two_empty_lines_and_one_before_each_table(judged, printed):
+    wrong = replace(judged.suspects[0], needs=(("m", 2.0, 1.0),))
+    d = replace(judged, reason="no_suspect", suspects=(wrong, *judged.suspects[1:]))
+    for told in (printed(*diagnosis_report(judged)), printed(*diagnosis_report(d))):
+        lines = [line.strip() for line in told.split("\n")]
+        assert not any(lines[k] == lines[k + 1] == "" for k in range(len(lines) - 2))
+        heads = [k for k, line in enumerate(lines) if line.startswith(("where the", "not named"))]
+        assert heads
+        assert all(lines[k - 1] == "" for k in heads)
+    assert "is implausible: it would need" in told
+
+
+def test_a_curve_of_the_terminal_has_degrees(shown):
+    x, y = np.array([-np.pi, 0.5 * np.pi]), np.array([-1e-3, 1e-3])
+    of = ("joint 2", np.zeros(3), x, y, np.full(2, 1e-5), "rad")
+    told = shown(*curves([Dependence("joint 4 angle", "rad", 0.9, *of)]))
+    assert "joint 4 angle [°]" in told
+    assert "-180" in told
