@@ -114,7 +114,7 @@ COVERAGE = 2.0  # coverage factor k, as is usual (GUM, 6.3.3)
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """Standard uncertainties of a 3-D position or deflection at a pose that was not fitted, m."""
+    """Standard uncertainties of what is read at a pose that was not fitted, m; 3-D of positions."""
 
     parameters: float  # of the parameters, estimated without the pose
     misfit: float  # of the model's misfit beyond the noise
@@ -143,7 +143,9 @@ def budget(fit: Fit) -> Budget:
     chain = evaluate(cell.arm, used.states.q[fit.whitening.reading])
     covariance = arm_scatter.covariance(cell, chain, chain.point(cell.target[:3, 3]))
     arrivals = 2 if fit.mode == "deflection" else 1
-    scatter = arrivals * float(np.trace(covariance, axis1=1, axis2=2).mean())
+    axes = fit.model.predict(used.states, fit.theta).observation.axes[fit.whitening.reading]
+    read = axes @ covariance @ np.swapaxes(axes, 1, 2)  # of a distance or height, one element
+    scatter = arrivals * float(np.trace(read, axis1=1, axis2=2).mean())
     stated = noise_floor(fit.whitening.covariance) ** 2
     included = used.scatter_stated or used.arm_scatter is not None
     return Budget(

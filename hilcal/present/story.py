@@ -21,7 +21,7 @@ from hilcal.errors import InputError
 from hilcal.identification.fit import Fit, all_left_out, mahalanobis2
 from hilcal.identification.prediction.full_prediction import FullPrediction, full_prediction
 from hilcal.identification.residual import ErrorBlock
-from hilcal.model.model import Model
+from hilcal.model.model import Model, Prediction
 from hilcal.numbers import digits, length
 from hilcal.present import diagnosis
 from hilcal.present.document import Block, note, table
@@ -144,6 +144,7 @@ class Story:
     target_names: tuple[str, ...] = ()
     pose_names: tuple[str, ...] = ()  # (N,); empty if the numbers are the names
     time_s: Floats | None = None  # (N,); None: unknown
+    along: Floats | None = None  # (N, 3) direction of a distance or height, else 0; None: no such
     growing: bool = False  # whether further revisions may follow
     set_aside: Bools | None = None  # (N,) gross errors, or deflections from them; None: none
 
@@ -181,8 +182,15 @@ class Story:
         return np.array([np.median(offset[number == k], axis=0) for k in np.unique(number)])
 
     def deviation(self, value: Floats) -> Floats:
-        """Return deflections (N, 3), or the deviations of positions from the nominal arm's."""
-        return value if self.mode == "deflection" else value - self.anchor
+        """Return deflections (N, 3), or the deviations of positions from the nominal arm's.
+
+        Of a distance or height, the part along its direction.
+        """
+        out = value if self.mode == "deflection" else value - self.anchor
+        if self.along is None:
+            return out
+        part = np.sum(out * self.along, axis=1, keepdims=True) * self.along
+        return np.where(self.along.any(axis=1, keepdims=True), part, out)
 
     def last_of_poses(self, badness: Floats) -> Ints:
         """Return the reading (P,) of each pose with the largest badness (N,)."""
@@ -275,15 +283,17 @@ def build_story(chapters: Sequence[Chapter]) -> Story:
         if c.fit.mode != fit.mode or not same:
             why = "was fitted to other readings; nothing to compare"
             raise InputError(f"revision {c.number} {why}")
-    readings, rows, frames = last.readings, last.whitening.reading, fit.frames
-    to_base, states = frames.base[:3, :3], readings.states  # v @ to_base is a vector v in base axes
+    readings, rows, states = last.readings, last.whitening.reading, last.readings.states
+    frames, to_base = fit.frames, _sensor_axes(fit, last.prediction)[rows]
+    scalar = readings.scalar[rows]
     rigid = Model(fit.model.cell.with_targets(frames.declared), ()).predict(states, np.zeros(0))
     if fit.mode == "absolute":
         chain, predicted = frames.chain, last.prediction.observation.base_position
-        measured = chain[:3, 3] + predicted @ chain[:3, :3].T + last.raw[:, :3] @ to_base
+        at = chain[:3, 3] + predicted[rows] @ chain[:3, :3].T
+        measured = at + _turned(last.raw, to_base)
     else:
-        measured = last.whitening.raw(readings.value[:, :3]) @ to_base
-    covariance = to_base.T @ last.whitening.covariance[:, :3, :3] @ to_base
+        measured = _turned(last.whitening.raw(readings.value[:, :3]), to_base)
+    covariance = np.swapaxes(to_base, 1, 2) @ last.whitening.covariance[:, :3, :3] @ to_base
     pairs = zip(chapters, parts, strict=True)
     return Story(
         arm=fit.model.cell.arm,
@@ -295,11 +305,12 @@ def build_story(chapters: Sequence[Chapter]) -> Story:
         measured=measured,
         covariance=0.5 * (covariance + np.swapaxes(covariance, 1, 2)),
         noise_floor_m=last.noise_floor,
-        revisions=tuple(_revision(c, p, p.raw[:, :3] @ to_base, measured) for c, p in pairs),
+        revisions=tuple(_revision(c, p, _turned(p.raw, to_base), measured) for c, p in pairs),
         target=None if states.target is None else readings.target[rows],
         target_names=readings.target_names,
         pose_names=tuple(readings.pose_names[k] for k in readings.pose[rows]),
         time_s=None if states.time is None else states.time[rows],
+        along=np.where(scalar[:, None], to_base[:, 0], 0.0) if scalar.any() else None,
         set_aside=~np.isin(rows, np.flatnonzero(~fit.outlier)[fit.whitening.reading]),
     )
 
@@ -307,10 +318,24 @@ def build_story(chapters: Sequence[Chapter]) -> Story:
 def of_left_out(revision: StoryRevision, fit: Fit) -> StoryRevision:
     """Return a revision with the residuals of each pose when left out instead of fitted."""
     raw, w = all_left_out(fit)
-    residual = raw[:, :3] @ fit.frames.base[:3, :3]
+    axes = _sensor_axes(fit, full_prediction(fit).prediction)
+    residual = _turned(raw, axes[w.reading])
     predicted = revision.predicted + revision.residual - residual
     norm2 = mahalanobis2(raw[:, :3], w.covariance[:, :3, :3])
     return replace(revision, residual=residual, predicted=predicted, whitened_norm2=norm2)
+
+
+def _sensor_axes(fit: Fit, p: Prediction) -> Floats:
+    """Return (N, 3, 3) axes in which each reading is given, as rows in base axes.
+
+    A distance or height has one, the direction along which it is measured; the others are zero.
+    """
+    return np.asarray(p.observation.axes @ fit.frames.chain[:3, :3].T)
+
+
+def _turned(vectors: Floats, axes: Floats) -> Floats:
+    """Return vectors (D, m) of the sensor, of which three elements are taken, in base axes."""
+    return np.asarray(np.einsum("di,dij->dj", vectors[:, :3], axes))
 
 
 def round_factor(limit: float, steps: Sequence[float]) -> float:
@@ -406,12 +431,9 @@ def laws(fit: Fit) -> tuple[DependenceCurve, ...]:
 
 def curve(d: Dependence) -> DependenceCurve:
     """Return a dependence in display units."""
-    x_unit, x_factor = numbers.joint_unit(d.unit) if d.unit in ("rad", "m") else (d.unit, 1.0)
-    if d.unit == "s" and (span := float(np.ptp(d.x))) > 120:
-        x_unit, x_factor = ("h", 1 / 3600) if span > 7200 else ("min", 1 / 60)
+    over, x_factor = diagnosis.variable_head(d)
     y_unit, y_factor = numbers.unit_for(d.y_unit, list(d.y))
     says = f"{numbers.percent(d.share)} of the misfit on poses left out follows {d.variable}."
-    over = f"{d.variable} [{x_unit}]" if x_unit else d.variable
     error, x, y = (
         f"error of {erring_quantity(d)} [{y_unit}]",
         x_factor * d.x,

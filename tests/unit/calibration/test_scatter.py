@@ -13,6 +13,7 @@ from hilcal.identification.noise.full_covariance import joint_factors
 from hilcal.readings.readings import Readings
 from tests.support.campaigns import campaign
 from tests.support.fit_cases import fitted_model
+from tests.support.observer_cases import base_cell, observed, stated
 
 TRUE = 1e-5
 """rad; what the simulated arm scatters by."""
@@ -57,6 +58,14 @@ def test_without_repeats_it_is_the_makers(mode, rp, source):
     arrivals = 2 if mode == "deflection" else 1
     np.testing.assert_allclose(b.scatter, np.sqrt(arrivals) * (rp or 1e-4) / RP_PER_RMS)
     assert b.expanded >= 2 * b.scatter
+
+
+def test_of_distances_the_scatter_is_that_along_their_line():
+    """A distance shows the scatter in one of three directions."""
+    c = observed(["A", "B"], 3, cell=base_cell(stated("AB")), base=True)
+    positions = campaign(poses=12)
+    of = [budget(fitted(x, "absolute", x.readings, 1e-5)).scatter for x in (c, positions)]
+    assert of[0] == pytest.approx(of[1] / np.sqrt(3), rel=0.02)
 
 
 @pytest.mark.parametrize("poses", [8, 12, 24])

@@ -15,6 +15,7 @@ from hilcal.present.story import Chapter, build_story, curve, of_left_out, pose_
 from hilcal.robot.chain import evaluate
 from tests.support.cli_cases import rehearsal
 from tests.support.fit_cases import fitted_model
+from tests.support.observer_cases import POINTS, base_cell, observed, stated
 from tests.support.refusals import refusal
 from tests.support.rows import first
 from tests.unit.diagnosis.test_residual_regression import hidden
@@ -62,6 +63,19 @@ def test_vectors_are_in_base_axes():
     assert off.max() < 0.01 * np.linalg.norm(expected, axis=1).max()
     weight = np.array(story.load_names) == "10kg"
     assert (story.measured[weight, 2] < 0).all()  # it pulls down
+
+
+@pytest.mark.parametrize("mode", ["deflection", "absolute"])
+def test_a_distance_is_drawn_along_the_line_that_is_measured(mode):
+    c = observed(["A"], 2, cell=base_cell(stated("A")), base=True)
+    f = fitted_model(c.cell, c.readings, mode)
+    story = build_story([Chapter(1, None, f, None)])
+    along = story.anchor - POINTS["A"]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    for vectors in (story.revisions[0].residual, story.deviation(story.measured)):
+        size = np.sum(vectors * along, axis=1)
+        np.testing.assert_allclose(vectors, size[:, None] * along, atol=0.01 * abs(size).max())
+    np.testing.assert_allclose(story.revisions[0].size_m, abs(f.raw[:, 0]), atol=1e-12)
 
 
 def test_arrows_start_at_the_nominal_target():
