@@ -405,7 +405,8 @@ def validation_report(
         yield f"Extrapolation: {count} of {total} lie outside the measured range:"
         yield from (f"  {_beyond(v)}" for v in beyond.variables[:MOST_VARIABLES])
         unlisted = len(beyond.variables) - MOST_VARIABLES
-        yield f"  and {unlisted} more variables\n" if unlisted > 0 else ""
+        more = f"  and {unlisted} more variable{'s' * (unlisted != 1)}\n"
+        yield more if unlisted > 0 else ""
     if (z_all := _rms(beyond.z)) > MIN_ERROR_RATIO:
         yield _as_far_off(z_all)
     if test.registered:

@@ -23,6 +23,7 @@ from hilcal.numbers import length, percent
 from hilcal.present import charts
 from hilcal.present import fit as fit_words
 from hilcal.present.calibration import (
+    MIN_ERROR_RATIO,
     REFUTED,
     fit_and_test_lines,
     loads_report,
@@ -157,6 +158,11 @@ def first_screen(m: ReportContent) -> FirstScreen:
         elif d.lead is not None and not d.wrong_figures:
             name = d.lead.coarse or d.lead.effect
             missing += f" {name} is: {d.fit.model.catalogue[name].summary}."
+    if (z := _unseen_ratio(m)) > MIN_ERROR_RATIO and m.test is not None:
+        if verdict == "adequate":
+            title, tone = "refuted by its validation", "bad"
+            good = f"Only where it was fitted. {good.removeprefix('Yes. ')}"
+        good += f" The readings of {m.test.name} are {z:.2g} times as far off as the fit states."
     answers = (
         ("Is the model good?", good),
         ("Where is it wrong?", misfit_sentence(m)),
@@ -164,6 +170,13 @@ def first_screen(m: ReportContent) -> FirstScreen:
     )
     title, cards = f"{title[0].upper()}{title[1:]}", tuple(_cards(m))
     return FirstScreen(title, tone, answers, cards, *limit_words(m), verdict)
+
+
+def _unseen_ratio(m: ReportContent) -> float:
+    """Return the rms ratio of error to stated deviation of a validation never fitted; 0 without."""
+    if m.test is None or not m.test.validation.judged.unseen:
+        return 0.0
+    return m.test.validation.shares.everything.z
 
 
 def misfit_sentence(m: ReportContent) -> str:

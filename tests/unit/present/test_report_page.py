@@ -23,10 +23,13 @@ from hilcal.present.html.report import (
 )
 from hilcal.present.html.report import page as page_of
 from hilcal.present.story import Chapter
+from hilcal.readings.covariance import INSTRUMENT_AND_ARM
 from hilcal.refinement import Refinement, RefinementStep
 from hilcal.store.overview import MeasuringDevice
 from hilcal.write_report import ReportOptions, content_of
 from tests.support.browser import DESKTOP, PHONE, needs_chromium, open_browser
+from tests.support.campaigns import campaign, measured, plan
+from tests.support.cli_cases import stored_readings
 from tests.support.outline import Outline
 from tests.support.picture import pixels
 from tests.support.report_pages import EVIL, opened, small_content, write_campaign
@@ -169,6 +172,26 @@ def test_a_limit_of_the_cell_is_not_judged_by_a_campaign_that_was_fitted(tmp_pat
     assert passed
     assert words.startswith("PASSED")
     assert f"{same.name} was fitted itself: an independent test is missing" in words
+
+
+@pytest.mark.parametrize("off", [0.0, 5e-4])
+def test_a_validation_that_refutes_the_fit_is_the_headline(off, tmp_path):
+    c, p = campaign("none", "deflection", 5), plan(8, 77)
+    fresh = measured(c.world, p, np.random.default_rng(3))
+    law = np.sin(5 * p.states.q[:, :1] * p.load[:, None])
+    moved = replace(fresh, value=fresh.value + off * law)
+    paths = [
+        stored_readings(tmp_path / f"{name}.hilcal", r, covers=INSTRUMENT_AND_ARM)
+        for name, r in (("a", c.readings), ("b", moved))
+    ]
+    with Campaign.open(paths[0]) as run, Campaign.open(paths[1]) as other:
+        first = first_screen(content_of(run, ReportOptions(validation=other)))
+    good = dict(first.answers)["Is the model good?"]
+    assert first.verdict == "adequate"
+    assert (first.headline == "Refuted by its validation") == bool(off)
+    assert ("times as far off as the fit states" in good) == bool(off)
+    assert good.startswith("Only where it was fitted." if off else "Yes.")
+    assert (first.tone == "good") == (not off)
 
 
 def test_what_is_said_to_be_wrong_is_of_poses_left_out(made):
