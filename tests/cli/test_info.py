@@ -59,7 +59,7 @@ def test_an_imported_campaign(imported, capsys):
     assert second["error"]["fit"] == pytest.approx(shown["error"]["fit"], rel=1e-6)
     assert second["variance_factor"] == pytest.approx(shown["variance_factor"], rel=1e-6)
     words = ok(capsys, "info", imported).out
-    for part in ("run.hilcal: 40 readings of 8 poses, ur10e", "5kg 8", "+ hysteresis", "→ 3"):
+    for part in ("run.hilcal: 40 readings of 8 poses, ur10e", "5kg (8)", "+ hysteresis", "→ 3"):
         assert part in words
     assert "Instruments" not in words
     assert hashlib.sha256(imported.read_bytes()).hexdigest() == before
