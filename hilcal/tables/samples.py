@@ -2,8 +2,8 @@
 
 Rows of one state that follow one another within `LONGEST_PAUSE_S` are samples: no arm leaves a
 pose, comes back and settles within that time. As readings, they would share the arm's scatter of
-that arrival, and count it as many times as there are samples. Without times, samples cannot be
-distinguished from repeated arrivals that the table lists one after the other.
+that arrival, and count it as many times as there are samples. Without a time of each, samples
+cannot be distinguished from repeated arrivals that the table lists one after the other.
 """
 
 from dataclasses import replace
@@ -18,7 +18,7 @@ from hilcal.types import Bools, Floats
 LONGEST_PAUSE_S = 1.0
 """Longest time from one sample to the next. A choice: trackers read 10 to 1000 times a second."""
 MANY_ROWS = 8
-"""Rows of a state, in the mean, from which rows without times are probably samples; a choice."""
+"""Mean number of rows of a state from which a note asks whether they are samples; a choice."""
 
 
 def averaged_samples(
@@ -30,21 +30,12 @@ def averaged_samples(
     all samples; force, time, temperatures, torques and reported joint values are means, too.
     """
     again = _same_as_last(readings)
-    count = len(readings)
+    count, visits = len(readings), len(readings) - int(again.sum())
     time = readings.states.time
-    if time is None:
-        visits = count - int(again.sum())
-        if count < MANY_ROWS * visits:
-            return readings, ()
-        return readings, (
-            f"{count} rows are of {visits} states, each of rows that follow one another, and count "
-            "as that many arrivals of the arm: if they are samples of one standstill, give their "
-            "times, or average them",
-        )
-    again[1:] &= _within_pause(time)
+    again[1:] &= False if time is None else _within_pause(time, again[1:])
     first = np.flatnonzero(~again)
     if len(first) == count:
-        return readings, ()
+        return readings, _probably_samples(count, visits)
     value, covariance = readings.value[first].copy(), readings.covariance[first].copy()
     left_out = 0
     ends = np.append(first[1:], count)
@@ -70,6 +61,17 @@ def averaged_samples(
     return replace(out, states=replace(out.states, **means)), (note,)
 
 
+def _probably_samples(rows: int, visits: int) -> tuple[str, ...]:
+    """Return a note where many rows of each state follow one another and no clock tells more."""
+    if rows < MANY_ROWS * visits:
+        return ()
+    return (
+        f"{rows} rows are of {visits} states, each of rows that follow one another, and count "
+        "as that many arrivals of the arm: if they are samples of one standstill, give the time "
+        "of each, or average them",
+    )
+
+
 AVERAGED = (
     *("wrench", "time", "load_time", "air_temperature", "joint_temperature", "q_actual", "torque"),
 )
@@ -87,13 +89,15 @@ def _same_as_last(readings: Readings) -> Bools:
     return same
 
 
-def _within_pause(time: Floats) -> Bools:
-    """(N − 1,) whether rows follow within a pause; nowhere by a clock that is too coarse for it.
+def _within_pause(time: Floats, again: Bools) -> Bools:
+    """(N − 1,) whether rows follow within a pause, or at the same time, of those `again` (N − 1,).
 
-    A clock that counts rows, or whose least step is longer than a pause, does not tell.
+    A clock that counts rows does not tell, nor does one whose least step is longer than a pause,
+    unless all rows of each state have the same time.
     """
     step = np.diff(time)
     forward = step[step > 0]
-    if not len(forward) or forward.min() > LONGEST_PAUSE_S or np.all(step == step[0]):
+    counts_rows = not len(forward) or bool(np.all(step == step[0]))
+    if counts_rows or (forward.min() > LONGEST_PAUSE_S and bool(np.any(step[again]))):
         return np.zeros(len(step), dtype=np.bool_)
     return np.asarray((step >= 0) & (step <= LONGEST_PAUSE_S))

@@ -26,7 +26,8 @@ def sampled(tmp_path, *, time="s", visits=1, noise=1.0, outlier=None):
     value = r.value + noise * np.einsum("nij,nj->ni", root, rng.standard_normal(r.value.shape))
     if outlier is not None:
         value[outlier] += 0.05
-    clock = {"s": seconds, "row": np.arange(len(rows), dtype=float), None: None}[time]
+    clocks = {"s": seconds, "row": np.arange(len(rows), dtype=float), "pose": TRAVEL_S * rows}
+    clock = clocks.get(time)
     r = replace(r, value=value, states=replace(r.states, time=clock))[order]
     columns = {k: v for k, v in exchange_columns(r).items() if not k.startswith("cov")}
     write_columns(tmp_path / "t.csv", columns, {})
@@ -63,12 +64,16 @@ def test_arrivals_that_a_table_lists_together_stay_readings(tmp_path):
     assert len(result.readings) == len(at)
 
 
+def test_rows_with_the_time_of_their_pose_are_samples(tmp_path):
+    at, result = sampled(tmp_path, time="pose")
+    assert len(result.readings) == len(at)
+
+
 @pytest.mark.parametrize("time", ["row", None])
 def test_without_a_clock_samples_are_not_told_from_arrivals(tmp_path, time):
     at, result = sampled(tmp_path, time=time)
     assert len(result.readings) == SAMPLES * len(at)
-    expected = "" if time else "if they are samples of one standstill, give their times"
-    assert expected in "".join(notes(result))
+    assert "if they are samples of one standstill, give the time of each" in notes(result)[0]
 
 
 def test_readings_of_a_session_are_no_samples(tmp_path):
