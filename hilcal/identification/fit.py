@@ -342,8 +342,8 @@ class Residuals(Sequence[Floats]):
             return raw
         if frame != "base":
             raise InputError(f"frame {frame!r} is unknown; valid: sensor, base")
-        parts = raw.reshape(len(raw), -1, 3)
-        return np.asarray((parts @ self._fit.frames.base[:3, :3]).reshape(raw.shape))
+        axes = sensor_axes(self._fit, self._fit.solution.prediction.observation)
+        return in_base_axes(raw, axes[self._fit.whitening.reading])
 
     def to_frame(self) -> "pd.DataFrame":
         """Return a row for each reading: pose, load, residual, and residual without its pose."""
@@ -361,6 +361,20 @@ class Residuals(Sequence[Floats]):
     def __repr__(self) -> str:
         rms = 1e6 * self._fit.error.rms_m
         return f"Residuals({len(self)} of {self._fit.mode} readings: {rms:.1f} µm rms)"
+
+
+def sensor_axes(fit: Fit, observed: Observation) -> Floats:
+    """(N, 3, 3) axes in which each of N readings is given, as rows in axes of the arm's base.
+
+    A distance or height has one, the direction along which it is measured; the others are zero.
+    """
+    return np.asarray(observed.axes @ fit.frames.chain[:3, :3].T)
+
+
+def in_base_axes(vectors: Floats, axes: Floats) -> Floats:
+    """Turn vectors (D, m) of readings with their `sensor_axes` (D, 3, 3) into base axes."""
+    parts = vectors.reshape(len(vectors), -1, 3)
+    return np.asarray(np.einsum("dki,dij->dkj", parts, axes).reshape(vectors.shape))
 
 
 def require_gc(fit: Fit, task: str) -> None:

@@ -18,10 +18,16 @@ from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.discovery.curve import drawn_laws
 from hilcal.discovery.law import Coefficient
 from hilcal.errors import InputError
-from hilcal.identification.fit import Fit, all_left_out, mahalanobis2
+from hilcal.identification.fit import (
+    Fit,
+    all_left_out,
+    in_base_axes,
+    mahalanobis2,
+    sensor_axes,
+)
 from hilcal.identification.prediction.full_prediction import FullPrediction, full_prediction
 from hilcal.identification.residual import ErrorBlock
-from hilcal.model.model import Model, Prediction
+from hilcal.model.model import Model
 from hilcal.numbers import digits, length
 from hilcal.present import diagnosis
 from hilcal.present.document import Block, note, table
@@ -284,15 +290,15 @@ def build_story(chapters: Sequence[Chapter]) -> Story:
             why = "was fitted to other readings; nothing to compare"
             raise InputError(f"revision {c.number} {why}")
     readings, rows, states = last.readings, last.whitening.reading, last.readings.states
-    frames, to_base = fit.frames, _sensor_axes(fit, last.prediction)[rows]
+    frames, to_base = fit.frames, sensor_axes(fit, last.prediction.observation)[rows]
     scalar = readings.scalar[rows]
     rigid = Model(fit.model.cell.with_targets(frames.declared), ()).predict(states, np.zeros(0))
     if fit.mode == "absolute":
         chain, predicted = frames.chain, last.prediction.observation.base_position
         at = chain[:3, 3] + predicted[rows] @ chain[:3, :3].T
-        measured = at + _turned(last.raw, to_base)
+        measured = at + in_base_axes(last.raw[:, :3], to_base)
     else:
-        measured = _turned(last.whitening.raw(readings.value[:, :3]), to_base)
+        measured = in_base_axes(last.whitening.raw(readings.value[:, :3]), to_base)
     covariance = np.swapaxes(to_base, 1, 2) @ last.whitening.covariance[:, :3, :3] @ to_base
     pairs = zip(chapters, parts, strict=True)
     return Story(
@@ -305,7 +311,9 @@ def build_story(chapters: Sequence[Chapter]) -> Story:
         measured=measured,
         covariance=0.5 * (covariance + np.swapaxes(covariance, 1, 2)),
         noise_floor_m=last.noise_floor,
-        revisions=tuple(_revision(c, p, _turned(p.raw, to_base), measured) for c, p in pairs),
+        revisions=tuple(
+            _revision(c, p, in_base_axes(p.raw[:, :3], to_base), measured) for c, p in pairs
+        ),
         target=None if states.target is None else readings.target[rows],
         target_names=readings.target_names,
         pose_names=tuple(readings.pose_names[k] for k in readings.pose[rows]),
@@ -318,24 +326,11 @@ def build_story(chapters: Sequence[Chapter]) -> Story:
 def of_left_out(revision: StoryRevision, fit: Fit) -> StoryRevision:
     """Return a revision with the residuals of each pose when left out instead of fitted."""
     raw, w = all_left_out(fit)
-    axes = _sensor_axes(fit, full_prediction(fit).prediction)
-    residual = _turned(raw, axes[w.reading])
+    axes = sensor_axes(fit, full_prediction(fit).prediction.observation)
+    residual = in_base_axes(raw[:, :3], axes[w.reading])
     predicted = revision.predicted + revision.residual - residual
     norm2 = mahalanobis2(raw[:, :3], w.covariance[:, :3, :3])
     return replace(revision, residual=residual, predicted=predicted, whitened_norm2=norm2)
-
-
-def _sensor_axes(fit: Fit, p: Prediction) -> Floats:
-    """Return (N, 3, 3) axes in which each reading is given, as rows in base axes.
-
-    A distance or height has one, the direction along which it is measured; the others are zero.
-    """
-    return np.asarray(p.observation.axes @ fit.frames.chain[:3, :3].T)
-
-
-def _turned(vectors: Floats, axes: Floats) -> Floats:
-    """Return vectors (D, m) of the sensor, of which three elements are taken, in base axes."""
-    return np.asarray(np.einsum("di,dij->dj", vectors[:, :3], axes))
 
 
 def round_factor(limit: float, steps: Sequence[float]) -> float:

@@ -10,7 +10,14 @@ import numpy as np
 import scipy
 
 from hilcal.effects.protocol import FRAME_ROLES
-from hilcal.identification.fit import Fit, all_left_out, mahalanobis2, with_outliers
+from hilcal.identification.fit import (
+    Fit,
+    all_left_out,
+    in_base_axes,
+    mahalanobis2,
+    sensor_axes,
+    with_outliers,
+)
 from hilcal.identification.gauss_newton import solve
 from hilcal.identification.outliers.least_trimmed_squares import MOST_WRONG
 from hilcal.identification.residual import ErrorBlock, error_block, noise_floor, residual
@@ -120,8 +127,9 @@ def residual_table(fit: Fit) -> dict[str, Column]:
         table["target"] = [r.target_names[k] for k in r.target.tolist()]
     table["set_aside"] = fit.outlier.astype(int)
     table["sigma"] = spread(np.sqrt(mahalanobis2(raw, w.covariance)))
+    axes = sensor_axes(fit, full_prediction(fit).prediction.observation)[w.reading]
     for kind, values in (("residual", raw), ("left_out", all_left_out(fit)[0])):
-        base = (values.reshape(len(values), -1, 3) @ fit.frames.base[:3, :3]).reshape(values.shape)
+        base = in_base_axes(values, axes)
         for frame, components in (("", values), ("base_", base)):
             for element, column in zip(ELEMENTS, components.T, strict=False):
                 table[f"{kind}_{frame}{element}"] = spread(column)

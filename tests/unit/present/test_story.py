@@ -9,7 +9,7 @@ import pytest
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.identification.prediction.full_prediction import full_prediction
+from hilcal.identification.prediction.full_prediction import full_prediction, residual_table
 from hilcal.present.html.report import left_out_errors
 from hilcal.present.story import Chapter, build_story, curve, of_left_out, pose_numbers
 from hilcal.robot.chain import evaluate
@@ -76,6 +76,11 @@ def test_a_distance_is_drawn_along_the_line_that_is_measured(mode):
         size = np.sum(vectors * along, axis=1)
         np.testing.assert_allclose(vectors, size[:, None] * along, atol=0.01 * abs(size).max())
     np.testing.assert_allclose(story.revisions[0].size_m, abs(f.raw[:, 0]), atol=1e-12)
+    np.testing.assert_allclose(f.residuals("base"), story.revisions[0].residual, atol=1e-12)
+    rows, table = np.flatnonzero(~f.outlier)[f.whitening.reading], residual_table(f)
+    columns = [np.array(table[f"residual_base_{axis}_m"])[rows] for axis in "xyz"]
+    in_table = np.stack(columns, axis=1).astype(float)
+    np.testing.assert_allclose(in_table, f.residuals("base"), atol=1e-12)
 
 
 def test_arrows_start_at_the_nominal_target():
