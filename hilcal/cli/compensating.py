@@ -33,6 +33,7 @@ from hilcal.present.calibration import (
     waypoints_table,
 )
 from hilcal.present.progress import working
+from hilcal.procedure.state import Files
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.store.plan import UNLOADED
@@ -163,7 +164,8 @@ def compensate(
     t.show(compensation_report(calibration, task.points.names, q, result))
     t.show(waypoints_table(outcomes))
     cell = calibration.model.cell
-    if doubt := refuted_line(calibration, model):
+    run = model.parent / str(calibration.source.get("campaign", "RUN.hilcal"))
+    if doubt := refuted_line(calibration, model, run, Files(run).validation):
         t.notice(f"warning: {doubt}")
     if remark := "" if task.program else _two_targets(targets, arm, on_flange):
         t.notice(f"note: {points}: {remark}")

@@ -25,6 +25,7 @@ from hilcal.numbers import length
 from hilcal.present.calibration import refuted_line
 from hilcal.present.progress import Say, working
 from hilcal.present.registration import base_line
+from hilcal.procedure.state import Files
 from hilcal.readings.covariance import INSTRUMENT
 from hilcal.store.revision import RevisionRecord
 from hilcal.store.stored_texts import ROBOT_FILE
@@ -242,7 +243,7 @@ def _write_model(
         return
     say("restoring the fit, and what it knows of other readings")
     identified = run.calibration(revision)
-    if doubt := refuted_line(identified, run.path):
+    if doubt := refuted_line(identified, run.path, run.path, Files(run.path).validation):
         t.notice(f"warning: {doubt}")
     if options.calibration is not None:
         identified.save(options.calibration)

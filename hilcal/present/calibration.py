@@ -24,7 +24,6 @@ from hilcal.present.fit import error_words, kind, model_name
 from hilcal.present.progress import duration_text
 from hilcal.present.registration import base_line
 from hilcal.present.verdict import UNCALIBRATED, repeatability_source
-from hilcal.procedure.state import Files
 from hilcal.readings.whitening import Mode
 from hilcal.types import Floats
 
@@ -289,19 +288,18 @@ def compensation_report(
         yield f"The {MOST_POINTS} of {len(names)} points with the largest error before are listed."
 
 
-def refuted_line(calibration: Calibration, path: Path) -> str:
+def refuted_line(calibration: Calibration, path: Path, run: Path, validation: Path) -> str:
     """Return that a test at corrected targets refutes a calibration; "" where none does.
 
-    `path` is its campaign, or its file, beside which the campaign is looked for.
+    `path` is the file that it was read from, `run` its campaign.
     """
     if calibration.refuted_by is None:
         return ""
     inside, count = calibration.refuted_by
-    run = path.parent / str(calibration.source.get("campaign", "RUN.hilcal"))
     return (
         f"{path}: {inside} of {count} points that were measured at corrected targets lie within "
         "their 95 % band: the bands stated here do not hold; calibrate again, or ask what has "
-        f"changed: hilcal compare {quoted(run)} {quoted(Files(run).validation)}"
+        f"changed: hilcal compare {quoted(run)} {quoted(validation)}"
     )
 
 
