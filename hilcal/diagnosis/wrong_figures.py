@@ -45,8 +45,8 @@ BIC_MARGIN = 10.0
 evidence (Kass and Raftery, *Bayes factors*, J. Am. Stat. Assoc. 90 (1995) 773)."""
 LEAST_PROMISE = 0.2  # share of χ² that the first step must promise for a refit; a choice
 LEAST_DIRECTION_PROMISE = 0.05
-"""The same for gravity and the axes of forces, which explain little until the direction is near; a
-choice."""
+"""Share of χ² that another direction of gravity or of forces must promise for refits; a choice,
+small because a direction explains little until it is nearly right."""
 LEAST_RELATIVE_PROMISE = 0.5  # the same, as a share of the largest promise
 MOST_STEPS = 5  # most refits of a figure; a choice, two or three are usual
 SMALL_STEP = 1.0  # largest step that needs no further refit, in units of `DERIVATIVE_STEP`
@@ -149,7 +149,10 @@ class _Figure:
         return np.array([size]), size * float(x @ r) / max(float(r @ r), 1e-300)
 
     def promise(self, stated: Fit) -> float:
-        """Share of χ² that the figure as it stands explains, gross errors as stated or none."""
+        """Largest share of χ² that the figure explains with the change zero.
+
+        Of the readings that the stated fit uses, and of all readings, gross errors included.
+        """
         changed, shares = self.applied(stated, np.zeros(self.size)), [0.0]
         for rows in (~stated.outlier, np.ones_like(stated.outlier)):
             with suppress(CannotAnswerError):
@@ -280,7 +283,7 @@ def _wrong_direction(fit: Fit, least_share: float, best: float) -> tuple[WrongFi
     axes = (*np.eye(3), *-np.eye(3)) if g.any() else ()
     figures += [_Figure("gravity", axis=tuple(a.tolist())) for a in axes if _elsewhere(a, g)]
     reversed_loads = loads_reversed(fit)
-    if not reversed_loads and not _turns(fit):
+    if not reversed_loads and not _direction_promises(fit):
         figures = [f for f in figures if f.promise(fit) > LEAST_DIRECTION_PROMISE]
     refits: list[tuple[Fit, _Figure]] = []
     for figure in figures:
@@ -305,7 +308,7 @@ def _wrong_direction(fit: Fit, least_share: float, best: float) -> tuple[WrongFi
     return (figure.named(fit, np.zeros(figure.size), refit),) if explained else ()
 
 
-def _turns(fit: Fit) -> bool:
+def _direction_promises(fit: Fit) -> bool:
     """Whether the first step of gravity's direction, from that stated, promises enough."""
     g = fit.model.cell.gravity
     if not g.any():

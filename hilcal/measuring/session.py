@@ -64,7 +64,7 @@ further readings; else the status may be of fewer ones, as fits must not delay t
 
 
 class Session:
-    """Connected devices, and what the session knows from the readings so far."""
+    """Visits the stops of a route, and stores a reading at every stop with a step."""
 
     def __init__(
         self,

@@ -465,7 +465,8 @@ def _shares_table(
         rms, largest, stated = map(length, (s.rms_m, s.max_m, s.stated_m))
         verdict = () if limit is None else ("kept" if s.passes(limit) else "over",)
         within = f"{100 * s.within:.0f} %"
-        out.add(s.name, str(s.count), rms, largest, s.worst, stated, f"{s.z:.2f}", within, *verdict)
+        of, at = (load_name(x) if k == "load" else x for k, x in ((head, s.name), (worst, s.worst)))
+        out.add(of, str(s.count), rms, largest, at, stated, f"{s.z:.2f}", within, *verdict)
     return out
 
 

@@ -17,6 +17,10 @@ from hilcal.types import Bools, Floats
 
 LONGEST_PAUSE_S = 1.0
 """Longest time from one sample to the next. A choice: trackers read 10 to 1000 times a second."""
+AVERAGED = (
+    *("wrench", "time", "load_time", "air_temperature", "joint_temperature", "q_actual", "torque"),
+)
+"""Columns of `States` of which a standstill has the mean."""
 MANY_ROWS = 8
 """Mean number of rows of a state from which a note asks whether they are samples; a choice."""
 
@@ -72,12 +76,6 @@ def _probably_samples(rows: int, visits: int) -> tuple[str, ...]:
     )
 
 
-AVERAGED = (
-    *("wrench", "time", "load_time", "air_temperature", "joint_temperature", "q_actual", "torque"),
-)
-"""Columns of `States` of which a standstill has the mean."""
-
-
 def _same_as_last(readings: Readings) -> Bools:
     """(N,) whether a row is of the same state as the row before it."""
     s = readings.states
@@ -93,11 +91,12 @@ def _within_pause(time: Floats, again: Bools) -> Bools:
     """(N − 1,) whether rows follow within a pause, or at the same time, of those `again` (N − 1,).
 
     A clock that counts rows does not tell, nor does one whose least step is longer than a pause,
-    unless all rows of each state have the same time.
+    such as a date, unless each standstill has a time of its own, that of all its rows.
     """
     step = np.diff(time)
     forward = step[step > 0]
     counts_rows = not len(forward) or bool(np.all(step == step[0]))
-    if counts_rows or (forward.min() > LONGEST_PAUSE_S and bool(np.any(step[again]))):
+    time_of_each = not np.any(step[again]) and bool(np.all(step[~again]))
+    if counts_rows or (forward.min() > LONGEST_PAUSE_S and not time_of_each):
         return np.zeros(len(step), dtype=np.bool_)
     return np.asarray((step >= 0) & (step <= LONGEST_PAUSE_S))

@@ -26,7 +26,12 @@ def sampled(tmp_path, *, time="s", visits=1, noise=1.0, outlier=None):
     value = r.value + noise * np.einsum("nij,nj->ni", root, rng.standard_normal(r.value.shape))
     if outlier is not None:
         value[outlier] += 0.05
-    clocks = {"s": seconds, "row": np.arange(len(rows), dtype=float), "pose": TRAVEL_S * rows}
+    clocks = {
+        "s": seconds,
+        "row": np.arange(len(rows), dtype=float),
+        "pose": TRAVEL_S * rows,
+        "day": 86400.0 * (r.pose >= POSES // 2),
+    }
     clock = clocks.get(time)
     r = replace(r, value=value, states=replace(r.states, time=clock))[order]
     columns = {k: v for k, v in exchange_columns(r).items() if not k.startswith("cov")}
@@ -45,7 +50,6 @@ def test_samples_of_a_standstill_are_one_reading_with_the_covariance_of_their_me
     assert np.array_equal(r.states.q, at.states.q)
     off = np.linalg.solve(np.linalg.cholesky(r.covariance), (r.value - at.value)[:, :, None])
     assert 0.6 < np.sqrt(np.mean(off**2)) < 1.4
-    assert np.all(np.trace(r.covariance, axis1=1, axis2=2) < 2e-10 + 2 / SAMPLES * 1e-8)
     step = np.diff(r.states.time)
     assert step == pytest.approx(TRAVEL_S + SAMPLES * PERIOD_S)
     (note,) = notes(result)
@@ -69,7 +73,7 @@ def test_rows_with_the_time_of_their_pose_are_samples(tmp_path):
     assert len(result.readings) == len(at)
 
 
-@pytest.mark.parametrize("time", ["row", None])
+@pytest.mark.parametrize("time", ["row", "day", None])
 def test_without_a_clock_samples_are_not_told_from_arrivals(tmp_path, time):
     at, result = sampled(tmp_path, time=time)
     assert len(result.readings) == SAMPLES * len(at)
