@@ -95,6 +95,7 @@ from hilcal.readings.readings import ArmScatter
 NO_HISTORY = History()
 NOTHING_PREDICTED = ResidualRegression(0.0, ())
 IN_SAMPLE = ("pose", "direction")  # first words of variables whose share is of the fitted poses
+IN_ORDER = (ROW_ORDER, "time")  # variables of the order of the readings
 MOST_NAMED = 2  # variables that a sentence names
 BACKGROUND_OVERRIDES = (
     "residual_is_noise", "inseparable_addition", "arm_scatter", "misjudged_noise",
@@ -133,14 +134,16 @@ def diagnose(
 def with_order_step(d: Diagnosis) -> Diagnosis:
     """Return a diagnosis with the step in the order of the readings, where there is one.
 
-    None is sought where a suspect passes, or stated noise explains the residual of named effects;
-    a background, the arm's scatter, serial or estimated noise may have taken up a step. Where the
-    recorded state predicts more of the misfit than a step explains, the step resembles the law.
+    None is sought where stated noise explains the residual of named effects, as a background, the
+    arm's scatter, serial or estimated noise may have taken up a step; nor where a suspect passes,
+    unless the misfit follows the order, as a step resembles a drift. Where the recorded state
+    predicts more of the misfit than a step explains, the step resembles the law.
     """
     readings = d.fit.readings
     hides = d.fit.model.background or readings.serial is not None or not readings.noise_stated
     explained = d.residual_is_noise and not hides and readings.arm_scatter is None
-    if explained or d.significant or d.wrong_figures:
+    first = next((v.variable for v in _predictors(d.misfit_breakdown)), "")
+    if explained or d.wrong_figures or (d.significant and first not in IN_ORDER):
         return d
     step = step_in_order(d.fit)
     if step is None or (step.share < d.predictable_share and not _follows_order(d)):
@@ -397,7 +400,7 @@ def _is_background(e: Evidence, reason: Reason, noise: NoiseVerdict, implausible
     small to be resolved scatter alike.
     """
     overstated = noise.reason == "too_large" and e.fit.variance_factor < OVERSTATED
-    if not e.background or overstated:
+    if not e.background or (reason == "misjudged_noise" and overstated):
         return False
     repeated = implausible and e.pure_error is not None
     if reason == "misjudged_noise" and not repeated:
@@ -426,12 +429,12 @@ def _follows_state(d: Diagnosis) -> bool:
 
 def _follows_order(d: Diagnosis) -> bool:
     """Whether the misfit follows the order of the readings most, or nothing that is recorded."""
-    return not d.follows or d.follows[0] in (ROW_ORDER, "time")
+    return not d.follows or d.follows[0] in IN_ORDER
 
 
 def _predicted(e: Evidence, regression: ResidualRegression) -> bool:
     """Whether something recorded predicts the misfit on poses left out, beyond chance."""
-    shares = (v.share for v in e.misfit_breakdown if v.variable.split()[0] not in IN_SAMPLE)
+    shares = (v.share for v in _predictors(e.misfit_breakdown))
     chance = 2.0 / np.sqrt(int(e.fit.pose.max()) + 1)
     return regression.share > PREDICTABLE or max(shares, default=0.0) > chance
 
@@ -443,6 +446,11 @@ def _carrying(regression: ResidualRegression) -> tuple[str, ...]:
 
 def _significant(breakdown: tuple[MisfitShare, ...]) -> tuple[MisfitShare, ...]:
     """Variables that predict a share of the misfit worth naming, beyond chance among all."""
-    predictors = [v for v in breakdown if v.variable.split()[0] not in IN_SAMPLE]
+    predictors = _predictors(breakdown)
     alarm = FALSE_ALARM / max(len(predictors), 1)
     return tuple(v for v in predictors if v.p_value < alarm and v.share >= LEAST_SHARE)
+
+
+def _predictors(breakdown: tuple[MisfitShare, ...]) -> list[MisfitShare]:
+    """Return the variables whose share is of poses left out, largest share first."""
+    return [v for v in breakdown if v.variable.split()[0] not in IN_SAMPLE]

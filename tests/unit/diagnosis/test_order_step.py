@@ -52,6 +52,13 @@ def test_the_verdict_names_the_step(what):
     assert "was moved" in message(d)
 
 
+def test_a_diagnosis_alone_names_the_step_where_a_drift_passes():
+    d = diagnose(fitted_model(C.cell, moved("sensor", 3e-4), "absolute"))
+    assert d.verdict == "unknown_effect"
+    assert d.step.moved[0] == "sensor"
+    assert d.step.previous < FIRST <= d.step.first
+
+
 @pytest.mark.parametrize("joint", first(1, [2, 3]))
 def test_a_joint_that_slipped_is_named_with_its_row(joint):
     r, model = C.readings, baseline(C.cell, C.readings, "absolute")
