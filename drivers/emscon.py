@@ -25,7 +25,7 @@ from hilcal.config import CellConfig
 from hilcal.config.cell import Tracker as TrackerConfig
 from hilcal.drivers import emscon_packets as es
 from hilcal.drivers.links import address, check_tracker_frame, network_failures
-from hilcal.errors import DeviceError, InputError
+from hilcal.errors import DeviceError, InputError, undone_by
 from hilcal.measuring.devices import Clock, Report, Row, TargetLostError, TrackerSample, report_of
 from hilcal.readings.covariance import tracker_covariance, tracker_noise
 from hilcal.toml import Positive, Section, check_section
@@ -211,11 +211,8 @@ class EmsconTracker:
         self._remarks: list[str] = []
         self._distance = 2.0
         self._line = connect()
-        try:
+        with undone_by(self._line.close):
             self._set_up(time.monotonic() + DEADLINE_S)
-        except BaseException:
-            self._line.close()
-            raise
 
     def measure(self) -> TrackerSample:
         """Measure once; a reading of a reflector that has been changed is refused."""

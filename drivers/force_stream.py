@@ -18,7 +18,7 @@ from hilcal.config import CellConfig
 from hilcal.config.sections import PORT
 from hilcal.config.sections import ForceSensor as Section
 from hilcal.drivers.links import close_port, drain, line_failures, open_port
-from hilcal.errors import DeviceError, InputError
+from hilcal.errors import DeviceError, InputError, undone_by
 from hilcal.measuring.devices import Losses, Report, Row, WrenchSample, report_of
 from hilcal.types import Floats, Ints
 
@@ -267,14 +267,11 @@ class ForceStream:
     def started(self, seconds: float = FIRST_FRAME_S) -> Self:
         """Wait for the first frame; without one in time, close the port and raise DeviceError."""
         end = time.monotonic() + seconds
-        try:
+        with undone_by(self.close):
             while not self._count and not self._failure and time.monotonic() < end:
                 time.sleep(POLL_S)
             if not self._count:
                 raise DeviceError(self._silence())
-        except BaseException:
-            self.close()
-            raise
         return self
 
     def latest(self) -> WrenchSample:
@@ -451,12 +448,8 @@ def open_streaming(section: Section, baud: int, sensor: SensorFormat) -> ForceSt
     """Open the port of a sensor that streams from power-on, and wait for the first frame."""
     path = serial_port(section)
     port = open_port(DEVICE, path, section.baud or baud)
-    try:
-        with line_failures(DEVICE, path):
-            drain(port, quiet=OLD_S, limit=OLD_S)  # adapters buffer old bytes
-    except BaseException:
-        close_port(port)
-        raise
+    with undone_by(lambda: close_port(port)), line_failures(DEVICE, path):
+        drain(port, quiet=OLD_S, limit=OLD_S)  # adapters buffer old bytes
     return ForceStream(port, sensor).started()
 
 

@@ -21,7 +21,7 @@ from hilcal.config import CellConfig
 from hilcal.drivers import force_stream as fs
 from hilcal.drivers.force_stream import DEVICE
 from hilcal.drivers.links import close_port, crc_modbus, drain, line_failures, open_port
-from hilcal.errors import DeviceError
+from hilcal.errors import DeviceError, undone_by
 from hilcal.measuring.devices import ForceSensorDevice
 from hilcal.types import Floats
 
@@ -103,13 +103,12 @@ def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
     section = fs.checked_config(config)
     path = fs.serial_port(section)
     port = open_port(DEVICE, path, section.baud or BAUD, timeout=0.1)
-    try:
-        with line_failures(DEVICE, path):
-            firmware, number = _start(port)
-    except BaseException:
-        _stop(port)
-        close_port(port)
-        raise
+    with (
+        undone_by(lambda: close_port(port)),
+        undone_by(lambda: _stop(port)),
+        line_failures(DEVICE, path),
+    ):
+        firmware, number = _start(port)
     name = f"{SENSOR.name}, serial number {number}"
     facts = (("firmware", firmware),)
     stream = fs.ForceStream(port, SENSOR, name, facts, before_close=lambda: _stop(port))

@@ -28,7 +28,7 @@ from pydantic import Field
 from hilcal.config import CellConfig
 from hilcal.config.cell import Tracker as TrackerConfig
 from hilcal.drivers.links import check_tracker_frame, close_port, drain, line_failures, open_port
-from hilcal.errors import DeviceError, InputError
+from hilcal.errors import DeviceError, InputError, undone_by
 from hilcal.measuring.devices import Clock, Report, Row, TargetLostError, TrackerSample, report_of
 from hilcal.readings.covariance import TrackerNoise, tracker_covariance
 from hilcal.toml import NonNegative, Positive, Section, check_section
@@ -172,7 +172,7 @@ class Link:
         """Open the port for this program alone; raises DeviceError if no instrument answers."""
         self._path, self._baud = path, baud
         self._port = open_port(DEVICE, path, baud, _FIRST_ANSWER_S)
-        try:
+        with undone_by(self.close):
             with line_failures(DEVICE, path):
                 if not drain(self._port, _QUIET_S, _DRAIN_S):
                     raise DeviceError(
@@ -181,9 +181,6 @@ class Link:
                     )
             self._connection = _Connection(self._port)
             self._instrument = self._greet()
-        except BaseException:
-            self.close()
-            raise
 
     def ask(
         self,

@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.config import CellConfig
 from hilcal.drivers.links import address, check_tracker_frame, network_failures
-from hilcal.errors import DeviceError, InputError
+from hilcal.errors import DeviceError, InputError, undone_by
 from hilcal.measuring.devices import Report, Row, TargetLostError, TrackerSample, report_of
 from hilcal.toml import Section, check_section
 from hilcal.types import Floats
@@ -230,15 +230,12 @@ class NatNetTracker:
         self._newest = -1
         with network_failures(DEVICE, self.where):
             self._line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            try:
+            with undone_by(self.close):
                 self._line.connect(self._to)
                 self._server = self._greet()
                 if self._server.group:
                     self._data = self._joined(self._server)
                 self._body, self._name = self._rigid_body()
-            except BaseException:
-                self.close()
-                raise
 
     def measure(self) -> TrackerSample:
         """Average the next frames, see the module; identical frames are refused."""
@@ -384,14 +381,11 @@ class NatNetTracker:
 
     def _joined(self, server: NatNetServer) -> socket.socket:
         line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        try:
+        with undone_by(line.close):
             line.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             line.bind((server.group, server.data_port or DATA_PORT))
             member = socket.inet_aton(server.group) + socket.inet_aton(self._options.local)
             line.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
-        except BaseException:
-            line.close()
-            raise
         return line
 
     def _rigid_body(self) -> tuple[int, str]:

@@ -24,7 +24,7 @@ from hilcal.config.sections import Whole
 from hilcal.drivers import force_stream as fs
 from hilcal.drivers.force_stream import DEVICE
 from hilcal.drivers.links import address, network_failures
-from hilcal.errors import DeviceError
+from hilcal.errors import DeviceError, undone_by
 from hilcal.measuring.devices import ForceSensorDevice
 from hilcal.toml import Positive, Section, check_section
 from hilcal.types import Floats
@@ -77,14 +77,11 @@ class Datagrams:
         self._heard = time.monotonic()
         with network_failures(DEVICE, self.port):
             self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            try:
+            with undone_by(self._socket.close):
                 self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
                 self._socket.connect((host, port))
                 self._socket.setblocking(False)
                 self._ask(START)
-            except BaseException:
-                self._socket.close()
-                raise
 
     @property
     def in_waiting(self) -> int:

@@ -35,7 +35,7 @@ from hilcal.drivers.ur_link.reading import (
 from hilcal.drivers.ur_link.states import CHECK_LINK, CONTROL, HOLD_ON, failure
 from hilcal.drivers.ur_link.supervision import UrController, UrOptions
 from hilcal.drivers.ur_link.worker import WorkerError
-from hilcal.errors import InputError
+from hilcal.errors import InputError, undone_by
 from hilcal.measuring.devices import ArmSample, Report
 from hilcal.optional import install
 from hilcal.toml import check_section
@@ -123,11 +123,8 @@ class UrArm:
         self._control = command.take_control(self._controller, self._receiver)
         self._program_uploaded = True
         self._fault = ""
-        try:
+        with undone_by(self._release_control):
             self.set_payload(mass, com)
-        except BaseException:
-            self._release_control()
-            raise
 
     def set_payload(self, mass: float, com: Floats) -> None:
         """Set mass, kg, and centre of mass, m, at the flange; read back and compared."""

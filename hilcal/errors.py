@@ -1,5 +1,8 @@
 """Errors that a user can act on; each carries the exit code of the command line."""
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
 
 class HilcalError(Exception):
     """Base of all errors that are reported in one line, without a traceback."""
@@ -46,6 +49,16 @@ class StoppedError(HilcalError):
     """A person stopped the program; the message states what is stored and how to resume."""
 
     exit_code = 130
+
+
+@contextmanager
+def undone_by(undo: Callable[[], object]) -> Iterator[None]:
+    """Call `undo` where the block fails, an interrupt included, and raise the error."""
+    try:
+        yield
+    except BaseException:
+        undo()
+        raise
 
 
 def expect(value: object, classes: type | tuple[type, ...], name: str, valid: str) -> None:

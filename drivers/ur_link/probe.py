@@ -14,6 +14,8 @@ import time
 from collections.abc import Iterator
 from typing import Self
 
+from hilcal.errors import undone_by
+
 PORT = 30004
 _HEAD = struct.Struct(">HB")
 _PROBE_HZ, _STREAM_HZ = 10.0, 125.0
@@ -130,13 +132,10 @@ def check_stream(host: str, seconds: float) -> None:
 def stream(host: str, hz: float, outputs: tuple[str, ...], seconds: float) -> Connection:
     """Return a connection that receives packets of `outputs`; the controller must have them."""
     line = _greeted(host, seconds)
-    try:
+    with undone_by(line.close):
         _agreed(line, hz, outputs)
         _send(line, "S")
         _reply(line, "S", 1)
-    except BaseException:
-        line.close()
-        raise
     return line
 
 
@@ -155,13 +154,10 @@ def in_use(host: str, inputs: tuple[str, ...], seconds: float) -> bool:
 def _greeted(host: str, seconds: float) -> Connection:
     """Return a connection that speaks protocol 2."""
     line = Connection(host, PORT, "RTDE server", seconds)
-    try:
+    with undone_by(line.close):
         _send(line, "V", struct.pack(">H", 2))
         if _reply(line, "V", 1) != b"\x01":
             raise LinkError("the RTDE server (port 30004) does not speak protocol 2")
-    except BaseException:
-        line.close()
-        raise
     return line
 
 

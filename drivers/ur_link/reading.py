@@ -228,15 +228,12 @@ class TorqueReader:
         """
         if self._worker is None:
             return None
-        try:
+        with contextlib.suppress(WorkerError):
             torque = np.asarray(self._worker.call("mean", _ANSWER_S)["torque"], dtype=np.float64)
-        except WorkerError:
-            self.close()
-            return None
-        if torque.shape != (6,) or not (np.abs(torque) <= _LARGEST).all():
-            self.close()
-            return None
-        return torque
+            if torque.shape == (6,) and (np.abs(torque) <= _LARGEST).all():
+                return torque
+        self.close()
+        return None
 
     def close(self) -> None:
         """End the process; may be called twice."""

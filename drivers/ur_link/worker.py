@@ -13,6 +13,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from hilcal.errors import undone_by
+
 _ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -61,11 +63,8 @@ class Worker:
         finally:
             child_socket.close()
             os.close(life)
-        try:
+        with undone_by(self.kill):
             self._answer(0, time.monotonic() + seconds, seconds)
-        except BaseException:
-            self.kill()
-            raise
 
     @property
     def pid(self) -> int:
@@ -122,11 +121,8 @@ class Worker:
             self._process.wait(0.5)
         self.kill()
         code = self._process.returncode
-        try:
-            how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-        except ValueError:
-            how = f"exit code {code}"
-        return WorkerError(how, lost=True)
+        by = next((s.name for s in signal.Signals if s == -code), None)
+        return WorkerError(f"killed by {by}" if by else f"exit code {code}", lost=True)
 
     def _close(self) -> None:
         self._socket.close()

@@ -21,7 +21,7 @@ from hilcal.diagnosis.evidence import Evidence
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.diagnosis.verdict import diagnose, judge_naming, with_insufficiency
 from hilcal.effects.catalogue import Catalogue, installed
-from hilcal.errors import InputError, expect
+from hilcal.errors import InputError, expect, undone_by
 from hilcal.identification.baseline import baseline
 from hilcal.identification.carried.posterior import Posterior, Source
 from hilcal.identification.fit import Fit, fit
@@ -93,13 +93,10 @@ class Campaign(Brief):
             InputError: not a valid campaign, or without readings.
         """
         file = CampaignFile.open(path, read_only=read_only)
-        try:
+        with undone_by(file.close):
             number, records = file.accepted(), file.revisions()
             in_use = records[-1:] if number is None else records[number - 1 : number]
             self._set(file, catalogue or installed(), in_use[0].cell if in_use else {})
-        except BaseException:
-            file.close()
-            raise
 
     @property
     def config(self) -> CellConfig:

@@ -16,7 +16,7 @@ from hilcal.config import CellConfig
 from hilcal.design import tour
 from hilcal.design.tour import NEVER
 from hilcal.errors import CannotAnswerError
-from hilcal.measuring.route import duration, route, seconds_at_rest
+from hilcal.measuring.route import duration, durations, route, seconds_at_rest
 from hilcal.robot.arm import Arm
 from hilcal.store.plan import ARM, REFERENCE, UNLOADED, Plan, Step
 from hilcal.types import Bools, Floats
@@ -30,13 +30,6 @@ class Pace:
     acceleration: float  # of the leading joint, rad/s²
     reading_s: float  # time at rest for one step: the readings of all targets
     change_s: float  # time of a person for changing the load
-
-    def legs(self, starts: Floats, ends: Floats) -> Floats:
-        """Return the times (N, M) of straight motions, s; vectorised `route.duration`."""
-        way = np.abs(starts[:, None] - ends[None]).max(axis=-1, initial=0.0)
-        long = way / self.speed + self.speed / self.acceleration
-        short = 2.0 * np.sqrt(way / self.acceleration)
-        return np.asarray(np.where(way >= self.speed**2 / self.acceleration, long, short))
 
 
 @dataclass(frozen=True, slots=True)
@@ -446,7 +439,7 @@ def motion_times(q: Floats, load: str, passable: Passable, pace: Pace) -> tuple[
     First of straight motions, `NEVER` if not known to be clear; second the shorter of these and of
     the motion via the reference with a reading there.
     """
-    legs = pace.legs(q, q)
+    legs = durations(q[:, None], q, pace.speed, pace.acceleration)
     count = len(q)
     close = np.argsort(legs, axis=1, kind="stable")[:, : N_NEIGHBOURS + 1]
     tested = np.zeros((count, count), dtype=np.bool_)

@@ -410,10 +410,11 @@ class ForceMeter:
         if not weight and not place:
             return None
         return (
-            f"the force sensor measures a tool of {_tool(tool.mass, com)}, flange axes; [tool] "
-            f"says {_tool(cell.tool_mass, cell.tool_com)}"
+            f"the force sensor measures a tool of {body_text(tool.mass, com)}, flange axes; [tool] "
+            f"says {body_text(cell.tool_mass, cell.tool_com)}"
         )
 
 
-def _tool(mass: float, com: Floats) -> str:
+def body_text(mass: float, com: Floats) -> str:
+    """Return a mass, kg, and its centre (3,), m, for people."""
     return f"{mass:.3g} kg at ({', '.join(f'{x:.3f}' for x in com)}) m"

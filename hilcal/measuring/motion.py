@@ -11,7 +11,7 @@ from hilcal.errors import DeviceError
 from hilcal.measuring.connect import Setup
 from hilcal.measuring.devices import ArmSample, LoadChangedError
 from hilcal.measuring.feasibility import Feasibility, Margins
-from hilcal.measuring.force import ForceMeter, TaredWrench, judged_part
+from hilcal.measuring.force import ForceMeter, TaredWrench, body_text, judged_part
 from hilcal.measuring.progress import ArmPosition
 from hilcal.measuring.route import Stop, duration, route_problems
 from hilcal.store.plan import UNLOADED
@@ -290,7 +290,7 @@ class Mover:
             return None
         return (
             f"another program, or somebody at the pendant, has set its payload to "
-            f"{_payload_text(sample.payload, reported)}; it was {_payload_text(mass, com)}, tool "
+            f"{body_text(sample.payload, reported)}; it was {body_text(mass, com)}, tool "
             "and load by the cell. It decides how the controller corrects the arm's deflection "
             "and when it stops: let nothing else set it"
         )
@@ -464,7 +464,3 @@ class Mover:
         if not moved <= STILL_RAD:
             return f"arm: it moved by {moved:.3g} rad during the reading"
         return None
-
-
-def _payload_text(mass: float, com: Floats) -> str:
-    return f"{mass:.3g} kg at ({', '.join(f'{x:.3f}' for x in com)}) m"

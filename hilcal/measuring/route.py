@@ -75,15 +75,20 @@ def approach_sides(stops: Sequence[Stop]) -> Floats:
     return np.array(sides)
 
 
-def duration(start: Floats, end: Floats, speed: float, acceleration: float) -> float:
-    """Return the duration of a motion with a trapezoidal speed of the leading joint, s.
+def durations(start: Floats, end: Floats, speed: float, acceleration: float) -> Floats:
+    """Return the durations (...) of motions with a trapezoidal speed of the leading joint, s.
 
-    t = d/v + v/a if the speed v is reached, else 2 sqrt(d/a).
+    t = d/v + v/a if the speed v is reached, else 2 sqrt(d/a), between joint values (..., n).
     """
-    way = float(np.abs(end - start).max(initial=0.0))
-    if way >= speed**2 / acceleration:
-        return way / speed + speed / acceleration
-    return 2.0 * float(np.sqrt(way / acceleration))
+    way = np.abs(end - start).max(axis=-1, initial=0.0)
+    cruising = way >= speed**2 / acceleration
+    ramps = 2.0 * np.sqrt(way / acceleration)
+    return np.asarray(np.where(cruising, way / speed + speed / acceleration, ramps))
+
+
+def duration(start: Floats, end: Floats, speed: float, acceleration: float) -> float:
+    """Return the duration of one motion, as `durations`."""
+    return float(durations(start, end, speed, acceleration))
 
 
 MEASURING_S = 1.0

@@ -116,7 +116,8 @@ def open_grid(path: str | Path, file_format: FileFormat, check: Check | None = N
     if file_format.sheet or file_format.variable:
         key = "sheet" if file_format.sheet else "variable"
         raise InputError(f"{name}: text has no {key}; remove [file] {key}")
-    return read_text(name, content, file_format, check)
+    text = decoded(name, content, file_format.encoding)
+    return grid_of_rows(name, list(records(name, text, file_format)), file_format, check)
 
 
 def kind_of(path: str, content: bytes) -> str:
@@ -177,12 +178,8 @@ class Workbook:
     """A workbook that is read sheet by sheet."""
 
     reader: Any  # of openpyxl
+    sheetnames: list[str]  # in order
     merged: dict[str, list[str]]  # ranges of merged cells, by the name of a sheet's part
-
-    @property
-    def sheetnames(self) -> list[str]:
-        """Names of the sheets, in order."""
-        return list(self.reader.sheetnames)
 
 
 def workbook(path: str, content: bytes) -> Workbook:
@@ -207,9 +204,10 @@ def workbook(path: str, content: bytes) -> Workbook:
         book = openpyxl.load_workbook(
             io.BytesIO(content), read_only=True, data_only=True, keep_links=False
         )
-    if len(book.sheetnames) > limits.SHEETS:
-        raise InputError(f"{path}: {len(book.sheetnames)} sheets; valid: at most {limits.SHEETS}")
-    return Workbook(book, merged)
+    names = list(book.sheetnames)
+    if len(names) > limits.SHEETS:
+        raise InputError(f"{path}: {len(names)} sheets; valid: at most {limits.SHEETS}")
+    return Workbook(book, names, merged)
 
 
 def _check_xml(path: str, name: str, stream: IO[bytes]) -> list[str]:
@@ -452,14 +450,6 @@ def decoded(path: str, content: bytes, encoding: str | None) -> str:
     if "\x00" in text:
         raise InputError(f"{path}: binary data; expected text, XLSX, MAT or Parquet")
     return text
-
-
-def read_text(
-    path: str, content: bytes, file_format: FileFormat, check: Check | None = None
-) -> Grid:
-    """Read delimited text; `check` is given its header."""
-    text = decoded(path, content, file_format.encoding)
-    return grid_of_rows(path, list(records(path, text, file_format)), file_format, check)
 
 
 def records(path: str, text: str, file_format: FileFormat) -> Iterator[tuple[int, list[str]]]:
