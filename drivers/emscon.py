@@ -87,7 +87,9 @@ class EmsconConnection:
         """Send a command, again while the server is busy; return its status and content."""
         while True:
             body = struct.pack("<I", command) + parameters
-            self._send(es.HEADER.pack(es.HEADER.size + len(body), es.COMMAND) + body)
+            with self._failures():
+                self._socket.settimeout(DEADLINE_S)
+                self._socket.sendall(es.HEADER.pack(es.HEADER.size + len(body), es.COMMAND) + body)
             status, returned = self.answer(command, deadline=deadline)
             if status != es.BUSY or time.monotonic() + _PAUSE_S > deadline:
                 return status, returned
@@ -144,11 +146,6 @@ class EmsconConnection:
         except DeviceError:
             self.close()
             raise
-
-    def _send(self, data: bytes) -> None:
-        with self._failures():
-            self._socket.settimeout(DEADLINE_S)
-            self._socket.sendall(data)
 
     def _packet(self, until: float) -> tuple[int, bytes]:
         """Type and content of the next packet; state changes go to `changes`.

@@ -26,10 +26,6 @@ _SHEET = "a number over 0, from the sensor's own sheet"
 _BODY = np.dtype([("ticks", ">u2"), ("status", ">u2"), ("wrench", ">i2", 6)])
 
 
-def _checksum(frame: bytes) -> bytes:
-    return (sum(frame) & 0xFFFF).to_bytes(2, "big")
-
-
 def _sensor(counts_per_N: float, counts_per_Nm: float, rate: float) -> fs.SensorFormat:
     unit = 1.0 / np.repeat((counts_per_N, counts_per_Nm), 3)
 
@@ -40,7 +36,9 @@ def _sensor(counts_per_N: float, counts_per_Nm: float, rate: float) -> fs.Sensor
             return f"the {NAME} is loaded over its range; take the load off"
         return ""
 
-    frame = fs.FrameFormat(b"\xaa\x07\x08\x10", 22, _checksum, weak_checksum=True)
+    frame = fs.FrameFormat(
+        b"\xaa\x07\x08\x10", 22, lambda f: (sum(f) & 0xFFFF).to_bytes(2, "big"), weak_checksum=True
+    )
     return fs.SensorFormat(
         NAME, frame, _BODY, unit, lambda: fs.ByDeviceClock(1.0 / rate, 16), overload
     )

@@ -383,7 +383,7 @@ class _LoadedArm:
         acting = local.copy()
         if self.sensor is not None:
             loaded = wrench.any(axis=1)
-            acting[loaded] = self.sensor.true_wrench(local[loaded])
+            acting[loaded] = (local[loaded] - self.sensor.bias) @ self.sensor.gain.T
             turn = self.sensor.gain @ turn
         acting[:, 3:] += acting[:, :3] @ self.lever.T
         turn[:, 3:] += self.lever @ turn[:, :3]

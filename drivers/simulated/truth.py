@@ -277,10 +277,6 @@ class Misreading:
         turn = _both(axes)
         return Misreading(turn @ self.gain @ turn.T, turn @ self.bias)
 
-    def true_wrench(self, reading: Floats) -> Floats:
-        """Return the (N, 6) wrenches that act when the sensor reads `reading`, N and N·m."""
-        return np.asarray((reading - self.bias) @ self.gain.T)
-
 
 def _both(turn: Floats) -> Floats:
     """Return the (6, 6) rotation of force and moment."""

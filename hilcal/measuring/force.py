@@ -292,10 +292,6 @@ class ForceMeter:
         moment = cell.tool_mass * self._com
         self.tool = ToolLoad(np.zeros(6), cell.tool_mass, moment, exact, cell.gravity, 0.0, 0)
 
-    def present_wrench(self) -> Floats:
-        """Return the present tared wrench (6,), sensor axes."""
-        return np.asarray(self.sensor.latest().wrench - self.zero)
-
     def average(self) -> WrenchSample:
         """Return a mean of at least `MIN_FRAMES` frames, not tared."""
         sample = self.sensor.average(self._seconds)

@@ -85,7 +85,7 @@ class Hook:
         """Note that one of these loads hangs, and stop comparing the force with a load."""
         self._mover.hanging = hanging
         if self._mover.watch is not None:
-            self._mover.watch.suspend()
+            self._mover.watch.watching = False
 
     def _note_hanging(self, name: str) -> None:
         """Note that a load hangs, and compare the force with it."""

@@ -125,10 +125,6 @@ class LoadWatch:
         self._load, self.watching, self._since = load, True, None
         self._hung = np.zeros(6) if load is None else load.wrench(self._cell.gravity)
 
-    def suspend(self) -> None:
-        """Stop comparing, for a change of the load."""
-        self.watching = False
-
     def check_frame(self, sample: ArmSample, wrench: Floats, *, moving: bool) -> None:
         """Compare a frame of the sensor: a tared wrench (6,), sensor axes, N and N·m."""
         if not self.watching:
@@ -251,7 +247,8 @@ class Mover:
         if self._stop_requested():
             raise KeyboardInterrupt
         sample = self._arm.sample()
-        measured = None if self._meter is None else self._meter.present_wrench()
+        meter = self._meter
+        measured = None if meter is None else meter.sensor.latest().wrench - meter.zero
         checked = (self.guard.check(sample, measured, load) for load in self.hanging)
         reason = next(filter(None, checked), None) or self._frozen_clock(sample)
         if reason is not None:
@@ -345,11 +342,6 @@ class Mover:
         goal, name = self.goal, WHERE_LEFT
         self.goal = self.agreed_start(goal, name, goal, ask)
         self.move(goal, name)
-
-    def set_goal_here(self) -> None:
-        """Set the goal to the position of an arm that was stopped in motion."""
-        if self.goal is None:
-            self.goal = self._arm.sample().q
 
     def check_path(self, start: Floats, goal: Floats, name: str) -> None:
         """Check the straight line in joint space between two states (n,), rad."""

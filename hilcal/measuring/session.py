@@ -201,7 +201,8 @@ class Session:
                 self._rig.arm.stop()
                 if not remaining:
                     raise
-                self._mover.set_goal_here()
+                if self._mover.goal is None:  # it was stopped in motion
+                    self._mover.goal = self._rig.arm.sample().q
                 self._event("load", {"hanging": None, "why": str(error)})
                 self._remark(f"{error} The arm stands")
                 self._hook.restore(str(error))

@@ -113,7 +113,9 @@ def mapped_table(
     q = None if joints is None else _joint_units(joints, arm) * _block(raw, grid, joints.columns)
     wrench = _wrench(grid, mapping, np.asarray(gravity), table)
     if mapping.wrench is not None and mapping.wrench.axes == "flange" and q is not None:
-        wrench = _in_base_axes(wrench, arm, q)
+        # about the load point, by the nominal arm
+        turn = chain.evaluate(arm, arm.complete(q)).rotation[-1][:, None]
+        wrench = se3.apply(turn, wrench.reshape(-1, 2, 3)).reshape(-1, 6)
     if wrench.any():
         table.number.update(zip(columns.WRENCH, wrench.T, strict=True))
     table.text["load"] = _loads(grid, mapping, wrench)
@@ -411,12 +413,6 @@ def _hung_mass(grid: Grid, hung: forms.HungMass) -> Floats:
         return units.MASSES[hung.unit] * figures
     downwards = -1.0 if figures.max() <= 0 else 1.0
     return downwards * units.FORCES[hung.unit] / STANDARD_GRAVITY_M_S2 * figures
-
-
-def _in_base_axes(wrench: Floats, arm: Arm, q: Floats) -> Floats:
-    """Turn wrenches (N, 6) about the load point from flange axes, by the nominal arm."""
-    flange = chain.evaluate(arm, arm.complete(q)).rotation[-1]
-    return se3.apply(flange[:, None], wrench.reshape(-1, 2, 3)).reshape(-1, 6)
 
 
 def _loads(grid: Grid, mapping: forms.PointMapping, wrench: Floats) -> list[str]:
