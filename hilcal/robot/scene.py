@@ -341,7 +341,8 @@ class Pairs:
                 active = self._state.activeCollisionPairs[k]
                 if active and self._pin.computeCollision(self._geometry, self._state, k):
                     name = self._names[a], self._names[b] if segment is None else segment.name
-                    out[name] = min(out.get(name, np.inf), self._gap(k))
+                    gap = self._pin.computeDistance(self._geometry, self._state, k).min_distance
+                    out[name] = min(out.get(name, np.inf), float(gap))
         return out
 
     def contact_share(self, q: Floats, margin: float = 0.0) -> Floats:
@@ -353,16 +354,6 @@ class Pairs:
             self._pin.computeCollisions(self._geometry, self._state, False)
             count += [result.isCollision() for result in self._state.collisionResults]
         return np.asarray(count / len(q))
-
-    def distance(self, q: Floats, segment: Segment | None = None) -> float:
-        """Return the least distance in one state (n,), m; negative where shapes overlap."""
-        self._prepare(0.0, segment)
-        self._place(self._arm.chain_angles(q), _placements(segment, 1))
-        active = self._state.activeCollisionPairs
-        return min((self._gap(k) for k in range(len(self._pairs)) if active[k]), default=np.inf)
-
-    def _gap(self, k: int) -> float:
-        return float(self._pin.computeDistance(self._geometry, self._state, k).min_distance)
 
     def _prepare(self, margin: float | Floats, segment: Segment | None) -> None:
         """Set the margins of all pairs, and activate the pairs to check."""

@@ -7,6 +7,7 @@ import numpy as np
 from hilcal import limits
 from hilcal.config import CellConfig
 from hilcal.errors import InputError
+from hilcal.readings.averaging import averaged_samples
 from hilcal.readings.covariance import INSTRUMENT, INSTRUMENT_AND_ARM, tracker_noise
 from hilcal.readings.readings import ObserverName, Readings
 from hilcal.robot import chain, se3
@@ -14,7 +15,6 @@ from hilcal.robot.arm import Arm
 from hilcal.tables import mapping as forms
 from hilcal.tables import table as exchange
 from hilcal.tables.mapped import import_mapped
-from hilcal.tables.samples import averaged_samples
 
 ONE_DIRECTION, MANY_DIRECTIONS = 0.99, 0.9  # length of the mean of unit vectors; a choice
 SAME_WEIGHT = 0.1  # share by which a measured weight may be off that of the tool; a choice

@@ -25,6 +25,12 @@ def frames(arm, q):
     return [*out, pose @ arm.links[-1]]
 
 
+def least_distance(pairs, q, segment=None):
+    """Least distance of pairs of shapes in one state (n,), m; negative where they overlap."""
+    everywhere = pairs.close_pairs(q[None], 100.0, segment)
+    return min(everywhere.values(), default=np.inf)
+
+
 def along(a, b):
     """(POINTS, 3) points of a segment."""
     return a + np.linspace(0.0, 1.0, POINTS)[:, None] * (b - a)

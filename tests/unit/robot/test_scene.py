@@ -14,7 +14,7 @@ from hilcal.robot.chain import evaluate
 from hilcal.robot.scene import Scene, Segment, capsules, is_known
 from tests.support.arm_cases import ODD, arm_of
 from tests.support.fake_bench import POSES
-from tests.support.space_cases import frames, gap, gap_to, placed, self_gap
+from tests.support.space_cases import frames, gap, gap_to, least_distance, placed, self_gap
 
 POINT = st.tuples(*[st.floats(-2.0, 2.0, width=32)] * 3)
 UPRIGHT = np.array([0.0, -np.pi / 2, 0.0, -np.pi / 2, 0.0, 0.0])
@@ -73,10 +73,10 @@ def test_known_distances_to_a_ball_a_box_and_a_cylinder():
     at = 0.5 * side + [0.0, 0.0, height]
     ball = Segment("ball", at, at, 0.05)
     scene = Scene(arm)
-    distance = scene.segment_pairs.distance(UPRIGHT, ball)
+    distance = least_distance(scene.segment_pairs, UPRIGHT, ball)
     assert distance == pytest.approx(0.5 - 0.1762 - 0.06 - 0.05, abs=1e-6)
     turned = np.array([np.pi, *UPRIGHT[1:]])
-    assert scene.segment_pairs.distance(turned, ball) > 0.4
+    assert least_distance(scene.segment_pairs, turned, ball) > 0.4
     box = Obstacle(name="wall", center_m=(0.0, -0.5, height), size_m=(0.1, 0.2, 0.1))
     tube = 0.5 - 0.1 - 0.1762 - 0.06
     for thing in (box, Obstacle(name="x", bottom_m=(0, -0.5, 0.45), radius_m=0.1, height_m=0.06)):
@@ -134,9 +134,9 @@ def test_no_gap_closes_faster_than_its_rate(name, thing, seed):
         old, new = q[k : k + 1], (q + turns)[k : k + 1]
         was, here = (Segment("hung", at[k], at[k] - [0.0, 0.0, 0.2], 0.02) for at in places)
         for pairs in (scene.self_pairs, scene.obstacle_pairs):
-            near = pairs.distance(new[0]) + pairs.rates @ turn + 1e-4
+            near = least_distance(pairs, new[0]) + pairs.rates @ turn + 1e-4
             assert pairs.touching(old, near).all()
-        near = scene.segment_pairs.distance(new[0], here) + towards @ turn + 1e-4
+        near = least_distance(scene.segment_pairs, new[0], here) + towards @ turn + 1e-4
         assert scene.segment_pairs.touching(old, near, was).all()
 
 
