@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from hilcal.errors import InputError
+from hilcal.errors import InputError, undone_by
 
 SQLITE = b"SQLite format 3\x00"  # first bytes of a campaign
 RECORDING, PAGE = "RRF", "<!DOCTYPE html>"  # first bytes of a recording, and of a page
@@ -80,13 +80,10 @@ def replacing(
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
         new = place.with_name(f".{place.stem[:40]}-{secrets.token_hex(4)}{place.suffix[-20:]}")
         os.close(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
-        try:
+        with undone_by(lambda: new.unlink(missing_ok=True)):
             yield new
             _finish(new, old)
             new.replace(place)
-        except BaseException:
-            new.unlink(missing_ok=True)
-            raise
     except OSError as error:
         reason = os.strerror(error.errno) if error.errno else error  # libraries set no number
         raise InputError(f"{path}: cannot be written ({reason})") from error

@@ -17,7 +17,7 @@ from typing import Any, Self
 import numpy as np
 
 from hilcal import __version__, limits
-from hilcal.errors import HilcalError, InputError, MovedFileError
+from hilcal.errors import HilcalError, InputError, MovedFileError, undone_by
 from hilcal.names import quoted
 from hilcal.readings.readings import ObserverKind, ObserverName, Readings
 from hilcal.store import rows, schema
@@ -435,22 +435,15 @@ def new_campaign(
     """Yield an empty campaign to be filled; the file appears at the end of the block."""
     may_write(path, overwrite)
     with replacing(path, campaign=True) as new:
-        try:
-            with schema.sqlite_errors(path):
-                connection = schema.connect(new)
-                try:
-                    connection.execute("PRAGMA journal_mode = DELETE")
-                    with schema.transaction(connection):
-                        for statement in schema.statements():
-                            connection.execute(statement)
-                        for key, value in about.items():
-                            rows.insert_meta(connection, key, value)
-                        yield connection
-                finally:
-                    connection.close()
-        except BaseException:
-            _remove_journals(new)
-            raise
+        undo = undone_by(lambda: _remove_journals(new))
+        with undo, schema.sqlite_errors(path), closing(schema.connect(new)) as connection:
+            connection.execute("PRAGMA journal_mode = DELETE")
+            with schema.transaction(connection):
+                for statement in schema.statements():
+                    connection.execute(statement)
+                for key, value in about.items():
+                    rows.insert_meta(connection, key, value)
+                yield connection
         _remove_journals(Path(os.path.realpath(path)))  # another file's journal
 
 

@@ -20,7 +20,7 @@ from functools import cache
 from pathlib import Path
 
 from hilcal import limits
-from hilcal.errors import DeviceError, HilcalError, InputError
+from hilcal.errors import DeviceError, HilcalError, InputError, undone_by
 from hilcal.whole_file import SQLITE
 
 APPLICATION_ID = 0x68696C63  # "hilc"
@@ -139,7 +139,7 @@ def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
     connection = sqlite3.connect(
         f"{path.absolute().as_uri()}?mode={mode}", uri=True, isolation_level=None, timeout=5.0
     )
-    try:
+    with undone_by(connection.close):
         connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limits.DOCUMENT)
         pragmas = "synchronous = EXTRA", "foreign_keys = ON", "trusted_schema = OFF"
         for pragma in (*pragmas, "cell_size_check = ON"):
@@ -147,9 +147,6 @@ def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
         connection.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
         if sys.version_info >= (3, 12):
             connection.setconfig(sqlite3.SQLITE_DBCONFIG_DEFENSIVE, True)
-    except BaseException:
-        connection.close()
-        raise
     return connection
 
 
