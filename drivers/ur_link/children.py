@@ -133,10 +133,6 @@ _TRIES = 20
 _FIRST_S = 2.0  # longest wait for the first data, s
 
 
-class StaleError(Exception):
-    """No new data."""
-
-
 def _next_stamp(link: Any, seconds: float) -> float:
     """Wait until the controller's timestamp changes, and return it."""
     first, end = link.getTimestamp(), time.monotonic() + seconds
@@ -145,9 +141,9 @@ def _next_stamp(link: Any, seconds: float) -> float:
         if stamp != first:
             return float(stamp)
         if not link.isConnected():
-            raise StaleError("the RTDE connection is closed")
+            raise probe.LinkError("the RTDE connection is closed")
         if time.monotonic() > end:
-            raise StaleError(f"no new data over RTDE for {seconds:g} s")
+            raise probe.LinkError(f"no new data over RTDE for {seconds:g} s")
         time.sleep(_POLL)
 
 
@@ -165,7 +161,7 @@ def _sample(link: Any, names: list[str], stale: float) -> dict[str, Any]:
         if newest == stamp == fields["timestamp"]:
             return {"host_ns": host_ns, "fields": fields}
         stamp = newest
-    raise StaleError("the RTDE data change faster than they can be read")
+    raise probe.LinkError("the RTDE data change faster than they can be read")
 
 
 def _rate(link: Any, seconds: float, stale: float) -> dict[str, Any]:
@@ -183,7 +179,7 @@ def receive(host: str, hz: str, outputs: str) -> Serve:
     names = outputs.split(",")
     link = rtde_receive.RTDEReceiveInterface(host, float(hz), names, False, False)
     if not link.isConnected():
-        raise StaleError("the controller negotiates RTDE but sends no data")
+        raise probe.LinkError("the controller negotiates RTDE but sends no data")
     _next_stamp(link, _FIRST_S)
 
     def do(request: Request) -> dict[str, Any]:

@@ -103,10 +103,6 @@ PATIENCE_S = 0.8  # longest wait for new data at rest, real s
 _CONNECT_S, _ANSWER_S = 4.0, 0.3
 
 
-class ReadingError(Exception):
-    """The packet cannot be what the controller sent."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
     """The sample for the run, and the states that the driver checks."""
@@ -118,7 +114,7 @@ class Reading:
 
 
 def read(answer: dict[str, Any], reduced: bool = False) -> Reading:
-    """Return the reading in an answer of the receive worker; raises ReadingError.
+    """Return the reading in an answer of the receive worker; raises LinkError.
 
     `reduced`: the reduced mode is normal.
     """
@@ -127,7 +123,7 @@ def read(answer: dict[str, Any], reduced: bool = False) -> Reading:
     def checked(name: str, count: int, largest: float) -> Any:
         value = np.asarray(fields[name], dtype=np.float64)
         if value.shape != (count,) * (count > 0) or not (np.abs(value) <= largest).all():
-            raise ReadingError(f"{name} is {fields[name]}")
+            raise LinkError(f"the RTDE data are damaged: {name} is {fields[name]}")
         return value if count else float(value)
 
     values: dict[str, Any] = {"ft_raw_wrench": None, "payload": math.nan, "payload_com": None}
@@ -167,8 +163,6 @@ class Receiver:
         except WorkerError as error:
             source = "the process that receives over RTDE: " if error.lost else ""
             raise LinkError(f"{source}{error}") from None
-        except ReadingError as error:
-            raise LinkError(f"the RTDE data are damaged: {error}") from None
 
     def rate(self, seconds: float) -> float:
         """Return the packets per second, counted for `seconds`."""

@@ -51,10 +51,6 @@ class TargetLostError(DeviceError):
     """The tracker does not see its target; worth another try after `TrackerDevice.find_target`."""
 
 
-class WrongLoadError(DeviceError):
-    """The load is not the requested one."""
-
-
 class LoadChangedError(DeviceError):
     """The load has changed during a run; worth another try once a person has restored it."""
 

@@ -8,7 +8,7 @@ import numpy as np
 from hilcal.config import CellLoad
 from hilcal.errors import DeviceError
 from hilcal.measuring.connect import Setup
-from hilcal.measuring.devices import ConfirmingOperator, TerminalPerson, WrongLoadError
+from hilcal.measuring.devices import ConfirmingOperator, TerminalPerson
 from hilcal.measuring.force import ForceMeter
 from hilcal.measuring.motion import Mover, payload
 from hilcal.measuring.progress import Answered, Phase, Question, Remark
@@ -19,7 +19,7 @@ SWINGING_S = 2.0  # pause before a load that seems wrong is measured again, cell
 
 
 class Hook:
-    """The hanging load and its changes; WrongLoadError after `TRIES` wrong loads."""
+    """The hanging load and its changes; DeviceError after `TRIES` wrong loads."""
 
     def __init__(self, setup: Setup, meter: ForceMeter | None, mover: Mover) -> None:
         """Start with an unknown load, until `take_all_off`."""
@@ -132,7 +132,7 @@ class Hook:
             why += (
                 ". If nothing does, a load hung, or the tool was touched, when the sensor was tared"
             )
-        raise WrongLoadError(f"operator: asked {TRIES} times to {task}; {why}")
+        raise DeviceError(f"operator: asked {TRIES} times to {task}; {why}")
 
     def _differs(self, load: CellLoad | None) -> str:
         """Return why the measured wrench is not that of a load; tried twice, as it may swing."""

@@ -246,7 +246,7 @@ def packet() -> Parser:
             raise Accepted("packet: joints or temperatures that cannot be")
         return True
 
-    return Parser("packet", make, parse, refusals=(reading.ReadingError,))
+    return Parser("packet", make, parse, refusals=(LinkError,))
 
 
 TARGET = np.array([0.5, 2.8, 0.4])

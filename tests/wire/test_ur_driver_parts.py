@@ -26,7 +26,6 @@ from hilcal.drivers.ur_link.reading import (
     PRIMARY_PORT,
     TORQUE,
     N,
-    ReadingError,
     read,
     read_kinematics,
     settled_rate,
@@ -89,7 +88,7 @@ def test_slider_and_scaling_multiply():
 )
 def test_damaged_readings_are_refused(changes):
     reading()
-    with pytest.raises(ReadingError, match=next(iter(changes))):
+    with pytest.raises(LinkError, match=next(iter(changes))):
         reading(**changes)
 
 
