@@ -2,7 +2,6 @@
 
 import contextlib
 import itertools
-import os
 import time
 
 import numpy as np
@@ -13,10 +12,8 @@ from geocompy.geo import GeoCom
 from geocompy.geo.gctypes import GeoComCode
 from scipy import stats
 
-from hilcal.drivers.simulated.admin import Operations
 from hilcal.drivers.simulated.geocom_server import PolarPoint
 from hilcal.drivers.simulated.pty_port import PtyPort
-from hilcal.drivers.simulated.world import SimulatedNoise
 from tests.support.instruments import tracker
 
 BAUD = 115200
@@ -42,25 +39,6 @@ def received(port, line, count):
         port.pump()
         data += line.read(min(count - len(data), 64))
     return data
-
-
-def take(port, count):
-    data = b""
-    for _ in range(200):
-        data += port.read(0.02)
-        if len(data) >= count:
-            break
-    return data
-
-
-def test_carries_every_byte_value_both_ways(port):
-    every = bytes(range(256))
-    with client(port) as line:
-        port.send(every)
-        port.drain()
-        assert line.read(256) == every
-        line.write(every)
-        assert take(port, 256) == every
 
 
 def test_bytes_take_ten_bits_each(port):
@@ -96,40 +74,6 @@ def test_a_full_line_drops_whole_frames_and_counts_them(port):
     assert len(numbers) == sent
     assert all(a < b for a, b in itertools.pairwise(numbers))
     assert whole == [k.to_bytes(2, "big") * (size // 2) for k in numbers]
-
-
-def test_old_bytes_are_gone_when_a_client_opens(port):
-    past = time.monotonic() - 100.0
-    for _ in range(2000):
-        port.send(b"old" * 20, past)
-    port.pump()
-    with client(port, timeout=0.2) as line:
-        port.send(b"new")
-        port.drain()
-        assert line.read(100) == b"new"
-
-
-def test_plugged_in_again_it_works_under_the_same_name(port):
-    before = os.readlink(port.link)
-    port.unplug()
-    other = os.openpty()  # takes the freed number: the name has to lead to the new one
-    try:
-        port.faults()["replug"]()
-        assert os.readlink(port.link) != before
-        with client(port) as line:
-            port.send(b"back")
-            port.drain()
-            assert line.read(4) == b"back"
-    finally:
-        for end in other:
-            os.close(end)
-
-
-def test_refuses_what_it_does_not_know(port):
-    with pytest.raises(ValueError, match="unknown op 'explode'; valid: flip, cut"):
-        Operations(port.faults())("explode", {})
-    with pytest.raises(ValueError, match="valid"):
-        Operations(port.faults())("baud", {"baud": 12345})
 
 
 TARGET = (0.5, 2.8, 0.4)
@@ -240,15 +184,6 @@ def test_geocompy_reads_where_the_target_is(station):
         assert float(angles[0]) == pytest.approx(float(hz), abs=1e-4)
 
 
-def test_refuses_what_it_cannot_do(station):
-    with Line(station) as line:
-        assert line.tell("%R1Q,4711,1:") == "%R1P,0,1:3081"
-        assert line.tell("%R1Q,none:") == "%R1P,3080,0:0"
-        assert line.tell("%R1Q,17017,1:two") == "%R1P,0,1:2"
-        assert line.tell("%R1Q,9027,1:1.0") == "%R1P,0,1:2"
-        assert line.tell("hello\r\n\r\n%R1Q,0,3:") == "%R1P,0,3:0"
-
-
 @pytest.mark.parametrize(
     ("target", "scale"), [((0.4, 0.6, 1.3), 200.0), ((-8.0, 9.0, -6.0), 200.0)]
 )
@@ -273,16 +208,6 @@ def test_noise_is_as_specified_and_fresh(target, scale):
         *(np.mean(error[:, i] * error[:, j]) for i, j in ((0, 1), (0, 2), (1, 2))),
     ]
     assert np.all(np.abs(together) < 5 / np.sqrt(count))
-
-
-@pytest.mark.parametrize("point", [(0.0, 0.0, 2.0), (0.0, 0.0, -2.0), (1e-9, 0.0, 2.0)])
-def test_straight_above_and_below(point):
-    noise, rng = SimulatedNoise((0.0, 0.0), (1e-4, 0.0)), np.random.default_rng(1)
-    for _ in range(100):
-        seen = PolarPoint.of(noise.observe(np.array([point]), rng)[0])
-        assert 0.0 <= seen.hz < 2 * np.pi
-        assert 0.0 <= seen.v <= np.pi
-        np.testing.assert_allclose(cartesian(seen.hz, seen.v, seen.distance), point, atol=2e-3)
 
 
 def test_reads_the_target_of_the_moment_when_it_has_measured(station):

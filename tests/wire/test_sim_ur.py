@@ -3,7 +3,6 @@
 import socket
 import struct
 import time
-from contextlib import closing
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from hilcal.calibration.programs.urscript import movej_program, waypoints, with_joints
 from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.drivers.simulated.cell_processes import free_host
-from hilcal.drivers.simulated.ur_programs import ScriptStream
 from hilcal.drivers.simulated.ur_state import GRAVITY, Kinematics, Trajectory, line
 from hilcal.errors import DeviceError
 from hilcal.robot.catalogue import load_arm
@@ -84,17 +82,6 @@ def learns(run, part, call, good=bool):
         assert time.monotonic() < deadline, f"{call} stays {answer!r}"
         time.sleep(0.005)
     return answer
-
-
-def test_stopj_decelerates_as_told(sim):
-    with client(sim.host, "control") as run:
-        under_way(run, sim)
-        run("control", "stopJ", 1.0)
-        state = sim.admin()
-        assert not state["moving"]  # it blocked until the arm stood
-        assert state["script_running"]
-    (began,) = [ns for ns, what in sim.admin("log") if what == "stop command, 1"]
-    assert state["rest_ns"] - began == pytest.approx(SPEED / 1.0 * 1e9, rel=0.05)
 
 
 @pytest.mark.parametrize("how", ["dashboard", "line", "program", "killed"])
@@ -177,14 +164,6 @@ def test_forward_kinematics_is_that_of_the_nominal_arm(sim):
     np.testing.assert_allclose(turned(told[3:]), expected[:3, :3], atol=1e-9)
 
 
-def test_goal_beyond_the_joints_is_a_protective_stop(sim):
-    with client(sim.host, "control") as run:
-        goal = sim.admin()["q"]
-        goal[5] = 7.0
-        assert run("control", "moveJ", goal, SPEED, ACCELERATION) is False
-    assert sim.admin()["safety"] & 1 << 2
-
-
 Q = np.array([[0.1, -1.2, 1.5, -1.0, -1.4, 0.3], [0.3, -1.1, 1.4, -0.9, -1.5, 0.4]])
 PROGRAM = """def prog():
   set_tcp(p[0,0,0.1,0,0,0])
@@ -213,77 +192,6 @@ def test_a_program_of_compensated_points_is_carried_out(sim):
 
 def test_a_rewritten_program_goes_to_its_new_waypoints(sim):
     reached(sim, with_joints(PROGRAM, waypoints(PROGRAM), Q), Q)
-
-
-def test_programs_with_other_statements_are_foreign_and_move_nothing(sim):
-    before = sim.admin()["q"]
-    send_script(sim.host, "def p():\n  movej([0,0,0,0,0,0])\n  while (True):\n  end\nend\n")
-    wait_until(
-        lambda: any("foreign program" in line for _, line in sim.admin("log")), "a foreign program"
-    )
-    assert sim.admin()["q"] == before
-
-
-LOCAL = "Command is not allowed due to safety reasons, please switch robot to Remote Control mode"
-
-
-def test_clients_get_the_rate_that_they_asked_for(sim):
-    with Wire(sim.host) as fast, Wire(sim.host) as slow:
-        for wire, hz in ((fast, 250.0), (slow, 25.0)):
-            wire.outputs("timestamp", hz)
-            wire.ask("S")
-            times = [struct.unpack(">Bd", wire.receive()[1])[1] for _ in range(int(hz))]
-            assert times[-1] - times[0] == pytest.approx((hz - 1) / hz, abs=0.1)
-
-
-def test_nonsense_ends_the_connection_and_nothing_else(sim):
-    for data in (b"\x00\x04U\x09", b"\x00\x03U", b"\x00\x04V\x01", b"\x00\x0bO" + b"\xff" * 8):
-        with Wire(sim.host) as wire:
-            wire.socket.sendall(data)
-            with pytest.raises(ConnectionError):
-                wire.exactly(1)
-    with Wire(sim.host) as wire:
-        assert wire.ask("V", struct.pack(">H", 2)) == b"\x01"
-
-
-def test_dashboard_answers(sim):
-    with Lines(sim.host) as dashboard:
-        assert dashboard.read() == "Connected: Universal Robots Dashboard Server"
-        assert dashboard.ask("PolyscopeVersion").startswith("URSoftware 5.11.6.1010327 ")
-        assert dashboard.ask("get robot model") == "UR10e"
-        assert dashboard.ask("get serial number").isdigit()
-        assert dashboard.ask("robotmode") == "Robotmode: RUNNING"
-        assert dashboard.ask("safetystatus") == "Safetystatus: NORMAL"
-        assert dashboard.ask("running") == "Program running: false"
-        assert dashboard.ask("programState").split()[0] == "STOPPED"
-        assert dashboard.ask("play") == "Failed to execute: play"
-        assert dashboard.ask("close safety popup") == "closing safety popup"
-        assert dashboard.ask("dance") == "could not understand: 'dance'"
-        assert dashboard.ask("quit") == "Disconnected"
-        assert dashboard.read() == ""
-
-
-def test_dashboard_connections_of_local_mode_stay_without_rights(sim):
-    sim.admin("local_mode")
-    with Lines(sim.host) as dashboard:
-        dashboard.read()
-        assert dashboard.ask("is in remote control") == "false"
-        assert dashboard.ask("stop").startswith(LOCAL)
-        sim.admin("remote_mode")
-        assert dashboard.ask("is in remote control") == "true"
-        assert dashboard.ask("stop").startswith(LOCAL)
-    with Lines(sim.host) as dashboard:
-        dashboard.read()
-        assert dashboard.ask("stop") == "Stopped"
-
-
-def test_unknown_operations_and_settings_are_refused(sim):
-    with pytest.raises(DeviceError, match=r"'explode'; valid: protective_stop"):
-        sim.admin("explode")
-    with pytest.raises(DeviceError, match=r"speed_scaling = 2; valid: 0 to 1"):
-        sim.admin("set", speed_scaling=2)
-    with pytest.raises(DeviceError, match="four numbers"):
-        sim.admin("set", version="5.11")
 
 
 def test_the_truth_is_what_the_sensors_tell(tmp_path):
@@ -336,21 +244,6 @@ def test_an_address_in_use_is_refused(tmp_path, port):
         process.end()
     assert process.log.read_text().count("\n") == 1
     assert not (tmp_path / "arm.sock").exists()
-
-
-@pytest.mark.long
-def test_a_restarted_controller_finds_its_arm_where_it_was(tmp_path):
-    sim = start(tmp_path)
-    q = sim.admin()["q"]
-    sim.close()
-    q[2] += 0.5
-    sim.board.write("arm", q=q, moving=1.0, arrivals=41)
-    with closing(sim):
-        sim.start()
-        state = sim.admin()
-        assert state["q"] == q
-        assert state["arrivals"] == 42
-        assert sim.board.read("arm")["arrivals"] == 42
 
 
 GOAL = np.array([1.0, -0.5, 0.0, 0.2, 0.0, -1.5])
@@ -420,12 +313,3 @@ def test_jacobian_and_weight_are_derivatives():
     np.testing.assert_allclose(kinematics.jacobian(q, tip(q))[:3], numeric, atol=1e-8)
     work = [(energy(q + s) - energy(q - s)) / (2 * h) for s in steps]
     np.testing.assert_allclose(kinematics.weight_torque(q, mass, com), work, atol=1e-6)
-
-
-def test_script_port_cuts_programs_and_lines():
-    text = "stopj(2.0)\ndef a():\n  def b():\n    x = 1\n  end\nend\n\nsec c():\n  y = 2\nend\nd()"
-    stream = ScriptStream()
-    programs = [p for k in range(0, len(text), 3) for p in stream.feed(text[k : k + 3].encode())]
-    assert [p.split("\n")[0] for p in programs] == ["stopj(2.0)", "def a():", "sec c():"]
-    assert programs[1].endswith("  end\nend")
-    assert list(stream.feed(b"\r\n")) == ["d()"]

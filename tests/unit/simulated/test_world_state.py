@@ -1,6 +1,5 @@
 """The world as time goes by, its effects there, and its file."""
 
-import json
 import time
 from dataclasses import replace
 
@@ -8,12 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilcal.drivers.simulated.blackboard import Blackboard
-from hilcal.drivers.simulated.truth import Truth
-from hilcal.drivers.simulated.world import World
-from hilcal.drivers.simulated.world_server import WorldState, read_world, write_world
-from hilcal.errors import InputError
-from tests.support.arm_cases import ODD, arm_of
+from hilcal.drivers.simulated.world_server import read_world, write_world
 from tests.support.refusals import refusal
 from tests.support.running_world import (
     PULL,
@@ -221,20 +215,6 @@ def test_a_pose_without_equilibrium_is_logged_and_the_world_lives_on(tmp_path):
     assert cell.rest_at(upright)["arrivals"] == 3
 
 
-@pytest.mark.parametrize(
-    "wrong", [[1.0], [np.nan] * 6, [0.0, 0.0, 1e9, 0.0, 0.0, 0.0], [[0.0] * 6]]
-)
-def test_what_nobody_can_push_is_refused(cell, tmp_path, wrong):
-    refusal("valid: six numbers", cell.living.push, wrong)
-    refusal("valid: six numbers", cell.living.swing, wrong, period=1.0, decay=1.0)
-    refusal("valid: over 0", cell.living.swing, [1.0] * 6, period=1.0, decay=0.0)
-
-
-def test_an_unknown_load_is_refused_with_the_known_ones(cell, tmp_path):
-    for refused in (cell.living.hang, cell.living.mistake):
-        refusal(r'no load \'5 kg\' \(did you mean "5kg"\?\); valid: ', refused, "5 kg")
-
-
 def test_a_load_swings_for_a_while_and_rests_where_it_should(cell, tmp_path):
     cell.rest_at(Q)
     cell.living.swing([0.0, 0.0, 20.0, 0.0, 0.0, 0.0], period=1e-3, decay=0.2)  # world s
@@ -245,16 +225,6 @@ def test_a_load_swings_for_a_while_and_rests_where_it_should(cell, tmp_path):
     assert not same_bytes(seen[0], seen[1])
     time.sleep(0.2)  # 4 s of the world, 20 decays
     assert same_bytes(cell.truth_after()["flange"], still)
-
-
-def test_an_arm_of_seven_joints_is_refused(tmp_path):
-    made = config()
-    usual = world_of(made)
-    arm = arm_of(ODD)
-    cell, places = replace(usual.cell, arm=arm), (np.eye(4), np.eye(4))
-    odd = World(cell, Truth.rigid(arm), *places, usual.noise, np.zeros(7))
-    board = Blackboard.create(tmp_path / "world.bin", 1.0)
-    refusal("arm odd has 7 joints, the shared world one of 6", WorldState, odd, made, board, 1)
 
 
 def state_of(cell, truth, wrench):
@@ -339,27 +309,3 @@ def test_world_comes_back_from_its_file_to_the_last_bit(tmp_path):
     assert back.joint_reference == 23.4
     state = replace(states(Q, WEIGHT, 12.3), joint_temperature=np.full((1, 6), 25.0))
     assert same_bytes(back.ideal_readings(state).position, world.ideal_readings(state).position)
-
-
-def test_a_configuration_of_another_cell_is_refused(tmp_path):
-    world = world_of(config())
-    other = config(tool={"mass_kg": 0.9, "load_point_m": [0.1, -0.03, 0.15]})
-    with pytest.raises(InputError, match="differ in targets, tool_mass, tool_com;"):
-        write_world(tmp_path / "world.json", world, other)
-    assert not (tmp_path / "world.json").exists()
-
-
-@pytest.mark.parametrize("text", ["", "[1]", '{"format": "hilcal-plan"}', "{"])
-def test_another_file_is_no_world(tmp_path, text):
-    (tmp_path / "world.json").write_text(text)
-    refusal("no world", read_world, tmp_path / "world.json")
-
-
-def test_a_damaged_world_says_so(tmp_path):
-    path = tmp_path / "world.json"
-    write_world(path, world_of(config()), config())
-    content = json.loads(path.read_text())
-    del content["physics"]["base_frame"]
-    path.write_text(json.dumps(content))
-    refusal(r"no world: TypeError .*'base_frame'", read_world, path)
-    refusal("cannot be read", read_world, tmp_path / "none.json")
